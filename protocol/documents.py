@@ -1,0 +1,136 @@
+"""Reading JSON and YAML documents, and turning validation faults into one sentence."""
+
+import difflib
+import json
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, Self, TypeVar
+
+import yaml
+from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
+from pydantic_core import ErrorDetails, PydanticCustomError
+
+from protocol.errors import DeltalightError
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def nearest(word: str, known: Iterable[str]) -> str | None:
+    """Return the known word that looks most like `word`, or None where nothing is alike."""
+    by_lower = {name.lower(): name for name in known}
+    found = difflib.get_close_matches(word.lower(), by_lower, n=1, cutoff=0.4)
+    return by_lower[found[0]] if found else None
+
+
+class StrictModel(BaseModel):
+    """A frozen model that refuses unknown keys (naming the nearest) and numbers that are not finite."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _refuse_unknown_keys(cls, data: Any) -> Any:  # noqa: ANN401 - whatever the document holds
+        if isinstance(data, Mapping):
+            for key in data:
+                if key not in cls.model_fields:
+                    known = sorted(cls.model_fields)
+                    hint = nearest(str(key), known)
+                    advice = (
+                        f"the nearest known key is `{hint}`" if hint else f"known keys are {', '.join(known)}"
+                    )
+                    raise PydanticCustomError("unknown_key", "{advice}", {"key": str(key), "advice": advice})
+        return data
+
+    def replaced(self, **changes: object) -> Self:
+        """Return a validated copy with some fields changed."""
+        return type(self).model_validate({**dict(self), **changes})
+
+
+def read_mapping(path: Path) -> dict[str, Any]:
+    """Read a JSON (`.json`) or YAML document whose top level is a mapping.
+
+    Raises:
+        DeltalightError: the file is missing, unreadable, malformed, or not a mapping.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise DeltalightError(
+            f"{path} cannot be read ({error.strerror}); give a file that exists."
+        ) from error
+    except UnicodeDecodeError as error:
+        raise DeltalightError(f"{path} is not a text file; give a JSON or YAML document.") from error
+    return parse_mapping(text, str(path), is_json=path.suffix.lower() == ".json")
+
+
+def parse_mapping(text: str, name: str, *, is_json: bool) -> dict[str, Any]:
+    """Parse the text of a document called `name` whose top level is a mapping.
+
+    Raises:
+        DeltalightError: the text is malformed or not a mapping.
+    """
+    kind = "JSON" if is_json else "YAML"
+    try:
+        data = json.loads(text) if is_json else yaml.safe_load(text)
+    except (ValueError, yaml.YAMLError, RecursionError) as error:
+        detail = " ".join(str(error).split())[:160]
+        raise DeltalightError(f"{name} is not valid {kind} ({detail}); correct it there.") from error
+    if not isinstance(data, dict):
+        raise DeltalightError(
+            f"{name} must hold keys and values, not a {type(data).__name__}; write `key: value` lines."
+        )
+    return data
+
+
+def validate(model: type[Model], data: Mapping[str, Any], name: str) -> Model:
+    """Validate a document called `name` against a model.
+
+    Raises:
+        DeltalightError: the first fault, as one sentence with the place in the document.
+    """
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        raise DeltalightError(f"{name}: {_sentence(error.errors(include_url=False)[0], data)}") from error
+
+
+def _sentence(fault: ErrorDetails, document: Mapping[str, Any]) -> str:
+    place = _place(fault, document)
+    context = fault.get("ctx", {})
+    match fault["type"]:
+        case "unknown_key":
+            where = f"{place}.{context['key']}" if place else context["key"]
+            return f"unknown key `{where}`; {context['advice']}."
+        case "missing":
+            return f"the key `{place}` is missing; add it."
+        case "union_tag_invalid":
+            tag = str(context["tag"])
+            expected = [word.strip(" '") for word in str(context["expected_tags"]).split(",")]
+            hint = nearest(tag, expected)
+            advice = f"the nearest is `{hint}` of" if hint else "use one of"
+            return f"`{place}` names the unknown kind `{tag}`; {advice} {', '.join(expected)}."
+        case "value_error":
+            message = str(context["error"])
+        case _:
+            message = fault["msg"]
+    message = (message[:1].lower() + message[1:]).rstrip(".")
+    return f"`{place}` is wrong: {message}{_given(fault['input'])}." if place else f"{message}."
+
+
+def _given(value: object) -> str:
+    shown = isinstance(value, (str, int, float, bool)) or value is None
+    return f" (given: {value!r})"[:120] if shown else ""
+
+
+def _place(fault: ErrorDetails, document: Any) -> str:  # noqa: ANN401 - whatever the document holds
+    """Write a fault's location as `a.b[0].c`, without the union tags that pydantic puts between."""
+    place, here = "", document
+    for index, step in enumerate(fault["loc"]):
+        is_last_missing = fault["type"] == "missing" and index == len(fault["loc"]) - 1
+        if isinstance(step, int):
+            place += f"[{step}]"
+            here = here[step] if isinstance(here, (list, tuple)) and step < len(here) else None
+        elif is_last_missing or (isinstance(here, Mapping) and step in here):
+            place += f".{step}" if place else step
+            here = here.get(step) if isinstance(here, Mapping) else None
+    return place

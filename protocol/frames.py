@@ -1,0 +1,92 @@
+"""What cameras give and what the renderer takes: pictures, depth, poses."""
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, UInt8
+
+from protocol.board import BoardSpec
+from protocol.camera_model import CameraModel
+
+
+@dataclass(frozen=True, eq=False)
+class BoardPose:
+    """Where one picture was taken, as the marker board shows it.
+
+    `world_from_camera` is (4, 4); `alternative` is the other solution of the planar ambiguity, if known.
+    """
+
+    world_from_camera: Float64[np.ndarray, "4 4"]
+    reprojection_error_px: float | None = None
+    alternative: Float64[np.ndarray, "4 4"] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class DepthImage:
+    """Depth in metres along the optical axis.
+
+    `depth_m` is 0 where unknown; `valid` is the mask that says so. `camera` is the depth image's own camera,
+    equal to the colour camera if registered. `noise_sigma_m` is the noise at 1 m; it grows with the square of
+    the distance.
+    """
+
+    depth_m: Float32[np.ndarray, "h w"]
+    valid: Bool[np.ndarray, "h w"]
+    camera: CameraModel
+    noise_sigma_m: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class SensorFrame:
+    """One picture with its depth, raw, as captured or recorded.
+
+    `frame_id` is the zero-based index of the line in rgb.txt for datasets. `color` is RGB, camera-coded.
+    `response` is linear R G B for each code (None = sRGB). `exposure_s` None = reference exposure.
+    `world_from_camera` is a given pose, if any. `color_jpeg` holds the encoded bytes where the source has
+    them.
+    """
+
+    frame_id: int
+    timestamp_ns: int
+    color: UInt8[np.ndarray, "h w 3"]
+    camera: CameraModel
+    response: Float32[np.ndarray, "256 3"] | None = None
+    exposure_s: float | None = None
+    depth: DepthImage | None = None
+    depth_timestamp_ns: int | None = None
+    world_from_camera: Float64[np.ndarray, "4 4"] | None = None
+    color_jpeg: bytes | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class ViewFrame:
+    """The input of one composite.
+
+    Linear camera colour is `decode_lut(response)[color] / exposure_scale`. `depth` is clean and registered to
+    colour; None where the scene gives a model. `board` lets the renderer find the board's white paper.
+    """
+
+    frame_id: int
+    timestamp_ns: int
+    color: UInt8[np.ndarray, "h w 3"]
+    camera: CameraModel
+    response: Float32[np.ndarray, "256 3"] | None = None
+    exposure_scale: float = 1.0
+    pose: BoardPose | None = None
+    depth: DepthImage | None = None
+    board: BoardSpec | None = None
+
+
+def decode_lut(response: Float32[np.ndarray, "256 3"] | None) -> Float32[np.ndarray, "256 3"]:
+    """Return the table camera code -> linear R G B (1.0 = sensor white); None: sRGB (IEC 61966-2-1)."""
+    return _srgb_lut() if response is None else response
+
+
+@cache
+def _srgb_lut() -> Float32[np.ndarray, "256 3"]:
+    code = np.arange(256) / 255.0
+    linear = np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
+    table = np.repeat(linear[:, None], 3, axis=1).astype(np.float32)
+    table.flags.writeable = False
+    return table

@@ -1,0 +1,312 @@
+"""The messages of the wire: one validated model each, whose fields are the header (SPEC.md, section 3).
+
+A model holds everything but the bulk data; pictures and depth travel as raw parts behind the header.
+`part_rules` of a message says which parts follow it and how long each must be.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Final, Literal, Self, get_args
+
+import numpy as np
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints, model_validator
+
+SCHEMA_VERSION: Final = 1
+MAX_HEADER_BYTES = 64 * 1024
+MAX_PART_BYTES = 64 * 1024 * 1024
+MAX_EDGE_PX = 16384
+MAX_LIGHTS = 64
+MAX_EXPOSURES = 12
+MAX_PLAIN_DEPTH = 16
+RESPONSE_SHAPE = (256, 3)
+ROTATION_TOLERANCE = 1e-3
+
+DType = Literal["uint8", "uint16", "float32"]
+Stream = Literal[
+    "color", "depth", "clean_depth", "fisheye", "pose", "lights", "composite", "stats", "request", "reply"
+]
+ITEM_SIZE: dict[DType, int] = {"uint8": 1, "uint16": 2, "float32": 4}
+
+
+def _plain(value: object, depth: int = 0) -> object:
+    """Refuse what JSON cannot say: other types, numbers that are not finite, deep nesting."""
+    if depth > MAX_PLAIN_DEPTH:
+        raise ValueError(f"is nested deeper than {MAX_PLAIN_DEPTH} levels")
+    if isinstance(value, dict):
+        if not all(isinstance(key, str) for key in value):
+            raise ValueError("has a key that is not text")
+        for item in value.values():
+            _plain(item, depth + 1)
+    elif isinstance(value, list | tuple):
+        for item in value:
+            _plain(item, depth + 1)
+    elif isinstance(value, float):
+        if not math.isfinite(value):
+            raise ValueError("holds a number that is not finite")
+    elif value is not None and not isinstance(value, str | int):
+        raise ValueError(f"holds a {type(value).__name__}, which is not plain data")
+    return value
+
+
+def _rigid(rows: "Matrix4") -> "Matrix4":
+    matrix = np.array(rows)
+    rotation = matrix[:3, :3]
+    if rows[3] != (0.0, 0.0, 0.0, 1.0):
+        raise ValueError("its last row must be 0 0 0 1")
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() > ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
+        raise ValueError("it must be a rigid transform (a rotation with determinant +1, and a translation)")
+    return rows
+
+
+Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")]
+Label = Annotated[str, StringConstraints(min_length=1, max_length=96)]
+Sentence = Annotated[str, StringConstraints(max_length=2000)]
+Nanoseconds = Annotated[int, Field(ge=0, le=2**63 - 1)]
+Count = Annotated[int, Field(ge=0, le=2**63 - 1)]
+Edge = Annotated[int, Field(ge=1, le=MAX_EDGE_PX, strict=True)]
+Coordinate = Annotated[float, Field(ge=-1e6, le=1e6, strict=True)]
+Seconds = Annotated[float, Field(gt=0, le=3600, strict=True)]
+# Tuples are not strict because msgpack has one array type; what is inside them is.
+Row4 = Annotated[tuple[Coordinate, Coordinate, Coordinate, Coordinate], Field(strict=False)]
+Matrix4 = Annotated[tuple[Row4, Row4, Row4, Row4], Field(strict=False)]
+RigidMatrix = Annotated[Matrix4, AfterValidator(_rigid)]
+Channels = Annotated[int, Field(ge=3, le=3, strict=True)]
+PictureShape = Annotated[tuple[Edge, Edge, Channels], Field(strict=False)]
+DepthShape = Annotated[tuple[Edge, Edge], Field(strict=False)]
+PlainDict = Annotated[dict[str, object], AfterValidator(_plain)]
+LightList = Annotated[tuple[PlainDict, ...], Field(strict=False, max_length=MAX_LIGHTS)]
+Durations = Annotated[dict[Label, Annotated[float, Field(ge=0, le=1e7)]], Field(max_length=128)]
+Counts = Annotated[dict[Label, Count], Field(max_length=128)]
+Rates = Annotated[dict[Label, Annotated[float, Field(ge=0, le=1e6)]], Field(max_length=128)]
+
+
+@dataclass(frozen=True)
+class PartRule:
+    """One raw part: `shape` of little-endian `dtype` in C order, or a code that unpacks to it."""
+
+    name: str
+    shape: tuple[int, ...]
+    dtype: DType
+    compressed: bool = False
+
+    @property
+    def raw_bytes(self) -> int:
+        """Length of the part when it is not compressed, in bytes."""
+        return math.prod(self.shape) * ITEM_SIZE[self.dtype]
+
+
+class MessageBase(BaseModel):
+    """Fields that every message carries; times are nanoseconds since 1970 by the sender's clock.
+
+    `capture_ns + clock_offset_ns` is the capture time by the render server's clock, wrong by at most
+    `clock_bound_ns`; a bound of None says that the clocks were never compared.
+    """
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+    schema_version: Literal[1] = SCHEMA_VERSION
+    node: Name
+    stream: Stream
+    frame_id: Count
+    capture_ns: Nanoseconds
+    clock_offset_ns: Annotated[int, Field(ge=-(2**62), le=2**62)] = 0
+    clock_bound_ns: Nanoseconds | None = None
+
+    @property
+    def topic(self) -> str:
+        """Topic of the message: `<stream>.<node>`."""
+        return f"{self.stream}.{self.node}"
+
+    def part_rules(self) -> tuple[PartRule, ...]:
+        """Raw parts that follow the header, in order."""
+        return ()
+
+    @model_validator(mode="after")
+    def _parts_fit(self) -> Self:
+        for rule in self.part_rules():
+            if rule.raw_bytes > MAX_PART_BYTES:
+                raise ValueError(f"{rule.name} of shape {rule.shape} is larger than {MAX_PART_BYTES} bytes")
+        return self
+
+
+class ColorMessage(MessageBase):
+    """A colour picture as captured, RGB, camera-coded; parts: picture, then the response if `has_response`.
+
+    Without a response (float32 256x3, camera code to linear) the code is sRGB. `exposure_s` None is the
+    reference exposure. `camera` is `CameraModel.to_dict()`.
+    """
+
+    stream: Literal["color"] = "color"
+    encoding: Literal["jpeg", "raw"]
+    shape: PictureShape
+    dtype: Literal["uint8"] = "uint8"
+    camera: PlainDict
+    has_response: bool = False
+    exposure_s: Seconds | None = None
+
+    def part_rules(self) -> tuple[PartRule, ...]:
+        """The picture, and the camera response if there is one."""
+        picture = PartRule("picture", self.shape, self.dtype, self.encoding == "jpeg")
+        return (picture, PartRule("response", RESPONSE_SHAPE, "float32")) if self.has_response else (picture,)
+
+
+class DepthMessage(MessageBase):
+    """Depth along the optical axis in steps of `depth_scale_m`, 0 = unknown; one part.
+
+    Stream `depth` is as captured, `clean_depth` is registered to colour and cleaned. `noise_sigma_m` is the
+    standard deviation at 1 m (it grows with the square of the distance), None = unknown. `camera` is the
+    depth's own.
+    """
+
+    stream: Literal["depth", "clean_depth"] = "depth"
+    encoding: Literal["blosc2", "raw"]
+    shape: DepthShape
+    dtype: Literal["uint16"] = "uint16"
+    depth_scale_m: Annotated[float, Field(ge=1e-6, le=1.0)]
+    camera: PlainDict
+    noise_sigma_m: Annotated[float, Field(gt=0, le=10.0)] | None = None
+
+    def part_rules(self) -> tuple[PartRule, ...]:
+        """The depth image."""
+        return (PartRule("depth", self.shape, self.dtype, self.encoding == "blosc2"),)
+
+
+class FisheyeMessage(MessageBase):
+    """A fish-eye picture or exposure bracket, RGB: one part for each entry of `exposures_s`.
+
+    uint8 is sRGB-coded, float32 is linear (raw only). An exposure of None is the reference exposure.
+    """
+
+    stream: Literal["fisheye"] = "fisheye"
+    encoding: Literal["jpeg", "raw"]
+    shape: PictureShape
+    dtype: Literal["uint8", "float32"] = "uint8"
+    camera: PlainDict
+    exposures_s: Annotated[
+        tuple[Seconds | None, ...], Field(strict=False, min_length=1, max_length=MAX_EXPOSURES)
+    ] = (None,)
+
+    def part_rules(self) -> tuple[PartRule, ...]:
+        """One picture for each exposure."""
+        compressed = self.encoding == "jpeg"
+        return tuple(
+            PartRule(f"picture {i}", self.shape, self.dtype, compressed) for i in range(len(self.exposures_s))
+        )
+
+    @model_validator(mode="after")
+    def _jpeg_is_bytes(self) -> Self:
+        if self.encoding == "jpeg" and self.dtype != "uint8":
+            raise ValueError("a jpeg picture has dtype uint8")
+        return self
+
+
+class PoseMessage(MessageBase):
+    """Pose of the camera for the colour frame `frame_id`: point_world = world_from_camera @ point_camera.
+
+    `alternative` is the other solution of a planar board; `board` describes the board (`BoardSpec` as plain
+    data).
+    """
+
+    stream: Literal["pose"] = "pose"
+    status: Literal["ok", "no_board"]
+    world_from_camera: RigidMatrix | None = None
+    alternative: RigidMatrix | None = None
+    reprojection_error_px: Annotated[float, Field(ge=0, le=1e5)] | None = None
+    board: PlainDict | None = None
+
+    @model_validator(mode="after")
+    def _status_agrees(self) -> Self:
+        if (self.status == "ok") != (self.world_from_camera is not None):
+            raise ValueError("world_from_camera must be given where status is ok, and only there")
+        return self
+
+
+class LightsMessage(MessageBase):
+    """Lights of the real room, each written as in `lights.manual` of the scene document."""
+
+    stream: Literal["lights"] = "lights"
+    lights: LightList
+
+
+class CompositeMessage(MessageBase):
+    """The finished picture of the colour frame `frame_id` (sRGB, RGB order); one part.
+
+    `capture_ns` and the clock fields are those of that frame; `received_ns` and `rendered_ns` are by the
+    server's clock.
+    """
+
+    stream: Literal["composite"] = "composite"
+    encoding: Literal["jpeg", "raw"]
+    shape: PictureShape
+    dtype: Literal["uint8"] = "uint8"
+    status: Literal["ok", "no_pose"]
+    received_ns: Nanoseconds
+    rendered_ns: Nanoseconds
+    pass_times_ms: Durations = Field(default_factory=dict)
+    lights: LightList = ()
+    drops: Counts = Field(default_factory=dict)
+
+    def part_rules(self) -> tuple[PartRule, ...]:
+        """The picture."""
+        return (PartRule("picture", self.shape, self.dtype, self.encoding == "jpeg"),)
+
+
+class StatsMessage(MessageBase):
+    """How a process is doing: rates in 1/s and drops by topic, a state, and a sentence for people."""
+
+    stream: Literal["stats"] = "stats"
+    frame_id: Count = 0
+    state: Literal["starting", "running", "waiting", "degraded", "stopping"]
+    detail: Sentence = ""
+    rates: Rates = Field(default_factory=dict)
+    drops: Counts = Field(default_factory=dict)
+
+
+class ControlRequest(MessageBase):
+    """A command: `op` with `payload`.
+
+    A repeated `id`, or a repeated `revision` of one op, is not carried out twice.
+    """
+
+    stream: Literal["request"] = "request"
+    frame_id: Count = 0
+    capture_ns: Nanoseconds = 0
+    id: Name
+    op: Name
+    revision: Count | None = None
+    payload: PlainDict = Field(default_factory=dict)
+
+
+class ControlReply(MessageBase):
+    """The answer to the request of the same `id`; `error` is one sentence where `ok` is false."""
+
+    stream: Literal["reply"] = "reply"
+    frame_id: Count = 0
+    capture_ns: Nanoseconds = 0
+    id: Name
+    ok: bool
+    error: Sentence | None = None
+    payload: PlainDict = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _error_agrees(self) -> Self:
+        if self.ok != (self.error is None):
+            raise ValueError("error must be given where ok is false, and only there")
+        return self
+
+
+Message = (
+    ColorMessage
+    | DepthMessage
+    | FisheyeMessage
+    | PoseMessage
+    | LightsMessage
+    | CompositeMessage
+    | StatsMessage
+    | ControlRequest
+    | ControlReply
+)
+MESSAGE_TYPES: Mapping[str, type[Message]] = {
+    stream: kind for kind in get_args(Message) for stream in get_args(kind.model_fields["stream"].annotation)
+}

@@ -1,0 +1,51 @@
+"""Sender of streams: a PUB socket that never waits for anybody."""
+
+import threading
+from collections.abc import Sequence
+
+import zmq
+
+from protocol.errors import DeltalightError
+from protocol.messages import MAX_PART_BYTES
+from protocol.sockets import HIGH_WATER_MARK, attach, open_socket
+
+STREAMS_OF_A_NODE = 8
+
+
+class Publisher:
+    """Publishes multiparts to whoever subscribes; a subscriber that is too slow misses messages.
+
+    `streams` is how many messages are sent in a row for one frame. The queue to each subscriber holds two
+    frames of so many messages: one shorter than such a row would always lose its last messages (the pose).
+    """
+
+    def __init__(self, endpoint: str, *, bind: bool = True, streams: int = STREAMS_OF_A_NODE) -> None:
+        self._context = zmq.Context()
+        self._lock = threading.Lock()
+        try:
+            self._socket = open_socket(self._context, zmq.PUB, high_water_mark=HIGH_WATER_MARK * streams)
+            self.endpoint = attach(self._socket, endpoint, bind=bind)
+        except DeltalightError:
+            self._context.destroy(0)
+            raise
+
+    def send(self, multipart: Sequence[bytes | memoryview]) -> None:
+        """Send one multipart [topic, header, part...]; its bytes are copied before this returns.
+
+        Raises:
+            DeltalightError: a piece is too large for the receivers, or the publisher is closed.
+        """
+        largest = max(len(piece) for piece in multipart)
+        if largest > MAX_PART_BYTES:
+            raise DeltalightError(
+                f"a part has {largest} bytes and {MAX_PART_BYTES} are allowed: send smaller pictures"
+            )
+        with self._lock:
+            if self._socket.closed:
+                raise DeltalightError("the publisher is closed: open a new one to send")
+            self._socket.send_multipart(multipart)
+
+    def close(self) -> None:
+        """Close the socket; what is still queued is thrown away."""
+        with self._lock:
+            self._context.destroy(0)

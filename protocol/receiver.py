@@ -1,0 +1,113 @@
+"""Receiver of streams: a thread that owns the SUB socket and keeps the newest message of each topic."""
+
+import threading
+import time
+from collections import Counter
+from collections.abc import Sequence
+
+import zmq
+
+from protocol.envelope import MAX_PARTS, MAX_TOPIC_BYTES
+from protocol.errors import DeltalightError
+from protocol.sockets import attach, open_socket
+
+MAX_TOPICS = 256
+
+
+class ReceivedMultipart(list[memoryview]):
+    """Pieces of one message, [topic, header, part...], and when it arrived."""
+
+    received_ns: int
+
+    def __init__(self, pieces: Sequence[memoryview], received_ns: int) -> None:
+        super().__init__(pieces)
+        self.received_ns = received_ns
+
+
+class Receiver:
+    """Mailbox with one slot for each topic: the newest message wins, and each never taken is counted.
+
+    The thread empties the socket at once: a slow consumer meets new frames and not a queue of old ones.
+    `topics` are stream names (`color`) or whole topics (`color.desk`); none at all means everything.
+    """
+
+    def __init__(self, endpoints: Sequence[str], topics: Sequence[str], *, bind: bool = False) -> None:
+        self._topics = tuple(topics)
+        self._slots: dict[str, ReceivedMultipart] = {}
+        self._drops: Counter[str] = Counter()
+        self._refused = 0
+        self._seen: set[str] = set()
+        self._fresh = threading.Condition()
+        self._closed = False
+        self._context = zmq.Context()
+        try:
+            self._socket = open_socket(self._context, zmq.SUB)
+            for topic in self._topics or ("",):
+                self._socket.subscribe(topic)
+            self.endpoints = tuple(attach(self._socket, endpoint, bind=bind) for endpoint in endpoints)
+        except DeltalightError:
+            self._context.destroy(0)
+            raise
+        self._thread = threading.Thread(target=self._run, name="receiver", daemon=True)
+        self._thread.start()
+
+    def latest(self, timeout_s: float) -> dict[str, ReceivedMultipart] | None:
+        """Newest message of every topic that has one not taken yet, by topic; taking empties the slots.
+
+        Waits until there is one; None after `timeout_s` seconds without any, or when the receiver is closed.
+        """
+        with self._fresh:
+            self._fresh.wait_for(lambda: self._slots or self._closed, timeout_s)
+            taken, self._slots = self._slots, {}
+        return taken or None
+
+    @property
+    def drops(self) -> dict[str, int]:
+        """Messages of each topic that a newer one replaced before they were taken."""
+        with self._fresh:
+            return dict(self._drops)
+
+    @property
+    def refused(self) -> int:
+        """Messages thrown away because they had no readable topic, too many parts, or one topic too many."""
+        return self._refused
+
+    def close(self) -> None:
+        """Stop the thread and wake whoever waits."""
+        self._context.term()  # interrupts the thread, which closes its own socket
+        self._thread.join()
+
+    def _run(self) -> None:
+        try:
+            while True:
+                frames = self._socket.recv_multipart(copy=False)
+                self._store(ReceivedMultipart([frame.buffer for frame in frames], time.time_ns()))
+        except zmq.ContextTerminated:
+            pass
+        finally:
+            self._socket.close(0)
+            with self._fresh:
+                self._closed = True
+                self._fresh.notify_all()
+
+    def _store(self, message: ReceivedMultipart) -> None:
+        topic = bytes(message[0][: MAX_TOPIC_BYTES + 1]).decode("ascii", errors="replace")
+        if not self._accepts(topic, len(message)):
+            self._refused += 1
+            return
+        with self._fresh:
+            if topic in self._slots:
+                self._drops[topic] += 1
+            self._slots[topic] = message
+            self._fresh.notify()
+
+    def _accepts(self, topic: str, pieces: int) -> bool:
+        """Whether a message is wanted: subscriptions are prefixes, so `color.a` also brings `color.ab`."""
+        if not topic.isascii() or len(topic) > MAX_TOPIC_BYTES or pieces > MAX_PARTS + 2:
+            return False
+        if self._topics and not any(topic == wish or topic.startswith(wish + ".") for wish in self._topics):
+            return False
+        if topic not in self._seen and len(self._seen) >= MAX_TOPICS:
+            return False
+        self._seen.add(topic)
+        return True

@@ -1,0 +1,6 @@
+"""Recordings (FORMATS 2): one `.mcap` file a take."""
+
+from protocol.recording_reader import RecordingReader
+from protocol.recording_writer import RecordingWriter
+
+__all__ = ["RecordingReader", "RecordingWriter"]

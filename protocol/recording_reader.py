@@ -1,0 +1,306 @@
+"""Reading a recording (FORMATS 2), also one that was cut short."""
+
+import struct
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.reader import SeekingReader
+from mcap.records import Attachment, Channel, Chunk, Message, MessageIndex
+from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
+from mcap.summary import Summary
+from mcap.writer import MCAP0_MAGIC
+from zstandard import ZstdError
+
+from protocol.board import BoardSpec
+from protocol.calibration import Extrinsics
+from protocol.camera_model import CameraModel
+from protocol.documents import parse_mapping
+from protocol.errors import DeltalightError
+from protocol.frames import DepthImage, SensorFrame
+from protocol.pictures import decode_rgb, depth_from_steps, is_jpeg
+from protocol.recording_format import (
+    COLOR_TOPIC,
+    DEPTH_TOPIC,
+    FRAME_TOPIC,
+    SCENE_ATTACHMENT,
+    SESSION_TOPIC,
+    DepthRecord,
+    FrameRecord,
+    SessionRecord,
+)
+from protocol.scene import SceneDocument, parse_scene, resolve_asset
+
+MAX_CHUNK_BYTES = 512 * 1024 * 1024
+RECORD_HEAD = struct.Struct("<BQ")
+# What the mcap package raises for damaged records.
+DAMAGE = (
+    McapError,
+    CRCValidationError,
+    ZstdError,
+    struct.error,
+    ValueError,
+    KeyError,
+    IndexError,
+    StopIteration,
+)
+
+
+@dataclass(frozen=True)
+class _Span:
+    """Where a chunk begins in the file, and the times of its messages."""
+
+    offset: int
+    start_ns: int
+    end_ns: int
+
+
+class RecordingReader:
+    """The frames of a recording, decoded one by one as they are asked for; a `Source`.
+
+    `notes` says whether the file was unfinished or damaged and how many frames were found. `board` takes the
+    place of the board in the recording.
+
+    Raises:
+        DeltalightError: not a recording, of another schema version, or without a complete frame.
+    """
+
+    def __init__(self, path: Path, board: BoardSpec | None = None) -> None:
+        self.path = path
+        self.notes: list[str] = []
+        self._channels: dict[int, str] = {}
+        self._spans: list[_Span] = []
+        self._cached: tuple[int, list[Message]] = (-1, [])
+        self._scene_json: bytes | None = None
+        self.timestamps_ns = sorted(self._open())
+        self._starts_ns = np.array([span.start_ns for span in self._spans], np.uint64)
+        self._ends_ns = np.array([span.end_ns for span in self._spans], np.uint64)
+        if not self.timestamps_ns:
+            raise DeltalightError(f"{path} holds no complete Deltalight frame; record it again.")
+        session = self._read_session()
+        self.board = board or session.board
+        self.extrinsics = Extrinsics.from_dict(session.extrinsics, str(path))
+        first, _ = self._read_record(0)
+        self.camera = CameraModel.from_dict(first.camera)
+        self.depth_scale = session.depth_scale or (first.depth.scale if first.depth else None)
+        self.scene = self._read_scene()
+        self._note_missing(first)
+
+    def __len__(self) -> int:
+        return len(self.timestamps_ns)
+
+    def __iter__(self) -> Iterator[SensorFrame]:
+        """Yield every frame in order."""
+        return (self[index] for index in range(len(self)))
+
+    def __getitem__(self, index: int) -> SensorFrame:
+        """Decode one frame.
+
+        Raises:
+            IndexError: no such frame.
+            DeltalightError: the frame's messages are damaged.
+        """
+        record, parts = self._read_record(range(len(self))[index])
+        name = f"{self.path} frame {record.frame_id}"
+        try:
+            data = CompressedImage.FromString(parts[COLOR_TOPIC]).data
+            depth = None if record.depth is None else _depth_image(record.depth, parts[DEPTH_TOPIC])
+        except (KeyError, ValueError, DecodeError) as error:
+            raise DeltalightError(f"{name} is damaged; leave it out of the range of frames.") from error
+        pose = record.world_from_camera
+        return SensorFrame(
+            frame_id=record.frame_id,
+            timestamp_ns=record.timestamp_ns,
+            color=decode_rgb(data, name),
+            camera=self._camera(record),
+            response=_response(record),
+            exposure_s=record.exposure_s,
+            depth=depth,
+            depth_timestamp_ns=None if record.depth is None else record.depth.timestamp_ns,
+            world_from_camera=None if pose is None else np.array(pose).reshape(4, 4),
+            color_jpeg=data if is_jpeg(data) else None,
+        )
+
+    def _camera(self, record: FrameRecord) -> CameraModel:
+        """Give the same instance while the camera stays, so that its rays are computed once."""
+        camera = CameraModel.from_dict(record.camera)
+        return self.camera if camera == self.camera else camera
+
+    def _open(self) -> set[int]:
+        """Find the chunks and the times of all frames: by the index if there is one, else by a scan."""
+        try:
+            with self.path.open("rb") as file:
+                if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
+                    raise DeltalightError(f"{self.path} is not an MCAP recording; give a file that is.")
+                summary = _summary(file)
+                if summary is not None:
+                    return self._use_index(file, summary)
+                return self._scan(file)
+        except OSError as error:
+            raise DeltalightError(
+                f"{self.path} cannot be read ({error.strerror}); give a readable file."
+            ) from error
+
+    def _use_index(self, file: IO[bytes], summary: Summary) -> set[int]:
+        self._channels = {channel.id: channel.topic for channel in summary.channels.values()}
+        frames = [number for number, topic in self._channels.items() if topic == FRAME_TOPIC]
+        times: set[int] = set()
+        for chunk in summary.chunk_indexes:
+            self._spans.append(
+                _Span(chunk.chunk_start_offset, chunk.message_start_time, chunk.message_end_time)
+            )
+            for number in frames:
+                if number in chunk.message_index_offsets:
+                    index = _record_at(file, chunk.message_index_offsets[number])
+                    times.update(time for time, _ in index.records if isinstance(index, MessageIndex))
+        for entry in summary.attachment_indexes:
+            if entry.name == SCENE_ATTACHMENT:
+                self._scene_json = _record_at(file, entry.offset).data
+        return times
+
+    def _scan(self, file: IO[bytes]) -> set[int]:
+        topics: dict[int, set[str]] = defaultdict(set)
+        damaged = 0
+        for opcode, offset in _walk(file):
+            try:
+                self._scan_record(opcode, _record_at(file, offset), offset, topics)
+            except DAMAGE:
+                damaged += 1
+        times = {time for time, found in topics.items() if {FRAME_TOPIC, COLOR_TOPIC} <= found}
+        lost = f" and {damaged} damaged parts were left out" if damaged else ""
+        self.notes.append(
+            f"{self.path} was not finished; {len(times)} frames were recovered by reading it through{lost}."
+        )
+        return times
+
+    def _scan_record(self, opcode: int, record: Any, offset: int, topics: dict[int, set[str]]) -> None:  # noqa: ANN401
+        if opcode == Opcode.ATTACHMENT and isinstance(record, Attachment) and record.name == SCENE_ATTACHMENT:
+            self._scene_json = record.data
+        if opcode != Opcode.CHUNK:
+            return
+        contents = _chunk_contents(record)
+        self._channels.update({item.id: item.topic for item in contents if isinstance(item, Channel)})
+        for item in contents:
+            if isinstance(item, Message):
+                topics[item.log_time].add(self._channels[item.channel_id])
+        self._spans.append(_Span(offset, record.message_start_time, record.message_end_time))
+
+    def _parts(self, time_ns: int) -> dict[str, bytes]:
+        """Messages of a time by topic; several of one topic leave the last."""
+        near = np.flatnonzero((self._starts_ns <= time_ns) & (time_ns <= self._ends_ns))
+        messages = (message for index in near for message in self._messages(self._spans[index].offset))
+        return {self._channels[part.channel_id]: part.data for part in messages if part.log_time == time_ns}
+
+    def _messages(self, offset: int) -> list[Message]:
+        """Messages of a chunk; the last one read is kept, because frames are mostly read in order."""
+        known, messages = self._cached
+        if known == offset:
+            return messages
+        try:
+            with self.path.open("rb") as file:
+                contents = _chunk_contents(_record_at(file, offset))
+        except (*DAMAGE, OSError) as error:
+            raise DeltalightError(
+                f"{self.path} is damaged at byte {offset}; leave these frames out."
+            ) from error
+        messages = [item for item in contents if isinstance(item, Message)]
+        self._cached = offset, messages
+        return messages
+
+    def _read_record(self, index: int) -> tuple[FrameRecord, dict[str, bytes]]:
+        parts = self._parts(self.timestamps_ns[index])
+        return FrameRecord.unpacked(parts[FRAME_TOPIC], str(self.path)), parts
+
+    def _read_session(self) -> SessionRecord:
+        parts = self._parts(self.timestamps_ns[0])
+        if SESSION_TOPIC in parts:
+            return SessionRecord.unpacked(parts[SESSION_TOPIC], str(self.path))
+        self.notes.append(f"{self.path} has lost its beginning; board and transforms are unknown.")
+        return SessionRecord()
+
+    def _read_scene(self) -> SceneDocument | None:
+        if self._scene_json is None:
+            return None
+        name, folder = f"{self.path} ({SCENE_ATTACHMENT})", self.path.parent
+        text = self._scene_json.decode("utf-8", errors="replace")
+        scene = parse_scene(parse_mapping(text, name, is_json=True), name)
+        return scene.with_assets(lambda _place, asset: resolve_asset(asset, folder))
+
+    def _note_missing(self, first: FrameRecord) -> None:
+        if self.board is None:
+            self.notes.append(f"{self.path} describes no marker board; no board is looked for.")
+        elif self.board.white_albedo is None:
+            albedo = self.board.paper_albedo
+            self.notes.append(f"{self.path} gives no white_albedo; {albedo} is assumed for the paper.")
+        if first.depth is None:
+            self.notes.append(
+                f"{self.path} begins without depth; the scene document must give a model of the room."
+            )
+
+
+def _summary(file: IO[bytes]) -> Summary | None:
+    """Index at the end of the file; None where the file was cut short or the index is damaged."""
+    file.seek(0, 2)
+    if file.tell() < 2 * len(MCAP0_MAGIC):
+        return None
+    file.seek(-len(MCAP0_MAGIC), 2)
+    if file.read() != MCAP0_MAGIC:
+        return None
+    file.seek(0)
+    try:
+        return SeekingReader(file).get_summary()
+    except DAMAGE:
+        return None
+
+
+def _walk(file: IO[bytes]) -> Iterator[tuple[int, int]]:
+    """Yield (opcode, offset) of every whole record, up to where the file was cut (or filled with zeros)."""
+    file.seek(0, 2)
+    size, offset = file.tell(), len(MCAP0_MAGIC)
+    while offset + RECORD_HEAD.size <= size:
+        file.seek(offset)
+        opcode, length = RECORD_HEAD.unpack(file.read(RECORD_HEAD.size))
+        end = offset + RECORD_HEAD.size + length
+        if opcode == 0 or end > size:
+            return
+        yield opcode, offset
+        offset = end
+
+
+def _record_at(file: IO[bytes], offset: int) -> Any:  # noqa: ANN401 - one of mcap's record classes
+    file.seek(offset)
+    return next(StreamReader(file, skip_magic=True, emit_chunks=True).records)
+
+
+def _chunk_contents(chunk: Any) -> list[Any]:  # noqa: ANN401 - mcap's record classes
+    if not isinstance(chunk, Chunk) or chunk.uncompressed_size > MAX_CHUNK_BYTES:
+        raise ValueError("not a chunk that can be read")
+    contents: list[Any] = breakup_chunk(chunk, validate_crc=True)
+    return contents
+
+
+def _depth_image(record: DepthRecord, data: bytes) -> DepthImage:
+    image = RawImage.FromString(data)
+    camera = CameraModel.from_dict(record.camera)
+    kind = "<f4" if record.scale is None else "<u2"
+    values = np.frombuffer(image.data, kind).reshape(image.height, image.width)
+    if values.shape != (camera.height, camera.width):
+        raise ValueError("the depth image has another size than its camera")
+    if record.scale is not None:
+        return depth_from_steps(values.astype(np.uint16), record.scale, camera, record.noise_sigma_m)
+    depth_m = values.astype(np.float32)
+    return DepthImage(depth_m, depth_m > 0, camera, record.noise_sigma_m)
+
+
+def _response(record: FrameRecord) -> np.ndarray | None:
+    if record.response is None:
+        return None
+    return np.frombuffer(record.response, "<f4").reshape(256, 3).astype(np.float32)

@@ -1,0 +1,213 @@
+"""Control by request and reply: a client that gives up in time, a server that carries nothing out twice."""
+
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import structlog
+import zmq
+
+from protocol.envelope import EnvelopeError, decode, encode
+from protocol.errors import DeltalightError
+from protocol.messages import MAX_HEADER_BYTES, ControlReply, ControlRequest
+from protocol.sockets import attach, open_socket
+
+UNREADABLE_ID = "unreadable"
+REMEMBERED_REPLIES = 256
+
+Handler = Callable[[ControlRequest], dict[str, object]]
+_log = structlog.get_logger(__name__)
+
+
+@dataclass(frozen=True)
+class _Applied:
+    revision: int
+    payload: dict[str, object]
+    reply: ControlReply
+
+
+class ReplyMemory:
+    """Makes control idempotent: by request id, and by revision for each op (SPEC.md, section 6)."""
+
+    def __init__(self, size: int = REMEMBERED_REPLIES) -> None:
+        self._size = size
+        self._by_id: OrderedDict[str, ControlReply] = OrderedDict()
+        self._applied: dict[str, _Applied] = {}
+
+    def find(self, request: ControlRequest) -> ControlReply | None:
+        """Reply of an earlier request that this one repeats.
+
+        Raises:
+            DeltalightError: its revision is older than the applied one, or is the same with other content.
+        """
+        if request.id in self._by_id:
+            return self._by_id[request.id]
+        last = self._applied.get(request.op)
+        if last is None or request.revision is None or request.revision > last.revision:
+            return None
+        if request.revision < last.revision or request.payload != last.payload:
+            raise DeltalightError(
+                f"revision {request.revision} of {request.op} is not newer than the applied {last.revision}: "
+                f"send {last.revision + 1} or higher"
+            )
+        return last.reply.model_copy(update={"id": request.id})
+
+    def remember(self, request: ControlRequest, reply: ControlReply) -> None:
+        """Keep a reply; a refused request may come again with the same revision."""
+        self._by_id[request.id] = reply
+        if len(self._by_id) > self._size:
+            self._by_id.popitem(last=False)
+        if reply.ok and request.revision is not None:
+            self._applied[request.op] = _Applied(request.revision, request.payload, reply)
+
+
+class ReplyServer:
+    """Answers requests in a thread of its own that owns the socket.
+
+    `handler(request)` returns the payload of the reply; a `DeltalightError` from it refuses the request.
+    """
+
+    def __init__(self, endpoint: str, handler: Handler, *, node: str = "server") -> None:
+        self._handler = handler
+        self._node = node
+        self._memory = ReplyMemory()
+        self._context = zmq.Context()
+        try:
+            self._socket = open_socket(self._context, zmq.REP, max_bytes=MAX_HEADER_BYTES)
+            self.endpoint = attach(self._socket, endpoint, bind=True)
+        except DeltalightError:
+            self._context.destroy(0)
+            raise
+        self._thread = threading.Thread(target=self._run, name="control", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop the thread, after the request that it is at."""
+        self._context.term()
+        self._thread.join()
+
+    def _run(self) -> None:
+        try:
+            while True:
+                self._socket.send_multipart(self._answer(self._socket.recv_multipart()))
+        except zmq.ContextTerminated:
+            pass
+        finally:
+            self._socket.close(0)
+
+    def _answer(self, multipart: list[bytes]) -> list[bytes]:
+        try:
+            request, _ = decode(multipart)
+            if not isinstance(request, ControlRequest):
+                raise EnvelopeError(
+                    f"a {request.stream} message came to the control endpoint: send a request"
+                )
+        except EnvelopeError as error:
+            return encode(self._reply(UNREADABLE_ID, error=str(error)))
+        reply = self._answered(request)
+        try:
+            return encode(reply)
+        except EnvelopeError as error:
+            return encode(self._reply(request.id, error=f"the answer cannot be sent: {error}"))
+
+    def _answered(self, request: ControlRequest) -> ControlReply:
+        try:
+            earlier = self._memory.find(request)
+            if earlier is not None:
+                return earlier
+            reply = self._reply(request.id, payload=self._handler(request))
+        except DeltalightError as error:
+            reply = self._reply(request.id, error=str(error))
+        except Exception as error:  # the thread must outlive a fault of the handler
+            _log.exception("control handler failed", op=request.op)
+            reply = self._reply(
+                request.id, error=f"{request.op} failed with {error!r}: see the log of {self._node}"
+            )
+        self._memory.remember(request, reply)
+        return reply
+
+    def _reply(
+        self, request_id: str, *, payload: dict[str, object] | None = None, error: str | None = None
+    ) -> ControlReply:
+        return ControlReply(
+            node=self._node,
+            capture_ns=time.time_ns(),
+            id=request_id,
+            ok=error is None,
+            error=None if error is None else error[:2000],
+            payload=payload or {},
+        )
+
+
+class RequestClient:
+    """Sends requests to one `ReplyServer`, one at a time; threads may share it.
+
+    A request that got no answer may be sent again as it is: its id keeps it from being carried out twice.
+    """
+
+    def __init__(self, endpoint: str) -> None:
+        self.endpoint = endpoint
+        self._context = zmq.Context()
+        self._lock = threading.Lock()
+        self._socket: zmq.Socket[bytes] | None = None
+        try:
+            self._connected()
+        except DeltalightError:
+            self._context.destroy(0)
+            raise
+
+    def request(self, control: ControlRequest, timeout_s: float) -> ControlReply:
+        """Reply to `control`; look at its `ok` and `error`.
+
+        Raises:
+            DeltalightError: no answer within `timeout_s` seconds, or the server could not read the request.
+        """
+        multipart = encode(control)
+        deadline = time.monotonic() + timeout_s
+        if not self._lock.acquire(timeout=timeout_s):
+            raise DeltalightError(f"{self.endpoint} is still busy with another request: try again")
+        try:
+            socket = self._connected()
+            socket.send_multipart(multipart)
+            if not socket.poll(max(0, round((deadline - time.monotonic()) * 1000)), zmq.POLLIN):
+                raise DeltalightError(
+                    f"no answer from {self.endpoint} within {timeout_s:g} s: see whether the server runs"
+                )
+            return _matched(control, socket.recv_multipart())
+        except DeltalightError:
+            self._drop()
+            raise
+        finally:
+            self._lock.release()
+
+    def close(self) -> None:
+        """Close the socket."""
+        with self._lock:
+            self._context.destroy(0)
+
+    def _connected(self) -> "zmq.Socket[bytes]":
+        if self._socket is None:
+            self._socket = open_socket(self._context, zmq.REQ, max_bytes=MAX_HEADER_BYTES)
+            attach(self._socket, self.endpoint, bind=False)
+        return self._socket
+
+    def _drop(self) -> None:
+        """A fresh socket for the next request: a late answer must not meet it, nor a dead server's queue."""
+        if self._socket is not None:
+            self._socket.close(0)
+            self._socket = None
+
+
+def _matched(control: ControlRequest, multipart: list[bytes]) -> ControlReply:
+    reply, _ = decode(multipart)
+    if not isinstance(reply, ControlReply):
+        raise EnvelopeError(f"a {reply.stream} message came as the answer: see what listens at the endpoint")
+    if reply.id == UNREADABLE_ID:
+        raise EnvelopeError(f"the server cannot read the request: {reply.error}")
+    if reply.id != control.id:
+        raise EnvelopeError(
+            f"the answer belongs to request {reply.id} and not to {control.id}: send it again"
+        )
+    return reply

@@ -1,0 +1,38 @@
+"""Field types that the parts of the scene document share."""
+
+import math
+from typing import Annotated
+
+from pydantic import AfterValidator, Field, StringConstraints
+
+
+def _unit(values: tuple[float, ...]) -> tuple[float, ...]:
+    """Normalise a vector; one that is already of length 1 keeps its bits."""
+    length = math.sqrt(sum(value * value for value in values))
+    if length < 1e-9:
+        raise ValueError("its length must not be zero")
+    return values if abs(length - 1) < 1e-12 else tuple(value / length for value in values)
+
+
+def _unit_vector(values: tuple[float, float, float]) -> tuple[float, float, float]:
+    x, y, z = _unit(values)
+    return x, y, z
+
+
+def _unit_quaternion(values: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
+    w, x, y, z = _unit(values)
+    return w, x, y, z
+
+
+Coordinate = Annotated[float, Field(gt=-1e4, lt=1e4)]
+Fraction = Annotated[float, Field(ge=0, le=1)]
+NonNegative = Annotated[float, Field(ge=0, le=1e9)]
+Point = tuple[Coordinate, Coordinate, Coordinate]
+Colour = tuple[Fraction, Fraction, Fraction]
+Radiance = tuple[NonNegative, NonNegative, NonNegative]
+Direction = Annotated[tuple[Coordinate, Coordinate, Coordinate], AfterValidator(_unit_vector)]
+Quaternion = Annotated[
+    tuple[Coordinate, Coordinate, Coordinate, Coordinate], AfterValidator(_unit_quaternion)
+]
+Asset = Annotated[str, StringConstraints(min_length=1, max_length=4096)]
+ASSET_TEXT = "`sha256:<hex>`, an uploaded asset's name, or a path relative to the document."

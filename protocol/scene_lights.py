@@ -1,0 +1,176 @@
+"""The lights of the scene document (FORMATS 3); radiometry in camera units (METHOD 1)."""
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from pydantic import ConfigDict, Discriminator, Field, Tag, model_validator
+
+from protocol.documents import StrictModel
+from protocol.scene_fields import ASSET_TEXT, Asset, Direction, Fraction, NonNegative, Point, Radiance
+
+DEFAULT_LIGHT_TYPE = "sphere"
+# Without `type` a light is a sphere, so the other kinds need the key for a document to match one kind only.
+NEEDS_TYPE = ConfigDict(json_schema_extra={"required": ["type"]})
+Factor = Annotated[float, Field(gt=0, le=1e6)]
+
+
+class _Light(StrictModel):
+    color_linear: Radiance = Field(
+        default=(1.0, 1.0, 1.0), description="Linear R G B that multiplies the strength."
+    )
+
+
+class DirectionalLight(_Light):
+    """A distant light such as the sun."""
+
+    model_config = NEEDS_TYPE
+
+    type: Literal["directional"] = "directional"
+    direction: Direction = Field(
+        default=(0.0, 0.0, -1.0), description="The way the light travels, world; normalised."
+    )
+    irradiance: NonNegative = Field(default=1.0, description="Irradiance across the beam, camera units.")
+    angular_radius_deg: float = Field(
+        default=0.5, ge=0, le=90, description="Angular radius of the light, degrees (the sun's is 0.27)."
+    )
+
+
+class SphereLight(_Light):
+    """A lamp that shines equally in all directions."""
+
+    type: Literal["sphere"] = "sphere"
+    position_m: Point = Field(default=(0.0, 0.0, 1.0), description="Centre, world, metres.")
+    intensity: NonNegative = Field(
+        default=1.0, description="Intensity, camera units times square metres: E = I cos/d^2."
+    )
+    radius_m: float = Field(default=0.05, ge=0, le=100, description="Radius of the lamp, metres; 0 = point.")
+
+
+class SpotLight(_Light):
+    """A lamp that shines into a cone."""
+
+    model_config = NEEDS_TYPE
+
+    type: Literal["spot"] = "spot"
+    position_m: Point = Field(default=(0.0, 0.0, 1.0), description="Centre, world, metres.")
+    intensity: NonNegative = Field(
+        default=1.0, description="Intensity on the axis, camera units times square metres."
+    )
+    radius_m: float = Field(default=0.05, ge=0, le=100, description="Radius of the lamp, metres; 0 = point.")
+    direction: Direction = Field(
+        default=(0.0, 0.0, -1.0), description="The cone's axis as light travels; normalised."
+    )
+    angle_deg: float = Field(
+        default=60.0, gt=0, lt=180, description="Full opening angle of the cone, degrees."
+    )
+    blend: Fraction = Field(
+        default=0.15, description="Share of the half angle over which the light falls to zero, 0..1."
+    )
+
+
+class RectangleLight(_Light):
+    """A diffuse area light; it shines to the side of axis_u x axis_v."""
+
+    model_config = NEEDS_TYPE
+
+    type: Literal["rectangle"] = "rectangle"
+    position_m: Point = Field(default=(0.0, 0.0, 1.0), description="Centre, world, metres.")
+    axis_u_m: Point = Field(default=(0.5, 0.0, 0.0), description="First edge, whole length, world, metres.")
+    axis_v_m: Point = Field(default=(0.0, -0.5, 0.0), description="Second edge, whole length, world, metres.")
+    radiance: NonNegative = Field(default=1.0, description="Radiance of the shining side, camera units.")
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if np.linalg.norm(np.cross(self.axis_u_m, self.axis_v_m)) < 1e-9:
+            raise ValueError("axis_u_m and axis_v_m must span an area")
+        return self
+
+
+class AmbientLight(_Light):
+    """The same radiance from every direction."""
+
+    model_config = NEEDS_TYPE
+
+    type: Literal["ambient"] = "ambient"
+    radiance: NonNegative = Field(default=0.1, description="Radiance from every direction, camera units.")
+
+
+def _light_type(value: Any) -> Any:  # noqa: ANN401 - whatever the document holds
+    if isinstance(value, Mapping):
+        return value.get("type", DEFAULT_LIGHT_TYPE)
+    return getattr(value, "type", DEFAULT_LIGHT_TYPE)
+
+
+ManualLight = Annotated[
+    Annotated[DirectionalLight, Tag("directional")]
+    | Annotated[SphereLight, Tag("sphere")]
+    | Annotated[SpotLight, Tag("spot")]
+    | Annotated[RectangleLight, Tag("rectangle")]
+    | Annotated[AmbientLight, Tag("ambient")],
+    Discriminator(_light_type),
+]
+
+
+def _registration_kind(value: Any) -> str:  # noqa: ANN401 - whatever the document holds
+    return "auto" if isinstance(value, str) else "factors"
+
+
+Registration = Annotated[
+    Annotated[Literal["auto"], Tag("auto")] | Annotated[tuple[Factor, Factor, Factor], Tag("factors")],
+    Discriminator(_registration_kind),
+]
+
+
+class FisheyeLights(StrictModel):
+    """How lights are taken from the fish-eye picture (METHOD 2)."""
+
+    count: int = Field(default=4, ge=1, le=16, description="Number of lights.")
+    split: Literal["peaks", "all"] = Field(
+        default="peaks",
+        description="Cut only what outshines its surroundings, or (as in the papers) the whole map.",
+    )
+
+
+class EnvironmentLights(StrictModel):
+    """A given environment map (latitude-longitude, linear)."""
+
+    map: Asset | None = Field(default=None, description=f"Radiance map: {ASSET_TEXT}")
+    up: Direction = Field(default=(0.0, 0.0, 1.0), description="The map's up axis in world axes; normalised.")
+    rotation_deg: float = Field(
+        default=0.0, ge=-360, le=360, description="Turn of the map about up, degrees."
+    )
+    intensity: NonNegative = Field(default=1.0, description="Factor on the map's radiance.")
+
+
+class Lights(StrictModel):
+    """Where light comes from."""
+
+    mode: Literal["fisheye", "tracked", "manual", "environment"] = "manual"
+    manual: tuple[ManualLight, ...] = Field(default=(), max_length=64, description="Lights of mode `manual`.")
+    fisheye: FisheyeLights = Field(default_factory=FisheyeLights)
+    environment: EnvironmentLights = Field(default_factory=EnvironmentLights)
+    registration: Registration | None = Field(
+        default=None,
+        description="Factor R G B on all lights, or `auto` = from the picture; null = auto for fisheye and "
+        "environment, 1 1 1 for manual and tracked.",
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.mode == "environment" and self.environment.map is None:
+            raise ValueError("mode environment needs environment.map, the asset of a radiance map")
+        return self
+
+    @property
+    def resolved_registration(self) -> Literal["auto"] | tuple[float, float, float]:
+        """Registration as given, or the default of the mode."""
+        if self.registration is not None:
+            return self.registration
+        return "auto" if self.mode in ("fisheye", "environment") else (1.0, 1.0, 1.0)
+
+
+def default_lights() -> Lights:
+    """Return the lights of a document that names none: one from above and a little from everywhere."""
+    above = DirectionalLight(direction=(0.3, 0.2, -1.0), irradiance=1.5, angular_radius_deg=5.0)
+    return Lights(manual=(above, AmbientLight(radiance=0.2)))

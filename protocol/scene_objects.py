@@ -1,0 +1,207 @@
+"""The parts of the scene document that hold geometry and materials: `objects` and `real` (FORMATS 3)."""
+
+from pathlib import PurePosixPath
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from jaxtyping import Float64
+from pydantic import Discriminator, Field, Tag, model_validator
+
+from protocol.documents import StrictModel
+from protocol.poses import rigid_matrix, rotation_from_wxyz
+from protocol.scene_fields import (
+    ASSET_TEXT,
+    Asset,
+    Colour,
+    Direction,
+    Fraction,
+    Point,
+    Quaternion,
+    Radiance,
+)
+
+GLTF_SUFFIXES = (".gltf", ".glb")
+# Turns an asset whose y is up so that its z is up: +90 degrees about x.
+Z_UP_FROM_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+
+
+class Pose(StrictModel):
+    """Place, turn and size: frame_from_object = translation * rotation * scale."""
+
+    translation_m: Point = Field(
+        default=(0.0, 0.0, 0.0), description="Position of the object's origin, metres."
+    )
+    rotation_wxyz: Quaternion = Field(
+        default=(1.0, 0.0, 0.0, 0.0), description="Rotation as a quaternion w, x, y, z; it is normalised."
+    )
+    scale: float = Field(
+        default=1.0, gt=0, le=1e4, description="Uniform scale, a factor (assets are in metres)."
+    )
+
+    def matrix(self) -> Float64[np.ndarray, "4 4"]:
+        """Return the 4x4 matrix frame_from_object, scale included."""
+        return rigid_matrix(self.scale * rotation_from_wxyz(self.rotation_wxyz), self.translation_m)
+
+
+class Material(StrictModel):
+    """Surface of a virtual object: metallic/roughness workflow of the Disney BRDF, GGX microfacets."""
+
+    base_color: Colour = Field(default=(0.8, 0.8, 0.8), description="Linear R G B reflectance, 0..1.")
+    metallic: Fraction = Field(default=0.0, description="0 = dielectric, 1 = metal.")
+    roughness: Fraction = Field(
+        default=0.5, description="Perceptual roughness (alpha = roughness squared), 0..1."
+    )
+    specular: Fraction = Field(
+        default=0.5, description="F0 = 0.08 specular; 0 with metallic 0 is Lambertian."
+    )
+    ior: float | None = Field(
+        default=None, ge=1, le=4, description="Index of refraction; overrides specular. null = from specular."
+    )
+    emission: Radiance = Field(
+        default=(0.0, 0.0, 0.0), description="Emitted radiance, linear R G B, camera units."
+    )
+    transmission: Fraction = Field(default=0.0, description="Share of light that passes through, 0..1.")
+
+
+class PrecomputedMaterial(StrictModel):
+    """A material that was precomputed (transfer, measured BRDF) and is kept as an asset."""
+
+    precomputed: Asset = Field(description=f"Asset of the precomputed data: {ASSET_TEXT}")
+
+
+def _material_kind(value: Any) -> str:  # noqa: ANN401 - whatever the document holds
+    if isinstance(value, dict):
+        return "precomputed" if "precomputed" in value else "material"
+    return "precomputed" if isinstance(value, PrecomputedMaterial) else "material"
+
+
+AnyMaterial = Annotated[
+    Annotated[Material, Tag("material")] | Annotated[PrecomputedMaterial, Tag("precomputed")],
+    Discriminator(_material_kind),
+]
+
+
+class SceneObject(StrictModel):
+    """A virtual object."""
+
+    id: str = Field(
+        default="object", min_length=1, max_length=200, description="Unique name; default `object<index>`."
+    )
+    asset: Asset = Field(description=f"Mesh: {ASSET_TEXT}")
+    up_axis: Literal["y", "z"] | None = Field(
+        default=None,
+        description="The asset's up axis; null = y for glTF, else z. The object's own frame is then z up.",
+    )
+    pose: Pose = Field(default_factory=Pose, description="frame_from_object.")
+    frame: str = Field(
+        default="world", pattern=r"^(world|marker:\d+)$", description="`world` (the board) or `marker:ID`."
+    )
+    material: AnyMaterial | None = Field(default=None, description="null = from the asset.")
+    rigid: bool = Field(
+        default=True, description="Whether the shape never changes (then its transfer may be precomputed)."
+    )
+    visible: bool = Field(default=True, description="Whether the object takes part at all.")
+
+    @property
+    def resolved_up_axis(self) -> Literal["y", "z"]:
+        """The asset's up axis: as given, or y for glTF and z for all else."""
+        if self.up_axis is not None:
+            return self.up_axis
+        return "y" if PurePosixPath(self.asset).suffix.lower() in GLTF_SUFFIXES else "z"
+
+    def world_from_object(self) -> Float64[np.ndarray, "4 4"]:
+        """Return the 4x4 matrix from asset coordinates to `frame` (the world unless it is a marker).
+
+        The asset is first turned so that its up axis is z (+90 degrees about x where it is y), then scaled,
+        rotated and moved by the pose.
+        """
+        matrix = self.pose.matrix()
+        return matrix @ Z_UP_FROM_Y_UP if self.resolved_up_axis == "y" else matrix
+
+
+class ModelGeometry(StrictModel):
+    """A given model of the real scene, registered to the board."""
+
+    model: Asset = Field(description=f"Mesh of the real scene: {ASSET_TEXT}")
+    pose: Pose = Field(
+        default_factory=Pose, description="world_from_model; the model's own axes are used as they are."
+    )
+
+
+def _geometry_kind(value: Any) -> str:  # noqa: ANN401 - whatever the document holds
+    return "model" if isinstance(value, (dict, ModelGeometry)) else "sensed"
+
+
+Geometry = Annotated[
+    Annotated[Literal["depth", "fused"], Tag("sensed")] | Annotated[ModelGeometry, Tag("model")],
+    Discriminator(_geometry_kind),
+]
+
+
+class PlaneRegion(StrictModel):
+    """Points near a plane."""
+
+    point_m: Point = Field(default=(0.0, 0.0, 0.0), description="A point of the plane, world, metres.")
+    normal: Direction = Field(
+        default=(0.0, 0.0, 1.0), description="The plane's normal, world; it is normalised."
+    )
+    tolerance_m: float = Field(
+        default=0.01, gt=0, le=100, description="Greatest distance from the plane, metres."
+    )
+
+
+class BoxRegion(StrictModel):
+    """Points in a box along the world axes."""
+
+    min_m: Point = Field(default=(-0.5, -0.5, -0.5), description="Lower corner, world, metres.")
+    max_m: Point = Field(default=(0.5, 0.5, 0.5), description="Upper corner, world, metres.")
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if any(low >= high for low, high in zip(self.min_m, self.max_m, strict=True)):
+            raise ValueError("every coordinate of min_m must be below that of max_m")
+        return self
+
+
+class Region(StrictModel):
+    """Where a real surface is: exactly one of plane, box, material; without any, the board's plane."""
+
+    plane: PlaneRegion | None = Field(default=None, description="Points near a plane.")
+    box: BoxRegion | None = Field(default=None, description="Points in a box.")
+    material: str | None = Field(
+        default=None, min_length=1, description="Name of a material of the given model."
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _default_plane(cls, data: Any) -> Any:  # noqa: ANN401 - whatever the document holds
+        return {"plane": {}} if data == {} else data
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if sum(part is not None for part in (self.plane, self.box, self.material)) != 1:
+            raise ValueError("a region has exactly one of plane, box, material")
+        return self
+
+
+class Surface(StrictModel):
+    """What a region of the real scene is made of."""
+
+    region: Region = Field(default_factory=lambda: Region(plane=PlaneRegion()))
+    roughness: Fraction = Field(default=0.5, description="Perceptual roughness, 0..1.")
+    metallic: Fraction = Field(default=0.0, description="0 = dielectric, 1 = metal.")
+    specular: Fraction = Field(default=0.5, description="F0 = 0.08 specular.")
+    albedo: Colour | None = Field(
+        default=None, description="Linear R G B, 0..1 (F0 where metallic); null = measured from the picture."
+    )
+
+
+class RealScene(StrictModel):
+    """The real scene: where its shape comes from, and which of its surfaces are not diffuse."""
+
+    geometry: Geometry = Field(
+        default="depth", description="`depth` (of each frame), `fused`, or a given model."
+    )
+    surfaces: tuple[Surface, ...] = Field(
+        default=(), max_length=64, description="First match wins; the rest is diffuse."
+    )

@@ -1,0 +1,79 @@
+"""What can be replayed: a dataset folder or a recording, behind one interface."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Protocol
+
+from protocol.board import BoardSpec
+from protocol.calibration import Extrinsics
+from protocol.camera_model import CameraModel
+from protocol.errors import DeltalightError
+from protocol.frames import SensorFrame
+from protocol.scene import SceneDocument
+
+RECORDING_SUFFIXES = (".mcap", ".mcap.active")
+
+
+class Source(Protocol):
+    """A sequence of frames with what was known about the cameras and the room.
+
+    `notes` are sentences, each said once, about missing optional parts and what is used instead;
+    `depth_scale` is the step of the stored depth in metres (None where it is not stored in steps); `scene` is
+    the attached scene document.
+    """
+
+    @property
+    def camera(self) -> CameraModel:
+        """Colour camera."""
+
+    @property
+    def board(self) -> BoardSpec | None:
+        """Marker board, if it is described."""
+
+    @property
+    def extrinsics(self) -> Extrinsics:
+        """Transforms between the sensors."""
+
+    @property
+    def depth_scale(self) -> float | None:
+        """Metres for each step of the stored depth."""
+
+    @property
+    def notes(self) -> list[str]:
+        """Sentences about missing optional parts."""
+
+    @property
+    def scene(self) -> SceneDocument | None:
+        """Attached scene document."""
+
+    @property
+    def timestamps_ns(self) -> list[int]:
+        """Capture time of every frame."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, index: int) -> SensorFrame: ...
+
+    def __iter__(self) -> Iterator[SensorFrame]: ...
+
+
+def open_source(path: Path, board: BoardSpec | None = None) -> Source:
+    """Open a dataset folder or a recording (`.mcap`, also one that is still `.mcap.active`).
+
+    `board` takes the place of the board that the source describes.
+
+    Raises:
+        DeltalightError: there is no such source, or it cannot be read.
+    """
+    # Imported here because both readers are heavy and few callers need both.
+    if path.is_dir():
+        from protocol.dataset import open_dataset
+
+        return open_dataset(path, board)
+    if not path.exists():
+        raise DeltalightError(f"{path} does not exist; give a dataset folder or an .mcap recording.")
+    if not path.name.endswith(RECORDING_SUFFIXES):
+        raise DeltalightError(f"{path} is neither a folder nor an .mcap recording; give one of these.")
+    from protocol.recording_reader import RecordingReader
+
+    return RecordingReader(path, board)

@@ -1,0 +1,8 @@
+"""Transport of the wire over ZeroMQ: streams by publisher and mailbox, control by request and reply."""
+
+from protocol.publisher import Publisher
+from protocol.receiver import ReceivedMultipart, Receiver
+from protocol.request import ReplyServer, RequestClient
+from protocol.sockets import check_endpoint
+
+__all__ = ["Publisher", "ReceivedMultipart", "Receiver", "ReplyServer", "RequestClient", "check_endpoint"]

@@ -1,0 +1,181 @@
+"""Write the byte vectors anew, after a change of the wire and its version: `python -m protocol.vectors`."""
+
+import base64
+import json
+from collections.abc import Iterator, Sequence
+from typing import Any, Literal
+
+import numpy as np
+
+from protocol.codecs import encode_color, encode_depth
+from protocol.envelope import encode
+from protocol.messages import (
+    ColorMessage,
+    CompositeMessage,
+    ControlReply,
+    ControlRequest,
+    DepthMessage,
+    FisheyeMessage,
+    LightsMessage,
+    Message,
+    PoseMessage,
+    StatsMessage,
+)
+from protocol.vectors import FOLDER, frame_pieces
+
+CAMERA: dict[str, object] = {
+    "width": 4,
+    "height": 2,
+    "matrix": [3.5, 0.0, 1.5, 0.0, 3.5, 0.5, 0.0, 0.0, 1.0],
+    "distortion_model": "plumb_bob",
+    "distortion": [0.1, -0.05, 0.0, 0.0, 0.0],
+}
+LAMP: dict[str, object] = {
+    "type": "sphere",
+    "position_m": [0.5, -0.25, 1.5],
+    "intensity": 20.0,
+    "radius_m": 0.05,
+    "color_linear": [1.0, 0.9, 0.8],
+}
+POSE = ((1.0, 0.0, 0.0, 0.25), (0.0, -1.0, 0.0, -0.5), (0.0, 0.0, -1.0, 0.75), (0.0, 0.0, 0.0, 1.0))
+OTHER_POSE = ((1.0, 0.0, 0.0, 0.25), (0.0, -0.6, 0.8, -0.5), (0.0, -0.8, -0.6, 0.75), (0.0, 0.0, 0.0, 1.0))
+NODE, FRAME, CAPTURE_NS, OFFSET_NS, BOUND_NS = "desk", 7, 1_700_000_000_123_456_789, -1500, 800
+
+Example = tuple[str, Message, Sequence[bytes], list[list[int]]]
+
+
+def main() -> None:
+    """Write every vector into the folder of this module."""
+    for name, message, parts, values in [*_picture_examples(), *_depth_examples(), *_small_examples()]:
+        pieces = encode(message, parts)
+        (FOLDER / f"{name}.bin").write_bytes(frame_pieces(pieces))
+        meaning = {
+            "topic": message.topic,
+            "header": message.model_dump(mode="json"),
+            "parts": [base64.b64encode(part).decode() for part in parts],
+            **({"values": values} if values else {}),
+        }
+        (FOLDER / f"{name}.json").write_text(json.dumps(meaning, indent=1) + "\n")
+
+
+def _stamps() -> dict[str, Any]:
+    return {
+        "frame_id": FRAME,
+        "capture_ns": CAPTURE_NS,
+        "clock_offset_ns": OFFSET_NS,
+        "clock_bound_ns": BOUND_NS,
+    }
+
+
+def _picture_examples() -> Iterator[Example]:
+    pixels = np.arange(24, dtype=np.uint8).reshape(2, 4, 3) * 10
+    shape = (2, 4, 3)
+    response = np.repeat(np.arange(256, dtype="<f4")[:, None] / np.float32(255), 3, axis=1)
+    yield (
+        "color_raw",
+        ColorMessage(
+            node=NODE,
+            **_stamps(),
+            encoding="raw",
+            shape=shape,
+            camera=CAMERA,
+            has_response=True,
+            exposure_s=0.01,
+        ),
+        [pixels.tobytes(), response.tobytes()],
+        [pixels.ravel().tolist()],
+    )
+    yield (
+        "color_jpeg",
+        ColorMessage(node=NODE, **_stamps(), encoding="jpeg", shape=shape, camera=CAMERA),
+        [encode_color(pixels)],
+        [],
+    )
+    bracket = [np.float32(exposure) * pixels for exposure in (0.5, 2.0)]
+    yield (
+        "fisheye_raw",
+        FisheyeMessage(
+            node=NODE,
+            **_stamps(),
+            encoding="raw",
+            shape=shape,
+            dtype="float32",
+            camera={**CAMERA, "distortion_model": "equidistant", "distortion": [0.0, 0.0, 0.0, 0.0]},
+            exposures_s=(0.005, 0.02),
+        ),
+        [picture.astype("<f4").tobytes() for picture in bracket],
+        [picture.astype(int).ravel().tolist() for picture in bracket],
+    )
+    yield (
+        "composite_raw",
+        CompositeMessage(
+            node="server",
+            **_stamps(),
+            encoding="raw",
+            shape=shape,
+            status="ok",
+            received_ns=CAPTURE_NS + 2_000_000,
+            rendered_ns=CAPTURE_NS + 30_000_000,
+            pass_times_ms={"voxelize": 1.25, "cones": 20.5},
+            lights=(LAMP,),
+            drops={"color.desk": 3},
+        ),
+        [pixels.tobytes()],
+        [pixels.ravel().tolist()],
+    )
+
+
+def _depth_examples() -> Iterator[Example]:
+    steps = np.array([[0, 5000, 5001, 65535], [1, 0, 10000, 20000]])
+    encodings: tuple[Literal["raw", "blosc2"], ...] = ("raw", "blosc2")
+    for encoding in encodings:
+        part = encode_depth((steps * 0.0002).astype(np.float32), steps > 0, encoding, 0.0002)
+        message = DepthMessage(
+            node=NODE,
+            **_stamps(),
+            encoding=encoding,
+            stream="clean_depth" if encoding == "raw" else "depth",
+            shape=(2, 4),
+            depth_scale_m=0.0002,
+            camera=CAMERA,
+            noise_sigma_m=0.002,
+        )
+        yield f"{message.stream}_{encoding}", message, [part], [steps.ravel().tolist()]
+
+
+def _small_examples() -> Iterator[Example]:
+    pose = PoseMessage(
+        node=NODE,
+        **_stamps(),
+        status="ok",
+        world_from_camera=POSE,
+        alternative=OTHER_POSE,
+        reprojection_error_px=0.25,
+        board={"type": "aruco_grid", "rows": 2, "columns": 3},
+    )
+    yield "pose_ok", pose, [], []
+    yield "pose_no_board", PoseMessage(node=NODE, **_stamps(), status="no_board"), [], []
+    yield "lights", LightsMessage(node=NODE, **_stamps(), lights=(LAMP,)), [], []
+    stats = StatsMessage(
+        node="server",
+        capture_ns=CAPTURE_NS,
+        state="running",
+        detail="rendering on llvmpipe",
+        rates={"composite": 12.5},
+        drops={"color.desk": 3},
+    )
+    yield "stats", stats, [], []
+    request = ControlRequest(
+        node="api", capture_ns=CAPTURE_NS, id="a1", op="set_scene", revision=4, payload={"name": "table"}
+    )
+    yield "request", request, [], []
+    accepted = ControlReply(node="server", capture_ns=CAPTURE_NS, id="a1", ok=True, payload={"revision": 4})
+    yield "reply_ok", accepted, [], []
+    refused = ControlReply(
+        node="server", capture_ns=CAPTURE_NS, id="a1", ok=False, error="the scene has no object: add one"
+    )
+    yield "reply_error", refused, [], []
+
+
+if __name__ == "__main__":
+    main()

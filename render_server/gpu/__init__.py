@@ -1,0 +1,1 @@
+"""OpenGL through moderngl: context, programs with includes, per-pass timers, asynchronous readback."""

@@ -1,0 +1,73 @@
+"""The one OpenGL context of a process (EGL, headless)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import moderngl
+
+from protocol.errors import DeltalightError
+
+SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swiftshader", "swrast")
+
+# What EGL and the GL loader say, and what a user can do about it.
+HINTS = {
+    "libGL.so not loaded": "OpenGL is not installed: apt-get install --no-install-recommends libegl1 libgl1",
+    "libEGL.so not loaded": "EGL is not installed: apt-get install --no-install-recommends libegl1 libgl1",
+    "eglInitialize failed": "EGL found no driver: install libgl1-mesa-dri, or the NVIDIA driver's EGL library",
+    "XOpenDisplay": "a display was asked for where none is: the EGL backend must be used",
+    "eglCreateContext failed": "the driver offers less than OpenGL 4.3: update the graphics driver",
+    "requested device": "there is no such GPU: leave --device out, or see `deltalight doctor` for the list",
+}
+
+
+@dataclass(frozen=True)
+class GpuContext:
+    """A current OpenGL 4.3 context and what it runs on.
+
+    One process has one context and uses it from one thread.
+    """
+
+    ctx: moderngl.Context
+    renderer_name: str
+    version: str
+    is_software: bool
+
+    def release(self) -> None:
+        """Free the context; nothing made from it may be used afterwards."""
+        self.ctx.release()
+
+
+def is_software_renderer(name: str) -> bool:
+    """Whether the renderer string names a CPU rasteriser."""
+    return any(word in name.lower() for word in SOFTWARE_RENDERERS)
+
+
+def explain_context_failure(text: str) -> str:
+    """One sentence for the error text of a context that could not be made."""
+    for needle, hint in HINTS.items():
+        if needle in text:
+            return f"No OpenGL context ({text}): {hint}."
+    return f"No OpenGL context ({text}): run `deltalight doctor` to see what is missing."
+
+
+def create_context(device: int | None = None, *, allow_software: bool = True) -> GpuContext:
+    """Make the process's context on EGL device `device` (the driver's first when None).
+
+    Raises:
+        DeltalightError: no driver, no such device, or only a software renderer where none is allowed.
+    """
+    options = {} if device is None else {"device_index": device}
+    try:
+        ctx = moderngl.create_context(standalone=True, backend="egl", require=430, **options)
+    except Exception as error:  # moderngl and glcontext raise plain Exception
+        raise DeltalightError(explain_context_failure(str(error))) from error
+    name = str(ctx.info["GL_RENDERER"])
+    software = is_software_renderer(name)
+    if software and not allow_software:
+        ctx.release()
+        raise DeltalightError(
+            f"Only the software renderer {name} was found: "
+            "install a GPU driver, or add --allow-software to accept slow frames."
+        )
+    return GpuContext(ctx, name, str(ctx.info["GL_VERSION"]), software)

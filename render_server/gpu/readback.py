@@ -1,0 +1,58 @@
+"""Reading pictures back without stalling the GPU: a ring of pixel buffers that are read later."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+import moderngl
+import numpy as np
+
+from render_server.gpu.context import GpuContext
+
+RING = 3
+
+
+class AsyncReadback:
+    """Copies textures into pixel buffers at once and gives their bytes when asked, oldest first."""
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self._ctx = gpu.ctx
+        self._free: list[moderngl.Buffer] = []
+        self._waiting: deque[tuple[moderngl.Buffer, tuple[int, int, int], np.dtype[Any]]] = deque()
+
+    def __len__(self) -> int:
+        return len(self._waiting)
+
+    def push(self, texture: moderngl.Texture, dtype: str) -> None:
+        """Start copying `texture` (level 0, as `dtype` elements)."""
+        width, height = texture.size
+        shape = (height, width, texture.components)
+        size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+        buffer = self._take(size)
+        texture.read_into(buffer, alignment=1)
+        self._waiting.append((buffer, shape, np.dtype(dtype)))
+
+    def pop(self) -> np.ndarray[Any, Any]:
+        """Array (h, w, components) of the oldest texture pushed; waits only if the GPU is not done with it."""
+        buffer, shape, dtype = self._waiting.popleft()
+        size = int(np.prod(shape)) * dtype.itemsize
+        array = np.frombuffer(buffer.read(size), dtype=dtype).reshape(shape)
+        self._free.append(buffer)
+        return array
+
+    def _take(self, size: int) -> moderngl.Buffer:
+        """A buffer of `size` bytes that nothing waits in."""
+        for index, buffer in enumerate(self._free):
+            if buffer.size == size:
+                return self._free.pop(index)
+        while len(self._free) >= RING:
+            self._free.pop(0).release()
+        return self._ctx.buffer(reserve=size, dynamic=True)
+
+    def release(self) -> None:
+        """Free all buffers."""
+        for buffer in [*self._free, *(entry[0] for entry in self._waiting)]:
+            buffer.release()
+        self._free.clear()
+        self._waiting.clear()

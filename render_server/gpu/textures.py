@@ -1,0 +1,50 @@
+"""Making textures with the sampling state that every pass here wants."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import moderngl
+import numpy as np
+
+from render_server.gpu.context import GpuContext
+
+
+def texture_2d(
+    gpu: GpuContext,
+    size: tuple[int, int],
+    components: int,
+    dtype: str,
+    *,
+    linear: bool = False,
+    data: bytes | None = None,
+) -> moderngl.Texture:
+    """Texture of `size` (width, height), clamped at its edges; nearest unless `linear`."""
+    texture = gpu.ctx.texture(size, components, data, dtype=dtype, alignment=1)
+    mode = moderngl.LINEAR if linear else moderngl.NEAREST
+    if dtype[0] == "f":
+        texture.filter = (mode, mode)
+    texture.repeat_x = texture.repeat_y = False
+    return texture
+
+
+def texture_from_array(
+    gpu: GpuContext, array: np.ndarray[Any, Any], *, linear: bool = False, integer: bool = False
+) -> moderngl.Texture:
+    """Texture with the contents of `array` (h, w, components): float16, float32 or uint8."""
+    kind = {"float16": "f2", "float32": "f4", "uint8": "u1" if integer else "f1"}[array.dtype.name]
+    height, width, components = array.shape
+    data = np.ascontiguousarray(array).tobytes()
+    return texture_2d(gpu, (width, height), components, kind, linear=linear, data=data)
+
+
+def bind_images(*textures: moderngl.Texture | moderngl.Texture3D, first: int = 0) -> None:
+    """Bind textures as read-write images of their own format, on units from `first` on."""
+    for unit, texture in enumerate(textures, start=first):
+        texture.bind_to_image(unit, read=True, write=True)
+
+
+def bind_samplers(textures: dict[int, moderngl.Texture | moderngl.Texture3D | moderngl.TextureArray]) -> None:
+    """Bind textures to sampler units."""
+    for unit, texture in textures.items():
+        texture.use(location=unit)

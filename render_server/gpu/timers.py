@@ -1,0 +1,62 @@
+"""Per-pass times: GPU timer queries, or finish + clock where the driver's queries read zero (llvmpipe)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import moderngl
+
+from render_server.gpu.context import GpuContext
+
+QUERIES_IN_FLIGHT = 3  # frames after which a query is read without waiting for the GPU
+
+
+class PassTimers:
+    """Milliseconds a pass, by name, for the newest frame whose times are known.
+
+    A pass that runs several times in one frame is summed.
+    """
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self._gpu = gpu
+        self._free: list[moderngl.Query] = []
+        self._pending: list[list[tuple[str, moderngl.Query]]] = []
+        self._current: list[tuple[str, moderngl.Query]] = []
+        self._clock: dict[str, float] = {}
+        self.times_ms: dict[str, float] = {}
+
+    @contextmanager
+    def measure(self, name: str) -> Iterator[None]:
+        """Time the GL work issued inside."""
+        if self._gpu.is_software:
+            start = time.perf_counter()
+            yield
+            self._gpu.ctx.finish()
+            elapsed = (time.perf_counter() - start) * 1e3
+            self._clock[name] = self._clock.get(name, 0.0) + elapsed
+            return
+        query = self._free.pop() if self._free else self._gpu.ctx.query(time=True)
+        with query:
+            yield
+        self._current.append((name, query))
+
+    def end_frame(self) -> dict[str, float]:
+        """Close the frame's list and return the newest known times."""
+        if self._gpu.is_software:
+            self.times_ms, self._clock = self._clock, {}
+            return self.times_ms
+        self._pending.append(self._current)
+        self._current = []
+        if len(self._pending) >= QUERIES_IN_FLIGHT:
+            self.times_ms = self._read(self._pending.pop(0))
+        return self.times_ms
+
+    def _read(self, queries: list[tuple[str, moderngl.Query]]) -> dict[str, float]:
+        """Sum the queries of one frame by name and free them."""
+        times: dict[str, float] = {}
+        for name, query in queries:
+            times[name] = times.get(name, 0.0) + query.elapsed / 1e6
+            self._free.append(query)
+        return times

@@ -1,0 +1,140 @@
+// Relit picture: real pixels by the ratio of irradiances or by addition, virtual pixels over them by the matte, camera
+// response; where nothing changed the camera's own bytes (METHOD 3, composition).
+#include "passes/common/brdf.glsl"
+#include "passes/common/geometry.glsl"
+#include "passes/common/surfaces.glsl"
+#include "passes/common/upsample.glsl"
+
+layout(local_size_x = 8, local_size_y = 8) in;
+layout(binding = 0, rgba8ui) writeonly uniform uimage2D code_out;
+layout(binding = 1, rgba16f) writeonly uniform image2D linear_out;
+layout(binding = 1) uniform usampler2D picture;
+layout(binding = 2) uniform sampler2D linear_picture;
+layout(binding = 3) uniform sampler2D response;
+layout(binding = 8) uniform sampler2D matte;
+layout(binding = 9) uniform sampler2D virtual_radiance;
+layout(binding = 10) uniform sampler2D direct_mu;
+layout(binding = 11) uniform sampler2D direct_rho;
+layout(binding = 12) uniform sampler2D cone_mu;
+layout(binding = 13) uniform sampler2D cone_rho;
+layout(binding = 14) uniform sampler2D cone_specular_mu;
+layout(binding = 16) uniform sampler2D cone_specular_rho;
+layout(binding = 17) uniform sampler2D lobe_mu;
+layout(binding = 18) uniform sampler2D lobe_rho;
+uniform float exposure_scale;
+uniform float sample_distance;   // m at 1 m depth
+uniform vec3 camera_position;
+uniform bool additive;
+uniform bool filmic;             // ACES tone curve on the whole picture instead of the camera's response
+uniform bool specular_surfaces;
+
+const vec2 ALBEDO_RANGE = vec2(0.02, 0.95);
+
+struct Change { vec3 e_mu; vec3 delta; vec3 s_mu; vec3 s_rho; bool any_change; };
+
+// Indirect part: E_mu of the cones, and fade (E_rho - E_mu).
+void add_cones(ivec2 pixel, vec4 position, vec3 normal, inout Change c) {
+    vec3 e_mu = vec3(0.0), delta = vec3(0.0), s_mu = vec3(0.0), s_rho = vec3(0.0);
+    float total = 0.0;
+    for (int j = 0; j < 4; ++j) {
+        float w;
+        ivec2 texel = low_texel(pixel, j, w);
+        vec4 mu = texelFetch(cone_mu, texel, 0);
+        ivec2 at = texelFetch(sample_pixels, texel, 0).xy;
+        if (at.x < 0) continue;
+        vec3 sp = texelFetch(real_surface_position, at, 0).xyz;
+        vec3 sn = texelFetch(real_surface_normal, at, 0).xyz;
+        w *= continuation(position.xyz, normal, sp, sn, sample_distance * position.w) + 1e-4;
+        vec4 rho = texelFetch(cone_rho, texel, 0);
+        e_mu += w * mu.rgb;
+        delta += w * rho.a * (rho.rgb - mu.rgb);
+        if (specular_surfaces) {
+            s_mu += w * texelFetch(cone_specular_mu, texel, 0).rgb;
+            s_rho += w * mix(texelFetch(cone_specular_mu, texel, 0).rgb, texelFetch(cone_specular_rho, texel, 0).rgb, rho.a);
+        }
+        total += w;
+    }
+    if (total == 0.0) return;
+    c.e_mu += e_mu / total;
+    c.delta += delta / total;
+    c.s_mu = s_mu / total;
+    c.s_rho = s_rho / total;
+}
+
+Change change_at(ivec2 pixel, vec4 position, vec4 normal) {
+    vec3 e_mu = texelFetch(direct_mu, pixel, 0).rgb;
+    Change c = Change(e_mu, texelFetch(direct_rho, pixel, 0).rgb - e_mu, vec3(0.0), vec3(0.0), false);
+    add_cones(pixel, position, normal.xyz, c);
+    if (specular_surfaces && normal.w >= 0.0) {
+        SurfaceEntry e = surfaces[int(normal.w)];
+        float cosine = max(dot(normal.xyz, normalize(camera_position - position.xyz)), 1e-3);
+        vec3 reflectance = specular_reflectance(e.f0.rgb, e.surface.x, cosine);
+        c.s_mu = reflectance * c.s_mu + texelFetch(lobe_mu, pixel, 0).rgb;
+        c.s_rho = reflectance * c.s_rho + texelFetch(lobe_rho, pixel, 0).rgb;
+    } else {
+        c.s_mu = vec3(0.0);
+        c.s_rho = vec3(0.0);
+    }
+    c.any_change = c.delta != vec3(0.0) || c.s_mu != c.s_rho;
+    return c;
+}
+
+// Share of the picture's radiance that is diffuse.
+vec3 diffuse_share(Change c, vec4 normal, vec3 b) {
+    if (c.s_mu == vec3(0.0)) return vec3(1.0);
+    SurfaceEntry e = surfaces[int(normal.w)];
+    vec3 diffuse = e.albedo.w > 0.5 ? e.albedo.rgb / PI * c.e_mu : max(b - c.s_mu, vec3(0.0));
+    return (1.0 - e.f0.w) * diffuse / max(diffuse + c.s_mu, vec3(1e-6));
+}
+
+vec3 relit(ivec2 pixel, Change c, vec4 normal, vec3 b) {
+    if (additive) {
+        vec3 albedo = clamp(PI * b / max(c.e_mu, vec3(1e-6)), ALBEDO_RANGE.x, ALBEDO_RANGE.y);
+        return max(vec3(0.0), b + albedo / PI * c.delta + c.s_rho - c.s_mu);
+    }
+    float e = 1e-3 * max(texelFetch(direct_mu, pixel, 0).a, 1e-6);
+    vec3 ratio = (max(c.e_mu + c.delta, vec3(0.0)) + e) / (c.e_mu + e);
+    vec3 w = diffuse_share(c, normal, b);
+    return w * b * ratio + max(vec3(0.0), (1.0 - w) * b + c.s_rho - c.s_mu);
+}
+
+// Code whose linear value is nearest, by bisection of the response.
+uint encode(float x, int channel) {
+    int low = 0, high = 255;
+    while (high - low > 1) {
+        int mid = (low + high) / 2;
+        if (texelFetch(response, ivec2(mid, 0), 0)[channel] <= x) low = mid; else high = mid;
+    }
+    float a = texelFetch(response, ivec2(low, 0), 0)[channel], b = texelFetch(response, ivec2(high, 0), 0)[channel];
+    return uint(x - a < b - x ? low : high);
+}
+
+// ACES tone curve (Narkowicz's fit, 2015).
+vec3 aces(vec3 x) { return clamp(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 0.0, 1.0); }
+
+void main() {
+    ivec2 pixel = ivec2(gl_GlobalInvocationID.xy);
+    if (any(greaterThanEqual(pixel, textureSize(picture, 0)))) return;
+    uvec4 code = uvec4(texelFetch(picture, pixel, 0).rgb, 255u);
+    vec3 b = texelFetch(linear_picture, pixel, 0).rgb;
+    vec3 result = b;
+    bool changed = filmic;
+    vec4 position = texelFetch(real_surface_position, pixel, 0);
+    float shown = texelFetch(matte, pixel, 0).r;
+    if (position.w > 0.0 && shown < 1.0) {
+        vec4 normal = texelFetch(real_surface_normal, pixel, 0);
+        Change c = change_at(pixel, position, normal);
+        if (c.any_change) { result = relit(pixel, c, normal, b); changed = true; }
+    }
+    if (shown > 0.0) {
+        result = mix(result, texelFetch(virtual_radiance, pixel, 0).rgb, shown);
+        changed = true;
+    }
+    if (changed) {
+        vec3 x = result * exposure_scale;
+        if (filmic) x = aces(x);
+        code.rgb = uvec3(encode(x.r, 0), encode(x.g, 1), encode(x.b, 2));
+    }
+    imageStore(code_out, pixel, code);
+    imageStore(linear_out, pixel, vec4(result, 1.0));
+}

@@ -1,0 +1,56 @@
+"""The relit picture: camera codes and linear radiance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import moderngl
+
+from render_server.gpu.context import GpuContext
+from render_server.gpu.program import ComputeProgram
+from render_server.gpu.textures import bind_images, bind_samplers, texture_2d
+from render_server.passes.direct_light import DirectLightPass
+from render_server.passes.picture import Picture
+from render_server.passes.sampling_grid import SamplingGrid
+from render_server.passes.trace_cones import ConeFields
+
+
+@dataclass(frozen=True)
+class RelitLayers:
+    """What a relighting method hands to composition."""
+
+    matte: moderngl.Texture
+    virtual_radiance: moderngl.Texture
+    direct: DirectLightPass
+    cones: ConeFields
+    grid: SamplingGrid
+
+
+class CompositePass:
+    """Writes `code` (RGBA8UI, the camera's response applied) and `linear` (RGBA16F, camera units)."""
+
+    def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
+        self._size = size
+        self.code = texture_2d(gpu, size, 4, "u1")
+        self.linear = texture_2d(gpu, size, 4, "f2")
+        self._program = ComputeProgram(gpu, Path(__file__).with_name("composite.comp.glsl"))
+
+    def run(self, picture: Picture, layers: RelitLayers, uniforms: dict[str, Any]) -> None:
+        """Compose; geometry and surfaces must be bound."""
+        cones, direct = layers.cones, layers.direct
+        bind_samplers(
+            {0: layers.grid.pixels, 1: picture.code, 2: picture.linear, 3: picture.response, 8: layers.matte}
+            | {9: layers.virtual_radiance, 10: direct.mu, 11: direct.rho, 12: cones.mu, 13: cones.rho}
+            | {14: cones.specular_mu, 16: cones.specular_rho, 17: direct.lobe_mu, 18: direct.lobe_rho}
+        )
+        bind_images(self.code, self.linear)
+        self._program.run(
+            self._size, scale=layers.grid.scale, exposure_scale=picture.exposure_scale, **uniforms
+        )
+
+    def release(self) -> None:
+        """Free the GL objects."""
+        for item in (self.code, self.linear, self._program):
+            item.release()

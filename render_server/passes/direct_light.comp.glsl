@@ -1,0 +1,51 @@
+// Direct irradiance of the real surface at each pixel without and with the virtual objects (METHOD 3, direct), and
+// the light lobes on declared specular surfaces.
+#include "passes/common/lights.glsl"
+#include "passes/common/brdf.glsl"
+#include "passes/common/geometry.glsl"
+#include "passes/common/surfaces.glsl"
+
+layout(local_size_x = 8, local_size_y = 8) in;
+layout(binding = 0, rgba16f) writeonly uniform image2D direct_mu;    // rgb E_mu; a: unshadowed E, mean of channels
+layout(binding = 1, rgba16f) writeonly uniform image2D direct_rho;   // rgb E_rho
+layout(binding = 2, rgba16f) writeonly uniform image2D lobe_mu;      // rgb radiance of light lobes
+layout(binding = 3, rgba16f) writeonly uniform image2D lobe_rho;
+uniform vec3 camera_position;
+uniform float noise_sigma;   // m at 1 m
+uniform bool specular_surfaces;
+
+void main() {
+    ivec2 pixel = ivec2(gl_GlobalInvocationID.xy);
+    ivec2 size = textureSize(real_surface_position, 0);
+    if (any(greaterThanEqual(pixel, size))) return;
+    vec4 position = texelFetch(real_surface_position, pixel, 0);
+    vec4 normal = texelFetch(real_surface_normal, pixel, 0);
+    vec3 e_mu = vec3(0.0), e_rho = vec3(0.0), s_mu = vec3(0.0), s_rho = vec3(0.0);
+    float unshadowed = 0.0;
+    if (position.w > 0.0) {
+        vec3 v = normalize(camera_position - position.xyz);
+        float bias = 3.0 * noise_sigma * position.w * position.w;
+        for (int i = 0; i < light_count; ++i) {
+            vec3 l; float radius;
+            vec3 across = light_at(lights[i], position.xyz, l, radius);
+            float cosine = dot(normal.xyz, l);
+            if (cosine <= 0.0) continue;
+            vec2 seen = visibility(lights[i], position.xyz, bias, bias);
+            e_mu += across * cosine * seen.x;
+            e_rho += across * cosine * seen.y;
+            unshadowed += dot(across, vec3(1.0 / 3.0)) * cosine;
+            if (specular_surfaces && normal.w >= 0.0) {
+                SurfaceEntry e = surfaces[int(normal.w)];
+                vec3 lobe = across * specular_times_cosine(normal.xyz, v, l, e.f0.rgb, e.surface.x, radius);
+                s_mu += lobe * seen.x;
+                s_rho += lobe * seen.y;
+            }
+        }
+    }
+    imageStore(direct_mu, pixel, vec4(e_mu, unshadowed));
+    imageStore(direct_rho, pixel, vec4(e_rho, 0.0));
+    if (specular_surfaces) {
+        imageStore(lobe_mu, pixel, vec4(s_mu, 0.0));
+        imageStore(lobe_rho, pixel, vec4(s_rho, 0.0));
+    }
+}

@@ -1,0 +1,145 @@
+"""Lights, their depth maps and the environment, bound for every pass that shades."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import moderngl
+import numpy as np
+from jaxtyping import Float64
+
+from render_server.gpu.context import GpuContext
+from render_server.gpu.textures import texture_from_array
+from render_server.passes.light_maps import LightView, light_views, pack_light, pack_view, tile_columns
+from render_server.passes.reflective_shadow_map import ShadowMapAtlas, texel_size_m
+from render_server.scene.lights import DirectionalLight, SphereLight
+from render_server.scene.prefiltered import PrefilteredEnvironment
+
+EMPTY = b"\0" * 128
+
+
+class LightTable:
+    """What the lights see of the real scene and of the virtual objects, and the records that tell shaders so."""
+
+    def __init__(self, gpu: GpuContext, tile_size: int, shadow_samples: int) -> None:
+        self._gpu = gpu
+        self.tile_size = tile_size
+        self.shadow_samples = shadow_samples
+        self.lights: list[DirectionalLight | SphereLight] = []
+        self.real_views: list[LightView] = []
+        self.virtual_views: list[LightView] = []
+        self.real_atlas = ShadowMapAtlas(gpu, 1, tile_size)
+        self.virtual_atlas = ShadowMapAtlas(gpu, 1, tile_size)
+        self._light_buffer = gpu.ctx.buffer(EMPTY, dynamic=True)
+        self._view_buffer = gpu.ctx.buffer(EMPTY, dynamic=True)
+        self._environment: moderngl.Texture | None = None
+        self._irradiance: moderngl.Texture | None = None
+        self._environment_uniforms: dict[str, Any] = {}
+
+    def set_environment(self, environment: PrefilteredEnvironment) -> None:
+        """Upload the residual environment R with its cone levels, and its irradiance map."""
+        for texture in (self._environment, self._irradiance):
+            if texture is not None:
+                texture.release()
+        first = texture_from_array(self._gpu, environment.levels[0].astype(np.float32), linear=True)
+        count = len(environment.levels)
+        if count > 1:
+            first.build_mipmaps(0, count - 1)
+            for level, image in enumerate(environment.levels[1:], start=1):
+                first.write(np.ascontiguousarray(image, np.float32).tobytes(), level=level, alignment=1)
+            first.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
+        self._environment = first
+        self._irradiance = texture_from_array(
+            self._gpu, environment.irradiance.astype(np.float32), linear=True
+        )
+        self._environment_uniforms = {
+            "environment_levels": count,
+            "environment_first_half_angle": environment.first_half_angle_rad,
+        }
+
+    def place(
+        self,
+        lights: list[DirectionalLight | SphereLight],
+        real_points: Float64[np.ndarray, "n 3"],
+        virtual_points: Float64[np.ndarray, "m 3"],
+    ) -> None:
+        """Fit each light's views: around the visible real scene, and closely around the virtual objects."""
+        self.lights = lights
+        real = [light_views(light, real_points) if len(real_points) else [] for light in lights]
+        virtual = [light_views(light, virtual_points) if len(virtual_points) else [] for light in lights]
+        self.real_views = [view for views in real for view in views]
+        self.virtual_views = [view for views in virtual for view in views]
+        self.real_atlas = self._atlas_for(self.real_atlas, len(self.real_views))
+        self.virtual_atlas = self._atlas_for(self.virtual_atlas, len(self.virtual_views))
+        self._write_records(real, virtual)
+
+    def _atlas_for(self, atlas: ShadowMapAtlas, tiles: int) -> ShadowMapAtlas:
+        if atlas.tiles == max(tiles, 1):
+            return atlas
+        atlas.release()
+        return ShadowMapAtlas(self._gpu, max(tiles, 1), self.tile_size)
+
+    def _write_records(self, real: list[list[LightView]], virtual: list[list[LightView]]) -> None:
+        """Records of all lights and views; the real views come first."""
+        records = b""
+        first_real, first_virtual = 0, len(self.real_views)
+        for light, real_part, virtual_part in zip(self.lights, real, virtual, strict=True):
+            ranges = (first_real, len(real_part), first_virtual, len(virtual_part))
+            records += pack_light(light, ranges)
+            first_real += len(real_part)
+            first_virtual += len(virtual_part)
+        views = [
+            pack_view(view, tile, tile_columns(len(group)), self.tile_size)
+            for group in (self.real_views, self.virtual_views)
+            for tile, view in enumerate(group)
+        ]
+        packed = np.array(views, np.float32).tobytes()
+        self._light_buffer.orphan(max(len(records), 16))
+        self._view_buffer.orphan(max(len(packed), 16))
+        self._light_buffer.write(records or EMPTY[:16])
+        self._view_buffer.write(packed or EMPTY[:16])
+
+    @property
+    def first_virtual_view(self) -> int:
+        """Index of the first virtual view's record."""
+        return len(self.real_views)
+
+    def virtual_texel_m(self, point: Float64[np.ndarray, "3"]) -> float:
+        """Largest texel of the virtual depth maps at `point`, m."""
+        sizes = []
+        for view in self.virtual_views:
+            depth = (view.view_from_world @ np.append(point, 1.0))[2]
+            sizes.append(texel_size_m(view, self.tile_size, float(depth)))
+        return max(sizes, default=0.0)
+
+    def bind_records(self) -> None:
+        """Bind the records alone (while depth maps are being drawn)."""
+        self._light_buffer.bind_to_storage_buffer(0)
+        self._view_buffer.bind_to_storage_buffer(1)
+
+    def bind(self) -> None:
+        """Bind everything to the places that lights.glsl and environment.glsl name."""
+        self.bind_records()
+        self.real_atlas.depth.use(location=10)
+        self.virtual_atlas.depth.use(location=11)
+        if self._environment is not None and self._irradiance is not None:
+            self._environment.use(location=12)
+            self._irradiance.use(location=13)
+
+    def uniforms(self) -> dict[str, Any]:
+        """Every uniform that shaders read of the lights."""
+        return {
+            "light_count": len(self.lights),
+            "shadow_samples": self.shadow_samples,
+            **self._environment_uniforms,
+        }
+
+    def release(self) -> None:
+        """Free the GL objects."""
+        self.real_atlas.release()
+        self.virtual_atlas.release()
+        self._light_buffer.release()
+        self._view_buffer.release()
+        for texture in (self._environment, self._irradiance):
+            if texture is not None:
+                texture.release()

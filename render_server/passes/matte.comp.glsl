@@ -1,0 +1,42 @@
+// Share of each pixel that the virtual objects cover: real surfaces hide them by depth, with an edge softened along
+// the picture's own edges. Unknown depth never hides; depth masks the object only, never its delta (METHOD 3).
+#include "passes/common/geometry.glsl"
+
+layout(local_size_x = 8, local_size_y = 8) in;
+layout(binding = 0, r16f) writeonly uniform image2D matte_out;
+layout(binding = 1) uniform sampler2D linear_picture;
+uniform float noise_sigma;     // m at 1 m
+
+const int RADIUS = 2;
+
+float covers(ivec2 pixel) {
+    ivec2 raster = raster_texel(pixel);
+    if (any(lessThan(raster, ivec2(0))) || any(greaterThanEqual(raster, textureSize(virtual_raster_position, 0))))
+        return 0.0;
+    return texelFetch(virtual_raster_position, raster, 0).w;
+}
+
+// 1 in front of the real surface, 0 behind it.
+float in_front(ivec2 pixel, float z) {
+    float real = texelFetch(real_surface_position, pixel, 0).w;
+    return real > 0.0 && real < z - 3.0 * noise_sigma * z * z ? 0.0 : 1.0;
+}
+
+void main() {
+    ivec2 pixel = ivec2(gl_GlobalInvocationID.xy);
+    ivec2 size = textureSize(real_surface_position, 0);
+    if (any(greaterThanEqual(pixel, size))) return;
+    float z = covers(pixel);
+    if (z <= 0.0) { imageStore(matte_out, pixel, vec4(0.0)); return; }
+    vec3 colour = texelFetch(linear_picture, pixel, 0).rgb;
+    float sum = 0.0, weight = 0.0;
+    for (int j = -RADIUS; j <= RADIUS; ++j)
+        for (int i = -RADIUS; i <= RADIUS; ++i) {
+            ivec2 at = clamp(pixel + ivec2(i, j), ivec2(0), size - 1);
+            vec3 d = (texelFetch(linear_picture, at, 0).rgb - colour) / (0.05 + colour);
+            float w = exp(-float(i * i + j * j) * 0.25 - 4.0 * dot(d, d));
+            sum += w * in_front(at, z);
+            weight += w;
+        }
+    imageStore(matte_out, pixel, vec4(sum / weight));
+}

@@ -1,0 +1,31 @@
+"""Share of each pixel that the virtual objects cover."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from render_server.gpu.context import GpuContext
+from render_server.gpu.program import ComputeProgram
+from render_server.gpu.textures import bind_images, bind_samplers, texture_2d
+from render_server.passes.picture import Picture
+
+
+class MattePass:
+    """R16F matte on the picture's grid; needs the geometry buffers bound."""
+
+    def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
+        self._size = size
+        self.texture = texture_2d(gpu, size, 1, "f2")
+        self._program = ComputeProgram(gpu, Path(__file__).with_name("matte.comp.glsl"))
+
+    def run(self, picture: Picture, uniforms: dict[str, Any]) -> None:
+        """Compare depths, soften along the picture's edges."""
+        bind_samplers({1: picture.linear})
+        bind_images(self.texture)
+        self._program.run(self._size, **uniforms)
+
+    def release(self) -> None:
+        """Free the GL objects."""
+        self.texture.release()
+        self._program.release()

@@ -1,0 +1,61 @@
+"""Real geometry buffer: position and normal of the real surface at each pixel."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from protocol.frames import DepthImage
+from render_server.gpu.context import GpuContext
+from render_server.gpu.program import ComputeProgram
+from render_server.gpu.textures import bind_images, bind_samplers, texture_2d
+from render_server.passes.geometry_buffer import GeometryBuffer
+from render_server.passes.picture import Picture
+from render_server.view import CameraView
+
+FIT_SPAN = 1.0 / 80.0  # half-width of the normal fit's window as a share of the picture's width
+
+
+class RealSurface:
+    """World position + depth (RGBA32F; w = 0 unknown) and normal + surface entry (RGBA16F) on the picture's grid."""
+
+    def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
+        self.size = size
+        self.position = texture_2d(gpu, size, 4, "f4")
+        self.normal = texture_2d(gpu, size, 4, "f2")
+        self._depth = texture_2d(gpu, size, 1, "f4")
+        folder = Path(__file__).parent
+        self._from_depth = ComputeProgram(gpu, folder / "real_surface.comp.glsl")
+        self._from_model = ComputeProgram(gpu, folder / "real_surface_model.comp.glsl")
+
+    def from_depth(
+        self, depth: DepthImage, picture: Picture, view: CameraView, sigma: float, surface_count: int
+    ) -> None:
+        """Fill from the clean, registered depth map; `sigma` is its noise at 1 m."""
+        known = np.where(depth.valid, depth.depth_m, 0.0).astype(np.float32)
+        self._depth.write(known.tobytes(), alignment=1)
+        bind_samplers({0: self._depth, 1: picture.rays})
+        bind_images(self.position, self.normal)
+        self._from_depth.run(
+            self.size,
+            noise_sigma=sigma,
+            surface_count=surface_count,
+            normal_stride=max(1, round(self.size[0] * FIT_SPAN / 2)),
+            **view.uniforms(),
+        )
+
+    def from_model(self, raster: GeometryBuffer, picture: Picture, view: CameraView, surface_count: int) -> None:
+        """Fill from a raster of the given model, through the lens."""
+        bind_samplers({6: raster.position, 7: raster.normal, 15: picture.rays})
+        bind_images(self.position, self.normal)
+        self._from_model.run(self.size, surface_count=surface_count, **view.uniforms())
+
+    def bind(self) -> None:
+        """Bind to the places that geometry.glsl names."""
+        bind_samplers({4: self.position, 5: self.normal})
+
+    def release(self) -> None:
+        """Free the GL objects."""
+        for item in (self.position, self.normal, self._depth, self._from_depth, self._from_model):
+            item.release()

@@ -1,0 +1,21 @@
+// Real geometry buffer from a given model: its raster, looked up through the lens model.
+#include "passes/common/geometry.glsl"
+#include "passes/common/surfaces.glsl"
+
+layout(local_size_x = 8, local_size_y = 8) in;
+layout(binding = 0, rgba32f) writeonly uniform image2D position_out;
+layout(binding = 1, rgba16f) writeonly uniform image2D normal_out;
+
+void main() {
+    ivec2 pixel = ivec2(gl_GlobalInvocationID.xy);
+    if (any(greaterThanEqual(pixel, imageSize(position_out)))) return;
+    ivec2 raster = raster_texel(pixel);
+    vec4 position = vec4(0.0);
+    vec4 normal = vec4(0.0, 0.0, 1.0, -1.0);
+    if (all(greaterThanEqual(raster, ivec2(0))) && all(lessThan(raster, textureSize(virtual_raster_position, 0)))) {
+        position = texelFetch(virtual_raster_position, raster, 0);
+        normal = vec4(texelFetch(virtual_raster_normal, raster, 0).xyz, float(surface_entry(position.xyz)));
+    }
+    imageStore(position_out, pixel, position);
+    imageStore(normal_out, pixel, normal);
+}

@@ -1,0 +1,55 @@
+"""Fixed-point sums -> texels of level 0, and the clearing of texels that a set had touched."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from render_server.gpu.context import GpuContext
+from render_server.gpu.program import ComputeProgram
+from render_server.gpu.textures import bind_images
+from render_server.passes.light_voxels import WALKERS
+from render_server.passes.volume import Pyramid
+from render_server.passes.voxel_store import VoxelStore, bind_storage
+
+RESOLVE = Path(__file__).with_name("resolve_voxels.comp.glsl")
+CLEAR = Path(__file__).with_name("clear_voxels.comp.glsl")
+
+
+class ResolveVoxelsPass:
+    """Writes the mu set (real alone) and the rho set (real with its changed light, and virtual)."""
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self._mu = ComputeProgram(gpu, RESOLVE)
+        self._rho_real = ComputeProgram(gpu, RESOLVE, {"RHO_REAL": 1})
+        self._rho_virtual = ComputeProgram(gpu, RESOLVE, {"RHO_VIRTUAL": 1})
+        self._clear = ComputeProgram(gpu, CLEAR)
+
+    def clear(self, pyramid: Pyramid, store: VoxelStore, uniforms: dict[str, Any], *, free: bool) -> None:
+        """Empty the texels of the store's voxels; with `free`, its slots too."""
+        bind_images(pyramid.texture)
+        store.bind()
+        self._clear.run((WALKERS,), free_slots=free, **uniforms)
+
+    def resolve_mu(self, pyramid: Pyramid, real: VoxelStore, uniforms: dict[str, Any]) -> None:
+        """(c_mu, a_real)."""
+        bind_images(pyramid.texture)
+        real.bind()
+        self._mu.run((WALKERS,), **uniforms)
+
+    def resolve_rho(
+        self, pyramid: Pyramid, real: VoxelStore, virtual: VoxelStore, uniforms: dict[str, Any]
+    ) -> None:
+        """(c_rho, a_real + a_virtual)."""
+        bind_images(pyramid.texture)
+        real.bind()
+        bind_storage({8: real.delta_sums, 9: virtual.grid, 10: virtual.sums})
+        self._rho_real.run((WALKERS,), **uniforms)
+        virtual.bind()
+        bind_storage({9: real.grid})
+        self._rho_virtual.run((WALKERS,), **uniforms)
+
+    def release(self) -> None:
+        """Free the programs."""
+        for program in (self._mu, self._rho_real, self._rho_virtual, self._clear):
+            program.release()

@@ -1,0 +1,33 @@
+"""The reduced grid on which cones are traced: which pixel stands for each texel."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import moderngl
+
+from render_server.gpu.context import GpuContext
+from render_server.gpu.program import ComputeProgram
+from render_server.gpu.textures import bind_images, bind_samplers, texture_2d
+
+
+class SamplingGrid:
+    """RGBA16I: pixel of a real surface (x, y) and of a virtual one (x, y), -1 where the block shows none."""
+
+    def __init__(self, gpu: GpuContext, picture_size: tuple[int, int], scale: int) -> None:
+        self.picture_size, self.scale = picture_size, scale
+        self.size = (-(-picture_size[0] // scale), -(-picture_size[1] // scale))
+        self.pixels = texture_2d(gpu, self.size, 4, "i2")
+        self._program = ComputeProgram(gpu, Path(__file__).with_name("sampling_grid.comp.glsl"))
+
+    def run(self, matte: moderngl.Texture, uniforms: dict[str, Any]) -> None:
+        """Choose the pixels; needs the geometry buffers bound."""
+        bind_samplers({0: matte})
+        bind_images(self.pixels)
+        self._program.run(self.size, picture_pixels=self.picture_size, scale=self.scale, **uniforms)
+
+    def release(self) -> None:
+        """Free the GL objects."""
+        self.pixels.release()
+        self._program.release()

@@ -1,0 +1,89 @@
+// Diffuse and specular cones of the exact operator at 1/scale of the picture (METHOD 3, 4.5).
+// REAL: E_mu and E_rho of ambient + bounced light on real surfaces. VIRTUAL: E_rho and the specular cone of the object.
+#include "passes/common/march.glsl"
+#include "passes/common/environment.glsl"
+#include "passes/common/brdf.glsl"
+#include "passes/common/sampling_grid.glsl"
+
+layout(local_size_x = 8, local_size_y = 8) in;
+#ifdef REAL
+layout(binding = 0, rgba16f) writeonly uniform image2D irradiance_mu;    // rgb E_mu, a: 1 where traced
+layout(binding = 1, rgba16f) writeonly uniform image2D irradiance_rho;   // rgb E_rho, a: volume fade
+#else
+layout(binding = 0, rgba16f) writeonly uniform image2D irradiance_rho;   // rgb E_rho, a: 1 where traced
+#endif
+#ifdef REAL
+layout(binding = 2, rgba16f) writeonly uniform image2D specular_mu;      // rgb mean radiance of the specular cone
+#endif
+layout(binding = 3, rgba16f) writeonly uniform image2D specular_rho;
+uniform int cone_count;
+uniform vec3 camera_position;
+uniform bool trace_everywhere;   // also where the volume does not reach (photometric registration)
+
+const float START = 1.5;         // voxels along the normal: with one-sided voxels enough against self-hits
+
+// Direction k of `cone_count` cosine-stratified ones about z (realtime-gi, appendix A).
+vec3 cone_direction(int k) {
+    float z = sqrt(1.0 - (float(k) + 0.5) / float(cone_count));
+    float phi = float(k) * GOLDEN_ANGLE;
+    return vec3(sqrt(1.0 - z * z) * vec2(cos(phi), sin(phi)), z);
+}
+
+void diffuse(vec3 q, vec3 n, bool only_rho, out vec3 e_mu, out vec3 e_rho) {
+    // cones of equal projected solid angle pi / K: diameter / distance = 2 tan(half-angle)
+    float ratio = 1.5 * sqrt(2.0 / float(cone_count));
+    float half_angle = atan(0.5 * ratio);
+    mat3 basis = basis_around(n);
+    e_mu = vec3(0.0);
+    e_rho = vec3(0.0);
+    for (int k = 0; k < cone_count; ++k) {
+        vec3 d = basis * cone_direction(k);
+        March m = march(q, d, ratio, only_rho);
+        vec3 r = environment(d, half_angle);
+        e_mu += m.c_mu + m.t_mu * r;
+        e_rho += m.c_rho + m.t_rho * r;
+    }
+    e_mu *= PI / float(cone_count);
+    e_rho *= PI / float(cone_count);
+}
+
+void main() {
+    ivec2 texel = ivec2(gl_GlobalInvocationID.xy);
+    if (any(greaterThanEqual(texel, low_resolution_size))) return;
+    SurfacePoint s = surface_point(texel);
+    vec3 q = volume_coordinate(s.position);
+    vec3 e_mu = vec3(0.0), e_rho = vec3(0.0), c_mu = vec3(0.0), c_rho = vec3(0.0);
+    float traced = 0.0, fade = 0.0;
+#ifdef REAL
+    fade = s.present ? volume_fade(q) : 0.0;
+    bool active_here = s.present && (fade > 0.0 || trace_everywhere);
+#else
+    bool active_here = s.present;
+#endif
+    if (active_here) {
+        vec3 start = q + START * s.normal;
+        traced = 1.0;
+#ifdef REAL
+        diffuse(start, s.normal, false, e_mu, e_rho);
+#else
+        diffuse(start, s.normal, true, e_mu, e_rho);
+#endif
+        if (s.roughness >= 0.0) {
+            vec3 v = normalize(camera_position - s.position);
+            vec3 d = reflect(-v, s.normal);
+            float half_angle = specular_half_angle(s.roughness);
+            March m = march(start, d, 2.0 * tan(half_angle), false);
+            vec3 r = environment(d, half_angle);
+            c_mu = m.c_mu + m.t_mu * r;
+            c_rho = m.c_rho + m.t_rho * r;
+        }
+    }
+#ifdef REAL
+    imageStore(irradiance_mu, texel, vec4(e_mu, traced));
+    imageStore(irradiance_rho, texel, vec4(e_rho, fade));
+    imageStore(specular_mu, texel, vec4(c_mu, traced));
+#else
+    imageStore(irradiance_rho, texel, vec4(e_rho, traced));
+#endif
+    imageStore(specular_rho, texel, vec4(c_rho, traced));
+}

@@ -1,0 +1,61 @@
+"""Cone tracing of the exact operator (METHOD 3, 4.5)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from render_server.gpu.context import GpuContext
+from render_server.gpu.program import ComputeProgram
+from render_server.gpu.textures import bind_images, bind_samplers, texture_2d
+from render_server.passes.sampling_grid import SamplingGrid
+from render_server.passes.volume import Pyramid
+
+SHADER = Path(__file__).with_name("trace_cones.comp.glsl")
+
+
+class ConeFields:
+    """What cones bring, at 1/scale of the picture: irradiance (diffuse) and mean radiance (specular cone)."""
+
+    def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
+        self.mu = texture_2d(gpu, size, 4, "f2")
+        self.rho = texture_2d(gpu, size, 4, "f2")
+        self.specular_mu = texture_2d(gpu, size, 4, "f2")
+        self.specular_rho = texture_2d(gpu, size, 4, "f2")
+        self.virtual = texture_2d(gpu, size, 4, "f2")
+        self.virtual_specular = texture_2d(gpu, size, 4, "f2")
+
+    def release(self) -> None:
+        """Free the textures."""
+        for texture in vars(self).values():
+            texture.release()
+
+
+class TraceConesPass:
+    """Dual march on real surfaces, rho march on virtual ones; lights, geometry and support must be bound."""
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self._real = ComputeProgram(gpu, SHADER, {"REAL": 1})
+        self._virtual = ComputeProgram(gpu, SHADER)
+
+    def trace_real(
+        self, fields: ConeFields, grid: SamplingGrid, mu: Pyramid, rho: Pyramid, uniforms: dict[str, Any]
+    ) -> None:
+        """E_mu, E_rho and the specular cones of the real surfaces."""
+        bind_samplers({0: grid.pixels, 2: mu.texture, 3: rho.texture})
+        bind_images(fields.mu, fields.rho, fields.specular_mu, fields.specular_rho)
+        self._real.run(grid.size, low_resolution_size=grid.size, **uniforms)
+
+    def trace_virtual(
+        self, fields: ConeFields, grid: SamplingGrid, mu: Pyramid, rho: Pyramid, uniforms: dict[str, Any]
+    ) -> None:
+        """E_rho and the specular cone of the virtual surfaces."""
+        bind_samplers({0: grid.pixels, 2: mu.texture, 3: rho.texture})
+        bind_images(fields.virtual)
+        fields.virtual_specular.bind_to_image(3, read=True, write=True)
+        self._virtual.run(grid.size, low_resolution_size=grid.size, **uniforms)
+
+    def release(self) -> None:
+        """Free the programs."""
+        self._real.release()
+        self._virtual.release()

@@ -1,0 +1,72 @@
+// Radiance of the virtual surfaces (METHOD 4.7): direct light shadowed by real and virtual geometry, GGX lobes,
+// diffuse cones and the specular cone of the rho set.
+#include "passes/common/lights.glsl"
+#include "passes/common/brdf.glsl"
+#include "passes/common/geometry.glsl"
+#include "passes/common/materials.glsl"
+#include "passes/common/upsample.glsl"
+
+layout(local_size_x = 8, local_size_y = 8) in;
+layout(binding = 0, rgba16f) writeonly uniform image2D radiance_out;
+layout(binding = 1) uniform sampler2D matte;
+layout(binding = 2) uniform sampler2D cone_irradiance;
+layout(binding = 3) uniform sampler2D cone_specular;
+layout(binding = 8) uniform sampler2D virtual_raster_uv;
+layout(binding = 9) uniform sampler2D virtual_raster_tint;
+uniform vec3 camera_position;
+uniform float noise_sigma;      // m at 1 m
+uniform float normal_offset;    // m: against self-shadowing by the virtual depth map
+uniform float sample_distance;  // m at 1 m depth: what a texel of the reduced resolution spans
+
+struct Indirect { vec3 irradiance; vec3 specular; };
+
+Indirect indirect_at(ivec2 pixel, vec4 position, vec3 normal) {
+    Indirect sum = Indirect(vec3(0.0), vec3(0.0));
+    float total = 0.0;
+    for (int j = 0; j < 4; ++j) {
+        float w;
+        ivec2 texel = low_texel(pixel, j, w);
+        vec4 e = texelFetch(cone_irradiance, texel, 0);
+        if (e.a == 0.0) continue;
+        ivec2 raster = raster_texel(texelFetch(sample_pixels, texel, 0).zw);
+        vec3 sp = texelFetch(virtual_raster_position, raster, 0).xyz;
+        vec3 sn = texelFetch(virtual_raster_normal, raster, 0).xyz;
+        w *= continuation(position.xyz, normal, sp, sn, sample_distance * position.w) + 1e-4;
+        sum.irradiance += w * e.rgb;
+        sum.specular += w * texelFetch(cone_specular, texel, 0).rgb;
+        total += w;
+    }
+    if (total > 0.0) { sum.irradiance /= total; sum.specular /= total; }
+    return sum;
+}
+
+vec3 direct_radiance(vec3 p, float depth, vec3 n, vec3 v, Material m) {
+    vec3 sum = vec3(0.0);
+    for (int i = 0; i < light_count; ++i) {
+        vec3 l; float radius;
+        vec3 across = light_at(lights[i], p, l, radius);
+        float cosine = dot(n, l);
+        if (cosine <= 0.0) continue;
+        float seen = visibility(lights[i], p + normal_offset * n, 3.0 * noise_sigma * depth * depth, 0.0).y;
+        vec3 response = m.diffuse / PI * cosine + specular_times_cosine(n, v, l, m.f0, m.roughness, radius);
+        sum += across * seen * response;
+    }
+    return sum;
+}
+
+void main() {
+    ivec2 pixel = ivec2(gl_GlobalInvocationID.xy);
+    if (any(greaterThanEqual(pixel, textureSize(matte, 0)))) return;
+    if (texelFetch(matte, pixel, 0).r == 0.0) return;
+    ivec2 raster = raster_texel(pixel);
+    vec4 position = texelFetch(virtual_raster_position, raster, 0);
+    vec4 normal = texelFetch(virtual_raster_normal, raster, 0);
+    Material m = material_of(
+        int(normal.w), texelFetch(virtual_raster_uv, raster, 0).xy, texelFetch(virtual_raster_tint, raster, 0).rgb);
+    vec3 v = normalize(camera_position - position.xyz);
+    Indirect indirect = indirect_at(pixel, position, normal.xyz);
+    vec3 radiance = m.emission + direct_radiance(position.xyz, position.w, normal.xyz, v, m);
+    radiance += m.diffuse / PI * indirect.irradiance;
+    radiance += specular_reflectance(m.f0, m.roughness, max(dot(normal.xyz, v), 1e-3)) * indirect.specular;
+    imageStore(radiance_out, pixel, vec4(radiance, 1.0));
+}

@@ -1,0 +1,42 @@
+"""Radiance of the virtual surfaces."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import moderngl
+
+from render_server.gpu.context import GpuContext
+from render_server.gpu.program import ComputeProgram
+from render_server.gpu.textures import bind_images, bind_samplers, texture_2d
+from render_server.passes.geometry_buffer import GeometryBuffer
+from render_server.passes.sampling_grid import SamplingGrid
+
+
+class VirtualSurfacePass:
+    """RGBA16F radiance on the picture's grid, where the matte is above zero."""
+
+    def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
+        self._size = size
+        self.radiance = texture_2d(gpu, size, 4, "f2")
+        self._program = ComputeProgram(gpu, Path(__file__).with_name("virtual_surface.comp.glsl"))
+
+    def run(
+        self,
+        matte: moderngl.Texture,
+        raster: GeometryBuffer,
+        irradiance: moderngl.Texture,
+        specular: moderngl.Texture,
+        grid: SamplingGrid,
+        uniforms: dict[str, Any],
+    ) -> None:
+        """Shade; lights, materials and geometry must be bound."""
+        bind_samplers({0: grid.pixels, 1: matte, 2: irradiance, 3: specular, 8: raster.uv, 9: raster.tint})
+        bind_images(self.radiance)
+        self._program.run(self._size, scale=grid.scale, **uniforms)
+
+    def release(self) -> None:
+        """Free the GL objects."""
+        self.radiance.release()
+        self._program.release()

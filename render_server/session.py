@@ -1,0 +1,221 @@
+"""One scene's render session: newest frame in, composite out, commands in between.
+
+No sockets, no threads: `server.py` feeds it and sends what comes out, tests give it messages and a renderer.
+"""
+
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import structlog
+from jaxtyping import UInt8
+
+from protocol.documents import nearest
+from protocol.envelope import decode
+from protocol.errors import DeltalightError
+from protocol.frames import ViewFrame
+from protocol.messages import CompositeMessage, ControlRequest, StatsMessage
+from protocol.scene import SceneDocument, parse_scene
+from protocol.transport import ReceivedMultipart
+from render_server.frame_assembly import AssembledFrame, FrameAssembler
+
+RATE_WINDOW_S = 5.0
+WAITING_AFTER_S = 2.0
+
+log = structlog.get_logger()
+
+
+class Composite(Protocol):
+    """What a renderer gives back (`renderer.CompositeFrame`)."""
+
+    @property
+    def color(self) -> UInt8[np.ndarray, "h w 3"]:
+        """The finished picture, camera-coded RGB."""
+
+    @property
+    def status(self) -> str:
+        """`ok` or `no_pose`."""
+
+    @property
+    def pass_times_ms(self) -> dict[str, float]:
+        """Milliseconds of each pass."""
+
+    @property
+    def lights(self) -> Sequence[dict[str, Any]]:
+        """The lights that the picture was made with."""
+
+
+class Renderer(Protocol):
+    """What a session needs of `renderer.SceneRenderer`."""
+
+    def render(self, frame: ViewFrame) -> Composite:
+        """The composite of one frame."""
+
+    def set_scene(self, scene: SceneDocument) -> None:
+        """Use another scene from the next frame on."""
+
+
+@dataclass(frozen=True)
+class RenderedFrame:
+    """A composite that is to be encoded and sent; `pixels` belong to `message` (stated as raw)."""
+
+    message: CompositeMessage
+    pixels: UInt8[np.ndarray, "h w 3"]
+
+
+class RenderSession:
+    """Keeps one scene, its renderer and the frames that wait for it.
+
+    `keep_scene` is called with every scene that was accepted, so that a restart can go on with it;
+    `mailbox_drops` tells what the receiver dropped, by topic.
+    """
+
+    def __init__(
+        self,
+        renderer: Renderer,
+        scene: SceneDocument,
+        *,
+        assembler: FrameAssembler | None = None,
+        name: str = "render-server",
+        renderer_name: str = "",
+        keep_scene: Callable[[SceneDocument], None] = lambda _scene: None,
+        mailbox_drops: Callable[[], Mapping[str, int]] = dict,
+        clock_ns: Callable[[], int] = time.time_ns,
+    ) -> None:
+        self.scene = scene
+        self.counts: Counter[str] = Counter()
+        self.stopping = False
+        self._renderer = renderer
+        self._assembler = assembler or FrameAssembler()
+        self._assembler.needs_depth = _needs_depth(scene)
+        self._name = name
+        self._renderer_name = renderer_name
+        self._keep_scene = keep_scene
+        self._mailbox_drops = mailbox_drops
+        self._clock_ns = clock_ns
+        self._rendered_ns: deque[int] = deque()
+        self._last_fault = ""
+
+    def receive(self, multipart: ReceivedMultipart) -> None:
+        """Take a message of the sensor node; a malformed one is counted and logged."""
+        try:
+            message, parts = decode(multipart)
+        except DeltalightError as fault:
+            self._count_fault("bad_messages", fault)
+            return
+        self._assembler.add(message, parts, multipart.received_ns)
+
+    def step(self) -> RenderedFrame | None:
+        """Render the newest frame, if one is ready; a frame that cannot be rendered is counted and logged."""
+        try:
+            frame = self._assembler.take(self._clock_ns())
+            return None if frame is None else self._render(frame)
+        except Exception as fault:  # whatever it is, the next frame must still be rendered
+            self._count_fault("bad_frames", fault)
+            return None
+
+    def drops(self) -> dict[str, int]:
+        """What was lost so far, and where."""
+        return {**self._mailbox_drops(), **self._assembler.counts, **self.counts}
+
+    def stats(self) -> StatsMessage:
+        """How the session is doing."""
+        now_ns = self._clock_ns()
+        while self._rendered_ns and self._rendered_ns[0] < now_ns - RATE_WINDOW_S * 1e9:
+            self._rendered_ns.popleft()
+        is_running = bool(self._rendered_ns) and self._rendered_ns[-1] > now_ns - WAITING_AFTER_S * 1e9
+        return StatsMessage(
+            node=self._name,
+            capture_ns=now_ns,
+            state="degraded" if self._last_fault else "running" if is_running else "waiting",
+            detail=f"{self._renderer_name}; {self._last_fault}" if self._last_fault else self._renderer_name,
+            rates={"frames_per_s": len(self._rendered_ns) / RATE_WINDOW_S},
+            drops=self.drops(),
+        )
+
+    def carry_out(self, request: ControlRequest) -> dict[str, object]:
+        """Carry out a command between two frames; gives the payload of the reply.
+
+        Raises:
+            DeltalightError: an unknown command, or one that is refused.
+        """
+        match request.op:
+            case "ping":
+                return {}
+            case "get_scene":
+                return {"scene": self.scene.model_dump(mode="json")}
+            case "set_scene":
+                return self._set_scene(request)
+            case "set_view":
+                return self._use_scene(_with_view(self.scene, request.payload.get("view")))
+            case "stats":
+                return {"stats": self.stats().model_dump(mode="json")}
+            case "shutdown":
+                self.stopping = True
+                return {}
+        known = ("ping", "get_scene", "set_scene", "set_view", "stats", "shutdown")
+        hint = nearest(request.op, known) or ", ".join(known)
+        raise DeltalightError(f"There is no command '{request.op}'; did you mean {hint}?")
+
+    def _render(self, frame: AssembledFrame) -> RenderedFrame:
+        composite = self._renderer.render(frame.view)
+        self._last_fault = ""
+        self._rendered_ns.append(self._clock_ns())
+        color = frame.color
+        message = CompositeMessage(
+            node=self._name,
+            frame_id=color.frame_id,
+            capture_ns=color.capture_ns,
+            clock_offset_ns=color.clock_offset_ns,
+            clock_bound_ns=color.clock_bound_ns,
+            encoding="raw",
+            shape=(*composite.color.shape[:2], 3),
+            status=composite.status,
+            received_ns=frame.received_ns,
+            rendered_ns=self._rendered_ns[-1],
+            pass_times_ms=composite.pass_times_ms,
+            lights=tuple(composite.lights),
+            drops=self.drops(),
+        )
+        return RenderedFrame(message, composite.color)
+
+    def _set_scene(self, request: ControlRequest) -> dict[str, object]:
+        """Idempotent by revision: the current revision is confirmed and an older one refused."""
+        current = self.scene.revision
+        revision = current + 1 if request.revision is None else request.revision
+        document = request.payload.get("scene")
+        if not isinstance(document, dict):
+            raise DeltalightError("The command set_scene needs the scene document as `scene` in its payload.")
+        scene = parse_scene({**document, "revision": revision})
+        if revision < current or (revision == current and scene != self.scene):
+            raise DeltalightError(
+                f"The scene is already at revision {current}; get it, change it and send it as {current + 1}."
+            )
+        return {"revision": current} if revision == current else self._use_scene(scene)
+
+    def _use_scene(self, scene: SceneDocument) -> dict[str, object]:
+        self._renderer.set_scene(scene)
+        self._assembler.needs_depth = _needs_depth(scene)
+        self.scene = scene
+        self._keep_scene(scene)
+        return {"revision": scene.revision}
+
+    def _count_fault(self, kind: str, fault: Exception) -> None:
+        self.counts[kind] += 1
+        sentence = str(fault) if isinstance(fault, DeltalightError) else f"{type(fault).__name__}: {fault}"
+        if sentence != self._last_fault:  # a fault of every frame is one line, not thirty a second
+            log.warning(kind, fault=sentence, exc_info=not isinstance(fault, DeltalightError))
+        self._last_fault = sentence
+
+
+def _needs_depth(scene: SceneDocument) -> bool:
+    return scene.real.geometry in ("depth", "fused")
+
+
+def _with_view(scene: SceneDocument, view: object) -> SceneDocument:
+    document = scene.model_dump(mode="json")
+    document["output"]["view"] = view
+    return parse_scene({**document, "revision": scene.revision + 1})

@@ -1,0 +1,82 @@
+"""The camera of one picture: matrices and lens as the passes need them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from protocol.camera_model import CameraModel
+
+NEAR_M = 0.02
+FAR_M = 100.0
+
+
+@dataclass(frozen=True, eq=False)
+class CameraView:
+    """Where and through which lens a picture was taken.
+
+    `world_from_camera` is (4, 4), optical frame (+x right, +y down, +z forward).
+    """
+
+    camera: CameraModel
+    world_from_camera: Float64[np.ndarray, "4 4"]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height in pixels."""
+        return self.camera.width, self.camera.height
+
+    @cached_property
+    def camera_from_world(self) -> Float64[np.ndarray, "4 4"]:
+        """Inverse of `world_from_camera`."""
+        return np.linalg.inv(self.world_from_camera)
+
+    @property
+    def position(self) -> Float64[np.ndarray, "3"]:
+        """Optical centre in the world, m."""
+        return self.world_from_camera[:3, 3]
+
+    @cached_property
+    def raster(self) -> tuple[Float64[np.ndarray, "4"], tuple[int, int]]:
+        """Pinhole (fx, fy, cx, cy) and size that cover every ray of the lens; the camera's own without distortion."""
+        matrix = self.camera.matrix
+        own = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])
+        if not self.camera.has_distortion:
+            return own, self.size
+        rays = self.camera.rays().reshape(-1, 2)
+        low = np.floor(rays.min(axis=0) * own[:2]) - 1
+        high = np.ceil(rays.max(axis=0) * own[:2]) + 1
+        width, height = (int(v) + 1 for v in high - low)
+        return np.array([own[0], own[1], -low[0], -low[1]]), (width, height)
+
+    @cached_property
+    def clip_from_camera(self) -> Float64[np.ndarray, "4 4"]:
+        """Projection of the raster pinhole; row 0 of the picture comes first in memory."""
+        (fx, fy, cx, cy), (width, height) = self.raster
+        depth = (FAR_M + NEAR_M) / (FAR_M - NEAR_M)
+        return np.array(
+            [
+                [2 * fx / width, 0, (2 * cx + 1) / width - 1, 0],
+                [0, 2 * fy / height, (2 * cy + 1) / height - 1, 0],
+                [0, 0, depth, -2 * FAR_M * NEAR_M / (FAR_M - NEAR_M)],
+                [0, 0, 1, 0],
+            ]
+        )
+
+    def uniforms(self) -> dict[str, Any]:
+        """Every uniform that shaders read of the camera."""
+        matrix = self.camera.matrix
+        return {
+            "camera_from_world": self.camera_from_world,
+            "world_from_camera": self.world_from_camera,
+            "clip_from_camera": self.clip_from_camera,
+            "camera_position": tuple(float(v) for v in self.position),
+            "camera_pinhole": (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]),
+            "picture_size": tuple(float(v) for v in self.size),
+            "lens_distortion": self.camera.has_distortion,
+            "raster_pinhole": tuple(float(v) for v in self.raster[0]),
+        }

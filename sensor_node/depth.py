@@ -1,0 +1,166 @@
+"""Depth clean-up (METHOD 2): validity, smoothing guided by colour, small holes filled, large ones left."""
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, UInt8
+from pydantic import Field
+
+from protocol.documents import StrictModel
+from protocol.errors import DeltalightError
+from protocol.frames import DepthImage
+from sensor_node.depth_filter import NoiseModel, SmoothedDepth, smooth_inverse_depth
+
+# A normal variable's standard deviation is this multiple of its median absolute deviation.
+SIGMA_PER_MAD = 1.4826
+NOISE_FIT_RADIUS_PX = 5
+# Sensors that store depth in steps cannot be more exact than this; keeps noise-free depth filterable.
+LEAST_NOISE_SIGMA_M = 1e-4
+UNKNOWN_NOISE_SIGMA_M = 0.0025
+LEAST_NOISE_SAMPLES = 500
+# Weight of the windows around a pixel from which on the surface counts as smooth there.
+SMOOTH_CONFIDENCE = 0.3
+# Window weight below which nothing is known about a hole.
+LEAST_CONFIDENCE = 1e-3
+
+
+class DepthSettings(StrictModel):
+    """Strength of the depth clean-up; lengths in the picture are in pixels of the colour image."""
+
+    filter_radius_px: int = Field(
+        default=4, ge=0, le=16, description="Half the filter window's edge; 0 = no filter."
+    )
+    edge_sigmas: float = Field(
+        default=3.0,
+        ge=1,
+        le=10,
+        description="Depth steps above this many standard deviations stay as measured.",
+    )
+    guide_contrast: float = Field(
+        default=0.05,
+        ge=0.005,
+        le=1,
+        description="Colour contrast (0..1) below which colour does not guide depth.",
+    )
+    fill_area_px: int = Field(
+        default=64, ge=0, le=10000, description="Holes up to this area are filled; 0 = none is."
+    )
+    noise_sigma_m: float | None = Field(
+        default=None,
+        ge=1e-5,
+        le=0.1,
+        description="Noise at 1 m, growing with distance squared; null = the sensor's, else measured.",
+    )
+    depth_step_m: float = Field(
+        default=0.001, ge=0, le=0.05, description="Step in which the sensor stores depth, in metres."
+    )
+
+
+def clean_depth(
+    depth: DepthImage, color: UInt8[np.ndarray, "h w 3"], settings: DepthSettings | None = None
+) -> DepthImage:
+    """Return smoothed depth with small holes filled; `color` (RGB) guides both.
+
+    Known pixels move only where a smooth surface explains them: at depth steps larger than
+    `edge_sigmas` standard deviations they stay as measured. Depth 0 is unknown, never near.
+
+    Raises:
+        DeltalightError: depth and colour differ in size (register depth first).
+    """
+    settings = settings or DepthSettings()
+    valid = known_pixels(depth)
+    if depth.depth_m.shape != color.shape[:2]:
+        raise DeltalightError(
+            f"depth of {_size(depth.depth_m)} does not lie on the colour picture of {_size(color)}; "
+            "give calibration/depth.yaml and extrinsics.yaml so that it can be registered."
+        )
+    sigma_m = settings.noise_sigma_m or depth.noise_sigma_m or estimate_noise_sigma(depth)
+    if settings.filter_radius_px == 0 and settings.fill_area_px == 0:
+        return DepthImage(np.where(valid, depth.depth_m, 0), valid, depth.camera, sigma_m)
+    inverse = _inverse(depth.depth_m, valid)
+    # A value evenly spread over a step deviates by step/sqrt(12) from its middle.
+    noise = NoiseModel(max(sigma_m, LEAST_NOISE_SIGMA_M), settings.depth_step_m / np.sqrt(12))
+    smoothed = smooth_inverse_depth(
+        inverse,
+        valid,
+        cv2.cvtColor(np.ascontiguousarray(color), cv2.COLOR_RGB2GRAY).astype(np.float32) / 255,
+        noise=noise,
+        radius_px=settings.filter_radius_px or NOISE_FIT_RADIUS_PX,
+        guide_contrast=settings.guide_contrast,
+    )
+    filled = _fillable(valid, smoothed, noise, settings)
+    known = valid | filled
+    taken = filled | _explained(inverse, smoothed, noise, settings) if settings.filter_radius_px else filled
+    cleaned = np.where(taken, smoothed.inverse_depth, inverse)
+    return DepthImage(_inverse(cleaned, known), known, depth.camera, sigma_m)
+
+
+def estimate_noise_sigma(depth: DepthImage) -> float:
+    """Measure the depth noise at 1 m, in metres: scaled MAD of the residuals of local plane fits.
+
+    Fits run on inverse depth, where noise that grows with z^2 is constant. Only windows without holes or
+    edges count; where too few are left a typical sensor's value is returned.
+    """
+    valid = known_pixels(depth)
+    inverse = _inverse(depth.depth_m, valid)
+    planes = smooth_inverse_depth(
+        inverse,
+        valid,
+        np.zeros_like(inverse),
+        noise=NoiseModel(1.0, 0.0),
+        radius_px=NOISE_FIT_RADIUS_PX,
+        guide_contrast=1.0,
+    ).inverse_depth
+    inside = cv2.erode(valid.view(np.uint8), np.ones((2 * NOISE_FIT_RADIUS_PX + 1,) * 2, np.uint8)) > 0
+    residuals = (inverse - planes)[inside]
+    if len(residuals) < LEAST_NOISE_SAMPLES:
+        return UNKNOWN_NOISE_SIGMA_M
+    mad = float(np.median(np.abs(residuals - np.median(residuals))))
+    return max(SIGMA_PER_MAD * mad, LEAST_NOISE_SIGMA_M)
+
+
+def known_pixels(depth: DepthImage) -> Bool[np.ndarray, "h w"]:
+    """Return the mask of pixels whose depth is known: valid and positive (0 and infinity are unknown)."""
+    return depth.valid & (depth.depth_m > 0) & (depth.depth_m < np.inf)
+
+
+def _inverse(
+    values: Float32[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"]
+) -> Float32[np.ndarray, "h w"]:
+    """Return 1/values, 0 where unknown."""
+    return np.asarray(known / np.where(known, values, np.float32(1)))
+
+
+def _explained(
+    inverse: Float32[np.ndarray, "h w"], smoothed: SmoothedDepth, noise: NoiseModel, settings: DepthSettings
+) -> Bool[np.ndarray, "h w"]:
+    """Pixels on smooth surfaces, and those beside a step that the smoothed value fits within the noise."""
+    tolerance = settings.edge_sigmas * noise.of_inverse_depth(inverse)
+    near = np.abs(smoothed.inverse_depth - inverse) <= tolerance
+    return (near | (smoothed.confidence > SMOOTH_CONFIDENCE)) & (smoothed.inverse_depth > 0)
+
+
+def _fillable(
+    valid: Bool[np.ndarray, "h w"], smoothed: SmoothedDepth, noise: NoiseModel, settings: DepthSettings
+) -> Bool[np.ndarray, "h w"]:
+    """Pixels of small holes about which the windows agree.
+
+    Where surfaces of different depth reach a hole it stays open rather than being bridged in mid-air.
+    """
+    filled = np.zeros(valid.shape, bool)
+    rows, columns = np.nonzero(_small_holes(valid, settings.fill_area_px))
+    value = smoothed.inverse_depth[rows, columns]
+    agreed = smoothed.spread(rows, columns) <= settings.edge_sigmas * noise.of_inverse_depth(value)
+    filled[rows, columns] = agreed & (value > 0) & (smoothed.confidence[rows, columns] > LEAST_CONFIDENCE)
+    return filled
+
+
+def _small_holes(valid: Bool[np.ndarray, "h w"], area_px: int) -> Bool[np.ndarray, "h w"]:
+    holes = (~valid).view(np.uint8)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(holes, connectivity=4)
+    small = stats[:, cv2.CC_STAT_AREA] <= area_px
+    small[0] = False
+    return np.asarray(small[labels])
+
+
+def _size(image: np.ndarray) -> str:
+    return f"{image.shape[1]}x{image.shape[0]} pixels"

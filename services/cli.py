@@ -1,0 +1,101 @@
+"""The `deltalight` command: registers the commands and turns faults into sentences and exit codes.
+
+Exit codes: 0 done, 1 a fault of the program (or `doctor` found one), 2 wrong use or bad input, 130 Ctrl-C.
+"""
+
+import sys
+from typing import Annotated
+
+import typer
+
+from protocol.errors import DeltalightError
+from services.commands.bench import bench
+from services.commands.demo import demo
+from services.commands.doctor import doctor
+from services.commands.node import node
+from services.commands.render import render
+from services.commands.schema import schema
+from services.commands.server import server
+from services.commands.up import up
+from services.commands.viewer import viewer
+from services.lifeline import end_with_supervisor
+from services.logs import configure_logging
+from services.signals import Terminated, raise_on_sigterm
+
+DEBUG_FLAG = "--debug"
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    help="Mixed-reality relighting: virtual objects in a camera picture, with light that agrees both ways.",
+)
+for command in (render, demo, node, server, viewer, up, doctor, schema):
+    app.command()(command)
+app.add_typer(bench, name="bench")
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        typer.echo(f"deltalight {version('deltalight')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _global_options(
+    debug: Annotated[  # read from sys.argv by main(), so that it may stand anywhere
+        bool, typer.Option(DEBUG_FLAG, help="Show the traceback of a fault instead of one sentence.")
+    ] = False,
+    log_level: Annotated[
+        str, typer.Option(help="Least level of log lines: debug, info, warning, error.")
+    ] = "info",
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version.")
+    ] = False,
+) -> None:
+    del debug, version
+    configure_logging(log_level)
+
+
+def main() -> None:
+    """Run the command line of this process and exit with its code."""
+    arguments = [argument for argument in sys.argv[1:] if argument != DEBUG_FLAG]
+    debug = len(arguments) < len(sys.argv) - 1
+    raise_on_sigterm()
+    end_with_supervisor()
+    sys.exit(_run(arguments, debug=debug))
+
+
+def _run(arguments: list[str], *, debug: bool) -> int:
+    try:
+        app(arguments, prog_name="deltalight")
+    except SystemExit as stop:
+        return int(stop.code or 0)
+    except Terminated:
+        return 0
+    except KeyboardInterrupt:
+        return 130
+    except Exception as fault:
+        if debug:
+            raise
+        return _report(fault)
+    return 0
+
+
+def _report(fault: Exception) -> int:
+    if isinstance(fault, DeltalightError):
+        print(f"deltalight: {' '.join(str(fault).split())}", file=sys.stderr)
+        return 2
+    kind = type(fault).__name__
+    print(
+        f"deltalight: internal fault, {kind}: {fault}; run it again with --debug and report the traceback.",
+        file=sys.stderr,
+    )
+    return 1
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,34 @@
+"""`deltalight demo`: the whole path on loopback from the shipped recording."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from protocol.errors import DeltalightError
+from services.commands.options import Method
+from services.ports import PAGE_PORT
+
+
+def demo(
+    headless: Annotated[
+        bool, typer.Option("--headless", help="No page: write composites, a contact sheet and a video to --out.")
+    ] = False,
+    frames: Annotated[int, typer.Option(min=1, max=100_000, help="Composites of a headless demo.")] = 30,
+    out: Annotated[Path | None, typer.Option(help="Folder of a headless demo.")] = None,
+    method: Annotated[
+        Method, typer.Option(help="Relighting method; dvct is as the demo's scene says.")
+    ] = Method.DVCT,
+    no_browser: Annotated[bool, typer.Option("--no-browser", help="Do not open a browser.")] = False,
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the page.")] = PAGE_PORT,
+    as_json: Annotated[bool, typer.Option("--json", help="Print a headless demo's summary as JSON.")] = False,
+) -> None:
+    """Play the shipped recording through node, render server and viewer, each a process of its own."""
+    from services.demo import run_headless, run_live
+
+    if not headless:
+        run_live(method.value, port=port, with_browser=not no_browser)
+        return
+    if out is None:
+        raise DeltalightError("A headless demo writes files; name their folder with --out.")
+    run_headless(method.value, frames, out, as_json=as_json)

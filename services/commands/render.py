@@ -1,0 +1,73 @@
+"""`deltalight render`: a recording to composites on disk."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from services.commands.options import View
+
+if TYPE_CHECKING:
+    from services.offline import RenderJob, RenderSummary
+
+
+def render(
+    source: Annotated[Path, typer.Argument(help="Dataset folder or .mcap recording.")],
+    out: Annotated[Path, typer.Option(help="Folder for the pictures; created where missing.")],
+    scene: Annotated[
+        Path | None, typer.Option(help="Scene document; default: the one that the recording carries.")
+    ] = None,
+    frames: Annotated[
+        str | None, typer.Option(metavar="A:B", help="Frame numbers, B not included; default all.")
+    ] = None,
+    size: Annotated[str | None, typer.Option(metavar="WxH", help="Size of the pictures.")] = None,
+    device: Annotated[int | None, typer.Option(min=0, help="EGL device; `deltalight doctor` lists them.")] = None,
+    view: Annotated[View | None, typer.Option(help="What to show; default: as the scene says.")] = None,
+    exr: Annotated[bool, typer.Option("--exr", help="Write linear OpenEXR files too.")] = False,
+    allow_software: Annotated[
+        bool, typer.Option("--allow-software", help="Do not warn where there is no GPU.")
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
+) -> None:
+    """Render a recording: OUT/<frame number>.png and OUT/frames.jsonl, a line a frame."""
+    from protocol.source import open_source
+    from services.arguments import parse_frames, parse_size
+    from services.host import choose_scene
+    from services.offline import RenderJob, with_output
+
+    size_px = None if size is None else parse_size(size)
+    recording = open_source(source)
+    document = with_output(choose_scene(recording, scene), size_px, view and view.value)
+    job = RenderJob(recording, document, parse_frames(frames, len(recording)), out, device, with_exr=exr)
+    for note in recording.notes:
+        typer.echo(note, err=True)
+    _print_summary(_run_with_progress(job, warn=not allow_software), as_json=as_json)
+
+
+def _run_with_progress(job: "RenderJob", *, warn: bool) -> "RenderSummary":
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from services.offline import run_job
+
+    columns = (TextColumn("rendering"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("rendering", total=len(job.frames))
+
+        def tell_renderer(name: str, is_software: bool) -> None:
+            if is_software and warn:
+                progress.console.print(f"warning: no GPU found, rendering slowly in software with {name}")
+
+        return run_job(job, on_renderer=tell_renderer, on_frame=lambda _number: progress.advance(task))
+
+
+def _print_summary(summary: "RenderSummary", *, as_json: bool) -> None:
+    figures = summary.as_dict()
+    if as_json:
+        typer.echo(json.dumps(figures))
+        return
+    typer.echo(
+        f"{figures['frames']} frames, {figures['no_pose']} without a pose, {figures['mean_ms']:.1f} ms a frame,"
+        f" {figures['renderer']}, written to {figures['out']}"
+    )

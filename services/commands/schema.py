@@ -1,0 +1,45 @@
+"""`deltalight schema`: JSON Schemas for editors and programs."""
+
+import json
+from enum import StrEnum
+from typing import Annotated
+
+import typer
+
+
+class Document(StrEnum):
+    """What has a schema."""
+
+    SCENE = "scene"
+    NODE = "node"
+    SERVER = "server"
+    VIEWER = "viewer"
+
+
+def schema(
+    document: Annotated[
+        Document, typer.Argument(help="The scene document, or the settings of a process.")
+    ] = Document.SCENE,
+) -> None:
+    """Print the JSON Schema of the scene document or of a process's settings."""
+    typer.echo(json.dumps(_schema(document), indent=2))
+
+
+def _schema(document: Document) -> dict[str, object]:
+    match document:
+        case Document.SCENE:
+            from protocol.scene import scene_json_schema
+
+            return scene_json_schema()
+        case Document.NODE:
+            from sensor_node.node import NodeConfig
+
+            return NodeConfig.model_json_schema()
+        case Document.SERVER:
+            from render_server.server import ServerSettings
+
+            return ServerSettings.model_json_schema()
+        case Document.VIEWER:
+            from services.viewer import ViewerSettings
+
+            return ViewerSettings.model_json_schema()

@@ -1,0 +1,130 @@
+"""What this machine has and what is missing: each check ends in one line with a hint."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from importlib.metadata import PackageNotFoundError, version
+from typing import Literal
+
+from services import ports
+
+PROBE_TIMEOUT_S = 60
+MAXIMUM_DEVICES = 16
+PACKAGES = {"render": ("moderngl", "trimesh", "scipy"), "api": ("fastapi", "uvicorn", "websockets")}
+
+CONTAINER_HINT = (
+    "EGL sees no device: apt-get install --no-install-recommends libegl1 libgl1; in a container with an NVIDIA GPU"
+    " set NVIDIA_DRIVER_CAPABILITIES=graphics,compute,utility"
+)
+
+_PROBE = """
+import json, sys
+from render_server.gpu.context import create_context
+gpu = create_context(int(sys.argv[1]))
+print(json.dumps([gpu.renderer_name, gpu.version, gpu.is_software]))
+"""
+
+
+@dataclass(frozen=True)
+class Check:
+    """One finding: `missing` makes the command end with 1; `note` does not."""
+
+    name: str
+    state: Literal["ok", "note", "missing"]
+    detail: str
+    hint: str = ""
+
+    def as_dict(self) -> dict[str, str]:
+        """The check as plain data."""
+        return asdict(self)
+
+
+def examine() -> Iterator[Check]:
+    """All checks, one after the other."""
+    yield Check("python", "ok", sys.version.split()[0])
+    yield from _packages()
+    yield _opencv()
+    yield from _renderers()
+    yield _oak_camera()
+    yield from _ports()
+
+
+def _packages() -> Iterator[Check]:
+    for extra, names in PACKAGES.items():
+        missing = [name for name in names if _version(name) is None]
+        if missing:
+            hint = f"pip install 'deltalight[{extra}]'"
+            yield Check(f"packages [{extra}]", "missing", f"not installed: {', '.join(missing)}", hint)
+        else:
+            found = ", ".join(f"{name} {_version(name)}" for name in names)
+            yield Check(f"packages [{extra}]", "ok", found)
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def _opencv() -> Check:
+    import cv2
+
+    modules = {"aruco": hasattr(cv2, "aruco"), "ximgproc": hasattr(cv2, "ximgproc")}
+    absent = [name for name, present in modules.items() if not present]
+    if absent:
+        hint = "pip uninstall opencv-python, then pip install --force-reinstall opencv-contrib-python-headless"
+        return Check("OpenCV", "missing", f"{cv2.__version__} lacks {', '.join(absent)}", hint)
+    return Check("OpenCV", "ok", f"{cv2.__version__} with {', '.join(modules)}")
+
+
+def _renderers() -> Iterator[Check]:
+    """Probe each EGL device in a child, because a broken driver ends the process."""
+    only_software = True
+    for device in range(MAXIMUM_DEVICES):
+        probe = _probe(device)
+        said = (probe.stderr.strip().splitlines() or [f"the driver ended the probe ({probe.returncode})"])[-1]
+        if probe.returncode != 0 and device > 0 and "requested device" in said:
+            break
+        if probe.returncode != 0:
+            # The last line of a traceback is `module.DeltalightError: what is wrong: what to do`.
+            detail = said.partition("DeltalightError: ")[2] or said
+            yield Check(f"OpenGL device {device}", "missing", detail, CONTAINER_HINT if "0 devices" in said else "")
+            break
+        renderer, gl_version, is_software = json.loads(probe.stdout)
+        only_software &= is_software
+        yield Check(f"OpenGL device {device}", "ok", f"{renderer}, OpenGL {gl_version}")
+    if only_software:
+        hint = "render, demo and bench work slowly without a GPU; server and up need --allow-software"
+        yield Check("GPU", "note", "none found through EGL", hint)
+
+
+def _probe(device: int) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", _PROBE, str(device)]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, timeout=PROBE_TIMEOUT_S, check=False)
+    except subprocess.TimeoutExpired:
+        return subprocess.CompletedProcess(command, 1, "", f"no answer within {PROBE_TIMEOUT_S} s")
+
+
+def _oak_camera() -> Check:
+    found = _version("depthai")
+    if found is None:
+        return Check("OAK cameras", "note", "not installed", "pip install 'deltalight[oak]'")
+    return Check("OAK cameras", "ok", f"depthai {found}")
+
+
+def _ports() -> Iterator[Check]:
+    uses = {
+        "node": ports.NODE_PORT,
+        "composite": ports.COMPOSITE_PORT,
+        "control": ports.CONTROL_PORT,
+        "page": ports.PAGE_PORT,
+    }
+    for use, port in uses.items():
+        if ports.is_free(port):
+            yield Check(f"port {port}", "ok", f"free ({use})")
+        else:
+            yield Check(f"port {port}", "note", f"in use ({use})", "end that program or choose another port")

@@ -1,0 +1,91 @@
+"""Files that appear whole or not at all, and the picture formats that commands write."""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from protocol.errors import DeltalightError
+
+PNG_COMPRESSION = 1  # zlib level; higher levels cost more time than a frame takes to render
+
+
+def make_output_folder(folder: Path) -> Path:
+    """Create `folder` where missing and prove that files can be written into it.
+
+    Raises:
+        DeltalightError: it is a file, or cannot be created or written.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise DeltalightError(f"The output '{folder}' is a file; name a folder with --out.")
+    probe = folder / f".write-test-{os.getpid()}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe.touch()
+        probe.unlink()
+    except OSError as fault:
+        raise DeltalightError(
+            f"The output folder '{folder}' cannot be written ({fault.strerror}); choose another with --out."
+        ) from fault
+    return folder
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Give a temporary path beside `path`; put it in place at the end, remove it at a fault.
+
+    The suffix is kept, because encoders choose their format by it.
+
+    Raises:
+        DeltalightError: the file cannot be written (a full disk, no rights).
+    """
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
+    try:
+        yield temporary
+        temporary.replace(path)
+    except OSError as fault:
+        raise DeltalightError(f"'{path}' cannot be written ({fault.strerror}); free some space or name another --out.") from fault
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write `content` to `path`, whole or not at all."""
+    with replacing(path) as temporary:
+        temporary.write_bytes(content)
+
+
+def write_png(path: Path, color: UInt8[np.ndarray, "h w 3"]) -> None:
+    """Write an RGB picture losslessly, at a low compression level."""
+    bgr = cv2.cvtColor(color, cv2.COLOR_RGB2BGR)
+    _, encoded = cv2.imencode(".png", bgr, [cv2.IMWRITE_PNG_COMPRESSION, PNG_COMPRESSION])
+    write_bytes(path, encoded.tobytes())
+
+
+def write_exr(path: Path, linear: Float32[np.ndarray, "h w 3"]) -> None:
+    """Write linear RGB as an OpenEXR file of 32-bit floats.
+
+    Raises:
+        DeltalightError: the package OpenEXR is not installed.
+    """
+    exr = require_openexr()
+    header = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
+    with replacing(path) as temporary, exr.File(header, {"RGB": np.ascontiguousarray(linear)}) as picture:
+        picture.write(str(temporary))
+
+
+def require_openexr() -> "OpenExrModule":
+    """The OpenEXR package.
+
+    Raises:
+        DeltalightError: it is not installed.
+    """
+    try:
+        import OpenEXR
+    except ImportError as fault:
+        raise DeltalightError("--exr needs the package OpenEXR: pip install 'deltalight[render]'.") from fault
+    return OpenEXR

@@ -1,0 +1,100 @@
+"""The processes of one host and how they are joined: node -> render server -> viewer, on loopback."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from protocol.errors import DeltalightError
+from protocol.scene import SceneDocument, load_scene
+from protocol.source import Source
+from services import ports
+from services.files import write_bytes
+from services.supervisor import ChildSpec
+
+SYNTHETIC = "synthetic"  # the source that is computed, not read
+
+
+@dataclass(frozen=True)
+class HostPlan:
+    """What runs on this host; `session_file` holds the scene document, which survives a server's restart."""
+
+    source: str
+    session_file: Path
+    node_port: int = ports.NODE_PORT
+    composite_port: int = ports.COMPOSITE_PORT
+    control_port: int = ports.CONTROL_PORT
+    page_port: int | None = ports.PAGE_PORT
+    device: int | None = None
+    allow_software: bool = False
+    loop: bool = True
+    log_level: str = "info"
+
+    def specs(self) -> list[ChildSpec]:
+        """The children to supervise, in the order of the stream."""
+        specs = [self._node(), self._server()]
+        return specs if self.page_port is None else [*specs, self._viewer(self.page_port)]
+
+    def require_free_ports(self) -> None:
+        """Check every port before a child is started.
+
+        Raises:
+            DeltalightError: another program listens on one of them.
+        """
+        ports.require_free(self.node_port, "sensor node", "--node-port")
+        ports.require_free(self.composite_port, "composite of the render server", "--composite-port")
+        ports.require_free(self.control_port, "control of the render server", "--control-port")
+        if self.page_port is not None:
+            ports.require_free(self.page_port, "viewer page", "--port")
+
+    def _child(self, name: str, command: str, *options: str) -> ChildSpec:
+        return ChildSpec.deltalight(name, "--log-level", self.log_level, command, *options)
+
+    def _node(self) -> ChildSpec:
+        options = ["--source", self.source, "--publish", ports.endpoint(self.node_port)]
+        return self._child("sensor node", "node", *options, *(["--loop"] if self.loop else []))
+
+    def _server(self) -> ChildSpec:
+        options = [
+            *("--session", str(self.session_file)),
+            *("--subscribe", ports.endpoint(self.node_port)),
+            *("--publish", ports.endpoint(self.composite_port)),
+            *("--control", ports.endpoint(self.control_port)),
+        ]
+        if self.device is not None:
+            options += ["--device", str(self.device)]
+        if self.allow_software:
+            options += ["--allow-software"]
+        return self._child("render server", "server", *options)
+
+    def _viewer(self, port: int) -> ChildSpec:
+        return self._child(
+            "viewer",
+            "viewer",
+            *("--subscribe", ports.endpoint(self.composite_port)),
+            *("--control", ports.endpoint(self.control_port)),
+            *("--port", str(port)),
+        )
+
+
+@contextmanager
+def session_file(scene: SceneDocument) -> Iterator[Path]:
+    """A temporary file with the scene document, as the render server's `--session` wants it."""
+    with TemporaryDirectory(prefix="deltalight-") as folder:
+        path = Path(folder) / "scene.json"
+        write_bytes(path, scene.model_dump_json(indent=1).encode())
+        yield path
+
+
+def choose_scene(source: Source | None, path: Path | None) -> SceneDocument:
+    """The scene document at `path`, else the one that the recording carries.
+
+    Raises:
+        DeltalightError: there is neither, or the document is wrong.
+    """
+    if path is not None:
+        return load_scene(path)
+    if source is None or source.scene is None:
+        raise DeltalightError("The source carries no scene document; name one with --scene.")
+    return source.scene

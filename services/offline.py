@@ -1,0 +1,137 @@
+"""Rendering a recording to files, frame by frame: what `deltalight render` does."""
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any
+
+from protocol.frames import BoardPose, ViewFrame
+from protocol.scene import SceneDocument
+from protocol.source import Source
+from services.files import make_output_folder, require_openexr, write_exr, write_png
+
+if TYPE_CHECKING:
+    from render_server.renderer import CompositeFrame
+
+INDEX_FILE = "frames.jsonl"
+
+
+@dataclass(frozen=True)
+class RenderJob:
+    """What to render where; `frames` are indices into the source."""
+
+    source: Source
+    scene: SceneDocument
+    frames: range
+    out: Path
+    device: int | None = None
+    with_exr: bool = False
+
+
+@dataclass
+class RenderSummary:
+    """What a finished job did; `render_ms` holds each frame's time from input to pixels."""
+
+    renderer: str
+    is_software: bool
+    out: Path
+    without_pose: int = 0
+    render_ms: list[float] = field(default_factory=list)
+
+    def add(self, composite: "CompositeFrame", milliseconds: float) -> None:
+        """Count one frame."""
+        self.render_ms.append(milliseconds)
+        self.without_pose += composite.status == "no_pose"
+
+    def as_dict(self) -> dict[str, Any]:
+        """The summary as plain data."""
+        return {
+            "frames": len(self.render_ms),
+            "no_pose": self.without_pose,
+            "mean_ms": round(sum(self.render_ms) / max(len(self.render_ms), 1), 3),
+            "renderer": self.renderer,
+            "out": str(self.out),
+        }
+
+
+def with_output(scene: SceneDocument, size: tuple[int, int] | None, view: str | None) -> SceneDocument:
+    """The scene with another output size (width, height) or view, where given."""
+    changes: dict[str, object] = {}
+    if size is not None:
+        changes |= {"width": size[0], "height": size[1]}
+    if view is not None:
+        changes["view"] = view
+    return scene.replaced(output=scene.output.replaced(**changes))
+
+
+def run_job(
+    job: RenderJob, *, on_renderer: Callable[[str, bool], None], on_frame: Callable[[int], None]
+) -> RenderSummary:
+    """Render every frame of the job; calls back with (renderer name, is software) and each finished frame.
+
+    A picture is in place before its line in frames.jsonl is written, and each line is written whole, so what
+    an interrupted run leaves is a shorter run.
+
+    Raises:
+        DeltalightError: bad input, no OpenGL, or the output cannot be written.
+    """
+    from render_server.gpu.context import create_context
+    from render_server.renderer import SceneRenderer
+    from sensor_node.view_frames import ViewFrameBuilder
+
+    if job.with_exr:
+        require_openexr()
+    out = make_output_folder(job.out)
+    gpu = create_context(job.device, allow_software=True)
+    on_renderer(gpu.renderer_name, gpu.is_software)
+    summary = RenderSummary(gpu.renderer_name, gpu.is_software, out)
+    builder = ViewFrameBuilder(job.source)
+    renderer = SceneRenderer(gpu, job.scene)
+    try:
+        with (out / INDEX_FILE).open("w", encoding="utf-8") as index:
+            for number in job.frames:
+                frame = builder(job.source[number])
+                started_s = time.perf_counter()
+                composite = renderer.render(frame)
+                summary.add(composite, 1000 * (time.perf_counter() - started_s))
+                _write_frame(job, number, frame, composite, index)
+                on_frame(number)
+    finally:
+        renderer.release()
+        gpu.release()
+    return summary
+
+
+def _write_frame(
+    job: RenderJob, number: int, frame: ViewFrame, composite: "CompositeFrame", index: IO[str]
+) -> None:
+    write_png(job.out / f"{number:06d}.png", composite.color)
+    if job.with_exr and composite.linear is not None:
+        write_exr(job.out / f"{number:06d}.exr", composite.linear)
+    index.write(json.dumps(frame_record(number, frame, composite)) + "\n")
+    index.flush()
+
+
+def frame_record(number: int, frame: ViewFrame, composite: "CompositeFrame") -> dict[str, Any]:
+    """The line of frames.jsonl for one frame."""
+    return {
+        "frame": number,
+        "timestamp": frame.timestamp_ns / 1e9,
+        "timestamp_ns": frame.timestamp_ns,
+        "status": composite.status,
+        "pose": _pose_record(frame.pose),
+        "lights": composite.lights,
+        "pass_times_ms": {name: round(value, 4) for name, value in composite.pass_times_ms.items()},
+        "drops": 0,  # every frame of a file is rendered
+    }
+
+
+def _pose_record(pose: BoardPose | None) -> dict[str, Any] | None:
+    if pose is None:
+        return None
+    return {
+        "world_from_camera": pose.world_from_camera.tolist(),
+        "reprojection_error_px": pose.reprojection_error_px,
+    }

@@ -1,0 +1,83 @@
+"""Which loopback port serves what, and whether it is free."""
+
+import random
+import socket
+
+from protocol.errors import DeltalightError
+
+LOOPBACK = "127.0.0.1"
+NODE_PORT = 5601  # a sensor node publishes
+COMPOSITE_PORT = 5602  # the render server publishes
+CONTROL_PORT = 5603  # the render server answers
+PAGE_PORT = 8000  # the viewer page
+PRIVATE_PORTS = range(20_000, 32_000)  # below the range that the kernel hands to outgoing connections
+
+
+def endpoint(port: int) -> str:
+    """ZeroMQ endpoint of a loopback port."""
+    return f"tcp://{LOOPBACK}:{port}"
+
+
+def is_free(port: int) -> bool:
+    """Whether a server could listen on this loopback port now."""
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a closed connection's rest is no server
+        try:
+            probe.bind((LOOPBACK, port))
+        except OSError:
+            return False
+        return True
+
+
+def answers(port: int) -> bool:
+    """Whether a server accepts connections on this loopback port now."""
+    try:
+        socket.create_connection((LOOPBACK, port), timeout=0.5).close()
+    except OSError:
+        return False
+    return True
+
+
+def require_free(port: int, purpose: str, option: str) -> None:
+    """Check a port before anything starts.
+
+    Raises:
+        DeltalightError: another program listens on it.
+    """
+    if not is_free(port):
+        raise DeltalightError(
+            f"Port {port} ({purpose}) is in use by another program; end that one or choose another with {option}."
+        )
+
+
+def private_ports(count: int) -> list[int]:
+    """Free ports for one run's own processes, chosen so that two runs rarely meet.
+
+    Raises:
+        DeltalightError: nearly all ports of the range are in use.
+    """
+    found: list[int] = []
+    for port in random.sample(PRIVATE_PORTS, len(PRIVATE_PORTS)):
+        if is_free(port):
+            found.append(port)
+        if len(found) == count:
+            return found
+    raise DeltalightError(f"No {count} free ports between {PRIVATE_PORTS.start} and {PRIVATE_PORTS.stop}.")
+
+
+def listen(port: int) -> socket.socket:
+    """A socket bound to the loopback port.
+
+    Raises:
+        DeltalightError: another program listens on it.
+    """
+    bound = socket.socket()
+    bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        bound.bind((LOOPBACK, port))
+    except OSError as fault:
+        bound.close()
+        raise DeltalightError(
+            f"Port {port} is in use by another program; end that one or choose another with --port."
+        ) from fault
+    return bound

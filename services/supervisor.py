@@ -1,0 +1,176 @@
+"""Keeps the processes of one host alive: restart within a second, give up after too many, end together.
+
+Each child is a command line of its own (`python -m services.cli ...`): one process, one OpenGL context.
+"""
+
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from types import TracebackType
+from typing import Self
+
+from protocol.errors import DeltalightError
+from services.lifeline import SUPERVISOR_VARIABLE
+
+POLL_INTERVAL_S = 0.1
+RESTART_DELAY_S = 0.2
+MAXIMUM_RESTARTS = 5
+RESTART_WINDOW_S = 60.0
+STOP_TIMEOUT_S = 1.5  # then SIGKILL; all are gone within 2 s
+WRONG_INPUT_EXIT_CODE = 2
+KEPT_LINES = 20
+
+
+@dataclass(frozen=True)
+class ChildSpec:
+    """One supervised process: a name for people and the arguments after the interpreter."""
+
+    name: str
+    arguments: tuple[str, ...]
+
+    @classmethod
+    def deltalight(cls, name: str, *arguments: str) -> "ChildSpec":
+        """A child that runs a command of this command line."""
+        return cls(name, ("-m", "services.cli", *arguments))
+
+
+@dataclass
+class _Child:
+    spec: ChildSpec
+    forward: Callable[[str], None]
+    process: subprocess.Popen[str] | None = None
+    started: int = 0
+    deaths_s: deque[float] = field(default_factory=deque)
+    last_lines: deque[str] = field(default_factory=lambda: deque(maxlen=KEPT_LINES))
+    reader: threading.Thread | None = None
+
+    def start(self) -> None:
+        self.last_lines.clear()
+        self.process = subprocess.Popen(
+            [sys.executable, *self.spec.arguments],
+            stdin=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            errors="replace",
+            start_new_session=True,  # Ctrl-C reaches the supervisor only, which ends them in order
+            env={**os.environ, SUPERVISOR_VARIABLE: str(os.getpid())},
+        )
+        self.started += 1
+        self.reader = threading.Thread(target=self._read, args=(self.process,), daemon=True)
+        self.reader.start()
+
+    def _read(self, process: subprocess.Popen[str]) -> None:
+        assert process.stderr is not None
+        with process.stderr as lines:
+            for line in lines:
+                self.last_lines.append(line.rstrip())
+                self.forward(f"{self.spec.name}: {line.rstrip()}")
+
+    def last_sentence(self) -> str:
+        """The last line that the child wrote, without the command's name before it."""
+        if self.reader is not None:
+            self.reader.join(timeout=1.0)
+        line = next((line for line in reversed(self.last_lines) if line.strip()), "it said nothing")
+        return line.removeprefix("deltalight: ")
+
+    def end_reading(self) -> None:
+        if self.reader is not None:
+            self.reader.join(timeout=0.2)
+
+
+class Supervisor:
+    """Starts children, restarts those that die and ends all of them; a context manager.
+
+    Raises from `poll`:
+        DeltalightError: a child refused its input (exit code 2; its own sentence is quoted), or died more
+            than `maximum_restarts` times within a minute.
+    """
+
+    def __init__(
+        self,
+        specs: Sequence[ChildSpec],
+        *,
+        forward: Callable[[str], None] | None = None,
+        maximum_restarts: int = MAXIMUM_RESTARTS,
+    ) -> None:
+        write = forward or (lambda line: print(line, file=sys.stderr, flush=True))
+        self._children = [_Child(spec, write) for spec in specs]
+        self._maximum_restarts = maximum_restarts
+
+    def __enter__(self) -> Self:
+        try:
+            for child in self._children:
+                child.start()
+        except BaseException:
+            self.stop()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, fault: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    def process_ids(self) -> dict[str, int]:
+        """Process id of every child that was started, by name."""
+        return {c.spec.name: c.process.pid for c in self._children if c.process is not None}
+
+    def restarts(self) -> dict[str, int]:
+        """How often each child was started again, by name."""
+        return {child.spec.name: max(child.started - 1, 0) for child in self._children}
+
+    def poll(self) -> None:
+        """Look at every child once; start a dead one again after `RESTART_DELAY_S`."""
+        for child in self._children:
+            if child.process is not None and child.process.poll() is not None:
+                self._restart(child, child.process.returncode)
+
+    def run(self, until: Callable[[], bool] = lambda: False) -> None:
+        """Poll until `until` answers true (or an exception ends the process)."""
+        while not until():
+            self.poll()
+            time.sleep(POLL_INTERVAL_S)
+
+    def stop(self) -> None:
+        """End all children: SIGTERM to all, SIGKILL to what still lives after `STOP_TIMEOUT_S`."""
+        processes = [child.process for child in self._children if child.process is not None]
+        try:
+            for process in processes:
+                process.terminate()
+            deadline_s = time.monotonic() + STOP_TIMEOUT_S
+            for process in processes:
+                _wait(process, deadline_s - time.monotonic())
+        finally:  # a second Ctrl-C must not leave orphans
+            for process in processes:
+                process.kill()
+                process.wait()
+        for child in self._children:
+            child.end_reading()
+
+    def _restart(self, child: _Child, exit_code: int) -> None:
+        if exit_code == WRONG_INPUT_EXIT_CODE:
+            raise DeltalightError(child.last_sentence())
+        now_s = time.monotonic()
+        child.deaths_s.append(now_s)
+        while child.deaths_s[0] < now_s - RESTART_WINDOW_S:
+            child.deaths_s.popleft()
+        if len(child.deaths_s) > self._maximum_restarts:
+            raise DeltalightError(
+                f"The {child.spec.name} died {len(child.deaths_s)} times within a minute (exit code"
+                f" {exit_code}) and is not started again; its last line was: {child.last_sentence()}"
+            )
+        child.forward(f"{child.spec.name}: died with exit code {exit_code}; it is started again.")
+        time.sleep(RESTART_DELAY_S)
+        child.start()
+
+
+def _wait(process: subprocess.Popen[str], timeout_s: float) -> None:
+    try:
+        process.wait(max(timeout_s, 0.0))
+    except subprocess.TimeoutExpired:
+        return
