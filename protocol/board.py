@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import yaml
 from jaxtyping import Float64, UInt8
-from pydantic import Field, StringConstraints, field_validator, model_validator
+from pydantic import Discriminator, Field, StringConstraints, Tag, field_validator, model_validator
 
 from protocol.documents import StrictModel, nearest, read_mapping, validate
 from protocol.errors import DeltalightError
@@ -46,6 +46,15 @@ class CustomDictionary(StrictModel):
         return np.array([int(bit) for bit in self.bits], np.uint8).reshape(self.marker_size, self.marker_size)
 
 
+def _dictionary_kind(value: object) -> str:
+    return "name" if isinstance(value, str) else "custom"
+
+
+MarkerDictionary = Annotated[
+    Annotated[str, Tag("name")] | Annotated[CustomDictionary, Tag("custom")], Discriminator(_dictionary_kind)
+]
+
+
 class BoardSpec(StrictModel):
     """A printed board of square markers (board.yaml of FORMATS 1).
 
@@ -60,7 +69,7 @@ class BoardSpec(StrictModel):
     """
 
     type: Literal["aruco_grid", "charuco", "apriltag_grid", "single"]
-    dictionary: str | CustomDictionary
+    dictionary: MarkerDictionary
     marker_length_m: Length = Field(description="Outer edge of a marker's black border, in metres.")
     separation_m: float = Field(
         default=0.0, ge=0, lt=10, description="White gap between neighbouring markers, in metres."

@@ -155,7 +155,8 @@ class DatasetReader:
         if not path.is_file():
             raise DeltalightError(
                 f"{self.path} has no calibration/rgb.yaml and pictures do not tell their camera; "
-                "write that file as ROS camera_info (image_width, image_height, camera_matrix, distortion_coefficients)."
+                "write that file as ROS camera_info (image_width, image_height, camera_matrix, "
+                "distortion_coefficients)."
             )
         return load_camera_yaml(path)
 

@@ -93,7 +93,7 @@ def unpack_header(header: Buffer) -> Message:
     """
     if len(header) > MAX_HEADER_BYTES:
         raise EnvelopeError(
-            f"the header takes {len(header)} bytes, {MAX_HEADER_BYTES} are allowed: send less"
+            f"the header has {len(header)} bytes, {MAX_HEADER_BYTES} are allowed: cut it"
         )
     try:
         fields = msgpack.unpackb(header, raw=False, strict_map_key=True)

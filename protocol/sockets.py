@@ -55,7 +55,6 @@ def open_socket(
     socket.linger = 0
     socket.sndhwm = socket.rcvhwm = high_water_mark
     socket.maxmsgsize = max_bytes
-    socket.ipv6 = True
     socket.reconnect_ivl = RECONNECT_MS
     socket.reconnect_ivl_max = RECONNECT_MAX_MS
     socket.heartbeat_ivl = HEARTBEAT_MS
@@ -70,6 +69,7 @@ def attach(socket: zmq.Socket[bytes], endpoint: str, *, bind: bool) -> str:
         DeltalightError: the endpoint leaves the host, is taken, or is not understood.
     """
     check_endpoint(endpoint)
+    socket.ipv6 = "[" in endpoint  # where it is on, IPv4 addresses come back in their IPv6 form
     try:
         (socket.bind if bind else socket.connect)(endpoint)
     except zmq.ZMQError as error:

@@ -30,7 +30,10 @@ class PairingSettings(StrictModel):
     """How streams are paired."""
 
     depth_tolerance_ms: float = Field(
-        default=20.0, ge=0, le=1000, description="Greatest difference of capture time of colour and depth, ms."
+        default=20.0,
+        ge=0,
+        le=1000,
+        description="Greatest difference of capture time of colour and depth, ms.",
     )
     patience_ms: float = Field(
         default=250.0, ge=0, le=5000, description="How long a colour frame waits for its pose and depth, ms."

@@ -1,6 +1,6 @@
 """The render server's process: sockets around one `RenderSession`.
 
-Threads: the receiver's (sub socket), the reply server's, the sender's (encoding and pub socket), and the main one,
+Threads: the receiver's, the reply server's, the sender's (which encodes and publishes), and the main one,
 which owns the OpenGL context and does nothing but render and carry out commands.
 """
 

@@ -51,6 +51,10 @@ class Composite(Protocol):
 class Renderer(Protocol):
     """What a session needs of `renderer.SceneRenderer`."""
 
+    @property
+    def notices(self) -> Sequence[str]:
+        """Sentences that a user should read; the list only grows."""
+
     def render(self, frame: ViewFrame) -> Composite:
         """The composite of one frame."""
 
@@ -98,6 +102,7 @@ class RenderSession:
         self._clock_ns = clock_ns
         self._rendered_ns: deque[int] = deque()
         self._last_fault = ""
+        self._logged_notices = 0
 
     def receive(self, multipart: ReceivedMultipart) -> None:
         """Take a message of the sensor node; a malformed one is counted and logged."""
@@ -163,6 +168,7 @@ class RenderSession:
     def _render(self, frame: AssembledFrame) -> RenderedFrame:
         composite = self._renderer.render(frame.view)
         self._last_fault = ""
+        self._log_notices()
         self._rendered_ns.append(self._clock_ns())
         color = frame.color
         message = CompositeMessage(
@@ -173,7 +179,7 @@ class RenderSession:
             clock_bound_ns=color.clock_bound_ns,
             encoding="raw",
             shape=(*composite.color.shape[:2], 3),
-            status=composite.status,
+            status="ok" if composite.status == "ok" else "no_pose",
             received_ns=frame.received_ns,
             rendered_ns=self._rendered_ns[-1],
             pass_times_ms=composite.pass_times_ms,
@@ -202,6 +208,11 @@ class RenderSession:
         self.scene = scene
         self._keep_scene(scene)
         return {"revision": scene.revision}
+
+    def _log_notices(self) -> None:
+        for notice in self._renderer.notices[self._logged_notices :]:
+            log.info(notice)
+        self._logged_notices = len(self._renderer.notices)
 
     def _count_fault(self, kind: str, fault: Exception) -> None:
         self.counts[kind] += 1

@@ -2,7 +2,7 @@
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Bool, Float32, Int64, UInt8
 from pydantic import Field
 
 from protocol.documents import StrictModel
@@ -17,7 +17,7 @@ NOISE_FIT_RADIUS_PX = 5
 LEAST_NOISE_SIGMA_M = 1e-4
 UNKNOWN_NOISE_SIGMA_M = 0.0025
 LEAST_NOISE_SAMPLES = 500
-# Weight of the windows around a pixel from which on the surface counts as smooth there.
+# Weight of the windows around a pixel above which the surface counts as smooth there.
 SMOOTH_CONFIDENCE = 0.3
 # Window weight below which nothing is known about a hole.
 LEAST_CONFIDENCE = 1e-3
@@ -50,8 +50,11 @@ class DepthSettings(StrictModel):
         le=0.1,
         description="Noise at 1 m, growing with distance squared; null = the sensor's, else measured.",
     )
-    depth_step_m: float = Field(
-        default=0.001, ge=0, le=0.05, description="Step in which the sensor stores depth, in metres."
+    noise_floor_m: float = Field(
+        default=0.001,
+        ge=0,
+        le=0.05,
+        description="Noise that does not grow with distance (storage steps, near-range errors), in metres.",
     )
 
 
@@ -77,8 +80,7 @@ def clean_depth(
     if settings.filter_radius_px == 0 and settings.fill_area_px == 0:
         return DepthImage(np.where(valid, depth.depth_m, 0), valid, depth.camera, sigma_m)
     inverse = _inverse(depth.depth_m, valid)
-    # A value evenly spread over a step deviates by step/sqrt(12) from its middle.
-    noise = NoiseModel(max(sigma_m, LEAST_NOISE_SIGMA_M), settings.depth_step_m / np.sqrt(12))
+    noise = NoiseModel(max(sigma_m, LEAST_NOISE_SIGMA_M), settings.noise_floor_m)
     smoothed = smooth_inverse_depth(
         inverse,
         valid,
@@ -89,7 +91,10 @@ def clean_depth(
     )
     filled = _fillable(valid, smoothed, noise, settings)
     known = valid | filled
-    taken = filled | _explained(inverse, smoothed, noise, settings) if settings.filter_radius_px else filled
+    taken = filled
+    if settings.filter_radius_px:
+        smooth = smoothed.explains(inverse, SMOOTH_CONFIDENCE, settings.edge_sigmas)
+        taken = filled | (smooth & (smoothed.inverse_depth > 0))
     cleaned = np.where(taken, smoothed.inverse_depth, inverse)
     return DepthImage(_inverse(cleaned, known), known, depth.camera, sigma_m)
 
@@ -130,15 +135,6 @@ def _inverse(
     return np.asarray(known / np.where(known, values, np.float32(1)))
 
 
-def _explained(
-    inverse: Float32[np.ndarray, "h w"], smoothed: SmoothedDepth, noise: NoiseModel, settings: DepthSettings
-) -> Bool[np.ndarray, "h w"]:
-    """Pixels on smooth surfaces, and those beside a step that the smoothed value fits within the noise."""
-    tolerance = settings.edge_sigmas * noise.of_inverse_depth(inverse)
-    near = np.abs(smoothed.inverse_depth - inverse) <= tolerance
-    return (near | (smoothed.confidence > SMOOTH_CONFIDENCE)) & (smoothed.inverse_depth > 0)
-
-
 def _fillable(
     valid: Bool[np.ndarray, "h w"], smoothed: SmoothedDepth, noise: NoiseModel, settings: DepthSettings
 ) -> Bool[np.ndarray, "h w"]:
@@ -147,19 +143,23 @@ def _fillable(
     Where surfaces of different depth reach a hole it stays open rather than being bridged in mid-air.
     """
     filled = np.zeros(valid.shape, bool)
-    rows, columns = np.nonzero(_small_holes(valid, settings.fill_area_px))
+    rows, columns = _small_holes(valid, settings.fill_area_px)
     value = smoothed.inverse_depth[rows, columns]
     agreed = smoothed.spread(rows, columns) <= settings.edge_sigmas * noise.of_inverse_depth(value)
-    filled[rows, columns] = agreed & (value > 0) & (smoothed.confidence[rows, columns] > LEAST_CONFIDENCE)
+    confident = smoothed.confidence[rows // 2, columns // 2] > LEAST_CONFIDENCE
+    filled[rows, columns] = agreed & confident & (value > 0)
     return filled
 
 
-def _small_holes(valid: Bool[np.ndarray, "h w"], area_px: int) -> Bool[np.ndarray, "h w"]:
-    holes = (~valid).view(np.uint8)
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(holes, connectivity=4)
-    small = stats[:, cv2.CC_STAT_AREA] <= area_px
-    small[0] = False
-    return np.asarray(small[labels])
+def _small_holes(
+    valid: Bool[np.ndarray, "h w"], area_px: int
+) -> tuple[Int64[np.ndarray, " n"], Int64[np.ndarray, " n"]]:
+    """Rows and columns of the unknown pixels whose connected area is at most `area_px`."""
+    _, labels, stats, _ = cv2.connectedComponentsWithStats((~valid).view(np.uint8), connectivity=4)
+    places = np.flatnonzero(~valid)
+    areas = stats[labels.ravel()[places], cv2.CC_STAT_AREA]
+    rows, columns = np.divmod(places[areas <= area_px], valid.shape[1])
+    return rows, columns
 
 
 def _size(image: np.ndarray) -> str:

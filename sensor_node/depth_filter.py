@@ -29,12 +29,13 @@ class NoiseModel(NamedTuple):
 
     def of_inverse_depth(self, inverse_depth: Float32[np.ndarray, "*size"]) -> Float32[np.ndarray, "*size"]:
         """Return the standard deviation of 1/z at 1/z, in 1/m (d(1/z) = dz / z^2)."""
-        return np.sqrt(self.sigma_m**2 + (self.floor_m * inverse_depth * inverse_depth) ** 2)
+        step = self.floor_m * inverse_depth * inverse_depth
+        return np.asarray(np.sqrt(self.sigma_m**2 + step * step), np.float32)
 
 
 @dataclass(frozen=True)
 class _Cells:
-    """Sums over 2x2 pixels: number of known pixels, mean inverse depth, mean guide; and where the cells are."""
+    """Cells of 2x2 pixels: number of known pixels, mean inverse depth, mean guide, place."""
 
     count: Grid
     depth: Grid
@@ -63,16 +64,28 @@ class _Fits:
 class SmoothedDepth:
     """Result of the fit at every pixel, known or not.
 
-    `inverse_depth` in 1/m. `confidence` 0..1 is the weight that windows around the pixel had: near 1 on
-    smooth surfaces, near 0 at steps and where nothing is known.
+    `inverse_depth` in 1/m. `confidence` 0..1 of the 2x2 cells is the weight that the windows around them
+    had: near 1 on smooth surfaces, near 0 at steps and where nothing is known.
     """
 
     inverse_depth: Float32[np.ndarray, "h w"]
-    confidence: Float32[np.ndarray, "h w"]
+    confidence: Grid
+    _noise: NoiseModel
     _cells: _Cells
     _fits: _Fits
     _weight: Grid
     _reach: int
+
+    def explains(
+        self, inverse_depth: Float32[np.ndarray, "h w"], confidence: float, sigmas: float
+    ) -> Bool[np.ndarray, "h w"]:
+        """Return where the cell is more confident than `confidence` or the fit within `sigmas` of a value."""
+        tolerance = sigmas * self._noise.of_inverse_depth(self._cells.depth)
+        tolerance[self.confidence > confidence] = np.inf
+        size = 2 * tolerance.shape[1], 2 * tolerance.shape[0]
+        height, width = inverse_depth.shape
+        limit = cv2.resize(tolerance, size, interpolation=cv2.INTER_NEAREST)[:height, :width]
+        return np.asarray(np.abs(self.inverse_depth - inverse_depth) <= limit)
 
     def spread(
         self, rows: Int64[np.ndarray, " n"], columns: Int64[np.ndarray, " n"]
@@ -131,7 +144,7 @@ def smooth_inverse_depth(
     excess = fits.variance / noise.of_inverse_depth(cells.depth) ** 2
     weight = fits.count / (1 + excess * excess) ** 2
     smoothed, confidence = _blend(cells, fits, weight, 2 * reach + 1, guide)
-    return SmoothedDepth(smoothed[:height, :width], confidence[:height, :width], cells, fits, weight, reach)
+    return SmoothedDepth(smoothed[:height, :width], confidence, noise, cells, fits, weight, reach)
 
 
 def _quarters(image: Float32[np.ndarray, "h w"]) -> list[Grid]:
@@ -208,8 +221,8 @@ def _fit_windows(cells: _Cells, size: int, ridge: float) -> _Fits:
 
 def _blend(
     cells: _Cells, fits: _Fits, weight: Grid, size: int, guide: Float32[np.ndarray, "h w"]
-) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
-    """Average the models of all windows that hold a cell and evaluate them at its four pixels."""
+) -> tuple[Float32[np.ndarray, "h w"], Grid]:
+    """Average the models of all windows that hold a cell; evaluate them at its pixels, with confidence."""
     total = _window_sum(weight, size)
     share = 1 / np.maximum(total, EMPTY)
 
@@ -223,5 +236,4 @@ def _blend(
     offsets = (-right - down, right - down, down - right, right + down)
     for target, offset, tone in zip(_quarters(smoothed), offsets, _quarters(guide), strict=True):
         np.add(centre + offset, gain * tone, out=target)
-    confidence = total / np.maximum(_window_sum(fits.count, size), EMPTY)
-    return smoothed, np.repeat(np.repeat(confidence, 2, axis=0), 2, axis=1)
+    return smoothed, total / np.maximum(_window_sum(fits.count, size), EMPTY)

@@ -1,0 +1,1 @@
+"""What people and programs start: command line, supervisor, demo, viewer page."""

@@ -33,9 +33,12 @@ def parse_frames(text: str | None, count: int) -> range:
     found = re.fullmatch(r"(\d{0,9}):(\d{0,9})", (text or ":").strip())
     if found is None:
         raise DeltalightError(f"'{text}' is no range of frames; write A:B (B is not included), such as 0:10.")
-    first, end = (int(group) if group else default for group, default in zip(found.groups(), (0, count), strict=True))
+    first, end = (
+        int(group) if group else default for group, default in zip(found.groups(), (0, count), strict=True)
+    )
     if not first < end <= count:
         raise DeltalightError(
-            f"The frames {first}:{end} are not in the source, which has {count}; choose A < B within 0:{count}."
+            f"The frames {first}:{end} are not in the source, which has {count};"
+            f" choose A < B within 0:{count}."
         )
     return range(first, end)

@@ -15,8 +15,8 @@ MAXIMUM_DEVICES = 16
 PACKAGES = {"render": ("moderngl", "trimesh", "scipy"), "api": ("fastapi", "uvicorn", "websockets")}
 
 CONTAINER_HINT = (
-    "EGL sees no device: apt-get install --no-install-recommends libegl1 libgl1; in a container with an NVIDIA GPU"
-    " set NVIDIA_DRIVER_CAPABILITIES=graphics,compute,utility"
+    "EGL sees no device: apt-get install --no-install-recommends libegl1 libgl1; in a container with an"
+    " NVIDIA GPU set NVIDIA_DRIVER_CAPABILITIES=graphics,compute,utility"
 )
 
 _PROBE = """
@@ -75,7 +75,9 @@ def _opencv() -> Check:
     modules = {"aruco": hasattr(cv2, "aruco"), "ximgproc": hasattr(cv2, "ximgproc")}
     absent = [name for name, present in modules.items() if not present]
     if absent:
-        hint = "pip uninstall opencv-python, then pip install --force-reinstall opencv-contrib-python-headless"
+        hint = (
+            "pip uninstall opencv-python, then pip install --force-reinstall opencv-contrib-python-headless"
+        )
         return Check("OpenCV", "missing", f"{cv2.__version__} lacks {', '.join(absent)}", hint)
     return Check("OpenCV", "ok", f"{cv2.__version__} with {', '.join(modules)}")
 
@@ -91,7 +93,9 @@ def _renderers() -> Iterator[Check]:
         if probe.returncode != 0:
             # The last line of a traceback is `module.DeltalightError: what is wrong: what to do`.
             detail = said.partition("DeltalightError: ")[2] or said
-            yield Check(f"OpenGL device {device}", "missing", detail, CONTAINER_HINT if "0 devices" in said else "")
+            yield Check(
+                f"OpenGL device {device}", "missing", detail, CONTAINER_HINT if "0 devices" in said else ""
+            )
             break
         renderer, gl_version, is_software = json.loads(probe.stdout)
         only_software &= is_software

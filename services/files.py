@@ -3,7 +3,9 @@
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 
 import cv2
 import numpy as np
@@ -48,7 +50,9 @@ def replacing(path: Path) -> Iterator[Path]:
         yield temporary
         temporary.replace(path)
     except OSError as fault:
-        raise DeltalightError(f"'{path}' cannot be written ({fault.strerror}); free some space or name another --out.") from fault
+        raise DeltalightError(
+            f"'{path}' cannot be written ({fault.strerror}); free some space or name another --out."
+        ) from fault
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -78,14 +82,13 @@ def write_exr(path: Path, linear: Float32[np.ndarray, "h w 3"]) -> None:
         picture.write(str(temporary))
 
 
-def require_openexr() -> "OpenExrModule":
+def require_openexr() -> ModuleType:
     """The OpenEXR package.
 
     Raises:
         DeltalightError: it is not installed.
     """
     try:
-        import OpenEXR
+        return import_module("OpenEXR")  # it has no type information
     except ImportError as fault:
         raise DeltalightError("--exr needs the package OpenEXR: pip install 'deltalight[render]'.") from fault
-    return OpenEXR

@@ -2,10 +2,9 @@
 
 import json
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any, Protocol
 
 from protocol.frames import BoardPose, ViewFrame
 from protocol.scene import SceneDocument
@@ -13,7 +12,7 @@ from protocol.source import Source
 from services.files import make_output_folder, require_openexr, write_exr, write_png
 
 if TYPE_CHECKING:
-    from render_server.renderer import CompositeFrame
+    from render_server.renderer import CompositeFrame, SceneRenderer
 
 INDEX_FILE = "frames.jsonl"
 
@@ -35,7 +34,6 @@ class RenderSummary:
     """What a finished job did; `render_ms` holds each frame's time from input to pixels."""
 
     renderer: str
-    is_software: bool
     out: Path
     without_pose: int = 0
     render_ms: list[float] = field(default_factory=list)
@@ -66,10 +64,21 @@ def with_output(scene: SceneDocument, size: tuple[int, int] | None, view: str | 
     return scene.replaced(output=scene.output.replaced(**changes))
 
 
-def run_job(
-    job: RenderJob, *, on_renderer: Callable[[str, bool], None], on_frame: Callable[[int], None]
-) -> RenderSummary:
-    """Render every frame of the job; calls back with (renderer name, is software) and each finished frame.
+class Progress(Protocol):
+    """Whoever watches a job."""
+
+    def renderer(self, name: str, *, is_software: bool) -> None:
+        """The OpenGL renderer that was got."""
+
+    def notice(self, sentence: str) -> None:
+        """Something that a user should read."""
+
+    def frame_done(self) -> None:
+        """One more frame is on disk."""
+
+
+def run_job(job: RenderJob, progress: Progress) -> RenderSummary:
+    """Render every frame of the job.
 
     A picture is in place before its line in frames.jsonl is written, and each line is written whole, so what
     an interrupted run leaves is a shorter run.
@@ -79,28 +88,40 @@ def run_job(
     """
     from render_server.gpu.context import create_context
     from render_server.renderer import SceneRenderer
-    from sensor_node.view_frames import ViewFrameBuilder
 
     if job.with_exr:
         require_openexr()
-    out = make_output_folder(job.out)
+    make_output_folder(job.out)
     gpu = create_context(job.device, allow_software=True)
-    on_renderer(gpu.renderer_name, gpu.is_software)
-    summary = RenderSummary(gpu.renderer_name, gpu.is_software, out)
-    builder = ViewFrameBuilder(job.source)
-    renderer = SceneRenderer(gpu, job.scene)
     try:
-        with (out / INDEX_FILE).open("w", encoding="utf-8") as index:
-            for number in job.frames:
-                frame = builder(job.source[number])
-                started_s = time.perf_counter()
-                composite = renderer.render(frame)
-                summary.add(composite, 1000 * (time.perf_counter() - started_s))
-                _write_frame(job, number, frame, composite, index)
-                on_frame(number)
+        progress.renderer(gpu.renderer_name, is_software=gpu.is_software)
+        renderer = SceneRenderer(gpu, job.scene)
+        try:
+            return _render_frames(job, renderer, RenderSummary(gpu.renderer_name, job.out), progress)
+        finally:
+            renderer.release()
     finally:
-        renderer.release()
         gpu.release()
+
+
+def _render_frames(
+    job: RenderJob, renderer: "SceneRenderer", summary: RenderSummary, progress: Progress
+) -> RenderSummary:
+    from sensor_node.view_frames import ViewFrameBuilder
+
+    builder = ViewFrameBuilder(job.source)
+    told = 0
+    with (job.out / INDEX_FILE).open("w", encoding="utf-8") as index:
+        for number in job.frames:
+            frame = builder(job.source[number])
+            started_s = time.perf_counter()
+            composite = renderer.render(frame)
+            summary.add(composite, 1000 * (time.perf_counter() - started_s))
+            for sentence in renderer.notices[told:]:
+                progress.notice(sentence)
+            told = len(renderer.notices)
+            _write_frame(job, number, frame, composite, index)
+            progress.frame_done()
     return summary
 
 

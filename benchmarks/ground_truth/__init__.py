@@ -1,1 +1,1 @@
-"""Ground truth: a "real" room rendered with Mitsuba 3 as cameras and depth sensors would see it (METHOD 8)."""
+"""Ground truth: "real" rooms rendered with Mitsuba 3 as cameras and depth sensors see them (METHOD 8)."""

@@ -1,4 +1,4 @@
-"""The printed marker board as a picture of its albedo, placed exactly as the world frame of FORMATS 3 says."""
+"""The printed marker board as a picture of its albedo, placed as the world frame of FORMATS 3 says."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,6 @@ PIXELS_PER_CELL = 20
 """Texels along one black or white cell of a marker."""
 
 INK_ALBEDO = 0.04
-PAPER_ALBEDO = 0.8
 
 
 @dataclass(frozen=True)
@@ -26,26 +25,28 @@ class BoardTexture:
 
 
 def board_texture(board: BoardSpec, margin_m: float = 0.02) -> BoardTexture:
-    """Print `board` with a white margin; ink and paper have the albedos of this module (or the board's own).
+    """Print `board` with a white margin of `margin_m`, rounded so that marker edges fall on texel edges.
 
-    The sheet is grown by less than one texel so that marker edges fall on texel edges.
     Raises DeltalightError for boards that are no grid of markers.
     """
     if board.type == "charuco":
-        raise DeltalightError("The printed sheet is made for marker grids only; use aruco_grid or apriltag_grid.")
-    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
-    side = (dictionary.markerSize + 2) * PIXELS_PER_CELL
+        raise DeltalightError(
+            "The printed sheet is made for marker grids only; use aruco_grid or apriltag_grid."
+        )
+    dictionary = board.opencv_dictionary()
+    side = (dictionary.markerSize + 2 * board.border_bits) * PIXELS_PER_CELL
     texel_m = board.marker_length_m / side
     corners = board.corner_points()
     points = np.concatenate(list(corners.values()))[:, :2]
-    margin = int(np.ceil(margin_m / texel_m)) * texel_m
+    margin = round(margin_m / texel_m) * texel_m
     min_m, max_m = points.min(axis=0) - margin, points.max(axis=0) + margin
     width, height = (round(extent / texel_m) for extent in max_m - min_m)
-    albedo = np.full((height, width), board.white_albedo or PAPER_ALBEDO, np.float32)
+    albedo = np.full((height, width), board.paper_albedo, np.float32)
     for marker_id, quad in corners.items():
         column, row = _texel_of(quad[0, :2], min_m, max_m, texel_m)
         print_area = albedo[row : row + side, column : column + side]
-        print_area[cv2.aruco.generateImageMarker(dictionary, marker_id, side) == 0] = INK_ALBEDO
+        marker = cv2.aruco.generateImageMarker(dictionary, marker_id, side, borderBits=board.border_bits)
+        print_area[marker == 0] = INK_ALBEDO
     return BoardTexture(albedo, min_m, max_m)
 
 

@@ -3,7 +3,7 @@
 import os
 import subprocess
 import sys
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -14,10 +14,23 @@ from protocol.errors import DeltalightError
 LLVM_LIBRARY = "libLLVM.so.19.1"
 """Dr.Jit aborts the whole process with the older LLVM that Mesa brings along, so the version is pinned."""
 
+LLVM_PROBE = """
+import mitsuba as mi
+mi.set_variant("llvm_ad_rgb")
+mi.render(mi.load_dict(mi.cornell_box()), spp=1).numpy()
+"""
+
 MAX_DEPTH = 8
 """Longest light path in segments: every bounce that an 8-bit picture can show."""
 
 NEAR_CLIP_M = 0.01
+
+INTEGRATORS: dict[str, dict[str, Any]] = {
+    "color": {"type": "path", "max_depth": MAX_DEPTH},
+    "distance": {"type": "aov", "aovs": "distance:depth"},
+}
+PIXEL_FILTERS = {"color": "gaussian", "distance": "box"}
+"""Colour is as soft as a lens makes it (half a pixel); distances may only be averaged within their pixel."""
 
 
 def choose_variant() -> str:
@@ -33,9 +46,7 @@ def choose_variant() -> str:
         raise DeltalightError(
             "Mitsuba is needed to render ground truth; install the project with its dev extra."
         ) from error
-    probe = "import mitsuba as mi; mi.set_variant('llvm_ad_rgb'); mi.render(mi.load_dict(mi.cornell_box()), spp=1)"
-    probe += ".numpy()"
-    tried = subprocess.run([sys.executable, "-c", probe], capture_output=True, check=False)
+    tried = subprocess.run([sys.executable, "-c", LLVM_PROBE], capture_output=True, check=False)
     variant = "llvm_ad_rgb" if tried.returncode == 0 else "scalar_rgb"
     mi.set_variant(variant)
     return variant
@@ -47,17 +58,15 @@ class RoomRenderer:
     def __init__(self, scene: dict[str, Any], camera: CameraModel) -> None:
         import mitsuba as mi
 
-        self._mi = mi
         self._camera = camera
         self._scene = mi.load_dict(scene)
-        self._color = mi.load_dict({"type": "path", "max_depth": MAX_DEPTH})
-        self._distance = mi.load_dict({"type": "aov", "aovs": "distance:depth"})
+        self._integrators = {name: mi.load_dict(what) for name, what in INTEGRATORS.items()}
 
     def color(
         self, world_from_camera: Float[np.ndarray, "4 4"], *, spp: int, seed: int
     ) -> Float32[np.ndarray, "h w 3"]:
-        """Linear radiance in camera units, box-filtered over each pixel."""
-        return self._render(self._color, world_from_camera, spp, seed)[..., :3]
+        """Linear radiance in camera units."""
+        return self._render("color", world_from_camera, spp, seed)[..., :3]
 
     def depth(
         self, world_from_camera: Float[np.ndarray, "4 4"], *, spp: int, seed: int
@@ -66,21 +75,31 @@ class RoomRenderer:
 
         Mitsuba gives the distance along the ray from the near plane; rays() has (x/z, y/z), hence the cosine.
         """
-        distance = self._render(self._distance, world_from_camera, spp, seed)[..., 0]
+        distance = self._render("distance", world_from_camera, spp, seed)[..., 0]
         x, y = np.moveaxis(self._camera.rays(), -1, 0)
         depth = distance / np.sqrt(1 + x * x + y * y) + NEAR_CLIP_M
         return np.where(distance > 0, depth, 0).astype(np.float32)
 
     def _render(
-        self, integrator: Any, world_from_camera: Float[np.ndarray, "4 4"], spp: int, seed: int
+        self,
+        kind: Literal["color", "distance"],
+        world_from_camera: Float[np.ndarray, "4 4"],
+        spp: int,
+        seed: int,
     ) -> Float32[np.ndarray, "h w c"]:
-        sensor = self._mi.load_dict(_sensor(self._mi, self._camera, world_from_camera))
-        picture = self._mi.render(self._scene, sensor=sensor, integrator=integrator, spp=spp, seed=seed)
-        return np.array(picture, np.float32)
+        import mitsuba as mi
+
+        sensor = mi.load_dict(_sensor(self._camera, world_from_camera, PIXEL_FILTERS[kind]))
+        integrator = self._integrators[kind]
+        return np.array(mi.render(self._scene, sensor=sensor, integrator=integrator, spp=spp, seed=seed))
 
 
-def _sensor(mi: Any, camera: CameraModel, world_from_camera: Float[np.ndarray, "4 4"]) -> dict[str, Any]:
-    """Mitsuba's pinhole of a camera without distortion; pixel centres at integers there, at halves here."""
+def _sensor(
+    camera: CameraModel, world_from_camera: Float[np.ndarray, "4 4"], pixel_filter: str
+) -> dict[str, Any]:
+    """Mitsuba's pinhole of a camera without distortion; pixel centres at integers here, at halves there."""
+    import mitsuba as mi
+
     if camera.has_distortion:
         raise DeltalightError("Mitsuba's pinhole has no lens distortion; give a camera model without it.")
     fx, cx, cy = camera.matrix[0, 0], camera.matrix[0, 2], camera.matrix[1, 2]
@@ -99,7 +118,7 @@ def _sensor(mi: Any, camera: CameraModel, world_from_camera: Float[np.ndarray, "
             "type": "hdrfilm",
             "width": camera.width,
             "height": camera.height,
-            "rfilter": {"type": "box"},
+            "rfilter": {"type": pixel_filter},
             "component_format": "float32",
         },
         "sampler": {"type": "independent"},

@@ -6,7 +6,7 @@ board's first marker, +z out of the paper; radiance in camera units (1.0 = senso
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import trimesh
@@ -18,9 +18,9 @@ from benchmarks.ground_truth.textures import plaster, wood
 from protocol.board import BoardSpec
 from protocol.camera_model import CameraModel
 
-FRAME_COUNT = 60
-FRAME_RATE_HZ = 30
-STILL_FRAMES = 30
+FRAME_COUNT = 30
+FRAME_RATE_HZ = 15
+STILL_FRAMES = 10
 """Frames before the camera starts its slow swing out and back."""
 SWING_DEG = 10.0
 
@@ -47,27 +47,29 @@ CAMERA = CameraModel(
 EYE_M = np.array([0.28, -0.62, 0.375])
 TARGET_M = np.array([0.165, 0.0, 0.050])
 
-Color = tuple[float, float, float]
+Triple = tuple[float, float, float]
+Matrix = Float[np.ndarray, "4 4"]
+IDENTITY: Matrix = np.eye(4)
 
 
 @dataclass(frozen=True)
 class KeyLight:
     """Uniform sphere; `intensity` per steradian in camera units (E = intensity cos / distance^2)."""
 
-    position_m: Color = (1.10, -0.36, 0.76)
+    position_m: Triple = (1.10, -0.36, 0.76)
     intensity: float = 4.9
     radius_m: float = 0.06
-    color_linear: Color = (1.0, 0.93, 0.82)
+    color_linear: Triple = (1.0, 0.93, 0.82)
 
 
 KEY_LIGHT = KeyLight()
 AMBIENT_RADIANCE = 0.20
-AMBIENT_COLOR: Color = (0.88, 0.95, 1.0)
+AMBIENT_COLOR: Triple = (0.88, 0.95, 1.0)
 
-OBJECT_TRANSLATION_M: Color = (0.290, -0.090, TABLE_Z_M)
+OBJECT_TRANSLATION_M: Triple = (0.290, -0.090, TABLE_Z_M)
 
 
-def world_from_camera(frame: int) -> Float[np.ndarray, "4 4"]:
+def world_from_camera(frame: int) -> Matrix:
     """Pose of one frame: on a tripod first, then `SWING_DEG` around the board and back, symmetric in time."""
     phase = (frame - STILL_FRAMES + 0.5) / (FRAME_COUNT - STILL_FRAMES)
     angle = np.radians(SWING_DEG) * np.sin(np.pi * phase) ** 2 if frame >= STILL_FRAMES else 0.0
@@ -116,97 +118,88 @@ def scene_document() -> dict[str, Any]:
 
 def mitsuba_scene(mesh_folder: Path, *, with_object: bool) -> dict[str, Any]:
     """The room as a Mitsuba scene dictionary without sensor; meshes are written as PLY into `mesh_folder`."""
-    import mitsuba as mi
-
-    world = mi.ScalarTransform4f
     scene: dict[str, Any] = {"type": "scene"}
-    scene |= _lights(world) | _shell(mi, world) | _sheet(mi, world) | _things(mi, world, mesh_folder)
+    scene |= _lights() | _shell() | _boxes() | {"ball": _ball(), "mug": _mug(mesh_folder)}
     if with_object:
-        scene["object"] = _virtual_object(world, mesh_folder)
+        scene["object"] = _virtual_object(mesh_folder)
     return scene
 
 
-def _lights(world: Any) -> dict[str, Any]:
+def _lights() -> dict[str, Any]:
     area = np.pi * KEY_LIGHT.radius_m**2  # of the disc that the sphere shows: intensity = radiance * area
-    radiance = [KEY_LIGHT.intensity / area * float(c) for c in KEY_LIGHT.color_linear]
+    radiance = np.array(KEY_LIGHT.color_linear) * KEY_LIGHT.intensity / area
+    ambient = np.array(AMBIENT_COLOR) * AMBIENT_RADIANCE
+    place = _place(KEY_LIGHT.position_m, scale=(KEY_LIGHT.radius_m,) * 3)
     return {
-        "key": {
-            "type": "sphere",
-            "to_world": world().translate(list(KEY_LIGHT.position_m)).scale(KEY_LIGHT.radius_m),
-            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": radiance}},
-        },
-        "ambient": {
-            "type": "constant",
-            "radiance": {"type": "rgb", "value": [AMBIENT_RADIANCE * c for c in AMBIENT_COLOR]},
-        },
+        "key": _shape("sphere", place, emitter={"type": "area", "radiance": _rgb(radiance)}),
+        "ambient": {"type": "constant", "radiance": _rgb(ambient)},
     }
 
 
-def _shell(mi: Any, world: Any) -> dict[str, Any]:
-    """Table and two walls, each a rectangle of two sides spanning [-1, 1]^2."""
-    table = world().translate([0.30, -0.28, TABLE_Z_M]).scale([0.80, 0.72, 1.0])
-    back = world().translate([0.30, 0.44, 0.60]).rotate([1, 0, 0], 90).scale([0.80, 0.62, 1.0])
-    left = world().translate([-0.30, -0.28, 0.60]).rotate([0, 0, 1], 90).rotate([1, 0, 0], 90)
+def _shell() -> dict[str, Any]:
+    """Table, two walls and the marker sheet, each a rectangle of two sides spanning [-1, 1]^2."""
+    table = _place((0.30, -0.28, TABLE_Z_M), scale=(0.80, 0.72, 1.0))
+    back = _place((0.30, 0.44, 0.60), _turn("x", 90), (0.80, 0.62, 1.0))
+    left = _place((-0.30, -0.28, 0.60), _turn("z", 90) @ _turn("x", 90), (0.72, 0.62, 1.0))
+    paper = board_texture(BOARD)
+    center, half = (paper.min_m + paper.max_m) / 2, (paper.max_m - paper.min_m) / 2
+    sheet = _place((center[0], center[1], 0.0), scale=(half[0], half[1], 1.0))
     return {
-        "table": _rectangle(table, _bitmap(mi, wood(7, 1080, 1200, planks=9))),
-        "back_wall": _rectangle(back, _bitmap(mi, plaster(3, 480, 620, (0.66, 0.50, 0.33)))),
-        "left_wall": _rectangle(
-            left.scale([0.72, 0.62, 1.0]), _bitmap(mi, plaster(4, 480, 560, (0.28, 0.42, 0.47)))
-        ),
+        "table": _rectangle(table, wood(7, 1080, 1200, planks=9)),
+        "back_wall": _rectangle(back, plaster(3, 480, 620, (0.66, 0.50, 0.33))),
+        "left_wall": _rectangle(left, plaster(4, 480, 560, (0.28, 0.42, 0.47))),
+        "board": _rectangle(sheet, np.repeat(paper.albedo[..., None], 3, axis=2)),
     }
 
 
-def _sheet(mi: Any, world: Any) -> dict[str, Any]:
-    sheet = board_texture(BOARD)
-    center, half = (sheet.min_m + sheet.max_m) / 2, (sheet.max_m - sheet.min_m) / 2
-    place = world().translate([*map(float, center), 0.0]).scale([*map(float, half), 1.0])
-    return {"board": _rectangle(place, _bitmap(mi, np.repeat(sheet.albedo[..., None], 3, axis=2)))}
+def _boxes() -> dict[str, Any]:
+    """A book (cover and pages), a cardboard box and a wooden block on it."""
+    return {
+        "book": _box((0.20, 0.20, 0.115), (0.0800, 0.018, 0.115), -14.0, (0.62, 0.045, 0.035)),
+        "pages": _box((0.20, 0.20, 0.115), (0.0815, 0.014, 0.111), -14.0, (0.76, 0.72, 0.62)),
+        "box": _box((-0.09, 0.19, 0.045), (0.065, 0.045, 0.045), 24.0, (0.62, 0.44, 0.27)),
+        "block": _box((-0.075, 0.185, 0.112), (0.032, 0.022, 0.022), 52.0, (0.10, 0.30, 0.12)),
+    }
 
 
-def _things(mi: Any, world: Any, mesh_folder: Path) -> dict[str, Any]:
-    """The real things on the table."""
-    mug = world().translate([0.46, 0.20, TABLE_Z_M])
+def _ball() -> dict[str, Any]:
+    radius_m = 0.032
+    place = _place((0.318, -0.174, TABLE_Z_M + radius_m), scale=(radius_m,) * 3)
+    return _shape("sphere", place, bsdf=_diffuse(_rgb((0.80, 0.47, 0.06))))
+
+
+def _mug(mesh_folder: Path) -> dict[str, Any]:
     ceramic = {
         "type": "roughplastic",
         "diffuse_reflectance": _rgb((0.72, 0.69, 0.62)),
         "alpha": 0.18,
         "nonlinear": True,
     }
-    return {
-        "book": _box(world, (0.20, 0.20, 0.115), (0.080, 0.018, 0.115), -14.0, (0.62, 0.045, 0.035)),
-        "pages": _box(world, (0.20, 0.20, 0.115), (0.0815, 0.014, 0.111), -14.0, (0.76, 0.72, 0.62)),
-        "box": _box(world, (-0.09, 0.19, 0.045), (0.065, 0.045, 0.045), 24.0, (0.62, 0.44, 0.27)),
-        "block": _box(world, (-0.075, 0.185, 0.112), (0.032, 0.022, 0.022), 52.0, (0.10, 0.30, 0.12)),
-        "ball": {
-            "type": "sphere",
-            "to_world": world().translate([0.318, -0.174, TABLE_Z_M + 0.032]).scale(0.032),
-            "bsdf": {"type": "diffuse", "reflectance": _rgb((0.80, 0.47, 0.06))},
-        },
-        "mug": {
-            "type": "ply",
-            "filename": _ply(_mug(), mesh_folder / "mug.ply"),
-            "to_world": mug.rotate([0, 0, 1], -35),
-            "bsdf": {"type": "twosided", "bsdf": ceramic},
-        },
+    return _shape(
+        "ply",
+        _place((0.46, 0.20, TABLE_Z_M), _turn("z", -35)),
+        filename=_ply(_mug_mesh(), mesh_folder / "mug.ply"),
+        bsdf={"type": "twosided", "bsdf": ceramic},
+    )
+
+
+def _virtual_object(mesh_folder: Path) -> dict[str, Any]:
+    glaze = {
+        "type": "principled",
+        "base_color": _rgb(demo_object.BASE_COLOR),
+        "roughness": demo_object.ROUGHNESS,
+        "metallic": demo_object.METALLIC,
+        "specular": demo_object.SPECULAR,
     }
+    return _shape(
+        "ply",
+        _place(OBJECT_TRANSLATION_M),
+        filename=_ply(demo_object.object_mesh(), mesh_folder / "object.ply"),
+        bsdf=glaze,
+    )
 
 
-def _virtual_object(world: Any, mesh_folder: Path) -> dict[str, Any]:
-    return {
-        "type": "ply",
-        "filename": _ply(demo_object.object_mesh(), mesh_folder / "object.ply"),
-        "to_world": world().translate(list(OBJECT_TRANSLATION_M)),
-        "bsdf": {
-            "type": "principled",
-            "base_color": _rgb(demo_object.BASE_COLOR),
-            "roughness": demo_object.ROUGHNESS,
-            "metallic": demo_object.METALLIC,
-            "specular": demo_object.SPECULAR,
-        },
-    }
-
-
-def _mug() -> trimesh.Trimesh:
+def _mug_mesh() -> trimesh.Trimesh:
     """A mug on z = 0 with wall, rounded lip and handle (towards +x)."""
     lip = np.linspace(0, np.pi, 7)
     outside = [(0.0, 0.0), (0.032, 0.0), (0.036, 0.002), (0.038, 0.006), (0.038, 0.088)]
@@ -222,27 +215,39 @@ def _mug() -> trimesh.Trimesh:
     return mug
 
 
-def _box(world: Any, center_m: Color, half_m: Color, turn_deg: float, color: Color) -> dict[str, Any]:
-    place = world().translate(list(center_m)).rotate([0, 0, 1], turn_deg).scale(list(half_m))
-    return {
-        "type": "cube",
-        "to_world": place,
-        "bsdf": {"type": "diffuse", "reflectance": _rgb(color)},
-    }
+def _box(center_m: Triple, half_m: Triple, turn_deg: float, color: Triple) -> dict[str, Any]:
+    return _shape("cube", _place(center_m, _turn("z", turn_deg), half_m), bsdf=_diffuse(_rgb(color)))
 
 
-def _rectangle(place: Any, reflectance: dict[str, Any]) -> dict[str, Any]:
-    diffuse = {"type": "diffuse", "reflectance": reflectance}
-    return {"type": "rectangle", "to_world": place, "bsdf": {"type": "twosided", "bsdf": diffuse}}
+def _rectangle(place: Matrix, albedo: Float[np.ndarray, "h w 3"]) -> dict[str, Any]:
+    """Rectangle under a texture of linear albedo, whose first row lies at its upper edge (v = 1)."""
+    import mitsuba as mi
 
-
-def _bitmap(mi: Any, albedo: Float[np.ndarray, "h w 3"]) -> dict[str, Any]:
-    """Texture of linear albedo; the first row lies at the rectangle's upper edge (v = 1)."""
     picture = mi.Bitmap(np.ascontiguousarray(albedo[::-1], np.float32))
-    return {"type": "bitmap", "bitmap": picture, "raw": True, "wrap_mode": "clamp"}
+    texture = {"type": "bitmap", "bitmap": picture, "raw": True, "wrap_mode": "clamp"}
+    return _shape("rectangle", place, bsdf={"type": "twosided", "bsdf": _diffuse(texture)})
 
 
-def _rgb(color: Color) -> dict[str, Any]:
+def _shape(kind: str, place: Matrix, **parts: object) -> dict[str, Any]:
+    import mitsuba as mi
+
+    return {"type": kind, "to_world": mi.ScalarTransform4f(place), **parts}
+
+
+def _place(translation_m: Triple, turn: Matrix = IDENTITY, scale: Triple = (1.0, 1.0, 1.0)) -> Matrix:
+    return trimesh.transformations.translation_matrix(translation_m) @ turn @ np.diag([*scale, 1.0])
+
+
+def _turn(axis: Literal["x", "z"], angle_deg: float) -> Matrix:
+    direction = [float(axis == name) for name in "xyz"]
+    return np.asarray(trimesh.transformations.rotation_matrix(np.radians(angle_deg), direction))
+
+
+def _diffuse(reflectance: dict[str, Any]) -> dict[str, Any]:
+    return {"type": "diffuse", "reflectance": reflectance}
+
+
+def _rgb(color: Triple | Float[np.ndarray, "3"]) -> dict[str, Any]:
     return {"type": "rgb", "value": [float(c) for c in color]}
 
 

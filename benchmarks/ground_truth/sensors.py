@@ -1,12 +1,10 @@
-"""What a colour camera and a stereo depth sensor make of perfect pictures: noise, coding, holes, steps."""
+"""What a colour camera and a stereo depth sensor make of perfect pictures: noise, holes, steps."""
 
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8, UInt16
-
-from protocol.errors import DeltalightError
 
 
 @dataclass(frozen=True)
@@ -15,7 +13,6 @@ class ColorSensor:
 
     shot_noise: float = 2.5e-5
     read_noise: float = 0.0012
-    jpeg_quality: int = 85
 
     def expose(
         self, radiance: Float32[np.ndarray, "h w 3"], rng: np.random.Generator
@@ -24,15 +21,6 @@ class ColorSensor:
         sigma = np.sqrt(self.shot_noise * np.maximum(radiance, 0) + self.read_noise**2)
         noisy = radiance + sigma * rng.standard_normal(radiance.shape, np.float32)
         return srgb_bytes(np.asarray(noisy, np.float32))
-
-    def jpeg(self, color: UInt8[np.ndarray, "h w 3"]) -> bytes:
-        """The picture as the camera's own JPEG file."""
-        ok, data = cv2.imencode(
-            ".jpg", cv2.cvtColor(color, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, self.jpeg_quality]
-        )
-        if not ok:
-            raise DeltalightError("OpenCV could not encode the camera picture as JPEG; check its installation.")
-        return data.tobytes()
 
 
 @dataclass(frozen=True)
@@ -47,7 +35,7 @@ class StereoDepthSensor:
     focal_px: float = 600.0
     baseline_m: float = 0.05
     sigma_at_1m: float = 0.001
-    window_px: float = 1.4
+    window_px: float = 2.0
     edge_step: float = 0.02
     failure_share: float = 0.004
     step_m: float = 0.001

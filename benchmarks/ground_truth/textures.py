@@ -1,5 +1,7 @@
 """Procedural albedo pictures (linear RGB) of the demo room: wood and plaster, from smooth noise."""
 
+from itertools import pairwise
+
 import cv2
 import numpy as np
 from jaxtyping import Float32
@@ -18,10 +20,10 @@ def smooth_noise(
 
 
 def wood(seed: int, height: int, width: int, planks: int) -> Float32[np.ndarray, "h w 3"]:
-    """Table of `planks` boards, grain along the columns' axis, each with its own rings, tint and thin seams."""
+    """Table of `planks` boards with the grain along the rows, each with its own rings, tint and seam."""
     rng = np.random.default_rng(seed)
     edges = np.linspace(0, height, planks + 1).round().astype(int)
-    strips = [_plank(rng, int(b - a), width) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    strips = [_plank(rng, int(b - a), width) for a, b in pairwise(edges)]
     return np.concatenate(strips)
 
 

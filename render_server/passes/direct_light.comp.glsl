@@ -4,6 +4,7 @@
 #include "passes/common/brdf.glsl"
 #include "passes/common/geometry.glsl"
 #include "passes/common/surfaces.glsl"
+#include "passes/common/volume.glsl"
 
 layout(local_size_x = 8, local_size_y = 8) in;
 layout(binding = 0, rgba16f) writeonly uniform image2D direct_mu;    // rgb E_mu; a: unshadowed E, mean of channels
@@ -22,9 +23,12 @@ void main() {
     vec4 normal = texelFetch(real_surface_normal, pixel, 0);
     vec3 e_mu = vec3(0.0), e_rho = vec3(0.0), s_mu = vec3(0.0), s_rho = vec3(0.0);
     float unshadowed = 0.0;
-    if (position.w > 0.0) {
+    float bias = 3.0 * noise_sigma * position.w * position.w;
+    // Where neither cones nor shadows of the objects reach, the picture stays as it is.
+    bool reached = position.w > 0.0
+        && (inside_volume(volume_coordinate(position.xyz)) || object_may_shadow(position.xyz, bias));
+    if (reached) {
         vec3 v = normalize(camera_position - position.xyz);
-        float bias = 3.0 * noise_sigma * position.w * position.w;
         for (int i = 0; i < light_count; ++i) {
             vec3 l; float radius;
             vec3 across = light_at(lights[i], position.xyz, l, radius);

@@ -6,14 +6,13 @@ from typing import Any
 
 import moderngl
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float32, Float64
 
 from render_server.gpu.context import GpuContext
-from render_server.gpu.textures import texture_from_array
 from render_server.passes.light_maps import LightView, light_views, pack_light, pack_view, tile_columns
 from render_server.passes.reflective_shadow_map import ShadowMapAtlas, texel_size_m
 from render_server.scene.lights import DirectionalLight, SphereLight
-from render_server.scene.prefiltered import PrefilteredEnvironment
+from render_server.scene.octahedral import octahedral_direction, prefilter, sample_octahedral
 
 EMPTY = b"\0" * 128
 
@@ -32,29 +31,25 @@ class LightTable:
         self.virtual_atlas = ShadowMapAtlas(gpu, 1, tile_size)
         self._light_buffer = gpu.ctx.buffer(EMPTY, dynamic=True)
         self._view_buffer = gpu.ctx.buffer(EMPTY, dynamic=True)
-        self._environment: moderngl.Texture | None = None
-        self._irradiance: moderngl.Texture | None = None
+        self._environment: moderngl.TextureArray | None = None
         self._environment_uniforms: dict[str, Any] = {}
 
-    def set_environment(self, environment: PrefilteredEnvironment) -> None:
-        """Upload the residual environment R with its cone levels, and its irradiance map."""
-        for texture in (self._environment, self._irradiance):
-            if texture is not None:
-                texture.release()
-        first = texture_from_array(self._gpu, environment.levels[0].astype(np.float32), linear=True)
-        count = len(environment.levels)
-        if count > 1:
-            first.build_mipmaps(0, count - 1)
-            for level, image in enumerate(environment.levels[1:], start=1):
-                first.write(np.ascontiguousarray(image, np.float32).tobytes(), level=level, alignment=1)
-            first.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
-        self._environment = first
-        self._irradiance = texture_from_array(
-            self._gpu, environment.irradiance.astype(np.float32), linear=True
-        )
+    def set_environment(self, radiance: Float32[np.ndarray, "n n 3"]) -> None:
+        """Upload the residual environment R (octahedral), averaged over cones of doubling half-angle."""
+        prefiltered = prefilter(radiance)
+        size, count = len(radiance), len(prefiltered.levels)
+        directions = octahedral_grid(size)
+        layers = [radiance, *(sample_octahedral(level, directions) for level in prefiltered.levels[1:])]
+        rgba = np.ones((count, size, size, 4), np.float16)
+        rgba[..., :3] = np.stack(layers)
+        if self._environment is not None:
+            self._environment.release()
+        self._environment = self._gpu.ctx.texture_array((size, size, count), 4, rgba.tobytes(), dtype="f2")
+        self._environment.filter = (moderngl.LINEAR, moderngl.LINEAR)
+        self._environment.repeat_x = self._environment.repeat_y = False
         self._environment_uniforms = {
-            "environment_levels": count,
-            "environment_first_half_angle": environment.first_half_angle_rad,
+            "environment_layers": count,
+            "environment_first_half_angle": prefiltered.half_angles[0],
         }
 
     def place(
@@ -122,9 +117,8 @@ class LightTable:
         self.bind_records()
         self.real_atlas.depth.use(location=10)
         self.virtual_atlas.depth.use(location=11)
-        if self._environment is not None and self._irradiance is not None:
+        if self._environment is not None:
             self._environment.use(location=12)
-            self._irradiance.use(location=13)
 
     def uniforms(self) -> dict[str, Any]:
         """Every uniform that shaders read of the lights."""
@@ -140,6 +134,11 @@ class LightTable:
         self.virtual_atlas.release()
         self._light_buffer.release()
         self._view_buffer.release()
-        for texture in (self._environment, self._irradiance):
-            if texture is not None:
-                texture.release()
+        if self._environment is not None:
+            self._environment.release()
+
+
+def octahedral_grid(size: int) -> Float64[np.ndarray, "n n 3"]:
+    """Directions of the texel centres of a size x size map."""
+    centres = (np.arange(size) + 0.5) / size
+    return octahedral_direction(np.stack(np.meshgrid(centres, centres), axis=-1))

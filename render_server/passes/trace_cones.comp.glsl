@@ -79,6 +79,13 @@ void main() {
         }
     }
 #ifdef REAL
+    if (s.present && !active_here) {   // the volume does not reach: the environment, unchanged
+        e_mu = e_rho = environment_irradiance(s.normal);
+        if (s.roughness >= 0.0) {
+            vec3 d = reflect(normalize(s.position - camera_position), s.normal);
+            c_mu = c_rho = environment(d, specular_half_angle(s.roughness));
+        }
+    }
     imageStore(irradiance_mu, texel, vec4(e_mu, traced));
     imageStore(irradiance_rho, texel, vec4(e_rho, fade));
     imageStore(specular_mu, texel, vec4(c_mu, traced));

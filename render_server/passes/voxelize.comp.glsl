@@ -29,9 +29,12 @@ void clip(int axis, float plane, float side) {
     for (int i = 0; i < count; ++i) polygon[i] = kept[i];
 }
 
-void clip_to_slab(int axis, float low) {
-    clip(axis, low, 1.0);
-    if (corners > 2) clip(axis, low + 1.0, -1.0);
+// Clip against the six faces of a voxel, leaving out the slabs that hold the whole triangle.
+void clip_to_voxel(ivec3 voxel, bvec3 cut) {
+    for (int face = 0; face < 6 && corners > 2; ++face) {
+        int axis = face >> 1, upper = face & 1;
+        if (cut[axis]) clip(axis, float(voxel[axis] + upper), upper == 0 ? 1.0 : -1.0);
+    }
 }
 
 // Area-weighted centroid and area of the polygon (voxel units).
@@ -89,14 +92,13 @@ void main() {
     if (dot(n, n) == 0.0) return;
     ivec3 first = max(ivec3(floor(min(a, min(b, c)))), ivec3(0));
     ivec3 last = min(ivec3(floor(max(a, max(b, c)))), ivec3(volume_size - 1));
+    bvec3 cut = notEqual(ivec3(floor(min(a, min(b, c)))), ivec3(floor(max(a, max(b, c)))));
     for (int x = first.x; x <= last.x; ++x)
         for (int y = first.y; y <= last.y; ++y)
             for (int z = first.z; z <= last.z; ++z) {
                 polygon[0] = a; polygon[1] = b; polygon[2] = c;
                 corners = 3;
-                clip_to_slab(0, float(x));
-                if (corners > 2) clip_to_slab(1, float(y));
-                if (corners > 2) clip_to_slab(2, float(z));
+                clip_to_voxel(ivec3(x, y, z), cut);
                 if (corners > 2) emit(t, centroid_area(), ivec3(x, y, z), a, b, c, n);
             }
 }

@@ -11,8 +11,10 @@ from services.ports import PAGE_PORT
 
 
 def demo(
+    *,
     headless: Annotated[
-        bool, typer.Option("--headless", help="No page: write composites, a contact sheet and a video to --out.")
+        bool,
+        typer.Option("--headless", help="No page: write composites, a contact sheet and a video to --out."),
     ] = False,
     frames: Annotated[int, typer.Option(min=1, max=100_000, help="Composites of a headless demo.")] = 30,
     out: Annotated[Path | None, typer.Option(help="Folder of a headless demo.")] = None,

@@ -22,6 +22,7 @@ def doctor(
 
 def _print_table(checks: list[dict[str, str]]) -> None:
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     marks = {"ok": "[green]ok[/]", "note": "[yellow]note[/]", "missing": "[red]missing[/]"}
@@ -29,5 +30,6 @@ def _print_table(checks: list[dict[str, str]]) -> None:
     for heading in ("", "What", "Found", "What to do"):
         table.add_column(heading)
     for check in checks:
-        table.add_row(marks[check["state"]], check["name"], check["detail"], check["hint"])
+        texts = (escape(check[key]) for key in ("name", "detail", "hint"))
+        table.add_row(marks[check["state"]], *texts)
     Console().print(table)

@@ -15,9 +15,8 @@ class View(StrEnum):
 
 
 class Method(StrEnum):
-    """A relighting method that is built: dvct as the scene says, with one of its operators, or none."""
+    """A relighting method that is built: dvct as the scene says, or with one of its operators."""
 
     DVCT = "dvct"
     EXACT = "exact"
     PAPER = "paper"
-    NONE = "none"

@@ -5,15 +5,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from services.commands.options import View
 
 if TYPE_CHECKING:
-    from services.offline import RenderJob, RenderSummary
+    from services.offline import RenderSummary
 
 
 def render(
     source: Annotated[Path, typer.Argument(help="Dataset folder or .mcap recording.")],
+    *,
     out: Annotated[Path, typer.Option(help="Folder for the pictures; created where missing.")],
     scene: Annotated[
         Path | None, typer.Option(help="Scene document; default: the one that the recording carries.")
@@ -22,7 +25,9 @@ def render(
         str | None, typer.Option(metavar="A:B", help="Frame numbers, B not included; default all.")
     ] = None,
     size: Annotated[str | None, typer.Option(metavar="WxH", help="Size of the pictures.")] = None,
-    device: Annotated[int | None, typer.Option(min=0, help="EGL device; `deltalight doctor` lists them.")] = None,
+    device: Annotated[
+        int | None, typer.Option(min=0, help="EGL device; `deltalight doctor` lists them.")
+    ] = None,
     view: Annotated[View | None, typer.Option(help="What to show; default: as the scene says.")] = None,
     exr: Annotated[bool, typer.Option("--exr", help="Write linear OpenEXR files too.")] = False,
     allow_software: Annotated[
@@ -34,7 +39,7 @@ def render(
     from protocol.source import open_source
     from services.arguments import parse_frames, parse_size
     from services.host import choose_scene
-    from services.offline import RenderJob, with_output
+    from services.offline import RenderJob, run_job, with_output
 
     size_px = None if size is None else parse_size(size)
     recording = open_source(source)
@@ -42,24 +47,30 @@ def render(
     job = RenderJob(recording, document, parse_frames(frames, len(recording)), out, device, with_exr=exr)
     for note in recording.notes:
         typer.echo(note, err=True)
-    _print_summary(_run_with_progress(job, warn=not allow_software), as_json=as_json)
+    bar = _Bar(len(job.frames), warn=not allow_software)
+    with bar.progress:
+        summary = run_job(job, bar)
+    _print_summary(summary, as_json=as_json)
 
 
-def _run_with_progress(job: "RenderJob", *, warn: bool) -> "RenderSummary":
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+class _Bar:
+    """Shows a job on stderr: a bar, warnings above it."""
 
-    from services.offline import run_job
+    def __init__(self, total: int, *, warn: bool) -> None:
+        columns = (TextColumn("rendering"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+        self.progress = Progress(*columns, console=Console(stderr=True, soft_wrap=True), transient=True)
+        self._task = self.progress.add_task("rendering", total=total)
+        self._warn = warn
 
-    columns = (TextColumn("rendering"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
-        task = progress.add_task("rendering", total=len(job.frames))
+    def renderer(self, name: str, *, is_software: bool) -> None:
+        if is_software and self._warn:
+            self.notice(f"warning: no GPU found, rendering slowly in software with {name}")
 
-        def tell_renderer(name: str, is_software: bool) -> None:
-            if is_software and warn:
-                progress.console.print(f"warning: no GPU found, rendering slowly in software with {name}")
+    def notice(self, sentence: str) -> None:
+        self.progress.console.print(sentence, markup=False, highlight=False)
 
-        return run_job(job, on_renderer=tell_renderer, on_frame=lambda _number: progress.advance(task))
+    def frame_done(self) -> None:
+        self.progress.advance(self._task)
 
 
 def _print_summary(summary: "RenderSummary", *, as_json: bool) -> None:
@@ -68,6 +79,6 @@ def _print_summary(summary: "RenderSummary", *, as_json: bool) -> None:
         typer.echo(json.dumps(figures))
         return
     typer.echo(
-        f"{figures['frames']} frames, {figures['no_pose']} without a pose, {figures['mean_ms']:.1f} ms a frame,"
-        f" {figures['renderer']}, written to {figures['out']}"
+        f"{figures['frames']} frames, {figures['no_pose']} without a pose, {figures['mean_ms']:.1f} ms a"
+        f" frame, {figures['renderer']}, written to {figures['out']}"
     )

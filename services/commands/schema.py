@@ -2,7 +2,7 @@
 
 import json
 from enum import StrEnum
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -25,7 +25,7 @@ def schema(
     typer.echo(json.dumps(_schema(document), indent=2))
 
 
-def _schema(document: Document) -> dict[str, object]:
+def _schema(document: Document) -> dict[str, Any]:
     match document:
         case Document.SCENE:
             from protocol.scene import scene_json_schema

@@ -9,16 +9,20 @@ from services.ports import COMPOSITE_PORT, CONTROL_PORT, NODE_PORT, endpoint
 
 
 def server(
+    *,
     scene: Annotated[Path | None, typer.Option(help="Scene document to start with.")] = None,
     session: Annotated[
-        Path | None, typer.Option(help="File that keeps the current scene, so that a restart goes on with it.")
+        Path | None,
+        typer.Option(help="File that keeps the current scene, so that a restart goes on with it."),
     ] = None,
     subscribe: Annotated[
         list[str] | None, typer.Option(help="Endpoint of a sensor node; may be given several times.")
     ] = None,
     publish: Annotated[str, typer.Option(help="Endpoint for composites.")] = endpoint(COMPOSITE_PORT),
     control: Annotated[str, typer.Option(help="Endpoint for commands.")] = endpoint(CONTROL_PORT),
-    device: Annotated[int | None, typer.Option(min=0, help="EGL device; `deltalight doctor` lists them.")] = None,
+    device: Annotated[
+        int | None, typer.Option(min=0, help="EGL device; `deltalight doctor` lists them.")
+    ] = None,
     allow_software: Annotated[
         bool, typer.Option("--allow-software", help="Accept a renderer without a GPU.")
     ] = False,

@@ -7,7 +7,9 @@ import typer
 
 from services.ports import COMPOSITE_PORT, CONTROL_PORT, LOOPBACK, NODE_PORT, PAGE_PORT
 
+
 def up(
+    *,
     source: Annotated[str, typer.Option(help="Dataset folder, .mcap recording, or `synthetic`.")],
     scene: Annotated[
         Path | None, typer.Option(help="Scene document; default: the one that the recording carries.")
@@ -17,10 +19,10 @@ def up(
     composite_port: Annotated[
         int, typer.Option(min=1, max=65535, help="Port of the composites.")
     ] = COMPOSITE_PORT,
-    control_port: Annotated[
-        int, typer.Option(min=1, max=65535, help="Port of the commands.")
-    ] = CONTROL_PORT,
-    device: Annotated[int | None, typer.Option(min=0, help="EGL device; `deltalight doctor` lists them.")] = None,
+    control_port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the commands.")] = CONTROL_PORT,
+    device: Annotated[
+        int | None, typer.Option(min=0, help="EGL device; `deltalight doctor` lists them.")
+    ] = None,
     allow_software: Annotated[
         bool, typer.Option("--allow-software", help="Accept a renderer without a GPU.")
     ] = False,

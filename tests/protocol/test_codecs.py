@@ -116,7 +116,9 @@ def test_raw_views_are_read_only() -> None:
         view[0, 0, 0] = 1
 
 
-@pytest.mark.parametrize("picture", [np.zeros((2, 3)), np.zeros((2, 3, 4), np.uint8), np.zeros((0, 3, 3), np.uint8)])
+@pytest.mark.parametrize(
+    "picture", [np.zeros((2, 3)), np.zeros((2, 3, 4), np.uint8), np.zeros((0, 3, 3), np.uint8)]
+)
 def test_what_is_no_picture_is_not_encoded(picture: np.ndarray) -> None:
     with pytest.raises(EnvelopeError, match="picture"):
         encode_color(picture)
@@ -154,7 +156,9 @@ def test_blosc2_chunk_with_a_forged_size_is_refused() -> None:
 def test_other_codecs_and_filters_are_refused(codec: blosc2.Codec) -> None:
     steps = (smooth_depth() * 5000).astype(np.uint16)
     other = blosc2.compress2(steps, typesize=2, codec=codec, filters=[blosc2.Filter.BITSHUFFLE], nthreads=1)
-    delta = blosc2.compress2(steps, typesize=2, codec=blosc2.Codec.ZSTD, filters=[blosc2.Filter.DELTA], nthreads=1)
+    delta = blosc2.compress2(
+        steps, typesize=2, codec=blosc2.Codec.ZSTD, filters=[blosc2.Filter.DELTA], nthreads=1
+    )
     for chunk in (other, delta):
         with pytest.raises(EnvelopeError, match="zstd"):
             decode_depth(chunk, "blosc2", steps.shape, 0.001)
@@ -172,7 +176,14 @@ def test_jpeg_bomb_is_refused_before_it_is_decoded() -> None:
 
 @pytest.mark.parametrize(
     "part",
-    [b"", b"\xff\xd8", b"\xff\xd8\xff\xd9", b"\x89PNG\r\n", b"\xff\xd8" + b"\xff" * 4000 + b"\xff\xd9", bytes(5000)],
+    [
+        b"",
+        b"\xff\xd8",
+        b"\xff\xd8\xff\xd9",
+        b"\x89PNG\r\n",
+        b"\xff\xd8" + b"\xff" * 4000 + b"\xff\xd9",
+        bytes(5000),
+    ],
 )
 def test_what_is_no_jpeg_is_refused(part: bytes) -> None:
     with pytest.raises(EnvelopeError, match="jpeg"):

@@ -65,12 +65,19 @@ def header_of(message: Any, **changes: Any) -> bytes:
 
 @given(base_fields, st.integers(1, 9), st.integers(1, 9), plain_dicts, st.booleans(), st.data())
 def test_colour_comes_back(
-    base: dict[str, Any], height: int, width: int, camera: dict[str, Any], has_response: bool, data: st.DataObject
+    base: dict[str, Any],
+    height: int,
+    width: int,
+    camera: dict[str, Any],
+    has_response: bool,
+    data: st.DataObject,
 ) -> None:
     message = ColorMessage(
         **base, encoding="raw", shape=(height, width, 3), camera=camera, has_response=has_response
     )
-    pixels = np.frombuffer(data.draw(st.binary(min_size=height * width * 3, max_size=height * width * 3)), np.uint8)
+    pixels = np.frombuffer(
+        data.draw(st.binary(min_size=height * width * 3, max_size=height * width * 3)), np.uint8
+    )
     response = np.linspace(0, 1, 768, dtype=np.float32).reshape(256, 3)
     parts = [pixels.reshape(height, width, 3), response][: 1 + has_response]
     received, raw = decode(encode(message, parts))
@@ -84,13 +91,12 @@ def test_control_comes_back(base: dict[str, Any], payload: dict[str, Any], revis
     assert decode(encode(message)) == (message, [])
 
 
-def test_strided_and_big_endian_arrays_are_sent_in_c_order_little_endian() -> None:
+def test_arrays_are_sent_in_c_order_and_never_big_endian() -> None:
     steps = np.arange(8, dtype=np.uint16).reshape(4, 2).T
     message = DepthMessage(
         node="desk", frame_id=0, capture_ns=0, encoding="raw", shape=(2, 4), depth_scale_m=0.001, camera={}
     )
     assert encode(message, [steps])[2] == np.ascontiguousarray(steps, "<u2").tobytes()
-    assert encode(message, [steps.astype(">u2").view(">u2").astype("<u2")])[2] == steps.tobytes("C")
     with pytest.raises(EnvelopeError, match="uint16"):
         encode(message, [steps.astype(">u2")])
 
@@ -330,7 +336,9 @@ def test_headers_with_a_foreign_value_raise_nothing_but_envelope_errors(
     pieces: list[bytes], data: st.DataObject
 ) -> None:
     fields = msgpack.unpackb(pieces[1])
-    fields[data.draw(st.sampled_from(sorted(fields)))] = data.draw(plain | st.binary(max_size=5) | st.floats())
+    fields[data.draw(st.sampled_from(sorted(fields)))] = data.draw(
+        plain | st.binary(max_size=5) | st.floats()
+    )
     try:
         message, parts = decode([pieces[0], msgpack.packb(fields), *pieces[2:]])
     except EnvelopeError:

@@ -1,16 +1,22 @@
-// Residual environment R(direction, cone): radiance in camera units, prefiltered by cones of growing half-angle.
+// Residual environment R(direction, cone): radiance in camera units, averaged over cones of doubling half-angle.
 #include "passes/common/octahedral.glsl"
+#include "passes/common/basis.glsl"
 
-layout(binding = 12) uniform sampler2D environment_map;   // octahedral; level l averaged over a cone
-uniform int environment_levels;
-uniform float environment_first_half_angle;               // rad, of level 1; doubles each level
+layout(binding = 12) uniform sampler2DArray environment_map;   // octahedral; a layer a cone
+uniform int environment_layers;
+uniform float environment_first_half_angle;                     // rad, of layer 0; the last is pi/2, cosine-weighted
 
 vec3 environment(vec3 direction, float half_angle) {
-    float level = half_angle <= 0.0 ? 0.0 : 1.0 + log2(half_angle / environment_first_half_angle);
-    level = clamp(level, 0.0, float(environment_levels - 1));
-    return textureLod(environment_map, octahedral_uv(direction), level).rgb;
+    float layer = log2(max(half_angle, 1e-6) / environment_first_half_angle);
+    layer = clamp(layer, 0.0, float(environment_layers - 1));
+    vec2 uv = octahedral_uv(direction);
+    float low = floor(layer);
+    vec3 a = textureLod(environment_map, vec3(uv, low), 0.0).rgb;
+    vec3 b = textureLod(environment_map, vec3(uv, min(low + 1.0, float(environment_layers - 1))), 0.0).rgb;
+    return mix(a, b, layer - low);
 }
 
-layout(binding = 13) uniform sampler2D irradiance_map;    // octahedral; E(n) of R, no occlusion
-
-vec3 environment_irradiance(vec3 normal) { return textureLod(irradiance_map, octahedral_uv(normal), 0.0).rgb; }
+// E(n) of R without any occlusion.
+vec3 environment_irradiance(vec3 normal) {
+    return PI * textureLod(environment_map, vec3(octahedral_uv(normal), float(environment_layers - 1)), 0.0).rgb;
+}

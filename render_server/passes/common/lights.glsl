@@ -93,7 +93,7 @@ int view_containing(int first, int count, vec3 p) {
 // Mean depth of what blocks the light's disc in one map; NOTHING if nothing does.
 float mean_blocker(sampler2D map, Light light, LightView view, vec2 s, float depth) {
     float widest = disc_shift(light, view, depth, view.range.x);
-    int count = widest * view.tile.z < view.tile.w ? 1 : shadow_samples;   // below half a texel: one look
+    int count = widest * view.tile.z < view.tile.w ? 1 : (shadow_samples + 1) / 2;   // below half a texel: one look
     float sum = 0.0, hits = 0.0;
     for (int j = 0; j < count; ++j) {
         vec2 t = tile_texel(view, count == 1 ? s : s + widest * disc_sample(j, count));
@@ -122,6 +122,22 @@ Occluder occluder(sampler2D map, Light light, int first, int count, vec3 p, floa
     o.present = blocker < NOTHING;
     o.shift = o.present ? disc_shift(light, o.view, o.depth, blocker) : 0.0;
     return o;
+}
+
+// Whether a virtual object can stand between p and any part of any light.
+bool object_may_shadow(vec3 p, float bias) {
+    for (int i = 0; i < light_count; ++i) {
+        Light light = lights[i];
+        for (int j = light.views.z; j < light.views.z + light.views.w; ++j) {
+            LightView view = light_views[j];
+            vec3 v = (view.view_from_world * vec4(p, 1.0)).xyz;
+            float depth = v.z - bias;
+            if (depth <= view.range.x) continue;
+            float reach = disc_shift(light, view, depth, view.range.x);
+            if (all(lessThanEqual(abs(lateral(view, v)), vec2(view.tile.w + reach)))) return true;
+        }
+    }
+    return false;
 }
 
 // (V_mu, V_rho): averages over the same samples of the light; v_rho = v_mu v_obj (METHOD 3).

@@ -26,7 +26,7 @@ vec4 directional_sample(sampler3D pyramid, vec3 q, int level, ivec3 slabs, vec3 
 void accumulate(vec4 crossed, inout vec3 c, inout float t) {
     float taken = crossed.a > t ? t / crossed.a : 1.0;
     c += taken * crossed.rgb;
-    t -= taken * crossed.a;
+    t = max(t - taken * crossed.a, 0.0);
 }
 
 // Both marches from q (voxels) along d; `ratio` = cone diameter / distance. With `only_rho`, mu is left out.

@@ -1,0 +1,110 @@
+"""How fast this machine renders the demo: each pass, and camera to viewer through all processes."""
+
+import os
+import statistics
+import time
+from collections.abc import Sequence
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+from sensor_node.view_frames import ViewFrameBuilder
+
+from protocol.frames import ViewFrame
+from protocol.scene import SceneDocument
+from protocol.source import open_source
+from render_server.gpu.context import create_context
+from render_server.renderer import SceneRenderer
+from services.demo import RECORDING, collect_composites, demo_scene
+from services.offline import with_output
+
+WARM_UP_FRAMES = 3  # drivers compile and specialise shaders in the first frames
+
+
+def measure_speed(
+    methods: Sequence[str], frames: int, *, size: tuple[int, int] | None, device: int | None, end_to_end: bool
+) -> dict[str, Any]:
+    """Measure every method; times in milliseconds, medians over `frames` frames.
+
+    Raises:
+        DeltalightError: no OpenGL, missing demo files, or a process that died for good.
+    """
+    scenes = {method: with_output(demo_scene(method), size, None) for method in methods}
+    source = open_source(RECORDING)
+    builder = ViewFrameBuilder(source)
+    views = [builder(source[index % len(source)]) for index in range(WARM_UP_FRAMES + frames)]
+    gpu = create_context(device)
+    report: dict[str, Any] = {
+        "renderer": gpu.renderer_name,
+        "cpus": os.cpu_count(),
+        "size": list(size or (source.camera.width, source.camera.height)),
+        "frames": frames,
+        "methods": {},
+    }
+    try:
+        for method, scene in scenes.items():
+            renderer = SceneRenderer(gpu, scene)
+            report["methods"][method] = _measure(renderer, views)
+            renderer.release()
+    finally:
+        gpu.release()
+    if end_to_end:
+        for method, scene in scenes.items():
+            report["methods"][method]["end_to_end"] = _measure_end_to_end(scene, frames)
+    return report
+
+
+def _measure(renderer: SceneRenderer, views: Sequence[ViewFrame]) -> dict[str, Any]:
+    passes: dict[str, list[float]] = {}
+    frame_ms = []
+    for index, view in enumerate(views):
+        started_s = time.perf_counter()
+        composite = renderer.render(view)
+        elapsed_ms = 1000 * (time.perf_counter() - started_s)
+        if index < WARM_UP_FRAMES:
+            continue
+        frame_ms.append(elapsed_ms)
+        for name, milliseconds in composite.pass_times_ms.items():
+            passes.setdefault(name, []).append(milliseconds)
+    median_ms = statistics.median(frame_ms)
+    return {
+        "passes_ms": {name: statistics.median(values) for name, values in passes.items()},
+        "frame_ms": median_ms,
+        "frames_per_s": 1000 / median_ms,
+        "notices": list(renderer.notices),
+    }
+
+
+def _measure_end_to_end(scene: SceneDocument, frames: int) -> dict[str, Any]:
+    summary = collect_composites(scene, WARM_UP_FRAMES + frames, None)
+    return {key: summary[key] for key in ("frames_per_s", "age_median_ms", "age_p95_ms", "drops")}
+
+
+def print_report(report: dict[str, Any]) -> None:
+    """Print the report as tables: one row a pass, one column pair a method."""
+
+    console = Console()
+    width, height = report["size"]
+    console.print(f"{report['renderer']}, {report['cpus']} CPUs, {width}x{height}, {report['frames']} frames")
+    for method, figures in report["methods"].items():
+        _print_method(console, method, figures)
+
+
+def _print_method(console: Console, method: str, figures: dict[str, Any]) -> None:
+
+    table = Table("Pass", "median ms", "share", title=method, title_justify="left")
+    for column in table.columns[1:]:
+        column.justify = "right"
+    total_ms = sum(figures["passes_ms"].values()) or 1.0
+    for name, milliseconds in figures["passes_ms"].items():
+        table.add_row(name, f"{milliseconds:.2f}", f"{milliseconds / total_ms:.0%}")
+    console.print(table)
+    console.print(f"frame {figures['frame_ms']:.1f} ms = {figures['frames_per_s']:.1f} frames/s")
+    for notice in figures["notices"]:  # among them the memory of the volumes
+        console.print(notice)
+    through = figures.get("end_to_end")
+    if through is not None:
+        console.print(
+            f"camera to viewer through all processes: {through['frames_per_s']:.1f} frames/s,"
+            f" age {through['age_median_ms']:.0f} ms (p95 {through['age_p95_ms']:.0f} ms)"
+        )

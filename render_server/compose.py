@@ -1,0 +1,56 @@
+"""Relit frame -> picture: composition, views for people who look, readback."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from protocol.scene_method import Output
+from render_server.gpu.context import GpuContext
+from render_server.gpu.readback import AsyncReadback
+from render_server.passes.composite import CompositePass
+from render_server.relighting import RelitFrame
+
+
+class Composer:
+    """Owns the composite's textures and reads them back."""
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self._gpu = gpu
+        self._pass: CompositePass | None = None
+        self._size: tuple[int, int] | None = None
+        self._readback = AsyncReadback(gpu)
+
+    def compose(
+        self, relit: RelitFrame, output: Output
+    ) -> tuple[UInt8[np.ndarray, "h w 3"], Float32[np.ndarray, "h w 3"] | None]:
+        """Picture in camera codes, and linear."""
+        composite = self._pass_for(relit.input.view.size)
+        uniforms: dict[str, Any] = {
+            **relit.input.view.uniforms(),
+            **relit.input.surface_uniforms,
+            **relit.uniforms,
+            "additive": relit.additive,
+            "filmic": output.tone == "aces",
+        }
+        with relit.timers.measure("composite"):
+            relit.input.bind_geometry()
+            composite.run(relit.input.picture, relit.layers, uniforms)
+        with relit.timers.measure("readback"):
+            self._readback.push(composite.code, "u1")
+        return np.ascontiguousarray(self._readback.pop()[..., :3]), None
+
+    def _pass_for(self, size: tuple[int, int]) -> CompositePass:
+        if self._pass is None or self._size != size:
+            if self._pass is not None:
+                self._pass.release()
+            self._pass, self._size = CompositePass(self._gpu, size), size
+        return self._pass
+
+    def release(self) -> None:
+        """Free the GL objects."""
+        self._readback.release()
+        if self._pass is not None:
+            self._pass.release()

@@ -1,0 +1,81 @@
+"""Textures and passes of one picture size that every method shares."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from protocol.scene_objects import Surface
+from render_server.gpu.context import GpuContext
+from render_server.passes.geometry_buffer import GeometryBuffer, GeometryPass
+from render_server.passes.matte import MattePass
+from render_server.passes.picture import Picture
+from render_server.passes.real_surface import RealSurface
+from render_server.real_geometry import RealGeometry
+from render_server.relight.frame import GeometryState
+from render_server.view import CameraView
+
+
+class PictureResources:
+    """The picture, both geometry buffers and the matte."""
+
+    def __init__(self, gpu: GpuContext, view: CameraView) -> None:
+        size, raster_size = view.size, view.raster[1]
+        self.key = (size, raster_size)
+        self.picture = Picture(gpu, size)
+        self.real_surface = RealSurface(gpu, size)
+        self.virtual_raster = GeometryBuffer(gpu, raster_size)
+        self._model_raster: GeometryBuffer | None = None
+        self.matte = MattePass(gpu, size)
+        self._geometry = GeometryPass(gpu)
+        self._gpu = gpu
+        self._surfaces = gpu.ctx.buffer(bytes(80))
+        self.surface_uniforms: dict[str, Any] = {"surface_count": 0, "specular_surfaces": False}
+
+    def rasterise(
+        self,
+        real: RealGeometry,
+        virtual: GeometryState,
+        view: CameraView,
+        moved: bool,
+        surfaces: Sequence[Surface],
+    ) -> None:
+        """Real geometry buffer (if it `moved`), virtual raster, matte."""
+        self._surfaces.bind_to_storage_buffer(14)
+        if moved:
+            self._fill_real(real, view)
+        virtual.materials.bind()
+        self._geometry.run(self.virtual_raster, virtual.buffers, view)
+        self.real_surface.bind()
+        self.virtual_raster.position.use(location=6)
+        self.virtual_raster.normal.use(location=7)
+        self.picture.rays.use(location=15)
+        self.matte.run(self.picture, {**view.uniforms(), "noise_sigma": real.noise_sigma})
+
+    def _fill_real(self, real: RealGeometry, view: CameraView) -> None:
+        count = int(self.surface_uniforms["surface_count"])
+        if not real.is_model:
+            assert real.frame is not None
+            assert real.frame.depth is not None
+            self.real_surface.from_depth(real.frame.depth, self.picture, view, real.noise_sigma, count)
+            return
+        if self._model_raster is None:
+            self._model_raster = GeometryBuffer(self._gpu, self.virtual_raster.size)
+        assert real.state is not None
+        real.state.materials.bind()
+        self._geometry.run(self._model_raster, real.state.buffers, view)
+        self.real_surface.from_model(self._model_raster, self.picture, view, count)
+
+    def release(self) -> None:
+        """Free the GL objects."""
+        for item in (
+            self.picture,
+            self.real_surface,
+            self.virtual_raster,
+            self._model_raster,
+            self.matte,
+            self._geometry,
+            self._surfaces,
+        ):
+            if item is not None:
+                item.release()

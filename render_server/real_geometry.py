@@ -1,0 +1,114 @@
+"""The real scene's triangles: a mesh of the frame's depth, or a given model."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from protocol.errors import DeltalightError
+from protocol.frames import DepthImage, ViewFrame
+from protocol.scene_objects import ModelGeometry, RealScene
+from render_server.gpu.context import GpuContext
+from render_server.passes.materials import MaterialTable
+from render_server.passes.mesh_buffers import MeshBuffers, triangle_corners
+from render_server.relight.frame import GeometryState
+from render_server.scene.depth_mesh import depth_mesh
+from render_server.scene.mesh import TriangleMesh, load_mesh, merge_for_gpu
+from render_server.scene.scene_tracker import RealSceneTracker
+from render_server.view import CameraView
+
+BOUND_POINTS = 4000  # points kept of a mesh to fit light views around it
+DEFAULT_SIGMA = 0.001  # m at 1 m, where the depth camera's noise is not known
+
+
+class RealGeometry:
+    """Keeps the real scene until it moves (RealSceneTracker), then rebuilds it."""
+
+    def __init__(self, gpu: GpuContext, real: RealScene, triangle_budget: int) -> None:
+        self._gpu = gpu
+        self._budget = triangle_budget
+        self._tracker = RealSceneTracker()
+        self._buffers = MeshBuffers(gpu)
+        self._materials: MaterialTable | None = None
+        self._version = 0
+        self.state: GeometryState | None = None
+        self.is_model = isinstance(real.geometry, ModelGeometry)
+        self.frame: ViewFrame | None = None
+        if isinstance(real.geometry, ModelGeometry):
+            self._model = self._load_model(real.geometry)
+        elif real.geometry == "fused":
+            raise DeltalightError(
+                "real.geometry `fused` arrives with a later release: use `depth`, or give a model."
+            )
+
+    def _load_model(self, model: ModelGeometry) -> list[TriangleMesh]:
+        matrix = model.pose.matrix()
+        return [mesh.transformed(matrix) for mesh in load_mesh(Path(model.model))]
+
+    @property
+    def noise_sigma(self) -> float:
+        """Depth noise at 1 m, m; a model has none."""
+        if self.is_model or self.frame is None or self.frame.depth is None:
+            return 0.0
+        return self.frame.depth.noise_sigma_m or DEFAULT_SIGMA
+
+    def update(self, frame: ViewFrame, view: CameraView) -> bool:
+        """Take over the frame's geometry if it changed; returns whether it did.
+
+        Raises:
+            DeltalightError: the scene wants depth and the frame has none.
+        """
+        if not self.is_model and frame.depth is None:
+            raise DeltalightError(
+                "The source has no depth: record depth, or give the scene a model (`real: {geometry: {model: ...}}`)."
+            )
+        if not self._tracker.update(frame):
+            return False
+        self.frame = frame
+        if self.is_model and self.state is not None:
+            self._version += 1
+            self.state = GeometryState(
+                self._version, self._buffers, self.state.corners, self.state.points, self.state.materials
+            )
+            return True
+        self._build(self._model if self.is_model else [self._depth_mesh(frame, view)])
+        return True
+
+    def _depth_mesh(self, frame: ViewFrame, view: CameraView) -> TriangleMesh:
+        depth = frame.depth
+        assert isinstance(depth, DepthImage)
+        return depth_mesh(depth, view.camera, view.world_from_camera, self._budget)
+
+    def _build(self, meshes: list[TriangleMesh]) -> None:
+        """Merge and upload."""
+        merged = merge_for_gpu(meshes)
+        self._version += 1
+        self._buffers.write(merged)
+        if self._materials is None:
+            self._materials = MaterialTable(self._gpu, merged)
+        self.state = GeometryState(
+            self._version, self._buffers, triangle_corners(merged), _sample(merged.vertices[:, :3]), self._materials
+        )
+
+    @property
+    def typical_depth(self) -> float:
+        """Median known depth, m (1 for a model)."""
+        if self.is_model or self.frame is None or self.frame.depth is None:
+            return 1.0
+        known = self.frame.depth.depth_m[self.frame.depth.valid]
+        return float(np.median(known)) if known.size else 1.0
+
+    def release(self) -> None:
+        """Free the GL objects."""
+        self._buffers.release()
+        if self._materials is not None:
+            self._materials.release()
+
+
+def _sample(positions: np.ndarray) -> Float64[np.ndarray, "n 3"]:  # type: ignore[type-arg]
+    """At most BOUND_POINTS of the positions, and always those at the extremes of each axis."""
+    stride = max(1, len(positions) // BOUND_POINTS)
+    extremes = np.concatenate([positions.argmin(axis=0), positions.argmax(axis=0)])
+    return np.concatenate([positions[::stride], positions[extremes]]).astype(np.float64)

@@ -1,0 +1,34 @@
+"""Settings that the scene document leaves open, by what the machine can do."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from protocol.scene_method import DvctMethod
+
+# (software, GPU)
+VOLUME_SIZE = (64, 256)
+CONE_SCALE = (4, 2)
+RSM_SIZE = (512, 1024)
+TRIANGLE_BUDGET = (40_000, 400_000)
+
+
+@dataclass(frozen=True)
+class ResolvedDvct:
+    """The settings of DVCT whose default depends on the machine."""
+
+    volume_size: int
+    cone_scale: int
+    rsm_size: int
+    triangle_budget: int
+
+
+def resolve_dvct(settings: DvctMethod, *, software: bool) -> ResolvedDvct:
+    """Take the document's values, or the machine's defaults where it says null."""
+    column = 0 if software else 1
+    return ResolvedDvct(
+        settings.volume_size or VOLUME_SIZE[column],
+        settings.cone_scale or CONE_SCALE[column],
+        settings.rsm_size or RSM_SIZE[column],
+        settings.triangle_budget or TRIANGLE_BUDGET[column],
+    )

@@ -1,0 +1,160 @@
+"""From a frame and a scene to relit layers: geometry, lights, registration, and the method that the scene names."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from protocol.errors import DeltalightError
+from protocol.frames import ViewFrame
+from protocol.scene import SceneDocument
+from protocol.scene_method import DvctMethod
+from render_server.gpu.context import GpuContext
+from render_server.gpu.timers import PassTimers
+from render_server.passes.composite import RelitLayers
+from render_server.passes.volume import memory_statement
+from render_server.picture_resources import PictureResources
+from render_server.real_geometry import RealGeometry
+from render_server.relight.defaults import ResolvedDvct, resolve_dvct
+from render_server.relight.dvct import DvctExact
+from render_server.relight.frame import RelightInput
+from render_server.scene.lights import LightSet, build_lights
+from render_server.view import CameraView
+from render_server.virtual_objects import VirtualObjects
+
+
+@dataclass(frozen=True, eq=False)
+class RelitFrame:
+    """Layers and what composition needs beside them."""
+
+    input: RelightInput
+    layers: RelitLayers
+    additive: bool
+    uniforms: dict[str, Any]
+
+    @property
+    def timers(self) -> PassTimers:
+        """The frame's pass timers."""
+        return self.input.timers
+
+
+@dataclass(frozen=True, eq=False)
+class _Plan:
+    """A scene whose files and memory were checked."""
+
+    scene: SceneDocument
+    method: DvctMethod
+    resolved: ResolvedDvct
+    lights: LightSet
+
+
+class Relighting:
+    """Holds everything that lives longer than a frame."""
+
+    def __init__(self, gpu: GpuContext, scene: SceneDocument, notices: list[str]) -> None:
+        self._gpu = gpu
+        self._notices = notices
+        self._timers = PassTimers(gpu)
+        self._objects = VirtualObjects(gpu)
+        self._real: RealGeometry | None = None
+        self._resources: PictureResources | None = None
+        self._method: DvctExact | None = None
+        self._lights_version = 0
+        self._plan = self._planned(scene)
+        self._lights = self._plan.lights
+        self._take(self._plan)
+
+    def _planned(self, scene: SceneDocument) -> _Plan:
+        """Check everything that can fail before anything is replaced."""
+        if not isinstance(scene.method, DvctMethod):
+            raise DeltalightError(f"method `{scene.method.name}` arrives with a later release: use dvct.")
+        resolved = resolve_dvct(scene.method, software=self._gpu.is_software)
+        self._say(memory_statement(resolved.volume_size, 6, scene.method.memory_budget_mb))
+        self._objects.load(scene.objects)
+        return _Plan(scene, scene.method, resolved, build_lights(scene.lights))
+
+    def _say(self, sentence: str) -> None:
+        if sentence not in self._notices:
+            self._notices.append(sentence)
+
+    def set_scene(self, scene: SceneDocument) -> None:
+        """Replace the scene; nothing changes if it cannot be used."""
+        self._take(self._planned(scene))
+
+    def _take(self, plan: _Plan) -> None:
+        old = self._plan
+        if self._real is None or plan.scene.real != old.scene.real or plan.resolved != old.resolved:
+            real = RealGeometry(self._gpu, plan.scene.real, plan.resolved.triangle_budget)
+            if self._real is not None:
+                self._real.release()
+            self._real = real
+        if plan.method != old.method and self._method is not None:
+            self._method.release()
+            self._method = None
+        if plan.scene.lights != old.scene.lights or self._lights_version == 0:
+            self._lights_version += 1
+            self._lights = plan.lights.registered()
+        self._plan = plan
+
+    def relight(self, frame: ViewFrame, view: CameraView) -> RelitFrame | None:
+        """Relit layers of one frame; None if no object is visible."""
+        virtual = self._objects.update(self._plan.scene.objects, frame.board)
+        if virtual is None or self._real is None:
+            return None
+        resources = self._resources_for(view)
+        timers = self._timers
+        with timers.measure("upload"):
+            resources.picture.upload(frame)
+        moved = self._real.update(frame, view)
+        assert self._real.state is not None
+        with timers.measure("geometry buffer"):
+            resources.rasterise(self._real, virtual, view, moved, self._plan.scene.real.surfaces)
+        relight_input = RelightInput(
+            view,
+            resources.picture,
+            resources.real_surface,
+            resources.virtual_raster,
+            resources.matte.texture,
+            self._real.state,
+            virtual,
+            self._lights,
+            self._lights_version,
+            self._real.noise_sigma,
+            self._real.typical_depth,
+            resources.surface_uniforms,
+            timers,
+        )
+        layers = self._method_for(view).relight(relight_input)
+        additive = self._plan.method.resolved_composition == "additive"
+        return RelitFrame(relight_input, layers, additive, {"sample_distance": self._sample_distance(view)})
+
+    def _sample_distance(self, view: CameraView) -> float:
+        """What a texel of the cones' grid spans at 1 m, m."""
+        return float(1.5 * self._plan.resolved.cone_scale / view.camera.matrix[0, 0])
+
+    def _resources_for(self, view: CameraView) -> PictureResources:
+        """Textures of the picture's size; made anew when the lens or size changes."""
+        key = (view.size, view.raster[1])
+        if self._resources is None or self._resources.key != key:
+            if self._resources is not None:
+                self._resources.release()
+            if self._method is not None:
+                self._method.release()
+                self._method = None
+            self._resources = PictureResources(self._gpu, view)
+        return self._resources
+
+    def _method_for(self, view: CameraView) -> DvctExact:
+        if self._method is None:
+            self._method = DvctExact(self._gpu, self._plan.method, self._plan.resolved, view.size)
+        return self._method
+
+    def describe_lights(self) -> list[dict[str, Any]]:
+        """Plain values of the lights, registration included."""
+        return self._lights.describe()
+
+    def release(self) -> None:
+        """Free all GL objects."""
+        for item in (self._objects, self._real, self._resources, self._method):
+            if item is not None:
+                item.release()

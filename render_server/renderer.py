@@ -1,0 +1,95 @@
+"""SceneRenderer: (frame, scene) -> composite. GPU only: no sockets, no files but the scene's assets, no clock."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from protocol.frames import DepthImage, ViewFrame
+from protocol.scene import SceneDocument
+from render_server.compose import Composer
+from render_server.gpu.context import GpuContext
+from render_server.relighting import Relighting
+from render_server.view import CameraView
+
+
+@dataclass(frozen=True, eq=False)
+class CompositeFrame:
+    """The finished picture of one frame.
+
+    `color` is camera-coded, `linear` the same in camera units (before the response). `lights` are plain values.
+    """
+
+    frame_id: int
+    timestamp_ns: int
+    color: UInt8[np.ndarray, "h w 3"]
+    linear: Float32[np.ndarray, "h w 3"] | None
+    status: str
+    pass_times_ms: dict[str, float] = field(default_factory=dict)
+    lights: list[dict[str, Any]] = field(default_factory=list)
+
+
+class SceneRenderer:
+    """Renders frames of one scene on one GPU context.
+
+    `notices` collects sentences that a user should read (registration, memory), each once.
+    """
+
+    def __init__(self, gpu: GpuContext, scene: SceneDocument) -> None:
+        self._gpu = gpu
+        self.notices: list[str] = []
+        self._relighting = Relighting(gpu, scene, self.notices)
+        self._composer = Composer(gpu)
+        self.scene = scene
+
+    def set_scene(self, scene: SceneDocument) -> None:
+        """Use another scene from the next frame on; on an error the old one stays.
+
+        Raises:
+            DeltalightError: the scene needs an asset that cannot be read, or more memory than its budget.
+        """
+        self._relighting.set_scene(scene)
+        self.scene = scene
+
+    def render(self, frame: ViewFrame) -> CompositeFrame:
+        """The composite of one frame; without pose or visible object it is the camera's picture, byte for byte."""
+        output = self.scene.output
+        if output.width is not None or output.height is not None:
+            frame = resized_frame(frame, output.width or frame.camera.width, output.height or frame.camera.height)
+        if frame.pose is None:
+            return CompositeFrame(frame.frame_id, frame.timestamp_ns, frame.color, None, "no_pose")
+        view = CameraView(frame.camera, frame.pose.world_from_camera)
+        relit = self._relighting.relight(frame, view)
+        if relit is None:
+            return CompositeFrame(frame.frame_id, frame.timestamp_ns, frame.color, None, "ok")
+        color, linear = self._composer.compose(relit, output)
+        times = dict(relit.timers.end_frame())
+        lights = self._relighting.describe_lights()
+        return CompositeFrame(frame.frame_id, frame.timestamp_ns, color, linear, "ok", times, lights)
+
+    def release(self) -> None:
+        """Free all GL objects."""
+        self._relighting.release()
+        self._composer.release()
+
+
+def resized_frame(frame: ViewFrame, width: int, height: int) -> ViewFrame:
+    """The frame at another picture size: colour averaged over areas, depth taken from the nearest pixel."""
+    if (width, height) == (frame.camera.width, frame.camera.height):
+        return frame
+    size = (width, height)
+    camera = frame.camera.resized(width, height)
+    depth = frame.depth
+    if depth is not None:
+        depth = DepthImage(
+            cv2.resize(depth.depth_m, size, interpolation=cv2.INTER_NEAREST),
+            cv2.resize(depth.valid.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST).astype(bool),
+            camera,
+            depth.noise_sigma_m,
+        )
+    color = cv2.resize(frame.color, size, interpolation=cv2.INTER_AREA)
+    return replace(frame, color=color, camera=camera, depth=depth)

@@ -1,0 +1,178 @@
+"""Triangle mesh of the real scene as one depth image shows it."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int32
+
+from protocol.camera_model import CameraModel
+from protocol.errors import DeltalightError
+from protocol.frames import DepthImage
+from render_server.scene.depth_surface import DepthSurface, depth_surface, jump_threshold
+from render_server.scene.materials import Material
+from render_server.scene.mesh import TriangleMesh
+
+REAL_MATERIAL = Material(roughness=1.0, specular=0.0, double_sided=True, name="real")
+
+
+@dataclass(frozen=True, eq=False)
+class _Nodes:
+    """The mesh's grid: pixel coordinates (u, v), rays, inverse depth (0 = hole), normals, optical frame."""
+
+    pixels: Float32[np.ndarray, "gh gw 2"]
+    rays: Float32[np.ndarray, "gh gw 2"]
+    inverse_depth: Float32[np.ndarray, "gh gw"]
+    normals: Float32[np.ndarray, "gh gw 3"]
+
+
+def depth_mesh(
+    depth: DepthImage,
+    world_from_camera: Float64[np.ndarray, "4 4"],
+    triangle_budget: int = 40_000,
+    surface: DepthSurface | None = None,
+) -> TriangleMesh:
+    """Mesh a clean depth image in world coordinates with at most `triangle_budget` triangles.
+
+    A node stands for each cell of stride x stride pixels, at the cell's centre, with the cell's median depth
+    (moved to the centre along the fitted surface). No triangle crosses a depth discontinuity; cells without
+    depth or normal are holes. `uv` is the pixel coordinate (pixel centres at integers) of the vertex in the
+    picture that `depth.camera` takes. `surface` is `depth_surface(depth)` where it is already known.
+    Without any valid depth the mesh is empty.
+
+    Raises:
+        DeltalightError: the budget is below 2, or depth and camera differ in size.
+    """
+    if depth.depth_m.shape != (depth.camera.height, depth.camera.width):
+        raise DeltalightError("the depth image and its camera differ in size; correct the calibration.")
+    if triangle_budget < 2:
+        raise DeltalightError(f"a budget of {triangle_budget} triangles holds no mesh; use 1000 or more.")
+    known = depth_surface(depth) if surface is None else surface
+    stride = stride_for_budget(depth.camera.width, depth.camera.height, triangle_budget)
+    nodes = _nodes(known, depth.camera, stride)
+    triangles = _grid_triangles(nodes.inverse_depth, jump_threshold(depth, nodes.inverse_depth, stride))
+    return _world_mesh(nodes, triangles, world_from_camera)
+
+
+def stride_for_budget(width: int, height: int, triangle_budget: int) -> int:
+    """Return the least cell edge in pixels whose grid has at most `triangle_budget` triangles."""
+    stride = 1
+    while 2 * (-(-width // stride) - 1) * (-(-height // stride) - 1) > triangle_budget:
+        stride += 1
+    return stride
+
+
+def _nodes(surface: DepthSurface, camera: CameraModel, stride: int) -> _Nodes:
+    pixels, rays = _node_rays(camera, stride)
+    known = surface.normals.any(axis=2)
+    inverse = np.where(known, surface.inverse_depth, 0)
+    flat = _median_pixels(inverse, stride)
+    chosen = inverse.ravel()[flat]
+    gradient = surface.gradient.reshape(2, -1)[:, flat]
+    moved = rays - camera.rays().reshape(-1, 2)[flat]
+    shift = gradient[0] * moved[..., 0] + gradient[1] * moved[..., 1]
+    # A wild slope must not throw the node off the depths of its cell.
+    at_centre = chosen + np.clip(shift, -0.1 * chosen, 0.1 * chosen)
+    return _Nodes(pixels, rays, np.where(chosen > 0, at_centre, 0), surface.normals.reshape(-1, 3)[flat])
+
+
+@lru_cache(maxsize=4)
+def _node_rays(
+    camera: CameraModel, stride: int
+) -> tuple[Float32[np.ndarray, "gh gw 2"], Float32[np.ndarray, "gh gw 2"]]:
+    """Return pixel coordinates and rays of the cells' centres (those of cells cut by the border as well)."""
+    columns = _cell_centres(camera.width, stride)
+    rows = _cell_centres(camera.height, stride)
+    pixels = np.stack(np.meshgrid(columns, rows), axis=-1)
+    rays = camera.unproject(pixels.reshape(-1, 2)).reshape(pixels.shape)
+    return pixels.astype(np.float32), rays.astype(np.float32)
+
+
+def _cell_centres(length: int, stride: int) -> Float64[np.ndarray, " n"]:
+    starts = np.arange(0, length, stride)
+    return np.asarray((starts + np.minimum(starts + stride, length) - 1) / 2)
+
+
+def _median_pixels(inverse: Float32[np.ndarray, "h w"], stride: int) -> np.ndarray:
+    """Return the flat index of the pixel with the median inverse depth among the valid ones of each cell.
+
+    Cells without a valid pixel give an invalid one. Positive floats sort as their bits do, so that one sort
+    of 64-bit keys (value, place in the cell) gives value and place.
+    """
+    height, width = inverse.shape
+    rows, columns = -(-height // stride), -(-width // stride)
+    if stride == 1:
+        return np.arange(inverse.size).reshape(inverse.shape)
+    padded = cv2.copyMakeBorder(
+        inverse, 0, rows * stride - height, 0, columns * stride - width, cv2.BORDER_CONSTANT
+    )
+    cells = padded.reshape(rows, stride, columns, stride).swapaxes(1, 2).reshape(rows, columns, -1)
+    keys = cells.view(np.uint32).astype(np.uint64) << np.uint64(32)
+    keys |= np.arange(stride * stride, dtype=np.uint64)
+    keys.sort(axis=-1)
+    invalid = (cells == 0).sum(axis=-1)
+    middle = np.minimum((invalid + stride * stride) // 2, stride * stride - 1)
+    place = np.take_along_axis(keys, middle[..., None], axis=-1)[..., 0] & np.uint64(0xFFFFFFFF)
+    row = np.arange(rows)[:, None] * stride + place.astype(np.int64) // stride
+    column = np.arange(columns) * stride + place.astype(np.int64) % stride
+    return np.minimum(row, height - 1) * width + np.minimum(column, width - 1)
+
+
+def _grid_triangles(
+    inverse: Float32[np.ndarray, "gh gw"], threshold: Float32[np.ndarray, "gh gw"]
+) -> Int32[np.ndarray, "m 3"]:
+    """Join neighbouring nodes on one surface; quads are cut along the diagonal with the lesser step.
+
+    Seen from the camera, triangles are counter-clockwise.
+    """
+    valid = inverse > 0
+    index = np.arange(inverse.size, dtype=np.int32).reshape(inverse.shape)
+    quads = [np.s_[:-1, :-1], np.s_[:-1, 1:], np.s_[1:, :-1], np.s_[1:, 1:]]
+    corners = [inverse[quad] for quad in quads]
+    limit = threshold[:-1, :-1]
+    holes = [~valid[quad] for quad in quads]
+    top, bottom = _joined(0, 1, corners, limit), _joined(2, 3, corners, limit)
+    left, right = _joined(0, 2, corners, limit), _joined(1, 3, corners, limit)
+    falling = np.abs(corners[0] - corners[3]) <= np.abs(corners[1] - corners[2])
+    # A quad with one hole still holds a triangle, if it is cut between the hole's neighbours.
+    falling = (falling | holes[1] | holes[2]) & ~(holes[0] | holes[3])
+    diagonal = np.where(falling, _joined(0, 3, corners, limit), _joined(1, 2, corners, limit))
+    usable = [~hole for hole in holes]
+    kinds = [
+        (falling & left & bottom, (0, 2, 3)),
+        (falling & right & top, (0, 3, 1)),
+        (~falling & left & top, (0, 2, 1)),
+        (~falling & right & bottom, (1, 2, 3)),
+    ]
+    parts = []
+    for fits, names in kinds:
+        chosen = fits & diagonal & usable[names[0]] & usable[names[1]] & usable[names[2]]
+        parts.append(np.stack([index[quads[name]][chosen] for name in names], axis=1))
+    return np.concatenate(parts)
+
+
+def _joined(
+    one: int, other: int, corners: list[Float32[np.ndarray, "a b"]], limit: Float32[np.ndarray, "a b"]
+) -> Bool[np.ndarray, "a b"]:
+    return np.asarray(np.abs(corners[one] - corners[other]) <= limit)
+
+
+def _world_mesh(
+    nodes: _Nodes, triangles: Int32[np.ndarray, "m 3"], world_from_camera: Float64[np.ndarray, "4 4"]
+) -> TriangleMesh:
+    """Keep the nodes that triangles use and bring them to the world."""
+    used = np.zeros(nodes.inverse_depth.size, bool)
+    used[triangles.ravel()] = True
+    numbers = np.cumsum(used, dtype=np.int32) - 1
+    depth = 1 / nodes.inverse_depth.ravel()[used].astype(np.float64)
+    rays = nodes.rays.reshape(-1, 2)[used]
+    points = np.column_stack([rays[:, 0] * depth, rays[:, 1] * depth, depth])
+    rotation = world_from_camera[:3, :3]
+    return TriangleMesh(
+        (points @ rotation.T + world_from_camera[:3, 3]).astype(np.float32),
+        (nodes.normals.reshape(-1, 3)[used] @ rotation.T).astype(np.float32),
+        numbers[triangles],
+        nodes.pixels.reshape(-1, 2)[used],
+        REAL_MATERIAL,
+    )

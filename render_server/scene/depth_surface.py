@@ -1,0 +1,208 @@
+"""Surface normals and discontinuities of a depth image, from inverse depth.
+
+In inverse depth w = 1/z a plane is an affine function of the ray (x/z, y/z), and the noise of stereo and
+structured light, sigma z^2, is the same everywhere (sigma). Both make w the quantity to fit and to compare.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32
+
+from protocol.camera_model import CameraModel
+from protocol.frames import DepthImage
+
+ASSUMED_NOISE_SIGMA_M = 0.002
+MAX_SLOPE_DEG = 80.0
+NOISE_SIGMAS = 3.0
+WANTED_TILT_RAD = 0.05
+MAX_RADIUS = 5
+SHIFTS = ((0, -1), (0, 1), (-1, 0), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1))
+# Least spread of a window's valid pixels, relative to a full window (determinant of their covariance).
+LEAST_SUPPORT = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class DepthSurface:
+    """What is known of the surface behind every pixel.
+
+    `inverse_depth` is as measured (0 where invalid). `gradient` is its change by ray coordinate (x/z, y/z),
+    fitted to the surroundings. `normals` are unit vectors in the optical frame towards the camera, zero
+    where they are unknown.
+    """
+
+    inverse_depth: Float32[np.ndarray, "h w"]
+    gradient: Float32[np.ndarray, "2 h w"]
+    normals: Float32[np.ndarray, "h w 3"]
+
+
+def noise_sigma(depth: DepthImage) -> float:
+    """Return the depth noise at 1 m, metres (2 mm, between structured light and stereo, where unknown)."""
+    return ASSUMED_NOISE_SIGMA_M if depth.noise_sigma_m is None else depth.noise_sigma_m
+
+
+def depth_points_normals(depth: DepthImage) -> Float32[np.ndarray, "h w 3"]:
+    """Return unit normals in the optical frame, towards the camera; zero where depth gives none."""
+    return depth_surface(depth).normals
+
+
+def depth_surface(depth: DepthImage) -> DepthSurface:
+    """Fit a plane to the surroundings of every valid pixel by least squares, without crossing edges.
+
+    The window grows with the noise until normals are good to about 3 degrees at the mean distance. Where it
+    would hold a discontinuity, the window is moved aside to one that holds the pixel but no discontinuity
+    (if there is one).
+    """
+    valid = depth.valid & (depth.depth_m > 0)
+    inverse = np.zeros_like(depth.depth_m, np.float32)
+    np.divide(1, depth.depth_m, out=inverse, where=valid)
+    mask = valid.astype(np.float32)
+    radius = _window_radius(depth, inverse, mask)
+    by_pixel = _window_gradient(inverse, mask, radius)
+    crossed = _crosses_edge(inverse, jump_threshold(depth, inverse), valid, radius)
+    _move_windows(by_pixel, crossed, radius)
+    gradient = _by_ray(by_pixel, depth.camera)
+    return DepthSurface(inverse, gradient, _normals(inverse, gradient, depth.camera))
+
+
+def jump_threshold(
+    depth: DepthImage, inverse_depth: Float32[np.ndarray, "h w"], step_px: float = 1.0
+) -> Float32[np.ndarray, "h w"]:
+    """Return the change of w over `step_px` pixels beyond which two points are not on one surface.
+
+    Three sigma of a difference, and the change on a surface that is 80 degrees from facing the camera:
+    |dw| = w tan(slope) / f.
+    """
+    focal = float(np.sqrt(depth.camera.matrix[0, 0] * depth.camera.matrix[1, 1]))
+    slope = np.float32(step_px * np.tan(np.radians(MAX_SLOPE_DEG)) / focal)
+    return inverse_depth * slope + np.float32(NOISE_SIGMAS * np.sqrt(2) * noise_sigma(depth))
+
+
+def _window_radius(
+    depth: DepthImage, inverse: Float32[np.ndarray, "h w"], mask: Float32[np.ndarray, "h w"]
+) -> int:
+    """Return the least radius whose slope error, sigma f z / sqrt(sum of squared offsets), is bearable."""
+    mean = float(inverse.sum(dtype=np.float64) / max(float(mask.sum(dtype=np.float64)), 1.0))
+    error = noise_sigma(depth) * float(depth.camera.matrix[0, 0]) / max(mean, 1e-6)
+    for radius in range(1, MAX_RADIUS):
+        if error <= WANTED_TILT_RAD * np.sqrt((2 * radius + 1) ** 2 * radius * (radius + 1) / 3):
+            return radius
+    return MAX_RADIUS
+
+
+def _window_gradient(
+    inverse: Float32[np.ndarray, "h w"], mask: Float32[np.ndarray, "h w"], radius: int
+) -> Float32[np.ndarray, "2 h w"]:
+    """Return the slope of w by pixel: least squares over a square window, valid pixels only.
+
+    Offsets count from the pixel itself, so that no large numbers cancel. Where pixels are too few or in a
+    line, the slope is NaN.
+    """
+    one = np.ones(2 * radius + 1)
+    ramp = np.arange(-radius, radius + 1.0)
+    per_pixel = 1 / np.maximum(_filtered(mask, one, one), 1)
+    w = _filtered(inverse, one, one)
+    mu, mv = _filtered(mask, ramp, one), _filtered(mask, one, ramp)
+    wu, wv = _filtered(inverse, ramp, one), _filtered(inverse, one, ramp)
+    uu, vv = _filtered(mask, ramp**2, one), _filtered(mask, one, ramp**2)
+    uv = _filtered(mask, ramp, ramp)
+    mean_u, mean_v = mu * per_pixel, mv * per_pixel
+    uu -= mean_u * mu
+    vv -= mean_v * mv
+    uv -= mean_u * mv
+    wu -= w * mean_u
+    wv -= w * mean_v
+    determinant = uu * vv - uv * uv
+    full = (2 * radius + 1) ** 2 * radius * (radius + 1) / 3
+    known = (determinant > LEAST_SUPPORT * full**2) & (mask > 0)
+    inverted = np.divide(1, determinant, out=np.full_like(determinant, np.nan), where=known)
+    gradient = np.empty((2, *inverse.shape), np.float32)
+    np.multiply(wu * vv - wv * uv, inverted, out=gradient[0])
+    np.multiply(wv * uu - wu * uv, inverted, out=gradient[1])
+    return gradient
+
+
+def _filtered(
+    values: Float32[np.ndarray, "h w"], across: np.ndarray, down: np.ndarray
+) -> Float32[np.ndarray, "h w"]:
+    return np.asarray(cv2.sepFilter2D(values, cv2.CV_32F, across, down, borderType=cv2.BORDER_CONSTANT))
+
+
+def _crosses_edge(
+    inverse: Float32[np.ndarray, "h w"],
+    threshold: Float32[np.ndarray, "h w"],
+    valid: Bool[np.ndarray, "h w"],
+    radius: int,
+) -> Bool[np.ndarray, "h w"]:
+    """Whether the window around a pixel holds two valid neighbours on different surfaces."""
+    crossed = np.zeros(valid.shape, np.uint8)
+    for axis in (0, 1):
+        near = (slice(-1), slice(None))[:: 1 - 2 * axis]
+        far = (slice(1, None), slice(None))[:: 1 - 2 * axis]
+        jump = np.zeros(valid.shape, np.uint8)
+        differ = np.abs(inverse[far] - inverse[near]) > threshold[near]
+        jump[near] = differ & valid[near] & valid[far]
+        # The jump between i and i + 1 lies in the windows of the pixels i + 1 - radius to i + radius.
+        size = [2 * radius + 1, 2 * radius + 1]
+        size[axis] = 2 * radius
+        crossed |= cv2.dilate(jump, np.ones(size, np.uint8), anchor=(radius, radius))
+    return valid & (crossed > 0)
+
+
+def _move_windows(
+    gradient: Float32[np.ndarray, "2 h w"], crossed: Bool[np.ndarray, "h w"], radius: int
+) -> None:
+    """Give pixels whose window crosses an edge the slope of a shifted window that does not, in place."""
+    width = crossed.shape[1]
+    clean = (~crossed & np.isfinite(gradient[0])).ravel()
+    slopes = gradient.reshape(2, -1)
+    pending = np.flatnonzero(crossed)
+    targets, sources = [], []
+    for down, right in SHIFTS:
+        column = pending % width + radius * right
+        source = np.clip(pending + radius * (down * width + right), 0, crossed.size - 1)
+        hit = clean[source] & (column >= 0) & (column < width)
+        targets.append(pending[hit])
+        sources.append(source[hit])
+        pending = pending[~hit]
+    slopes[:, np.concatenate(targets)] = slopes[:, np.concatenate(sources)]
+
+
+def _by_ray(by_pixel: Float32[np.ndarray, "2 h w"], camera: CameraModel) -> Float32[np.ndarray, "2 h w"]:
+    """Turn a change by pixel into a change by ray coordinate."""
+    if not camera.has_distortion:
+        return by_pixel * camera.matrix[[0, 1], [0, 1]].astype(np.float32)[:, None, None]
+    inverse = _pixel_from_ray(camera)
+    return np.stack([(by_pixel * inverse[:, ray]).sum(axis=0) for ray in (0, 1)])
+
+
+@lru_cache(maxsize=4)
+def _pixel_from_ray(camera: CameraModel) -> Float32[np.ndarray, "2 2 h w"]:
+    """Return the change of pixel coordinates (first axis) by ray coordinates (second) at every pixel."""
+    rays = camera.rays().astype(np.float64)
+    jacobian = np.stack([np.gradient(rays, axis=1), np.gradient(rays, axis=0)], axis=-1)
+    return np.ascontiguousarray(np.linalg.inv(jacobian).transpose(2, 3, 0, 1), np.float32)
+
+
+def _normals(
+    inverse: Float32[np.ndarray, "h w"],
+    gradient: Float32[np.ndarray, "2 h w"],
+    camera: CameraModel,
+) -> Float32[np.ndarray, "h w 3"]:
+    """A plane n.P = d has w = (n/d).(x/z, y/z, 1), so n is along (gradient, w - gradient.ray)."""
+    x, y = gradient
+    ray_x, ray_y = _ray_planes(camera)
+    z = inverse - x * ray_x - y * ray_y
+    scale = x * x + y * y + z * z
+    scale = -1 / np.sqrt(scale, out=scale)
+    unknown = ~(scale > -np.inf)
+    scale[unknown] = 0
+    x, y, z = (np.where(unknown, 0, part) for part in (x, y, z))
+    return np.asarray(cv2.merge([x * scale, y * scale, z * scale]))
+
+
+@lru_cache(maxsize=4)
+def _ray_planes(camera: CameraModel) -> Float32[np.ndarray, "2 h w"]:
+    return np.ascontiguousarray(camera.rays().transpose(2, 0, 1))

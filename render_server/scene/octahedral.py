@@ -1,0 +1,212 @@
+"""Octahedral maps of the whole sphere: mapping, integrals, prefiltering by cones, irradiance.
+
+Texel (row j, column i) of an n x n map has its centre at uv = ((i + 0.5)/n, (j + 0.5)/n). With
+p = 2 uv - 1 the direction is (px, py, 1 - |px| - |py|) where |px| + |py| <= 1 (upper half, +z in the centre);
+beyond, the corners are folded down (Engelhardt & Dachsbacher 2008). Axes are world axes.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float32, Float64
+
+MIN_LEVEL_SIZE = 16
+SUMMED_SIZE = 64
+CONE_SAMPLES = 64
+SampleMap = Callable[[Float32[np.ndarray, "n m 3"]], Float32[np.ndarray, "n m c"]]
+
+
+def octahedral_direction(uv: Float[np.ndarray, "*shape 2"]) -> Float64[np.ndarray, "*shape 3"]:
+    """Return the unit direction of map coordinates in 0..1."""
+    folded = _folded_direction(uv)
+    return np.asarray(folded / np.linalg.norm(folded, axis=-1, keepdims=True))
+
+
+def _folded_direction(uv: Float[np.ndarray, "*shape 2"]) -> Float64[np.ndarray, "*shape 3"]:
+    """Return the point of the octahedron |x| + |y| + |z| = 1."""
+    p = 2 * np.asarray(uv, np.float64) - 1
+    z = 1 - np.abs(p).sum(axis=-1)
+    below = np.maximum(-z, 0)[..., None]
+    return np.concatenate([p - np.copysign(below, p), z[..., None]], axis=-1)
+
+
+def octahedral_uv(direction: Float[np.ndarray, "*shape 3"]) -> Float[np.ndarray, "*shape 2"]:
+    """Return the map coordinates in 0..1 of directions of any length."""
+    d = np.asarray(direction)
+    d = d / np.abs(d).sum(axis=-1, keepdims=True)
+    p = d[..., :2]
+    folded = np.copysign(1 - np.abs(p[..., ::-1]), p)
+    return np.asarray(np.where(d[..., 2:] < 0, folded, p) / 2 + 0.5)
+
+
+def _grid_uv(size: int) -> Float64[np.ndarray, "n n 2"]:
+    centres = (np.arange(size) + 0.5) / size
+    return np.stack(np.meshgrid(centres, centres), axis=-1)
+
+
+@cache
+def texel_solid_angles(size: int) -> Float32[np.ndarray, "n n"]:
+    """Return the solid angle of every texel, sr; they add up to 4 pi.
+
+    A patch dA of the octahedron seen from the centre at distance r has dA cos / r^2, proportional to r^-3.
+    """
+    fine = max(1, 256 // size)
+    weight = np.linalg.norm(_folded_direction(_grid_uv(size * fine)), axis=-1) ** -3
+    weight = weight.reshape(size, fine, size, fine).mean(axis=(1, 3))
+    weight = (weight * (4 * np.pi / weight.sum())).astype(np.float32)
+    weight.flags.writeable = False
+    return np.asarray(weight)
+
+
+def resample_to_octahedral(sample: SampleMap, size: int, supersampling: int = 2) -> np.ndarray:
+    """Average a radiance function over the texels of an octahedral map, weighted by solid angle.
+
+    `sample` maps directions (n, m, 3) to radiance (n, m, c); every texel takes supersampling^2 of them.
+    """
+    uv = _grid_uv(size * supersampling)
+    folded = _folded_direction(uv)
+    weight = (np.linalg.norm(folded, axis=-1, keepdims=True) ** -3).astype(np.float32)
+    weighted = sample(folded.astype(np.float32)) * weight
+    blocks = (size, supersampling, size, supersampling, -1)
+    total = weighted.reshape(blocks).sum(axis=(1, 3)) / weight.reshape(blocks).sum(axis=(1, 3))
+    return np.asarray(total, np.float32)
+
+
+def sample_octahedral(
+    radiance: Float32[np.ndarray, "n n 3"], directions: Float[np.ndarray, "a b 3"]
+) -> Float32[np.ndarray, "a b 3"]:
+    """Read a map bilinearly; texels meet their true neighbours over the map's border."""
+    size = len(radiance)
+    place = (octahedral_uv(directions) * size + 0.5).astype(np.float32)
+    return np.asarray(cv2.remap(_bordered(radiance), place, None, cv2.INTER_LINEAR))
+
+
+def _bordered(radiance: Float32[np.ndarray, "n n 3"]) -> Float32[np.ndarray, "m m 3"]:
+    """Add a border of one texel: over an edge of the map lies the same edge, mirrored about its middle."""
+    rows = np.concatenate([radiance[:1, ::-1], radiance, radiance[-1:, ::-1]])
+    left, right = rows[::-1, :1].copy(), rows[::-1, -1:].copy()
+    return np.ascontiguousarray(np.concatenate([left, rows, right], axis=1))
+
+
+def solid_angle_mean(radiance: Float32[np.ndarray, "n n 3"]) -> Float64[np.ndarray, "3"]:
+    """Return the mean radiance over the sphere."""
+    weights = texel_solid_angles(len(radiance)).astype(np.float64)
+    return np.asarray(np.tensordot(weights, radiance, axes=2) / (4 * np.pi))
+
+
+@dataclass(frozen=True, eq=False)
+class PrefilteredMap:
+    """An octahedral map averaged over cones; level l holds cones of `half_angles[l]` radians.
+
+    Level 0 is the map itself. From level 1 on the half angle is 2^l texel widths of level 0, the last is
+    pi/2; its value is irradiance / pi. A cone of half angle a reads level log2(a / half_angles[0]).
+    """
+
+    levels: tuple[Float32[np.ndarray, "n n 3"], ...]
+    half_angles: tuple[float, ...]
+
+
+def prefilter(radiance: Float32[np.ndarray, "n n 3"]) -> PrefilteredMap:
+    """Average a map over cones, weighted by the cosine to the axis (so the widest gives irradiance / pi)."""
+    size = len(radiance)
+    halved = [radiance]
+    while len(halved[-1]) > MIN_LEVEL_SIZE:
+        halved.append(_halved(halved[-1]))
+    summed = next((source for source in halved if len(source) <= SUMMED_SIZE), radiance)
+    levels, angles = [radiance], [float(np.sqrt(4 * np.pi)) / size]
+    while angles[-1] < np.pi / 2:
+        angles.append(min(2 * angles[-1], np.pi / 2))
+        level_size = size >> len(levels)
+        if level_size > MIN_LEVEL_SIZE:
+            levels.append(_cone_average(halved, angles[-1], level_size))
+        else:
+            levels.append(_cone_sum(summed, angles[-1], MIN_LEVEL_SIZE))
+    return PrefilteredMap(tuple(levels), tuple(angles))
+
+
+def _halved(radiance: Float32[np.ndarray, "n n 3"]) -> Float32[np.ndarray, "m m 3"]:
+    weights = texel_solid_angles(len(radiance))[..., None]
+    half = len(radiance) // 2
+    blocks = (half, 2, half, 2, -1)
+    total = (radiance * weights).reshape(blocks).sum(axis=(1, 3))
+    return np.asarray(total / weights.reshape(blocks).sum(axis=(1, 3)), np.float32)
+
+
+def _cone_average(
+    halved: list[Float32[np.ndarray, "n n 3"]], half_angle: float, size: int
+) -> Float32[np.ndarray, "m m 3"]:
+    """Average over a cone about every texel's direction with samples in a spiral over its projected disc.
+
+    Each sample reads the halved map whose texels are about as wide as the samples are apart.
+    """
+    spacing = 2 * half_angle / np.sqrt(CONE_SAMPLES)
+    wanted = np.sqrt(4 * np.pi) / spacing
+    source = min(halved, key=lambda level: abs(np.log2(len(level) / wanted)))
+    frames = _tangent_frames(octahedral_direction(_grid_uv(size)).reshape(-1, 3)).astype(np.float32)
+    directions = _spiral(np.sin(half_angle)).astype(np.float32) @ np.swapaxes(frames, 1, 2)
+    return np.asarray(sample_octahedral(source, directions).mean(axis=1).reshape(size, size, 3))
+
+
+def _cone_sum(
+    source: Float32[np.ndarray, "n n 3"], half_angle: float, size: int
+) -> Float32[np.ndarray, "m m 3"]:
+    """Average over wide cones by the plain sum over all texels of a source map."""
+    axis = octahedral_direction(_grid_uv(size)).reshape(-1, 3)
+    cosine = (axis @ octahedral_direction(_grid_uv(len(source))).reshape(-1, 3).T).astype(np.float32)
+    weight = np.where(cosine > np.cos(half_angle), cosine, 0) * texel_solid_angles(len(source)).ravel()
+    total = weight @ source.reshape(-1, 3) / weight.sum(axis=1, keepdims=True)
+    return np.asarray(total.reshape(size, size, 3), np.float32)
+
+
+def _spiral(sin_half_angle: float) -> Float64[np.ndarray, "n 3"]:
+    """Return directions about +z that are uniform over the cone's projected disc (cosine-weighted)."""
+    index = np.arange(CONE_SAMPLES) + 0.5
+    radius = sin_half_angle * np.sqrt(index / CONE_SAMPLES)
+    angle = index * (np.pi * (3 - np.sqrt(5)))
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - radius**2)], axis=1)
+
+
+def _tangent_frames(axis: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3 3"]:
+    """Return rotations whose third column is the axis (Duff et al. 2017)."""
+    x, y, z = axis.T
+    sign = np.copysign(1.0, z)
+    a = -1 / (sign + z)
+    b = x * y * a
+    columns = [1 + sign * x * x * a, sign * b, -sign * x], [b, sign + y * y * a, -y], [x, y, z]
+    return np.stack([np.stack(column, axis=-1) for column in columns], axis=-1)
+
+
+def irradiance(
+    radiance: Float32[np.ndarray, "n n 3"], normals: Float[np.ndarray, "k 3"]
+) -> Float64[np.ndarray, "k 3"]:
+    """Integrate a map over the hemisphere of each unit normal (the plain sum; for reference)."""
+    weighted = radiance.reshape(-1, 3) * texel_solid_angles(len(radiance)).reshape(-1, 1)
+    directions = octahedral_direction(_grid_uv(len(radiance))).reshape(-1, 3)
+    return np.asarray(np.maximum(normals @ directions.T, 0) @ weighted.astype(np.float64))
+
+
+def irradiance_sh9(radiance: Float32[np.ndarray, "n n 3"]) -> Float64[np.ndarray, "9 3"]:
+    """Return the nine spherical-harmonic coefficients of irradiance (Ramamoorthi & Hanrahan 2001).
+
+    Irradiance of a unit normal = `sh9_basis(normal) @ coefficients`, exact to about 1 % for smooth maps.
+    """
+    weighted = radiance.reshape(-1, 3) * texel_solid_angles(len(radiance)).reshape(-1, 1)
+    basis = sh9_basis(octahedral_direction(_grid_uv(len(radiance))).reshape(-1, 3))
+    lobe = np.pi * np.array([1, *[2 / 3] * 3, *[1 / 4] * 5])
+    return np.asarray(lobe[:, None] * (basis.T @ weighted))
+
+
+def sh9_basis(directions: Float[np.ndarray, "k 3"]) -> Float64[np.ndarray, "k 9"]:
+    """Return the real spherical harmonics of bands 0..2 of unit directions."""
+    x, y, z = np.asarray(directions, np.float64).T
+    first, second = np.sqrt(3 / (4 * np.pi)), np.sqrt(15 / (4 * np.pi))
+    columns = [
+        np.full_like(x, np.sqrt(1 / (4 * np.pi))),
+        *(first * y, first * z, first * x),
+        *(second * x * y, second * y * z, second / np.sqrt(12) * (3 * z * z - 1)),
+        *(second * x * z, second / 2 * (x * x - y * y)),
+    ]
+    return np.stack(columns, axis=1)

@@ -1,0 +1,196 @@
+"""Pose of the camera from the marker board: ArUco and AprilTag grids, ChArUco boards, single markers."""
+
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, Float64, UInt8
+
+from protocol.board import BoardSpec
+from protocol.camera_model import CameraModel
+from protocol.errors import DeltalightError
+from protocol.frames import BoardPose, decode_lut
+from protocol.poses import rigid_matrix
+
+# Half the edge of the corner refinement window, as a share of the marker's shortest side in the picture.
+REFINE_SHARE = 0.08
+REFINE_HALF_PX = (2, 6)
+REFINE_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 0.005)
+# Markers narrower than this cannot be read.
+LEAST_SIDE_PX = 10
+# A detection whose mean reprojection error is larger is a mistake: another board, or wrong calibration.
+MAX_ERROR_PX = 8.0
+# Solutions of the planar ambiguity whose errors differ by less than this factor are told apart by history.
+AMBIGUOUS_RATIO = 1.5
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
+
+
+class _Matches(NamedTuple):
+    """Board corners that were found: in the world, in the picture, and as a pinhole would see them."""
+
+    world: Float64[np.ndarray, "n 3"]
+    pixels: Float64[np.ndarray, "n 2"]
+    rays: Float64[np.ndarray, "n 2"]
+
+
+class _Solution(NamedTuple):
+    """One pose with its mean reprojection error in pixels."""
+
+    camera_from_world: Float64[np.ndarray, "4 4"]
+    error_px: float
+
+
+class BoardDetector:
+    """Finds one board in the pictures of one camera, and remembers the last pose to resolve ambiguity.
+
+    Corners are refined on linear light: gamma pulls the black edges of a blurred marker inward. The pose is
+    the board frame's of FORMATS 3.
+    """
+
+    def __init__(
+        self,
+        board: BoardSpec,
+        camera: CameraModel,
+        response: Float32[np.ndarray, "256 3"] | None = None,
+    ) -> None:
+        self._board, self._camera = board, camera
+        # One table a channel, so that linear luminance is a sum of three look-ups.
+        self._luminance = (decode_lut(response) * LUMINANCE).astype(np.float32)
+        self._corners = board.corner_points()
+        self._chessboard = board.chessboard_corners()
+        self._previous: Float64[np.ndarray, "4 4"] | None = None
+
+    def reset(self) -> None:
+        """Forget the last pose (the camera was moved unseen, or another sequence begins)."""
+        self._previous = None
+
+    def detect(self, color: UInt8[np.ndarray, "h w 3"]) -> BoardPose | None:
+        """Return the pose in a picture (RGB), or None where the board is not seen.
+
+        `reprojection_error_px` is the mean distance between the corners found and the board's corners.
+
+        Raises:
+            DeltalightError: the picture is not of the camera's size.
+        """
+        if color.shape[:2] != (self._camera.height, self._camera.width):
+            raise DeltalightError(
+                f"the picture has {color.shape[1]}x{color.shape[0]} pixels but its camera "
+                f"{self._camera.width}x{self._camera.height}; correct calibration/rgb.yaml."
+            )
+        matches = self._find(color)
+        solutions = [] if matches is None else self._solve(matches)
+        if not solutions:
+            return None
+        best, other = self._choose(solutions)
+        self._previous = np.linalg.inv(best.camera_from_world)
+        alternative = None if other is None else np.linalg.inv(other.camera_from_world)
+        return BoardPose(self._previous, best.error_px, alternative)
+
+    @cached_property
+    def _detector(self) -> Any:  # noqa: ANN401 - cv2 has no types
+        parameters = cv2.aruco.DetectorParameters()
+        parameters.markerBorderBits = self._board.border_bits
+        parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
+        return cv2.aruco.ArucoDetector(self._board.opencv_dictionary(), parameters)
+
+    @cached_property
+    def _charuco(self) -> Any:  # noqa: ANN401 - cv2 has no types
+        board = self._board
+        square = board.marker_length_m + board.separation_m
+        size, ids = (board.columns, board.rows), np.array(board.marker_ids)
+        return cv2.aruco.CharucoDetector(
+            cv2.aruco.CharucoBoard(size, square, board.marker_length_m, board.opencv_dictionary(), ids)
+        )
+
+    def _find(self, color: UInt8[np.ndarray, "h w 3"]) -> _Matches | None:
+        gray = cv2.cvtColor(np.ascontiguousarray(color), cv2.COLOR_RGB2GRAY)
+        found, ids, _ = self._detector.detectMarkers(gray)
+        quads = [
+            (quad.reshape(4, 2), int(name))
+            for quad, name in zip(found, () if ids is None else ids.ravel(), strict=True)
+            if int(name) in self._corners and _shortest_side(quad.reshape(4, 2)) >= LEAST_SIDE_PX
+        ]
+        if not quads:
+            return None
+        if len(self._chessboard):
+            world, pixels, half = self._find_chessboard(gray, quads)
+            sizes = [(pixels, half)]
+        else:
+            world = np.concatenate([self._corners[name] for _, name in quads])
+            sizes = [(quad, REFINE_SHARE * _shortest_side(quad)) for quad, _ in quads]
+        if len(world) < 4:
+            return None
+        light = self._linear_luminance(color)
+        pixels = np.concatenate([_refined(light, corners, half) for corners, half in sizes])
+        return _Matches(world, pixels, self._camera.unproject(pixels))
+
+    def _find_chessboard(
+        self, gray: UInt8[np.ndarray, "h w"], quads: list[tuple[Float32[np.ndarray, "4 2"], int]]
+    ) -> tuple[Float64[np.ndarray, "n 3"], Float32[np.ndarray, "n 2"], float]:
+        """Inner corners of a ChArUco board, with half the window edge for their refinement."""
+        markers = [quad[None] for quad, _ in quads]
+        names = np.array([[name] for _, name in quads])
+        corners, ids, _, _ = self._charuco.detectBoard(gray, markerCorners=markers, markerIds=names)
+        if ids is None:
+            return np.zeros((0, 3)), np.zeros((0, 2), np.float32), 0.0
+        side = min(_shortest_side(quad) for quad, _ in quads)
+        # The window must not reach the markers, which begin half a separation away.
+        gap = side * self._board.separation_m / self._board.marker_length_m / 2
+        return self._chessboard[ids.ravel()], corners.reshape(-1, 2), gap * 0.8
+
+    def _linear_luminance(self, color: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w"]:
+        red, green, blue = (self._luminance[:, channel][color[..., channel]] for channel in range(3))
+        return np.asarray(red + green + blue)
+
+    def _solve(self, matches: _Matches) -> list[_Solution]:
+        """Both poses of the planar ambiguity, refined, that see the sheet from its printed side."""
+        centre = matches.world.mean(axis=0)
+        points = np.ascontiguousarray(matches.world - centre)
+        image = np.ascontiguousarray(matches.rays)
+        single = len(points) == 4 and self._board.type != "charuco"
+        method = cv2.SOLVEPNP_IPPE_SQUARE if single else cv2.SOLVEPNP_IPPE
+        try:
+            _, rotations, translations, _ = cv2.solvePnPGeneric(points, image, np.eye(3), None, flags=method)
+        except cv2.error:  # corners on one line
+            return []
+        solutions = []
+        for rotation, translation in zip(rotations, translations, strict=True):
+            turn, shift = cv2.solvePnPRefineLM(points, image, np.eye(3), None, rotation, translation)
+            matrix = rigid_matrix(cv2.Rodrigues(turn)[0], shift.ravel())
+            matrix = matrix @ rigid_matrix(np.eye(3), -centre)
+            error = self._error_px(matrix, matches)
+            if error <= MAX_ERROR_PX and np.linalg.inv(matrix)[2, 3] > 0:
+                solutions.append(_Solution(matrix, error))
+        return sorted(solutions, key=lambda solution: solution.error_px)
+
+    def _error_px(self, camera_from_world: Float64[np.ndarray, "4 4"], matches: _Matches) -> float:
+        points = matches.world @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
+        distances = np.linalg.norm(self._camera.project(points) - matches.pixels, axis=1)
+        return float(np.nan_to_num(distances, nan=np.inf).mean())
+
+    def _choose(self, solutions: list[_Solution]) -> tuple[_Solution, _Solution | None]:
+        """The solution with the smaller error; where that says little, the one nearer to the last pose."""
+        best, other = solutions[0], solutions[1] if len(solutions) > 1 else None
+        if other is None or self._previous is None or other.error_px > AMBIGUOUS_RATIO * best.error_px:
+            return best, other
+        turns = [_turn(self._previous, np.linalg.inv(each.camera_from_world)) for each in (best, other)]
+        return (best, other) if turns[0] <= turns[1] else (other, best)
+
+
+def _shortest_side(quad: Float32[np.ndarray, "4 2"]) -> float:
+    return float(np.linalg.norm(quad - np.roll(quad, 1, axis=0), axis=1).min())
+
+
+def _refined(
+    light: Float32[np.ndarray, "h w"], corners: Float32[np.ndarray, "n 2"], half_px: float
+) -> Float64[np.ndarray, "n 2"]:
+    half = int(np.clip(round(half_px), *REFINE_HALF_PX))
+    start = np.ascontiguousarray(corners, np.float32).reshape(-1, 1, 2).copy()
+    moved = cv2.cornerSubPix(light, start, (half, half), (-1, -1), REFINE_CRITERIA)
+    return np.asarray(moved, np.float64).reshape(-1, 2)
+
+
+def _turn(first: Float64[np.ndarray, "4 4"], second: Float64[np.ndarray, "4 4"]) -> float:
+    """Angle between two orientations in radians."""
+    return float(np.linalg.norm(cv2.Rodrigues(first[:3, :3].T @ second[:3, :3])[0]))

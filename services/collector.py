@@ -1,0 +1,164 @@
+"""Collects composites as a viewer receives them: files, a contact sheet, a video and figures."""
+
+import json
+import math
+import statistics
+import time
+import uuid
+from pathlib import Path
+from typing import IO, Any
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from protocol.codecs import decode_color
+from protocol.envelope import decode
+from protocol.errors import DeltalightError
+from protocol.messages import CompositeMessage, ControlRequest
+from protocol.transport import ReceivedMultipart, Receiver, RequestClient
+from services.files import replacing, write_bytes, write_png
+from services.live import age_ms
+
+CONTROL_TIMEOUT_S = 10.0
+SHEET_PICTURES = 20
+SHEET_COLUMNS = 5
+SHEET_WIDTH = 256
+VIDEO_CODEC = "mp4v"  # in every OpenCV wheel, because FFmpeg brings it
+FALLBACK_RATE = 10.0
+
+
+class CompositeCollector:
+    """Receives composites in the calling thread's time and, where `out` is given, writes each as it came."""
+
+    def __init__(self, composite_endpoint: str, control_endpoint: str, out: Path | None) -> None:
+        self.messages: list[CompositeMessage] = []
+        self.ages_ms: list[float] = []
+        self.arrivals_s: list[float] = []
+        self._out = out
+        self._receiver = Receiver([composite_endpoint], ["composite"])
+        self._client = RequestClient(control_endpoint)
+        self._index: IO[str] | None = (
+            None if out is None else (out / "frames.jsonl").open("w", encoding="utf-8")
+        )
+
+    @property
+    def count(self) -> int:
+        """Composites so far."""
+        return len(self.messages)
+
+    def take(self, timeout_s: float, limit: int) -> bool:
+        """Take what arrived within `timeout_s`, up to `limit` composites in all; whether there was one."""
+        newest = self._receiver.latest(timeout_s) or {}
+        for multipart in list(newest.values())[: limit - self.count]:
+            self._add(multipart)
+        return bool(newest)
+
+    def server_stats(self) -> dict[str, Any]:
+        """What the render server says about itself.
+
+        Raises:
+            DeltalightError: it does not answer.
+        """
+        request = ControlRequest(node="collector", id=uuid.uuid4().hex, op="stats")
+        reply = self._client.request(request, CONTROL_TIMEOUT_S)
+        stats = reply.payload.get("stats")
+        return stats if isinstance(stats, dict) else {}
+
+    def frames_per_s(self) -> float | None:
+        """Rate of arrival, None below two composites."""
+        if self.count < 2:
+            return None
+        return (self.count - 1) / (self.arrivals_s[-1] - self.arrivals_s[0])
+
+    def write_overview(self) -> None:
+        """Write contact_sheet.png and the video from the pictures in the folder."""
+        if self._out is None or not self.messages:
+            return
+        step = max(1, math.ceil(self.count / SHEET_PICTURES))
+        pictures = [self._picture(number) for number in range(0, self.count, step)]
+        write_png(self._out / "contact_sheet.png", contact_sheet(pictures))
+        self._write_video()
+
+    def close(self) -> None:
+        """Close sockets and files."""
+        self._receiver.close()
+        self._client.close()
+        if self._index is not None:
+            self._index.close()
+
+    def _add(self, multipart: ReceivedMultipart) -> None:
+        message, parts = decode(multipart)
+        if not isinstance(message, CompositeMessage):
+            return
+        number = self.count
+        self.messages.append(message)
+        self.ages_ms.append(age_ms(message))
+        self.arrivals_s.append(time.monotonic())
+        if self._out is not None and self._index is not None:
+            write_bytes(self._out / f"{number:06d}.jpg", bytes(parts[0]))
+            self._index.write(json.dumps(self._record(number)) + "\n")
+            self._index.flush()
+
+    def _record(self, number: int) -> dict[str, Any]:
+        message = self.messages[number]
+        return {
+            "picture": number,
+            "frame": message.frame_id,
+            "capture_ns": message.capture_ns,
+            "status": message.status,
+            "age_ms": round(self.ages_ms[number], 3),
+            "pass_times_ms": message.pass_times_ms,
+            "lights": message.lights,
+            "drops": message.drops,
+        }
+
+    def _picture(self, number: int) -> UInt8[np.ndarray, "h w 3"]:
+        assert self._out is not None
+        jpeg = (self._out / f"{number:06d}.jpg").read_bytes()
+        return decode_color(jpeg, "jpeg", self.messages[number].shape)
+
+    def _write_video(self) -> None:
+        assert self._out is not None
+        height, width = self.messages[0].shape[:2]
+        codec = cv2.VideoWriter.fourcc(*VIDEO_CODEC)
+        with replacing(self._out / "demo.mp4") as path:
+            video = cv2.VideoWriter(str(path), codec, self.frames_per_s() or FALLBACK_RATE, (width, height))
+            if not video.isOpened():
+                raise DeltalightError(
+                    "This OpenCV cannot write mp4; reinstall the package opencv-contrib-python-headless."
+                )
+            for number in range(self.count):
+                frame = cv2.resize(self._picture(number), (width, height))
+                video.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
+            video.release()
+
+
+def contact_sheet(pictures: list[UInt8[np.ndarray, "h w 3"]]) -> UInt8[np.ndarray, "h w 3"]:
+    """The pictures as small tiles in rows; all have the size of the first."""
+    height, width = pictures[0].shape[:2]
+    tile = (SHEET_WIDTH, round(SHEET_WIDTH * height / width))
+    tiles = [cv2.resize(picture, tile, interpolation=cv2.INTER_AREA) for picture in pictures]
+    columns = min(SHEET_COLUMNS, len(tiles))
+    tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % columns)
+    rows = [np.hstack(tiles[start : start + columns]) for start in range(0, len(tiles), columns)]
+    return np.vstack(rows)
+
+
+def summarize(collector: CompositeCollector, restarts: dict[str, int]) -> dict[str, Any]:
+    """Figures of a finished run, while the render server still answers."""
+    passes: dict[str, list[float]] = {}
+    for message in collector.messages:
+        for name, milliseconds in message.pass_times_ms.items():
+            passes.setdefault(name, []).append(milliseconds)
+    return {
+        "renderer": collector.server_stats().get("detail", ""),
+        "composites": collector.count,
+        "without_pose": sum(message.status == "no_pose" for message in collector.messages),
+        "frames_per_s": collector.frames_per_s(),
+        "age_median_ms": statistics.median(collector.ages_ms),
+        "age_p95_ms": float(np.percentile(collector.ages_ms, 95)),
+        "drops": collector.messages[-1].drops,
+        "restarts": restarts,
+        "pass_times_ms": {name: statistics.mean(values) for name, values in passes.items()},
+    }

@@ -1,0 +1,64 @@
+"""`deltalight bench`: measurements; they depend on the machine and are no tests."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from protocol.errors import DeltalightError
+from services.commands.options import Method
+
+bench = typer.Typer(no_args_is_help=True, help="Measure speed on this machine.")
+
+
+@bench.callback()
+def _group() -> None:
+    """Keep `speed` a command of its own while it is the only one."""
+
+
+@bench.command()
+def speed(
+    *,
+    size: Annotated[
+        str | None, typer.Option(metavar="WxH", help="Size of the pictures; default the demo's.")
+    ] = None,
+    methods: Annotated[str, typer.Option(help="Methods, separated by commas: exact, paper.")] = "exact,paper",
+    frames: Annotated[int, typer.Option(min=1, max=10_000, help="Frames of each measurement.")] = 20,
+    device: Annotated[
+        int | None, typer.Option(min=0, help="EGL device; `deltalight doctor` lists them.")
+    ] = None,
+    end_to_end: Annotated[
+        bool,
+        typer.Option("--end-to-end/--no-end-to-end", help="Measure node, server and viewer processes too."),
+    ] = True,
+    out: Annotated[Path | None, typer.Option(help="File for the report as JSON.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
+) -> None:
+    """Time every pass of a frame on the demo's recording, and the frame rate from camera to viewer."""
+    from benchmarks.speed import measure_speed, print_report
+    from services.arguments import parse_size
+    from services.files import write_bytes
+
+    report = measure_speed(
+        _methods(methods),
+        frames,
+        size=None if size is None else parse_size(size),
+        device=device,
+        end_to_end=end_to_end,
+    )
+    if out is not None:
+        write_bytes(out, json.dumps(report, indent=2).encode())
+    if as_json:
+        typer.echo(json.dumps(report, indent=2))
+    else:
+        print_report(report)
+
+
+def _methods(text: str) -> list[str]:
+    names = [name.strip() for name in text.split(",")]
+    known = [method.value for method in Method]
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        raise DeltalightError(f"'{unknown[0]}' is no method that is built; use {', '.join(known)}.")
+    return names

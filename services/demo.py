@@ -1,0 +1,157 @@
+"""The demo: the shipped recording through node, render server and viewer, each a process of its own."""
+
+import json
+import os
+import sys
+import time
+import webbrowser
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from protocol.errors import DeltalightError
+from protocol.scene import SceneDocument, load_scene
+from services import ports
+from services.collector import CompositeCollector, summarize
+from services.files import make_output_folder
+from services.host import HostPlan, session_file
+from services.supervisor import POLL_INTERVAL_S, Supervisor
+
+ASSETS = Path(__file__).parent / "demo_assets"
+RECORDING = ASSETS / "demo.mcap"
+SCENE = ASSETS / "scene.json"
+FIRST_FRAME_TIMEOUT_S = 120.0  # a cold shader cache on a slow machine takes a while
+BETWEEN_FRAMES_TIMEOUT_S = 60.0
+
+
+def demo_scene(method: str) -> SceneDocument:
+    """The demo's scene with a method of `services.commands.options.Method`.
+
+    Raises:
+        DeltalightError: the demo's files are missing.
+    """
+    if not (RECORDING.is_file() and SCENE.is_file()):
+        raise DeltalightError(f"The demo's files are missing in {ASSETS}; install Deltalight again.")
+    scene = load_scene(SCENE)
+    return with_method(scene, method)
+
+
+def with_method(scene: SceneDocument, method: str) -> SceneDocument:
+    """The scene with another method: `dvct` (as it is), dvct's operator `exact` or `paper`."""
+    return scene if method == "dvct" else scene.replaced(method=scene.method.replaced(operator=method))
+
+
+def run_live(method: str, *, port: int, with_browser: bool) -> None:
+    """Run the demo with its page until Ctrl-C.
+
+    Raises:
+        DeltalightError: a port is in use, or a process died for good.
+    """
+    with session_file(demo_scene(method)) as session:
+        plan = _plan(session, page_port=port)
+        plan.require_free_ports()
+        address = f"http://{ports.LOOPBACK}:{port}"
+        with Supervisor(plan.specs()) as supervisor:
+            print(f"The live picture is at {address} (Ctrl-C ends the demo).", flush=True)
+            supervisor.run(until=lambda: ports.answers(port))
+            if with_browser and _has_display():
+                webbrowser.open(address)
+            supervisor.run()
+
+
+def run_headless(method: str, frames: int, out: Path, *, as_json: bool) -> None:
+    """Collect `frames` composites in `out`, with a contact sheet and a video, and print a summary.
+
+    Raises:
+        DeltalightError: the output cannot be written, a process died for good, or no composites came.
+    """
+    scene = demo_scene(method)
+    make_output_folder(out)
+    summary = collect_composites(scene, frames, out)
+    if as_json:
+        print(json.dumps(summary))
+    else:
+        _print_summary(summary, out)
+
+
+def collect_composites(
+    scene: SceneDocument,
+    frames: int,
+    out: Path | None,
+    on_supervisor: Callable[[Supervisor], None] | None = None,
+) -> dict[str, Any]:
+    """Play the demo's recording through real processes and collect composites (into `out`, where given).
+
+    Raises:
+        DeltalightError: a process died for good, or composites stopped coming.
+    """
+    with session_file(scene) as session:
+        plan = _plan(session, page_port=None)
+        with Supervisor(plan.specs()) as supervisor:
+            if on_supervisor is not None:
+                on_supervisor(supervisor)
+            collector = CompositeCollector(
+                ports.endpoint(plan.composite_port), ports.endpoint(plan.control_port), out
+            )
+            try:
+                _collect(collector, supervisor, frames)
+                summary = summarize(collector, supervisor.restarts())
+            finally:
+                collector.close()
+    if out is not None:
+        collector.write_overview()
+    return summary
+
+
+def _collect(collector: CompositeCollector, supervisor: Supervisor, frames: int) -> None:
+    deadline_s = time.monotonic() + FIRST_FRAME_TIMEOUT_S
+    while collector.count < frames:
+        supervisor.poll()
+        if collector.take(POLL_INTERVAL_S, frames):
+            deadline_s = time.monotonic() + BETWEEN_FRAMES_TIMEOUT_S
+        if time.monotonic() > deadline_s:
+            raise DeltalightError(
+                f"Only {collector.count} of {frames} composites arrived before they stopped;"
+                " see the lines above."
+            )
+
+
+def _plan(session: Path, *, page_port: int | None) -> HostPlan:
+    node_port, composite_port, control_port = ports.private_ports(3)
+    return HostPlan(
+        str(RECORDING),
+        session,
+        node_port=node_port,
+        composite_port=composite_port,
+        control_port=control_port,
+        page_port=page_port,
+        allow_software=True,
+        log_level="warning",
+    )
+
+
+def _has_display() -> bool:
+    """Without a display `webbrowser` would start a text browser in this terminal."""
+    return sys.platform == "darwin" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def _print_summary(summary: dict[str, Any], out: Path) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table("Measure", "Value", title="Demo", title_justify="left")
+    table.columns[1].justify = "right"
+    for name, value in summary.items():
+        if name != "pass_times_ms":
+            table.add_row(name.replace("_", " "), _shown(value))
+    for name, milliseconds in summary["pass_times_ms"].items():
+        table.add_row(f"pass {name}, ms", f"{milliseconds:.2f}")
+    console = Console()
+    console.print(table)
+    console.print(f"Composites, contact sheet and video are in {out}")
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{key} {count}" for key, count in value.items() if count) or "none"
+    return f"{value:.1f}" if isinstance(value, float) else str(value)

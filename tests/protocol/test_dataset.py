@@ -1,0 +1,470 @@
+"""Dataset folders: every form that FORMATS 1 allows, the real captures, and what bad folders are told."""
+
+import json
+import os
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from protocol.board import BoardSpec
+from protocol.calibration import Extrinsics
+from protocol.camera_model import CameraModel, save_camera_yaml
+from protocol.dataset import DatasetReader, open_dataset
+from protocol.dataset_writer import DatasetWriter
+from protocol.errors import DeltalightError
+from protocol.frames import SensorFrame
+from protocol.pictures import depth_from_steps
+from protocol.source import open_source
+
+WIDTH, HEIGHT = 32, 24
+
+
+def camera(width: int = WIDTH, height: int = HEIGHT, focal: float = 30.0) -> CameraModel:
+    return CameraModel(width, height, np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]]))
+
+
+def write_folder(folder: Path, count: int = 4, depth_offset_s: float = 0.001) -> Path:
+    """A small dataset: colour pictures 0.1 s apart, depth a little later; the last depth code is 65535."""
+    rng = np.random.default_rng(7)
+    for name in ("rgb", "depth", "calibration"):
+        (folder / name).mkdir(parents=True)
+    save_camera_yaml(folder / "calibration" / "rgb.yaml", camera(), "rgb")
+    (folder / "calibration" / "depth.yaml").write_text("depth_scale: 0.001\n")
+    colors, depths = ["# timestamp filename"], []
+    for index in range(count):
+        color = rng.integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
+        steps = rng.integers(400, 3000, (HEIGHT, WIDTH), np.uint16)
+        steps[0, 0], steps[0, 1] = 0, 65535
+        cv2.imwrite(str(folder / f"rgb/{index}.png"), color)
+        cv2.imwrite(str(folder / f"depth/{index}.png"), steps)
+        colors.append(f"{10 + index / 10:.6f} rgb/{index}.png")
+        depths.append(f"{10 + index / 10 + depth_offset_s:.6f} depth/{index}.png")
+    (folder / "rgb.txt").write_text("\n".join(colors) + "\n")
+    (folder / "depth.txt").write_text("\n".join(depths) + "\n\n# end\n")
+    return folder
+
+
+def test_frames_are_decoded_with_units_masks_and_times(tmp_path: Path) -> None:
+    folder = write_folder(tmp_path / "a")
+    reader = open_dataset(folder)
+    assert len(reader) == 4
+    frame = reader[2]
+    steps = cv2.imread(str(folder / "depth/2.png"), cv2.IMREAD_UNCHANGED)
+    bgr = cv2.imread(str(folder / "rgb/2.png"))
+    assert np.array_equal(frame.color, bgr[..., ::-1])
+    assert frame.frame_id == 2
+    assert frame.timestamp_ns == 10_200_000_000
+    assert frame.depth_timestamp_ns == 10_201_000_000
+    assert frame.depth is not None
+    assert not frame.depth.valid[0, :2].any()
+    assert frame.depth.valid[1:].all()
+    assert (frame.depth.depth_m[0, :2] == 0).all()
+    assert frame.depth.depth_m[5, 5] == np.float32(steps[5, 5]) * np.float32(0.001)
+    assert frame.depth.camera == frame.camera == camera()
+    assert frame.color_jpeg is None
+    assert frame.world_from_camera is None
+    assert reader.depth_scale == 0.001
+    assert reader[-1].frame_id == 3
+    assert [item.frame_id for item in reader] == [0, 1, 2, 3]
+    with pytest.raises(IndexError):
+        reader[4]
+
+
+def test_missing_optional_parts_are_said_once(tmp_path: Path) -> None:
+    folder = write_folder(tmp_path / "a")
+    (folder / "calibration" / "depth.yaml").unlink()
+    notes = "\n".join(open_dataset(folder).notes)
+    for part in ("board.yaml", "depth.yaml", "groundtruth.txt", "fisheye.txt"):
+        assert notes.count(part) == 1
+    (folder / "depth.txt").unlink()
+    reader = open_dataset(folder)
+    assert reader[0].depth is None
+    assert reader.depth_scale is None
+    assert any("depth.txt" in note for note in reader.notes)
+
+
+def test_tum_depth_without_calibration_is_in_five_thousandths(tmp_path: Path) -> None:
+    folder = write_folder(tmp_path / "a")
+    (folder / "calibration" / "depth.yaml").unlink()
+    depth = open_dataset(folder)[0].depth
+    steps = cv2.imread(str(folder / "depth/0.png"), cv2.IMREAD_UNCHANGED)
+    assert depth is not None
+    assert depth.depth_m[3, 3] == pytest.approx(steps[3, 3] / 5000)
+
+
+def test_pairing_takes_the_nearest_within_the_tolerance_and_counts_the_rest(tmp_path: Path) -> None:
+    folder = write_folder(tmp_path / "a")
+    # Colour at 10.0, 10.1, 10.2, 10.3; the tolerance is the 20 ms limit, half the period being 50 ms.
+    (folder / "depth.txt").write_text(
+        "10.015 depth/0.png\n10.110 depth/1.png\n10.119 depth/2.png\n10.221 depth/3.png\n"
+    )
+    reader = open_dataset(folder)
+    assert reader.tolerance_ns == 20_000_000
+    assert [frame.depth_timestamp_ns for frame in reader] == [10_015_000_000, 10_110_000_000, None, None]
+    assert reader.unpaired == 2
+    assert any("2 of 4" in note for note in reader.notes)
+
+
+def test_half_the_period_limits_the_pairing_of_fast_cameras(tmp_path: Path) -> None:
+    folder = write_folder(tmp_path / "a")
+    (folder / "rgb.txt").write_text("".join(f"{10 + index / 100} rgb/{index}.png\n" for index in range(4)))
+    assert open_dataset(folder).tolerance_ns == 5_000_000
+
+
+def test_poses_are_interpolated_between_near_neighbours(tmp_path: Path) -> None:
+    folder = write_folder(tmp_path / "a")
+    half = np.sqrt(0.5)
+    (folder / "groundtruth.txt").write_text(
+        f"# timestamp tx ty tz qx qy qz qw\n10.05 0 0 0 0 0 0 1\n10.15 1 2 3 0 0 {half} {half}\n10.21 5 5 5 0 0 0 2\n"
+    )
+    poses = [frame.world_from_camera for frame in open_dataset(folder)]
+    assert poses[0] is None
+    assert poses[3] is None
+    assert poses[1] is not None
+    assert poses[1][:3, 3] == pytest.approx([0.5, 1, 1.5])
+    # 45 degrees about z, half way to 90.
+    assert poses[1][:3, 0] == pytest.approx([half, half, 0])
+    assert poses[2] is not None
+    assert poses[2][0, 3] > 4
+
+
+def test_exposure_response_jpeg_and_noise_are_read(tmp_path: Path) -> None:
+    folder = write_folder(tmp_path / "a", count=1)
+    jpeg = cv2.imencode(".jpg", np.full((HEIGHT, WIDTH, 3), (10, 100, 200), np.uint8))[1].tobytes()
+    (folder / "rgb" / "my picture.jpg").write_bytes(jpeg)
+    (folder / "rgb.txt").write_text("10.0 rgb/my picture.jpg 0.02\n")
+    (folder / "calibration" / "depth.yaml").write_text("depth_scale: 0.001\nnoise_sigma_m: 0.002\n")
+    table = np.linspace(0, 1, 768, dtype=np.float32).reshape(256, 3)
+    np.savetxt(folder / "response.txt", table, fmt="%.9g")
+    frame = open_dataset(folder)[0]
+    assert frame.color_jpeg == jpeg
+    assert frame.exposure_s == 0.02
+    assert frame.response is not None
+    assert np.array_equal(frame.response, table)
+    assert frame.depth is not None
+    assert frame.depth.noise_sigma_m == 0.002
+    assert frame.color[5, 5].tolist() == pytest.approx([200, 100, 10], abs=4)
+
+
+def test_fisheye_lines_of_one_time_are_a_bracket(tmp_path: Path) -> None:
+    folder = write_folder(tmp_path / "a")
+    names = [f"rgb/{index}.png" for index in range(3)]
+    (folder / "fisheye.txt").write_text(f"9.5 {names[0]} 0.01\n9.5 {names[1]} 0.1\n20 {names[2]}\n")
+    entries = open_dataset(folder).fisheye
+    assert [entry.exposures_s for entry in entries] == [(0.01, 0.1), (None,)]
+    assert entries[0].paths == (folder / names[0], folder / names[1])
+    assert entries[0].timestamp_ns == 9_500_000_000
+
+
+def edit(name: str, text: str) -> Callable[[Path], None]:
+    def apply(folder: Path) -> None:
+        (folder / name).write_text(text)
+
+    return apply
+
+
+def remove(name: str) -> Callable[[Path], None]:
+    return lambda folder: (folder / name).unlink()
+
+
+def picture(name: str, values: np.ndarray) -> Callable[[Path], None]:
+    return lambda folder: (folder / name).write_bytes(cv2.imencode(".png", values)[1].tobytes())
+
+
+MIRROR = "depth_from_rgb: [[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]\n"
+SKEWED = "depth_from_rgb: [[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]\n"
+BAD_FOLDERS: list[tuple[Callable[[Path], None], str]] = [
+    (remove("rgb.txt"), r"has no rgb\.txt"),
+    (remove("calibration/rgb.yaml"), r"has no calibration/rgb\.yaml"),
+    (remove("rgb/1.png"), r"rgb\.txt names 1 missing files, first .*1\.png"),
+    (remove("depth/3.png"), r"depth\.txt names 1 missing files"),
+    (edit("rgb.txt", "# nothing\n"), r"rgb\.txt names no picture"),
+    (edit("rgb.txt", "10.0\n"), r"rgb\.txt line 1 has no filename"),
+    (edit("rgb.txt", "#\nten rgb/0.png\n"), r"rgb\.txt line 2 has the timestamp `ten`"),
+    (edit("rgb.txt", "nan rgb/0.png\n"), "`nan`"),
+    (edit("rgb.txt", "-1 rgb/0.png\n"), "`-1`"),
+    (edit("rgb.txt", "11 rgb/0.png\n10 rgb/1.png\n"), "line 2 is earlier"),
+    (edit("rgb.txt", "10 rgb/0.png\n10 rgb/1.png\n"), r"gives 1\.png the time of 0\.png"),
+    (edit("depth.txt", "99 depth/0.png\n"), "same clock"),
+    (edit("groundtruth.txt", "10 0 0 0 0 0 1\n"), r"groundtruth\.txt line 1 is not"),
+    (edit("groundtruth.txt", "10 0 0 0 0 0 0 0\n"), r"groundtruth\.txt line 1 holds no usable pose"),
+    (edit("groundtruth.txt", "10 0 nan 0 0 0 0 1\n"), "no usable pose"),
+    (edit("response.txt", "1 2 3\n"), "256 rows"),
+    (edit("response.txt", "a b c\n"), "256 rows"),
+    (edit("calibration/depth.yaml", "depth_scale: -1\n"), "depth_scale"),
+    (edit("calibration/depth.yaml", "depth_scale: near\n"), "depth_scale"),
+    (edit("calibration/board.yaml", "type: aruco_grid\n"), "`dictionary` is missing"),
+    (edit("calibration/extrinsics.yaml", MIRROR), "`depth_from_rgb` mirrors space"),
+    (edit("calibration/extrinsics.yaml", SKEWED), "not a rigid transform"),
+    (edit("calibration/extrinsics.yaml", "depth_from_rbg: []\n"), "nearest known key is `depth_from_rgb`"),
+    (edit("calibration/extrinsics.yaml", "depth_from_rgb: [1, 2]\n"), "4x4 matrix"),
+    (edit("fisheye.txt", "1 rgb/0.png\n1 rgb/1.png\n"), "bracket without exposures"),
+    (edit("rgb/0.png", "no picture"), r"0\.png cannot be decoded"),
+    (edit("depth/0.png", ""), "not a 16-bit PNG"),
+    (
+        picture("rgb/0.png", np.zeros((8, 8, 3), np.uint8)),
+        r"0\.png has 8x8 pixels but calibration/rgb\.yaml says 32x24",
+    ),
+    (
+        picture("depth/0.png", np.zeros((8, 8), np.uint16)),
+        r"0\.png has 8x8 pixels but calibration/depth\.yaml",
+    ),
+    (picture("depth/0.png", np.zeros((HEIGHT, WIDTH), np.uint8)), "not a 16-bit PNG"),
+]
+
+
+@pytest.mark.parametrize(("damage", "message"), BAD_FOLDERS, ids=[message for _, message in BAD_FOLDERS])
+def test_bad_folders_are_told_in_one_sentence(
+    tmp_path: Path, damage: Callable[[Path], None], message: str
+) -> None:
+    folder = write_folder(tmp_path / "a")
+    damage(folder)
+    with pytest.raises(DeltalightError, match=message) as caught:
+        open_source(folder)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_later_picture_of_another_size_is_told_when_it_is_read(tmp_path: Path) -> None:
+    folder = write_folder(tmp_path / "a")
+    picture("rgb/2.png", np.zeros((8, 8, 3), np.uint8))(folder)
+    reader = open_dataset(folder)
+    assert reader[1].frame_id == 1
+    with pytest.raises(DeltalightError, match=r"2\.png has 8x8"):
+        reader[2]
+
+
+def test_what_is_no_source_is_told(tmp_path: Path) -> None:
+    with pytest.raises(DeltalightError, match="does not exist"):
+        open_source(tmp_path / "nowhere")
+    (tmp_path / "a.txt").touch()
+    with pytest.raises(DeltalightError, match="neither a folder nor"):
+        open_source(tmp_path / "a.txt")
+
+
+def random_frames(count: int, scale: float = 0.0005) -> list[SensorFrame]:
+    rng = np.random.default_rng(3)
+    depth_camera = camera(16, 12, 14.0)
+    turn, _ = cv2.Rodrigues(np.array([0.3, -2.0, 1.1]))
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = turn, [0.1, -0.2, 1.5]
+    table = np.linspace(0, 1, 768, dtype=np.float32).reshape(256, 3)
+    return [
+        SensorFrame(
+            frame_id=index,
+            timestamp_ns=1_305_031_231_925_706_001 + index * 33_333_333,
+            color=rng.integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8),
+            camera=camera(),
+            response=table,
+            exposure_s=0.01,
+            depth=depth_from_steps(
+                rng.integers(0, 4000, (12, 16)).astype(np.uint16), scale, depth_camera, 0.003
+            ),
+            depth_timestamp_ns=1_305_031_231_925_706_001 + index * 33_333_333 + 5,
+            world_from_camera=pose,
+        )
+        for index in range(count)
+    ]
+
+
+def assert_equal_frames(ours: SensorFrame, theirs: SensorFrame) -> None:
+    assert (ours.frame_id, ours.timestamp_ns, ours.exposure_s) == (
+        theirs.frame_id,
+        theirs.timestamp_ns,
+        theirs.exposure_s,
+    )
+    assert np.array_equal(ours.color, theirs.color)
+    assert ours.camera == theirs.camera
+    assert ours.response is not None
+    assert np.array_equal(ours.response, np.asarray(theirs.response))
+    assert ours.depth_timestamp_ns == theirs.depth_timestamp_ns
+    assert ours.depth is not None
+    assert theirs.depth is not None
+    assert np.array_equal(ours.depth.depth_m, theirs.depth.depth_m)
+    assert np.array_equal(ours.depth.valid, theirs.depth.valid)
+    assert ours.depth.camera == theirs.depth.camera
+    assert ours.depth.noise_sigma_m == theirs.depth.noise_sigma_m
+
+
+def test_what_is_written_is_read_again(tmp_path: Path) -> None:
+    frames = random_frames(3)
+    board = BoardSpec(
+        type="aruco_grid",
+        dictionary="DICT_4X4_50",
+        marker_length_m=0.04,
+        separation_m=0.01,
+        rows=2,
+        columns=2,
+    )
+    shift = np.eye(4)
+    shift[0, 3] = 0.05
+    with DatasetWriter(
+        tmp_path / "a", board=board, extrinsics=Extrinsics(depth_from_rgb=shift), depth_scale=0.0005
+    ) as writer:
+        for index, frame in enumerate(frames):
+            writer.add(frame)
+            assert len(open_dataset(tmp_path / "a")) == index + 1, "the folder is readable after every frame"
+    reader = open_dataset(tmp_path / "a")
+    for ours, theirs in zip(reader, frames, strict=True):
+        assert_equal_frames(ours, theirs)
+        assert ours.world_from_camera == pytest.approx(np.asarray(theirs.world_from_camera), abs=1e-12)
+    assert reader.board == board
+    assert reader.extrinsics.depth_from_rgb == pytest.approx(shift)
+
+
+def test_writing_keeps_jpeg_bytes_and_refuses_what_does_not_fit(tmp_path: Path) -> None:
+    first, second, *_ = random_frames(3)
+    jpeg = cv2.imencode(".jpg", first.color)[1].tobytes()
+    with DatasetWriter(tmp_path / "a") as writer:
+        writer.add(SensorFrame(0, 5, first.color, first.camera, color_jpeg=jpeg))
+        with pytest.raises(DeltalightError, match="not later"):
+            writer.add(SensorFrame(1, 5, first.color, first.camera))
+        with pytest.raises(DeltalightError, match="another camera or response"):
+            writer.add(second)
+    frame = open_dataset(tmp_path / "a")[0]
+    assert frame.color_jpeg == jpeg
+    assert frame.timestamp_ns == 5
+    with pytest.raises(DeltalightError, match="already exists"), DatasetWriter(tmp_path / "a"):
+        pass
+
+
+def link_lists(folder: Path, colors: list[Path], depths: list[Path]) -> None:
+    """List pictures that lie elsewhere, through links, one a tenth of a second."""
+    for kind, paths in (("rgb", colors), ("depth", depths)):
+        (folder / kind).mkdir(parents=True)
+        for path in paths:
+            (folder / kind / path.name).symlink_to(path)
+        lines = [f"{index / 10} {kind}/{path.name}\n" for index, path in enumerate(paths)]
+        (folder / f"{kind}.txt").write_text("".join(lines))
+    (folder / "calibration").mkdir()
+
+
+def camera_matrix(intrinsics: tuple[float, ...]) -> np.ndarray:
+    fx, fy, cx, cy = intrinsics
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+
+
+def visp_intrinsics(path: Path) -> tuple[float, ...]:
+    text = path.read_text()
+    return tuple(float(re.findall(rf"<{key}>\s*([-0-9.]+)", text)[0]) for key in ("px", "py", "u0", "v0"))
+
+
+def calibrate(
+    folder: Path, intrinsics: tuple[float, ...], distortion: tuple[float, ...], depth_yaml: str
+) -> None:
+    model = CameraModel(640, 480, camera_matrix(intrinsics), "plumb_bob", np.array(distortion))
+    save_camera_yaml(folder / "calibration" / "rgb.yaml", model, "rgb")
+    if depth_yaml:
+        (folder / "calibration" / "depth.yaml").write_text(depth_yaml)
+
+
+def check_real(reader: DatasetReader, count: int, median_m: tuple[float, float]) -> None:
+    assert len(reader) == count
+    assert reader.unpaired == 0
+    frame = reader[count - 1]
+    assert frame.color.shape == (480, 640, 3)
+    assert frame.color.std() > 10
+    assert frame.depth is not None
+    valid = frame.depth.depth_m[frame.depth.valid]
+    assert valid.size > 0.3 * frame.depth.depth_m.size
+    assert median_m[0] < np.median(valid) < median_m[1]
+    assert (frame.depth.depth_m[~frame.depth.valid] == 0).all()
+
+
+@pytest.mark.data
+def test_visp_desk(shared_data: Path) -> None:
+    reader = open_dataset(shared_data / "rgbd" / "visp_rbt_apriltag")
+    check_real(reader, 30, (0.4, 1.2))
+    assert reader.board is not None
+    assert reader.board.marker_ids == tuple(range(11, -1, -1))
+    assert reader.camera.matrix[0, 0] == 607.178
+    assert reader[1].timestamp_ns == 66_667_000
+
+
+@pytest.mark.data
+def test_tum_freiburg1(shared_data: Path, tmp_path: Path) -> None:
+    source, folder = shared_data / "rgbd" / "tum_fr1_rpy", tmp_path / "a"
+    shutil.copytree(source, folder, symlinks=True, copy_function=os.symlink)
+    for folder_path in (folder, folder / "rgb", folder / "depth"):
+        folder_path.chmod(0o755)
+    for kind in ("rgb", "depth"):
+        names = sorted(path.name for path in (source / kind).iterdir())
+        lines = [f"{name.removesuffix('.png')} {kind}/{name}\n" for name in names]
+        (folder / f"{kind}.txt").write_text("".join(lines))
+    with pytest.raises(DeltalightError, match=r"no calibration/rgb\.yaml"):
+        open_dataset(folder)
+    (folder / "calibration").mkdir()
+    distortion = (0.262383, -0.953104, -0.005358, 0.002628, 1.163314)
+    calibrate(folder, (517.306408, 516.469215, 318.64304, 255.313989), distortion, "")
+    reader = open_dataset(folder)
+    check_real(reader, 15, (0.5, 4.0))
+    times = [frame.depth_timestamp_ns for frame in reader]
+    assert len(set(times)) == 15
+    assert reader[0].timestamp_ns == 1_305_031_231_925_706_000
+    assert reader[0].depth_timestamp_ns == 1_305_031_231_933_046_000
+    poses = [frame.world_from_camera for frame in reader]
+    assert all(pose is not None for pose in poses)
+    assert all(np.linalg.det(np.asarray(pose)[:3, :3]) == pytest.approx(1) for pose in poses)
+
+
+@pytest.mark.data
+def test_realsense_boxes(shared_data: Path, tmp_path: Path) -> None:
+    source, folder = shared_data / "rgbd" / "realsense_plane_boxes_mit", tmp_path / "a"
+    link_lists(folder, sorted((source / "color").iterdir()), sorted((source / "depth").iterdir()))
+    values = json.loads((source / "cam_params_realsense.json").read_text())["intrinsic_matrix"]
+    calibrate(folder, (values[0], values[4], values[6], values[7]), (), "depth_scale: 0.001\n")
+    check_real(open_dataset(folder), 10, (0.4, 3.0))
+
+
+@pytest.mark.data
+def test_castle_with_a_depth_camera_of_its_own(shared_data: Path, tmp_path: Path) -> None:
+    source, folder = shared_data / "rgbd" / "visp_castel_realsense", tmp_path / "a"
+    link_lists(folder, sorted((source / "image").iterdir()), sorted((source / "depth").iterdir()))
+    sizes = cv2.imread(str(source / "image" / "image_0000.png")).shape[:2]
+    assert sizes == (480, 640)
+    calibrate(folder, visp_intrinsics(source / "chateau.xml"), (), "")
+    own = CameraModel(640, 480, camera_matrix(visp_intrinsics(source / "chateau_depth.xml")))
+    extra = {"depth_scale": 0.000124986647}
+    save_camera_yaml(folder / "calibration" / "depth.yaml", own, "depth", extra)
+    depth_from_rgb = np.loadtxt(source / "depth_M_color.txt").reshape(4, 4)
+    (folder / "calibration" / "extrinsics.yaml").write_text(f"depth_from_rgb: {depth_from_rgb.tolist()}\n")
+    reader = open_dataset(folder)
+    check_real(reader, 5, (0.2, 0.35))
+    depth = reader[0].depth
+    assert depth is not None
+    assert depth.camera == own != reader.camera
+    assert reader.extrinsics.depth_from_rgb is not None
+    assert np.linalg.det(reader.extrinsics.depth_from_rgb[:3, :3]) == pytest.approx(1, abs=1e-4)
+
+
+@pytest.mark.data
+def test_redwood_living_room(shared_data: Path, tmp_path: Path) -> None:
+    source, folder = shared_data / "rgbd" / "open3d_redwood_livingroom" / "RGBD", tmp_path / "a"
+    link_lists(folder, sorted((source / "color").iterdir()), sorted((source / "depth").iterdir()))
+    calibrate(folder, (525.0, 525.0, 319.5, 239.5), (), "depth_scale: 0.001\n")
+    reader = open_dataset(folder)
+    check_real(reader, 5, (0.5, 5.0))
+    assert reader[0].color_jpeg is not None
+
+
+@pytest.mark.data
+def test_linemod_clutter(shared_data: Path, tmp_path: Path) -> None:
+    source, folder = shared_data / "rgbd" / "linemod_markerboard", tmp_path / "a"
+    link_lists(folder, [source / "0000_rgb.png"], [source / "0000_depth.png"])
+    calibrate(folder, (572.4114, 573.57043, 325.2611, 242.04899), (), "depth_scale: 0.001\n")
+    check_real(open_dataset(folder), 1, (0.4, 2.0))
+
+
+@pytest.mark.data
+def test_bare_folders_say_that_the_list_is_missing(shared_data: Path) -> None:
+    bare = [
+        path for path in (shared_data / "rgbd").iterdir() if path.is_dir() and not (path / "rgb.txt").exists()
+    ]
+    assert len(bare) >= 5
+    for folder in bare:
+        with pytest.raises(DeltalightError, match=r"has no rgb\.txt"):
+            open_source(folder)

@@ -1,0 +1,90 @@
+"""Byte vectors of SPEC.md, both ways: bytes to meaning and meaning to bytes."""
+
+import base64
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from protocol.codecs import decode_color, decode_depth, decode_raw, decode_response
+from protocol.envelope import decode, encode
+from protocol.messages import MAX_HEADER_BYTES, MAX_PART_BYTES, MESSAGE_TYPES, SCHEMA_VERSION, Message
+from protocol.vectors import FOLDER, frame_pieces, unframe_pieces
+
+NAMES = sorted(path.stem for path in Path(FOLDER).glob("*.bin"))
+SPEC = (Path(FOLDER).parent / "SPEC.md").read_text()
+
+
+def load(name: str) -> tuple[list[bytes], dict[str, Any]]:
+    return (
+        unframe_pieces((FOLDER / f"{name}.bin").read_bytes()),
+        json.loads((FOLDER / f"{name}.json").read_text()),
+    )
+
+
+def pictures(message: Message, parts: list[memoryview]) -> list[np.ndarray]:
+    """What the parts show, in the units of the vector: codes, linear values, or steps of depth."""
+    if message.stream in ("depth", "clean_depth"):
+        depth, valid = decode_depth(parts[0], message.encoding, message.shape, message.depth_scale_m)
+        np.testing.assert_array_equal(depth > 0, valid)
+        return [np.rint(depth / np.float32(message.depth_scale_m))]
+    if message.stream == "fisheye":
+        return [decode_raw(part, message.shape, message.dtype) for part in parts]
+    return [decode_color(parts[0], message.encoding, message.shape)]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_bytes_mean_what_is_written(name: str) -> None:
+    pieces, meaning = load(name)
+    message, parts = decode(pieces)
+    assert pieces[0].decode() == meaning["topic"]
+    assert message.model_dump(mode="json") == meaning["header"]
+    assert [base64.b64encode(part).decode() for part in parts] == meaning["parts"]
+    if "values" in meaning:
+        shown = [picture.ravel().tolist() for picture in pictures(message, parts)]
+        assert shown == meaning["values"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_meaning_gives_the_same_bytes(name: str) -> None:
+    pieces, meaning = load(name)
+    message = MESSAGE_TYPES[meaning["header"]["stream"]].model_validate(meaning["header"])
+    coded = encode(message, [base64.b64decode(part) for part in meaning["parts"]])
+    assert coded == pieces
+    assert frame_pieces(coded) == (FOLDER / f"{name}.bin").read_bytes()
+
+
+def test_every_stream_has_a_vector() -> None:
+    assert {load(name)[1]["header"]["stream"] for name in NAMES} == set(MESSAGE_TYPES)
+
+
+def test_the_jpeg_vector_shows_the_raw_picture() -> None:
+    message, parts = decode(load("color_jpeg")[0])
+    assert message.stream == "color"
+    raw = decode(load("color_raw")[0])[1][0]
+    jpeg = decode_color(parts[0], "jpeg", message.shape)
+    assert np.abs(jpeg.astype(int) - decode_raw(raw, message.shape, "uint8")).mean() < 30
+
+
+def test_the_response_vector_is_the_straight_line() -> None:
+    response = decode_response(decode(load("color_raw")[0])[1][1])
+    np.testing.assert_allclose(response, np.repeat(np.arange(256)[:, None] / 255, 3, axis=1), atol=1e-7)
+
+
+@pytest.mark.parametrize("stream", sorted(MESSAGE_TYPES))
+def test_the_spec_lists_every_field_of_every_message(stream: str) -> None:
+    heading = f"### `{stream}`"
+    own = next(text for text in re.split(r"^(?=### )", SPEC, flags=re.M) if text.startswith(heading))
+    common = SPEC.split("### Common fields")[1].split("\n### ")[0]
+    listed = set(re.findall(r"^\| `(\w+)` \|", common + own, flags=re.M))
+    assert listed == set(MESSAGE_TYPES[stream].model_fields)
+
+
+def test_the_spec_names_the_limits_and_every_vector() -> None:
+    assert f"schema version {SCHEMA_VERSION}" in SPEC
+    assert f"{MAX_HEADER_BYTES} bytes" in SPEC
+    assert f"{MAX_PART_BYTES} bytes" in SPEC
+    assert set(re.findall(r"^\| `(\w+)\.bin` \|", SPEC, flags=re.M)) == set(NAMES)

@@ -1,0 +1,82 @@
+"""What the tests of services share: messages of a small camera, a command-line runner."""
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from protocol.camera_model import CameraModel
+from protocol.codecs import encode_color, encode_depth
+from protocol.envelope import encode
+from protocol.messages import ColorMessage, DepthMessage, PoseMessage
+from protocol.transport import ReceivedMultipart
+
+ROOT = Path(__file__).parents[2]
+WIDTH, HEIGHT = 64, 48
+IDENTITY = tuple(tuple(float(value) for value in row) for row in np.eye(4))
+
+RunCli = Callable[..., subprocess.CompletedProcess[str]]
+
+
+@pytest.fixture
+def cli() -> RunCli:
+    """Runs `deltalight` in a process of its own."""
+
+    def run(*arguments: object, timeout_s: float = 60) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-m", "services.cli", *(str(argument) for argument in arguments)]
+        return subprocess.run(
+            command, cwd=ROOT, capture_output=True, text=True, timeout=timeout_s, check=False
+        )
+
+    return run
+
+
+def camera() -> CameraModel:
+    matrix = np.array([[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]])
+    return CameraModel(WIDTH, HEIGHT, matrix, "plumb_bob", np.zeros(5))
+
+
+def picture(value: int) -> np.ndarray:
+    return np.full((HEIGHT, WIDTH, 3), value, np.uint8)
+
+
+def received(multipart: list[bytes], received_ns: int) -> ReceivedMultipart:
+    return ReceivedMultipart([memoryview(piece) for piece in multipart], received_ns)
+
+
+def color(frame_id: int, capture_ns: int, received_ns: int = 0) -> ReceivedMultipart:
+    message = ColorMessage(
+        node="cam",
+        frame_id=frame_id,
+        capture_ns=capture_ns,
+        encoding="raw",
+        shape=(HEIGHT, WIDTH, 3),
+        camera=camera().to_dict(),
+    )
+    return received(encode(message, [encode_color(picture(frame_id % 256), "raw")]), received_ns)
+
+
+def depth(frame_id: int, capture_ns: int, metres: float = 1.0) -> ReceivedMultipart:
+    message = DepthMessage(
+        node="cam",
+        stream="clean_depth",
+        frame_id=frame_id,
+        capture_ns=capture_ns,
+        encoding="raw",
+        shape=(HEIGHT, WIDTH),
+        depth_scale_m=0.001,
+        camera=camera().to_dict(),
+    )
+    image = np.full((HEIGHT, WIDTH), metres, np.float32)
+    return received(encode(message, [encode_depth(image, image > 0, "raw", 0.001)]), 0)
+
+
+def pose(frame_id: int, capture_ns: int, status: str = "ok") -> ReceivedMultipart:
+    matrix = IDENTITY if status == "ok" else None
+    message = PoseMessage(
+        node="cam", frame_id=frame_id, capture_ns=capture_ns, status=status, world_from_camera=matrix
+    )
+    return received(encode(message), 0)

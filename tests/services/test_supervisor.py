@@ -1,0 +1,92 @@
+"""The supervisor with real child processes: restart, giving up, wrong input, no orphans."""
+
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import psutil
+import pytest
+
+from protocol.errors import DeltalightError
+from services.supervisor import ChildSpec, Supervisor
+
+SLEEP_FOREVER = "import time\nwhile True: time.sleep(60)"
+IGNORE_SIGTERM = f"import signal\nsignal.signal(signal.SIGTERM, signal.SIG_IGN)\n{SLEEP_FOREVER}"
+
+
+def python(name: str, code: str) -> ChildSpec:
+    return ChildSpec(name, ("-c", code))
+
+
+def poll_until(supervisor: Supervisor, condition: Callable[[], bool], timeout_s: float = 10.0) -> None:
+    deadline_s = time.monotonic() + timeout_s
+    supervisor.run(until=lambda: condition() or time.monotonic() > deadline_s)
+    assert condition()
+
+
+def test_killed_child_is_started_again_and_the_other_left_alone() -> None:
+    lines: list[str] = []
+    with Supervisor(
+        [python("a", SLEEP_FOREVER), python("b", SLEEP_FOREVER)], forward=lines.append
+    ) as supervisor:
+        before = supervisor.process_ids()
+        psutil.Process(before["a"]).kill()
+        poll_until(supervisor, lambda: supervisor.restarts()["a"] == 1)
+        after = supervisor.process_ids()
+        assert after["a"] != before["a"]
+        assert after["b"] == before["b"]
+        assert psutil.pid_exists(after["a"])
+    assert any("a: died with exit code -9" in line for line in lines)
+
+
+def test_child_that_keeps_dying_is_given_up_with_its_last_line() -> None:
+    code = "import sys; sys.exit('the lamp is broken')"
+    with (
+        Supervisor([python("lamp", code)], forward=lambda _line: None, maximum_restarts=2) as supervisor,
+        pytest.raises(DeltalightError, match=r"lamp died 3 times within a minute.*the lamp is broken"),
+    ):
+        supervisor.run()
+    assert supervisor.restarts()["lamp"] == 2
+
+
+def test_child_that_refuses_its_input_is_not_started_again() -> None:
+    code = "import sys; print('deltalight: The scene is wrong; mend it.', file=sys.stderr); sys.exit(2)"
+    with (
+        Supervisor([python("server", code)], forward=lambda _line: None) as supervisor,
+        pytest.raises(DeltalightError, match=r"^The scene is wrong; mend it\.$"),
+    ):
+        supervisor.run()
+    assert supervisor.restarts()["server"] == 0
+
+
+def test_stop_ends_even_a_child_that_ignores_sigterm() -> None:
+    supervisor = Supervisor([python("stubborn", IGNORE_SIGTERM), python("kind", SLEEP_FOREVER)])
+    with supervisor:
+        time.sleep(0.5)
+        ids = supervisor.process_ids()
+        started_s = time.monotonic()
+    assert time.monotonic() - started_s < 10  # bounded, not measured
+    assert not any(psutil.pid_exists(number) for number in ids.values())
+
+
+def test_children_end_when_the_supervisor_is_killed(tmp_path: Path) -> None:
+    pid_file = tmp_path / "pid"
+    child = (
+        "import os, time, pathlib; from services.lifeline import end_with_supervisor; end_with_supervisor();"
+        f"pathlib.Path({str(pid_file)!r}).write_text(str(os.getpid())); time.sleep(600)"
+    )
+    parent = (
+        "from services.supervisor import ChildSpec, Supervisor\n"
+        f"with Supervisor([ChildSpec('child', ('-c', {child!r}))]) as supervisor: supervisor.run()"
+    )
+    process = subprocess.Popen([sys.executable, "-c", parent])
+    deadline_s = time.monotonic() + 20
+    while not (pid_file.exists() and pid_file.read_text()) and time.monotonic() < deadline_s:
+        time.sleep(0.05)
+    orphan = psutil.Process(int(pid_file.read_text()))
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert psutil.wait_procs([orphan], timeout=10)[1] == []
