@@ -73,7 +73,7 @@ def sensor_frame(
 
 
 def write_demo(out: Path, spp: int, progress: Progress) -> None:
-    """Write demo.mcap, object.glb and scene.json into `out`; what is there is replaced when all are complete."""
+    """Write demo.mcap, object.glb and scene.json into `out`; replacing older ones when all are complete."""
     out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=out, prefix=".making-") as folder:
         made = Path(folder)

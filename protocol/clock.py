@@ -2,7 +2,7 @@
 
 One exchange gives four stamps as in NTP (RFC 5905, section 8): t0 request sent and t3 reply received by the
 local clock, t1 request received and t2 reply sent by the remote one. Whatever the two delays are, the true
-offset lies within half the round trip of the middle; so the exchange with the shortest round trip is the best.
+offset lies within half the round trip of the middle; so the exchange of the shortest round trip is best.
 """
 
 import time

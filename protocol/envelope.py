@@ -92,9 +92,7 @@ def unpack_header(header: Buffer) -> Message:
         EnvelopeError: not a header, another schema version (both are named), or a field out of its range.
     """
     if len(header) > MAX_HEADER_BYTES:
-        raise EnvelopeError(
-            f"the header has {len(header)} bytes, {MAX_HEADER_BYTES} are allowed: cut it"
-        )
+        raise EnvelopeError(f"the header has {len(header)} bytes, {MAX_HEADER_BYTES} are allowed: cut it")
     try:
         fields = msgpack.unpackb(header, raw=False, strict_map_key=True)
     except Exception as error:  # the unpacker documents no closed set, and extension types add their own

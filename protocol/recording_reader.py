@@ -4,6 +4,7 @@ import struct
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import IO, Any
 
@@ -15,7 +16,7 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
 from mcap.records import Attachment, Channel, Chunk, Message, MessageIndex
-from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
+from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
 from zstandard import ZstdError
@@ -39,19 +40,10 @@ from protocol.recording_format import (
 )
 from protocol.scene import SceneDocument, parse_scene, resolve_asset
 
-MAX_CHUNK_BYTES = 512 * 1024 * 1024
+MAX_RECORD_BYTES = 512 * 1024 * 1024
 RECORD_HEAD = struct.Struct("<BQ")
-# What the mcap package raises for damaged records.
-DAMAGE = (
-    McapError,
-    CRCValidationError,
-    ZstdError,
-    struct.error,
-    ValueError,
-    KeyError,
-    IndexError,
-    StopIteration,
-)
+# What the mcap package raises for damaged records (wrong offsets and lengths end in the last three).
+DAMAGE = (McapError, ZstdError, struct.error, ValueError, LookupError, OverflowError, OSError, MemoryError)
 
 
 @dataclass(frozen=True)
@@ -115,12 +107,15 @@ class RecordingReader:
             depth = None if record.depth is None else _depth_image(record.depth, parts[DEPTH_TOPIC])
         except (KeyError, ValueError, DecodeError) as error:
             raise DeltalightError(f"{name} is damaged; leave it out of the range of frames.") from error
+        color, camera = decode_rgb(data, name), self._camera(record)
+        if color.shape[:2] != (camera.height, camera.width):
+            raise DeltalightError(f"{name} has a picture of another size than its camera; leave it out.")
         pose = record.world_from_camera
         return SensorFrame(
             frame_id=record.frame_id,
             timestamp_ns=record.timestamp_ns,
-            color=decode_rgb(data, name),
-            camera=self._camera(record),
+            color=color,
+            camera=camera,
             response=_response(record),
             exposure_s=record.exposure_s,
             depth=depth,
@@ -140,9 +135,12 @@ class RecordingReader:
             with self.path.open("rb") as file:
                 if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
                     raise DeltalightError(f"{self.path} is not an MCAP recording; give a file that is.")
-                summary = _summary(file)
-                if summary is not None:
-                    return self._use_index(file, summary)
+                try:
+                    summary = _summary(file)
+                    if summary is not None:
+                        return self._use_index(file, summary)
+                except DAMAGE:
+                    self._channels, self._spans = {}, []
                 return self._scan(file)
         except OSError as error:
             raise DeltalightError(
@@ -160,10 +158,12 @@ class RecordingReader:
             for number in frames:
                 if number in chunk.message_index_offsets:
                     index = _record_at(file, chunk.message_index_offsets[number])
-                    times.update(time for time, _ in index.records if isinstance(index, MessageIndex))
+                    entries = index.records if isinstance(index, MessageIndex) else []
+                    times.update(time for time, _ in entries)
         for entry in summary.attachment_indexes:
-            if entry.name == SCENE_ATTACHMENT:
-                self._scene_json = _record_at(file, entry.offset).data
+            attachment = _record_at(file, entry.offset) if entry.name == SCENE_ATTACHMENT else None
+            if isinstance(attachment, Attachment):
+                self._scene_json = attachment.data
         return times
 
     def _scan(self, file: IO[bytes]) -> set[int]:
@@ -197,7 +197,11 @@ class RecordingReader:
         """Messages of a time by topic; several of one topic leave the last."""
         near = np.flatnonzero((self._starts_ns <= time_ns) & (time_ns <= self._ends_ns))
         messages = (message for index in near for message in self._messages(self._spans[index].offset))
-        return {self._channels[part.channel_id]: part.data for part in messages if part.log_time == time_ns}
+        return {
+            self._channels.get(part.channel_id, ""): part.data
+            for part in messages
+            if part.log_time == time_ns
+        }
 
     def _messages(self, offset: int) -> list[Message]:
         """Messages of a chunk; the last one read is kept, because frames are mostly read in order."""
@@ -207,7 +211,7 @@ class RecordingReader:
         try:
             with self.path.open("rb") as file:
                 contents = _chunk_contents(_record_at(file, offset))
-        except (*DAMAGE, OSError) as error:
+        except DAMAGE as error:
             raise DeltalightError(
                 f"{self.path} is damaged at byte {offset}; leave these frames out."
             ) from error
@@ -217,6 +221,8 @@ class RecordingReader:
 
     def _read_record(self, index: int) -> tuple[FrameRecord, dict[str, bytes]]:
         parts = self._parts(self.timestamps_ns[index])
+        if FRAME_TOPIC not in parts:
+            raise DeltalightError(f"{self.path} is damaged; leave frame {index} out.")
         return FrameRecord.unpacked(parts[FRAME_TOPIC], str(self.path)), parts
 
     def _read_session(self) -> SessionRecord:
@@ -247,7 +253,7 @@ class RecordingReader:
 
 
 def _summary(file: IO[bytes]) -> Summary | None:
-    """Index at the end of the file; None where the file was cut short or the index is damaged."""
+    """Index at the end of the file; None where the file was cut short."""
     file.seek(0, 2)
     if file.tell() < 2 * len(MCAP0_MAGIC):
         return None
@@ -255,10 +261,7 @@ def _summary(file: IO[bytes]) -> Summary | None:
     if file.read() != MCAP0_MAGIC:
         return None
     file.seek(0)
-    try:
-        return SeekingReader(file).get_summary()
-    except DAMAGE:
-        return None
+    return SeekingReader(file).get_summary()
 
 
 def _walk(file: IO[bytes]) -> Iterator[tuple[int, int]]:
@@ -277,11 +280,17 @@ def _walk(file: IO[bytes]) -> Iterator[tuple[int, int]]:
 
 def _record_at(file: IO[bytes], offset: int) -> Any:  # noqa: ANN401 - one of mcap's record classes
     file.seek(offset)
-    return next(StreamReader(file, skip_magic=True, emit_chunks=True).records)
+    head = file.read(RECORD_HEAD.size)
+    _, length = RECORD_HEAD.unpack(head)
+    if length > MAX_RECORD_BYTES:
+        raise ValueError("a record is longer than any that is written")
+    # From memory, so that a wrong length inside the record cannot ask for more than is there.
+    record = BytesIO(head + file.read(length))
+    return next(iter(StreamReader(record, skip_magic=True, emit_chunks=True).records), None)
 
 
 def _chunk_contents(chunk: Any) -> list[Any]:  # noqa: ANN401 - mcap's record classes
-    if not isinstance(chunk, Chunk) or chunk.uncompressed_size > MAX_CHUNK_BYTES:
+    if not isinstance(chunk, Chunk) or chunk.uncompressed_size > MAX_RECORD_BYTES:
         raise ValueError("not a chunk that can be read")
     contents: list[Any] = breakup_chunk(chunk, validate_crc=True)
     return contents

@@ -188,6 +188,8 @@ class RequestClient:
             self._context.destroy(0)
 
     def _connected(self) -> "zmq.Socket[bytes]":
+        if self._context.closed:
+            raise DeltalightError(f"the client of {self.endpoint} is closed: open a new one to ask")
         if self._socket is None:
             self._socket = open_socket(self._context, zmq.REQ, max_bytes=MAX_HEADER_BYTES)
             attach(self._socket, self.endpoint, bind=False)

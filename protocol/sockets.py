@@ -53,7 +53,10 @@ def open_socket(
     """Socket with queues of `high_water_mark` messages, pieces up to `max_bytes`, no linger, heartbeats."""
     socket = context.socket(kind)
     socket.linger = 0
-    socket.sndhwm = socket.rcvhwm = high_water_mark
+    if kind == zmq.PUB:
+        socket.sndhwm = high_water_mark
+    else:  # a SUB socket sends its subscriptions, and loses those beyond its send mark
+        socket.rcvhwm = high_water_mark
     socket.maxmsgsize = max_bytes
     socket.reconnect_ivl = RECONNECT_MS
     socket.reconnect_ivl_max = RECONNECT_MAX_MS

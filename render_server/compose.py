@@ -7,10 +7,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, UInt8
 
+from protocol.errors import DeltalightError
 from protocol.scene_method import Output
 from render_server.gpu.context import GpuContext
 from render_server.gpu.readback import AsyncReadback
 from render_server.passes.composite import CompositePass
+from render_server.passes.views import ViewPasses
 from render_server.relighting import RelitFrame
 
 
@@ -22,6 +24,7 @@ class Composer:
         self._pass: CompositePass | None = None
         self._size: tuple[int, int] | None = None
         self._readback = AsyncReadback(gpu)
+        self._views = ViewPasses(gpu)
 
     def compose(
         self, relit: RelitFrame, output: Output
@@ -38,9 +41,28 @@ class Composer:
         with relit.timers.measure("composite"):
             relit.input.bind_geometry()
             composite.run(relit.input.picture, relit.layers, uniforms)
+        self._show_view(composite, relit, output.view)
         with relit.timers.measure("readback"):
             self._readback.push(composite.code, "u1")
         return np.ascontiguousarray(self._readback.pop()[..., :3]), None
+
+    def _show_view(self, composite: CompositePass, relit: RelitFrame, view: str) -> None:
+        """Replace the picture by a look inside, if one is asked for."""
+        picture, layers = relit.input.picture, relit.layers
+        if view == "composite":
+            return
+        if view == "lights":
+            raise DeltalightError("view `lights` arrives with a later release: use composite, effects, delta, volume or rsm.")
+        with relit.timers.measure("view"):
+            if view == "volume":
+                uniforms = relit.input.view.uniforms()
+                self._views.volume(composite.code, picture, layers.pyramid, layers.placement, uniforms)
+            elif view == "rsm":
+                self._views.shadow_maps(composite.code, layers.table)
+            else:
+                self._views.change(
+                    composite.code, picture, composite.linear, layers.matte, effects=view == "effects"
+                )
 
     def _pass_for(self, size: tuple[int, int]) -> CompositePass:
         if self._pass is None or self._size != size:
@@ -52,5 +74,6 @@ class Composer:
     def release(self) -> None:
         """Free the GL objects."""
         self._readback.release()
+        self._views.release()
         if self._pass is not None:
             self._pass.release()

@@ -79,7 +79,7 @@ class RealGeometry:
     def _depth_mesh(self, frame: ViewFrame, view: CameraView) -> TriangleMesh:
         depth = frame.depth
         assert isinstance(depth, DepthImage)
-        return depth_mesh(depth, view.camera, view.world_from_camera, self._budget)
+        return depth_mesh(depth, view.world_from_camera, self._budget)
 
     def _build(self, meshes: list[TriangleMesh]) -> None:
         """Merge and upload."""

@@ -13,9 +13,9 @@ from protocol.errors import DeltalightError
 from protocol.frames import BoardPose, decode_lut
 from protocol.poses import rigid_matrix
 
-# Half the edge of the corner refinement window, as a share of the marker's shortest side in the picture.
-REFINE_SHARE = 0.08
-REFINE_HALF_PX = (2, 6)
+# Half the edge of the corner refinement window in cells of the marker: it must not reach the code.
+REFINE_CELLS = 0.5
+REFINE_HALF_PX = (2, 8)
 REFINE_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 0.005)
 # Markers narrower than this cannot be read.
 LEAST_SIDE_PX = 10
@@ -118,7 +118,8 @@ class BoardDetector:
             sizes = [(pixels, half)]
         else:
             world = np.concatenate([self._corners[name] for _, name in quads])
-            sizes = [(quad, REFINE_SHARE * _shortest_side(quad)) for quad, _ in quads]
+            share = REFINE_CELLS / (self._board.opencv_dictionary().markerSize + 2 * self._board.border_bits)
+            sizes = [(quad, share * _shortest_side(quad)) for quad, _ in quads]
         if len(world) < 4:
             return None
         light = self._linear_luminance(color)
@@ -130,7 +131,7 @@ class BoardDetector:
     ) -> tuple[Float64[np.ndarray, "n 3"], Float32[np.ndarray, "n 2"], float]:
         """Inner corners of a ChArUco board, with half the window edge for their refinement."""
         markers = [quad[None] for quad, _ in quads]
-        names = np.array([[name] for _, name in quads])
+        names = np.array([[name] for _, name in quads], np.int32)
         corners, ids, _, _ = self._charuco.detectBoard(gray, markerCorners=markers, markerIds=names)
         if ids is None:
             return np.zeros((0, 3)), np.zeros((0, 2), np.float32), 0.0

@@ -5,7 +5,6 @@ import os
 import sys
 import time
 import webbrowser
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +47,7 @@ def run_live(method: str, *, port: int, with_browser: bool) -> None:
         DeltalightError: a port is in use, or a process died for good.
     """
     with session_file(demo_scene(method)) as session:
-        plan = _plan(session, page_port=port)
+        plan = demo_plan(session, page_port=port)
         plan.require_free_ports()
         address = f"http://{ports.LOOPBACK}:{port}"
         with Supervisor(plan.specs()) as supervisor:
@@ -74,22 +73,15 @@ def run_headless(method: str, frames: int, out: Path, *, as_json: bool) -> None:
         _print_summary(summary, out)
 
 
-def collect_composites(
-    scene: SceneDocument,
-    frames: int,
-    out: Path | None,
-    on_supervisor: Callable[[Supervisor], None] | None = None,
-) -> dict[str, Any]:
+def collect_composites(scene: SceneDocument, frames: int, out: Path | None) -> dict[str, Any]:
     """Play the demo's recording through real processes and collect composites (into `out`, where given).
 
     Raises:
         DeltalightError: a process died for good, or composites stopped coming.
     """
     with session_file(scene) as session:
-        plan = _plan(session, page_port=None)
+        plan = demo_plan(session, page_port=None)
         with Supervisor(plan.specs()) as supervisor:
-            if on_supervisor is not None:
-                on_supervisor(supervisor)
             collector = CompositeCollector(
                 ports.endpoint(plan.composite_port), ports.endpoint(plan.control_port), out
             )
@@ -116,7 +108,8 @@ def _collect(collector: CompositeCollector, supervisor: Supervisor, frames: int)
             )
 
 
-def _plan(session: Path, *, page_port: int | None) -> HostPlan:
+def demo_plan(session: Path, *, page_port: int | None) -> HostPlan:
+    """The demo's processes, joined by ports of their own."""
     node_port, composite_port, control_port = ports.private_ports(3)
     return HostPlan(
         str(RECORDING),

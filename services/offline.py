@@ -4,7 +4,7 @@ import json
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from protocol.frames import BoardPose, ViewFrame
 from protocol.scene import SceneDocument
@@ -111,28 +111,26 @@ def _render_frames(
 
     builder = ViewFrameBuilder(job.source)
     told = 0
-    with (job.out / INDEX_FILE).open("w", encoding="utf-8") as index:
-        for number in job.frames:
-            frame = builder(job.source[number])
-            started_s = time.perf_counter()
-            composite = renderer.render(frame)
-            summary.add(composite, 1000 * (time.perf_counter() - started_s))
-            for sentence in renderer.notices[told:]:
-                progress.notice(sentence)
-            told = len(renderer.notices)
-            _write_frame(job, number, frame, composite, index)
-            progress.frame_done()
+    for number in job.frames:
+        frame = builder(job.source[number])
+        started_s = time.perf_counter()
+        composite = renderer.render(frame)
+        summary.add(composite, 1000 * (time.perf_counter() - started_s))
+        for sentence in renderer.notices[told:]:
+            progress.notice(sentence)
+        told = len(renderer.notices)
+        _write_frame(job, number, frame, composite)
+        progress.frame_done()
     return summary
 
 
-def _write_frame(
-    job: RenderJob, number: int, frame: ViewFrame, composite: "CompositeFrame", index: IO[str]
-) -> None:
+def _write_frame(job: RenderJob, number: int, frame: ViewFrame, composite: "CompositeFrame") -> None:
     write_png(job.out / f"{number:06d}.png", composite.color)
     if job.with_exr and composite.linear is not None:
         write_exr(job.out / f"{number:06d}.exr", composite.linear)
-    index.write(json.dumps(frame_record(number, frame, composite)) + "\n")
-    index.flush()
+    mode = "w" if number == job.frames.start else "a"  # an older run's index goes with the first picture
+    with (job.out / INDEX_FILE).open(mode, encoding="utf-8") as index:
+        index.write(json.dumps(frame_record(number, frame, composite)) + "\n")
 
 
 def frame_record(number: int, frame: ViewFrame, composite: "CompositeFrame") -> dict[str, Any]:

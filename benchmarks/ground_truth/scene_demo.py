@@ -235,7 +235,8 @@ def _shape(kind: str, place: Matrix, **parts: object) -> dict[str, Any]:
 
 
 def _place(translation_m: Triple, turn: Matrix = IDENTITY, scale: Triple = (1.0, 1.0, 1.0)) -> Matrix:
-    return trimesh.transformations.translation_matrix(translation_m) @ turn @ np.diag([*scale, 1.0])
+    translation = trimesh.transformations.translation_matrix(translation_m)
+    return np.asarray(translation @ turn @ np.diag([*scale, 1.0]))
 
 
 def _turn(axis: Literal["x", "z"], angle_deg: float) -> Matrix:

@@ -74,4 +74,4 @@ def srgb_bytes(linear: Float32[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3
     """8-bit sRGB code (IEC 61966-2-1) of linear values, clipped at sensor white."""
     v = np.clip(linear, 0.0, 1.0)
     coded = np.where(v <= 0.0031308, 12.92 * v, 1.055 * np.power(v, 1 / 2.4) - 0.055)
-    return np.rint(255 * coded).astype(np.uint8)
+    return np.asarray(np.rint(255 * coded), np.uint8)

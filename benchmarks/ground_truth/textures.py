@@ -16,7 +16,7 @@ def smooth_noise(
     """Noise of unit variance whose features are height/cells_y by width/cells_x pixels large."""
     coarse = rng.standard_normal((cells_y + 1, cells_x + 1)).astype(np.float32)
     fine = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
-    return fine / max(float(fine.std()), 1e-6)
+    return np.asarray(fine / fine.std())
 
 
 def wood(seed: int, height: int, width: int, planks: int) -> Float32[np.ndarray, "h w 3"]:

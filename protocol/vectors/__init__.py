@@ -1,8 +1,8 @@
 """Byte vectors of the wire: for every kind of message its bytes (`NAME.bin`) and their meaning (`NAME.json`).
 
 A `.bin` holds one multipart: for each piece its length (4 bytes, little-endian) and then its bytes. The
-`.json` has `topic`, `header` (the fields), `parts` (base64), and `values`: what the pictures decode to, flat in
-C order (not for jpeg, whose pixels depend on the decoder). See SPEC.md, section 8.
+`.json` has `topic`, `header` (the fields), `parts` (base64), and `values`: what the pictures decode to, flat
+in C order (not for jpeg, whose pixels depend on the decoder). See SPEC.md, section 8.
 """
 
 import struct

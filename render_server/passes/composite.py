@@ -12,20 +12,25 @@ from render_server.gpu.context import GpuContext
 from render_server.gpu.program import ComputeProgram
 from render_server.gpu.textures import bind_images, bind_samplers, texture_2d
 from render_server.passes.direct_light import DirectLightPass
+from render_server.passes.light_table import LightTable
 from render_server.passes.picture import Picture
 from render_server.passes.sampling_grid import SamplingGrid
 from render_server.passes.trace_cones import ConeFields
+from render_server.passes.volume import Pyramid, VolumePlacement
 
 
 @dataclass(frozen=True)
 class RelitLayers:
-    """What a relighting method hands to composition."""
+    """What a relighting method hands to composition; `pyramid` and `table` are there to be looked at."""
 
     matte: moderngl.Texture
     virtual_radiance: moderngl.Texture
     direct: DirectLightPass
     cones: ConeFields
     grid: SamplingGrid
+    pyramid: Pyramid
+    placement: VolumePlacement
+    table: LightTable
 
 
 class CompositePass:

@@ -99,6 +99,7 @@ class Pyramid:
                 f"This GPU's 3-D textures end at {limit} texels, {size}^3 voxels need {max(shape)}: "
                 "lower method.volume_size."
             )
+        self.directions = directions
         self.texture = gpu.ctx.texture3d(shape, 4, dtype="f2")
         self.texture.filter = (moderngl.LINEAR, moderngl.LINEAR)
         self.texture.repeat_x = self.texture.repeat_y = self.texture.repeat_z = False

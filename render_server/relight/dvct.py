@@ -46,12 +46,11 @@ class DvctExact:
         """Compute everything that composition needs."""
         placement = self._placement(frame)
         voxels = self._voxel_scene(placement)
-        uniforms = self._uniforms(frame, placement)
         real_key = (frame.real.version, frame.lights_version, placement)
         object_key = (real_key, frame.virtual.version)
         if object_key != self._object_key:
             self._place_lights(frame)
-            uniforms |= self.table.uniforms()
+        uniforms = self._uniforms(frame, placement)
         if real_key != self._real_key:
             self._draw_real_maps(frame)
             voxels.rebuild_real(frame, self.table, placement, uniforms)
@@ -60,7 +59,16 @@ class DvctExact:
             voxels.rebuild_virtual(frame, self.table, uniforms)
         self._real_key, self._object_key = real_key, object_key
         self._shade(frame, voxels, uniforms)
-        return RelitLayers(frame.matte, self._surface.radiance, self._direct, self._cones, self._grid)
+        return RelitLayers(
+            frame.matte,
+            self._surface.radiance,
+            self._direct,
+            self._cones,
+            self._grid,
+            voxels.rho,
+            placement,
+            self.table,
+        )
 
     def _placement(self, frame: RelightInput) -> VolumePlacement:
         low, high = frame.virtual.bounds

@@ -5,7 +5,7 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int32
+from jaxtyping import Bool, Float32, Float64, Int32, Int64, UInt32
 
 from protocol.camera_model import CameraModel
 from protocol.errors import DeltalightError
@@ -14,6 +14,7 @@ from render_server.scene.depth_surface import DepthSurface, depth_surface, jump_
 from render_server.scene.materials import Material
 from render_server.scene.mesh import TriangleMesh
 
+CELL_SAMPLES = 6
 REAL_MATERIAL = Material(roughness=1.0, specular=0.0, double_sided=True, name="real")
 
 
@@ -29,29 +30,32 @@ class _Nodes:
 
 def depth_mesh(
     depth: DepthImage,
+    camera: CameraModel,
     world_from_camera: Float64[np.ndarray, "4 4"],
     triangle_budget: int = 40_000,
     surface: DepthSurface | None = None,
 ) -> TriangleMesh:
-    """Mesh a clean depth image in world coordinates with at most `triangle_budget` triangles.
+    """Mesh a clean depth image that is registered to `camera`, in the world.
 
-    A node stands for each cell of stride x stride pixels, at the cell's centre, with the cell's median depth
+    The mesh has at most `triangle_budget` triangles. A node stands for each cell of stride x stride pixels, at the cell's centre, with the cell's median depth
     (moved to the centre along the fitted surface). No triangle crosses a depth discontinuity; cells without
     depth or normal are holes. `uv` is the pixel coordinate (pixel centres at integers) of the vertex in the
-    picture that `depth.camera` takes. `surface` is `depth_surface(depth)` where it is already known.
+    camera's picture. `surface` is `depth_surface(depth, camera)` where it is already known.
     Without any valid depth the mesh is empty.
 
     Raises:
         DeltalightError: the budget is below 2, or depth and camera differ in size.
     """
-    if depth.depth_m.shape != (depth.camera.height, depth.camera.width):
+    if depth.depth_m.shape != (camera.height, camera.width):
         raise DeltalightError("the depth image and its camera differ in size; correct the calibration.")
     if triangle_budget < 2:
         raise DeltalightError(f"a budget of {triangle_budget} triangles holds no mesh; use 1000 or more.")
-    known = depth_surface(depth) if surface is None else surface
-    stride = stride_for_budget(depth.camera.width, depth.camera.height, triangle_budget)
-    nodes = _nodes(known, depth.camera, stride)
-    triangles = _grid_triangles(nodes.inverse_depth, jump_threshold(depth, nodes.inverse_depth, stride))
+    known = depth_surface(depth, camera) if surface is None else surface
+    stride = stride_for_budget(camera.width, camera.height, triangle_budget)
+    nodes = _nodes(known, camera, stride)
+    triangles = _grid_triangles(
+        nodes.inverse_depth, jump_threshold(depth, camera, nodes.inverse_depth, stride)
+    )
     return _world_mesh(nodes, triangles, world_from_camera)
 
 
@@ -65,7 +69,7 @@ def stride_for_budget(width: int, height: int, triangle_budget: int) -> int:
 
 def _nodes(surface: DepthSurface, camera: CameraModel, stride: int) -> _Nodes:
     pixels, rays = _node_rays(camera, stride)
-    known = surface.normals.any(axis=2)
+    known = np.isfinite(surface.gradient[0])
     inverse = np.where(known, surface.inverse_depth, 0)
     flat = _median_pixels(inverse, stride)
     chosen = inverse.ravel()[flat]
@@ -94,29 +98,44 @@ def _cell_centres(length: int, stride: int) -> Float64[np.ndarray, " n"]:
     return np.asarray((starts + np.minimum(starts + stride, length) - 1) / 2)
 
 
-def _median_pixels(inverse: Float32[np.ndarray, "h w"], stride: int) -> np.ndarray:
+def _median_pixels(inverse: Float32[np.ndarray, "h w"], stride: int) -> Int64[np.ndarray, "gh gw"]:
     """Return the flat index of the pixel with the median inverse depth among the valid ones of each cell.
 
-    Cells without a valid pixel give an invalid one. Positive floats sort as their bits do, so that one sort
-    of 64-bit keys (value, place in the cell) gives value and place.
+    Cells without a valid pixel give an invalid one. Large cells are judged by 6 x 6 of their pixels.
+    Positive floats sort as their bits do; the lowest bits make way for the pixel's number in the cell.
     """
     height, width = inverse.shape
     rows, columns = -(-height // stride), -(-width // stride)
-    if stride == 1:
-        return np.arange(inverse.size).reshape(inverse.shape)
     padded = cv2.copyMakeBorder(
         inverse, 0, rows * stride - height, 0, columns * stride - width, cv2.BORDER_CONSTANT
-    )
-    cells = padded.reshape(rows, stride, columns, stride).swapaxes(1, 2).reshape(rows, columns, -1)
-    keys = cells.view(np.uint32).astype(np.uint64) << np.uint64(32)
-    keys |= np.arange(stride * stride, dtype=np.uint64)
-    keys.sort(axis=-1)
-    invalid = (cells == 0).sum(axis=-1)
-    middle = np.minimum((invalid + stride * stride) // 2, stride * stride - 1)
-    place = np.take_along_axis(keys, middle[..., None], axis=-1)[..., 0] & np.uint64(0xFFFFFFFF)
-    row = np.arange(rows)[:, None] * stride + place.astype(np.int64) // stride
-    column = np.arange(columns) * stride + place.astype(np.int64) % stride
-    return np.minimum(row, height - 1) * width + np.minimum(column, width - 1)
+    ).view(np.uint32)
+    steps = np.unique(np.linspace(0, stride - 1, min(stride, CELL_SAMPLES)).round().astype(int))
+    offsets = [(down, right) for down in steps for right in steps]
+    number_bits = np.uint32((1 << (len(offsets) - 1).bit_length()) - 1)
+    planes = [padded[down::stride, right::stride] for down, right in offsets]
+    invalid = sum((plane == 0).astype(np.intp) for plane in planes)
+    keys = [(plane & ~number_bits) | np.uint32(number) for number, plane in enumerate(planes)]
+    _sort_planes(keys)
+    middle = np.minimum((invalid + len(offsets)) // 2, len(offsets) - 1)
+    chosen = np.take_along_axis(np.stack(keys), middle[None], axis=0)[0] & number_bits
+    down, right = np.array(offsets)[chosen.astype(np.intp)].transpose(2, 0, 1)
+    row = np.minimum(np.arange(rows)[:, None] * stride + down, height - 1)
+    return np.asarray(row * width + np.minimum(np.arange(columns) * stride + right, width - 1))
+
+
+def _sort_planes(planes: list[UInt32[np.ndarray, "a b"]]) -> None:
+    """Sort every element's values over the planes, in place: Batcher's odd-even merge network."""
+    count, run = len(planes), 1
+    while run < count:
+        gap = run
+        while gap:
+            for start in range(gap % run, count - gap, 2 * gap):
+                for low in range(start, min(start + gap, count - gap)):
+                    if low // (2 * run) == (low + gap) // (2 * run):
+                        one, other = planes[low], planes[low + gap]
+                        planes[low], planes[low + gap] = np.minimum(one, other), np.maximum(one, other)
+            gap //= 2
+        run *= 2
 
 
 def _grid_triangles(
@@ -167,11 +186,14 @@ def _world_mesh(
     numbers = np.cumsum(used, dtype=np.int32) - 1
     depth = 1 / nodes.inverse_depth.ravel()[used].astype(np.float64)
     rays = nodes.rays.reshape(-1, 2)[used]
-    points = np.column_stack([rays[:, 0] * depth, rays[:, 1] * depth, depth])
+    points = np.stack([rays[:, 0] * depth, rays[:, 1] * depth, depth], axis=1)
     rotation = world_from_camera[:3, :3]
+    # einsum, because the BLAS behind `@` spins on every core for such slim matrices.
+    world = np.einsum("ni,ji->nj", points, rotation) + world_from_camera[:3, 3]
+    normals = np.einsum("ni,ji->nj", nodes.normals.reshape(-1, 3)[used], rotation)
     return TriangleMesh(
-        (points @ rotation.T + world_from_camera[:3, 3]).astype(np.float32),
-        (nodes.normals.reshape(-1, 3)[used] @ rotation.T).astype(np.float32),
+        world.astype(np.float32),
+        normals.astype(np.float32),
         numbers[triangles],
         nodes.pixels.reshape(-1, 2)[used],
         REAL_MATERIAL,

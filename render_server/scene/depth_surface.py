@@ -29,8 +29,8 @@ class DepthSurface:
     """What is known of the surface behind every pixel.
 
     `inverse_depth` is as measured (0 where invalid). `gradient` is its change by ray coordinate (x/z, y/z),
-    fitted to the surroundings. `normals` are unit vectors in the optical frame towards the camera, zero
-    where they are unknown.
+    fitted to the surroundings (NaN where unknown). `normals` are unit vectors in the optical frame towards
+    the camera, zero where they are unknown.
     """
 
     inverse_depth: Float32[np.ndarray, "h w"]
@@ -43,12 +43,12 @@ def noise_sigma(depth: DepthImage) -> float:
     return ASSUMED_NOISE_SIGMA_M if depth.noise_sigma_m is None else depth.noise_sigma_m
 
 
-def depth_points_normals(depth: DepthImage) -> Float32[np.ndarray, "h w 3"]:
+def depth_points_normals(depth: DepthImage, camera: CameraModel) -> Float32[np.ndarray, "h w 3"]:
     """Return unit normals in the optical frame, towards the camera; zero where depth gives none."""
-    return depth_surface(depth).normals
+    return depth_surface(depth, camera).normals
 
 
-def depth_surface(depth: DepthImage) -> DepthSurface:
+def depth_surface(depth: DepthImage, camera: CameraModel) -> DepthSurface:
     """Fit a plane to the surroundings of every valid pixel by least squares, without crossing edges.
 
     The window grows with the noise until normals are good to about 3 degrees at the mean distance. Where it
@@ -59,33 +59,36 @@ def depth_surface(depth: DepthImage) -> DepthSurface:
     inverse = np.zeros_like(depth.depth_m, np.float32)
     np.divide(1, depth.depth_m, out=inverse, where=valid)
     mask = valid.astype(np.float32)
-    radius = _window_radius(depth, inverse, mask)
+    radius = _window_radius(noise_sigma(depth) * float(camera.matrix[0, 0]), inverse, mask)
     by_pixel = _window_gradient(inverse, mask, radius)
-    crossed = _crosses_edge(inverse, jump_threshold(depth, inverse), valid, radius)
+    crossed = _crosses_edge(inverse, jump_threshold(depth, camera, inverse), valid, radius)
     _move_windows(by_pixel, crossed, radius)
-    gradient = _by_ray(by_pixel, depth.camera)
-    return DepthSurface(inverse, gradient, _normals(inverse, gradient, depth.camera))
+    gradient = _by_ray(by_pixel, camera)
+    return DepthSurface(inverse, gradient, _normals(inverse, gradient, camera))
 
 
 def jump_threshold(
-    depth: DepthImage, inverse_depth: Float32[np.ndarray, "h w"], step_px: float = 1.0
+    depth: DepthImage,
+    camera: CameraModel,
+    inverse_depth: Float32[np.ndarray, "h w"],
+    step_px: float = 1.0,
 ) -> Float32[np.ndarray, "h w"]:
     """Return the change of w over `step_px` pixels beyond which two points are not on one surface.
 
     Three sigma of a difference, and the change on a surface that is 80 degrees from facing the camera:
     |dw| = w tan(slope) / f.
     """
-    focal = float(np.sqrt(depth.camera.matrix[0, 0] * depth.camera.matrix[1, 1]))
+    focal = float(np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1]))
     slope = np.float32(step_px * np.tan(np.radians(MAX_SLOPE_DEG)) / focal)
     return inverse_depth * slope + np.float32(NOISE_SIGMAS * np.sqrt(2) * noise_sigma(depth))
 
 
 def _window_radius(
-    depth: DepthImage, inverse: Float32[np.ndarray, "h w"], mask: Float32[np.ndarray, "h w"]
+    sigma_px: float, inverse: Float32[np.ndarray, "h w"], mask: Float32[np.ndarray, "h w"]
 ) -> int:
     """Return the least radius whose slope error, sigma f z / sqrt(sum of squared offsets), is bearable."""
     mean = float(inverse.sum(dtype=np.float64) / max(float(mask.sum(dtype=np.float64)), 1.0))
-    error = noise_sigma(depth) * float(depth.camera.matrix[0, 0]) / max(mean, 1e-6)
+    error = sigma_px / max(mean, 1e-6)
     for radius in range(1, MAX_RADIUS):
         if error <= WANTED_TILT_RAD * np.sqrt((2 * radius + 1) ** 2 * radius * (radius + 1) / 3):
             return radius

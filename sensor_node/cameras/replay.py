@@ -82,7 +82,7 @@ class PacedCamera(Camera):
         age_s = (elapsed - self._due_ns(newest)) / 1e9
         if age_s > max_age_s:
             raise StaleFrameError(
-                f"the newest frame is {age_s:.2f} s old, {max_age_s:g} s are allowed; see if capture has ended."
+                f"the newest frame is {age_s:.2f} s old, {max_age_s:g} s are allowed; see if capture ended."
             )
         return self._take(newest)
 

@@ -9,7 +9,7 @@ from protocol.board import BoardSpec
 from protocol.camera_model import CameraModel
 from protocol.frames import DepthImage, SensorFrame
 from sensor_node.cameras.replay import PacedCamera
-from sensor_node.cameras.synthetic_scene import SyntheticScene
+from sensor_node.cameras.synthetic_scene import SAMPLES_PER_EDGE, SyntheticScene
 
 FRAMES_PER_ROUND = 90
 PERIOD_NS = 33_333_333
@@ -70,26 +70,29 @@ class SyntheticCamera(PacedCamera):
         self.board = board or default_board()
         self.camera = camera or default_camera()
         self.scene = SyntheticScene(self.board)
+        self._fine = self.camera.resized(
+            self.camera.width * SAMPLES_PER_EDGE, self.camera.height * SAMPLES_PER_EDGE
+        )
         self._noise = noise
 
     def pose_at(self, index: int) -> Float64[np.ndarray, "4 4"]:
-        """Return the true world_from_camera of a frame: swaying in front of the board, looking at its middle."""
+        """Return the true world_from_camera of a frame, which sways in front of the board's middle."""
         phase = 2 * np.pi * (index % FRAMES_PER_ROUND) / FRAMES_PER_ROUND
         sway, tilt = SWAY_RAD * np.sin(phase), TILT_RAD + 0.1 * np.cos(phase)
         # The board fills about half the picture's width.
-        distance = 1.2 * self.scene.extent_m * self.camera.matrix[0, 0] / self.camera.width * 2
+        distance = 1.1 * self.scene.extent_m * self.camera.matrix[0, 0] / self.camera.width * 2
         away = np.array([np.sin(sway) * np.sin(tilt), -np.cos(sway) * np.sin(tilt), np.cos(tilt)])
         right = np.cross([0, 0, 1.0], away)
         right /= np.linalg.norm(right)
         pose = np.eye(4)
         pose[:3, :3] = np.column_stack([right, np.cross(-away, right), -away])
-        pose[:3, 3] = self.scene.center + distance * away
+        pose[:3, 3] = self.scene.aim + distance * away
         return pose
 
     def frame_at(self, index: int) -> SensorFrame:
         """Return the frame of the path's first round."""
         pose = self.pose_at(index)
-        linear = self.scene.picture(self.camera, pose)
+        linear = self.scene.picture(self._fine, pose)
         depth_m = self.scene.trace(self.camera, pose).depth_m
         sigma = None
         if self._noise is not None:
@@ -109,8 +112,17 @@ class SyntheticCamera(PacedCamera):
         )
 
 
-def srgb_codes(linear: Float32[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
-    """Return the 8-bit sRGB codes of linear light (IEC 61966-2-1)."""
-    light = np.clip(linear, 0, 1)
+def _srgb_table(size: int) -> UInt8[np.ndarray, " n"]:
+    light = np.linspace(0, 1, size)
     coded = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
     return np.asarray(np.rint(coded * 255), np.uint8)
+
+
+# Fine enough that every code is met: the steepest step of the curve is 12.92.
+_SRGB_OF_LINEAR = _srgb_table(1 << 14)
+
+
+def srgb_codes(linear: Float32[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Return the 8-bit sRGB codes of linear light (IEC 61966-2-1)."""
+    steps = np.clip(linear * (len(_SRGB_OF_LINEAR) - 1) + 0.5, 0, len(_SRGB_OF_LINEAR) - 1)
+    return np.asarray(_SRGB_OF_LINEAR[steps.astype(np.int32)])

@@ -1,52 +1,67 @@
 """A small exact scene for tests and demonstrations: a textured table, a marker board on it, and a box.
 
-Everything is computed by intersecting the rays of the camera's full lens model, several a pixel, with the
-table plane z = 0 and the box, in the world frame of FORMATS 3. Light is one distant lamp and a constant
-ambient; nothing casts shadows.
+Rays of the camera's full lens model, several a pixel for colour, end on the table plane z = 0 or on the box,
+in the world frame of FORMATS 3. Light is one distant lamp and a constant ambient; nothing casts shadows.
 """
 
-from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int8
+from jaxtyping import Bool, Float32, Float64
 
 from protocol.board import BoardSpec
 from protocol.camera_model import CameraModel
 
-SAMPLES_PER_EDGE = 3
+SAMPLES_PER_EDGE = 2
 BLACK_ALBEDO, PAPER_ALBEDO = 0.04, 0.8
 TABLE_ALBEDO = np.array([0.45, 0.33, 0.22], np.float32)
 BOX_ALBEDO = np.array([0.2, 0.35, 0.6], np.float32)
-TO_LAMP = np.array([0.3, -0.2, 0.93], np.float32) / np.float32(np.linalg.norm([0.3, -0.2, 0.93]))
+TO_LAMP = np.array([0.3, -0.2, 0.93]) / np.linalg.norm([0.3, -0.2, 0.93])
 LAMP_IRRADIANCE, AMBIENT_IRRADIANCE = 1.8, 0.9
 # White paper around the printed area, as a share of a marker's edge.
 SHEET_MARGIN = 0.35
-WOOD_PERIOD_M = 0.037
-FACES = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
-FLOOR, SHEET, BOX = 0, 1, 2
+# Texels of the printed sheet for each cell of a marker, and samples a texel edge where it is drawn.
+TEXELS_PER_CELL, SAMPLES_PER_TEXEL = 16, 4
+WOOD_PERIOD_M, WOOD_EDGE_M, WOOD_TEXEL_M = 0.037, 4.0, 0.003
+
+Field = Float32[np.ndarray, "h w"]
 
 
-class Surface(NamedTuple):
-    """What the rays of a picture hit."""
+class Hits(NamedTuple):
+    """Where rays end: depth along the optical axis (0: nowhere), table coordinates, light on the box.
 
-    depth_m: Float32[np.ndarray, "h w"]
-    radiance: Float32[np.ndarray, "h w 3"]
-    hit: Bool[np.ndarray, "h w"]
+    `box_irradiance` is 0 where the ray does not end on the box.
+    """
+
+    depth_m: Field
+    x: Field
+    y: Field
+    box_irradiance: Field
 
 
-@dataclass(frozen=True)
+def irradiance(normal: Float64[np.ndarray, "3"]) -> float:
+    """Return the irradiance of a surface with this normal, in camera units."""
+    return float(AMBIENT_IRRADIANCE + LAMP_IRRADIANCE * max(normal @ TO_LAMP, 0))
+
+
 class SyntheticScene:
     """The table with the board and, to the right of it, a box of `box_m` (width, depth, height)."""
 
-    board: BoardSpec
-    box_m: tuple[float, float, float] = (0.1, 0.1, 0.12)
+    def __init__(self, board: BoardSpec, box_m: tuple[float, float, float] = (0.08, 0.08, 0.1)) -> None:
+        self.board, self.box_m = board, box_m
 
     @property
     def center(self) -> Float64[np.ndarray, "3"]:
         """Middle of the board in the world."""
         return np.asarray(self.board.sheet_outline().mean(axis=0))
+
+    @property
+    def aim(self) -> Float64[np.ndarray, "3"]:
+        """Middle of what there is to see: board and box, on the table."""
+        left, right = self.board.sheet_outline()[0, 0], self.box_bounds[1, 0]
+        return np.array([(left + right) / 2, self.center[1], 0.0])
 
     @property
     def extent_m(self) -> float:
@@ -58,86 +73,147 @@ class SyntheticScene:
     def box_bounds(self) -> Float64[np.ndarray, "2 3"]:
         """Lower and upper corner of the box in the world."""
         right, middle = self.board.sheet_outline()[1, 0], self.center[1]
-        margin = SHEET_MARGIN * self.board.marker_length_m
-        low = np.array([right + margin + 0.02, middle - self.box_m[1] / 2, 0.0])
+        low = np.array([right + self._margin + 0.02, middle - self.box_m[1] / 2, 0.0])
         return np.array([low, low + self.box_m])
 
-    def trace(self, camera: CameraModel, world_from_camera: Float64[np.ndarray, "4 4"]) -> Surface:
-        """Return depth along the optical axis and linear radiance where each ray of the camera ends."""
-        rays = np.dstack([camera.rays(), np.ones((camera.height, camera.width), np.float32)])
-        directions = rays @ world_from_camera[:3, :3].T.astype(np.float32)
-        eye = world_from_camera[:3, 3].astype(np.float32)
+    @property
+    def _margin(self) -> float:
+        return SHEET_MARGIN * self.board.marker_length_m
+
+    def trace(self, camera: CameraModel, world_from_camera: Float64[np.ndarray, "4 4"]) -> Hits:
+        """Intersect the ray through every pixel centre with the table and the box."""
+        turn, eye = world_from_camera[:3, :3].astype(np.float32), world_from_camera[:3, 3]
+        rays = camera.rays()
+        direction = [rays[..., 0] * row[0] + rays[..., 1] * row[1] + row[2] for row in turn]
         with np.errstate(divide="ignore", invalid="ignore"):
-            table = -eye[2] / directions[..., 2]
-            box, axis = self._box_hit(eye, directions)
+            table = np.float32(-eye[2]) / direction[2]
+            box, light = self._box_hit(eye, direction)
         table[~(table > 0)] = np.inf
-        nearest = np.minimum(table, box)
-        hit = np.isfinite(nearest)
-        depth = np.where(hit, nearest, 0).astype(np.float32)
-        places = eye + directions * depth[..., None]
-        albedo = self._table_albedo(places[..., 0], places[..., 1])
         on_box = box < table
-        albedo[on_box] = BOX_ALBEDO
-        normals = np.broadcast_to(FACES[2], directions.shape).copy()
-        normals[on_box] = FACES[axis[on_box]]
-        normals *= -np.sign((normals * directions).sum(axis=-1, keepdims=True))
-        irradiance = AMBIENT_IRRADIANCE + LAMP_IRRADIANCE * np.clip(normals @ TO_LAMP, 0, None)
-        radiance = albedo / np.pi * irradiance[..., None]
-        radiance[~hit] = AMBIENT_IRRADIANCE / np.pi
-        return Surface(depth, radiance.astype(np.float32), hit)
+        depth = np.where(on_box, box, table)
+        depth[~np.isfinite(depth)] = 0
+        x, y = (np.float32(eye[axis]) + depth * direction[axis] for axis in (0, 1))
+        return Hits(depth, x, y, np.where(on_box, light, np.float32(0)))
 
     def picture(
-        self, camera: CameraModel, world_from_camera: Float64[np.ndarray, "4 4"]
+        self, fine: CameraModel, world_from_camera: Float64[np.ndarray, "4 4"]
     ) -> Float32[np.ndarray, "h w 3"]:
-        """Return linear radiance, averaged over each pixel."""
-        fine = camera.resized(camera.width * SAMPLES_PER_EDGE, camera.height * SAMPLES_PER_EDGE)
-        radiance = self.trace(fine, world_from_camera).radiance
-        mean = cv2.resize(radiance, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-        return np.asarray(mean)
+        """Return linear radiance, averaged over SAMPLES_PER_EDGE x SAMPLES_PER_EDGE pixels of `fine`."""
+        hits = self.trace(fine, world_from_camera)
+        on_table = ((hits.depth_m > 0) & (hits.box_irradiance == 0)).astype(np.float32)
+        paper = _look_up(self._sheet, hits.x, hits.y) * on_table
+        # The sheet's texture is negative outside the paper.
+        wood = np.where(paper < 0, _look_up(self._wood, hits.x, hits.y), np.float32(0)) * on_table
+        size = fine.width // SAMPLES_PER_EDGE, fine.height // SAMPLES_PER_EDGE
+        shares = [np.maximum(paper, 0), wood, hits.box_irradiance, on_table + (hits.box_irradiance > 0)]
+        paper, wood, box, hit = (cv2.resize(share, size, interpolation=cv2.INTER_AREA) for share in shares)
+        upward = irradiance(np.array([0, 0, 1.0]))
+        reflected = (paper * upward)[..., None] + (wood * upward)[..., None] * TABLE_ALBEDO
+        reflected += box[..., None] * BOX_ALBEDO + ((1 - hit) * AMBIENT_IRRADIANCE)[..., None]
+        return np.asarray(reflected / np.pi, np.float32)
 
-    def _box_hit(
-        self, eye: Float32[np.ndarray, "3"], directions: Float32[np.ndarray, "h w 3"]
-    ) -> tuple[Float32[np.ndarray, "h w"], Int8[np.ndarray, "h w"]]:
-        """Distance at which each ray enters the box (infinity: never), and the axis of the face."""
-        bounds = self.box_bounds.astype(np.float32)
-        slabs = np.stack([(bound - eye) / directions for bound in bounds])
-        entries = slabs.min(axis=0)
-        entry, leave = entries.max(axis=-1), slabs.max(axis=0).min(axis=-1)
-        distance = np.where((entry < leave) & (entry > 0), entry, np.inf)
-        return distance.astype(np.float32), entries.argmax(axis=-1).astype(np.int8)
+    def _box_hit(self, eye: Float64[np.ndarray, "3"], direction: list[Field]) -> tuple[Field, Field]:
+        """Distance at which each ray enters the box (infinity: never), and the irradiance of that face."""
+        enter, leave = np.full_like(direction[0], -np.inf), np.full_like(direction[0], np.inf)
+        light = np.zeros_like(enter)
+        for axis, (low, high) in enumerate(self.box_bounds.T - eye[:, None]):
+            inverse = 1 / direction[axis]
+            first, second = np.float32(low) * inverse, np.float32(high) * inverse
+            near = np.minimum(first, second)
+            normal = np.eye(3)[axis] * np.sign(eye[axis] - self.box_bounds[:, axis].mean())
+            light = np.where(near > enter, np.float32(irradiance(normal)), light)
+            enter, leave = np.maximum(enter, near), np.minimum(leave, np.maximum(first, second))
+        return np.where((enter < leave) & (enter > 0), enter, np.float32(np.inf)), light
 
-    def _table_albedo(
-        self, x: Float32[np.ndarray, "h w"], y: Float32[np.ndarray, "h w"]
-    ) -> Float32[np.ndarray, "h w 3"]:
+    @cached_property
+    def _wood(self) -> "_Texture":
+        half = WOOD_EDGE_M / 2
+        low = self.center[:2] - half
+        x, y = np.meshgrid(*(start + np.arange(0, WOOD_EDGE_M, WOOD_TEXEL_M) for start in low))
         phase = 2 * np.pi / WOOD_PERIOD_M
         grain = 1 + 0.15 * np.sin(phase * x + 2 * np.sin(0.37 * phase * y)) * np.cos(0.6 * phase * y)
-        albedo = TABLE_ALBEDO * grain[..., None]
-        outline = self.board.sheet_outline()
-        margin = SHEET_MARGIN * self.board.marker_length_m
-        low, high = outline[3, :2] - margin, outline[1, :2] + margin
-        albedo[(x > low[0]) & (x < high[0]) & (y > low[1]) & (y < high[1])] = PAPER_ALBEDO
-        self._print_markers(albedo, x, y)
-        return np.asarray(albedo, np.float32)
+        return _Texture(grain.astype(np.float32), low, WOOD_TEXEL_M, border=1.0)
 
-    def _print_markers(
-        self,
-        albedo: Float32[np.ndarray, "h w 3"],
-        x: Float32[np.ndarray, "h w"],
-        y: Float32[np.ndarray, "h w"],
-    ) -> None:
-        board, length = self.board, self.board.marker_length_m
+    @cached_property
+    def _sheet(self) -> "_Texture":
+        """Albedo of the printed sheet, exact on average over each texel."""
+        board, outline = self.board, self.board.sheet_outline()
         cells = board.opencv_dictionary().markerSize + 2 * board.border_bits
+        texel = board.marker_length_m / cells / TEXELS_PER_CELL
+        step = texel / SAMPLES_PER_TEXEL
+        low, high = outline[3, :2] - self._margin, outline[1, :2] + self._margin
+        counts = np.ceil((high - low) / texel).astype(int) * SAMPLES_PER_TEXEL
+        x, y = (low[axis] + (np.arange(counts[axis]) + 0.5) * step for axis in (0, 1))
+        albedo = np.full((counts[1], counts[0]), PAPER_ALBEDO, np.float32)
         for name, corners in board.corner_points().items():
-            column = (x - corners[0, 0]) * (cells / length)
-            row = (corners[0, 1] - y) * (cells / length)
-            inside = (column >= 0) & (column < cells) & (row >= 0) & (row < cells)
-            code = marker_cells(board, name)
-            white = code[row[inside].astype(int), column[inside].astype(int)]
-            albedo[inside] = np.where(white, PAPER_ALBEDO, BLACK_ALBEDO)[:, None]
+            _print(
+                albedo,
+                _marker_cells(board, name),
+                x - corners[0, 0],
+                corners[0, 1] - y,
+                board.marker_length_m,
+            )
+        if board.type == "charuco":
+            self._print_squares(albedo, x - outline[0, 0], outline[0, 1] - y)
+        size = tuple(int(count) for count in counts // SAMPLES_PER_TEXEL)
+        texels = cv2.resize(albedo, size, interpolation=cv2.INTER_AREA)
+        return _Texture(texels, low + texel / 2, texel, border=-1.0)
+
+    def _print_squares(
+        self, albedo: Field, right: Float64[np.ndarray, " w"], down: Float64[np.ndarray, " h"]
+    ) -> None:
+        """The black squares of a ChArUco board; (row + column) even."""
+        square = self.board.marker_length_m + self.board.separation_m
+        column, row = np.floor(right / square), np.floor(down / square)
+        black = (column[None] + row[:, None]) % 2 == 0
+        black &= ((column >= 0) & (column < self.board.columns))[None]
+        black &= ((row >= 0) & (row < self.board.rows))[:, None]
+        albedo[black] = BLACK_ALBEDO
 
 
-def marker_cells(board: BoardSpec, name: int) -> Bool[np.ndarray, "n n"]:
-    """Return the cells of a marker with its black border, True = white."""
+class _Texture(NamedTuple):
+    """Values over the table: texel (row, column) is at (x, y) = low + (column, row) * texel_m."""
+
+    values: Field
+    low: Float64[np.ndarray, "2"]
+    texel_m: float
+    border: float
+
+
+def _look_up(texture: _Texture, x: Field, y: Field) -> Field:
+    column = (x - np.float32(texture.low[0])) * np.float32(1 / texture.texel_m)
+    row = (y - np.float32(texture.low[1])) * np.float32(1 / texture.texel_m)
+    return np.asarray(
+        cv2.remap(
+            texture.values,
+            column,
+            row,
+            cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_CONSTANT,
+            borderValue=texture.border,
+        )
+    )
+
+
+def _print(
+    albedo: Field,
+    cells: Bool[np.ndarray, "n n"],
+    right: Float64[np.ndarray, " w"],
+    down: Float64[np.ndarray, " h"],
+    length_m: float,
+) -> None:
+    """Print a marker; `right` and `down` are the places of the columns and rows from its top-left corner."""
+    columns, rows = (np.flatnonzero((place >= 0) & (place < length_m)) for place in (right, down))
+    column, row = (
+        (right[columns] / length_m * len(cells)).astype(int),
+        (down[rows] / length_m * len(cells)).astype(int),
+    )
+    white = cells[row[:, None], column[None]]
+    albedo[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] = np.where(white, PAPER_ALBEDO, BLACK_ALBEDO)
+
+
+def _marker_cells(board: BoardSpec, name: int) -> Bool[np.ndarray, "n n"]:
+    """Cells of a marker with its black border, True = white."""
     dictionary = board.opencv_dictionary()
     cells = dictionary.markerSize + 2 * board.border_bits
     return np.asarray(dictionary.generateImageMarker(name, cells, borderBits=board.border_bits) > 127)

@@ -153,7 +153,8 @@ def test_a_marker_picture_becomes_a_dictionary_that_finds_it(tmp_path: Path) -> 
     marker = np.kron(np.pad(code, 2), np.full((20, 20), 255, np.uint8))
     cv2.imwrite(str(tmp_path / "marker.png"), marker)
     (tmp_path / "board.yaml").write_text(
-        "type: single\ndictionary: {marker_size: 4, border_bits: 2, image: marker.png}\nmarker_length_m: 0.1\n"
+        "type: single\nmarker_length_m: 0.1\n"
+        "dictionary: {marker_size: 4, border_bits: 2, image: marker.png}\n"
     )
     spec = load_board_yaml(tmp_path / "board.yaml")
     assert isinstance(spec.dictionary, CustomDictionary)
@@ -185,9 +186,12 @@ def test_the_papers_marker_is_found_in_their_photograph(shared_data: Path, tmp_p
     folder = shared_data / "paper_scene_dirtchamber" / "data"
     (tmp_path / "marker.png").write_bytes((folder / "marker.png").read_bytes())
     (tmp_path / "board.yaml").write_text(
-        "type: single\ndictionary: {marker_size: 6, border_bits: 3, image: marker.png}\nmarker_length_m: 0.1\n"
+        "type: single\nmarker_length_m: 0.1\n"
+        "dictionary: {marker_size: 6, border_bits: 3, image: marker.png}\n"
     )
     spec = load_board_yaml(tmp_path / "board.yaml")
-    corners = detect_single(cv2.imread(str(folder / "real_static_scene.png"), cv2.IMREAD_GRAYSCALE), spec)
+    corners = detect_single(
+        np.asarray(cv2.imread(str(folder / "real_static_scene.png"), cv2.IMREAD_GRAYSCALE)), spec
+    )
     assert corners.min(axis=0) == pytest.approx([220, 311], abs=3)
     assert corners.max(axis=0) == pytest.approx([317, 373], abs=3)

@@ -28,6 +28,10 @@ def camera(width: int = WIDTH, height: int = HEIGHT, focal: float = 30.0) -> Cam
     return CameraModel(width, height, np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]]))
 
 
+def pixels(path: Path) -> np.ndarray:
+    return np.asarray(cv2.imread(str(path), cv2.IMREAD_UNCHANGED))
+
+
 def write_folder(folder: Path, count: int = 4, depth_offset_s: float = 0.001) -> Path:
     """A small dataset: colour pictures 0.1 s apart, depth a little later; the last depth code is 65535."""
     rng = np.random.default_rng(7)
@@ -54,8 +58,8 @@ def test_frames_are_decoded_with_units_masks_and_times(tmp_path: Path) -> None:
     reader = open_dataset(folder)
     assert len(reader) == 4
     frame = reader[2]
-    steps = cv2.imread(str(folder / "depth/2.png"), cv2.IMREAD_UNCHANGED)
-    bgr = cv2.imread(str(folder / "rgb/2.png"))
+    steps = pixels(folder / "depth/2.png")
+    bgr = pixels(folder / "rgb/2.png")
     assert np.array_equal(frame.color, bgr[..., ::-1])
     assert frame.frame_id == 2
     assert frame.timestamp_ns == 10_200_000_000
@@ -92,7 +96,7 @@ def test_tum_depth_without_calibration_is_in_five_thousandths(tmp_path: Path) ->
     folder = write_folder(tmp_path / "a")
     (folder / "calibration" / "depth.yaml").unlink()
     depth = open_dataset(folder)[0].depth
-    steps = cv2.imread(str(folder / "depth/0.png"), cv2.IMREAD_UNCHANGED)
+    steps = pixels(folder / "depth/0.png")
     assert depth is not None
     assert depth.depth_m[3, 3] == pytest.approx(steps[3, 3] / 5000)
 
@@ -120,7 +124,8 @@ def test_poses_are_interpolated_between_near_neighbours(tmp_path: Path) -> None:
     folder = write_folder(tmp_path / "a")
     half = np.sqrt(0.5)
     (folder / "groundtruth.txt").write_text(
-        f"# timestamp tx ty tz qx qy qz qw\n10.05 0 0 0 0 0 0 1\n10.15 1 2 3 0 0 {half} {half}\n10.21 5 5 5 0 0 0 2\n"
+        "# timestamp tx ty tz qx qy qz qw\n10.05 0 0 0 0 0 0 1\n"
+        f"10.15 1 2 3 0 0 {half} {half}\n10.21 5 5 5 0 0 0 2\n"
     )
     poses = [frame.world_from_camera for frame in open_dataset(folder)]
     assert poses[0] is None
@@ -173,7 +178,10 @@ def remove(name: str) -> Callable[[Path], None]:
 
 
 def picture(name: str, values: np.ndarray) -> Callable[[Path], None]:
-    return lambda folder: (folder / name).write_bytes(cv2.imencode(".png", values)[1].tobytes())
+    def apply(folder: Path) -> None:
+        (folder / name).write_bytes(cv2.imencode(".png", values)[1].tobytes())
+
+    return apply
 
 
 MIRROR = "depth_from_rgb: [[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]\n"
@@ -424,8 +432,6 @@ def test_realsense_boxes(shared_data: Path, tmp_path: Path) -> None:
 def test_castle_with_a_depth_camera_of_its_own(shared_data: Path, tmp_path: Path) -> None:
     source, folder = shared_data / "rgbd" / "visp_castel_realsense", tmp_path / "a"
     link_lists(folder, sorted((source / "image").iterdir()), sorted((source / "depth").iterdir()))
-    sizes = cv2.imread(str(source / "image" / "image_0000.png")).shape[:2]
-    assert sizes == (480, 640)
     calibrate(folder, visp_intrinsics(source / "chateau.xml"), (), "")
     own = CameraModel(640, 480, camera_matrix(visp_intrinsics(source / "chateau_depth.xml")))
     extra = {"depth_scale": 0.000124986647}

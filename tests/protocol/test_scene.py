@@ -214,7 +214,7 @@ def test_schema_forbids_unknown_keys_and_tells_units() -> None:
 def test_documents_are_values() -> None:
     assert SceneDocument() == parse_scene({})
     with pytest.raises(ValueError, match="frozen"):
-        SceneDocument().name = "other"  # type: ignore[misc]
+        SceneDocument().name = "other"
 
 
 def ply_vertices(path: Path) -> np.ndarray:

@@ -1,11 +1,10 @@
-"""Transport over real sockets on loopback: newest wins, slow consumers, lost peers, idempotent control."""
+"""Streams over real sockets on loopback: newest wins, slow consumers, lost peers, refused endpoints."""
 
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,26 +13,13 @@ import psutil
 import pytest
 import zmq
 
-from protocol.envelope import EnvelopeError, decode, encode
+from protocol.envelope import decode, encode
 from protocol.errors import DeltalightError
-from protocol.messages import MAX_PART_BYTES, ControlReply, ControlRequest, StatsMessage
-from protocol.request import ReplyMemory
+from protocol.messages import MAX_PART_BYTES, StatsMessage
 from protocol.transport import Publisher, Receiver, ReplyServer, RequestClient, check_endpoint
 
 ANY = "tcp://127.0.0.1:0"
 SETTLE_S = 5.0
-
-
-@pytest.fixture
-def opened() -> Iterator[Callable[[Any], Any]]:
-    """Registers whatever has a `close`, and closes it at the end."""
-    with ExitStack() as stack:
-
-        def register(resource: Any) -> Any:
-            stack.callback(resource.close)
-            return resource
-
-        yield register
 
 
 def connected(publisher: Publisher, receiver: Receiver, topic: str = "hello") -> None:
@@ -57,11 +43,7 @@ def all_of(receiver: Receiver, wanted: set[str]) -> dict[str, Any]:
     return got
 
 
-def request(**fields: Any) -> ControlRequest:
-    return ControlRequest(**{"node": "api", "id": "r1", "op": "set_scene", **fields})
-
-
-def test_a_message_comes_through_with_its_arrival_time(opened: Any) -> None:
+def test_a_message_comes_through_with_its_arrival_time(opened: Callable[[Any], Any]) -> None:
     publisher = opened(Publisher(ANY))
     receiver = opened(Receiver([publisher.endpoint], ["stats", "hello"]))
     connected(publisher, receiver)
@@ -74,7 +56,7 @@ def test_a_message_comes_through_with_its_arrival_time(opened: Any) -> None:
     assert receiver.latest(0.01) is None
 
 
-def test_newest_wins_and_the_others_are_counted(opened: Any) -> None:
+def test_newest_wins_and_the_others_are_counted(opened: Callable[[Any], Any]) -> None:
     publisher = opened(Publisher(ANY))
     receiver = opened(Receiver([publisher.endpoint], []))
     connected(publisher, receiver)
@@ -94,29 +76,31 @@ def test_newest_wins_and_the_others_are_counted(opened: Any) -> None:
     assert receiver.drops == {"color.a": 11}
 
 
-def test_a_row_of_messages_for_one_frame_is_not_torn(opened: Any) -> None:
+def test_a_row_of_messages_for_one_frame_is_not_torn(opened: Callable[[Any], Any]) -> None:
     publisher = opened(Publisher(ANY))
     receiver = opened(Receiver([publisher.endpoint], []))
     connected(publisher, receiver)
     streams = [b"color", b"depth", b"clean_depth", b"fisheye", b"pose", b"lights", b"stats"]
     for i in range(15):
+        time.sleep(1 / 60)
         for stream in streams:
             publisher.send([stream + b".a", b"%d" % i, bytes(900_000 if stream == b"color" else 1000)])
         got = all_of(receiver, {f"{stream.decode()}.a" for stream in streams})
         assert [bytes(got[f"{stream.decode()}.a"][1]) for stream in streams] == [b"%d" % i] * len(streams)
 
 
-def test_topics_are_whole_names_and_not_prefixes(opened: Any) -> None:
+def test_topics_are_whole_names_and_not_prefixes(opened: Callable[[Any], Any]) -> None:
     publisher = opened(Publisher(ANY))
-    receiver = opened(Receiver([publisher.endpoint], ["color.a", "pose", "hello"]))
+    receiver = opened(Receiver([publisher.endpoint], ["color.a", "pose", "lights", "stats", "hello"]))
     connected(publisher, receiver)
-    for topic in (b"color.ab", b"posed.x", b"color.a", b"pose.x", b"depth.a"):
-        publisher.send([topic, b""])
-    assert set(all_of(receiver, {"color.a", "pose.x"})) == {"color.a", "pose.x"}
+    wanted = {"color.a", "pose.x", "lights.a", "stats.a"}
+    for topic in ["color.ab", "posed.x", "depth.a", *wanted]:
+        publisher.send([topic.encode(), b""])
+    assert set(all_of(receiver, wanted)) == wanted
     assert receiver.refused == 2
 
 
-def test_topics_without_end_and_broken_topics_take_no_memory(opened: Any) -> None:
+def test_topics_without_end_and_broken_topics_take_no_memory(opened: Callable[[Any], Any]) -> None:
     publisher = opened(Publisher(ANY, streams=1000))
     receiver = opened(Receiver([publisher.endpoint], []))
     connected(publisher, receiver)
@@ -134,7 +118,7 @@ def test_topics_without_end_and_broken_topics_take_no_memory(opened: Any) -> Non
     assert len(got) == 255
 
 
-def test_a_waiting_consumer_is_woken_by_a_message_and_by_closing(opened: Any) -> None:
+def test_a_waiting_consumer_is_woken_by_a_message_and_by_closing(opened: Callable[[Any], Any]) -> None:
     publisher = opened(Publisher(ANY))
     receiver = Receiver([publisher.endpoint], [])
     connected(publisher, receiver)
@@ -153,7 +137,7 @@ def test_a_waiting_consumer_is_woken_by_a_message_and_by_closing(opened: Any) ->
     assert receiver.latest(10) is None
 
 
-def test_many_publishers_and_a_receiver_that_listens(opened: Any) -> None:
+def test_many_publishers_and_a_receiver_that_listens(opened: Callable[[Any], Any]) -> None:
     receiver = opened(Receiver([ANY], [], bind=True))
     nodes = [opened(Publisher(receiver.endpoints[0], bind=False)) for _ in range(3)]
     for i, node in enumerate(nodes):
@@ -163,7 +147,7 @@ def test_many_publishers_and_a_receiver_that_listens(opened: Any) -> None:
     assert set(all_of(receiver, {"color.0", "color.1", "color.2"})) == {"color.0", "color.1", "color.2"}
 
 
-def test_a_stream_returns_after_its_publisher_did(opened: Any) -> None:
+def test_a_stream_returns_after_its_publisher_did(opened: Callable[[Any], Any]) -> None:
     first = Publisher(ANY)
     receiver = opened(Receiver([first.endpoint], []))
     connected(first, receiver)
@@ -181,7 +165,7 @@ def test_what_is_too_large_or_closed_is_said() -> None:
         publisher.send([b"color.a", b""])
 
 
-def test_an_oversize_piece_does_not_reach_the_mailbox(opened: Any) -> None:
+def test_an_oversize_piece_does_not_reach_the_mailbox(opened: Callable[[Any], Any]) -> None:
     context = zmq.Context()
     socket = context.socket(zmq.PUB)
     port = socket.bind_to_random_port("tcp://127.0.0.1")
@@ -243,177 +227,12 @@ def test_what_is_no_endpoint_is_refused(endpoint: str) -> None:
         check_endpoint(endpoint)
 
 
-def test_a_taken_port_is_named(opened: Any) -> None:
+def test_a_taken_port_is_named(opened: Callable[[Any], Any]) -> None:
     endpoint = opened(Publisher(ANY)).endpoint
     with pytest.raises(DeltalightError, match=f"cannot listen at {endpoint}"):
         Publisher(endpoint)
     with pytest.raises(DeltalightError, match=f"cannot listen at {endpoint}"):
         ReplyServer(endpoint, lambda _: {})
-
-
-# control
-
-
-def test_request_and_reply(opened: Any) -> None:
-    server = opened(ReplyServer(ANY, lambda control: {"echo": control.payload, "op": control.op}, node="gpu"))
-    client = opened(RequestClient(server.endpoint))
-    reply = client.request(request(payload={"a": [1, 2.5, None]}), 5)
-    assert (reply.id, reply.ok, reply.error, reply.node) == ("r1", True, None, "gpu")
-    assert reply.payload == {"echo": {"a": [1, 2.5, None]}, "op": "set_scene"}
-
-
-def test_refusals_faults_and_bad_answers_are_sentences_and_the_server_lives_on(opened: Any) -> None:
-    def handler(control: ControlRequest) -> dict[str, object]:
-        if control.op == "refuse":
-            raise DeltalightError("the scene has no object: add one")
-        if control.op == "fault":
-            raise ZeroDivisionError("oops")
-        return {"large": "x" * 70_000} if control.op == "large" else {"object": object()}
-
-    server = opened(ReplyServer(ANY, handler))
-    client = opened(RequestClient(server.endpoint))
-    answers = {
-        op: client.request(request(id=op, op=op), 5) for op in ("refuse", "fault", "large", "odd", "refuse")
-    }
-    assert not any(answer.ok for answer in answers.values())
-    assert answers["refuse"].error == "the scene has no object: add one"
-    assert "ZeroDivisionError" in str(answers["fault"].error)
-    assert "cannot be sent" in str(answers["large"].error)
-    assert "odd failed" in str(answers["odd"].error)
-
-
-def test_repeats_are_not_carried_out_twice(opened: Any) -> None:
-    done: list[int | None] = []
-    server = opened(ReplyServer(ANY, lambda control: {"n": len(done), "done": done.append(control.revision)}))
-    client = opened(RequestClient(server.endpoint))
-    first = client.request(request(revision=3, payload={"name": "a"}), 5)
-    again = client.request(request(revision=3, payload={"name": "a"}), 5)
-    renamed = client.request(request(id="r2", revision=3, payload={"name": "a"}), 5)
-    assert done == [3]
-    assert first == again
-    assert (renamed.id, renamed.payload) == ("r2", first.payload)
-    older = client.request(request(id="r3", revision=2), 5)
-    other = client.request(request(id="r4", revision=3, payload={"name": "b"}), 5)
-    assert not older.ok
-    assert not other.ok
-    assert "send 4 or higher" in str(older.error)
-    assert client.request(request(id="r5", revision=4), 5).ok
-    assert client.request(request(id="r6", op="other", revision=1), 5).ok
-    assert done == [3, 4, 1]
-
-
-def test_memory_forgets_old_ids_and_a_refused_revision_may_come_again() -> None:
-    memory = ReplyMemory(size=2)
-    refused = request(id="a", revision=1)
-    memory.remember(refused, ControlReply(node="s", id="a", ok=False, error="no"))
-    assert memory.find(request(id="b", revision=1)) is None
-    for name in ("b", "c"):
-        memory.remember(request(id=name), ControlReply(node="s", id=name, ok=True))
-    assert memory.find(refused) is None
-    assert memory.find(request(id="c")) is not None
-
-
-def test_a_silent_server_is_named_in_time_and_its_queue_is_forgotten(opened: Any) -> None:
-    done: list[str] = []
-    server = ReplyServer(ANY, lambda control: {"x": done.append(control.id)})
-    client = opened(RequestClient(server.endpoint))
-    assert client.request(request(), 5).ok
-    server.close()
-    started = time.monotonic()
-    with pytest.raises(DeltalightError, match=r"no answer from tcp://127.0.0.1:\d+ within 0.3 s"):
-        client.request(request(id="lost"), 0.3)
-    assert time.monotonic() - started < 3
-    opened(ReplyServer(server.endpoint, lambda control: {"x": done.append(control.id)}))
-    assert client.request(request(id="found"), 5).ok
-    assert done == ["r1", "found"]
-
-
-def test_a_late_answer_does_not_meet_the_next_request(opened: Any) -> None:
-    slow = threading.Event()
-
-    def handler(control: ControlRequest) -> dict[str, object]:
-        if control.id == "slow":
-            slow.wait(5)
-        return {"id": control.id}
-
-    server = opened(ReplyServer(ANY, handler))
-    client = opened(RequestClient(server.endpoint))
-    with pytest.raises(DeltalightError, match="no answer"):
-        client.request(request(id="slow"), 0.2)
-    slow.set()
-    assert client.request(request(id="next"), 5).payload == {"id": "next"}
-    assert client.request(request(id="slow"), 5).payload == {"id": "slow"}
-
-
-def test_threads_may_share_a_client(opened: Any) -> None:
-    server = opened(ReplyServer(ANY, lambda control: {"id": control.id}))
-    client = opened(RequestClient(server.endpoint))
-    answers: list[ControlReply] = []
-
-    def ask(name: str) -> None:
-        answers.extend(client.request(request(id=f"{name}{i}"), 10) for i in range(20))
-
-    threads = [threading.Thread(target=ask, args=(name,)) for name in "abcd"]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(20)
-    assert len(answers) == 80
-    assert all(answer.payload == {"id": answer.id} for answer in answers)
-
-
-@pytest.mark.parametrize(
-    "pieces",
-    [
-        [b""],
-        [b"request.a", b"\xc1"],
-        encode(StatsMessage(node="a", capture_ns=0, state="running")),
-        [b"x"] * 30,
-    ],
-)
-def test_malformed_requests_get_a_sentence(opened: Any, pieces: list[bytes]) -> None:
-    server = opened(ReplyServer(ANY, lambda _: {}))
-    context = zmq.Context()
-    try:
-        socket = context.socket(zmq.REQ)
-        socket.connect(server.endpoint)
-        socket.send_multipart(pieces)
-        assert socket.poll(5000)
-        reply, _ = decode(socket.recv_multipart())
-    finally:
-        context.destroy(0)
-    assert isinstance(reply, ControlReply)
-    assert (reply.id, reply.ok) == ("unreadable", False)
-    assert opened(RequestClient(server.endpoint)).request(request(), 5).ok
-
-
-@pytest.mark.parametrize(
-    "answer",
-    [
-        [b"nonsense"],
-        encode(ControlReply(node="s", id="other", ok=True)),
-        encode(ControlReply(node="s", id="unreadable", ok=False, error="version 2")),
-        encode(StatsMessage(node="a", capture_ns=0, state="running")),
-    ],
-)
-def test_a_foreign_answer_is_refused(opened: Any, answer: list[bytes]) -> None:
-    context = zmq.Context()
-    socket = context.socket(zmq.REP)
-    port = socket.bind_to_random_port("tcp://127.0.0.1")
-
-    def serve() -> None:
-        socket.recv_multipart()
-        socket.send_multipart(answer)
-
-    thread = threading.Thread(target=serve)
-    thread.start()
-    client = opened(RequestClient(f"tcp://127.0.0.1:{port}"))
-    try:
-        with pytest.raises(EnvelopeError):
-            client.request(request(), 5)
-    finally:
-        thread.join(5)
-        context.destroy(0)
 
 
 # the slow consumer
@@ -438,7 +257,9 @@ for frame_id in range(100_000):
 """
 
 
-def test_a_consumer_ten_times_too_slow_gets_fresh_frames_and_keeps_its_memory(opened: Any) -> None:
+def test_a_consumer_ten_times_too_slow_gets_fresh_frames_and_keeps_its_memory(
+    opened: Callable[[Any], Any],
+) -> None:
     period_s, rounds = 0.33, 17
     root = Path(__file__).parents[2]
     with subprocess.Popen(

@@ -1,0 +1,194 @@
+"""Control over real sockets on loopback: idempotent, in time, and never silent about a fault."""
+
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import zmq
+
+from protocol.envelope import EnvelopeError, decode, encode
+from protocol.errors import DeltalightError
+from protocol.messages import ControlReply, ControlRequest, StatsMessage
+from protocol.request import ReplyMemory
+from protocol.transport import ReplyServer, RequestClient
+
+ANY = "tcp://127.0.0.1:0"
+
+
+def request(**fields: object) -> ControlRequest:
+    return ControlRequest.model_validate({"node": "api", "id": "r1", "op": "set_scene", **fields})
+
+
+def test_request_and_reply(opened: Callable[[Any], Any]) -> None:
+    server = opened(ReplyServer(ANY, lambda control: {"echo": control.payload, "op": control.op}, node="gpu"))
+    client = opened(RequestClient(server.endpoint))
+    reply = client.request(request(payload={"a": [1, 2.5, None]}), 5)
+    assert (reply.id, reply.ok, reply.error, reply.node) == ("r1", True, None, "gpu")
+    assert reply.payload == {"echo": {"a": [1, 2.5, None]}, "op": "set_scene"}
+
+
+def test_refusals_faults_and_bad_answers_are_sentences_and_the_server_lives_on(
+    opened: Callable[[Any], Any],
+) -> None:
+    def handler(control: ControlRequest) -> dict[str, object]:
+        if control.op == "refuse":
+            raise DeltalightError("the scene has no object: add one")
+        if control.op == "fault":
+            raise ZeroDivisionError("oops")
+        return {"large": "x" * 70_000} if control.op == "large" else {"object": object()}
+
+    server = opened(ReplyServer(ANY, handler))
+    client = opened(RequestClient(server.endpoint))
+    answers = {
+        op: client.request(request(id=op, op=op), 5) for op in ("refuse", "fault", "large", "odd", "refuse")
+    }
+    assert not any(answer.ok for answer in answers.values())
+    assert answers["refuse"].error == "the scene has no object: add one"
+    assert "ZeroDivisionError" in str(answers["fault"].error)
+    assert "cannot be sent" in str(answers["large"].error)
+    assert "odd failed" in str(answers["odd"].error)
+
+
+def test_repeats_are_not_carried_out_twice(opened: Callable[[Any], Any]) -> None:
+    done: list[int | None] = []
+    server = opened(ReplyServer(ANY, lambda control: {"n": len(done), "done": done.append(control.revision)}))
+    client = opened(RequestClient(server.endpoint))
+    first = client.request(request(revision=3, payload={"name": "a"}), 5)
+    again = client.request(request(revision=3, payload={"name": "a"}), 5)
+    renamed = client.request(request(id="r2", revision=3, payload={"name": "a"}), 5)
+    assert done == [3]
+    assert first == again
+    assert (renamed.id, renamed.payload) == ("r2", first.payload)
+    older = client.request(request(id="r3", revision=2), 5)
+    other = client.request(request(id="r4", revision=3, payload={"name": "b"}), 5)
+    assert not older.ok
+    assert not other.ok
+    assert "send 4 or higher" in str(older.error)
+    assert client.request(request(id="r5", revision=4), 5).ok
+    assert client.request(request(id="r6", op="other", revision=1), 5).ok
+    assert done == [3, 4, 1]
+
+
+def test_memory_forgets_old_ids_and_a_refused_revision_may_come_again() -> None:
+    memory = ReplyMemory(size=2)
+    refused = request(id="a", revision=1)
+    memory.remember(refused, ControlReply(node="s", id="a", ok=False, error="no"))
+    assert memory.find(request(id="b", revision=1)) is None
+    for name in ("b", "c"):
+        memory.remember(request(id=name), ControlReply(node="s", id=name, ok=True))
+    assert memory.find(refused) is None
+    assert memory.find(request(id="c")) is not None
+
+
+def test_a_silent_server_is_named_in_time_and_its_queue_is_forgotten(opened: Callable[[Any], Any]) -> None:
+    done: list[str] = []
+    server = ReplyServer(ANY, lambda control: {"x": done.append(control.id)})
+    client = opened(RequestClient(server.endpoint))
+    assert client.request(request(), 5).ok
+    server.close()
+    started = time.monotonic()
+    with pytest.raises(DeltalightError, match=r"no answer from tcp://127.0.0.1:\d+ within 0.3 s"):
+        client.request(request(id="lost"), 0.3)
+    assert time.monotonic() - started < 3
+    opened(ReplyServer(server.endpoint, lambda control: {"x": done.append(control.id)}))
+    assert client.request(request(id="found"), 5).ok
+    assert done == ["r1", "found"]
+
+
+def test_a_late_answer_does_not_meet_the_next_request(opened: Callable[[Any], Any]) -> None:
+    slow = threading.Event()
+
+    def handler(control: ControlRequest) -> dict[str, object]:
+        if control.id == "slow":
+            slow.wait(5)
+        return {"id": control.id}
+
+    server = opened(ReplyServer(ANY, handler))
+    client = opened(RequestClient(server.endpoint))
+    with pytest.raises(DeltalightError, match="no answer"):
+        client.request(request(id="slow"), 0.2)
+    slow.set()
+    assert client.request(request(id="next"), 5).payload == {"id": "next"}
+    assert client.request(request(id="slow"), 5).payload == {"id": "slow"}
+
+
+def test_closing_twice_is_fine_and_a_closed_client_says_so() -> None:
+    server = ReplyServer(ANY, lambda _: {})
+    client = RequestClient(server.endpoint)
+    for resource in (client, client, server, server):
+        resource.close()
+    with pytest.raises(DeltalightError, match="is closed"):
+        client.request(request(), 1)
+
+
+def test_threads_may_share_a_client(opened: Callable[[Any], Any]) -> None:
+    server = opened(ReplyServer(ANY, lambda control: {"id": control.id}))
+    client = opened(RequestClient(server.endpoint))
+    answers: list[ControlReply] = []
+
+    def ask(name: str) -> None:
+        answers.extend(client.request(request(id=f"{name}{i}"), 10) for i in range(20))
+
+    threads = [threading.Thread(target=ask, args=(name,)) for name in "abcd"]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(20)
+    assert len(answers) == 80
+    assert all(answer.payload == {"id": answer.id} for answer in answers)
+
+
+@pytest.mark.parametrize(
+    "pieces",
+    [
+        [b""],
+        [b"request.a", b"\xc1"],
+        encode(StatsMessage(node="a", capture_ns=0, state="running")),
+        [b"x"] * 30,
+    ],
+)
+def test_malformed_requests_get_a_sentence(opened: Callable[[Any], Any], pieces: list[bytes]) -> None:
+    server = opened(ReplyServer(ANY, lambda _: {}))
+    context = zmq.Context()
+    try:
+        socket = context.socket(zmq.REQ)
+        socket.connect(server.endpoint)
+        socket.send_multipart(pieces)
+        assert socket.poll(5000)
+        reply, _ = decode(socket.recv_multipart())
+    finally:
+        context.destroy(0)
+    assert isinstance(reply, ControlReply)
+    assert (reply.id, reply.ok) == ("unreadable", False)
+    assert opened(RequestClient(server.endpoint)).request(request(), 5).ok
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        [b"nonsense"],
+        encode(ControlReply(node="s", id="other", ok=True)),
+        encode(ControlReply(node="s", id="unreadable", ok=False, error="version 2")),
+        encode(StatsMessage(node="a", capture_ns=0, state="running")),
+    ],
+)
+def test_a_foreign_answer_is_refused(opened: Callable[[Any], Any], answer: list[bytes]) -> None:
+    context = zmq.Context()
+    socket = context.socket(zmq.REP)
+    port = socket.bind_to_random_port("tcp://127.0.0.1")
+
+    def serve() -> None:
+        socket.recv_multipart()
+        socket.send_multipart(answer)
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    client = opened(RequestClient(f"tcp://127.0.0.1:{port}"))
+    try:
+        with pytest.raises(EnvelopeError):
+            client.request(request(), 5)
+    finally:
+        thread.join(5)
+        context.destroy(0)

@@ -1,0 +1,333 @@
+"""`deltalight render`: what it writes, and a sentence with exit code 2 for every bad input."""
+
+import json
+import os
+import shutil
+import signal
+import struct
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+
+from protocol.camera_model import CameraModel
+from protocol.dataset_writer import DatasetWriter
+from protocol.recording import RecordingWriter
+from sensor_node.cameras.synthetic import SyntheticCamera
+from tests.services.conftest import ROOT, RunCli
+
+FRAMES = 3
+FRAME_WITHOUT_BOARD = 2
+SIZE = (320, 240)
+
+
+@pytest.fixture(scope="module")
+def take(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with `take` (dataset), `take.mcap`, `scene.json` and the box that it names."""
+    folder = tmp_path_factory.mktemp("render")
+    write_take(folder)
+    trimesh.creation.box((0.06, 0.06, 0.06)).export(folder / "box.glb")
+    write_scene(folder / "scene.json")
+    return folder
+
+
+def write_take(folder: Path) -> None:
+    matrix = np.array([[260.0, 0, 159.5], [0, 260.0, 119.5], [0, 0, 1]])
+    synthetic = SyntheticCamera(camera=CameraModel(*SIZE, matrix))
+    frames = [synthetic.frame_at(index) for index in range(FRAMES)]
+    grey = np.full_like(frames[0].color, 120)
+    frames[FRAME_WITHOUT_BOARD] = replace(frames[FRAME_WITHOUT_BOARD], color=grey)
+    with (
+        DatasetWriter(folder / "take", board=synthetic.board) as dataset,
+        RecordingWriter(folder / "take.mcap", board=synthetic.board) as recording,
+    ):
+        for frame in frames:
+            dataset.add(frame)
+            recording.add(frame)
+
+
+def scene_document(**changes: object) -> dict[str, object]:
+    directional = {"type": "directional", "direction": [0.3, 0.4, -1.0], "irradiance": 2.0}
+    return {
+        "name": "box",
+        "objects": [{"asset": "box.glb", "pose": {"translation_m": [0.1, -0.1, 0.03]}}],
+        "lights": {"mode": "manual", "manual": [directional, {"type": "ambient", "radiance": 0.2}]},
+        "method": {
+            "name": "dvct",
+            "operator": "paper",
+            "volume_size": 32,
+            "rsm_size": 128,
+            "triangle_budget": 5000,
+        },
+        **changes,
+    }
+
+
+def write_scene(path: Path, **changes: object) -> Path:
+    path.write_text(json.dumps(scene_document(**changes)))
+    return path
+
+
+def records(out: Path) -> list[dict[str, object]]:
+    return [json.loads(line) for line in (out / "frames.jsonl").read_text().splitlines()]
+
+
+def read_rgb(path: Path) -> np.ndarray:
+    picture = cv2.imread(str(path))
+    assert picture is not None
+    return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+
+
+def test_writes_pictures_index_and_one_summary_line(cli: RunCli, take: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    done = cli("render", take / "take", "--scene", take / "scene.json", "--out", out)
+    assert done.returncode == 0, done.stderr
+    assert sorted(path.name for path in out.iterdir()) == [
+        *(f"{number:06d}.png" for number in range(FRAMES)),
+        "frames.jsonl",
+    ]
+    lines = records(out)
+    assert [line["frame"] for line in lines] == [0, 1, 2]
+    assert [line["status"] for line in lines] == ["ok", "ok", "no_pose"]
+    assert np.array(lines[0]["pose"]["world_from_camera"]).shape == (4, 4)  # type: ignore[index]
+    assert lines[0]["pass_times_ms"]
+    assert lines[0]["lights"]
+    assert lines[FRAME_WITHOUT_BOARD]["pose"] is None
+    assert all(line["drops"] == 0 for line in lines)
+    assert done.stdout.count("\n") == 1
+    assert "3 frames, 1 without a pose" in done.stdout
+    assert done.stderr.count("warning: no GPU found") <= 1
+
+
+def test_frame_without_pose_is_the_camera_picture_bit_for_bit(
+    cli: RunCli, take: Path, tmp_path: Path
+) -> None:
+    done = cli(
+        "render", take / "take.mcap", "--scene", take / "scene.json", "--out", tmp_path, "--frames", "1:3"
+    )
+    assert done.returncode == 0, done.stderr
+    assert [line["frame"] for line in records(tmp_path)] == [1, 2]
+    assert np.all(read_rgb(tmp_path / "000002.png") == 120)
+    assert not (tmp_path / "000000.png").exists()
+
+
+def test_second_run_overwrites_and_is_bit_identical(cli: RunCli, take: Path, tmp_path: Path) -> None:
+    pictures = []
+    for _ in range(2):
+        done = cli(
+            "render", take / "take", "--scene", take / "scene.json", "--out", tmp_path, "--frames", ":1"
+        )
+        assert done.returncode == 0, done.stderr
+        pictures.append((tmp_path / "000000.png").read_bytes())
+    assert pictures[0] == pictures[1]
+    assert len(records(tmp_path)) == 1
+
+
+def test_size_exr_and_json(cli: RunCli, take: Path, tmp_path: Path) -> None:
+    options = ("--frames", "0:1", "--size", "160x120", "--exr", "--json", "--allow-software")
+    done = cli("render", take / "take", "--scene", take / "scene.json", "--out", tmp_path, *options)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["frames"] == 1
+    assert read_rgb(tmp_path / "000000.png").shape == (120, 160, 3)
+    assert (tmp_path / "000000.exr").read_bytes()[:4] == struct.pack("<I", 20000630)
+    assert "no GPU" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (("--frames", "2:2"), "choose A < B"),
+        (("--frames", "0:99"), "which has 3"),
+        (("--frames", "first"), "write A:B"),
+        (("--size", "640"), "WIDTHxHEIGHT"),
+        (("--size", "8x8"), "each from 16"),
+    ],
+)
+def test_wrong_options_are_sentences(
+    cli: RunCli, take: Path, tmp_path: Path, options: tuple[str, str], sentence: str
+) -> None:
+    out = tmp_path / "out"
+    done = cli("render", take / "take", "--scene", take / "scene.json", "--out", out, *options)
+    assert_refused(done, sentence)
+    assert not out.exists()
+
+
+def test_wrong_use_is_exit_code_2(cli: RunCli) -> None:
+    assert cli("render").returncode == 2
+    assert cli("redner").returncode == 2
+    assert cli("render", "x", "--out", "y", "--view", "sideways").returncode == 2
+
+
+def assert_refused(done: subprocess.CompletedProcess[str], sentence: str) -> None:
+    assert done.returncode == 2, done.stderr
+    assert sentence in done.stderr
+    assert "Traceback" not in done.stderr
+    last_line = done.stderr.strip().splitlines()[-1]
+    assert last_line.startswith("deltalight: ")
+
+
+def test_out_that_is_a_file_or_cannot_be_made(cli: RunCli, take: Path, tmp_path: Path) -> None:
+    taken = tmp_path / "taken"
+    taken.touch()
+    for out, sentence in ((taken, "is a file"), (taken / "below", "cannot be written")):
+        assert_refused(cli("render", take / "take", "--scene", take / "scene.json", "--out", out), sentence)
+
+
+def test_source_without_scene_needs_one(cli: RunCli, take: Path, tmp_path: Path) -> None:
+    assert_refused(cli("render", take / "take", "--out", tmp_path / "out"), "--scene")
+
+
+def remove(name: str) -> object:
+    def change(folder: Path) -> None:
+        target = folder / name
+        shutil.rmtree(target) if target.is_dir() else target.unlink()
+
+    return change
+
+
+def shrink_depth(folder: Path) -> None:
+    for path in (folder / "depth").iterdir():
+        cv2.imwrite(str(path), np.full((10, 10), 500, np.uint16))
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        pytest.param(remove("rgb.txt"), "rgb.txt", id="missing list"),
+        pytest.param(remove("calibration"), "calibration", id="no calibration"),
+        pytest.param(shrink_depth, "10", id="depth of another size"),
+    ],
+)
+def test_broken_datasets_are_sentences(
+    cli: RunCli, take: Path, tmp_path: Path, change: object, sentence: str
+) -> None:
+    broken = tmp_path / "broken"
+    shutil.copytree(take / "take", broken)
+    assert callable(change)
+    change(broken)
+    out = tmp_path / "out"
+    assert_refused(cli("render", broken, "--scene", take / "scene.json", "--out", out), sentence)
+    assert not list(out.glob("*.png"))
+    assert not list(out.glob(".*"))
+
+
+def test_source_that_is_missing_or_no_recording(cli: RunCli, take: Path, tmp_path: Path) -> None:
+    text = tmp_path / "notes.txt"
+    text.write_text("no recording")
+    empty = tmp_path / "empty.mcap"
+    empty.write_bytes(b"")
+    for source in (tmp_path / "nowhere", text, empty):
+        assert_refused(
+            cli("render", source, "--scene", take / "scene.json", "--out", tmp_path / "out"), source.name
+        )
+
+
+def light(**changes: object) -> dict[str, object]:
+    return {"mode": "manual", "manual": [{"type": "directional", "direction": [0, 0, -1], **changes}]}
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        pytest.param({"lihgts": {}}, "nearest known key is `lights`", id="unknown key"),
+        pytest.param({"lights": light(irradiance=-1.0)}, "irradiance", id="negative light"),
+        pytest.param({"objects": [{"asset": "absent.glb"}]}, "absent.glb", id="missing asset"),
+        pytest.param({"method": {"name": "dvtc"}}, "dvct", id="unknown method"),
+        pytest.param(
+            {"method": {"name": "dvct", "volume_size": 512, "memory_budget_mb": 16}},
+            "memory_budget_mb",
+            id="memory",
+        ),
+    ],
+)
+def test_broken_scenes_are_sentences(
+    cli: RunCli, take: Path, tmp_path: Path, changes: dict[str, object], sentence: str
+) -> None:
+    scene = take / f"broken-{os.getpid()}.json"
+    write_scene(scene, **changes)
+    out = tmp_path / "out"
+    assert_refused(cli("render", take / "take", "--scene", scene, "--out", out), sentence)
+    assert not list(out.glob("*"))
+
+
+def triangles(vertices: list[list[float]]) -> str:
+    lines = [f"v {x} {y} {z}" for x, y, z in vertices]
+    return "\n".join([*lines, *(["f 1 2 3"] if vertices else [])]) + "\n"
+
+
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        pytest.param(triangles([[float("nan"), 0, 0], [1, 0, 0], [0, 1, 0]]), "mesh.obj", id="NaN"),
+        pytest.param(triangles([[1e30, 0, 0], [1, 0, 0], [0, 1, 0]]), "mesh.obj", id="huge"),
+        pytest.param(triangles([]), "mesh.obj", id="empty"),
+    ],
+)
+def test_broken_meshes_are_sentences(
+    cli: RunCli, take: Path, tmp_path: Path, content: str, sentence: str
+) -> None:
+    (tmp_path / "mesh.obj").write_text(content)
+    scene = write_scene(tmp_path / "scene.json", objects=[{"asset": "mesh.obj"}])
+    out = tmp_path / "out"
+    assert_refused(cli("render", take / "take", "--scene", scene, "--out", out), sentence)
+    assert not list(out.glob("*"))
+
+
+def test_truncated_recording(cli: RunCli, take: Path, tmp_path: Path) -> None:
+    """What is complete in it is rendered, or it is refused in a sentence: nothing else."""
+    whole = (take / "take.mcap").read_bytes()
+    for share in (0.3, 0.9):
+        cut = tmp_path / "cut.mcap"
+        cut.write_bytes(whole[: int(share * len(whole))])
+        done = cli("render", cut, "--scene", take / "scene.json", "--out", tmp_path / f"out{share}")
+        assert done.returncode in (0, 2)
+        assert "Traceback" not in done.stderr
+        assert done.stderr.strip()
+
+
+def test_missing_gpu_is_a_sentence(take: Path, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "services.cli", "render", take / "take", "--scene", take / "scene.json"]
+    environment = {**os.environ, "GLCONTEXT_LINUX_LIBEGL": "libno-such-egl.so"}
+    done = subprocess.run(
+        [*command, "--out", tmp_path / "out"],
+        cwd=ROOT,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert_refused(done, "apt-get install")
+    missing = [*command, "--out", tmp_path / "out", "--device", "77"]
+    done = subprocess.run(missing, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
+    assert_refused(done, "deltalight doctor")
+
+
+def test_debug_shows_the_traceback(cli: RunCli, tmp_path: Path) -> None:
+    done = cli("render", tmp_path / "nowhere", "--out", tmp_path / "out", "--debug")
+    assert done.returncode != 0
+    assert "Traceback" in done.stderr
+
+
+def test_ctrl_c_is_130_and_leaves_whole_files(take: Path, tmp_path: Path) -> None:
+    scene = write_scene(take / "slow.json", method={"name": "dvct", "volume_size": 128})
+    out = tmp_path / "out"
+    command = [sys.executable, "-m", "services.cli", "render", take / "take", "--scene", scene, "--out", out]
+    process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
+    deadline_s = time.monotonic() + 60
+    while not out.exists() and time.monotonic() < deadline_s:
+        time.sleep(0.02)
+    process.send_signal(signal.SIGINT)
+    _, error = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "Traceback" not in error
+    assert not list(out.glob(".*"))
+    pictures = len(list(out.glob("*.png")))
+    lines = len(records(out)) if (out / "frames.jsonl").exists() else 0
+    assert lines <= pictures <= lines + 1

@@ -1,0 +1,170 @@
+"""The demo through real processes: files, killed processes, Ctrl-C, a second start."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+import cv2
+import httpx
+import psutil
+import pytest
+
+from protocol.envelope import decode
+from protocol.messages import CompositeMessage, ControlRequest
+from protocol.transport import Receiver, RequestClient
+from services import ports
+from services.demo import RECORDING, SCENE, demo_plan, demo_scene
+from services.host import HostPlan, session_file
+from services.supervisor import Supervisor
+from tests.services.conftest import ROOT, RunCli
+
+pytestmark = pytest.mark.skipif(
+    not (RECORDING.is_file() and SCENE.is_file()), reason="the demo's recording is not in this checkout"
+)
+PATIENCE_S = 90
+
+
+def test_headless_demo_writes_composites_sheet_and_video(cli: RunCli, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    options = ("--headless", "--frames", 4, "--out", out, "--method", "paper", "--json")
+    done = cli("demo", *options, timeout_s=PATIENCE_S)
+    assert done.returncode == 0, done.stderr
+    assert len(list(out.glob("??????.jpg"))) == 4
+    sheet, first = cv2.imread(str(out / "contact_sheet.png")), cv2.imread(str(out / "000000.jpg"))
+    assert sheet is not None
+    assert first is not None
+    assert sheet.shape[1] == 4 * 256
+    video = cv2.VideoCapture(str(out / "demo.mp4"))
+    assert int(video.get(cv2.CAP_PROP_FRAME_COUNT)) == 4
+    summary = json.loads(done.stdout)
+    assert summary["composites"] == 4
+    assert summary["without_pose"] == 0
+    assert summary["renderer"]
+    assert summary["pass_times_ms"]
+    assert summary["restarts"] == {"sensor node": 0, "render server": 0}
+    records = [json.loads(line) for line in (out / "frames.jsonl").read_text().splitlines()]
+    frames = [record["frame"] for record in records]
+    assert frames == sorted(set(frames))
+    assert all(record["age_ms"] > 0 for record in records)
+
+
+def test_headless_demo_needs_a_folder(cli: RunCli) -> None:
+    done = cli("demo", "--headless")
+    assert done.returncode == 2
+    assert "--out" in done.stderr
+
+
+def test_picture_returns_after_node_and_server_are_killed(tmp_path: Path) -> None:
+    with session_file(demo_scene("paper")) as session:
+        plan = demo_plan(session, page_port=None)
+        lines: list[str] = []
+        with Supervisor(plan.specs(), forward=lines.append) as supervisor:
+            receiver = Receiver([ports.endpoint(plan.composite_port)], ["composite"])
+            try:
+                wait_for_composite(supervisor, receiver, after_ns=0)
+                change_view(plan, "effects")
+                for name in ("sensor node", "render server"):
+                    killed_ns = time.time_ns()
+                    os.kill(supervisor.process_ids()[name], signal.SIGKILL)
+                    wait_for_composite(supervisor, receiver, after_ns=killed_ns, restarted=name)
+                assert current_view(plan) == "effects"
+            finally:
+                receiver.close()
+    assert supervisor.restarts() == {"sensor node": 1, "render server": 1}
+
+
+def wait_for_composite(
+    supervisor: Supervisor, receiver: Receiver, *, after_ns: int, restarted: str | None = None
+) -> None:
+    """Wait for a composite of a frame that was captured later, sent after the named process came back."""
+    deadline_s = time.monotonic() + PATIENCE_S
+    while time.monotonic() < deadline_s:
+        supervisor.poll()
+        is_back = restarted is None or supervisor.restarts()[restarted] == 1
+        for multipart in (receiver.latest(0.1) or {}).values():
+            message, _ = decode(multipart)
+            assert isinstance(message, CompositeMessage)
+            if is_back and message.capture_ns > after_ns and message.status == "ok":
+                return
+    pytest.fail(f"no composite came back after {restarted} was killed")
+
+
+def ask(plan: HostPlan, op: str, **payload: object) -> dict[str, object]:
+    client = RequestClient(ports.endpoint(plan.control_port))
+    try:
+        reply = client.request(ControlRequest(node="test", id=op, op=op, payload=payload), 20)
+    finally:
+        client.close()
+    assert reply.error is None
+    return reply.payload
+
+
+def change_view(plan: HostPlan, view: str) -> None:
+    ask(plan, "set_view", view=view)
+
+
+def current_view(plan: HostPlan) -> str:
+    scene = ask(plan, "get_scene")["scene"]
+    assert isinstance(scene, dict)
+    return str(scene["output"]["view"])
+
+
+def test_ctrl_c_ends_the_demo_without_orphans_and_it_starts_again() -> None:
+    (page_port,) = ports.private_ports(1)
+    for _ in range(2):
+        command = [sys.executable, "-m", "services.cli", "demo", "--no-browser", "--port", str(page_port)]
+        demo = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        wait_until(lambda: health(page_port) == "ok")
+        children = psutil.Process(demo.pid).children(recursive=True)
+        assert len(children) == 3
+        demo.send_signal(signal.SIGINT)
+        output, error = demo.communicate(timeout=20)
+        assert demo.returncode == 130
+        assert "Traceback" not in error
+        assert f"http://127.0.0.1:{page_port}" in output
+        assert psutil.wait_procs(children, timeout=1)[1] == []
+        assert ports.is_free(page_port)
+
+
+def test_page_port_in_use_is_a_sentence(cli: RunCli) -> None:
+    taken = ports.listen(ports.private_ports(1)[0])
+    taken.listen()
+    port = taken.getsockname()[1]
+    done = cli("demo", "--no-browser", "--port", port)
+    taken.close()
+    assert done.returncode == 2
+    assert f"Port {port}" in done.stderr
+    assert "--port" in done.stderr
+
+
+def test_up_without_a_gpu_refuses_in_a_sentence(cli: RunCli) -> None:
+    """The server's own sentence ends the command; no restarts are tried."""
+    if "llvmpipe" not in cli("doctor", "--json").stdout:
+        pytest.skip("this machine has a GPU")
+    numbers = ports.private_ports(4)
+    names = ("--port", "--node-port", "--composite-port", "--control-port")
+    options = [str(part) for pair in zip(names, numbers, strict=True) for part in pair]
+    done = cli("up", "--source", RECORDING, "--scene", SCENE, *options, timeout_s=PATIENCE_S)
+    assert done.returncode == 2
+    last_line = done.stderr.strip().splitlines()[-1]
+    assert "--allow-software" in last_line
+    assert "started again" not in done.stderr
+
+
+def health(port: int) -> str:
+    with suppress(httpx.TransportError):
+        return str(httpx.get(f"http://127.0.0.1:{port}/api/v1/health").json()["status"])
+    return "no answer"
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.1)
