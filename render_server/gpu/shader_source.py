@@ -16,7 +16,7 @@ def shader_source(path: Path, defines: Mapping[str, int | float | str] | None = 
     files: list[Path] = []
     body = _expand(path, files)
     head = [VERSION, *(f"#define {name} {value}" for name, value in (defines or {}).items())]
-    table = [f"// file {index}: {file.relative_to(ROOT)}" for index, file in enumerate(files)]
+    table = [f"// file {index}: {file.parent.name}/{file.name}" for index, file in enumerate(files)]
     return "\n".join([*head, *table, body])
 
 

@@ -3,6 +3,7 @@
 #include "passes/common/march.glsl"
 #include "passes/common/environment.glsl"
 #include "passes/common/brdf.glsl"
+#include "passes/common/lights.glsl"
 #include "passes/common/sampling_grid.glsl"
 
 layout(local_size_x = 8, local_size_y = 8) in;
@@ -56,7 +57,7 @@ void main() {
     float traced = 0.0, fade = 0.0;
 #ifdef REAL
     fade = s.present ? volume_fade(q) : 0.0;
-    bool active_here = s.present && (fade > 0.0 || trace_everywhere);
+    bool active_here = s.present && (fade > 0.0 || trace_everywhere || object_may_shadow(s.position, 0.0));
 #else
     bool active_here = s.present;
 #endif
@@ -79,7 +80,7 @@ void main() {
         }
     }
 #ifdef REAL
-    if (s.present && !active_here) {   // the volume does not reach: the environment, unchanged
+    if (s.present && !active_here) {   // the objects do not reach: the environment, unchanged
         e_mu = e_rho = environment_irradiance(s.normal);
         if (s.roughness >= 0.0) {
             vec3 d = reflect(normalize(s.position - camera_position), s.normal);

@@ -119,6 +119,8 @@ class DvctExact:
         self.table.bind()
         frame.virtual.materials.bind()
         voxels.bind_support()
+        voxels.far.pyramid.texture.use(location=16)
+        uniforms = {**uniforms, **voxels.far.uniforms()}
         with frame.timers.measure("cones real"):
             self._trace.trace_real(self._cones, self._grid, voxels.mu, voxels.rho, uniforms)
         with frame.timers.measure("cones virtual"):

@@ -11,15 +11,70 @@ from render_server.passes.filter_voxels import FilterVoxelsPass
 from render_server.passes.light_table import LightTable
 from render_server.passes.light_voxels import LightVoxelsPass, bind_picture
 from render_server.passes.resolve_voxels import ResolveVoxelsPass
-from render_server.passes.volume import Pyramid, VolumePlacement
+from render_server.passes.volume import Pyramid, VolumePlacement, place_volume
 from render_server.passes.voxel_store import VoxelStore
 from render_server.passes.voxelize import VoxelizePass
 from render_server.relight.frame import RelightInput
 
 DIRECTIONS = 6
+FAR_SIZE = 32  # voxels an edge of the coarse volume beyond
+FAR_EDGE_M = 20.0  # its greatest edge: what lies farther lights little through a cone's solid angle
+FAR_MARGIN = 1.05
 SURFEL_SHADOW_SAMPLES = 4  # of a light's area: a voxel averages many surfels
 DEPTH_TOLERANCE = 0.02  # a surfel this near (relative) to what the camera sees is what it sees
 MEAN_ALBEDO = 0.5  # of real surfaces that no camera pixel shows
+
+
+class FarScene:
+    """The real scene beyond the volume: a coarse mu pyramid around everything that the camera sees.
+
+    What leaves the volume meets the radiance that the camera measured there, not the environment.
+    """
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self.pyramid = Pyramid(gpu, FAR_SIZE, DIRECTIONS)
+        self._store = VoxelStore(gpu, FAR_SIZE)
+        self._placement = VolumePlacement((0.0, 0.0, 0.0), 1.0, FAR_SIZE)
+        self._key: object = None
+        self._stale = False
+
+    def voxelize(self, frame: RelightInput, voxelize: VoxelizePass, resolve: ResolveVoxelsPass) -> None:
+        """Voxelise the whole real scene, unless it stood still."""
+        key = (frame.real.version, frame.lights_version)
+        self._stale = key != self._key
+        if not self._stale:
+            return
+        self._key = key
+        resolve.clear(self.pyramid, self._store, self._placement.uniforms(), free=True)
+        low, high = frame.real.bounds
+        edge = min(float(np.max(high - low)), FAR_EDGE_M) * FAR_MARGIN
+        self._placement = place_volume(low, high, FAR_SIZE, edge)
+        voxelize.run(self._store, frame.real.corners, self._placement)
+
+    def light(self, light: LightVoxelsPass, lighting: dict[str, Any]) -> None:
+        """Give its voxels the radiance that the camera measured."""
+        if self._stale:
+            light.light_real(self._store, {**lighting, **self._placement.uniforms()})
+
+    def filter(self, resolve: ResolveVoxelsPass, filter_pass: FilterVoxelsPass) -> None:
+        """Resolve and filter."""
+        if self._stale:
+            resolve.resolve_mu(self.pyramid, self._store, self._placement.uniforms())
+            filter_pass.run(self.pyramid, self._placement)
+
+    def uniforms(self) -> dict[str, Any]:
+        """Every uniform that march.glsl reads of it."""
+        return {
+            "far_origin": self._placement.origin,
+            "far_edge": self._placement.voxel_edge,
+            "far_size": self._placement.size,
+            "far_levels": self._placement.levels,
+        }
+
+    def release(self) -> None:
+        """Free the GL objects."""
+        self.pyramid.release()
+        self._store.release()
 
 
 class VoxelScene:
@@ -30,6 +85,7 @@ class VoxelScene:
         self.mu = Pyramid(gpu, placement.size, DIRECTIONS)
         self.rho = Pyramid(gpu, placement.size, DIRECTIONS)
         self._real = VoxelStore(gpu, placement.size)
+        self.far = FarScene(gpu)
         self._virtual = VoxelStore(gpu, placement.size)
         self._voxelize = VoxelizePass(gpu)
         self._light = LightVoxelsPass(gpu)
@@ -51,13 +107,17 @@ class VoxelScene:
             self._clear_virtual()
             self.placement = placement
             self._voxelize.run(self._real, frame.real.corners, placement)
+            self.far.voxelize(frame, self._voxelize, self._resolve)
         with timers.measure("light voxels"):
             frame.picture.build_levels()
             self._bind(frame, table)
-            self._light.light_real(self._real, _lighting_uniforms(frame, uniforms))
+            lighting = _lighting_uniforms(frame, uniforms)
+            self._light.light_real(self._real, lighting)
+            self.far.light(self._light, lighting)
         with timers.measure("filter"):
             self._resolve.resolve_mu(self.mu, self._real, placement.uniforms())
             self._filter.run(self.mu, placement)
+            self.far.filter(self._resolve, self._filter)
 
     def _clear_virtual(self) -> None:
         self._resolve.clear(self.rho, self._virtual, self.placement.uniforms(), free=True)

@@ -36,17 +36,13 @@ def speed(
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
 ) -> None:
     """Time every pass of a frame on the demo's recording, and the frame rate from camera to viewer."""
-    from benchmarks.speed import measure_speed, print_report
     from services.arguments import parse_size
     from services.files import write_bytes
 
-    report = measure_speed(
-        _methods(methods),
-        frames,
-        size=None if size is None else parse_size(size),
-        device=device,
-        end_to_end=end_to_end,
-    )
+    chosen, size_px = _methods(methods), None if size is None else parse_size(size)
+    from benchmarks.speed import measure_speed, print_report  # needs OpenGL's packages, wrong options do not
+
+    report = measure_speed(chosen, frames, size=size_px, device=device, end_to_end=end_to_end)
     if out is not None:
         write_bytes(out, json.dumps(report, indent=2).encode())
     if as_json:

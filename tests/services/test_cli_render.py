@@ -293,7 +293,7 @@ def test_truncated_recording(cli: RunCli, take: Path, tmp_path: Path) -> None:
 
 def test_missing_gpu_is_a_sentence(take: Path, tmp_path: Path) -> None:
     command = [sys.executable, "-m", "services.cli", "render", take / "take", "--scene", take / "scene.json"]
-    environment = {**os.environ, "GLCONTEXT_LINUX_LIBEGL": "libno-such-egl.so"}
+    environment = {**os.environ, "GLCONTEXT_LINUX_LIBEGL": "/nonexistent/libEGL.so"}
     done = subprocess.run(
         [*command, "--out", tmp_path / "out"],
         cwd=ROOT,

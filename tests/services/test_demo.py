@@ -60,7 +60,7 @@ def test_headless_demo_needs_a_folder(cli: RunCli) -> None:
     assert "--out" in done.stderr
 
 
-def test_picture_returns_after_node_and_server_are_killed(tmp_path: Path) -> None:
+def test_picture_returns_after_node_and_server_are_killed() -> None:
     with session_file(demo_scene("paper")) as session:
         plan = demo_plan(session, page_port=None)
         lines: list[str] = []

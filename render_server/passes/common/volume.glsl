@@ -9,22 +9,25 @@ uniform float voxel_edge;     // h, m
 uniform int volume_size;      // n, voxels an edge
 uniform int volume_levels;
 
-ivec3 level_base(int level, int k) {
-    int n = volume_size;
+ivec3 level_base_of(int n, int level, int k) {
     if (level == 0) return ivec3(0, 0, k * n);
     return ivec3((k & 1) * n / 2, n - (n >> (level - 1)), DIRECTIONS * n + (k >> 1) * n / 2);
 }
 
+ivec3 level_base(int level, int k) { return level_base_of(volume_size, level, k); }
+
 // Premultiplied (c, a) at q (voxels of level 0 from the low corner), trilinear within one level and direction.
-vec4 volume_sample(sampler3D pyramid, vec3 q, int level, int k) {
-    float cells = float(volume_size >> level);
-    vec3 c = clamp(q * exp2(-float(level)), vec3(0.5), vec3(cells - 0.5)) + vec3(level_base(level, k));
+vec4 volume_sample(sampler3D pyramid, int n, vec3 q, int level, int k) {
+    float cells = float(n >> level);
+    vec3 c = clamp(q * exp2(-float(level)), vec3(0.5), vec3(cells - 0.5)) + vec3(level_base_of(n, level, k));
     return textureLod(pyramid, c / vec3(textureSize(pyramid, 0)), 0.0);
 }
 
 vec3 volume_coordinate(vec3 p) { return (p - volume_origin) / voxel_edge; }
 
-bool inside_volume(vec3 q) { return all(greaterThan(q, vec3(0.0))) && all(lessThan(q, vec3(float(volume_size)))); }
+bool inside_cube(vec3 q, int n) { return all(greaterThan(q, vec3(0.0))) && all(lessThan(q, vec3(float(n)))); }
+
+bool inside_volume(vec3 q) { return inside_cube(q, volume_size); }
 
 // The delta fades over the last voxels, so that nothing is cut off at the border.
 const float FADE_VOXELS = 4.0;

@@ -1,0 +1,89 @@
+"""The command line beside `render`: help, schema, doctor, sentences, quick start."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from services import doctor, ports
+from tests.services.conftest import ROOT, RunCli
+
+COMMANDS = ("render", "demo", "node", "server", "viewer", "up", "doctor", "schema", "bench", "bench speed")
+
+
+def test_every_command_has_help(cli: RunCli) -> None:
+    overview = cli("--help")
+    assert overview.returncode == 0
+    for command in COMMANDS:
+        assert command.split()[0] in overview.stdout
+    for command in COMMANDS:
+        done = cli(*command.split(), "--help")
+        assert done.returncode == 0
+        assert "Usage" in done.stdout
+
+
+def test_help_loads_no_heavy_module() -> None:
+    heavy = "('cv2', 'moderngl', 'zmq', 'fastapi', 'numpy', 'pydantic')"
+    code = f"import sys, services.cli\nprint([name for name in {heavy} if name in sys.modules])"
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=30, check=True
+    )
+    assert done.stdout.strip() == "[]"
+
+
+def test_schema_is_json_schema(cli: RunCli) -> None:
+    keys = {"scene": "objects", "server": "subscribe", "viewer": "port", "node": "source"}
+    for document, key in keys.items():
+        done = cli("schema", document)
+        assert done.returncode == 0, done.stderr
+        assert key in json.loads(done.stdout)["properties"]
+
+
+def test_doctor_finds_what_the_demo_needs(cli: RunCli) -> None:
+    done = cli("doctor", "--json")
+    assert done.returncode == 0, done.stdout
+    checks = {check["name"]: check for check in json.loads(done.stdout)}
+    assert checks["OpenGL device 0"]["state"] == "ok"
+    assert checks["OpenCV"]["state"] == "ok"
+    assert f"port {ports.PAGE_PORT}" in checks
+
+
+def test_doctor_says_what_is_missing_without_opengl(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from services.commands.doctor import _print_table
+
+    monkeypatch.setenv("GLCONTEXT_LINUX_LIBEGL", "/nonexistent/libEGL.so")
+    monkeypatch.setattr(doctor, "PACKAGES", {"render": ("no-such-package",)})
+    checks = [check.as_dict() for check in doctor.examine()]
+    found = {check["name"]: check for check in checks}
+    assert found["OpenGL device 0"]["state"] == "missing"
+    assert "apt-get install" in found["OpenGL device 0"]["detail"]
+    assert "pip install 'deltalight[render]'" in found["packages [render]"]["hint"]
+    _print_table(checks)
+    assert "packages [render]" in capsys.readouterr().out
+
+
+def test_server_and_up_refuse_wrong_input_in_a_sentence(cli: RunCli, tmp_path: object) -> None:
+    for arguments, sentence in (
+        (("server", "--scene", f"{tmp_path}/absent.json", "--allow-software"), "absent.json"),
+        (("up", "--source", f"{tmp_path}/absent.mcap"), "absent.mcap"),
+        (("up", "--source", "synthetic"), "--scene"),
+        (("--log-level", "loud", "doctor"), "log level"),
+        (("bench", "speed", "--methods", "guess"), "exact"),
+    ):
+        done = cli(*arguments)
+        assert done.returncode == 2, done.stderr
+        assert sentence in done.stderr
+        assert "Traceback" not in done.stderr
+
+
+def test_node_names_a_port_in_use(cli: RunCli) -> None:
+    taken = ports.listen(ports.private_ports(1)[0])
+    taken.listen()
+    port = taken.getsockname()[1]
+    done = cli("node", "--source", "synthetic", "--publish", ports.endpoint(port))
+    taken.close()
+    assert done.returncode == 2
+    assert str(port) in done.stderr
