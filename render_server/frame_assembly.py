@@ -71,6 +71,7 @@ class FrameAssembler:
         self._colors: deque[_Held[ColorMessage]] = deque()
         self._depths: deque[_Held[DepthMessage]] = deque(maxlen=KEPT_MESSAGES)
         self._poses: deque[_Held[PoseMessage]] = deque(maxlen=KEPT_MESSAGES)
+        self._reference_exposure_s: float | None = None  # of the first frame, as for recordings
         self._camera = _Unchanged(CameraModel.from_dict)
         self._depth_camera = _Unchanged(CameraModel.from_dict)
         self._board = _Unchanged(_board_spec)
@@ -128,12 +129,15 @@ class FrameAssembler:
         self.counts["unpaired_pose"] += pose is None
         self.counts["unpaired_depth"] += depth is None and self.needs_depth
         header = color.message
+        if self._reference_exposure_s is None:
+            self._reference_exposure_s = header.exposure_s
         view = ViewFrame(
             frame_id=header.frame_id,
             timestamp_ns=header.capture_ns,
             color=decode_color(color.parts[0], header.encoding, header.shape),
             camera=self._camera(header.camera),
             response=decode_response(color.parts[1]) if header.has_response else None,
+            exposure_scale=(header.exposure_s or 1.0) / (self._reference_exposure_s or 1.0),
             pose=None if pose is None else _board_pose(pose.message),
             depth=None if depth is None else self._depth_image(depth),
             board=None if pose is None or pose.message.board is None else self._board(pose.message.board),

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
-from protocol.scene_objects import Surface
+import numpy as np
+
 from render_server.gpu.context import GpuContext
 from render_server.passes.geometry_buffer import GeometryBuffer, GeometryPass
 from render_server.passes.matte import MattePass
@@ -13,6 +13,7 @@ from render_server.passes.picture import Picture
 from render_server.passes.real_surface import RealSurface
 from render_server.real_geometry import RealGeometry
 from render_server.relight.frame import GeometryState
+from render_server.scene.surfaces import DIFFUSE_BOX, MAX_SURFACES, SurfaceTable
 from render_server.view import CameraView
 
 
@@ -29,8 +30,15 @@ class PictureResources:
         self.matte = MattePass(gpu, size)
         self._geometry = GeometryPass(gpu)
         self._gpu = gpu
-        self._surfaces = gpu.ctx.buffer(bytes(80))
+        self._surfaces = gpu.ctx.buffer(reserve=MAX_SURFACES * 80 + 80)
         self.surface_uniforms: dict[str, Any] = {"surface_count": 0, "specular_surfaces": False}
+
+    def declare_surfaces(self, table: SurfaceTable) -> None:
+        """Take over the declared surfaces of the real scene."""
+        if len(table):
+            self._surfaces.write(np.ascontiguousarray(table.packed, np.float32).tobytes())
+        specular = bool((table.packed[:, 3, 3] < DIFFUSE_BOX).any())
+        self.surface_uniforms = {"surface_count": len(table), "specular_surfaces": specular}
 
     def rasterise(
         self,
@@ -38,7 +46,6 @@ class PictureResources:
         virtual: GeometryState,
         view: CameraView,
         moved: bool,
-        surfaces: Sequence[Surface],
     ) -> None:
         """Real geometry buffer (if it `moved`), virtual raster, matte."""
         self._surfaces.bind_to_storage_buffer(14)

@@ -34,10 +34,12 @@ class RealGeometry:
         self._materials: MaterialTable | None = None
         self._version = 0
         self.state: GeometryState | None = None
+        self.material_names: tuple[str, ...] = ()
         self.is_model = isinstance(real.geometry, ModelGeometry)
         self.frame: ViewFrame | None = None
         if isinstance(real.geometry, ModelGeometry):
             self._model = self._load_model(real.geometry)
+            self.material_names = tuple(mesh.material.name for mesh in self._model)
         elif real.geometry == "fused":
             raise DeltalightError(
                 "real.geometry `fused` arrives with a later release: use `depth`, or give a model."

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from protocol.errors import DeltalightError
@@ -13,12 +13,14 @@ from render_server.gpu.context import GpuContext
 from render_server.gpu.timers import PassTimers
 from render_server.passes.composite import RelitLayers
 from render_server.passes.volume import memory_statement
+from render_server.light_registration import register_lights
 from render_server.picture_resources import PictureResources
 from render_server.real_geometry import RealGeometry
 from render_server.relight.defaults import ResolvedDvct, resolve_dvct
 from render_server.relight.dvct import DvctExact
 from render_server.relight.frame import RelightInput
 from render_server.scene.lights import LightSet, build_lights
+from render_server.scene.surfaces import build_surface_table
 from render_server.view import CameraView
 from render_server.virtual_objects import VirtualObjects
 
@@ -62,6 +64,7 @@ class Relighting:
         self._lights_version = 0
         self._plan = self._planned(scene)
         self._lights = self._plan.lights
+        self._unregistered: LightSet | None = None
         self._take(self._plan)
 
     def _planned(self, scene: SceneDocument) -> _Plan:
@@ -93,6 +96,7 @@ class Relighting:
             self._method = None
         if plan.scene.lights != old.scene.lights or self._lights_version == 0:
             self._lights_version += 1
+            self._unregistered = plan.lights if plan.lights.registration_auto else None
             self._lights = plan.lights.registered()
         self._plan = plan
 
@@ -108,7 +112,11 @@ class Relighting:
         moved = self._real.update(frame, view)
         assert self._real.state is not None
         with timers.measure("geometry buffer"):
-            resources.rasterise(self._real, virtual, view, moved, self._plan.scene.real.surfaces)
+            if moved:
+                surfaces = self._plan.scene.real.surfaces
+                table = build_surface_table(surfaces, frame.board if surfaces else None, self._real.material_names)
+                resources.declare_surfaces(table)
+            resources.rasterise(self._real, virtual, view, moved)
         relight_input = RelightInput(
             view,
             resources.picture,
@@ -124,9 +132,25 @@ class Relighting:
             resources.surface_uniforms,
             timers,
         )
+        if self._unregistered is not None:
+            relight_input = self._register(frame, relight_input, self._method_for(view))
         layers = self._method_for(view).relight(relight_input)
         additive = self._plan.method.resolved_composition == "additive"
         return RelitFrame(relight_input, layers, additive, {"sample_distance": self._sample_distance(view)})
+
+    def _register(self, frame: ViewFrame, scene: RelightInput, method: DvctExact) -> RelightInput:
+        """Find the lights' factor from this frame and use it from now on."""
+        assert self._unregistered is not None
+        found = register_lights(frame, replace(scene, lights=self._unregistered), method.relight)
+        self._lights = self._unregistered.registered(found.factor)
+        self._unregistered = None
+        self._lights_version += 2
+        factor = ", ".join(f"{value:.3g}" for value in found.factor)
+        fit = "" if found.residual is None else f", residual {100 * found.residual:.1f} %"
+        self._say(f"lights registered by {found.source}: factor ({factor}){fit}")
+        if found.warning is not None:
+            self._say(found.warning)
+        return replace(scene, lights=self._lights, lights_version=self._lights_version)
 
     def _sample_distance(self, view: CameraView) -> float:
         """What a texel of the cones' grid spans at 1 m, m."""

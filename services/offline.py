@@ -109,7 +109,7 @@ def _render_frames(
 ) -> RenderSummary:
     from sensor_node.view_frames import ViewFrameBuilder
 
-    builder = ViewFrameBuilder(job.source)
+    builder = ViewFrameBuilder(job.source, needs_depth=job.scene.real.geometry == "depth")
     told = 0
     for number in job.frames:
         frame = builder(job.source[number])

@@ -14,6 +14,7 @@ layout(binding = 3, rgba16f) writeonly uniform image2D lobe_rho;
 uniform vec3 camera_position;
 uniform float noise_sigma;   // m at 1 m
 uniform bool specular_surfaces;
+uniform bool everywhere;       // also where the objects do not reach (photometric registration)
 
 void main() {
     ivec2 pixel = ivec2(gl_GlobalInvocationID.xy);
@@ -26,7 +27,7 @@ void main() {
     float bias = 3.0 * noise_sigma * position.w * position.w;
     // Where neither cones nor shadows of the objects reach, the picture stays as it is.
     bool reached = position.w > 0.0
-        && (inside_volume(volume_coordinate(position.xyz)) || object_may_shadow(position.xyz, bias));
+        && (everywhere || inside_volume(volume_coordinate(position.xyz)) || object_may_shadow(position.xyz, bias));
     if (reached) {
         vec3 v = normalize(camera_position - position.xyz);
         for (int i = 0; i < light_count; ++i) {

@@ -53,5 +53,5 @@ void main() {
     vec3 world = (world_from_camera * vec4(camera, 1.0)).xyz;
     vec3 normal = mat3(world_from_camera) * fitted_normal(pixel, z, size);
     imageStore(position_out, pixel, vec4(world, z));
-    imageStore(normal_out, pixel, vec4(normal, float(surface_entry(world))));
+    imageStore(normal_out, pixel, vec4(normal, float(surface_entry(world, -2.0))));
 }

@@ -14,7 +14,8 @@ void main() {
     vec4 normal = vec4(0.0, 0.0, 1.0, -1.0);
     if (all(greaterThanEqual(raster, ivec2(0))) && all(lessThan(raster, textureSize(virtual_raster_position, 0)))) {
         position = texelFetch(virtual_raster_position, raster, 0);
-        normal = vec4(texelFetch(virtual_raster_normal, raster, 0).xyz, float(surface_entry(position.xyz)));
+        vec4 seen = texelFetch(virtual_raster_normal, raster, 0);
+        normal = vec4(seen.xyz, float(surface_entry(position.xyz, seen.w)));
     }
     imageStore(position_out, pixel, position);
     imageStore(normal_out, pixel, normal);

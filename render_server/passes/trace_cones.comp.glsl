@@ -19,7 +19,7 @@ layout(binding = 2, rgba16f) writeonly uniform image2D specular_mu;      // rgb 
 layout(binding = 3, rgba16f) writeonly uniform image2D specular_rho;
 uniform int cone_count;
 uniform vec3 camera_position;
-uniform bool trace_everywhere;   // also where the volume does not reach (photometric registration)
+uniform bool everywhere;   // also where the volume does not reach (photometric registration)
 
 const float START = 1.5;         // voxels along the normal: with one-sided voxels enough against self-hits
 
@@ -57,7 +57,7 @@ void main() {
     float traced = 0.0, fade = 0.0;
 #ifdef REAL
     fade = s.present ? volume_fade(q) : 0.0;
-    bool active_here = s.present && (fade > 0.0 || trace_everywhere || object_may_shadow(s.position, 0.0));
+    bool active_here = s.present && (fade > 0.0 || everywhere || object_may_shadow(s.position, 0.0));
 #else
     bool active_here = s.present;
 #endif

@@ -108,7 +108,7 @@ class DvctExact:
             "normal_offset": SELF_SHADOW_TEXELS * self.table.virtual_texel_m(centre),
             "sample_distance": 1.5 * self._resolved.cone_scale / pixel,
             "cone_count": self._settings.cone_count,
-            "trace_everywhere": False,
+            "everywhere": frame.everywhere,
         }
 
     def _shade(self, frame: RelightInput, voxels: VoxelScene, uniforms: dict[str, Any]) -> None:

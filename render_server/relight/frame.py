@@ -55,6 +55,7 @@ class RelightInput:
     typical_depth: float
     surface_uniforms: dict[str, Any]
     timers: PassTimers
+    everywhere: bool = False  # light every pixel, not only where the objects reach (photometric registration)
 
     def bind_geometry(self) -> None:
         """Bind the geometry buffers to the places that geometry.glsl names."""

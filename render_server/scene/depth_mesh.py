@@ -37,11 +37,11 @@ def depth_mesh(
 ) -> TriangleMesh:
     """Mesh a clean depth image that is registered to `camera`, in the world.
 
-    The mesh has at most `triangle_budget` triangles. A node stands for each cell of stride x stride pixels, at the cell's centre, with the cell's median depth
-    (moved to the centre along the fitted surface). No triangle crosses a depth discontinuity; cells without
-    depth or normal are holes. `uv` is the pixel coordinate (pixel centres at integers) of the vertex in the
-    camera's picture. `surface` is `depth_surface(depth, camera)` where it is already known.
-    Without any valid depth the mesh is empty.
+    A node stands for each cell of stride x stride pixels, at the cell's centre, with the cell's median depth
+    (moved to the centre along the fitted surface); the stride is the least that keeps to the budget. No
+    triangle crosses a depth discontinuity; cells without depth or normal are holes. `uv` is the pixel
+    coordinate (pixel centres at integers) of the vertex in the camera's picture. `surface` is
+    `depth_surface(depth, camera)` where it is already known. Without any valid depth the mesh is empty.
 
     Raises:
         DeltalightError: the budget is below 2, or depth and camera differ in size.

@@ -15,6 +15,8 @@ from render_server.scene.environment import (
 
 PEAK_THRESHOLD = 4.0
 LEAST_SHARE = 0.01
+# Lights of this angular radius are not cut again: sampling a light's disc does the rest.
+LEAST_RADIUS_RAD = float(np.radians(5.0))
 
 
 @dataclass(frozen=True)
@@ -103,7 +105,7 @@ def variance_cut(
 
     Again and again the region with the greatest weighted squared distance to its centroid is cut, across
     rows or columns, where the two sides' squared distances add up to least. Regions without weight are
-    left out, and cutting stops early where nothing is left to cut.
+    left out, and cutting stops early once every region's angular radius is at most 5 degrees.
     """
     moments = np.concatenate([weight[..., None], weight[..., None] * directions], axis=-1)
     table = np.zeros((weight.shape[0] + 1, weight.shape[1] + 1, 4))
@@ -112,10 +114,13 @@ def variance_cut(
         return []
     regions = [Region(0, weight.shape[0], 0, weight.shape[1])]
     while len(regions) < count:
-        spreads = [float(_spread(_moments(table, region))) for region in regions]
+        sums = np.array([_moments(table, region) for region in regions])
+        spreads = _spread(sums)
+        # Radius as of a light: sqrt(2 mean squared angle).
+        spreads[2 * spreads <= LEAST_RADIUS_RAD**2 * sums[:, 0]] = 0
         widest = int(np.argmax(spreads))
         halves = _cut(table, regions[widest])
-        if spreads[widest] <= 1e-9 * table[-1, -1, 0] or halves is None:
+        if spreads[widest] <= 0 or halves is None:
             break
         regions[widest : widest + 1] = halves
     return [region for region in regions if _moments(table, region)[0] > 0]

@@ -13,8 +13,9 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Float64
 
-MIN_LEVEL_SIZE = 16
+MIN_LEVEL_SIZE = 32
 SUMMED_SIZE = 64
+SUMMED_FROM_RAD = 0.4
 CONE_SAMPLES = 64
 SampleMap = Callable[[Float32[np.ndarray, "n m 3"]], Float32[np.ndarray, "n m c"]]
 
@@ -113,17 +114,17 @@ def prefilter(radiance: Float32[np.ndarray, "n n 3"]) -> PrefilteredMap:
     """Average a map over cones, weighted by the cosine to the axis (so the widest gives irradiance / pi)."""
     size = len(radiance)
     halved = [radiance]
-    while len(halved[-1]) > MIN_LEVEL_SIZE:
+    while len(halved[-1]) > SUMMED_SIZE // 4:
         halved.append(_halved(halved[-1]))
     summed = next((source for source in halved if len(source) <= SUMMED_SIZE), radiance)
     levels, angles = [radiance], [float(np.sqrt(4 * np.pi)) / size]
     while angles[-1] < np.pi / 2:
         angles.append(min(2 * angles[-1], np.pi / 2))
-        level_size = size >> len(levels)
-        if level_size > MIN_LEVEL_SIZE:
+        level_size = max(size >> len(levels), min(size, MIN_LEVEL_SIZE))
+        if angles[-1] < SUMMED_FROM_RAD:
             levels.append(_cone_average(halved, angles[-1], level_size))
         else:
-            levels.append(_cone_sum(summed, angles[-1], MIN_LEVEL_SIZE))
+            levels.append(_cone_sum(summed, angles[-1], level_size))
     return PrefilteredMap(tuple(levels), tuple(angles))
 
 

@@ -155,6 +155,6 @@ def albedo_from_irradiance(
     ([P2] eq. 1 with visibility, ambient and one bounce in E_mu, METHOD 2; 0.5 where no pixel is valid.)
     """
     ratio = np.pi * measured / np.maximum(irradiance, LEAST_IRRADIANCE)
-    albedo = np.clip(ratio, LEAST_ALBEDO, GREATEST_ALBEDO).astype(np.float32)
+    albedo = np.asarray(np.clip(ratio, LEAST_ALBEDO, GREATEST_ALBEDO), np.float32)
     albedo[~valid] = albedo[valid].mean(axis=0, dtype=np.float64) if valid.any() else 0.5
     return albedo

@@ -86,7 +86,7 @@ def build_surface_table(
     """
     if len(surfaces) > MAX_SURFACES:
         raise DeltalightError(
-            f"real.surfaces has {len(surfaces)} entries; declare at most {MAX_SURFACES}, without diffuse ones."
+            f"real.surfaces has {len(surfaces)} entries; declare at most {MAX_SURFACES}, no diffuse ones."
         )
     rows = [] if board is None else [_sheet_row(board)]
     rows += [_row(surface, material_names) for surface in surfaces]

@@ -1,0 +1,89 @@
+"""Photometric registration on the GPU's own fields: which factor ties the lights to what the camera sees (METHOD 1)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import moderngl
+import numpy as np
+from jaxtyping import Bool, Float64, Int16
+
+from protocol.frames import ViewFrame, decode_lut
+from render_server.passes.composite import RelitLayers
+from render_server.relight.frame import RelightInput
+from render_server.scene.registration import (
+    Registration,
+    paper_pixels,
+    registration_from_albedo_percentile,
+    registration_from_patch,
+    unclipped,
+)
+
+UNSHADOWED = 0.95  # share of its direct light that a pixel gets, from which on it counts as unshadowed
+
+Relight = Callable[[RelightInput], RelitLayers]
+
+
+@dataclass(frozen=True, eq=False)
+class _Samples:
+    """What is known at the pixels that stand for the reduced grid; all linear RGB."""
+
+    measured: Float64[np.ndarray, "k 3"]
+    light: Float64[np.ndarray, "k 3"]
+    bounce: Float64[np.ndarray, "k 3"]
+    usable: Bool[np.ndarray, " k"]
+    unshadowed: Bool[np.ndarray, " k"]
+    paper: Bool[np.ndarray, " k"]
+
+
+def register_lights(frame: ViewFrame, scene: RelightInput, relight: Relight) -> Registration:
+    """Factor R G B on all lights: from the board's white paper, else from the brightest albedo.
+
+    `scene.lights` are not registered yet. The light that other real surfaces throw is in camera units already (it
+    is measured), so the cones are traced twice: with the environment and without.
+    """
+    samples = _samples(frame, scene, relight)
+    if frame.board is not None and frame.pose is not None:
+        on_paper = samples.usable & samples.paper
+        found = registration_from_patch(
+            samples.measured[on_paper],
+            samples.light[on_paper],
+            samples.bounce[on_paper],
+            frame.board.paper_albedo,
+        )
+        if found is not None:
+            return found
+    lit = samples.usable & samples.unshadowed
+    return registration_from_albedo_percentile(samples.measured[lit], samples.light[lit], samples.bounce[lit])
+
+
+def _samples(frame: ViewFrame, scene: RelightInput, relight: Relight) -> _Samples:
+    """Read the fields back at the grid's pixels."""
+    black = replace(scene.lights, environment=np.zeros_like(scene.lights.environment))
+    without = relight(replace(scene, lights=black, lights_version=scene.lights_version + 1, everywhere=True))
+    bounce = _read(without.cones.mu)[..., :3]
+    layers = relight(replace(scene, everywhere=True))
+    cones, direct = _read(layers.cones.mu), _read(layers.direct.mu)
+    pixels: Int16[np.ndarray, "h w 4"] = np.frombuffer(layers.grid.pixels.read(), np.int16).reshape(
+        *cones.shape[:2], 4
+    )
+    present = (pixels[..., 0] >= 0) & (cones[..., 3] > 0)
+    x, y = pixels[present][:, 0], pixels[present][:, 1]
+    coded = decode_lut(frame.response)[frame.color, np.arange(3)]
+    at_pixel = direct[y, x]
+    mask = paper_pixels(frame.board, frame.camera, frame.pose) if frame.board and frame.pose else None
+    return _Samples(
+        (coded / frame.exposure_scale)[y, x],
+        at_pixel[:, :3] + cones[present][:, :3] - bounce[present],
+        bounce[present],
+        unclipped(frame.color, coded)[y, x],
+        at_pixel[:, :3].mean(axis=1) >= UNSHADOWED * at_pixel[:, 3],
+        np.zeros(len(x), bool) if mask is None else mask[y, x],
+    )
+
+
+def _read(texture: moderngl.Texture) -> Float64[np.ndarray, "h w c"]:
+    """Contents of an RGBA16F texture."""
+    width, height = texture.size
+    return np.frombuffer(texture.read(), np.float16).reshape(height, width, -1).astype(np.float64)
