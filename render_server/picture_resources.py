@@ -64,7 +64,8 @@ class PictureResources:
         if not real.is_model:
             assert real.frame is not None
             assert real.frame.depth is not None
-            self.real_surface.from_depth(real.frame.depth, self.picture, view, real.noise_sigma, count)
+            assert real.surface is not None
+            self.real_surface.from_depth(real.frame.depth, real.surface.normals, self.picture, view, count)
             return
         if self._model_raster is None:
             self._model_raster = GeometryBuffer(self._gpu, self.virtual_raster.size)

@@ -15,12 +15,12 @@ from render_server.passes.materials import MaterialTable
 from render_server.passes.mesh_buffers import MeshBuffers, triangle_corners
 from render_server.relight.frame import GeometryState
 from render_server.scene.depth_mesh import depth_mesh
+from render_server.scene.depth_surface import DepthSurface, depth_surface, noise_sigma
 from render_server.scene.mesh import TriangleMesh, load_mesh, merge_for_gpu
 from render_server.scene.scene_tracker import RealSceneTracker
 from render_server.view import CameraView
 
 BOUND_POINTS = 4000  # points kept of a mesh to fit light views around it
-DEFAULT_SIGMA = 0.001  # m at 1 m, where the depth camera's noise is not known
 
 
 class RealGeometry:
@@ -37,6 +37,7 @@ class RealGeometry:
         self.material_names: tuple[str, ...] = ()
         self.is_model = isinstance(real.geometry, ModelGeometry)
         self.frame: ViewFrame | None = None
+        self.surface: DepthSurface | None = None
         if isinstance(real.geometry, ModelGeometry):
             self._model = self._load_model(real.geometry)
             self.material_names = tuple(mesh.material.name for mesh in self._model)
@@ -54,7 +55,7 @@ class RealGeometry:
         """Depth noise at 1 m, m; a model has none."""
         if self.is_model or self.frame is None or self.frame.depth is None:
             return 0.0
-        return self.frame.depth.noise_sigma_m or DEFAULT_SIGMA
+        return noise_sigma(self.frame.depth)
 
     def update(self, frame: ViewFrame, view: CameraView) -> bool:
         """Take over the frame's geometry if it changed; returns whether it did.
@@ -81,7 +82,8 @@ class RealGeometry:
     def _depth_mesh(self, frame: ViewFrame, view: CameraView) -> TriangleMesh:
         depth = frame.depth
         assert isinstance(depth, DepthImage)
-        return depth_mesh(depth, view.world_from_camera, self._budget)
+        self.surface = depth_surface(depth, view.camera)
+        return depth_mesh(depth, view.camera, view.world_from_camera, self._budget, self.surface)
 
     def _build(self, meshes: list[TriangleMesh]) -> None:
         """Merge and upload."""

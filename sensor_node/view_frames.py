@@ -1,115 +1,124 @@
 """From a raw frame to the renderer's input: pose, registered and clean depth. The same live and offline."""
 
-from typing import Protocol
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
-from jaxtyping import Float64
 
-from protocol.board import BoardSpec
-from protocol.calibration import Extrinsics
-from protocol.camera_model import CameraModel
 from protocol.errors import DeltalightError
 from protocol.frames import BoardPose, DepthImage, SensorFrame, ViewFrame
 from protocol.poses import require_rigid
+from protocol.source import Source
+from sensor_node.cameras.base import Camera
 from sensor_node.depth import DepthSettings, clean_depth, estimate_noise_sigma
 from sensor_node.depth_registration import register_depth
 from sensor_node.markers import BoardDetector
 
 
-class Rig(Protocol):
-    """What is known about the cameras that frames come from: a `Source` or a `Camera`."""
+@dataclass(frozen=True)
+class _Reference:
+    """What holds for a whole sequence, by one of its frames."""
 
-    @property
-    def camera(self) -> CameraModel:
-        """Colour camera."""
+    exposure_s: float | None
+    noise_sigma_m: float | None
+    has_depth: bool
 
-    @property
-    def board(self) -> BoardSpec | None:
-        """Marker board, if it is described."""
-
-    @property
-    def extrinsics(self) -> Extrinsics:
-        """Transforms between the sensors."""
-
-    @property
-    def depth_scale(self) -> float | None:
-        """Metres for each step of the stored depth; None where there is no depth in steps."""
-
-    def __getitem__(self, index: int) -> SensorFrame:
-        """Frame by number; 0 gives what the whole sequence is measured by."""
+    @classmethod
+    def of(cls, frame: SensorFrame) -> Self:
+        depth = frame.depth
+        noise = None if depth is None else depth.noise_sigma_m or estimate_noise_sigma(depth)
+        return cls(frame.exposure_s, noise, depth is not None)
 
 
 class ViewFrameBuilder:
-    """Makes the renderer's input of the frames of one rig.
+    """Makes the renderer's input of the frames of one source or camera.
 
-    The pose is the one given with the frame, else what the board shows, else none. What holds for the whole
-    sequence (depth noise where it is unknown, the reference exposure) comes from its first frame, so that
-    a frame's result does not depend on where a run began.
+    The pose is the one given with the frame, else what the board shows, else none. The reference exposure
+    and, where it is unknown, the depth noise are those of the source's first frame, so that a frame's result
+    does not depend on where a run began; of a camera's first frame that comes.
 
     Args:
-        rig: source or camera of the frames.
+        rig: what the frames come from.
         settings: of the depth clean-up.
-        needs_depth: whether the scene's geometry is depth, so that a rig without any is an error.
+        needs_depth: whether the scene's geometry is depth, so that a source without any is an error.
+
+    Raises:
+        DeltalightError: depth is needed and the source has none.
     """
 
     def __init__(
-        self, rig: Rig, settings: DepthSettings | None = None, *, needs_depth: bool = False
+        self, rig: Source | Camera, settings: DepthSettings | None = None, *, needs_depth: bool = False
     ) -> None:
         self._rig, self._settings = rig, settings or DepthSettings()
-        first = rig[0]
-        if needs_depth and first.depth is None and rig.depth_scale is None:
-            raise DeltalightError(
-                "the scene's geometry is depth but the source has none; "
-                "give depth.txt with pictures, or a model in real.geometry."
-            )
-        self._reference_exposure_s = first.exposure_s
-        self._noise_sigma_m = None if first.depth is None else _noise_sigma_m(first.depth)
-        self._detector = None if rig.board is None else BoardDetector(rig.board, rig.camera, first.response)
-        self._color_from_depth = _color_from_depth(rig.extrinsics)
+        self._reference = None if isinstance(rig, Camera) else _Reference.of(rig[0])
+        self._detector: BoardDetector | None = None
+        from_rgb = rig.extrinsics.depth_from_rgb
+        self._color_from_depth = np.eye(4) if from_rgb is None else np.linalg.inv(from_rgb)
+        self._needs_depth = needs_depth
+        if self._reference is not None:
+            self._check_depth(self._reference)
 
     def __call__(self, frame: SensorFrame) -> ViewFrame:
-        """Return the renderer's input for a frame; `pose` is None where the board is not seen.
+        """Return the renderer's input for a frame.
+
+        `pose` is None where the board is not seen. `depth` is None where the source has no depth; a single
+        frame without has a depth image that is unknown everywhere.
 
         Raises:
             DeltalightError: depth and colour, or colour and camera, do not fit each other.
         """
+        if self._reference is None:
+            self._reference = _Reference.of(frame)
+            self._check_depth(self._reference)
         return ViewFrame(
             frame_id=frame.frame_id,
             timestamp_ns=frame.timestamp_ns,
             color=frame.color,
             camera=self._rig.camera,
             response=frame.response,
-            exposure_scale=self._exposure_scale(frame),
+            exposure_scale=_exposure_scale(frame.exposure_s, self._reference.exposure_s),
             pose=self._pose(frame),
-            depth=None if frame.depth is None else self._clean(frame.depth, frame),
+            depth=self._depth(frame, self._reference),
             board=self._rig.board,
         )
 
-    def _exposure_scale(self, frame: SensorFrame) -> float:
-        if frame.exposure_s is None or self._reference_exposure_s is None:
-            return 1.0
-        return frame.exposure_s / self._reference_exposure_s
+    def _has_depth(self, reference: _Reference) -> bool:
+        return reference.has_depth or self._rig.depth_scale is not None
+
+    def _check_depth(self, reference: _Reference) -> None:
+        if self._needs_depth and not self._has_depth(reference):
+            raise DeltalightError(
+                "the scene's geometry is depth but the source has none; "
+                "give depth.txt with its pictures, or a model in the scene's real.geometry."
+            )
 
     def _pose(self, frame: SensorFrame) -> BoardPose | None:
         if frame.world_from_camera is not None:
             return BoardPose(require_rigid(frame.world_from_camera, f"the pose of frame {frame.frame_id}"))
-        return None if self._detector is None else self._detector.detect(frame.color)
+        if self._rig.board is None:
+            return None
+        if self._detector is None:
+            self._detector = BoardDetector(self._rig.board, self._rig.camera, frame.response)
+        return self._detector.detect(frame.color)
 
-    def _clean(self, depth: DepthImage, frame: SensorFrame) -> DepthImage:
+    def _depth(self, frame: SensorFrame, reference: _Reference) -> DepthImage | None:
+        camera, depth = self._rig.camera, frame.depth
+        if depth is None:
+            return _unknown(frame) if self._has_depth(reference) else None
         if depth.noise_sigma_m is None:
-            if self._noise_sigma_m is None:
-                self._noise_sigma_m = estimate_noise_sigma(depth)
-            depth = DepthImage(depth.depth_m, depth.valid, depth.camera, self._noise_sigma_m)
-        if depth.camera is not self._rig.camera and depth.camera != self._rig.camera:
-            depth = register_depth(depth, self._rig.camera, self._color_from_depth)
+            if reference.noise_sigma_m is None:  # the first frame had no depth
+                reference = self._reference = replace(reference, noise_sigma_m=estimate_noise_sigma(depth))
+            depth = replace(depth, noise_sigma_m=reference.noise_sigma_m)
+        if depth.camera is not camera and depth.camera != camera:
+            depth = register_depth(depth, camera, self._color_from_depth)
         return clean_depth(depth, frame.color, self._settings)
 
 
-def _noise_sigma_m(depth: DepthImage) -> float:
-    return depth.noise_sigma_m or estimate_noise_sigma(depth)
+def _unknown(frame: SensorFrame) -> DepthImage:
+    size = frame.color.shape[:2]
+    return DepthImage(np.zeros(size, np.float32), np.zeros(size, bool), frame.camera)
 
 
-def _color_from_depth(extrinsics: Extrinsics) -> Float64[np.ndarray, "4 4"]:
-    if extrinsics.depth_from_rgb is None:
-        return np.eye(4)
-    return np.linalg.inv(extrinsics.depth_from_rgb)
+def _exposure_scale(exposure_s: float | None, reference_s: float | None) -> float:
+    """Factor of the frame's exposure over the reference (an exposure that is not told is the reference)."""
+    return 1.0 if exposure_s is None or reference_s is None else exposure_s / reference_s

@@ -13,8 +13,6 @@ from services import ports
 from services.files import write_bytes
 from services.supervisor import ChildSpec
 
-SYNTHETIC = "synthetic"  # the source that is computed, not read
-
 
 @dataclass(frozen=True)
 class HostPlan:
@@ -52,7 +50,11 @@ class HostPlan:
         return ChildSpec.deltalight(name, "--log-level", self.log_level, command, *options)
 
     def _node(self) -> ChildSpec:
-        options = ["--source", self.source, "--publish", ports.endpoint(self.node_port)]
+        options = [
+            *("--source", self.source),
+            *("--publish", ports.endpoint(self.node_port)),
+            *("--clock", ports.endpoint(self.control_port)),
+        ]
         return self._child("sensor node", "node", *options, *(["--loop"] if self.loop else []))
 
     def _server(self) -> ChildSpec:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float32
 
 from protocol.frames import DepthImage
 from render_server.gpu.context import GpuContext
@@ -13,8 +14,6 @@ from render_server.gpu.textures import bind_images, bind_samplers, texture_2d
 from render_server.passes.geometry_buffer import GeometryBuffer
 from render_server.passes.picture import Picture
 from render_server.view import CameraView
-
-FIT_SPAN = 1.0 / 80.0  # half-width of the normal fit's window as a share of the picture's width
 
 
 class RealSurface:
@@ -25,25 +24,27 @@ class RealSurface:
         self.position = texture_2d(gpu, size, 4, "f4")
         self.normal = texture_2d(gpu, size, 4, "f2")
         self._depth = texture_2d(gpu, size, 1, "f4")
+        self._fitted = texture_2d(gpu, size, 3, "f4")
         folder = Path(__file__).parent
         self._from_depth = ComputeProgram(gpu, folder / "real_surface.comp.glsl")
         self._from_model = ComputeProgram(gpu, folder / "real_surface_model.comp.glsl")
 
     def from_depth(
-        self, depth: DepthImage, picture: Picture, view: CameraView, sigma: float, surface_count: int
+        self,
+        depth: DepthImage,
+        normals: Float32[np.ndarray, "h w 3"],
+        picture: Picture,
+        view: CameraView,
+        surface_count: int,
     ) -> None:
-        """Fill from the clean, registered depth map; `sigma` is its noise at 1 m."""
+        """Fill from the clean, registered depth map and its normals (optical frame, zero where unknown)."""
         known = np.where(depth.valid, depth.depth_m, 0.0).astype(np.float32)
         self._depth.write(known.tobytes(), alignment=1)
-        bind_samplers({0: self._depth, 1: picture.rays})
+        self._fitted.write(np.ascontiguousarray(normals, np.float32).tobytes(), alignment=1)
+        bind_samplers({0: self._depth, 1: picture.rays, 2: self._fitted})
         bind_images(self.position, self.normal)
         self._from_depth.run(
-            self.size,
-            noise_sigma=sigma,
-            surface_count=surface_count,
-            normal_stride=max(1, round(self.size[0] * FIT_SPAN / 2)),
-            **view.uniforms(),
-        )
+            self.size, surface_count=surface_count, **view.uniforms())
 
     def from_model(self, raster: GeometryBuffer, picture: Picture, view: CameraView, surface_count: int) -> None:
         """Fill from a raster of the given model, through the lens."""
@@ -57,5 +58,5 @@ class RealSurface:
 
     def release(self) -> None:
         """Free the GL objects."""
-        for item in (self.position, self.normal, self._depth, self._from_depth, self._from_model):
+        for item in (self.position, self.normal, self._depth, self._fitted, self._from_depth, self._from_model):
             item.release()

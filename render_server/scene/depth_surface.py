@@ -9,7 +9,7 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, UInt8
 
 from protocol.camera_model import CameraModel
 from protocol.frames import DepthImage
@@ -28,7 +28,7 @@ LEAST_SUPPORT = 0.01
 class DepthSurface:
     """What is known of the surface behind every pixel.
 
-    `inverse_depth` is as measured (0 where invalid). `gradient` is its change by ray coordinate (x/z, y/z),
+    `inverse_depth` is as measured (0 where invalid, and where a pixel stands alone). `gradient` is its change by ray coordinate (x/z, y/z),
     fitted to the surroundings (NaN where unknown). `normals` are unit vectors in the optical frame towards
     the camera, zero where they are unknown.
     """
@@ -58,11 +58,13 @@ def depth_surface(depth: DepthImage, camera: CameraModel) -> DepthSurface:
     valid = depth.valid & (depth.depth_m > 0)
     inverse = np.zeros_like(depth.depth_m, np.float32)
     np.divide(1, depth.depth_m, out=inverse, where=valid)
+    jumps = _jumps(inverse, jump_threshold(depth, camera, inverse), valid)
+    valid &= ~_lonely(jumps)
+    inverse *= valid
     mask = valid.astype(np.float32)
     radius = _window_radius(noise_sigma(depth) * float(camera.matrix[0, 0]), inverse, mask)
     by_pixel = _window_gradient(inverse, mask, radius)
-    crossed = _crosses_edge(inverse, jump_threshold(depth, camera, inverse), valid, radius)
-    _move_windows(by_pixel, crossed, radius)
+    _move_windows(by_pixel, valid & _crosses_edge(jumps, valid, radius), radius)
     gradient = _by_ray(by_pixel, camera)
     return DepthSurface(inverse, gradient, _normals(inverse, gradient, camera))
 
@@ -133,25 +135,43 @@ def _filtered(
     return np.asarray(cv2.sepFilter2D(values, cv2.CV_32F, across, down, borderType=cv2.BORDER_CONSTANT))
 
 
+def _jumps(
+    inverse: Float32[np.ndarray, "h w"], threshold: Float32[np.ndarray, "h w"], valid: Bool[np.ndarray, "h w"]
+) -> tuple[UInt8[np.ndarray, "h w"], UInt8[np.ndarray, "h w"]]:
+    """Return where a pixel and the next one down, and right, are valid but on different surfaces (1)."""
+    down, right = np.zeros((2, *valid.shape), np.uint8)
+    down[:-1] = (np.abs(inverse[1:] - inverse[:-1]) > threshold[:-1]) & valid[1:] & valid[:-1]
+    right[:, :-1] = (
+        (np.abs(inverse[:, 1:] - inverse[:, :-1]) > threshold[:, :-1]) & valid[:, 1:] & valid[:, :-1]
+    )
+    return down, right
+
+
+def _lonely(jumps: tuple[UInt8[np.ndarray, "h w"], UInt8[np.ndarray, "h w"]]) -> Bool[np.ndarray, "h w"]:
+    """Whether a pixel jumps to three of its neighbours or all four: a spike, or afloat between two surfaces."""
+    down, right = jumps
+    count = down + right
+    count[1:] += down[:-1]
+    count[:, 1:] += right[:, :-1]
+    return np.asarray(count >= 3)
+
+
 def _crosses_edge(
-    inverse: Float32[np.ndarray, "h w"],
-    threshold: Float32[np.ndarray, "h w"],
+    jumps: tuple[UInt8[np.ndarray, "h w"], UInt8[np.ndarray, "h w"]],
     valid: Bool[np.ndarray, "h w"],
     radius: int,
 ) -> Bool[np.ndarray, "h w"]:
-    """Whether the window around a pixel holds two valid neighbours on different surfaces."""
+    """Whether the window around a pixel holds a jump between two valid neighbours."""
+    down, right = jumps
+    down[:-1] &= valid[1:] & valid[:-1]
+    right[:, :-1] &= valid[:, 1:] & valid[:, :-1]
     crossed = np.zeros(valid.shape, np.uint8)
-    for axis in (0, 1):
-        near = (slice(-1), slice(None))[:: 1 - 2 * axis]
-        far = (slice(1, None), slice(None))[:: 1 - 2 * axis]
-        jump = np.zeros(valid.shape, np.uint8)
-        differ = np.abs(inverse[far] - inverse[near]) > threshold[near]
-        jump[near] = differ & valid[near] & valid[far]
+    for axis, jump in enumerate(jumps):
         # The jump between i and i + 1 lies in the windows of the pixels i + 1 - radius to i + radius.
         size = [2 * radius + 1, 2 * radius + 1]
         size[axis] = 2 * radius
         crossed |= cv2.dilate(jump, np.ones(size, np.uint8), anchor=(radius, radius))
-    return valid & (crossed > 0)
+    return crossed > 0
 
 
 def _move_windows(

@@ -17,6 +17,7 @@ from render_server.scene.materials import Material, material_table
 from render_server.scene.normals import face_normals, smooth_normals
 
 MAX_COORDINATE_M = 1e4
+MAX_PIECES = 4_000_000
 VERTEX_LAYOUT = "3f 3f 2f 3f 1f"
 VERTEX_ATTRIBUTES = ("in_position", "in_normal", "in_uv", "in_color", "in_material")
 
@@ -286,21 +287,33 @@ def split_triangles(corners: Float32[np.ndarray, "m 3 c"], max_edge: float) -> F
     (llvmpipe ends loops of a shader invocation early, so voxelisation needs triangles of bounded size.)
 
     Raises:
-        DeltalightError: more than 20 million triangles would result.
+        DeltalightError: more than 4 million triangles would result.
     """
     done: list[np.ndarray] = []
     pending = np.ascontiguousarray(corners, np.float32)
+    _check_pieces(pending, max_edge)
     while len(pending):
         edges = np.roll(pending[..., :3], -1, axis=1) - pending[..., :3]
         lengths = np.linalg.norm(edges, axis=2)
         long = lengths.max(axis=1) > max_edge
         done.append(pending[~long])
         pending = _bisected(pending[long], lengths[long].argmax(axis=1))
-        if sum(map(len, done)) + len(pending) > MAX_TRIANGLES:
-            raise DeltalightError(
-                f"a mesh splits into more than {MAX_TRIANGLES} triangles; use fewer voxels or a smaller mesh."
-            )
     return np.concatenate(done) if done else np.zeros_like(pending)
+
+
+def _check_pieces(corners: Float32[np.ndarray, "m 3 c"], max_edge: float) -> None:
+    """Refuse before the memory is gone: an equilateral triangle is the largest that the limit allows.
+
+    Bisection ends at half of the longest edges or above, so the true number is at most 8 times the bound.
+    """
+    edges = np.roll(corners[..., :3], -1, axis=1) - corners[..., :3]
+    areas = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) / 2
+    by_area = areas / (np.sqrt(3) / 4 * max_edge**2)
+    by_length = np.linalg.norm(edges, axis=2).max(axis=1, initial=0) / max_edge
+    if np.maximum(by_area, by_length).sum() > MAX_PIECES:
+        raise DeltalightError(
+            f"a mesh splits into more than {MAX_PIECES} triangles; use fewer voxels or a smaller mesh."
+        )
 
 
 def _bisected(corners: Float32[np.ndarray, "m 3 c"], edge: np.ndarray) -> Float32[np.ndarray, "k 3 c"]:

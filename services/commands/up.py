@@ -29,7 +29,8 @@ def up(
 ) -> None:
     """Run node, render server and viewer on this host and restart what dies, until Ctrl-C."""
     from protocol.source import open_source
-    from services.host import SYNTHETIC, HostPlan, choose_scene, session_file
+    from sensor_node.node import SYNTHETIC
+    from services.host import HostPlan, choose_scene, session_file
     from services.supervisor import Supervisor
 
     recording = None if source == SYNTHETIC else open_source(Path(source))

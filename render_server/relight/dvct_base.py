@@ -1,0 +1,150 @@
+"""What both operators of delta voxel cone tracing share: lights, light maps, when to rebuild, shading (METHOD 4)."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any
+
+import numpy as np
+
+from protocol.scene_method import DvctMethod
+from render_server.gpu.context import GpuContext
+from render_server.passes.composite import RelitLayers
+from render_server.passes.direct_light import DirectLightPass
+from render_server.passes.light_table import LightTable
+from render_server.passes.reflective_shadow_map import ReflectiveShadowMapPass
+from render_server.passes.sampling_grid import SamplingGrid
+from render_server.passes.trace_cones import ConeFields
+from render_server.passes.virtual_surface import VirtualSurfacePass
+from render_server.passes.volume import Pyramid, VolumePlacement, place_volume
+from render_server.relight.defaults import ResolvedDvct
+from render_server.relight.frame import RelightInput
+
+SELF_SHADOW_TEXELS = 1.5  # a virtual receiver is lifted by so many texels of the depth map
+
+
+class DvctBase(ABC):
+    """One frame as a list of passes; an operator says how its voxels are made and its cones traced."""
+
+    directions: int  # of the operator's pyramids
+
+    def __init__(
+        self, gpu: GpuContext, settings: DvctMethod, resolved: ResolvedDvct, size: tuple[int, int]
+    ) -> None:
+        self._gpu = gpu
+        self._settings = settings
+        self._resolved = resolved
+        self.table = LightTable(gpu, resolved.rsm_size, settings.shadow_samples)
+        self._shadow_maps = ReflectiveShadowMapPass(gpu)
+        self._grid = SamplingGrid(gpu, size, resolved.cone_scale)
+        self._cones = ConeFields(gpu, self._grid.size)
+        cones = self.directions if settings.resolved_shadow == "cone" else None
+        self._direct = DirectLightPass(gpu, size, shadow_cones=cones)
+        self._surface = VirtualSurfacePass(gpu, size)
+        self._real_key: object = None
+        self._object_key: object = None
+        self._environment_version = -1
+
+    @abstractmethod
+    def _rebuild_real(
+        self, frame: RelightInput, placement: VolumePlacement, uniforms: dict[str, Any]
+    ) -> None:
+        """Make the voxels of the real scene anew."""
+
+    @abstractmethod
+    def _rebuild_virtual(self, frame: RelightInput, uniforms: dict[str, Any]) -> None:
+        """Make everything anew that depends on the objects."""
+
+    @abstractmethod
+    def _trace(self, frame: RelightInput, uniforms: dict[str, Any]) -> None:
+        """Fill the cone fields; geometry, lights and materials are bound."""
+
+    @abstractmethod
+    def _joint(self) -> Pyramid:
+        """The pyramid whose opacity is that of real and virtual geometry together."""
+
+    def relight(self, frame: RelightInput) -> RelitLayers:
+        """Compute everything that composition needs."""
+        placement = self._placement(frame)
+        uniforms = self._uniforms(frame, placement)
+        real_key = (frame.real.version, frame.lights_version, placement)
+        object_key = (real_key, frame.virtual.version)
+        if object_key != self._object_key:
+            self._place_lights(frame)
+            uniforms |= self.table.uniforms()
+        if real_key != self._real_key:
+            self._draw_real_maps(frame)
+            self._rebuild_real(frame, placement, uniforms)
+        if object_key != self._object_key:
+            self._draw_virtual_maps(frame)
+            self._rebuild_virtual(frame, uniforms)
+        self._real_key, self._object_key = real_key, object_key
+        self._shade(frame, uniforms)
+        return RelitLayers(frame.matte, self._surface.radiance, self._direct, self._cones, self._grid)
+
+    def _placement(self, frame: RelightInput) -> VolumePlacement:
+        low, high = frame.virtual.bounds
+        return place_volume(low, high, self._resolved.volume_size, self._settings.volume_edge_m)
+
+    def _place_lights(self, frame: RelightInput) -> None:
+        if self._environment_version != frame.lights_version:
+            self.table.set_environment(frame.lights.environment)
+            self._environment_version = frame.lights_version
+        self.table.place(list(frame.lights.lights), frame.real.points, frame.virtual.points)
+
+    def _draw_real_maps(self, frame: RelightInput) -> None:
+        with frame.timers.measure("RSM real"):
+            self.table.bind_records()
+            self._shadow_maps.run(self.table.real_atlas, frame.real.buffers, self.table.real_views, 0)
+
+    def _draw_virtual_maps(self, frame: RelightInput) -> None:
+        with frame.timers.measure("RSM virtual"):
+            self.table.bind_records()
+            first = self.table.first_virtual_view
+            self._shadow_maps.run(
+                self.table.virtual_atlas, frame.virtual.buffers, self.table.virtual_views, first
+            )
+
+    def _uniforms(self, frame: RelightInput, placement: VolumePlacement) -> dict[str, Any]:
+        centre = np.mean(np.stack(frame.virtual.bounds), axis=0)
+        pixel = frame.view.camera.matrix[0, 0]
+        bounds = placement.voxel_bounds(np.stack(frame.virtual.bounds)).astype(float)
+        return {
+            **frame.view.uniforms(),
+            **placement.uniforms(),
+            **self.table.uniforms(),
+            **frame.surface_uniforms,
+            "noise_sigma": frame.noise_sigma,
+            "normal_offset": SELF_SHADOW_TEXELS * self.table.virtual_texel_m(centre),
+            "sample_distance": 1.5 * self._resolved.cone_scale / pixel,
+            "object_low": tuple(bounds[:3]),
+            "object_high": tuple(1.0 - bounds[3:]),
+            "everywhere": frame.everywhere,
+        }
+
+    def _shade(self, frame: RelightInput, uniforms: dict[str, Any]) -> None:
+        """Cones at reduced resolution, direct light and virtual surfaces at full."""
+        frame.bind_geometry()
+        with frame.timers.measure("sampling grid"):
+            self._grid.run(frame.matte, uniforms)
+        self.table.bind()
+        frame.virtual.materials.bind()
+        self._trace(frame, uniforms)
+        with frame.timers.measure("direct light"):
+            self._joint().texture.use(location=3)
+            self._direct.run(uniforms)
+        with frame.timers.measure("virtual surface"):
+            self._surface.run(
+                frame.matte,
+                frame.virtual_raster,
+                self._cones.virtual,
+                self._cones.virtual_specular,
+                self._grid,
+                uniforms,
+            )
+
+    def release(self) -> None:
+        """Free the GL objects."""
+        for item in vars(self).values():
+            if hasattr(item, "release"):
+                item.release()

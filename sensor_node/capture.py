@@ -1,0 +1,129 @@
+"""A thread that reads a camera into one slot, and one that follows the render server's clock."""
+
+import queue
+import threading
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Self
+
+from protocol.clock import ClockEstimator, clock_exchange, measure_offset
+from protocol.errors import DeltalightError
+from protocol.frames import SensorFrame
+from protocol.transport import RequestClient
+from sensor_node.cameras.base import Camera, EndOfStream
+
+POLL_S = 0.1
+CLOCK_PERIOD_S = 2.0
+CLOCK_TIMEOUT_S = 0.5
+CLOCK_ROUNDS = 4
+
+
+@dataclass(frozen=True)
+class CapturedFrame:
+    """A frame and when it was captured, in ns since 1970 by this host's clock."""
+
+    frame: SensorFrame
+    capture_ns: int
+
+
+class CaptureThread:
+    """Reads an open camera into one slot: a newer frame replaces one that nobody took, and `drops` counts it.
+
+    With `keep_all` the camera waits instead. `error` is what ended capture, if anything did but the camera's
+    end or `close`.
+    """
+
+    def __init__(self, camera: Camera, *, keep_all: bool) -> None:
+        self.drops = 0
+        self.error: Exception | None = None
+        self._camera, self._keep_all = camera, keep_all
+        self._slot: queue.Queue[CapturedFrame] = queue.Queue(maxsize=1)
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="capture", daemon=True)
+
+    def __enter__(self) -> Self:
+        """Begin to read."""
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Stop reading."""
+        self._closing.set()
+        self._camera.interrupt()
+        self._thread.join()
+
+    @property
+    def ended(self) -> bool:
+        """Whether no further frame will come."""
+        return not self._thread.is_alive() and self._slot.empty()
+
+    def take(self, timeout_s: float) -> CapturedFrame | None:
+        """Return the newest frame, or None if there is none in time."""
+        try:
+            return self._slot.get(timeout=timeout_s)
+        except queue.Empty:
+            return None
+
+    def _run(self) -> None:
+        try:
+            while not self._closing.is_set():
+                frame = self._camera.read()
+                self._put(CapturedFrame(frame, self._camera.capture_ns))
+        except EndOfStream:
+            pass
+        except Exception as error:  # whoever waits for frames raises it
+            self.error = error
+
+    def _put(self, captured: CapturedFrame) -> None:
+        while not self._closing.is_set():
+            try:
+                self._slot.put(captured, block=self._keep_all, timeout=POLL_S)
+                return
+            except queue.Full:
+                if not self._keep_all and self.take(0) is not None:
+                    self.drops += 1
+
+
+class ServerClock:
+    """Follows the clock of a render server in a thread; without an endpoint there is nothing to follow.
+
+    Args:
+        node: name that the requests carry.
+        endpoint: control endpoint of the server.
+    """
+
+    def __init__(self, node: str, endpoint: str | None) -> None:
+        self._estimator = ClockEstimator()
+        self._lock, self._closing = threading.Lock(), threading.Event()
+        self._client = None if endpoint is None else RequestClient(endpoint)
+        self._thread = threading.Thread(target=self._run, args=(node,), name="clock", daemon=True)
+        self._thread.start()
+
+    def at(self, local_ns: int) -> tuple[int, int | None]:
+        """Return the offset to the server's clock and its bound in ns; 0 and None if never compared."""
+        with self._lock:
+            sample = self._estimator.at(local_ns)
+        return (0, None) if sample is None else (sample.offset_ns, sample.bound_ns)
+
+    def close(self) -> None:
+        """Stop the thread."""
+        self._closing.set()
+        self._thread.join()
+        if self._client is not None:
+            self._client.close()
+
+    def _run(self, node: str) -> None:
+        if self._client is None:
+            return
+        exchange = clock_exchange(self._client.request, node, CLOCK_TIMEOUT_S)
+        while not self._closing.is_set():
+            try:
+                sample = measure_offset(exchange, CLOCK_ROUNDS)
+            except DeltalightError:  # no server yet; meanwhile the bound of what was measured grows
+                self._closing.wait(POLL_S)
+                continue
+            with self._lock:
+                self._estimator.add(sample)
+            self._closing.wait(CLOCK_PERIOD_S)
