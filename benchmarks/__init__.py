@@ -1,0 +1,1 @@
+"""Ground truth, quality and speed measurements."""

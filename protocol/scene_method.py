@@ -50,8 +50,9 @@ class DvctMethod(StrictModel):
         le=4_000_000,
         description="Triangles of the depth mesh; null = 400000 on a GPU, 40000 in software.",
     )
-    shadow: Literal["map", "cone"] = Field(
-        default="map", description="Shadows from shadow maps, or shadow cones."
+    shadow: Literal["map", "cone"] | None = Field(
+        default=None,
+        description="Shadows from shadow maps, or from shadow cones; null = map for exact, cone for paper.",
     )
     shadow_samples: int = Field(
         default=16, ge=1, le=64, description="Samples of a light's area for soft shadows."
@@ -66,6 +67,11 @@ class DvctMethod(StrictModel):
         le=65536,
         description="Greatest memory of the volumes, MB; beyond it rendering is refused.",
     )
+
+    @property
+    def resolved_shadow(self) -> Literal["map", "cone"]:
+        """Kind of shadow as given, or the operator's default."""
+        return self.shadow or ("map" if self.operator == "exact" else "cone")
 
     @property
     def resolved_composition(self) -> Literal["ratio", "additive"]:

@@ -30,6 +30,7 @@ class PictureResources:
         self.matte = MattePass(gpu, size)
         self._geometry = GeometryPass(gpu)
         self._gpu = gpu
+        self._rastered: object = None
         self._surfaces = gpu.ctx.buffer(reserve=MAX_SURFACES * 80 + 80)
         self.surface_uniforms: dict[str, Any] = {"surface_count": 0, "specular_surfaces": False}
 
@@ -47,10 +48,14 @@ class PictureResources:
         view: CameraView,
         moved: bool,
     ) -> None:
-        """Real geometry buffer (if it `moved`), virtual raster, matte."""
+        """Real geometry buffer (if it `moved`), virtual raster and matte (if anything did)."""
         self._surfaces.bind_to_storage_buffer(14)
         if moved:
             self._fill_real(real, view)
+        key = (view, virtual.version)
+        if not moved and key == self._rastered:
+            return
+        self._rastered = key
         virtual.materials.bind()
         self._geometry.run(self.virtual_raster, virtual.buffers, view)
         self.real_surface.bind()

@@ -24,6 +24,7 @@ from render_server.frame_assembly import AssembledFrame, FrameAssembler
 
 RATE_WINDOW_S = 5.0
 WAITING_AFTER_S = 2.0
+MAXIMUM_FAULTS_IN_A_ROW = 30
 
 log = structlog.get_logger()
 
@@ -102,6 +103,7 @@ class RenderSession:
         self._clock_ns = clock_ns
         self._rendered_ns: deque[int] = deque()
         self._last_fault = ""
+        self._faults_in_a_row = 0
         self._logged_notices = 0
 
     def receive(self, multipart: ReceivedMultipart) -> None:
@@ -114,13 +116,23 @@ class RenderSession:
         self._assembler.add(message, parts, multipart.received_ns)
 
     def step(self) -> RenderedFrame | None:
-        """Render the newest frame, if one is ready; a frame that cannot be rendered is counted and logged."""
+        """Render the newest frame, if one is ready; a frame that cannot be rendered is counted and logged.
+
+        Raises:
+            Exception: nothing but unexpected faults `MAXIMUM_FAULTS_IN_A_ROW` times: the renderer is broken,
+                not the frames, and only a restart of the process helps.
+        """
         try:
             frame = self._assembler.take(self._clock_ns())
             return None if frame is None else self._render(frame)
+        except DeltalightError as fault:
+            self._count_fault("bad_frames", fault)
         except Exception as fault:  # whatever it is, the next frame must still be rendered
             self._count_fault("bad_frames", fault)
-            return None
+            self._faults_in_a_row += 1
+            if self._faults_in_a_row >= MAXIMUM_FAULTS_IN_A_ROW:
+                raise
+        return None
 
     def drops(self) -> dict[str, int]:
         """What was lost so far, and where."""
@@ -168,6 +180,7 @@ class RenderSession:
     def _render(self, frame: AssembledFrame) -> RenderedFrame:
         composite = self._renderer.render(frame.view)
         self._last_fault = ""
+        self._faults_in_a_row = 0
         self._log_notices()
         self._rendered_ns.append(self._clock_ns())
         color = frame.color
@@ -218,7 +231,8 @@ class RenderSession:
         self.counts[kind] += 1
         sentence = str(fault) if isinstance(fault, DeltalightError) else f"{type(fault).__name__}: {fault}"
         if sentence != self._last_fault:  # a fault of every frame is one line, not thirty a second
-            log.warning(kind, fault=sentence, exc_info=not isinstance(fault, DeltalightError))
+            log.warning(kind, fault=sentence)
+            log.debug("traceback", exc_info=fault)
         self._last_fault = sentence
 
 

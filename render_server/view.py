@@ -25,6 +25,14 @@ class CameraView:
     camera: CameraModel
     world_from_camera: Float64[np.ndarray, "4 4"]
 
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, CameraView):
+            return NotImplemented
+        return self.camera == other.camera and np.array_equal(self.world_from_camera, other.world_from_camera)
+
+    def __hash__(self) -> int:
+        return hash((self.camera, self.world_from_camera.tobytes()))
+
     @property
     def size(self) -> tuple[int, int]:
         """Width and height in pixels."""

@@ -30,7 +30,7 @@ class Stamps(TypedDict):
 def depth_multipart(
     depth: DepthImage, stamps: Stamps, stream: Literal["depth", "clean_depth"], step_m: float | None = None
 ) -> list[bytes]:
-    """Return the depth message; `step_m` is the step of the stored depth, None = as fine as its range allows."""
+    """Return the depth message; `step_m` is the step it is stored in, None = as fine as its range allows."""
     step_m = step_m or fitting_step_m(depth)
     height, width = depth.depth_m.shape
     message = DepthMessage(
@@ -54,16 +54,16 @@ def fitting_step_m(depth: DepthImage) -> float:
 
 def pose_multipart(pose: BoardPose | None, board: BoardSpec | None, stamps: Stamps) -> list[bytes]:
     """Return the pose message, which says so where no pose is known."""
-    known = {} if board is None else {"board": board.model_dump(mode="json", exclude_none=True)}
+    described = None if board is None else board.model_dump(mode="json", exclude_none=True)
     if pose is None:
-        return encode(PoseMessage(**stamps, status="no_board", **known))
+        return encode(PoseMessage(**stamps, status="no_board", board=described))
     message = PoseMessage(
         **stamps,
         status="ok",
         world_from_camera=_rows(pose.world_from_camera),
         alternative=None if pose.alternative is None else _rows(pose.alternative),
         reprojection_error_px=pose.reprojection_error_px,
-        **known,
+        board=described,
     )
     return encode(message)
 

@@ -5,18 +5,24 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Float64, UInt8
+from jaxtyping import Bool, Float32, Float64, UInt8
 
 from protocol.board import BoardSpec
 from protocol.camera_model import CameraModel
 from protocol.errors import DeltalightError
 from protocol.frames import BoardPose, decode_lut
 from protocol.poses import rigid_matrix
+from sensor_node.marker_edges import refine_corners
 
-# Half the edge of the corner refinement window in cells of the marker: it must not reach the code.
-REFINE_CELLS = 0.5
-REFINE_HALF_PX = (2, 8)
-REFINE_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 0.005)
+# How far from a marker's edge it is looked for, as a share of the border cell or the white gap.
+REACH_SHARE = 0.6
+REACH_PX = (1.5, 8.0)
+# Half the edge of the window that refines a chessboard corner, as a share of the way to the next marker.
+WINDOW_SHARE = 0.8
+WINDOW_HALF_PX = (2, 8)
+WINDOW_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 0.005)
+# Corners that miss by more than this and three times the median are hidden by something, and left out.
+OUTLIER_PX, OUTLIER_MEDIANS = 1.5, 3.0
 # Markers narrower than this cannot be read.
 LEAST_SIDE_PX = 10
 # A detection whose mean reprojection error is larger is a mistake: another board, or wrong calibration.
@@ -32,6 +38,9 @@ class _Matches(NamedTuple):
     world: Float64[np.ndarray, "n 3"]
     pixels: Float64[np.ndarray, "n 2"]
     rays: Float64[np.ndarray, "n 2"]
+
+    def only(self, kept: Bool[np.ndarray, " n"]) -> "_Matches":
+        return _Matches(*(values[kept] for values in self))
 
 
 class _Solution(NamedTuple):
@@ -79,7 +88,7 @@ class BoardDetector:
                 f"{self._camera.width}x{self._camera.height}; correct calibration/rgb.yaml."
             )
         matches = self._find(color)
-        solutions = [] if matches is None else self._solve(matches)
+        solutions = [] if matches is None else self._solve_seen(matches)
         if not solutions:
             return None
         best, other = self._choose(solutions)
@@ -106,43 +115,71 @@ class BoardDetector:
     def _find(self, color: UInt8[np.ndarray, "h w 3"]) -> _Matches | None:
         gray = cv2.cvtColor(np.ascontiguousarray(color), cv2.COLOR_RGB2GRAY)
         found, ids, _ = self._detector.detectMarkers(gray)
-        quads = [
-            (quad.reshape(4, 2), int(name))
+        quads = {
+            int(name): quad.reshape(4, 2).astype(np.float64)
             for quad, name in zip(found, () if ids is None else ids.ravel(), strict=True)
             if int(name) in self._corners and _shortest_side(quad.reshape(4, 2)) >= LEAST_SIDE_PX
-        ]
+        }
         if not quads:
             return None
-        if len(self._chessboard):
-            world, pixels, half = self._find_chessboard(gray, quads)
-            sizes = [(pixels, half)]
+        light = self._linear_luminance(color)
+        if self._board.type == "charuco":
+            world, pixels = self._chessboard_corners(gray, light, quads)
         else:
-            world = np.concatenate([self._corners[name] for _, name in quads])
-            share = REFINE_CELLS / (self._board.opencv_dictionary().markerSize + 2 * self._board.border_bits)
-            sizes = [(quad, share * _shortest_side(quad)) for quad, _ in quads]
+            world, pixels = self._marker_corners(light, quads)
         if len(world) < 4:
             return None
-        light = self._linear_luminance(color)
-        pixels = np.concatenate([_refined(light, corners, half) for corners, half in sizes])
         return _Matches(world, pixels, self._camera.unproject(pixels))
 
-    def _find_chessboard(
-        self, gray: UInt8[np.ndarray, "h w"], quads: list[tuple[Float32[np.ndarray, "4 2"], int]]
-    ) -> tuple[Float64[np.ndarray, "n 3"], Float32[np.ndarray, "n 2"], float]:
-        """Inner corners of a ChArUco board, with half the window edge for their refinement."""
-        markers = [quad[None] for quad, _ in quads]
-        names = np.array([[name] for _, name in quads], np.int32)
+    def _marker_corners(
+        self, light: Float32[np.ndarray, "h w"], quads: dict[int, Float64[np.ndarray, "4 2"]]
+    ) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 2"]]:
+        """Corners of markers in the world and in the picture."""
+        board, corners = self._board, np.array(list(quads.values()))
+        cells = board.opencv_dictionary().markerSize + 2 * board.border_bits
+        thin = min(board.border_bits / cells, board.separation_m / board.marker_length_m or 1.0)
+        reach = np.clip([REACH_SHARE * thin * _shortest_side(quad) for quad in corners], *REACH_PX)
+        world = np.concatenate([self._corners[name] for name in quads])
+        return world, refine_corners(light, corners, reach).reshape(-1, 2)
+
+    def _chessboard_corners(
+        self,
+        gray: UInt8[np.ndarray, "h w"],
+        light: Float32[np.ndarray, "h w"],
+        quads: dict[int, Float64[np.ndarray, "4 2"]],
+    ) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 2"]]:
+        """Inner corners of a ChArUco board in the world and in the picture."""
+        markers = [quad[None].astype(np.float32) for quad in quads.values()]
+        names = np.array([[name] for name in quads], np.int32)
         corners, ids, _, _ = self._charuco.detectBoard(gray, markerCorners=markers, markerIds=names)
         if ids is None:
-            return np.zeros((0, 3)), np.zeros((0, 2), np.float32), 0.0
-        side = min(_shortest_side(quad) for quad, _ in quads)
+            return np.zeros((0, 3)), np.zeros((0, 2))
         # The window must not reach the markers, which begin half a separation away.
+        side = min(_shortest_side(quad) for quad in quads.values())
         gap = side * self._board.separation_m / self._board.marker_length_m / 2
-        return self._chessboard[ids.ravel()], corners.reshape(-1, 2), gap * 0.8
+        half = int(np.clip(round(WINDOW_SHARE * gap), *WINDOW_HALF_PX))
+        start = np.ascontiguousarray(corners, np.float32).reshape(-1, 1, 2)
+        pixels = cv2.cornerSubPix(light, start, (half, half), (-1, -1), WINDOW_CRITERIA)
+        return self._chessboard[ids.ravel()], pixels.reshape(-1, 2).astype(np.float64)
 
     def _linear_luminance(self, color: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w"]:
         red, green, blue = (self._luminance[:, channel][color[..., channel]] for channel in range(3))
         return np.asarray(red + green + blue)
+
+    def _solve_seen(self, matches: _Matches) -> list[_Solution]:
+        """Poses by the corners that nothing hides."""
+        solutions = self._solve(matches)
+        if not solutions:
+            return []
+        misses = self._misses_px(solutions[0].camera_from_world, matches)
+        kept = misses <= max(OUTLIER_PX, OUTLIER_MEDIANS * float(np.median(misses)))
+        if kept.all() or np.count_nonzero(kept) < 4:
+            return self._plausible(solutions)
+        return self._plausible(self._solve(matches.only(kept)))
+
+    @staticmethod
+    def _plausible(solutions: list[_Solution]) -> list[_Solution]:
+        return [solution for solution in solutions if solution.error_px <= MAX_ERROR_PX]
 
     def _solve(self, matches: _Matches) -> list[_Solution]:
         """Both poses of the planar ambiguity, refined, that see the sheet from its printed side."""
@@ -160,15 +197,16 @@ class BoardDetector:
             turn, shift = cv2.solvePnPRefineLM(points, image, np.eye(3), None, rotation, translation)
             matrix = rigid_matrix(cv2.Rodrigues(turn)[0], shift.ravel())
             matrix = matrix @ rigid_matrix(np.eye(3), -centre)
-            error = self._error_px(matrix, matches)
-            if error <= MAX_ERROR_PX and np.linalg.inv(matrix)[2, 3] > 0:
-                solutions.append(_Solution(matrix, error))
+            if np.linalg.inv(matrix)[2, 3] > 0:
+                solutions.append(_Solution(matrix, float(self._misses_px(matrix, matches).mean())))
         return sorted(solutions, key=lambda solution: solution.error_px)
 
-    def _error_px(self, camera_from_world: Float64[np.ndarray, "4 4"], matches: _Matches) -> float:
+    def _misses_px(
+        self, camera_from_world: Float64[np.ndarray, "4 4"], matches: _Matches
+    ) -> Float64[np.ndarray, " n"]:
         points = matches.world @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
         distances = np.linalg.norm(self._camera.project(points) - matches.pixels, axis=1)
-        return float(np.nan_to_num(distances, nan=np.inf).mean())
+        return np.nan_to_num(distances, nan=np.inf)
 
     def _choose(self, solutions: list[_Solution]) -> tuple[_Solution, _Solution | None]:
         """The solution with the smaller error; where that says little, the one nearer to the last pose."""
@@ -179,17 +217,8 @@ class BoardDetector:
         return (best, other) if turns[0] <= turns[1] else (other, best)
 
 
-def _shortest_side(quad: Float32[np.ndarray, "4 2"]) -> float:
+def _shortest_side(quad: Float64[np.ndarray, "4 2"]) -> float:
     return float(np.linalg.norm(quad - np.roll(quad, 1, axis=0), axis=1).min())
-
-
-def _refined(
-    light: Float32[np.ndarray, "h w"], corners: Float32[np.ndarray, "n 2"], half_px: float
-) -> Float64[np.ndarray, "n 2"]:
-    half = int(np.clip(round(half_px), *REFINE_HALF_PX))
-    start = np.ascontiguousarray(corners, np.float32).reshape(-1, 1, 2).copy()
-    moved = cv2.cornerSubPix(light, start, (half, half), (-1, -1), REFINE_CRITERIA)
-    return np.asarray(moved, np.float64).reshape(-1, 2)
 
 
 def _turn(first: Float64[np.ndarray, "4 4"], second: Float64[np.ndarray, "4 4"]) -> float:

@@ -1,8 +1,10 @@
 """The `deltalight` command: registers the commands and turns faults into sentences and exit codes.
 
-Exit codes: 0 done, 1 a fault of the program (or `doctor` found one), 2 wrong use or bad input, 130 Ctrl-C.
+Exit codes: 0 done, 1 a fault of the program (or `doctor` found one), 2 wrong use or bad input, 130 Ctrl-C,
+143 SIGTERM.
 """
 
+import signal
 import sys
 from typing import Annotated
 
@@ -75,9 +77,9 @@ def _run(arguments: list[str], *, debug: bool) -> int:
     except SystemExit as stop:
         return int(stop.code or 0)
     except Terminated:
-        return 0
+        return 128 + signal.SIGTERM
     except KeyboardInterrupt:
-        return 130
+        return 128 + signal.SIGINT
     except Exception as fault:
         if debug:
             raise

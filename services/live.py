@@ -72,7 +72,7 @@ class LiveHub:
             "frame_id": message.frame_id,
             "status": message.status,
             "pass_times_ms": message.pass_times_ms,
-            "drops": sum(message.drops.values()),
+            "drops": message.drops,
             "age_ms": age_ms(message),
             "frames_per_s": self._frames_per_s(),
             "renderer": self.renderer,

@@ -6,7 +6,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from protocol.frames import BoardPose, ViewFrame
+import numpy as np
+from jaxtyping import Float32
+
+from protocol.frames import BoardPose, ViewFrame, decode_lut
 from protocol.scene import SceneDocument
 from protocol.source import Source
 from services.files import make_output_folder, require_openexr, write_exr, write_png
@@ -126,11 +129,19 @@ def _render_frames(
 
 def _write_frame(job: RenderJob, number: int, frame: ViewFrame, composite: "CompositeFrame") -> None:
     write_png(job.out / f"{number:06d}.png", composite.color)
-    if job.with_exr and composite.linear is not None:
-        write_exr(job.out / f"{number:06d}.exr", composite.linear)
+    if job.with_exr:
+        write_exr(job.out / f"{number:06d}.exr", _linear(frame, composite))
     mode = "w" if number == job.frames.start else "a"  # an older run's index goes with the first picture
     with (job.out / INDEX_FILE).open(mode, encoding="utf-8") as index:
         index.write(json.dumps(frame_record(number, frame, composite)) + "\n")
+
+
+def _linear(frame: ViewFrame, composite: "CompositeFrame") -> Float32[np.ndarray, "h w 3"]:
+    """The composite before the camera's response; an untouched picture is decoded by that response."""
+    if composite.linear is not None:
+        return composite.linear
+    lut = decode_lut(frame.response) / np.float32(frame.exposure_scale)
+    return np.stack([lut[composite.color[..., channel], channel] for channel in range(3)], axis=-1)
 
 
 def frame_record(number: int, frame: ViewFrame, composite: "CompositeFrame") -> dict[str, Any]:

@@ -5,6 +5,9 @@
 #include "passes/common/geometry.glsl"
 #include "passes/common/surfaces.glsl"
 #include "passes/common/volume.glsl"
+#ifdef SHADOW_CONES
+#include "passes/common/shadow_cone.glsl"
+#endif
 
 layout(local_size_x = 8, local_size_y = 8) in;
 layout(binding = 0, rgba16f) writeonly uniform image2D direct_mu;    // rgb E_mu; a: unshadowed E, mean of channels
@@ -15,6 +18,14 @@ uniform vec3 camera_position;
 uniform float noise_sigma;   // m at 1 m
 uniform bool specular_surfaces;
 uniform bool everywhere;       // also where the objects do not reach (photometric registration)
+
+#ifdef SHADOW_CONES
+bool shadow_may_reach(vec3 p, vec3 n, float bias) { return object_meets_cone(p, n); }
+vec2 light_share(Light light, vec3 p, vec3 n, float bias) { return cone_visibility(light, p, n, bias); }
+#else
+bool shadow_may_reach(vec3 p, vec3 n, float bias) { return object_may_shadow(p, bias); }
+vec2 light_share(Light light, vec3 p, vec3 n, float bias) { return visibility(light, p, n, bias, bias); }
+#endif
 
 void main() {
     ivec2 pixel = ivec2(gl_GlobalInvocationID.xy);
@@ -27,7 +38,7 @@ void main() {
     float bias = 3.0 * noise_sigma * position.w * position.w;
     // Where neither cones nor shadows of the objects reach, the picture stays as it is.
     bool reached = position.w > 0.0
-        && (everywhere || inside_volume(volume_coordinate(position.xyz)) || object_may_shadow(position.xyz, bias));
+        && (everywhere || inside_volume(volume_coordinate(position.xyz)) || shadow_may_reach(position.xyz, normal.xyz, bias));
     if (reached) {
         vec3 v = normalize(camera_position - position.xyz);
         for (int i = 0; i < light_count; ++i) {
@@ -35,7 +46,7 @@ void main() {
             vec3 across = light_at(lights[i], position.xyz, l, radius);
             float cosine = dot(normal.xyz, l);
             if (cosine <= 0.0) continue;
-            vec2 seen = visibility(lights[i], position.xyz, bias, bias);
+            vec2 seen = light_share(lights[i], position.xyz, normal.xyz, bias);
             e_mu += across * cosine * seen.x;
             e_rho += across * cosine * seen.y;
             unshadowed += dot(across, vec3(1.0 / 3.0)) * cosine;

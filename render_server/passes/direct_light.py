@@ -11,15 +11,20 @@ from render_server.gpu.textures import bind_images, texture_2d
 
 
 class DirectLightPass:
-    """E_mu and E_rho of the lights (RGBA16F), and their lobes on declared specular surfaces."""
+    """E_mu and E_rho of the lights (RGBA16F), and their lobes on declared specular surfaces.
 
-    def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
+    With `shadow_cones` the objects' shadows come from cones through the voxels ([P1] eq. 4) of a pyramid of so many
+    directions, bound to unit 3; without, from the shadow maps.
+    """
+
+    def __init__(self, gpu: GpuContext, size: tuple[int, int], *, shadow_cones: int | None = None) -> None:
         self._size = size
         self.mu = texture_2d(gpu, size, 4, "f2")
         self.rho = texture_2d(gpu, size, 4, "f2")
         self.lobe_mu = texture_2d(gpu, size, 4, "f2")
         self.lobe_rho = texture_2d(gpu, size, 4, "f2")
-        self._program = ComputeProgram(gpu, Path(__file__).with_name("direct_light.comp.glsl"))
+        defines = {} if shadow_cones is None else {"SHADOW_CONES": 1, "DIRECTIONS": shadow_cones}
+        self._program = ComputeProgram(gpu, Path(__file__).with_name("direct_light.comp.glsl"), defines)
 
     def run(self, uniforms: dict[str, Any]) -> None:
         """Shade every pixel; lights, geometry and surfaces must be bound."""

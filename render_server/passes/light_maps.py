@@ -38,17 +38,22 @@ class LightView:
 
 
 def light_views(
-    light: DirectionalLight | SphereLight, points: Float64[np.ndarray, "n 3"]
+    light: DirectionalLight | SphereLight,
+    receivers: Float64[np.ndarray, "n 3"],
+    occluders: Float64[np.ndarray, "m 3"],
 ) -> list[LightView]:
-    """Views that enclose the world points: one, or the cube faces needed for a sphere light among them."""
+    """Views that enclose the receivers (world points): one, or cube faces for a sphere light among them.
+
+    The occluders set where a view begins: what stands between the light and the receivers is in it.
+    """
     if isinstance(light, DirectionalLight):
-        return [_orthographic_view(np.asarray(light.direction, float), points)]
+        return [_orthographic_view(np.asarray(light.direction, float), receivers, occluders)]
     position = np.asarray(light.position, float)
-    axis = points.mean(axis=0) - position
-    view = _perspective_view(position, axis, points)
+    view = _perspective_view(position, receivers.mean(axis=0) - position, receivers, occluders)
     if view is not None:
         return [view]
-    faces = [_perspective_view(position, a, points, cube_face=True) for a in np.vstack([np.eye(3), -np.eye(3)])]
+    axes = np.vstack([np.eye(3), -np.eye(3)])
+    faces = [_cube_face(position, axis, receivers, occluders) for axis in axes]
     return [face for face in faces if face is not None]
 
 
@@ -69,45 +74,71 @@ def _matrix(rotation: Float64[np.ndarray, "3 3"], origin: Float64[np.ndarray, "3
     return matrix
 
 
-def _orthographic_view(direction: Float64[np.ndarray, "3"], points: Float64[np.ndarray, "n 3"]) -> LightView:
+def _orthographic_view(
+    direction: Float64[np.ndarray, "3"],
+    receivers: Float64[np.ndarray, "n 3"],
+    occluders: Float64[np.ndarray, "m 3"],
+) -> LightView:
     rotation = _frame(direction)
-    local = points @ rotation.T
+    local = receivers @ rotation.T
     low, high = local.min(axis=0), local.max(axis=0)
+    first = min(float((occluders @ rotation[2]).min()), float(low[2]))
     centre = (low + high) / 2
     margin = 0.01 * float((high - low).max()) + NEAREST_M
     half = float((high - low)[:2].max()) / 2 + margin
-    origin = rotation.T @ np.array([centre[0], centre[1], low[2] - 2 * margin])
-    return LightView(_matrix(rotation, origin), half, margin, float(high[2] - low[2]) + 3 * margin, True)
+    origin = rotation.T @ np.array([centre[0], centre[1], first - 2 * margin])
+    return LightView(_matrix(rotation, origin), half, margin, float(high[2]) - first + 3 * margin, True)
+
+
+def _tangents(local: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:
+    """Greater tangent of each point's direction against +z, per axis; infinite behind the light."""
+    tangents = np.abs(local[:, :2]).max(axis=1) / np.maximum(local[:, 2], NEAREST_M)
+    return np.where(local[:, 2] > NEAREST_M, tangents, np.inf)
+
+
+def _depth_range(
+    local: Float64[np.ndarray, "n 3"], blocking: Float64[np.ndarray, "m 3"], half: float
+) -> tuple[float, float]:
+    """Near plane before all that can block within the view, far plane behind the receivers."""
+    within = blocking[_tangents(blocking) <= half]
+    depths = np.concatenate([within[:, 2], local[_tangents(local) <= half][:, 2]])
+    near = max(float(depths.min()) * NEAR_MARGIN, NEAREST_M)
+    return near, max(float(local[:, 2].max()) * FAR_MARGIN, near + NEAREST_M)
 
 
 def _perspective_view(
     position: Float64[np.ndarray, "3"],
     axis: Float64[np.ndarray, "3"],
-    points: Float64[np.ndarray, "n 3"],
-    cube_face: bool = False,
+    receivers: Float64[np.ndarray, "n 3"],
+    occluders: Float64[np.ndarray, "m 3"],
 ) -> LightView | None:
-    """View along `axis`; None if the points do not fit one view, or no point lies in this cube face."""
+    """View along `axis` around all receivers; None if that is too wide for one view."""
     if np.linalg.norm(axis) < NEAREST_M:
         return None
     rotation = _frame(axis)
-    local = (points - position) @ rotation.T
-    in_front = local[:, 2] > NEAREST_M
-    tangents = np.abs(local[:, :2]).max(axis=1) / np.maximum(local[:, 2], NEAREST_M)
-    if cube_face:
-        in_front &= tangents <= 1.0
-        if not in_front.any():
-            return None
-        half = 1.0
-    else:
-        half = float(tangents.max()) * 1.01 + 1e-4
-        if not in_front.all() or half > WIDEST_SINGLE_TANGENT:
-            return None
-    depth = local[in_front, 2]
-    near = max(float(depth.min()) * NEAR_MARGIN, NEAREST_M)
-    # A face of the cube may clip triangles whose vertices lie in its neighbours: keep what is nearer than its points.
-    near = min(near, 0.1 * near + NEAREST_M) if cube_face else near
-    far = float(np.linalg.norm(local, axis=1).max()) * FAR_MARGIN if cube_face else float(depth.max()) * FAR_MARGIN
-    return LightView(_matrix(rotation, position), half, near, max(far, near + NEAREST_M), False)
+    local = (receivers - position) @ rotation.T
+    half = float(_tangents(local).max()) * 1.01 + 1e-4
+    if half > WIDEST_SINGLE_TANGENT:
+        return None
+    near, far = _depth_range(local, (occluders - position) @ rotation.T, half)
+    return LightView(_matrix(rotation, position), half, near, far, False)
+
+
+def _cube_face(
+    position: Float64[np.ndarray, "3"],
+    axis: Float64[np.ndarray, "3"],
+    receivers: Float64[np.ndarray, "n 3"],
+    occluders: Float64[np.ndarray, "m 3"],
+) -> LightView | None:
+    """90-degree view along `axis`; None if no receiver lies in it."""
+    rotation = _frame(axis)
+    local = (receivers - position) @ rotation.T
+    if not (_tangents(local) <= 1.0).any():
+        return None
+    near, far = _depth_range(local, (occluders - position) @ rotation.T, 1.0)
+    # Triangles whose vertices lie in the neighbouring faces reach nearer than any vertex of this one.
+    reach = float(np.linalg.norm(local, axis=1).max()) * FAR_MARGIN
+    return LightView(_matrix(rotation, position), 1.0, max(0.1 * near, NEAREST_M), max(far, reach), False)
 
 
 def tile_columns(count: int) -> int:

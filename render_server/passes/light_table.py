@@ -56,12 +56,15 @@ class LightTable:
         self,
         lights: list[DirectionalLight | SphereLight],
         real_points: Float64[np.ndarray, "n 3"],
+        receivers: Float64[np.ndarray, "k 3"],
         virtual_points: Float64[np.ndarray, "m 3"],
     ) -> None:
-        """Fit each light's views: around the visible real scene, and closely around the virtual objects."""
+        """Fit each light's views: around the real points that may receive the objects' shadow, and closely around
+        the virtual objects.
+        """
         self.lights = lights
-        real = [light_views(light, real_points) if len(real_points) else [] for light in lights]
-        virtual = [light_views(light, virtual_points) if len(virtual_points) else [] for light in lights]
+        real = [light_views(light, receivers, real_points) if len(receivers) else [] for light in lights]
+        virtual = [light_views(light, virtual_points, virtual_points) if len(virtual_points) else [] for light in lights]
         self.real_views = [view for views in real for view in views]
         self.virtual_views = [view for views in virtual for view in views]
         self.real_atlas = self._atlas_for(self.real_atlas, len(self.real_views))

@@ -29,7 +29,7 @@ void irradiances(vec3 p, vec3 n, out vec3 mu, out vec3 rho) {
         vec3 across = light_at(lights[i], p, to_light, radius);
         float cosine = dot(n, to_light);
         if (cosine <= 0.0) continue;
-        vec2 v = visibility(lights[i], p, bias_real, bias_virtual);
+        vec2 v = visibility(lights[i], p, n, bias_real, bias_virtual);
         mu += across * cosine * v.x;
         rho += across * cosine * v.y;
     }
@@ -63,12 +63,12 @@ void light(Surfel s, vec3 n) {
 #elif defined(REAL_DELTA)
     irradiances(p, n, mu, rho);
     if (mu == rho) return;
-    vec3 radiance = real_radiance(s, n, mu) * ((rho + 1e-6) / (mu + 1e-6) - 1.0);
+    vec3 radiance = real_radiance(p, mu) * ((rho + 1e-6) / (mu + 1e-6) - 1.0);
     ivec3 v = voxel_of_index(voxel, volume_size);
     for (int j = 0; j < 3; ++j) { atomicMin(support[j], v[j]); atomicMin(support[3 + j], -v[j]); }
 #else
     vec3 radiance = vec3(0.0);
-    if (camera_sees(p)) radiance = measured_radiance(s);
+    if (camera_sees(p)) radiance = measured_radiance(p);
     else { irradiances(p, n, mu, rho); radiance = predicted_radiance(mu); }
 #endif
     add(voxel, n, s.position_area.w, radiance);

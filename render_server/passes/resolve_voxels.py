@@ -1,4 +1,4 @@
-"""Fixed-point sums -> texels of level 0, and the clearing of texels that a set had touched."""
+"""Fixed-point sums -> texels of level 0."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from render_server.passes.volume import Pyramid
 from render_server.passes.voxel_store import VoxelStore, bind_storage
 
 RESOLVE = Path(__file__).with_name("resolve_voxels.comp.glsl")
-CLEAR = Path(__file__).with_name("clear_voxels.comp.glsl")
 
 
 class ResolveVoxelsPass:
@@ -23,13 +22,6 @@ class ResolveVoxelsPass:
         self._mu = ComputeProgram(gpu, RESOLVE)
         self._rho_real = ComputeProgram(gpu, RESOLVE, {"RHO_REAL": 1})
         self._rho_virtual = ComputeProgram(gpu, RESOLVE, {"RHO_VIRTUAL": 1})
-        self._clear = ComputeProgram(gpu, CLEAR)
-
-    def clear(self, pyramid: Pyramid, store: VoxelStore, uniforms: dict[str, Any], *, free: bool) -> None:
-        """Empty the texels of the store's voxels; with `free`, its slots too."""
-        bind_images(pyramid.texture)
-        store.bind()
-        self._clear.run((WALKERS,), free_slots=free, **uniforms)
 
     def resolve_mu(self, pyramid: Pyramid, real: VoxelStore, uniforms: dict[str, Any]) -> None:
         """(c_mu, a_real)."""
@@ -51,5 +43,5 @@ class ResolveVoxelsPass:
 
     def release(self) -> None:
         """Free the programs."""
-        for program in (self._mu, self._rho_real, self._rho_virtual, self._clear):
+        for program in (self._mu, self._rho_real, self._rho_virtual):
             program.release()

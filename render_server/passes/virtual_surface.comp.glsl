@@ -47,7 +47,7 @@ vec3 direct_radiance(vec3 p, float depth, vec3 n, vec3 v, Material m) {
         vec3 across = light_at(lights[i], p, l, radius);
         float cosine = dot(n, l);
         if (cosine <= 0.0) continue;
-        float seen = visibility(lights[i], p + normal_offset * n, 3.0 * noise_sigma * depth * depth, 0.0).y;
+        float seen = visibility(lights[i], p + normal_offset * n, n, 3.0 * noise_sigma * depth * depth, 0.0).y;
         vec3 response = m.diffuse / PI * cosine + specular_times_cosine(n, v, l, m.f0, m.roughness, radius);
         sum += across * seen * response;
     }

@@ -1,139 +1,48 @@
-"""Delta voxel cone tracing, the exact operator (METHOD 3 and 4): one frame as the list of its passes."""
+"""Delta voxel cone tracing, the exact operator (METHOD 3 and 4)."""
 
 from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from protocol.scene_method import DvctMethod
 from render_server.gpu.context import GpuContext
-from render_server.passes.composite import RelitLayers
-from render_server.passes.direct_light import DirectLightPass
-from render_server.passes.light_table import LightTable
-from render_server.passes.reflective_shadow_map import ReflectiveShadowMapPass
-from render_server.passes.sampling_grid import SamplingGrid
-from render_server.passes.trace_cones import ConeFields, TraceConesPass
-from render_server.passes.virtual_surface import VirtualSurfacePass
-from render_server.passes.volume import VolumePlacement, place_volume
+from render_server.passes.trace_cones import TraceConesPass
+from render_server.passes.volume import Pyramid, VolumePlacement
 from render_server.relight.defaults import ResolvedDvct
+from render_server.relight.dvct_base import DvctBase
 from render_server.relight.frame import RelightInput
-from render_server.relight.voxel_scene import VoxelScene
-
-SELF_SHADOW_TEXELS = 1.5  # a virtual receiver is lifted by so many texels of the depth map
+from render_server.relight.voxel_scene import DIRECTIONS, VoxelScene
 
 
-class DvctExact:
-    """Dual march through one-sided directional voxels, soft shadows from depth maps."""
+class DvctExact(DvctBase):
+    """Dual march through one-sided directional voxels."""
 
-    def __init__(self, gpu: GpuContext, settings: DvctMethod, resolved: ResolvedDvct, size: tuple[int, int]) -> None:
-        self._gpu = gpu
-        self._settings = settings
-        self._resolved = resolved
-        self.table = LightTable(gpu, resolved.rsm_size, settings.shadow_samples)
-        self._shadow_maps = ReflectiveShadowMapPass(gpu)
-        self._grid = SamplingGrid(gpu, size, resolved.cone_scale)
-        self._cones = ConeFields(gpu, self._grid.size)
-        self._trace = TraceConesPass(gpu)
-        self._direct = DirectLightPass(gpu, size)
-        self._surface = VirtualSurfacePass(gpu, size)
-        self._voxels: VoxelScene | None = None
-        self._real_key: object = None
-        self._object_key: object = None
-        self._environment_version = -1
+    directions = DIRECTIONS
 
-    def relight(self, frame: RelightInput) -> RelitLayers:
-        """Compute everything that composition needs."""
-        placement = self._placement(frame)
-        voxels = self._voxel_scene(placement)
-        real_key = (frame.real.version, frame.lights_version, placement)
-        object_key = (real_key, frame.virtual.version)
-        if object_key != self._object_key:
-            self._place_lights(frame)
-        uniforms = self._uniforms(frame, placement)
-        if real_key != self._real_key:
-            self._draw_real_maps(frame)
-            voxels.rebuild_real(frame, self.table, placement, uniforms)
-        if object_key != self._object_key:
-            self._draw_virtual_maps(frame)
-            voxels.rebuild_virtual(frame, self.table, uniforms)
-        self._real_key, self._object_key = real_key, object_key
-        self._shade(frame, voxels, uniforms)
-        return RelitLayers(
-            frame.matte,
-            self._surface.radiance,
-            self._direct,
-            self._cones,
-            self._grid,
-            voxels.rho,
-            placement,
-            self.table,
-        )
+    def __init__(
+        self, gpu: GpuContext, settings: DvctMethod, resolved: ResolvedDvct, size: tuple[int, int]
+    ) -> None:
+        super().__init__(gpu, settings, resolved, size)
+        self._tracing = TraceConesPass(gpu)
+        self._voxels = VoxelScene(gpu, VolumePlacement((0.0, 0.0, 0.0), 1.0, resolved.volume_size))
 
-    def _placement(self, frame: RelightInput) -> VolumePlacement:
-        low, high = frame.virtual.bounds
-        return place_volume(low, high, self._resolved.volume_size, self._settings.volume_edge_m)
+    def _rebuild_real(
+        self, frame: RelightInput, placement: VolumePlacement, uniforms: dict[str, Any]
+    ) -> None:
+        self._voxels.rebuild_real(frame, self.table, placement, uniforms)
 
-    def _voxel_scene(self, placement: VolumePlacement) -> VoxelScene:
-        if self._voxels is None:
-            self._voxels = VoxelScene(self._gpu, placement)
-        return self._voxels
+    def _rebuild_virtual(self, frame: RelightInput, uniforms: dict[str, Any]) -> None:
+        self._voxels.rebuild_virtual(frame, self.table, uniforms)
 
-    def _place_lights(self, frame: RelightInput) -> None:
-        if self._environment_version != frame.lights_version:
-            self.table.set_environment(frame.lights.environment)
-            self._environment_version = frame.lights_version
-        self.table.place(list(frame.lights.lights), frame.real.points, frame.virtual.points)
-
-    def _draw_real_maps(self, frame: RelightInput) -> None:
-        with frame.timers.measure("RSM real"):
-            self.table.bind_records()
-            self._shadow_maps.run(self.table.real_atlas, frame.real.buffers, self.table.real_views, 0)
-
-    def _draw_virtual_maps(self, frame: RelightInput) -> None:
-        with frame.timers.measure("RSM virtual"):
-            self.table.bind_records()
-            first = self.table.first_virtual_view
-            self._shadow_maps.run(self.table.virtual_atlas, frame.virtual.buffers, self.table.virtual_views, first)
-
-    def _uniforms(self, frame: RelightInput, placement: VolumePlacement) -> dict[str, Any]:
-        centre = np.mean(np.stack(frame.virtual.bounds), axis=0)
-        pixel = frame.view.camera.matrix[0, 0]
-        return {
-            **frame.view.uniforms(),
-            **placement.uniforms(),
-            **self.table.uniforms(),
-            **frame.surface_uniforms,
-            "noise_sigma": frame.noise_sigma,
-            "normal_offset": SELF_SHADOW_TEXELS * self.table.virtual_texel_m(centre),
-            "sample_distance": 1.5 * self._resolved.cone_scale / pixel,
-            "cone_count": self._settings.cone_count,
-            "everywhere": frame.everywhere,
-        }
-
-    def _shade(self, frame: RelightInput, voxels: VoxelScene, uniforms: dict[str, Any]) -> None:
-        """Cones at reduced resolution, direct light and virtual surfaces at full."""
-        frame.bind_geometry()
-        with frame.timers.measure("sampling grid"):
-            self._grid.run(frame.matte, uniforms)
-        self.table.bind()
-        frame.virtual.materials.bind()
+    def _trace(self, frame: RelightInput, uniforms: dict[str, Any]) -> None:
+        voxels = self._voxels
         voxels.bind_support()
         voxels.far.pyramid.texture.use(location=16)
-        uniforms = {**uniforms, **voxels.far.uniforms()}
+        own = {**uniforms, **voxels.far.uniforms(), "cone_count": self._settings.cone_count}
         with frame.timers.measure("cones real"):
-            self._trace.trace_real(self._cones, self._grid, voxels.mu, voxels.rho, uniforms)
+            self._tracing.trace_real(self._cones, self._grid, voxels.mu, voxels.rho, own)
         with frame.timers.measure("cones virtual"):
-            self._trace.trace_virtual(self._cones, self._grid, voxels.mu, voxels.rho, uniforms)
-        with frame.timers.measure("direct light"):
-            self._direct.run(uniforms)
-        with frame.timers.measure("virtual surface"):
-            self._surface.run(
-                frame.matte, frame.virtual_raster, self._cones.virtual, self._cones.virtual_specular, self._grid, uniforms
-            )
+            self._tracing.trace_virtual(self._cones, self._grid, voxels.mu, voxels.rho, own)
 
-    def release(self) -> None:
-        """Free the GL objects."""
-        for item in vars(self).values():
-            if hasattr(item, "release"):
-                item.release()
+    def _joint(self) -> Pyramid:
+        return self._voxels.rho

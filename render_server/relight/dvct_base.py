@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float64
 
 from protocol.scene_method import DvctMethod
 from render_server.gpu.context import GpuContext
@@ -20,6 +21,7 @@ from render_server.passes.volume import Pyramid, VolumePlacement, place_volume
 from render_server.relight.defaults import ResolvedDvct
 from render_server.relight.frame import RelightInput
 
+SHADOW_REACH = 4.0  # in longest edges of the objects' bounds: how far around them real shadows are resolved
 SELF_SHADOW_TEXELS = 1.5  # a virtual receiver is lifted by so many texels of the depth map
 
 
@@ -43,6 +45,8 @@ class DvctBase(ABC):
         self._surface = VirtualSurfacePass(gpu, size)
         self._real_key: object = None
         self._object_key: object = None
+        self._virtual_map_key: object = None
+        self._shade_key: object = None
         self._environment_version = -1
 
     @abstractmethod
@@ -66,21 +70,33 @@ class DvctBase(ABC):
     def relight(self, frame: RelightInput) -> RelitLayers:
         """Compute everything that composition needs."""
         placement = self._placement(frame)
-        uniforms = self._uniforms(frame, placement)
-        real_key = (frame.real.version, frame.lights_version, placement)
+        real_key = (frame.real.version, frame.lights_version, frame.everywhere, placement)
+        virtual_map_key = (frame.lights_version, frame.virtual.version)
         object_key = (real_key, frame.virtual.version)
         if object_key != self._object_key:
             self._place_lights(frame)
-            uniforms |= self.table.uniforms()
+        uniforms = self._uniforms(frame, placement)
         if real_key != self._real_key:
             self._draw_real_maps(frame)
             self._rebuild_real(frame, placement, uniforms)
-        if object_key != self._object_key:
+        if virtual_map_key != self._virtual_map_key:
             self._draw_virtual_maps(frame)
+        if object_key != self._object_key:
             self._rebuild_virtual(frame, uniforms)
-        self._real_key, self._object_key = real_key, object_key
-        self._shade(frame, uniforms)
-        return RelitLayers(frame.matte, self._surface.radiance, self._direct, self._cones, self._grid)
+        if (object_key, frame.view) != self._shade_key:
+            self._shade(frame, uniforms)
+        self._real_key, self._object_key, self._virtual_map_key = real_key, object_key, virtual_map_key
+        self._shade_key = (object_key, frame.view)
+        return RelitLayers(
+            frame.matte,
+            self._surface.radiance,
+            self._direct,
+            self._cones,
+            self._grid,
+            self._joint(),
+            placement,
+            self.table,
+        )
 
     def _placement(self, frame: RelightInput) -> VolumePlacement:
         low, high = frame.virtual.bounds
@@ -90,7 +106,8 @@ class DvctBase(ABC):
         if self._environment_version != frame.lights_version:
             self.table.set_environment(frame.lights.environment)
             self._environment_version = frame.lights_version
-        self.table.place(list(frame.lights.lights), frame.real.points, frame.virtual.points)
+        receivers = frame.real.points if frame.everywhere else shadow_receivers(frame)
+        self.table.place(list(frame.lights.lights), frame.real.points, receivers, frame.virtual.points)
 
     def _draw_real_maps(self, frame: RelightInput) -> None:
         with frame.timers.measure("RSM real"):
@@ -148,3 +165,11 @@ class DvctBase(ABC):
         for item in vars(self).values():
             if hasattr(item, "release"):
                 item.release()
+
+
+def shadow_receivers(frame: RelightInput) -> Float64[np.ndarray, "n 3"]:
+    """Real points around the objects; all of them where none is near."""
+    low, high = frame.virtual.bounds
+    reach = SHADOW_REACH * float(np.max(high - low))
+    near = np.linalg.norm(frame.real.points - (low + high) / 2, axis=1) <= reach
+    return frame.real.points[near] if near.any() else frame.real.points

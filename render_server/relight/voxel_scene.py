@@ -7,22 +7,21 @@ from typing import Any
 import numpy as np
 
 from render_server.gpu.context import GpuContext
+from render_server.passes.clear_voxels import ClearVoxelsPass
 from render_server.passes.filter_voxels import FilterVoxelsPass
 from render_server.passes.light_table import LightTable
-from render_server.passes.light_voxels import LightVoxelsPass, bind_picture
+from render_server.passes.light_voxels import LightVoxelsPass
 from render_server.passes.resolve_voxels import ResolveVoxelsPass
 from render_server.passes.volume import Pyramid, VolumePlacement, place_volume
 from render_server.passes.voxel_store import VoxelStore
 from render_server.passes.voxelize import VoxelizePass
 from render_server.relight.frame import RelightInput
+from render_server.relight.voxel_sets import VoxelSets, bind_lighting, lighting_uniforms
 
 DIRECTIONS = 6
 FAR_SIZE = 32  # voxels an edge of the coarse volume beyond
 FAR_EDGE_M = 20.0  # its greatest edge: what lies farther lights little through a cone's solid angle
 FAR_MARGIN = 1.05
-SURFEL_SHADOW_SAMPLES = 4  # of a light's area: a voxel averages many surfels
-DEPTH_TOLERANCE = 0.02  # a surfel this near (relative) to what the camera sees is what it sees
-MEAN_ALBEDO = 0.5  # of real surfaces that no camera pixel shows
 
 
 class FarScene:
@@ -38,14 +37,14 @@ class FarScene:
         self._key: object = None
         self._stale = False
 
-    def voxelize(self, frame: RelightInput, voxelize: VoxelizePass, resolve: ResolveVoxelsPass) -> None:
+    def voxelize(self, frame: RelightInput, voxelize: VoxelizePass, clear: ClearVoxelsPass) -> None:
         """Voxelise the whole real scene, unless it stood still."""
         key = (frame.real.version, frame.lights_version)
         self._stale = key != self._key
         if not self._stale:
             return
         self._key = key
-        resolve.clear(self.pyramid, self._store, self._placement.uniforms(), free=True)
+        clear.run(self._store, [self.pyramid], self._placement)
         low, high = frame.real.bounds
         edge = min(float(np.max(high - low)), FAR_EDGE_M) * FAR_MARGIN
         self._placement = place_volume(low, high, FAR_SIZE, edge)
@@ -77,25 +76,17 @@ class FarScene:
         self._store.release()
 
 
-class VoxelScene:
+class VoxelScene(VoxelSets):
     """Two directional pyramids over one placement of the volume."""
 
     def __init__(self, gpu: GpuContext, placement: VolumePlacement) -> None:
-        self.placement = placement
+        super().__init__(gpu, placement, DIRECTIONS)
         self.mu = Pyramid(gpu, placement.size, DIRECTIONS)
         self.rho = Pyramid(gpu, placement.size, DIRECTIONS)
-        self._real = VoxelStore(gpu, placement.size)
         self.far = FarScene(gpu)
-        self._virtual = VoxelStore(gpu, placement.size)
-        self._voxelize = VoxelizePass(gpu)
         self._light = LightVoxelsPass(gpu)
         self._resolve = ResolveVoxelsPass(gpu)
         self._filter = FilterVoxelsPass(gpu)
-
-    def _clear_real(self) -> None:
-        uniforms = self.placement.uniforms()
-        self._resolve.clear(self.mu, self._real, uniforms, free=False)
-        self._resolve.clear(self.rho, self._real, uniforms, free=True)
 
     def rebuild_real(
         self, frame: RelightInput, table: LightTable, placement: VolumePlacement, uniforms: dict[str, Any]
@@ -103,15 +94,12 @@ class VoxelScene:
         """Voxelise, light and filter the real scene (the mu set)."""
         timers = frame.timers
         with timers.measure("voxelize"):
-            self._clear_real()
-            self._clear_virtual()
-            self.placement = placement
-            self._voxelize.run(self._real, frame.real.corners, placement)
-            self.far.voxelize(frame, self._voxelize, self._resolve)
+            self._voxelize_real(frame.real.corners, placement, [self.mu, self.rho])
+            self.far.voxelize(frame, self._voxelize, self._clear)
         with timers.measure("light voxels"):
             frame.picture.build_levels()
-            self._bind(frame, table)
-            lighting = _lighting_uniforms(frame, uniforms)
+            bind_lighting(frame, table)
+            lighting = lighting_uniforms(frame, uniforms)
             self._light.light_real(self._real, lighting)
             self.far.light(self._light, lighting)
         with timers.measure("filter"):
@@ -119,19 +107,14 @@ class VoxelScene:
             self._filter.run(self.mu, placement)
             self.far.filter(self._resolve, self._filter)
 
-    def _clear_virtual(self) -> None:
-        self._resolve.clear(self.rho, self._virtual, self.placement.uniforms(), free=True)
-        self._virtual.start(0)
-
     def rebuild_virtual(self, frame: RelightInput, table: LightTable, uniforms: dict[str, Any]) -> None:
         """Voxelise and light the objects, change the light of real surfaces, filter the rho set."""
         timers = frame.timers
         with timers.measure("voxelize"):
-            self._clear_virtual()
-            self._voxelize.run(self._virtual, frame.virtual.corners, self.placement)
+            self._voxelize_virtual(frame.virtual.corners, [self.rho])
         with timers.measure("light voxels"):
-            self._bind(frame, table)
-            lighting = _lighting_uniforms(frame, uniforms)
+            bind_lighting(frame, table)
+            lighting = lighting_uniforms(frame, uniforms)
             self._light.light_virtual(self._virtual, lighting)
             bounds = self.placement.voxel_bounds(np.stack(frame.virtual.bounds))
             self._light.light_real_delta(self._real, bounds, lighting)
@@ -139,35 +122,6 @@ class VoxelScene:
             self._resolve.resolve_rho(self.rho, self._real, self._virtual, self.placement.uniforms())
             self._filter.run(self.rho, self.placement)
 
-    def _bind(self, frame: RelightInput, table: LightTable) -> None:
-        table.bind()
-        frame.virtual.materials.bind()
-        bind_picture(frame.picture.linear, frame.real_surface.position)
-
     def bind_support(self) -> None:
         """Bind the bounds of the voxels where mu and rho differ."""
         self._light.bind_support()
-
-    def counts(self) -> dict[str, tuple[int, int]]:
-        """Touched voxels and surfels of both sets; waits for the GPU."""
-        return {"real": self._real.counts(), "virtual": self._virtual.counts()}
-
-    def release(self) -> None:
-        """Free the GL objects."""
-        for item in vars(self).values():
-            if hasattr(item, "release"):
-                item.release()
-
-
-def _lighting_uniforms(frame: RelightInput, uniforms: dict[str, Any]) -> dict[str, Any]:
-    """Uniforms of the voxel lighting passes."""
-    bias = 3.0 * frame.noise_sigma * frame.typical_depth**2
-    own = {
-        "shadow_samples": SURFEL_SHADOW_SAMPLES,
-        "bias_real": bias,
-        "bias_virtual": bias,
-        "depth_tolerance": DEPTH_TOLERANCE,
-        "unseen_albedo": (MEAN_ALBEDO,) * 3,
-        "picture_lod": 2.0,
-    }
-    return {**uniforms, **own}

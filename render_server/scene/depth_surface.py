@@ -28,9 +28,9 @@ LEAST_SUPPORT = 0.01
 class DepthSurface:
     """What is known of the surface behind every pixel.
 
-    `inverse_depth` is as measured (0 where invalid, and where a pixel stands alone). `gradient` is its change by ray coordinate (x/z, y/z),
-    fitted to the surroundings (NaN where unknown). `normals` are unit vectors in the optical frame towards
-    the camera, zero where they are unknown.
+    `inverse_depth` is as measured, 0 where invalid and where a pixel stands alone. `gradient` is its change
+    by ray coordinate (x/z, y/z), fitted to the surroundings (NaN where unknown). `normals` are unit vectors
+    in the optical frame towards the camera, zero where they are unknown.
     """
 
     inverse_depth: Float32[np.ndarray, "h w"]
@@ -148,7 +148,7 @@ def _jumps(
 
 
 def _lonely(jumps: tuple[UInt8[np.ndarray, "h w"], UInt8[np.ndarray, "h w"]]) -> Bool[np.ndarray, "h w"]:
-    """Whether a pixel jumps to three of its neighbours or all four: a spike, or afloat between two surfaces."""
+    """Whether a pixel jumps to three of its neighbours or more: a spike, or afloat between surfaces."""
     down, right = jumps
     count = down + right
     count[1:] += down[:-1]

@@ -302,9 +302,9 @@ def split_triangles(corners: Float32[np.ndarray, "m 3 c"], max_edge: float) -> F
 
 
 def _check_pieces(corners: Float32[np.ndarray, "m 3 c"], max_edge: float) -> None:
-    """Refuse before the memory is gone: an equilateral triangle is the largest that the limit allows.
+    """Refuse before the memory is gone, by a bound from below on the number of pieces.
 
-    Bisection ends at half of the longest edges or above, so the true number is at most 8 times the bound.
+    An equilateral triangle is the largest that the limit allows; bisection ends a few times above that.
     """
     edges = np.roll(corners[..., :3], -1, axis=1) - corners[..., :3]
     areas = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) / 2

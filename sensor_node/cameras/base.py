@@ -23,8 +23,8 @@ class Camera(ABC):
     """A source of frames in real time (or as fast as asked for); use it as a context manager.
 
     One thread uses a camera. `timestamp_ns` of a frame is when it was captured, by the camera's own clock;
-    `capture_ns` is the same moment by this host's clock. `depth_scale` is metres for each step of the depth, None
-    where it does not come in steps.
+    `capture_ns` is the same moment by this host's clock. `depth_scale` is metres for each step of the depth,
+    None where it does not come in steps.
     """
 
     camera: CameraModel

@@ -55,9 +55,17 @@ function showFigures(header) {
   element("rate").textContent = header.frames_per_s === null ? "–" : `${header.frames_per_s.toFixed(1)} / s`;
   element("age").textContent = header.age_ms === null ? "–" : `${header.age_ms.toFixed(0)} ms`;
   element("frame").textContent = header.frame_id;
-  element("drops").textContent = header.drops;
+  showDrops(header.drops);
   element("renderer").textContent = header.renderer;
   showPasses(header.pass_times_ms);
+}
+
+// Depth and pose are dropped together with their colour frame, so only the others count as frames.
+function showDrops(drops) {
+  const entries = Object.entries(drops).filter(([, count]) => count > 0);
+  const frames = entries.filter(([name]) => !/^(clean_depth|pose)\./.test(name));
+  element("drops").textContent = frames.reduce((sum, [, count]) => sum + count, 0);
+  element("drops").title = entries.map(([name, count]) => `${name}: ${count}`).join("\n");
 }
 
 function showPasses(times) {

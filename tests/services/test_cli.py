@@ -79,11 +79,21 @@ def test_server_and_up_refuse_wrong_input_in_a_sentence(cli: RunCli, tmp_path: o
         assert "Traceback" not in done.stderr
 
 
-def test_node_names_a_port_in_use(cli: RunCli) -> None:
-    taken = ports.listen(ports.private_ports(1)[0])
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("node", "--source", "synthetic", "--publish"),
+        ("server", "--allow-software", "--publish"),
+        ("server", "--allow-software", "--control"),
+    ],
+)
+def test_port_in_use_is_a_sentence_that_names_it(cli: RunCli, command: tuple[str, ...]) -> None:
+    taken, own = ports.listen(ports.private_ports(1)[0]), ports.endpoint(ports.private_ports(1)[0])
     taken.listen()
     port = taken.getsockname()[1]
-    done = cli("node", "--source", "synthetic", "--publish", ports.endpoint(port))
+    rest = ("--publish", own) if command[-1] == "--control" else ()
+    done = cli(*command, ports.endpoint(port), *rest)
     taken.close()
-    assert done.returncode == 2
+    assert done.returncode == 2, done.stderr
     assert str(port) in done.stderr
+    assert "Traceback" not in done.stderr

@@ -12,7 +12,7 @@ from protocol.frames import ViewFrame
 from protocol.messages import ControlRequest
 from protocol.scene import SceneDocument
 from render_server.frame_assembly import FrameAssembler
-from render_server.session import RenderSession
+from render_server.session import MAXIMUM_FAULTS_IN_A_ROW, RenderSession
 from tests.services.conftest import color, depth, pose, received
 
 START = 10**15
@@ -104,6 +104,18 @@ def test_bad_frame_is_counted_and_the_next_is_rendered(
     feed(session, 2)
     assert session.step() is not None
     assert session.stats().state == "running"
+
+
+def test_renderer_that_only_fails_ends_the_process_after_a_while(
+    session: RenderSession, renderer: InvertingRenderer
+) -> None:
+    renderer.fails_at = set(range(100))
+    for number in range(MAXIMUM_FAULTS_IN_A_ROW - 1):
+        feed(session, number)
+        assert session.step() is None
+    feed(session, MAXIMUM_FAULTS_IN_A_ROW)
+    with pytest.raises(RuntimeError, match="fell over"):
+        session.step()
 
 
 def test_bad_message_is_counted(session: RenderSession) -> None:

@@ -56,17 +56,34 @@ float first_depth(sampler2D map, LightView view, ivec2 texel) {
     return d >= 1.0 ? NOTHING : linear_depth(view, d);
 }
 
-// Bilinear comparison: share of the 2x2 texels around s that lie behind `depth`.
+// A receiver in a light's view: its plane, so that a tilted surface does not block its own surroundings.
+struct Receiver { vec2 s; float depth; vec3 normal; float plane; float bias; };
+
+Receiver receiver_at(LightView view, vec3 p, vec3 n, float bias) {
+    vec3 v = (view.view_from_world * vec4(p, 1.0)).xyz;
+    vec3 normal = mat3(view.view_from_world) * n;
+    normal.z = min(normal.z, -0.1);   // grazing: a slope of at most 10
+    return Receiver(lateral(view, v), v.z, normal, dot(normal, v), bias);
+}
+
+// Depth of the receiver's plane at another lateral position.
+float plane_depth(LightView view, Receiver r, vec2 s) {
+    float z = view.range.z > 0.5 ? (r.plane - dot(r.normal.xy, s)) / r.normal.z
+                                 : r.plane / min(dot(r.normal.xy, s) + r.normal.z, -1e-3);
+    return z > 0.0 ? z : r.depth;
+}
+
+// Bilinear comparison: share of the 2x2 texels around s that lie no nearer to the light than `depth`.
 float lit_share(sampler2D map, LightView view, vec2 s, float depth) {
     vec2 t = tile_texel(view, s);
     if (t.x < 0.0) return 1.0;
-    vec2 low = view.tile.xy, high = view.tile.xy + view.tile.z - 1.0;
-    vec2 base = floor(t - 0.5), f = t - 0.5 - base;
-    ivec2 a = ivec2(clamp(base, low, high)), b = ivec2(clamp(base + 1.0, low, high));
-    vec4 lit = vec4(
-        first_depth(map, view, a) >= depth, first_depth(map, view, ivec2(b.x, a.y)) >= depth,
-        first_depth(map, view, ivec2(a.x, b.y)) >= depth, first_depth(map, view, b) >= depth);
-    return mix(mix(lit.x, lit.y, f.x), mix(lit.z, lit.w, f.x), f.y);
+    t = clamp(t, view.tile.xy + 0.5, view.tile.xy + view.tile.z - 0.5);
+    vec4 d = textureGather(map, t / vec2(textureSize(map, 0)), 0);   // (0,1) (1,1) (1,0) (0,0)
+    float near = view.range.x, far = view.range.y;
+    float limit = view.range.z > 0.5 ? (depth - near) / (far - near) : far * (depth - near) / (depth * (far - near));
+    vec4 lit = vec4(greaterThanEqual(d, vec4(min(depth <= near ? 0.0 : limit, 1.0))));
+    vec2 f = fract(t - 0.5);
+    return mix(mix(lit.w, lit.z, f.x), mix(lit.x, lit.y, f.x), f.y);
 }
 
 vec2 disc_sample(int j, int count) {
@@ -90,38 +107,59 @@ int view_containing(int first, int count, vec3 p) {
     return first + count - 1;
 }
 
-// Mean depth of what blocks the light's disc in one map; NOTHING if nothing does.
-float mean_blocker(sampler2D map, Light light, LightView view, vec2 s, float depth) {
-    float widest = disc_shift(light, view, depth, view.range.x);
-    int count = widest * view.tile.z < view.tile.w ? 1 : (shadow_samples + 1) / 2;   // below half a texel: one look
+// Mean depth of what blocks the light's disc in one map; NOTHING if nothing does. Only what lies inside the cone from
+// the receiver to the disc counts, so that a tilted or noisy surface does not block itself. Samples crowd towards the
+// axis, because what is near the receiver matters only there.
+float mean_blocker(sampler2D map, Light light, LightView view, Receiver r) {
+    float widest = disc_shift(light, view, r.depth, view.range.x);
+    float texel = 2.0 * view.tile.w / view.tile.z;
+    int count = widest < 0.5 * texel ? 1 : shadow_samples;   // below half a texel: one look
     float sum = 0.0, hits = 0.0;
     for (int j = 0; j < count; ++j) {
-        vec2 t = tile_texel(view, count == 1 ? s : s + widest * disc_sample(j, count));
+        vec2 unit = disc_sample(j, count);
+        vec2 offset = count == 1 ? vec2(0.0) : widest * length(unit) * unit;
+        vec2 t = tile_texel(view, r.s + offset);
         if (t.x < 0.0) continue;
         float d = first_depth(map, view, ivec2(t));
-        if (d < depth) { sum += d; hits += 1.0; }
+        if (d < r.depth - r.bias && length(offset) <= disc_shift(light, view, r.depth, d) + 0.5 * texel) {
+            sum += d;
+            hits += 1.0;
+        }
     }
-    if (hits == 0.0) return lit_share(map, view, s, depth) < 1.0 ? depth : NOTHING;
+    if (hits == 0.0) return lit_share(map, view, r.s, r.depth - r.bias) < 1.0 ? r.depth : NOTHING;
     return sum / hits;
 }
 
-struct Occluder { bool present; LightView view; vec2 s; float depth; float shift; };
+const float STEEPEST = 3.0;   // slope up to which a texel's rise is allowed for
 
-Occluder occluder(sampler2D map, Light light, int first, int count, vec3 p, float bias) {
+struct Occluder { bool present; LightView view; Receiver receiver; float blocker; float shift; };
+
+Occluder occluder(sampler2D map, Light light, int first, int count, vec3 p, vec3 n, float bias) {
     Occluder o;
     o.present = false;
     if (count == 0) return o;
     o.view = light_views[view_containing(first, count, p)];
-    vec3 v = (o.view.view_from_world * vec4(p, 1.0)).xyz;
-    o.depth = v.z - bias;
-    if (o.depth <= o.view.range.x) return o;
-    o.s = lateral(o.view, v);
-    float reach = disc_shift(light, o.view, o.depth, o.view.range.x);
-    if (any(greaterThan(abs(o.s), vec2(o.view.tile.w + reach)))) return o;
-    float blocker = mean_blocker(map, light, o.view, o.s, o.depth);
-    o.present = blocker < NOTHING;
-    o.shift = o.present ? disc_shift(light, o.view, o.depth, blocker) : 0.0;
+    o.receiver = receiver_at(o.view, p, n, bias);
+    // What a tilted surface rises within a texel of the map must not block it either.
+    float texel = 2.0 * o.view.tile.w / o.view.tile.z * (o.view.range.z > 0.5 ? 1.0 : o.receiver.depth);
+    float slope = length(o.receiver.normal.xy) / -o.receiver.normal.z;
+    o.receiver.bias += texel * min(slope, STEEPEST);
+    if (o.receiver.depth - o.receiver.bias <= o.view.range.x) return o;
+    float reach = disc_shift(light, o.view, o.receiver.depth, o.view.range.x);
+    if (any(greaterThan(abs(o.receiver.s), vec2(o.view.tile.w + reach)))) return o;
+    o.blocker = mean_blocker(map, light, o.view, o.receiver);
+    o.present = o.blocker < NOTHING;
+    o.shift = o.present ? disc_shift(light, o.view, o.receiver.depth, o.blocker) : 0.0;
     return o;
+}
+
+// Whether the ray to one sample of the light (offset on its unit disc) gets through, bilinearly. The receiver's plane
+// may rise towards the light there, but what stands a quarter of the way to the blockers above it does block.
+float passes(sampler2D map, Occluder o, vec2 offset) {
+    vec2 s = o.receiver.s + o.shift * offset;
+    float highest = mix(o.receiver.depth, o.blocker, 0.75);
+    float depth = clamp(plane_depth(o.view, o.receiver, s), highest, o.receiver.depth);
+    return lit_share(map, o.view, s, depth - o.receiver.bias);
 }
 
 // Whether a virtual object can stand between p and any part of any light.
@@ -140,20 +178,18 @@ bool object_may_shadow(vec3 p, float bias) {
     return false;
 }
 
-// (V_mu, V_rho): averages over the same samples of the light; v_rho = v_mu v_obj (METHOD 3).
+// (V_mu, V_rho) at p with normal n: averages over the same samples of the light; v_rho = v_mu v_obj (METHOD 3).
 // `bias_real`, `bias_virtual` (m) move the receiver towards the light.
-vec2 visibility(Light light, vec3 p, float bias_real, float bias_virtual) {
-    Occluder real = occluder(real_light_depth, light, light.views.x, light.views.y, p, bias_real);
-    Occluder object = occluder(virtual_light_depth, light, light.views.z, light.views.w, p, bias_virtual);
+vec2 visibility(Light light, vec3 p, vec3 n, float bias_real, float bias_virtual) {
+    Occluder real = occluder(real_light_depth, light, light.views.x, light.views.y, p, n, bias_real);
+    Occluder object = occluder(virtual_light_depth, light, light.views.z, light.views.w, p, n, bias_virtual);
     if (!real.present && !object.present) return vec2(1.0);
     vec2 sum = vec2(0.0);
     for (int j = 0; j < shadow_samples; ++j) {
         vec2 offset = disc_sample(j, shadow_samples);
-        float v = 1.0;
-        if (real.present) v = lit_share(real_light_depth, real.view, real.s + real.shift * offset, real.depth);
+        float v = real.present ? passes(real_light_depth, real, offset) : 1.0;
         sum.x += v;
-        if (object.present && v > 0.0)
-            v *= lit_share(virtual_light_depth, object.view, object.s + object.shift * offset, object.depth);
+        if (object.present && v > 0.0) v *= passes(virtual_light_depth, object, offset);
         sum.y += v;
     }
     return sum / float(shadow_samples);

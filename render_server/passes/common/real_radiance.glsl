@@ -1,6 +1,6 @@
-// Radiance that a real surfel sends out, from the picture where the camera looks at it.
+// Radiance that a point of the real scene sends out, from the picture where the camera looks at it.
 #include "passes/common/picture.glsl"
-uniform float depth_tolerance;      // relative to depth: how far a surfel may lie from what the camera sees
+uniform float depth_tolerance;      // relative to depth: how far a point may lie from what the camera sees
 uniform vec3 unseen_albedo;         // of real surfaces that the camera does not see: the mean of those it sees
 uniform float picture_lod;          // of the linear picture: one sample covers a triangle's pixels
 
@@ -13,13 +13,13 @@ bool camera_sees(vec3 p) {
     return seen > 0.0 && abs(seen - c.z) < depth_tolerance * c.z;
 }
 
-vec3 measured_radiance(Surfel s) {
-    vec3 c = (camera_from_world * vec4(s.position_area.xyz, 1.0)).xyz;
+vec3 measured_radiance(vec3 p) {
+    vec3 c = (camera_from_world * vec4(p, 1.0)).xyz;
     return textureLod(linear_picture, picture_pixel(c) / picture_size, picture_lod).rgb;
 }
 
 vec3 predicted_radiance(vec3 irradiance) { return unseen_albedo / PI * irradiance; }
 
-vec3 real_radiance(Surfel s, vec3 n, vec3 irradiance) {
-    return camera_sees(s.position_area.xyz) ? measured_radiance(s) : predicted_radiance(irradiance);
+vec3 real_radiance(vec3 p, vec3 irradiance) {
+    return camera_sees(p) ? measured_radiance(p) : predicted_radiance(irradiance);
 }

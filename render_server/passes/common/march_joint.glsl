@@ -1,0 +1,41 @@
+// Cone marching of [P1] 3.2: front-to-back through one pyramid whose opacity is the joint one (V_eta),
+//   c += (1 - a) c_v,  a += (1 - a) a_v        (c_v premultiplied; the factor a_0 before c_0 in eq. 5 is a slip).
+// A step is the edge of the cell sampled, as printed there, so that opacity needs no correction for it (METHOD 4.5).
+#include "passes/common/volume.glsl"
+
+const float OPAQUE = 0.99;   // opacity that ends a march
+
+// Premultiplied (c, a) as a cone along d meets it.
+vec4 cone_sample(sampler3D pyramid, vec3 q, int level, vec3 d) {
+#if DIRECTIONS == 1
+    return volume_sample(pyramid, q, level, 0);
+#else
+    vec3 weights = abs(d);
+    ivec3 slabs = ivec3(d.x >= 0.0 ? 0 : 1, d.y >= 0.0 ? 2 : 3, d.z >= 0.0 ? 4 : 5);
+    return weights.x * volume_sample(pyramid, q, level, slabs.x) + weights.y * volume_sample(pyramid, q, level, slabs.y)
+        + weights.z * volume_sample(pyramid, q, level, slabs.z);
+#endif
+}
+
+// Where the ray q + t d, t >= 0, is inside a box: (first t, last t); none where first >= last.
+vec2 box_interval(vec3 q, vec3 d, vec3 low, vec3 high) {
+    vec3 inverse = 1.0 / (d + vec3(equal(d, vec3(0.0))) * 1e-9);
+    vec3 t0 = (low - q) * inverse, t1 = (high - q) * inverse;
+    vec3 near = min(t0, t1), far = max(t0, t1);
+    return vec2(max(max(near.x, near.y), max(near.z, 0.0)), min(far.x, min(far.y, far.z)));
+}
+
+// (c, a) of the cone from q (voxels) along d within `interval`; `ratio` = diameter / distance.
+vec4 march(sampler3D pyramid, vec3 q, vec3 d, float ratio, vec2 interval) {
+    vec4 sum = vec4(0.0);
+    float t = interval.x;
+    for (int i = 0; i < 1024 && t < interval.y && sum.a < OPAQUE; ++i) {
+        float diameter = max(1.0, ratio * t);
+        int level = min(int(floor(log2(diameter) + 0.5)), volume_levels - 1);
+        float edge = exp2(float(level));
+        vec4 v = cone_sample(pyramid, q + (t + 0.5 * edge) * d, level, d);
+        sum += (1.0 - sum.a) * vec4(v.rgb, min(v.a, 1.0));
+        t += edge;
+    }
+    return sum;
+}

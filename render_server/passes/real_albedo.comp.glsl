@@ -1,0 +1,46 @@
+// Albedo of the real surface at each texel of a light's map that lies in the volume, from the picture where the
+// camera looks at it: albedo = pi B_lin / E_mu ([P2] eq. 1, with visibility and ambient light).
+#include "passes/common/light_rays.glsl"
+#include "passes/common/environment.glsl"
+#include "passes/common/volume.glsl"
+#include "passes/common/real_radiance.glsl"
+
+layout(local_size_x = 8, local_size_y = 8) in;
+layout(binding = 0, rgba16f) writeonly uniform image2D albedo_out;
+layout(binding = 13) uniform sampler2D real_light_normal;
+uniform int view_index;
+uniform int light_index;
+uniform float bias_real;      // m
+uniform float bias_virtual;   // m
+
+const vec2 ALBEDO_RANGE = vec2(0.02, 0.95);
+
+vec3 irradiance(vec3 p, vec3 n) {
+    vec3 e = environment_irradiance(n);
+    for (int i = 0; i < light_count; ++i) {
+        vec3 to_light; float radius;
+        vec3 across = light_at(lights[i], p, to_light, radius);
+        float cosine = dot(n, to_light);
+        if (cosine > 0.0) e += across * cosine * visibility(lights[i], p, n, bias_real, bias_virtual).x;
+    }
+    return e;
+}
+
+void main() {
+    LightView view = light_views[view_index];
+    if (any(greaterThanEqual(vec2(gl_GlobalInvocationID.xy), view.tile.zz))) return;
+    ivec2 texel = ivec2(gl_GlobalInvocationID.xy) + ivec2(view.tile.xy);
+    float depth = first_depth(real_light_depth, view, texel);
+    if (depth == NOTHING) return;
+    vec3 p = ray_point(view, texel_lateral(view, texel), depth);
+    if (!inside_volume(volume_coordinate(p))) return;
+    vec3 albedo = unseen_albedo;
+    if (camera_sees(p)) {
+        vec3 n = normalize(texelFetch(real_light_normal, texel, 0).xyz);
+        vec3 to_light; float radius;
+        light_at(lights[light_index], p, to_light, radius);
+        if (dot(n, to_light) < 0.0) n = -n;   // what the light sees faces it
+        albedo = clamp(PI * measured_radiance(p) / max(irradiance(p, n), vec3(1e-6)), ALBEDO_RANGE.x, ALBEDO_RANGE.y);
+    }
+    imageStore(albedo_out, texel, vec4(albedo, 1.0));
+}

