@@ -18,11 +18,15 @@ from render_server.picture_resources import PictureResources
 from render_server.real_geometry import RealGeometry
 from render_server.relight.defaults import ResolvedDvct, resolve_dvct
 from render_server.relight.dvct import DvctExact
+from render_server.relight.dvct_base import DvctBase
+from render_server.relight.dvct_paper import DvctPaper
 from render_server.relight.frame import RelightInput
 from render_server.scene.lights import LightSet, build_lights
 from render_server.scene.surfaces import build_surface_table
 from render_server.view import CameraView
 from render_server.virtual_objects import VirtualObjects
+
+OPERATORS: dict[str, type[DvctBase]] = {"exact": DvctExact, "paper": DvctPaper}
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +64,7 @@ class Relighting:
         self._objects = VirtualObjects(gpu)
         self._real: RealGeometry | None = None
         self._resources: PictureResources | None = None
-        self._method: DvctExact | None = None
+        self._method: DvctBase | None = None
         self._lights_version = 0
         self._plan = self._planned(scene)
         self._lights = self._plan.lights
@@ -72,7 +76,7 @@ class Relighting:
         if not isinstance(scene.method, DvctMethod):
             raise DeltalightError(f"method `{scene.method.name}` arrives with a later release: use dvct.")
         resolved = resolve_dvct(scene.method, software=self._gpu.is_software)
-        self._say(memory_statement(resolved.volume_size, 6, scene.method.memory_budget_mb))
+        self._say(memory_statement(resolved.volume_size, OPERATORS[scene.method.operator].directions, scene.method.memory_budget_mb))
         self._objects.load(scene.objects)
         return _Plan(scene, scene.method, resolved, build_lights(scene.lights))
 
@@ -138,7 +142,7 @@ class Relighting:
         additive = self._plan.method.resolved_composition == "additive"
         return RelitFrame(relight_input, layers, additive, {"sample_distance": self._sample_distance(view)})
 
-    def _register(self, frame: ViewFrame, scene: RelightInput, method: DvctExact) -> RelightInput:
+    def _register(self, frame: ViewFrame, scene: RelightInput, method: DvctBase) -> RelightInput:
         """Find the lights' factor from this frame and use it from now on."""
         assert self._unregistered is not None
         found = register_lights(frame, replace(scene, lights=self._unregistered), method.relight)
@@ -168,9 +172,10 @@ class Relighting:
             self._resources = PictureResources(self._gpu, view)
         return self._resources
 
-    def _method_for(self, view: CameraView) -> DvctExact:
+    def _method_for(self, view: CameraView) -> DvctBase:
         if self._method is None:
-            self._method = DvctExact(self._gpu, self._plan.method, self._plan.resolved, view.size)
+            operator = OPERATORS[self._plan.method.operator]
+            self._method = operator(self._gpu, self._plan.method, self._plan.resolved, view.size)
         return self._method
 
     def describe_lights(self) -> list[dict[str, Any]]:

@@ -5,14 +5,19 @@ off; on an edge blur is symmetric, if the picture is linear in light. Measured o
 scene with 0 to 1.2 px of blur: 0.05 to 0.07 px rms, where `cv2.cornerSubPix` leaves 0.22 to 0.33 px.
 """
 
+from typing import NamedTuple
+
 import cv2
 import numpy as np
 from jaxtyping import Float32, Float64
+
+from protocol.camera_model import CameraModel
 
 # Places along an edge, as shares of its length, at which its position is measured; not at the round corners.
 SHARES = np.linspace(0.12, 0.88, 16)
 # Places across the edge, from inside to outside, in units of the reach.
 ACROSS = np.linspace(-1, 1, 25)
+REACH_PX = (1.5, 8.0)
 ROUNDS = 2
 LINE_ITERATIONS = 3
 # Measurements that miss the line by this much count half (a finger or shadow on the edge).
@@ -22,22 +27,51 @@ TINY = 1e-9
 
 def refine_corners(
     light: Float32[np.ndarray, "h w"],
-    quads: Float64[np.ndarray, "m 4 2"],
-    reach_px: Float64[np.ndarray, " m"],
+    camera: CameraModel,
+    corners: Float64[np.ndarray, "m 4 2"],
+    reach_share: float,
 ) -> Float64[np.ndarray, "m 4 2"]:
-    """Return the refined corners of dark markers on white paper.
+    """Return the refined corners (pixels) of dark markers on white paper.
+
+    Edges are straight where a pinhole camera of the same focal length would see them; there lines are fitted.
 
     Args:
         light: picture, linear in light.
-        quads: corners of each marker, clockwise as seen, within `reach_px` of the truth.
-        reach_px: how far on either side an edge is looked for; less than the border and the white margin.
+        camera: camera of the picture, with its full lens model.
+        corners: pixels of each marker's corners, clockwise as seen, a pixel or two from the truth.
+        reach_share: how far on either side an edge is looked for, in shares of the marker's shortest side;
+            less than the border and the white margin.
     """
+    focal = camera.matrix[0, 0]
+    quads = focal * camera.unproject(corners.reshape(-1, 2)).reshape(corners.shape)
+    sides = np.linalg.norm(quads - np.roll(quads, 1, axis=1), axis=-1).min(axis=-1)
+    pinhole = _refined(_Picture(light, camera), quads, np.clip(reach_share * sides, *REACH_PX))
+    return camera.project(_homogeneous(pinhole).reshape(-1, 3) / (focal, focal, 1)).reshape(corners.shape)
+
+
+class _Picture(NamedTuple):
+    """A picture that is looked up where a pinhole camera would see a point."""
+
+    light: Float32[np.ndarray, "h w"]
+    camera: CameraModel
+
+    def at(self, points: Float64[np.ndarray, "*size 2"]) -> Float64[np.ndarray, "*size"]:
+        focal = self.camera.matrix[0, 0]
+        pixels = self.camera.project(_homogeneous(points).reshape(-1, 3) / (focal, focal, 1))
+        columns, rows = pixels.astype(np.float32).reshape(-1, points.shape[-2], 2).transpose(2, 0, 1)
+        values = cv2.remap(self.light, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(values, np.float64).reshape(points.shape[:-1])
+
+
+def _refined(
+    picture: _Picture, quads: Float64[np.ndarray, "m 4 2"], reach_px: Float64[np.ndarray, " m"]
+) -> Float64[np.ndarray, "m 4 2"]:
     for _ in range(ROUNDS):
         following = np.roll(quads, -1, axis=1)
         along = following - quads
         along /= np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), TINY)
         outward = np.stack([along[..., 1], -along[..., 0]], axis=-1)
-        offset, slope = _fit_lines(*_edge_offsets(light, quads, following, outward, reach_px))
+        offset, slope = _fit_lines(*_edge_offsets(picture, quads, following, outward, reach_px))
         starts = quads + outward * offset[..., None]
         ends = following + outward * (offset + slope)[..., None]
         lines = np.cross(_homogeneous(starts), _homogeneous(ends))
@@ -49,7 +83,7 @@ def refine_corners(
 
 
 def _edge_offsets(
-    light: Float32[np.ndarray, "h w"],
+    picture: _Picture,
     starts: Float64[np.ndarray, "m 4 2"],
     ends: Float64[np.ndarray, "m 4 2"],
     outward: Float64[np.ndarray, "m 4 2"],
@@ -58,10 +92,8 @@ def _edge_offsets(
     """Distance of the true edge outward from the assumed one, in pixels, and the contrast found there."""
     on_edge = starts[:, :, None] + (ends - starts)[:, :, None] * SHARES[:, None]
     steps = outward[:, :, None, None] * (ACROSS[:, None] * reach_px[:, None, None, None, None])
-    places = (on_edge[:, :, :, None] + steps).astype(np.float32)
-    columns, rows = places[..., 0].reshape(-1, len(ACROSS)), places[..., 1].reshape(-1, len(ACROSS))
-    profiles = cv2.remap(light, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    rises = np.maximum(np.diff(profiles.astype(np.float64), axis=-1), 0).reshape(*on_edge.shape[:3], -1)
+    profiles = picture.at(on_edge[:, :, :, None] + steps)
+    rises = np.maximum(np.diff(profiles, axis=-1), 0)
     contrast = rises.sum(axis=-1)
     middle = (ACROSS[1:] + ACROSS[:-1]) / 2
     return rises @ middle / np.maximum(contrast, TINY) * reach_px[:, None, None], contrast
@@ -85,5 +117,5 @@ def _fit_lines(
     return start, slope
 
 
-def _homogeneous(points: Float64[np.ndarray, "m 4 2"]) -> Float64[np.ndarray, "m 4 3"]:
+def _homogeneous(points: Float64[np.ndarray, "*size 2"]) -> Float64[np.ndarray, "*size 3"]:
     return np.concatenate([points, np.ones_like(points[..., :1])], axis=-1)

@@ -16,7 +16,6 @@ from sensor_node.marker_edges import refine_corners
 
 # How far from a marker's edge it is looked for, as a share of the border cell or the white gap.
 REACH_SHARE = 0.6
-REACH_PX = (1.5, 8.0)
 # Half the edge of the window that refines a chessboard corner, as a share of the way to the next marker.
 WINDOW_SHARE = 0.8
 WINDOW_HALF_PX = (2, 8)
@@ -27,8 +26,9 @@ OUTLIER_PX, OUTLIER_MEDIANS = 1.5, 3.0
 LEAST_SIDE_PX = 10
 # A detection whose mean reprojection error is larger is a mistake: another board, or wrong calibration.
 MAX_ERROR_PX = 8.0
-# Solutions of the planar ambiguity whose errors differ by less than this factor are told apart by history.
-AMBIGUOUS_RATIO = 1.5
+# Solutions of the planar ambiguity are told apart by history where their errors, each with the noise of a
+# corner added, differ by less than this factor.
+AMBIGUOUS_RATIO, CORNER_NOISE_PX = 1.5, 0.05
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
 
@@ -138,9 +138,8 @@ class BoardDetector:
         board, corners = self._board, np.array(list(quads.values()))
         cells = board.opencv_dictionary().markerSize + 2 * board.border_bits
         thin = min(board.border_bits / cells, board.separation_m / board.marker_length_m or 1.0)
-        reach = np.clip([REACH_SHARE * thin * _shortest_side(quad) for quad in corners], *REACH_PX)
         world = np.concatenate([self._corners[name] for name in quads])
-        return world, refine_corners(light, corners, reach).reshape(-1, 2)
+        return world, refine_corners(light, self._camera, corners, REACH_SHARE * thin).reshape(-1, 2)
 
     def _chessboard_corners(
         self,
@@ -206,12 +205,14 @@ class BoardDetector:
     ) -> Float64[np.ndarray, " n"]:
         points = matches.world @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
         distances = np.linalg.norm(self._camera.project(points) - matches.pixels, axis=1)
-        return np.nan_to_num(distances, nan=np.inf)
+        return np.asarray(np.nan_to_num(distances, nan=np.inf))
 
     def _choose(self, solutions: list[_Solution]) -> tuple[_Solution, _Solution | None]:
         """The solution with the smaller error; where that says little, the one nearer to the last pose."""
         best, other = solutions[0], solutions[1] if len(solutions) > 1 else None
-        if other is None or self._previous is None or other.error_px > AMBIGUOUS_RATIO * best.error_px:
+        if other is None or self._previous is None:
+            return best, other
+        if other.error_px + CORNER_NOISE_PX > AMBIGUOUS_RATIO * (best.error_px + CORNER_NOISE_PX):
             return best, other
         turns = [_turn(self._previous, np.linalg.inv(each.camera_from_world)) for each in (best, other)]
         return (best, other) if turns[0] <= turns[1] else (other, best)

@@ -21,6 +21,8 @@ layout(binding = 14) uniform sampler2D cone_specular_mu;
 layout(binding = 16) uniform sampler2D cone_specular_rho;
 layout(binding = 17) uniform sampler2D lobe_mu;
 layout(binding = 18) uniform sampler2D lobe_rho;
+layout(binding = 19) uniform sampler2D change_ratio;
+layout(binding = 20) uniform sampler2D change_near;
 uniform float exposure_scale;
 uniform float sample_distance;   // m at 1 m depth
 uniform vec3 camera_position;
@@ -98,6 +100,26 @@ vec3 relit(ivec2 pixel, Change c, vec4 normal, vec3 b) {
     return w * b * ratio + max(vec3(0.0), (1.0 - w) * b + c.s_rho - c.s_mu);
 }
 
+// Where depth is unknown the change of light continues from the surroundings of similar colour; 1 if there is none.
+vec3 surrounding_ratio(ivec2 pixel, vec3 b) {
+    ivec2 centre = pixel / scale, last = textureSize(sample_pixels, 0) - 1;
+    float total = 1e-4;   // no change, should all be far or of another colour
+    vec3 sum = vec3(total);
+    for (int j = -FILL_RADIUS; j <= FILL_RADIUS; ++j)
+        for (int i = -FILL_RADIUS; i <= FILL_RADIUS; ++i) {
+            ivec2 texel = clamp(centre + ivec2(i, j), ivec2(0), last);
+            vec4 ratio = texelFetch(change_ratio, texel, 0);
+            if (ratio.a == 0.0) continue;
+            ivec2 at = texelFetch(sample_pixels, texel, 0).xy;
+            vec3 apart = (texelFetch(linear_picture, at, 0).rgb - b) / (0.1 + b);
+            vec2 away = vec2(at - pixel) / float(FILL_RADIUS * scale);
+            float w = exp(-4.0 * dot(away, away) - 4.0 * dot(apart, apart));
+            sum += w * ratio.rgb;
+            total += w;
+        }
+    return sum / total;
+}
+
 // Code whose linear value is nearest, by bisection of the response.
 uint encode(float x, int channel) {
     int low = 0, high = 255;
@@ -121,10 +143,16 @@ void main() {
     bool changed = filmic;
     vec4 position = texelFetch(real_surface_position, pixel, 0);
     float shown = texelFetch(matte, pixel, 0).r;
-    if (position.w > 0.0 && shown < 1.0) {
+    bool reached = shown < 1.0 && (texelFetch(change_near, pixel / scale, 0).r > 0.0
+        || texelFetch(direct_mu, pixel, 0).rgb != texelFetch(direct_rho, pixel, 0).rgb);
+    if (reached && position.w > 0.0) {
         vec4 normal = texelFetch(real_surface_normal, pixel, 0);
         Change c = change_at(pixel, position, normal);
         if (c.any_change) { result = relit(pixel, c, normal, b); changed = true; }
+    }
+    if (reached && position.w <= 0.0) {
+        vec3 ratio = surrounding_ratio(pixel, b);
+        if (ratio != vec3(1.0)) { result = b * ratio; changed = true; }
     }
     if (shown > 0.0) {
         result = mix(result, texelFetch(virtual_radiance, pixel, 0).rgb, shown);

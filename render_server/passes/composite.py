@@ -11,6 +11,7 @@ import moderngl
 from render_server.gpu.context import GpuContext
 from render_server.gpu.program import ComputeProgram
 from render_server.gpu.textures import bind_images, bind_samplers, texture_2d
+from render_server.passes.change_ratio import FILL_RADIUS, ChangeRatioPass
 from render_server.passes.direct_light import DirectLightPass
 from render_server.passes.light_table import LightTable
 from render_server.passes.picture import Picture
@@ -28,6 +29,7 @@ class RelitLayers:
     direct: DirectLightPass
     cones: ConeFields
     grid: SamplingGrid
+    change: ChangeRatioPass
     pyramid: Pyramid
     placement: VolumePlacement
     table: LightTable
@@ -40,7 +42,7 @@ class CompositePass:
         self._size = size
         self.code = texture_2d(gpu, size, 4, "u1")
         self.linear = texture_2d(gpu, size, 4, "f2")
-        self._program = ComputeProgram(gpu, Path(__file__).with_name("composite.comp.glsl"))
+        self._program = ComputeProgram(gpu, Path(__file__).with_name("composite.comp.glsl"), {"FILL_RADIUS": FILL_RADIUS})
 
     def run(self, picture: Picture, layers: RelitLayers, uniforms: dict[str, Any]) -> None:
         """Compose; geometry and surfaces must be bound."""
@@ -49,6 +51,7 @@ class CompositePass:
             {0: layers.grid.pixels, 1: picture.code, 2: picture.linear, 3: picture.response, 8: layers.matte}
             | {9: layers.virtual_radiance, 10: direct.mu, 11: direct.rho, 12: cones.mu, 13: cones.rho}
             | {14: cones.specular_mu, 16: cones.specular_rho, 17: direct.lobe_mu, 18: direct.lobe_rho}
+            | {19: layers.change.ratio, 20: layers.change.near}
         )
         bind_images(self.code, self.linear)
         self._program.run(

@@ -9,7 +9,6 @@ layout(local_size_x = 8, local_size_y = 8) in;
 layout(binding = 0, rgba16f) writeonly uniform image2D albedo_out;
 layout(binding = 13) uniform sampler2D real_light_normal;
 uniform int view_index;
-uniform int light_index;
 uniform float bias_real;      // m
 uniform float bias_virtual;   // m
 
@@ -38,7 +37,7 @@ void main() {
     if (camera_sees(p)) {
         vec3 n = normalize(texelFetch(real_light_normal, texel, 0).xyz);
         vec3 to_light; float radius;
-        light_at(lights[light_index], p, to_light, radius);
+        light_at(light_of_view(view_index), p, to_light, radius);
         if (dot(n, to_light) < 0.0) n = -n;   // what the light sees faces it
         albedo = clamp(PI * measured_radiance(p) / max(irradiance(p, n), vec3(1e-6)), ALBEDO_RANGE.x, ALBEDO_RANGE.y);
     }

@@ -27,8 +27,8 @@ class RealAlbedoPass:
         bind_images(self.atlas)
         table.real_atlas.normal.use(location=13)
         threads = (table.tile_size, table.tile_size)
-        for view, light in table.real_view_lights():
-            self._program.run(threads, view_index=view, light_index=light, **uniforms)
+        for view in range(len(table.real_views)):
+            self._program.run(threads, view_index=view, **uniforms)
 
     def release(self) -> None:
         """Free the GL objects."""

@@ -17,7 +17,6 @@ layout(binding = 13) uniform sampler2D real_light_normal;
 layout(binding = 16) uniform sampler2D virtual_light_uv;
 layout(binding = 17) uniform sampler2D virtual_light_normal;
 uniform int view_index;
-uniform int light_index;
 uniform float bias_real;   // m: how far behind the real map an object's surface may lie and still be lit
 
 const bool REAL_SET = true, VIRTUAL_SET = false;
@@ -98,5 +97,5 @@ void split(Light light, LightView view, ivec2 texel) {
 void main() {
     LightView view = light_views[view_index];
     if (any(greaterThanEqual(vec2(gl_GlobalInvocationID.xy), view.tile.zz))) return;
-    split(lights[light_index], view, ivec2(gl_GlobalInvocationID.xy) + ivec2(view.tile.xy));
+    split(light_of_view(view_index), view, ivec2(gl_GlobalInvocationID.xy) + ivec2(view.tile.xy));
 }

@@ -40,10 +40,10 @@ class SplitInjectPass:
         atlas = table.virtual_atlas
         bind_samplers({8: real_albedo, 13: table.real_atlas.normal, 16: atlas.uv, 17: atlas.normal})
         threads = (table.tile_size, table.tile_size)
-        for view, light in table.real_view_lights():
-            self._real.run(threads, view_index=view, light_index=light, **uniforms)
-        for view, light in table.virtual_view_lights():
-            self._virtual.run(threads, view_index=view, light_index=light, **uniforms)
+        for view in range(len(table.real_views)):
+            self._real.run(threads, view_index=view, **uniforms)
+        for view in range(len(table.virtual_views)):
+            self._virtual.run(threads, view_index=table.first_virtual_view + view, **uniforms)
 
     def release(self) -> None:
         """Free the programs."""

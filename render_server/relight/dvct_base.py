@@ -10,6 +10,7 @@ from jaxtyping import Float64
 
 from protocol.scene_method import DvctMethod
 from render_server.gpu.context import GpuContext
+from render_server.passes.change_ratio import ChangeRatioPass
 from render_server.passes.composite import RelitLayers
 from render_server.passes.direct_light import DirectLightPass
 from render_server.passes.light_table import LightTable
@@ -33,7 +34,6 @@ class DvctBase(ABC):
     def __init__(
         self, gpu: GpuContext, settings: DvctMethod, resolved: ResolvedDvct, size: tuple[int, int]
     ) -> None:
-        self._gpu = gpu
         self._settings = settings
         self._resolved = resolved
         self.table = LightTable(gpu, resolved.rsm_size, settings.shadow_samples)
@@ -43,6 +43,7 @@ class DvctBase(ABC):
         cones = self.directions if settings.resolved_shadow == "cone" else None
         self._direct = DirectLightPass(gpu, size, shadow_cones=cones)
         self._surface = VirtualSurfacePass(gpu, size)
+        self._change = ChangeRatioPass(gpu, self._grid.size)
         self._real_key: object = None
         self._object_key: object = None
         self._virtual_map_key: object = None
@@ -93,6 +94,7 @@ class DvctBase(ABC):
             self._direct,
             self._cones,
             self._grid,
+            self._change,
             self._joint(),
             placement,
             self.table,
@@ -150,6 +152,7 @@ class DvctBase(ABC):
         with frame.timers.measure("direct light"):
             self._joint().texture.use(location=3)
             self._direct.run(uniforms)
+            self._change.run(self._grid, self._direct, self._cones)
         with frame.timers.measure("virtual surface"):
             self._surface.run(
                 frame.matte,

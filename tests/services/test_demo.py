@@ -22,6 +22,7 @@ from services import ports
 from services.demo import RECORDING, SCENE, demo_plan, demo_scene
 from services.host import HostPlan, session_file
 from services.supervisor import Supervisor
+from services.viewer import Choice, SceneControl
 from tests.services.conftest import ROOT, RunCli
 
 pytestmark = pytest.mark.skipif(
@@ -113,6 +114,24 @@ def current_view(plan: HostPlan) -> str:
     scene = ask(plan, "get_scene")["scene"]
     assert isinstance(scene, dict)
     return str(scene["output"]["view"])
+
+
+def test_operator_and_view_are_switched_while_the_picture_runs() -> None:
+    with session_file(demo_scene("paper")) as session:
+        plan = demo_plan(session, page_port=None)
+        control = SceneControl(ports.endpoint(plan.control_port))
+        with Supervisor(plan.specs()) as supervisor:
+            receiver = Receiver([ports.endpoint(plan.composite_port)], ["composite"])
+            try:
+                wait_for_composite(supervisor, receiver, after_ns=0)
+                for choice in (Choice(operator="exact"), Choice(view="delta"), Choice(operator="paper")):
+                    chosen = control.choose(choice)
+                    assert choice.view in (None, chosen["view"])
+                    assert choice.operator in (None, chosen["operator"])
+                    wait_for_composite(supervisor, receiver, after_ns=time.time_ns())
+            finally:
+                receiver.close()
+                control.close()
 
 
 def test_ctrl_c_ends_the_demo_without_orphans_and_it_starts_again() -> None:

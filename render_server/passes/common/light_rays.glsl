@@ -1,6 +1,17 @@
 // Texels of reflective shadow maps as bundles of light rays: where they lie and how much light they hold (METHOD 4.1).
 #include "passes/common/lights.glsl"
 
+// The light that a view belongs to.
+Light light_of_view(int view) {
+    int i = 0;
+    for (; i < light_count - 1; ++i) {
+        ivec4 views = lights[i].views;
+        bool real = view >= views.x && view < views.x + views.y;
+        if (real || (view >= views.z && view < views.z + views.w)) break;
+    }
+    return lights[i];
+}
+
 vec2 texel_lateral(LightView view, ivec2 texel) {
     return (2.0 * (vec2(texel) + 0.5 - view.tile.xy) / view.tile.z - 1.0) * view.tile.w;
 }

@@ -8,12 +8,12 @@ const float OPAQUE = 0.99;   // opacity that ends a march
 // Premultiplied (c, a) as a cone along d meets it.
 vec4 cone_sample(sampler3D pyramid, vec3 q, int level, vec3 d) {
 #if DIRECTIONS == 1
-    return volume_sample(pyramid, q, level, 0);
+    return volume_sample(pyramid, volume_size, q, level, 0);
 #else
     vec3 weights = abs(d);
     ivec3 slabs = ivec3(d.x >= 0.0 ? 0 : 1, d.y >= 0.0 ? 2 : 3, d.z >= 0.0 ? 4 : 5);
-    return weights.x * volume_sample(pyramid, q, level, slabs.x) + weights.y * volume_sample(pyramid, q, level, slabs.y)
-        + weights.z * volume_sample(pyramid, q, level, slabs.z);
+    return weights.x * volume_sample(pyramid, volume_size, q, level, slabs.x) + weights.y * volume_sample(pyramid, volume_size, q, level, slabs.y)
+        + weights.z * volume_sample(pyramid, volume_size, q, level, slabs.z);
 #endif
 }
 
