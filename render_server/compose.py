@@ -19,7 +19,8 @@ from render_server.relighting import RelitFrame
 class Composer:
     """Owns the composite's textures and reads them back."""
 
-    def __init__(self, gpu: GpuContext) -> None:
+    def __init__(self, gpu: GpuContext, *, with_linear: bool) -> None:
+        self._with_linear = with_linear
         self._gpu = gpu
         self._pass: CompositePass | None = None
         self._size: tuple[int, int] | None = None
@@ -29,7 +30,7 @@ class Composer:
     def compose(
         self, relit: RelitFrame, output: Output
     ) -> tuple[UInt8[np.ndarray, "h w 3"], Float32[np.ndarray, "h w 3"] | None]:
-        """Picture in camera codes, and linear."""
+        """Picture in camera codes, and linear if that was asked for."""
         composite = self._pass_for(relit.input.view.size)
         uniforms: dict[str, Any] = {
             **relit.input.view.uniforms(),
@@ -37,6 +38,7 @@ class Composer:
             **relit.uniforms,
             "additive": relit.additive,
             "filmic": output.tone == "aces",
+            "store_linear": self._with_linear or output.view in ("effects", "delta"),
         }
         with relit.timers.measure("composite"):
             relit.input.bind_geometry()
@@ -44,7 +46,11 @@ class Composer:
         self._show_view(composite, relit, output.view)
         with relit.timers.measure("readback"):
             self._readback.push(composite.code, "u1")
-        return np.ascontiguousarray(self._readback.pop()[..., :3]), None
+            if self._with_linear:
+                self._readback.push(composite.linear, "f2")
+        color = np.ascontiguousarray(self._readback.pop()[..., :3])
+        linear = self._readback.pop()[..., :3].astype(np.float32) if self._with_linear else None
+        return color, linear
 
     def _show_view(self, composite: CompositePass, relit: RelitFrame, view: str) -> None:
         """Replace the picture by a look inside, if one is asked for."""

@@ -36,14 +36,14 @@ class CompositeFrame:
 class SceneRenderer:
     """Renders frames of one scene on one GPU context.
 
-    `notices` collects sentences that a user should read (registration, memory), each once.
+    `with_linear`: composites carry the linear picture too (for files). `notices` collects sentences that a user should read (registration, memory), each once.
     """
 
-    def __init__(self, gpu: GpuContext, scene: SceneDocument) -> None:
+    def __init__(self, gpu: GpuContext, scene: SceneDocument, *, with_linear: bool = False) -> None:
         self._gpu = gpu
         self.notices: list[str] = []
         self._relighting = Relighting(gpu, scene, self.notices)
-        self._composer = Composer(gpu)
+        self._composer = Composer(gpu, with_linear=with_linear)
         self.scene = scene
 
     def set_scene(self, scene: SceneDocument) -> None:

@@ -29,6 +29,7 @@ uniform vec3 camera_position;
 uniform bool additive;
 uniform bool filmic;             // ACES tone curve on the whole picture instead of the camera's response
 uniform bool specular_surfaces;
+uniform bool store_linear;       // for views and files; the picture itself needs only codes
 
 const vec2 ALBEDO_RANGE = vec2(0.02, 0.95);
 
@@ -164,5 +165,5 @@ void main() {
         code.rgb = uvec3(encode(x.r, 0), encode(x.g, 1), encode(x.b, 2));
     }
     imageStore(code_out, pixel, code);
-    imageStore(linear_out, pixel, vec4(result, 1.0));
+    if (store_linear) imageStore(linear_out, pixel, vec4(result, 1.0));
 }

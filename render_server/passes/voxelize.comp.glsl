@@ -90,9 +90,13 @@ void main() {
     vec3 c = volume_coordinate(corner_position(t.corners[2]));
     vec3 n = cross(b - a, c - a);
     if (dot(n, n) == 0.0) return;
-    ivec3 first = max(ivec3(floor(min(a, min(b, c)))), ivec3(0));
-    ivec3 last = min(ivec3(floor(max(a, max(b, c)))), ivec3(volume_size - 1));
-    bvec3 cut = notEqual(ivec3(floor(min(a, min(b, c)))), ivec3(floor(max(a, max(b, c)))));
+    ivec3 low = ivec3(floor(min(a, min(b, c)))), high = ivec3(floor(max(a, max(b, c))));
+    ivec3 first = max(low, ivec3(0)), last = min(high, ivec3(volume_size - 1));
+    bvec3 cut = notEqual(low, high);
+    if (!any(cut)) {   // most triangles of a depth mesh lie within one voxel
+        emit(t, vec4((a + b + c) / 3.0, 0.5 * length(n)), first, a, b, c, n);
+        return;
+    }
     for (int x = first.x; x <= last.x; ++x)
         for (int y = first.y; y <= last.y; ++y)
             for (int z = first.z; z <= last.z; ++z) {

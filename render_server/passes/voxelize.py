@@ -50,8 +50,8 @@ def _voxel_extents(
     corners: Float32[np.ndarray, "m 3 10"], placement: VolumePlacement
 ) -> tuple[Float64[np.ndarray, "m 3"], Float64[np.ndarray, "m 3"]]:
     """Lowest and highest voxel coordinates of each triangle."""
-    voxels = np.floor((corners[..., :3] - np.array(placement.origin)) / placement.voxel_edge)
-    return voxels.min(axis=1), voxels.max(axis=1)
+    a, b, c = (np.floor((corners[:, i, :3] - placement.origin) / placement.voxel_edge) for i in range(3))
+    return np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
 
 
 def triangles_in_volume(

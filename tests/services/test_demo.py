@@ -132,6 +132,7 @@ def test_operator_and_view_are_switched_while_the_picture_runs() -> None:
             finally:
                 receiver.close()
                 control.close()
+    assert supervisor.restarts() == {"sensor node": 0, "render server": 0}
 
 
 def test_ctrl_c_ends_the_demo_without_orphans_and_it_starts_again() -> None:

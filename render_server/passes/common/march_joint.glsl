@@ -5,15 +5,15 @@
 
 const float OPAQUE = 0.99;   // opacity that ends a march
 
-// Premultiplied (c, a) as a cone along d meets it.
+// Premultiplied (c, a) as a cone along d meets it. One-sided pyramids are asked for both sides: a cone that starts
+// inside an object is blocked by its far wall.
 vec4 cone_sample(sampler3D pyramid, vec3 q, int level, vec3 d) {
 #if DIRECTIONS == 1
     return volume_sample(pyramid, volume_size, q, level, 0);
 #else
-    vec3 weights = abs(d);
-    ivec3 slabs = ivec3(d.x >= 0.0 ? 0 : 1, d.y >= 0.0 ? 2 : 3, d.z >= 0.0 ? 4 : 5);
-    return weights.x * volume_sample(pyramid, volume_size, q, level, slabs.x) + weights.y * volume_sample(pyramid, volume_size, q, level, slabs.y)
-        + weights.z * volume_sample(pyramid, volume_size, q, level, slabs.z);
+    vec4 sum = vec4(0.0);
+    for (int k = 0; k < DIRECTIONS; ++k) sum += abs(d[k >> 1]) * volume_sample(pyramid, volume_size, q, level, k);
+    return sum;
 #endif
 }
 
@@ -25,6 +25,17 @@ vec2 box_interval(vec3 q, vec3 d, vec3 low, vec3 high) {
     return vec2(max(max(near.x, near.y), max(near.z, 0.0)), min(far.x, min(far.y, far.z)));
 }
 
+// One step further. Directional cells hold the share of their face that is covered, which adds up to 1 across a surface
+// however it lies between the samples (march.glsl); the marker of isotropic ones is composited as printed.
+vec4 accumulated(vec4 sum, vec4 v) {
+    float room = 1.0 - sum.a;
+#if DIRECTIONS == 1
+    return sum + room * v;
+#else
+    return sum + v * (v.a > room ? room / v.a : 1.0);
+#endif
+}
+
 // (c, a) of the cone from q (voxels) along d within `interval`; `ratio` = diameter / distance.
 vec4 march(sampler3D pyramid, vec3 q, vec3 d, float ratio, vec2 interval) {
     vec4 sum = vec4(0.0);
@@ -33,8 +44,7 @@ vec4 march(sampler3D pyramid, vec3 q, vec3 d, float ratio, vec2 interval) {
         float diameter = max(1.0, ratio * t);
         int level = min(int(floor(log2(diameter) + 0.5)), volume_levels - 1);
         float edge = exp2(float(level));
-        vec4 v = cone_sample(pyramid, q + (t + 0.5 * edge) * d, level, d);
-        sum += (1.0 - sum.a) * vec4(v.rgb, min(v.a, 1.0));
+        sum = accumulated(sum, cone_sample(pyramid, q + (t + 0.5 * edge) * d, level, d));
         t += edge;
     }
     return sum;
