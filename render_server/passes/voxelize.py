@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Float32, Float64
 
 from render_server.gpu.context import GpuContext
 from render_server.gpu.program import ComputeProgram
@@ -29,9 +28,8 @@ class VoxelizePass:
         self, store: VoxelStore, corners: Float32[np.ndarray, "m 3 10"], placement: VolumePlacement
     ) -> None:
         """Fill `store` (empty before) with the surfels of the triangles inside the volume."""
-        inside = corners[triangles_in_volume(corners, placement)]
-        pieces = split_triangles(inside, LONGEST_EDGE_VOXELS * placement.voxel_edge)
-        store.start(surfel_bound(pieces, placement))
+        pieces, bound = pieces_in_volume(corners, placement)
+        store.start(bound)
         if not len(pieces):
             return
         self._triangles.orphan(pieces.nbytes)
@@ -46,6 +44,19 @@ class VoxelizePass:
         self._triangles.release()
 
 
+def pieces_in_volume(
+    corners: Float32[np.ndarray, "m 3 10"], placement: VolumePlacement
+) -> tuple[Float32[np.ndarray, "k 3 10"], int]:
+    """Triangles that meet the volume, long ones split, and the greatest number of surfels that they can make."""
+    low, high = _voxel_extents(corners, placement)
+    met = np.all((high >= 0) & (low < placement.size), axis=1)
+    short = np.all(high - low < LONGEST_EDGE_VOXELS / 2, axis=1)
+    kept = met & short
+    split = split_triangles(corners[met & ~short], LONGEST_EDGE_VOXELS * placement.voxel_edge)
+    bound = _voxels_in(low[kept], high[kept], placement) + _voxels_in(*_voxel_extents(split, placement), placement)
+    return np.concatenate([corners[kept], split]), bound
+
+
 def _voxel_extents(
     corners: Float32[np.ndarray, "m 3 10"], placement: VolumePlacement
 ) -> tuple[Float64[np.ndarray, "m 3"], Float64[np.ndarray, "m 3"]]:
@@ -54,18 +65,9 @@ def _voxel_extents(
     return np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
 
 
-def triangles_in_volume(
-    corners: Float32[np.ndarray, "m 3 10"], placement: VolumePlacement
-) -> Bool[np.ndarray, " m"]:
-    """Which triangles' bounds meet the volume."""
-    low, high = _voxel_extents(corners, placement)
-    met: np.ndarray[Any, np.dtype[np.bool_]] = np.all((high >= 0) & (low < placement.size), axis=1)
-    return met
-
-
-def surfel_bound(corners: Float32[np.ndarray, "m 3 10"], placement: VolumePlacement) -> int:
-    """Greatest number of surfels that the triangles can make: the voxels in their bounds."""
-    if not len(corners):
-        return 0
-    low, high = (np.clip(v, 0, placement.size - 1) for v in _voxel_extents(corners, placement))
-    return int(np.prod(high - low + 1, axis=1).sum())
+def _voxels_in(
+    low: Float64[np.ndarray, "m 3"], high: Float64[np.ndarray, "m 3"], placement: VolumePlacement
+) -> int:
+    """Number of voxels in the boxes, as far as they are in the volume."""
+    first, last = (np.clip(v, 0, placement.size - 1) for v in (low, high))
+    return int(np.prod(last - first + 1, axis=1).sum())

@@ -43,7 +43,7 @@ class DeltaVolume(VoxelSets):
     def rebuild_virtual(self, frame: RelightInput, table: LightTable, uniforms: dict[str, Any]) -> None:
         """Voxelise the objects, inject the light of all maps, filter."""
         with frame.timers.measure("voxelize"):
-            self._voxelize_virtual(frame.virtual.corners, [self.delta, self.rho])
+            self._voxelize_virtual(frame.virtual, [self.delta, self.rho])
         with frame.timers.measure("split inject"):
             bind_lighting(frame, table)
             lighting = lighting_uniforms(frame, uniforms)

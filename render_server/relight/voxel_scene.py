@@ -111,7 +111,7 @@ class VoxelScene(VoxelSets):
         """Voxelise and light the objects, change the light of real surfaces, filter the rho set."""
         timers = frame.timers
         with timers.measure("voxelize"):
-            self._voxelize_virtual(frame.virtual.corners, [self.rho])
+            self._voxelize_virtual(frame.virtual, [self.rho])
         with timers.measure("light voxels"):
             bind_lighting(frame, table)
             lighting = lighting_uniforms(frame, uniforms)

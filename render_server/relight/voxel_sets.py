@@ -15,7 +15,7 @@ from render_server.passes.light_voxels import bind_picture
 from render_server.passes.volume import Pyramid, VolumePlacement
 from render_server.passes.voxel_store import VoxelStore
 from render_server.passes.voxelize import VoxelizePass
-from render_server.relight.frame import RelightInput
+from render_server.relight.frame import GeometryState, RelightInput
 
 SURFEL_SHADOW_SAMPLES = 4  # of a light's area: a voxel averages many surfels
 DEPTH_TOLERANCE = 0.02  # a surfel this near (relative) to what the camera sees is what it sees
@@ -31,6 +31,7 @@ class VoxelSets:
         self._virtual = VoxelStore(gpu, placement.size)
         self._voxelize = VoxelizePass(gpu)
         self._clear = ClearVoxelsPass(gpu, directions)
+        self._virtual_version: int | None = None
 
     def _voxelize_real(
         self,
@@ -38,18 +39,26 @@ class VoxelSets:
         placement: VolumePlacement,
         pyramids: Sequence[Pyramid],
     ) -> None:
-        """Replace both sets by the real scene at `placement`; the pyramids lose their old texels."""
-        self._clear.run(self._virtual, pyramids, self.placement)
+        """Replace the real set; the pyramids lose its old texels. The objects go too if the volume moved."""
+        if placement != self.placement:
+            self._clear.run(self._virtual, pyramids, self.placement)
+            self._virtual_version = None
         self._clear.run(self._real, pyramids, self.placement)
         self.placement = placement
         self._voxelize.run(self._real, corners, placement)
 
     def _voxelize_virtual(
-        self, corners: Float32[np.ndarray, "m 3 10"], pyramids: Sequence[Pyramid]
+        self, virtual: GeometryState, pyramids: Sequence[Pyramid]
     ) -> None:
-        """Replace the objects; the pyramids lose the texels of the old ones."""
+        """Replace the objects; the pyramids lose the texels of the old ones. Objects that stood still keep their
+        voxels, only their light is forgotten.
+        """
+        if virtual.version == self._virtual_version:
+            self._virtual.sums.clear()
+            return
+        self._virtual_version = virtual.version
         self._clear.run(self._virtual, pyramids, self.placement)
-        self._voxelize.run(self._virtual, corners, self.placement)
+        self._voxelize.run(self._virtual, virtual.corners, self.placement)
 
     def counts(self) -> dict[str, tuple[int, int]]:
         """Touched voxels and surfels of both sets; waits for the GPU."""

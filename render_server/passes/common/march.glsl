@@ -1,9 +1,9 @@
 // Cone marching with two transmittances through the same voxels (METHOD 3, exact operator).
 //
-// Along a ray, a cell of coverage a (seen along k) is crossed a |D_k| times per cell edge; the crossings of one plane
-// add up to 1 however the plane lies between the samples. So coverage is summed, and a cone is blocked when the sum
-// reaches 1. (Front-to-back products of a one-voxel shell let e^-2 of the light through at any step: no furnace test
-// could hold.)
+// A ray walks from slice to slice of cells across its main axis and samples the middle of each, so that every cell is
+// met once, also where the level changes. The coverage that it meets is summed and a cone is blocked when the sum is
+// that of a wall. (Front-to-back products of a one-voxel shell let e^-2 of the light through at any step: no furnace
+// test could hold.)
 #include "passes/common/volume.glsl"
 
 layout(binding = 2) uniform sampler3D pyramid_mu;
@@ -15,83 +15,131 @@ uniform int far_size;         // voxels an edge
 uniform int far_levels;
 layout(std430, binding = 9) readonly buffer Support { int support[6]; };   // voxels where mu and rho differ: min, -max
 
-const float OPAQUE = 0.01;   // transmittance that ends a march
-const float STEP = 1.0;      // march step in cell edges of the sampled level
+// A wall's summed coverage scatters about 1 with its slant and place on the grid (2/3..4/3 at 45 degrees) and with
+// changes of level and other walls (down to 1/2). Below, the sum is the share of the cone that is covered.
+const float PARTLY = 0.4;
+const float WALL = 0.5;
 
 struct March { vec3 c_mu; float t_mu; vec3 c_rho; float t_rho; };
 
-ivec3 facing_slabs(vec3 d) { return ivec3(d.x >= 0.0 ? 0 : 1, d.y >= 0.0 ? 2 : 3, d.z >= 0.0 ? 4 : 5); }
+struct Crossed { vec3 c; float coverage; };   // radiance gathered, coverage met so far
 
-vec4 directional_sample(sampler3D pyramid, int n, vec3 q, int level, ivec3 slabs, vec3 weights) {
-    return weights.x * volume_sample(pyramid, n, q, level, slabs.x)
-         + weights.y * volume_sample(pyramid, n, q, level, slabs.y)
-         + weights.z * volume_sample(pyramid, n, q, level, slabs.z);
+float blocked_share(float coverage) {
+    return coverage < PARTLY ? coverage : min(PARTLY + (coverage - PARTLY) * (1.0 - PARTLY) / (WALL - PARTLY), 1.0);
 }
 
-void accumulate(vec4 crossed, inout vec3 c, inout float t) {
-    float taken = crossed.a > t ? t / crossed.a : 1.0;
-    c += taken * crossed.rgb;
-    t = max(t - taken * crossed.a, 0.0);
+void cross_cell(vec4 cell, inout Crossed sum) {
+    if (cell.a <= 0.0) return;
+    float taken = blocked_share(sum.coverage + cell.a) - blocked_share(sum.coverage);
+    sum.c += cell.rgb * (taken / cell.a);
+    sum.coverage += cell.a;
 }
 
-int level_for(float diameter, int levels) { return clamp(int(floor(log2(max(diameter, 1.0)) + 0.5)), 0, levels - 1); }
+// A ray through a grid; its coordinate on the main axis is mirrored so that it grows.
+struct Walk {
+    vec3 from;       // cells of level 0
+    float first;     // main coordinate of `from`
+    vec3 slope;      // direction, 1 on the main axis
+    float stretch;   // distance a cell of the main axis
+    ivec3 facing;    // slabs that the ray sees from the front
+    int plane;       // where the next slice begins
+    int level;
+};
 
-bool blocked(March m, bool only_rho) { return max(only_rho ? 0.0 : m.t_mu, m.t_rho) < OPAQUE; }
+Walk walk_from(vec3 q, vec3 d) {
+    vec3 a = abs(d);
+    int axis = a.x >= a.y && a.x >= a.z ? 0 : (a.y >= a.z ? 1 : 2);
+    float first = d[axis] >= 0.0 ? q[axis] : -q[axis];
+    ivec3 facing = ivec3(d.x >= 0.0 ? 0 : 1, d.y >= 0.0 ? 2 : 3, d.z >= 0.0 ? 4 : 5);
+    return Walk(q, first, d / a[axis], 1.0 / a[axis], facing, int(ceil(first - 0.5)), 0);
+}
 
-// Through the volume around the objects, from q (voxels); returns the distance travelled (voxels).
-float march_near(vec3 q, vec3 d, float ratio, bool only_rho, inout March m) {
-    vec3 weights = abs(d);
-    ivec3 slabs = facing_slabs(d);
+float middle(Walk w) { return float(w.plane) + 0.5 * float(1 << w.level) - w.first; }
+
+float travelled(Walk w) { return max(float(w.plane) - w.first, 0.0) * w.stretch; }
+
+// Cells grow, at most twofold a slice, to half..all of the cone's diameter, where a slice begins that is whole on the
+// coarser level too. `before`: what the cone had travelled ahead of this walk, cells of level 0.
+void choose_level(inout Walk w, float ratio, float before, int levels) {
+    int wide = 2 << w.level;
+    bool whole = w.level + 1 < levels && (w.plane & (wide - 1)) == 0;
+    if (whole && ratio * (before + middle(w) * w.stretch) >= float(wide)) ++w.level;
+}
+
+// Coverage and radiance that the ray meets in one slice. Of all surfaces in a cell, f and b are known: their area
+// towards and away from the ray along each axis. The net area n.d is exact; what a closed lump adds to it on the
+// side that the ray sees is at most half of `round` (exact for a sphere) and of the pairs min(f, b) (exact, 0, for a
+// plane: no surface hides itself).
+vec4 directional_sample(sampler3D pyramid, int n, vec3 q, Walk w) {
+    vec4 x = volume_sample(pyramid, n, q, w.level, w.facing.x);
+    vec4 y = volume_sample(pyramid, n, q, w.level, w.facing.y);
+    vec4 z = volume_sample(pyramid, n, q, w.level, w.facing.z);
+    vec3 weights = abs(w.slope);
+    vec4 most = weights.x * x + weights.y * y + weights.z * z;
+    if (most.a <= 0.0) return vec4(0.0);
+    vec3 f = vec3(x.a, y.a, z.a);
+    vec3 b = vec3(
+        volume_sample(pyramid, n, q, w.level, w.facing.x ^ 1).a,
+        volume_sample(pyramid, n, q, w.level, w.facing.y ^ 1).a,
+        volume_sample(pyramid, n, q, w.level, w.facing.z ^ 1).a);
+    float net = dot(weights, f - b);
+    float round = 0.5 * (net + max(abs(net), length(weights * (f + b))));
+    float paired = max(net, 0.0) + length(weights * min(f, b));
+    return most * min(min(round, paired) / most.a, 1.0);
+}
+
+// Through the volume around the objects, from q (voxels), until a wall or the volume's end at distance t (voxels).
+// `differs`: the way led through cells where mu and rho are not the same.
+Crossed march_near(sampler3D pyramid, vec3 q, vec3 d, float ratio, out float t, out bool differs) {
+    Crossed sum = Crossed(vec3(0.0), 0.0);
+    Walk w = walk_from(q, d);
     vec3 low = vec3(support[0], support[1], support[2]);
     vec3 high = vec3(-support[3], -support[4], -support[5]) + 1.0;
-    float t = 0.0;
+    differs = false;
+    for (int i = 0; i < 1024; ++i) {
+        choose_level(w, ratio, 0.0, volume_levels);
+        vec3 at = q + middle(w) * w.slope;
+        if (!inside_volume(at) || sum.coverage >= WALL) break;
+        vec3 reach = vec3(1.5 * float(1 << w.level));
+        differs = differs || (all(greaterThan(at, low - reach)) && all(lessThan(at, high + reach)));
+        cross_cell(directional_sample(pyramid, volume_size, at, w), sum);
+        w.plane += 1 << w.level;
+    }
+    t = travelled(w);
+    return sum;
+}
+
+// On through the coarse real scene, from q after a distance `before` (both in its voxels).
+void march_far(vec3 q, vec3 d, float before, float ratio, inout Crossed sum) {
+    Walk w = walk_from(q, d);
+    for (int i = 1; i < far_levels; ++i) choose_level(w, ratio, before, far_levels);
     for (int i = 0; i < 256; ++i) {
-        int level = level_for(ratio * t, volume_levels);
-        float edge = exp2(float(level));
-        float stride = STEP * edge;
-        vec3 at = q + (t + 0.5 * stride) * d;
-        if (!inside_volume(at)) break;
-        vec4 rho = STEP * directional_sample(pyramid_rho, volume_size, at, level, slabs, weights);
-        if (!only_rho) {
-            bool differs = all(greaterThan(at, low - 1.5 * edge)) && all(lessThan(at, high + 1.5 * edge));
-            vec4 mu = differs ? STEP * directional_sample(pyramid_mu, volume_size, at, level, slabs, weights) : rho;
-            accumulate(mu, m.c_mu, m.t_mu);
-        }
-        accumulate(rho, m.c_rho, m.t_rho);
-        if (blocked(m, only_rho)) break;
-        t += stride;
-    }
-    return t;
-}
-
-// On through the coarse real scene, from q after a distance t (both in its voxels).
-void march_far(vec3 q, vec3 d, float t, float ratio, bool only_rho, inout March m) {
-    vec3 weights = abs(d);
-    ivec3 slabs = facing_slabs(d);
-    float travelled = 0.0;
-    for (int i = 0; i < 128; ++i) {
-        int level = level_for(ratio * (t + travelled), far_levels);
-        float stride = STEP * exp2(float(level));
-        vec3 at = q + (travelled + 0.5 * stride) * d;
-        if (!inside_cube(at, far_size)) break;
-        vec4 real = STEP * directional_sample(pyramid_far, far_size, at, level, slabs, weights);
-        if (!only_rho) accumulate(real, m.c_mu, m.t_mu);
-        accumulate(real, m.c_rho, m.t_rho);
-        if (blocked(m, only_rho)) break;
-        travelled += stride;
+        choose_level(w, ratio, before, far_levels);
+        vec3 at = q + middle(w) * w.slope;
+        if (!inside_cube(at, far_size) || sum.coverage >= WALL) break;
+        cross_cell(directional_sample(pyramid_far, far_size, at, w), sum);
+        w.plane += 1 << w.level;
     }
 }
 
-// Both marches from q (voxels) along d; `ratio` = cone diameter / distance. With `only_rho`, mu is left out.
-March march(vec3 q, vec3 d, float ratio, bool only_rho) {
-    March m = March(vec3(0.0), 1.0, vec3(0.0), 1.0);
-    float t = march_near(q, d, ratio, only_rho, m);
-    if (far_size > 0 && !blocked(m, only_rho)) {
-        float scale = voxel_edge / far_edge;
+// One march from q (voxels) along d, on into the coarse scene.
+Crossed march_one(sampler3D pyramid, vec3 q, vec3 d, float ratio, out bool differs) {
+    float t;
+    Crossed sum = march_near(pyramid, q, d, ratio, t, differs);
+    if (far_size > 0 && sum.coverage < WALL) {
         vec3 leave = (volume_origin + (q + t * d) * voxel_edge - far_origin) / far_edge;
         // A surface that starts the march outside of the volume must not meet its own coarse voxels.
         float skip = t > 0.0 ? 0.0 : 1.5;
-        march_far(leave + skip * d, d, t * scale + skip, ratio, only_rho, m);
+        march_far(leave + skip * d, d, t * voxel_edge / far_edge + skip, ratio, sum);
     }
-    return m;
+    return sum;
+}
+
+// Both marches from q (voxels) along d; `ratio` = cone diameter / distance. With `only_rho`, mu is that of rho.
+March march(vec3 q, vec3 d, float ratio, bool only_rho) {
+    bool differs;
+    Crossed rho = march_one(pyramid_rho, q, d, ratio, differs);
+    Crossed mu = rho;
+    if (differs && !only_rho) mu = march_one(pyramid_mu, q, d, ratio, differs);
+    return March(mu.c, 1.0 - blocked_share(mu.coverage), rho.c, 1.0 - blocked_share(rho.coverage));
 }
