@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import moderngl
 import numpy as np
-from jaxtyping import Bool, Float64, Int16
+from jaxtyping import Bool, Float64
 
 from protocol.frames import ViewFrame, decode_lut
 from render_server.passes.composite import RelitLayers
@@ -27,7 +27,7 @@ Relight = Callable[[RelightInput], RelitLayers]
 
 @dataclass(frozen=True, eq=False)
 class _Samples:
-    """What is known at the pixels that stand for the reduced grid; all linear RGB."""
+    """What is known at pixels that show real surfaces; all linear RGB."""
 
     measured: Float64[np.ndarray, "k 3"]
     light: Float64[np.ndarray, "k 3"]
@@ -59,31 +59,33 @@ def register_lights(frame: ViewFrame, scene: RelightInput, relight: Relight) -> 
 
 
 def _samples(frame: ViewFrame, scene: RelightInput, relight: Relight) -> _Samples:
-    """Read the fields back at the grid's pixels."""
+    """Read the fields back where the real scene is in view; cones are those of the pixel's texel of the grid."""
     black = replace(scene.lights, environment=np.zeros_like(scene.lights.environment))
     without = relight(replace(scene, lights=black, lights_version=scene.lights_version + 1, everywhere=True))
     bounce = _read(without.cones.mu)[..., :3]
     layers = relight(replace(scene, everywhere=True))
     cones, direct = _read(layers.cones.mu), _read(layers.direct.mu)
-    pixels: Int16[np.ndarray, "h w 4"] = np.frombuffer(layers.grid.pixels.read(), np.int16).reshape(
-        *cones.shape[:2], 4
-    )
-    present = (pixels[..., 0] >= 0) & (cones[..., 3] > 0)
-    x, y = pixels[present][:, 0], pixels[present][:, 1]
+    rows, columns = (np.arange(n) // layers.grid.scale for n in direct.shape[:2])
+    known = _read(scene.real_surface.position)[..., 3] > 0
+    shown = known & (_read(scene.matte)[..., 0] == 0) & (cones[np.ix_(rows, columns)][..., 3] > 0)
+    y, x = np.nonzero(shown)
     coded = decode_lut(frame.response)[frame.color, np.arange(3)]
-    at_pixel = direct[y, x]
-    mask = paper_pixels(frame.board, frame.camera, frame.pose) if frame.board and frame.pose else None
+    own, reflected = direct[y, x], bounce[rows[y], columns[x]]
+    on_paper = np.zeros(known.shape, bool)
+    if frame.board is not None and frame.pose is not None:
+        on_paper = paper_pixels(frame.board, frame.camera, frame.pose)
     return _Samples(
         (coded / frame.exposure_scale)[y, x],
-        at_pixel[:, :3] + cones[present][:, :3] - bounce[present],
-        bounce[present],
+        own[:, :3] + cones[rows[y], columns[x]][:, :3] - reflected,
+        reflected,
         unclipped(frame.color, coded)[y, x],
-        at_pixel[:, :3].mean(axis=1) >= UNSHADOWED * at_pixel[:, 3],
-        np.zeros(len(x), bool) if mask is None else mask[y, x],
+        own[:, :3].mean(axis=1) >= UNSHADOWED * own[:, 3],
+        on_paper[y, x],
     )
 
 
 def _read(texture: moderngl.Texture) -> Float64[np.ndarray, "h w c"]:
-    """Contents of an RGBA16F texture."""
+    """Contents of a half-float or float texture."""
     width, height = texture.size
-    return np.frombuffer(texture.read(), np.float16).reshape(height, width, -1).astype(np.float64)
+    dtype = np.float16 if texture.dtype == "f2" else np.float32
+    return np.frombuffer(texture.read(), dtype).reshape(height, width, -1).astype(np.float64)

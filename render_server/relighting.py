@@ -76,7 +76,8 @@ class Relighting:
         if not isinstance(scene.method, DvctMethod):
             raise DeltalightError(f"method `{scene.method.name}` arrives with a later release: use dvct.")
         resolved = resolve_dvct(scene.method, software=self._gpu.is_software)
-        self._say(memory_statement(resolved.volume_size, OPERATORS[scene.method.operator].directions, scene.method.memory_budget_mb))
+        directions = OPERATORS[scene.method.operator].directions
+        self._say(memory_statement(resolved.volume_size, directions, scene.method.memory_budget_mb))
         self._objects.load(scene.objects)
         return _Plan(scene, scene.method, resolved, build_lights(scene.lights))
 

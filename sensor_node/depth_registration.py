@@ -7,6 +7,8 @@ from protocol.camera_model import CameraModel
 from protocol.frames import DepthImage
 from sensor_node.depth import known_pixels
 
+# Pixels are taken a little larger than they are: lenses and slopes stretch some.
+FOOTPRINT_MARGIN = 1.2
 # A pixel this much larger in the colour picture would mean a calibration in the wrong unit.
 MAX_FOOTPRINT_PX = 8
 
@@ -30,7 +32,7 @@ def register_depth(
     points = np.column_stack([rays * depth_m[:, None], depth_m])
     points = points @ color_from_depth[:3, :3].T + color_from_depth[:3, 3]
     # Half the side of a depth pixel's square as the colour camera sees it.
-    growth = color_camera.matrix[0, 0] / depth.camera.matrix[0, 0]
+    growth = FOOTPRINT_MARGIN * color_camera.matrix[0, 0] / depth.camera.matrix[0, 0]
     half = np.clip(growth * depth_m / np.maximum(points[:, 2], 1e-6), 1, MAX_FOOTPRINT_PX) / 2
     registered = _splat(color_camera, points, half)
     known = np.isfinite(registered)

@@ -140,8 +140,8 @@ class _Node:
             state="stopping" if is_ending else state,
             detail=detail,
             rates={
-                "frames": self._frames / elapsed_s,
-                "frames without board": self._without_board / elapsed_s,
+                "fps": self._frames / elapsed_s,
+                "without_board": self._without_board / elapsed_s,
             },
             drops={"capture": drops},
         )

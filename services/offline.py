@@ -98,7 +98,7 @@ def run_job(job: RenderJob, progress: Progress) -> RenderSummary:
     gpu = create_context(job.device, allow_software=True)
     try:
         progress.renderer(gpu.renderer_name, is_software=gpu.is_software)
-        renderer = SceneRenderer(gpu, job.scene)
+        renderer = SceneRenderer(gpu, job.scene, with_linear=job.with_exr)
         try:
             return _render_frames(job, renderer, RenderSummary(gpu.renderer_name, job.out), progress)
         finally:

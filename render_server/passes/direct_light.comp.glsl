@@ -38,7 +38,8 @@ void main() {
     float bias = 3.0 * noise_sigma * position.w * position.w;
     // Where neither cones nor shadows of the objects reach, the picture stays as it is.
     bool reached = position.w > 0.0
-        && (everywhere || inside_volume(volume_coordinate(position.xyz)) || shadow_may_reach(position.xyz, normal.xyz, bias));
+        && (everywhere || inside_volume(volume_coordinate(position.xyz))
+            || shadow_may_reach(position.xyz, normal.xyz, bias));
     if (reached) {
         vec3 v = normalize(camera_position - position.xyz);
         for (int i = 0; i < light_count; ++i) {

@@ -13,8 +13,8 @@ from render_server.gpu.textures import bind_images, texture_2d
 class DirectLightPass:
     """E_mu and E_rho of the lights (RGBA16F), and their lobes on declared specular surfaces.
 
-    With `shadow_cones` the objects' shadows come from cones through the voxels ([P1] eq. 4) of a pyramid of so many
-    directions, bound to unit 3; without, from the shadow maps.
+    With `shadow_cones` the objects' shadows come from cones through the voxels ([P1] eq. 4) of a pyramid of
+    so many directions, bound to unit 3; without, from the shadow maps.
     """
 
     def __init__(self, gpu: GpuContext, size: tuple[int, int], *, shadow_cones: int | None = None) -> None:

@@ -14,13 +14,16 @@ uniform float bias_virtual;   // m
 
 const vec2 ALBEDO_RANGE = vec2(0.02, 0.95);
 
+// Real direct and ambient light. The light whose map this is reaches its texels by what the map is.
 vec3 irradiance(vec3 p, vec3 n) {
     vec3 e = environment_irradiance(n);
     for (int i = 0; i < light_count; ++i) {
+        bool own = i == light_of_view(view_index);
         vec3 to_light; float radius;
         vec3 across = light_at(lights[i], p, to_light, radius);
         float cosine = dot(n, to_light);
-        if (cosine > 0.0) e += across * cosine * visibility(lights[i], p, n, bias_real, bias_virtual).x;
+        if (cosine <= 0.0) continue;
+        e += across * cosine * (own ? 1.0 : visibility(lights[i], p, n, bias_real, bias_virtual).x);
     }
     return e;
 }
@@ -37,7 +40,7 @@ void main() {
     if (camera_sees(p)) {
         vec3 n = normalize(texelFetch(real_light_normal, texel, 0).xyz);
         vec3 to_light; float radius;
-        light_at(light_of_view(view_index), p, to_light, radius);
+        light_at(lights[light_of_view(view_index)], p, to_light, radius);
         if (dot(n, to_light) < 0.0) n = -n;   // what the light sees faces it
         albedo = clamp(PI * measured_radiance(p) / max(irradiance(p, n), vec3(1e-6)), ALBEDO_RANGE.x, ALBEDO_RANGE.y);
     }

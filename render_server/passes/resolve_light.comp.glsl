@@ -17,7 +17,10 @@ void main() {
         uint other = other_grid[voxel];
         if (skip_shared && other != 0u) continue;
         int sums[6];
-        for (int j = 0; j < 6; ++j) sums[j] = light[i * 6u + uint(j)] + (other == 0u ? 0 : other_light[(other - 1u) * 6u + uint(j)]);
+        for (uint j = 0u; j < 6u; ++j) {
+            sums[j] = light[i * 6u + j];
+            if (other != 0u) sums[j] += other_light[(other - 1u) * 6u + j];
+        }
         ivec3 v = voxel_of_index(voxel, volume_size);
         imageStore(delta, v, vec4(vec3(sums[0], sums[1], sums[2]) / FIXED_POINT, 1.0));
         imageStore(rho, v, vec4(vec3(sums[3], sums[4], sums[5]) / FIXED_POINT, 1.0));

@@ -97,5 +97,5 @@ void split(Light light, LightView view, ivec2 texel) {
 void main() {
     LightView view = light_views[view_index];
     if (any(greaterThanEqual(vec2(gl_GlobalInvocationID.xy), view.tile.zz))) return;
-    split(light_of_view(view_index), view, ivec2(gl_GlobalInvocationID.xy) + ivec2(view.tile.xy));
+    split(lights[light_of_view(view_index)], view, ivec2(gl_GlobalInvocationID.xy) + ivec2(view.tile.xy));
 }

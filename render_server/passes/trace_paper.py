@@ -32,7 +32,7 @@ class TracePaperPass:
         linear_picture: moderngl.Texture,
         uniforms: dict[str, Any],
     ) -> None:
-        """`mu` = ambient irradiance without occlusion, `rho` = `mu` + C_delta; the specular cones likewise."""
+        """Ambient irradiance without occlusion (mu), the same with C_delta (rho), and the specular cones."""
         bind_samplers({0: grid.pixels, 3: delta.texture, 8: linear_picture})
         bind_images(fields.mu, fields.rho, fields.specular_mu, fields.specular_rho)
         self._real.run(grid.size, low_resolution_size=grid.size, **uniforms)

@@ -1,4 +1,4 @@
-"""What both operators of delta voxel cone tracing share: lights, light maps, when to rebuild, shading (METHOD 4)."""
+"""What both operators of delta voxel cone tracing share: lights, maps, when to rebuild (METHOD 4)."""
 
 from __future__ import annotations
 

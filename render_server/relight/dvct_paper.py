@@ -15,7 +15,7 @@ from render_server.relight.frame import RelightInput
 
 
 class DvctPaper(DvctBase):
-    """Split-inject into V_delta and V_rho, visibility from the joint V_eta, nine diffuse cones."""
+    """Split-inject into V_delta and V_rho (`volume`), visibility from the joint V_eta, nine diffuse cones."""
 
     directions = DIRECTIONS
 
@@ -24,22 +24,22 @@ class DvctPaper(DvctBase):
     ) -> None:
         super().__init__(gpu, settings, resolved, size)
         self._tracing = TracePaperPass(gpu)
-        self._voxels = DeltaVolume(gpu, VolumePlacement((0.0, 0.0, 0.0), 1.0, resolved.volume_size))
+        self.volume = DeltaVolume(gpu, VolumePlacement((0.0, 0.0, 0.0), 1.0, resolved.volume_size))
 
     def _rebuild_real(
         self, frame: RelightInput, placement: VolumePlacement, uniforms: dict[str, Any]
     ) -> None:
-        self._voxels.rebuild_real(frame, self.table, placement, uniforms)
+        self.volume.rebuild_real(frame, self.table, placement, uniforms)
 
     def _rebuild_virtual(self, frame: RelightInput, uniforms: dict[str, Any]) -> None:
-        self._voxels.rebuild_virtual(frame, self.table, uniforms)
+        self.volume.rebuild_virtual(frame, self.table, uniforms)
 
     def _trace(self, frame: RelightInput, uniforms: dict[str, Any]) -> None:
-        delta, rho = self._voxels.delta, self._voxels.rho
+        delta, rho = self.volume.delta, self.volume.rho
         with frame.timers.measure("cones real"):
             self._tracing.trace_real(self._cones, self._grid, delta, frame.picture.linear, uniforms)
         with frame.timers.measure("cones virtual"):
             self._tracing.trace_virtual(self._cones, self._grid, rho, uniforms)
 
     def _joint(self) -> Pyramid:
-        return self._voxels.rho
+        return self.volume.rho

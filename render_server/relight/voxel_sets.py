@@ -47,11 +47,10 @@ class VoxelSets:
         self.placement = placement
         self._voxelize.run(self._real, corners, placement)
 
-    def _voxelize_virtual(
-        self, virtual: GeometryState, pyramids: Sequence[Pyramid]
-    ) -> None:
-        """Replace the objects; the pyramids lose the texels of the old ones. Objects that stood still keep their
-        voxels, only their light is forgotten.
+    def _voxelize_virtual(self, virtual: GeometryState, pyramids: Sequence[Pyramid]) -> None:
+        """Replace the objects; the pyramids lose the texels of the old ones.
+
+        Objects that stood still keep their voxels, only their light is forgotten.
         """
         if virtual.version == self._virtual_version:
             self._virtual.sums.clear()

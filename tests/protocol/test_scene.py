@@ -119,6 +119,22 @@ def test_the_papers_operator_composes_additively_unless_told() -> None:
     assert isinstance(parse_scene({"method": {"name": "none"}}).method, NoneMethod)
 
 
+@pytest.mark.parametrize(
+    ("method", "shadow"),
+    [
+        ({}, "map"),
+        ({"operator": "paper"}, "cone"),
+        ({"operator": "paper", "shadow": "map"}, "map"),
+        ({"shadow": "cone"}, "cone"),
+        ({"operator": "paper", "shadow": None}, "cone"),
+    ],
+)
+def test_the_papers_operator_casts_shadow_cones_unless_told(method: dict[str, Any], shadow: str) -> None:
+    parsed = parse_scene({"method": method}).method
+    assert isinstance(parsed, DvctMethod)
+    assert parsed.resolved_shadow == shadow
+
+
 def test_directions_and_quaternions_are_normalised_once() -> None:
     scene = parse_scene(
         {**lights(type="spot", direction=[0, 3, 4]), **an_object(pose={"rotation_wxyz": [2, 0, 0, 2]})}

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from protocol.camera_model import CameraModel
 from protocol.clock import CLOCK_OP, clock_payload
 from protocol.codecs import decode_color, decode_depth
 from protocol.dataset_writer import DatasetWriter
@@ -27,6 +28,7 @@ from protocol.messages import (
 from protocol.receiver import Receiver
 from protocol.transport import ReplyServer
 from sensor_node.cameras.synthetic import SyntheticCamera, default_camera
+from sensor_node.capture import CaptureThread
 from sensor_node.frame_messages import depth_multipart, fitting_step_m
 from sensor_node.node import NodeConfig, run_node
 from tests.sensor_node.conftest import pose_difference
@@ -147,23 +149,36 @@ def test_colour_comes_after_what_belongs_to_it(endpoint: str, take: Path) -> Non
     assert order[start : start + 4] == ["depth", "clean_depth", "pose", "color"]
 
 
-def test_every_frame_of_a_source_goes_out_when_it_is_not_in_real_time(take: Path, endpoint: str) -> None:
-    config = NodeConfig(source=str(take), endpoint=endpoint, realtime=False, loop=False, color_encoding="raw")
-    receiver = Receiver([endpoint], ["color", "stats"])
-    stop = threading.Event()
-    thread = threading.Thread(target=run_node, args=(config, stop))
-    time.sleep(0.3)
-    thread.start()
-    messages = collect(
-        receiver, lambda got: any(isinstance(m, StatsMessage) and m.state == "stopping" for m, _ in got)
-    )
-    thread.join(5)
-    assert not thread.is_alive()
-    receiver.close()
-    last = max((m for m, _ in messages if isinstance(m, ColorMessage)), key=lambda message: message.frame_id)
-    assert last.frame_id == 5
-    picture = next(parts for message, parts in messages if message is last)[0]
-    assert decode_color(picture, last.encoding, last.shape).shape == (480, 640, 3)
+def test_a_node_ends_with_its_source_and_sends_raw_pictures_if_asked(take: Path, endpoint: str) -> None:
+    run_node(NodeConfig(source=str(take), endpoint=endpoint, realtime=False, loop=False), threading.Event())
+    with running(NodeConfig(source=str(take), endpoint=endpoint, color_encoding="raw")):
+        receiver = Receiver([endpoint], ["color"])
+        messages = collect(receiver, lambda got: len(got) > 0)
+        receiver.close()
+    message, parts = messages[0]
+    assert isinstance(message, ColorMessage)
+    picture = decode_color(parts[0], "raw", message.shape)
+    jpegs = sorted((take / "rgb").glob("*.jpg"))
+    expected = cv2.cvtColor(cv2.imread(str(jpegs[message.frame_id % 6])), cv2.COLOR_BGR2RGB)
+    np.testing.assert_array_equal(picture, expected)
+
+
+def test_a_capture_thread_keeps_all_or_the_newest() -> None:
+    def captured(*, keep_all: bool) -> tuple[list[int], int]:
+        camera = SyntheticCamera(camera=CameraModel(64, 48, np.diag([50.0, 50, 1])), loop=False)
+        ids = []
+        with camera, CaptureThread(camera, keep_all=keep_all) as capture:
+            while not capture.ended:
+                time.sleep(0 if keep_all else 0.02)
+                taken = capture.take(0.1)
+                ids += [] if taken is None else [taken.frame.frame_id]
+        return ids, capture.drops
+
+    assert captured(keep_all=True) == (list(range(90)), 0)
+    ids, drops = captured(keep_all=False)
+    assert len(ids) + drops == 90
+    assert drops > 0
+    assert ids == sorted(ids)
 
 
 def test_the_servers_clock_is_followed(take: Path, endpoint: str, tmp_path: Path) -> None:

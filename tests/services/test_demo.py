@@ -188,3 +188,17 @@ def wait_until(condition: Callable[[], bool]) -> None:
     while not condition():
         assert time.monotonic() < deadline_s
         time.sleep(0.1)
+
+
+def test_bench_speed_reports_every_pass(cli: RunCli, tmp_path: Path) -> None:
+    report = tmp_path / "speed.json"
+    options = ("--methods", "paper", "--frames", 1, "--size", "160x120", "--no-end-to-end", "--json")
+    done = cli("bench", "speed", *options, "--out", report, timeout_s=PATIENCE_S)
+    assert done.returncode == 0, done.stderr
+    figures = json.loads(done.stdout)
+    assert figures == json.loads(report.read_text())
+    assert figures["size"] == [160, 120]
+    paper = figures["methods"]["paper"]
+    assert paper["passes"]
+    assert paper["frames_per_s"] > 0
+    assert any("MB" in notice for notice in paper["notices"])

@@ -1,15 +1,15 @@
 // Texels of reflective shadow maps as bundles of light rays: where they lie and how much light they hold (METHOD 4.1).
 #include "passes/common/lights.glsl"
 
-// The light that a view belongs to.
-Light light_of_view(int view) {
+// Index of the light that a view belongs to.
+int light_of_view(int view) {
     int i = 0;
     for (; i < light_count - 1; ++i) {
         ivec4 views = lights[i].views;
         bool real = view >= views.x && view < views.x + views.y;
         if (real || (view >= views.z && view < views.z + views.w)) break;
     }
-    return lights[i];
+    return i;
 }
 
 vec2 texel_lateral(LightView view, ivec2 texel) {
@@ -46,7 +46,7 @@ Hit first_hit(sampler2D map, int first, int count, vec3 p) {
     if (count == 0) return hit;
     hit.view = light_views[view_containing(first, count, p)];
     vec3 v = (hit.view.view_from_world * vec4(p, 1.0)).xyz;
-    if (v.z <= 0.0) return hit;
+    if (v.z <= 0.0 && hit.view.range.z < 0.5) return hit;   // parallel rays come from before the view too
     hit.ray_depth = v.z;
     hit.s = lateral(hit.view, v);
     vec2 t = tile_texel(hit.view, hit.s);

@@ -130,6 +130,7 @@ float mean_blocker(sampler2D map, Light light, LightView view, Receiver r) {
     return sum / hits;
 }
 
+const float WIDE_TEXELS = 6.0;
 const float STEEPEST = 3.0;   // slope up to which a texel's rise is allowed for
 
 struct Occluder { bool present; LightView view; Receiver receiver; float blocker; float shift; };
@@ -178,19 +179,27 @@ bool object_may_shadow(vec3 p, float bias) {
     return false;
 }
 
+// Where the penumbra is many texels wide, few samples would show as steps.
+int samples_for(Occluder o) {
+    if (!o.present) return 1;
+    float texels = o.shift * o.view.tile.z / (2.0 * o.view.tile.w);
+    return texels > WIDE_TEXELS ? 4 * shadow_samples : shadow_samples;
+}
+
 // (V_mu, V_rho) at p with normal n: averages over the same samples of the light; v_rho = v_mu v_obj (METHOD 3).
 // `bias_real`, `bias_virtual` (m) move the receiver towards the light.
 vec2 visibility(Light light, vec3 p, vec3 n, float bias_real, float bias_virtual) {
     Occluder real = occluder(real_light_depth, light, light.views.x, light.views.y, p, n, bias_real);
     Occluder object = occluder(virtual_light_depth, light, light.views.z, light.views.w, p, n, bias_virtual);
     if (!real.present && !object.present) return vec2(1.0);
+    int count = max(samples_for(real), samples_for(object));
     vec2 sum = vec2(0.0);
-    for (int j = 0; j < shadow_samples; ++j) {
-        vec2 offset = disc_sample(j, shadow_samples);
+    for (int j = 0; j < count; ++j) {
+        vec2 offset = disc_sample(j, count);
         float v = real.present ? passes(real_light_depth, real, offset) : 1.0;
         sum.x += v;
         if (object.present && v > 0.0) v *= passes(virtual_light_depth, object, offset);
         sum.y += v;
     }
-    return sum / float(shadow_samples);
+    return sum / float(count);
 }

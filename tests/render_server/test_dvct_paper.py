@@ -1,0 +1,244 @@
+"""The paper's operator of delta voxel cone tracing, on a box over a floor whose light is known in closed form."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import moderngl
+import numpy as np
+import pytest
+import trimesh
+from jaxtyping import Bool, Float32, Float64
+
+from protocol.camera_model import CameraModel
+from protocol.frames import BoardPose, ViewFrame, decode_lut
+from protocol.scene import SceneDocument, parse_scene
+from render_server.gpu.context import GpuContext, create_context
+from render_server.passes.trace_paper import TracePaperPass
+from render_server.passes.volume import Pyramid
+from render_server.relight.defaults import resolve_dvct
+from render_server.relight.dvct_paper import DvctPaper
+from render_server.relighting import Relighting, RelitFrame
+from render_server.renderer import SceneRenderer
+from render_server.view import CameraView
+
+WIDTH, HEIGHT, VOXELS = 160, 120, 32
+EDGE = 0.2  # of the box, m
+VOXEL_M = 0.8 / VOXELS
+IRRADIANCE, AMBIENT = 2.0, 0.1
+BASE_COLOR = np.array([0.8, 0.4, 0.2])
+CODE = 150  # of the camera's picture everywhere
+DOWN, OBLIQUE = (0.0, 0.0, -1.0), (0.6, 0.0, -0.8)
+
+
+@pytest.fixture(scope="module")
+def gpu() -> Iterator[GpuContext]:
+    context = create_context()
+    yield context
+    context.release()
+
+
+@pytest.fixture(scope="module")
+def assets(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("assets")
+    floor = trimesh.creation.box((2, 2, 0.02), transform=trimesh.transformations.translation_matrix((0, 0, -0.01)))
+    roof = trimesh.creation.box((0.8, 0.8, 0.02), transform=trimesh.transformations.translation_matrix((0, 0, 0.7)))
+    box = trimesh.creation.box((EDGE,) * 3, transform=trimesh.transformations.translation_matrix((0, 0, EDGE / 2)))
+    floor.export(folder / "floor.ply")
+    trimesh.util.concatenate([floor, roof]).export(folder / "roofed.ply")
+    box.export(folder / "box.ply")
+    return folder
+
+
+def scene(
+    assets: Path, *, real: str = "floor", direction: tuple[float, ...] = DOWN, gain: float = 1, **method: Any
+) -> SceneDocument:
+    light = {"type": "directional", "direction": direction, "irradiance": IRRADIANCE * gain}
+    ambient = {"type": "ambient", "radiance": AMBIENT * gain}
+    material = {"base_color": BASE_COLOR.tolist(), "specular": 0}
+    return parse_scene(
+        {
+            "real": {"geometry": {"model": str(assets / f"{real}.ply")}},
+            "objects": [{"asset": str(assets / "box.ply"), "material": material}],
+            "lights": {"manual": [light, ambient]},
+            "method": {"operator": "paper", "volume_size": VOXELS, "volume_edge_m": 0.8, **method},
+        }
+    )
+
+
+def frame(exposure_scale: float = 1.0) -> ViewFrame:
+    """Look at the box from the front, a little from above; the whole picture has one code."""
+    matrix = np.array([[150.0, 0, 79.5], [0, 150, 59.5], [0, 0, 1]])
+    eye = np.array([0.0, -1.0, 0.55])
+    forward = (np.array([0, 0, 0.05]) - eye) / np.linalg.norm(np.array([0, 0, 0.05]) - eye)
+    right = np.array([1.0, 0, 0])
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+    pose[:3, 3] = eye
+    return ViewFrame(
+        frame_id=0,
+        timestamp_ns=0,
+        color=np.full((HEIGHT, WIDTH, 3), CODE, np.uint8),
+        camera=CameraModel(WIDTH, HEIGHT, matrix, "plumb_bob", np.zeros(5)),
+        exposure_scale=exposure_scale,
+        pose=BoardPose(pose),
+    )
+
+
+class Run(NamedTuple):
+    """The operator's own run over one frame, and what it was given."""
+
+    relit: RelitFrame
+    operator: DvctPaper
+    relighting: Relighting
+
+    def texture(self, name: str) -> Float64[np.ndarray, "h w 4"]:
+        return texels(getattr(self.relit.layers.cones, name))
+
+    def delta(self) -> Float64[np.ndarray, "n n n 3"]:
+        return level_0(self.operator.volume.delta)
+
+    def release(self) -> None:
+        self.operator.release()
+        self.relighting.release()
+
+
+def run(gpu: GpuContext, document: SceneDocument, view_frame: ViewFrame) -> Run:
+    relighting = Relighting(gpu, document, [])
+    assert view_frame.pose is not None
+    view = CameraView(view_frame.camera, view_frame.pose.world_from_camera)
+    relit = relighting.relight(view_frame, view)
+    assert relit is not None
+    settings: Any = document.method
+    operator = DvctPaper(gpu, settings, resolve_dvct(settings, software=True), view.size)
+    layers = operator.relight(relit.input)
+    return Run(RelitFrame(relit.input, layers, relit.additive, relit.uniforms), operator, relighting)
+
+
+def texels(texture: moderngl.Texture) -> Float64[np.ndarray, "h w 4"]:
+    width, height = texture.size
+    return np.frombuffer(texture.read(), np.float16).reshape(height, width, 4).astype(np.float64)
+
+
+def level_0(pyramid: Pyramid) -> Float64[np.ndarray, "n n n 3"]:
+    cells = np.frombuffer(pyramid.texture.read(), np.float16).reshape(-1, VOXELS, VOXELS, 4)
+    return cells[:VOXELS, ..., :3].astype(np.float64)
+
+
+def camera_radiance() -> float:
+    return float(decode_lut(None)[CODE, 0])
+
+
+def test_the_delta_holds_the_flux_that_the_box_reflects_and_what_the_floor_lost(
+    gpu: GpuContext, assets: Path
+) -> None:
+    result = run(gpu, scene(assets), frame())
+    cells = result.delta() * np.pi * VOXEL_M**2
+    result.release()
+    albedo = np.pi * camera_radiance() / (IRRADIANCE + np.pi * AMBIENT)
+    gained = np.clip(cells, 0, None).sum(axis=(0, 1, 2))
+    lost = np.clip(cells, None, 0).sum(axis=(0, 1, 2))
+    assert gained == pytest.approx(BASE_COLOR * IRRADIANCE * EDGE**2, rel=0.02)
+    assert lost == pytest.approx(np.full(3, -albedo * IRRADIANCE * EDGE**2), rel=0.02)
+
+
+def test_where_the_real_scene_keeps_the_light_off_nothing_changes(gpu: GpuContext, assets: Path) -> None:
+    result = run(gpu, scene(assets, real="roofed"), frame())
+    direct = result.relit.layers.direct
+    mu, rho = texels(direct.mu), texels(direct.rho)
+    cells = result.delta()
+    result.release()
+    assert (mu[..., 3] > 0).any()
+    assert not cells.any()
+    assert np.array_equal(mu[..., :3], rho[..., :3])
+
+
+def test_a_second_run_gives_the_same_bits(gpu: GpuContext, assets: Path) -> None:
+    results = [run(gpu, scene(assets, direction=OBLIQUE), frame()) for _ in range(2)]
+    volumes = [result.operator.volume for result in results]
+    first, second = ((volume.delta.texture.read(), volume.rho.texture.read()) for volume in volumes)
+    assert first == second
+    assert np.array_equal(results[0].texture("rho"), results[1].texture("rho"))
+    for result in results:
+        result.release()
+
+
+def test_the_change_is_linear_in_the_light(gpu: GpuContext, assets: Path) -> None:
+    changes = []
+    for gain in (1.0, 4.0):
+        result = run(gpu, scene(assets, gain=gain, direction=OBLIQUE), frame(exposure_scale=1 / gain))
+        changes.append((result.texture("rho") - result.texture("mu"))[..., :3].sum(axis=(0, 1)))
+        result.release()
+    assert changes[0].max() > 1.0
+    assert changes[1] == pytest.approx(4.0 * changes[0], rel=0.01)
+
+
+@pytest.mark.parametrize("opacity", [0.0, 0.3, 1.0])
+def test_the_nine_cones_of_a_constant_field_bring_pi_times_its_radiance(
+    gpu: GpuContext, assets: Path, opacity: float
+) -> None:
+    result = run(gpu, scene(assets), frame())
+    relit, layers = result.relit.input, result.relit.layers
+    rho = result.operator.volume.rho
+    cells = np.full((*rho.texture.size[::-1], 4), opacity * AMBIENT, np.float16)
+    cells[..., 3] = opacity
+    rho.texture.write(cells.tobytes())
+    relit.bind_geometry()
+    layers.table.bind()
+    relit.virtual.materials.bind()
+    tracing = TracePaperPass(gpu)
+    uniforms = {**relit.view.uniforms(), **layers.placement.uniforms(), **layers.table.uniforms()}
+    tracing.trace_virtual(layers.cones, layers.grid, rho, uniforms)
+    traced = result.texture("virtual")
+    tracing.release()
+    result.release()
+    assert (traced[..., 3] > 0).sum() > 20
+    assert traced[traced[..., 3] > 0][:, :3] == pytest.approx(np.pi * AMBIENT, rel=0.01)
+
+
+def box_is_met(
+    origins: Float64[np.ndarray, "k 3"], directions: Float64[np.ndarray, "k 3"], margin: float
+) -> Bool[np.ndarray, " k"]:
+    """Which rays meet the box, grown by `margin` m to all sides but the floor."""
+    low = np.array([-EDGE / 2 - margin, -EDGE / 2 - margin, 0.0])
+    high = np.array([EDGE / 2 + margin, EDGE / 2 + margin, EDGE + margin])
+    with np.errstate(divide="ignore"):
+        a, b = (low - origins) / directions, (high - origins) / directions
+    first, last = np.minimum(a, b).max(axis=1), np.maximum(a, b).min(axis=1)
+    met: Bool[np.ndarray, " k"] = (first < last) & (last > 0)
+    return met
+
+
+def floor_seen(view_frame: ViewFrame) -> tuple[Float64[np.ndarray, "k 3"], Bool[np.ndarray, " k"]]:
+    """Floor point of each pixel, and whether it is seen near the box and not hidden by it."""
+    assert view_frame.pose is not None
+    pose = view_frame.pose.world_from_camera
+    rays: Float32[np.ndarray, "k 2"] = view_frame.camera.rays().reshape(-1, 2)
+    directions = np.column_stack([rays, np.ones(len(rays))]) @ pose[:3, :3].T
+    eyes = np.repeat(pose[None, :3, 3], len(rays), axis=0)
+    points = eyes - directions * (eyes[:, 2:] / directions[:, 2:])
+    near = (directions[:, 2] < 0) & (np.abs(points[:, :2]).max(axis=1) < 0.6)
+    return points, near & ~box_is_met(eyes, directions, 0.01)
+
+
+@pytest.mark.parametrize(
+    "method",
+    [{}, {"shadow": "map"}, {"operator": "exact", "shadow": "cone", "composition": "additive"}],
+    ids=["paper", "paper with maps", "exact with cones"],
+)
+def test_the_shadow_lies_where_geometry_puts_it(
+    gpu: GpuContext, assets: Path, method: dict[str, Any]
+) -> None:
+    renderer = SceneRenderer(gpu, scene(assets, direction=OBLIQUE, **method))
+    picture = renderer.render(frame()).color
+    renderer.release()
+    linear = decode_lut(None)[picture[..., 1], 1].reshape(-1) / camera_radiance()
+    points, seen = floor_seen(frame())
+    to_light = np.broadcast_to(-np.array(OBLIQUE), points.shape)
+    umbra = seen & box_is_met(points, to_light, -VOXEL_M)
+    lit = seen & ~box_is_met(points, to_light, 3 * VOXEL_M)
+    ambient = np.pi * AMBIENT / (0.8 * IRRADIANCE + np.pi * AMBIENT)
+    assert umbra.sum() > 100
+    assert np.median(linear[umbra]) == pytest.approx(ambient, abs=0.08)
+    assert np.mean(linear[umbra] < 0.5) > 0.95
+    assert np.mean(np.abs(linear[lit] - 1) < 0.1) > 0.98
