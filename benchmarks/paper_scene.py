@@ -29,7 +29,7 @@ TABLE_M = (0.85, 0.6)  # what the photograph shows of the table, as the marker m
 TABLE_CENTRE_M = (-0.04, 0.005)
 BUDDHA_HEIGHT_M = 0.2
 # The light file gives a direction only. The window's size and the room's share are estimates from the mug's shadow.
-WINDOW_ANGULAR_RADIUS_DEG = 12.0
+WINDOW_ANGULAR_RADIUS_DEG = 7.0
 AMBIENT_SHARE = 0.2  # ambient radiance against the window's irradiance
 BOARD_YAML = (
     "type: single\n"

@@ -15,10 +15,11 @@ layout(location = 3) out vec4 out_tint;
 void main() {
     vec3 n = normalize(normal);
     vec3 view = camera_position - world;
-    // An interpolated normal may lean away at a silhouette: bend it back into view.
-    float away = dot(n, normalize(view));
+    // An interpolated normal may lean away at a silhouette: the triangle's own then serves.
+    vec3 flat_normal = normalize(cross(dFdx(world), dFdy(world)));
+    if (dot(flat_normal, view) < 0.0) flat_normal = -flat_normal;
     bool double_sided = materials[int(material)].flags.x > 0.5;
-    if (away < 0.0) n = double_sided ? -n : normalize(n - (away - 0.01) * normalize(view));
+    if (dot(n, view) < 0.0) n = double_sided ? -n : flat_normal;
     out_position = vec4(world, depth);
     out_normal = vec4(n, material);
     out_uv = uv;

@@ -1,4 +1,4 @@
-"""The paper's operator of delta voxel cone tracing, on a box over a floor whose light is known in closed form."""
+"""The paper's operator of delta voxel cone tracing, on a box over a floor that are lit in closed form."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -38,20 +38,27 @@ def gpu() -> Iterator[GpuContext]:
     context.release()
 
 
+def cuboid(size: tuple[float, float, float], centre_z: float) -> trimesh.Trimesh:
+    return trimesh.creation.box(size, trimesh.transformations.translation_matrix((0, 0, centre_z)))
+
+
 @pytest.fixture(scope="module")
 def assets(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("assets")
-    floor = trimesh.creation.box((2, 2, 0.02), transform=trimesh.transformations.translation_matrix((0, 0, -0.01)))
-    roof = trimesh.creation.box((0.8, 0.8, 0.02), transform=trimesh.transformations.translation_matrix((0, 0, 0.7)))
-    box = trimesh.creation.box((EDGE,) * 3, transform=trimesh.transformations.translation_matrix((0, 0, EDGE / 2)))
+    floor, roof = cuboid((2, 2, 0.02), -0.01), cuboid((0.8, 0.8, 0.02), 0.7)
     floor.export(folder / "floor.ply")
     trimesh.util.concatenate([floor, roof]).export(folder / "roofed.ply")
-    box.export(folder / "box.ply")
+    cuboid((EDGE, EDGE, EDGE), EDGE / 2).export(folder / "box.ply")
     return folder
 
 
 def scene(
-    assets: Path, *, real: str = "floor", direction: tuple[float, ...] = DOWN, gain: float = 1, **method: Any
+    assets: Path,
+    *,
+    real: str = "floor",
+    direction: tuple[float, ...] = DOWN,
+    gain: float = 1,
+    **method: object,
 ) -> SceneDocument:
     light = {"type": "directional", "direction": direction, "irradiance": IRRADIANCE * gain}
     ambient = {"type": "ambient", "radiance": AMBIENT * gain}

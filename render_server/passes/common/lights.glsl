@@ -50,6 +50,7 @@ vec2 tile_texel(LightView view, vec2 s) {
 }
 
 const float NOTHING = 1e30;
+const float WIDE_TEXELS = 6.0;   // penumbrae wider than this get more samples
 
 float first_depth(sampler2D map, LightView view, ivec2 texel) {
     float d = texelFetch(map, texel, 0).r;
@@ -113,7 +114,8 @@ int view_containing(int first, int count, vec3 p) {
 float mean_blocker(sampler2D map, Light light, LightView view, Receiver r) {
     float widest = disc_shift(light, view, r.depth, view.range.x);
     float texel = 2.0 * view.tile.w / view.tile.z;
-    int count = widest < 0.5 * texel ? 1 : shadow_samples;   // below half a texel: one look
+    int count = widest < 0.5 * texel ? 1   // below half a texel: one look
+        : widest > WIDE_TEXELS * texel ? 2 * shadow_samples : shadow_samples;
     float sum = 0.0, hits = 0.0;
     for (int j = 0; j < count; ++j) {
         vec2 unit = disc_sample(j, count);
@@ -130,7 +132,6 @@ float mean_blocker(sampler2D map, Light light, LightView view, Receiver r) {
     return sum / hits;
 }
 
-const float WIDE_TEXELS = 6.0;
 const float STEEPEST = 3.0;   // slope up to which a texel's rise is allowed for
 
 struct Occluder { bool present; LightView view; Receiver receiver; float blocker; float shift; };
