@@ -6,9 +6,9 @@ Buddha). Nothing of it is part of this project. docs/paper-scene.md tells what i
 
 import json
 import sys
-import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import Annotated, Any
+from xml.etree import ElementTree
 
 import numpy as np
 import trimesh
@@ -41,7 +41,10 @@ BOARD_YAML = (
 def read_camera(path: Path, width: int, height: int) -> CameraModel:
     """Intrinsics of the authors' OpenCV XML file."""
     root = ElementTree.parse(path).getroot()
-    values = {name: np.array((root.findtext(f"{name}/data") or "").split(), float) for name in ("intrinsic", "distortion")}
+    values = {
+        name: np.array((root.findtext(f"{name}/data") or "").split(), float)
+        for name in ("intrinsic", "distortion")
+    }
     return CameraModel(width, height, values["intrinsic"].reshape(3, 3), "plumb_bob", values["distortion"])
 
 
@@ -50,7 +53,7 @@ def read_light_direction(path: Path) -> Float64[np.ndarray, "3"]:
     root = ElementTree.parse(path).getroot() if path.read_text().count("<camera>") == 0 else _settings(path)
     x, y, z = (float(root.findtext(f"light/direction/{axis}") or 0) for axis in "xyz")
     direction = np.array([x, -y, z])
-    return direction / np.linalg.norm(direction)
+    return np.asarray(direction / np.linalg.norm(direction))
 
 
 def _settings(path: Path) -> ElementTree.Element:
@@ -69,7 +72,12 @@ def scene_document(direction: Float64[np.ndarray, "3"], asset: Path) -> dict[str
         "name": "the papers' scene",
         "real": {"geometry": {"model": "table.ply"}},
         "objects": [
-            {"id": "buddha", "asset": str(asset.resolve()), "up_axis": "y", "pose": {"translation_m": place, "rotation_wxyz": [0, 0, 0, 1], "scale": scale}}
+            {
+                "id": "buddha",
+                "asset": str(asset.resolve()),
+                "up_axis": "y",
+                "pose": {"translation_m": place, "rotation_wxyz": [0, 0, 0, 1], "scale": scale},
+            }
         ],
         "lights": {
             "mode": "manual",
@@ -95,7 +103,13 @@ def write_scene(source: Path, out: Path) -> None:
         DeltalightError: a file of the authors' data is missing, or the marker is not found.
     """
     photograph, buddha = source / "real_static_scene.png", source / "tracked" / "happy.obj"
-    for needed in (photograph, buddha, source / "marker.png", source / "camera_parameters.xml", source / "demo_gi_mr.xml"):
+    for needed in (
+        photograph,
+        buddha,
+        source / "marker.png",
+        source / "camera_parameters.xml",
+        source / "demo_gi_mr.xml",
+    ):
         if not needed.is_file():
             raise DeltalightError(f"{needed} is missing: give the `data` folder of the Dirtchamber release.")
     picture = decode_rgb(photograph.read_bytes(), str(photograph))
@@ -130,7 +144,9 @@ def main(
     except DeltalightError as error:
         sys.stderr.write(f"{error}\n")
         raise typer.Exit(2) from None
-    sys.stdout.write(f"now run: deltalight render {out}/dataset --scene {out}/scene.json --out {out}/pictures\n")
+    sys.stdout.write(
+        f"now run: deltalight render {out}/dataset --scene {out}/scene.json --out {out}/pictures\n"
+    )
 
 
 if __name__ == "__main__":

@@ -1,7 +1,5 @@
 """Relit frame -> picture: composition, views for people who look, readback."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -58,7 +56,9 @@ class Composer:
         if view == "composite":
             return
         if view == "lights":
-            raise DeltalightError("view `lights` arrives with a later release: use composite, effects, delta, volume or rsm.")
+            raise DeltalightError(
+                "view `lights` arrives with a later release: use composite, effects, delta, volume or rsm."
+            )
         with relit.timers.measure("view"):
             if view == "volume":
                 uniforms = relit.input.view.uniforms()

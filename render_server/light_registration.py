@@ -1,6 +1,4 @@
-"""Photometric registration on the GPU's own fields: which factor ties the lights to what the camera sees (METHOD 1)."""
-
-from __future__ import annotations
+"""Photometric registration: which factor ties the lights to what the camera sees (METHOD 1)."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace

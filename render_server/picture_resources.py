@@ -1,7 +1,5 @@
 """Textures and passes of one picture size that every method shares."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The real scene's triangles: a mesh of the frame's depth, or a given model."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -93,7 +91,11 @@ class RealGeometry:
         if self._materials is None:
             self._materials = MaterialTable(self._gpu, merged)
         self.state = GeometryState(
-            self._version, self._buffers, triangle_corners(merged), _sample(merged.vertices[:, :3]), self._materials
+            self._version,
+            self._buffers,
+            triangle_corners(merged),
+            _sample(merged.vertices[:, :3]),
+            self._materials,
         )
 
     @property
@@ -111,7 +113,7 @@ class RealGeometry:
             self._materials.release()
 
 
-def _sample(positions: np.ndarray) -> Float64[np.ndarray, "n 3"]:  # type: ignore[type-arg]
+def _sample(positions: np.ndarray) -> Float64[np.ndarray, "n 3"]:
     """At most BOUND_POINTS of the positions, and always those at the extremes of each axis."""
     stride = max(1, len(positions) // BOUND_POINTS)
     extremes = np.concatenate([positions.argmin(axis=0), positions.argmax(axis=0)])

@@ -1,7 +1,5 @@
 """From a frame and a scene to relit layers: geometry, lights, registration, and the method that the scene names."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,9 +9,9 @@ from protocol.scene import SceneDocument
 from protocol.scene_method import DvctMethod
 from render_server.gpu.context import GpuContext
 from render_server.gpu.timers import PassTimers
+from render_server.light_registration import register_lights
 from render_server.passes.composite import RelitLayers
 from render_server.passes.volume import memory_statement
-from render_server.light_registration import register_lights
 from render_server.picture_resources import PictureResources
 from render_server.real_geometry import RealGeometry
 from render_server.relight.defaults import ResolvedDvct, resolve_dvct
@@ -119,7 +117,9 @@ class Relighting:
         with timers.measure("geometry buffer"):
             if moved:
                 surfaces = self._plan.scene.real.surfaces
-                table = build_surface_table(surfaces, frame.board if surfaces else None, self._real.material_names)
+                table = build_surface_table(
+                    surfaces, frame.board if surfaces else None, self._real.material_names
+                )
                 resources.declare_surfaces(table)
             resources.rasterise(self._real, virtual, view, moved)
         relight_input = RelightInput(

@@ -1,7 +1,5 @@
 """SceneRenderer: (frame, scene) -> composite. GPU only: no sockets, no files but the scene's assets, no clock."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -36,7 +34,8 @@ class CompositeFrame:
 class SceneRenderer:
     """Renders frames of one scene on one GPU context.
 
-    `with_linear`: composites carry the linear picture too (for files). `notices` collects sentences that a user should read (registration, memory), each once.
+    `with_linear`: composites carry the linear picture too (for files). `notices` collects sentences that a user
+    should read (registration, memory), each once.
     """
 
     def __init__(self, gpu: GpuContext, scene: SceneDocument, *, with_linear: bool = False) -> None:
@@ -59,7 +58,9 @@ class SceneRenderer:
         """The composite of one frame; without pose or visible object it is the camera's picture, byte for byte."""
         output = self.scene.output
         if output.width is not None or output.height is not None:
-            frame = resized_frame(frame, output.width or frame.camera.width, output.height or frame.camera.height)
+            frame = resized_frame(
+                frame, output.width or frame.camera.width, output.height or frame.camera.height
+            )
         if frame.pose is None:
             return CompositeFrame(frame.frame_id, frame.timestamp_ns, frame.color, None, "no_pose")
         view = CameraView(frame.camera, frame.pose.world_from_camera)

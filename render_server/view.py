@@ -1,7 +1,5 @@
 """The camera of one picture: matrices and lens as the passes need them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any

@@ -1,7 +1,5 @@
 """The scene document's objects as one set of triangles in the world."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -102,7 +100,7 @@ def world_from_frame(item: SceneObject, board: BoardSpec | None) -> Float64[np.n
     return matrix
 
 
-def _box_corners(bounds: np.ndarray) -> Float64[np.ndarray, "8 3"]:  # type: ignore[type-arg]
+def _box_corners(bounds: np.ndarray) -> Float64[np.ndarray, "8 3"]:
     """Eight corners of a box given as (least, greatest)."""
     picks = np.array([[(index >> axis) & 1 for axis in range(3)] for index in range(8)])
-    return np.asarray(bounds, np.float64)[picks, np.arange(3)]
+    return np.asarray(np.asarray(bounds, np.float64)[picks, np.arange(3)])

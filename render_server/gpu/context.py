@@ -1,8 +1,7 @@
 """The one OpenGL context of a process (EGL, headless)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
+from typing import Any
 
 import moderngl
 
@@ -57,9 +56,11 @@ def create_context(device: int | None = None, *, allow_software: bool = True) ->
     Raises:
         DeltalightError: no driver, no such device, or only a software renderer where none is allowed.
     """
-    options = {} if device is None else {"device_index": device}
+    options: dict[str, Any] = {"standalone": True, "backend": "egl", "require": 430}
+    if device is not None:
+        options["device_index"] = device
     try:
-        ctx = moderngl.create_context(standalone=True, backend="egl", require=430, **options)
+        ctx = moderngl.create_context(**options)
     except Exception as error:  # moderngl and glcontext raise plain Exception
         raise DeltalightError(explain_context_failure(str(error))) from error
     name = str(ctx.info["GL_RENDERER"])

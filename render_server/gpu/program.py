@@ -1,7 +1,5 @@
 """Programs: a compute shader with its dispatch helper, and a raster program."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,12 +13,10 @@ from render_server.gpu.shader_source import shader_source
 Uniform = float | int | bool | Sequence[float] | Sequence[int] | np.ndarray[Any, Any]
 
 
-def set_uniforms(
-    program: moderngl.Program | moderngl.ComputeShader, uniforms: Mapping[str, Uniform]
-) -> None:
+def set_uniforms(program: moderngl.Program | moderngl.ComputeShader, uniforms: Mapping[str, Uniform]) -> None:
     """Write uniforms by name; one that the compiler removed is skipped. 4x4 arrays are row-major here."""
     for name, value in uniforms.items():
-        member = program.get(name, None)
+        member: Any = program.get(name, None)
         if member is None:
             continue
         if isinstance(value, np.ndarray):
@@ -61,7 +57,8 @@ def _local_size(path: Path) -> tuple[int, int, int]:
     """Workgroup size that the shader at `path` declares."""
     line = next(text for text in path.read_text().splitlines() if "local_size_x" in text)
     sizes = dict(
-        part.strip().split("=") for part in line[line.index("(") + 1 : line.index(")")].replace(" ", "").split(",")
+        part.strip().split("=")
+        for part in line[line.index("(") + 1 : line.index(")")].replace(" ", "").split(",")
     )
     return int(sizes["local_size_x"]), int(sizes.get("local_size_y", 1)), int(sizes.get("local_size_z", 1))
 

@@ -1,7 +1,5 @@
 """Reading pictures back without stalling the GPU: a ring of pixel buffers that are read later."""
 
-from __future__ import annotations
-
 from collections import deque
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Shader text: recursive `#include`, once each, with `#line` marks and defines after `#version`."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from pathlib import Path

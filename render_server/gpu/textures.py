@@ -1,7 +1,6 @@
 """Making textures with the sampling state that every pass here wants."""
 
-from __future__ import annotations
-
+from collections.abc import Mapping
 from typing import Any
 
 import moderngl
@@ -44,7 +43,9 @@ def bind_images(*textures: moderngl.Texture | moderngl.Texture3D, first: int = 0
         texture.bind_to_image(unit, read=True, write=True)
 
 
-def bind_samplers(textures: dict[int, moderngl.Texture | moderngl.Texture3D | moderngl.TextureArray]) -> None:
+def bind_samplers(
+    textures: Mapping[int, moderngl.Texture | moderngl.Texture3D | moderngl.TextureArray],
+) -> None:
     """Bind textures to sampler units."""
     for unit, texture in textures.items():
         texture.use(location=unit)

@@ -1,7 +1,5 @@
 """Per-pass times: GPU timer queries, or finish + clock where the driver's queries read zero (llvmpipe)."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,0 +1,1 @@
+"""One GPU pass a file, its GLSL beside it with the same stem."""

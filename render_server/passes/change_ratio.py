@@ -1,7 +1,5 @@
 """How light changed, on the reduced grid: for holes of the depth map, and to pass over what did not change."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from render_server.gpu.context import GpuContext

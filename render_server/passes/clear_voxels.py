@@ -1,7 +1,5 @@
 """Emptying the voxels that a set had touched, instead of whole volumes."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The relit picture: camera codes and linear radiance."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -42,7 +40,9 @@ class CompositePass:
         self._size = size
         self.code = texture_2d(gpu, size, 4, "u1")
         self.linear = texture_2d(gpu, size, 4, "f2")
-        self._program = ComputeProgram(gpu, Path(__file__).with_name("composite.comp.glsl"), {"FILL_RADIUS": FILL_RADIUS})
+        self._program = ComputeProgram(
+            gpu, Path(__file__).with_name("composite.comp.glsl"), {"FILL_RADIUS": FILL_RADIUS}
+        )
 
     def run(self, picture: Picture, layers: RelitLayers, uniforms: dict[str, Any]) -> None:
         """Compose; geometry and surfaces must be bound."""

@@ -1,7 +1,5 @@
 """Direct light on the real surfaces, without and with the objects."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Isotropic filtering ([P1] 3.2): the levels of V_delta and V_rho above level 0."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from render_server.gpu.context import GpuContext

@@ -1,7 +1,5 @@
 """Filtering: the levels of a pyramid above level 0 (METHOD 4.4)."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from render_server.gpu.context import GpuContext

@@ -1,7 +1,5 @@
 """Geometry buffer: meshes rastered from the camera (virtual objects, or a given model of the real scene)."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import moderngl

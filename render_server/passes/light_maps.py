@@ -1,7 +1,5 @@
 """Lights for shaders, the views their depth maps need, and the environment's textures."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -66,7 +64,9 @@ def _frame(axis: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
     return np.stack([x, np.cross(z, x), z])
 
 
-def _matrix(rotation: Float64[np.ndarray, "3 3"], origin: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "4 4"]:
+def _matrix(
+    rotation: Float64[np.ndarray, "3 3"], origin: Float64[np.ndarray, "3"]
+) -> Float64[np.ndarray, "4 4"]:
     """view_from_world of a frame with its origin in the world."""
     matrix = np.eye(4)
     matrix[:3, :3] = rotation

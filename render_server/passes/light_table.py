@@ -1,7 +1,5 @@
 """Lights, their depth maps and the environment, bound for every pass that shades."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import moderngl
@@ -64,7 +62,10 @@ class LightTable:
         """
         self.lights = lights
         real = [light_views(light, receivers, real_points) if len(receivers) else [] for light in lights]
-        virtual = [light_views(light, virtual_points, virtual_points) if len(virtual_points) else [] for light in lights]
+        virtual = [
+            light_views(light, virtual_points, virtual_points) if len(virtual_points) else []
+            for light in lights
+        ]
         self.real_views = [view for views in real for view in views]
         self.virtual_views = [view for views in virtual for view in views]
         self.real_atlas = self._atlas_for(self.real_atlas, len(self.real_views))

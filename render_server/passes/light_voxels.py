@@ -1,7 +1,5 @@
 """Lighting of the voxels: radiance and opacity of each surfel, summed per direction (METHOD 4.3)."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The material table that shaders read (passes/common/materials.glsl)."""
 
-from __future__ import annotations
-
 import cv2
 import moderngl
 import numpy as np

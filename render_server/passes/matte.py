@@ -1,7 +1,5 @@
 """Share of each pixel that the virtual objects cover."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Triangle meshes on the GPU: vertices for the raster passes, whole triangles for the voxeliser."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import moderngl
@@ -21,7 +19,7 @@ def triangle_corners(mesh: GpuMesh) -> Float32[np.ndarray, "m 3 10"]:
     double_sided = np.array([material.double_sided for material in mesh.materials], np.float32)
     flags = double_sided[vertices[:, MATERIAL].astype(int)][:, None]
     columns = [vertices[:, :3], vertices[:, UV], vertices[:, COLOR], vertices[:, MATERIAL:], flags]
-    return np.concatenate(columns, axis=1)[mesh.triangles].astype(np.float32)
+    return np.asarray(np.concatenate(columns, axis=1)[mesh.triangles], np.float32)
 
 
 class MeshBuffers:

@@ -1,7 +1,5 @@
 """The camera's picture on the GPU: its codes, the response, and linear radiance."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import moderngl

@@ -1,7 +1,5 @@
 """Albedo of the real scene as the lights see it ([P2] eq. 1)."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

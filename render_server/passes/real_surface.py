@@ -1,7 +1,5 @@
 """Real geometry buffer: position and normal of the real surface at each pixel."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -43,10 +41,11 @@ class RealSurface:
         self._fitted.write(np.ascontiguousarray(normals, np.float32).tobytes(), alignment=1)
         bind_samplers({0: self._depth, 1: picture.rays, 2: self._fitted})
         bind_images(self.position, self.normal)
-        self._from_depth.run(
-            self.size, surface_count=surface_count, **view.uniforms())
+        self._from_depth.run(self.size, surface_count=surface_count, **view.uniforms())
 
-    def from_model(self, raster: GeometryBuffer, picture: Picture, view: CameraView, surface_count: int) -> None:
+    def from_model(
+        self, raster: GeometryBuffer, picture: Picture, view: CameraView, surface_count: int
+    ) -> None:
         """Fill from a raster of the given model, through the lens."""
         bind_samplers({6: raster.position, 7: raster.normal, 15: picture.rays})
         bind_images(self.position, self.normal)
@@ -58,5 +57,12 @@ class RealSurface:
 
     def release(self) -> None:
         """Free the GL objects."""
-        for item in (self.position, self.normal, self._depth, self._fitted, self._from_depth, self._from_model):
+        for item in (
+            self.position,
+            self.normal,
+            self._depth,
+            self._fitted,
+            self._from_depth,
+            self._from_model,
+        ):
             item.release()

@@ -1,7 +1,5 @@
 """Reflective shadow maps: depth, normal and texture coordinate of what each light sees first."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -49,7 +47,7 @@ class ShadowMapAtlas:
 
     def end(self) -> None:
         """Lift the tile limits."""
-        self._target.scissor = None
+        self._target.scissor = (0, 0, *self.size)
 
     def release(self) -> None:
         """Free the GL objects."""
@@ -63,7 +61,9 @@ class ReflectiveShadowMapPass:
     def __init__(self, gpu: GpuContext) -> None:
         self._program = raster_program(gpu, Path(__file__).with_name("reflective_shadow_map"))
 
-    def run(self, atlas: ShadowMapAtlas, mesh: MeshBuffers, views: Sequence[LightView], first_view: int) -> None:
+    def run(
+        self, atlas: ShadowMapAtlas, mesh: MeshBuffers, views: Sequence[LightView], first_view: int
+    ) -> None:
         """Draw `mesh` for each view; the views' records begin at `first_view` of the bound storage buffer."""
         atlas.clear()
         for tile in range(len(views)):

@@ -1,7 +1,5 @@
 """Sums of split-inject -> level 0 of V_delta and V_rho, with the marker of V_eta ([P1] 3.2)."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from render_server.gpu.context import GpuContext

@@ -1,7 +1,5 @@
 """Fixed-point sums -> texels of level 0."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The reduced grid on which cones are traced: which pixel stands for each texel."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

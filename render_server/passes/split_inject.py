@@ -1,7 +1,5 @@
 """Split-inject: the flux of reflective shadow maps into the voxels of V_delta and V_rho ([P1] 3.2)."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

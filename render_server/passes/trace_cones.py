@@ -1,7 +1,5 @@
 """Cone tracing of the exact operator (METHOD 3, 4.5)."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Cone tracing of the paper's operator ([P1] eq. 6 and 8)."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

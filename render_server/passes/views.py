@@ -1,7 +1,5 @@
 """Views for people who look inside: they replace the composite's codes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

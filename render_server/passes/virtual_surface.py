@@ -1,7 +1,5 @@
 """Radiance of the virtual surfaces."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +10,7 @@ from render_server.gpu.program import ComputeProgram
 from render_server.gpu.textures import bind_images, bind_samplers, texture_2d
 from render_server.passes.geometry_buffer import GeometryBuffer
 from render_server.passes.sampling_grid import SamplingGrid
+from render_server.passes.trace_cones import ConeFields
 
 
 class VirtualSurfacePass:
@@ -26,13 +25,21 @@ class VirtualSurfacePass:
         self,
         matte: moderngl.Texture,
         raster: GeometryBuffer,
-        irradiance: moderngl.Texture,
-        specular: moderngl.Texture,
+        cones: ConeFields,
         grid: SamplingGrid,
         uniforms: dict[str, Any],
     ) -> None:
         """Shade; lights, materials and geometry must be bound."""
-        bind_samplers({0: grid.pixels, 1: matte, 2: irradiance, 3: specular, 8: raster.uv, 9: raster.tint})
+        bind_samplers(
+            {
+                0: grid.pixels,
+                1: matte,
+                2: cones.virtual,
+                3: cones.virtual_specular,
+                8: raster.uv,
+                9: raster.tint,
+            }
+        )
         bind_images(self.radiance)
         self._program.run(self._size, scale=grid.scale, **uniforms)
 

@@ -1,7 +1,5 @@
 """The voxel volume: where it lies, how much memory it takes, its pyramids."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -19,7 +17,7 @@ SUPPORT_SLOTS = 6
 
 @dataclass(frozen=True)
 class VolumePlacement:
-    """A cube of `size`^3 voxels of edge `voxel_edge` m with its low corner at `origin` (world, m), snapped to voxels."""
+    """A cube of `size`^3 voxels of edge `voxel_edge` m; its low corner `origin` (world, m) is snapped to voxels."""
 
     origin: tuple[float, float, float]
     voxel_edge: float

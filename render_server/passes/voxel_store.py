@@ -1,7 +1,5 @@
 """Buffers of one sparse voxel set (passes/common/voxel_store.glsl)."""
 
-from __future__ import annotations
-
 import moderngl
 import numpy as np
 

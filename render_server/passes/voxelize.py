@@ -1,7 +1,5 @@
 """Voxelisation: triangles -> surfels, touched voxels (METHOD 4.2)."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -53,7 +51,9 @@ def pieces_in_volume(
     short = np.all(high - low < LONGEST_EDGE_VOXELS / 2, axis=1)
     kept = met & short
     split = split_triangles(corners[met & ~short], LONGEST_EDGE_VOXELS * placement.voxel_edge)
-    bound = _voxels_in(low[kept], high[kept], placement) + _voxels_in(*_voxel_extents(split, placement), placement)
+    bound = _voxels_in(low[kept], high[kept], placement) + _voxels_in(
+        *_voxel_extents(split, placement), placement
+    )
     return np.concatenate([corners[kept], split]), bound
 
 

@@ -1,7 +1,5 @@
 """Settings that the scene document leaves open, by what the machine can do."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from protocol.scene_method import DvctMethod

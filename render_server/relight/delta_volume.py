@@ -1,7 +1,5 @@
 """V_delta and V_rho with the joint opacity of V_eta, as split-inject fills them ([P1] 3.2)."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from render_server.gpu.context import GpuContext

@@ -1,7 +1,5 @@
 """Delta voxel cone tracing, the exact operator (METHOD 3 and 4)."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from protocol.scene_method import DvctMethod

@@ -1,7 +1,5 @@
 """What both operators of delta voxel cone tracing share: lights, maps, when to rebuild (METHOD 4)."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from typing import Any
 
@@ -154,14 +152,7 @@ class DvctBase(ABC):
             self._direct.run(uniforms)
             self._change.run(self._grid, self._direct, self._cones)
         with frame.timers.measure("virtual surface"):
-            self._surface.run(
-                frame.matte,
-                frame.virtual_raster,
-                self._cones.virtual,
-                self._cones.virtual_specular,
-                self._grid,
-                uniforms,
-            )
+            self._surface.run(frame.matte, frame.virtual_raster, self._cones, self._grid, uniforms)
 
     def release(self) -> None:
         """Free the GL objects."""

@@ -1,7 +1,5 @@
 """Delta voxel cone tracing, the operator as printed in [P1] 3, in radiometric units."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from protocol.scene_method import DvctMethod

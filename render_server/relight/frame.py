@@ -1,7 +1,5 @@
 """What a relighting method gets for one picture."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

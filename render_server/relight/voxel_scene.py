@@ -1,6 +1,4 @@
-"""The lit voxels of the real scene (mu) and of real + virtual (rho), rebuilt only where something moved (METHOD 4)."""
-
-from __future__ import annotations
+"""The lit voxels of the real scene (mu) and of real + virtual (rho), rebuilt where something moved (METHOD 4)."""
 
 from typing import Any
 

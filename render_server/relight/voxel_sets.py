@@ -1,7 +1,5 @@
 """The touched voxels of the real scene and of the objects over one placement of the volume (METHOD 4.2)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
