@@ -25,10 +25,8 @@ class Composer:
         self._readback = AsyncReadback(gpu)
         self._views = ViewPasses(gpu)
 
-    def compose(
-        self, relit: RelitFrame, output: Output
-    ) -> tuple[UInt8[np.ndarray, "h w 3"], Float32[np.ndarray, "h w 3"] | None]:
-        """Picture in camera codes, and linear if that was asked for."""
+    def start(self, relit: RelitFrame, output: Output) -> None:
+        """Compose and begin to read back; `finish` gives the oldest picture that was started."""
         composite = self._pass_for(relit.input.view.size)
         uniforms: dict[str, Any] = {
             **relit.input.view.uniforms(),
@@ -46,6 +44,9 @@ class Composer:
             self._readback.push(composite.code, "u1")
             if self._with_linear:
                 self._readback.push(composite.linear, "f2")
+
+    def finish(self) -> tuple[UInt8[np.ndarray, "h w 3"], Float32[np.ndarray, "h w 3"] | None]:
+        """Picture in camera codes, and linear if that was asked for; waits only if the GPU is not done with it."""
         color = np.ascontiguousarray(self._readback.pop()[..., :3])
         linear = self._readback.pop()[..., :3].astype(np.float32) if self._with_linear else None
         return color, linear

@@ -1,5 +1,6 @@
 """SceneRenderer: (frame, scene) -> composite. GPU only: no sockets, no files but the scene's assets, no clock."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -31,6 +32,17 @@ class CompositeFrame:
     lights: list[dict[str, Any]] = field(default_factory=list)
 
 
+@dataclass(frozen=True)
+class PendingComposite:
+    """A frame that was handed to the GPU. Frames are finished in the order in which they were started.
+
+    `immediate`: nothing is gained by starting another frame first (software renders at once).
+    """
+
+    finish: Callable[[], CompositeFrame]
+    immediate: bool
+
+
 class SceneRenderer:
     """Renders frames of one scene on one GPU context.
 
@@ -56,26 +68,41 @@ class SceneRenderer:
 
     def render(self, frame: ViewFrame) -> CompositeFrame:
         """The composite of one frame; without pose or visible object it is the camera's picture, byte for byte."""
+        return self.start(frame).finish()
+
+    def start(self, frame: ViewFrame) -> PendingComposite:
+        """Hand a frame to the GPU; reading its picture back does not stall the frames after it."""
         output = self.scene.output
         if output.width is not None or output.height is not None:
             frame = resized_frame(
                 frame, output.width or frame.camera.width, output.height or frame.camera.height
             )
         if frame.pose is None:
-            return CompositeFrame(frame.frame_id, frame.timestamp_ns, frame.color, None, "no_pose")
+            return _untouched(frame, "no_pose")
         view = CameraView(frame.camera, frame.pose.world_from_camera)
         relit = self._relighting.relight(frame, view)
         if relit is None:
-            return CompositeFrame(frame.frame_id, frame.timestamp_ns, frame.color, None, "ok")
-        color, linear = self._composer.compose(relit, output)
+            return _untouched(frame, "ok")
+        self._composer.start(relit, output)
         times = dict(relit.timers.end_frame())
         lights = self._relighting.describe_lights()
-        return CompositeFrame(frame.frame_id, frame.timestamp_ns, color, linear, "ok", times, lights)
+
+        def finish() -> CompositeFrame:
+            color, linear = self._composer.finish()
+            return CompositeFrame(frame.frame_id, frame.timestamp_ns, color, linear, "ok", times, lights)
+
+        return PendingComposite(finish, self._gpu.is_software)
 
     def release(self) -> None:
         """Free all GL objects."""
         self._relighting.release()
         self._composer.release()
+
+
+def _untouched(frame: ViewFrame, status: str) -> PendingComposite:
+    """The camera's picture itself."""
+    composite = CompositeFrame(frame.frame_id, frame.timestamp_ns, frame.color, None, status)
+    return PendingComposite(lambda: composite, immediate=True)
 
 
 def resized_frame(frame: ViewFrame, width: int, height: int) -> ViewFrame:

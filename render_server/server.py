@@ -29,6 +29,7 @@ from render_server.gpu.context import create_context
 from render_server.renderer import SceneRenderer
 from render_server.session import RenderedFrame, RenderSession
 
+GPU_TIMEOUT_S = 0.002  # a started frame is read back after so long, should no other follow
 RECEIVE_TIMEOUT_S = 0.05  # bounds how long a command waits while no frames come
 STATS_INTERVAL_S = 1.0
 ANSWER_TIMEOUT_S = 20.0
@@ -187,10 +188,15 @@ def run_server(settings: ServerSettings) -> None:
         _loop(session, receiver, sender, desk)
 
 
+def _patience_s(session: RenderSession) -> float:
+    """How long to wait for a message."""
+    return GPU_TIMEOUT_S if session.is_waiting_for_gpu else RECEIVE_TIMEOUT_S
+
+
 def _loop(session: RenderSession, receiver: Receiver, sender: Sender, desk: CommandDesk) -> None:
     stats_due_s = time.monotonic()
     while not session.stopping:
-        for multipart in (receiver.latest(RECEIVE_TIMEOUT_S) or {}).values():
+        for multipart in (receiver.latest(_patience_s(session)) or {}).values():
             session.receive(multipart)
         rendered = session.step()
         if rendered is not None:

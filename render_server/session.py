@@ -49,6 +49,18 @@ class Composite(Protocol):
         """The lights that the picture was made with."""
 
 
+class Pending(Protocol):
+    """A started frame (`renderer.PendingComposite`)."""
+
+    @property
+    def immediate(self) -> bool:
+        """Whether nothing is gained by starting another frame first."""
+
+    @property
+    def finish(self) -> Callable[[], Composite]:
+        """Gives the composite; waits for the GPU if it must."""
+
+
 class Renderer(Protocol):
     """What a session needs of `renderer.SceneRenderer`."""
 
@@ -56,8 +68,8 @@ class Renderer(Protocol):
     def notices(self) -> Sequence[str]:
         """Sentences that a user should read; the list only grows."""
 
-    def render(self, frame: ViewFrame) -> Composite:
-        """The composite of one frame."""
+    def start(self, frame: ViewFrame) -> Pending:
+        """Begin the composite of one frame; frames finish in the order in which they were started."""
 
     def set_scene(self, scene: SceneDocument) -> None:
         """Use another scene from the next frame on."""
@@ -101,6 +113,7 @@ class RenderSession:
         self._keep_scene = keep_scene
         self._mailbox_drops = mailbox_drops
         self._clock_ns = clock_ns
+        self._started: tuple[AssembledFrame, Pending] | None = None
         self._rendered_ns: deque[int] = deque()
         self._last_fault = ""
         self._faults_in_a_row = 0
@@ -115,8 +128,15 @@ class RenderSession:
             return
         self._assembler.add(message, parts, multipart.received_ns)
 
+    @property
+    def is_waiting_for_gpu(self) -> bool:
+        """Whether a started frame is to be finished by the next step."""
+        return self._started is not None
+
     def step(self) -> RenderedFrame | None:
-        """Render the newest frame, if one is ready; a frame that cannot be rendered is counted and logged.
+        """Start the newest frame, if one is ready, and give the one that was started before (in software: itself).
+
+        A frame that cannot be rendered is counted and logged.
 
         Raises:
             Exception: nothing but unexpected faults `MAXIMUM_FAULTS_IN_A_ROW` times: the renderer is broken,
@@ -124,7 +144,7 @@ class RenderSession:
         """
         try:
             frame = self._assembler.take(self._clock_ns())
-            return None if frame is None else self._render(frame)
+            return self._render(frame)
         except DeltalightError as fault:
             self._count_fault("bad_frames", fault)
         except Exception as fault:  # whatever it is, the next frame must still be rendered
@@ -177,8 +197,16 @@ class RenderSession:
         hint = nearest(request.op, known) or ", ".join(known)
         raise DeltalightError(f"There is no command '{request.op}'; did you mean {hint}?")
 
-    def _render(self, frame: AssembledFrame) -> RenderedFrame:
-        composite = self._renderer.render(frame.view)
+    def _render(self, frame: AssembledFrame | None) -> RenderedFrame | None:
+        before, self._started = self._started, None
+        if frame is not None:
+            self._started = frame, self._renderer.start(frame.view)
+        if before is None and self._started is not None and self._started[1].immediate:
+            before, self._started = self._started, None
+        return None if before is None else self._finish(*before)
+
+    def _finish(self, frame: AssembledFrame, pending: Pending) -> RenderedFrame:
+        composite = pending.finish()
         self._last_fault = ""
         self._faults_in_a_row = 0
         self._log_notices()

@@ -9,8 +9,7 @@ layout(local_size_x = 8, local_size_y = 8) in;
 layout(binding = 0, rgba16f) writeonly uniform image2D albedo_out;
 layout(binding = 13) uniform sampler2D real_light_normal;
 uniform int view_index;
-uniform float bias_real;      // m
-uniform float bias_virtual;   // m
+uniform float bias_real;   // m
 
 const vec2 ALBEDO_RANGE = vec2(0.02, 0.95);
 
@@ -23,7 +22,7 @@ vec3 irradiance(vec3 p, vec3 n) {
         vec3 across = light_at(lights[i], p, to_light, radius);
         float cosine = dot(n, to_light);
         if (cosine <= 0.0) continue;
-        e += across * cosine * (own ? 1.0 : visibility(lights[i], p, n, bias_real, bias_virtual).x);
+        e += across * cosine * (own ? 1.0 : real_visibility(lights[i], p, n, bias_real));
     }
     return e;
 }

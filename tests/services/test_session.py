@@ -1,5 +1,6 @@
 """A render session with a renderer that the test gives: frames, faults, commands."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -26,18 +27,26 @@ class Picture:
     lights: list[dict[str, Any]] = field(default_factory=list)
 
 
+@dataclass
+class Started:
+    finish: Callable[[], Picture]
+    immediate: bool
+
+
 class InvertingRenderer:
     """Inverts the picture; fails where the test says so."""
 
     def __init__(self) -> None:
         self.fails_at: set[int] = set()
+        self.immediate = True
         self.notices: list[str] = []
         self.scenes: list[SceneDocument] = []
 
-    def render(self, frame: ViewFrame) -> Picture:
+    def start(self, frame: ViewFrame) -> Started:
         if frame.frame_id in self.fails_at:
             raise RuntimeError("the volume fell over")
-        return Picture(255 - frame.color, "no_pose" if frame.pose is None else "ok")
+        picture = Picture(255 - frame.color, "no_pose" if frame.pose is None else "ok")
+        return Started(lambda: picture, self.immediate)
 
     def set_scene(self, scene: SceneDocument) -> None:
         if scene.name == "refused":
@@ -173,3 +182,18 @@ def test_scene_with_a_model_needs_no_depth(tmp_path: Path) -> None:
     session.receive(color(1, START, START))
     session.receive(pose(1, START))
     assert session.step() is not None
+
+
+def test_on_a_gpu_a_frame_is_read_back_after_the_next_was_started(
+    session: RenderSession, renderer: InvertingRenderer
+) -> None:
+    renderer.immediate = False
+    for number in (0, 1):
+        feed(session, number)
+        rendered = session.step()
+        assert (None if rendered is None else rendered.message.frame_id) == (None, 0)[number]
+    assert session.is_waiting_for_gpu
+    last = session.step()
+    assert last is not None
+    assert last.message.frame_id == 1
+    assert not session.is_waiting_for_gpu

@@ -187,6 +187,16 @@ int samples_for(Occluder o) {
     return texels > WIDE_TEXELS ? 4 * shadow_samples : shadow_samples;
 }
 
+// V_mu alone.
+float real_visibility(Light light, vec3 p, vec3 n, float bias) {
+    Occluder real = occluder(real_light_depth, light, light.views.x, light.views.y, p, n, bias);
+    if (!real.present) return 1.0;
+    int count = samples_for(real);
+    float sum = 0.0;
+    for (int j = 0; j < count; ++j) sum += passes(real_light_depth, real, disc_sample(j, count));
+    return sum / float(count);
+}
+
 // (V_mu, V_rho) at p with normal n: averages over the same samples of the light; v_rho = v_mu v_obj (METHOD 3).
 // `bias_real`, `bias_virtual` (m) move the receiver towards the light.
 vec2 visibility(Light light, vec3 p, vec3 n, float bias_real, float bias_virtual) {

@@ -38,7 +38,7 @@ bool object_meets_cone(vec3 p, vec3 n) {
 
 // (V_mu, V_rho)
 vec2 cone_visibility(Light light, vec3 p, vec3 n, float bias) {
-    float v_mu = visibility(light, p, n, bias, bias).x;
+    float v_mu = real_visibility(light, p, n, bias);
     ShadowCone cone = shadow_cone(light, p, n);
     if (v_mu == 0.0 || cone.interval.x >= cone.interval.y) return vec2(v_mu);
     float blocked = march(joint_pyramid, cone.start, cone.d, cone.ratio, cone.interval).a;

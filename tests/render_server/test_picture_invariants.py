@@ -1,0 +1,253 @@
+"""What must hold for every picture (METHOD 7): bytes that are copied, shadows that are not, caches that do not show."""
+
+import hashlib
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from render_server.gpu.context import GpuContext
+from render_server.renderer import SceneRenderer
+from tests.render_server.scenes import (
+    HEIGHT,
+    WIDTH,
+    Stage,
+    ambient,
+    array_of,
+    ball,
+    composite,
+    cube,
+    depth_image,
+    directional,
+    everyday,
+    fields_of,
+    floor,
+    floor_depth,
+    frame,
+    look_at,
+    noisy,
+    plain,
+    shifted,
+    solve,
+    sphere_light,
+)
+
+pytestmark = pytest.mark.usefixtures("clean_gl")
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture
+def stage(tmp_path: Path) -> Stage:
+    return Stage(tmp_path)
+
+
+def test_no_object_gives_the_cameras_bytes(gpu: GpuContext, stage: Stage) -> None:
+    document = stage.document([], [ambient(0.2)], floor())
+    assert np.array_equal(composite(gpu, document, frame(noisy())), noisy())
+
+
+def test_invisible_object_gives_the_cameras_bytes(gpu: GpuContext, stage: Stage) -> None:
+    document = stage.document([stage.object(cube(), visible=False)], [directional(), ambient(0.2)], floor())
+    assert np.array_equal(composite(gpu, document, frame(noisy())), noisy())
+
+
+def test_without_pose_the_cameras_bytes_and_the_status_say_so(gpu: GpuContext, stage: Stage) -> None:
+    renderer = SceneRenderer(gpu, everyday(stage))
+    result = renderer.render(replace(frame(noisy()), pose=None))
+    renderer.release()
+    assert result.status == "no_pose"
+    assert np.array_equal(result.color, noisy())
+
+
+def test_object_behind_the_camera_without_light_changes_nothing(gpu: GpuContext, stage: Stage) -> None:
+    """Its volume, too, lies behind the camera, and no lamp throws its shadow into view."""
+    document = stage.document([stage.object(cube(at=(0.25, -3.0, 0.6)))], [ambient(0.2)], floor(5))
+    assert np.array_equal(composite(gpu, document, frame(noisy())), noisy())
+
+
+def test_same_input_gives_the_same_bytes(gpu: GpuContext, stage: Stage) -> None:
+    document = everyday(stage)
+    renderer = SceneRenderer(gpu, document)
+    first, second = (renderer.render(frame(noisy())).color for _ in range(2))
+    renderer.release()
+    assert not np.array_equal(first, noisy())
+    assert np.array_equal(first, second)
+    assert np.array_equal(first, composite(gpu, document, frame(noisy())))
+
+
+CHILD = """
+import hashlib, sys, tempfile, pathlib
+from render_server.gpu.context import create_context
+from tests.render_server.scenes import Stage, composite, everyday, frame, noisy
+folder = tempfile.TemporaryDirectory()
+picture = composite(create_context(), everyday(Stage(pathlib.Path(folder.name))), frame(noisy()))
+print(hashlib.sha256(picture.tobytes()).hexdigest())
+"""
+
+
+def test_two_processes_give_the_same_bytes(gpu: GpuContext, stage: Stage) -> None:
+    command = [sys.executable, "-c", CHILD]
+    children = [
+        subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        for _ in range(2)
+    ]
+    outputs = [child.communicate(timeout=120) for child in children]
+    assert [child.returncode for child in children] == [0, 0], outputs
+    own = hashlib.sha256(composite(gpu, everyday(stage), frame(noisy())).tobytes()).hexdigest()
+    assert [out.strip() for out, _ in outputs] == [own, own]
+
+
+@pytest.mark.parametrize("composition", ["ratio", "additive"])
+def test_no_negative_pixel(gpu: GpuContext, stage: Stage, composition: str) -> None:
+    renderer = SceneRenderer(gpu, everyday(stage, composition=composition), with_linear=True)
+    linear = renderer.render(frame(noisy())).linear
+    renderer.release()
+    assert linear is not None
+    assert np.isfinite(linear).all()
+    assert linear.min() >= 0.0
+
+
+def test_no_shadow_where_the_real_scene_is_in_shadow(gpu: GpuContext, stage: Stage) -> None:
+    """A wall hides the lamp from a part of the floor; an object inside the wall's shadow darkens nothing there."""
+    wall = shifted(cube(1.0), 0.65, 0, 0)  # its face towards the object is the plane x = 0.15
+    sun = directional((-1.0, 0.0, -0.5), 2.0)
+    objects = [stage.object(cube(0.1))]
+    open_floor = solve(gpu, stage.document(objects, [sun], floor()))
+    walled = stage.document(objects, [sun], wall + floor())
+    renderer = SceneRenderer(gpu, walled)
+    picture = renderer.render(frame(noisy())).color
+    shaded = fields_of(renderer)
+    renderer.release()
+    would_darken = (open_floor.direct_mu - open_floor.direct_rho).max(axis=-1) > 0.5
+    on_floor = (shaded.position[..., 3] > 0) & (np.abs(shaded.position[..., 2]) < 1e-3)
+    seen = would_darken & on_floor & (shaded.matte == 0)
+    assert np.count_nonzero(seen) > 50
+    assert np.abs(shaded.direct_mu[seen]).max() == 0
+    assert np.array_equal(shaded.direct_mu, shaded.direct_rho)
+    untouched = seen & (shaded.cones_mu == shaded.cones_rho).all(axis=-1)
+    assert np.array_equal(picture[untouched], noisy()[untouched])
+
+
+def test_depth_holes_never_hide_the_object(gpu: GpuContext, stage: Stage) -> None:
+    document = stage.document([stage.object(ball())], [directional(), ambient(0.2)])
+    depth = floor_depth(look_at())
+    hole = np.ones((HEIGHT, WIDTH), bool)
+    hole[30:90, 50:110] = False
+    whole, holed = (
+        solve(gpu, document, frame(depth=depth_image(depth, valid))) for valid in (None, hole)
+    )
+    assert np.count_nonzero(whole.matte == 1) > 100
+    assert np.all(holed.matte[whole.matte == 1] == 1)
+
+
+def test_real_surface_in_front_hides_the_object_but_not_its_shadow(gpu: GpuContext, stage: Stage) -> None:
+    """Depth masks the object only, never its delta."""
+    screen = shifted(cube(1.0), 0, -0.68, 0.03)  # hangs 3 cm above the floor, its back at y = -0.18
+    document = stage.document([stage.object(cube(0.1))], [directional((0.0, -1.0, -0.7))], screen + floor())
+    pose = look_at((0.0, -1.3, 0.3), (0.0, 0.0, 0.05))
+    assert solve(gpu, document, frame(pose=pose)).matte.max() == 0
+    above = look_at((0.0, 0.9, 0.65))
+    found = solve(gpu, document, frame(pose=above))
+    assert found.matte.max() == 1
+    assert (found.direct_mu - found.direct_rho).max() > 0.5
+
+
+def test_pixels_beyond_every_influence_are_the_cameras(gpu: GpuContext, stage: Stage) -> None:
+    document = stage.document([stage.object(cube(0.1))], [directional(), ambient(0.2)], floor(5))
+    renderer = SceneRenderer(gpu, document)
+    picture = renderer.render(frame(noisy())).color
+    fields = fields_of(renderer)
+    renderer.release()
+    away = np.linalg.norm(fields.position[..., :2], axis=-1) > 0.6  # the volume's edge is 0.6 m
+    assert 0.3 < away.mean() < 0.99
+    assert np.array_equal(picture[away], noisy()[away])
+    assert (picture != noisy()).any(axis=-1).sum() > 200
+
+
+def test_another_picture_of_the_same_scene_is_not_relit_with_the_old_one(gpu: GpuContext, stage: Stage) -> None:
+    document = everyday(stage)
+    renderer = SceneRenderer(gpu, document)
+    renderer.render(frame(plain(90)))
+    cached = renderer.render(frame(plain(180))).color
+    renderer.release()
+    assert np.array_equal(cached, composite(gpu, document, frame(plain(180))))
+
+
+def test_noise_in_the_picture_passes_through_the_caches(gpu: GpuContext, stage: Stage) -> None:
+    """What the tracker takes for noise keeps the voxels, yet the new bytes are what is relit."""
+    grain = np.random.default_rng(3).integers(-1, 2, plain().shape)
+    grainy = (plain().astype(int) + grain).astype(np.uint8)
+    document = everyday(stage)
+    renderer = SceneRenderer(gpu, document)
+    renderer.render(frame(plain()))
+    cached = renderer.render(frame(grainy)).color
+    renderer.release()
+    fresh = composite(gpu, document, frame(grainy))
+    assert np.abs(cached.astype(int) - fresh.astype(int)).max() <= 2
+    unchanged = (composite(gpu, document) == plain()).all(axis=-1)
+    assert np.array_equal(cached[unchanged], grainy[unchanged])
+
+
+def test_moving_there_and_back_leaves_no_trace(gpu: GpuContext, stage: Stage) -> None:
+    asset = stage.object(cube())
+    lights = [sphere_light((0.4, -0.3, 0.9), 2.0, 0.05), ambient(0.2)]
+    here = stage.document([asset], lights, floor())
+    placed = here.objects[0].model_copy(update={"position_m": (0.11, 0.07, 0.0)})
+    there = here.model_copy(update={"objects": (placed,)})
+    renderer = SceneRenderer(gpu, here)
+    first = renderer.render(frame(noisy())).color
+    renderer.set_scene(there)
+    moved = renderer.render(frame(noisy())).color
+    renderer.set_scene(here)
+    back = renderer.render(frame(noisy())).color
+    renderer.release()
+    assert np.array_equal(moved, composite(gpu, there, frame(noisy())))
+    assert not np.array_equal(first, moved)
+    assert np.array_equal(first, back)
+
+
+def test_light_that_changes_and_changes_back_leaves_no_trace(gpu: GpuContext, stage: Stage) -> None:
+    day = everyday(stage)
+    night = day.model_copy(
+        update={"lights": stage.document([], [directional((0.5, 0.2, -1.0), 0.4)]).lights}
+    )
+    renderer = SceneRenderer(gpu, day)
+    pictures = []
+    for document in (day, night, day):
+        renderer.set_scene(document)
+        pictures.append(renderer.render(frame()).color)
+    renderer.release()
+    assert np.array_equal(pictures[1], composite(gpu, night))
+    assert np.array_equal(pictures[0], pictures[2])
+
+
+def test_camera_that_moves_and_returns_leaves_no_trace(gpu: GpuContext, stage: Stage) -> None:
+    document = everyday(stage)
+    aside = frame(pose=look_at((-0.3, -0.8, 0.6)))
+    renderer = SceneRenderer(gpu, document)
+    first = renderer.render(frame()).color
+    moved = renderer.render(aside).color
+    back = renderer.render(frame()).color
+    renderer.release()
+    assert np.array_equal(moved, composite(gpu, document, aside))
+    assert np.array_equal(first, back)
+
+
+def test_lens_distortion_moves_the_object_not_the_picture(gpu: GpuContext, stage: Stage) -> None:
+    """The picture is never resampled: where nothing changes, its bytes stay, whatever the lens."""
+    document = stage.document([stage.object(cube(0.1))], [directional()], floor())
+    bent = replace(frame(noisy()).camera, distortion=np.array([-0.3, 0.1, 0.0, 0.0, 0.0]))
+    straight = composite(gpu, document, frame(noisy()))
+    picture = composite(gpu, document, frame(noisy(), camera=bent))
+    changed = (picture != noisy()).any(axis=-1)
+    assert 100 < np.count_nonzero(changed) < 0.5 * WIDTH * HEIGHT
+    assert not np.array_equal(picture, straight)
+
+
+def test_textures_are_read_back_whole(gpu: GpuContext) -> None:
+    texture = gpu.ctx.texture((5, 3), 2, np.arange(30, dtype=np.float16).tobytes(), dtype="f2", alignment=1)
+    assert array_of(texture)[2, 4].tolist() == [28, 29]
+    texture.release()
