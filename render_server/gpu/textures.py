@@ -49,3 +49,9 @@ def bind_samplers(
     """Bind textures to sampler units."""
     for unit, texture in textures.items():
         texture.use(location=unit)
+
+
+def release_target(target: moderngl.Framebuffer) -> None:
+    """Free a framebuffer; a bound one is unbound first, or the next one made would meet a GL error."""
+    target.ctx.detect_framebuffer(0).use()
+    target.release()

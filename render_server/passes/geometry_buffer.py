@@ -6,7 +6,7 @@ import moderngl
 
 from render_server.gpu.context import GpuContext
 from render_server.gpu.program import raster_program, set_uniforms
-from render_server.gpu.textures import texture_2d
+from render_server.gpu.textures import release_target, texture_2d
 from render_server.passes.mesh_buffers import MeshBuffers
 from render_server.view import CameraView
 
@@ -33,7 +33,8 @@ class GeometryBuffer:
 
     def release(self) -> None:
         """Free the GL objects."""
-        for item in (self._target, self._depth, self.position, self.normal, self.uv, self.tint):
+        release_target(self._target)
+        for item in (self._depth, self.position, self.normal, self.uv, self.tint):
             item.release()
 
 

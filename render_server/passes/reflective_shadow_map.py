@@ -8,7 +8,7 @@ import numpy as np
 
 from render_server.gpu.context import GpuContext
 from render_server.gpu.program import raster_program, set_uniforms
-from render_server.gpu.textures import texture_2d
+from render_server.gpu.textures import release_target, texture_2d
 from render_server.passes.light_maps import LightView, tile_columns
 from render_server.passes.mesh_buffers import MeshBuffers
 
@@ -51,7 +51,8 @@ class ShadowMapAtlas:
 
     def release(self) -> None:
         """Free the GL objects."""
-        for item in (self._target, self.depth, self.normal, self.uv):
+        release_target(self._target)
+        for item in (self.depth, self.normal, self.uv):
             item.release()
 
 

@@ -60,11 +60,13 @@ float first_depth(sampler2D map, LightView view, ivec2 texel) {
 // A receiver in a light's view: its plane, so that a tilted surface does not block its own surroundings.
 struct Receiver { vec2 s; float depth; vec3 normal; float plane; float bias; };
 
+const float DEPTH_ROUNDING = 1e-4;   // relative: no surface blocks itself by the rounding of its own depth
+
 Receiver receiver_at(LightView view, vec3 p, vec3 n, float bias) {
     vec3 v = (view.view_from_world * vec4(p, 1.0)).xyz;
     vec3 normal = mat3(view.view_from_world) * n;
     normal.z = min(normal.z, -0.1);   // grazing: a slope of at most 10
-    return Receiver(lateral(view, v), v.z, normal, dot(normal, v), bias);
+    return Receiver(lateral(view, v), v.z, normal, dot(normal, v), bias + DEPTH_ROUNDING * abs(v.z));
 }
 
 // Depth of the receiver's plane at another lateral position.
