@@ -1,9 +1,10 @@
 """The real scene's triangles: a mesh of the frame's depth, or a given model."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float32, Float64
 
 from protocol.errors import DeltalightError
 from protocol.frames import DepthImage, ViewFrame
@@ -18,6 +19,7 @@ from render_server.scene.mesh import TriangleMesh, load_mesh, merge_for_gpu
 from render_server.scene.scene_tracker import RealSceneTracker
 from render_server.view import CameraView
 
+COARSE_SHARE = 8  # of the triangles, for the coarse volume: its voxels are several times as large
 BOUND_POINTS = 4000  # points kept of a mesh to fit light views around it
 
 
@@ -70,20 +72,28 @@ class RealGeometry:
         self.frame = frame
         if self.is_model and self.state is not None:
             self._version += 1
-            self.state = GeometryState(
-                self._version, self._buffers, self.state.corners, self.state.points, self.state.materials
-            )
-            return True
-        self._build(self._model if self.is_model else [self._depth_mesh(frame, view)])
+            self.state = replace(self.state, version=self._version)
+        elif self.is_model:
+            self._build(self._model, None)
+        else:
+            assert frame.depth is not None
+            self._build_from_depth(frame.depth, view)
         return True
 
-    def _depth_mesh(self, frame: ViewFrame, view: CameraView) -> TriangleMesh:
-        depth = frame.depth
-        assert isinstance(depth, DepthImage)
+    def _build_from_depth(self, depth: DepthImage, view: CameraView) -> None:
+        """Mesh the depth image, and once more with few triangles for what lies far from the objects."""
         self.surface = depth_surface(depth, view.camera)
-        return depth_mesh(depth, view.camera, view.world_from_camera, self._budget, self.surface)
+        place = view.world_from_camera
+        fine = depth_mesh(depth, view.camera, place, self._budget, self.surface)
+        if not len(fine.triangles):
+            self.state = None
+            return
+        coarse = depth_mesh(depth, view.camera, place, self._budget // COARSE_SHARE, self.surface)
+        self._build([fine], triangle_corners(merge_for_gpu([coarse])))
 
-    def _build(self, meshes: list[TriangleMesh]) -> None:
+    def _build(
+        self, meshes: list[TriangleMesh], coarse_corners: Float32[np.ndarray, "k 3 10"] | None
+    ) -> None:
         """Merge and upload."""
         merged = merge_for_gpu(meshes)
         self._version += 1
@@ -96,6 +106,7 @@ class RealGeometry:
             triangle_corners(merged),
             _sample(merged.vertices[:, :3]),
             self._materials,
+            coarse_corners,
         )
 
     @property

@@ -113,7 +113,11 @@ class Relighting:
         with timers.measure("upload"):
             resources.picture.upload(frame)
         moved = self._real.update(frame, view)
-        assert self._real.state is not None
+        if self._real.state is None:
+            self._say(
+                "Depth showed no surface in some frames; they are passed through as the camera saw them."
+            )
+            return None
         with timers.measure("geometry buffer"):
             if moved:
                 surfaces = self._plan.scene.real.surfaces

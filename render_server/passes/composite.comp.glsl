@@ -10,7 +10,7 @@ layout(binding = 0, rgba8ui) writeonly uniform uimage2D code_out;
 layout(binding = 1, rgba16f) writeonly uniform image2D linear_out;
 layout(binding = 1) uniform usampler2D picture;
 layout(binding = 2) uniform sampler2D linear_picture;
-layout(binding = 3) uniform sampler2D response;
+layout(binding = 3) uniform sampler2D inverse_response;   // camera code of linear values
 layout(binding = 8) uniform sampler2D matte;
 layout(binding = 9) uniform sampler2D virtual_radiance;
 layout(binding = 10) uniform sampler2D direct_mu;
@@ -121,15 +121,13 @@ vec3 surrounding_ratio(ivec2 pixel, vec3 b) {
     return sum / total;
 }
 
-// Code whose linear value is nearest, by bisection of the response.
-uint encode(float x, int channel) {
-    int low = 0, high = 255;
-    while (high - low > 1) {
-        int mid = (low + high) / 2;
-        if (texelFetch(response, ivec2(mid, 0), 0)[channel] <= x) low = mid; else high = mid;
-    }
-    float a = texelFetch(response, ivec2(low, 0), 0)[channel], b = texelFetch(response, ivec2(high, 0), 0)[channel];
-    return uint(x - a < b - x ? low : high);
+// Camera code of each channel; the table is even in the square root, where codes are about equally far apart.
+uvec3 encode(vec3 x) {
+    int last = textureSize(inverse_response, 0).x - 1;
+    ivec3 at = ivec3(round(sqrt(clamp(x, 0.0, 1.0)) * float(last)));
+    return uvec3(round(vec3(
+        texelFetch(inverse_response, ivec2(at.r, 0), 0).r, texelFetch(inverse_response, ivec2(at.g, 0), 0).g,
+        texelFetch(inverse_response, ivec2(at.b, 0), 0).b)));
 }
 
 // ACES tone curve (Narkowicz's fit, 2015).
@@ -162,7 +160,7 @@ void main() {
     if (changed) {
         vec3 x = result * exposure_scale;
         if (filmic) x = aces(x);
-        code.rgb = uvec3(encode(x.r, 0), encode(x.g, 1), encode(x.b, 2));
+        code.rgb = encode(x);
     }
     imageStore(code_out, pixel, code);
     if (store_linear) imageStore(linear_out, pixel, vec4(result, 1.0));

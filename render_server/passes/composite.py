@@ -48,7 +48,13 @@ class CompositePass:
         """Compose; geometry and surfaces must be bound."""
         cones, direct = layers.cones, layers.direct
         bind_samplers(
-            {0: layers.grid.pixels, 1: picture.code, 2: picture.linear, 3: picture.response, 8: layers.matte}
+            {
+                0: layers.grid.pixels,
+                1: picture.code,
+                2: picture.linear,
+                3: picture.inverse_response,
+                8: layers.matte,
+            }
             | {9: layers.virtual_radiance, 10: direct.mu, 11: direct.rho, 12: cones.mu, 13: cones.rho}
             | {14: cones.specular_mu, 16: cones.specular_rho, 17: direct.lobe_mu, 18: direct.lobe_rho}
             | {19: layers.change.ratio, 20: layers.change.near}

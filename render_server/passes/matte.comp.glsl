@@ -7,7 +7,7 @@ layout(binding = 0, r16f) writeonly uniform image2D matte_out;
 layout(binding = 1) uniform sampler2D linear_picture;
 uniform float noise_sigma;     // m at 1 m
 
-const int RADIUS = 2;
+const int WINDOW = 5;   // pixels
 
 float covers(ivec2 pixel) {
     ivec2 raster = raster_texel(pixel);
@@ -22,21 +22,34 @@ float in_front(ivec2 pixel, float z) {
     return real > 0.0 && real < z - 3.0 * noise_sigma * z * z ? 0.0 : 1.0;
 }
 
+ivec2 neighbour(ivec2 pixel, int i, ivec2 size) {
+    return clamp(pixel + ivec2(i % WINDOW, i / WINDOW) - WINDOW / 2, ivec2(0), size - 1);
+}
+
+// Share of the window that is in front, of the pixels that are near and of similar colour.
+float softened(ivec2 pixel, float z, ivec2 size) {
+    vec3 colour = texelFetch(linear_picture, pixel, 0).rgb;
+    float sum = 0.0, weight = 0.0;
+    for (int i = 0; i < WINDOW * WINDOW; ++i) {
+        ivec2 at = neighbour(pixel, i, size);
+        vec3 d = (texelFetch(linear_picture, at, 0).rgb - colour) / (0.05 + colour);
+        vec2 away = vec2(at - pixel);
+        float w = exp(-0.25 * dot(away, away) - 4.0 * dot(d, d));
+        sum += w * in_front(at, z);
+        weight += w;
+    }
+    return sum / weight;
+}
+
 void main() {
     ivec2 pixel = ivec2(gl_GlobalInvocationID.xy);
     ivec2 size = textureSize(real_surface_position, 0);
     if (any(greaterThanEqual(pixel, size))) return;
     float z = covers(pixel);
     if (z <= 0.0) { imageStore(matte_out, pixel, vec4(0.0)); return; }
-    vec3 colour = texelFetch(linear_picture, pixel, 0).rgb;
-    float sum = 0.0, weight = 0.0;
-    for (int j = -RADIUS; j <= RADIUS; ++j)
-        for (int i = -RADIUS; i <= RADIUS; ++i) {
-            ivec2 at = clamp(pixel + ivec2(i, j), ivec2(0), size - 1);
-            vec3 d = (texelFetch(linear_picture, at, 0).rgb - colour) / (0.05 + colour);
-            float w = exp(-float(i * i + j * j) * 0.25 - 4.0 * dot(d, d));
-            sum += w * in_front(at, z);
-            weight += w;
-        }
-    imageStore(matte_out, pixel, vec4(sum / weight));
+    float share = 0.0;
+    for (int i = 0; i < WINDOW * WINDOW; ++i) share += in_front(neighbour(pixel, i, size), z);
+    share /= float(WINDOW * WINDOW);
+    if (share > 0.0 && share < 1.0) share = softened(pixel, z, size);
+    imageStore(matte_out, pixel, vec4(share));
 }

@@ -94,7 +94,7 @@ void main() {
     ivec3 first = max(low, ivec3(0)), last = min(high, ivec3(volume_size - 1));
     bvec3 cut = notEqual(low, high);
     if (!any(cut)) {   // most triangles of a depth mesh lie within one voxel
-        emit(t, vec4((a + b + c) / 3.0, 0.5 * length(n)), first, a, b, c, n);
+        if (first == last) emit(t, vec4((a + b + c) / 3.0, 0.5 * length(n)), first, a, b, c, n);   // rounding may put it outside
         return;
     }
     for (int x = first.x; x <= last.x; ++x)

@@ -21,6 +21,7 @@ from render_server.relight.defaults import ResolvedDvct
 from render_server.relight.frame import RelightInput
 
 SHADOW_REACH = 4.0  # in longest edges of the objects' bounds: how far around them real shadows are resolved
+LARGE_TRIANGLE = 0.1  # of that reach: from here on a triangle's own extent matters, not only its corners
 SELF_SHADOW_TEXELS = 1.5  # a virtual receiver is lifted by so many texels of the depth map
 
 
@@ -162,8 +163,17 @@ class DvctBase(ABC):
 
 
 def shadow_receivers(frame: RelightInput) -> Float64[np.ndarray, "n 3"]:
-    """Real points around the objects; all of them where none is near."""
+    """Real points around the objects; all of them where nothing is near.
+
+    Vertices within reach, and what triangles too large to have any there bring into the cube of that reach.
+    """
     low, high = frame.virtual.bounds
-    reach = SHADOW_REACH * float(np.max(high - low))
-    near = np.linalg.norm(frame.real.points - (low + high) / 2, axis=1) <= reach
-    return frame.real.points[near] if near.any() else frame.real.points
+    centre, reach = (low + high) / 2, SHADOW_REACH * float(np.max(high - low))
+    points = frame.real.points
+    near = points[np.linalg.norm(points - centre, axis=1) <= reach]
+    corners = frame.real.corners[..., :3].astype(np.float64)
+    first, last = corners.min(axis=1), corners.max(axis=1)
+    meets = np.all((first <= centre + reach) & (last >= centre - reach), axis=1)
+    large = meets & (np.max(last - first, axis=1) > LARGE_TRIANGLE * reach)
+    clipped = np.clip(corners[large].reshape(-1, 3), centre - reach, centre + reach)
+    return np.concatenate([near, clipped]) if len(near) or len(clipped) else points

@@ -29,6 +29,9 @@ class GeometryState:
     corners: Float32[np.ndarray, "m 3 10"]
     points: Float64[np.ndarray, "n 3"]
     materials: MaterialTable
+    coarse_corners: Float32[np.ndarray, "k 3 10"] | None = (
+        None  # fewer triangles for what lies far; None: all
+    )
 
     @property
     def bounds(self) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:

@@ -46,7 +46,8 @@ class FarScene:
         low, high = frame.real.bounds
         edge = min(float(np.max(high - low)), FAR_EDGE_M) * FAR_MARGIN
         self._placement = place_volume(low, high, FAR_SIZE, edge)
-        voxelize.run(self._store, frame.real.corners, self._placement)
+        coarse = frame.real.coarse_corners
+        voxelize.run(self._store, frame.real.corners if coarse is None else coarse, self._placement)
 
     def light(self, light: LightVoxelsPass, lighting: dict[str, Any]) -> None:
         """Give its voxels the radiance that the camera measured."""

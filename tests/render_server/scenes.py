@@ -1,4 +1,4 @@
-"""Small scenes for the renderer's tests: models, cameras, pictures, documents, and the fields that a method computed."""
+"""Small scenes for the renderer's tests: models, cameras, pictures, documents, and the fields computed from them."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +23,7 @@ Vector = tuple[float, float, float]
 
 
 def camera(
-    width: int = WIDTH, height: int = HEIGHT, focal: float = FOCAL, distortion: Any = (0.0,) * 5
+    width: int = WIDTH, height: int = HEIGHT, focal: float = FOCAL, distortion: tuple[float, ...] = (0.0,) * 5
 ) -> CameraModel:
     matrix = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
     return CameraModel(width, height, matrix, "plumb_bob", np.array(distortion))
@@ -51,7 +51,7 @@ def noisy(seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
 
 
-def frame(color: np.ndarray | None = None, *, pose: BoardPose | None = None, **changes: Any) -> ViewFrame:
+def frame(color: np.ndarray | None = None, *, pose: BoardPose | None = None, **changes: Any) -> ViewFrame:  # noqa: ANN401
     color = plain() if color is None else color
     given = {"frame_id": 0, "timestamp_ns": 0, "camera": camera(), "pose": pose or look_at()}
     return ViewFrame(color=color, **{**given, **changes})
@@ -129,9 +129,13 @@ class Stage:
         return stored(self.folder, f"mesh{self.count}", mesh)
 
     def object(
-        self, mesh: trimesh.Trimesh, base_color: Vector = (0.5, 0.5, 0.5), **more: Any
+        self,
+        mesh: trimesh.Trimesh,
+        base_color: Vector = (0.5, 0.5, 0.5),
+        material: dict[str, Any] | None = None,
+        **more: object,
     ) -> dict[str, Any]:
-        material = {"base_color": base_color, "specular": 0, **more.pop("material", {})}
+        material = {"base_color": base_color, "specular": 0, **(material or {})}
         return {"asset": self.asset(mesh), "material": material, **more}
 
     def document(
@@ -139,7 +143,7 @@ class Stage:
         objects: list[dict[str, Any]],
         lights: list[dict[str, Any]],
         real: trimesh.Trimesh | None = None,
-        **method: Any,
+        **method: object,
     ) -> SceneDocument:
         """`real`: the given model; None: the depth of each frame."""
         geometry: Any = "depth" if real is None else {"model": self.asset(real)}
@@ -154,7 +158,7 @@ class Stage:
         )
 
 
-def everyday(stage: Stage, **method: Any) -> SceneDocument:
+def everyday(stage: Stage, **method: object) -> SceneDocument:
     """A red ball and a green box on a floor beside a wall, under a lamp and a little light from everywhere."""
     wall = shifted(trimesh.creation.box((0.02, 2, 0.6)), -0.3, 0, 0.3)
     objects = [

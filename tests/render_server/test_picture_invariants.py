@@ -1,4 +1,4 @@
-"""What must hold for every picture (METHOD 7): bytes that are copied, shadows that are not, caches that do not show."""
+"""What must hold for every picture (METHOD 7): bytes are copied, real shadows stay, caches do not show."""
 
 import hashlib
 import subprocess
@@ -137,9 +137,7 @@ def test_depth_holes_never_hide_the_object(gpu: GpuContext, stage: Stage) -> Non
     depth = floor_depth(look_at())
     hole = np.ones((HEIGHT, WIDTH), bool)
     hole[30:90, 50:110] = False
-    whole, holed = (
-        solve(gpu, document, frame(depth=depth_image(depth, valid))) for valid in (None, hole)
-    )
+    whole, holed = (solve(gpu, document, frame(depth=depth_image(depth, valid))) for valid in (None, hole))
     assert np.count_nonzero(whole.matte == 1) > 100
     assert np.all(holed.matte[whole.matte == 1] == 1)
 
@@ -168,7 +166,9 @@ def test_pixels_beyond_every_influence_are_the_cameras(gpu: GpuContext, stage: S
     assert (picture != noisy()).any(axis=-1).sum() > 200
 
 
-def test_another_picture_of_the_same_scene_is_not_relit_with_the_old_one(gpu: GpuContext, stage: Stage) -> None:
+def test_another_picture_of_the_same_scene_is_not_relit_with_the_old_one(
+    gpu: GpuContext, stage: Stage
+) -> None:
     document = everyday(stage)
     renderer = SceneRenderer(gpu, document)
     renderer.render(frame(plain(90)))
@@ -214,9 +214,7 @@ def test_moving_there_and_back_leaves_no_trace(gpu: GpuContext, stage: Stage) ->
 
 def test_light_that_changes_and_changes_back_leaves_no_trace(gpu: GpuContext, stage: Stage) -> None:
     day = everyday(stage)
-    night = day.model_copy(
-        update={"lights": stage.document([], [directional((0.5, 0.2, -1.0), 0.4)]).lights}
-    )
+    night = day.model_copy(update={"lights": stage.document([], [directional((0.5, 0.2, -1.0), 0.4)]).lights})
     renderer = SceneRenderer(gpu, day)
     pictures = []
     for document in (day, night, day):

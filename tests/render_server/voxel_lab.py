@@ -1,0 +1,143 @@
+"""Voxels filled with emissive meshes, and single cones fired through them."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from render_server.gpu.context import GpuContext
+from render_server.gpu.program import ComputeProgram
+from render_server.gpu.textures import bind_samplers
+from render_server.passes.filter_voxels import FilterVoxelsPass
+from render_server.passes.light_table import LightTable
+from render_server.passes.light_voxels import LightVoxelsPass
+from render_server.passes.materials import MaterialTable
+from render_server.passes.mesh_buffers import triangle_corners
+from render_server.passes.resolve_voxels import ResolveVoxelsPass
+from render_server.passes.volume import Pyramid, VolumePlacement
+from render_server.passes.voxel_store import VoxelStore
+from render_server.passes.voxelize import VoxelizePass
+from render_server.scene.materials import Material
+from render_server.scene.mesh import GpuMesh, TriangleMesh, merge_for_gpu
+from render_server.scene.normals import smooth_normals
+
+DIRECTIONS = 6
+
+
+def gpu_mesh(mesh: trimesh.Trimesh, radiance: float = 0.0, *, inside_out: bool = False) -> GpuMesh:
+    """One black mesh that glows; `inside_out` turns its faces to the inside."""
+    triangles = np.asarray(mesh.faces, np.int32)
+    triangles = np.ascontiguousarray(triangles[:, ::-1] if inside_out else triangles)
+    positions = np.asarray(mesh.vertices, np.float32)
+    source, triangles, normals = smooth_normals(positions, triangles)
+    material = Material(
+        base_color=np.zeros(3, np.float32), specular=0.0, emission=np.full(3, radiance, np.float32)
+    )
+    return merge_for_gpu([TriangleMesh(positions[source], normals, triangles, None, material)])
+
+
+@dataclass
+class Voxels:
+    """Pyramids of one filling: mu is empty, rho holds the mesh."""
+
+    mu: Pyramid
+    rho: Pyramid
+    store: VoxelStore
+    empty: VoxelStore
+
+    def release(self) -> None:
+        for item in (self.mu, self.rho, self.store, self.empty):
+            item.release()
+
+
+class VoxelLab:
+    """A cube of `size`^3 voxels of edge 1 with its low corner at the origin, so that world = voxel coordinates."""
+
+    def __init__(self, gpu: GpuContext, size: int = 64) -> None:
+        self.gpu = gpu
+        self.placement = VolumePlacement((0.0, 0.0, 0.0), 1.0, size)
+        self._voxelize = VoxelizePass(gpu)
+        self._light = LightVoxelsPass(gpu)
+        self._resolve = ResolveVoxelsPass(gpu)
+        self._filter = FilterVoxelsPass(gpu)
+        self._table = LightTable(gpu, 64, 4)
+        self._table.set_environment(np.zeros((16, 16, 3), np.float32))
+        self._cones = ComputeProgram(gpu, Path(__file__).with_name("cones.comp.glsl"))
+
+    def surfels(self, mesh: GpuMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """World positions, areas, unit normals and voxel coordinates of a mesh's surfels."""
+        store = VoxelStore(self.gpu, self.placement.size)
+        self._voxelize.run(store, triangle_corners(mesh), self.placement)
+        _, count = store.counts()
+        assert count <= store.surfel_capacity
+        data = (
+            np.frombuffer(store.surfels.read(max(count, 1) * 64), np.float32).reshape(-1, 16)[:count].copy()
+        )
+        store.release()
+        index = data[:, 10].copy().view(np.uint32).astype(int)
+        size = self.placement.size
+        voxels = np.stack([index % size, index // size % size, index // size**2], axis=1)
+        return data[:, :3], data[:, 3], data[:, 4:7], voxels
+
+    def fill(self, mesh: GpuMesh) -> Voxels:
+        """Voxelise, light by its own glow, filter."""
+        size = self.placement.size
+        pyramids = [Pyramid(self.gpu, size, DIRECTIONS) for _ in range(2)]
+        stores = [VoxelStore(self.gpu, size) for _ in range(2)]
+        voxels = Voxels(pyramids[0], pyramids[1], stores[0], stores[1])
+        uniforms: dict[str, Any] = {**self.placement.uniforms(), **self._table.uniforms()}
+        materials = MaterialTable(self.gpu, mesh)
+        self._voxelize.run(voxels.store, triangle_corners(mesh), self.placement)
+        self._table.bind()
+        materials.bind()
+        self._light.light_virtual(voxels.store, {**uniforms, "bias_real": 0.0, "bias_virtual": 0.0})
+        self._resolve.resolve_rho(voxels.rho, voxels.empty, voxels.store, uniforms)
+        self._filter.run(voxels.rho, self.placement)
+        materials.release()
+        return voxels
+
+    def level_zero(self, voxels: Voxels) -> np.ndarray:
+        """(direction, z, y, x, rgba) of the rho pyramid's finest level."""
+        size = self.placement.size
+        texels = np.frombuffer(voxels.rho.texture.read(), np.float16).reshape(-1, size, size, 4)
+        return texels[: DIRECTIONS * size].reshape(DIRECTIONS, size, size, size, 4).astype(float)
+
+    def trace(self, voxels: Voxels, starts: np.ndarray, directions: np.ndarray, ratio: float) -> np.ndarray:
+        """(n, 4): radiance and transmittance of mu and of rho; `ratio` = cone diameter / distance."""
+        count = len(starts)
+        rays = np.zeros((count, 8), np.float32)
+        rays[:, :3], rays[:, 3], rays[:, 4:7] = starts, ratio, directions
+        ray_buffer = self.gpu.ctx.buffer(rays.tobytes())
+        results = self.gpu.ctx.buffer(reserve=count * 16)
+        everywhere = np.array([0, 0, 0, *[-self.placement.size] * 3], np.int32)
+        self._light.support.write(everywhere.tobytes())
+        self._light.bind_support()
+        bind_samplers({2: voxels.mu.texture, 3: voxels.rho.texture})
+        ray_buffer.bind_to_storage_buffer(0)
+        results.bind_to_storage_buffer(1)
+        self._cones.run((count,), ray_count=count, far_size=0, **self.placement.uniforms())
+        found = np.frombuffer(results.read(), np.float32).reshape(count, 4).copy()
+        ray_buffer.release()
+        results.release()
+        return found
+
+    def release(self) -> None:
+        for item in (self._voxelize, self._light, self._resolve, self._filter, self._table, self._cones):
+            item.release()
+
+
+def directions_everywhere(count: int, rng: np.random.Generator) -> np.ndarray:
+    found = rng.normal(size=(count, 3))
+    return found / np.linalg.norm(found, axis=1, keepdims=True)
+
+
+def cosine_directions(count: int, normal: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Directions of density cos/pi about a unit normal."""
+    share, angle = rng.uniform(size=count), rng.uniform(0, 2 * np.pi, count)
+    helper = np.eye(3)[np.argmin(np.abs(normal))]
+    x = np.cross(helper, normal)
+    x /= np.linalg.norm(x)
+    across = np.cos(angle)[:, None] * x + np.sin(angle)[:, None] * np.cross(normal, x)
+    return np.sqrt(share)[:, None] * across + np.sqrt(1 - share)[:, None] * normal
