@@ -37,6 +37,7 @@ class RealGeometry:
         self.material_names: tuple[str, ...] = ()
         self.is_model = isinstance(real.geometry, ModelGeometry)
         self.frame: ViewFrame | None = None
+        self.view: CameraView | None = None
         self.surface: DepthSurface | None = None
         if isinstance(real.geometry, ModelGeometry):
             self._model = self._load_model(real.geometry)
@@ -69,7 +70,7 @@ class RealGeometry:
             )
         if not self._tracker.update(frame):
             return False
-        self.frame = frame
+        self.frame, self.view = frame, view
         if self.is_model and self.state is not None:
             self._version += 1
             self.state = replace(self.state, version=self._version)

@@ -113,6 +113,8 @@ class Relighting:
         with timers.measure("upload"):
             resources.picture.upload(frame)
         moved = self._real.update(frame, view)
+        assert self._real.view is not None
+        view = self._real.view  # while nothing moves, the pose's own jitter must not shake the picture
         if self._real.state is None:
             self._say(
                 "Depth showed no surface in some frames; they are passed through as the camera saw them."

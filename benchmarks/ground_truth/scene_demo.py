@@ -20,9 +20,9 @@ from protocol.camera_model import CameraModel
 
 FRAME_COUNT = 30
 FRAME_RATE_HZ = 15
-STILL_FRAMES = 10
+STILL_FRAMES = 20
 """Frames before the camera starts its slow swing out and back."""
-SWING_DEG = 10.0
+SWING_DEG = 6.0
 
 TABLE_Z_M = -0.0005
 """The sheet has a thickness; its printed side is z = 0."""

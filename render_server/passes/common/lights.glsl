@@ -146,7 +146,7 @@ Occluder occluder(sampler2D map, Light light, int first, int count, vec3 p, vec3
     o.receiver = receiver_at(o.view, p, n, bias);
     // What a tilted surface rises within a texel of the map must not block it either.
     float texel = 2.0 * o.view.tile.w / o.view.tile.z * (o.view.range.z > 0.5 ? 1.0 : o.receiver.depth);
-    float slope = length(o.receiver.normal.xy) / -o.receiver.normal.z;
+    float slope = (abs(o.receiver.normal.x) + abs(o.receiver.normal.y)) / -o.receiver.normal.z;   // of texels askew too
     o.receiver.bias += texel * min(slope, STEEPEST);
     if (o.receiver.depth - o.receiver.bias <= o.view.range.x) return o;
     float reach = disc_shift(light, o.view, o.receiver.depth, o.view.range.x);
