@@ -62,7 +62,7 @@ class DvctMethod(StrictModel):
         description="How the delta meets the picture; null = ratio for exact, additive for paper.",
     )
     memory_budget_mb: int = Field(
-        default=2048,
+        default=4096,
         ge=16,
         le=65536,
         description="Greatest memory of the volumes, MB; beyond it rendering is refused.",

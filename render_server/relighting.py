@@ -7,6 +7,7 @@ from protocol.errors import DeltalightError
 from protocol.frames import ViewFrame
 from protocol.scene import SceneDocument
 from protocol.scene_method import DvctMethod
+from protocol.scene_objects import Material
 from render_server.gpu.context import GpuContext
 from render_server.gpu.timers import PassTimers
 from render_server.light_registration import register_lights
@@ -77,6 +78,8 @@ class Relighting:
         directions = OPERATORS[scene.method.operator].directions
         self._say(memory_statement(resolved.volume_size, directions, scene.method.memory_budget_mb))
         self._objects.load(scene.objects)
+        for sentence in ignored_wishes(scene):
+            self._say(sentence)
         return _Plan(scene, scene.method, resolved, build_lights(scene.lights))
 
     def _say(self, sentence: str) -> None:
@@ -194,3 +197,17 @@ class Relighting:
         for item in (self._objects, self._real, self._resources, self._method):
             if item is not None:
                 item.release()
+
+
+def ignored_wishes(scene: SceneDocument) -> list[str]:
+    """Sentences on what the document asks for and this release leaves out of the picture."""
+    materials = [item.material for item in scene.objects if isinstance(item.material, Material)]
+    wishes = {
+        "output.antialiasing": scene.output.antialiasing,
+        "output.camera_artifacts": scene.output.camera_artifacts,
+        f"shading.name `{scene.shading.name}`": scene.shading.name not in ("auto", "volume"),
+        "a material's transmission": any(material.transmission > 0 for material in materials),
+    }
+    return [
+        f"{name} arrives with a later release and is left out." for name, asked in wishes.items() if asked
+    ]

@@ -1,10 +1,8 @@
 """Making textures with the sampling state that every pass here wants."""
 
 from collections.abc import Mapping
-from typing import Any
 
 import moderngl
-import numpy as np
 
 from render_server.gpu.context import GpuContext
 
@@ -25,16 +23,6 @@ def texture_2d(
         texture.filter = (mode, mode)
     texture.repeat_x = texture.repeat_y = False
     return texture
-
-
-def texture_from_array(
-    gpu: GpuContext, array: np.ndarray[Any, Any], *, linear: bool = False, integer: bool = False
-) -> moderngl.Texture:
-    """Texture with the contents of `array` (h, w, components): float16, float32 or uint8."""
-    kind = {"float16": "f2", "float32": "f4", "uint8": "u1" if integer else "f1"}[array.dtype.name]
-    height, width, components = array.shape
-    data = np.ascontiguousarray(array).tobytes()
-    return texture_2d(gpu, (width, height), components, kind, linear=linear, data=data)
 
 
 def bind_images(*textures: moderngl.Texture | moderngl.Texture3D, first: int = 0) -> None:

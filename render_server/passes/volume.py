@@ -12,7 +12,6 @@ from protocol.errors import DeltalightError
 from render_server.gpu.context import GpuContext
 
 MEGABYTE = 1_000_000
-SUPPORT_SLOTS = 6
 
 
 @dataclass(frozen=True)

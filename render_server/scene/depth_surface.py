@@ -43,11 +43,6 @@ def noise_sigma(depth: DepthImage) -> float:
     return ASSUMED_NOISE_SIGMA_M if depth.noise_sigma_m is None else depth.noise_sigma_m
 
 
-def depth_points_normals(depth: DepthImage, camera: CameraModel) -> Float32[np.ndarray, "h w 3"]:
-    """Return unit normals in the optical frame, towards the camera; zero where depth gives none."""
-    return depth_surface(depth, camera).normals
-
-
 def depth_surface(depth: DepthImage, camera: CameraModel) -> DepthSurface:
     """Fit a plane to the surroundings of every valid pixel by least squares, without crossing edges.
 

@@ -19,7 +19,6 @@ LEAST_PIXELS = 30
 OUTLIER_DEVIATIONS = 3.0
 LEAST_IRRADIANCE = 1e-4
 GREATEST_ALBEDO = 0.95
-LEAST_ALBEDO = 0.02
 PERCENTILE = 99.0
 EROSION_PX = 2
 EDGE_POINTS = 8
@@ -143,18 +142,3 @@ def _dense_outline(patch: Float64[np.ndarray, "4 3"]) -> Float64[np.ndarray, "n 
     return np.concatenate(
         [start + share * (end - start) for start, end in zip(patch, following, strict=True)]
     )
-
-
-def albedo_from_irradiance(
-    measured: Float[np.ndarray, "h w 3"],
-    irradiance: Float[np.ndarray, "h w 3"],
-    valid: Bool[np.ndarray, "h w"],
-) -> Float32[np.ndarray, "h w 3"]:
-    """Return albedo = pi B/E_mu, clipped to 0.02..0.95; where it is not valid, the mean of the valid pixels.
-
-    ([P2] eq. 1 with visibility, ambient and one bounce in E_mu, METHOD 2; 0.5 where no pixel is valid.)
-    """
-    ratio = np.pi * measured / np.maximum(irradiance, LEAST_IRRADIANCE)
-    albedo = np.asarray(np.clip(ratio, LEAST_ALBEDO, GREATEST_ALBEDO), np.float32)
-    albedo[~valid] = albedo[valid].mean(axis=0, dtype=np.float64) if valid.any() else 0.5
-    return albedo

@@ -58,10 +58,6 @@ class RealSceneTracker:
         self._reference = current
         return True
 
-    def reset(self) -> None:
-        """Make the next frame count as changed."""
-        self._reference = None
-
     def _changed(self, old: _Reference, new: _Reference) -> bool:
         before, after = old.frame, new.frame
         return (

@@ -8,7 +8,7 @@ from protocol.camera_model import CameraModel
 from protocol.errors import DeltalightError
 from protocol.frames import DepthImage
 from render_server.scene.depth_mesh import depth_mesh, stride_for_budget
-from render_server.scene.depth_surface import depth_points_normals, depth_surface
+from render_server.scene.depth_surface import depth_surface
 
 WIDTH, HEIGHT = 160, 120
 MATRIX = np.array([[150.0, 0, 81.3], [0, 152.0, 58.9], [0, 0, 1]])
@@ -78,7 +78,7 @@ def test_no_triangle_crosses_a_step_and_both_sides_keep_their_normals() -> None:
     assert np.ptp(z, axis=1).max() < 1e-4
     np.testing.assert_allclose(np.unique(z.round(3)), [0.8, 1.2], atol=1e-6)
     np.testing.assert_allclose(mesh.normals, np.tile([0, 0, -1], (len(mesh.normals), 1)), atol=1e-4)
-    normals = depth_points_normals(depth, PINHOLE)
+    normals = depth_surface(depth, PINHOLE).normals
     np.testing.assert_allclose(normals[..., 2], -1, atol=1e-4)
 
 
@@ -116,7 +116,7 @@ def test_sphere_has_radial_normals_in_spite_of_noise() -> None:
     z = np.where(inside > 0, (b - np.sqrt(np.maximum(inside, 0))) / a, 0)
     sigma = 0.001
     noisy = np.where(z > 0, z + sigma * z**2 * np.random.default_rng(2).normal(size=z.shape), 0)
-    normals = depth_points_normals(image(noisy.astype(np.float32), sigma=sigma), PINHOLE)
+    normals = depth_surface(image(noisy.astype(np.float32), sigma=sigma), PINHOLE).normals
     radial = (rays * z[..., None] - centre) / radius
     facing = (z > 0) & ((radial * rays).sum(axis=2) / np.sqrt(a) < -0.5)
     angles = np.degrees(np.arccos(np.clip((normals * radial).sum(axis=2)[facing], -1, 1)))

@@ -5,7 +5,6 @@ from protocol.board import BoardSpec
 from protocol.camera_model import CameraModel
 from protocol.frames import BoardPose
 from render_server.scene.registration import (
-    albedo_from_irradiance,
     paper_pixels,
     registration_from_albedo_percentile,
     registration_from_patch,
@@ -116,12 +115,3 @@ def test_a_board_behind_or_out_of_sight_has_no_paper() -> None:
     away = np.diag([1.0, -1, -1, 1])
     away[:3, 3] = [5, 5, 0.4]
     assert not paper_pixels(BOARD, camera, BoardPose(away)).any()
-
-
-def test_albedo_is_the_papers_ratio_inside_its_bounds() -> None:
-    irradiance = np.full((1, 4, 3), 0.5)
-    measured = np.array([0.3, 0.0, 5.0, 0.9])[None, :, None] * irradiance / np.pi
-    albedo = albedo_from_irradiance(measured, irradiance, np.array([[True, True, True, False]]))
-    assert albedo[0, :, 0] == pytest.approx([0.3, 0.02, 0.95, (0.3 + 0.02 + 0.95) / 3])
-    nothing = albedo_from_irradiance(measured, irradiance, np.zeros((1, 4), bool))
-    assert np.unique(nothing).tolist() == [0.5]

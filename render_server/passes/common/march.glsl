@@ -1,9 +1,9 @@
 // Cone marching with two transmittances through the same voxels (METHOD 3, exact operator).
 //
-// A ray walks from slice to slice of cells across its main axis and samples the middle of each, so that every cell is
-// met once, also where the level changes. The coverage that it meets is summed and a cone is blocked when the sum is
-// that of a wall. (Front-to-back products of a one-voxel shell let e^-2 of the light through at any step: no furnace
-// test could hold.)
+// A ray walks across the slices of cells along its main axis and looks where they touch, half into each, so that every
+// cell is met once, and none is missed where the level changes. The coverage that it meets is summed and a cone is
+// blocked when the sum is that of a wall. (Front-to-back products of a one-voxel shell let e^-2 of the light through at
+// any step: no furnace test could hold.)
 #include "passes/common/volume.glsl"
 
 layout(binding = 2) uniform sampler3D pyramid_mu;
@@ -42,28 +42,39 @@ struct Walk {
     vec3 slope;      // direction, 1 on the main axis
     float stretch;   // distance a cell of the main axis
     ivec3 facing;    // slabs that the ray sees from the front
-    int plane;       // where the next slice begins
+    vec3 ahead;      // from the next look's face to its sample: half a cell at the start, where nothing behind counts
+    int plane;       // main coordinate of the face
     int level;
 };
 
 Walk walk_from(vec3 q, vec3 d) {
     vec3 a = abs(d);
     int axis = a.x >= a.y && a.x >= a.z ? 0 : (a.y >= a.z ? 1 : 2);
-    float first = d[axis] >= 0.0 ? q[axis] : -q[axis];
+    float way = d[axis] >= 0.0 ? 1.0 : -1.0;
+    vec3 ahead = vec3(0.0);
+    ahead[axis] = 0.5 * way;
     ivec3 facing = ivec3(d.x >= 0.0 ? 0 : 1, d.y >= 0.0 ? 2 : 3, d.z >= 0.0 ? 4 : 5);
-    return Walk(q, first, d / a[axis], 1.0 / a[axis], facing, int(ceil(first - 0.5)), 0);
+    return Walk(q, way * q[axis], d / a[axis], 1.0 / a[axis], facing, ahead, int(ceil(way * q[axis] - 0.5)), 0);
 }
 
-float middle(Walk w) { return float(w.plane) + 0.5 * float(1 << w.level) - w.first; }
-
 float travelled(Walk w) { return max(float(w.plane) - w.first, 0.0) * w.stretch; }
+
+vec3 sample_point(Walk w) { return w.from + (float(w.plane) - w.first) * w.slope + w.ahead; }
+
+float share(Walk w) { return w.ahead == vec3(0.0) ? 1.0 : 0.5; }
 
 // Cells grow, at most twofold a slice, to half..all of the cone's diameter, where a slice begins that is whole on the
 // coarser level too. `before`: what the cone had travelled ahead of this walk, cells of level 0.
 void choose_level(inout Walk w, float ratio, float before, int levels) {
     int wide = 2 << w.level;
     bool whole = w.level + 1 < levels && (w.plane & (wide - 1)) == 0;
-    if (whole && ratio * (before + middle(w) * w.stretch) >= float(wide)) ++w.level;
+    if (whole && ratio * (before + travelled(w)) >= float(wide)) ++w.level;
+}
+
+void advance(inout Walk w, float ratio, float before, int levels) {
+    w.plane += 1 << w.level;
+    w.ahead = vec3(0.0);
+    choose_level(w, ratio, before, levels);
 }
 
 // Coverage and radiance that the ray meets in one slice. Of all surfaces in a cell, f and b are known: their area
@@ -97,13 +108,12 @@ Crossed march_near(sampler3D pyramid, vec3 q, vec3 d, float ratio, out float t, 
     vec3 high = vec3(-support[3], -support[4], -support[5]) + 1.0;
     differs = false;
     for (int i = 0; i < 1024; ++i) {
-        choose_level(w, ratio, 0.0, volume_levels);
-        vec3 at = q + middle(w) * w.slope;
+        vec3 at = sample_point(w);
         if (!inside_volume(at) || sum.coverage >= WALL) break;
         vec3 reach = vec3(1.5 * float(1 << w.level));
         differs = differs || (all(greaterThan(at, low - reach)) && all(lessThan(at, high + reach)));
-        cross_cell(directional_sample(pyramid, volume_size, at, w), sum);
-        w.plane += 1 << w.level;
+        cross_cell(share(w) * directional_sample(pyramid, volume_size, at, w), sum);
+        advance(w, ratio, 0.0, volume_levels);
     }
     t = travelled(w);
     return sum;
@@ -113,12 +123,12 @@ Crossed march_near(sampler3D pyramid, vec3 q, vec3 d, float ratio, out float t, 
 void march_far(vec3 q, vec3 d, float before, float ratio, inout Crossed sum) {
     Walk w = walk_from(q, d);
     for (int i = 1; i < far_levels; ++i) choose_level(w, ratio, before, far_levels);
+    w.ahead *= float(1 << w.level);
     for (int i = 0; i < 256; ++i) {
-        choose_level(w, ratio, before, far_levels);
-        vec3 at = q + middle(w) * w.slope;
+        vec3 at = sample_point(w);
         if (!inside_cube(at, far_size) || sum.coverage >= WALL) break;
-        cross_cell(directional_sample(pyramid_far, far_size, at, w), sum);
-        w.plane += 1 << w.level;
+        cross_cell(share(w) * directional_sample(pyramid_far, far_size, at, w), sum);
+        advance(w, ratio, before, far_levels);
     }
 }
 
