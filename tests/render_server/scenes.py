@@ -51,6 +51,17 @@ def noisy(seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
 
 
+def checkered() -> np.ndarray:
+    """A floor of light and dark squares as the usual camera sees it, brighter to the right."""
+    rays = np.dstack([camera().rays(), np.ones((HEIGHT, WIDTH))])
+    matrix = look_at().world_from_camera
+    along = rays @ matrix[:3, :3].T
+    place = matrix[:3, 3] - along * (matrix[2, 3] / along[..., 2:])
+    light = (np.floor(place[..., 0] * 8) + np.floor(place[..., 1] * 8)) % 2
+    brightness = 70 + 70 * light + np.linspace(0, 60, WIDTH)
+    return np.stack([brightness, 0.95 * brightness, 0.85 * brightness], axis=-1).astype(np.uint8)
+
+
 def frame(color: np.ndarray | None = None, *, pose: BoardPose | None = None, **changes: Any) -> ViewFrame:  # noqa: ANN401
     color = plain() if color is None else color
     given = {"frame_id": 0, "timestamp_ns": 0, "camera": camera(), "pose": pose or look_at()}
@@ -128,7 +139,7 @@ class Stage:
         self.count += 1
         return stored(self.folder, f"mesh{self.count}", mesh)
 
-    def object(
+    def virtual(
         self,
         mesh: trimesh.Trimesh,
         base_color: Vector = (0.5, 0.5, 0.5),
@@ -162,8 +173,8 @@ def everyday(stage: Stage, **method: object) -> SceneDocument:
     """A red ball and a green box on a floor beside a wall, under a lamp and a little light from everywhere."""
     wall = shifted(trimesh.creation.box((0.02, 2, 0.6)), -0.3, 0, 0.3)
     objects = [
-        stage.object(ball(), (0.8, 0.2, 0.1), id="ball", material={"roughness": 0.4, "specular": 0.5}),
-        stage.object(cube(0.08, (0.12, 0.08, 0)), (0.2, 0.7, 0.2), id="box"),
+        stage.virtual(ball(), (0.8, 0.2, 0.1), id="ball", material={"roughness": 0.4, "specular": 0.5}),
+        stage.virtual(cube(0.08, (0.12, 0.08, 0)), (0.2, 0.7, 0.2), id="box"),
     ]
     lights = [sphere_light((0.5, -0.4, 1.0), 2.0, 0.05), ambient(0.15)]
     return stage.document(objects, lights, trimesh.util.concatenate([floor(), wall]), **method)

@@ -51,7 +51,7 @@ def test_no_object_gives_the_cameras_bytes(gpu: GpuContext, stage: Stage) -> Non
 
 
 def test_invisible_object_gives_the_cameras_bytes(gpu: GpuContext, stage: Stage) -> None:
-    document = stage.document([stage.object(cube(), visible=False)], [directional(), ambient(0.2)], floor())
+    document = stage.document([stage.virtual(cube(), visible=False)], [directional(), ambient(0.2)], floor())
     assert np.array_equal(composite(gpu, document, frame(noisy())), noisy())
 
 
@@ -65,7 +65,7 @@ def test_without_pose_the_cameras_bytes_and_the_status_say_so(gpu: GpuContext, s
 
 def test_object_behind_the_camera_without_light_changes_nothing(gpu: GpuContext, stage: Stage) -> None:
     """Its volume, too, lies behind the camera, and no lamp throws its shadow into view."""
-    document = stage.document([stage.object(cube(at=(0.25, -3.0, 0.6)))], [ambient(0.2)], floor(5))
+    document = stage.document([stage.virtual(cube(at=(0.25, -3.0, 0.6)))], [ambient(0.2)], floor(5))
     assert np.array_equal(composite(gpu, document, frame(noisy())), noisy())
 
 
@@ -115,7 +115,7 @@ def test_no_shadow_where_the_real_scene_is_in_shadow(gpu: GpuContext, stage: Sta
     """A wall hides the lamp from a part of the floor; an object inside the wall's shadow darkens nothing there."""
     wall = shifted(cube(1.0), 0.65, 0, 0)  # its face towards the object is the plane x = 0.15
     sun = directional((-1.0, 0.0, -0.5), 2.0)
-    objects = [stage.object(cube(0.1))]
+    objects = [stage.virtual(cube(0.1))]
     open_floor = solve(gpu, stage.document(objects, [sun], floor()))
     walled = stage.document(objects, [sun], wall + floor())
     renderer = SceneRenderer(gpu, walled)
@@ -133,7 +133,7 @@ def test_no_shadow_where_the_real_scene_is_in_shadow(gpu: GpuContext, stage: Sta
 
 
 def test_depth_holes_never_hide_the_object(gpu: GpuContext, stage: Stage) -> None:
-    document = stage.document([stage.object(ball())], [directional(), ambient(0.2)])
+    document = stage.document([stage.virtual(ball())], [directional(), ambient(0.2)])
     depth = floor_depth(look_at())
     hole = np.ones((HEIGHT, WIDTH), bool)
     hole[30:90, 50:110] = False
@@ -145,7 +145,7 @@ def test_depth_holes_never_hide_the_object(gpu: GpuContext, stage: Stage) -> Non
 def test_real_surface_in_front_hides_the_object_but_not_its_shadow(gpu: GpuContext, stage: Stage) -> None:
     """Depth masks the object only, never its delta."""
     screen = shifted(cube(1.0), 0, -0.68, 0.03)  # hangs 3 cm above the floor, its back at y = -0.18
-    document = stage.document([stage.object(cube(0.1))], [directional((0.0, -1.0, -0.7))], screen + floor())
+    document = stage.document([stage.virtual(cube(0.1))], [directional((0.0, -1.0, -0.7))], screen + floor())
     pose = look_at((0.0, -1.3, 0.3), (0.0, 0.0, 0.05))
     assert solve(gpu, document, frame(pose=pose)).matte.max() == 0
     above = look_at((0.0, 0.9, 0.65))
@@ -155,7 +155,7 @@ def test_real_surface_in_front_hides_the_object_but_not_its_shadow(gpu: GpuConte
 
 
 def test_pixels_beyond_every_influence_are_the_cameras(gpu: GpuContext, stage: Stage) -> None:
-    document = stage.document([stage.object(cube(0.1))], [directional(), ambient(0.2)], floor(5))
+    document = stage.document([stage.virtual(cube(0.1))], [directional(), ambient(0.2)], floor(5))
     renderer = SceneRenderer(gpu, document)
     picture = renderer.render(frame(noisy())).color
     fields = fields_of(renderer)
@@ -195,7 +195,7 @@ def test_noise_in_the_picture_passes_through_the_caches(gpu: GpuContext, stage: 
 
 
 def test_moving_there_and_back_leaves_no_trace(gpu: GpuContext, stage: Stage) -> None:
-    asset = stage.object(cube())
+    asset = stage.virtual(cube())
     lights = [sphere_light((0.4, -0.3, 0.9), 2.0, 0.05), ambient(0.2)]
     here = stage.document([asset], lights, floor())
     placed = here.objects[0].model_copy(update={"pose": Pose(translation_m=(0.11, 0.07, 0.0))})
@@ -239,7 +239,7 @@ def test_camera_that_moves_and_returns_leaves_no_trace(gpu: GpuContext, stage: S
 
 def test_lens_distortion_moves_the_object_not_the_picture(gpu: GpuContext, stage: Stage) -> None:
     """The picture is never resampled: where nothing changes, its bytes stay, whatever the lens."""
-    document = stage.document([stage.object(cube(0.1))], [directional()], floor())
+    document = stage.document([stage.virtual(cube(0.1))], [directional()], floor())
     bent = replace(frame(noisy()).camera, distortion=np.array([-0.3, 0.1, 0.0, 0.0, 0.0]))
     straight = composite(gpu, document, frame(noisy()))
     picture = composite(gpu, document, frame(noisy(), camera=bent))

@@ -102,7 +102,7 @@ class VoxelLab:
         """(direction, z, y, x, rgba) of the rho pyramid's finest level."""
         size = self.placement.size
         texels = np.frombuffer(voxels.rho.texture.read(), np.float16).reshape(-1, size, size, 4)
-        return texels[: DIRECTIONS * size].reshape(DIRECTIONS, size, size, size, 4).astype(float)
+        return np.asarray(texels[: DIRECTIONS * size].reshape(DIRECTIONS, size, size, size, 4), float)
 
     def trace(self, voxels: Voxels, starts: np.ndarray, directions: np.ndarray, ratio: float) -> np.ndarray:
         """(n, 4): radiance and transmittance of mu and of rho; `ratio` = cone diameter / distance."""
@@ -130,7 +130,7 @@ class VoxelLab:
 
 def directions_everywhere(count: int, rng: np.random.Generator) -> np.ndarray:
     found = rng.normal(size=(count, 3))
-    return found / np.linalg.norm(found, axis=1, keepdims=True)
+    return np.asarray(found / np.linalg.norm(found, axis=1, keepdims=True))
 
 
 def cosine_directions(count: int, normal: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -140,4 +140,4 @@ def cosine_directions(count: int, normal: np.ndarray, rng: np.random.Generator) 
     x = np.cross(helper, normal)
     x /= np.linalg.norm(x)
     across = np.cos(angle)[:, None] * x + np.sin(angle)[:, None] * np.cross(normal, x)
-    return np.sqrt(share)[:, None] * across + np.sqrt(1 - share)[:, None] * normal
+    return np.asarray(np.sqrt(share)[:, None] * across + np.sqrt(1 - share)[:, None] * normal)
