@@ -3,10 +3,10 @@
 #include "passes/common/march.glsl"
 #include "passes/common/environment.glsl"
 #include "passes/common/brdf.glsl"
-#include "passes/common/lights.glsl"
 #include "passes/common/sampling_grid.glsl"
 
-layout(local_size_x = 8, local_size_y = 8) in;
+layout(local_size_x = 64) in;
+layout(std430, binding = 6) readonly buffer Texels { uint texel_count; uint texels[]; };   // select_texels lists them
 #ifdef REAL
 layout(binding = 0, rgba16f) writeonly uniform image2D irradiance_mu;    // rgb E_mu, a: 1 where traced
 layout(binding = 1, rgba16f) writeonly uniform image2D irradiance_rho;   // rgb E_rho, a: volume fade
@@ -19,7 +19,6 @@ layout(binding = 2, rgba16f) writeonly uniform image2D specular_mu;      // rgb 
 layout(binding = 3, rgba16f) writeonly uniform image2D specular_rho;
 uniform int cone_count;
 uniform vec3 camera_position;
-uniform bool everywhere;   // also where the volume does not reach (photometric registration)
 
 const float START = 1.5;         // voxels along the normal: with one-sided voxels enough against self-hits
 
@@ -48,50 +47,38 @@ void diffuse(vec3 q, vec3 n, bool only_rho, out vec3 e_mu, out vec3 e_rho) {
     e_rho *= PI / float(cone_count);
 }
 
-void main() {
-    ivec2 texel = ivec2(gl_GlobalInvocationID.xy);
-    if (any(greaterThanEqual(texel, low_resolution_size))) return;
+void trace(ivec2 texel) {
     SurfacePoint s = surface_point(texel);
     vec3 q = volume_coordinate(s.position);
-    vec3 e_mu = vec3(0.0), e_rho = vec3(0.0), c_mu = vec3(0.0), c_rho = vec3(0.0);
-    float traced = 0.0, fade = 0.0;
+    vec3 start = q + START * s.normal;
+    vec3 e_mu, e_rho, c_mu = vec3(0.0), c_rho = vec3(0.0);
 #ifdef REAL
-    fade = s.present ? volume_fade(q) : 0.0;
-    bool active_here = s.present && (fade > 0.0 || everywhere || object_may_shadow(s.position, 0.0));
+    diffuse(start, s.normal, false, e_mu, e_rho);
 #else
-    bool active_here = s.present;
+    diffuse(start, s.normal, true, e_mu, e_rho);
 #endif
-    if (active_here) {
-        vec3 start = q + START * s.normal;
-        traced = 1.0;
-#ifdef REAL
-        diffuse(start, s.normal, false, e_mu, e_rho);
-#else
-        diffuse(start, s.normal, true, e_mu, e_rho);
-#endif
-        if (s.roughness >= 0.0) {
-            vec3 v = normalize(camera_position - s.position);
-            vec3 d = reflect(-v, s.normal);
-            float half_angle = specular_half_angle(s.roughness);
-            March m = march(start, d, 2.0 * tan(half_angle), false);
-            vec3 r = environment(d, half_angle);
-            c_mu = m.c_mu + m.t_mu * r;
-            c_rho = m.c_rho + m.t_rho * r;
-        }
+    if (s.roughness >= 0.0) {
+        vec3 v = normalize(camera_position - s.position);
+        vec3 d = reflect(-v, s.normal);
+        float half_angle = specular_half_angle(s.roughness);
+        March m = march(start, d, 2.0 * tan(half_angle), false);
+        vec3 r = environment(d, half_angle);
+        c_mu = m.c_mu + m.t_mu * r;
+        c_rho = m.c_rho + m.t_rho * r;
     }
 #ifdef REAL
-    if (s.present && !active_here) {   // the objects do not reach: the environment, unchanged
-        e_mu = e_rho = environment_irradiance(s.normal);
-        if (s.roughness >= 0.0) {
-            vec3 d = reflect(normalize(s.position - camera_position), s.normal);
-            c_mu = c_rho = environment(d, specular_half_angle(s.roughness));
-        }
-    }
-    imageStore(irradiance_mu, texel, vec4(e_mu, traced));
-    imageStore(irradiance_rho, texel, vec4(e_rho, fade));
-    imageStore(specular_mu, texel, vec4(c_mu, traced));
+    imageStore(irradiance_mu, texel, vec4(e_mu, 1.0));
+    imageStore(irradiance_rho, texel, vec4(e_rho, volume_fade(q)));
+    imageStore(specular_mu, texel, vec4(c_mu, 1.0));
 #else
-    imageStore(irradiance_rho, texel, vec4(e_rho, traced));
+    imageStore(irradiance_rho, texel, vec4(e_rho, 1.0));
 #endif
-    imageStore(specular_rho, texel, vec4(c_rho, traced));
+    imageStore(specular_rho, texel, vec4(c_rho, 1.0));
+}
+
+void main() {
+    for (uint i = gl_GlobalInvocationID.x; i < texel_count; i += gl_NumWorkGroups.x * 64u) {
+        int index = int(texels[i]);
+        trace(ivec2(index % low_resolution_size.x, index / low_resolution_size.x));
+    }
 }
