@@ -28,13 +28,15 @@ class Composer:
     def start(self, relit: RelitFrame, output: Output) -> None:
         """Compose and begin to read back; `finish` gives the oldest picture that was started."""
         composite = self._pass_for(relit.input.view.size)
+        needs_linear = self._with_linear or output.view in ("effects", "delta")
         uniforms: dict[str, Any] = {
             **relit.input.view.uniforms(),
             **relit.input.surface_uniforms,
             **relit.uniforms,
             "additive": relit.additive,
             "filmic": output.tone == "aces",
-            "store_linear": self._with_linear or output.view in ("effects", "delta"),
+            "store_linear": needs_linear,
+            "whole": needs_linear or output.tone == "aces",
         }
         with relit.timers.measure("composite"):
             relit.input.bind_geometry()

@@ -60,7 +60,8 @@ class PictureResources:
         self.virtual_raster.position.use(location=6)
         self.virtual_raster.normal.use(location=7)
         self.picture.rays.use(location=15)
-        self.matte.run(self.picture, {**view.uniforms(), "noise_sigma": real.noise_sigma})
+        rectangle = view.rectangle_around(virtual.points)
+        self.matte.run(self.picture, rectangle, {**view.uniforms(), "noise_sigma": real.noise_sigma})
 
     def _fill_real(self, real: RealGeometry, view: CameraView) -> None:
         count = int(self.surface_uniforms["surface_count"])

@@ -11,6 +11,7 @@ from protocol.camera_model import CameraModel
 
 NEAR_M = 0.02
 FAR_M = 100.0
+RECTANGLE_MARGIN_PX = 8  # a lens bends the edges between the corners of a box
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +73,23 @@ class CameraView:
                 [0, 0, 1, 0],
             ]
         )
+
+    def rectangle_around(self, points: Float64[np.ndarray, "n 3"]) -> tuple[int, int, int, int]:
+        """First column and row, width and height of the pixels that can show the hull of world points.
+
+        The whole picture if one of them lies behind the camera; none (0, 0) if all lie beside the picture.
+        """
+        matrix = self.camera_from_world
+        seen = points @ matrix[:3, :3].T + matrix[:3, 3]
+        if (seen[:, 2] <= NEAR_M).any():
+            return 0, 0, *self.size
+        pixels = self.camera.project(seen)
+        if not np.isfinite(pixels).all():
+            return 0, 0, *self.size
+        low = np.clip(np.floor(pixels.min(axis=0)) - RECTANGLE_MARGIN_PX, 0, self.size)
+        high = np.clip(np.ceil(pixels.max(axis=0)) + RECTANGLE_MARGIN_PX, 0, self.size)
+        x, y, width, height = (int(v) for v in (*low, *(high - low)))
+        return x, y, width, height
 
     def uniforms(self) -> dict[str, Any]:
         """Every uniform that shaders read of the camera."""

@@ -10,6 +10,8 @@ import numpy as np
 from render_server.gpu.context import GpuContext
 from render_server.gpu.shader_source import shader_source
 
+SOFTWARE_WALKERS = 1024
+
 Uniform = float | int | bool | Sequence[float] | Sequence[int] | np.ndarray[Any, Any]
 
 
@@ -51,6 +53,11 @@ class ComputeProgram:
     def release(self) -> None:
         """Free the GL object."""
         self._shader.release()
+
+
+def list_threads(gpu: GpuContext, longest: int) -> int:
+    """Threads to walk a list: one an entry on a GPU; few in software, where an idle one costs too."""
+    return min(longest, SOFTWARE_WALKERS) if gpu.is_software else longest
 
 
 def _local_size(path: Path) -> tuple[int, int, int]:

@@ -1,19 +1,30 @@
-// How light changed on the reduced grid. RATIO: E_rho / E_mu at each texel's pixel. Otherwise: whether anything within
-// FILL_RADIUS texels changed at all, so that composition can pass over the rest of the picture.
+// How light changed on the reduced grid. RATIO: E_rho / E_mu at each texel's pixel, and whether anything changed in
+// its block of pixels. Otherwise: list the texels that are within FILL_RADIUS of a change or show an object; only
+// their pixels are composed.
 layout(local_size_x = 8, local_size_y = 8) in;
-layout(binding = 0, rgba16f) writeonly uniform image2D result;
 layout(binding = 0) uniform isampler2D sample_pixels;
+#ifdef RATIO
+layout(binding = 0, rgba16f) writeonly uniform image2D result;
 layout(binding = 1) uniform sampler2D direct_mu;
 layout(binding = 2) uniform sampler2D direct_rho;
 layout(binding = 3) uniform sampler2D cone_mu;
 layout(binding = 8) uniform sampler2D cone_rho;
-layout(binding = 9) uniform sampler2D ratios;
 layout(binding = 16) uniform sampler2D specular_mu;
 layout(binding = 17) uniform sampler2D specular_rho;
+uniform int scale;
 
 const float LEAST_IRRADIANCE = 1e-4;
 
-#ifdef RATIO
+bool block_changed(ivec2 texel) {
+    bool changed = false;
+    ivec2 last = textureSize(direct_mu, 0) - 1;
+    for (int i = 0; i < scale * scale; ++i) {
+        ivec2 pixel = min(texel * scale + ivec2(i % scale, i / scale), last);
+        changed = changed || texelFetch(direct_mu, pixel, 0).rgb != texelFetch(direct_rho, pixel, 0).rgb;
+    }
+    return changed;
+}
+
 // rgb: ratio; a: 0 no real surface, 1 unchanged, 2 changed.
 vec4 value(ivec2 texel) {
     ivec2 at = texelFetch(sample_pixels, texel, 0).xy;
@@ -21,22 +32,32 @@ vec4 value(ivec2 texel) {
     vec4 rho = texelFetch(cone_rho, texel, 0), mu = texelFetch(cone_mu, texel, 0);
     vec3 e_mu = texelFetch(direct_mu, at, 0).rgb + mu.rgb;
     vec3 e_rho = texelFetch(direct_rho, at, 0).rgb + mu.rgb + rho.a * (rho.rgb - mu.rgb);
-    bool changed = e_mu != e_rho || texelFetch(specular_mu, texel, 0) != texelFetch(specular_rho, texel, 0);
+    bool changed = e_mu != e_rho || texelFetch(specular_mu, texel, 0) != texelFetch(specular_rho, texel, 0)
+        || block_changed(texel);
     return vec4((e_rho + LEAST_IRRADIANCE) / (e_mu + LEAST_IRRADIANCE), changed ? 2.0 : 1.0);
 }
 #else
-vec4 value(ivec2 texel) {
+layout(binding = 9) uniform sampler2D ratios;
+layout(std430, binding = 6) buffer Texels { uint texel_count; uint texels[]; };
+
+bool near_change(ivec2 texel) {
     ivec2 last = textureSize(ratios, 0) - 1;
     float near = 0.0;
     for (int j = -FILL_RADIUS; j <= FILL_RADIUS; ++j)
         for (int i = -FILL_RADIUS; i <= FILL_RADIUS; ++i)
             near = max(near, texelFetch(ratios, clamp(texel + ivec2(i, j), ivec2(0), last), 0).a);
-    return vec4(near > 1.5 ? 1.0 : 0.0);
+    return near > 1.5;
 }
 #endif
 
 void main() {
     ivec2 texel = ivec2(gl_GlobalInvocationID.xy);
-    if (any(greaterThanEqual(texel, textureSize(sample_pixels, 0)))) return;
+    ivec2 size = textureSize(sample_pixels, 0);
+    if (any(greaterThanEqual(texel, size))) return;
+#ifdef RATIO
     imageStore(result, texel, value(texel));
+#else
+    if (texelFetch(sample_pixels, texel, 0).z >= 0 || near_change(texel))
+        texels[atomicAdd(texel_count, 1u)] = uint(texel.y * size.x + texel.x);
+#endif
 }

@@ -1,4 +1,4 @@
-"""How light changed, on the reduced grid: for holes of the depth map, and to pass over what did not change."""
+"""How light changed, on the reduced grid: for holes of the depth map, and to compose only what changed."""
 
 from pathlib import Path
 
@@ -14,11 +14,11 @@ FILL_RADIUS = 3  # texels of the reduced grid over which the change continues in
 
 
 class ChangeRatioPass:
-    """`ratio` (rgb E_rho / E_mu, a: 0 unknown, 1 unchanged, 2 changed) and `near` (whether any change is near)."""
+    """`ratio` (rgb E_rho / E_mu, a: 0 unknown, 1 unchanged, 2 changed) and `texels`, those near a change."""
 
     def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
         self.ratio = texture_2d(gpu, size, 4, "f2")
-        self.near = texture_2d(gpu, size, 4, "f2")
+        self.texels = gpu.ctx.buffer(bytes(4 * (1 + size[0] * size[1])))
         self._ratio = ComputeProgram(gpu, SHADER, {"RATIO": 1})
         self._near = ComputeProgram(gpu, SHADER, {"FILL_RADIUS": FILL_RADIUS})
 
@@ -29,11 +29,12 @@ class ChangeRatioPass:
             | {16: cones.specular_mu, 17: cones.specular_rho}
         )
         bind_images(self.ratio)
-        self._ratio.run(grid.size)
-        bind_images(self.near)
+        self._ratio.run(grid.size, scale=grid.scale)
+        self.texels.write(bytes(4))
+        self.texels.bind_to_storage_buffer(6)
         self._near.run(grid.size)
 
     def release(self) -> None:
         """Free the GL objects."""
-        for item in (self.ratio, self.near, self._ratio, self._near):
+        for item in (self.ratio, self.texels, self._ratio, self._near):
             item.release()

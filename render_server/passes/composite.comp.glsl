@@ -5,7 +5,8 @@
 #include "passes/common/surfaces.glsl"
 #include "passes/common/upsample.glsl"
 
-layout(local_size_x = 8, local_size_y = 8) in;
+layout(local_size_x = 64) in;
+layout(std430, binding = 6) readonly buffer Texels { uint texel_count; uint texels[]; };   // change_ratio lists them
 layout(binding = 0, rgba8ui) writeonly uniform uimage2D code_out;
 layout(binding = 1, rgba16f) writeonly uniform image2D linear_out;
 layout(binding = 1) uniform usampler2D picture;
@@ -22,13 +23,13 @@ layout(binding = 16) uniform sampler2D cone_specular_rho;
 layout(binding = 17) uniform sampler2D lobe_mu;
 layout(binding = 18) uniform sampler2D lobe_rho;
 layout(binding = 19) uniform sampler2D change_ratio;
-layout(binding = 20) uniform sampler2D change_near;
 uniform float exposure_scale;
 uniform float sample_distance;   // m at 1 m depth
 uniform vec3 camera_position;
 uniform bool additive;
 uniform bool filmic;             // ACES tone curve on the whole picture instead of the camera's response
 uniform bool specular_surfaces;
+uniform bool whole;              // compose every pixel, not only those near a change
 uniform bool store_linear;       // for views and files; the picture itself needs only codes
 
 const vec2 ALBEDO_RANGE = vec2(0.02, 0.95);
@@ -133,23 +134,19 @@ uvec3 encode(vec3 x) {
 // ACES tone curve (Narkowicz's fit, 2015).
 vec3 aces(vec3 x) { return clamp(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 0.0, 1.0); }
 
-void main() {
-    ivec2 pixel = ivec2(gl_GlobalInvocationID.xy);
-    if (any(greaterThanEqual(pixel, textureSize(picture, 0)))) return;
+void compose(ivec2 pixel) {
     uvec4 code = uvec4(texelFetch(picture, pixel, 0).rgb, 255u);
     vec3 b = texelFetch(linear_picture, pixel, 0).rgb;
     vec3 result = b;
     bool changed = filmic;
     vec4 position = texelFetch(real_surface_position, pixel, 0);
     float shown = texelFetch(matte, pixel, 0).r;
-    bool reached = shown < 1.0 && (texelFetch(change_near, pixel / scale, 0).r > 0.0
-        || texelFetch(direct_mu, pixel, 0).rgb != texelFetch(direct_rho, pixel, 0).rgb);
-    if (reached && position.w > 0.0) {
+    if (shown < 1.0 && position.w > 0.0) {
         vec4 normal = texelFetch(real_surface_normal, pixel, 0);
         Change c = change_at(pixel, position, normal);
         if (c.any_change) { result = relit(pixel, c, normal, b); changed = true; }
     }
-    if (reached && position.w <= 0.0) {
+    if (shown < 1.0 && position.w <= 0.0) {
         vec3 ratio = surrounding_ratio(pixel, b);
         if (ratio != vec3(1.0)) { result = b * ratio; changed = true; }
     }
@@ -164,4 +161,16 @@ void main() {
     }
     imageStore(code_out, pixel, code);
     if (store_linear) imageStore(linear_out, pixel, vec4(result, 1.0));
+}
+
+// The pixels of the listed texels, or (`whole`) of all.
+void main() {
+    ivec2 size = textureSize(picture, 0), grid = textureSize(sample_pixels, 0);
+    uint block = uint(scale * scale);
+    uint count = (whole ? uint(grid.x * grid.y) : texel_count) * block;
+    for (uint i = gl_GlobalInvocationID.x; i < count; i += gl_NumWorkGroups.x * 64u) {
+        int texel = int(whole ? i / block : texels[i / block]), inside = int(i % block);
+        ivec2 pixel = ivec2(texel % grid.x, texel / grid.x) * scale + ivec2(inside % scale, inside / scale);
+        if (all(lessThan(pixel, size))) compose(pixel);
+    }
 }

@@ -7,7 +7,7 @@ from typing import Any
 import moderngl
 
 from render_server.gpu.context import GpuContext
-from render_server.gpu.program import ComputeProgram
+from render_server.gpu.program import ComputeProgram, list_threads
 from render_server.gpu.textures import bind_images, bind_samplers, texture_2d
 from render_server.passes.change_ratio import FILL_RADIUS, ChangeRatioPass
 from render_server.passes.direct_light import DirectLightPass
@@ -38,6 +38,7 @@ class CompositePass:
 
     def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
         self._size = size
+        self._threads = list_threads(gpu, size[0] * size[1])
         self.code = texture_2d(gpu, size, 4, "u1")
         self.linear = texture_2d(gpu, size, 4, "f2")
         self._program = ComputeProgram(
@@ -57,11 +58,13 @@ class CompositePass:
             }
             | {9: layers.virtual_radiance, 10: direct.mu, 11: direct.rho, 12: cones.mu, 13: cones.rho}
             | {14: cones.specular_mu, 16: cones.specular_rho, 17: direct.lobe_mu, 18: direct.lobe_rho}
-            | {19: layers.change.ratio, 20: layers.change.near}
+            | {19: layers.change.ratio}
         )
+        self.code.write(picture.bytes, alignment=1)
+        layers.change.texels.bind_to_storage_buffer(6)
         bind_images(self.code, self.linear)
         self._program.run(
-            self._size, scale=layers.grid.scale, exposure_scale=picture.exposure_scale, **uniforms
+            (self._threads,), scale=layers.grid.scale, exposure_scale=picture.exposure_scale, **uniforms
         )
 
     def release(self) -> None:

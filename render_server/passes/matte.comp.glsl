@@ -6,6 +6,7 @@ layout(local_size_x = 8, local_size_y = 8) in;
 layout(binding = 0, r16f) writeonly uniform image2D matte_out;
 layout(binding = 1) uniform sampler2D linear_picture;
 uniform float noise_sigma;     // m at 1 m
+uniform ivec2 first_pixel;     // of the rectangle that may show an object; the rest was emptied
 
 const int WINDOW = 5;   // pixels
 
@@ -42,7 +43,7 @@ float softened(ivec2 pixel, float z, ivec2 size) {
 }
 
 void main() {
-    ivec2 pixel = ivec2(gl_GlobalInvocationID.xy);
+    ivec2 pixel = first_pixel + ivec2(gl_GlobalInvocationID.xy);
     ivec2 size = textureSize(real_surface_position, 0);
     if (any(greaterThanEqual(pixel, size))) return;
     float z = covers(pixel);

@@ -17,11 +17,15 @@ class MattePass:
         self.texture = texture_2d(gpu, size, 1, "f2")
         self._program = ComputeProgram(gpu, Path(__file__).with_name("matte.comp.glsl"))
 
-    def run(self, picture: Picture, uniforms: dict[str, Any]) -> None:
-        """Compare depths, soften along the picture's edges."""
+    def run(self, picture: Picture, rectangle: tuple[int, int, int, int], uniforms: dict[str, Any]) -> None:
+        """Compare depths, soften along the picture's edges, in the `rectangle` (x, y, width, height)."""
+        self.texture.write(bytes(2 * self._size[0] * self._size[1]), alignment=1)
+        x, y, width, height = rectangle
+        if width <= 0 or height <= 0:
+            return
         bind_samplers({1: picture.linear})
         bind_images(self.texture)
-        self._program.run(self._size, **uniforms)
+        self._program.run((width, height), first_pixel=(x, y), **uniforms)
 
     def release(self) -> None:
         """Free the GL objects."""

@@ -28,6 +28,7 @@ class Picture:
         self.inverse_response = texture_2d(gpu, (INVERSE_SIZE, 1), 4, "f4")
         self.rays = texture_2d(gpu, size, 2, "f4")
         self.exposure_scale = 1.0
+        self.bytes = b""
         self._program = ComputeProgram(gpu, Path(__file__).with_name("linearize.comp.glsl"))
         self._rays_of: object = None
         self._response_of: object = None
@@ -38,7 +39,8 @@ class Picture:
         rgba = np.empty((height, width, 4), np.uint8)
         rgba[..., :3] = frame.color
         rgba[..., 3] = 255
-        self.code.write(rgba.tobytes(), alignment=1)
+        self.bytes = rgba.tobytes()
+        self.code.write(self.bytes, alignment=1)
         self._write_response(decode_lut(frame.response))
         if self._rays_of != frame.camera:
             self.rays.write(np.ascontiguousarray(frame.camera.rays(), np.float32).tobytes(), alignment=1)

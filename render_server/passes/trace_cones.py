@@ -4,14 +4,13 @@ from pathlib import Path
 from typing import Any
 
 from render_server.gpu.context import GpuContext
-from render_server.gpu.program import ComputeProgram
+from render_server.gpu.program import ComputeProgram, list_threads
 from render_server.gpu.textures import bind_images, bind_samplers, texture_2d
 from render_server.passes.sampling_grid import SamplingGrid
 from render_server.passes.volume import Pyramid
 
 SHADER = Path(__file__).with_name("trace_cones.comp.glsl")
 SELECT = Path(__file__).with_name("select_texels.comp.glsl")
-WALKERS = 1024  # threads that share the texels in software, where an idle thread costs as much as a busy one
 
 
 class ConeFields:
@@ -38,8 +37,7 @@ class TraceConesPass:
         self._gpu = gpu
         self._real = ComputeProgram(gpu, SHADER, {"REAL": 1})
         self._virtual = ComputeProgram(gpu, SHADER)
-        self._select_real = ComputeProgram(gpu, SELECT, {"REAL": 1})
-        self._select_virtual = ComputeProgram(gpu, SELECT)
+        self._select = ComputeProgram(gpu, SELECT, {"REAL": 1})
         self._texels = gpu.ctx.buffer(reserve=4)
 
     def trace_real(
@@ -47,35 +45,30 @@ class TraceConesPass:
     ) -> None:
         """E_mu, E_rho and the specular cones of the real surfaces."""
         bind_images(fields.mu, fields.rho, fields.specular_mu, fields.specular_rho)
-        self._run(self._select_real, self._real, grid, (mu, rho), uniforms)
-
-    def trace_virtual(
-        self, fields: ConeFields, grid: SamplingGrid, mu: Pyramid, rho: Pyramid, uniforms: dict[str, Any]
-    ) -> None:
-        """E_rho and the specular cone of the virtual surfaces."""
-        bind_images(fields.virtual)
-        fields.virtual_specular.bind_to_image(3, read=True, write=True)
-        self._run(self._select_virtual, self._virtual, grid, (mu, rho), uniforms)
-
-    def _run(
-        self,
-        select: ComputeProgram,
-        trace: ComputeProgram,
-        grid: SamplingGrid,
-        pyramids: tuple[Pyramid, Pyramid],
-        uniforms: dict[str, Any],
-    ) -> None:
-        """List the texels to trace, then trace them."""
         needed = 4 * (1 + grid.size[0] * grid.size[1])
         if self._texels.size < needed:
             self._texels.orphan(needed)
         self._texels.write(bytes(4))
         self._texels.bind_to_storage_buffer(6)
-        bind_samplers({0: grid.pixels, 2: pyramids[0].texture, 3: pyramids[1].texture})
-        select.run(grid.size, low_resolution_size=grid.size, **uniforms)
-        trace.run((WALKERS if self._gpu.is_software else needed,), low_resolution_size=grid.size, **uniforms)
+        bind_samplers({0: grid.pixels, 2: mu.texture, 3: rho.texture})
+        self._select.run(grid.size, low_resolution_size=grid.size, **uniforms)
+        self._real.run(self._threads(grid), low_resolution_size=grid.size, **uniforms)
+
+    def trace_virtual(
+        self, fields: ConeFields, grid: SamplingGrid, mu: Pyramid, rho: Pyramid, uniforms: dict[str, Any]
+    ) -> None:
+        """E_rho and the specular cone of the virtual surfaces."""
+        fields.virtual.write(bytes(8 * grid.size[0] * grid.size[1]))
+        bind_images(fields.virtual)
+        fields.virtual_specular.bind_to_image(3, read=True, write=True)
+        grid.virtual_texels.bind_to_storage_buffer(6)
+        bind_samplers({0: grid.pixels, 2: mu.texture, 3: rho.texture})
+        self._virtual.run(self._threads(grid), low_resolution_size=grid.size, **uniforms)
+
+    def _threads(self, grid: SamplingGrid) -> tuple[int]:
+        return (list_threads(self._gpu, grid.size[0] * grid.size[1]),)
 
     def release(self) -> None:
         """Free the GL objects."""
-        for item in (self._real, self._virtual, self._select_real, self._select_virtual, self._texels):
+        for item in (self._real, self._virtual, self._select, self._texels):
             item.release()

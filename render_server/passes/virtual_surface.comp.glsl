@@ -6,7 +6,8 @@
 #include "passes/common/materials.glsl"
 #include "passes/common/upsample.glsl"
 
-layout(local_size_x = 8, local_size_y = 8) in;
+layout(local_size_x = 64) in;
+layout(std430, binding = 6) readonly buffer Texels { uint texel_count; uint texels[]; };   // those that show an object
 layout(binding = 0, rgba16f) writeonly uniform image2D radiance_out;
 layout(binding = 1) uniform sampler2D matte;
 layout(binding = 2) uniform sampler2D cone_irradiance;
@@ -54,10 +55,7 @@ vec3 direct_radiance(vec3 p, float depth, vec3 n, vec3 v, Material m) {
     return sum;
 }
 
-void main() {
-    ivec2 pixel = ivec2(gl_GlobalInvocationID.xy);
-    if (any(greaterThanEqual(pixel, textureSize(matte, 0)))) return;
-    if (texelFetch(matte, pixel, 0).r == 0.0) return;
+void shade(ivec2 pixel) {
     ivec2 raster = raster_texel(pixel);
     vec4 position = texelFetch(virtual_raster_position, raster, 0);
     vec4 normal = texelFetch(virtual_raster_normal, raster, 0);
@@ -69,4 +67,14 @@ void main() {
     radiance += m.diffuse / PI * indirect.irradiance;
     radiance += specular_reflectance(m.f0, m.roughness, max(dot(normal.xyz, v), 1e-3)) * indirect.specular;
     imageStore(radiance_out, pixel, vec4(radiance, 1.0));
+}
+
+void main() {
+    ivec2 size = textureSize(matte, 0), grid = textureSize(sample_pixels, 0);
+    uint block = uint(scale * scale);
+    for (uint i = gl_GlobalInvocationID.x; i < texel_count * block; i += gl_NumWorkGroups.x * 64u) {
+        int texel = int(texels[i / block]), inside = int(i % block);
+        ivec2 pixel = ivec2(texel % grid.x, texel / grid.x) * scale + ivec2(inside % scale, inside / scale);
+        if (all(lessThan(pixel, size)) && texelFetch(matte, pixel, 0).r > 0.0) shade(pixel);
+    }
 }

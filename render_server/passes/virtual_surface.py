@@ -6,7 +6,7 @@ from typing import Any
 import moderngl
 
 from render_server.gpu.context import GpuContext
-from render_server.gpu.program import ComputeProgram
+from render_server.gpu.program import ComputeProgram, list_threads
 from render_server.gpu.textures import bind_images, bind_samplers, texture_2d
 from render_server.passes.geometry_buffer import GeometryBuffer
 from render_server.passes.sampling_grid import SamplingGrid
@@ -17,7 +17,7 @@ class VirtualSurfacePass:
     """RGBA16F radiance on the picture's grid, where the matte is above zero."""
 
     def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
-        self._size = size
+        self._threads = list_threads(gpu, size[0] * size[1])
         self.radiance = texture_2d(gpu, size, 4, "f2")
         self._program = ComputeProgram(gpu, Path(__file__).with_name("virtual_surface.comp.glsl"))
 
@@ -41,7 +41,8 @@ class VirtualSurfacePass:
             }
         )
         bind_images(self.radiance)
-        self._program.run(self._size, scale=grid.scale, **uniforms)
+        grid.virtual_texels.bind_to_storage_buffer(6)
+        self._program.run((self._threads,), scale=grid.scale, **uniforms)
 
     def release(self) -> None:
         """Free the GL objects."""
