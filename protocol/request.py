@@ -63,6 +63,9 @@ class ReplyMemory:
             self._applied[request.op] = _Applied(request.revision, request.payload, reply)
 
 
+LAST_REPLY_MS = 200  # what a closing server waits for its last reply to leave
+
+
 class ReplyServer:
     """Answers requests in a thread of its own that owns the socket.
 
@@ -73,6 +76,7 @@ class ReplyServer:
         self._handler = handler
         self._node = node
         self._memory = ReplyMemory()
+        self._answering = threading.Lock()
         self._context = zmq.Context()
         try:
             self._socket = open_socket(self._context, zmq.REP, max_bytes=MAX_HEADER_BYTES)
@@ -84,18 +88,22 @@ class ReplyServer:
         self._thread.start()
 
     def close(self) -> None:
-        """Stop the thread, after the request that it is at."""
+        """Stop the thread, after the reply to the request that it is at was sent."""
+        with self._answering:
+            pass
         self._context.term()
         self._thread.join()
 
     def _run(self) -> None:
         try:
             while True:
-                self._socket.send_multipart(self._answer(self._socket.recv_multipart()))
+                request = self._socket.recv_multipart()
+                with self._answering:
+                    self._socket.send_multipart(self._answer(request))
         except zmq.ContextTerminated:
             pass
         finally:
-            self._socket.close(0)
+            self._socket.close(LAST_REPLY_MS)
 
     def _answer(self, multipart: list[bytes]) -> list[bytes]:
         try:

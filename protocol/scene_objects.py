@@ -203,5 +203,5 @@ class RealScene(StrictModel):
         default="depth", description="`depth` (of each frame), `fused`, or a given model."
     )
     surfaces: tuple[Surface, ...] = Field(
-        default=(), max_length=64, description="First match wins; the rest is diffuse."
+        default=(), max_length=16, description="First match wins; the rest is diffuse."
     )

@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from protocol.errors import DeltalightError
 from protocol.scene_method import Output
 from render_server.gpu.context import GpuContext
 from render_server.gpu.readback import AsyncReadback
@@ -58,10 +57,6 @@ class Composer:
         picture, layers = relit.input.picture, relit.layers
         if view == "composite":
             return
-        if view == "lights":
-            raise DeltalightError(
-                "view `lights` arrives with a later release: use composite, effects, delta, volume or rsm."
-            )
         with relit.timers.measure("view"):
             if view == "volume":
                 uniforms = relit.input.view.uniforms()

@@ -61,7 +61,7 @@ class FrameAssembler:
 
     `needs_depth` says whether the scene's real geometry comes from depth. Payloads are decoded for the chosen
     frame only. `counts` holds what happened to the others: `superseded` (overtaken by a newer frame),
-    `unpaired_pose`, `unpaired_depth` (rendered without, after the patience ran out).
+    `unpaired_pose` (passed through when the patience ran out), `unpaired_depth` (dropped: no depth near its time).
     """
 
     def __init__(self, settings: PairingSettings | None = None, *, needs_depth: bool = True) -> None:
@@ -98,6 +98,10 @@ class FrameAssembler:
             color = self._colors[index]
             pose, depth = self._pose_of(color.message), self._depth_of(color.message)
             complete = pose is not None and (depth is not None or not self.needs_depth)
+            if color.received_ns <= expired_ns and depth is None and self.needs_depth and self._depths:
+                self._colors.remove(color)
+                self.counts["unpaired_depth"] += 1
+                return None
             if complete or color.received_ns <= expired_ns:
                 self._drop_colors(index)
                 self._colors.popleft()
@@ -127,7 +131,6 @@ class FrameAssembler:
         self, color: _Held[ColorMessage], pose: _Held[PoseMessage] | None, depth: _Held[DepthMessage] | None
     ) -> AssembledFrame:
         self.counts["unpaired_pose"] += pose is None
-        self.counts["unpaired_depth"] += depth is None and self.needs_depth
         header = color.message
         if self._reference_exposure_s is None:
             self._reference_exposure_s = header.exposure_s

@@ -74,6 +74,10 @@ class Relighting:
         """Check everything that can fail before anything is replaced."""
         if not isinstance(scene.method, DvctMethod):
             raise DeltalightError(f"method `{scene.method.name}` arrives with a later release: use dvct.")
+        if scene.output.view == "lights":
+            raise DeltalightError(
+                "view `lights` arrives with a later release: use composite, effects, delta, volume or rsm."
+            )
         resolved = resolve_dvct(scene.method, software=self._gpu.is_software)
         directions = OPERATORS[scene.method.operator].directions
         self._say(memory_statement(resolved.volume_size, directions, scene.method.memory_budget_mb))

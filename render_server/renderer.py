@@ -10,6 +10,7 @@ from jaxtyping import Float32, UInt8
 
 from protocol.frames import DepthImage, ViewFrame
 from protocol.scene import SceneDocument
+from protocol.scene_method import Output
 from render_server.compose import Composer
 from render_server.gpu.context import GpuContext
 from render_server.relighting import Relighting
@@ -73,10 +74,9 @@ class SceneRenderer:
     def start(self, frame: ViewFrame) -> PendingComposite:
         """Hand a frame to the GPU; reading its picture back does not stall the frames after it."""
         output = self.scene.output
-        if output.width is not None or output.height is not None:
-            frame = resized_frame(
-                frame, output.width or frame.camera.width, output.height or frame.camera.height
-            )
+        size = output_size(frame, output)
+        if size != (frame.camera.width, frame.camera.height):
+            frame = resized_frame(frame, *size)
         if frame.pose is None:
             return _untouched(frame, "no_pose")
         view = CameraView(frame.camera, frame.pose.world_from_camera)
@@ -105,10 +105,17 @@ def _untouched(frame: ViewFrame, status: str) -> PendingComposite:
     return PendingComposite(lambda: composite, immediate=True)
 
 
+def output_size(frame: ViewFrame, output: Output) -> tuple[int, int]:
+    """Width and height of the composite; where the document gives one of them, the camera's proportions hold."""
+    camera = frame.camera
+    if output.width is None and output.height is None:
+        return camera.width, camera.height
+    width = output.width or round(camera.width * (output.height or 0) / camera.height)
+    return width, output.height or round(camera.height * width / camera.width)
+
+
 def resized_frame(frame: ViewFrame, width: int, height: int) -> ViewFrame:
     """The frame at another picture size: colour averaged over areas, depth taken from the nearest pixel."""
-    if (width, height) == (frame.camera.width, frame.camera.height):
-        return frame
     size = (width, height)
     camera = frame.camera.resized(width, height)
     depth = frame.depth

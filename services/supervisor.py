@@ -125,10 +125,14 @@ class Supervisor:
         return {child.spec.name: max(child.started - 1, 0) for child in self._children}
 
     def poll(self) -> None:
-        """Look at every child once; start a dead one again after `RESTART_DELAY_S`."""
+        """Look at every child once; start one that died again after `RESTART_DELAY_S`, not one that ended well."""
         for child in self._children:
-            if child.process is not None and child.process.poll() is not None:
-                self._restart(child, child.process.returncode)
+            code = None if child.process is None else child.process.poll()
+            if code == 0:
+                child.forward(f"{child.spec.name}: ended by itself.")
+                child.process = None
+            elif code is not None:
+                self._restart(child, code)
 
     def run(self, until: Callable[[], bool] = lambda: False) -> None:
         """Poll until `until` answers true (or an exception ends the process)."""

@@ -167,7 +167,7 @@ void compose(ivec2 pixel) {
 void main() {
     ivec2 size = textureSize(picture, 0), grid = textureSize(sample_pixels, 0);
     uint block = uint(scale * scale);
-    uint count = (whole ? uint(grid.x * grid.y) : texel_count) * block;
+    uint count = (whole ? uint(grid.x * grid.y) : min(texel_count, uint(texels.length()))) * block;
     for (uint i = gl_GlobalInvocationID.x; i < count; i += gl_NumWorkGroups.x * 64u) {
         int texel = int(whole ? i / block : texels[i / block]), inside = int(i % block);
         ivec2 pixel = ivec2(texel % grid.x, texel / grid.x) * scale + ivec2(inside % scale, inside / scale);

@@ -10,6 +10,7 @@ from render_server.gpu.context import GpuContext
 from render_server.scene.mesh import VERTEX_ATTRIBUTES, VERTEX_LAYOUT, GpuMesh
 
 UV, COLOR, MATERIAL = slice(6, 8), slice(8, 11), 11  # columns of a vertex
+DOUBLE_SIDED = 9  # column of a triangle corner
 
 
 def triangle_corners(mesh: GpuMesh) -> Float32[np.ndarray, "m 3 10"]:
@@ -19,6 +20,13 @@ def triangle_corners(mesh: GpuMesh) -> Float32[np.ndarray, "m 3 10"]:
     flags = double_sided[vertices[:, MATERIAL].astype(int)][:, None]
     columns = [vertices[:, :3], vertices[:, UV], vertices[:, COLOR], vertices[:, MATERIAL:], flags]
     return np.asarray(np.concatenate(columns, axis=1)[mesh.triangles], np.float32)
+
+
+def one_sided(corners: Float32[np.ndarray, "m 3 10"]) -> Float32[np.ndarray, "m 3 10"]:
+    """The same triangles, seen from their front only."""
+    changed = corners.copy()
+    changed[..., DOUBLE_SIDED] = 0.0
+    return changed
 
 
 class MeshBuffers:

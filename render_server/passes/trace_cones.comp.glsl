@@ -77,7 +77,7 @@ void trace(ivec2 texel) {
 }
 
 void main() {
-    for (uint i = gl_GlobalInvocationID.x; i < texel_count; i += gl_NumWorkGroups.x * 64u) {
+    for (uint i = gl_GlobalInvocationID.x; i < min(texel_count, uint(texels.length())); i += gl_NumWorkGroups.x * 64u) {
         int index = int(texels[i]);
         trace(ivec2(index % low_resolution_size.x, index / low_resolution_size.x));
     }

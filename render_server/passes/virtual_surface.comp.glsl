@@ -72,7 +72,7 @@ void shade(ivec2 pixel) {
 void main() {
     ivec2 size = textureSize(matte, 0), grid = textureSize(sample_pixels, 0);
     uint block = uint(scale * scale);
-    for (uint i = gl_GlobalInvocationID.x; i < texel_count * block; i += gl_NumWorkGroups.x * 64u) {
+    for (uint i = gl_GlobalInvocationID.x; i < min(texel_count, uint(texels.length())) * block; i += gl_NumWorkGroups.x * 64u) {
         int texel = int(texels[i / block]), inside = int(i % block);
         ivec2 pixel = ivec2(texel % grid.x, texel / grid.x) * scale + ivec2(inside % scale, inside / scale);
         if (all(lessThan(pixel, size)) && texelFetch(matte, pixel, 0).r > 0.0) shade(pixel);

@@ -24,7 +24,7 @@ class SurfaceTable:
     A row of `packed` is five vectors (SurfaceEntry of passes/common/surfaces.glsl): (F0 R G B, metallic);
     (roughness, 0, 0, 0); (albedo R G B, 1 if declared); and the region, whose kind is the first vector's
     last number. 0 plane: (point, kind), (unit normal, tolerance); 1 box: (lower corner, kind), (upper
-    corner, 0); 2 material of the given model: (its index, or -1 where the model has none of that name, 0, 0,
+    corner, 0); 2 material of the given model: (its index, 0, 0,
     kind), zeros; 3 box in which all is diffuse: the marker sheet, which comes first.
     """
 
@@ -110,9 +110,12 @@ def _region(region: Region, material_names: Sequence[str]) -> tuple[list[float],
         return [*region.plane.point_m, PLANE], [*region.plane.normal, region.plane.tolerance_m]
     if region.box is not None:
         return [*region.box.min_m, BOX], [*region.box.max_m, 0.0]
-    known = region.material in material_names
-    index = list(material_names).index(str(region.material)) if known else -1
-    return [float(index), 0.0, 0.0, MATERIAL], [0.0] * 4
+    if region.material is None or region.material not in material_names:
+        known = (
+            f"it has {', '.join(material_names)}" if material_names else "only a given model has materials"
+        )
+        raise DeltalightError(f"real.surfaces names the material `{region.material}`, but {known}.")
+    return [float(list(material_names).index(region.material)), 0.0, 0.0, MATERIAL], [0.0] * 4
 
 
 def _sheet_row(board: BoardSpec) -> list[list[float]]:

@@ -29,6 +29,22 @@ def test_request_and_reply(opened: Callable[[Any], Any]) -> None:
     assert reply.payload == {"echo": {"a": [1, 2.5, None]}, "op": "set_scene"}
 
 
+def test_a_server_that_is_closed_by_a_request_still_answers_it(opened: Callable[[Any], Any]) -> None:
+    asked = threading.Event()
+
+    def handler(control: ControlRequest) -> dict[str, object]:
+        asked.set()
+        time.sleep(0.1)  # the owner closes the server meanwhile
+        return {"op": control.op}
+
+    server = ReplyServer(ANY, handler)
+    client = opened(RequestClient(server.endpoint))
+    owner = threading.Thread(target=lambda: (asked.wait(5), server.close()))
+    owner.start()
+    assert client.request(request(op="shutdown"), 5).payload == {"op": "shutdown"}
+    owner.join()
+
+
 def test_refusals_faults_and_bad_answers_are_sentences_and_the_server_lives_on(
     opened: Callable[[Any], Any],
 ) -> None:

@@ -48,7 +48,10 @@ def test_materials_of_the_model_are_found_by_name() -> None:
         0,
         -1,
     ]
-    assert build_surface_table([shiny], None, ("wood",)).lookup(points, materials).tolist() == [-1] * 3
+    with pytest.raises(DeltalightError, match="`glass`, but it has wood"):
+        build_surface_table([shiny], None, ("wood",))
+    with pytest.raises(DeltalightError, match="only a given model has materials"):
+        build_surface_table([shiny])
     assert build_surface_table([shiny], None, ("glass",)).lookup(points).tolist() == [-1] * 3
 
 

@@ -67,11 +67,18 @@ def test_depth_beyond_the_tolerance_is_unpaired_and_counted_after_the_patience()
     assembler = FrameAssembler(PairingSettings(depth_tolerance_ms=20, patience_ms=100))
     add(assembler, color(1, START, START), pose(1, START), depth(1, START + 21 * MS))
     assert assembler.take(START + 99 * MS) is None
+    assert assembler.counts["unpaired_depth"] == 0
+    assert assembler.take(START + 100 * MS) is None
+    assert assembler.counts["unpaired_depth"] == 1
+
+
+def test_frame_of_a_node_without_depth_is_given_so_that_the_renderer_can_say_what_it_lacks() -> None:
+    assembler = FrameAssembler(PairingSettings(patience_ms=100))
+    add(assembler, color(1, START, START), pose(1, START))
+    assert assembler.take(START + 99 * MS) is None
     frame = assembler.take(START + 100 * MS)
     assert frame is not None
     assert frame.view.depth is None
-    assert assembler.counts["unpaired_depth"] == 1
-    assert assembler.counts["unpaired_pose"] == 0
 
 
 def test_nearest_depth_is_chosen() -> None:

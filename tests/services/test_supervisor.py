@@ -62,6 +62,15 @@ def test_child_that_refuses_its_input_is_not_started_again() -> None:
     assert supervisor.restarts()["server"] == 0
 
 
+def test_child_that_ends_well_is_not_started_again() -> None:
+    lines: list[str] = []
+    with Supervisor([python("node", "pass"), python("b", SLEEP_FOREVER)], forward=lines.append) as supervisor:
+        poll_until(supervisor, lambda: "node" not in supervisor.process_ids())
+        supervisor.poll()
+        assert supervisor.restarts() == {"node": 0, "b": 0}
+    assert "node: ended by itself." in lines
+
+
 def test_stop_ends_even_a_child_that_ignores_sigterm() -> None:
     supervisor = Supervisor([python("stubborn", IGNORE_SIGTERM), python("kind", SLEEP_FOREVER)])
     with supervisor:
