@@ -57,7 +57,9 @@ def measure_speed(
 
 def _measure(renderer: SceneRenderer, views: Sequence[ViewFrame]) -> dict[str, Any]:
     passes: dict[str, list[float]] = {}
-    frame_ms, moving_ms, still_ms = [], [], []
+    frame_ms: list[float] = []
+    moving_ms: list[float] = []
+    still_ms: list[float] = []
     for index, view in enumerate(views):
         started_s = time.perf_counter()
         composite = renderer.render(view)

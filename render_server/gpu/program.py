@@ -11,6 +11,7 @@ from render_server.gpu.context import GpuContext
 from render_server.gpu.shader_source import shader_source
 
 SOFTWARE_WALKERS = 1024
+LIST_WALKERS = 16384
 
 Uniform = float | int | bool | Sequence[float] | Sequence[int] | np.ndarray[Any, Any]
 
@@ -55,8 +56,10 @@ class ComputeProgram:
         self._shader.release()
 
 
-def list_threads(gpu: GpuContext, longest: int) -> int:
-    """Threads to walk a list: one an entry on a GPU; few in software, where an idle one costs too."""
+def list_threads(gpu: GpuContext, longest: int = LIST_WALKERS) -> int:
+    """Threads to walk a list whose length only the GPU knows: at most `longest`; few in software, where an idle one
+    costs as much as a busy one.
+    """
     return min(longest, SOFTWARE_WALKERS) if gpu.is_software else longest
 
 

@@ -4,9 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from render_server.gpu.context import GpuContext
-from render_server.gpu.program import ComputeProgram
+from render_server.gpu.program import ComputeProgram, list_threads
 from render_server.gpu.textures import bind_images
-from render_server.passes.light_voxels import WALKERS
 from render_server.passes.volume import Pyramid, VolumePlacement
 from render_server.passes.voxel_store import VoxelStore
 
@@ -15,6 +14,7 @@ class ClearVoxelsPass:
     """Gives back a set's slots and its texels of level 0 (in all `directions`)."""
 
     def __init__(self, gpu: GpuContext, directions: int) -> None:
+        self._threads = list_threads(gpu)
         self._program = ComputeProgram(
             gpu, Path(__file__).with_name("clear_voxels.comp.glsl"), {"DIRECTIONS": directions}
         )
@@ -25,7 +25,7 @@ class ClearVoxelsPass:
         for index, pyramid in enumerate(pyramids):
             bind_images(pyramid.texture)
             is_last = index == len(pyramids) - 1
-            self._program.run((WALKERS,), free_slots=is_last, **placement.uniforms())
+            self._program.run((self._threads,), free_slots=is_last, **placement.uniforms())
         store.start(0)
 
     def release(self) -> None:

@@ -7,17 +7,17 @@ import moderngl
 import numpy as np
 
 from render_server.gpu.context import GpuContext
-from render_server.gpu.program import ComputeProgram
+from render_server.gpu.program import ComputeProgram, list_threads
 from render_server.passes.voxel_store import VoxelStore
 
 SHADER = Path(__file__).with_name("light_voxels.comp.glsl")
-WALKERS = 16384  # threads that share the surfels
 
 
 class LightVoxelsPass:
     """Three variants of one walk over the surfels: real without objects, real's change, virtual."""
 
     def __init__(self, gpu: GpuContext) -> None:
+        self._threads = list_threads(gpu)
         self._real = ComputeProgram(gpu, SHADER, {"REAL": 1})
         self._real_delta = ComputeProgram(gpu, SHADER, {"REAL_DELTA": 1})
         self._virtual = ComputeProgram(gpu, SHADER, {"VIRTUAL": 1})
@@ -26,7 +26,7 @@ class LightVoxelsPass:
     def light_real(self, store: VoxelStore, uniforms: dict[str, Any]) -> None:
         """Sum c_mu and a_real."""
         store.bind()
-        self._real.run((WALKERS,), **uniforms)
+        self._real.run((self._threads,), **uniforms)
 
     def light_real_delta(
         self, store: VoxelStore, bounds: np.ndarray[Any, np.dtype[np.int32]], uniforms: dict[str, Any]
@@ -37,12 +37,12 @@ class LightVoxelsPass:
         store.bind()
         store.delta_sums.bind_to_storage_buffer(8)
         self.support.bind_to_storage_buffer(9)
-        self._real_delta.run((WALKERS,), **uniforms)
+        self._real_delta.run((self._threads,), **uniforms)
 
     def light_virtual(self, store: VoxelStore, uniforms: dict[str, Any]) -> None:
         """Sum c and a of the virtual surfaces."""
         store.bind()
-        self._virtual.run((WALKERS,), **uniforms)
+        self._virtual.run((self._threads,), **uniforms)
 
     def bind_support(self) -> None:
         """Bind the support's bounds to the place that march.glsl names."""
