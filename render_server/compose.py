@@ -32,7 +32,6 @@ class Composer:
             **relit.input.view.uniforms(),
             **relit.input.surface_uniforms,
             **relit.uniforms,
-            "additive": relit.additive,
             "filmic": output.tone == "aces",
             "store_linear": needs_linear,
             "whole": needs_linear or output.tone == "aces",

@@ -6,7 +6,7 @@ from typing import Any
 from protocol.errors import DeltalightError
 from protocol.frames import ViewFrame
 from protocol.scene import SceneDocument
-from protocol.scene_method import DvctMethod
+from protocol.scene_method import DvctMethod, NoneMethod
 from protocol.scene_objects import Material
 from render_server.gpu.context import GpuContext
 from render_server.gpu.timers import PassTimers
@@ -34,7 +34,6 @@ class RelitFrame:
 
     input: RelightInput
     layers: RelitLayers
-    additive: bool
     uniforms: dict[str, Any]
 
     @property
@@ -72,19 +71,20 @@ class Relighting:
 
     def _planned(self, scene: SceneDocument) -> _Plan:
         """Check everything that can fail before anything is replaced."""
-        if not isinstance(scene.method, DvctMethod):
+        method = DvctMethod() if isinstance(scene.method, NoneMethod) else scene.method
+        if not isinstance(method, DvctMethod):
             raise DeltalightError(f"method `{scene.method.name}` arrives with a later release: use dvct.")
         if scene.output.view == "lights":
             raise DeltalightError(
                 "view `lights` arrives with a later release: use composite, effects, delta, volume or rsm."
             )
-        resolved = resolve_dvct(scene.method, software=self._gpu.is_software)
-        directions = OPERATORS[scene.method.operator].directions
-        self._say(memory_statement(resolved.volume_size, directions, scene.method.memory_budget_mb))
+        resolved = resolve_dvct(method, software=self._gpu.is_software)
+        directions = OPERATORS[method.operator].directions
+        self._say(memory_statement(resolved.volume_size, directions, method.memory_budget_mb))
         self._objects.load(scene.objects)
         for sentence in ignored_wishes(scene):
             self._say(sentence)
-        return _Plan(scene, scene.method, resolved, build_lights(scene.lights))
+        return _Plan(scene, method, resolved, build_lights(scene.lights))
 
     def _say(self, sentence: str) -> None:
         if sentence not in self._notices:
@@ -153,8 +153,12 @@ class Relighting:
         if self._unregistered is not None:
             relight_input = self._register(frame, relight_input, self._method_for(view))
         layers = self._method_for(view).relight(relight_input)
-        additive = self._plan.method.resolved_composition == "additive"
-        return RelitFrame(relight_input, layers, additive, {"sample_distance": self._sample_distance(view)})
+        uniforms = {
+            "additive": self._plan.method.resolved_composition == "additive",
+            "relights_real": not isinstance(self._plan.scene.method, NoneMethod),
+            "sample_distance": self._sample_distance(view),
+        }
+        return RelitFrame(relight_input, layers, uniforms)
 
     def _register(self, frame: ViewFrame, scene: RelightInput, method: DvctBase) -> RelightInput:
         """Find the lights' factor from this frame and use it from now on."""

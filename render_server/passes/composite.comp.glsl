@@ -27,6 +27,7 @@ uniform float exposure_scale;
 uniform float sample_distance;   // m at 1 m depth
 uniform vec3 camera_position;
 uniform bool additive;
+uniform bool relights_real;    // method `none` shows objects and leaves the real scene as it is
 uniform bool filmic;             // ACES tone curve on the whole picture instead of the camera's response
 uniform bool specular_surfaces;
 uniform bool whole;              // compose every pixel, not only those near a change
@@ -141,12 +142,13 @@ void compose(ivec2 pixel) {
     bool changed = filmic;
     vec4 position = texelFetch(real_surface_position, pixel, 0);
     float shown = texelFetch(matte, pixel, 0).r;
-    if (shown < 1.0 && position.w > 0.0) {
+    bool relights = relights_real && shown < 1.0;
+    if (relights && position.w > 0.0) {
         vec4 normal = texelFetch(real_surface_normal, pixel, 0);
         Change c = change_at(pixel, position, normal);
         if (c.any_change) { result = relit(pixel, c, normal, b); changed = true; }
     }
-    if (shown < 1.0 && position.w <= 0.0) {
+    if (relights && position.w <= 0.0) {
         vec3 ratio = surrounding_ratio(pixel, b);
         if (ratio != vec3(1.0)) { result = b * ratio; changed = true; }
     }

@@ -119,7 +119,7 @@ def run(gpu: GpuContext, document: SceneDocument, view_frame: ViewFrame) -> Run:
     settings: Any = document.method
     operator = DvctPaper(gpu, settings, resolve_dvct(settings, software=True), view.size)
     layers = operator.relight(relit.input)
-    return Run(RelitFrame(relit.input, layers, relit.additive, relit.uniforms), operator, relighting)
+    return Run(RelitFrame(relit.input, layers, relit.uniforms), operator, relighting)
 
 
 def texels(texture: moderngl.Texture) -> Float64[np.ndarray, "h w 4"]:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from protocol.scene_method import NoneMethod
 from protocol.scene_objects import Pose
 from render_server.gpu.context import GpuContext
 from render_server.renderer import SceneRenderer
@@ -19,6 +20,7 @@ from tests.render_server.scenes import (
     ambient,
     array_of,
     ball,
+    checkered,
     composite,
     cube,
     depth_image,
@@ -252,3 +254,17 @@ def test_textures_are_read_back_whole(gpu: GpuContext) -> None:
     texture = gpu.ctx.texture((5, 3), 2, np.arange(30, dtype=np.float16).tobytes(), dtype="f2", alignment=1)
     assert array_of(texture)[2, 4].tolist() == [28, 29]
     texture.release()
+
+
+def test_method_none_shows_objects_and_leaves_every_real_pixel_as_it_was(
+    gpu: GpuContext, tmp_path: Path
+) -> None:
+    document = everyday(Stage(tmp_path))
+    picture = checkered()
+    relit = (composite(gpu, document, frame(picture)) != picture).any(axis=-1)
+    renderer = SceneRenderer(gpu, document.replaced(method=NoneMethod()))
+    drawn = (renderer.render(frame(picture)).color != picture).any(axis=-1)
+    renderer.release()
+    assert 0.01 < drawn.mean() < 0.3
+    assert relit[drawn].all()
+    assert relit.sum() > 1.5 * drawn.sum()
