@@ -1,5 +1,6 @@
 """The real scene's triangles: a mesh of the frame's depth, or a given model."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,15 +25,20 @@ BOUND_POINTS = 4000  # points kept of a mesh to fit light views around it
 
 
 class RealGeometry:
-    """Keeps the real scene until it moves (RealSceneTracker), then rebuilds it."""
+    """Keeps the real scene until it moves (RealSceneTracker), then rebuilds it.
 
-    def __init__(self, gpu: GpuContext, real: RealScene, triangle_budget: int) -> None:
+    `versions` numbers every state, also across scenes, so that no cache takes one for another.
+    """
+
+    def __init__(
+        self, gpu: GpuContext, real: RealScene, triangle_budget: int, versions: Iterator[int]
+    ) -> None:
         self._gpu = gpu
         self._budget = triangle_budget
         self._tracker = RealSceneTracker()
         self._buffers = MeshBuffers(gpu)
         self._materials: MaterialTable | None = None
-        self._version = 0
+        self._versions = versions
         self.state: GeometryState | None = None
         self.material_names: tuple[str, ...] = ()
         self.is_model = isinstance(real.geometry, ModelGeometry)
@@ -72,8 +78,7 @@ class RealGeometry:
             return False
         self.frame, self.view = frame, view
         if self.is_model and self.state is not None:
-            self._version += 1
-            self.state = replace(self.state, version=self._version)
+            self.state = replace(self.state, version=next(self._versions))
         elif self.is_model:
             self._build(self._model, None)
         else:
@@ -97,12 +102,11 @@ class RealGeometry:
     ) -> None:
         """Merge and upload."""
         merged = merge_for_gpu(meshes)
-        self._version += 1
         self._buffers.write(merged)
         if self._materials is None:
             self._materials = MaterialTable(self._gpu, merged)
         self.state = GeometryState(
-            self._version,
+            next(self._versions),
             self._buffers,
             triangle_corners(merged),
             _sample(merged.vertices[:, :3]),

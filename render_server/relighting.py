@@ -1,6 +1,7 @@
 """From a frame and a scene to relit layers: geometry, lights, registration, and the method that the scene names."""
 
 from dataclasses import dataclass, replace
+from itertools import count
 from typing import Any
 
 from protocol.errors import DeltalightError
@@ -61,6 +62,7 @@ class Relighting:
         self._timers = PassTimers(gpu)
         self._objects = VirtualObjects(gpu)
         self._real: RealGeometry | None = None
+        self._real_versions = count(1)
         self._resources: PictureResources | None = None
         self._method: DvctBase | None = None
         self._lights_version = 0
@@ -97,7 +99,8 @@ class Relighting:
     def _take(self, plan: _Plan) -> None:
         old = self._plan
         if self._real is None or plan.scene.real != old.scene.real or plan.resolved != old.resolved:
-            real = RealGeometry(self._gpu, plan.scene.real, plan.resolved.triangle_budget)
+            budget = plan.resolved.triangle_budget
+            real = RealGeometry(self._gpu, plan.scene.real, budget, self._real_versions)
             if self._real is not None:
                 self._real.release()
             self._real = real

@@ -16,6 +16,7 @@ HINTS = {
     "eglInitialize failed": "EGL found no driver: install libgl1-mesa-dri, or the NVIDIA driver's EGL library",
     "XOpenDisplay": "a display was asked for where none is: the EGL backend must be used",
     "eglCreateContext failed": "the driver offers less than OpenGL 4.3: update the graphics driver",
+    "found 0 devices": "EGL sees no device: in a container, pass the GPU with its graphics capability",
     "requested device": "there is no such GPU: leave --device out, or see `deltalight doctor` for the list",
 }
 

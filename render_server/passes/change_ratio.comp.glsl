@@ -1,6 +1,8 @@
 // How light changed on the reduced grid. RATIO: E_rho / E_mu at each texel's pixel, and whether anything changed in
 // its block of pixels. Otherwise: list the texels that are within FILL_RADIUS of a change or show an object; only
 // their pixels are composed.
+#include "passes/common/texel_list.glsl"
+
 layout(local_size_x = 8, local_size_y = 8) in;
 layout(binding = 0) uniform isampler2D sample_pixels;
 #ifdef RATIO
@@ -19,7 +21,7 @@ bool block_changed(ivec2 texel) {
     bool changed = false;
     ivec2 last = textureSize(direct_mu, 0) - 1;
     for (int i = 0; i < scale * scale; ++i) {
-        ivec2 pixel = min(texel * scale + ivec2(i % scale, i / scale), last);
+        ivec2 pixel = min(pixel_in_block(texel, i, scale), last);
         changed = changed || texelFetch(direct_mu, pixel, 0).rgb != texelFetch(direct_rho, pixel, 0).rgb;
     }
     return changed;
@@ -38,7 +40,6 @@ vec4 value(ivec2 texel) {
 }
 #else
 layout(binding = 9) uniform sampler2D ratios;
-layout(std430, binding = 6) buffer Texels { uint texel_count; uint texels[]; };
 
 bool near_change(ivec2 texel) {
     ivec2 last = textureSize(ratios, 0) - 1;
@@ -58,6 +59,6 @@ void main() {
     imageStore(result, texel, value(texel));
 #else
     if (texelFetch(sample_pixels, texel, 0).z >= 0 || near_change(texel))
-        texels[atomicAdd(texel_count, 1u)] = uint(texel.y * size.x + texel.x);
+        append_texel(texel, size.x);
 #endif
 }

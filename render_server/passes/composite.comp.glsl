@@ -4,9 +4,9 @@
 #include "passes/common/geometry.glsl"
 #include "passes/common/surfaces.glsl"
 #include "passes/common/upsample.glsl"
+#include "passes/common/texel_list.glsl"
 
 layout(local_size_x = 64) in;
-layout(std430, binding = 6) readonly buffer Texels { uint texel_count; uint texels[]; };   // change_ratio lists them
 layout(binding = 0, rgba8ui) writeonly uniform uimage2D code_out;
 layout(binding = 1, rgba16f) writeonly uniform image2D linear_out;
 layout(binding = 1) uniform usampler2D picture;
@@ -165,14 +165,14 @@ void compose(ivec2 pixel) {
     if (store_linear) imageStore(linear_out, pixel, vec4(result, 1.0));
 }
 
-// The pixels of the listed texels, or (`whole`) of all.
+// The pixels of the texels that change_ratio listed, or (`whole`) of all.
 void main() {
     ivec2 size = textureSize(picture, 0), grid = textureSize(sample_pixels, 0);
     uint block = uint(scale * scale);
-    uint count = (whole ? uint(grid.x * grid.y) : min(texel_count, uint(texels.length()))) * block;
+    uint count = (whole ? uint(grid.x * grid.y) : listed_count()) * block;
     for (uint i = gl_GlobalInvocationID.x; i < count; i += gl_NumWorkGroups.x * 64u) {
-        int texel = int(whole ? i / block : texels[i / block]), inside = int(i % block);
-        ivec2 pixel = ivec2(texel % grid.x, texel / grid.x) * scale + ivec2(inside % scale, inside / scale);
+        uint index = whole ? i / block : texels[i / block];
+        ivec2 pixel = pixel_in_block(texel_of_index(index, grid.x), int(i % block), scale);
         if (all(lessThan(pixel, size))) compose(pixel);
     }
 }

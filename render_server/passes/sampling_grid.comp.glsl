@@ -1,10 +1,10 @@
 // For each texel of the reduced resolution, the picture pixel nearest to its centre that shows a real surface with
 // depth, and the one that shows a virtual object.
 #include "passes/common/geometry.glsl"
+#include "passes/common/texel_list.glsl"
 
 layout(local_size_x = 8, local_size_y = 8) in;
 layout(binding = 0, rgba16i) writeonly uniform iimage2D sample_pixels_out;
-layout(std430, binding = 6) buffer Texels { uint texel_count; uint texels[]; };   // those that show an object
 layout(binding = 0) uniform sampler2D matte;
 uniform ivec2 picture_pixels;
 uniform int scale;
@@ -28,5 +28,5 @@ void main() {
             if (away < nearest.y && shown > 0.0) { nearest.y = away; best.zw = pixel; }
         }
     imageStore(sample_pixels_out, texel, best);
-    if (best.z >= 0) texels[atomicAdd(texel_count, 1u)] = uint(texel.y * low.x + texel.x);
+    if (best.z >= 0) append_texel(texel, low.x);
 }

@@ -1,22 +1,19 @@
 // List the texels of the reduced grid where cones are to be traced on real surfaces, and fill in those where they are not: there the
-// objects do not reach, and the environment is unchanged. (A list instead of a branch: software renderers run both
-// sides of a branch, and a GPU keeps its lanes full.)
+// objects do not reach, and the environment is unchanged.
 #include "passes/common/environment.glsl"
 #include "passes/common/brdf.glsl"
 #include "passes/common/volume.glsl"
 #include "passes/common/lights.glsl"
 #include "passes/common/sampling_grid.glsl"
+#include "passes/common/texel_list.glsl"
 
 layout(local_size_x = 8, local_size_y = 8) in;
-layout(std430, binding = 6) buffer Texels { uint texel_count; uint texels[]; };
 layout(binding = 0, rgba16f) writeonly uniform image2D irradiance_mu;
 layout(binding = 1, rgba16f) writeonly uniform image2D irradiance_rho;
 layout(binding = 2, rgba16f) writeonly uniform image2D specular_mu;
 layout(binding = 3, rgba16f) writeonly uniform image2D specular_rho;
 uniform vec3 camera_position;
 uniform bool everywhere;   // also where the objects do not reach (photometric registration)
-
-void append(ivec2 texel) { texels[atomicAdd(texel_count, 1u)] = uint(texel.y * low_resolution_size.x + texel.x); }
 
 void leave(ivec2 texel, SurfacePoint s) {
     vec3 e = s.present ? environment_irradiance(s.normal) : vec3(0.0);
@@ -35,5 +32,5 @@ void main() {
     SurfacePoint s = surface_point(texel);
     bool reached = s.present && (everywhere || volume_fade(volume_coordinate(s.position)) > 0.0
         || object_may_shadow(s.position, 0.0));
-    if (reached) append(texel); else leave(texel, s);
+    if (reached) append_texel(texel, low_resolution_size.x); else leave(texel, s);
 }

@@ -4,9 +4,9 @@
 #include "passes/common/environment.glsl"
 #include "passes/common/brdf.glsl"
 #include "passes/common/sampling_grid.glsl"
+#include "passes/common/texel_list.glsl"
 
 layout(local_size_x = 64) in;
-layout(std430, binding = 6) readonly buffer Texels { uint texel_count; uint texels[]; };   // select_texels lists them
 #ifdef REAL
 layout(binding = 0, rgba16f) writeonly uniform image2D irradiance_mu;    // rgb E_mu, a: 1 where traced
 layout(binding = 1, rgba16f) writeonly uniform image2D irradiance_rho;   // rgb E_rho, a: volume fade
@@ -76,9 +76,8 @@ void trace(ivec2 texel) {
     imageStore(specular_rho, texel, vec4(c_rho, 1.0));
 }
 
+// The texels that select_texels or sampling_grid listed.
 void main() {
-    for (uint i = gl_GlobalInvocationID.x; i < min(texel_count, uint(texels.length())); i += gl_NumWorkGroups.x * 64u) {
-        int index = int(texels[i]);
-        trace(ivec2(index % low_resolution_size.x, index / low_resolution_size.x));
-    }
+    for (uint i = gl_GlobalInvocationID.x; i < listed_count(); i += gl_NumWorkGroups.x * 64u)
+        trace(texel_of_index(texels[i], low_resolution_size.x));
 }

@@ -5,9 +5,9 @@
 #include "passes/common/geometry.glsl"
 #include "passes/common/materials.glsl"
 #include "passes/common/upsample.glsl"
+#include "passes/common/texel_list.glsl"
 
 layout(local_size_x = 64) in;
-layout(std430, binding = 6) readonly buffer Texels { uint texel_count; uint texels[]; };   // those that show an object
 layout(binding = 0, rgba16f) writeonly uniform image2D radiance_out;
 layout(binding = 1) uniform sampler2D matte;
 layout(binding = 2) uniform sampler2D cone_irradiance;
@@ -69,12 +69,13 @@ void shade(ivec2 pixel) {
     imageStore(radiance_out, pixel, vec4(radiance, 1.0));
 }
 
+// The pixels of the texels that show an object.
 void main() {
-    ivec2 size = textureSize(matte, 0), grid = textureSize(sample_pixels, 0);
+    ivec2 size = textureSize(matte, 0);
+    int grid_width = textureSize(sample_pixels, 0).x;
     uint block = uint(scale * scale);
-    for (uint i = gl_GlobalInvocationID.x; i < min(texel_count, uint(texels.length())) * block; i += gl_NumWorkGroups.x * 64u) {
-        int texel = int(texels[i / block]), inside = int(i % block);
-        ivec2 pixel = ivec2(texel % grid.x, texel / grid.x) * scale + ivec2(inside % scale, inside / scale);
+    for (uint i = gl_GlobalInvocationID.x; i < listed_count() * block; i += gl_NumWorkGroups.x * 64u) {
+        ivec2 pixel = pixel_in_block(texel_of_index(texels[i / block], grid_width), int(i % block), scale);
         if (all(lessThan(pixel, size)) && texelFetch(matte, pixel, 0).r > 0.0) shade(pixel);
     }
 }

@@ -268,3 +268,19 @@ def test_method_none_shows_objects_and_leaves_every_real_pixel_as_it_was(
     assert 0.01 < drawn.mean() < 0.3
     assert relit[drawn].all()
     assert relit.sum() > 1.5 * drawn.sum()
+
+
+def test_another_real_model_gives_what_a_fresh_renderer_gives(gpu: GpuContext, tmp_path: Path) -> None:
+    stage = Stage(tmp_path)
+    document = everyday(stage)
+    lower = document.real.geometry.model_copy(
+        update={"pose": Pose(translation_m=(0.0, 0.0, -0.05))}  # type: ignore[union-attr]
+    )
+    changed = document.replaced(real=document.real.model_copy(update={"geometry": lower}))
+    renderer = SceneRenderer(gpu, document)
+    before = renderer.render(frame(checkered())).color
+    renderer.set_scene(changed)
+    after = renderer.render(frame(checkered())).color
+    renderer.release()
+    assert not np.array_equal(before, after)
+    assert np.array_equal(after, composite(gpu, changed, frame(checkered())))

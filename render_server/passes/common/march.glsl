@@ -1,4 +1,5 @@
-// Cone marching with two transmittances through the same voxels (METHOD 3, exact operator).
+// Cone marching through the rho and the mu set (METHOD 3, exact operator): where a way does not lead through the support
+// of the delta, both are the same and one march serves.
 //
 // A ray walks across the slices of cells along its main axis and looks where they touch, half into each, so that every
 // cell is met once, and none is missed where the level changes. The coverage that it meets is summed and a cone is
