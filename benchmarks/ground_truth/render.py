@@ -3,11 +3,16 @@
 import os
 import subprocess
 import sys
+from collections.abc import Callable
+from functools import cache
 from typing import Any, Literal
 
+import cv2
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float32
 
+from benchmarks.ground_truth.fisheye import fisheye_sensor
+from benchmarks.ground_truth.parts import Matrix
 from protocol.camera_model import CameraModel
 from protocol.errors import DeltalightError
 
@@ -27,10 +32,18 @@ NEAR_CLIP_M = 0.01
 
 INTEGRATORS: dict[str, dict[str, Any]] = {
     "color": {"type": "path", "max_depth": MAX_DEPTH},
+    "cover": {"type": "path", "max_depth": 1},  # directly visible light only
     "distance": {"type": "aov", "aovs": "distance:depth"},
 }
-PIXEL_FILTERS = {"color": "gaussian", "distance": "box"}
-"""Colour is as soft as a lens makes it (half a pixel); distances may only be averaged within their pixel."""
+SUBPIXELS = 2
+"""Colour is rendered this much finer each way and then filtered here. Mitsuba's own filter lets samples of several
+pixels meet: the order of its threads changes the last digits, so the same seed would not give the same picture."""
+SOFTNESS_PX = 0.5
+"""Standard deviation of the lens's blur, as of Mitsuba's default filter; a subpixel's own area is part of it."""
+WAVEFRONT = 20_000_000
+"""Samples that are drawn at once; with Mitsuba's LLVM variant that takes less than half a GB."""
+MAX_PASSES = 4096
+"""Seeds are this far apart, so that no two pictures share a pass's seed."""
 
 
 def choose_variant() -> str:
@@ -46,63 +59,143 @@ def choose_variant() -> str:
         raise DeltalightError(
             "Mitsuba is needed to render ground truth; install the project with its dev extra."
         ) from error
-    tried = subprocess.run([sys.executable, "-c", LLVM_PROBE], capture_output=True, check=False)
-    variant = "llvm_ad_rgb" if tried.returncode == 0 else "scalar_rgb"
+    variant = "llvm_ad_rgb" if _llvm_works() else "scalar_rgb"
     mi.set_variant(variant)
     return variant
 
 
+@cache
+def _llvm_works() -> bool:
+    return (
+        subprocess.run([sys.executable, "-c", LLVM_PROBE], capture_output=True, check=False).returncode == 0
+    )
+
+
+def passes(spp: int, pixels: int) -> tuple[int, ...]:
+    """Split `spp` samples a pixel (rounded up to whole subpixels) into passes, samples a subpixel each.
+
+    They are powers of 4, which the stratified sampler can lay out, and no pass exceeds `WAVEFRONT`.
+    """
+    area = SUBPIXELS**2
+    left, taken = -(-spp // area), []
+    while left:
+        size = 4 ** ((left.bit_length() - 1) // 2)
+        while size > 1 and size * area * pixels > WAVEFRONT:
+            size //= 4
+        taken.append(size)
+        left -= size
+    return tuple(taken)
+
+
+def _ignore() -> None:
+    """Nobody counts the passes."""
+
+
 class RoomRenderer:
-    """Renders one Mitsuba scene from any pose; the variant must be set (`choose_variant`)."""
+    """Renders one Mitsuba scene from any pose; the variant must be set (`choose_variant`).
+
+    With Mitsuba's LLVM variant the same seed gives the same picture, bit for bit.
+    """
 
     def __init__(self, scene: dict[str, Any], camera: CameraModel) -> None:
         import mitsuba as mi
 
         self._camera = camera
+        self._fine = camera.resized(SUBPIXELS * camera.width, SUBPIXELS * camera.height)
         self._scene = mi.load_dict(scene)
         self._integrators = {name: mi.load_dict(what) for name, what in INTEGRATORS.items()}
 
     def color(
-        self, world_from_camera: Float[np.ndarray, "4 4"], *, spp: int, seed: int
+        self, world_from_camera: Matrix, *, spp: int, seed: int, advance: Callable[[], None] = _ignore
     ) -> Float32[np.ndarray, "h w 3"]:
-        """Linear radiance in camera units."""
-        return self._render("color", world_from_camera, spp, seed)[..., :3]
+        """Linear radiance in camera units; `advance` is called after each of the `passes`."""
+        return self._mean("color", world_from_camera, spp, seed, advance)
 
-    def depth(
-        self, world_from_camera: Float[np.ndarray, "4 4"], *, spp: int, seed: int
+    def cover(
+        self, world_from_camera: Matrix, *, spp: int, seed: int, advance: Callable[[], None] = _ignore
     ) -> Float32[np.ndarray, "h w"]:
+        """Share of each pixel, 0..1, that shapes shining with radiance 1 fill; nothing else may shine.
+
+        The same seed puts the samples where `color` puts them.
+        """
+        return np.ascontiguousarray(self._mean("cover", world_from_camera, spp, seed, advance)[..., 0])
+
+    def depth(self, world_from_camera: Matrix, *, spp: int, seed: int) -> Float32[np.ndarray, "h w"]:
         """Metres along the optical axis, mean over each pixel; 0 where nothing is hit.
 
         Mitsuba gives the distance along the ray from the near plane; rays() has (x/z, y/z), hence the cosine.
         """
-        distance = self._render("distance", world_from_camera, spp, seed)[..., 0]
+        sensor = _sensor(self._camera, world_from_camera, "independent")
+        distance = self._render("distance", sensor, spp, seed)[..., 0]
         x, y = np.moveaxis(self._camera.rays(), -1, 0)
         depth = distance / np.sqrt(1 + x * x + y * y) + NEAR_CLIP_M
         return np.where(distance > 0, depth, 0).astype(np.float32)
 
-    def _render(
+    def _mean(
         self,
-        kind: Literal["color", "distance"],
-        world_from_camera: Float[np.ndarray, "4 4"],
+        kind: Literal["color", "cover"],
+        world_from_camera: Matrix,
         spp: int,
         seed: int,
-    ) -> Float32[np.ndarray, "h w c"]:
+        advance: Callable[[], None],
+    ) -> Float32[np.ndarray, "h w 3"]:
+        sensor = _sensor(self._fine, world_from_camera, "stratified")
+        total = np.zeros((self._fine.height, self._fine.width, 3), np.float32)
+        plan = passes(spp, self._camera.width * self._camera.height)
+        for number, samples in enumerate(plan):
+            total += samples * self._render(kind, sensor, samples, seed * MAX_PASSES + number)[..., :3]
+            advance()
+        return filtered(total / np.float32(sum(plan)))
+
+    def _render(self, kind: str, sensor: dict[str, Any], spp: int, seed: int) -> Float32[np.ndarray, "h w c"]:
         import mitsuba as mi
 
-        sensor = mi.load_dict(_sensor(self._camera, world_from_camera, PIXEL_FILTERS[kind]))
-        integrator = self._integrators[kind]
-        return np.array(mi.render(self._scene, sensor=sensor, integrator=integrator, spp=spp, seed=seed))
+        camera, integrator = mi.load_dict(sensor), self._integrators[kind]
+        return np.array(mi.render(self._scene, sensor=camera, integrator=integrator, spp=spp, seed=seed))
 
 
-def _sensor(
-    camera: CameraModel, world_from_camera: Float[np.ndarray, "4 4"], pixel_filter: str
-) -> dict[str, Any]:
-    """Mitsuba's pinhole of a camera without distortion; pixel centres at integers here, at halves there."""
+def filtered(fine: Float32[np.ndarray, "hs ws 3"]) -> Float32[np.ndarray, "h w 3"]:
+    """Blur a picture of subpixels by the lens and sample it at the pixels' centres; borders count what is there."""
+    taps = 4 * SUBPIXELS  # 2 px to either side: 4 standard deviations
+    offset_px = (np.arange(taps) - (taps - 1) / 2) / SUBPIXELS
+    variance = SOFTNESS_PX**2 - 1 / (12 * SUBPIXELS**2)
+    kernel = np.exp(-(offset_px**2) / (2 * variance)).astype(np.float32)
+    anchor = (taps - SUBPIXELS) // 2  # taps before a pixel's first subpixel
+
+    def blurred(picture: Float32[np.ndarray, "hs ws 3"]) -> Float32[np.ndarray, "h w 3"]:
+        soft = cv2.sepFilter2D(
+            picture, -1, kernel, kernel, anchor=(anchor, anchor), borderType=cv2.BORDER_CONSTANT
+        )
+        return np.asarray(soft[::SUBPIXELS, ::SUBPIXELS])
+
+    return np.asarray(blurred(fine) / blurred(np.ones_like(fine)))
+
+
+def _sensor(camera: CameraModel, world_from_camera: Matrix, sampler: str) -> dict[str, Any]:
+    """Mitsuba's sensor of a camera, with a film on which every sample stays in its pixel."""
+    fisheye = camera.distortion_model == "equidistant"
+    lens = (fisheye_sensor if fisheye else _pinhole)(camera, world_from_camera)
+    film = {
+        "type": "hdrfilm",
+        "width": camera.width,
+        "height": camera.height,
+        "rfilter": {"type": "box"},
+        "component_format": "float32",
+    }
+    return {**lens, "film": film, "sampler": {"type": sampler}}
+
+
+def _pinhole(camera: CameraModel, world_from_camera: Matrix) -> dict[str, Any]:
+    """Camera without distortion; pixel centres are at integers here, at halves in Mitsuba."""
     import mitsuba as mi
 
+    fx, fy, cx, cy = camera.matrix[[0, 1, 0, 1], [0, 1, 2, 2]]
     if camera.has_distortion:
         raise DeltalightError("Mitsuba's pinhole has no lens distortion; give a camera model without it.")
-    fx, cx, cy = camera.matrix[0, 0], camera.matrix[0, 2], camera.matrix[1, 2]
+    if not np.isclose(fx, fy):
+        raise DeltalightError(
+            "Mitsuba's pinhole has square pixels; give a picture size of the camera's own aspect."
+        )
     # Mitsuba looks along +z with +x to the left and +y up.
     turned = world_from_camera @ np.diag([-1.0, -1.0, 1.0, 1.0])
     return {
@@ -114,12 +207,4 @@ def _sensor(
         "near_clip": NEAR_CLIP_M,
         "far_clip": 100.0,
         "to_world": mi.ScalarTransform4f(turned),
-        "film": {
-            "type": "hdrfilm",
-            "width": camera.width,
-            "height": camera.height,
-            "rfilter": {"type": pixel_filter},
-            "component_format": "float32",
-        },
-        "sampler": {"type": "independent"},
     }

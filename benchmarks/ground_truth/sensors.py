@@ -70,8 +70,13 @@ class StereoDepthSensor:
         return np.asarray(field > np.quantile(field, 1 - self.failure_share))
 
 
-def srgb_bytes(linear: Float32[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
-    """8-bit sRGB code (IEC 61966-2-1) of linear values, clipped at sensor white."""
+def srgb_coded(linear: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
+    """SRGB code (IEC 61966-2-1), 0..255 and not yet rounded, of linear values clipped at sensor white."""
     v = np.clip(linear, 0.0, 1.0)
     coded = np.where(v <= 0.0031308, 12.92 * v, 1.055 * np.power(v, 1 / 2.4) - 0.055)
-    return np.asarray(np.rint(255 * coded), np.uint8)
+    return np.asarray(255 * coded, np.float32)
+
+
+def srgb_bytes(linear: Float32[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+    """8-bit sRGB code of linear values, clipped at sensor white."""
+    return np.asarray(np.rint(srgb_coded(linear)), np.uint8)

@@ -9,12 +9,9 @@ import typer
 from protocol.errors import DeltalightError
 from services.commands.options import Method
 
-bench = typer.Typer(no_args_is_help=True, help="Measure speed on this machine.")
-
-
-@bench.callback()
-def _group() -> None:
-    """Keep `speed` a command of its own while it is the only one."""
+bench = typer.Typer(
+    no_args_is_help=True, help="Measure speed on this machine, and agreement with ground truth."
+)
 
 
 @bench.command()
@@ -49,6 +46,45 @@ def speed(
         typer.echo(json.dumps(report, indent=2))
     else:
         print_report(report)
+
+
+@bench.command()
+def quality(
+    *,
+    scenes: Annotated[
+        str | None, typer.Option(help="Benchmark scenes, separated by commas; default all.")
+    ] = None,
+    methods: Annotated[
+        str,
+        typer.Option(help="camera, none, paper, exact, path, or exact:KEY=VALUE[,KEY=VALUE] (also paper:)."),
+    ] = "camera,none,paper,exact,path",
+    ablation: Annotated[
+        bool, typer.Option("--ablation", help="Compare the paper's operator with ours, one switch a row.")
+    ] = False,
+    size: Annotated[str, typer.Option(metavar="WxH", help="Size of the pictures.")] = "320x240",
+    volume: Annotated[
+        int | None, typer.Option(min=32, max=512, help="Voxels an edge; default as the machine can.")
+    ] = None,
+    spp: Annotated[int, typer.Option(min=1, help="Light paths a pixel of the truth; an even number.")] = 512,
+    out: Annotated[Path, typer.Option(help="Folder for the report.")] = Path("quality"),
+    device: Annotated[
+        int | None, typer.Option(min=0, help="EGL device; `deltalight doctor` lists them.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
+) -> None:
+    """Compare relit pictures with path-traced truth: figures, and a page with pictures of the errors."""
+    from services.arguments import parse_size
+
+    size_px = parse_size(size)
+    try:
+        from benchmarks.quality.command import run_quality
+    except ModuleNotFoundError as missing:
+        raise DeltalightError(
+            f"`bench quality` needs the package {missing.name}; install the project with its dev extra."
+        ) from missing
+    chosen = None if scenes is None else scenes.split(",")
+    compared = None if ablation else methods
+    run_quality(chosen, compared, size_px, spp, volume_size=volume, device=device, out=out, as_json=as_json)
 
 
 def _methods(text: str) -> list[str]:

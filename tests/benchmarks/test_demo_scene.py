@@ -97,8 +97,8 @@ def test_color_noise_grows_with_light_and_repeats_by_seed() -> None:
     sigma = [lut[sensor.expose(flat, np.random.default_rng(1))][..., 0].std() for flat in (dark, bright)]
     assert sigma[0] == pytest.approx(np.sqrt(4e-4 * 0.05 + 0.002**2), rel=0.1)
     assert sigma[1] == pytest.approx(np.sqrt(4e-4 * 0.6 + 0.002**2), rel=0.1)
-    again = [sensor.expose(bright, np.random.default_rng(5)) for _ in range(2)]
-    assert np.array_equal(*again)
+    first, second = (sensor.expose(bright, np.random.default_rng(5)) for _ in range(2))
+    assert np.array_equal(first, second)
 
 
 def test_depth_noise_grows_with_distance_squared() -> None:
@@ -197,7 +197,7 @@ def _depth_of_plane(frame: SensorFrame, world_from_camera: np.ndarray, z_m: floa
     """Depth along the optical axis at which each pixel's ray meets the plane z = z_m of the world."""
     rays = np.concatenate([frame.camera.rays(), np.ones((*frame.color.shape[:2], 1))], axis=2)
     rise = rays @ world_from_camera[2, :3]
-    return (z_m - world_from_camera[2, 3]) / rise
+    return np.asarray((z_m - world_from_camera[2, 3]) / rise)
 
 
 def _board_mask(frame: SensorFrame, world_from_camera: np.ndarray) -> np.ndarray:

@@ -1,15 +1,21 @@
 """Mitsuba's pictures agree with `CameraModel` and with the scene's own geometry and light."""
 
 import importlib.util
+import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from benchmarks.ground_truth import scene_demo
-from benchmarks.ground_truth.render import RoomRenderer, choose_variant
+from benchmarks.ground_truth import fisheye, scene_demo
+from benchmarks.ground_truth.assembly import environment_light, material
+from benchmarks.ground_truth.benchmark_scene import Finish
+from benchmarks.ground_truth.lamps import Ambient
+from benchmarks.ground_truth.parts import looking, placed, rectangle, rgb, shape, turned, two_sided
+from benchmarks.ground_truth.render import RoomRenderer, choose_variant, passes
 from protocol.camera_model import CameraModel
 from protocol.errors import DeltalightError
+from render_server.scene.environment import EnvironmentMap, map_directions
 
 if importlib.util.find_spec("mitsuba") is None:
     pytest.skip("Mitsuba is not installed (dev extra)", allow_module_level=True)
@@ -64,3 +70,91 @@ def test_lens_distortion_is_refused(room: RoomRenderer, tmp_path: Path) -> None:
     renderer = RoomRenderer(scene_demo.mitsuba_scene(tmp_path, with_object=False), bent)
     with pytest.raises(DeltalightError, match="distortion"):
         renderer.color(scene_demo.world_from_camera(0), spp=1, seed=0)
+
+
+def test_map_shines_from_where_the_renderer_reads_it() -> None:
+    """One bright texel among black ones, met by the centre pixel of a camera that looks its way."""
+    choose_variant()
+    sky = np.zeros((8, 16, 3), np.float32)
+    directions = map_directions(8, 16)
+    for row, column in ((2, 3), (6, 11), (0, 9)):
+        sky[:] = 0
+        sky[row, column] = (1.0, 2.0, 4.0)
+        scene = {"type": "scene", "sky": environment_light(sky)}
+        x, y, z = (float(v) for v in directions[row, column])
+        picture = RoomRenderer(scene, CAMERA).color(looking((0.0, 0.0, 0.0), (x, y, z)), spp=4, seed=1)
+        assert picture[39, 40] == pytest.approx((1.0, 2.0, 4.0), rel=0.1)
+
+
+def test_map_is_the_same_function_as_the_renderers() -> None:
+    choose_variant()
+    sky = np.random.default_rng(3).uniform(0, 1, (8, 16, 3)).astype(np.float32)
+    scene = {"type": "scene", "sky": environment_light(sky)}
+    pose = looking((0.0, 0.0, 0.0), (-0.5, 0.6, 0.3))
+    picture = RoomRenderer(scene, CAMERA).color(pose, spp=64, seed=1)
+    rays = np.concatenate([CAMERA.rays(), np.ones((72, 96, 1), np.float32)], axis=2) @ pose[:3, :3].T
+    expected = EnvironmentMap(sky, np.eye(3)).sample(rays.astype(np.float32))
+    assert np.abs(picture - expected)[2:-2, 2:-2].max() < 0.02
+
+
+def test_fisheye_sees_each_direction_at_its_angle() -> None:
+    """A sky whose colour is the direction itself: the picture must show each pixel's own, also below the horizon."""
+    choose_variant()
+    sky = 0.5 + 0.5 * map_directions(64, 128)
+    scene = {"type": "scene", "sky": environment_light(sky)}
+    camera = fisheye.CAMERA.resized(60, 60)
+    picture = RoomRenderer(scene, camera).color(np.eye(4), spp=16, seed=1)
+    columns, rows = np.meshgrid(np.arange(60) - 29.5, np.arange(60) - 29.5)
+    radius = np.hypot(columns, rows)
+    angle = np.radians(190) / 60 * radius
+    around = np.stack([columns, rows], axis=2) / radius[..., None] * np.sin(angle)[..., None]
+    expected = np.concatenate([around, np.cos(angle)[..., None]], axis=2)
+    inside, outside = radius < 28, radius > 33.5
+    assert angle[inside].max() > np.pi / 2 - 0.05
+    assert np.abs(2 * picture - 1 - expected)[inside].max() < 0.03
+    assert not picture[outside].any()
+
+
+def test_cover_of_an_edge_is_as_soft_as_colour() -> None:
+    """A white square before a black room: its cover is its colour when it shines with 1."""
+    choose_variant()
+    square = rectangle(placed((0.013, 0.0, 1.0), scale=(0.2, 0.2, 1.0)) @ turned("x", 180), (0.0, 0.0, 0.0))
+    shining = {**square, "emitter": {"type": "area", "radiance": rgb((1.0, 1.0, 1.0))}}
+    room = RoomRenderer({"type": "scene", "square": shining}, CAMERA)
+    cover = room.cover(np.eye(4), spp=16, seed=5)
+    assert np.array_equal(cover, np.clip(room.color(np.eye(4), spp=16, seed=5)[..., 0], 0, 1))
+    assert cover.sum() == pytest.approx((0.4 * 88) ** 2, rel=0.01)
+    edge_px = 40 + 88 * (0.013 - 0.2)
+    assert np.interp(0.5, cover[39, 15:35], np.arange(15, 35)) == pytest.approx(edge_px, abs=0.1)
+    # Blurred by a Gaussian of half a pixel, an edge rises from 16 % to 84 % within a pixel.
+    rise = np.interp([0.16, 0.84], cover[39, 15:35], np.arange(15, 35))
+    assert rise[1] - rise[0] == pytest.approx(1.0, abs=0.25)
+
+
+@pytest.mark.parametrize("spp", [1, 4, 30, 192, 2048])
+def test_passes_add_up_and_fit(spp: int) -> None:
+    plan = passes(spp, 640 * 480)
+    assert 4 * sum(plan) == 4 * math.ceil(spp / 4)
+    assert all(size in (1, 4, 16) for size in plan)
+
+
+def test_pixels_that_are_not_square_are_refused() -> None:
+    choose_variant()
+    with pytest.raises(DeltalightError, match="aspect"):
+        RoomRenderer({"type": "scene"}, CAMERA.resized(96, 48)).color(np.eye(4), spp=4, seed=0)
+
+
+@pytest.mark.parametrize("metallic", [0.0, 1.0])
+def test_furnace_keeps_materials_below_the_light(metallic: float) -> None:
+    """In a uniform surrounding nothing is brighter than it, and a Lambertian surface shows its albedo."""
+    choose_variant()
+    for finish, expected in (
+        (Finish((0.5, 0.25, 0.1), specular=0.0), (0.5, 0.25, 0.1)),
+        (Finish((0.5, 0.25, 0.1), metallic=metallic), None),
+    ):
+        ball = shape("sphere", placed((0.0, 0.0, 1.0), scale=(0.3,) * 3), bsdf=two_sided(material(finish)))
+        scene = {"type": "scene", "sky": Ambient(1.0).mitsuba(), "ball": ball}
+        middle = RoomRenderer(scene, CAMERA).color(np.eye(4), spp=256, seed=1)[36:42, 37:43].mean(axis=(0, 1))
+        assert middle.max() < 1.0
+        if expected is not None:
+            assert middle == pytest.approx(expected, rel=0.02)

@@ -9,7 +9,19 @@ import pytest
 from services import doctor, ports
 from tests.services.conftest import ROOT, RunCli
 
-COMMANDS = ("render", "demo", "node", "server", "viewer", "up", "doctor", "schema", "bench", "bench speed")
+COMMANDS = (
+    "render",
+    "demo",
+    "node",
+    "server",
+    "viewer",
+    "up",
+    "doctor",
+    "schema",
+    "bench",
+    "bench speed",
+    "bench quality",
+)
 
 
 def test_every_command_has_help(cli: RunCli) -> None:
@@ -72,6 +84,11 @@ def test_server_and_up_refuse_wrong_input_in_a_sentence(cli: RunCli, tmp_path: o
         (("up", "--source", "synthetic"), "--scene"),
         (("--log-level", "loud", "doctor"), "log level"),
         (("bench", "speed", "--methods", "guess"), "exact"),
+        (("bench", "quality", "--methods", "exact:cone_cont=9"), "cone_count"),
+        (("bench", "quality", "--scenes", "tabletopp"), "tabletop"),
+        (("bench", "quality", "--spp", 3, "--scenes", "tabletop", "--out", f"{tmp_path}/quality"), "even"),
+        (("bench", "quality", "--ablation", "--volume", 64), "--volume"),
+        (("bench", "quality", "--size", "big"), "WIDTHxHEIGHT"),
     ):
         done = cli(*arguments)
         assert done.returncode == 2, done.stderr

@@ -1,0 +1,126 @@
+"""A benchmark scene as Mitsuba renders it: without objects, with them, and the objects alone as a mask."""
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float32
+
+from benchmarks.ground_truth.benchmark_scene import BenchmarkScene, Finish
+from benchmarks.ground_truth.parts import MeshFolder, diffuse, rgb, shape, two_sided
+from render_server.scene.environment import read_radiance
+
+ENVIRONMENT_FILE = "environment.hdr"
+
+WORLD_FROM_MITSUBA_MAP = np.array(
+    [[0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+)
+"""Mitsuba's map has +y up, its centre column looks along +z, and a quarter to the left of that lies +x; ours has
+these at +z, +x and +y."""
+
+
+def material(finish: Finish) -> dict[str, Any]:
+    """Mitsuba's Disney BRDF, in the same terms as the scene document; Lambertian where the document says so."""
+    if finish.metallic == 0 and finish.specular == 0:
+        return diffuse(rgb(finish.base_color))
+    return {
+        "type": "principled",
+        "base_color": rgb(finish.base_color),
+        "roughness": finish.roughness,
+        "metallic": finish.metallic,
+        "specular": finish.specular,
+    }
+
+
+def environment_light(radiance: Float32[np.ndarray, "h w 3"]) -> dict[str, Any]:
+    """Light from a map that is laid out as in render_server/scene/environment.py.
+
+    Mitsuba puts the first and the last row on the poles, we put row j at (j + 0.5)/h of the way. A map of
+    2 h + 1 rows with ours at the odd ones and their means between is the same function in its layout.
+    """
+    import mitsuba as mi
+
+    rows = np.concatenate([radiance[:1], radiance, radiance[-1:]])
+    dense = np.empty((2 * len(radiance) + 1, *radiance.shape[1:]), np.float32)
+    dense[1::2] = radiance
+    dense[::2] = (rows[:-1] + rows[1:]) / 2
+    place = mi.ScalarTransform4f(WORLD_FROM_MITSUBA_MAP)
+    return {"type": "envmap", "bitmap": mi.Bitmap(dense), "to_world": place}
+
+
+class Assembly:
+    """Mitsuba dictionaries of a scene; its meshes and its map are written into a folder when this is made.
+
+    `assets` holds what the scene document names: a PLY for each object, the environment map.
+    """
+
+    def __init__(self, scene: BenchmarkScene, folder: Path) -> None:
+        self.scene, self.folder = scene, folder
+        self.assets = folder / "assets"
+        meshes = folder / "real"
+        for path in (self.assets, meshes):
+            path.mkdir()
+        self._real = {f"real_{name}": part for name, part in scene.real(MeshFolder(meshes)).items()}
+        self._lights = self._make_lights()
+        self._meshes = [item.mesh() for item in scene.objects]
+        self._files = [
+            MeshFolder(self.assets).ply(item.id, mesh)
+            for item, mesh in zip(scene.objects, self._meshes, strict=True)
+        ]
+
+    def without(self) -> dict[str, Any]:
+        """Return the real room and its lights."""
+        return {"type": "scene", **self._lights, **self._real}
+
+    def with_objects(self, frame: int) -> dict[str, Any]:
+        """Return the same and the virtual objects as they stand in a frame.
+
+        They come last, so that paths that never meet them draw the same random numbers as without.
+        """
+        objects = {}
+        for index, (item, file) in enumerate(zip(self.scene.objects, self._files, strict=True)):
+            place, bsdf = item.world_from_object[frame], two_sided(material(item.finish))
+            glow = {"emitter": _area(item.finish.emission)} if any(item.finish.emission) else {}
+            objects[f"object_{index}"] = shape("ply", place, filename=file, bsdf=bsdf, **glow)
+        return {**self.without(), **objects}
+
+    def mask(self, frame: int) -> dict[str, Any]:
+        """Return objects that shine with radiance 1 among dark real things, for `RoomRenderer.cover`.
+
+        Flat normals: an emitter is dark where its interpolated normal turns away, as it does along outlines.
+        """
+        lamps = {name: _dark(lamp) for name, lamp in self._lights.items() if "emitter" in lamp}
+        objects = {
+            f"object_{index}": shape(
+                "ply",
+                item.world_from_object[frame],
+                filename=file,
+                face_normals=True,
+                emitter=_area((1.0, 1.0, 1.0)),
+            )
+            for index, (item, file) in enumerate(zip(self.scene.objects, self._files, strict=True))
+        }
+        return {"type": "scene", **lamps, **self._real, **objects}
+
+    def base_m(self) -> Float[np.ndarray, "3"]:
+        """Return the middle of the first object's underside, where it stands in the first frame."""
+        low, high = self._meshes[0].bounds
+        middle = np.array([*(low[:2] + high[:2]) / 2, low[2], 1.0])
+        return np.asarray((self.scene.objects[0].world_from_object[0] @ middle)[:3])
+
+    def _make_lights(self) -> dict[str, Any]:
+        if self.scene.environment is None:
+            return {f"lamp_{index}": lamp.mitsuba() for index, lamp in enumerate(self.scene.lamps)}
+        # The file's rounding (RGBE) is part of the light, for truth and renderer alike.
+        path = self.assets / ENVIRONMENT_FILE
+        cv2.imwrite(str(path), np.ascontiguousarray(self.scene.environment()[..., ::-1]))
+        return {"environment": environment_light(read_radiance(path))}
+
+
+def _area(radiance: tuple[float, float, float]) -> dict[str, Any]:
+    return {"type": "area", "radiance": rgb(radiance)}
+
+
+def _dark(lamp: dict[str, Any]) -> dict[str, Any]:
+    return {name: part for name, part in lamp.items() if name != "emitter"}

@@ -1,0 +1,43 @@
+"""The benchmark's scenes, one a file."""
+
+import difflib
+
+from benchmarks.ground_truth.benchmark_scene import BenchmarkScene
+from benchmarks.ground_truth.scenes import (
+    concave_box,
+    cornell,
+    glossy_table,
+    hidden_in_shadow,
+    mirror_table,
+    moving,
+    natural_light,
+    studio,
+    tabletop,
+    two_lights,
+)
+from protocol.errors import DeltalightError
+
+SCENES: tuple[BenchmarkScene, ...] = (
+    tabletop.SCENE,
+    glossy_table.SCENE,
+    mirror_table.SCENE,
+    natural_light.SCENE,
+    cornell.SCENE,
+    concave_box.SCENE,
+    two_lights.SCENE,
+    hidden_in_shadow.SCENE,
+    moving.SCENE,
+    studio.SCENE,
+)
+
+
+def scene_named(name: str) -> BenchmarkScene:
+    """Find a scene; DeltalightError names the known ones and the nearest."""
+    known = {scene.name: scene for scene in SCENES}
+    if name not in known:
+        near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+        hint = f" did you mean `{near[0]}`?" if near else ""
+        raise DeltalightError(
+            f"There is no benchmark scene `{name}`;{hint} Known scenes: {', '.join(known)}."
+        )
+    return known[name]

@@ -1,0 +1,188 @@
+"""The truth of a benchmark scene: rendered once, then kept and found again by the hash of all that determines it."""
+
+import json
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+from rich.progress import Progress
+
+from benchmarks.ground_truth import fisheye
+from benchmarks.ground_truth.assembly import Assembly
+from benchmarks.ground_truth.benchmark_scene import BenchmarkScene
+from benchmarks.ground_truth.content_hash import content_hash
+from benchmarks.ground_truth.document import document_path, scene_document
+from benchmarks.ground_truth.render import INTEGRATORS, SUBPIXELS, choose_variant
+from benchmarks.ground_truth.sensors import ColorSensor, StereoDepthSensor
+from benchmarks.ground_truth.truth_pictures import TruthRenderer
+from benchmarks.ground_truth.truth_writer import MANIFEST_FILE, TRUTH_FOLDER, picture_path, write_truth
+from protocol.camera_model import CameraModel
+from protocol.errors import DeltalightError
+from protocol.pictures import decode_rgb, read_bytes
+from protocol.scene import SceneDocument, load_scene
+
+RENDER_VERSION = 1
+"""Counts up when rendering changes in a way that the hashed numbers do not show (seeds, samples of depth...)."""
+CACHE_VARIABLE = "DELTALIGHT_CACHE"
+
+
+@dataclass(frozen=True, eq=False)
+class TruthFrame:
+    """One frame of truth; pictures are linear in camera units, without noise, where nothing else is said.
+
+    `without` and `with_objects` are the room without and with virtual objects, each the mean of two halves of
+    the samples. `halves_psnr_db` is how well the halves of `with_objects` agree in sRGB code of range 255; the
+    mean lies about 6 dB closer to the limit of infinitely many samples. `cover` is the share of each pixel that
+    virtual objects fill, 0..1. The `sensor` pictures are 8-bit sRGB with one and the same draw of camera noise.
+    """
+
+    without: Float32[np.ndarray, "h w 3"]
+    with_objects: Float32[np.ndarray, "h w 3"]
+    halves_psnr_db: float
+    cover: Float32[np.ndarray, "h w"]
+    sensor_without: UInt8[np.ndarray, "h w 3"]
+    sensor_with: UInt8[np.ndarray, "h w 3"]
+
+
+@dataclass(frozen=True)
+class Truth:
+    """A finished dataset folder (FORMATS 1) of the room without objects, and the truth beside it."""
+
+    folder: Path
+    scene: BenchmarkScene
+    size: tuple[int, int]
+    spp: int
+
+    @property
+    def frame_count(self) -> int:
+        """Frames of the take."""
+        return self.scene.frame_count
+
+    def document(self, frame: int) -> SceneDocument:
+        """Return the scene document of a frame, with objects posed for it and absolute asset paths."""
+        return load_scene(document_path(self.folder, self.scene, frame))
+
+    def frame(self, frame: int) -> TruthFrame:
+        """Read the truth of a frame.
+
+        Raises:
+            DeltalightError: a picture is missing or damaged.
+        """
+        without, with_objects, cover = (self._picture(name, frame) for name in ("without", "with", "cover"))
+        return TruthFrame(
+            without=without,
+            with_objects=with_objects,
+            halves_psnr_db=float(self._manifest["halves_psnr_db"][frame]),
+            cover=cover,
+            sensor_without=self._sensor(self.folder / "rgb" / f"{frame:06d}.png"),
+            sensor_with=self._sensor(self.folder / TRUTH_FOLDER / f"sensor_with-{frame:06d}.png"),
+        )
+
+    @cached_property
+    def _manifest(self) -> dict[str, Any]:
+        return dict(json.loads((self.folder / TRUTH_FOLDER / MANIFEST_FILE).read_text()))
+
+    def _picture(self, name: str, frame: int) -> np.ndarray:
+        path = picture_path(self.folder / TRUTH_FOLDER, name, frame)
+        try:
+            return np.asarray(np.load(path), np.float32)
+        except (OSError, ValueError) as error:
+            raise DeltalightError(
+                f"{path} cannot be read; remove {self.folder} to have it rendered again."
+            ) from error
+
+    def _sensor(self, path: Path) -> UInt8[np.ndarray, "h w 3"]:
+        return decode_rgb(read_bytes(path), str(path))
+
+
+def ensure_truth(
+    scene: BenchmarkScene, *, size: tuple[int, int], spp: int, progress: Progress, cache: Path | None = None
+) -> Truth:
+    """Return the truth of a scene, rendering it if `cache` (default: `default_cache`) does not hold it.
+
+    `size` is width and height in pixels, `spp` the samples a pixel of each picture. The
+    folder appears when it is complete; what is interrupted leaves nothing.
+
+    Raises:
+        DeltalightError: Mitsuba is missing, or size or spp cannot be rendered.
+    """
+    least = 2 * SUBPIXELS**2
+    if spp < least or spp % least:
+        raise DeltalightError(f"{spp} samples a pixel cannot be halved evenly; give a multiple of {least}.")
+    variant = choose_variant()
+    camera, cache = scene.camera.resized(*size), cache or default_cache()
+    with _workshop(cache) as workshop:
+        assembly = Assembly(scene, workshop)
+        about = _about(scene, size, spp, variant)
+        digest = content_hash(about, *_determining(assembly, camera))
+        truth = Truth(cache / f"{scene.name}-{size[0]}x{size[1]}-{digest}", scene, size, spp)
+        if not truth.folder.is_dir():
+            _render(truth, assembly, camera, about, progress)
+    return truth
+
+
+def default_cache() -> Path:
+    """Return `ground-truth` in DELTALIGHT_CACHE, else in the user's cache folder."""
+    given = os.environ.get(CACHE_VARIABLE)
+    user = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return (Path(given) if given else user / "deltalight") / "ground-truth"
+
+
+@contextmanager
+def _workshop(cache: Path) -> Iterator[Path]:
+    """Make a folder beside the finished ones that does not outlive the work in it."""
+    try:
+        cache.mkdir(parents=True, exist_ok=True)
+        workshop = tempfile.TemporaryDirectory(dir=cache, prefix=".making-")
+    except OSError as error:
+        raise DeltalightError(
+            f"ground truth cannot be kept in {cache} ({error.strerror}); set {CACHE_VARIABLE} to a folder."
+        ) from error
+    with workshop as folder:
+        yield Path(folder)
+
+
+def _about(scene: BenchmarkScene, size: tuple[int, int], spp: int, variant: str) -> dict[str, Any]:
+    import mitsuba as mi
+
+    return {
+        "scene": scene.name,
+        "size": list(size),
+        "spp": spp,
+        "mitsuba": mi.__version__,
+        "variant": variant,
+        "render_version": RENDER_VERSION,
+    }
+
+
+def _determining(assembly: Assembly, camera: CameraModel) -> list[object]:
+    """Return everything else that the folder's content follows from."""
+    scene = assembly.scene
+    poses = [scene.world_from_camera, *(item.world_from_object for item in scene.objects)]
+    documents = [scene_document(scene, 0), scene.board.model_dump(mode="json")]
+    lenses = [camera.to_dict(), fisheye.CAMERA.to_dict(), fisheye.EXPOSURES_S]
+    sensors = [repr(ColorSensor()), repr(StereoDepthSensor())]
+    return [assembly.with_objects(0), poses, documents, lenses, sensors, INTEGRATORS]
+
+
+def _render(
+    truth: Truth, assembly: Assembly, camera: CameraModel, about: dict[str, Any], progress: Progress
+) -> None:
+    task = progress.add_task(f"rendering truth of {truth.scene.name}")
+    renderer = TruthRenderer(assembly, camera, truth.spp, lambda: progress.advance(task))
+    progress.update(task, total=renderer.step_count)
+    made = assembly.folder / truth.folder.name
+    write_truth(made, renderer, about)
+    try:
+        made.rename(truth.folder)
+    except OSError:
+        # Somebody else may have finished the same truth meanwhile.
+        if not truth.folder.is_dir():
+            raise

@@ -1,0 +1,1 @@
+"""How well relighting agrees with ground truth: `deltalight bench quality`."""

@@ -1,0 +1,47 @@
+"""One benchmark scene, ready to be rendered and compared."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+from benchmarks.ground_truth.benchmark_scene import BenchmarkScene
+from benchmarks.ground_truth.truth import Truth, TruthFrame
+from benchmarks.quality.metrics import Picture
+from benchmarks.quality.regions import Regions, find_regions
+from protocol.frames import ViewFrame
+from protocol.source import open_source
+from sensor_node.view_frames import ViewFrameBuilder
+
+
+@dataclass(frozen=True, eq=False)
+class SceneCase:
+    """Truth of a scene with what the renderer gets to see of it, a view a frame."""
+
+    truth: Truth
+    frames: Sequence[TruthFrame]
+    views: Sequence[ViewFrame]
+    regions: Sequence[Regions]
+
+    @classmethod
+    def opened(cls, truth: Truth) -> "SceneCase":
+        """Read all frames of a truth's dataset, cleaned as a node does it.
+
+        Raises:
+            DeltalightError: the dataset cannot be read.
+        """
+        source = open_source(truth.folder)
+        builder = ViewFrameBuilder(source)
+        frames = [truth.frame(index) for index in range(truth.frame_count)]
+        views = [builder(source[index]) for index in range(truth.frame_count)]
+        regions = [find_regions(frame.without, frame.with_objects, frame.cover) for frame in frames]
+        return cls(truth, frames, views, regions)
+
+    @property
+    def scene(self) -> BenchmarkScene:
+        """The scene itself."""
+        return self.truth.scene
+
+    @cached_property
+    def references(self) -> list[Picture]:
+        """What the sensor would have seen with the objects, noise included."""
+        return [frame.sensor_with for frame in self.frames]

@@ -1,0 +1,23 @@
+"""The best picture that relighting could make of what the camera saw."""
+
+import numpy as np
+
+from benchmarks.ground_truth.sensors import srgb_bytes
+from benchmarks.ground_truth.truth import TruthFrame
+from benchmarks.quality.figures import linear
+from benchmarks.quality.metrics import Picture
+
+REGULARIZER = 1e-3
+"""Keeps the ratio finite in black; the same share of white as composition uses of the light (METHOD 3)."""
+
+
+def ideal_composite(truth: TruthFrame) -> Picture:
+    """Camera picture times the true change of light, true objects over it, coded.
+
+    What then differs from the reference is the sensor's noise: it is scaled with the light here, and absent on
+    the objects.
+    """
+    ratio = (truth.with_objects + REGULARIZER) / (truth.without + REGULARIZER)
+    cover = truth.cover[..., None]
+    relit = (1 - cover) * linear(truth.sensor_without) * ratio + cover * truth.with_objects
+    return srgb_bytes(np.asarray(relit, np.float32))

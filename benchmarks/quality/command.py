@@ -1,0 +1,55 @@
+"""What `deltalight bench quality` does once its options are read."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import Progress
+
+from benchmarks.ground_truth.scenes import SCENES, scene_named
+from benchmarks.quality.evaluate import QualityJob, measure_quality
+from benchmarks.quality.report import require_replaceable, write_report
+from benchmarks.quality.report_data import as_data
+from benchmarks.quality.tables import all_tables
+from benchmarks.quality.variants import Variant, ablation_chain, parse_variants
+from protocol.errors import DeltalightError
+
+
+def run_quality(
+    scenes: Sequence[str] | None,
+    methods: str | None,
+    size: tuple[int, int],
+    spp: int,
+    *,
+    volume_size: int | None,
+    device: int | None,
+    out: Path,
+    as_json: bool,
+) -> None:
+    """Measure, write the report as folder `out`, and print it.
+
+    `scenes` None = all; `methods` None = the ablation chain; `size` is width and height in pixels.
+
+    Raises:
+        DeltalightError: an unknown scene or method, `out` is something else, no OpenGL, or no truth.
+    """
+    chosen = SCENES if scenes is None else [scene_named(name.strip()) for name in scenes]
+    variants = _ablation(volume_size) if methods is None else parse_variants(methods)
+    require_replaceable(out)
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True) as progress:
+        result = measure_quality(QualityJob(chosen, variants, size, spp, volume_size, device), progress)
+    write_report(result, out)
+    if as_json:
+        print(json.dumps(as_data(result), indent=2))
+    else:
+        for table in all_tables(result):
+            table.print(Console())
+    console.print(f"The report is {out / 'index.html'}", soft_wrap=True)
+
+
+def _ablation(volume_size: int | None) -> list[Variant]:
+    if volume_size is not None:
+        raise DeltalightError("--ablation chooses the voxels of each row itself; leave out --volume.")
+    return ablation_chain()

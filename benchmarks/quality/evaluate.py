@@ -1,0 +1,139 @@
+"""The benchmark: every variant on every scene, against truth."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from rich.progress import Progress
+
+from benchmarks.ground_truth.benchmark_scene import BenchmarkScene
+from benchmarks.ground_truth.truth import ensure_truth
+from benchmarks.quality.case import SceneCase
+from benchmarks.quality.ceiling import ideal_composite
+from benchmarks.quality.figures import Figures, mean_figures, scene_figures
+from benchmarks.quality.metrics import Picture
+from benchmarks.quality.path_tracing import trace_in_time
+from benchmarks.quality.renders import Rendered, render_variant
+from benchmarks.quality.variants import TIMED_VARIANT, Variant
+from render_server.gpu.context import GpuContext, create_context
+
+CEILING = Variant(
+    "ceiling", "the camera's picture times the true change: what perfect relighting could reach", "camera"
+)
+
+
+@dataclass(frozen=True)
+class QualityJob:
+    """What to measure; `volume_size` None = the machine's default, `cache` None = where truth is kept by default."""
+
+    scenes: Sequence[BenchmarkScene]
+    variants: Sequence[Variant]
+    size: tuple[int, int]
+    spp: int
+    volume_size: int | None = None
+    device: int | None = None
+    cache: Path | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class VariantResult:
+    """A variant on one scene: figures (figures.py), the picture that the report shows, and `Rendered`'s account."""
+
+    figures: Figures
+    shown: Picture
+    is_repeatable: bool | None = None
+    history_codes: int | None = None
+    note: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class SceneResult:
+    """One scene: every variant by name, and what truth itself is like."""
+
+    scene: BenchmarkScene
+    halves_psnr_db: float
+    camera: Picture
+    reference: Picture
+    variants: dict[str, VariantResult]
+
+
+@dataclass(frozen=True, eq=False)
+class QualityResult:
+    """Everything that was measured."""
+
+    job: QualityJob
+    renderer: str
+    scenes: list[SceneResult] = field(default_factory=list)
+
+    @property
+    def variants(self) -> list[Variant]:
+        """Rows of the tables."""
+        return [*self.job.variants, CEILING]
+
+    def means(self) -> dict[str, Figures]:
+        """Figures of each variant, mean over scenes."""
+        return {
+            variant.name: mean_figures(scene.variants[variant.name].figures for scene in self.scenes)
+            for variant in self.variants
+        }
+
+
+def measure_quality(job: QualityJob, progress: Progress) -> QualityResult:
+    """Render missing truth and measure every variant on every scene.
+
+    Raises:
+        DeltalightError: no OpenGL, truth is missing and cannot be rendered, or a variant cannot be used.
+    """
+    gpu = create_context(job.device)
+    try:
+        result = QualityResult(job, gpu.renderer_name)
+        steps = progress.add_task("measuring", total=len(job.scenes) * len(job.variants))
+        for scene in job.scenes:
+            truth = ensure_truth(scene, size=job.size, spp=job.spp, progress=progress, cache=job.cache)
+            case = SceneCase.opened(truth)
+            variants: dict[str, VariantResult] = {}
+            for variant in job.variants:
+                progress.update(steps, description=f"measuring {scene.name}: {variant.name}")
+                variants[variant.name] = _measure(gpu, case, variant, job.volume_size, variants)
+                progress.advance(steps)
+            variants[CEILING.name] = _result(case, Rendered([ideal_composite(one) for one in case.frames]))
+            result.scenes.append(_scene_result(case, variants))
+    finally:
+        gpu.release()
+    return result
+
+
+def _measure(
+    gpu: GpuContext,
+    case: SceneCase,
+    variant: Variant,
+    volume_size: int | None,
+    before: dict[str, VariantResult],
+) -> VariantResult:
+    match variant.kind:
+        case "camera":
+            rendered = Rendered([frame.sensor_without for frame in case.frames])
+        case "path":
+            rendered = trace_in_time(case, before[TIMED_VARIANT].figures["frame_ms"])
+        case _:
+            rendered = render_variant(gpu, case, variant, volume_size)
+    return _result(case, rendered)
+
+
+def _result(case: SceneCase, rendered: Rendered) -> VariantResult:
+    figures = scene_figures(rendered.pictures, case)
+    if rendered.frame_ms is not None:
+        figures["frame_ms"] = rendered.frame_ms
+    shown = rendered.pictures[_shown_frame(case)]
+    return VariantResult(figures, shown, rendered.is_repeatable, rendered.history_codes, rendered.note)
+
+
+def _scene_result(case: SceneCase, variants: dict[str, VariantResult]) -> SceneResult:
+    shown = case.frames[_shown_frame(case)]
+    halves_db = min(frame.halves_psnr_db for frame in case.frames)
+    return SceneResult(case.scene, halves_db, shown.sensor_without, shown.sensor_with, variants)
+
+
+def _shown_frame(case: SceneCase) -> int:
+    """The middle of a sequence."""
+    return len(case.frames) // 2

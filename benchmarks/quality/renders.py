@@ -1,0 +1,83 @@
+"""A variant's pictures of a scene: composites as the render server makes them, with their time."""
+
+import statistics
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from benchmarks.quality.case import SceneCase
+from benchmarks.quality.metrics import Picture
+from benchmarks.quality.variants import Variant
+from protocol.frames import BoardPose, ViewFrame
+from protocol.scene import SceneDocument
+from render_server.gpu.context import GpuContext
+from render_server.renderer import SceneRenderer
+
+TIMED_PAIRS = 2
+STEP_ASIDE_M = 0.05
+"""Far enough for every real surface to be built anew: many pixels at any distance in a room."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rendered:
+    """Pictures, one a frame.
+
+    `frame_ms`: median time of a frame in which everything is built anew. `is_repeatable`: the first frame rendered
+    again at once gave the same bytes. `history_codes`: greatest difference of any channel, in 8-bit codes, when it
+    is rendered once more after other frames. None where nothing was rendered.
+    """
+
+    pictures: Sequence[Picture]
+    frame_ms: float | None = None
+    is_repeatable: bool | None = None
+    history_codes: int | None = None
+    note: str = ""
+
+
+def render_variant(gpu: GpuContext, case: SceneCase, variant: Variant, volume_size: int | None) -> Rendered:
+    """Render every frame of a scene with a variant of kind `none` or `dvct`.
+
+    Raises:
+        DeltalightError: the variant needs more memory than its budget, or asks for what is not built.
+    """
+    documents = [variant.applied(case.truth.document(frame), volume_size) for frame in range(len(case.views))]
+    renderer = SceneRenderer(gpu, documents[0])
+    try:
+        first, again = (renderer.render(case.views[0]).color for _ in range(2))
+        later, frame_ms = _time_rebuilds(renderer, case.views[0])
+        others = _render_rest(renderer, documents, case.views)
+    finally:
+        renderer.release()
+    history_codes = int(np.abs(first.astype(int) - later).max())
+    return Rendered([first, *others], frame_ms, np.array_equal(first, again), history_codes)
+
+
+def _time_rebuilds(renderer: SceneRenderer, view: ViewFrame) -> tuple[Picture, float]:
+    """The last picture and the median time (ms) of frames between which the camera steps aside and back."""
+    times_ms: list[float] = []
+    aside = _stepped_aside(view)
+    for frame in (aside, view) * TIMED_PAIRS:
+        started_s = time.perf_counter()
+        color = renderer.render(frame).color
+        times_ms.append(1000 * (time.perf_counter() - started_s))
+    return color, statistics.median(times_ms)
+
+
+def _stepped_aside(view: ViewFrame) -> ViewFrame:
+    assert view.pose is not None  # truth gives every frame its pose
+    moved = view.pose.world_from_camera.copy()
+    moved[:3, 3] += STEP_ASIDE_M * moved[:3, 0]
+    return replace(view, pose=BoardPose(moved))
+
+
+def _render_rest(
+    renderer: SceneRenderer, documents: Sequence[SceneDocument], views: Sequence[ViewFrame]
+) -> list[Picture]:
+    """The frames after the first, in their order, objects where they are by then."""
+    pictures = []
+    for document, view in zip(documents[1:], views[1:], strict=True):
+        renderer.set_scene(document)
+        pictures.append(renderer.render(view).color)
+    return pictures

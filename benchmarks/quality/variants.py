@@ -1,0 +1,124 @@
+"""What is compared: pictures without relighting, the renderer with chosen settings, path tracing in equal time."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from protocol.documents import parse_mapping, validate
+from protocol.errors import DeltalightError
+from protocol.scene import SceneDocument
+from protocol.scene_method import DvctMethod, NoneMethod
+
+Kind = Literal["camera", "none", "dvct", "path"]
+OPERATORS = ("exact", "paper")
+DEFAULT_METHODS = "camera,none,paper,exact,path"
+TIMED_VARIANT = "exact"
+"""`path` takes the time of this one's frame."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One way to make the picture; `settings` are changes of the scene document's `method` (dvct only)."""
+
+    name: str
+    sentence: str
+    kind: Kind
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+    def applied(self, document: SceneDocument, volume_size: int | None) -> SceneDocument:
+        """Return the document with this variant's method; `volume_size` is used where no setting names one."""
+        if self.kind == "none":
+            return document.replaced(method=NoneMethod())
+        size = {} if volume_size is None else {"volume_size": volume_size}
+        return document.replaced(method=document.method.replaced(**{**size, **self.settings}))
+
+
+FIXED: dict[str, Variant] = {
+    variant.name: variant
+    for variant in (
+        Variant("camera", "the camera's picture: no object, no relighting", "camera"),
+        Variant("none", "objects drawn, the real scene left as it was", "none"),
+        Variant("paper", "the operator as printed in [P1]", "dvct", {"operator": "paper"}),
+        Variant("exact", "the exact operator, machine's defaults", "dvct", {"operator": "exact"}),
+        Variant("path", "path tracing with and without objects, in the time of an `exact` frame", "path"),
+    )
+}
+
+PAPER_IN_SOFTWARE: dict[str, Any] = {
+    "operator": "paper",
+    "shadow": "cone",
+    "composition": "additive",
+    "cone_scale": 4,
+    "volume_size": 64,
+}
+"""Everything that a later row switches, so that a chain means the same on every machine."""
+
+ABLATION_STEPS: tuple[tuple[str, str, dict[str, Any]], ...] = (
+    # name, sentence, what changes against the row above
+    (
+        "paper",
+        "the operator as printed in [P1], 64 voxels an edge, cones at every 4th pixel",
+        PAPER_IN_SOFTWARE,
+    ),
+    ("+ shadow maps", "shadows from maps in place of shadow cones", {"shadow": "map"}),
+    ("+ ratio", "the change multiplies the picture in place of being added", {"composition": "ratio"}),
+    ("+ exact", "both sets of voxels marched, light from the camera", {"operator": "exact", "cone_count": 9}),
+    ("+ 16 cones", "16 equal cones in place of 9", {"cone_count": 16}),
+    ("+ every pixel", "cones traced at every pixel", {"cone_scale": 1}),
+    ("+ finer voxels", "128 voxels an edge", {"volume_size": 128}),
+)
+
+
+def ablation_chain() -> list[Variant]:
+    """From the paper's operator to the exact one and beyond, one switch a row."""
+    chain: list[Variant] = []
+    settings: dict[str, Any] = {}
+    for name, sentence, changes in ABLATION_STEPS:
+        settings = settings | changes
+        chain.append(Variant(name, sentence, "dvct", settings))
+    return chain
+
+
+def parse_variants(text: str) -> list[Variant]:
+    """Read `camera,paper,exact:cone_count=32,cone_scale=1`: names with settings, separated by commas.
+
+    Raises:
+        DeltalightError: an unknown name, or a setting that the method does not have or allow.
+    """
+    written: list[str] = []
+    for piece in (piece.strip() for piece in text.split(",")):
+        if "=" in piece and ":" not in piece and written:
+            written[-1] += f",{piece}"  # a further setting of the variant before it
+        else:
+            written.append(piece)
+    if len(set(written)) < len(written):
+        raise DeltalightError(f"--methods '{text}' names one thing twice; write each once.")
+    variants = [_parse(one) for one in written]
+    if "path" in written and TIMED_VARIANT not in written:
+        raise DeltalightError(
+            f"`path` takes the time of `{TIMED_VARIANT}`; add {TIMED_VARIANT} to --methods."
+        )
+    return variants
+
+
+def _parse(text: str) -> Variant:
+    name, _, changes = text.partition(":")
+    if not changes and name in FIXED:
+        return FIXED[name]
+    if not changes or name not in OPERATORS:
+        known = ", ".join(FIXED)
+        raise DeltalightError(
+            f"'{text}' is no method to compare; use {known}, or exact:KEY=VALUE or paper:KEY=VALUE."
+        )
+    settings: dict[str, Any] = {"operator": name}
+    for pair in changes.split(","):
+        settings |= _setting(pair, text)
+    validate(DvctMethod, settings, f"--methods {text}")
+    return Variant(text, f"{name} with {changes.replace(',', ', ')}", "dvct", settings)
+
+
+def _setting(pair: str, variant: str) -> dict[str, Any]:
+    key, equals, value = pair.partition("=")
+    if not equals:
+        raise DeltalightError(f"'{pair}' in '{variant}' is no setting; write KEY=VALUE.")
+    return parse_mapping(f"{key.strip()}: {value}", f"--methods {variant}", is_json=False)

@@ -1,0 +1,72 @@
+"""Relighting stays as good as it is: the quality benchmark on two scenes, small and with few light paths.
+
+The floors lie about 1.5 dB under what was measured when they were set (in brackets): truth with few light paths is
+noisy, and a change of the renderer may cost one scene a little of what it gives another.
+"""
+
+import importlib.util
+
+import pytest
+from rich.progress import Progress
+
+from benchmarks.ground_truth.scenes import scene_named
+from benchmarks.quality.evaluate import QualityJob, QualityResult, measure_quality
+from benchmarks.quality.variants import parse_variants
+
+if importlib.util.find_spec("mitsuba") is None:
+    pytest.skip("Mitsuba is not installed (dev extra)", allow_module_level=True)
+
+SIZE = (320, 240)  # smaller, a stereo sensor sees less of slanted surfaces
+LIGHT_PATHS = 32
+PICTURE_FLOOR_DB = {"two_lights": 34.8, "natural_light": 36.0}  # (36.3, 37.5)
+GAIN_FLOOR_DB = {"two_lights": 12.2, "natural_light": 14.4}  # (13.7, 15.9)
+"""Of changed real surfaces, over the untouched camera picture."""
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory: pytest.TempPathFactory) -> QualityResult:
+    scenes = [scene_named(name) for name in PICTURE_FLOOR_DB]
+    variants = parse_variants("camera,paper,exact")
+    job = QualityJob(
+        scenes, variants, SIZE, LIGHT_PATHS, volume_size=64, cache=tmp_path_factory.mktemp("truth")
+    )
+    with Progress(disable=True) as progress:
+        return measure_quality(job, progress)
+
+
+def figure(measured: QualityResult, variant: str, name: str) -> dict[str, float]:
+    return {scene.scene.name: scene.variants[variant].figures[name] for scene in measured.scenes}
+
+
+def test_whole_picture_is_close_to_truth(measured: QualityResult) -> None:
+    for scene, psnr_db in figure(measured, "exact", "picture_psnr_db").items():
+        assert psnr_db >= PICTURE_FLOOR_DB[scene], scene
+
+
+def test_light_on_real_surfaces_is_far_better_than_none(measured: QualityResult) -> None:
+    untouched = figure(measured, "camera", "changed_real_psnr_db")
+    for scene, psnr_db in figure(measured, "exact", "changed_real_psnr_db").items():
+        assert psnr_db - untouched[scene] >= GAIN_FLOOR_DB[scene], scene
+
+
+def test_exact_operator_is_no_worse_than_the_papers(measured: QualityResult) -> None:
+    means = measured.means()
+    assert means["exact"]["changed_psnr_db"] >= means["paper"]["changed_psnr_db"]
+
+
+def test_shadows_take_away_the_right_amount_of_light(measured: QualityResult) -> None:
+    for scene, share in figure(measured, "exact", "darkening").items():
+        assert share == pytest.approx(1, abs=0.15), scene  # (0.97, 1.06)
+
+
+def test_nothing_relit_is_better_than_the_ceiling(measured: QualityResult) -> None:
+    ceiling = figure(measured, "ceiling", "changed_psnr_db")
+    for scene, psnr_db in figure(measured, "exact", "changed_psnr_db").items():
+        assert psnr_db < ceiling[scene]
+        assert ceiling[scene] > 45  # else the sensor's noise would hide what is measured
+
+
+def test_same_frame_gives_the_same_bytes(measured: QualityResult) -> None:
+    for scene in measured.scenes:
+        assert scene.variants["exact"].is_repeatable
+        assert scene.variants["paper"].is_repeatable

@@ -1,0 +1,62 @@
+"""What `--methods` and `--ablation` of the quality benchmark stand for."""
+
+from itertools import pairwise
+
+import pytest
+
+from benchmarks.quality.variants import ABLATION_STEPS, DEFAULT_METHODS, ablation_chain, parse_variants
+from protocol.errors import DeltalightError
+from protocol.scene import parse_scene
+from protocol.scene_method import DvctMethod, NoneMethod
+
+SCENE = parse_scene({"method": {"name": "dvct", "volume_edge_m": 0.7}})
+
+
+def test_default_methods_are_known() -> None:
+    assert [variant.name for variant in parse_variants(DEFAULT_METHODS)] == DEFAULT_METHODS.split(",")
+
+
+def test_settings_belong_to_the_variant_before_them() -> None:
+    first, second, third = parse_variants("exact:cone_count=32,cone_scale=1, paper,paper:shadow=map")
+    assert first.settings == {"operator": "exact", "cone_count": 32, "cone_scale": 1}
+    assert second.name == "paper"
+    assert third.settings == {"operator": "paper", "shadow": "map"}
+
+
+def test_variant_changes_its_settings_only() -> None:
+    (variant,) = parse_variants("exact:cone_count=32")
+    method = variant.applied(SCENE, 128).method
+    assert method == DvctMethod(operator="exact", cone_count=32, volume_edge_m=0.7, volume_size=128)
+    (own_size,) = parse_variants("exact:volume_size=64")
+    assert own_size.applied(SCENE, 128).method.volume_size == 64
+    assert isinstance(parse_variants("none")[0].applied(SCENE, None).method, NoneMethod)
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("guess", "exact"),
+        ("", "exact"),
+        ("camera:cone_count=3", "exact:KEY=VALUE"),
+        ("exact:cone_cont=3", "cone_count"),
+        ("exact:cone_count=1000", "64"),
+        ("exact:cone_count=[", "YAML"),
+        ("exact:cone_count", "KEY=VALUE"),
+        ("exact,exact", "twice"),
+        ("camera,path", "add exact"),
+    ],
+)
+def test_wrong_methods_are_refused_in_a_sentence(text: str, sentence: str) -> None:
+    with pytest.raises(DeltalightError, match=sentence):
+        parse_variants(text)
+
+
+def test_ablation_goes_from_paper_to_exact_by_one_switch_a_row() -> None:
+    chain = ablation_chain()
+    assert len({variant.name for variant in chain}) == len(ABLATION_STEPS)
+    assert chain[0].settings["operator"] == "paper"
+    assert chain[-1].settings["operator"] == "exact"
+    for before, after in pairwise(chain):
+        assert before.settings != after.settings
+    for variant in chain:
+        assert isinstance(variant.applied(SCENE, None).method, DvctMethod)
