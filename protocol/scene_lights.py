@@ -48,7 +48,7 @@ class SphereLight(_Light):
 
 
 class SpotLight(_Light):
-    """A lamp that shines into a cone."""
+    """A lamp that shines into a cone: evenly inside, then falling linearly with the angle from the axis to zero."""
 
     model_config = NEEDS_TYPE
 
@@ -62,15 +62,16 @@ class SpotLight(_Light):
         default=(0.0, 0.0, -1.0), description="The cone's axis as light travels; normalised."
     )
     angle_deg: float = Field(
-        default=60.0, gt=0, lt=180, description="Full opening angle of the cone, degrees."
+        default=60.0, gt=0, lt=180, description="Full opening angle of the cone, degrees; no light beyond."
     )
     blend: Fraction = Field(
-        default=0.15, description="Share of the half angle over which the light falls to zero, 0..1."
+        default=0.15,
+        description="Share of the half angle, at its outer end, over which the light falls to zero, 0..1.",
     )
 
 
 class RectangleLight(_Light):
-    """A diffuse area light; it shines to the side of axis_u x axis_v."""
+    """A diffuse area light around position_m; it shines to the side of axis_u x axis_v alone."""
 
     model_config = NEEDS_TYPE
 
@@ -154,6 +155,11 @@ class Lights(StrictModel):
         default=None,
         description="Factor R G B on all lights, or `auto` = from the picture; null = auto for fisheye and "
         "environment, 1 1 1 for manual and tracked.",
+    )
+    surroundings: Literal["auto", "none"] = Field(
+        default="auto",
+        description="Mode manual: light from what neither the camera nor the lights show, as an even radiance found "
+        "on the board's paper where board.yaml gives its white_albedo; or none.",
     )
 
     @model_validator(mode="after")

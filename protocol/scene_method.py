@@ -38,6 +38,13 @@ class DvctMethod(StrictModel):
         description="Cones are traced at 1/scale of the picture; null = 2 on a GPU, 4 in software.",
     )
     cone_count: int = Field(default=16, ge=4, le=64, description="Diffuse cones of the exact operator.")
+    bounces: int = Field(
+        default=1,
+        ge=0,
+        le=4,
+        description="Gathers of light from voxel to voxel, after the light that the camera measured and the lights' "
+        "own; 0 = direct and unoccluded ambient only (exact operator).",
+    )
     rsm_size: int | None = Field(
         default=None,
         ge=128,

@@ -1,11 +1,11 @@
-"""Photometric registration: which factor ties the lights to what the camera sees (METHOD 1)."""
+"""Light that has to be found from the picture: the lights' factor (METHOD 1), and what is out of sight."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import moderngl
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float32, Float64
 
 from protocol.frames import ViewFrame, decode_lut
 from render_server.passes.composite import RelitLayers
@@ -15,10 +15,14 @@ from render_server.scene.registration import (
     paper_pixels,
     registration_from_albedo_percentile,
     registration_from_patch,
+    surroundings_from_patch,
     unclipped,
 )
 
 UNSHADOWED = 0.95  # share of its direct light that a pixel gets, from which on it counts as unshadowed
+
+GROUND_SIZES = 2.0
+FACES_UP = 0.7  # cosine to the vertical
 
 Relight = Callable[[RelightInput], RelitLayers]
 
@@ -28,6 +32,7 @@ class _Samples:
     """What is known at pixels that show real surfaces; all linear RGB."""
 
     measured: Float64[np.ndarray, "k 3"]
+    direct: Float64[np.ndarray, "k 3"]
     light: Float64[np.ndarray, "k 3"]
     bounce: Float64[np.ndarray, "k 3"]
     usable: Bool[np.ndarray, " k"]
@@ -41,7 +46,7 @@ def register_lights(frame: ViewFrame, scene: RelightInput, relight: Relight) -> 
     `scene.lights` are not registered yet. The light that other real surfaces throw is in camera units already (it
     is measured), so the cones are traced twice: with the environment and without.
     """
-    samples = _samples(frame, scene, relight)
+    samples = _samples(frame, scene, _bounce(scene, relight), relight)
     if frame.board is not None and frame.pose is not None:
         on_paper = samples.usable & samples.paper
         found = registration_from_patch(
@@ -56,11 +61,53 @@ def register_lights(frame: ViewFrame, scene: RelightInput, relight: Relight) -> 
     return registration_from_albedo_percentile(samples.measured[lit], samples.light[lit], samples.bounce[lit])
 
 
-def _samples(frame: ViewFrame, scene: RelightInput, relight: Relight) -> _Samples:
-    """Read the fields back where the real scene is in view; cones are those of the pixel's texel of the grid."""
+def find_surroundings(
+    frame: ViewFrame, scene: RelightInput, relight: Relight
+) -> Float32[np.ndarray, "3"] | None:
+    """Even radiance of what neither the camera nor the lights show; None if the board's paper cannot tell.
+
+    Walls beside and behind the camera reflect light too. On paper of known albedo the irradiance is known from the
+    picture; what the lights and the visible scene leave unexplained comes from there.
+    """
+    board = frame.board
+    if board is None or board.white_albedo is None or frame.pose is None:
+        return None
+    one = replace(scene.lights, environment=np.ones_like(scene.lights.environment))
+    bounce = _bounce(scene, relight)
+    known = _samples(frame, scene, bounce, relight)
+    even = _samples(frame, replace(scene, lights=one, lights_version=scene.lights_version + 2), bounce, relight)
+    paper = known.usable & known.paper
+    total, per_radiance = known.light + known.bounce, even.light - known.direct
+    return surroundings_from_patch(
+        known.measured[paper], total[paper], per_radiance[paper], board.white_albedo
+    )
+
+
+def ground_radiance(frame: ViewFrame, scene: RelightInput) -> Float32[np.ndarray, "3"] | None:
+    """Mean radiance of the ground around the objects: of what faces up within two object sizes (METHOD 2)."""
+    position = _read(scene.real_surface.position)
+    normal = _read(scene.real_surface.normal)
+    low, high = scene.virtual.bounds
+    away = np.linalg.norm(position[..., :3] - (low + high) / 2, axis=-1)
+    near = (position[..., 3] > 0) & (away <= GROUND_SIZES * float(np.max(high - low)))
+    ground = near & (normal[..., 2] > FACES_UP)
+    if not ground.any():
+        return None
+    coded = decode_lut(frame.response)[frame.color[ground], np.arange(3)]
+    return np.asarray(coded.mean(axis=0) / frame.exposure_scale, np.float32)
+
+
+def _bounce(scene: RelightInput, relight: Relight) -> Float64[np.ndarray, "h w 3"]:
+    """What the cones gather from real surfaces alone: traced under a black environment."""
     black = replace(scene.lights, environment=np.zeros_like(scene.lights.environment))
-    without = relight(replace(scene, lights=black, lights_version=scene.lights_version + 1, everywhere=True))
-    bounce = _read(without.cones.mu)[..., :3]
+    layers = relight(replace(scene, lights=black, lights_version=scene.lights_version + 1, everywhere=True))
+    return _read(layers.cones.mu)[..., :3]
+
+
+def _samples(
+    frame: ViewFrame, scene: RelightInput, bounce: Float64[np.ndarray, "h w 3"], relight: Relight
+) -> _Samples:
+    """Read the fields back where the real scene is in view; cones are those of the pixel's texel of the grid."""
     layers = relight(replace(scene, everywhere=True))
     cones, direct = _read(layers.cones.mu), _read(layers.direct.mu)
     rows, columns = (np.arange(n) // layers.grid.scale for n in direct.shape[:2])
@@ -74,6 +121,7 @@ def _samples(frame: ViewFrame, scene: RelightInput, relight: Relight) -> _Sample
         on_paper = paper_pixels(frame.board, frame.camera, frame.pose)
     return _Samples(
         (coded / frame.exposure_scale)[y, x],
+        own[:, :3],
         own[:, :3] + cones[rows[y], columns[x]][:, :3] - reflected,
         reflected,
         unclipped(frame.color, coded)[y, x],

@@ -2,17 +2,20 @@
 
 from typing import Any
 
+import moderngl
 import numpy as np
 
 from render_server.gpu.context import GpuContext
+from render_server.passes.coverage import CoveragePass
 from render_server.passes.geometry_buffer import GeometryBuffer, GeometryPass
+from render_server.passes.inner_edges import InnerEdgesPass
 from render_server.passes.matte import MattePass
 from render_server.passes.picture import Picture
 from render_server.passes.real_surface import RealSurface
 from render_server.real_geometry import RealGeometry
 from render_server.relight.frame import GeometryState
 from render_server.scene.surfaces import DIFFUSE_BOX, MAX_SURFACES, SurfaceTable
-from render_server.view import CameraView
+from render_server.view import CameraView, Rectangle
 
 
 class PictureResources:
@@ -23,7 +26,11 @@ class PictureResources:
         self.key = (size, raster_size)
         self.picture = Picture(gpu, size)
         self.real_surface = RealSurface(gpu, size)
-        self.virtual_raster = GeometryBuffer(gpu, raster_size)
+        self._raster = GeometryBuffer(gpu, raster_size)
+        self.virtual_raster = self._raster
+        self._coverage: CoveragePass | None = None
+        self._inner_edges: InnerEdgesPass | None = None
+        self._rectangle: Rectangle = 0, 0, 0, 0
         self._model_raster: GeometryBuffer | None = None
         self.matte = MattePass(gpu, size)
         self._geometry = GeometryPass(gpu)
@@ -45,23 +52,64 @@ class PictureResources:
         virtual: GeometryState,
         view: CameraView,
         moved: bool,
+        antialiasing: bool = False,
     ) -> None:
-        """Real geometry buffer (if it `moved`), virtual raster and matte (if anything did)."""
+        """Real geometry buffer (if it `moved`), virtual raster and matte (if anything did).
+
+        With `antialiasing` the virtual raster is on the picture's grid: passes need `view.with_antialiasing`.
+        """
         self._surfaces.bind_to_storage_buffer(14)
         if moved:
             self._fill_real(real, view)
-        key = (view, virtual.version)
+        key = (view, virtual.version, antialiasing)
         if not moved and key == self._rastered:
             return
         self._rastered = key
         virtual.materials.bind()
-        self._geometry.run(self.virtual_raster, virtual.buffers, view)
         self.real_surface.bind()
-        self.virtual_raster.position.use(location=6)
-        self.virtual_raster.normal.use(location=7)
+        if antialiasing:
+            self._draw_samples(virtual, view, real.noise_sigma)
+        else:
+            self._draw_centres(virtual, view, real.noise_sigma)
+
+    def _draw_centres(self, virtual: GeometryState, view: CameraView, noise_sigma: float) -> None:
+        """Virtual raster and matte of one sample a pixel."""
+        self.virtual_raster = self._raster
+        self._geometry.run(self._raster, virtual.buffers, view)
+        self._raster.position.use(location=6)
+        self._raster.normal.use(location=7)
         self.picture.rays.use(location=15)
         rectangle = view.rectangle_around(virtual.points)
-        self.matte.run(self.picture, rectangle, {**view.uniforms(), "noise_sigma": real.noise_sigma})
+        self.matte.run(self.picture, rectangle, {**view.uniforms(), "noise_sigma": noise_sigma})
+
+    def _draw_samples(self, virtual: GeometryState, view: CameraView, noise_sigma: float) -> None:
+        """The same of several samples a pixel."""
+        if self._coverage is None:
+            self._coverage = CoveragePass(self._gpu, view.size)
+        coverage, rectangle = self._coverage, view.rectangle_around(virtual.points)
+        self._rectangle = rectangle
+        self.virtual_raster = coverage.surface
+        rectangles = rectangle, view.raster_rectangle_around(virtual.points)
+        coverage.run(
+            self._geometry,
+            self._raster,
+            virtual.buffers,
+            picture=self.picture,
+            view=view,
+            rectangles=rectangles,
+            noise_sigma=noise_sigma,
+        )
+        self.virtual_raster.position.use(location=6)
+        uniforms = {**view.with_antialiasing.uniforms(), "noise_sigma": noise_sigma}
+        self.matte.run(self.picture, rectangle, uniforms, coverage.texture)
+
+    def with_inner_edges(self, radiance: moderngl.Texture) -> moderngl.Texture:
+        """The objects' shaded radiance with the edges before each other antialiased; after `rasterise` with it."""
+        assert self._coverage is not None
+        if self._inner_edges is None:
+            self._inner_edges = InnerEdgesPass(self._gpu, self._coverage.surface.size)
+        self._inner_edges.run(radiance, self._coverage, self._rectangle)
+        return self._inner_edges.radiance
 
     def _fill_real(self, real: RealGeometry, view: CameraView) -> None:
         count = int(self.surface_uniforms["surface_count"])
@@ -72,7 +120,7 @@ class PictureResources:
             self.real_surface.from_depth(real.frame.depth, real.surface.normals, self.picture, view, count)
             return
         if self._model_raster is None:
-            self._model_raster = GeometryBuffer(self._gpu, self.virtual_raster.size)
+            self._model_raster = GeometryBuffer(self._gpu, self._raster.size)
         assert real.state is not None
         real.state.materials.bind()
         self._geometry.run(self._model_raster, real.state.buffers, view)
@@ -83,7 +131,9 @@ class PictureResources:
         for item in (
             self.picture,
             self.real_surface,
-            self.virtual_raster,
+            self._raster,
+            self._coverage,
+            self._inner_edges,
             self._model_raster,
             self.matte,
             self._geometry,

@@ -12,7 +12,7 @@ from protocol.frames import DepthImage, ViewFrame
 from protocol.scene_objects import ModelGeometry, RealScene
 from render_server.gpu.context import GpuContext
 from render_server.passes.materials import MaterialTable
-from render_server.passes.mesh_buffers import MeshBuffers, one_sided, triangle_corners
+from render_server.passes.mesh_buffers import MeshBuffers, triangle_corners
 from render_server.relight.frame import GeometryState
 from render_server.scene.depth_mesh import depth_mesh
 from render_server.scene.depth_surface import DepthSurface, depth_surface, noise_sigma
@@ -95,7 +95,7 @@ class RealGeometry:
             self.state = None
             return
         coarse = depth_mesh(depth, view.camera, place, self._budget // COARSE_SHARE, self.surface)
-        self._build([fine], one_sided(triangle_corners(merge_for_gpu([coarse]))))
+        self._build([fine], triangle_corners(merge_for_gpu([coarse])))
 
     def _build(
         self, meshes: list[TriangleMesh], coarse_corners: Float32[np.ndarray, "k 3 10"] | None

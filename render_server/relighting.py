@@ -11,7 +11,7 @@ from protocol.scene_method import DvctMethod, NoneMethod
 from protocol.scene_objects import Material
 from render_server.gpu.context import GpuContext
 from render_server.gpu.timers import PassTimers
-from render_server.light_registration import register_lights
+from render_server.light_registration import find_surroundings, ground_radiance, register_lights
 from render_server.passes.composite import RelitLayers
 from render_server.passes.volume import memory_statement
 from render_server.picture_resources import PictureResources
@@ -69,6 +69,7 @@ class Relighting:
         self._plan = self._planned(scene)
         self._lights = self._plan.lights
         self._unregistered: LightSet | None = None
+        self._wants_surroundings = False
         self._take(self._plan)
 
     def _planned(self, scene: SceneDocument) -> _Plan:
@@ -111,6 +112,10 @@ class Relighting:
             self._lights_version += 1
             self._unregistered = plan.lights if plan.lights.registration_auto else None
             self._lights = plan.lights.registered()
+            wished = plan.scene.lights
+            self._wants_surroundings = (
+                wished.mode == "manual" and wished.surroundings == "auto" and self._unregistered is None
+            )
         self._plan = plan
 
     def relight(self, frame: ViewFrame, view: CameraView) -> RelitFrame | None:
@@ -137,9 +142,10 @@ class Relighting:
                     surfaces, frame.board if surfaces else None, self._real.material_names
                 )
                 resources.declare_surfaces(table)
-            resources.rasterise(self._real, virtual, view, moved)
+            antialiasing = self._plan.scene.output.antialiasing
+            resources.rasterise(self._real, virtual, view, moved, antialiasing)
         relight_input = RelightInput(
-            view,
+            view.with_antialiasing if antialiasing else view,
             resources.picture,
             resources.real_surface,
             resources.virtual_raster,
@@ -155,7 +161,13 @@ class Relighting:
         )
         if self._unregistered is not None:
             relight_input = self._register(frame, relight_input, self._method_for(view))
+        elif self._wants_surroundings:
+            relight_input = self._add_surroundings(frame, relight_input, self._method_for(view))
         layers = self._method_for(view).relight(relight_input)
+        if antialiasing:
+            with timers.measure("inner edges"):
+                radiance = resources.with_inner_edges(layers.virtual_radiance)
+            layers = replace(layers, virtual_radiance=radiance)
         uniforms = {
             "additive": self._plan.method.resolved_composition == "additive",
             "relights_real": not isinstance(self._plan.scene.method, NoneMethod),
@@ -175,6 +187,21 @@ class Relighting:
         self._say(f"lights registered by {found.source}: factor ({factor}){fit}")
         if found.warning is not None:
             self._say(found.warning)
+        return replace(scene, lights=self._lights, lights_version=self._lights_version)
+
+    def _add_surroundings(self, frame: ViewFrame, scene: RelightInput, method: DvctBase) -> RelightInput:
+        """Add the light of what is out of sight, as this frame shows it, from now on."""
+        self._wants_surroundings = False
+        ground = ground_radiance(frame, scene)
+        if ground is not None:
+            self._lights = self._lights.with_ground(ground)
+        scene = replace(scene, lights=self._lights, lights_version=self._lights_version + 1)
+        found = find_surroundings(frame, scene, method.relight)
+        self._lights_version += 4  # the versions between were used to find it
+        if found is not None:
+            self._lights = self._lights.with_sky(found)
+            radiance = ", ".join(f"{value:.3g}" for value in found)
+            self._say(f"surroundings out of sight: radiance ({radiance}), found on the board's paper")
         return replace(scene, lights=self._lights, lights_version=self._lights_version)
 
     def _sample_distance(self, view: CameraView) -> float:
@@ -214,7 +241,6 @@ def ignored_wishes(scene: SceneDocument) -> list[str]:
     """Sentences on what the document asks for and this release leaves out of the picture."""
     materials = [item.material for item in scene.objects if isinstance(item.material, Material)]
     wishes = {
-        "output.antialiasing": scene.output.antialiasing,
         "output.camera_artifacts": scene.output.camera_artifacts,
         f"shading.name `{scene.shading.name}`": scene.shading.name not in ("auto", "volume"),
         "a material's transmission": any(material.transmission > 0 for material in materials),

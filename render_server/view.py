@@ -1,6 +1,6 @@
 """The camera of one picture: matrices and lens as the passes need them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -13,24 +13,34 @@ NEAR_M = 0.02
 FAR_M = 100.0
 RECTANGLE_MARGIN_PX = 8  # a lens bends the edges between the corners of a box
 
+Rectangle = tuple[int, int, int, int]  # first column and row, width and height
+
 
 @dataclass(frozen=True, eq=False)
 class CameraView:
     """Where and through which lens a picture was taken.
 
-    `world_from_camera` is (4, 4), optical frame (+x right, +y down, +z forward).
+    `world_from_camera` is (4, 4), optical frame (+x right, +y down, +z forward). `antialiased`: the objects' geometry
+    buffer holds several samples of a pixel made into one, on the picture's own grid.
     """
 
     camera: CameraModel
     world_from_camera: Float64[np.ndarray, "4 4"]
+    antialiased: bool = False
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, CameraView):
             return NotImplemented
-        return self.camera == other.camera and np.array_equal(self.world_from_camera, other.world_from_camera)
+        same_kind = self.camera == other.camera and self.antialiased == other.antialiased
+        return same_kind and np.array_equal(self.world_from_camera, other.world_from_camera)
 
     def __hash__(self) -> int:
-        return hash((self.camera, self.world_from_camera.tobytes()))
+        return hash((self.camera, self.world_from_camera.tobytes(), self.antialiased))
+
+    @cached_property
+    def with_antialiasing(self) -> "CameraView":
+        """The same view for passes that read an antialiased geometry buffer of the objects."""
+        return replace(self, antialiased=True)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -74,22 +84,31 @@ class CameraView:
             ]
         )
 
-    def rectangle_around(self, points: Float64[np.ndarray, "n 3"]) -> tuple[int, int, int, int]:
-        """First column and row, width and height of the pixels that can show the hull of world points.
+    def clip_from_camera_at(self, offset: tuple[float, float]) -> Float64[np.ndarray, "4 4"]:
+        """Projection of the raster pinhole whose texels show what is `offset` (x, y) pixels from their centres."""
+        matrix = self.clip_from_camera.copy()
+        matrix[:2, 2] -= 2.0 * np.array(offset) / self.raster[1]
+        return matrix
+
+    def rectangle_around(self, points: Float64[np.ndarray, "n 3"]) -> Rectangle:
+        """The pixels that can show the hull of world points.
 
         The whole picture if one of them lies behind the camera; none (0, 0) if all lie beside the picture.
         """
+        seen = self._in_camera(points)
+        return _rectangle(self.camera.project(seen) if seen is not None else None, self.size)
+
+    def raster_rectangle_around(self, points: Float64[np.ndarray, "n 3"]) -> Rectangle:
+        """The same of the raster's texels."""
+        seen = self._in_camera(points)
+        (fx, fy, cx, cy), size = self.raster
+        return _rectangle(seen[:, :2] / seen[:, 2:] * (fx, fy) + (cx, cy) if seen is not None else None, size)
+
+    def _in_camera(self, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"] | None:
+        """World points in the optical frame, None if one of them lies behind the camera."""
         matrix = self.camera_from_world
         seen = points @ matrix[:3, :3].T + matrix[:3, 3]
-        if (seen[:, 2] <= NEAR_M).any():
-            return 0, 0, *self.size
-        pixels = self.camera.project(seen)
-        if not np.isfinite(pixels).all():
-            return 0, 0, *self.size
-        low = np.clip(np.floor(pixels.min(axis=0)) - RECTANGLE_MARGIN_PX, 0, self.size)
-        high = np.clip(np.ceil(pixels.max(axis=0)) + RECTANGLE_MARGIN_PX, 0, self.size)
-        x, y, width, height = (int(v) for v in (*low, *(high - low)))
-        return x, y, width, height
+        return None if (seen[:, 2] <= NEAR_M).any() else seen
 
     def uniforms(self) -> dict[str, Any]:
         """Every uniform that shaders read of the camera."""
@@ -101,6 +120,16 @@ class CameraView:
             "camera_position": tuple(float(v) for v in self.position),
             "camera_pinhole": (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]),
             "picture_size": tuple(float(v) for v in self.size),
-            "lens_distortion": self.camera.has_distortion,
+            "lens_distortion": self.camera.has_distortion and not self.antialiased,
             "raster_pinhole": tuple(float(v) for v in self.raster[0]),
         }
+
+
+def _rectangle(places: Float64[np.ndarray, "n 2"] | None, size: tuple[int, int]) -> Rectangle:
+    """Around places in a picture, with a margin; all of it if there are none or some are not finite."""
+    if places is None or not np.isfinite(places).all():
+        return 0, 0, *size
+    low = np.clip(np.floor(places.min(axis=0)) - RECTANGLE_MARGIN_PX, 0, size)
+    high = np.clip(np.ceil(places.max(axis=0)) + RECTANGLE_MARGIN_PX, 0, size)
+    x, y, width, height = (int(v) for v in (*low, *(high - low)))
+    return x, y, width, height

@@ -1,4 +1,6 @@
-"""Depth clean-up (METHOD 2): validity, smoothing guided by colour, small holes filled, large ones left."""
+"""Depth clean-up (METHOD 2): validity, smoothing guided by colour, small holes filled,
+rims at depth edges given a surface by colour, large holes left.
+"""
 
 import cv2
 import numpy as np
@@ -8,6 +10,7 @@ from pydantic import Field
 from protocol.documents import StrictModel
 from protocol.errors import DeltalightError
 from protocol.frames import DepthImage
+from sensor_node.depth_edges import assign_edges
 from sensor_node.depth_filter import NoiseModel, SmoothedDepth, smooth_inverse_depth
 
 # A normal variable's standard deviation is this multiple of its median absolute deviation.
@@ -44,6 +47,13 @@ class DepthSettings(StrictModel):
     fill_area_px: int = Field(
         default=64, ge=0, le=10000, description="Holes up to this area are filled; 0 = none is."
     )
+    edge_reach_px: int = Field(
+        default=8,
+        ge=0,
+        le=32,
+        description="Unknown pixels at depth edges, up to this far from known ones, get a surface beside them "
+        "by colour; 0 = none does (nor without filter and filling).",
+    )
     noise_sigma_m: float | None = Field(
         default=None,
         ge=1e-5,
@@ -61,7 +71,7 @@ class DepthSettings(StrictModel):
 def clean_depth(
     depth: DepthImage, color: UInt8[np.ndarray, "h w 3"], settings: DepthSettings | None = None
 ) -> DepthImage:
-    """Return smoothed depth with small holes filled; `color` (RGB) guides both.
+    """Return smoothed depth with small holes filled and depth edges completed; `color` (RGB) guides all.
 
     Known pixels move only where a smooth surface explains them: at depth steps larger than
     `edge_sigmas` standard deviations they stay as measured. Depth 0 is unknown, never near.
@@ -96,6 +106,16 @@ def clean_depth(
         smooth = smoothed.explains(inverse, SMOOTH_CONFIDENCE, settings.edge_sigmas)
         taken = filled | (smooth & (smoothed.inverse_depth > 0))
     cleaned = np.where(taken, smoothed.inverse_depth, inverse)
+    if settings.edge_reach_px:
+        cleaned, known = assign_edges(
+            cleaned,
+            known,
+            color,
+            noise=noise,
+            sigmas=settings.edge_sigmas,
+            contrast=settings.guide_contrast,
+            reach_px=settings.edge_reach_px,
+        )
     return DepthImage(_inverse(cleaned, known), known, depth.camera, sigma_m)
 
 

@@ -82,6 +82,14 @@ def sheet(board: BoardSpec) -> dict[str, Any]:
     return rectangle(place, np.repeat(paper.albedo[..., None], 3, axis=2))
 
 
+def sheet_surface(board: BoardSpec) -> dict[str, Any]:
+    """Return the entry of `real.surfaces` that keeps the whole sheet diffuse, with the margin beyond its print."""
+    paper = board_texture(board)
+    low, high = ([float(v) for v in corner] for corner in (paper.min_m, paper.max_m))
+    region = {"box": {"min_m": [*low, -0.003], "max_m": [*high, 0.003]}}
+    return {"region": region, "roughness": 1.0, "specular": 0.0}
+
+
 def two_sided(bsdf: dict[str, Any]) -> dict[str, Any]:
     """Return a material that is the same on both sides."""
     return {"type": "twosided", "bsdf": bsdf}

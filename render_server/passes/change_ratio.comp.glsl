@@ -13,6 +13,8 @@ layout(binding = 3) uniform sampler2D cone_mu;
 layout(binding = 8) uniform sampler2D cone_rho;
 layout(binding = 16) uniform sampler2D specular_mu;
 layout(binding = 17) uniform sampler2D specular_rho;
+layout(binding = 18) uniform sampler2D reflection;   // a: share of a smooth surface's lobe that objects fill
+uniform bool has_reflection;
 uniform int scale;
 
 const float LEAST_IRRADIANCE = 1e-4;
@@ -22,7 +24,8 @@ bool block_changed(ivec2 texel) {
     ivec2 last = textureSize(direct_mu, 0) - 1;
     for (int i = 0; i < scale * scale; ++i) {
         ivec2 pixel = min(pixel_in_block(texel, i, scale), last);
-        changed = changed || texelFetch(direct_mu, pixel, 0).rgb != texelFetch(direct_rho, pixel, 0).rgb;
+        changed = changed || texelFetch(direct_mu, pixel, 0).rgb != texelFetch(direct_rho, pixel, 0).rgb
+            || (has_reflection && texelFetch(reflection, pixel, 0).a > 0.0);
     }
     return changed;
 }

@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import moderngl
+
 from render_server.gpu.context import GpuContext
 from render_server.gpu.program import ComputeProgram
 from render_server.gpu.textures import bind_images, bind_samplers, texture_2d
@@ -22,14 +24,22 @@ class ChangeRatioPass:
         self._ratio = ComputeProgram(gpu, SHADER, {"RATIO": 1})
         self._near = ComputeProgram(gpu, SHADER, {"FILL_RADIUS": FILL_RADIUS})
 
-    def run(self, grid: SamplingGrid, direct: DirectLightPass, cones: ConeFields) -> None:
-        """Compare the fields of one frame."""
+    def run(
+        self,
+        grid: SamplingGrid,
+        direct: DirectLightPass,
+        cones: ConeFields,
+        reflection: moderngl.Texture | None,
+    ) -> None:
+        """Compare the fields of one frame; `reflection` as in RelitLayers."""
         bind_samplers(
             {0: grid.pixels, 1: direct.mu, 2: direct.rho, 3: cones.mu, 8: cones.rho, 9: self.ratio}
             | {16: cones.specular_mu, 17: cones.specular_rho}
         )
+        if reflection is not None:
+            reflection.use(location=18)
         bind_images(self.ratio)
-        self._ratio.run(grid.size, scale=grid.scale)
+        self._ratio.run(grid.size, scale=grid.scale, has_reflection=reflection is not None)
         self.texels.write(bytes(4))
         self.texels.bind_to_storage_buffer(6)
         self._near.run(grid.size)

@@ -23,6 +23,8 @@ layout(binding = 16) uniform sampler2D cone_specular_rho;
 layout(binding = 17) uniform sampler2D lobe_mu;
 layout(binding = 18) uniform sampler2D lobe_rho;
 layout(binding = 19) uniform sampler2D change_ratio;
+layout(binding = 20) uniform sampler2D reflection;    // of objects in smooth surfaces, by rays; a: share of the lobe
+uniform bool has_reflection;
 uniform float exposure_scale;
 uniform float sample_distance;   // m at 1 m depth
 uniform vec3 camera_position;
@@ -35,7 +37,8 @@ uniform bool store_linear;       // for views and files; the picture itself need
 
 const vec2 ALBEDO_RANGE = vec2(0.02, 0.95);
 
-struct Change { vec3 e_mu; vec3 delta; vec3 s_mu; vec3 s_rho; bool any_change; };
+// `gained`: what objects bring into a smooth surface by rays; `hidden`: share of what it reflected that they hide.
+struct Change { vec3 e_mu; vec3 delta; vec3 s_mu; vec3 s_rho; vec3 gained; float hidden; bool any_change; };
 
 // Indirect part: E_mu of the cones, and fade (E_rho - E_mu).
 void add_cones(ivec2 pixel, vec4 position, vec3 normal, inout Change c) {
@@ -68,39 +71,55 @@ void add_cones(ivec2 pixel, vec4 position, vec3 normal, inout Change c) {
 
 Change change_at(ivec2 pixel, vec4 position, vec4 normal) {
     vec3 e_mu = texelFetch(direct_mu, pixel, 0).rgb;
-    Change c = Change(e_mu, texelFetch(direct_rho, pixel, 0).rgb - e_mu, vec3(0.0), vec3(0.0), false);
+    vec3 none = vec3(0.0);
+    Change c = Change(e_mu, texelFetch(direct_rho, pixel, 0).rgb - e_mu, none, none, none, 0.0, false);
     add_cones(pixel, position, normal.xyz, c);
     if (specular_surfaces && normal.w >= 0.0) {
         SurfaceEntry e = surfaces[int(normal.w)];
         float cosine = max(dot(normal.xyz, normalize(camera_position - position.xyz)), 1e-3);
         vec3 reflectance = specular_reflectance(e.f0.rgb, e.surface.x, cosine);
+        if (has_reflection && e.surface.x < RAY_ROUGHNESS) {   // rays tell what objects change there, cones do not
+            vec4 seen = texelFetch(reflection, pixel, 0);
+            c.gained = reflectance * seen.rgb;
+            c.hidden = seen.a;
+            c.s_rho = c.s_mu;
+        }
         c.s_mu = reflectance * c.s_mu + texelFetch(lobe_mu, pixel, 0).rgb;
         c.s_rho = reflectance * c.s_rho + texelFetch(lobe_rho, pixel, 0).rgb;
     } else {
         c.s_mu = vec3(0.0);
         c.s_rho = vec3(0.0);
     }
-    c.any_change = c.delta != vec3(0.0) || c.s_mu != c.s_rho;
+    c.any_change = c.delta != vec3(0.0) || c.s_mu != c.s_rho || c.hidden > 0.0;
     return c;
 }
 
 // Share of the picture's radiance that is diffuse.
-vec3 diffuse_share(Change c, vec4 normal, vec3 b) {
-    if (c.s_mu == vec3(0.0)) return vec3(1.0);
+vec3 diffuse_share(ivec2 pixel, Change c, vec4 normal, vec3 b) {
+    if (c.s_mu == vec3(0.0) && c.hidden == 0.0) return vec3(1.0);
     SurfaceEntry e = surfaces[int(normal.w)];
-    vec3 diffuse = e.albedo.w > 0.5 ? e.albedo.rgb / PI * c.e_mu : max(b - c.s_mu, vec3(0.0));
+    // Reflections reach farther than the direct light was computed.
+    bool lit = c.hidden == 0.0 || texelFetch(direct_mu, pixel, 0).a > 0.0;
+    vec3 diffuse = e.albedo.w > 0.5 && lit ? e.albedo.rgb / PI * c.e_mu : max(b - c.s_mu, vec3(0.0));
     return (1.0 - e.f0.w) * diffuse / max(diffuse + c.s_mu, vec3(1e-6));
+}
+
+// What a specular surface shows more than before, of `glossy`, the picture's specular part. What objects hide by rays
+// and the lights that they shadow overlap; which part of the picture is which cannot be told, so the larger counts.
+vec3 specular_change(Change c, vec3 glossy) {
+    return c.hidden > 0.0 ? c.gained - max(c.hidden * glossy, c.s_mu - c.s_rho) : c.s_rho - c.s_mu;
 }
 
 vec3 relit(ivec2 pixel, Change c, vec4 normal, vec3 b) {
     if (additive) {
         vec3 albedo = clamp(PI * b / max(c.e_mu, vec3(1e-6)), ALBEDO_RANGE.x, ALBEDO_RANGE.y);
-        return max(vec3(0.0), b + albedo / PI * c.delta + c.s_rho - c.s_mu);
+        vec3 glossy = c.hidden > 0.0 ? (1.0 - diffuse_share(pixel, c, normal, b)) * b : vec3(0.0);
+        return max(vec3(0.0), b + albedo / PI * c.delta + specular_change(c, glossy));
     }
     float e = 1e-3 * max(texelFetch(direct_mu, pixel, 0).a, 1e-6);
     vec3 ratio = (max(c.e_mu + c.delta, vec3(0.0)) + e) / (c.e_mu + e);
-    vec3 w = diffuse_share(c, normal, b);
-    return w * b * ratio + max(vec3(0.0), (1.0 - w) * b + c.s_rho - c.s_mu);
+    vec3 w = diffuse_share(pixel, c, normal, b), glossy = (1.0 - w) * b;
+    return w * b * ratio + max(vec3(0.0), glossy + specular_change(c, glossy));
 }
 
 // Where depth is unknown the change of light continues from the surroundings of similar colour; 1 if there is none.

@@ -12,6 +12,7 @@ from render_server.gpu.textures import bind_images, bind_samplers, texture_2d
 from render_server.passes.change_ratio import FILL_RADIUS, ChangeRatioPass
 from render_server.passes.direct_light import DirectLightPass
 from render_server.passes.light_table import LightTable
+from render_server.passes.mirror_objects import RAY_ROUGHNESS
 from render_server.passes.picture import Picture
 from render_server.passes.sampling_grid import SamplingGrid
 from render_server.passes.trace_cones import ConeFields
@@ -31,6 +32,8 @@ class RelitLayers:
     pyramid: Pyramid
     placement: VolumePlacement
     table: LightTable
+    reflection: moderngl.Texture | None = None
+    """Objects in smooth real surfaces (passes/mirror_objects.py); None: such surfaces have the cones' reflection."""
 
 
 class CompositePass:
@@ -41,9 +44,8 @@ class CompositePass:
         self._threads = list_threads(gpu, size[0] * size[1])
         self.code = texture_2d(gpu, size, 4, "u1")
         self.linear = texture_2d(gpu, size, 4, "f2")
-        self._program = ComputeProgram(
-            gpu, Path(__file__).with_name("composite.comp.glsl"), {"FILL_RADIUS": FILL_RADIUS}
-        )
+        defines = {"FILL_RADIUS": FILL_RADIUS, "RAY_ROUGHNESS": RAY_ROUGHNESS}
+        self._program = ComputeProgram(gpu, Path(__file__).with_name("composite.comp.glsl"), defines)
 
     def run(self, picture: Picture, layers: RelitLayers, uniforms: dict[str, Any]) -> None:
         """Compose; geometry and surfaces must be bound."""
@@ -63,9 +65,14 @@ class CompositePass:
         self.code.write(picture.bytes, alignment=1)
         layers.change.texels.bind_to_storage_buffer(6)
         bind_images(self.code, self.linear)
-        self._program.run(
-            (self._threads,), scale=layers.grid.scale, exposure_scale=picture.exposure_scale, **uniforms
-        )
+        if layers.reflection is not None:
+            layers.reflection.use(location=20)
+        own = {
+            "scale": layers.grid.scale,
+            "exposure_scale": picture.exposure_scale,
+            "has_reflection": layers.reflection is not None,
+        }
+        self._program.run((self._threads,), **own, **uniforms)
 
     def release(self) -> None:
         """Free the GL objects."""

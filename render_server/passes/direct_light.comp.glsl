@@ -44,7 +44,7 @@ void main() {
         vec3 v = normalize(camera_position - position.xyz);
         for (int i = 0; i < light_count; ++i) {
             vec3 l; float radius;
-            vec3 across = light_at(lights[i], position.xyz, l, radius);
+            vec3 across = light_at(lights[i], position.xyz, normal.xyz, l, radius);
             float cosine = dot(normal.xyz, l);
             if (cosine <= 0.0) continue;
             vec2 seen = light_share(lights[i], position.xyz, normal.xyz, bias);

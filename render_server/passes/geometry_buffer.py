@@ -8,7 +8,7 @@ from render_server.gpu.context import GpuContext
 from render_server.gpu.program import raster_program, set_uniforms
 from render_server.gpu.textures import release_target, texture_2d
 from render_server.passes.mesh_buffers import MeshBuffers
-from render_server.view import CameraView
+from render_server.view import CameraView, Rectangle
 
 
 class GeometryBuffer:
@@ -24,11 +24,11 @@ class GeometryBuffer:
         self._depth = gpu.ctx.depth_renderbuffer(size)
         self._target = gpu.ctx.framebuffer([self.position, self.normal, self.uv, self.tint], self._depth)
 
-    def begin(self) -> None:
-        """Make this the raster target, emptied."""
+    def begin(self, rectangle: Rectangle | None = None) -> None:
+        """Make this the raster target, emptied (only in the `rectangle`, if one is given)."""
         self._target.use()
         self._target.viewport = (0, 0, *self.size)
-        self._target.clear(0.0, 0.0, 0.0, 0.0, depth=1.0)
+        self._target.clear(0.0, 0.0, 0.0, 0.0, depth=1.0, viewport=rectangle)
         self._ctx.enable_only(moderngl.DEPTH_TEST)
 
     def release(self) -> None:
@@ -44,10 +44,21 @@ class GeometryPass:
     def __init__(self, gpu: GpuContext) -> None:
         self._program = raster_program(gpu, Path(__file__).with_name("geometry_buffer"))
 
-    def run(self, target: GeometryBuffer, mesh: MeshBuffers, view: CameraView) -> None:
-        """Draw `mesh` as `view` sees it."""
-        target.begin()
-        set_uniforms(self._program, view.uniforms())
+    def run(
+        self,
+        target: GeometryBuffer,
+        mesh: MeshBuffers,
+        view: CameraView,
+        offset: tuple[float, float] = (0.0, 0.0),
+        rectangle: Rectangle | None = None,
+    ) -> None:
+        """Draw `mesh` as `view` sees it, `offset` pixels beside the texels' centres.
+
+        `rectangle`: the texels that can show it; the others keep what they held.
+        """
+        target.begin(rectangle)
+        clip_from_camera = view.clip_from_camera_at(offset)
+        set_uniforms(self._program, {**view.uniforms(), "clip_from_camera": clip_from_camera})
         mesh.draw(self._program)
 
     def release(self) -> None:

@@ -2,25 +2,28 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
 
-from render_server.scene.lights import DirectionalLight, SphereLight
+from render_server.scene.lights import DirectionalLight, Light, RectangleLight, SpotLight
 
 NEAR_MARGIN = 0.98  # near and far planes lie a little outside of what they enclose
 FAR_MARGIN = 1.02
 WIDEST_SINGLE_TANGENT = math.tan(math.radians(65))  # wider needs the six faces of a cube
 NEAREST_M = 1e-3
+EVERYWHERE = (0.0, 0.0, 0.0, 1.0)  # the plane before which everything lies
+NARROWEST_BLEND_RAD = 1e-4  # what a spot without blend falls off over
 
 
 @dataclass(frozen=True, eq=False)
 class LightView:
     """One tile of a light's depth map: the frame (light at the origin, looking along +z) and what it encloses.
 
-    `half_extent` is in metres for a directional light, the tangent of the half angle for a sphere light.
+    `half_extent` is in metres for a directional light, the tangent of the half angle for all others.
+    `front` is the plane a, b, c, d (world) before which ax + by + cz + d >= 0 the light shines, if only there.
     """
 
     view_from_world: Float64[np.ndarray, "4 4"]
@@ -28,31 +31,78 @@ class LightView:
     near: float
     far: float
     orthographic: bool
+    front: Float64[np.ndarray, "4"] | None = None
 
     @property
     def texel_span(self) -> float:
-        """Extent of the tile; divided by its texels: m (directional) or tangent (sphere) a texel."""
+        """Extent of the tile; divided by its texels: m (directional) or tangent a texel."""
         return 2.0 * self.half_extent
 
 
 def light_views(
-    light: DirectionalLight | SphereLight,
-    receivers: Float64[np.ndarray, "n 3"],
-    occluders: Float64[np.ndarray, "m 3"],
+    light: Light, receivers: Float64[np.ndarray, "n 3"], occluders: Float64[np.ndarray, "m 3"]
 ) -> list[LightView]:
-    """Views that enclose the receivers (world points): one, or cube faces for a sphere light among them.
+    """Views that enclose the receivers (world points) as far as the light shines: one, or faces of a cube.
 
-    The occluders set where a view begins: what stands between the light and the receivers is in it.
+    The occluders set where a view begins: what stands between the light and the receivers is in it. A
+    rectangle looks from its centre.
     """
     if isinstance(light, DirectionalLight):
         return [_orthographic_view(np.asarray(light.direction, float), receivers, occluders)]
     position = np.asarray(light.position, float)
+    if isinstance(light, RectangleLight):
+        return _rectangle_views(light, position, receivers, occluders)
+    if isinstance(light, SpotLight):
+        return _spot_views(light, position, receivers, occluders)
+    return _views_around(position, receivers, occluders)
+
+
+def _views_around(
+    position: Float64[np.ndarray, "3"],
+    receivers: Float64[np.ndarray, "n 3"],
+    occluders: Float64[np.ndarray, "m 3"],
+) -> list[LightView]:
     view = _perspective_view(position, receivers.mean(axis=0) - position, receivers, occluders)
     if view is not None:
         return [view]
     axes = np.vstack([np.eye(3), -np.eye(3)])
-    faces = [_cube_face(position, axis, receivers, occluders) for axis in axes]
-    return [face for face in faces if face is not None]
+    return [
+        _wide_view(position, axis, 1.0, receivers, occluders)
+        for axis in axes
+        if (_tangents((receivers - position) @ _frame(axis).T) <= 1.0).any()
+    ]
+
+
+def _spot_views(
+    light: SpotLight,
+    position: Float64[np.ndarray, "3"],
+    receivers: Float64[np.ndarray, "n 3"],
+    occluders: Float64[np.ndarray, "m 3"],
+) -> list[LightView]:
+    """The cone, unless a view of the receivers alone is narrower."""
+    half = math.tan(light.half_angle_rad) * 1.01
+    around = _views_around(position, receivers, occluders)
+    if half > WIDEST_SINGLE_TANGENT or (len(around) == 1 and around[0].half_extent <= half):
+        return around
+    axis = np.asarray(light.direction, float)
+    if not ((receivers - position) @ axis > NEAREST_M).any():
+        return []
+    return [_wide_view(position, axis, half, receivers, occluders)]
+
+
+def _rectangle_views(
+    light: RectangleLight,
+    position: Float64[np.ndarray, "3"],
+    receivers: Float64[np.ndarray, "n 3"],
+    occluders: Float64[np.ndarray, "m 3"],
+) -> list[LightView]:
+    """Views of what lies before the rectangle; the lamp's own housing and the wall behind it are left out."""
+    normal = light.normal
+    front = np.append(normal, -normal @ position - NEAREST_M)
+    receivers, occluders = (points[points @ front[:3] + front[3] > 0] for points in (receivers, occluders))
+    if not len(receivers):
+        return []
+    return [replace(view, front=front) for view in _views_around(position, receivers, occluders)]
 
 
 def _frame(axis: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
@@ -102,7 +152,7 @@ def _depth_range(
     """Near plane before all that can block within the view, far plane behind the receivers."""
     within = blocking[_tangents(blocking) <= half]
     depths = np.concatenate([within[:, 2], local[_tangents(local) <= half][:, 2]])
-    near = max(float(depths.min()) * NEAR_MARGIN, NEAREST_M)
+    near = max(float(depths.min(initial=local[:, 2].max())) * NEAR_MARGIN, NEAREST_M)
     return near, max(float(local[:, 2].max()) * FAR_MARGIN, near + NEAREST_M)
 
 
@@ -124,21 +174,20 @@ def _perspective_view(
     return LightView(_matrix(rotation, position), half, near, far, False)
 
 
-def _cube_face(
+def _wide_view(
     position: Float64[np.ndarray, "3"],
     axis: Float64[np.ndarray, "3"],
+    half: float,
     receivers: Float64[np.ndarray, "n 3"],
     occluders: Float64[np.ndarray, "m 3"],
-) -> LightView | None:
-    """90-degree view along `axis`; None if no receiver lies in it."""
+) -> LightView:
+    """View along `axis` up to the tangent `half`, whatever of the receivers lies in it."""
     rotation = _frame(axis)
     local = (receivers - position) @ rotation.T
-    if not (_tangents(local) <= 1.0).any():
-        return None
-    near, far = _depth_range(local, (occluders - position) @ rotation.T, 1.0)
-    # Triangles whose vertices lie in the neighbouring faces reach nearer than any vertex of this one.
+    near, far = _depth_range(local, (occluders - position) @ rotation.T, half)
+    # Triangles whose vertices lie beside this view reach nearer than any vertex in it.
     reach = float(np.linalg.norm(local, axis=1).max()) * FAR_MARGIN
-    return LightView(_matrix(rotation, position), 1.0, max(0.1 * near, NEAREST_M), max(far, reach), False)
+    return LightView(_matrix(rotation, position), half, max(0.1 * near, NEAREST_M), max(far, reach), False)
 
 
 def tile_columns(count: int) -> int:
@@ -146,26 +195,36 @@ def tile_columns(count: int) -> int:
     return max(1, math.ceil(math.sqrt(count)))
 
 
-def pack_view(view: LightView, tile: int, columns: int, tile_size: int) -> Float64[np.ndarray, "24"]:
-    """std430 LightView: matrix by columns, tile, range."""
+def pack_view(view: LightView, tile: int, columns: int, tile_size: int) -> Float64[np.ndarray, "28"]:
+    """std430 LightView: matrix by columns, tile, range, front."""
     x, y = (tile % columns) * tile_size, (tile // columns) * tile_size
     return np.concatenate(
         [
             view.view_from_world.T.ravel(),
             [x, y, tile_size, view.half_extent],
             [view.near, view.far, float(view.orthographic), 0.0],
+            EVERYWHERE if view.front is None else view.front,
         ]
     )
 
 
-def pack_light(light: DirectionalLight | SphereLight, ranges: Sequence[int]) -> bytes:
-    """std430 Light: place, colour, shape as floats, then the ranges of its views as integers."""
+def pack_light(light: Light, ranges: Sequence[int]) -> bytes:
+    """std430 Light: place, colour, shape, two axes as floats, the ranges of its views as integers."""
+    axis_u = axis_v = np.zeros(3)
+    shape = (0.0, 1.0, 0.0)
     if isinstance(light, DirectionalLight):
-        place = [*map(float, light.direction), 0.0]
-        color, size = light.irradiance, math.tan(light.angular_radius_rad)
+        kind, place, color = 0, light.direction, light.irradiance
+        shape = (math.tan(light.angular_radius_rad), 1.0, 0.0)
+    elif isinstance(light, RectangleLight):
+        kind, place, color = 3, light.position, light.radiance
+        axis_u, axis_v = light.axis_u / 2, light.axis_v / 2
+    elif isinstance(light, SpotLight):
+        kind, place, color, axis_u = 2, light.position, light.intensity, light.direction
+        blend = max(light.half_angle_rad - light.full_angle_rad, NARROWEST_BLEND_RAD)
+        shape = (light.radius_m, light.half_angle_rad / blend, 1.0 / blend)
     else:
-        place = [*map(float, light.position), 1.0]
-        color, size = light.intensity, light.radius_m
-    floats = np.array([*place, *map(float, color), 0.0, size, 0.0, 0.0, 0.0], np.float32)
+        kind, place, color = 1, light.position, light.intensity
+        shape = (light.radius_m, 1.0, 0.0)
+    floats = [*place, kind, *color, 0.0, *shape, 0.0, *axis_u, 0.0, *axis_v, 0.0]
     integers: np.ndarray[Any, np.dtype[np.int32]] = np.array(ranges, np.int32)
-    return floats.tobytes() + integers.tobytes()
+    return np.array(floats, np.float32).tobytes() + integers.tobytes()

@@ -9,7 +9,7 @@ from jaxtyping import Float32, Float64
 from render_server.gpu.context import GpuContext
 from render_server.passes.light_maps import LightView, light_views, pack_light, pack_view, tile_columns
 from render_server.passes.reflective_shadow_map import ShadowMapAtlas, texel_size_m
-from render_server.scene.lights import DirectionalLight, SphereLight
+from render_server.scene.lights import Light
 from render_server.scene.octahedral import octahedral_direction, prefilter, sample_octahedral
 
 EMPTY = b"\0" * 128
@@ -22,7 +22,7 @@ class LightTable:
         self._gpu = gpu
         self.tile_size = tile_size
         self.shadow_samples = shadow_samples
-        self.lights: list[DirectionalLight | SphereLight] = []
+        self.lights: list[Light] = []
         self.real_views: list[LightView] = []
         self.virtual_views: list[LightView] = []
         self.real_atlas = ShadowMapAtlas(gpu, 1, tile_size)
@@ -52,7 +52,7 @@ class LightTable:
 
     def place(
         self,
-        lights: list[DirectionalLight | SphereLight],
+        lights: list[Light],
         real_points: Float64[np.ndarray, "n 3"],
         receivers: Float64[np.ndarray, "k 3"],
         virtual_points: Float64[np.ndarray, "m 3"],

@@ -1,10 +1,13 @@
 // Sum each surfel's opacity and outgoing radiance into its voxel, per direction k (METHOD 4.3):
 //   a_k += A max(0, -n.k) / h^2,   c_k += L A max(0, -n.k) / h^2.
 // REAL: L_mu is what the camera measured (all bounces), or albedo / pi E_mu where it does not look;
-//       REAL_DELTA sums L_rho - L_mu = L_mu (ratio - 1), ratio = E_rho / E_mu of direct + ambient light.
+//       REAL_DELTA sums L_rho - L_mu = L_mu (E_rho / E_mu - 1).
 // VIRTUAL: L_rho = albedo / pi E_rho + emission.
+// E is direct + ambient light at first; GATHERED: the direct light found then + what the surfel's group gathered;
+// REAL and VIRTUAL then add by how much L grows.
 #include "passes/common/volume.glsl"
 #include "passes/common/voxel_store.glsl"
+#include "passes/common/surfel_light.glsl"
 #include "passes/common/lights.glsl"
 #include "passes/common/environment.glsl"
 #include "passes/common/materials.glsl"
@@ -12,7 +15,9 @@
 layout(local_size_x = 64) in;
 uniform float bias_real;      // m
 uniform float bias_virtual;   // m
-#if defined(REAL) || defined(REAL_DELTA)
+uniform bool keep_light;      // in SurfelLights, for what is summed later
+const float WHITEST = 0.95;   // albedo of the brightest diffuse surfaces: no surface gives back more than it gets
+#ifdef REAL
 #include "passes/common/real_radiance.glsl"
 #endif
 #ifdef REAL_DELTA
@@ -20,20 +25,43 @@ layout(std430, binding = 8) buffer DeltaSums { int delta_sums[]; };   // 18 a sl
 layout(std430, binding = 9) buffer Support { int support[6]; };        // bounds of changed voxels: min xyz, -max xyz
 #endif
 
-// (E_mu, E_rho) of direct and ambient light.
-void irradiances(vec3 p, vec3 n, out vec3 mu, out vec3 rho) {
-    mu = environment_irradiance(n);
-    rho = mu;
+#ifdef GATHERED
+#include "passes/common/surfel_groups.glsl"
+
+void irradiances(Surfel s, vec3 n, uint own, out vec3 mu, out vec3 rho) {
+    int slot = group_slot(group_entry(floatBitsToUint(s.uv_voxel.z), n));
+    vec3 ambient = environment_irradiance(n);
+    mu = surfel_lights[own].direct_mu.rgb + (slot < 0 ? ambient : group_light[2 * slot].rgb);
+    rho = surfel_lights[own].direct_rho.rgb + (slot < 0 ? ambient : group_light[2 * slot + 1].rgb);
+}
+#else
+#ifdef VIRTUAL
+const float LIFT = 0.1;       // voxels, so that a curved surface does not shadow its own surfels
+#else
+const float LIFT = 0.0;
+#endif
+
+void irradiances(Surfel s, vec3 n, uint own, out vec3 mu, out vec3 rho) {
+    vec3 p = s.position_area.xyz + n * voxel_edge * LIFT;
+    mu = rho = vec3(0.0);
     for (int i = 0; i < light_count; ++i) {
         vec3 to_light; float radius;
-        vec3 across = light_at(lights[i], p, to_light, radius);
+        vec3 across = light_at(lights[i], p, n, to_light, radius);
         float cosine = dot(n, to_light);
         if (cosine <= 0.0) continue;
         vec2 v = visibility(lights[i], p, n, bias_real, bias_virtual);
         mu += across * cosine * v.x;
         rho += across * cosine * v.y;
     }
+    if (keep_light) {
+        surfel_lights[own].direct_mu = vec4(mu, 0.0);
+        surfel_lights[own].direct_rho = vec4(rho, 0.0);
+    }
+    vec3 ambient = environment_irradiance(n);
+    mu += ambient;
+    rho += ambient;
 }
+#endif
 
 void add(uint voxel, vec3 n, float area, vec3 radiance) {
     int slot = int(grid[voxel]) - 1;
@@ -46,30 +74,77 @@ void add(uint voxel, vec3 n, float area, vec3 radiance) {
         for (int j = 0; j < 3; ++j) atomicAdd(delta_sums[at + j], fixed_point(radiance[j] * share));
 #else
         int at = slot * SUMS_PER_SLOT;
+#ifndef GATHERED
         atomicAdd(sums[at + COVERAGE + k], fixed_point(share));
+#endif
         for (int j = 0; j < 3; ++j) atomicAdd(sums[at + RADIANCE + k * 3 + j], fixed_point(radiance[j] * share));
 #endif
     }
 }
 
-void light(Surfel s, vec3 n) {
-    vec3 p = s.position_area.xyz;
-    uint voxel = floatBitsToUint(s.uv_voxel.z);
+#ifndef REAL_DELTA
+// What the sums lack: all of it at first, what it gained when light was gathered. w: 1 where the camera measured it.
+vec3 unsummed(uint own, vec4 radiance) {
+#ifdef GATHERED
+    vec3 summed = surfel_lights[own].radiance.rgb;
+#else
+    vec3 summed = vec3(0.0);
+#endif
+    if (keep_light) surfel_lights[own].radiance = radiance;
+    return radiance.rgb - summed;
+}
+#endif
+
+#ifdef VIRTUAL
+vec3 outgoing(Surfel s, vec3 n, uint own) {
     vec3 mu, rho;
-#if defined(VIRTUAL)
-    irradiances(p + n * voxel_edge * 0.1, n, mu, rho);
+    irradiances(s, n, own, mu, rho);
     Material m = material_of(int(s.normal_material.w), s.uv_voxel.xy, s.tint.rgb);
-    vec3 radiance = (m.diffuse + m.f0) / PI * rho + m.emission;
-#elif defined(REAL_DELTA)
-    irradiances(p, n, mu, rho);
-    if (mu == rho) return;
-    vec3 radiance = real_radiance(p, mu) * ((rho + 1e-6) / (mu + 1e-6) - 1.0);
+    return unsummed(own, vec4(min(m.diffuse + m.f0, vec3(WHITEST)) / PI * rho + m.emission, 0.0));
+}
+#endif
+
+#ifdef REAL
+vec3 outgoing(Surfel s, vec3 n, uint own) {
+#ifdef GATHERED
+    if (surfel_lights[own].radiance.w > 0.5) return vec3(0.0);
+#else
+    vec3 p = s.position_area.xyz;
+    if (camera_sees(p)) return unsummed(own, vec4(measured_radiance(p), 1.0));
+#endif
+    vec3 mu, rho;
+    irradiances(s, n, own, mu, rho);
+    return unsummed(own, vec4(predicted_radiance(mu), 0.0));
+}
+#endif
+
+#ifdef REAL_DELTA
+// Changes of gathered light below this share of it would not show in 8-bit pictures; mu and rho are then taken as the
+// same there, and need no two marches.
+const float LEAST_CHANGE = 1.0 / 512.0;
+
+// L_rho - L_mu. A ratio is right whatever the light's scale; gained light comes back by at most the greatest albedo.
+vec3 outgoing(Surfel s, vec3 n, uint own) {
+    vec3 mu, rho;
+    irradiances(s, n, own, mu, rho);
+    vec3 change = rho - mu;
+#ifdef GATHERED
+    if (all(lessThanEqual(abs(change), LEAST_CHANGE * max(mu, rho)))) return vec3(0.0);
+#endif
+    vec3 back = surfel_lights[own].radiance.rgb / (mu + 1e-6);
+    return change * mix(back, min(back, vec3(WHITEST / PI)), greaterThan(change, vec3(0.0)));
+}
+#endif
+
+void light(Surfel s, uint own, vec3 n) {
+    uint voxel = floatBitsToUint(s.uv_voxel.z);
+    vec3 radiance = outgoing(s, n, own);
+#if defined(REAL_DELTA) || defined(GATHERED)
+    if (radiance == vec3(0.0)) return;
+#endif
+#ifdef REAL_DELTA
     ivec3 v = voxel_of_index(voxel, volume_size);
     for (int j = 0; j < 3; ++j) { atomicMin(support[j], v[j]); atomicMin(support[3 + j], -v[j]); }
-#else
-    vec3 radiance = vec3(0.0);
-    if (camera_sees(p)) radiance = measured_radiance(p);
-    else { irradiances(p, n, mu, rho); radiance = predicted_radiance(mu); }
 #endif
     add(voxel, n, s.position_area.w, radiance);
 }
@@ -78,7 +153,7 @@ void main() {
     uint count = min(surfel_count, surfel_capacity);
     for (uint i = gl_GlobalInvocationID.x; i < count; i += gl_NumWorkGroups.x * 64u) {
         Surfel s = surfels[i];
-        light(s, s.normal_material.xyz);
-        if (s.uv_voxel.w > 0.5) light(s, -s.normal_material.xyz);
+        light(s, 2u * i, s.normal_material.xyz);
+        if (s.uv_voxel.w > 0.5) light(s, 2u * i + 1u, -s.normal_material.xyz);
     }
 }

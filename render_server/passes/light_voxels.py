@@ -8,41 +8,81 @@ import numpy as np
 
 from render_server.gpu.context import GpuContext
 from render_server.gpu.program import ComputeProgram, list_threads
+from render_server.passes.group_surfels import SurfelGroups
 from render_server.passes.voxel_store import VoxelStore
 
 SHADER = Path(__file__).with_name("light_voxels.comp.glsl")
 
 
 class LightVoxelsPass:
-    """Three variants of one walk over the surfels: real without objects, real's change, virtual."""
+    """Three variants of one walk over the surfels: real without objects, real's change, virtual.
+
+    With `gathered`, what the surfels' groups gathered takes the place of the unoccluded ambient light, and the sums
+    change by that; direct light is that of the last walk without.
+    """
 
     def __init__(self, gpu: GpuContext) -> None:
+        self._gpu = gpu
         self._threads = list_threads(gpu)
-        self._real = ComputeProgram(gpu, SHADER, {"REAL": 1})
-        self._real_delta = ComputeProgram(gpu, SHADER, {"REAL_DELTA": 1})
-        self._virtual = ComputeProgram(gpu, SHADER, {"VIRTUAL": 1})
+        self._programs: dict[tuple[str, bool], ComputeProgram] = {}
         self.support = gpu.ctx.buffer(reserve=24, dynamic=True)
 
-    def light_real(self, store: VoxelStore, uniforms: dict[str, Any]) -> None:
-        """Sum c_mu and a_real."""
-        store.bind()
-        self._real.run((self._threads,), **uniforms)
+    def light_real(
+        self,
+        store: VoxelStore,
+        uniforms: dict[str, Any],
+        groups: SurfelGroups | None = None,
+        *,
+        gathered: bool = False,
+    ) -> None:
+        """Sum c_mu and a_real; `groups` keep each surfel's light."""
+        self._run("REAL", store, groups, uniforms, gathered=gathered)
 
     def light_real_delta(
-        self, store: VoxelStore, bounds: np.ndarray[Any, np.dtype[np.int32]], uniforms: dict[str, Any]
+        self, store: VoxelStore, uniforms: dict[str, Any], groups: SurfelGroups, *, gathered: bool = False
     ) -> None:
-        """Sum c_rho - c_mu of real surfaces; `bounds` (voxels of the objects) grow to the support of the delta."""
-        self.support.write(bounds.tobytes())
+        """Sum c_rho - c_mu of real surfaces, of which `groups` keep L_mu; the support grows."""
         store.delta_sums.clear()
-        store.bind()
         store.delta_sums.bind_to_storage_buffer(8)
-        self.support.bind_to_storage_buffer(9)
-        self._real_delta.run((self._threads,), **uniforms)
+        self.bind_support()
+        self._run("REAL_DELTA", store, groups, uniforms, gathered=gathered)
 
-    def light_virtual(self, store: VoxelStore, uniforms: dict[str, Any]) -> None:
-        """Sum c and a of the virtual surfaces."""
+    def light_virtual(
+        self,
+        store: VoxelStore,
+        uniforms: dict[str, Any],
+        groups: SurfelGroups | None = None,
+        *,
+        gathered: bool = False,
+    ) -> None:
+        """Sum c and a of the virtual surfaces; `groups` keep each surfel's light."""
+        self._run("VIRTUAL", store, groups, uniforms, gathered=gathered)
+
+    def _run(
+        self,
+        kind: str,
+        store: VoxelStore,
+        groups: SurfelGroups | None,
+        uniforms: dict[str, Any],
+        *,
+        gathered: bool,
+    ) -> None:
         store.bind()
-        self._virtual.run((self._threads,), **uniforms)
+        if groups is not None:
+            groups.bind()
+        program = self._program(kind, gathered=gathered)
+        program.run((self._threads,), keep_light=groups is not None, **uniforms)
+
+    def _program(self, kind: str, *, gathered: bool) -> ComputeProgram:
+        """Compiled when it is first needed."""
+        if (kind, gathered) not in self._programs:
+            defines = {kind: 1, **({"GATHERED": 1} if gathered else {})}
+            self._programs[kind, gathered] = ComputeProgram(self._gpu, SHADER, defines)
+        return self._programs[kind, gathered]
+
+    def start_support(self, bounds: np.ndarray[Any, np.dtype[np.int32]]) -> None:
+        """Begin the support of the delta anew with the voxels of the objects (min x, y, z, -max x, y, z)."""
+        self.support.write(bounds.tobytes())
 
     def bind_support(self) -> None:
         """Bind the support's bounds to the place that march.glsl names."""
@@ -50,8 +90,9 @@ class LightVoxelsPass:
 
     def release(self) -> None:
         """Free the GL objects."""
-        for item in (self._real, self._real_delta, self._virtual, self.support):
-            item.release()
+        for program in self._programs.values():
+            program.release()
+        self.support.release()
 
 
 def bind_picture(linear_picture: moderngl.Texture, real_position: moderngl.Texture) -> None:

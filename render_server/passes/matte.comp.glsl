@@ -1,26 +1,34 @@
 // Share of each pixel that the virtual objects cover: real surfaces hide them by depth, with an edge softened along
 // the picture's own edges. Unknown depth never hides; depth masks the object only, never its delta (METHOD 3).
-#include "passes/common/geometry.glsl"
+#include "passes/common/in_front.glsl"
 
 layout(local_size_x = 8, local_size_y = 8) in;
 layout(binding = 0, r16f) writeonly uniform image2D matte_out;
 layout(binding = 1) uniform sampler2D linear_picture;
-uniform float noise_sigma;     // m at 1 m
+layout(binding = 2) uniform sampler2D coverage;   // of samples; r: in front of the real surface, g: behind it, b: g times mean depth
+uniform bool antialiased;
+uniform vec4 camera_pinhole;   // fx, fy, cx, cy
 uniform ivec2 first_pixel;     // of the rectangle that may show an object; the rest was emptied
 
 const int WINDOW = 5;   // pixels
+const float STEEPEST = 10.0;   // tangent of the slant (84 degrees) up to which samples of one pixel are taken for one surface
 
-float covers(ivec2 pixel) {
+// Share of the pixel's samples that show the surface at depth z, or lie in front. Hidden samples of the same surface
+// count: how it passes behind the real one is what the softened edge says.
+float covered_share(ivec2 pixel, float z) {
+    vec4 c = texelFetch(coverage, pixel, 0);
+    if (c.r == 0.0) return c.g;
+    bool continues = c.b < c.g * z * (1.0 + STEEPEST / camera_pinhole.x);
+    return continues ? c.r + c.g : c.r;
+}
+
+// Depth of the object that the pixel shows, 0: none.
+float depth_shown(ivec2 pixel) {
+    if (antialiased && all(equal(texelFetch(coverage, pixel, 0).rg, vec2(0.0)))) return 0.0;
     ivec2 raster = raster_texel(pixel);
     if (any(lessThan(raster, ivec2(0))) || any(greaterThanEqual(raster, textureSize(virtual_raster_position, 0))))
         return 0.0;
     return texelFetch(virtual_raster_position, raster, 0).w;
-}
-
-// 1 in front of the real surface, 0 behind it.
-float in_front(ivec2 pixel, float z) {
-    float real = texelFetch(real_surface_position, pixel, 0).w;
-    return real > 0.0 && real < z - 3.0 * noise_sigma * z * z ? 0.0 : 1.0;
 }
 
 ivec2 neighbour(ivec2 pixel, int i, ivec2 size) {
@@ -46,11 +54,12 @@ void main() {
     ivec2 pixel = first_pixel + ivec2(gl_GlobalInvocationID.xy);
     ivec2 size = textureSize(real_surface_position, 0);
     if (any(greaterThanEqual(pixel, size))) return;
-    float z = covers(pixel);
+    float z = depth_shown(pixel);
     if (z <= 0.0) { imageStore(matte_out, pixel, vec4(0.0)); return; }
     float share = 0.0;
     for (int i = 0; i < WINDOW * WINDOW; ++i) share += in_front(neighbour(pixel, i, size), z);
     share /= float(WINDOW * WINDOW);
     if (share > 0.0 && share < 1.0) share = softened(pixel, z, size);
+    if (antialiased) share *= covered_share(pixel, z);
     imageStore(matte_out, pixel, vec4(share));
 }

@@ -3,10 +3,13 @@
 from pathlib import Path
 from typing import Any
 
+import moderngl
+
 from render_server.gpu.context import GpuContext
 from render_server.gpu.program import ComputeProgram
 from render_server.gpu.textures import bind_images, bind_samplers, texture_2d
 from render_server.passes.picture import Picture
+from render_server.view import Rectangle
 
 
 class MattePass:
@@ -17,15 +20,24 @@ class MattePass:
         self.texture = texture_2d(gpu, size, 1, "f2")
         self._program = ComputeProgram(gpu, Path(__file__).with_name("matte.comp.glsl"))
 
-    def run(self, picture: Picture, rectangle: tuple[int, int, int, int], uniforms: dict[str, Any]) -> None:
-        """Compare depths, soften along the picture's edges, in the `rectangle` (x, y, width, height)."""
+    def run(
+        self,
+        picture: Picture,
+        rectangle: Rectangle,
+        uniforms: dict[str, Any],
+        coverage: moderngl.Texture | None = None,
+    ) -> None:
+        """Compare depths, soften along the picture's edges, in the `rectangle`.
+
+        `coverage`: of samples (passes/coverage.py); None: the geometry buffer has one sample a pixel.
+        """
         self.texture.write(bytes(2 * self._size[0] * self._size[1]), alignment=1)
         x, y, width, height = rectangle
         if width <= 0 or height <= 0:
             return
-        bind_samplers({1: picture.linear})
+        bind_samplers({1: picture.linear} if coverage is None else {1: picture.linear, 2: coverage})
         bind_images(self.texture)
-        self._program.run((width, height), first_pixel=(x, y), **uniforms)
+        self._program.run((width, height), first_pixel=(x, y), antialiased=coverage is not None, **uniforms)
 
     def release(self) -> None:
         """Free the GL objects."""

@@ -22,13 +22,6 @@ def triangle_corners(mesh: GpuMesh) -> Float32[np.ndarray, "m 3 10"]:
     return np.asarray(np.concatenate(columns, axis=1)[mesh.triangles], np.float32)
 
 
-def one_sided(corners: Float32[np.ndarray, "m 3 10"]) -> Float32[np.ndarray, "m 3 10"]:
-    """The same triangles, seen from their front only."""
-    changed = corners.copy()
-    changed[..., DOUBLE_SIDED] = 0.0
-    return changed
-
-
 class MeshBuffers:
     """Vertex and index buffers that are rewritten when the mesh changes."""
 
@@ -60,6 +53,11 @@ class MeshBuffers:
             layout = [(self._vertices, *_layout_of(program))]
             self._arrays[program.glo] = self._ctx.vertex_array(program, layout, self._indices)
         self._arrays[program.glo].render(moderngl.TRIANGLES, vertices=self._index_count)
+
+    def bind_to_storage(self, vertices: int, corners: int) -> None:
+        """Bind vertices (rows of `VERTEX_LAYOUT`) and the vertex indices of triangles for shaders to read."""
+        self._vertices.bind_to_storage_buffer(vertices)
+        self._indices.bind_to_storage_buffer(corners)
 
     def release(self) -> None:
         """Free all buffers."""

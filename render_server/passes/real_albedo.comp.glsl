@@ -19,7 +19,7 @@ vec3 irradiance(vec3 p, vec3 n) {
     for (int i = 0; i < light_count; ++i) {
         bool own = i == light_of_view(view_index);
         vec3 to_light; float radius;
-        vec3 across = light_at(lights[i], p, to_light, radius);
+        vec3 across = light_at(lights[i], p, n, to_light, radius);
         float cosine = dot(n, to_light);
         if (cosine <= 0.0) continue;
         e += across * cosine * (own ? 1.0 : real_visibility(lights[i], p, n, bias_real));

@@ -12,6 +12,8 @@ from render_server.gpu.textures import release_target, texture_2d
 from render_server.passes.light_maps import LightView, tile_columns
 from render_server.passes.mesh_buffers import MeshBuffers
 
+CLIP_DISTANCE0 = 0x3000  # GL_CLIP_DISTANCE0, which moderngl does not name
+
 
 class ShadowMapAtlas:
     """One depth texture and its reflective layers, a tile for every light view of one geometry set."""
@@ -60,6 +62,7 @@ class ReflectiveShadowMapPass:
     """Draws a mesh into the tiles of an atlas."""
 
     def __init__(self, gpu: GpuContext) -> None:
+        self._ctx = gpu.ctx
         self._program = raster_program(gpu, Path(__file__).with_name("reflective_shadow_map"))
 
     def run(
@@ -67,10 +70,14 @@ class ReflectiveShadowMapPass:
     ) -> None:
         """Draw `mesh` for each view; the views' records begin at `first_view` of the bound storage buffer."""
         atlas.clear()
-        for tile in range(len(views)):
+        for tile, view in enumerate(views):
             atlas.begin_tile(tile)
+            if view.front is not None:
+                self._ctx.enable_direct(CLIP_DISTANCE0)
             set_uniforms(self._program, {"view_index": first_view + tile})
             mesh.draw(self._program)
+            if view.front is not None:
+                self._ctx.disable_direct(CLIP_DISTANCE0)
         atlas.end()
 
     def release(self) -> None:

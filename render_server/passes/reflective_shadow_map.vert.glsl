@@ -15,6 +15,7 @@ void main() {
     LightView view = light_views[view_index];
     vec3 v = (view.view_from_world * vec4(in_position, 1.0)).xyz;
     float near = view.range.x, far = view.range.y, extent = view.tile.w;
+    gl_ClipDistance[0] = dot(view.front, vec4(in_position, 1.0));
     normal = in_normal;
     uv = in_uv;
     tint = in_color;

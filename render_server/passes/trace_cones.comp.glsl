@@ -2,6 +2,7 @@
 // REAL: E_mu and E_rho of ambient + bounced light on real surfaces. VIRTUAL: E_rho and the specular cone of the object.
 #include "passes/common/march.glsl"
 #include "passes/common/environment.glsl"
+#include "passes/common/diffuse_cones.glsl"
 #include "passes/common/brdf.glsl"
 #include "passes/common/sampling_grid.glsl"
 #include "passes/common/texel_list.glsl"
@@ -17,35 +18,9 @@ layout(binding = 0, rgba16f) writeonly uniform image2D irradiance_rho;   // rgb 
 layout(binding = 2, rgba16f) writeonly uniform image2D specular_mu;      // rgb mean radiance of the specular cone
 #endif
 layout(binding = 3, rgba16f) writeonly uniform image2D specular_rho;
-uniform int cone_count;
 uniform vec3 camera_position;
 
-const float START = 1.5;         // voxels along the normal: with one-sided voxels enough against self-hits
-
-// Direction k of `cone_count` cosine-stratified ones about z (realtime-gi, appendix A).
-vec3 cone_direction(int k) {
-    float z = sqrt(1.0 - (float(k) + 0.5) / float(cone_count));
-    float phi = float(k) * GOLDEN_ANGLE;
-    return vec3(sqrt(1.0 - z * z) * vec2(cos(phi), sin(phi)), z);
-}
-
-void diffuse(vec3 q, vec3 n, bool only_rho, out vec3 e_mu, out vec3 e_rho) {
-    // cones of equal projected solid angle pi / K: diameter / distance = 2 tan(half-angle)
-    float ratio = 1.5 * sqrt(2.0 / float(cone_count));
-    float half_angle = atan(0.5 * ratio);
-    mat3 basis = basis_around(n);
-    e_mu = vec3(0.0);
-    e_rho = vec3(0.0);
-    for (int k = 0; k < cone_count; ++k) {
-        vec3 d = basis * cone_direction(k);
-        March m = march(q, d, ratio, only_rho);
-        vec3 r = environment(d, half_angle);
-        e_mu += m.c_mu + m.t_mu * r;
-        e_rho += m.c_rho + m.t_rho * r;
-    }
-    e_mu *= PI / float(cone_count);
-    e_rho *= PI / float(cone_count);
-}
+const float WHOLE = 1.0;         // cones as wide as their shares
 
 void trace(ivec2 texel) {
     SurfacePoint s = surface_point(texel);
@@ -53,9 +28,9 @@ void trace(ivec2 texel) {
     vec3 start = q + START * s.normal;
     vec3 e_mu, e_rho, c_mu = vec3(0.0), c_rho = vec3(0.0);
 #ifdef REAL
-    diffuse(start, s.normal, false, e_mu, e_rho);
+    diffuse(start, s.normal, WHOLE, 0.0, false, e_mu, e_rho);
 #else
-    diffuse(start, s.normal, true, e_mu, e_rho);
+    diffuse(start, s.normal, WHOLE, 0.0, true, e_mu, e_rho);
 #endif
     if (s.roughness >= 0.0) {
         vec3 v = normalize(camera_position - s.position);

@@ -3,7 +3,7 @@
 #include "passes/common/lights.glsl"
 #include "passes/common/brdf.glsl"
 #include "passes/common/geometry.glsl"
-#include "passes/common/materials.glsl"
+#include "passes/common/object_light.glsl"
 #include "passes/common/upsample.glsl"
 #include "passes/common/texel_list.glsl"
 
@@ -15,11 +15,7 @@ layout(binding = 3) uniform sampler2D cone_specular;
 layout(binding = 8) uniform sampler2D virtual_raster_uv;
 layout(binding = 9) uniform sampler2D virtual_raster_tint;
 uniform vec3 camera_position;
-uniform float noise_sigma;      // m at 1 m
-uniform float normal_offset;    // m: against self-shadowing by the virtual depth map
 uniform float sample_distance;  // m at 1 m depth: what a texel of the reduced resolution spans
-
-struct Indirect { vec3 irradiance; vec3 specular; };
 
 Indirect indirect_at(ivec2 pixel, vec4 position, vec3 normal) {
     Indirect sum = Indirect(vec3(0.0), vec3(0.0));
@@ -41,20 +37,6 @@ Indirect indirect_at(ivec2 pixel, vec4 position, vec3 normal) {
     return sum;
 }
 
-vec3 direct_radiance(vec3 p, float depth, vec3 n, vec3 v, Material m) {
-    vec3 sum = vec3(0.0);
-    for (int i = 0; i < light_count; ++i) {
-        vec3 l; float radius;
-        vec3 across = light_at(lights[i], p, l, radius);
-        float cosine = dot(n, l);
-        if (cosine <= 0.0) continue;
-        float seen = visibility(lights[i], p + normal_offset * n, n, 3.0 * noise_sigma * depth * depth, 0.0).y;
-        vec3 response = m.diffuse / PI * cosine + specular_times_cosine(n, v, l, m.f0, m.roughness, radius);
-        sum += across * seen * response;
-    }
-    return sum;
-}
-
 void shade(ivec2 pixel) {
     ivec2 raster = raster_texel(pixel);
     vec4 position = texelFetch(virtual_raster_position, raster, 0);
@@ -63,9 +45,7 @@ void shade(ivec2 pixel) {
         int(normal.w), texelFetch(virtual_raster_uv, raster, 0).xy, texelFetch(virtual_raster_tint, raster, 0).rgb);
     vec3 v = normalize(camera_position - position.xyz);
     Indirect indirect = indirect_at(pixel, position, normal.xyz);
-    vec3 radiance = m.emission + direct_radiance(position.xyz, position.w, normal.xyz, v, m);
-    radiance += m.diffuse / PI * indirect.irradiance;
-    radiance += specular_reflectance(m.f0, m.roughness, max(dot(normal.xyz, v), 1e-3)) * indirect.specular;
+    vec3 radiance = object_radiance(position.xyz, position.w, normal.xyz, v, m, indirect);
     imageStore(radiance_out, pixel, vec4(radiance, 1.0));
 }
 

@@ -1,9 +1,13 @@
 """Delta voxel cone tracing, the exact operator (METHOD 3 and 4)."""
 
+from functools import partial
 from typing import Any
+
+import moderngl
 
 from protocol.scene_method import DvctMethod
 from render_server.gpu.context import GpuContext
+from render_server.passes.mirror_objects import MirrorObjectsPass
 from render_server.passes.trace_cones import TraceConesPass
 from render_server.passes.volume import Pyramid, VolumePlacement
 from render_server.relight.defaults import ResolvedDvct
@@ -22,7 +26,10 @@ class DvctExact(DvctBase):
     ) -> None:
         super().__init__(gpu, settings, resolved, size)
         self._tracing = TraceConesPass(gpu)
-        self._voxels = VoxelScene(gpu, VolumePlacement((0.0, 0.0, 0.0), 1.0, resolved.volume_size))
+        self._make_mirror = partial(MirrorObjectsPass, gpu, self._grid)
+        self._mirror: MirrorObjectsPass | None = None
+        placement = VolumePlacement((0.0, 0.0, 0.0), 1.0, resolved.volume_size)
+        self._voxels = VoxelScene(gpu, placement, settings.bounces)
 
     def _rebuild_real(
         self, frame: RelightInput, placement: VolumePlacement, uniforms: dict[str, Any]
@@ -33,14 +40,31 @@ class DvctExact(DvctBase):
         self._voxels.rebuild_virtual(frame, self.table, uniforms)
 
     def _trace(self, frame: RelightInput, uniforms: dict[str, Any]) -> None:
-        voxels = self._voxels
-        voxels.bind_support()
-        voxels.far.pyramid.texture.use(location=16)
-        own = {**uniforms, **voxels.far.uniforms(), "cone_count": self._settings.cone_count}
+        voxels, own = self._voxels, self._bind_march(uniforms)
         with frame.timers.measure("cones real"):
             self._tracing.trace_real(self._cones, self._grid, voxels.mu, voxels.rho, own)
         with frame.timers.measure("cones virtual"):
             self._tracing.trace_virtual(self._cones, self._grid, voxels.mu, voxels.rho, own)
+
+    def _reflect(self, frame: RelightInput, uniforms: dict[str, Any]) -> moderngl.Texture | None:
+        if not frame.surface_uniforms["specular_surfaces"]:
+            if self._mirror is not None:
+                self._mirror.release()
+            self._mirror = None
+            return None
+        if self._mirror is None:
+            self._mirror = self._make_mirror()
+        virtual = frame.virtual
+        self._mirror.objects.follow(virtual.version, virtual.corners, virtual.bounds, virtual.buffers)
+        with frame.timers.measure("mirror"):
+            self._mirror.run(frame.matte, self._voxels.mu, self._voxels.rho, self._bind_march(uniforms))
+        return self._mirror.reflection
+
+    def _bind_march(self, uniforms: dict[str, Any]) -> dict[str, Any]:
+        """Bind what march.glsl reads beside mu and rho; return the uniforms of passes that march."""
+        self._voxels.bind_support()
+        self._voxels.far.pyramid.texture.use(location=16)
+        return {**uniforms, **self._voxels.far.uniforms(), "cone_count": self._settings.cone_count}
 
     def _joint(self) -> Pyramid:
         return self._voxels.rho

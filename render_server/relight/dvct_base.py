@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from typing import Any
 
+import moderngl
 import numpy as np
 from jaxtyping import Float64
 
@@ -43,6 +44,7 @@ class DvctBase(ABC):
         self._direct = DirectLightPass(gpu, size, shadow_cones=cones)
         self._surface = VirtualSurfacePass(gpu, size)
         self._change = ChangeRatioPass(gpu, self._grid.size)
+        self._reflection: moderngl.Texture | None = None
         self._real_key: object = None
         self._object_key: object = None
         self._virtual_map_key: object = None
@@ -62,6 +64,10 @@ class DvctBase(ABC):
     @abstractmethod
     def _trace(self, frame: RelightInput, uniforms: dict[str, Any]) -> None:
         """Fill the cone fields; geometry, lights and materials are bound."""
+
+    def _reflect(self, frame: RelightInput, uniforms: dict[str, Any]) -> moderngl.Texture | None:  # noqa: ARG002
+        """Objects in smooth real surfaces (passes/mirror_objects.py); None leaves these to the cones."""
+        return None
 
     @abstractmethod
     def _joint(self) -> Pyramid:
@@ -97,6 +103,7 @@ class DvctBase(ABC):
             self._joint(),
             placement,
             self.table,
+            self._reflection,
         )
 
     def _placement(self, frame: RelightInput) -> VolumePlacement:
@@ -151,7 +158,9 @@ class DvctBase(ABC):
         with frame.timers.measure("direct light"):
             self._joint().texture.use(location=3)
             self._direct.run(uniforms)
-            self._change.run(self._grid, self._direct, self._cones)
+        self._reflection = self._reflect(frame, uniforms)
+        with frame.timers.measure("change of light"):
+            self._change.run(self._grid, self._direct, self._cones, self._reflection)
         with frame.timers.measure("virtual surface"):
             self._surface.run(frame.matte, frame.virtual_raster, self._cones, self._grid, uniforms)
 

@@ -7,6 +7,8 @@ import numpy as np
 from render_server.gpu.context import GpuContext
 from render_server.passes.clear_voxels import ClearVoxelsPass
 from render_server.passes.filter_voxels import FilterVoxelsPass
+from render_server.passes.gather_voxels import GatherVoxelsPass
+from render_server.passes.group_surfels import GroupSurfelsPass, SurfelGroups
 from render_server.passes.light_table import LightTable
 from render_server.passes.light_voxels import LightVoxelsPass
 from render_server.passes.resolve_voxels import ResolveVoxelsPass
@@ -76,14 +78,22 @@ class FarScene:
 
 
 class VoxelScene(VoxelSets):
-    """Two directional pyramids over one placement of the volume."""
+    """Two directional pyramids over one placement of the volume.
 
-    def __init__(self, gpu: GpuContext, placement: VolumePlacement) -> None:
+    Light is gathered `bounces` times from voxel to voxel, beyond direct and unoccluded ambient light.
+    """
+
+    def __init__(self, gpu: GpuContext, placement: VolumePlacement, bounces: int) -> None:
         super().__init__(gpu, placement, DIRECTIONS)
         self.mu = Pyramid(gpu, placement.size, DIRECTIONS)
         self.rho = Pyramid(gpu, placement.size, DIRECTIONS)
         self.far = FarScene(gpu)
+        self._bounces = bounces
+        self._real_groups = SurfelGroups(gpu, placement.size)
+        self._virtual_groups = SurfelGroups(gpu, placement.size)
         self._light = LightVoxelsPass(gpu)
+        self._group = GroupSurfelsPass(gpu)
+        self._gather = GatherVoxelsPass(gpu)
         self._resolve = ResolveVoxelsPass(gpu)
         self._filter = FilterVoxelsPass(gpu)
 
@@ -99,27 +109,72 @@ class VoxelScene(VoxelSets):
             frame.picture.build_levels()
             bind_lighting(frame, table)
             lighting = lighting_uniforms(frame, uniforms)
-            self._light.light_real(self._real, lighting)
+            self._real_groups.start(self._real)
+            self._light.light_real(self._real, lighting, self._real_groups)
             self.far.light(self._light, lighting)
         with timers.measure("filter"):
-            self._resolve.resolve_mu(self.mu, self._real, placement.uniforms())
-            self._filter.run(self.mu, placement)
             self.far.filter(self._resolve, self._filter)
+            self._filter_mu()
+        if self._bounces > 0:
+            with timers.measure("bounces"):
+                self._bounce_unseen(lighting)
+
+    def _filter_mu(self) -> None:
+        self._resolve.resolve_mu(self.mu, self._real, self.placement.uniforms())
+        self._filter.run(self.mu, self.placement)
+
+    def _bounce_unseen(self, lighting: dict[str, Any]) -> None:
+        """Real surfaces that the camera does not see: what they gather from mu in place of all ambient light."""
+        self._group.run(self._real, self._real_groups, lighting, has_seen=True)
+        _, unseen = self._real_groups.counts()
+        for _ in range(self._bounces if unseen else 0):
+            self._bind_for_gathering()
+            marching = {**lighting, **self.far.uniforms()}
+            self._gather.gather_unseen(self._real, self._real_groups, self.mu, marching)
+            self._light.light_real(self._real, lighting, self._real_groups, gathered=True)
+            self._filter_mu()
 
     def rebuild_virtual(self, frame: RelightInput, table: LightTable, uniforms: dict[str, Any]) -> None:
         """Voxelise and light the objects, change the light of real surfaces, filter the rho set."""
         timers = frame.timers
         with timers.measure("voxelize"):
-            self._voxelize_virtual(frame.virtual, [self.rho])
+            moved = self._voxelize_virtual(frame.virtual, [self.rho])
         with timers.measure("light voxels"):
             bind_lighting(frame, table)
             lighting = lighting_uniforms(frame, uniforms)
-            self._light.light_virtual(self._virtual, lighting)
-            bounds = self.placement.voxel_bounds(np.stack(frame.virtual.bounds))
-            self._light.light_real_delta(self._real, bounds, lighting)
+            self._light.start_support(self.placement.voxel_bounds(np.stack(frame.virtual.bounds)))
+            if moved:
+                self._virtual_groups.start(self._virtual)
+            self._light_rho(lighting, gathered=False)
         with timers.measure("filter"):
-            self._resolve.resolve_rho(self.rho, self._real, self._virtual, self.placement.uniforms())
-            self._filter.run(self.rho, self.placement)
+            self._filter_rho()
+        if self._bounces > 0:
+            with timers.measure("bounces"):
+                if moved:
+                    self._group.run(self._virtual, self._virtual_groups, lighting, has_seen=False)
+                for _ in range(self._bounces):
+                    self._bounce(lighting)
+
+    def _light_rho(self, lighting: dict[str, Any], *, gathered: bool) -> None:
+        self._light.light_virtual(self._virtual, lighting, self._virtual_groups, gathered=gathered)
+        self._light.light_real_delta(self._real, lighting, self._real_groups, gathered=gathered)
+
+    def _filter_rho(self) -> None:
+        self._resolve.resolve_rho(self.rho, self._real, self._virtual, self.placement.uniforms())
+        self._filter.run(self.rho, self.placement)
+
+    def _bounce(self, lighting: dict[str, Any]) -> None:
+        """Gather light from mu and rho, light the objects and change the real surfaces by it."""
+        self._bind_for_gathering()
+        marching = {**lighting, **self.far.uniforms()}
+        self._gather.gather_real(self._real, self._real_groups, self.mu, self.rho, marching)
+        self._gather.gather_virtual(self._virtual, self._virtual_groups, self.rho, marching)
+        self._light_rho(lighting, gathered=True)
+        self._filter_rho()
+
+    def _bind_for_gathering(self) -> None:
+        self.bind_support()
+        self.far.pyramid.texture.use(location=16)
 
     def bind_support(self) -> None:
         """Bind the bounds of the voxels where mu and rho differ."""

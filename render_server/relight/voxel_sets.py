@@ -45,17 +45,18 @@ class VoxelSets:
         self.placement = placement
         self._voxelize.run(self._real, corners, placement)
 
-    def _voxelize_virtual(self, virtual: GeometryState, pyramids: Sequence[Pyramid]) -> None:
-        """Replace the objects; the pyramids lose the texels of the old ones.
+    def _voxelize_virtual(self, virtual: GeometryState, pyramids: Sequence[Pyramid]) -> bool:
+        """Replace the objects; the pyramids lose the texels of the old ones. Returns whether there are new voxels.
 
         Objects that stood still keep their voxels, only their light is forgotten.
         """
         if virtual.version == self._virtual_version:
             self._virtual.sums.clear()
-            return
+            return False
         self._virtual_version = virtual.version
         self._clear.run(self._virtual, pyramids, self.placement)
         self._voxelize.run(self._virtual, virtual.corners, self.placement)
+        return True
 
     def counts(self) -> dict[str, tuple[int, int]]:
         """Touched voxels and surfels of both sets; waits for the GPU."""

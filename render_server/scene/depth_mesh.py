@@ -15,7 +15,7 @@ from render_server.scene.materials import Material
 from render_server.scene.mesh import TriangleMesh
 
 CELL_SAMPLES = 6
-REAL_MATERIAL = Material(roughness=1.0, specular=0.0, double_sided=True, name="real")
+REAL_MATERIAL = Material(roughness=1.0, specular=0.0, name="real")
 
 
 @dataclass(frozen=True, eq=False)

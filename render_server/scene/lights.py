@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Float64
 
 from protocol import scene_lights as documents
 from protocol.errors import DeltalightError
@@ -13,7 +13,7 @@ from render_server.scene.median_cut import split_environment
 from render_server.scene.octahedral import resample_to_octahedral, solid_angle_mean
 
 ENVIRONMENT_SIZE = 256
-AMBIENT_SIZE = 16
+AMBIENT_SIZE = 32
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +61,78 @@ class SphereLight:
 
 
 @dataclass(frozen=True, eq=False)
+class SpotLight:
+    """A lamp whose intensity is constant up to an angle from its axis, then falls to zero linearly in the angle.
+
+    `direction` (unit, world) is the axis as light travels, `intensity` holds on it; position in metres, world.
+    """
+
+    position: Float32[np.ndarray, "3"]
+    direction: Float32[np.ndarray, "3"]
+    intensity: Float32[np.ndarray, "3"]
+    radius_m: float
+    half_angle_rad: float
+    blend: float
+
+    @property
+    def full_angle_rad(self) -> float:
+        """Angle from the axis up to which the intensity is constant."""
+        return self.half_angle_rad * (1.0 - self.blend)
+
+    def scaled(self, factor: Float32[np.ndarray, "3"]) -> "SpotLight":
+        """Return the light times a factor R G B."""
+        return replace(self, intensity=self.intensity * factor)
+
+    def describe(self) -> dict[str, Any]:
+        """Return plain values for messages and logs."""
+        return {
+            "type": "spot",
+            "position_m": self.position.tolist(),
+            "direction": self.direction.tolist(),
+            "intensity": self.intensity.tolist(),
+            "radius_m": self.radius_m,
+            "angle_deg": float(np.degrees(2 * self.half_angle_rad)),
+            "blend": self.blend,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class RectangleLight:
+    """A diffuse parallelogram around `position` that shines with `radiance` to the side of axis_u x axis_v.
+
+    The axes are whole edges; metres, world.
+    """
+
+    position: Float32[np.ndarray, "3"]
+    axis_u: Float32[np.ndarray, "3"]
+    axis_v: Float32[np.ndarray, "3"]
+    radiance: Float32[np.ndarray, "3"]
+
+    @property
+    def normal(self) -> Float64[np.ndarray, "3"]:
+        """Unit normal of the shining side."""
+        across = np.cross(self.axis_u.astype(float), self.axis_v.astype(float))
+        return np.asarray(across / np.linalg.norm(across))
+
+    def scaled(self, factor: Float32[np.ndarray, "3"]) -> "RectangleLight":
+        """Return the light times a factor R G B."""
+        return replace(self, radiance=self.radiance * factor)
+
+    def describe(self) -> dict[str, Any]:
+        """Return plain values for messages and logs."""
+        return {
+            "type": "rectangle",
+            "position_m": self.position.tolist(),
+            "axis_u_m": self.axis_u.tolist(),
+            "axis_v_m": self.axis_v.tolist(),
+            "radiance": self.radiance.tolist(),
+        }
+
+
+Light = DirectionalLight | SphereLight | SpotLight | RectangleLight
+
+
+@dataclass(frozen=True, eq=False)
 class LightSet:
     """Everything that shines, in camera units once multiplied by the registration.
 
@@ -69,7 +141,7 @@ class LightSet:
     is set it is to be found from the picture first.
     """
 
-    lights: tuple[DirectionalLight | SphereLight, ...]
+    lights: tuple[Light, ...]
     environment: Float32[np.ndarray, "n n 3"]
     registration: Float32[np.ndarray, "3"]
     registration_auto: bool
@@ -84,20 +156,34 @@ class LightSet:
             False,
         )
 
+    def with_ground(self, radiance: Float32[np.ndarray, "3"]) -> "LightSet":
+        """Return the set with ground of this radiance below the horizon, where nothing else is known to be."""
+        above = _above_horizon(len(self.environment))
+        return replace(self, environment=above * self.environment + (1 - above) * radiance)
+
+    def with_sky(self, radiance: Float32[np.ndarray, "3"]) -> "LightSet":
+        """Return the set with more radiance from everywhere above the horizon."""
+        return replace(self, environment=self.environment + _above_horizon(len(self.environment)) * radiance)
+
     def describe(self) -> list[dict[str, Any]]:
         """Return plain values of all lights and of the environment's mean, for messages and logs."""
         ambient = {"type": "environment", "mean_radiance": solid_angle_mean(self.environment).tolist()}
         return [*(light.describe() for light in self.lights), ambient]
 
 
+def _above_horizon(size: int) -> Float32[np.ndarray, "n n 1"]:
+    """Share of each texel of an octahedral map that looks up."""
+    return resample_to_octahedral(lambda direction: (direction[..., 2:] >= 0).astype(np.float32), size)
+
+
 def build_lights(lights: documents.Lights) -> LightSet:
     """Make the light set of a scene document's `lights`.
 
-    Modes `manual` (directional, sphere, ambient) and `environment`; the latter is split with the count and
+    Modes `manual` and `environment`; the latter is split with the count and
     the kind of split that `lights.fisheye` gives, as in mode `fisheye`.
 
     Raises:
-        DeltalightError: a mode or light that this release lacks, or an environment map that cannot be read.
+        DeltalightError: a mode that this release lacks, or an environment map that cannot be read.
     """
     if lights.mode == "manual":
         shining, environment = _manual(lights.manual)
@@ -115,7 +201,7 @@ def build_lights(lights: documents.Lights) -> LightSet:
 
 def _manual(
     manual: tuple[documents.ManualLight, ...],
-) -> tuple[tuple[DirectionalLight | SphereLight, ...], Float32[np.ndarray, "n n 3"]]:
+) -> tuple[tuple[Light, ...], Float32[np.ndarray, "n n 3"]]:
     shining = tuple(_light(light) for light in manual if not isinstance(light, documents.AmbientLight))
     ambient = np.zeros(3, np.float32)
     for light in manual:
@@ -124,23 +210,28 @@ def _manual(
     return shining, np.tile(ambient, (AMBIENT_SIZE, AMBIENT_SIZE, 1))
 
 
-def _light(light: documents.ManualLight) -> DirectionalLight | SphereLight:
+_Shining = documents.DirectionalLight | documents.SphereLight | documents.SpotLight | documents.RectangleLight
+
+
+def _light(light: _Shining) -> Light:
     color = np.array(light.color_linear, np.float32)
     if isinstance(light, documents.DirectionalLight):
         direction = np.array(light.direction, np.float32)
         radius = float(np.radians(light.angular_radius_deg))
         return DirectionalLight(direction, light.irradiance * color, radius)
+    position = np.array(light.position_m, np.float32)
     if isinstance(light, documents.SphereLight):
-        position = np.array(light.position_m, np.float32)
         return SphereLight(position, light.intensity * color, light.radius_m)
-    raise DeltalightError(
-        f"lights of type {light.type} arrive with a later release; use sphere, directional or ambient."
-    )
+    if isinstance(light, documents.SpotLight):
+        direction, half = np.array(light.direction, np.float32), float(np.radians(light.angle_deg / 2))
+        return SpotLight(position, direction, light.intensity * color, light.radius_m, half, light.blend)
+    axis_u, axis_v = np.array(light.axis_u_m, np.float32), np.array(light.axis_v_m, np.float32)
+    return RectangleLight(position, axis_u, axis_v, light.radiance * color)
 
 
 def _from_environment(
     lights: documents.Lights,
-) -> tuple[tuple[DirectionalLight | SphereLight, ...], Float32[np.ndarray, "n n 3"]]:
+) -> tuple[tuple[Light, ...], Float32[np.ndarray, "n n 3"]]:
     whole_map = lights.fisheye.split == "all"
     split = split_environment(load_environment(lights.environment), lights.fisheye.count, whole_map=whole_map)
     shining = tuple(

@@ -16,11 +16,14 @@ CLIPPED_LINEAR = 0.98
 CLIPPED_CODE = 255
 DARK_LINEAR = 0.005
 LEAST_PIXELS = 30
+ENOUGH_PIXELS = 10 * LEAST_PIXELS
+FARTHEST_PX = 1e5  # beyond, fixed-point outlines overflow
 OUTLIER_DEVIATIONS = 3.0
 LEAST_IRRADIANCE = 1e-4
+LEAST_OPENING = 0.05  # share of the hemisphere that must be open: below, noise of the paper decides
 GREATEST_ALBEDO = 0.95
 PERCENTILE = 99.0
-EROSION_PX = 2
+INSETS_PX = (2, 1)  # from the paper's edges, where lens and sampling mix it with ink; the second if little is left
 EDGE_POINTS = 8
 
 
@@ -66,6 +69,29 @@ def registration_from_patch(
         return None
     misfit = (factor * light - irradiance) / np.maximum(np.abs(irradiance).mean(axis=0), 1e-9)
     return Registration(factor.astype(np.float32), "patch", float(np.sqrt((misfit**2).mean())))
+
+
+def surroundings_from_patch(
+    measured: Float[np.ndarray, "k 3"],
+    irradiance: Float[np.ndarray, "k 3"],
+    per_radiance: Float[np.ndarray, "k 3"],
+    albedo: float,
+) -> Float32[np.ndarray, "3"] | None:
+    """Find the even radiance X >= 0 of what is out of sight: albedo/pi (E + X E_1) = B on paper, each channel.
+
+    `irradiance` E is what lights, environment and the real surfaces in view explain; `per_radiance` E_1 is what
+    radiance 1 from everywhere that they leave open would add. The median is robust against stains and shadows.
+
+    Returns:
+        None where fewer than 30 pixels see anything of the surroundings.
+    """
+    missing = np.pi / albedo * np.asarray(measured, np.float64) - irradiance
+    open_sky = np.asarray(per_radiance, np.float64)
+    usable = np.isfinite(missing).all(axis=1) & (open_sky > LEAST_OPENING * np.pi).all(axis=1)
+    if np.count_nonzero(usable) < LEAST_PIXELS:
+        return None
+    found = np.median(missing[usable] / open_sky[usable], axis=0)
+    return np.maximum(found, 0.0).astype(np.float32)
 
 
 def _without_outliers(ratios: Float64[np.ndarray, "k 3"]) -> Bool[np.ndarray, " k"]:
@@ -117,22 +143,33 @@ def unclipped(
 
 
 def paper_pixels(board: BoardSpec, camera: CameraModel, pose: BoardPose) -> Bool[np.ndarray, "h w"]:
-    """Return which pixels show white paper between the board's markers, 2 pixels inside its edges.
+    """Return which pixels show white paper between the board's markers, 2 pixels inside its edges (1 if few are).
 
     Patches that are not wholly in front of the camera are left out; what covers the board is not known here.
     """
+    patches = _patch_masks(board, camera, pose)
+    found = np.zeros((camera.height, camera.width), np.uint8)
+    for inset in INSETS_PX:
+        square = np.ones((2 * inset + 1,) * 2, np.uint8)
+        for patch in patches:
+            found |= cv2.erode(patch, square, borderValue=0)
+        if np.count_nonzero(found) >= ENOUGH_PIXELS:
+            break
+    return np.asarray(found.astype(bool))
+
+
+def _patch_masks(board: BoardSpec, camera: CameraModel, pose: BoardPose) -> list[UInt8[np.ndarray, "h w"]]:
     camera_from_world = np.linalg.inv(pose.world_from_camera)
-    mask = np.zeros((camera.height, camera.width), np.uint8)
+    masks = []
     for patch in board.paper_patches():
         outline = _dense_outline(patch) @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
         pixels = camera.project(outline)
-        if not np.isfinite(pixels).all() or np.abs(pixels).max() > 1e5:
+        if not np.isfinite(pixels).all() or np.abs(pixels).max() > FARTHEST_PX:
             continue
-        one = np.zeros_like(mask)
-        cv2.fillPoly(one, [np.round(pixels * 16).astype(np.int32)], 1, shift=4)
-        size = 2 * EROSION_PX + 1
-        mask |= cv2.erode(one, np.ones((size, size), np.uint8), borderValue=0)
-    return np.asarray(mask.astype(bool))
+        mask = np.zeros((camera.height, camera.width), np.uint8)
+        cv2.fillPoly(mask, [np.round(pixels * 16).astype(np.int32)], 1, shift=4)
+        masks.append(mask)
+    return masks
 
 
 def _dense_outline(patch: Float64[np.ndarray, "4 3"]) -> Float64[np.ndarray, "n 3"]:

@@ -253,8 +253,6 @@ def test_manual_lights_take_their_colour_and_ambient_adds_up() -> None:
     [
         documents.Lights(mode="fisheye"),
         documents.Lights(mode="tracked"),
-        documents.Lights(manual=(documents.SpotLight(),)),
-        documents.Lights(manual=(documents.RectangleLight(),)),
     ],
 )
 def test_what_this_release_lacks_is_said(lights: documents.Lights) -> None:

@@ -2,10 +2,10 @@
 
 from typing import Any
 
-from benchmarks.ground_truth.benchmark_scene import TABLE_Z_M, BenchmarkScene, Finish, VirtualObject
+from benchmarks.ground_truth.benchmark_scene import BOARD, TABLE_Z_M, BenchmarkScene, Finish, VirtualObject
 from benchmarks.ground_truth.lamps import Ambient, SphereLamp
 from benchmarks.ground_truth.meshes import pawn, vase
-from benchmarks.ground_truth.parts import MeshFolder, looking, shape, texture
+from benchmarks.ground_truth.parts import MeshFolder, looking, shape, sheet_surface, texture
 from benchmarks.ground_truth.scenes import rooms
 from benchmarks.ground_truth.textures import wood
 
@@ -43,9 +43,10 @@ SCENE = BenchmarkScene(
     ),
     lamps=(LAMP, Ambient(0.26, (0.92, 0.96, 1.0))),
     surfaces=(
+        sheet_surface(BOARD),
         {
             "region": {
-                "plane": {"point_m": [0.0, 0.0, TABLE_Z_M], "normal": [0.0, 0.0, 1.0], "tolerance_m": 0.006}
+                "plane": {"point_m": [0.0, 0.0, TABLE_Z_M], "normal": [0.0, 0.0, 1.0], "tolerance_m": 0.003}
             },
             "roughness": ROUGHNESS,
             "specular": SPECULAR,

@@ -5,7 +5,7 @@ from typing import Any
 from benchmarks.ground_truth.benchmark_scene import BOARD, TABLE_Z_M, BenchmarkScene, Finish, VirtualObject
 from benchmarks.ground_truth.lamps import Ambient, SphereLamp
 from benchmarks.ground_truth.meshes import rabbit, ring
-from benchmarks.ground_truth.parts import MeshFolder, Triple, looking, rgb, shape, sheet
+from benchmarks.ground_truth.parts import MeshFolder, Triple, looking, rgb, shape, sheet, sheet_surface
 from benchmarks.ground_truth.scenes import rooms
 
 ROUGHNESS = 0.1
@@ -47,9 +47,10 @@ SCENE = BenchmarkScene(
     ),
     lamps=(LAMP, Ambient(0.24, (0.92, 0.96, 1.0))),
     surfaces=(
+        sheet_surface(BOARD),
         {
             "region": {
-                "plane": {"point_m": [0.0, 0.0, TABLE_Z_M], "normal": [0.0, 0.0, 1.0], "tolerance_m": 0.006}
+                "plane": {"point_m": [0.0, 0.0, TABLE_Z_M], "normal": [0.0, 0.0, 1.0], "tolerance_m": 0.003}
             },
             "roughness": ROUGHNESS,
             "metallic": 1.0,

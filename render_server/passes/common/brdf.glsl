@@ -27,11 +27,25 @@ vec3 specular_reflectance(vec3 f0, float roughness, float n_dot_v) {
     return f0 * ab.x + ab.y;
 }
 
-// Specular BRDF times cosine for a light seen under half-angle `radius` (rad). Its disc is convolved with the lobe by
-// widening alpha (Karis 2013); D stays a normalised distribution, so the reflected energy is that of the unwidened lobe.
+// Diffuse reflection relative to Lambert's, under a rough dielectric interface (Burley 2012). Without an interface
+// (f0 = 0) it is Lambert's.
+float burley(float n_dot_l, float n_dot_v, float l_dot_v, float roughness) {
+    float grazing = roughness * (1.0 + l_dot_v) - 0.5;   // F_D90 - 1; 2 cos^2 of the difference angle is 1 + l.v
+    return (1.0 + grazing * pow(1.0 - n_dot_l, 5.0)) * (1.0 + grazing * pow(1.0 - n_dot_v, 5.0));
+}
+
+// The same for light from everywhere: mean of (1 - n.l)^5 over the cosine is 1/21, that of l.v is 2/3 n.v.
+float burley_mean(float n_dot_v, float roughness) {
+    float grazing = roughness * (1.0 + 2.0 / 3.0 * n_dot_v) - 0.5;
+    return (1.0 + grazing / 21.0) * (1.0 + grazing * pow(1.0 - n_dot_v, 5.0));
+}
+
+// Specular BRDF times cosine for a light seen under half-angle `radius` (rad). Averaging the lobe's peak over the
+// light's disc, of radius/2 in half-vectors, gives a GGX peak of alpha^2 + (radius/2)^2; D stays a normalised
+// distribution, so the reflected energy is that of the unwidened lobe.
 vec3 specular_times_cosine(vec3 n, vec3 v, vec3 l, vec3 f0, float roughness, float radius) {
     float alpha = max(roughness * roughness, 2e-3);
-    float wide = min(alpha + 0.25 * radius, 1.0);
+    float wide = min(sqrt(alpha * alpha + 0.25 * radius * radius), 1.0);
     float n_dot_l = max(dot(n, l), 0.0);
     float n_dot_v = max(dot(n, v), 1e-3);
     vec3 h = normalize(l + v);

@@ -28,12 +28,22 @@ vec3 ray_point(LightView view, vec2 s, float depth) {
     return transpose(mat3(view.view_from_world)) * (v - view.view_from_world[3].xyz);
 }
 
+// Intensity towards a world direction of travel, relative to color. A rectangle's is that of its far field, L A cos,
+// as if all of it came from its centre: its flux is right, its spread over near surfaces is too narrow.
+float intensity_towards(Light light, vec3 d) {
+    vec3 normal_area = 4.0 * cross(light.axis_u.xyz, light.axis_v.xyz);
+    return light.place.w == RECTANGLE ? max(dot(d, normal_area), 0.0) : spot_share(light, d);
+}
+
 // Light of a texel's rays before any reflection: I dW, or E_perp A (no cosine: a surface that leans away takes the
 // same rays on more area).
 vec3 texel_light(Light light, LightView view, vec2 s) {
     float side = 2.0 * view.tile.w / view.tile.z;
     vec3 parallel_rays = light.color.rgb * side * side;
-    return view.range.z > 0.5 ? parallel_rays : parallel_rays * pow(1.0 + dot(s, s), -1.5);
+    if (view.range.z > 0.5) return parallel_rays;
+    float slant2 = 1.0 + dot(s, s);
+    vec3 d = transpose(mat3(view.view_from_world)) * vec3(s, 1.0) * inversesqrt(slant2);
+    return parallel_rays * pow(slant2, -1.5) * intensity_towards(light, d);
 }
 
 struct Hit { bool present; ivec2 texel; LightView view; vec2 s; float depth; float ray_depth; };

@@ -18,8 +18,13 @@ layout(std430, binding = 9) readonly buffer Support { int support[6]; };   // vo
 
 // A wall's summed coverage scatters about 1 with its slant and place on the grid (2/3..4/3 at 45 degrees) and with
 // changes of level and other walls (down to 1/2). Below, the sum is the share of the cone that is covered.
+#ifdef MULTIPLIED_COVERAGE
+const float PARTLY = 1.0;
+const float WALL = 0.97;   // what is left could not be seen in an 8-bit picture
+#else
 const float PARTLY = 0.4;
 const float WALL = 0.5;
+#endif
 
 struct March { vec3 c_mu; float t_mu; vec3 c_rho; float t_rho; };
 
@@ -31,6 +36,9 @@ float blocked_share(float coverage) {
 
 void cross_cell(vec4 cell, inout Crossed sum) {
     if (cell.a <= 0.0) return;
+#ifdef MULTIPLIED_COVERAGE
+    cell *= min(1.0, 1.0 / cell.a) * (1.0 - sum.coverage);   // front to back, as usual
+#endif
     float taken = blocked_share(sum.coverage + cell.a) - blocked_share(sum.coverage);
     sum.c += cell.rgb * (taken / cell.a);
     sum.coverage += cell.a;
@@ -78,6 +86,19 @@ void advance(inout Walk w, float ratio, float before, int levels) {
     choose_level(w, ratio, before, levels);
 }
 
+#ifdef ISOTROPIC_VOXELS
+// One radiance and one opacity for all directions: what all six hold together, as opaque as from where it is most.
+vec4 directional_sample(sampler3D pyramid, int n, vec3 q, Walk w) {
+    vec4 sum = vec4(0.0);
+    float most = 0.0;
+    for (int k = 0; k < 6; ++k) {
+        vec4 cell = volume_sample(pyramid, n, q, w.level, k);
+        sum += cell;
+        most = max(most, cell.a);
+    }
+    return sum.a > 0.0 ? sum * (most / sum.a) : vec4(0.0);
+}
+#else
 // Coverage and radiance that the ray meets in one slice. Of all surfaces in a cell, f and b are known: their area
 // towards and away from the ray along each axis. The net area n.d is exact; what a closed lump adds to it on the
 // side that the ray sees is at most half of `round` (exact for a sphere) and of the pairs min(f, b) (exact, 0, for a
@@ -99,6 +120,7 @@ vec4 directional_sample(sampler3D pyramid, int n, vec3 q, Walk w) {
     float paired = max(net, 0.0) + length(weights * min(f, b));
     return most * min(min(round, paired) / most.a, 1.0);
 }
+#endif
 
 // Through the volume around the objects, from q (voxels), until a wall or the volume's end at distance t (voxels).
 // `differs`: the way led through cells where mu and rho are not the same.

@@ -19,7 +19,3 @@ vec3 measured_radiance(vec3 p) {
 }
 
 vec3 predicted_radiance(vec3 irradiance) { return unseen_albedo / PI * irradiance; }
-
-vec3 real_radiance(vec3 p, vec3 irradiance) {
-    return camera_sees(p) ? measured_radiance(p) : predicted_radiance(irradiance);
-}

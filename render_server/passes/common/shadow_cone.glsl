@@ -14,7 +14,7 @@ struct ShadowCone { vec3 start; vec3 d; float ratio; vec2 interval; };
 
 ShadowCone shadow_cone(Light light, vec3 p, vec3 n) {
     vec3 to_light; float radius;
-    light_at(light, p, to_light, radius);
+    light_at(light, p, n, to_light, radius);
     ShadowCone cone;
     cone.start = volume_coordinate(p) + SHADOW_START * n;
     cone.d = to_light;

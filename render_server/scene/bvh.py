@@ -1,0 +1,188 @@
+"""Bounding volume hierarchy over triangles, flattened for loops without a stack (passes/common/ray_mesh.glsl)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int32, Int64
+
+LEAF_SIZE = 4  # triangles at most: boxes around fewer cost as many tests as they save
+BINS = 16  # places an axis where a node may be split (Wald 2007)
+# Of the greatest coordinate: boxes grow by it, so that float32 rays do not miss what touches them.
+ROUNDING = 1e-6
+COUNT_BITS = 3  # of a leaf: its number of triangles stands below the place of the first
+
+
+@dataclass(frozen=True, eq=False)
+class Bvh:
+    """Nodes in depth-first order: what follows a node is its first child, `skip` is what follows its last descendant.
+
+    `leaf` is -1 for inner nodes, else the place of the first triangle in `order` << 3 | number of triangles.
+    """
+
+    low: Float32[np.ndarray, "k 3"]
+    high: Float32[np.ndarray, "k 3"]
+    leaf: Int32[np.ndarray, " k"]
+    skip: Int32[np.ndarray, " k"]
+    order: Int32[np.ndarray, " m"]
+
+    def packed(self) -> bytes:
+        """Nodes as the shader's struct: low corner, leaf, high corner, skip (32 bytes)."""
+        rows = np.empty((len(self.leaf), 8), np.float32)
+        rows[:, 0:3], rows[:, 4:7] = self.low, self.high
+        rows.view(np.int32)[:, 3], rows.view(np.int32)[:, 7] = self.leaf, self.skip
+        return rows.tobytes()
+
+    def packed_triangles(self, corners: Float32[np.ndarray, "m 3 3"]) -> bytes:
+        """Triangles in `order`: (corner, index in the mesh), (edge to the second corner, 0), (to the third, 0)."""
+        rows = np.zeros((len(self.order), 3, 4), np.float32)
+        first = corners[self.order, 0]
+        rows[:, 0, :3] = first
+        rows[:, 1:, :3] = corners[self.order, 1:] - first[:, None]
+        rows.view(np.int32)[:, 0, 3] = self.order
+        return rows.tobytes()
+
+
+@dataclass(frozen=True, eq=False)
+class _Level:
+    """Nodes of one depth. The children of those that are `inner` follow each other in the next level, in pairs."""
+
+    low: Float32[np.ndarray, "s 3"]
+    high: Float32[np.ndarray, "s 3"]
+    inner: Bool[np.ndarray, " s"]
+
+
+@dataclass(frozen=True, eq=False)
+class _Boxes:
+    """Bounds of every triangle."""
+
+    low: Float32[np.ndarray, "m 3"]
+    high: Float32[np.ndarray, "m 3"]
+    centre: Float32[np.ndarray, "m 3"]
+
+
+def build_bvh(corners: Float32[np.ndarray, "m 3 3"]) -> Bvh:
+    """Split by the surface area heuristic in bins, all nodes of a depth at once; m >= 1.
+
+    The same triangles give the same tree.
+    """
+    low, high = corners.min(axis=1), corners.max(axis=1)
+    boxes = _Boxes(low, high, (low + high) * np.float32(0.5))
+    levels: list[_Level] = []
+    leaf_of = np.zeros((len(corners), 2), np.int64)  # level and number of the leaf that holds a triangle
+    triangles, node = np.arange(len(corners)), np.zeros(len(corners), np.int64)
+    while len(triangles):
+        level, triangles, node = _split(boxes, triangles, node, leaf_of, len(levels))
+        levels.append(level)
+    return _flattened(levels, leaf_of, ROUNDING * float(np.abs(corners).max()))
+
+
+def _split(
+    boxes: _Boxes,
+    triangles: Int64[np.ndarray, " a"],
+    node: Int64[np.ndarray, " a"],
+    leaf_of: Int64[np.ndarray, "m 2"],
+    depth: int,
+) -> tuple[_Level, Int64[np.ndarray, " b"], Int64[np.ndarray, " b"]]:
+    """One level from `triangles`, sorted by their `node` in it, and the triangles of the next level with theirs."""
+    counts = np.bincount(node)
+    starts = np.cumsum(counts) - counts
+    low = np.minimum.reduceat(boxes.low[triangles], starts)
+    high = np.maximum.reduceat(boxes.high[triangles], starts)
+    inner = counts > LEAF_SIZE
+    ends = ~inner[node]
+    leaf_of[triangles[ends]] = np.stack([np.full(ends.sum(), depth), node[ends]], axis=1)
+    triangles, node = triangles[~ends], (np.cumsum(inner) - 1)[node[~ends]]
+    if len(triangles):
+        triangles, node = _children(boxes, triangles, node)
+    return _Level(low, high, inner), triangles, node
+
+
+def _children(
+    boxes: _Boxes, triangles: Int64[np.ndarray, " a"], node: Int64[np.ndarray, " a"]
+) -> tuple[Int64[np.ndarray, " a"], Int64[np.ndarray, " a"]]:
+    """Sort each node's triangles along its longest axis and deal them to its two children."""
+    counts = np.bincount(node)
+    starts = np.cumsum(counts) - counts
+    centre = boxes.centre[triangles]
+    least = np.minimum.reduceat(centre, starts)
+    extent = np.maximum.reduceat(centre, starts) - least
+    axis = extent.argmax(axis=1)
+    rows = np.arange(len(counts))
+    width = np.maximum(extent[rows, axis], np.finfo(np.float32).tiny)
+    along = np.take_along_axis(centre, axis[node, None], axis=1)[:, 0] - least[rows, axis][node]
+    cell = node * BINS + np.minimum((along / width[node] * BINS).astype(np.int64), BINS - 1)
+    sort = np.argsort(cell, kind="stable")
+    triangles, node, cell = triangles[sort], node[sort], cell[sort]
+    first_share = _best_split(boxes, triangles, cell, counts)
+    place = np.arange(len(triangles)) - starts[node]
+    return triangles, 2 * node + (place >= first_share[node])
+
+
+def _best_split(
+    boxes: _Boxes,
+    triangles: Int64[np.ndarray, " a"],
+    cell: Int64[np.ndarray, " a"],
+    counts: Int64[np.ndarray, " s"],
+) -> Int64[np.ndarray, " s"]:
+    """How many triangles of each node, sorted by cell, the first child gets: half, where all lie in one bin."""
+    held = np.bincount(cell, minlength=len(counts) * BINS)
+    used = np.flatnonzero(held)
+    starts = np.cumsum(held[used]) - held[used]
+    low = np.full((len(held), 3), np.inf, np.float32)
+    high = np.full((len(held), 3), -np.inf, np.float32)
+    low[used] = np.minimum.reduceat(boxes.low[triangles], starts)
+    high[used] = np.maximum.reduceat(boxes.high[triangles], starts)
+    bins_low, bins_high = low.reshape(-1, BINS, 3), high.reshape(-1, BINS, 3)
+    before = np.cumsum(held.reshape(-1, BINS), axis=1)[:, :-1]
+    behind = counts[:, None] - before
+    cost = _areas(bins_low, bins_high)[:, :-1] * before
+    cost += _areas(bins_low[:, ::-1], bins_high[:, ::-1])[:, ::-1][:, 1:] * behind
+    cost = np.where((before == 0) | (behind == 0), np.inf, cost)
+    best = cost.argmin(axis=1)
+    rows = np.arange(len(counts))
+    return np.where(np.isfinite(cost[rows, best]), before[rows, best], counts // 2)
+
+
+def _areas(
+    low: Float32[np.ndarray, "s b 3"], high: Float32[np.ndarray, "s b 3"]
+) -> Float32[np.ndarray, "s b"]:
+    """Half the surface of the box around the first bins; 0 where they hold nothing."""
+    extent = np.maximum.accumulate(high, axis=1) - np.minimum.accumulate(low, axis=1)
+    extent = np.where(np.isfinite(extent), extent, 0)
+    return np.asarray((extent * np.roll(extent, 1, axis=-1)).sum(axis=-1))
+
+
+def _flattened(levels: list[_Level], leaf_of: Int64[np.ndarray, "m 2"], margin: float) -> Bvh:
+    """Depth-first order: sizes of subtrees from below, places from above."""
+    sizes = [np.ones(len(level.inner), np.int64) for level in levels]
+    for depth in reversed(range(len(levels) - 1)):
+        sizes[depth][levels[depth].inner] += sizes[depth + 1].reshape(-1, 2).sum(axis=1)
+    places = [np.zeros(1, np.int64)]
+    for depth in range(len(levels) - 1):
+        first = places[depth][levels[depth].inner] + 1
+        places.append(np.stack([first, first + sizes[depth + 1][::2]], axis=1).ravel())
+    return _assembled(levels, sizes, places, leaf_of, margin)
+
+
+def _assembled(
+    levels: list[_Level],
+    sizes: list[Int64[np.ndarray, " s"]],
+    places: list[Int64[np.ndarray, " s"]],
+    leaf_of: Int64[np.ndarray, "m 2"],
+    margin: float,
+) -> Bvh:
+    """Put the nodes of all levels to their places, and the triangles in the order of their leaves."""
+    place, size = np.concatenate(places), np.concatenate(sizes)
+    back = np.argsort(place)
+    starts = np.cumsum([0] + [len(level.inner) for level in levels])
+    home = place[starts[leaf_of[:, 0]] + leaf_of[:, 1]]
+    order = np.argsort(home, kind="stable")
+    held = np.bincount(home, minlength=len(place))
+    first = np.cumsum(held) - held
+    return Bvh(
+        np.concatenate([level.low for level in levels])[back] - np.float32(margin),
+        np.concatenate([level.high for level in levels])[back] + np.float32(margin),
+        np.where(held > 0, first << COUNT_BITS | held, -1).astype(np.int32),
+        (place + size)[back].astype(np.int32),
+        order.astype(np.int32),
+    )

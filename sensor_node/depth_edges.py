@@ -1,0 +1,263 @@
+"""Unknown depth along depth edges gets one of the surfaces beside it, by colour.
+
+Stereo leaves a rim without depth around near things: its matching windows straddle the edge, and the second
+camera does not see all that the first one does. The colour picture still shows which surface a pixel of the
+rim belongs to. Each such pixel looks at known samples around it, parts them into a nearer and a farther
+surface, extends a plane of each to itself and takes the one whose colours match it clearly better. The vote
+is shared with neighbours of similar colour, so that the rim comes out smooth. Pixels that see one surface
+only, or match both or neither, stay unknown.
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, Int64, UInt8
+
+from sensor_node.depth_filter import NoiseModel
+
+Samples = Float32[np.ndarray, "samples n"]
+PerPixel = Float32[np.ndarray, " n"]
+
+# Directions and distances of the samples: on a spiral, as many in each doubling of the distance, so that near
+# ones say most and far ones are still found. The golden angle spreads them over all directions.
+SAMPLE_COUNT = 64
+GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
+# A pixel of a rim beside one surface has the other one farther off, behind the shadow of the occlusion.
+SIGHT_PER_REACH = 4.0
+# Samples of either surface that make a plane.
+LEAST_SAMPLES = 3
+# Rounds after which the mean of both means hardly moves where there are two surfaces.
+SPLIT_ROUNDS = 2
+# Keeps a plane through samples in a row solvable; square pixels.
+SLOPE_RIDGE_PX2 = 1.0
+# Share of the step between two planes below which their samples must lie beside them, else there are not two.
+STRAY_SHARE = 0.25
+# A surface must match this much better than the other: odds of 4 to 1.
+CLEAR_LOG_ODDS = float(np.log(4.0))
+# No pixel's own colour counts for more than this in the vote, so that one stray pixel does not turn it.
+MOST_LOG_ODDS = 3 * CLEAR_LOG_ODDS
+# Match of a colour that no surface around has (ten times the contrast away): it speaks for neither.
+ALIEN_MATCH = 1e-4
+VOTE_RADIUS_PX = 2
+# Pixels worked on at a time: what they need stays in the processor's cache.
+CHUNK = 2048
+EMPTY = 1e-9
+
+
+class _Offsets(NamedTuple):
+    """Where the samples of a pixel are, relative to it, in pixels, and their weights."""
+
+    x: Float32[np.ndarray, " samples"]
+    y: Float32[np.ndarray, " samples"]
+    weight: Float32[np.ndarray, " samples"]
+
+
+class _Padded(NamedTuple):
+    """Inverse depth (0 = unknown) and colour, flat, with a margin so that no look-up leaves them."""
+
+    inverse_depth: Float32[np.ndarray, " padded"]
+    color: Float32[np.ndarray, "padded 4"]
+    stride: int
+
+
+class _Surfaces(NamedTuple):
+    """Pixels that see two surfaces: flat places in the padded picture, both surfaces continued there (1/m)."""
+
+    places: Int64[np.ndarray, " n"]
+    near: PerPixel
+    far: PerPixel
+    log_odds: PerPixel
+    """For the nearer surface, by colour."""
+
+
+def assign_edges(
+    inverse_depth: Float32[np.ndarray, "h w"],
+    known: Bool[np.ndarray, "h w"],
+    color: UInt8[np.ndarray, "h w 3"],
+    *,
+    noise: NoiseModel,
+    sigmas: float,
+    contrast: float,
+    reach_px: int,
+) -> tuple[Float32[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+    """Return inverse depth and mask with the clear pixels along depth edges added; known ones stay as given.
+
+    Args:
+        inverse_depth: 1/m; whatever where not known.
+        known: which pixels are known.
+        color: RGB picture as coded, 0..255.
+        noise: of the depth.
+        sigmas: surfaces that differ by less than this many standard deviations of the noise are one.
+        contrast: difference of colour, 0..1, that tells surfaces apart.
+        reach_px: pixels farther than this from known ones of their surface stay unknown; at least 1.
+    """
+    offsets = _spiral(reach_px)
+    margin = int(np.ceil(SIGHT_PER_REACH * reach_px)) + VOTE_RADIUS_PX
+    picture = _pad(np.where(known, inverse_depth, 0), color, margin, contrast)
+    rows, columns = np.divmod(_rim(known, reach_px), known.shape[1])
+    places = (rows + margin) * picture.stride + columns + margin
+    parts = [_seen(picture, part, offsets, noise, sigmas) for part in _chunks(places)]
+    if parts:
+        seen = _Surfaces(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+        _assign(picture, seen, reach_px)
+    inside = slice(margin, -margin)
+    result = picture.inverse_depth.reshape(-1, picture.stride)[inside, inside]
+    return np.where(known, inverse_depth, result), known | (result > 0)
+
+
+def _assign(picture: _Padded, seen: _Surfaces, reach_px: int) -> None:
+    """Write the decided pixels into the picture: the clear ones, then those between both surfaces.
+
+    A pixel with both surfaces beside it is on the edge itself, where colours mix: there the likelier will do,
+    as at most that pixel is wrong.
+    """
+    log_odds = _voted(picture, seen)
+    value = np.where(log_odds > 0, seen.near, seen.far)
+    middle = (seen.near + seen.far) / 2
+    clear = (np.abs(log_odds) >= CLEAR_LOG_ODDS) & (value > 0)
+    _grow(picture, seen.places[clear], value[clear], np.abs(value - middle)[clear], reach_px)
+    beside = picture.inverse_depth[seen.places + _square(picture.stride, 1)]
+    nearer, farther = beside > middle, (beside > 0) & (beside <= middle)
+    between = nearer.any(axis=0) & farther.any(axis=0) & ~clear & (value > 0)
+    picture.inverse_depth[seen.places[between]] = value[between]
+
+
+def _grow(
+    picture: _Padded, places: Int64[np.ndarray, " n"], value: PerPixel, near_by: PerPixel, reach_px: int
+) -> None:
+    """Write pixels that touch their own surface (depth within `near_by`), then those that touch these.
+
+    Spots that only have the colour of a surface but no connection to it stay unknown, and no pixel is farther
+    than the reach from known ones of the surface that it gets.
+    """
+    for _ in range(reach_px):
+        beside = picture.inverse_depth[places + _square(picture.stride, 1)]
+        touches = ((beside > 0) & (np.abs(beside - value) < near_by)).any(axis=0)
+        picture.inverse_depth[places[touches]] = value[touches]
+        places, value, near_by = places[~touches], value[~touches], near_by[~touches]
+
+
+def _rim(known: Bool[np.ndarray, "h w"], reach_px: int) -> Int64[np.ndarray, " n"]:
+    """Flat places of the unknown pixels within reach of known ones."""
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach_px + 1,) * 2)
+    return np.flatnonzero(cv2.dilate(known.view(np.uint8), disc).view(bool) & ~known)
+
+
+def _spiral(reach_px: int) -> _Offsets:
+    """Samples from one pixel off to the end of sight; each weighs as its distance's inverse."""
+    step = np.arange(SAMPLE_COUNT)
+    radius = (SIGHT_PER_REACH * reach_px) ** (step / (SAMPLE_COUNT - 1))
+    x, y = (np.rint(radius * f(GOLDEN_ANGLE * step)) for f in (np.cos, np.sin))
+    weight = 1 / np.hypot(x, y)
+    return _Offsets(*(values.astype(np.float32) for values in (x, y, weight)))
+
+
+def _pad(
+    inverse_depth: Float32[np.ndarray, "h w"], color: UInt8[np.ndarray, "h w 3"], margin: int, contrast: float
+) -> _Padded:
+    """Colour comes in units of the contrast, so that a distance of 1 is one contrast."""
+    padded = cv2.copyMakeBorder(inverse_depth, *(margin,) * 4, cv2.BORDER_CONSTANT)
+    four = cv2.cvtColor(np.ascontiguousarray(color), cv2.COLOR_RGB2RGBA)
+    colors = cv2.copyMakeBorder(four, *(margin,) * 4, cv2.BORDER_REPLICATE).astype(np.float32)
+    colors *= np.float32(1 / (255 * contrast))
+    return _Padded(padded.ravel(), colors.reshape(-1, 4), padded.shape[1])
+
+
+def _chunks(places: Int64[np.ndarray, " n"]) -> Iterator[Int64[np.ndarray, " m"]]:
+    for first in range(0, len(places), CHUNK):
+        yield places[first : first + CHUNK]
+
+
+def _seen(
+    picture: _Padded, places: Int64[np.ndarray, " n"], offsets: _Offsets, noise: NoiseModel, sigmas: float
+) -> _Surfaces:
+    """Part the samples around pixels into two surfaces and compare colours; pixels without two drop out."""
+    shifts = (offsets.y * picture.stride + offsets.x).astype(np.int64)[:, None]
+    samples = picture.inverse_depth.take(places + shifts)
+    split = _split(samples, offsets.weight)
+    nearer = (samples > split).astype(np.float32)
+    farther = (samples > 0) - nearer
+    near, near_stray = _continued(samples - split, nearer, offsets)
+    far, far_stray = _continued(samples - split, farther, offsets)
+    step = near - far
+    two = (step > sigmas * noise.of_inverse_depth(split)) & (near_stray + far_stray < STRAY_SHARE * step)
+    two &= np.minimum(nearer.sum(axis=0), farther.sum(axis=0)) >= LEAST_SAMPLES
+    places = places[two]
+    match = _match(picture.color, places + shifts, places)
+    near_match, far_match = (_mean(match, part[:, two], offsets.weight) for part in (nearer, farther))
+    odds = (near_match + ALIEN_MATCH) / (far_match + ALIEN_MATCH)
+    return _Surfaces(places, (near + split)[two], (far + split)[two], np.log(odds))
+
+
+def _split(samples: Samples, weight: Float32[np.ndarray, " samples"]) -> PerPixel:
+    """Inverse depth between nearer and farther samples: the mean of both means, from half-way on."""
+    known = (samples > 0).astype(np.float32)
+    least = np.where(samples > 0, samples, np.float32(np.inf)).min(axis=0)
+    most = samples.max(axis=0)
+    split = np.asarray((np.minimum(least, most) + most) / 2)
+    for _ in range(SPLIT_ROUNDS):
+        nearer = (samples > split).astype(np.float32)
+        split = (_mean(samples, nearer, weight) + _mean(samples, known - nearer, weight)) / 2
+    return split
+
+
+def _mean(values: Samples, taken: Samples, weight: Float32[np.ndarray, " samples"]) -> PerPixel:
+    """Weighted mean of the values taken (0..1 each); 0 of none."""
+    return np.asarray((weight @ (values * taken)) / np.maximum(weight @ taken, EMPTY))
+
+
+def _continued(values: Samples, taken: Samples, offsets: _Offsets) -> tuple[PerPixel, PerPixel]:
+    """Value at the pixel of the plane through the samples taken, and how far those stray from it (rms)."""
+    x, y, weight = offsets
+    linear = np.stack([np.ones_like(x), x, y])
+    total, sum_x, sum_y, sum_xx, sum_xy, sum_yy = (
+        np.concatenate([linear, np.stack([x * x, x * y, y * y])]) * weight @ taken
+    )
+    share = 1 / np.maximum(total, EMPTY)
+    of_taken = values * taken
+    mean, xv, yv = linear * weight @ of_taken * share
+    mean_x, mean_y = sum_x * share, sum_y * share
+    xx = sum_xx * share - mean_x * mean_x + SLOPE_RIDGE_PX2
+    yy = sum_yy * share - mean_y * mean_y + SLOPE_RIDGE_PX2
+    xy, xv, yv = sum_xy * share - mean_x * mean_y, xv - mean_x * mean, yv - mean_y * mean
+    determinant = xx * yy - xy * xy
+    slope_x, slope_y = (xv * yy - yv * xy) / determinant, (yv * xx - xv * xy) / determinant
+    variance = weight @ (of_taken * values) * share - mean * mean
+    unexplained = np.maximum(variance - slope_x * xv - slope_y * yv, 0)
+    return mean - slope_x * mean_x - slope_y * mean_y, np.sqrt(unexplained)
+
+
+def _match(
+    color: Float32[np.ndarray, "padded 4"],
+    around: Int64[np.ndarray, "samples n"],
+    places: Int64[np.ndarray, " n"],
+) -> Samples:
+    """How alike the colours are: 1 the same, 1/4 one contrast apart.
+
+    The long tail still tells which of two colours a mixture of them, far from both, is closer to.
+    """
+    difference = color.take(around, axis=0) - color[places]
+    alike = 1 + np.einsum("snc,snc->sn", difference, difference)
+    return np.asarray(1 / (alike * alike))
+
+
+def _voted(picture: _Padded, seen: _Surfaces) -> PerPixel:
+    """Mean log odds of a pixel and of its unknown neighbours of similar colour."""
+    log_odds, votes = np.zeros((2, len(picture.inverse_depth)), np.float32)
+    log_odds[seen.places] = np.clip(seen.log_odds, -MOST_LOG_ODDS, MOST_LOG_ODDS)
+    votes[seen.places] = 1
+    shifts = _square(picture.stride, VOTE_RADIUS_PX)
+    alike = np.ones(len(shifts), np.float32)
+    means = []
+    for places in _chunks(seen.places):
+        around = places + shifts
+        means.append(_mean(log_odds[around], votes[around] * _match(picture.color, around, places), alike))
+    return np.concatenate(means) if means else seen.log_odds
+
+
+def _square(stride: int, radius_px: int) -> Int64[np.ndarray, "pixels 1"]:
+    """Shifts to the pixels of a square around one in the flat picture."""
+    y, x = np.mgrid[-radius_px : radius_px + 1, -radius_px : radius_px + 1]
+    return np.asarray((y * stride + x).reshape(-1, 1), np.int64)

@@ -1,0 +1,230 @@
+"""Coverage of pixels by objects: right for known shapes, nothing lost, nothing else changed."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from protocol.camera_model import CameraModel
+from protocol.frames import ViewFrame, decode_lut
+from protocol.scene import SceneDocument
+from protocol.scene_method import NoneMethod
+from render_server.gpu.context import GpuContext
+from render_server.passes.coverage import PATTERN, STEPS
+from render_server.renderer import SceneRenderer
+from tests.render_server.scenes import (
+    FOCAL,
+    HEIGHT,
+    WIDTH,
+    Stage,
+    ambient,
+    ball,
+    camera,
+    composite,
+    cube,
+    depth_image,
+    directional,
+    everyday,
+    fields_of,
+    frame,
+    look_at,
+    noisy,
+    shifted,
+    solve,
+)
+
+pytestmark = pytest.mark.usefixtures("clean_gl")
+PIXEL = 1.0 / FOCAL  # m that a pixel spans at 1 m
+ABOVE = look_at((0.0, 0.0, 1.0), (0.0, 0.0, 0.0))
+GLOW, DIM = 0.9, 0.1  # linear radiance
+
+
+@pytest.fixture
+def stage(tmp_path: Path) -> Stage:
+    return Stage(tmp_path)
+
+
+def antialiased(document: SceneDocument, wanted: bool = True) -> SceneDocument:
+    return document.replaced(output=document.output.model_copy(update={"antialiasing": wanted}))
+
+
+def glowing(stage: Stage, mesh: trimesh.Trimesh) -> SceneDocument:
+    """An object of one radiance; nothing else about the picture changes."""
+    material = {"base_color": (0, 0, 0), "specular": 0, "emission": (GLOW, GLOW, GLOW)}
+    document = stage.document([{"asset": stage.asset(mesh), "material": material}], [ambient(0.2)])
+    return document.replaced(method=NoneMethod())
+
+
+def seen_from_above(depth_m: float = 3.0, model: CameraModel | None = None) -> ViewFrame:
+    """A camera 1 m above the origin that looks down on a plane."""
+    depth = depth_image(np.full((HEIGHT, WIDTH), depth_m, np.float32))
+    return frame(noisy(), pose=ABOVE, depth=depth, **({} if model is None else {"camera": model}))
+
+
+def sheet(
+    width: float, height: float, x: float = 0.0, y: float = 0.0, turn_deg: float = 0.0
+) -> trimesh.Trimesh:
+    """A rectangle at 1 m below that camera; all in pixels from the optical centre."""
+    mesh = trimesh.creation.box((width * PIXEL, height * PIXEL, 1e-4))
+    mesh.apply_translation((x * PIXEL, y * PIXEL, -0.5e-4))
+    mesh.apply_transform(trimesh.transformations.rotation_matrix(np.radians(turn_deg), (0, 0, 1)))
+    return mesh
+
+
+def area_shares(normal: np.ndarray, shift: float, steps: int = 32) -> np.ndarray:
+    """Share of each pixel on the near side of a line: normal . x < shift, in pixels from the optical centre."""
+    fine = (np.arange(WIDTH * steps) + 0.5) / steps - WIDTH / 2
+    x, y = np.meshgrid(fine, -fine[: HEIGHT * steps] - (WIDTH - HEIGHT) / 2)  # picture rows run down
+    inside = normal[0] * x + normal[1] * y < shift
+    return np.asarray(inside.reshape(HEIGHT, steps, WIDTH, steps).mean(axis=(1, 3)))
+
+
+def test_the_pattern_holds_one_sample_in_each_row_and_column() -> None:
+    pattern = np.array(PATTERN)
+    places = np.arange(1 - len(PATTERN), len(PATTERN), STEPS // len(PATTERN))
+    assert np.array_equal(np.sort(pattern[:, 0]), places)
+    assert np.array_equal(np.sort(pattern[:, 1]), places)
+    assert np.all(np.diff((pattern**2).sum(axis=1)) >= 0)
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 90.0, 180.0, 17.0, 45.0])
+@pytest.mark.parametrize("shift", [0.1, 0.37, 0.8])
+def test_share_of_a_half_plane(gpu: GpuContext, stage: Stage, turn_deg: float, shift: float) -> None:
+    half_plane = sheet(400, 800, shift - 200, 0, turn_deg)
+    found = solve(gpu, antialiased(glowing(stage, half_plane)), seen_from_above())
+    angle = np.radians(turn_deg)
+    expected = area_shares(np.array([np.cos(angle), np.sin(angle)]), shift)
+    assert 0.1 < expected.mean() < 0.9
+    upright = turn_deg % 90 == 0
+    assert np.abs(found.matte - expected).max() <= (1 / 16 + 1e-3 if upright else 1 / 8)
+
+
+@pytest.mark.parametrize("distortion", [0.0, -0.3])
+def test_area_of_a_disc(gpu: GpuContext, stage: Stage, distortion: float) -> None:
+    disc = shifted(trimesh.creation.cylinder(9.3 * PIXEL, 1e-4, sections=128), 0.3 * PIXEL, 0.1 * PIXEL, 0)
+    lens = camera(distortion=(distortion, 0.0, 0.0, 0.0, 0.0))
+    found = solve(gpu, antialiased(glowing(stage, disc)), seen_from_above(model=lens))
+    assert found.matte.sum() == pytest.approx(np.pi * 9.3**2, rel=0.01)
+
+
+@pytest.mark.parametrize("x", [0.03, 0.28, 0.405, 0.655, 0.905])
+def test_thin_bar_is_neither_lost_nor_doubled(gpu: GpuContext, stage: Stage, x: float) -> None:
+    """Half a pixel wide: on each row its shares add up to its width, and the light it brings to its radiance."""
+    document = antialiased(glowing(stage, sheet(0.5, 40, x, 0.0)))
+    view = seen_from_above()
+    renderer = SceneRenderer(gpu, document, with_linear=True)
+    linear = renderer.render(view).linear
+    fields = fields_of(renderer)
+    renderer.release()
+    assert linear is not None
+    before = decode_lut(None)[view.color, np.arange(3)]
+    rows = slice(HEIGHT // 2 - 15, HEIGHT // 2 + 15)
+    shares = fields.matte[rows]
+    assert shares.sum(axis=1) == pytest.approx(0.5, abs=1 / 8)
+    mixed = (1 - shares[..., None]) * before[rows] + shares[..., None] * GLOW
+    assert linear[rows] == pytest.approx(mixed, abs=2e-3)
+
+
+def test_an_inclined_thin_bar_has_no_gap(gpu: GpuContext, stage: Stage) -> None:
+    found = solve(gpu, antialiased(glowing(stage, sheet(0.5, 80, 0.2, 0.0, 13.0))), seen_from_above())
+    rows = found.matte[HEIGHT // 2 - 30 : HEIGHT // 2 + 30]
+    assert (rows.sum(axis=1) > 0.2).all()
+    assert rows.sum() == pytest.approx(60 * 0.5 / np.cos(np.radians(13)), rel=0.05)
+
+
+def test_without_the_wish_pixels_are_covered_or_not(gpu: GpuContext, stage: Stage) -> None:
+    document = glowing(stage, ball(8.4 * PIXEL, (0, 0, 0)))
+    found = solve(gpu, document, seen_from_above())
+    assert set(np.unique(found.matte)) == {0.0, 1.0}
+
+
+def test_real_pixels_beside_the_object_are_the_cameras(gpu: GpuContext, stage: Stage) -> None:
+    document = antialiased(glowing(stage, ball(8.4 * PIXEL, (0, 0, 0))))
+    renderer = SceneRenderer(gpu, document)
+    picture = renderer.render(seen_from_above()).color
+    fields = fields_of(renderer)
+    renderer.release()
+    assert not any("antialiasing" in line for line in renderer.notices)
+    assert np.array_equal(picture[fields.matte == 0], noisy()[fields.matte == 0])
+    partly = (fields.matte > 0) & (fields.matte < 1)
+    assert np.count_nonzero(partly) > 30
+
+
+def test_asking_for_it_and_taking_it_back_leaves_no_trace(gpu: GpuContext, stage: Stage) -> None:
+    plain = everyday(stage)
+    smooth = antialiased(plain)
+    renderer = SceneRenderer(gpu, plain)
+    pictures = []
+    for document in (plain, smooth, smooth, plain):
+        renderer.set_scene(document)
+        pictures.append(renderer.render(frame(noisy())).color)
+    renderer.release()
+    assert not np.array_equal(pictures[0], pictures[1])
+    assert np.array_equal(pictures[1], pictures[2])
+    assert np.array_equal(pictures[0], pictures[3])
+    assert np.array_equal(pictures[1], composite(gpu, smooth, frame(noisy())))
+
+
+def test_real_surface_still_hides_the_object_and_softens_its_edge(gpu: GpuContext, stage: Stage) -> None:
+    """Where an object fills its pixels, the share is what it is without antialiasing."""
+    document = glowing(stage, cube(60 * PIXEL, (0, 0, -60 * PIXEL)))
+    depth = np.full((HEIGHT, WIDTH), 3.0, np.float32)
+    depth[:, : WIDTH // 2] = 0.5
+    view = frame(noisy(), pose=ABOVE, depth=depth_image(depth))
+    hard, smooth = (solve(gpu, antialiased(document, wanted), view).matte for wanted in (False, True))
+    assert smooth[:, : WIDTH // 2 - 3].max() == 0
+    filled = np.s_[HEIGHT // 2 - 28 : HEIGHT // 2 + 28, : WIDTH // 2 + 28]
+    assert np.array_equal(hard[filled], smooth[filled])
+    assert ((hard[filled] > 0) & (hard[filled] < 1)).any()
+
+
+def two_sheets(stage: Stage, near: trimesh.Trimesh) -> SceneDocument:
+    """A small sheet, and a large dimmer one 1 m below it."""
+    far = shifted(sheet(400, 400), 0, 0, -1.0)
+    objects = [
+        {
+            "asset": stage.asset(mesh),
+            "material": {"base_color": (0, 0, 0), "specular": 0, "emission": (glow,) * 3},
+        }
+        for mesh, glow in ((near, GLOW), (far, DIM))
+    ]
+    return stage.document(objects, [ambient(0.2)]).replaced(method=NoneMethod())
+
+
+def test_what_is_hidden_lends_nothing_to_the_outline_before_it(gpu: GpuContext, stage: Stage) -> None:
+    document = antialiased(two_sheets(stage, sheet(20, 20, 0.3, 0.3)))
+    assert solve(gpu, document, seen_from_above(1.5)).matte.sum() == pytest.approx(400, rel=0.02)
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 45.0])
+def test_edges_of_objects_before_each_other_are_mixed(gpu: GpuContext, stage: Stage, turn_deg: float) -> None:
+    document = antialiased(two_sheets(stage, sheet(400, 800, 0.37 - 200, 0, turn_deg)))
+    renderer = SceneRenderer(gpu, document, with_linear=True)
+    linear = renderer.render(seen_from_above()).linear
+    matte = fields_of(renderer).matte
+    renderer.release()
+    assert linear is not None
+    angle = np.radians(turn_deg)
+    shares = area_shares(np.array([np.cos(angle), np.sin(angle)]), 0.37)[..., None]
+    assert matte.min() == 1
+    assert np.abs(linear - (shares * GLOW + (1 - shares) * DIM)).max() <= (GLOW - DIM) / 8
+
+
+def test_creases_of_an_object_are_mixed(gpu: GpuContext, stage: Stage) -> None:
+    """Faces of unlike light meet along a roof's ridge: on each row the bright part adds up to its width."""
+    roof = trimesh.creation.box((40 * PIXEL, 40 * PIXEL, 40 * PIXEL))
+    roof.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 4, (0, 1, 0)))
+    ridge = 0.3
+    roof.apply_translation((ridge * PIXEL, 0, -20 * PIXEL * np.sqrt(2)))
+    document = stage.document([stage.virtual(roof)], [directional((1.0, 0.0, -1.0), 2.0)])
+    renderer = SceneRenderer(gpu, antialiased(document.replaced(method=NoneMethod())), with_linear=True)
+    linear = renderer.render(seen_from_above()).linear
+    renderer.release()
+    assert linear is not None
+    row = linear[HEIGHT // 2, :, 0]
+    left, right = WIDTH // 2 - 10, WIDTH // 2 + 10
+    bright, dark = row[left], row[right]
+    assert bright > 10 * dark
+    width = ((row[left:right] - dark) / (bright - dark)).sum()
+    assert width == pytest.approx(10 + ridge, abs=1 / 8)

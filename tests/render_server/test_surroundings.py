@@ -1,0 +1,76 @@
+"""Light of what is out of sight, found on the board's paper."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from protocol.board import BoardSpec
+from protocol.frames import ViewFrame, decode_lut
+from protocol.scene import SceneDocument
+from render_server.gpu.context import GpuContext
+from render_server.renderer import SceneRenderer
+from render_server.scene.registration import surroundings_from_patch
+from tests.render_server.scenes import Stage, ambient, cube, directional, floor, frame, plain
+
+ALBEDO = 0.7
+KNOWN, OUT_OF_SIGHT, SUN = 0.05, 0.12, 0.9
+BOARD = BoardSpec(
+    type="aruco_grid",
+    dictionary="DICT_4X4_50",
+    marker_length_m=0.12,
+    separation_m=0.15,
+    rows=2,
+    columns=3,
+    first_id=0,
+    white_albedo=ALBEDO,
+)
+
+
+def picture(irradiance: float) -> np.ndarray:
+    """All of it paper under this irradiance, to the nearest code."""
+    radiance = ALBEDO / np.pi * irradiance
+    return plain(int(np.abs(decode_lut(None)[:, 0] - radiance).argmin()))
+
+
+def document(stage: Stage, surroundings: str = "auto") -> SceneDocument:
+    made = stage.document(
+        [stage.virtual(cube(0.05, (-0.2, 0.15, 0)))], [directional((0, 0, -1), SUN), ambient(KNOWN)], floor()
+    )
+    return made.replaced(lights=made.lights.model_copy(update={"surroundings": surroundings}))
+
+
+def even_light(gpu: GpuContext, scene: SceneDocument, view: ViewFrame) -> np.ndarray:
+    """Radiance from everywhere that the renderer uses after its first frame."""
+    renderer = SceneRenderer(gpu, scene)
+    lights = renderer.render(view).lights
+    renderer.release()
+    return np.array(lights[-1]["mean_radiance"])
+
+
+@pytest.mark.usefixtures("clean_gl")
+def test_what_lights_do_not_explain_comes_from_all_around(gpu: GpuContext, tmp_path: Path) -> None:
+    color = picture(SUN + np.pi * (KNOWN + OUT_OF_SIGHT))
+    found = even_light(gpu, document(Stage(tmp_path)), frame(color, board=BOARD))
+    assert found == pytest.approx(KNOWN + OUT_OF_SIGHT, rel=0.03)  # one code is 1 % of the paper's radiance
+
+
+@pytest.mark.usefixtures("clean_gl")
+@pytest.mark.parametrize("case", ["switched off", "paper unknown", "darker than the lights"])
+def test_given_light_stays_where_nothing_can_be_found(gpu: GpuContext, tmp_path: Path, case: str) -> None:
+    board = BOARD.model_copy(update={"white_albedo": None}) if case == "paper unknown" else BOARD
+    color = picture(0.8 * SUN if case == "darker than the lights" else SUN + np.pi * (KNOWN + OUT_OF_SIGHT))
+    scene = document(Stage(tmp_path), "none" if case == "switched off" else "auto")
+    assert even_light(gpu, scene, frame(color, board=board)) == pytest.approx(KNOWN, rel=1e-3)
+
+
+def test_shadows_and_stains_on_the_paper_do_not_count() -> None:
+    rng = np.random.default_rng(1)
+    irradiance, per_radiance = rng.uniform(1, 2, (400, 3)), rng.uniform(2, np.pi, (400, 3))
+    wanted = np.array([0.3, 0.2, 0.1])
+    measured = ALBEDO / np.pi * (irradiance + wanted * per_radiance)
+    measured[:120] *= 0.2
+    found = surroundings_from_patch(measured, irradiance, per_radiance, ALBEDO)
+    assert found is not None
+    assert found[0] == pytest.approx(wanted[0], abs=0.01)
+    assert surroundings_from_patch(measured[:20], irradiance[:20], per_radiance[:20], ALBEDO) is None
