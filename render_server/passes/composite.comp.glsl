@@ -104,10 +104,13 @@ vec3 diffuse_share(ivec2 pixel, Change c, vec4 normal, vec3 b) {
     return (1.0 - e.f0.w) * diffuse / max(diffuse + c.s_mu, vec3(1e-6));
 }
 
-// What a specular surface shows more than before, of `glossy`, the picture's specular part. What objects hide by rays
+// What a specular surface shows more than before, of `glossy`, the picture's specular part. Predicted reflections that
+// the picture does not show (a wrong normal catches a light) cannot be taken away from it. What objects hide by rays
 // and the lights that they shadow overlap; which part of the picture is which cannot be told, so the larger counts.
 vec3 specular_change(Change c, vec3 glossy) {
-    return c.hidden > 0.0 ? c.gained - max(c.hidden * glossy, c.s_mu - c.s_rho) : c.s_rho - c.s_mu;
+    vec3 shown = min(glossy / max(c.s_mu, vec3(1e-6)), vec3(1.0));
+    vec3 lost = shown * max(c.s_mu - c.s_rho, vec3(0.0)), more = max(c.s_rho - c.s_mu, vec3(0.0));
+    return c.hidden > 0.0 ? c.gained - max(c.hidden * glossy, lost) : more - lost;
 }
 
 vec3 relit(ivec2 pixel, Change c, vec4 normal, vec3 b) {

@@ -36,12 +36,12 @@ void gather(ivec2 texel) {
     vec3 position = texelFetch(hit_position, texel, 0).xyz;
     vec4 normal = texelFetch(hit_normal, texel, 0);
     Mirror m = mirror_at(texelFetch(sample_pixels, texel, 0).xy);
-    vec3 q = volume_coordinate(position), start = q + START * normal.xyz;
+    vec3 q = volume_coordinate(position);
     vec3 e_mu, e_rho;
-    diffuse(start, normal.xyz, WHOLE, 0.0, true, e_mu, e_rho);
+    diffuse(q, normal.xyz, WHOLE, 0.0, true, e_mu, e_rho);
     vec3 d = reflect(normalize(position - m.point), normal.xyz);
     float half_angle = specular_half_angle(materials[int(normal.w)].dielectric.a);
-    March seen = march(start, d, 2.0 * tan(half_angle), true);
+    March seen = march(q, d, 2.0 * tan(half_angle), true);
     imageStore(irradiance_out, texel, vec4(e_rho, open_share(volume_coordinate(m.point) + OWN * m.normal, q)));
     imageStore(specular_out, texel, vec4(seen.c_rho + seen.t_rho * environment(d, half_angle), 1.0));
 }

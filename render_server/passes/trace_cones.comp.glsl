@@ -25,18 +25,17 @@ const float WHOLE = 1.0;         // cones as wide as their shares
 void trace(ivec2 texel) {
     SurfacePoint s = surface_point(texel);
     vec3 q = volume_coordinate(s.position);
-    vec3 start = q + START * s.normal;
     vec3 e_mu, e_rho, c_mu = vec3(0.0), c_rho = vec3(0.0);
 #ifdef REAL
-    diffuse(start, s.normal, WHOLE, 0.0, false, e_mu, e_rho);
+    diffuse(q, s.normal, WHOLE, 0.0, false, e_mu, e_rho);
 #else
-    diffuse(start, s.normal, WHOLE, 0.0, true, e_mu, e_rho);
+    diffuse(q, s.normal, WHOLE, 0.0, true, e_mu, e_rho);
 #endif
     if (s.roughness >= 0.0) {
         vec3 v = normalize(camera_position - s.position);
         vec3 d = reflect(-v, s.normal);
         float half_angle = specular_half_angle(s.roughness);
-        March m = march(start, d, 2.0 * tan(half_angle), false);
+        March m = march(q, d, 2.0 * tan(half_angle), false);
         vec3 r = environment(d, half_angle);
         c_mu = m.c_mu + m.t_mu * r;
         c_rho = m.c_rho + m.t_rho * r;

@@ -172,8 +172,9 @@ class LightSet:
 
 
 def _above_horizon(size: int) -> Float32[np.ndarray, "n n 1"]:
-    """Share of each texel of an octahedral map that looks up."""
-    return resample_to_octahedral(lambda direction: (direction[..., 2:] >= 0).astype(np.float32), size)
+    """Share of each texel of an octahedral map that looks up; the horizon is as wide as a texel."""
+    texel = np.pi / size
+    return resample_to_octahedral(lambda d: np.clip(0.5 + d[..., 2:] / texel, 0, 1).astype(np.float32), size)
 
 
 def build_lights(lights: documents.Lights) -> LightSet:

@@ -67,7 +67,7 @@ def scene(
         {
             "real": {"geometry": {"model": str(assets / f"{real}.ply")}},
             "objects": [{"asset": str(assets / "box.ply"), "material": material}],
-            "lights": {"manual": [light, ambient]},
+            "lights": {"manual": [light, ambient], "surroundings": "none"},
             "method": {"operator": "paper", "volume_size": VOXELS, "volume_edge_m": 0.8, **method},
         }
     )

@@ -15,7 +15,12 @@ float smith_visibility(float n_dot_l, float n_dot_v, float alpha) {
     return 0.5 / max(lambda_v + lambda_l, 1e-6);
 }
 
-vec3 fresnel_schlick(vec3 f0, float cosine) { return f0 + (1.0 - f0) * pow(clamp(1.0 - cosine, 0.0, 1.0), 5.0); }
+// Without reflection at normal incidence there is no interface, so none at grazing angles either: Lambert's surface.
+bool has_interface(vec3 f0) { return f0 != vec3(0.0); }
+
+vec3 fresnel_schlick(vec3 f0, float cosine) {
+    return has_interface(f0) ? f0 + (1.0 - f0) * pow(clamp(1.0 - cosine, 0.0, 1.0), 5.0) : vec3(0.0);
+}
 
 // Directional albedo of the specular lobe for light from everywhere: scale and offset of f0 (Karis 2014, analytic fit).
 vec3 specular_reflectance(vec3 f0, float roughness, float n_dot_v) {
@@ -24,7 +29,7 @@ vec3 specular_reflectance(vec3 f0, float roughness, float n_dot_v) {
     vec4 r = roughness * c0 + c1;
     float a004 = min(r.x * r.x, exp2(-9.28 * n_dot_v)) * r.x + r.y;
     vec2 ab = vec2(-1.04, 1.04) * a004 + r.zw;
-    return f0 * ab.x + ab.y;
+    return has_interface(f0) ? f0 * ab.x + ab.y : vec3(0.0);
 }
 
 // Diffuse reflection relative to Lambert's, under a rough dielectric interface (Burley 2012). Without an interface

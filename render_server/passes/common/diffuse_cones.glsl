@@ -2,7 +2,6 @@
 // Needs march.glsl, environment.glsl.
 uniform int cone_count;
 
-const float START = 0.5;         // voxels along the normal, out of its own voxel: one-sided voxels do not meet their own surface
 
 // Direction k of `cone_count` about z (realtime-gi, appendix A).
 vec3 cone_direction(int k, float turn) {
@@ -11,9 +10,9 @@ vec3 cone_direction(int k, float turn) {
     return vec3(sqrt(1.0 - z * z) * vec2(cos(phi), sin(phi)), z);
 }
 
-// Without and with the objects, from `start` (voxels) about n; `only_rho` leaves mu out. Cones have equal shares of
+// Without and with the objects, from `q` (voxels) on a surface about n: one-sided voxels do not meet their own surface; `only_rho` leaves mu out. Cones have equal shares of
 // the projected solid angle; each looks at the middle of its share, `width` (0..1) of it wide. `turn` (rad) is about n.
-void diffuse(vec3 start, vec3 n, float width, float turn, bool only_rho, out vec3 e_mu, out vec3 e_rho) {
+void diffuse(vec3 q, vec3 n, float width, float turn, bool only_rho, out vec3 e_mu, out vec3 e_rho) {
     // share pi / K: diameter / distance = 2 tan(half-angle)
     float share = 1.5 * sqrt(2.0 / float(cone_count));
     float half_angle = atan(0.5 * share);
@@ -22,7 +21,7 @@ void diffuse(vec3 start, vec3 n, float width, float turn, bool only_rho, out vec
     e_rho = vec3(0.0);
     for (int k = 0; k < cone_count; ++k) {
         vec3 d = basis * cone_direction(k, turn);
-        March m = march(start, d, width * share, only_rho);
+        March m = march(q, d, width * share, only_rho);
         vec3 r = environment(d, half_angle);
         e_mu += m.c_mu + m.t_mu * r;
         e_rho += m.c_rho + m.t_rho * r;
