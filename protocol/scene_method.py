@@ -57,6 +57,25 @@ class DvctMethod(StrictModel):
         le=4_000_000,
         description="Triangles of the depth mesh; null = 400000 on a GPU, 40000 in software.",
     )
+    voxels: Literal["directional", "isotropic"] = Field(
+        default="directional",
+        description="Of the exact operator: six one-sided directions a voxel, or one for all (as in the paper).",
+    )
+    coverage: Literal["summed", "multiplied"] = Field(
+        default="summed",
+        description="Of the exact operator: what a cone meets adds up to a wall, or blocks front to back.",
+    )
+    radiance: Literal["measured", "predicted"] = Field(
+        default="measured",
+        description="Of the exact operator: real surfaces shine as the camera sees them, or as lights predict.",
+    )
+    far_volume: bool = Field(
+        default=True, description="Of the exact operator: cones meet the real scene beyond the volume too."
+    )
+    reflections: Literal["rays", "cones"] = Field(
+        default="rays",
+        description="Of the exact operator: objects in smooth real surfaces by rays, or by cones.",
+    )
     shadow: Literal["map", "cone"] | None = Field(
         default=None,
         description="Shadows from shadow maps, or from shadow cones; null = map for exact, cone for paper.",

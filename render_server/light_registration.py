@@ -72,10 +72,13 @@ def find_surroundings(
     board = frame.board
     if board is None or board.white_albedo is None or frame.pose is None:
         return None
-    one = replace(scene.lights, environment=np.ones_like(scene.lights.environment))
+    black = replace(scene.lights, environment=np.zeros_like(scene.lights.environment))
+    one = black.with_sky(np.ones(3, np.float32))
     bounce = _bounce(scene, relight)
     known = _samples(frame, scene, bounce, relight)
-    even = _samples(frame, replace(scene, lights=one, lights_version=scene.lights_version + 2), bounce, relight)
+    even = _samples(
+        frame, replace(scene, lights=one, lights_version=scene.lights_version + 2), bounce, relight
+    )
     paper = known.usable & known.paper
     total, per_radiance = known.light + known.bounce, even.light - known.direct
     return surroundings_from_patch(

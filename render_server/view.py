@@ -59,16 +59,19 @@ class CameraView:
 
     @cached_property
     def raster(self) -> tuple[Float64[np.ndarray, "4"], tuple[int, int]]:
-        """Pinhole (fx, fy, cx, cy) and size that cover every ray of the lens; the camera's own without distortion."""
+        """Pinhole (fx, fy, cx, cy) and size that cover every ray of the lens; the camera's own without distortion.
+
+        It is the camera's, grown by whole pixels: where the lens does not bend, a texel's centre lies on each pixel's.
+        """
         matrix = self.camera.matrix
         own = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])
         if not self.camera.has_distortion:
             return own, self.size
         rays = self.camera.rays().reshape(-1, 2)
-        low = np.floor(rays.min(axis=0) * own[:2]) - 1
-        high = np.ceil(rays.max(axis=0) * own[:2]) + 1
+        low = np.floor(rays.min(axis=0) * own[:2] + own[2:]) - 1
+        high = np.ceil(rays.max(axis=0) * own[:2] + own[2:]) + 1
         width, height = (int(v) + 1 for v in high - low)
-        return np.array([own[0], own[1], -low[0], -low[1]]), (width, height)
+        return np.array([*own[:2], *(own[2:] - low)]), (width, height)
 
     @cached_property
     def clip_from_camera(self) -> Float64[np.ndarray, "4 4"]:

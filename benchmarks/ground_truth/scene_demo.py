@@ -73,6 +73,7 @@ def scene_document() -> dict[str, Any]:
         ],
         "lights": {"mode": "manual", "manual": [KEY_LIGHT.document(), AMBIENT.document()]},
         "method": {"name": "dvct", "operator": "exact"},
+        "output": {"antialiasing": True},
     }
 
 

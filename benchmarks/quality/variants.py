@@ -18,7 +18,10 @@ TIMED_VARIANT = "exact"
 
 @dataclass(frozen=True)
 class Variant:
-    """One way to make the picture; `settings` are changes of the scene document's `method` (dvct only)."""
+    """One way to make the picture; `settings` are changes of the scene document (dvct only).
+
+    A key names a setting of `method`, or one of `lights` or `output` with that before a dot.
+    """
 
     name: str
     sentence: str
@@ -30,7 +33,12 @@ class Variant:
         if self.kind == "none":
             return document.replaced(method=NoneMethod())
         size = {} if volume_size is None else {"volume_size": volume_size}
-        return document.replaced(method=document.method.replaced(**{**size, **self.settings}))
+        parts: dict[str, dict[str, Any]] = {"method": size, "lights": {}, "output": {}}
+        for key, value in self.settings.items():
+            part, _, name = key.rpartition(".")
+            parts[part or "method"][name] = value
+        changed = {part: getattr(document, part).replaced(**changes) for part, changes in parts.items()}
+        return document.replaced(**changed)
 
 
 FIXED: dict[str, Variant] = {
@@ -50,8 +58,21 @@ PAPER_IN_SOFTWARE: dict[str, Any] = {
     "composition": "additive",
     "cone_scale": 4,
     "volume_size": 64,
+    "lights.surroundings": "none",
+    "output.antialiasing": False,
 }
 """Everything that a later row switches, so that a chain means the same on every machine."""
+BARE_EXACT: dict[str, Any] = {
+    "operator": "exact",
+    "cone_count": 9,
+    "voxels": "isotropic",
+    "coverage": "multiplied",
+    "radiance": "predicted",
+    "far_volume": False,
+    "bounces": 0,
+    "reflections": "cones",
+}
+"""Two sets of voxels marched, everything else as in the paper as far as it can be."""
 
 ABLATION_STEPS: tuple[tuple[str, str, dict[str, Any]], ...] = (
     # name, sentence, what changes against the row above
@@ -62,8 +83,16 @@ ABLATION_STEPS: tuple[tuple[str, str, dict[str, Any]], ...] = (
     ),
     ("+ shadow maps", "shadows from maps in place of shadow cones", {"shadow": "map"}),
     ("+ ratio", "the change multiplies the picture in place of being added", {"composition": "ratio"}),
-    ("+ exact", "both sets of voxels marched, light from the camera", {"operator": "exact", "cone_count": 9}),
+    ("+ two sets", "voxels without and with objects, both marched", BARE_EXACT),
+    ("+ one-sided voxels", "six directions a voxel in place of one", {"voxels": "directional"}),
+    ("+ summed coverage", "a shell of voxels is a wall", {"coverage": "summed"}),
     ("+ 16 cones", "16 equal cones in place of 9", {"cone_count": 16}),
+    ("+ measured radiance", "real surfaces shine as the camera sees them", {"radiance": "measured"}),
+    ("+ far volume", "the real scene beyond the volume, coarse", {"far_volume": True}),
+    ("+ surroundings", "light of what is out of sight", {"lights.surroundings": "auto"}),
+    ("+ bounce", "light gathered once more from voxel to voxel", {"bounces": 1}),
+    ("+ rays", "objects in smooth real surfaces by rays", {"reflections": "rays"}),
+    ("+ antialiasing", "coverage of pixels at the objects' edges", {"output.antialiasing": True}),
     ("+ every pixel", "cones traced at every pixel", {"cone_scale": 1}),
     ("+ finer voxels", "128 voxels an edge", {"volume_size": 128}),
 )

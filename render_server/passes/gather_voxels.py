@@ -12,18 +12,16 @@ from render_server.passes.voxel_store import VoxelStore
 
 SHADER = Path(__file__).with_name("gather_voxels.comp.glsl")
 GATHER_CONES = 4  # as good as 16 in pictures: the cones that see gathered light average over many groups
-
-
 SOFTWARE_WALKERS = 256  # lists are short here: the last round of more walkers would mostly be idle
 
 
 class GatherVoxelsPass:
-    """A few cones a group; lights, the far pyramid and the support must be bound."""
+    """A few cones a group; lights, the far pyramid and the support must be bound. `defines`: those of march.glsl."""
 
-    def __init__(self, gpu: GpuContext) -> None:
+    def __init__(self, gpu: GpuContext, defines: dict[str, int]) -> None:
         self._threads = SOFTWARE_WALKERS if gpu.is_software else list_threads(gpu)
-        self._one = ComputeProgram(gpu, SHADER)
-        self._dual = ComputeProgram(gpu, SHADER, {"DUAL": 1})
+        self._one = ComputeProgram(gpu, SHADER, defines)
+        self._dual = ComputeProgram(gpu, SHADER, {"DUAL": 1, **defines})
 
     def gather_unseen(
         self, store: VoxelStore, groups: SurfelGroups, mu: Pyramid, uniforms: dict[str, Any]

@@ -25,6 +25,7 @@ class LightTable:
         self.lights: list[Light] = []
         self.real_views: list[LightView] = []
         self.virtual_views: list[LightView] = []
+        self.real_records = b""  # of the real views, as shaders read them: changes when these do
         self.real_atlas = ShadowMapAtlas(gpu, 1, tile_size)
         self.virtual_atlas = ShadowMapAtlas(gpu, 1, tile_size)
         self._light_buffer = gpu.ctx.buffer(EMPTY, dynamic=True)
@@ -87,16 +88,17 @@ class LightTable:
             records += pack_light(light, ranges)
             first_real += len(real_part)
             first_virtual += len(virtual_part)
-        views = [
-            pack_view(view, tile, tile_columns(len(group)), self.tile_size)
-            for group in (self.real_views, self.virtual_views)
-            for tile, view in enumerate(group)
-        ]
-        packed = np.array(views, np.float32).tobytes()
+        self.real_records = self._packed(self.real_views)
+        packed = self.real_records + self._packed(self.virtual_views)
         self._light_buffer.orphan(max(len(records), 16))
         self._view_buffer.orphan(max(len(packed), 16))
         self._light_buffer.write(records or EMPTY[:16])
         self._view_buffer.write(packed or EMPTY[:16])
+
+    def _packed(self, views: list[LightView]) -> bytes:
+        columns = tile_columns(len(views))
+        records = [pack_view(view, tile, columns, self.tile_size) for tile, view in enumerate(views)]
+        return np.array(records, np.float32).tobytes()
 
     @property
     def first_virtual_view(self) -> int:

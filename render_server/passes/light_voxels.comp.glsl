@@ -41,6 +41,13 @@ const float LIFT = 0.1;       // voxels, so that a curved surface does not shado
 const float LIFT = 0.0;
 #endif
 
+#ifdef REAL
+// Without the objects, whose maps may be those of an earlier frame.
+vec2 light_share(Light light, vec3 p, vec3 n) { return vec2(real_visibility(light, p, n, bias_real)); }
+#else
+vec2 light_share(Light light, vec3 p, vec3 n) { return visibility(light, p, n, bias_real, bias_virtual); }
+#endif
+
 void irradiances(Surfel s, vec3 n, uint own, out vec3 mu, out vec3 rho) {
     vec3 p = s.position_area.xyz + n * voxel_edge * LIFT;
     mu = rho = vec3(0.0);
@@ -49,7 +56,7 @@ void irradiances(Surfel s, vec3 n, uint own, out vec3 mu, out vec3 rho) {
         vec3 across = light_at(lights[i], p, n, to_light, radius);
         float cosine = dot(n, to_light);
         if (cosine <= 0.0) continue;
-        vec2 v = visibility(lights[i], p, n, bias_real, bias_virtual);
+        vec2 v = light_share(lights[i], p, n);
         mu += across * cosine * v.x;
         rho += across * cosine * v.y;
     }

@@ -25,9 +25,12 @@ ROW = 256  # workgroups a row: OpenGL promises no more than 65535
 
 
 class MirrorObjectsPass:
-    """`reflection` (RGBA16F): radiance of the objects times the share of the lobe that they fill, and that share."""
+    """`reflection` (RGBA16F): radiance of the objects times the share of the lobe that they fill, and that share.
 
-    def __init__(self, gpu: GpuContext, grid: SamplingGrid) -> None:
+    `defines`: those of march.glsl.
+    """
+
+    def __init__(self, gpu: GpuContext, grid: SamplingGrid, defines: dict[str, int]) -> None:
         self._grid = grid
         self.objects = ObjectTree(gpu)
         self.reflection = texture_2d(gpu, grid.picture_size, 4, "f2")
@@ -40,7 +43,7 @@ class MirrorObjectsPass:
         self._pixels = gpu.ctx.buffer(reserve=4 + 4 * grid.picture_size[0] * grid.picture_size[1])
         self._texels = gpu.ctx.buffer(reserve=4 + 4 * grid.size[0] * grid.size[1])
         self._select, self._hits, self._gather, self._trace, self._smooth = (
-            ComputeProgram(gpu, FOLDER / f"mirror_{name}.comp.glsl", DEFINES)
+            ComputeProgram(gpu, FOLDER / f"mirror_{name}.comp.glsl", {**DEFINES, **defines})
             for name in ("select", "hits", "gather", "objects", "smooth")
         )
 

@@ -1,4 +1,4 @@
-// Albedo of the real surface at each texel of a light's map that lies in the volume, from the picture where the
+// Albedo of the real surface at each texel of a light's map that has points in the volume, from the picture where the
 // camera looks at it: albedo = pi B_lin / E_mu ([P2] eq. 1, with visibility and ambient light).
 #include "passes/common/light_rays.glsl"
 #include "passes/common/environment.glsl"
@@ -27,14 +27,21 @@ vec3 irradiance(vec3 p, vec3 n) {
     return e;
 }
 
+// Whether a ball of radius `around` (m) reaches into the volume.
+bool reaches_volume(vec3 p, float around) {
+    vec3 q = volume_coordinate(p);
+    return distance(q, clamp(q, vec3(0.0), vec3(float(volume_size)))) <= around / voxel_edge;
+}
+
 void main() {
     LightView view = light_views[view_index];
     if (any(greaterThanEqual(vec2(gl_GlobalInvocationID.xy), view.tile.zz))) return;
     ivec2 texel = ivec2(gl_GlobalInvocationID.xy) + ivec2(view.tile.xy);
     float depth = first_depth(real_light_depth, view, texel);
     if (depth == NOTHING) return;
-    vec3 p = ray_point(view, texel_lateral(view, texel), depth);
-    if (!inside_volume(volume_coordinate(p))) return;
+    vec2 s = texel_lateral(view, texel);
+    vec3 p = ray_point(view, s, depth);
+    if (!reaches_volume(p, hit_spread(view, s, depth))) return;
     vec3 albedo = unseen_albedo;
     if (camera_sees(p)) {
         vec3 n = normalize(texelFetch(real_light_normal, texel, 0).xyz);

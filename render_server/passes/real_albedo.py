@@ -10,7 +10,7 @@ from render_server.passes.light_table import LightTable
 
 
 class RealAlbedoPass:
-    """RGBA16F atlas beside the real depth maps; only texels inside the volume are filled."""
+    """RGBA16F atlas beside the real depth maps; filled are the texels of which a part may lie inside the volume."""
 
     def __init__(self, gpu: GpuContext) -> None:
         self._gpu = gpu

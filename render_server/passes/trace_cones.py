@@ -31,12 +31,15 @@ class ConeFields:
 
 
 class TraceConesPass:
-    """Dual march on real surfaces, rho march on virtual ones; lights, geometry and support must be bound."""
+    """Dual march on real surfaces, rho march on virtual ones; lights, geometry and support must be bound.
 
-    def __init__(self, gpu: GpuContext) -> None:
+    `defines`: those of march.glsl.
+    """
+
+    def __init__(self, gpu: GpuContext, defines: dict[str, int]) -> None:
         self._gpu = gpu
-        self._real = ComputeProgram(gpu, SHADER, {"REAL": 1})
-        self._virtual = ComputeProgram(gpu, SHADER)
+        self._real = ComputeProgram(gpu, SHADER, {"REAL": 1, **defines})
+        self._virtual = ComputeProgram(gpu, SHADER, defines)
         self._select = ComputeProgram(gpu, SELECT, {"REAL": 1})
         self._texels = gpu.ctx.buffer(reserve=4)
 

@@ -21,6 +21,15 @@ class ResolvedDvct:
     triangle_budget: int
 
 
+def march_defines(settings: DvctMethod) -> dict[str, int]:
+    """What march.glsl is compiled with."""
+    defines = {
+        "ISOTROPIC_VOXELS": settings.voxels == "isotropic",
+        "MULTIPLIED_COVERAGE": settings.coverage == "multiplied",
+    }
+    return {name: 1 for name, wanted in defines.items() if wanted}
+
+
 def resolve_dvct(settings: DvctMethod, *, software: bool) -> ResolvedDvct:
     """Take the document's values, or the machine's defaults where it says null."""
     column = 0 if software else 1

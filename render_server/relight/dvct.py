@@ -10,7 +10,7 @@ from render_server.gpu.context import GpuContext
 from render_server.passes.mirror_objects import MirrorObjectsPass
 from render_server.passes.trace_cones import TraceConesPass
 from render_server.passes.volume import Pyramid, VolumePlacement
-from render_server.relight.defaults import ResolvedDvct
+from render_server.relight.defaults import ResolvedDvct, march_defines
 from render_server.relight.dvct_base import DvctBase
 from render_server.relight.frame import RelightInput
 from render_server.relight.voxel_scene import DIRECTIONS, VoxelScene
@@ -25,11 +25,12 @@ class DvctExact(DvctBase):
         self, gpu: GpuContext, settings: DvctMethod, resolved: ResolvedDvct, size: tuple[int, int]
     ) -> None:
         super().__init__(gpu, settings, resolved, size)
-        self._tracing = TraceConesPass(gpu)
-        self._make_mirror = partial(MirrorObjectsPass, gpu, self._grid)
+        defines = march_defines(settings)
+        self._tracing = TraceConesPass(gpu, defines)
+        self._make_mirror = partial(MirrorObjectsPass, gpu, self._grid, defines)
         self._mirror: MirrorObjectsPass | None = None
         placement = VolumePlacement((0.0, 0.0, 0.0), 1.0, resolved.volume_size)
-        self._voxels = VoxelScene(gpu, placement, settings.bounces)
+        self._voxels = VoxelScene(gpu, placement, settings)
 
     def _rebuild_real(
         self, frame: RelightInput, placement: VolumePlacement, uniforms: dict[str, Any]
@@ -47,7 +48,7 @@ class DvctExact(DvctBase):
             self._tracing.trace_virtual(self._cones, self._grid, voxels.mu, voxels.rho, own)
 
     def _reflect(self, frame: RelightInput, uniforms: dict[str, Any]) -> moderngl.Texture | None:
-        if not frame.surface_uniforms["specular_surfaces"]:
+        if self._settings.reflections == "cones" or not frame.surface_uniforms["specular_surfaces"]:
             if self._mirror is not None:
                 self._mirror.release()
             self._mirror = None

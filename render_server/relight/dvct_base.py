@@ -45,6 +45,7 @@ class DvctBase(ABC):
         self._surface = VirtualSurfacePass(gpu, size)
         self._change = ChangeRatioPass(gpu, self._grid.size)
         self._reflection: moderngl.Texture | None = None
+        self._placed_key: object = None
         self._real_key: object = None
         self._object_key: object = None
         self._virtual_map_key: object = None
@@ -76,11 +77,13 @@ class DvctBase(ABC):
     def relight(self, frame: RelightInput) -> RelitLayers:
         """Compute everything that composition needs."""
         placement = self._placement(frame)
-        real_key = (frame.real.version, frame.lights_version, frame.everywhere, placement)
+        scene_key = (frame.real.version, frame.lights_version, frame.everywhere, placement)
         virtual_map_key = (frame.lights_version, frame.virtual.version)
-        object_key = (real_key, frame.virtual.version)
-        if object_key != self._object_key:
+        if (scene_key, frame.virtual.version) != self._placed_key:
             self._place_lights(frame)
+            self._placed_key = (scene_key, frame.virtual.version)
+        real_key = (scene_key, self.table.real_records)  # objects that move take the real views with them
+        object_key = (real_key, frame.virtual.version)
         uniforms = self._uniforms(frame, placement)
         if real_key != self._real_key:
             self._draw_real_maps(frame)

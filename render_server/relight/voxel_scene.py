@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from protocol.scene_method import DvctMethod
 from render_server.gpu.context import GpuContext
 from render_server.passes.clear_voxels import ClearVoxelsPass
 from render_server.passes.filter_voxels import FilterVoxelsPass
@@ -15,6 +16,7 @@ from render_server.passes.resolve_voxels import ResolveVoxelsPass
 from render_server.passes.volume import Pyramid, VolumePlacement, place_volume
 from render_server.passes.voxel_store import VoxelStore
 from render_server.passes.voxelize import VoxelizePass
+from render_server.relight.defaults import march_defines
 from render_server.relight.frame import RelightInput
 from render_server.relight.voxel_sets import VoxelSets, bind_lighting, lighting_uniforms
 
@@ -27,23 +29,24 @@ FAR_MARGIN = 1.05
 class FarScene:
     """The real scene beyond the volume: a coarse mu pyramid around everything that the camera sees.
 
-    What leaves the volume meets the radiance that the camera measured there, not the environment.
+    What leaves the volume meets the radiance that the camera measured there, not the environment; unless the
+    volume is not `is_used`.
     """
 
-    def __init__(self, gpu: GpuContext) -> None:
+    def __init__(self, gpu: GpuContext, *, is_used: bool) -> None:
+        self._is_used = is_used
         self.pyramid = Pyramid(gpu, FAR_SIZE, DIRECTIONS)
         self._store = VoxelStore(gpu, FAR_SIZE)
         self._placement = VolumePlacement((0.0, 0.0, 0.0), 1.0, FAR_SIZE)
-        self._key: object = None
+        self._version: int | None = None
+        self._lit_key: object = None
         self._stale = False
 
     def voxelize(self, frame: RelightInput, voxelize: VoxelizePass, clear: ClearVoxelsPass) -> None:
         """Voxelise the whole real scene, unless it stood still."""
-        key = (frame.real.version, frame.lights_version)
-        self._stale = key != self._key
-        if not self._stale:
+        if not self._is_used or frame.real.version == self._version:
             return
-        self._key = key
+        self._version = frame.real.version
         clear.run(self._store, [self.pyramid], self._placement)
         low, high = frame.real.bounds
         edge = min(float(np.max(high - low)), FAR_EDGE_M) * FAR_MARGIN
@@ -51,9 +54,15 @@ class FarScene:
         coarse = frame.real.coarse_corners
         voxelize.run(self._store, frame.real.corners if coarse is None else coarse, self._placement)
 
-    def light(self, light: LightVoxelsPass, lighting: dict[str, Any]) -> None:
-        """Give its voxels the radiance that the camera measured."""
+    def light(
+        self, frame: RelightInput, table: LightTable, light: LightVoxelsPass, lighting: dict[str, Any]
+    ) -> None:
+        """Give its voxels the radiance that the camera measured, unless they and the light maps are as before."""
+        key = (frame.real.version, frame.lights_version, table.real_records)
+        self._stale = self._is_used and key != self._lit_key
         if self._stale:
+            self._lit_key = key
+            self._store.sums.clear()
             light.light_real(self._store, {**lighting, **self._placement.uniforms()})
 
     def filter(self, resolve: ResolveVoxelsPass, filter_pass: FilterVoxelsPass) -> None:
@@ -67,7 +76,7 @@ class FarScene:
         return {
             "far_origin": self._placement.origin,
             "far_edge": self._placement.voxel_edge,
-            "far_size": self._placement.size,
+            "far_size": self._placement.size if self._is_used else 0,
             "far_levels": self._placement.levels,
         }
 
@@ -80,20 +89,21 @@ class FarScene:
 class VoxelScene(VoxelSets):
     """Two directional pyramids over one placement of the volume.
 
-    Light is gathered `bounces` times from voxel to voxel, beyond direct and unoccluded ambient light.
+    Light is gathered `settings.bounces` times from voxel to voxel, beyond direct and unoccluded ambient light.
     """
 
-    def __init__(self, gpu: GpuContext, placement: VolumePlacement, bounces: int) -> None:
+    def __init__(self, gpu: GpuContext, placement: VolumePlacement, settings: DvctMethod) -> None:
         super().__init__(gpu, placement, DIRECTIONS)
         self.mu = Pyramid(gpu, placement.size, DIRECTIONS)
         self.rho = Pyramid(gpu, placement.size, DIRECTIONS)
-        self.far = FarScene(gpu)
-        self._bounces = bounces
+        self.far = FarScene(gpu, is_used=settings.far_volume)
+        self._bounces = settings.bounces
+        self._measured = settings.radiance == "measured"
         self._real_groups = SurfelGroups(gpu, placement.size)
         self._virtual_groups = SurfelGroups(gpu, placement.size)
         self._light = LightVoxelsPass(gpu)
         self._group = GroupSurfelsPass(gpu)
-        self._gather = GatherVoxelsPass(gpu)
+        self._gather = GatherVoxelsPass(gpu, march_defines(settings))
         self._resolve = ResolveVoxelsPass(gpu)
         self._filter = FilterVoxelsPass(gpu)
 
@@ -108,10 +118,10 @@ class VoxelScene(VoxelSets):
         with timers.measure("light voxels"):
             frame.picture.build_levels()
             bind_lighting(frame, table)
-            lighting = lighting_uniforms(frame, uniforms)
+            lighting = lighting_uniforms(frame, uniforms, measured=self._measured)
             self._real_groups.start(self._real)
             self._light.light_real(self._real, lighting, self._real_groups)
-            self.far.light(self._light, lighting)
+            self.far.light(frame, table, self._light, lighting)
         with timers.measure("filter"):
             self.far.filter(self._resolve, self._filter)
             self._filter_mu()
@@ -141,7 +151,7 @@ class VoxelScene(VoxelSets):
             moved = self._voxelize_virtual(frame.virtual, [self.rho])
         with timers.measure("light voxels"):
             bind_lighting(frame, table)
-            lighting = lighting_uniforms(frame, uniforms)
+            lighting = lighting_uniforms(frame, uniforms, measured=self._measured)
             self._light.start_support(self.placement.voxel_bounds(np.stack(frame.virtual.bounds)))
             if moved:
                 self._virtual_groups.start(self._virtual)

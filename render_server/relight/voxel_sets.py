@@ -76,14 +76,16 @@ def bind_lighting(frame: RelightInput, table: LightTable) -> None:
     bind_picture(frame.picture.linear, frame.real_surface.position)
 
 
-def lighting_uniforms(frame: RelightInput, uniforms: dict[str, Any]) -> dict[str, Any]:
-    """Uniforms of the passes that light voxels."""
+def lighting_uniforms(
+    frame: RelightInput, uniforms: dict[str, Any], *, measured: bool = True
+) -> dict[str, Any]:
+    """Uniforms of the passes that light voxels; without `measured`, no surface counts as seen by the camera."""
     bias = 3.0 * frame.noise_sigma * frame.typical_depth**2
     own = {
         "shadow_samples": SURFEL_SHADOW_SAMPLES,
         "bias_real": bias,
         "bias_virtual": bias,
-        "depth_tolerance": DEPTH_TOLERANCE,
+        "depth_tolerance": DEPTH_TOLERANCE if measured else -1.0,
         "unseen_albedo": (MEAN_ALBEDO,) * 3,
         "picture_lod": 2.0,
     }

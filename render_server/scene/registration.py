@@ -23,7 +23,10 @@ LEAST_IRRADIANCE = 1e-4
 LEAST_OPENING = 0.05  # share of the hemisphere that must be open: below, noise of the paper decides
 GREATEST_ALBEDO = 0.95
 PERCENTILE = 99.0
-INSETS_PX = (2, 1)  # from the paper's edges, where lens and sampling mix it with ink; the second if little is left
+INSETS_PX = (
+    2,
+    1,
+)  # from the paper's edges, where lens and sampling mix it with ink; the second if little is left
 EDGE_POINTS = 8
 
 
@@ -91,7 +94,7 @@ def surroundings_from_patch(
     if np.count_nonzero(usable) < LEAST_PIXELS:
         return None
     found = np.median(missing[usable] / open_sky[usable], axis=0)
-    return np.maximum(found, 0.0).astype(np.float32)
+    return np.asarray(np.maximum(found, 0.0), np.float32)
 
 
 def _without_outliers(ratios: Float64[np.ndarray, "k 3"]) -> Bool[np.ndarray, " k"]:

@@ -166,7 +166,8 @@ def test_exact_delta_is_the_difference_of_two_full_solutions(
     gpu: GpuContext, stage: Stage, shape: str
 ) -> None:
     """E_rho of an inserted object is, to the last bit, E_mu of a renderer to which the object is part of the given
-    model, where both know the same radiance of every surface (bounces would change the room's). (The second one's own object is a speck inside it.)"""
+    model, where both know the same radiance of every surface (bounces would change the room's). (The second one's own
+    object is a speck inside it.)"""
     mesh = {"cube": cube(0.12), "ball": ball(0.07, (0.02, 0.03, 0.09))}[shape]
     speck = shifted(trimesh.creation.box((0.002,) * 3), *mesh.bounds.mean(axis=0))
     room = floor(1.0) + shifted(trimesh.creation.box((0.02, 1, 0.4)), -0.2, 0, 0.2)

@@ -67,15 +67,22 @@ Hit first_hit(sampler2D map, int first, int count, vec3 p) {
     return hit;
 }
 
-// Where the ray itself meets the texel's surface: the plane through the texel's centre with its normal, but not
-// farther off than two texels (a normal across the ray says nothing).
+const float HIT_REACH = 2.0;   // texels along the ray from the depth of a texel's centre: a normal across the ray says nothing
+
+// How far the hit points of a texel lie from its centre at most, m: half its diagonal aside, HIT_REACH along the ray.
+float hit_spread(LightView view, vec2 s, float depth) {
+    float slant = view.range.z > 0.5 ? 1.0 : length(vec3(s, 1.0));
+    return (HIT_REACH + 1.0) * texel_side(view, depth) * slant;
+}
+
+// Where the ray itself meets the texel's surface: the plane through the texel's centre with its normal.
 vec3 hit_point(Hit hit, vec3 normal) {
     vec3 centre = ray_point(hit.view, texel_lateral(hit.view, hit.texel), hit.depth);
     vec3 a = ray_point(hit.view, hit.s, 0.0);
     vec3 b = ray_point(hit.view, hit.s, 1.0);
     float across = dot(normal, b - a);
     if (abs(across) < 1e-3) return centre;
-    float reach = 2.0 * texel_side(hit.view, hit.depth);
+    float reach = HIT_REACH * texel_side(hit.view, hit.depth);
     float depth = clamp(dot(normal, centre - a) / across, hit.depth - reach, hit.depth + reach);
     return ray_point(hit.view, hit.s, depth);
 }
