@@ -10,6 +10,8 @@ from jaxtyping import Bool, Float32, Float64
 from protocol.frames import ViewFrame, decode_lut
 from render_server.passes.composite import RelitLayers
 from render_server.relight.frame import RelightInput
+from render_server.scene.environment import LUMINANCE
+from render_server.scene.octahedral import irradiance, octahedral_uv, resample_to_octahedral
 from render_server.scene.registration import (
     Registration,
     paper_pixels,
@@ -62,9 +64,9 @@ def register_lights(frame: ViewFrame, scene: RelightInput, relight: Relight) -> 
 
 
 def find_surroundings(
-    frame: ViewFrame, scene: RelightInput, relight: Relight
+    frame: ViewFrame, scene: RelightInput, shape: Float32[np.ndarray, "n n 1"], relight: Relight
 ) -> Float32[np.ndarray, "3"] | None:
-    """Even radiance of what neither the camera nor the lights show; None if the board's paper cannot tell.
+    """Radiance, times `shape`, of what neither the camera nor the lights show; None if the paper cannot tell.
 
     Walls beside and behind the camera reflect light too. On paper of known albedo the irradiance is known from the
     picture; what the lights and the visible scene leave unexplained comes from there.
@@ -73,7 +75,7 @@ def find_surroundings(
     if board is None or board.white_albedo is None or frame.pose is None:
         return None
     black = replace(scene.lights, environment=np.zeros_like(scene.lights.environment))
-    one = black.with_sky(np.ones(3, np.float32))
+    one = black.with_sky(np.ones(3, np.float32), shape)
     bounce = _bounce(scene, relight)
     known = _samples(frame, scene, bounce, relight)
     even = _samples(
@@ -98,6 +100,32 @@ def ground_radiance(frame: ViewFrame, scene: RelightInput) -> Float32[np.ndarray
         return None
     coded = decode_lut(frame.response)[frame.color[ground], np.arange(3)]
     return np.asarray(coded.mean(axis=0) / frame.exposure_scale, np.float32)
+
+
+def surroundings_shape(frame: ViewFrame, scene: RelightInput) -> Float32[np.ndarray, "n n 1"]:
+    """How the light of what is out of sight is spread over an octahedral map: 1 in its strongest direction.
+
+    Unseen walls adjoin seen ones, so it is the light that the seen surfaces above the horizon, as the objects see
+    them, would throw on a surface facing each direction: as smooth as irradiance. Even where none is seen.
+    """
+    size = len(scene.lights.environment)
+    position = _read(scene.real_surface.position)
+    low, high = scene.virtual.bounds
+    way = position[..., :3] - (low + high) / 2
+    seen = (position[..., 3] > 0) & (way[..., 2] > 0)
+    luminance = decode_lut(frame.response)[frame.color[seen], np.arange(3)] @ LUMINANCE
+    texel = np.minimum((octahedral_uv(way[seen]) * size).astype(int), size - 1)
+    flat = texel[:, 1] * size + texel[:, 0]
+    count = np.bincount(flat, minlength=size * size)
+    mean = np.bincount(flat, luminance, size * size) / np.maximum(count, 1)
+    seen_radiance = np.repeat(mean.reshape(size, size, 1), 3, axis=2).astype(np.float32)
+
+    def thrown(direction: Float32[np.ndarray, "n m 3"]) -> Float32[np.ndarray, "n m 1"]:
+        light = irradiance(seen_radiance, direction.reshape(-1, 3))[:, 0]
+        return np.asarray(light.reshape(*direction.shape[:2], 1), np.float32)
+
+    shape = resample_to_octahedral(thrown, size, supersampling=1)
+    return shape / shape.max() if shape.max() > 0 else np.ones_like(shape)
 
 
 def _bounce(scene: RelightInput, relight: Relight) -> Float64[np.ndarray, "h w 3"]:

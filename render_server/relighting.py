@@ -11,7 +11,12 @@ from protocol.scene_method import DvctMethod, NoneMethod
 from protocol.scene_objects import Material
 from render_server.gpu.context import GpuContext
 from render_server.gpu.timers import PassTimers
-from render_server.light_registration import find_surroundings, ground_radiance, register_lights
+from render_server.light_registration import (
+    find_surroundings,
+    ground_radiance,
+    register_lights,
+    surroundings_shape,
+)
 from render_server.passes.composite import RelitLayers
 from render_server.passes.volume import memory_statement
 from render_server.picture_resources import PictureResources
@@ -196,12 +201,13 @@ class Relighting:
         if ground is not None:
             self._lights = self._lights.with_ground(ground)
         scene = replace(scene, lights=self._lights, lights_version=self._lights_version + 1)
-        found = find_surroundings(frame, scene, method.relight)
+        shape = surroundings_shape(frame, scene)
+        found = find_surroundings(frame, scene, shape, method.relight)
         self._lights_version += 4  # the versions between were used to find it
         if found is not None:
-            self._lights = self._lights.with_sky(found)
+            self._lights = self._lights.with_sky(found, shape)
             radiance = ", ".join(f"{value:.3g}" for value in found)
-            self._say(f"surroundings out of sight: radiance ({radiance}), found on the board's paper")
+            self._say(f"surroundings out of sight: radiance up to ({radiance}), found on the board's paper")
         return replace(scene, lights=self._lights, lights_version=self._lights_version)
 
     def _sample_distance(self, view: CameraView) -> float:

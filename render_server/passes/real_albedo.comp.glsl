@@ -27,10 +27,12 @@ vec3 irradiance(vec3 p, vec3 n) {
     return e;
 }
 
-// Whether a ball of radius `around` (m) reaches into the volume.
+const float SNAP_REACH = 0.5;   // voxels: split_inject looks for a touched voxel so near (SNAP along each axis)
+
+// Whether light that meets a surface within `around` (m) of p may go into a voxel of the volume.
 bool reaches_volume(vec3 p, float around) {
     vec3 q = volume_coordinate(p);
-    return distance(q, clamp(q, vec3(0.0), vec3(float(volume_size)))) <= around / voxel_edge;
+    return distance(q, clamp(q, vec3(0.0), vec3(float(volume_size)))) <= around / voxel_edge + SNAP_REACH;
 }
 
 void main() {

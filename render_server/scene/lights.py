@@ -161,9 +161,10 @@ class LightSet:
         above = _above_horizon(len(self.environment))
         return replace(self, environment=above * self.environment + (1 - above) * radiance)
 
-    def with_sky(self, radiance: Float32[np.ndarray, "3"]) -> "LightSet":
-        """Return the set with more radiance from everywhere above the horizon."""
-        return replace(self, environment=self.environment + _above_horizon(len(self.environment)) * radiance)
+    def with_sky(self, radiance: Float32[np.ndarray, "3"], shape: Float32[np.ndarray, "n n 1"]) -> "LightSet":
+        """Return the set with more radiance above the horizon: `shape` (of the environment's size) times this."""
+        above = _above_horizon(len(self.environment))
+        return replace(self, environment=self.environment + above * shape * radiance)
 
     def describe(self) -> list[dict[str, Any]]:
         """Return plain values of all lights and of the environment's mean, for messages and logs."""
