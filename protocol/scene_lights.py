@@ -158,9 +158,9 @@ class Lights(StrictModel):
     )
     surroundings: Literal["auto", "none"] = Field(
         default="auto",
-        description="Mode manual: light of what neither the camera nor the lights show. Below the horizon the mean of "
-        "the ground; above, more towards what is seen there, as strong as the board's paper tells where board.yaml "
-        "gives its white_albedo. Or none.",
+        description="Mode manual: light of what neither the camera nor the lights show. Below the horizon the mean "
+        "of the ground; above, more towards what is seen there, as strong as the board's paper tells where "
+        "board.yaml gives its white_albedo. Or none.",
     )
 
     @model_validator(mode="after")

@@ -65,7 +65,7 @@ def quality(
     volume: Annotated[
         int | None, typer.Option(min=32, max=512, help="Voxels an edge; default as the machine can.")
     ] = None,
-    spp: Annotated[int, typer.Option(min=1, help="Light paths a pixel of the truth; an even number.")] = 512,
+    spp: Annotated[int, typer.Option(min=1, help="Light paths a pixel of the truth; a multiple of 8.")] = 512,
     out: Annotated[Path, typer.Option(help="Folder for the report.")] = Path("quality"),
     device: Annotated[
         int | None, typer.Option(min=0, help="EGL device; `deltalight doctor` lists them.")

@@ -11,6 +11,9 @@ from protocol.frames import ViewFrame
 from protocol.scene import SceneDocument
 from protocol.scene_objects import Pose, Surface
 from render_server.gpu.context import GpuContext
+from render_server.passes.volume import VolumePlacement
+from render_server.relight.dvct import DvctExact
+from render_server.relight.dvct_paper import DvctPaper
 from render_server.renderer import CompositeFrame, SceneRenderer
 from tests.render_server.scenes import (
     Stage,
@@ -76,9 +79,9 @@ def glossy(region: dict[str, Any], roughness: float) -> Surface:
 
 
 def moved(document: SceneDocument, *by: float) -> SceneDocument:
-    """The same with the first object moved by so much."""
-    first, *others = document.objects
-    return document.replaced(objects=(first.model_copy(update={"pose": Pose(translation_m=by)}), *others))
+    """The same with all objects moved by so much."""
+    pose = Pose(translation_m=by)
+    return document.replaced(objects=tuple(one.model_copy(update={"pose": pose}) for one in document.objects))
 
 
 def fresh(gpu: GpuContext, document: SceneDocument, view: ViewFrame) -> CompositeFrame:
@@ -86,6 +89,12 @@ def fresh(gpu: GpuContext, document: SceneDocument, view: ViewFrame) -> Composit
     found = renderer.render(view)
     renderer.release()
     return found
+
+
+def placement_of(renderer: SceneRenderer) -> VolumePlacement:
+    method = renderer._relighting._method
+    assert isinstance(method, DvctExact | DvctPaper)
+    return (method._voxels if isinstance(method, DvctExact) else method.volume).placement
 
 
 def differing_pixels(one: CompositeFrame, other: CompositeFrame) -> int:
@@ -112,12 +121,15 @@ def test_a_camera_that_steps_aside_and_back(
 
 @pytest.mark.parametrize("operator", ["exact", "paper"])
 def test_an_object_that_moves_less_than_a_voxel(gpu: GpuContext, stage: Stage, operator: str) -> None:
-    """The volume stays where it is, but what receives the objects' shadows does not."""
-    start = room(stage, has_model=True, operator=operator)
-    end = moved(start, 0.003, 0.002, 0.0)
+    """The volume stays where it is, but what may receive the objects' shadows does not, nor the light maps around it."""
+    start = room(stage, has_model=True, operator=operator, volume_edge_m=0.5)
+    end = moved(start, 0.004, 0.003, 0.0)
     renderer = SceneRenderer(gpu, start, with_linear=True)
-    renderer.render(seen(HERE))
-    renderer.set_scene(end)
-    found = renderer.render(seen(HERE))
+    placements = []
+    for document in (start, end):
+        renderer.set_scene(document)
+        found = renderer.render(seen(HERE))
+        placements.append(placement_of(renderer))
     renderer.release()
+    assert placements[0] == placements[1]
     assert differing_pixels(found, fresh(gpu, end, seen(HERE))) == 0
