@@ -61,7 +61,7 @@ class CameraView:
     def raster(self) -> tuple[Float64[np.ndarray, "4"], tuple[int, int]]:
         """Pinhole (fx, fy, cx, cy) and size that cover every ray of the lens; the camera's own without distortion.
 
-        It is the camera's, grown by whole pixels: where the lens does not bend, a texel's centre lies on each pixel's.
+        It is the camera's, grown by whole pixels: where the lens does not bend, each pixel's centre is a texel's.
         """
         matrix = self.camera.matrix
         own = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])

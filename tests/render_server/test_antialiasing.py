@@ -1,5 +1,6 @@
 """Coverage of pixels by objects: right for known shapes, nothing lost, nothing else changed."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -100,12 +101,46 @@ def test_share_of_a_half_plane(gpu: GpuContext, stage: Stage, turn_deg: float, s
     assert np.abs(found.matte - expected).max() <= (1 / 16 + 1e-3 if upright else 1 / 8)
 
 
+def area_through(lens: CameraModel, radius_m: float, x: float, y: float, corners: int = 256) -> float:
+    """Pixels that the picture of a disc covers; it lies 1 m before the camera, its centre at (x, y) m."""
+    turn = np.linspace(0, 2 * np.pi, corners, endpoint=False)
+    rim = np.stack([x + radius_m * np.cos(turn), y + radius_m * np.sin(turn), np.ones(corners)], axis=1)
+    u, v = lens.project(rim).T
+    return float(abs(u @ np.roll(v, -1) - v @ np.roll(u, -1))) / 2
+
+
+def disc_in_the_middle(radius_px: float) -> trimesh.Trimesh:
+    disc = trimesh.creation.cylinder(radius_px * PIXEL, 1e-4, sections=256)
+    return shifted(disc, 0.3 * PIXEL, -0.1 * PIXEL, -0.5e-4)
+
+
 @pytest.mark.parametrize("distortion", [0.0, -0.3])
-def test_area_of_a_disc(gpu: GpuContext, stage: Stage, distortion: float) -> None:
-    disc = shifted(trimesh.creation.cylinder(9.3 * PIXEL, 1e-4, sections=128), 0.3 * PIXEL, 0.1 * PIXEL, 0)
+def test_area_of_a_small_disc(gpu: GpuContext, stage: Stage, distortion: float) -> None:
     lens = camera(distortion=(distortion, 0.0, 0.0, 0.0, 0.0))
-    found = solve(gpu, antialiased(glowing(stage, disc)), seen_from_above(model=lens))
-    assert found.matte.sum() == pytest.approx(np.pi * 9.3**2, rel=0.01)
+    document = antialiased(glowing(stage, disc_in_the_middle(9.3)))
+    found = solve(gpu, document, seen_from_above(model=lens))
+    expected = area_through(lens, 9.3 * PIXEL, 0.3 * PIXEL, 0.1 * PIXEL)
+    assert found.matte.sum() == pytest.approx(expected, rel=0.01)
+
+
+@pytest.mark.parametrize("distortion", [0.0, -0.3, 0.2])
+@pytest.mark.parametrize("middle", [(0.0, 0.0), (0.5, 0.5), (0.3, -0.2)])
+@pytest.mark.parametrize("radius_px", [8.14, 50.0])
+def test_area_of_a_disc_is_that_of_its_picture(
+    gpu: GpuContext, stage: Stage, distortion: float, middle: tuple[float, float], radius_px: float
+) -> None:
+    """Wherever between pixels the optical axis passes, with antialiasing or without: no row is skipped or doubled."""
+    matrix = camera().matrix.copy()
+    matrix[:2, 2] += middle
+    lens = replace(camera(distortion=(distortion, 0.0, 0.0, 0.0, 0.0)), matrix=matrix)
+    document = glowing(stage, disc_in_the_middle(radius_px))
+    areas = [
+        solve(gpu, antialiased(document, wanted), seen_from_above(model=lens)).matte.sum()
+        for wanted in (False, True)
+    ]
+    expected = area_through(lens, radius_px * PIXEL, 0.3 * PIXEL, 0.1 * PIXEL)
+    assert areas == pytest.approx([expected, expected], rel=0.01)
+    assert areas[0] == pytest.approx(areas[1], rel=0.01)
 
 
 @pytest.mark.parametrize("x", [0.03, 0.28, 0.405, 0.655, 0.905])
