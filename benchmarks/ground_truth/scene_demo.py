@@ -13,6 +13,7 @@ import trimesh
 from benchmarks.ground_truth import benchmark_scene, demo_object
 from benchmarks.ground_truth.assembly import material
 from benchmarks.ground_truth.lamps import Ambient, SphereLamp
+from benchmarks.ground_truth.meshes import mug
 from benchmarks.ground_truth.parts import (
     Matrix,
     MeshFolder,
@@ -129,20 +130,4 @@ def _mug(folder: MeshFolder) -> dict[str, Any]:
         "alpha": 0.18,
         "nonlinear": True,
     }
-    return mesh_shape("mug", _mug_mesh(), placed((0.46, 0.20, TABLE_Z_M), turned("z", -35)), folder, ceramic)
-
-
-def _mug_mesh() -> trimesh.Trimesh:
-    """A mug on z = 0 with wall, rounded lip and handle (towards +x)."""
-    lip = np.linspace(0, np.pi, 7)
-    outside = [(0.0, 0.0), (0.032, 0.0), (0.036, 0.002), (0.038, 0.006), (0.038, 0.088)]
-    rim = [(0.0365 + 0.0015 * float(np.cos(a)), 0.088 + 0.0015 * float(np.sin(a))) for a in lip[1:-1]]
-    inside = [(0.035, 0.088), (0.035, 0.010), (0.032, 0.006), (0.0, 0.005)]
-    body = trimesh.creation.revolve(np.array(outside + rim + inside), sections=64)
-    handle = trimesh.creation.torus(0.024, 0.005, major_sections=48, minor_sections=16)
-    handle.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0]))
-    handle.apply_translation([0.039, 0, 0.046])
-    handle.update_faces((handle.vertices[handle.faces][..., 0] > 0.0355).all(axis=1))  # none inside the mug
-    mug = trimesh.util.concatenate([body, handle])
-    assert isinstance(mug, trimesh.Trimesh)
-    return mug
+    return mesh_shape("mug", mug(), placed((0.46, 0.20, TABLE_Z_M), turned("z", -35)), folder, ceramic)
