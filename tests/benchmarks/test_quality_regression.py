@@ -18,9 +18,10 @@ if importlib.util.find_spec("mitsuba") is None:
 
 SIZE = (320, 240)  # smaller, a stereo sensor sees less of slanted surfaces
 LIGHT_PATHS = 32
-PICTURE_FLOOR_DB = {"two_lights": 34.8, "natural_light": 36.0}  # (36.3, 37.5)
-GAIN_FLOOR_DB = {"two_lights": 12.2, "natural_light": 14.4}  # (13.7, 15.9)
+PICTURE_FLOOR_DB = {"two_lights": 35.7, "natural_light": 37.0}  # (37.2, 38.5)
+GAIN_FLOOR_DB = {"two_lights": 11.4, "natural_light": 14.6}  # (12.9, 16.1)
 """Of changed real surfaces, over the untouched camera picture."""
+PAPER_GAIN_DB = 4.0  # the project's goal (8.7)
 
 
 @pytest.fixture(scope="module")
@@ -49,14 +50,19 @@ def test_light_on_real_surfaces_is_far_better_than_none(measured: QualityResult)
         assert psnr_db - untouched[scene] >= GAIN_FLOOR_DB[scene], scene
 
 
-def test_exact_operator_is_no_worse_than_the_papers(measured: QualityResult) -> None:
+def test_exact_operator_is_better_than_the_papers(measured: QualityResult) -> None:
     means = measured.means()
-    assert means["exact"]["changed_psnr_db"] >= means["paper"]["changed_psnr_db"]
+    name = "changed_real_psnr_db"
+    assert means["exact"][name] >= means["paper"][name] + PAPER_GAIN_DB
 
 
 def test_shadows_take_away_the_right_amount_of_light(measured: QualityResult) -> None:
     for scene, share in figure(measured, "exact", "darkening").items():
-        assert share == pytest.approx(1, abs=0.15), scene  # (0.97, 1.06)
+        assert share == pytest.approx(1, abs=0.15), scene  # (0.93, 1.07)
+
+
+def test_edge_of_a_shadow_is_as_soft_as_in_truth(measured: QualityResult) -> None:
+    assert figure(measured, "exact", "penumbra_error")["two_lights"] < 0.3  # (0.18; 0.07 at 512 light paths)
 
 
 def test_nothing_relit_is_better_than_the_ceiling(measured: QualityResult) -> None:

@@ -107,9 +107,10 @@ def test_objects_stand_on_something_and_touch_nothing_else(scene: BenchmarkScene
 def test_light_falls_from_all_to_none_along_shadow_edges(scene: BenchmarkScene, tmp_path: Path) -> None:
     assembly = Assembly(scene, tmp_path)
     empty, full = (Rays(_without_lamps(room)) for room in (assembly.without(), assembly.with_objects(0)))
-    for edge, lamp in zip(scene.shadow_edges, _lamps_of_edges(scene), strict=True):
+    for edge in scene.shadow_edges:
         start, end = np.array(edge.start_m), np.array(edge.end_m)
         way = start + np.linspace(0, 1, 81)[:, None] * (end - start)
+        lamp = _hidden_lamp(scene, full, way[-1:])
         assert _lit_share(empty, lamp, way) == pytest.approx(1.0)
         share = _lit_share(full, lamp, way)
         assert share[0] == 1
@@ -220,10 +221,11 @@ def _without_lamps(scene: dict[str, Any]) -> dict[str, Any]:
     return {name: part for name, part in scene.items() if not name.startswith("lamp_")}
 
 
-def _lamps_of_edges(scene: BenchmarkScene) -> list[SphereLamp]:
-    """A scene's edges are named in the order of its sphere lamps."""
+def _hidden_lamp(scene: BenchmarkScene, full: Rays, dark_end: np.ndarray) -> SphereLamp:
+    """The one lamp that the dark end of an edge does not see."""
     spheres = [lamp for lamp in scene.lamps if isinstance(lamp, SphereLamp)]
-    return spheres[: len(scene.shadow_edges)]
+    (hidden,) = (lamp for lamp in spheres if _lit_share(full, lamp, dark_end) == 0)
+    return hidden
 
 
 def _lit_share(rays: Rays, lamp: SphereLamp, points: np.ndarray) -> np.ndarray:

@@ -35,6 +35,7 @@ def _matte(
 _SIDE_M: Triple = (WALL_M, DEPTH_M, HEIGHT_M)
 _SIDE_X_M = (WIDTH_M - WALL_M) / 2
 _BACK_Y_M = (DEPTH_M + WALL_M) / 2
+_LEFT_M = CENTRE_M[0] - WIDTH_M / 2
 
 SCENE = BenchmarkScene(
     name="cornell",
@@ -54,14 +55,12 @@ SCENE = BenchmarkScene(
         ),
     ),
     lamps=(LAMP, Ambient(0.18, (0.92, 0.96, 1.0))),
+    # The left wall's outer top edge: its shadow falls on free ground.
     shadow_edges=(
         edge_of_shadow(
             LAMP,
-            (
-                (CENTRE_M[0] - 0.09, CENTRE_M[1] + DEPTH_M / 2 + WALL_M, TABLE_Z_M + HEIGHT_M),
-                (CENTRE_M[0] + 0.02, CENTRE_M[1] + DEPTH_M / 2 + WALL_M, TABLE_Z_M + HEIGHT_M),
-            ),
-            (*CENTRE_M, TABLE_Z_M),
+            ((_LEFT_M, 0.06, TABLE_Z_M + HEIGHT_M), (_LEFT_M, 0.11, TABLE_Z_M + HEIGHT_M)),
+            (_LEFT_M, 0.085, TABLE_Z_M),
         ),
     ),
 )
