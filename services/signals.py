@@ -1,7 +1,12 @@
 """How a long-running command ends: SIGTERM becomes an exception, so that every `finally` runs."""
 
+import os
 import signal
+import sys
+import threading
 from types import FrameType
+
+AGAIN_AFTER_S = 0.02
 
 
 class Terminated(BaseException):
@@ -11,7 +16,16 @@ class Terminated(BaseException):
 def raise_on_sigterm() -> None:
     """Make SIGTERM raise `Terminated` in the main thread (SIGINT raises `KeyboardInterrupt` already)."""
     signal.signal(signal.SIGTERM, _raise_terminated)
+    sys.unraisablehook = _deliver_again
 
 
 def _raise_terminated(_number: int, _frame: FrameType | None) -> None:
     raise Terminated
+
+
+def _deliver_again(lost: "sys.UnraisableHookArgs") -> None:
+    """A signal that comes while an object is freed is lost with a traceback: send it once more instead."""
+    if isinstance(lost.exc_value, Terminated):
+        threading.Timer(AGAIN_AFTER_S, os.kill, (os.getpid(), signal.SIGTERM)).start()
+    else:
+        sys.__unraisablehook__(lost)
