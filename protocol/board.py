@@ -46,6 +46,43 @@ class CustomDictionary(StrictModel):
         return np.array([int(bit) for bit in self.bits], np.uint8).reshape(self.marker_size, self.marker_size)
 
 
+class LampMarker(StrictModel):
+    """A marker of the board's dictionary that is fixed to a lamp and moves with it.
+
+    Its frame has the origin in the marker's middle, +x right, +y up the marker, +z out of the paper.
+    """
+
+    id: int = Field(ge=0, description="Id in the board's dictionary; not one of the board's own.")
+    marker_length_m: Length = Field(description="Outer edge of the marker's black border, in metres.")
+
+    def corner_points(self) -> Float64[np.ndarray, "4 3"]:
+        """Return the corners in the marker's frame, in OpenCV's order (top-left, then clockwise)."""
+        half = self.marker_length_m / 2
+        return _rectangle(-half, half, self.marker_length_m, self.marker_length_m)
+
+
+class GreyCard(StrictModel):
+    """A flat card of known albedo in the sheet's plane: on the sheet or beside it."""
+
+    center_m: tuple[float, float] = Field(description="Middle (x, y) in world coordinates, metres.")
+    size_m: tuple[Length, Length] = Field(description="Edges along x and y before the turn, metres.")
+    rotation_deg: float = Field(
+        default=0.0, ge=-180, le=180, description="Turn from x towards y about the middle, degrees."
+    )
+    albedo: float = Field(gt=0, le=1, description="Diffuse albedo; 0.18 for the usual grey card.")
+
+    def outline(self) -> Float64[np.ndarray, "4 3"]:
+        """Return the corners in world coordinates."""
+        width, height = self.size_m
+        angle = np.radians(self.rotation_deg)
+        across, along = (
+            np.array([np.cos(angle), np.sin(angle), 0]),
+            np.array([-np.sin(angle), np.cos(angle), 0]),
+        )
+        corners = _rectangle(-width / 2, height / 2, width, height)
+        return np.asarray((*self.center_m, 0.0) + corners[:, :1] * across + corners[:, 1:2] * along)
+
+
 def _dictionary_kind(value: object) -> str:
     return "name" if isinstance(value, str) else "custom"
 
@@ -85,6 +122,12 @@ class BoardSpec(StrictModel):
     white_albedo: float | None = Field(
         default=None, gt=0, le=1, description="Diffuse albedo of the paper; null = unknown, 0.8 is assumed."
     )
+    grey_cards: tuple[GreyCard, ...] = Field(
+        default=(), max_length=16, description="Cards of known albedo that lie in the sheet's plane."
+    )
+    lamp_markers: tuple[LampMarker, ...] = Field(
+        default=(), max_length=64, description="Markers of the same dictionary that are fixed to lamps."
+    )
 
     @field_validator("dictionary")
     @classmethod
@@ -115,6 +158,19 @@ class BoardSpec(StrictModel):
         size = len(self.opencv_dictionary().bytesList)
         if min(ids) < 0 or max(ids) >= size:
             raise ValueError(f"the dictionary has {size} markers, so ids go from 0 to {size - 1}")
+        self._check_lamp_ids(size)
+
+    def _check_lamp_ids(self, size: int) -> None:
+        lamps = [lamp.id for lamp in self.lamp_markers]
+        for lamp in lamps:
+            if lamp in self.marker_ids:
+                raise ValueError(
+                    f"marker {lamp} of lamp_markers is also on the board; give the lamp an id of its own"
+                )
+        if len(set(lamps)) != len(lamps):
+            raise ValueError("lamp_markers name a marker twice; give each lamp an id of its own")
+        if lamps and max(lamps) >= size:
+            raise ValueError(f"the dictionary has {size} markers, so lamp_markers go from 0 to {size - 1}")
 
     @property
     def paper_albedo(self) -> float:

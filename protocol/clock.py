@@ -77,16 +77,23 @@ class ClockEstimator:
         self._drift = max_drift_ppm * 1e-6
         self._samples: deque[ClockSample] = deque(maxlen=window)
 
-    def add(self, sample: ClockSample) -> None:
-        """Take in a measurement.
+    def add(self, sample: ClockSample) -> int:
+        """Take in a measurement; returns by how much a clock was set meanwhile, ns, 0 = not at all.
 
-        One that contradicts all before it (a clock was set) makes them void.
+        One that contradicts those before it (a clock was set) makes them void.
         """
+        jump_ns = 0
         if any(
             abs(old.offset_ns - sample.offset_ns) > self._contradiction(old, sample) for old in self._samples
         ):
+            jump_ns = sample.offset_ns - self._samples[-1].offset_ns
             self._samples.clear()
         self._samples.append(sample)
+        return jump_ns
+
+    def forget(self) -> None:
+        """Make all measurements void, because a clock was set."""
+        self._samples.clear()
 
     def at(self, local_ns: int) -> ClockSample | None:
         """Offset and bound at a local time, None before the first measurement."""

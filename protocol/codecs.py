@@ -1,4 +1,4 @@
-"""Codes of the raw parts: JPEG for pictures, blosc2 with bit shuffle for depth (SPEC.md, section 4).
+"""Codes of the raw parts: JPEG for pictures, blosc2 with bit shuffle for depth and maps (SPEC.md, section 4).
 
 Colour is RGB in every signature. Decoders compare the size that the coded data states with the shape of the
 message before they allocate a picture.
@@ -10,7 +10,7 @@ from typing import Literal
 import blosc2
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Shaped, UInt8, UInt16
+from jaxtyping import Bool, Float32, Shaped, UInt8
 
 from protocol.envelope import Buffer, EnvelopeError
 from protocol.messages import RESPONSE_SHAPE, DType
@@ -88,10 +88,7 @@ def encode_depth(
     with np.errstate(invalid="ignore", over="ignore"):
         steps = np.rint(depth_m / np.float32(depth_scale_m))
         known = valid.astype(bool) & (steps >= 1) & (steps <= _DEPTH_MAX)
-    packed = np.where(known, steps, 0).astype("<u2")
-    if encoding == "raw":
-        return packed.tobytes()
-    return _compress(packed)
+    return encode_array(np.where(known, steps, 0).astype(np.uint16), encoding)
 
 
 def decode_depth(
@@ -102,8 +99,25 @@ def decode_depth(
     Raises:
         EnvelopeError: not a blosc2 chunk as SPEC.md describes it, or of another size than `shape`.
     """
-    steps = decode_raw(part, shape, "uint16") if encoding == "raw" else _decompress(part, shape)
+    steps = decode_array(part, encoding, shape, "uint16")
     return steps.astype(np.float32) * np.float32(depth_scale_m), steps > 0
+
+
+def encode_array(values: Shaped[np.ndarray, "..."], encoding: Literal["blosc2", "raw"]) -> bytes:
+    """Coded array of uint8, uint16 or float32, without loss."""
+    stored = np.ascontiguousarray(values, values.dtype.newbyteorder("<"))
+    return stored.tobytes() if encoding == "raw" else _compress(stored)
+
+
+def decode_array(
+    part: Buffer, encoding: Literal["blosc2", "raw"], shape: tuple[int, ...], dtype: DType
+) -> Shaped[np.ndarray, "..."]:
+    """Array of a coded part; a raw one is a read-only view.
+
+    Raises:
+        EnvelopeError: not a blosc2 chunk as SPEC.md describes it, or of another size than `shape`.
+    """
+    return decode_raw(part, shape, dtype) if encoding == "raw" else _decompress(part, shape, dtype)
 
 
 def decode_response(part: Buffer) -> Float32[np.ndarray, "256 3"]:
@@ -161,37 +175,45 @@ def jpeg_size(part: Buffer) -> tuple[int, int]:
     raise EnvelopeError("the jpeg states no size: send a baseline or progressive one of 8 bits")
 
 
-def _compress(steps: UInt16[np.ndarray, "h w"]) -> bytes:
+def _compress(values: Shaped[np.ndarray, "..."]) -> bytes:
     # One thread: a frame takes about 1 ms, and the cores belong to the renderer.
     code: bytes = blosc2.compress2(
-        steps, typesize=2, codec=blosc2.Codec.ZSTD, clevel=1, filters=[blosc2.Filter.BITSHUFFLE], nthreads=1
+        values,
+        typesize=values.itemsize,
+        codec=blosc2.Codec.ZSTD,
+        clevel=1,
+        filters=[blosc2.Filter.BITSHUFFLE],
+        nthreads=1,
     )
     return code
 
 
-def _decompress(part: Buffer, shape: tuple[int, int]) -> UInt16[np.ndarray, "h w"]:
+def _decompress(part: Buffer, shape: tuple[int, ...], dtype: DType) -> Shaped[np.ndarray, "..."]:
     data = memoryview(part).cast("B")
-    _check_chunk(data, math.prod(shape) * 2)
-    steps = np.zeros(shape, "<u2")
+    values = np.dtype(dtype).newbyteorder("<")
+    _check_chunk(data, math.prod(shape) * values.itemsize, values.itemsize)
+    array = np.zeros(shape, values)
     try:
-        blosc2.decompress2(data, dst=steps, nthreads=1)
+        blosc2.decompress2(data, dst=array, nthreads=1)
     except (ValueError, RuntimeError, TypeError) as error:
-        raise EnvelopeError(f"the depth part is not a blosc2 chunk that can be read: {error}") from error
-    return steps
+        raise EnvelopeError(f"the part is not a blosc2 chunk that can be read: {error}") from error
+    return array
 
 
-def _check_chunk(data: memoryview, expected: int) -> None:
+def _check_chunk(data: memoryview, expected: int, expected_item: int) -> None:
     """Refuse a chunk whose 32-byte header states another size, codec or filter than SPEC.md allows."""
     if len(data) < _BLOSC2_HEADER_BYTES:
-        raise EnvelopeError(f"a blosc2 chunk has at least 32 bytes and the depth part has {len(data)}")
+        raise EnvelopeError(
+            f"a blosc2 chunk has at least 32 bytes and the part has {len(data)}: send it whole"
+        )
     flags, item_size = data[2], data[3]
     size, block, length = np.frombuffer(data[4:16], "<u4").tolist()
     if size != expected:
-        raise EnvelopeError(f"the depth unpacks to {size} bytes and its shape needs {expected}: correct one")
+        raise EnvelopeError(f"the part unpacks to {size} bytes and its shape needs {expected}: correct one")
     if length != len(data):
-        raise EnvelopeError(f"the depth part has {len(data)} bytes and states {length}: send it whole")
+        raise EnvelopeError(f"the part has {len(data)} bytes and states {length}: send it whole")
     known_codec = flags & _BLOSC2_MEMCPYED or flags >> 5 == _BLOSC2_ZSTD or data[31] == _BLOSC2_ZEROS
     known_filters = bytes(data[16:22]) in _BLOSC2_FILTERS and not any(data[24:31])
-    known_kind = data[31] in (_BLOSC2_PLAIN, _BLOSC2_ZEROS) and item_size == 2 and 1 <= block <= max(size, 32)
-    if not (known_codec and known_filters and known_kind):
-        raise EnvelopeError("the depth part is packed in another way than zstd with bit shuffle: use that")
+    known_kind = data[31] in (_BLOSC2_PLAIN, _BLOSC2_ZEROS) and 1 <= block <= max(size, 32)
+    if not (known_codec and known_filters and known_kind and item_size == expected_item):
+        raise EnvelopeError("the part is packed in another way than zstd with bit shuffle: use that")

@@ -10,6 +10,7 @@ from jaxtyping import Float32, UInt8
 from protocol.board import BoardSpec, load_board_yaml
 from protocol.calibration import Extrinsics, load_extrinsics_yaml
 from protocol.camera_model import CameraModel, camera_from_info, load_camera_yaml
+from protocol.dataset_fisheye import FisheyeFolder, load_fisheye_calibration
 from protocol.dataset_lists import (
     FisheyeEntry,
     ListEntry,
@@ -33,6 +34,7 @@ from protocol.pictures import (
     is_jpeg,
     read_bytes,
 )
+from protocol.response_table import load_response_table
 from protocol.scene import SceneDocument
 
 
@@ -59,8 +61,8 @@ class DatasetReader:
 
     Colour and depth are paired by nearest time, at most `tolerance_ns` apart (half the median colour period,
     at most 20 ms); `unpaired` counts the colour pictures that stay without depth. `notes` says once what is
-    missing and what is used instead. `fisheye` lists the fish-eye pictures. A third column of rgb.txt is the
-    exposure in seconds.
+    missing and what is used instead. A third column of rgb.txt is the exposure in seconds. `fisheye` lists the
+    fish-eye pictures; frames carry those that hold, decoded when they are first asked for, if their lens is known.
     """
 
     def __init__(self, path: Path, board: BoardSpec | None = None) -> None:
@@ -82,6 +84,7 @@ class DatasetReader:
         self._poses = self._read_poses()
         self._pose_times = [pose.timestamp_ns for pose in self._poses]
         self.fisheye = self._read_fisheye()
+        self._fisheye_folder = self._open_fisheye()
         self._check_first_pictures()
 
     def __len__(self) -> int:
@@ -114,6 +117,7 @@ class DatasetReader:
             depth_timestamp_ns=None if depth is None else depth.timestamp_ns,
             world_from_camera=pose_at(self._poses, self._pose_times, entry.timestamp_ns, self.tolerance_ns),
             color_jpeg=data if is_jpeg(data) else None,
+            fisheye=None if self._fisheye_folder is None else self._fisheye_folder.at(entry.timestamp_ns),
         )
 
     @property
@@ -139,6 +143,8 @@ class DatasetReader:
         self._decode_color(first, read_bytes(first.path))
         if self._depths:
             self._decode_depth(self._depths[0])
+        if self._fisheye_folder is not None:
+            self._fisheye_folder.at(first.timestamp_ns)
 
     def _read_colors(self) -> list[ListEntry]:
         path = self.path / "rgb.txt"
@@ -162,18 +168,7 @@ class DatasetReader:
 
     def _read_response(self) -> Float32[np.ndarray, "256 3"] | None:
         path = self.path / "response.txt"
-        if not path.is_file():
-            return None
-        try:
-            table = np.loadtxt(path, dtype=np.float32, comments="#", ndmin=2)
-        except (OSError, ValueError) as error:
-            raise DeltalightError(
-                f"{path} is not a table of numbers; write 256 rows of linear R G B."
-            ) from error
-        if table.shape != (256, 3) or not np.isfinite(table).all() or (table < 0).any():
-            raise DeltalightError(f"{path} does not hold 256 rows of linear R G B, zero or more; correct it.")
-        table.flags.writeable = False
-        return table
+        return load_response_table(path) if path.is_file() else None
 
     def _read_board(self) -> BoardSpec | None:
         path = self.path / "calibration" / "board.yaml"
@@ -251,6 +246,14 @@ class DatasetReader:
             return read_fisheye_list(path)
         self.notes.append(f"{self.path} has no fisheye.txt; light comes from the scene document.")
         return []
+
+    def _open_fisheye(self) -> FisheyeFolder | None:
+        calibration = load_fisheye_calibration(self.path) if self.fisheye else None
+        if self.fisheye and calibration is None:
+            self.notes.append(
+                f"{self.path} has fish-eye pictures but no calibration/fisheye.yaml; they are not used."
+            )
+        return None if calibration is None else FisheyeFolder(self.fisheye, calibration)
 
 
 def _positive(value: object, name: str) -> float:

@@ -10,6 +10,7 @@ from jaxtyping import Float64
 from protocol.board import BoardSpec, save_board_yaml
 from protocol.calibration import Extrinsics, save_extrinsics_yaml
 from protocol.camera_model import CameraModel, save_camera_yaml
+from protocol.dataset_fisheye import FisheyeFolderWriter
 from protocol.dataset_lists import format_timestamp
 from protocol.errors import DeltalightError
 from protocol.frames import DepthImage, SensorFrame
@@ -29,10 +30,12 @@ class DatasetWriter:
 
     Each picture is written before its line is appended, so the folder is readable after a crash at any time.
     Colour is kept as the frame's JPEG bytes where it has them, else as PNG. Depth is stored in steps of
-    `depth_scale` metres (default: the first frame's exact step, else 1 mm) as 16-bit PNG.
+    `depth_scale` metres (default: the first frame's exact step, else 1 mm) as 16-bit PNG. Fish-eye pictures are
+    written without loss, once for all frames that they hold for.
 
     Raises:
-        DeltalightError: the folder already holds something, or frames differ in camera or response.
+        DeltalightError: the folder already holds something, or frames differ in camera or response, or the fish-eye
+            pictures in calibration.
     """
 
     def __init__(
@@ -47,6 +50,7 @@ class DatasetWriter:
         self._board, self._extrinsics, self._depth_scale = board, extrinsics or Extrinsics(), depth_scale
         self._first: SensorFrame | None = None
         self._depth_camera: CameraModel | None = None
+        self._fisheye = FisheyeFolderWriter(path)
         self._count = 0
         self._last_ns = -1
 
@@ -72,6 +76,8 @@ class DatasetWriter:
         if self._first is None:
             self._begin(frame)
         self._require_same(frame)
+        if frame.fisheye is not None:
+            self._fisheye.add(frame.fisheye)
         self._add_color(frame)
         self._last_ns = frame.timestamp_ns
         self._count += 1

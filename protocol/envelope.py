@@ -21,7 +21,7 @@ from protocol.messages import (
 )
 
 MAX_TOPIC_BYTES = 128
-MAX_PARTS = 16
+MAX_PARTS = 32
 
 Buffer = bytes | bytearray | memoryview
 Part = Buffer | np.ndarray

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float32, Float64, UInt8
 
 from protocol.board import BoardSpec
 from protocol.camera_model import CameraModel
+from protocol.fisheye_lens import FisheyeCalibration
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,13 +39,54 @@ class DepthImage:
 
 
 @dataclass(frozen=True, eq=False)
+class FisheyePictures:
+    """A fish-eye picture, or an exposure bracket of one moment; it holds until the next one comes.
+
+    `pictures` are RGB: uint8 is camera-coded (by the calibration's response), float32 is linear. An exposure of
+    None is the reference exposure. Frames for which the same pictures hold carry the same object.
+    """
+
+    timestamp_ns: int
+    pictures: tuple[UInt8[np.ndarray, "h w 3"] | Float32[np.ndarray, "h w 3"], ...]
+    exposures_s: tuple[float | None, ...]
+    calibration: FisheyeCalibration
+
+
+@dataclass(frozen=True, eq=False)
+class RadianceMap:
+    """Radiance that reaches the fish-eye camera from the hemisphere about its axis (METHOD 2).
+
+    `radiance` is linear R G B in the fish-eye camera's units (1.0 = its white at the reference exposure) on the
+    grid of `protocol.hemisphere`, in the axes of its optical frame; 0 where not `seen`. `clipped_share` is the
+    share of the seen solid angle that even the shortest exposure clips (so its radiance is a lower bound).
+    `picture` (coded, RGB) shows people what was seen.
+    """
+
+    timestamp_ns: int
+    radiance: Float32[np.ndarray, "n n 3"]
+    seen: Bool[np.ndarray, "n n"]
+    world_from_fisheye: Float64[np.ndarray, "4 4"]
+    clipped_share: float
+    picture: UInt8[np.ndarray, "h w 3"]
+    calibration: FisheyeCalibration
+
+
+@dataclass(frozen=True, eq=False)
+class LampPose:
+    """A marker fixed to a lamp, as the camera sees it: point_world = world_from_marker @ point_marker (4, 4)."""
+
+    marker: int
+    world_from_marker: Float64[np.ndarray, "4 4"]
+
+
+@dataclass(frozen=True, eq=False)
 class SensorFrame:
     """One picture with its depth, raw, as captured or recorded.
 
     `frame_id` is the zero-based index of the line in rgb.txt for datasets. `color` is RGB, camera-coded.
     `response` is linear R G B for each code (None = sRGB). `exposure_s` None = reference exposure.
     `world_from_camera` is a given pose, if any. `color_jpeg` holds the encoded bytes where the source has
-    them.
+    them. `fisheye` is what the fish-eye camera saw last.
     """
 
     frame_id: int
@@ -57,6 +99,7 @@ class SensorFrame:
     depth_timestamp_ns: int | None = None
     world_from_camera: Float64[np.ndarray, "4 4"] | None = None
     color_jpeg: bytes | None = None
+    fisheye: FisheyePictures | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +119,8 @@ class ViewFrame:
     pose: BoardPose | None = None
     depth: DepthImage | None = None
     board: BoardSpec | None = None
+    radiance_map: RadianceMap | None = None
+    lamps: tuple[LampPose, ...] = ()
 
 
 def decode_lut(response: Float32[np.ndarray, "256 3"] | None) -> Float32[np.ndarray, "256 3"]:

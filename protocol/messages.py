@@ -12,19 +12,30 @@ from typing import Annotated, Final, Literal, Self, get_args
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints, model_validator
 
-SCHEMA_VERSION: Final = 1
+SCHEMA_VERSION: Final = 2
 MAX_HEADER_BYTES = 64 * 1024
 MAX_PART_BYTES = 64 * 1024 * 1024
 MAX_EDGE_PX = 16384
 MAX_LIGHTS = 64
-MAX_EXPOSURES = 12
+MAX_EXPOSURES = 24
+MAX_LAMPS = 64
 MAX_PLAIN_DEPTH = 16
 RESPONSE_SHAPE = (256, 3)
 ROTATION_TOLERANCE = 1e-3
 
 DType = Literal["uint8", "uint16", "float32"]
 Stream = Literal[
-    "color", "depth", "clean_depth", "fisheye", "pose", "lights", "composite", "stats", "request", "reply"
+    "color",
+    "depth",
+    "clean_depth",
+    "fisheye",
+    "radiance",
+    "pose",
+    "lamps",
+    "composite",
+    "stats",
+    "request",
+    "reply",
 ]
 ITEM_SIZE: dict[DType, int] = {"uint8": 1, "uint16": 2, "float32": 4}
 
@@ -96,6 +107,9 @@ class PartRule:
         return math.prod(self.shape) * ITEM_SIZE[self.dtype]
 
 
+RESPONSE_RULE = PartRule("response", RESPONSE_SHAPE, "float32")
+
+
 class MessageBase(BaseModel):
     """Fields that every message carries; times are nanoseconds since 1970 by the sender's clock.
 
@@ -105,7 +119,7 @@ class MessageBase(BaseModel):
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
-    schema_version: Literal[1] = SCHEMA_VERSION
+    schema_version: Literal[2] = SCHEMA_VERSION
     node: Name
     stream: Stream
     frame_id: Count
@@ -148,7 +162,7 @@ class ColorMessage(MessageBase):
     def part_rules(self) -> tuple[PartRule, ...]:
         """The picture, and the camera response if there is one."""
         picture = PartRule("picture", self.shape, self.dtype, self.encoding == "jpeg")
-        return (picture, PartRule("response", RESPONSE_SHAPE, "float32")) if self.has_response else (picture,)
+        return (picture, RESPONSE_RULE) if self.has_response else (picture,)
 
 
 class DepthMessage(MessageBase):
@@ -173,9 +187,10 @@ class DepthMessage(MessageBase):
 
 
 class FisheyeMessage(MessageBase):
-    """A fish-eye picture or exposure bracket, RGB: one part for each entry of `exposures_s`.
+    """A fish-eye picture or exposure bracket, RGB; parts: a picture for each of `exposures_s`, then the response.
 
-    uint8 is sRGB-coded, float32 is linear (raw only). An exposure of None is the reference exposure.
+    uint8 is camera-coded, by the response if `has_response`, else sRGB; float32 is linear (raw only). An exposure
+    of None is the reference exposure. `camera` is a fish-eye calibration without its response.
     """
 
     stream: Literal["fisheye"] = "fisheye"
@@ -183,22 +198,52 @@ class FisheyeMessage(MessageBase):
     shape: PictureShape
     dtype: Literal["uint8", "float32"] = "uint8"
     camera: PlainDict
+    has_response: bool = False
     exposures_s: Annotated[
         tuple[Seconds | None, ...], Field(strict=False, min_length=1, max_length=MAX_EXPOSURES)
     ] = (None,)
 
     def part_rules(self) -> tuple[PartRule, ...]:
-        """One picture for each exposure."""
+        """One picture for each exposure, and the camera response if there is one."""
         compressed = self.encoding == "jpeg"
-        return tuple(
+        pictures = tuple(
             PartRule(f"picture {i}", self.shape, self.dtype, compressed) for i in range(len(self.exposures_s))
         )
+        return (*pictures, RESPONSE_RULE) if self.has_response else pictures
 
     @model_validator(mode="after")
     def _jpeg_is_bytes(self) -> Self:
         if self.encoding == "jpeg" and self.dtype != "uint8":
             raise ValueError("a jpeg picture has dtype uint8")
         return self
+
+
+class RadianceMessage(MessageBase):
+    """The radiance that a fish-eye camera sees; it holds until the next and is repeated unchanged for who comes late.
+
+    Parts: linear R G B on the `size` x `size` grid of the hemisphere (`protocol.hemisphere`), what was seen of it
+    (0 or 1), the picture for people (jpeg), then the response of the fish-eye camera if `has_response`. `camera` is
+    as in `FisheyeMessage`; the pose is that of the time of the map, `capture_ns`.
+    """
+
+    stream: Literal["radiance"] = "radiance"
+    encoding: Literal["blosc2", "raw"]
+    size: Edge
+    picture_shape: PictureShape
+    clipped_share: Annotated[float, Field(ge=0, le=1)]
+    world_from_fisheye: RigidMatrix
+    camera: PlainDict
+    has_response: bool = False
+
+    def part_rules(self) -> tuple[PartRule, ...]:
+        """The map, its mask, the picture, and the camera response if there is one."""
+        compressed = self.encoding == "blosc2"
+        rules = (
+            PartRule("radiance", (self.size, self.size, 3), "float32", compressed),
+            PartRule("seen", (self.size, self.size), "uint8", compressed),
+            PartRule("picture", self.picture_shape, "uint8", compressed=True),
+        )
+        return (*rules, RESPONSE_RULE) if self.has_response else rules
 
 
 class PoseMessage(MessageBase):
@@ -222,11 +267,20 @@ class PoseMessage(MessageBase):
         return self
 
 
-class LightsMessage(MessageBase):
-    """Lights of the real room, each written as in `lights.manual` of the scene document."""
+class LampEntry(BaseModel):
+    """A marker on a lamp: point_world = world_from_marker @ point_marker."""
 
-    stream: Literal["lights"] = "lights"
-    lights: LightList
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+    marker: Count
+    world_from_marker: RigidMatrix
+
+
+class LampsMessage(MessageBase):
+    """Lamps whose markers the colour frame `frame_id` shows; those that it does not show are left out."""
+
+    stream: Literal["lamps"] = "lamps"
+    lamps: Annotated[tuple[LampEntry, ...], Field(strict=False, max_length=MAX_LAMPS)]
 
 
 class CompositeMessage(MessageBase):
@@ -300,8 +354,9 @@ Message = (
     ColorMessage
     | DepthMessage
     | FisheyeMessage
+    | RadianceMessage
     | PoseMessage
-    | LightsMessage
+    | LampsMessage
     | CompositeMessage
     | StatsMessage
     | ControlRequest

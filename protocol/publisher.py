@@ -5,7 +5,9 @@ from collections.abc import Sequence
 
 import zmq
 
+from protocol.curve import guard
 from protocol.errors import DeltalightError
+from protocol.keys import Keys
 from protocol.messages import MAX_PART_BYTES
 from protocol.sockets import HIGH_WATER_MARK, attach, open_socket
 
@@ -17,17 +19,31 @@ class Publisher:
 
     `streams` is how many messages are sent in a row for one frame. The queue to each subscriber holds two
     frames of so many messages: one shorter than such a row would always lose its last messages (the pose).
+    `keys` are needed where the endpoint leaves the host.
     """
 
-    def __init__(self, endpoint: str, *, bind: bool = True, streams: int = STREAMS_OF_A_NODE) -> None:
+    def __init__(
+        self,
+        endpoint: str,
+        *,
+        bind: bool = True,
+        streams: int = STREAMS_OF_A_NODE,
+        keys: Keys | None = None,
+    ) -> None:
         self._context = zmq.Context()
         self._lock = threading.Lock()
+        self._socket = open_socket(self._context, zmq.PUB, high_water_mark=HIGH_WATER_MARK * streams)
+        self._guard = guard(self._context, self._socket, keys, bind=bind)
         try:
-            self._socket = open_socket(self._context, zmq.PUB, high_water_mark=HIGH_WATER_MARK * streams)
-            self.endpoint = attach(self._socket, endpoint, bind=bind)
+            self.endpoint = attach(self._socket, endpoint, bind=bind, keys=keys)
         except DeltalightError:
-            self._context.destroy(0)
+            self.close()
             raise
+
+    @property
+    def refused(self) -> int:
+        """Connections that were refused because their keys are not right."""
+        return 0 if self._guard is None else self._guard.refused
 
     def send(self, multipart: Sequence[bytes | memoryview]) -> None:
         """Send one multipart [topic, header, part...]; its bytes are copied before this returns.
@@ -47,5 +63,7 @@ class Publisher:
 
     def close(self) -> None:
         """Close the socket; what is still queued is thrown away."""
+        if self._guard is not None:
+            self._guard.close()
         with self._lock:
             self._context.destroy(0)

@@ -7,8 +7,10 @@ from collections.abc import Sequence
 
 import zmq
 
+from protocol.curve import guard
 from protocol.envelope import MAX_PARTS, MAX_TOPIC_BYTES
 from protocol.errors import DeltalightError
+from protocol.keys import Keys
 from protocol.sockets import attach, open_socket
 
 MAX_TOPICS = 256
@@ -28,10 +30,18 @@ class Receiver:
     """Mailbox with one slot for each topic: the newest message wins, and each never taken is counted.
 
     The thread empties the socket at once: a slow consumer meets new frames and not a queue of old ones.
-    `topics` are stream names (`color`) or whole topics (`color.desk`); none at all means everything.
+    `topics` are stream names (`color`) or whole topics (`color.desk`); none at all means everything. `keys`
+    are needed where an endpoint leaves the host.
     """
 
-    def __init__(self, endpoints: Sequence[str], topics: Sequence[str], *, bind: bool = False) -> None:
+    def __init__(
+        self,
+        endpoints: Sequence[str],
+        topics: Sequence[str],
+        *,
+        bind: bool = False,
+        keys: Keys | None = None,
+    ) -> None:
         self._topics = tuple(topics)
         self._slots: dict[str, ReceivedMultipart] = {}
         self._drops: Counter[str] = Counter()
@@ -40,12 +50,15 @@ class Receiver:
         self._fresh = threading.Condition()
         self._closed = False
         self._context = zmq.Context()
+        self._socket = open_socket(self._context, zmq.SUB)
+        self._guard = guard(self._context, self._socket, keys, bind=bind)
+        for topic in self._topics or ("",):
+            self._socket.subscribe(topic)
         try:
-            self._socket = open_socket(self._context, zmq.SUB)
-            for topic in self._topics or ("",):
-                self._socket.subscribe(topic)
-            self.endpoints = tuple(attach(self._socket, endpoint, bind=bind) for endpoint in endpoints)
+            self.endpoints = tuple(attach(self._socket, each, bind=bind, keys=keys) for each in endpoints)
         except DeltalightError:
+            if self._guard is not None:
+                self._guard.close()
             self._context.destroy(0)
             raise
         self._thread = threading.Thread(target=self._run, name="receiver", daemon=True)
@@ -74,6 +87,8 @@ class Receiver:
 
     def close(self) -> None:
         """Stop the thread and wake whoever waits."""
+        if self._guard is not None:
+            self._guard.close()
         self._context.term()  # interrupts the thread, which closes its own socket
         self._thread.join()
 

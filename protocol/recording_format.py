@@ -2,7 +2,7 @@
 
 Every frame is a group of messages with one log time, the capture time: picture, depth and calibration as
 Foxglove shows them, and last a `FrameRecord`, which makes the group complete. The first group begins with a
-`SessionRecord`.
+`SessionRecord`. Fish-eye pictures have groups of their own (`recording_fisheye`).
 """
 
 from typing import Annotated, Any, Self
@@ -26,17 +26,32 @@ ACTIVE_SUFFIX = ".active"
 SCENE_ATTACHMENT = "scene.json"
 COLOR_TOPIC, COLOR_CAMERA_TOPIC = "/color/image", "/color/calibration"
 DEPTH_TOPIC, DEPTH_CAMERA_TOPIC = "/depth/image", "/depth/calibration"
+FISHEYE_TOPIC, FISHEYE_LINEAR_TOPIC = "/fisheye/image", "/fisheye/linear"
+FISHEYE_CAMERA_TOPIC = "/fisheye/calibration"
 POSE_TOPIC = "/tf"
 SESSION_TOPIC, FRAME_TOPIC = "/deltalight/session", "/deltalight/frame"
+FISHEYE_RECORD_TOPIC = "/deltalight/fisheye"
 FOXGLOVE_TOPICS: dict[str, Any] = {
     COLOR_TOPIC: CompressedImage,
     COLOR_CAMERA_TOPIC: CameraCalibration,
     DEPTH_TOPIC: RawImage,
     DEPTH_CAMERA_TOPIC: CameraCalibration,
+    FISHEYE_TOPIC: CompressedImage,
+    FISHEYE_LINEAR_TOPIC: RawImage,
+    FISHEYE_CAMERA_TOPIC: CameraCalibration,
     POSE_TOPIC: FrameTransform,
 }
-WORLD_FRAME, COLOR_FRAME, DEPTH_FRAME = "world", "camera", "depth_camera"
+WORLD_FRAME, COLOR_FRAME, DEPTH_FRAME, FISHEYE_FRAME = "world", "camera", "depth_camera", "fisheye_camera"
 RESPONSE_BYTES = 256 * 3 * 4
+Response = Annotated[
+    bytes,
+    Field(
+        min_length=RESPONSE_BYTES,
+        max_length=RESPONSE_BYTES,
+        description="256 x 3 little-endian 32-bit floats, linear R G B; null = sRGB.",
+    ),
+]
+Seconds = Annotated[float, Field(gt=0)]
 Matrix16 = Annotated[list[float], Field(min_length=16, max_length=16)]
 Metres = Annotated[float, Field(gt=0, lt=1e3)]
 
@@ -97,12 +112,31 @@ class FrameRecord(_Record):
     frame_id: int = Field(ge=0)
     timestamp_ns: int = Field(ge=0, description="Capture time of the colour picture.")
     camera: dict[str, Any] = Field(description="Colour camera: width, height, matrix, distortion.")
-    exposure_s: Annotated[float, Field(gt=0)] | None = None
-    response: Annotated[bytes, Field(min_length=RESPONSE_BYTES, max_length=RESPONSE_BYTES)] | None = Field(
-        default=None, description="256 x 3 little-endian 32-bit floats, linear R G B; null = sRGB."
-    )
+    exposure_s: Seconds | None = None
+    response: Response | None = None
     world_from_camera: Matrix16 | None = Field(default=None, description="Given pose, 4x4 by rows.")
     depth: DepthRecord | None = None
+    fisheye_ns: Annotated[int, Field(ge=0)] | None = Field(
+        default=None, description="Capture time of the fish-eye pictures that hold; null = none."
+    )
+
+
+class FisheyeRecord(_Record):
+    """What fish-eye pictures hold beside their pixels; it is written last."""
+
+    timestamp_ns: int = Field(ge=0, description="Capture time.")
+    exposures_s: list[Seconds | None] = Field(
+        min_length=1, description="One for each picture, in their order."
+    )
+    calibration: dict[str, Any] = Field(description="Lens and vignetting.")
+    response: Response | None = None
+
+
+OWN_TOPICS: dict[str, type[_Record]] = {
+    SESSION_TOPIC: SessionRecord,
+    FRAME_TOPIC: FrameRecord,
+    FISHEYE_RECORD_TOPIC: FisheyeRecord,
+}
 
 
 def timestamp_fields(timestamp_ns: int) -> dict[str, int]:

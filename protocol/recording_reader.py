@@ -28,9 +28,11 @@ from protocol.documents import parse_mapping
 from protocol.errors import DeltalightError
 from protocol.frames import DepthImage, SensorFrame
 from protocol.pictures import decode_rgb, depth_from_steps, is_jpeg
+from protocol.recording_fisheye import FisheyeTrack
 from protocol.recording_format import (
     COLOR_TOPIC,
     DEPTH_TOPIC,
+    FISHEYE_RECORD_TOPIC,
     FRAME_TOPIC,
     SCENE_ATTACHMENT,
     SESSION_TOPIC,
@@ -41,9 +43,12 @@ from protocol.recording_format import (
 from protocol.scene import SceneDocument, parse_scene, resolve_asset
 
 MAX_RECORD_BYTES = 512 * 1024 * 1024
+RECORD_TOPICS = (FRAME_TOPIC, FISHEYE_RECORD_TOPIC)
 RECORD_HEAD = struct.Struct("<BQ")
 # What the mcap package raises for damaged records (wrong offsets and lengths end in the last three).
 DAMAGE = (McapError, ZstdError, struct.error, ValueError, LookupError, OverflowError, OSError, MemoryError)
+
+Times = defaultdict[str, set[int]]  # log times of the records of each topic
 
 
 @dataclass(frozen=True)
@@ -72,7 +77,9 @@ class RecordingReader:
         self._spans: list[_Span] = []
         self._cached: tuple[int, list[Message]] = (-1, [])
         self._scene_json: bytes | None = None
-        self.timestamps_ns = sorted(self._open())
+        times = self._open()
+        self.timestamps_ns = sorted(times[FRAME_TOPIC])
+        self._fisheye = FisheyeTrack(sorted(times[FISHEYE_RECORD_TOPIC]), self._parts, str(path))
         self._starts_ns = np.array([span.start_ns for span in self._spans], np.uint64)
         self._ends_ns = np.array([span.end_ns for span in self._spans], np.uint64)
         if not self.timestamps_ns:
@@ -122,6 +129,7 @@ class RecordingReader:
             depth_timestamp_ns=None if record.depth is None else record.depth.timestamp_ns,
             world_from_camera=None if pose is None else np.array(pose).reshape(4, 4),
             color_jpeg=data if is_jpeg(data) else None,
+            fisheye=None if record.fisheye_ns is None else self._fisheye.at(record.timestamp_ns),
         )
 
     def _camera(self, record: FrameRecord) -> CameraModel:
@@ -129,8 +137,8 @@ class RecordingReader:
         camera = CameraModel.from_dict(record.camera)
         return self.camera if camera == self.camera else camera
 
-    def _open(self) -> set[int]:
-        """Find the chunks and the times of all frames: by the index if there is one, else by a scan."""
+    def _open(self) -> Times:
+        """Find the chunks and the times of all records: by the index if there is one, else by a scan."""
         try:
             with self.path.open("rb") as file:
                 if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
@@ -147,26 +155,25 @@ class RecordingReader:
                 f"{self.path} cannot be read ({error.strerror}); give a readable file."
             ) from error
 
-    def _use_index(self, file: IO[bytes], summary: Summary) -> set[int]:
+    def _use_index(self, file: IO[bytes], summary: Summary) -> Times:
         self._channels = {channel.id: channel.topic for channel in summary.channels.values()}
-        frames = [number for number, topic in self._channels.items() if topic == FRAME_TOPIC]
-        times: set[int] = set()
+        records = {number: topic for number, topic in self._channels.items() if topic in RECORD_TOPICS}
+        times: Times = defaultdict(set)
         for chunk in summary.chunk_indexes:
             self._spans.append(
                 _Span(chunk.chunk_start_offset, chunk.message_start_time, chunk.message_end_time)
             )
-            for number in frames:
-                if number in chunk.message_index_offsets:
-                    index = _record_at(file, chunk.message_index_offsets[number])
-                    entries = index.records if isinstance(index, MessageIndex) else []
-                    times.update(time for time, _ in entries)
+            for number in records.keys() & chunk.message_index_offsets.keys():
+                index = _record_at(file, chunk.message_index_offsets[number])
+                entries = index.records if isinstance(index, MessageIndex) else []
+                times[records[number]].update(time for time, _ in entries)
         for entry in summary.attachment_indexes:
             attachment = _record_at(file, entry.offset) if entry.name == SCENE_ATTACHMENT else None
             if isinstance(attachment, Attachment):
                 self._scene_json = attachment.data
         return times
 
-    def _scan(self, file: IO[bytes]) -> set[int]:
+    def _scan(self, file: IO[bytes]) -> Times:
         topics: dict[int, set[str]] = defaultdict(set)
         damaged = 0
         for opcode, offset in _walk(file):
@@ -174,12 +181,13 @@ class RecordingReader:
                 self._scan_record(opcode, _record_at(file, offset), offset, topics)
             except DAMAGE:
                 damaged += 1
-        times = {time for time, found in topics.items() if {FRAME_TOPIC, COLOR_TOPIC} <= found}
+        frames = {time for time, found in topics.items() if {FRAME_TOPIC, COLOR_TOPIC} <= found}
+        fisheyes = {time for time, found in topics.items() if FISHEYE_RECORD_TOPIC in found}
         lost = f" and {damaged} damaged parts were left out" if damaged else ""
         self.notes.append(
-            f"{self.path} was not finished; {len(times)} frames were recovered by reading it through{lost}."
+            f"{self.path} was not finished; {len(frames)} frames were recovered by reading it through{lost}."
         )
-        return times
+        return defaultdict(set, {FRAME_TOPIC: frames, FISHEYE_RECORD_TOPIC: fisheyes})
 
     def _scan_record(self, opcode: int, record: Any, offset: int, topics: dict[int, set[str]]) -> None:  # noqa: ANN401
         if opcode == Opcode.ATTACHMENT and isinstance(record, Attachment) and record.name == SCENE_ATTACHMENT:
@@ -193,40 +201,35 @@ class RecordingReader:
                 topics[item.log_time].add(self._channels[item.channel_id])
         self._spans.append(_Span(offset, record.message_start_time, record.message_end_time))
 
-    def _parts(self, time_ns: int) -> dict[str, bytes]:
-        """Messages of a time by topic; several of one topic leave the last."""
+    def _parts(self, time_ns: int) -> list[tuple[str, bytes]]:
+        """Messages (topic, data) of a time in their order, as far as they can be read."""
         near = np.flatnonzero((self._starts_ns <= time_ns) & (time_ns <= self._ends_ns))
         messages = (message for index in near for message in self._messages(self._spans[index].offset))
-        return {
-            self._channels.get(part.channel_id, ""): part.data
+        return [
+            (self._channels.get(part.channel_id, ""), part.data)
             for part in messages
             if part.log_time == time_ns
-        }
+        ]
 
     def _messages(self, offset: int) -> list[Message]:
-        """Messages of a chunk; the last one read is kept, because frames are mostly read in order."""
-        known, messages = self._cached
-        if known == offset:
-            return messages
-        try:
-            with self.path.open("rb") as file:
-                contents = _chunk_contents(_record_at(file, offset))
-        except DAMAGE as error:
-            raise DeltalightError(
-                f"{self.path} is damaged at byte {offset}; leave these frames out."
-            ) from error
-        messages = [item for item in contents if isinstance(item, Message)]
-        self._cached = offset, messages
-        return messages
+        """Messages of a chunk, none of a damaged one; the last one is kept, as frames are mostly read in order."""
+        if self._cached[0] != offset:
+            try:
+                with self.path.open("rb") as file:
+                    contents = _chunk_contents(_record_at(file, offset))
+            except DAMAGE:
+                contents = []
+            self._cached = offset, [item for item in contents if isinstance(item, Message)]
+        return self._cached[1]
 
     def _read_record(self, index: int) -> tuple[FrameRecord, dict[str, bytes]]:
-        parts = self._parts(self.timestamps_ns[index])
+        parts = dict(self._parts(self.timestamps_ns[index]))
         if FRAME_TOPIC not in parts:
             raise DeltalightError(f"{self.path} is damaged; leave frame {index} out.")
         return FrameRecord.unpacked(parts[FRAME_TOPIC], str(self.path)), parts
 
     def _read_session(self) -> SessionRecord:
-        parts = self._parts(self.timestamps_ns[0])
+        parts = dict(self._parts(self.timestamps_ns[0]))
         if SESSION_TOPIC in parts:
             return SessionRecord.unpacked(parts[SESSION_TOPIC], str(self.path))
         self.notes.append(f"{self.path} has lost its beginning; board and transforms are unknown.")

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
@@ -18,8 +18,9 @@ from mcap_protobuf.schema import register_schema
 from protocol.board import BoardSpec
 from protocol.calibration import Extrinsics
 from protocol.errors import DeltalightError
-from protocol.frames import DepthImage, SensorFrame
+from protocol.frames import DepthImage, FisheyePictures, SensorFrame
 from protocol.pictures import encode_png, exact_depth_scale, known_depth, steps_from_depth
+from protocol.recording_fisheye import fisheye_messages
 from protocol.recording_format import (
     ACTIVE_SUFFIX,
     COLOR_CAMERA_TOPIC,
@@ -28,8 +29,10 @@ from protocol.recording_format import (
     DEPTH_CAMERA_TOPIC,
     DEPTH_FRAME,
     DEPTH_TOPIC,
+    FISHEYE_FRAME,
     FOXGLOVE_TOPICS,
     FRAME_TOPIC,
+    OWN_TOPICS,
     POSE_TOPIC,
     SCENE_ATTACHMENT,
     SESSION_TOPIC,
@@ -57,7 +60,8 @@ class RecordingWriter:
 
     Colour is kept as the frame's JPEG bytes where it has them, else as PNG. Depth is kept without loss: in
     16-bit steps where one of the usual steps is exact, else as 32-bit floats. With `depth_scale` (metres) it
-    is rounded to these steps. Asset paths of the attached scene are kept relative to the recording.
+    is rounded to these steps. Fish-eye pictures are kept without loss, once for all frames that they hold for;
+    they are known by their time. Asset paths of the attached scene are kept relative to the recording.
 
     Raises:
         DeltalightError: the name is taken or not `*.mcap`, the disk refuses, or frames are out of order.
@@ -83,6 +87,7 @@ class RecordingWriter:
             board=board, extrinsics=self._extrinsics.to_dict(), depth_scale=depth_scale
         )
         self._last_ns, self._count, self._is_open = -1, 0, True
+        self._fisheye_ns: int | None = None
         with self._disk_errors():
             self._file = self.active_path.open("xb")
             self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
@@ -120,6 +125,10 @@ class RecordingWriter:
         with self._disk_errors():
             if self._count == 0:
                 self._write(SESSION_TOPIC, frame.timestamp_ns, self._session.packed())
+                # In a chunk with nothing else but the channels, because without these no other chunk can be read.
+                self._writer.flush()
+            if frame.fisheye is not None and frame.fisheye.timestamp_ns != self._fisheye_ns:
+                self._write_fisheye(frame.fisheye, frame.timestamp_ns)
             self._write_frame(frame)
             self._writer.flush()
         self._last_ns = frame.timestamp_ns
@@ -149,8 +158,7 @@ class RecordingWriter:
         )
         for topic, kind in FOXGLOVE_TOPICS.items():
             channels[topic] = self._writer.register_channel(topic, "protobuf", schemas[kind])
-        own: tuple[tuple[str, Any], ...] = ((SESSION_TOPIC, SessionRecord), (FRAME_TOPIC, FrameRecord))
-        for topic, record in own:
+        for topic, record in OWN_TOPICS.items():
             schema = json.dumps(record.model_json_schema()).encode()
             schema_id = self._writer.register_schema(f"deltalight.{record.__name__}", "jsonschema", schema)
             channels[topic] = self._writer.register_channel(topic, "msgpack", schema_id)
@@ -187,6 +195,7 @@ class RecordingWriter:
             response=None if frame.response is None else frame.response.astype("<f4").tobytes(),
             world_from_camera=None if pose is None else pose.ravel().tolist(),
             depth=depth,
+            fisheye_ns=None if frame.fisheye is None else frame.fisheye.timestamp_ns,
         )
         self._write(FRAME_TOPIC, now, record.packed())
 
@@ -218,6 +227,16 @@ class RecordingWriter:
             scale=scale,
             noise_sigma_m=depth.noise_sigma_m,
         )
+
+    def _write_fisheye(self, pictures: FisheyePictures, now: int) -> None:
+        for topic, data in fisheye_messages(pictures):
+            self._write(topic, now, data)
+        own, probe = self._extrinsics.rgb_from_fisheye, self._extrinsics.world_from_fisheye
+        parent, place = (WORLD_FRAME, probe) if own is None else (COLOR_FRAME, own)
+        if place is not None:
+            transform = transform_message(place, parent, FISHEYE_FRAME, now)
+            self._write(POSE_TOPIC, now, transform.SerializeToString())
+        self._fisheye_ns = pictures.timestamp_ns
 
     def _write_depth_place(self, now: int) -> None:
         depth_from_rgb = self._extrinsics.depth_from_rgb

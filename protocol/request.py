@@ -9,8 +9,10 @@ from dataclasses import dataclass
 import structlog
 import zmq
 
+from protocol.curve import guard
 from protocol.envelope import EnvelopeError, decode, encode
 from protocol.errors import DeltalightError
+from protocol.keys import Keys
 from protocol.messages import MAX_HEADER_BYTES, ControlReply, ControlRequest
 from protocol.sockets import attach, open_socket
 
@@ -70,27 +72,40 @@ class ReplyServer:
     """Answers requests in a thread of its own that owns the socket.
 
     `handler(request)` returns the payload of the reply; a `DeltalightError` from it refuses the request.
+    `keys` are needed where the endpoint leaves the host.
     """
 
-    def __init__(self, endpoint: str, handler: Handler, *, node: str = "server") -> None:
+    def __init__(
+        self, endpoint: str, handler: Handler, *, node: str = "server", keys: Keys | None = None
+    ) -> None:
         self._handler = handler
         self._node = node
         self._memory = ReplyMemory()
         self._answering = threading.Lock()
         self._context = zmq.Context()
+        self._socket = open_socket(self._context, zmq.REP, max_bytes=MAX_HEADER_BYTES)
+        self._guard = guard(self._context, self._socket, keys, bind=True)
         try:
-            self._socket = open_socket(self._context, zmq.REP, max_bytes=MAX_HEADER_BYTES)
-            self.endpoint = attach(self._socket, endpoint, bind=True)
+            self.endpoint = attach(self._socket, endpoint, bind=True, keys=keys)
         except DeltalightError:
+            if self._guard is not None:
+                self._guard.close()
             self._context.destroy(0)
             raise
         self._thread = threading.Thread(target=self._run, name="control", daemon=True)
         self._thread.start()
 
+    @property
+    def refused(self) -> int:
+        """Connections that were refused because their keys are not right."""
+        return 0 if self._guard is None else self._guard.refused
+
     def close(self) -> None:
         """Stop the thread, after the reply to the request that it is at was sent."""
         with self._answering:
             pass
+        if self._guard is not None:
+            self._guard.close()
         self._context.term()
         self._thread.join()
 
@@ -153,10 +168,12 @@ class RequestClient:
     """Sends requests to one `ReplyServer`, one at a time; threads may share it.
 
     A request that got no answer may be sent again as it is: its id keeps it from being carried out twice.
+    `keys` are needed where the endpoint leaves the host.
     """
 
-    def __init__(self, endpoint: str) -> None:
+    def __init__(self, endpoint: str, *, keys: Keys | None = None) -> None:
         self.endpoint = endpoint
+        self._keys = keys
         self._context = zmq.Context()
         self._lock = threading.Lock()
         self._socket: zmq.Socket[bytes] | None = None
@@ -180,8 +197,9 @@ class RequestClient:
             socket = self._connected()
             socket.send_multipart(multipart)
             if not socket.poll(max(0, round((deadline - time.monotonic()) * 1000)), zmq.POLLIN):
+                trust = "" if self._keys is None else f" and trusts {self._keys.name}.key"
                 raise DeltalightError(
-                    f"no answer from {self.endpoint} within {timeout_s:g} s: see whether the server runs"
+                    f"no answer from {self.endpoint} within {timeout_s:g} s: see whether the server runs{trust}"
                 )
             return _matched(control, socket.recv_multipart())
         except DeltalightError:
@@ -200,7 +218,7 @@ class RequestClient:
             raise DeltalightError(f"the client of {self.endpoint} is closed: open a new one to ask")
         if self._socket is None:
             self._socket = open_socket(self._context, zmq.REQ, max_bytes=MAX_HEADER_BYTES)
-            attach(self._socket, self.endpoint, bind=False)
+            attach(self._socket, self.endpoint, bind=False, keys=self._keys)
         return self._socket
 
     def _drop(self) -> None:

@@ -124,13 +124,44 @@ Registration = Annotated[
 
 
 class FisheyeLights(StrictModel):
-    """How lights are taken from the fish-eye picture (METHOD 2)."""
+    """How lights are taken from the fish-eye picture (METHOD 2); environment maps are split alike."""
 
     count: int = Field(default=4, ge=1, le=16, description="Number of lights.")
     split: Literal["peaks", "all"] = Field(
         default="peaks",
         description="Cut only what outshines its surroundings, or (as in the papers) the whole map.",
     )
+    threshold: float = Field(
+        default=4.0,
+        gt=0,
+        le=1000,
+        description="Luminance above which light is cut out, as a multiple of the map's mean (split peaks).",
+    )
+    smoothing_s: float = Field(
+        default=0.5,
+        ge=0,
+        le=60,
+        description="Time constant with which lights follow what the fish-eye camera sees, seconds; 0 = at once.",
+    )
+    distance_m: Annotated[float, Field(gt=0, le=1000)] | Literal["auto", "far"] = Field(
+        default="auto",
+        description="Distance of the lights from the fish-eye camera, metres; `far` = as the sun; `auto` = from how "
+        "light falls off over the board's paper, far where none is seen.",
+    )
+
+
+class TrackedLamp(_Light):
+    """A lamp with a marker on it: a sphere light that moves with the marker."""
+
+    marker: int = Field(ge=0, description="Id of the lamp's marker, one of board.yaml's `lamp_markers`.")
+    offset_m: Point = Field(
+        default=(0.0, 0.0, 0.0),
+        description="The bulb in the marker's frame, metres: +x right, +y up the marker, +z out of it.",
+    )
+    intensity: NonNegative = Field(
+        default=1.0, description="Intensity, camera units times square metres: E = I cos/d^2."
+    )
+    radius_m: float = Field(default=0.05, ge=0, le=100, description="Radius of the lamp, metres; 0 = point.")
 
 
 class EnvironmentLights(StrictModel):
@@ -150,6 +181,9 @@ class Lights(StrictModel):
     mode: Literal["fisheye", "tracked", "manual", "environment"] = "manual"
     manual: tuple[ManualLight, ...] = Field(default=(), max_length=64, description="Lights of mode `manual`.")
     fisheye: FisheyeLights = Field(default_factory=FisheyeLights)
+    tracked: tuple[TrackedLamp, ...] = Field(
+        default=(), max_length=16, description="Lamps of mode `tracked`."
+    )
     environment: EnvironmentLights = Field(default_factory=EnvironmentLights)
     registration: Registration | None = Field(
         default=None,
@@ -158,15 +192,20 @@ class Lights(StrictModel):
     )
     surroundings: Literal["auto", "none"] = Field(
         default="auto",
-        description="Mode manual: light of what neither the camera nor the lights show. Below the horizon the mean "
-        "of the ground; above, more towards what is seen there, as strong as the board's paper tells where "
-        "board.yaml gives its white_albedo. Or none.",
+        description="Modes manual and tracked: light of what neither the camera nor the lights show. Below the "
+        "horizon the mean of the ground; above, more towards what is seen there, as strong as the board's paper "
+        "tells where board.yaml gives its white_albedo. Or none.",
     )
 
     @model_validator(mode="after")
     def _check(self) -> Self:
         if self.mode == "environment" and self.environment.map is None:
             raise ValueError("mode environment needs environment.map, the asset of a radiance map")
+        if self.mode == "tracked" and not self.tracked:
+            raise ValueError("mode tracked needs tracked, a list of lamps with the markers that they carry")
+        markers = [lamp.marker for lamp in self.tracked]
+        if len(set(markers)) < len(markers):
+            raise ValueError("tracked names a marker twice; each lamp needs a marker of its own")
         return self
 
     @property

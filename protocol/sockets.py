@@ -1,11 +1,11 @@
 """What all sockets of the wire share: which endpoints are allowed, and their options (SPEC.md, section 5)."""
 
-import ipaddress
-import re
-
 import zmq
 
+from protocol.curve import secure
+from protocol.endpoints import Endpoint, parse_endpoint
 from protocol.errors import DeltalightError
+from protocol.keys import CREATE_HINT, Keys
 from protocol.messages import MAX_PART_BYTES
 
 HIGH_WATER_MARK = 2  # frames; the default of 1000 showed a slow consumer frames that were seconds old
@@ -13,34 +13,20 @@ RECONNECT_MS = 100
 RECONNECT_MAX_MS = 1000
 HEARTBEAT_MS = 1000
 HEARTBEAT_TIMEOUT_MS = 3000
-_TCP = re.compile(r"tcp://(?P<host>\[[0-9A-Fa-f:.]+\]|[^:/\[\]]+):(?P<port>\d{1,5}|\*)")
-_IPC = re.compile(r"ipc://.+")
 
 
-def check_endpoint(endpoint: str) -> None:
-    """Accept `tcp://` on loopback and `ipc://`: without CURVE keys nothing may leave the host.
+def check_endpoint(endpoint: str, keys: Keys | None = None) -> Endpoint:
+    """Take an endpoint apart: without keys, `tcp://` on loopback or `ipc://`; with keys any `tcp://`.
 
     Raises:
-        DeltalightError: another transport, or a host that is not loopback.
+        DeltalightError: another transport, or it leaves the host and there are no keys.
     """
-    if _IPC.fullmatch(endpoint):
-        return
-    parts = _TCP.fullmatch(endpoint)
-    if parts is None:
-        raise DeltalightError(f"{endpoint} is not an endpoint: write tcp://127.0.0.1:PORT or ipc://PATH")
-    if not _is_loopback(parts["host"]):
+    parts = parse_endpoint(endpoint)
+    if parts.needs_keys and keys is None:
         raise DeltalightError(
-            f"{endpoint} leaves this host, and without keys it may not: use 127.0.0.1, or a tunnel to it"
+            f"{endpoint} leaves this host, and without keys it may not: {CREATE_HINT}, or use 127.0.0.1"
         )
-
-
-def _is_loopback(host: str) -> bool:
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host.strip("[]")).is_loopback
-    except ValueError:
-        return False
+    return parts
 
 
 def open_socket(
@@ -65,16 +51,18 @@ def open_socket(
     return socket
 
 
-def attach(socket: zmq.Socket[bytes], endpoint: str, *, bind: bool) -> str:
+def attach(socket: zmq.Socket[bytes], endpoint: str, *, bind: bool, keys: Keys | None = None) -> str:
     """Bind or connect; returns the endpoint with the port that was got (port 0 lets the system choose).
 
     Raises:
-        DeltalightError: the endpoint leaves the host, is taken, or is not understood.
+        DeltalightError: the endpoint leaves the host and there are no keys for that, is taken, or is not
+            understood.
     """
-    check_endpoint(endpoint)
+    parts = check_endpoint(endpoint, keys)
+    secure(socket, parts, keys, bind=bind)
     socket.ipv6 = "[" in endpoint  # where it is on, IPv4 addresses come back in their IPv6 form
     try:
-        (socket.bind if bind else socket.connect)(endpoint)
+        (socket.bind if bind else socket.connect)(parts.address)
     except zmq.ZMQError as error:
         verb = "listen at" if bind else "connect to"
         raise DeltalightError(

@@ -1,7 +1,8 @@
 """Puts the streams of a sensor node together: a colour picture with its own pose and depth.
 
-A colour frame triggers; the pose is that of the same frame, the depth the nearest in capture time within a
-tolerance. What stays without a partner, or is overtaken by a newer frame, is counted.
+A colour frame triggers; pose and lamps are those of the same frame, the depth the nearest in capture time within a
+tolerance, the radiance map the one that holds. What stays without a partner, or is overtaken by a newer frame, is
+counted.
 """
 
 from collections import Counter, deque
@@ -16,10 +17,20 @@ from protocol.board import BoardSpec
 from protocol.camera_model import CameraModel
 from protocol.codecs import decode_color, decode_depth, decode_response
 from protocol.documents import StrictModel, validate
-from protocol.frames import BoardPose, DepthImage, ViewFrame
-from protocol.messages import ColorMessage, DepthMessage, Message, MessageBase, PoseMessage
+from protocol.errors import DeltalightError
+from protocol.frames import BoardPose, DepthImage, LampPose, RadianceMap, ViewFrame
+from protocol.light_codecs import lamp_poses, radiance_map
+from protocol.messages import (
+    ColorMessage,
+    DepthMessage,
+    LampsMessage,
+    Message,
+    MessageBase,
+    PoseMessage,
+    RadianceMessage,
+)
 
-TOPICS = ("color", "clean_depth", "pose")
+TOPICS = ("color", "clean_depth", "pose", "radiance", "lamps")
 KEPT_MESSAGES = 8  # per stream; a renderer that is slower than this many frames drops them anyway
 
 Built = TypeVar("Built")
@@ -71,6 +82,9 @@ class FrameAssembler:
         self._colors: deque[_Held[ColorMessage]] = deque()
         self._depths: deque[_Held[DepthMessage]] = deque(maxlen=KEPT_MESSAGES)
         self._poses: deque[_Held[PoseMessage]] = deque(maxlen=KEPT_MESSAGES)
+        self._lamps: deque[LampsMessage] = deque(maxlen=KEPT_MESSAGES)
+        self._radiance: deque[_Held[RadianceMessage]] = deque(maxlen=KEPT_MESSAGES)
+        self._map: tuple[_Held[RadianceMessage], RadianceMap] | None = None  # the one decoded last
         self._reference_exposure_s: float | None = None  # of the first frame, as for recordings
         self._camera = _Unchanged(CameraModel.from_dict)
         self._depth_camera = _Unchanged(CameraModel.from_dict)
@@ -86,6 +100,12 @@ class FrameAssembler:
                 self._depths.append(_Held(message, parts, received_ns))
             case PoseMessage():
                 self._poses.append(_Held(message, parts, received_ns))
+            case LampsMessage():
+                self._lamps.append(message)
+            case RadianceMessage():
+                # Maps are sent again for those who come late.
+                if all(_identity(held.message) != _identity(message) for held in self._radiance):
+                    self._radiance.append(_Held(message, parts, received_ns))
 
     def take(self, now_ns: int) -> AssembledFrame | None:
         """The newest complete frame, or the newest whose patience ran out; older ones are dropped.
@@ -115,8 +135,7 @@ class FrameAssembler:
 
     def _pose_of(self, color: ColorMessage) -> _Held[PoseMessage] | None:
         """The pose of this very frame; the capture time tells turns of a looped recording apart."""
-        wanted = (color.node, color.frame_id, color.capture_ns)
-        poses = (held for held in self._poses if _identity(held.message) == wanted)
+        poses = (held for held in self._poses if _identity(held.message) == _identity(color))
         return next(poses, None)
 
     def _depth_of(self, color: ColorMessage) -> _Held[DepthMessage] | None:
@@ -126,6 +145,28 @@ class FrameAssembler:
             return None
         apart_ms = abs(nearest.message.capture_ns - color.capture_ns) / 1e6
         return nearest if apart_ms <= self._settings.depth_tolerance_ms else None
+
+    def _lamps_of(self, color: ColorMessage) -> tuple[LampPose, ...]:
+        own = (message for message in self._lamps if _identity(message) == _identity(color))
+        return next((lamp_poses(message) for message in own), ())
+
+    def _map_of(self, color: ColorMessage) -> RadianceMap | None:
+        """The newest map that is not later than the frame; before the first the first."""
+        own = [held for held in self._radiance if held.message.node == color.node]
+        if not own:
+            return None
+        begun = [held for held in own if held.message.capture_ns <= color.capture_ns]
+        newest = max(begun, key=_captured) if begun else min(own, key=_captured)
+        if self._map is None or self._map[0] is not newest:
+            self._map = newest, self._decode_map(newest)
+        return self._map[1]
+
+    def _decode_map(self, held: _Held[RadianceMessage]) -> RadianceMap:
+        try:
+            return radiance_map(held.message, held.parts)
+        except DeltalightError:
+            self._radiance.remove(held)  # so that it costs one frame and not all that it holds for
+            raise
 
     def _build(
         self, color: _Held[ColorMessage], pose: _Held[PoseMessage] | None, depth: _Held[DepthMessage] | None
@@ -144,6 +185,8 @@ class FrameAssembler:
             pose=None if pose is None else _board_pose(pose.message),
             depth=None if depth is None else self._depth_image(depth),
             board=None if pose is None or pose.message.board is None else self._board(pose.message.board),
+            radiance_map=self._map_of(header),
+            lamps=self._lamps_of(header),
         )
         return AssembledFrame(view, header, color.received_ns)
 
@@ -167,6 +210,10 @@ class _Unchanged(Generic[Built]):
         if self._last is None or self._last[0] != data:
             self._last = (data, self._build(data))
         return self._last[1]
+
+
+def _captured(held: _Held[Kind]) -> int:
+    return held.message.capture_ns
 
 
 def _identity(message: MessageBase) -> tuple[str, int, int]:

@@ -10,11 +10,12 @@ from jaxtyping import Bool, Float32, Float64
 from protocol.frames import ViewFrame, decode_lut
 from render_server.passes.composite import RelitLayers
 from render_server.relight.frame import RelightInput
+from render_server.scene.albedo_memory import AlbedoMemory
 from render_server.scene.environment import LUMINANCE
+from render_server.scene.known_surfaces import known_albedo
 from render_server.scene.octahedral import irradiance, octahedral_uv, resample_to_octahedral
 from render_server.scene.registration import (
     Registration,
-    paper_pixels,
     registration_from_albedo_percentile,
     registration_from_patch,
     surroundings_from_patch,
@@ -31,34 +32,31 @@ Relight = Callable[[RelightInput], RelitLayers]
 
 @dataclass(frozen=True, eq=False)
 class _Samples:
-    """What is known at pixels that show real surfaces; all linear RGB."""
+    """What is known at pixels that show real surfaces; positions in world metres, the rest linear RGB."""
 
+    position: Float64[np.ndarray, "k 3"]
     measured: Float64[np.ndarray, "k 3"]
     direct: Float64[np.ndarray, "k 3"]
     light: Float64[np.ndarray, "k 3"]
     bounce: Float64[np.ndarray, "k 3"]
     usable: Bool[np.ndarray, " k"]
     unshadowed: Bool[np.ndarray, " k"]
-    paper: Bool[np.ndarray, " k"]
+    albedo: Float32[np.ndarray, " k"]  # where it is known, else 0
 
 
 def register_lights(frame: ViewFrame, scene: RelightInput, relight: Relight) -> Registration:
-    """Factor R G B on all lights: from the board's white paper, else from the brightest albedo.
+    """Factor R G B on all lights: from white paper and grey cards, else from the brightest albedo.
 
     `scene.lights` are not registered yet. The light that other real surfaces throw is in camera units already (it
     is measured), so the cones are traced twice: with the environment and without.
     """
     samples = _samples(frame, scene, _bounce(scene, relight), relight)
-    if frame.board is not None and frame.pose is not None:
-        on_paper = samples.usable & samples.paper
-        found = registration_from_patch(
-            samples.measured[on_paper],
-            samples.light[on_paper],
-            samples.bounce[on_paper],
-            frame.board.paper_albedo,
-        )
-        if found is not None:
-            return found
+    known = samples.usable & (samples.albedo > 0)
+    found = registration_from_patch(
+        samples.measured[known], samples.light[known], samples.bounce[known], samples.albedo[known]
+    )
+    if found is not None:
+        return found
     lit = samples.usable & samples.unshadowed
     return registration_from_albedo_percentile(samples.measured[lit], samples.light[lit], samples.bounce[lit])
 
@@ -72,7 +70,7 @@ def find_surroundings(
     picture; what the lights and the visible scene leave unexplained comes from there.
     """
     board = frame.board
-    if board is None or board.white_albedo is None or frame.pose is None:
+    if board is None or (board.white_albedo is None and not board.grey_cards):
         return None
     black = replace(scene.lights, environment=np.zeros_like(scene.lights.environment))
     one = black.with_sky(np.ones(3, np.float32), shape)
@@ -81,11 +79,18 @@ def find_surroundings(
     even = _samples(
         frame, replace(scene, lights=one, lights_version=scene.lights_version + 2), bounce, relight
     )
-    paper = known.usable & known.paper
+    paper = known.usable & (known.albedo > 0)
     total, per_radiance = known.light + known.bounce, even.light - known.direct
     return surroundings_from_patch(
-        known.measured[paper], total[paper], per_radiance[paper], board.white_albedo
+        known.measured[paper], total[paper], per_radiance[paper], known.albedo[paper]
     )
+
+
+def observe_albedo(frame: ViewFrame, scene: RelightInput, memory: AlbedoMemory, relight: Relight) -> None:
+    """Add what this frame shows of the real surfaces' albedo; `scene.lights` are registered."""
+    samples = _samples(frame, scene, None, relight)
+    lit = samples.usable & samples.unshadowed
+    memory.observe(scene.real.bounds, samples.position[lit], samples.measured[lit], samples.light[lit])
 
 
 def ground_radiance(frame: ViewFrame, scene: RelightInput) -> Float32[np.ndarray, "3"] | None:
@@ -136,28 +141,34 @@ def _bounce(scene: RelightInput, relight: Relight) -> Float64[np.ndarray, "h w 3
 
 
 def _samples(
-    frame: ViewFrame, scene: RelightInput, bounce: Float64[np.ndarray, "h w 3"], relight: Relight
+    frame: ViewFrame, scene: RelightInput, bounce: Float64[np.ndarray, "h w 3"] | None, relight: Relight
 ) -> _Samples:
-    """Read the fields back where the real scene is in view; cones are those of the pixel's texel of the grid."""
+    """Read the fields back where the real scene is in view; cones are those of the pixel's texel of the grid.
+
+    Without `bounce` all light that the cones gather counts as the lights'.
+    """
     layers = relight(replace(scene, everywhere=True))
     cones, direct = _read(layers.cones.mu), _read(layers.direct.mu)
     rows, columns = (np.arange(n) // layers.grid.scale for n in direct.shape[:2])
-    known = _read(scene.real_surface.position)[..., 3] > 0
+    position = _read(scene.real_surface.position)
+    known = position[..., 3] > 0
     shown = known & (_read(scene.matte)[..., 0] == 0) & (cones[np.ix_(rows, columns)][..., 3] > 0)
     y, x = np.nonzero(shown)
     coded = decode_lut(frame.response)[frame.color, np.arange(3)]
-    own, reflected = direct[y, x], bounce[rows[y], columns[x]]
-    on_paper = np.zeros(known.shape, bool)
+    own = direct[y, x]
+    reflected = np.zeros((len(y), 3)) if bounce is None else bounce[rows[y], columns[x]]
+    albedo = np.zeros(known.shape, np.float32)
     if frame.board is not None and frame.pose is not None:
-        on_paper = paper_pixels(frame.board, frame.camera, frame.pose)
+        albedo = known_albedo(frame.board, frame.camera, frame.pose)
     return _Samples(
+        position[y, x, :3],
         (coded / frame.exposure_scale)[y, x],
         own[:, :3],
         own[:, :3] + cones[rows[y], columns[x]][:, :3] - reflected,
         reflected,
         unclipped(frame.color, coded)[y, x],
         own[:, :3].mean(axis=1) >= UNSHADOWED * own[:, 3],
-        on_paper[y, x],
+        albedo[y, x],
     )
 
 

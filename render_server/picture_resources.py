@@ -117,14 +117,18 @@ class PictureResources:
             assert real.frame is not None
             assert real.frame.depth is not None
             assert real.surface is not None
+            assert real.surface_view is not None
+            view = real.surface_view
             self.real_surface.from_depth(real.frame.depth, real.surface.normals, self.picture, view, count)
-            return
+            if not real.is_fused:
+                return
         if self._model_raster is None:
             self._model_raster = GeometryBuffer(self._gpu, self._raster.size)
         assert real.state is not None
         real.state.materials.bind()
         self._geometry.run(self._model_raster, real.state.buffers, view)
-        self.real_surface.from_model(self._model_raster, self.picture, view, count)
+        noise = real.noise_sigma if real.is_fused else None
+        self.real_surface.from_model(self._model_raster, self.picture, view, count, noise_sigma=noise)
 
     def release(self) -> None:
         """Free the GL objects."""

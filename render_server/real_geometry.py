@@ -1,4 +1,4 @@
-"""The real scene's triangles: a mesh of the frame's depth, or a given model."""
+"""The real scene's triangles: a mesh of the frame's depth, the fused surface of all frames so far, or a given model."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -16,12 +16,18 @@ from render_server.passes.mesh_buffers import MeshBuffers, triangle_corners
 from render_server.relight.frame import GeometryState
 from render_server.scene.depth_mesh import depth_mesh
 from render_server.scene.depth_surface import DepthSurface, depth_surface, noise_sigma
+from render_server.scene.fused_scene import FusedScene
 from render_server.scene.mesh import TriangleMesh, load_mesh, merge_for_gpu
 from render_server.scene.scene_tracker import RealSceneTracker
 from render_server.view import CameraView
 
 COARSE_SHARE = 8  # of the triangles, for the coarse volume: its voxels are several times as large
 BOUND_POINTS = 4000  # points kept of a mesh to fit light views around it
+# Frames that are averaged while nothing moves: their noise is a quarter of one frame's. Then all stays as it is, so
+# that a scene at rest gives the same picture bit for bit.
+STILL_FRAMES = 16
+# A voxel's surface cuts the corner where two surfaces meet at a right angle, by up to sqrt(2) / 4 of its edge.
+ROUNDED_VOXELS = 0.35
 
 
 class RealGeometry:
@@ -45,13 +51,12 @@ class RealGeometry:
         self.frame: ViewFrame | None = None
         self.view: CameraView | None = None
         self.surface: DepthSurface | None = None
+        self.surface_view: CameraView | None = None
+        self._fused = FusedScene() if real.geometry == "fused" else None
+        self._still_frames = 0
         if isinstance(real.geometry, ModelGeometry):
             self._model = self._load_model(real.geometry)
             self.material_names = tuple(mesh.material.name for mesh in self._model)
-        elif real.geometry == "fused":
-            raise DeltalightError(
-                "real.geometry `fused` arrives with a later release: use `depth`, or give a model."
-            )
 
     def _load_model(self, model: ModelGeometry) -> list[TriangleMesh]:
         matrix = model.pose.matrix()
@@ -59,10 +64,12 @@ class RealGeometry:
 
     @property
     def noise_sigma(self) -> float:
-        """Depth noise at 1 m, m; a model has none."""
+        """Depth noise at 1 m, m; a model has none. Three of it are at least what voxels round off."""
         if self.is_model or self.frame is None or self.frame.depth is None:
             return 0.0
-        return noise_sigma(self.frame.depth)
+        sensor = noise_sigma(self.frame.depth)
+        rounded_m = 0.0 if self._fused is None else ROUNDED_VOXELS * self._fused.voxel_m
+        return max(sensor, rounded_m / (3 * self.typical_depth**2))
 
     def update(self, frame: ViewFrame, view: CameraView) -> bool:
         """Take over the frame's geometry if it changed; returns whether it did.
@@ -74,9 +81,13 @@ class RealGeometry:
             raise DeltalightError(
                 "The source has no depth: record depth, or give the scene a model (`real: {geometry: {model: ...}}`)."
             )
-        if not self._tracker.update(frame):
+        moved = self._tracker.update(frame)
+        if moved:
+            self.frame, self.view, self.surface_view = frame, view, view
+        if self._fused is not None:
+            return self._fuse(self._fused, frame, view, moved)
+        if not moved:
             return False
-        self.frame, self.view = frame, view
         if self.is_model and self.state is not None:
             self.state = replace(self.state, version=next(self._versions))
         elif self.is_model:
@@ -85,6 +96,36 @@ class RealGeometry:
             assert frame.depth is not None
             self._build_from_depth(frame.depth, view)
         return True
+
+    @property
+    def is_fused(self) -> bool:
+        """Whether triangles show more than the frame's own depth does, so that they fill its holes."""
+        return self._fused is not None
+
+    def _fuse(self, fused: FusedScene, frame: ViewFrame, view: CameraView, moved: bool) -> bool:
+        """Average a frame in, unless all stands still long enough; returns whether anything changed."""
+        self._still_frames = 0 if moved else self._still_frames + 1
+        if self._still_frames > STILL_FRAMES:
+            return False
+        assert frame.depth is not None
+        surface = depth_surface(frame.depth, view.camera)
+        settle = self._still_frames == STILL_FRAMES
+        renewed = fused.add(surface, view, noise_sigma(frame.depth), settle=settle)
+        if moved:
+            self.surface, self.surface_view = surface, fused.view
+        if renewed:
+            self._build_from_fused(fused)
+        elif moved and self.state is not None:
+            self.state = replace(self.state, version=next(self._versions))
+        return moved or renewed
+
+    def _build_from_fused(self, fused: FusedScene) -> None:
+        """Take over the fused surface, and once more in few triangles for what lies far from the objects."""
+        coarse = fused.meshes(self._budget // COARSE_SHARE)
+        if not any(len(mesh.triangles) for mesh in coarse):
+            self.state = None
+            return
+        self._build(fused.meshes(self._budget), triangle_corners(merge_for_gpu(coarse)))
 
     def _build_from_depth(self, depth: DepthImage, view: CameraView) -> None:
         """Mesh the depth image, and once more with few triangles for what lies far from the objects."""

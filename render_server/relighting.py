@@ -11,13 +11,9 @@ from protocol.scene_method import DvctMethod, NoneMethod
 from protocol.scene_objects import Material
 from render_server.gpu.context import GpuContext
 from render_server.gpu.timers import PassTimers
-from render_server.light_registration import (
-    find_surroundings,
-    ground_radiance,
-    register_lights,
-    surroundings_shape,
-)
+from render_server.lighting import VERSION_STEP, Lighting
 from render_server.passes.composite import RelitLayers
+from render_server.passes.unseen_albedo import UnseenAlbedo
 from render_server.passes.volume import memory_statement
 from render_server.picture_resources import PictureResources
 from render_server.real_geometry import RealGeometry
@@ -26,7 +22,6 @@ from render_server.relight.dvct import DvctExact
 from render_server.relight.dvct_base import DvctBase
 from render_server.relight.dvct_paper import DvctPaper
 from render_server.relight.frame import RelightInput
-from render_server.scene.lights import LightSet, build_lights
 from render_server.scene.surfaces import build_surface_table
 from render_server.view import CameraView
 from render_server.virtual_objects import VirtualObjects
@@ -55,7 +50,7 @@ class _Plan:
     scene: SceneDocument
     method: DvctMethod
     resolved: ResolvedDvct
-    lights: LightSet
+    lighting: Lighting
 
 
 class Relighting:
@@ -69,12 +64,11 @@ class Relighting:
         self._real: RealGeometry | None = None
         self._real_versions = count(1)
         self._resources: PictureResources | None = None
+        self._unseen_albedo = UnseenAlbedo(gpu)
         self._method: DvctBase | None = None
-        self._lights_version = 0
+        self._lights_versions = count(VERSION_STEP, VERSION_STEP)
         self._plan = self._planned(scene)
-        self._lights = self._plan.lights
-        self._unregistered: LightSet | None = None
-        self._wants_surroundings = False
+        self.lighting = self._plan.lighting
         self._take(self._plan)
 
     def _planned(self, scene: SceneDocument) -> _Plan:
@@ -82,17 +76,13 @@ class Relighting:
         method = DvctMethod() if isinstance(scene.method, NoneMethod) else scene.method
         if not isinstance(method, DvctMethod):
             raise DeltalightError(f"method `{scene.method.name}` arrives with a later release: use dvct.")
-        if scene.output.view == "lights":
-            raise DeltalightError(
-                "view `lights` arrives with a later release: use composite, effects, delta, volume or rsm."
-            )
         resolved = resolve_dvct(method, software=self._gpu.is_software)
         directions = OPERATORS[method.operator].directions
         self._say(memory_statement(resolved.volume_size, directions, method.memory_budget_mb))
         self._objects.load(scene.objects)
         for sentence in ignored_wishes(scene):
             self._say(sentence)
-        return _Plan(scene, method, resolved, build_lights(scene.lights))
+        return _Plan(scene, method, resolved, Lighting(scene.lights, self._lights_versions, self._say))
 
     def _say(self, sentence: str) -> None:
         if sentence not in self._notices:
@@ -113,20 +103,15 @@ class Relighting:
         if plan.method != old.method and self._method is not None:
             self._method.release()
             self._method = None
-        if plan.scene.lights != old.scene.lights or self._lights_version == 0:
-            self._lights_version += 1
-            self._unregistered = plan.lights if plan.lights.registration_auto else None
-            self._lights = plan.lights.registered()
-            wished = plan.scene.lights
-            self._wants_surroundings = (
-                wished.mode == "manual" and wished.surroundings == "auto" and self._unregistered is None
-            )
+        if plan.scene.lights != old.scene.lights:
+            self.lighting = plan.lighting
         self._plan = plan
 
     def relight(self, frame: ViewFrame, view: CameraView) -> RelitFrame | None:
-        """Relit layers of one frame; None if no object is visible."""
+        """Relit layers of one frame; None if no object is visible, or no light yet."""
+        lit = self.lighting.follow(frame)
         virtual = self._objects.update(self._plan.scene.objects, frame.board)
-        if virtual is None or self._real is None:
+        if virtual is None or self._real is None or not lit:
             return None
         resources = self._resources_for(view)
         timers = self._timers
@@ -149,6 +134,8 @@ class Relighting:
                 resources.declare_surfaces(table)
             antialiasing = self._plan.scene.output.antialiasing
             resources.rasterise(self._real, virtual, view, moved, antialiasing)
+        lights = self.lighting.lights
+        assert lights is not None
         relight_input = RelightInput(
             view.with_antialiasing if antialiasing else view,
             resources.picture,
@@ -157,18 +144,17 @@ class Relighting:
             resources.matte.texture,
             self._real.state,
             virtual,
-            self._lights,
-            self._lights_version,
+            lights,
+            self.lighting.version,
             self._real.noise_sigma,
             self._real.typical_depth,
             resources.surface_uniforms,
+            self._unseen_albedo,
             timers,
         )
-        if self._unregistered is not None:
-            relight_input = self._register(frame, relight_input, self._method_for(view))
-        elif self._wants_surroundings:
-            relight_input = self._add_surroundings(frame, relight_input, self._method_for(view))
-        layers = self._method_for(view).relight(relight_input)
+        method = self._method_for(view)
+        relight_input = self.lighting.complete(frame, relight_input, method.relight)
+        layers = method.relight(relight_input)
         if antialiasing:
             with timers.measure("inner edges"):
                 radiance = resources.with_inner_edges(layers.virtual_radiance)
@@ -179,36 +165,6 @@ class Relighting:
             "sample_distance": self._sample_distance(view),
         }
         return RelitFrame(relight_input, layers, uniforms)
-
-    def _register(self, frame: ViewFrame, scene: RelightInput, method: DvctBase) -> RelightInput:
-        """Find the lights' factor from this frame and use it from now on."""
-        assert self._unregistered is not None
-        found = register_lights(frame, replace(scene, lights=self._unregistered), method.relight)
-        self._lights = self._unregistered.registered(found.factor)
-        self._unregistered = None
-        self._lights_version += 2
-        factor = ", ".join(f"{value:.3g}" for value in found.factor)
-        fit = "" if found.residual is None else f", residual {100 * found.residual:.1f} %"
-        self._say(f"lights registered by {found.source}: factor ({factor}){fit}")
-        if found.warning is not None:
-            self._say(found.warning)
-        return replace(scene, lights=self._lights, lights_version=self._lights_version)
-
-    def _add_surroundings(self, frame: ViewFrame, scene: RelightInput, method: DvctBase) -> RelightInput:
-        """Add the light of what is out of sight, as this frame shows it, from now on."""
-        self._wants_surroundings = False
-        ground = ground_radiance(frame, scene)
-        if ground is not None:
-            self._lights = self._lights.with_ground(ground)
-        scene = replace(scene, lights=self._lights, lights_version=self._lights_version + 1)
-        shape = surroundings_shape(frame, scene)
-        found = find_surroundings(frame, scene, shape, method.relight)
-        self._lights_version += 4  # the versions between were used to find it
-        if found is not None:
-            self._lights = self._lights.with_sky(found, shape)
-            radiance = ", ".join(f"{value:.3g}" for value in found)
-            self._say(f"surroundings out of sight: radiance up to ({radiance}), found on the board's paper")
-        return replace(scene, lights=self._lights, lights_version=self._lights_version)
 
     def _sample_distance(self, view: CameraView) -> float:
         """What a texel of the cones' grid spans at 1 m, m."""
@@ -234,11 +190,11 @@ class Relighting:
 
     def describe_lights(self) -> list[dict[str, Any]]:
         """Plain values of the lights, registration included."""
-        return self._lights.describe()
+        return [] if self.lighting.lights is None else self.lighting.lights.describe()
 
     def release(self) -> None:
         """Free all GL objects."""
-        for item in (self._objects, self._real, self._resources, self._method):
+        for item in (self._objects, self._real, self._resources, self._unseen_albedo, self._method):
             if item is not None:
                 item.release()
 

@@ -81,11 +81,14 @@ class SceneRenderer:
             return _untouched(frame, "no_pose")
         view = CameraView(frame.camera, frame.pose.world_from_camera)
         relit = self._relighting.relight(frame, view)
+        lights = self._relighting.describe_lights()
+        if output.view == "lights" and lights:
+            times = {} if relit is None else dict(relit.timers.end_frame())
+            return _at_once(frame, self._relighting.lighting.picture(frame), lights, times)
         if relit is None:
             return _untouched(frame, "ok")
         self._composer.start(relit, output)
         times = dict(relit.timers.end_frame())
-        lights = self._relighting.describe_lights()
 
         def finish() -> CompositeFrame:
             color, linear = self._composer.finish()
@@ -97,6 +100,17 @@ class SceneRenderer:
         """Free all GL objects."""
         self._relighting.release()
         self._composer.release()
+
+
+def _at_once(
+    frame: ViewFrame,
+    color: UInt8[np.ndarray, "h w 3"],
+    lights: list[dict[str, Any]],
+    times: dict[str, float],
+) -> PendingComposite:
+    """A picture that the GPU had no part in."""
+    composite = CompositeFrame(frame.frame_id, frame.timestamp_ns, color, None, "ok", times, lights)
+    return PendingComposite(lambda: composite, immediate=True)
 
 
 def _untouched(frame: ViewFrame, status: str) -> PendingComposite:

@@ -21,6 +21,7 @@ from protocol.codecs import encode_color
 from protocol.documents import StrictModel
 from protocol.envelope import encode
 from protocol.errors import DeltalightError
+from protocol.keys import Keys
 from protocol.messages import ControlRequest, StatsMessage
 from protocol.scene import SceneDocument, load_scene
 from protocol.transport import Publisher, Receiver, ReplyServer
@@ -151,8 +152,10 @@ class Sender:
         return encode(item.message.model_copy(update={"encoding": "jpeg"}), [jpeg])
 
 
-def run_server(settings: ServerSettings) -> None:
+def run_server(settings: ServerSettings, keys: Keys | None = None) -> None:
     """Serve until a `shutdown` command or an exception (Ctrl-C, SIGTERM) ends it.
+
+    `keys` are needed where an endpoint leaves the host.
 
     Raises:
         DeltalightError: a wrong scene, no fit OpenGL device, or a port in use.
@@ -165,11 +168,11 @@ def run_server(settings: ServerSettings) -> None:
             log.warning("no GPU found, rendering slowly in software", renderer=gpu.renderer_name)
         renderer = SceneRenderer(gpu, scene)
         stack.callback(renderer.release)
-        publisher = Publisher(settings.publish)
+        publisher = Publisher(settings.publish, keys=keys)
         stack.callback(publisher.close)
         sender = Sender(publisher, settings.jpeg_quality)
         stack.callback(sender.close)
-        receiver = Receiver(settings.subscribe, TOPICS)
+        receiver = Receiver(settings.subscribe, TOPICS, keys=keys)
         stack.callback(receiver.close)
         session = RenderSession(
             renderer,
@@ -181,7 +184,7 @@ def run_server(settings: ServerSettings) -> None:
             mailbox_drops=lambda: {**receiver.drops, "send": sender.dropped},
         )
         desk = CommandDesk()
-        replies = ReplyServer(settings.control, desk.ask, node=settings.name)
+        replies = ReplyServer(settings.control, desk.ask, node=settings.name, keys=keys)
         stack.callback(replies.close)
         stack.callback(desk.close)
         log.info("render server runs", renderer=gpu.renderer_name, publish=settings.publish)

@@ -2,13 +2,15 @@
 
 import queue
 import threading
+import time
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Self
 
-from protocol.clock import ClockEstimator, clock_exchange, measure_offset
+from protocol.clock import Clock, ClockEstimator, clock_exchange, measure_offset
 from protocol.errors import DeltalightError
 from protocol.frames import SensorFrame
+from protocol.keys import Keys
 from protocol.transport import RequestClient
 from sensor_node.cameras.base import Camera, EndOfStream
 
@@ -16,6 +18,9 @@ POLL_S = 0.1
 CLOCK_PERIOD_S = 2.0
 CLOCK_TIMEOUT_S = 0.5
 CLOCK_ROUNDS = 4
+# Against the monotonic clock, between two looks: less than a frame, more than slewing (500 ppm) does in 30 s.
+CLOCK_JUMP_NS = 15_000_000
+REMARK_S = 10.0
 
 
 @dataclass(frozen=True)
@@ -89,41 +94,78 @@ class CaptureThread:
 class ServerClock:
     """Follows the clock of a render server in a thread; without an endpoint there is nothing to follow.
 
+    A clock that is set is noticed: this host's at the next `at`, the server's at the next comparison. Then what was
+    measured before is void.
+
     Args:
         node: name that the requests carry.
         endpoint: control endpoint of the server.
+        keys: needed where the endpoint leaves the host.
+        now: this host's clock, ns since 1970.
     """
 
-    def __init__(self, node: str, endpoint: str | None) -> None:
+    def __init__(
+        self, node: str, endpoint: str | None, *, keys: Keys | None = None, now: Clock = time.time_ns
+    ) -> None:
         self._estimator = ClockEstimator()
-        self._lock, self._closing = threading.Lock(), threading.Event()
-        self._client = None if endpoint is None else RequestClient(endpoint)
+        self._now, self._wall_ns = now, now() - time.monotonic_ns()
+        self._remark, self._remark_until_s = "", 0.0
+        self._lock, self._closing, self._is_due = threading.Lock(), threading.Event(), threading.Event()
+        self._client = None if endpoint is None else RequestClient(endpoint, keys=keys)
         self._thread = threading.Thread(target=self._run, args=(node,), name="clock", daemon=True)
         self._thread.start()
 
     def at(self, local_ns: int) -> tuple[int, int | None]:
         """Return the offset to the server's clock and its bound in ns; 0 and None if never compared."""
         with self._lock:
+            self._check_own_clock()
             sample = self._estimator.at(local_ns)
         return (0, None) if sample is None else (sample.offset_ns, sample.bound_ns)
+
+    @property
+    def remark(self) -> str:
+        """A sentence about a clock that was set lately, else nothing."""
+        with self._lock:
+            return self._remark if time.monotonic() < self._remark_until_s else ""
 
     def close(self) -> None:
         """Stop the thread."""
         self._closing.set()
+        self._is_due.set()
         self._thread.join()
         if self._client is not None:
             self._client.close()
+
+    def _check_own_clock(self) -> bool:
+        """Whether this host's clock was set since the last look; then nothing measured before holds."""
+        wall_ns = self._now() - time.monotonic_ns()
+        jump_ns, self._wall_ns = wall_ns - self._wall_ns, wall_ns
+        if abs(jump_ns) < CLOCK_JUMP_NS or self._client is None:
+            return False
+        self._estimator.forget()
+        self._tell("this host's", jump_ns)
+        self._is_due.set()
+        return True
+
+    def _tell(self, whose: str, jump_ns: int) -> None:
+        self._remark = f"{whose} clock was set by {jump_ns / 1e9:+.3g} s and the clocks are compared again"
+        self._remark_until_s = time.monotonic() + REMARK_S
 
     def _run(self, node: str) -> None:
         if self._client is None:
             return
         exchange = clock_exchange(self._client.request, node, CLOCK_TIMEOUT_S)
         while not self._closing.is_set():
+            self._is_due.clear()
             try:
-                sample = measure_offset(exchange, CLOCK_ROUNDS)
+                sample = measure_offset(exchange, CLOCK_ROUNDS, self._now)
             except DeltalightError:  # no server yet; meanwhile the bound of what was measured grows
                 self._closing.wait(POLL_S)
                 continue
             with self._lock:
-                self._estimator.add(sample)
-            self._closing.wait(CLOCK_PERIOD_S)
+                if self._check_own_clock():
+                    continue
+                jump_ns = self._estimator.add(sample)
+                if jump_ns:
+                    self._tell("the server's", jump_ns)
+            self._is_due.wait(CLOCK_PERIOD_S)

@@ -1,16 +1,27 @@
 """The messages in which a sensor node publishes one frame."""
 
 import math
+from collections.abc import Sequence
 from typing import Literal, TypedDict
 
 import numpy as np
 from jaxtyping import Float64
 
 from protocol.board import BoardSpec
-from protocol.codecs import encode_color, encode_depth
-from protocol.envelope import encode
-from protocol.frames import BoardPose, DepthImage, SensorFrame
-from protocol.messages import ColorMessage, DepthMessage, Matrix4, PoseMessage
+from protocol.codecs import encode_array, encode_color, encode_depth
+from protocol.envelope import EnvelopeError, encode
+from protocol.fisheye_parts import describe_calibration
+from protocol.frames import BoardPose, DepthImage, FisheyePictures, LampPose, RadianceMap, SensorFrame
+from protocol.messages import (
+    ColorMessage,
+    DepthMessage,
+    FisheyeMessage,
+    LampEntry,
+    LampsMessage,
+    Matrix4,
+    PoseMessage,
+    RadianceMessage,
+)
 
 # Depth that does not come in steps is sent in this step times the least power of two that its range fits.
 FINEST_DEPTH_STEP_M = 0.0001
@@ -84,6 +95,71 @@ def color_multipart(
         exposure_s=frame.exposure_s,
     )
     return encode(message, [picture] if frame.response is None else [picture, frame.response])
+
+
+def fisheye_multipart(
+    fisheye: FisheyePictures, stamps: Stamps, encoding: Literal["jpeg", "raw"], jpeg_quality: int
+) -> list[bytes]:
+    """Return the message of fish-eye pictures; linear ones go out raw. The stamps are those of their own capture.
+
+    Raises:
+        EnvelopeError: the pictures differ in size or kind.
+    """
+    first = fisheye.pictures[0]
+    if any(picture.shape != first.shape or picture.dtype != first.dtype for picture in fisheye.pictures):
+        raise EnvelopeError("the pictures of a fish-eye bracket differ in size or kind: use one for all")
+    is_linear = first.dtype == np.float32
+    code: Literal["jpeg", "raw"] = "raw" if is_linear else encoding
+    camera, response = describe_calibration(fisheye.calibration)
+    height, width = first.shape[:2]
+    message = FisheyeMessage(
+        **stamps,
+        encoding=code,
+        shape=(height, width, 3),
+        dtype="float32" if is_linear else "uint8",
+        camera=camera,
+        has_response=response is not None,
+        exposures_s=fisheye.exposures_s,
+    )
+    parts = [
+        encode_array(picture, "raw") if is_linear else encode_color(picture, code, jpeg_quality)
+        for picture in fisheye.pictures
+    ]
+    return encode(message, parts if response is None else [*parts, response])
+
+
+def radiance_multipart(radiance: RadianceMap, stamps: Stamps, jpeg_quality: int) -> list[bytes]:
+    """Return the message of a radiance map.
+
+    The stamps are those of the first frame that it holds for, also when it is sent again for those who came late:
+    by them a receiver knows that it has the map already.
+    """
+    camera, response = describe_calibration(radiance.calibration)
+    height, width = radiance.picture.shape[:2]
+    message = RadianceMessage(
+        **stamps,
+        encoding="blosc2",
+        size=len(radiance.radiance),
+        picture_shape=(height, width, 3),
+        clipped_share=float(radiance.clipped_share),
+        world_from_fisheye=_rows(radiance.world_from_fisheye),
+        camera=camera,
+        has_response=response is not None,
+    )
+    parts = [
+        encode_array(radiance.radiance, "blosc2"),
+        encode_array(radiance.seen.astype(np.uint8), "blosc2"),
+        encode_color(radiance.picture, "jpeg", jpeg_quality),
+    ]
+    return encode(message, parts if response is None else [*parts, response])
+
+
+def lamps_multipart(lamps: Sequence[LampPose], stamps: Stamps) -> list[bytes]:
+    """Return the message of the lamps that one colour frame shows."""
+    entries = (
+        LampEntry(marker=int(lamp.marker), world_from_marker=_rows(lamp.world_from_marker)) for lamp in lamps
+    )
+    return encode(LampsMessage(**stamps, lamps=tuple(entries)))
 
 
 def _rows(matrix: Float64[np.ndarray, "4 4"]) -> Matrix4:

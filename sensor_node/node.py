@@ -1,27 +1,45 @@
-"""The loop of a sensor node: captures, cleans, finds the pose, publishes."""
+"""The loop of a sensor node: captures, cleans, finds poses and light, publishes."""
 
 import threading
 import time
-from pathlib import Path
+from contextlib import ExitStack
+from dataclasses import replace
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, field_serializer, field_validator
 
 from protocol.documents import StrictModel
 from protocol.envelope import encode
+from protocol.frames import FisheyePictures, RadianceMap, SensorFrame, ViewFrame
+from protocol.keys import Keys
 from protocol.messages import Name, StatsMessage
-from protocol.source import open_source
 from protocol.transport import Publisher
+from sensor_node.announce import announced
 from sensor_node.cameras.base import Camera
-from sensor_node.cameras.replay import ReplayCamera
-from sensor_node.cameras.synthetic import SyntheticCamera
+from sensor_node.cameras.fisheye_capture import CameraWithFisheye
+from sensor_node.cameras.open import SYNTHETIC, open_camera, open_fisheye
+from sensor_node.cameras.settings import CameraSettings, FisheyeSettings
 from sensor_node.capture import POLL_S, CapturedFrame, CaptureThread, ServerClock
 from sensor_node.depth import DepthSettings
-from sensor_node.frame_messages import Stamps, color_multipart, depth_multipart, pose_multipart
+from sensor_node.fisheye import light_warnings
+from sensor_node.frame_messages import (
+    Stamps,
+    color_multipart,
+    depth_multipart,
+    fisheye_multipart,
+    lamps_multipart,
+    pose_multipart,
+    radiance_multipart,
+)
+from sensor_node.health import Health
+from sensor_node.pose_filter import PoseFilter, PoseFilterSettings
+from sensor_node.repeater import Repeater
 from sensor_node.view_frames import ViewFrameBuilder
 
-SYNTHETIC = "synthetic"
 STATS_PERIOD_S = 1.0
+STREAMS = ("fisheye", "depth", "radiance", "clean_depth", "lamps", "pose", "color", "stats")
+# Fish-eye pictures that are further than this from their frame are stamped by another clock (a loop began again).
+LONGEST_HOLD_NS = 60_000_000_000
 
 
 class NodeConfig(StrictModel):
@@ -29,14 +47,22 @@ class NodeConfig(StrictModel):
 
     name: Name = Field(default="camera", description="Name of the node; its topics end with it.")
     source: str = Field(
-        default=SYNTHETIC, description="Dataset folder, .mcap recording, or `synthetic`: a made-up scene."
+        default=SYNTHETIC,
+        description="Camera (`uvc:0`, `oak`), dataset folder, .mcap recording, or `synthetic`: a made-up scene.",
     )
     endpoint: str = Field(default="tcp://127.0.0.1:5601", description="Where the streams are published.")
     clock_endpoint: str | None = Field(
         default=None, description="Control endpoint of the server whose clock to follow; null = none."
     )
+    announce: bool = Field(
+        default=True, description="Announce the node on the network, if its endpoint leaves this host."
+    )
     realtime: bool = Field(default=True, description="Obey the recorded times; else as fast as possible.")
     loop: bool = Field(default=True, description="Begin again at the end of the source.")
+    camera: CameraSettings = Field(default=CameraSettings(), description="How a live camera is opened.")
+    fisheye: FisheyeSettings | None = Field(
+        default=None, description="Camera that sees the light; null = what the source itself brings."
+    )
     color_encoding: Literal["jpeg", "raw"] = Field(
         default="jpeg", description="Code of colour pictures; JPEGs of the source go out as they are."
     )
@@ -48,39 +74,55 @@ class NodeConfig(StrictModel):
         default=5.0, gt=0, le=600, description="Age of the newest frame from which the camera is lost, s."
     )
     depth: DepthSettings = Field(default=DepthSettings(), description="Depth clean-up.")
+    pose_filter: PoseFilterSettings | None = Field(
+        default=None, description="Smooth the poses that the board gives; null = publish them as found."
+    )
+
+    @field_validator("camera")
+    @classmethod
+    def _one_place_for_replay(cls, camera: CameraSettings) -> CameraSettings:
+        twice = sorted({"realtime", "loop"} & camera.model_fields_set)
+        if twice:
+            raise ValueError(f"write `{twice[0]}` into the node's settings, not into those of its camera")
+        return camera
+
+    @field_serializer("camera")
+    def _only_live_settings(self, camera: CameraSettings) -> dict[str, object]:
+        return camera.model_dump(mode="json", exclude={"realtime", "loop"})
 
 
-def open_camera(config: NodeConfig) -> Camera:
-    """Return the camera that a configuration names, not opened yet.
+def node_camera(config: NodeConfig) -> Camera:
+    """Return the camera that a configuration names, with its fish-eye camera, not opened yet.
 
     Raises:
-        DeltalightError: there is no such source, or it cannot be read.
+        DeltalightError: there is no such source, it cannot be read, or its calibration is missing.
     """
-    if config.source == SYNTHETIC:
-        return SyntheticCamera(realtime=config.realtime, loop=config.loop)
-    return ReplayCamera(open_source(Path(config.source)), realtime=config.realtime, loop=config.loop)
+    settings = config.camera.model_copy(update={"realtime": config.realtime, "loop": config.loop})
+    camera = open_camera(config.source, settings)
+    return camera if config.fisheye is None else CameraWithFisheye(camera, open_fisheye(config.fisheye))
 
 
-def run_node(config: NodeConfig, stop: threading.Event) -> None:
+def run_node(config: NodeConfig, stop: threading.Event, keys: Keys | None = None) -> None:
     """Publish frames until `stop` is set or the source ends; returns within a second of `stop`.
 
-    For each frame: raw depth, clean depth, pose, then colour, all with its `frame_id` and capture time; so
-    whoever has the colour has had the rest. Statistics go out once a second.
+    For each frame: fish-eye pictures and radiance where there are new ones, raw depth, clean depth, lamps, pose, then
+    colour, all with its `frame_id` and capture time; so whoever has the colour has had the rest. Statistics go out
+    once a second. `keys` are needed where an endpoint leaves the host.
 
     Raises:
         DeltalightError: the source or the endpoint cannot be used, or a frame of the source is broken.
     """
-    camera = open_camera(config)
-    publisher = Publisher(config.endpoint)
-    try:
-        clock = ServerClock(config.name, config.clock_endpoint)
-        try:
-            with camera, CaptureThread(camera, keep_all=not config.realtime) as capture:
-                _Node(config, camera, publisher, clock).run(capture, stop)
-        finally:
-            clock.close()
-    finally:
-        publisher.close()
+    camera = node_camera(config)
+    with ExitStack() as stack:
+        publisher = Publisher(config.endpoint, keys=keys)
+        stack.callback(publisher.close)
+        clock = ServerClock(config.name, config.clock_endpoint, keys=keys)
+        stack.callback(clock.close)
+        stack.enter_context(camera)
+        if config.announce:
+            stack.enter_context(announced(config.name, publisher.endpoint, STREAMS, keys))
+        capture = stack.enter_context(CaptureThread(camera, keep_all=not config.realtime))
+        _Node(config, camera, publisher, clock).run(capture, stop)
 
 
 class _Node:
@@ -89,8 +131,12 @@ class _Node:
     def __init__(self, config: NodeConfig, camera: Camera, publisher: Publisher, clock: ServerClock) -> None:
         self._config, self._camera, self._publisher, self._clock = config, camera, publisher, clock
         self._builder = ViewFrameBuilder(camera, config.depth)
-        self._newest_ns: int | None = None
-        self._started_ns = self._period_ns = time.time_ns()
+        self._filter = None if config.pose_filter is None else PoseFilter(config.pose_filter)
+        self._health = Health(camera, config.stale_after_s, config.lost_after_s)
+        self._fisheye: Repeater[FisheyePictures] = Repeater()
+        self._radiance: Repeater[RadianceMap] = Repeater()
+        self._light_remarks: list[str] = []
+        self._period_s = time.monotonic()
         self._frames = self._without_board = 0
 
     def run(self, capture: CaptureThread, stop: threading.Event) -> None:
@@ -99,7 +145,7 @@ class _Node:
             captured = capture.take(POLL_S)
             if captured is not None:
                 self._publish(captured)
-            if time.time_ns() - self._period_ns >= STATS_PERIOD_S * 1e9:
+            if time.monotonic() - self._period_s >= STATS_PERIOD_S:
                 self._send_stats(capture.drops)
         if capture.error is not None:
             raise capture.error
@@ -107,31 +153,68 @@ class _Node:
 
     def _publish(self, captured: CapturedFrame) -> None:
         config, frame = self._config, captured.frame
+        stamps = self._stamps(captured)
+        self._send_fisheye(frame, stamps)
+        if frame.depth is not None:
+            self._publisher.send(depth_multipart(frame.depth, stamps, "depth", self._camera.depth_scale))
+        view = self._filtered(self._builder(frame), frame)
+        self._send_radiance(view, stamps)
+        if view.depth is not None:
+            self._publisher.send(depth_multipart(view.depth, stamps, "clean_depth"))
+        if view.board is not None and view.board.lamp_markers:
+            self._publisher.send(lamps_multipart(view.lamps, stamps))
+        self._publisher.send(pose_multipart(view.pose, view.board, stamps))
+        self._publisher.send(color_multipart(frame, stamps, config.color_encoding, config.jpeg_quality))
+        self._health.note(view.pose)
+        self._frames += 1
+        self._without_board += view.pose is None
+
+    def _stamps(self, captured: CapturedFrame) -> Stamps:
         offset_ns, bound_ns = self._clock.at(captured.capture_ns)
-        stamps = Stamps(
-            node=config.name,
-            frame_id=frame.frame_id,
+        return Stamps(
+            node=self._config.name,
+            frame_id=captured.frame.frame_id,
             capture_ns=captured.capture_ns,
             clock_offset_ns=offset_ns,
             clock_bound_ns=bound_ns,
         )
-        if frame.depth is not None:
-            raw = depth_multipart(frame.depth, stamps, "depth", self._camera.depth_scale)
-            self._publisher.send(raw)
-        view = self._builder(frame)
-        if view.depth is not None:
-            self._publisher.send(depth_multipart(view.depth, stamps, "clean_depth"))
-        self._publisher.send(pose_multipart(view.pose, view.board, stamps))
-        self._publisher.send(color_multipart(frame, stamps, config.color_encoding, config.jpeg_quality))
-        self._newest_ns = captured.capture_ns
-        self._frames += 1
-        self._without_board += view.pose is None
+
+    def _filtered(self, view: ViewFrame, frame: SensorFrame) -> ViewFrame:
+        """Smooth a pose that the board gave; one that was given with the frame is the truth."""
+        if self._filter is None or frame.world_from_camera is not None:
+            return view
+        return replace(view, pose=self._filter(view.pose, frame.timestamp_ns))
+
+    def _send_fisheye(self, frame: SensorFrame, stamps: Stamps) -> None:
+        """Send fish-eye pictures once, and again now and then for whoever came later."""
+        config, pictures = self._config, frame.fisheye
+        if pictures is None:
+            return
+
+        def made() -> list[bytes]:
+            held_ns = frame.timestamp_ns - pictures.timestamp_ns
+            own = stamps.copy()
+            own["capture_ns"] -= held_ns if 0 <= held_ns <= LONGEST_HOLD_NS else 0
+            return fisheye_multipart(pictures, own, config.color_encoding, config.jpeg_quality)
+
+        self._fisheye.send(pictures, made, self._publisher.send)
+
+    def _send_radiance(self, view: ViewFrame, stamps: Stamps) -> None:
+        """As the fish-eye pictures."""
+        radiance = view.radiance_map
+        if radiance is None:
+            return
+
+        def made() -> list[bytes]:
+            self._light_remarks = light_warnings(radiance)
+            return radiance_multipart(radiance, stamps, self._config.jpeg_quality)
+
+        self._radiance.send(radiance, made, self._publisher.send)
 
     def _send_stats(self, drops: int, *, is_ending: bool = False) -> None:
-        now_ns = time.time_ns()
-        elapsed_s = max((now_ns - self._period_ns) / 1e9, 1e-3)
+        now_ns, elapsed_s = time.time_ns(), max(time.monotonic() - self._period_s, 1e-3)
         offset_ns, bound_ns = self._clock.at(now_ns)
-        state, detail = self._state(now_ns)
+        state, detail = self._health.state([self._clock.remark, *self._builder.notes, *self._light_remarks])
         message = StatsMessage(
             node=self._config.name,
             capture_ns=now_ns,
@@ -139,22 +222,8 @@ class _Node:
             clock_bound_ns=bound_ns,
             state="stopping" if is_ending else state,
             detail=detail,
-            rates={
-                "fps": self._frames / elapsed_s,
-                "without_board": self._without_board / elapsed_s,
-            },
-            drops={"capture": drops},
+            rates={"fps": self._frames / elapsed_s, "without_board": self._without_board / elapsed_s},
+            drops={"capture": drops, "connections_refused": self._publisher.refused},
         )
         self._publisher.send(encode(message))
-        self._period_ns, self._frames, self._without_board = now_ns, 0, 0
-
-    def _state(self, now_ns: int) -> tuple[Literal["starting", "running", "waiting", "degraded"], str]:
-        """State on the wire with a sentence that begins with live, stale or lost."""
-        age_s = (now_ns - (self._newest_ns or self._started_ns)) / 1e9
-        if age_s >= self._config.lost_after_s:
-            return "degraded", f"lost: no frame for {age_s:.1f} s"
-        if self._newest_ns is None:
-            return "starting", "no frame yet"
-        if age_s >= self._config.stale_after_s:
-            return "waiting", f"stale: the newest frame is {age_s:.1f} s old"
-        return "running", "live"
+        self._period_s, self._frames, self._without_board = time.monotonic(), 0, 0

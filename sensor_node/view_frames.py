@@ -6,12 +6,14 @@ from typing import Self
 import numpy as np
 
 from protocol.errors import DeltalightError
-from protocol.frames import BoardPose, DepthImage, SensorFrame, ViewFrame
+from protocol.frames import BoardPose, DepthImage, LampPose, SensorFrame, ViewFrame
 from protocol.poses import require_rigid
 from protocol.source import Source
 from sensor_node.cameras.base import Camera
 from sensor_node.depth import DepthSettings, clean_depth, estimate_noise_sigma
 from sensor_node.depth_registration import register_depth
+from sensor_node.fisheye.light import FisheyeLight
+from sensor_node.lamp_markers import detect_lamps
 from sensor_node.markers import BoardDetector
 
 
@@ -41,20 +43,29 @@ class ViewFrameBuilder:
         rig: what the frames come from.
         settings: of the depth clean-up.
         needs_depth: whether the scene's geometry is depth, so that a source without any is an error.
+        needs_light: whether the scene's light is what the node sees (modes `fisheye` and `tracked`); if not,
+            neither `radiance_map` nor `lamps` is filled, which saves their time.
 
     Raises:
         DeltalightError: depth is needed and the source has none.
     """
 
     def __init__(
-        self, rig: Source | Camera, settings: DepthSettings | None = None, *, needs_depth: bool = False
+        self,
+        rig: Source | Camera,
+        settings: DepthSettings | None = None,
+        *,
+        needs_depth: bool = False,
+        needs_light: bool = True,
     ) -> None:
         self._rig, self._settings = rig, settings or DepthSettings()
         self._reference = None if isinstance(rig, Camera) else _Reference.of(rig[0])
         self._detector: BoardDetector | None = None
         from_rgb = rig.extrinsics.depth_from_rgb
         self._color_from_depth = np.eye(4) if from_rgb is None else np.linalg.inv(from_rgb)
-        self._needs_depth = needs_depth
+        self._needs_depth, self._needs_light = needs_depth, needs_light
+        self._fisheye = FisheyeLight(rig, self._pose_alone)
+        self._lamps: tuple[LampPose, ...] = ()
         if self._reference is not None:
             self._check_depth(self._reference)
 
@@ -70,6 +81,7 @@ class ViewFrameBuilder:
         if self._reference is None:
             self._reference = _Reference.of(frame)
             self._check_depth(self._reference)
+        pose = self._pose(frame)
         return ViewFrame(
             frame_id=frame.frame_id,
             timestamp_ns=frame.timestamp_ns,
@@ -77,10 +89,17 @@ class ViewFrameBuilder:
             camera=self._rig.camera,
             response=frame.response,
             exposure_scale=_exposure_scale(frame.exposure_s, self._reference.exposure_s),
-            pose=self._pose(frame),
+            pose=pose,
             depth=self._depth(frame, self._reference),
             board=self._rig.board,
+            radiance_map=self._fisheye.at(frame, pose) if self._needs_light else None,
+            lamps=self._find_lamps(frame, pose) if self._needs_light else (),
         )
+
+    @property
+    def notes(self) -> list[str]:
+        """Sentences about what is missing for light, each said once."""
+        return self._fisheye.notes
 
     def _has_depth(self, reference: _Reference) -> bool:
         return reference.has_depth or self._rig.depth_scale is not None
@@ -100,6 +119,27 @@ class ViewFrameBuilder:
         if self._detector is None:
             self._detector = BoardDetector(self._rig.board, self._rig.camera, frame.response)
         return self._detector.detect(frame.color)
+
+    def _pose_alone(self, frame: SensorFrame) -> BoardPose | None:
+        """The pose of a frame out of turn, which the detector's memory must not hear of."""
+        detector, self._detector = self._detector, None
+        try:
+            return self._pose(frame)
+        finally:
+            self._detector = detector
+
+    def _find_lamps(self, frame: SensorFrame, pose: BoardPose | None) -> tuple[LampPose, ...]:
+        if self._rig.board is None or pose is None:
+            return ()
+        self._lamps = detect_lamps(
+            frame.color,
+            self._rig.board,
+            self._rig.camera,
+            frame.response,
+            pose.world_from_camera,
+            previous=self._lamps,
+        )
+        return self._lamps
 
     def _depth(self, frame: SensorFrame, reference: _Reference) -> DepthImage | None:
         camera, depth = self._rig.camera, frame.depth

@@ -12,10 +12,17 @@ import typer
 
 from protocol.errors import DeltalightError
 from services.commands.bench import bench
+from services.commands.board import board
+from services.commands.calibrate import calibrate
+from services.commands.config import config
 from services.commands.demo import demo
 from services.commands.doctor import doctor
+from services.commands.keys import keys
 from services.commands.node import node
+from services.commands.record import record
+from services.commands.recordings import recordings
 from services.commands.render import render
+from services.commands.replay import replay
 from services.commands.schema import schema
 from services.commands.server import server
 from services.commands.up import up
@@ -33,8 +40,11 @@ app = typer.Typer(
     rich_markup_mode="rich",
     help="Mixed-reality relighting: virtual objects in a camera picture, with light that agrees both ways.",
 )
-for command in (render, demo, node, server, viewer, up, doctor, schema):
+for command in (render, demo, node, server, viewer, up, record, replay, config, doctor, schema, board):
     app.command()(command)
+app.add_typer(recordings, name="recordings")
+app.add_typer(calibrate, name="calibrate")
+app.add_typer(keys, name="keys")
 app.add_typer(bench, name="bench")
 
 

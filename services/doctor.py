@@ -14,6 +14,8 @@ PROBE_TIMEOUT_S = 60
 MAXIMUM_DEVICES = 16
 PACKAGES = {"render": ("moderngl", "trimesh", "scipy"), "api": ("fastapi", "uvicorn", "websockets")}
 
+NAMES_OF_KINDS = {"uvc": "USB (UVC)", "oak": "OAK", "openni2": "OpenNI 2", "orbbec": "Orbbec"}
+
 CONTAINER_HINT = (
     "EGL sees no device: apt-get install --no-install-recommends libegl1 libgl1; in a container with an"
     " NVIDIA GPU set NVIDIA_DRIVER_CAPABILITIES=graphics,compute,utility"
@@ -47,7 +49,7 @@ def examine() -> Iterator[Check]:
     yield from _packages()
     yield _opencv()
     yield from _renderers()
-    yield _oak_camera()
+    yield from _cameras()
     yield from _ports()
 
 
@@ -113,11 +115,16 @@ def _probe(device: int) -> subprocess.CompletedProcess[str]:
         return subprocess.CompletedProcess(command, 1, "", f"no answer within {PROBE_TIMEOUT_S} s")
 
 
-def _oak_camera() -> Check:
-    found = _version("depthai")
-    if found is None:
-        return Check("OAK cameras", "note", "not installed", "pip install 'deltalight[oak]'")
-    return Check("OAK cameras", "ok", f"depthai {found}")
+def _cameras() -> Iterator[Check]:
+    """Every camera that is there, one line each, then the kinds of which none could be found."""
+    from sensor_node.cameras.discovery import discover
+
+    found = discover()
+    for camera in found.cameras:
+        detail = f"{camera.name} ({camera.details})"
+        yield Check(f"camera {camera.source}", "note" if camera.hint else "ok", detail, camera.hint)
+    for kind in found.missing:
+        yield Check(f"{NAMES_OF_KINDS[kind.kind]} cameras", "note", kind.details, kind.hint)
 
 
 def _ports() -> Iterator[Check]:

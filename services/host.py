@@ -16,10 +16,16 @@ from services.supervisor import ChildSpec
 
 @dataclass(frozen=True)
 class HostPlan:
-    """What runs on this host; `session_file` holds the scene document, which survives a server's restart."""
+    """What runs on this host; `session_file` holds the scene document, which survives a server's restart.
 
-    source: str
+    `source` is what the node of this host captures; None = there is none, and the server looks for the node called
+    `remote_node` on the network. `config` is the configuration file of all; None = the one they find.
+    """
+
+    source: str | None
     session_file: Path
+    remote_node: str = ""
+    config: Path | None = None
     node_port: int = ports.NODE_PORT
     composite_port: int = ports.COMPOSITE_PORT
     control_port: int = ports.CONTROL_PORT
@@ -31,7 +37,7 @@ class HostPlan:
 
     def specs(self) -> list[ChildSpec]:
         """The children to supervise, in the order of the stream."""
-        specs = [self._node(), self._server()]
+        specs = [self._server()] if self.source is None else [self._node(self.source), self._server()]
         return specs if self.page_port is None else [*specs, self._viewer(self.page_port)]
 
     def require_free_ports(self) -> None:
@@ -40,7 +46,8 @@ class HostPlan:
         Raises:
             DeltalightError: another program listens on one of them.
         """
-        ports.require_free(self.node_port, "sensor node", "--node-port")
+        if self.source is not None:
+            ports.require_free(self.node_port, "sensor node", "--node-port")
         ports.require_free(self.composite_port, "composite of the render server", "--composite-port")
         ports.require_free(self.control_port, "control of the render server", "--control-port")
         if self.page_port is not None:
@@ -49,18 +56,25 @@ class HostPlan:
     def _child(self, name: str, command: str, *options: str) -> ChildSpec:
         return ChildSpec.deltalight(name, "--log-level", self.log_level, command, *options)
 
-    def _node(self) -> ChildSpec:
+    @property
+    def _config(self) -> list[str]:
+        return [] if self.config is None else ["--config", str(self.config.absolute())]
+
+    def _node(self, source: str) -> ChildSpec:
         options = [
-            *("--source", self.source),
+            *self._config,
+            *("--source", source),
             *("--publish", ports.endpoint(self.node_port)),
             *("--clock", ports.endpoint(self.control_port)),
         ]
         return self._child("sensor node", "node", *options, *(["--loop"] if self.loop else []))
 
     def _server(self) -> ChildSpec:
+        has_node = self.source is not None
         options = [
+            *self._config,
             *("--session", str(self.session_file)),
-            *("--subscribe", ports.endpoint(self.node_port)),
+            *(("--subscribe", ports.endpoint(self.node_port)) if has_node else ("--node", self.remote_node)),
             *("--publish", ports.endpoint(self.composite_port)),
             *("--control", ports.endpoint(self.control_port)),
         ]

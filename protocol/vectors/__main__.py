@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from protocol.codecs import encode_color, encode_depth
+from protocol.codecs import encode_array, encode_color, encode_depth
 from protocol.envelope import encode
 from protocol.messages import (
     ColorMessage,
@@ -16,9 +16,11 @@ from protocol.messages import (
     ControlRequest,
     DepthMessage,
     FisheyeMessage,
-    LightsMessage,
+    LampEntry,
+    LampsMessage,
     Message,
     PoseMessage,
+    RadianceMessage,
     StatsMessage,
 )
 from protocol.vectors import FOLDER, frame_pieces
@@ -29,6 +31,16 @@ CAMERA: dict[str, object] = {
     "matrix": [3.5, 0.0, 1.5, 0.0, 3.5, 0.5, 0.0, 0.0, 1.0],
     "distortion_model": "plumb_bob",
     "distortion": [0.1, -0.05, 0.0, 0.0, 0.0],
+}
+FISHEYE: dict[str, object] = {
+    "lens": {
+        **CAMERA,
+        "distortion_model": "equidistant",
+        "distortion": [0.0, 0.0, 0.0, 0.0],
+        "image_circle": None,
+    },
+    "vignetting": [-0.05],
+    "response": None,
 }
 LAMP: dict[str, object] = {
     "type": "sphere",
@@ -41,12 +53,13 @@ POSE = ((1.0, 0.0, 0.0, 0.25), (0.0, -1.0, 0.0, -0.5), (0.0, 0.0, -1.0, 0.75), (
 OTHER_POSE = ((1.0, 0.0, 0.0, 0.25), (0.0, -0.6, 0.8, -0.5), (0.0, -0.8, -0.6, 0.75), (0.0, 0.0, 0.0, 1.0))
 NODE, FRAME, CAPTURE_NS, OFFSET_NS, BOUND_NS = "desk", 7, 1_700_000_000_123_456_789, -1500, 800
 
-Example = tuple[str, Message, Sequence[bytes], list[list[int]]]
+Example = tuple[str, Message, Sequence[bytes], Sequence[Sequence[float]]]
 
 
 def main() -> None:
     """Write every vector into the folder of this module."""
-    for name, message, parts, values in [*_picture_examples(), *_depth_examples(), *_small_examples()]:
+    examples = [*_picture_examples(), *_depth_examples(), *_radiance_examples(), *_small_examples()]
+    for name, message, parts, values in examples:
         pieces = encode(message, parts)
         (FOLDER / f"{name}.bin").write_bytes(frame_pieces(pieces))
         meaning = {
@@ -100,11 +113,19 @@ def _picture_examples() -> Iterator[Example]:
             encoding="raw",
             shape=shape,
             dtype="float32",
-            camera={**CAMERA, "distortion_model": "equidistant", "distortion": [0.0, 0.0, 0.0, 0.0]},
+            camera=FISHEYE,
             exposures_s=(0.005, 0.02),
         ),
         [picture.astype("<f4").tobytes() for picture in bracket],
         [picture.astype(int).ravel().tolist() for picture in bracket],
+    )
+    yield (
+        "fisheye_coded_raw",
+        FisheyeMessage(
+            node=NODE, **_stamps(), encoding="raw", shape=shape, camera=FISHEYE, has_response=True
+        ),
+        [pixels.tobytes(), response.tobytes()],
+        [pixels.ravel().tolist()],
     )
     yield (
         "composite_raw",
@@ -143,6 +164,27 @@ def _depth_examples() -> Iterator[Example]:
         yield f"{message.stream}_{encoding}", message, [part], [steps.ravel().tolist()]
 
 
+def _radiance_examples() -> Iterator[Example]:
+    radiance = np.arange(48, dtype=np.float32).reshape(4, 4, 3) * np.float32(2.5)
+    seen = np.arange(16, dtype=np.uint8).reshape(4, 4) % 3 > 0
+    picture = encode_color(np.arange(24, dtype=np.uint8).reshape(2, 4, 3) * 10)
+    encodings: tuple[Literal["raw", "blosc2"], ...] = ("raw", "blosc2")
+    for encoding in encodings:
+        message = RadianceMessage(
+            node=NODE,
+            **_stamps(),
+            encoding=encoding,
+            size=4,
+            picture_shape=(2, 4, 3),
+            clipped_share=0.125,
+            world_from_fisheye=POSE,
+            camera=FISHEYE,
+        )
+        parts = [encode_array(radiance, encoding), encode_array(seen.astype(np.uint8), encoding), picture]
+        values = [radiance.ravel().tolist(), seen.astype(int).ravel().tolist()]
+        yield f"radiance_{encoding}", message, parts, values
+
+
 def _small_examples() -> Iterator[Example]:
     pose = PoseMessage(
         node=NODE,
@@ -155,7 +197,8 @@ def _small_examples() -> Iterator[Example]:
     )
     yield "pose_ok", pose, [], []
     yield "pose_no_board", PoseMessage(node=NODE, **_stamps(), status="no_board"), [], []
-    yield "lights", LightsMessage(node=NODE, **_stamps(), lights=(LAMP,)), [], []
+    lamps = (LampEntry(marker=40, world_from_marker=POSE), LampEntry(marker=41, world_from_marker=OTHER_POSE))
+    yield "lamps", LampsMessage(node=NODE, **_stamps(), lamps=lamps), [], []
     stats = StatsMessage(
         node="server",
         capture_ns=CAPTURE_NS,

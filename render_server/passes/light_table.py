@@ -10,7 +10,7 @@ from render_server.gpu.context import GpuContext
 from render_server.passes.light_maps import LightView, light_views, pack_light, pack_view, tile_columns
 from render_server.passes.reflective_shadow_map import ShadowMapAtlas, texel_size_m
 from render_server.scene.lights import Light
-from render_server.scene.octahedral import octahedral_direction, prefilter, sample_octahedral
+from render_server.scene.octahedral import octahedral_grid, prefilter, sample_octahedral
 
 EMPTY = b"\0" * 128
 
@@ -142,9 +142,3 @@ class LightTable:
         self._view_buffer.release()
         if self._environment is not None:
             self._environment.release()
-
-
-def octahedral_grid(size: int) -> Float64[np.ndarray, "n n 3"]:
-    """Directions of the texel centres of a size x size map."""
-    centres = (np.arange(size) + 0.5) / size
-    return octahedral_direction(np.stack(np.meshgrid(centres, centres), axis=-1))

@@ -121,7 +121,7 @@ vec3 outgoing(Surfel s, vec3 n, uint own) {
 #endif
     vec3 mu, rho;
     irradiances(s, n, own, mu, rho);
-    return unsummed(own, vec4(predicted_radiance(mu), 0.0));
+    return unsummed(own, vec4(unseen_albedo(s.position_area.xyz) / PI * mu, 0.0));
 }
 #endif
 

@@ -44,7 +44,7 @@ void main() {
     vec2 s = texel_lateral(view, texel);
     vec3 p = ray_point(view, s, depth);
     if (!reaches_volume(p, hit_spread(view, s, depth))) return;
-    vec3 albedo = unseen_albedo;
+    vec3 albedo = unseen_albedo(p);
     if (camera_sees(p)) {
         vec3 n = normalize(texelFetch(real_light_normal, texel, 0).xyz);
         vec3 to_light; float radius;

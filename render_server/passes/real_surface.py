@@ -44,12 +44,24 @@ class RealSurface:
         self._from_depth.run(self.size, surface_count=surface_count, **view.uniforms())
 
     def from_model(
-        self, raster: GeometryBuffer, picture: Picture, view: CameraView, surface_count: int
+        self,
+        raster: GeometryBuffer,
+        picture: Picture,
+        view: CameraView,
+        surface_count: int,
+        *,
+        noise_sigma: float | None = None,
     ) -> None:
-        """Fill from a raster of the given model, through the lens."""
+        """Fill from a raster of the given model or the fused surface, through the lens.
+
+        `noise_sigma` (m at 1 m) of the depth from which pixels were filled before: they keep it where the surface
+        differs by more than three times that (something moved), and take the surface, the mean of many frames,
+        where it agrees. None: everything is taken.
+        """
         bind_samplers({6: raster.position, 7: raster.normal, 15: picture.rays})
         bind_images(self.position, self.normal)
-        self._from_model.run(self.size, surface_count=surface_count, **view.uniforms())
+        depth = {"fused": noise_sigma is not None, "noise_sigma": noise_sigma or 0.0}
+        self._from_model.run(self.size, surface_count=surface_count, **depth, **view.uniforms())
 
     def bind(self) -> None:
         """Bind to the places that geometry.glsl names."""

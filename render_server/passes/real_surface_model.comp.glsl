@@ -1,10 +1,12 @@
-// Real geometry buffer from a given model: its raster, looked up through the lens model.
+// Real geometry buffer from a given model or the fused surface: its raster, looked up through the lens model.
 #include "passes/common/geometry.glsl"
 #include "passes/common/surfaces.glsl"
 
 layout(local_size_x = 8, local_size_y = 8) in;
-layout(binding = 0, rgba32f) writeonly uniform image2D position_out;
+layout(binding = 0, rgba32f) uniform image2D position_out;
 layout(binding = 1, rgba16f) writeonly uniform image2D normal_out;
+uniform bool fused;           // the frame's own depth is there already, and stays where it says something else
+uniform float noise_sigma;    // of that depth, m at 1 m
 
 void main() {
     ivec2 pixel = ivec2(gl_GlobalInvocationID.xy);
@@ -17,6 +19,8 @@ void main() {
         vec4 seen = texelFetch(virtual_raster_normal, raster, 0);
         normal = vec4(seen.xyz, float(surface_entry(position.xyz, seen.w)));
     }
+    float own = fused ? imageLoad(position_out, pixel).w : 0.0;
+    if (own > 0.0 && abs(position.w - own) > 3.0 * noise_sigma * own * own) return;
     imageStore(position_out, pixel, position);
     imageStore(normal_out, pixel, normal);
 }

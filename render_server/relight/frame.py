@@ -13,6 +13,7 @@ from render_server.passes.materials import MaterialTable
 from render_server.passes.mesh_buffers import MeshBuffers
 from render_server.passes.picture import Picture
 from render_server.passes.real_surface import RealSurface
+from render_server.passes.unseen_albedo import UnseenAlbedo
 from render_server.scene.lights import LightSet
 from render_server.view import CameraView
 
@@ -55,6 +56,7 @@ class RelightInput:
     noise_sigma: float
     typical_depth: float
     surface_uniforms: dict[str, Any]
+    unseen_albedo: UnseenAlbedo
     timers: PassTimers
     everywhere: bool = False  # light every pixel, not only where the objects reach (photometric registration)
 

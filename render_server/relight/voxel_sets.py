@@ -17,7 +17,6 @@ from render_server.relight.frame import GeometryState, RelightInput
 
 SURFEL_SHADOW_SAMPLES = 4  # of a light's area: a voxel averages many surfels
 DEPTH_TOLERANCE = 0.02  # a surfel this near (relative) to what the camera sees is what it sees
-MEAN_ALBEDO = 0.5  # of real surfaces that no camera pixel shows
 
 
 class VoxelSets:
@@ -74,6 +73,7 @@ def bind_lighting(frame: RelightInput, table: LightTable) -> None:
     table.bind()
     frame.virtual.materials.bind()
     bind_picture(frame.picture.linear, frame.real_surface.position)
+    frame.unseen_albedo.bind()
 
 
 def lighting_uniforms(
@@ -86,7 +86,7 @@ def lighting_uniforms(
         "bias_real": bias,
         "bias_virtual": bias,
         "depth_tolerance": DEPTH_TOLERANCE if measured else -1.0,
-        "unseen_albedo": (MEAN_ALBEDO,) * 3,
+        **frame.unseen_albedo.uniforms(),
         "picture_lod": 2.0,
     }
     return {**uniforms, **own}

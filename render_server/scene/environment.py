@@ -1,7 +1,9 @@
 """Environment maps in latitude-longitude form: loading, orientation, area averaging."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
+from typing import Self
 
 import cv2
 import numpy as np
@@ -10,6 +12,7 @@ from jaxtyping import Float, Float32, Float64
 from protocol.errors import DeltalightError
 from protocol.frames import decode_lut
 from protocol.scene_lights import EnvironmentLights
+from render_server.scene.sky_grid import SkyGrid
 
 WORK_SIZE = (512, 256)
 MAX_EDGE = 16384
@@ -29,6 +32,25 @@ class EnvironmentMap:
 
     radiance: Float32[np.ndarray, "h w 3"]
     world_from_map: Float64[np.ndarray, "3 3"]
+
+    @property
+    def grid(self) -> SkyGrid:
+        """Directions and solid angles of the pixels."""
+        return _grid(*self.radiance.shape[:2])
+
+    @property
+    def known_solid_angle(self) -> float:
+        """All of the sphere, sr."""
+        return float(4 * np.pi)
+
+    def with_radiance(self, radiance: Float32[np.ndarray, "h w 3"]) -> Self:
+        """Return the map with other radiance."""
+        return replace(self, radiance=radiance)
+
+    def rolled(self, columns: int) -> "EnvironmentMap":
+        """Return the same light on a grid that begins at another column: the map's axes turn along."""
+        turned = orientation((0.0, 0.0, 1.0), -360 * columns / self.radiance.shape[1])
+        return EnvironmentMap(np.roll(self.radiance, -columns, axis=1), self.world_from_map @ turned)
 
     def resized(self, width: int, height: int) -> "EnvironmentMap":
         """Return a smaller map by averaging over solid angle; a larger size leaves the map as it is."""
@@ -63,6 +85,12 @@ def row_cosines(rows: int) -> Float32[np.ndarray, " h"]:
 def pixel_solid_angles(rows: int, columns: int) -> Float32[np.ndarray, "h 1"]:
     """Return the solid angle of the pixels of every row, sr; over all pixels they add up to 4 pi."""
     return np.asarray(row_cosines(rows)[:, None] * np.float32(2 * np.pi**2 / (rows * columns)))
+
+
+@lru_cache(maxsize=4)
+def _grid(rows: int, columns: int) -> SkyGrid:
+    solid_angles = np.repeat(pixel_solid_angles(rows, columns), columns, axis=1)
+    return SkyGrid(map_directions(rows, columns), solid_angles)
 
 
 def map_directions(rows: int, columns: int) -> Float32[np.ndarray, "h w 3"]:

@@ -7,10 +7,9 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from protocol import scene_lights as documents
-from protocol.errors import DeltalightError
 from render_server.scene.environment import load_environment
 from render_server.scene.median_cut import split_environment
-from render_server.scene.octahedral import resample_to_octahedral, solid_angle_mean
+from render_server.scene.octahedral import above_horizon, resample_to_octahedral, solid_angle_mean
 
 ENVIRONMENT_SIZE = 256
 AMBIENT_SIZE = 32
@@ -136,69 +135,79 @@ Light = DirectionalLight | SphereLight | SpotLight | RectangleLight
 class LightSet:
     """Everything that shines, in camera units once multiplied by the registration.
 
-    `environment` is the residual radiance map R, octahedral, world axes; the lights are not in it.
-    `registration` is the factor R G B that `lights` and `environment` still lack; where `registration_auto`
-    is set it is to be found from the picture first.
+    `environment` is the residual radiance map R, octahedral, world axes; the lights are not in it. Of it,
+    `ground_share` (0..1) is the share of each texel where the real ground's radiance belongs, because nothing else
+    is known to be there. `registration` is the factor R G B that `lights` and `environment` still lack; where
+    `registration_auto` is set it is to be found from the picture first. `identities` number the lights where they
+    are followed over time.
     """
 
     lights: tuple[Light, ...]
     environment: Float32[np.ndarray, "n n 3"]
+    ground_share: Float32[np.ndarray, "n n 1"]
     registration: Float32[np.ndarray, "3"]
     registration_auto: bool
+    identities: tuple[int, ...] = ()
 
     def registered(self, factor: Float32[np.ndarray, "3"] | None = None) -> "LightSet":
         """Return the set with the registration (or another factor) multiplied in."""
         chosen = np.asarray(self.registration if factor is None else factor, np.float32)
-        return LightSet(
-            tuple(light.scaled(chosen) for light in self.lights),
-            self.environment * chosen,
-            np.ones(3, np.float32),
-            False,
+        return replace(
+            self,
+            lights=tuple(light.scaled(chosen) for light in self.lights),
+            environment=self.environment * chosen,
+            registration=np.ones(3, np.float32),
+            registration_auto=False,
         )
 
     def with_ground(self, radiance: Float32[np.ndarray, "3"]) -> "LightSet":
         """Return the set with ground of this radiance below the horizon, where nothing else is known to be."""
-        above = _above_horizon(len(self.environment))
-        return replace(self, environment=above * self.environment + (1 - above) * radiance)
+        share = self.ground_share
+        return replace(self, environment=(1 - share) * self.environment + share * radiance)
 
     def with_sky(self, radiance: Float32[np.ndarray, "3"], shape: Float32[np.ndarray, "n n 1"]) -> "LightSet":
         """Return the set with more radiance above the horizon: `shape` (of the environment's size) times this."""
-        above = _above_horizon(len(self.environment))
+        above = above_horizon(len(self.environment))
         return replace(self, environment=self.environment + above * shape * radiance)
 
     def describe(self) -> list[dict[str, Any]]:
         """Return plain values of all lights and of the environment's mean, for messages and logs."""
-        ambient = {"type": "environment", "mean_radiance": solid_angle_mean(self.environment).tolist()}
-        return [*(light.describe() for light in self.lights), ambient]
-
-
-def _above_horizon(size: int) -> Float32[np.ndarray, "n n 1"]:
-    """Share of each texel of an octahedral map that looks up; the horizon is as wide as a texel."""
-    texel = np.pi / size
-    return resample_to_octahedral(lambda d: np.clip(0.5 + d[..., 2:] / texel, 0, 1).astype(np.float32), size)
+        lights = [light.describe() for light in self.lights]
+        for light, identity in zip(lights, self.identities, strict=False):
+            light["id"] = identity
+        return [
+            *lights,
+            {"type": "environment", "mean_radiance": solid_angle_mean(self.environment).tolist()},
+        ]
 
 
 def build_lights(lights: documents.Lights) -> LightSet:
-    """Make the light set of a scene document's `lights`.
+    """Make the light set of a scene document whose lights are given: modes `manual` and `environment`.
 
-    Modes `manual` and `environment`; the latter is split with the count and
-    the kind of split that `lights.fisheye` gives, as in mode `fisheye`.
+    An environment is split with the count, the threshold and the kind of split that `lights.fisheye` gives, as in
+    mode `fisheye`.
 
     Raises:
-        DeltalightError: a mode that this release lacks, or an environment map that cannot be read.
+        DeltalightError: an environment map that cannot be read.
     """
-    if lights.mode == "manual":
-        shining, environment = _manual(lights.manual)
-    elif lights.mode == "environment":
-        shining, environment = _from_environment(lights)
-    else:
-        raise DeltalightError(
-            f"lights of mode {lights.mode} arrive with a later release; use mode manual or environment."
-        )
+    shining, environment = (
+        _from_environment(lights) if lights.mode == "environment" else _manual(lights.manual)
+    )
+    return complete_set(lights, shining, environment, 1 - above_horizon(len(environment)))
+
+
+def complete_set(
+    lights: documents.Lights,
+    shining: tuple[Light, ...],
+    environment: Float32[np.ndarray, "n n 3"],
+    ground_share: Float32[np.ndarray, "n n 1"],
+    identities: tuple[int, ...] = (),
+) -> LightSet:
+    """Add the registration that a scene document wishes."""
     given = lights.resolved_registration
     auto = given == "auto"
     factor = np.ones(3, np.float32) if auto else np.array(given, np.float32)
-    return LightSet(shining, environment, factor, auto)
+    return LightSet(shining, environment, ground_share, factor, auto, identities)
 
 
 def _manual(
@@ -234,8 +243,13 @@ def _light(light: _Shining) -> Light:
 def _from_environment(
     lights: documents.Lights,
 ) -> tuple[tuple[Light, ...], Float32[np.ndarray, "n n 3"]]:
-    whole_map = lights.fisheye.split == "all"
-    split = split_environment(load_environment(lights.environment), lights.fisheye.count, whole_map=whole_map)
+    settings = lights.fisheye
+    split = split_environment(
+        load_environment(lights.environment),
+        settings.count,
+        threshold=settings.threshold,
+        whole_map=settings.split == "all",
+    )
     shining = tuple(
         DirectionalLight(
             (-light.toward).astype(np.float32), light.irradiance.astype(np.float32), light.angular_radius_rad

@@ -7,7 +7,7 @@ beyond, the corners are folded down (Engelhardt & Dachsbacher 2008). Axes are wo
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 
 import cv2
 import numpy as np
@@ -17,6 +17,7 @@ MIN_LEVEL_SIZE = 32
 SUMMED_SIZE = 64
 SUMMED_FROM_RAD = 0.4
 CONE_SAMPLES = 64
+KEPT_LEVELS = 16
 SampleMap = Callable[[Float32[np.ndarray, "n m 3"]], Float32[np.ndarray, "n m c"]]
 
 
@@ -41,6 +42,22 @@ def octahedral_uv(direction: Float[np.ndarray, "*shape 3"]) -> Float[np.ndarray,
     p = d[..., :2]
     folded = np.copysign(1 - np.abs(p[..., ::-1]), p)
     return np.asarray(np.where(d[..., 2:] < 0, folded, p) / 2 + 0.5)
+
+
+@cache
+def octahedral_grid(size: int) -> Float64[np.ndarray, "n n 3"]:
+    """Return the unit directions of the texel centres of a size x size map (read-only)."""
+    directions = octahedral_direction(_grid_uv(size))
+    directions.flags.writeable = False
+    return directions
+
+
+@cache
+def texel_weights(size: int, supersampling: int) -> Float32[np.ndarray, "k k"]:
+    """Return the solid angles of supersampling^2 samples a texel, as shares of the mean of their texel's."""
+    weight = np.linalg.norm(_folded_direction(_grid_uv(size * supersampling)), axis=-1) ** -3
+    mean = weight.reshape(size, supersampling, size, supersampling).mean(axis=(1, 3))
+    return np.asarray(weight / mean.repeat(supersampling, 0).repeat(supersampling, 1), np.float32)
 
 
 def _grid_uv(size: int) -> Float64[np.ndarray, "n n 2"]:
@@ -80,8 +97,17 @@ def sample_octahedral(
     radiance: Float32[np.ndarray, "n n 3"], directions: Float[np.ndarray, "a b 3"]
 ) -> Float32[np.ndarray, "a b 3"]:
     """Read a map bilinearly; texels meet their true neighbours over the map's border."""
-    size = len(radiance)
-    place = (octahedral_uv(directions) * size + 0.5).astype(np.float32)
+    return _sampled(radiance, _place(directions, len(radiance)))
+
+
+def _place(directions: Float[np.ndarray, "a b 3"], size: int) -> Float32[np.ndarray, "a b 2"]:
+    """Where `_sampled` reads a map of this size for directions."""
+    return (octahedral_uv(directions) * size + 0.5).astype(np.float32)
+
+
+def _sampled(
+    radiance: Float32[np.ndarray, "n n 3"], place: Float32[np.ndarray, "a b 2"]
+) -> Float32[np.ndarray, "a b 3"]:
     return np.asarray(cv2.remap(_bordered(radiance), place, None, cv2.INTER_LINEAR))
 
 
@@ -90,6 +116,13 @@ def _bordered(radiance: Float32[np.ndarray, "n n 3"]) -> Float32[np.ndarray, "m 
     rows = np.concatenate([radiance[:1, ::-1], radiance, radiance[-1:, ::-1]])
     left, right = rows[::-1, :1].copy(), rows[::-1, -1:].copy()
     return np.ascontiguousarray(np.concatenate([left, rows, right], axis=1))
+
+
+@cache
+def above_horizon(size: int) -> Float32[np.ndarray, "n n 1"]:
+    """Return the share of each texel that looks up (+z); the horizon is as wide as a texel."""
+    texel = np.pi / size
+    return resample_to_octahedral(lambda d: np.clip(0.5 + d[..., 2:] / texel, 0, 1).astype(np.float32), size)
 
 
 def solid_angle_mean(radiance: Float32[np.ndarray, "n n 3"]) -> Float64[np.ndarray, "3"]:
@@ -129,11 +162,9 @@ def prefilter(radiance: Float32[np.ndarray, "n n 3"]) -> PrefilteredMap:
 
 
 def _halved(radiance: Float32[np.ndarray, "n n 3"]) -> Float32[np.ndarray, "m m 3"]:
-    weights = texel_solid_angles(len(radiance))[..., None]
     half = len(radiance) // 2
-    blocks = (half, 2, half, 2, -1)
-    total = (radiance * weights).reshape(blocks).sum(axis=(1, 3))
-    return np.asarray(total / weights.reshape(blocks).sum(axis=(1, 3)), np.float32)
+    weighted = radiance * texel_weights(half, 2)[..., None]
+    return np.asarray(cv2.resize(weighted, (half, half), interpolation=cv2.INTER_AREA), np.float32)
 
 
 def _cone_average(
@@ -146,20 +177,32 @@ def _cone_average(
     spacing = 2 * half_angle / np.sqrt(CONE_SAMPLES)
     wanted = np.sqrt(4 * np.pi) / spacing
     source = min(halved, key=lambda level: abs(np.log2(len(level) / wanted)))
-    frames = _tangent_frames(octahedral_direction(_grid_uv(size)).reshape(-1, 3)).astype(np.float32)
+    samples = _sampled(source, _cone_places(half_angle, size, len(source)))
+    return np.asarray(samples.mean(axis=1).reshape(size, size, 3))
+
+
+# Maps of one size are filtered again and again while light is followed, so where to read them is kept.
+@lru_cache(maxsize=KEPT_LEVELS)
+def _cone_places(half_angle: float, size: int, source_size: int) -> Float32[np.ndarray, "n k 2"]:
+    frames = _tangent_frames(octahedral_grid(size).reshape(-1, 3)).astype(np.float32)
     directions = _spiral(np.sin(half_angle)).astype(np.float32) @ np.swapaxes(frames, 1, 2)
-    return np.asarray(sample_octahedral(source, directions).mean(axis=1).reshape(size, size, 3))
+    return _place(directions, source_size)
 
 
 def _cone_sum(
     source: Float32[np.ndarray, "n n 3"], half_angle: float, size: int
 ) -> Float32[np.ndarray, "m m 3"]:
     """Average over wide cones by the plain sum over all texels of a source map."""
-    axis = octahedral_direction(_grid_uv(size)).reshape(-1, 3)
-    cosine = (axis @ octahedral_direction(_grid_uv(len(source))).reshape(-1, 3).T).astype(np.float32)
-    weight = np.where(cosine > np.cos(half_angle), cosine, 0) * texel_solid_angles(len(source)).ravel()
-    total = weight @ source.reshape(-1, 3) / weight.sum(axis=1, keepdims=True)
+    total = _cone_weights(half_angle, size, len(source)) @ source.reshape(-1, 3)
     return np.asarray(total.reshape(size, size, 3), np.float32)
+
+
+@lru_cache(maxsize=KEPT_LEVELS)
+def _cone_weights(half_angle: float, size: int, source_size: int) -> Float32[np.ndarray, "n k"]:
+    axis, source = octahedral_grid(size).reshape(-1, 3), octahedral_grid(source_size).reshape(-1, 3)
+    cosine = (axis @ source.T).astype(np.float32)
+    weight = np.where(cosine > np.cos(half_angle), cosine, 0) * texel_solid_angles(source_size).ravel()
+    return np.asarray(weight / weight.sum(axis=1, keepdims=True))
 
 
 def _spiral(sin_half_angle: float) -> Float64[np.ndarray, "n 3"]:
@@ -185,7 +228,7 @@ def irradiance(
 ) -> Float64[np.ndarray, "k 3"]:
     """Integrate a map over the hemisphere of each unit normal (the plain sum; for reference)."""
     weighted = radiance.reshape(-1, 3) * texel_solid_angles(len(radiance)).reshape(-1, 1)
-    directions = octahedral_direction(_grid_uv(len(radiance))).reshape(-1, 3)
+    directions = octahedral_grid(len(radiance)).reshape(-1, 3)
     return np.asarray(np.maximum(normals @ directions.T, 0) @ weighted.astype(np.float64))
 
 
@@ -195,7 +238,7 @@ def irradiance_sh9(radiance: Float32[np.ndarray, "n n 3"]) -> Float64[np.ndarray
     Irradiance of a unit normal = `sh9_basis(normal) @ coefficients`, exact to about 1 % for smooth maps.
     """
     weighted = radiance.reshape(-1, 3) * texel_solid_angles(len(radiance)).reshape(-1, 1)
-    basis = sh9_basis(octahedral_direction(_grid_uv(len(radiance))).reshape(-1, 3))
+    basis = sh9_basis(octahedral_grid(len(radiance)).reshape(-1, 3))
     lobe = np.pi * np.array([1, *[2 / 3] * 3, *[1 / 4] * 5])
     return np.asarray(lobe[:, None] * (basis.T @ weighted))
 

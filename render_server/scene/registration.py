@@ -3,31 +3,26 @@
 from dataclasses import dataclass
 from typing import Literal
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, UInt8
 
-from protocol.board import BoardSpec
-from protocol.camera_model import CameraModel
-from protocol.frames import BoardPose
 from render_server.scene.environment import LUMINANCE
+from render_server.scene.known_surfaces import LEAST_PIXELS
 
 CLIPPED_LINEAR = 0.98
 CLIPPED_CODE = 255
 DARK_LINEAR = 0.005
-LEAST_PIXELS = 30
-ENOUGH_PIXELS = 10 * LEAST_PIXELS
-FARTHEST_PX = 1e5  # beyond, fixed-point outlines overflow
 OUTLIER_DEVIATIONS = 3.0
 LEAST_IRRADIANCE = 1e-4
 LEAST_OPENING = 0.05  # share of the hemisphere that must be open: below, noise of the paper decides
 GREATEST_ALBEDO = 0.95
 PERCENTILE = 99.0
-INSETS_PX = (
-    2,
-    1,
-)  # from the paper's edges, where lens and sampling mix it with ink; the second if little is left
-EDGE_POINTS = 8
+# Relative misfit from which users are warned: light that varies more over the paper than the lights explain is seen
+# as wrong (people notice differences of a few per cent within one surface).
+POOR_RESIDUAL = 0.1
+MOST_AVERAGED = (
+    30  # registrations: by then noise of a single one is a fifth, and slow drift is still followed
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +43,7 @@ def registration_from_patch(
     measured: Float[np.ndarray, "k 3"],
     light_irradiance: Float[np.ndarray, "k 3"],
     bounce_irradiance: Float[np.ndarray, "k 3"],
-    albedo: float,
+    albedo: Float[np.ndarray, " k"] | float,
 ) -> Registration | None:
     """Fit the factor on pixels of known albedo: albedo/pi (f E_light + E_bounce) = B, each channel.
 
@@ -59,7 +54,7 @@ def registration_from_patch(
     Returns:
         None where fewer than 30 pixels are left, or light or the fit vanishes in a channel.
     """
-    irradiance = np.pi / albedo * np.asarray(measured, np.float64) - bounce_irradiance
+    irradiance = _paper_irradiance(measured, albedo) - bounce_irradiance
     light = np.asarray(light_irradiance, np.float64)
     usable = np.isfinite(irradiance).all(axis=1) & (light > LEAST_IRRADIANCE).all(axis=1)
     if np.count_nonzero(usable) < LEAST_PIXELS:
@@ -71,14 +66,23 @@ def registration_from_patch(
     if len(irradiance) < LEAST_PIXELS or not (factor > 0).all():
         return None
     misfit = (factor * light - irradiance) / np.maximum(np.abs(irradiance).mean(axis=0), 1e-9)
-    return Registration(factor.astype(np.float32), "patch", float(np.sqrt((misfit**2).mean())))
+    residual = float(np.sqrt((misfit**2).mean()))
+    warning = _POOR_FIT.format(100 * residual) if residual > POOR_RESIDUAL else None
+    return Registration(factor.astype(np.float32), "patch", residual, warning)
+
+
+def _paper_irradiance(
+    measured: Float[np.ndarray, "k 3"], albedo: Float[np.ndarray, " k"] | float
+) -> Float64[np.ndarray, "k 3"]:
+    """Return the irradiance at which a diffuse surface of this albedo shows what was measured."""
+    return np.pi * np.asarray(measured, np.float64) / np.asarray(albedo, np.float64).reshape(-1, 1)
 
 
 def surroundings_from_patch(
     measured: Float[np.ndarray, "k 3"],
     irradiance: Float[np.ndarray, "k 3"],
     per_radiance: Float[np.ndarray, "k 3"],
-    albedo: float,
+    albedo: Float[np.ndarray, " k"] | float,
 ) -> Float32[np.ndarray, "3"] | None:
     """Find the even radiance X >= 0 of what is out of sight: albedo/pi (E + X E_1) = B on paper, each channel.
 
@@ -88,7 +92,7 @@ def surroundings_from_patch(
     Returns:
         None where fewer than 30 pixels see anything of the surroundings.
     """
-    missing = np.pi / albedo * np.asarray(measured, np.float64) - irradiance
+    missing = _paper_irradiance(measured, albedo) - irradiance
     open_sky = np.asarray(per_radiance, np.float64)
     usable = np.isfinite(missing).all(axis=1) & (open_sky > LEAST_OPENING * np.pi).all(axis=1)
     if np.count_nonzero(usable) < LEAST_PIXELS:
@@ -124,6 +128,10 @@ def registration_from_albedo_percentile(
     return Registration(np.full(3, factor, np.float32), "percentile", None, _NO_PATCH)
 
 
+_POOR_FIT = (
+    "The lights explain the board's paper only within {:.0f} %: see whether the lights' positions are right, and "
+    "whether something shadows the board."
+)
 _NO_PATCH = (
     "No white paper of the marker board was usable, so the lights' scale comes from the brightest real "
     "surface, taken to have albedo 0.95: show the board's paper unclipped, or set lights.registration."
@@ -145,40 +153,24 @@ def unclipped(
     return np.asarray(~bright.any(axis=-1) & (linear @ LUMINANCE >= DARK_LINEAR))
 
 
-def paper_pixels(board: BoardSpec, camera: CameraModel, pose: BoardPose) -> Bool[np.ndarray, "h w"]:
-    """Return which pixels show white paper between the board's markers, 2 pixels inside its edges (1 if few are).
+class RegistrationAverage:
+    """The mean of the factors found over time; at most the last 30 or so count.
 
-    Patches that are not wholly in front of the camera are left out; what covers the board is not known here.
+    A factor found on known surfaces replaces those that were guessed from the brightest albedo.
     """
-    patches = _patch_masks(board, camera, pose)
-    found = np.zeros((camera.height, camera.width), np.uint8)
-    for inset in INSETS_PX:
-        square = np.ones((2 * inset + 1,) * 2, np.uint8)
-        for patch in patches:
-            found |= cv2.erode(patch, square, borderValue=0)
-        if np.count_nonzero(found) >= ENOUGH_PIXELS:
-            break
-    return np.asarray(found.astype(bool))
 
+    def __init__(self) -> None:
+        self._mean = np.ones(3)
+        self._source = ""
+        self._count = 0
 
-def _patch_masks(board: BoardSpec, camera: CameraModel, pose: BoardPose) -> list[UInt8[np.ndarray, "h w"]]:
-    camera_from_world = np.linalg.inv(pose.world_from_camera)
-    masks = []
-    for patch in board.paper_patches():
-        outline = _dense_outline(patch) @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
-        pixels = camera.project(outline)
-        if not np.isfinite(pixels).all() or np.abs(pixels).max() > FARTHEST_PX:
-            continue
-        mask = np.zeros((camera.height, camera.width), np.uint8)
-        cv2.fillPoly(mask, [np.round(pixels * 16).astype(np.int32)], 1, shift=4)
-        masks.append(mask)
-    return masks
-
-
-def _dense_outline(patch: Float64[np.ndarray, "4 3"]) -> Float64[np.ndarray, "n 3"]:
-    """Return points along a quad's edges, because a lens bends straight lines."""
-    share = np.linspace(0, 1, EDGE_POINTS, endpoint=False)[:, None]
-    following = np.roll(patch, -1, axis=0)
-    return np.concatenate(
-        [start + share * (end - start) for start, end in zip(patch, following, strict=True)]
-    )
+    def add(self, found: Registration) -> Float32[np.ndarray, "3"]:
+        """Take a new registration and return the factor to use from now on."""
+        ranks = ("", "given", "percentile", "patch")
+        rank, known = ranks.index(found.source), ranks.index(self._source)
+        if rank > known:
+            self._count, self._source = 0, found.source
+        if rank >= known:
+            self._count = min(self._count + 1, MOST_AVERAGED)
+            self._mean = self._mean + (found.factor - self._mean) / self._count
+        return self._mean.astype(np.float32)

@@ -1,8 +1,12 @@
 """The interface of every camera."""
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 from types import TracebackType
-from typing import Self
+from typing import Literal, Self
+
+import numpy as np
+from jaxtyping import Float64
 
 from protocol.board import BoardSpec
 from protocol.calibration import Extrinsics
@@ -19,18 +23,37 @@ class StaleFrameError(DeltalightError):
     """The newest frame of a camera is older than the caller allows."""
 
 
+@dataclass(frozen=True)
+class StreamState:
+    """How a live camera is doing, with a sentence for people."""
+
+    name: Literal["live", "stale", "lost"]
+    detail: str
+
+
+@dataclass(frozen=True, eq=False)
+class ImuSample:
+    """One reading of an inertial unit, in its own axes; `timestamp_ns` as of the camera's frames."""
+
+    timestamp_ns: int
+    acceleration_m_s2: Float64[np.ndarray, "3"]
+    angular_rate_rad_s: Float64[np.ndarray, "3"]
+
+
 class Camera(ABC):
     """A source of frames in real time (or as fast as asked for); use it as a context manager.
 
     One thread uses a camera. `timestamp_ns` of a frame is when it was captured, by the camera's own clock;
     `capture_ns` is the same moment by this host's clock. `depth_scale` is metres for each step of the depth,
-    None where it does not come in steps.
+    None where it does not come in steps. A live camera may know these, and `camera`, only once it is open.
+    `exposure_is_measured` says that each frame's `exposure_s` is what the sensor did, not what was asked.
     """
 
     camera: CameraModel
     board: BoardSpec | None = None
     extrinsics: Extrinsics = Extrinsics()
     depth_scale: float | None = None
+    exposure_is_measured: bool = False
 
     @abstractmethod
     def open(self) -> None:
@@ -65,6 +88,25 @@ class Camera(ABC):
     @abstractmethod
     def interrupt(self) -> None:
         """Make a waiting `read`, and later ones, end at once with EndOfStream; any thread may call it."""
+
+    @property
+    def state(self) -> StreamState | None:
+        """What a live camera says of its stream; None where only the age of the frames tells."""
+        return None
+
+    def imu_samples(self) -> list[ImuSample]:
+        """Return what the camera's inertial unit measured since the last call, the last seconds at most."""
+        return []
+
+    def set_exposure(self, seconds: float) -> None:
+        """Lock the exposure; frames some way ahead have it.
+
+        Raises:
+            DeltalightError: the exposure of this camera cannot be set.
+        """
+        raise DeltalightError(
+            f"this camera's exposure cannot be set to {seconds:g} s; take pictures as they come, no bracket."
+        )
 
     def __enter__(self) -> Self:
         self.open()

@@ -1,47 +1,144 @@
 """`deltalight node`: a sensor node process."""
 
-from typing import Annotated
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from services.ports import NODE_PORT, endpoint
+from services.commands.options import ConfigFile
+
+if TYPE_CHECKING:
+    from sensor_node.cameras.discovery import Discovery
 
 
 def node(
     *,
     source: Annotated[
-        str, typer.Option(help="Dataset folder, .mcap recording, or `synthetic`.")
-    ] = "synthetic",
-    name: Annotated[str, typer.Option(help="Name of the node; topics end with it.")] = "camera",
-    publish: Annotated[str, typer.Option(help="Endpoint for the streams.")] = endpoint(NODE_PORT),
+        str | None,
+        typer.Option(
+            help="Camera (`uvc:0`, `oak`), dataset folder, .mcap recording, or `synthetic`, the default."
+        ),
+    ] = None,
+    name: Annotated[
+        str | None, typer.Option(help="Name of the node; topics end with it. Default: camera.")
+    ] = None,
+    publish: Annotated[
+        str | None, typer.Option(help="Endpoint for the streams. Default: tcp://127.0.0.1:5601.")
+    ] = None,
     clock: Annotated[
         str | None, typer.Option(help="Control endpoint of the render server whose clock stamps refer to.")
     ] = None,
-    loop: Annotated[bool, typer.Option("--loop", help="Start again at the end of the source.")] = False,
+    fisheye: Annotated[
+        str | None, typer.Option(help="Camera that sees the light, as --source; default: the source's own.")
+    ] = None,
+    calibration: Annotated[
+        Path | None, typer.Option(help="Calibration folder of a live camera (rgb.yaml, board.yaml, ...).")
+    ] = None,
+    loop: Annotated[
+        bool | None, typer.Option("--loop/--no-loop", help="Start again at the end of the source.")
+    ] = None,
     fast: Annotated[
-        bool, typer.Option("--fast", help="Do not wait for the source's own times between frames.")
+        bool | None, typer.Option("--fast", help="Do not wait for the source's own times between frames.")
+    ] = None,
+    config_file: ConfigFile = None,
+    list_cameras: Annotated[
+        bool, typer.Option("--list", help="List the cameras of this machine and end.")
     ] = False,
+    discover: Annotated[
+        bool,
+        typer.Option("--discover", help="List the nodes that announce themselves on the network and end."),
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print a list as JSON.")] = False,
 ) -> None:
-    """Publish colour, depth and pose of a camera or a recording, until Ctrl-C or its end."""
-    from concurrent.futures import ThreadPoolExecutor
-    from threading import Event
-
-    from protocol.documents import validate
-    from sensor_node.node import NodeConfig, run_node
-
-    settings = {
+    """Publish colour, depth, light and pose of a camera or a recording, until Ctrl-C or its end."""
+    if list_cameras or discover:
+        _print_lists(cameras=list_cameras, nodes=discover, as_json=as_json)
+        return
+    given = {
         "source": source,
         "name": name,
         "endpoint": publish,
         "clock_endpoint": clock,
         "loop": loop,
-        "realtime": not fast,
+        "realtime": None if fast is None else not fast,
+        "camera": None if calibration is None else {"calibration": calibration},
+        "fisheye": None if fisheye is None else {"source": fisheye},
     }
+    _run({key: value for key, value in given.items() if value is not None}, config_file)
+
+
+def _run(given: dict[str, Any], config_file: Path | None) -> None:
+    from concurrent.futures import ThreadPoolExecutor
+    from threading import Event
+
+    from protocol.keys import KeySettings
+    from sensor_node.node import NodeConfig, run_node
+    from services.settings import load_configuration
+
+    configuration = load_configuration(config_file)
+    config = configuration.section("node", NodeConfig, given)
+    endpoints = [each for each in (config.endpoint, config.clock_endpoint) if each is not None]
+    keys = configuration.section("keys", KeySettings).load(endpoints)
     stop = Event()
-    config = validate(NodeConfig, settings, "the node's settings")
     with ThreadPoolExecutor(1) as thread:
-        running = thread.submit(run_node, config, stop)
+        running = thread.submit(run_node, config, stop, keys)
         try:
             running.result()  # signals interrupt this wait, not the node's work
         finally:
             stop.set()
+
+
+def _print_lists(*, cameras: bool, nodes: bool, as_json: bool) -> None:
+    data: dict[str, Any] = {}
+    if cameras:
+        from sensor_node.cameras.discovery import discover
+
+        found = discover()
+        data["cameras"] = [camera.as_dict() for camera in found.cameras]
+        if not as_json:
+            _print_cameras(found)
+    if nodes:
+        from services.discovery import find_nodes
+
+        data["nodes"] = [each.as_dict() for each in find_nodes()]
+        if not as_json:
+            _print_nodes(data["nodes"])
+    if as_json:
+        typer.echo(json.dumps(data, indent=2))
+
+
+def _print_cameras(found: "Discovery") -> None:
+    _print_table(
+        ("Source", "Camera", "Found", "What to do"),
+        [(each.source, each.name, each.details, each.hint) for each in found.cameras],
+        "no camera was found",
+    )
+    for missing in found.missing:
+        typer.echo(f"{missing.kind}: {missing.details}; {missing.hint}")
+
+
+def _print_nodes(nodes: Sequence[dict[str, Any]]) -> None:
+    _print_table(
+        ("Node", "Endpoint", "Keys", "Streams"),
+        [
+            (each["name"], each["endpoint"], "yes" if each["curve"] else "no", " ".join(each["streams"]))
+            for each in nodes
+        ],
+        "no node announces itself on this network",
+    )
+
+
+def _print_table(headings: Sequence[str], rows: Sequence[Sequence[str]], otherwise: str) -> None:
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    if not rows:
+        typer.echo(otherwise)
+        return
+    table = Table(*headings, box=None)
+    for row in rows:
+        table.add_row(*map(escape, row))
+    Console().print(table)

@@ -1,6 +1,10 @@
 """Values that several commands take."""
 
 from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
 
 
 class View(StrEnum):
@@ -20,3 +24,16 @@ class Method(StrEnum):
     DVCT = "dvct"
     EXACT = "exact"
     PAPER = "paper"
+
+
+ConfigFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--config",
+        help="Configuration file; default: ./deltalight.toml, then ~/.config/deltalight/deltalight.toml.",
+    ),
+]
+NodeName = Annotated[
+    str | None,
+    typer.Option("--node", help="Name of a node to find on the network; `auto` takes the only one there is."),
+]

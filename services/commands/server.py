@@ -1,11 +1,14 @@
 """`deltalight server`: a render server process."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from services.ports import COMPOSITE_PORT, CONTROL_PORT, NODE_PORT, endpoint
+from services.commands.options import ConfigFile, NodeName
+
+if TYPE_CHECKING:
+    from protocol.keys import KeySettings
 
 
 def server(
@@ -16,28 +19,52 @@ def server(
         typer.Option(help="File that keeps the current scene, so that a restart goes on with it."),
     ] = None,
     subscribe: Annotated[
-        list[str] | None, typer.Option(help="Endpoint of a sensor node; may be given several times.")
+        list[str] | None,
+        typer.Option(
+            help="Endpoint of a sensor node; may be given several times. Default: tcp://127.0.0.1:5601."
+        ),
     ] = None,
-    publish: Annotated[str, typer.Option(help="Endpoint for composites.")] = endpoint(COMPOSITE_PORT),
-    control: Annotated[str, typer.Option(help="Endpoint for commands.")] = endpoint(CONTROL_PORT),
+    node: NodeName = None,
+    publish: Annotated[
+        str | None, typer.Option(help="Endpoint for composites. Default: tcp://127.0.0.1:5602.")
+    ] = None,
+    control: Annotated[
+        str | None, typer.Option(help="Endpoint for commands. Default: tcp://127.0.0.1:5603.")
+    ] = None,
     device: Annotated[
         int | None, typer.Option(min=0, help="EGL device; `deltalight doctor` lists them.")
     ] = None,
     allow_software: Annotated[
-        bool, typer.Option("--allow-software", help="Accept a renderer without a GPU.")
-    ] = False,
+        bool | None, typer.Option("--allow-software", help="Accept a renderer without a GPU.")
+    ] = None,
+    config_file: ConfigFile = None,
 ) -> None:
     """Render what sensor nodes send and publish the composites, until Ctrl-C."""
+    from protocol.keys import KeySettings
     from render_server.server import ServerSettings, run_server
+    from services.settings import load_configuration
 
-    run_server(
-        ServerSettings(
-            scene=scene,
-            session=session,
-            subscribe=tuple(subscribe or [endpoint(NODE_PORT)]),
-            publish=publish,
-            control=control,
-            device=device,
-            allow_software=allow_software,
-        )
-    )
+    configuration = load_configuration(config_file)
+    key_settings = configuration.section("keys", KeySettings)
+    given: dict[str, Any] = {
+        "scene": scene,
+        "session": session,
+        "subscribe": _subscriptions(subscribe, node, key_settings),
+        "publish": publish,
+        "control": control,
+        "device": device,
+        "allow_software": allow_software,
+    }
+    given = {key: value for key, value in given.items() if value is not None}
+    settings = configuration.section("server", ServerSettings, given)
+    keys = key_settings.load([*settings.subscribe, settings.publish, settings.control])
+    run_server(settings, keys)
+
+
+def _subscriptions(subscribe: list[str] | None, node: str | None, keys: "KeySettings") -> list[str] | None:
+    """Endpoints that are named, and that of the node that is to be found."""
+    if node is None:
+        return subscribe or None
+    from services.discovery import node_endpoint
+
+    return [*(subscribe or []), node_endpoint(node, keys)]

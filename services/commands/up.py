@@ -1,16 +1,27 @@
 """`deltalight up`: all processes of one host, supervised."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from protocol.errors import DeltalightError
+from services.commands.options import ConfigFile, NodeName
 from services.ports import COMPOSITE_PORT, CONTROL_PORT, LOOPBACK, NODE_PORT, PAGE_PORT
+
+if TYPE_CHECKING:
+    from protocol.source import Source
 
 
 def up(
     *,
-    source: Annotated[str, typer.Option(help="Dataset folder, .mcap recording, or `synthetic`.")],
+    source: Annotated[
+        str | None,
+        typer.Option(
+            help="Camera, dataset folder, .mcap recording, or `synthetic`; default: as the configuration says."
+        ),
+    ] = None,
+    node: NodeName = None,
     scene: Annotated[
         Path | None, typer.Option(help="Scene document; default: the one that the recording carries.")
     ] = None,
@@ -26,18 +37,25 @@ def up(
     allow_software: Annotated[
         bool, typer.Option("--allow-software", help="Accept a renderer without a GPU.")
     ] = False,
+    config_file: ConfigFile = None,
 ) -> None:
-    """Run node, render server and viewer on this host and restart what dies, until Ctrl-C."""
-    from protocol.source import open_source
-    from sensor_node.node import SYNTHETIC
+    """Run node, render server and viewer on this host and restart what dies, until Ctrl-C.
+
+    With --node no node is started: the server takes the streams of one that is found on the network.
+    """
     from services.host import HostPlan, choose_scene, session_file
     from services.supervisor import Supervisor
 
-    recording = None if source == SYNTHETIC else open_source(Path(source))
-    with session_file(choose_scene(recording, scene)) as session:
+    if node is None:
+        source = source or _configured_source(config_file)
+    elif source is not None:
+        raise DeltalightError("--source starts a node here and --node names one elsewhere; give one of them.")
+    with session_file(choose_scene(_recording(source), scene)) as session:
         plan = HostPlan(
             source,
             session,
+            remote_node=node or "",
+            config=config_file,
             node_port=node_port,
             composite_port=composite_port,
             control_port=control_port,
@@ -49,3 +67,28 @@ def up(
         with Supervisor(plan.specs()) as supervisor:
             typer.echo(f"The live picture is at http://{LOOPBACK}:{port} (Ctrl-C ends everything).")
             supervisor.run()
+
+
+def _configured_source(config_file: Path | None) -> str:
+    """The node's source of the configuration.
+
+    Raises:
+        DeltalightError: it names none.
+    """
+    from sensor_node.node import NodeConfig
+    from services.settings import DEFAULT, load_configuration
+
+    config, origins = load_configuration(config_file).explained("node", NodeConfig)
+    if origins["source"] == DEFAULT:
+        raise DeltalightError(
+            "up needs a source; name it with --source, or a node on the network with --node."
+        )
+    return config.source
+
+
+def _recording(source: str | None) -> "Source | None":
+    """The recording that a source names, None where it is a camera, or another host's."""
+    from protocol.source import open_source
+    from sensor_node.cameras.open import SYNTHETIC, is_live
+
+    return None if source is None or source == SYNTHETIC or is_live(source) else open_source(Path(source))

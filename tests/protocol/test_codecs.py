@@ -14,10 +14,12 @@ from hypothesis.extra import numpy as hnp
 
 from protocol.codecs import (
     DEFAULT_DEPTH_SCALE_M,
+    decode_array,
     decode_color,
     decode_depth,
     decode_raw,
     decode_response,
+    encode_array,
     encode_color,
     encode_depth,
     jpeg_size,
@@ -97,6 +99,30 @@ def test_depth_that_cannot_be_told_is_unknown_and_never_near() -> None:
     back, known = decode_depth(encode_depth(depth, valid), "blosc2", (1, 8), DEFAULT_DEPTH_SCALE_M)
     np.testing.assert_array_equal(known, [[True] + [False] * 7])
     np.testing.assert_array_equal(back[~known], 0)
+
+
+@given(
+    st.sampled_from(["uint8", "uint16", "float32"]),
+    st.integers(1, 40),
+    st.integers(1, 40),
+    st.integers(0, 2**32 - 1),
+    st.sampled_from(["raw", "blosc2"]),
+)
+def test_arrays_of_every_type_are_exact(
+    dtype: str, rows: int, columns: int, seed: int, encoding: str
+) -> None:
+    values = np.random.default_rng(seed).integers(0, 1000, (rows, columns)).astype(dtype)
+    values[: seed % rows] = 0
+    part = encode_array(values, encoding)
+    back = decode_array(part, encoding, values.shape, dtype)
+    assert back.dtype == np.dtype(dtype)
+    np.testing.assert_array_equal(back, values)
+
+
+def test_an_array_of_another_type_of_the_same_length_is_refused() -> None:
+    values = np.arange(4096, dtype=np.float32)
+    with pytest.raises(EnvelopeError, match="zstd with bit shuffle"):
+        decode_array(encode_array(values, "blosc2"), "blosc2", (8192,), "uint16")
 
 
 def test_response_comes_back_and_nonsense_in_it_is_refused() -> None:

@@ -24,7 +24,7 @@ from protocol.messages import (
     ControlRequest,
     DepthMessage,
     FisheyeMessage,
-    LightsMessage,
+    LampsMessage,
     Message,
     PoseMessage,
     StatsMessage,
@@ -111,7 +111,7 @@ def test_topic_is_stream_and_node() -> None:
     assert encode(color(), [np.zeros((2, 4, 3), np.uint8)])[0] == b"color.desk"
 
 
-@pytest.mark.parametrize("version", [0, 2, 999, -1])
+@pytest.mark.parametrize("version", [0, 1, 3, 999, -1])
 def test_another_version_is_refused_and_both_are_named(version: int) -> None:
     with pytest.raises(EnvelopeError, match=rf"version {version} .* version {SCHEMA_VERSION}"):
         unpack_header(header_of(color(), schema_version=version))
@@ -258,7 +258,11 @@ def test_a_pose_must_be_a_rigid_transform(matrix: np.ndarray) -> None:
         lambda base: ControlReply(**base, id="a", ok=False),
         lambda base: ControlReply(**base, id="a", ok=True, error="no"),
         lambda base: FisheyeMessage(**base, encoding="jpeg", shape=(2, 2, 3), dtype="float32", camera={}),
-        lambda base: LightsMessage(**base, lights=[{}] * 65),
+        lambda base: LampsMessage(**base, lamps=[{"marker": 1, "world_from_marker": IDENTITY}] * 65),
+        lambda base: LampsMessage(
+            **base, lamps=[{"marker": 1, "world_from_marker": np.diag([1, 1, 1, 2.0]).tolist()}]
+        ),
+        lambda base: LampsMessage(**base, lamps=[{"marker": -1, "world_from_marker": IDENTITY}]),
         lambda base: StatsMessage(**base, state="running", rates={"color": -1.0}),
         lambda base: StatsMessage(**base, state="running", drops={"color": 1.5}),
     ],
@@ -282,7 +286,8 @@ def test_numpy_scalars_and_arrays_cannot_slip_into_a_header() -> None:
 
 def test_every_stream_has_its_message_type() -> None:
     assert set(MESSAGE_TYPES) == {
-        "color", "depth", "clean_depth", "fisheye", "pose", "lights", "composite", "stats", "request", "reply"
+        "color", "depth", "clean_depth", "fisheye", "radiance", "pose", "lamps", "composite", "stats",
+        "request", "reply",
     }  # fmt: skip
 
 

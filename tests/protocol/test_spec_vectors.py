@@ -11,6 +11,7 @@ import pytest
 
 from protocol.codecs import decode_color, decode_depth, decode_raw, decode_response
 from protocol.envelope import decode, encode
+from protocol.light_codecs import fisheye_pictures, lamp_poses, radiance_map
 from protocol.messages import MAX_HEADER_BYTES, MAX_PART_BYTES, MESSAGE_TYPES, SCHEMA_VERSION, Message
 from protocol.vectors import FOLDER, frame_pieces, unframe_pieces
 
@@ -32,7 +33,10 @@ def pictures(message: Message, parts: list[memoryview]) -> list[np.ndarray]:
         np.testing.assert_array_equal(depth > 0, valid)
         return [np.rint(depth / np.float32(message.depth_scale_m))]
     if message.stream == "fisheye":
-        return [decode_raw(part, message.shape, message.dtype) for part in parts]
+        return list(fisheye_pictures(message, parts).pictures)
+    if message.stream == "radiance":
+        light = radiance_map(message, parts)
+        return [light.radiance, light.seen]
     return [decode_color(parts[0], message.encoding, message.shape)]
 
 
@@ -72,6 +76,19 @@ def test_the_jpeg_vector_shows_the_raw_picture() -> None:
 def test_the_response_vector_is_the_straight_line() -> None:
     response = decode_response(decode(load("color_raw")[0])[1][1])
     np.testing.assert_allclose(response, np.repeat(np.arange(256)[:, None] / 255, 3, axis=1), atol=1e-7)
+
+
+def test_the_light_vectors_tell_lens_response_and_places() -> None:
+    message, parts = decode(load("fisheye_coded_raw")[0])
+    calibration = fisheye_pictures(message, parts).calibration
+    assert (calibration.lens.width, calibration.lens.height, calibration.vignetting) == (4, 2, (-0.05,))
+    assert np.asarray(calibration.response)[51, 0] == pytest.approx(0.2)
+    lamps = lamp_poses(decode(load("lamps")[0])[0])
+    assert [lamp.marker for lamp in lamps] == [40, 41]
+    assert lamps[1].world_from_marker[:3, 3].tolist() == [0.25, -0.5, 0.75]
+    light = radiance_map(*decode(load("radiance_raw")[0]))
+    assert light.clipped_share == 0.125
+    assert light.world_from_fisheye.tolist() == lamps[0].world_from_marker.tolist()
 
 
 @pytest.mark.parametrize("stream", sorted(MESSAGE_TYPES))

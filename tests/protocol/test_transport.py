@@ -80,7 +80,7 @@ def test_a_row_of_messages_for_one_frame_is_not_torn(opened: Callable[[Any], Any
     publisher = opened(Publisher(ANY))
     receiver = opened(Receiver([publisher.endpoint], []))
     connected(publisher, receiver)
-    streams = [b"color", b"depth", b"clean_depth", b"fisheye", b"pose", b"lights", b"stats"]
+    streams = [b"color", b"depth", b"clean_depth", b"fisheye", b"radiance", b"pose", b"lamps", b"stats"]
     for i in range(15):
         time.sleep(1 / 60)
         for stream in streams:
@@ -91,9 +91,9 @@ def test_a_row_of_messages_for_one_frame_is_not_torn(opened: Callable[[Any], Any
 
 def test_topics_are_whole_names_and_not_prefixes(opened: Callable[[Any], Any]) -> None:
     publisher = opened(Publisher(ANY))
-    receiver = opened(Receiver([publisher.endpoint], ["color.a", "pose", "lights", "stats", "hello"]))
+    receiver = opened(Receiver([publisher.endpoint], ["color.a", "pose", "lamps", "stats", "hello"]))
     connected(publisher, receiver)
-    wanted = {"color.a", "pose.x", "lights.a", "stats.a"}
+    wanted = {"color.a", "pose.x", "lamps.a", "stats.a"}
     for topic in ["color.ab", "posed.x", "depth.a", *wanted]:
         publisher.send([topic.encode(), b""])
     assert set(all_of(receiver, wanted)) == wanted

@@ -248,18 +248,6 @@ def test_manual_lights_take_their_colour_and_ambient_adds_up() -> None:
     assert [item["type"] for item in built.describe()] == ["directional", "sphere", "environment"]
 
 
-@pytest.mark.parametrize(
-    "lights",
-    [
-        documents.Lights(mode="fisheye"),
-        documents.Lights(mode="tracked"),
-    ],
-)
-def test_what_this_release_lacks_is_said(lights: documents.Lights) -> None:
-    with pytest.raises(DeltalightError, match="arrive with a later release; use"):
-        build_lights(lights)
-
-
 def test_unusable_maps_are_refused(tmp_path: Path) -> None:
     square = EnvironmentMap(np.ones((64, 64, 3), np.float32), np.eye(3))
     cases = [

@@ -1,11 +1,13 @@
 import numpy as np
 import pytest
 
-from protocol.board import BoardSpec
+from protocol.board import BoardSpec, GreyCard
 from protocol.camera_model import CameraModel
 from protocol.frames import BoardPose
+from render_server.scene.known_surfaces import known_albedo, paper_pixels
 from render_server.scene.registration import (
-    paper_pixels,
+    Registration,
+    RegistrationAverage,
     registration_from_albedo_percentile,
     registration_from_patch,
     unclipped,
@@ -115,3 +117,62 @@ def test_a_board_behind_or_out_of_sight_has_no_paper() -> None:
     away = np.diag([1.0, -1, -1, 1])
     away[:3, 3] = [5, 5, 0.4]
     assert not paper_pixels(BOARD, camera, BoardPose(away)).any()
+
+
+def test_a_grey_card_is_known_and_an_assumed_paper_then_is_not() -> None:
+    camera, pose = look_at_board(0.4)
+    card = GreyCard(center_m=(0.07, -0.03), size_m=(0.04, 0.03), rotation_deg=30, albedo=0.18)
+    only_card = known_albedo(BOARD.model_copy(update={"grey_cards": (card,)}), camera, pose)
+    assert np.unique(only_card).tolist() == pytest.approx([0, 0.18])
+    area = np.count_nonzero(only_card) / (400 / 0.4) ** 2
+    assert 0.035 * 0.025 < area < 0.0365 * 0.0265  # 2 pixels of 1 mm inside its edges
+
+    both = BOARD.model_copy(update={"grey_cards": (card,), "white_albedo": 0.7})
+    albedo = known_albedo(both, camera, pose)
+    assert np.unique(albedo).tolist() == pytest.approx([0, 0.18, 0.7])
+    assert np.count_nonzero(albedo == np.float32(0.7)) < paper_pixels(BOARD, camera, pose).sum()
+
+    away = BOARD.model_copy(
+        update={"grey_cards": (GreyCard(center_m=(9, 9), size_m=(0.1, 0.1), albedo=0.2),)}
+    )
+    assert np.unique(known_albedo(away, camera, pose)).tolist() == pytest.approx([0, 0.8])
+
+
+def test_paper_and_card_are_fitted_together() -> None:
+    paper, card = patch(300, 0.8), patch(200, 0.18)
+    measured, light, bounce = (np.concatenate(pair) for pair in zip(paper, card, strict=True))
+    registration = registration_from_patch(measured, light, bounce, np.repeat([0.8, 0.18], [300, 200]))
+    assert registration is not None
+    assert registration.factor == pytest.approx(FACTOR, rel=1e-5)
+
+
+def test_a_poor_fit_warns_and_a_good_one_does_not() -> None:
+    measured, light, bounce = patch(500)
+    good = registration_from_patch(measured, light, bounce, 0.8)
+    sloped = measured * np.linspace(0.6, 1.4, 500)[:, None]
+    poor = registration_from_patch(sloped, light, bounce, 0.8)
+    assert good is not None
+    assert poor is not None
+    assert good.warning is None
+    assert poor.warning is not None
+    assert poor.residual is not None
+    assert f"within {100 * poor.residual:.0f} %" in poor.warning
+
+
+def test_factors_are_averaged_and_known_surfaces_replace_guesses() -> None:
+    rng = np.random.default_rng(2)
+    average = RegistrationAverage()
+    guess = Registration(np.full(3, 9, np.float32), "percentile")
+    assert average.add(guess).tolist() == [9, 9, 9]
+    for _ in range(30):
+        factor = average.add(Registration((FACTOR * rng.normal(1, 0.1, 3)).astype(np.float32), "patch"))
+    assert factor == pytest.approx(FACTOR, rel=0.06)
+    assert np.array_equal(average.add(guess), factor)
+
+
+def test_the_average_follows_a_lasting_change() -> None:
+    average = RegistrationAverage()
+    for value in (1.0, 2.0):
+        for _ in range(100):
+            factor = average.add(Registration(np.full(3, value, np.float32), "patch"))
+    assert factor == pytest.approx([2, 2, 2], rel=0.05)

@@ -222,7 +222,7 @@ def test_a_board_out_of_sight_is_told_and_is_no_error(tmp_path: Path, endpoint: 
 
 
 def test_an_unknown_source_is_a_sentence(endpoint: str) -> None:
-    with pytest.raises(DeltalightError, match="does not exist"):
+    with pytest.raises(DeltalightError, match="no file, folder or camera `nowhere`"):
         run_node(NodeConfig(source="nowhere", endpoint=endpoint), threading.Event())
 
 

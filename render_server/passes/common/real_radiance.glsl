@@ -1,7 +1,8 @@
 // Radiance that a point of the real scene sends out, from the picture where the camera looks at it.
 #include "passes/common/picture.glsl"
 uniform float depth_tolerance;      // relative to depth: how far a point may lie from what the camera sees
-uniform vec3 unseen_albedo;         // of real surfaces that the camera does not see: the mean of those it sees
+layout(binding = 21) uniform sampler3D albedo_memory;   // of real surfaces that the camera does not see now
+uniform vec4 albedo_cube;           // its lowest corner (world m) and 1 / edge (1/m)
 uniform float picture_lod;          // of the linear picture: one sample covers a triangle's pixels
 
 bool camera_sees(vec3 p) {
@@ -18,4 +19,4 @@ vec3 measured_radiance(vec3 p) {
     return textureLod(linear_picture, picture_pixel(c) / picture_size, picture_lod).rgb;
 }
 
-vec3 predicted_radiance(vec3 irradiance) { return unseen_albedo / PI * irradiance; }
+vec3 unseen_albedo(vec3 p) { return textureLod(albedo_memory, (p - albedo_cube.xyz) * albedo_cube.w, 0.0).rgb; }

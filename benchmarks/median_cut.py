@@ -1,0 +1,74 @@
+"""How long a fish-eye picture takes to become lights: split, resampling, filtering; on one core.
+
+`python -m benchmarks.median_cut` prints a table.
+"""
+
+import statistics
+import time
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from protocol.hemisphere import texel_directions
+from render_server.scene.fisheye_lights import RESIDUAL_SIZE
+from render_server.scene.hemisphere_map import HemisphereMap, to_world
+from render_server.scene.median_cut import split_map
+from render_server.scene.octahedral import prefilter
+
+ROUNDS = 30
+SIZES = (256, 512)
+COUNTS = (4, 16)
+
+
+def room(size: int) -> HemisphereMap:
+    """A room with three windows and a lamp, seen from below, with noise: peaks spread over most of the map."""
+    rng = np.random.default_rng(4)
+    directions = texel_directions(size)
+    radiance = np.full((size, size, 3), 0.2, np.float32) + 0.05 * rng.random((size, size, 3), np.float32)
+    for toward, radius_deg, value in (
+        ((1.0, 0.2, 0.5), 14.0, 6.0),
+        ((-0.9, 0.6, 0.4), 10.0, 9.0),
+        ((0.1, -1.0, 0.6), 12.0, 5.0),
+        ((0.1, 0.2, 1.0), 3.0, 80.0),
+    ):
+        unit = np.array(toward, np.float32) / np.float32(np.linalg.norm(toward))
+        radiance[directions @ unit > np.cos(np.radians(radius_deg))] = value
+    return HemisphereMap(radiance, np.ones((size, size), bool), np.eye(3))
+
+
+def median_ms(work: Callable[[], object]) -> float:
+    """Median time of a call, ms; the first one, which fills caches, is left out."""
+    work()
+    times = []
+    for _ in range(ROUNDS):
+        started_s = time.perf_counter()
+        work()
+        times.append(1e3 * (time.perf_counter() - started_s))
+    return statistics.median(times)
+
+
+def main() -> None:
+    """Measure and print."""
+    cv2.setNumThreads(1)
+    table = Table(title="fish-eye picture to lights, median ms")
+    table.add_column("hemisphere")
+    for head in ("4 lights", "16 lights", "whole map, 16", "to the world", "filtered"):
+        table.add_column(head, justify="right")
+    for size in SIZES:
+        sky = room(size)
+        residual = split_map(sky).residual
+        world = to_world(residual, RESIDUAL_SIZE)
+        times = [median_ms(lambda sky=sky, count=count: split_map(sky, count)) for count in COUNTS]  # type: ignore[misc]
+        times.append(median_ms(lambda sky=sky: split_map(sky, COUNTS[-1], whole_map=True)))  # type: ignore[misc]
+        times.append(median_ms(lambda residual=residual: to_world(residual, RESIDUAL_SIZE).filled()))  # type: ignore[misc]
+        times.append(median_ms(lambda world=world: prefilter(world.filled())))  # type: ignore[misc]
+        table.add_row(f"{size}x{size}", *(f"{value:.2f}" for value in times))
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    typer.run(main)

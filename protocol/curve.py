@@ -1,0 +1,125 @@
+"""Keys on sockets: who may connect, and what is said about connections that were refused."""
+
+import threading
+from typing import Any
+
+import structlog
+import zmq
+from zmq.auth.thread import ThreadAuthenticator
+from zmq.utils.monitor import recv_monitor_message
+
+from protocol.endpoints import Endpoint
+from protocol.keys import Keys
+
+ZAP_DOMAIN = "deltalight"
+POLL_MS = 200
+STOP_S = 2.0
+# What libzmq says at both ends where keys do not fit, and at the end that has keys where the other has none.
+REFUSALS = (
+    zmq.EVENT_HANDSHAKE_FAILED_AUTH
+    | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
+    | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
+)
+_log = structlog.get_logger(__name__)
+
+Context = zmq.Context[zmq.Socket[bytes]]
+
+
+def uses_keys(endpoint: Endpoint, keys: Keys | None) -> bool:
+    """Whether connections of an endpoint are encrypted."""
+    return keys is not None and (endpoint.needs_keys or (keys.on_loopback and endpoint.is_tcp))
+
+
+def secure(socket: zmq.Socket[bytes], endpoint: Endpoint, keys: Keys | None, *, bind: bool) -> None:
+    """Set what the next bind or connect of a socket uses: keys, or none.
+
+    Raises:
+        DeltalightError: the key of the host behind the endpoint is not known.
+    """
+    if keys is None or not uses_keys(endpoint, keys):
+        socket.curve_server = False  # also takes back the keys of an endpoint before
+        return
+    socket.curve_publickey, socket.curve_secretkey = keys.public, keys.secret
+    if bind:
+        socket.curve_server = True
+        # With a domain libzmq refuses everybody while nobody answers for it; without, it would let them in.
+        socket.zap_domain = ZAP_DOMAIN.encode()
+    else:
+        socket.curve_serverkey = keys.peer(endpoint.peer, endpoint.address)
+
+
+class Guard:
+    """Lets trusted keys into the sockets that one context binds, and counts refused connections of a socket.
+
+    Make it before the socket is bound or connected; close it before the context is ended.
+
+    Args:
+        context: of the socket, and of nothing else that is bound.
+        socket: what is watched.
+        keys: own keys and whom they trust.
+        bind: whether the socket is bound; else only refusals by the other end are told.
+    """
+
+    def __init__(self, context: Context, socket: zmq.Socket[bytes], keys: Keys, *, bind: bool) -> None:
+        self.refused = 0
+        self._keys, self._is_server = keys, bind
+        self._closing = threading.Event()
+        self._authenticator = ThreadAuthenticator(context) if bind else None
+        if self._authenticator is not None:
+            self._authenticator.configure_curve_callback(ZAP_DOMAIN, self)
+            self._authenticator.start()
+        address = f"inproc://refusals-{id(self)}"
+        socket.monitor(address, REFUSALS)
+        self._thread = threading.Thread(
+            target=self._watch, args=(context, address), name="guard", daemon=True
+        )
+        self._thread.start()
+
+    def callback(self, domain: str, key: bytes) -> bool:
+        """Whether a client's public key (Z85) is trusted; the authenticator asks."""
+        del domain
+        return key in self._keys.trusted().values()
+
+    def close(self) -> None:
+        """Stop watching; nobody else is let in."""
+        self._closing.set()
+        self._thread.join(STOP_S)
+        if self._authenticator is not None:
+            self._authenticator.stop()
+
+    def _watch(self, context: Context, address: str) -> None:
+        told: set[int] = set()
+        with context.socket(zmq.PAIR) as events:
+            events.linger = 0
+            events.connect(address)
+            while not self._closing.is_set():
+                if events.poll(POLL_MS):
+                    self._count(recv_monitor_message(events), told)
+
+    def _count(self, event: Any, told: set[int]) -> None:  # noqa: ANN401 - as pyzmq types it
+        kind = int(event["event"])
+        if not kind & REFUSALS:
+            return
+        self.refused += 1
+        if kind not in told:  # a refused peer tries again and again
+            told.add(kind)
+            _log.warning("connection refused", endpoint=event["endpoint"].decode(), reason=self._reason(kind))
+
+    def _reason(self, kind: int) -> str:
+        own = f"{self._keys.name}.key"
+        if kind == zmq.EVENT_HANDSHAKE_FAILED_AUTH:
+            if self._is_server:
+                return (
+                    "its key is not trusted; if it is yours, run `deltalight keys trust` with its public key"
+                )
+            return f"our key is not trusted there; run `deltalight keys trust {own}` on that host"
+        if self._is_server:
+            return (
+                f"it has no keys, or not our present key; give it {own} and run `deltalight keys trust` there"
+            )
+        return "the other end has no keys, or another than the trusted one"
+
+
+def guard(context: Context, socket: zmq.Socket[bytes], keys: Keys | None, *, bind: bool) -> Guard | None:
+    """Return the guard of a socket, None where there are no keys."""
+    return None if keys is None else Guard(context, socket, keys, bind=bind)

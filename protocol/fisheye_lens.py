@@ -1,0 +1,171 @@
+"""Fish-eye cameras: lens, response, vignetting (calibration/fisheye.yaml of FORMATS 1)."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import yaml
+from jaxtyping import Float32, Float64
+from numpy.polynomial.polynomial import polyval
+
+from protocol.camera_model import camera_from_info, save_camera_yaml
+from protocol.documents import nearest, read_mapping
+from protocol.equidistant_lens import EquidistantLens
+from protocol.errors import DeltalightError
+from protocol.ocam_lens import OcamLens
+from protocol.response_table import load_response_table, require_response
+
+FisheyeLens = EquidistantLens | OcamLens
+_LENSES: dict[str, type[EquidistantLens] | type[OcamLens]] = {
+    "equidistant": EquidistantLens,
+    "ocam": OcamLens,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class FisheyeCalibration:
+    """Lens, response and vignetting of a fish-eye camera.
+
+    `response` is linear R G B for each code, 1.0 = white (None = sRGB). `vignetting` holds (v1, v2, ...): at the
+    angle a (radians) from the axis the sensor gets 1 + v1 a^2 + v2 a^4 + ... of the light that it gets on the axis;
+    radiance = linear / vignetting. As it is a function of the angle it holds for any size of the picture.
+
+    Raises:
+        DeltalightError: the response is no table, or the vignetting is not positive within 90 degrees.
+    """
+
+    lens: FisheyeLens
+    response: Float32[np.ndarray, "256 3"] | None = None
+    vignetting: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.response is not None:
+            object.__setattr__(self, "response", require_response(self.response, "the fish-eye's `response`"))
+        object.__setattr__(self, "vignetting", tuple(float(v) for v in self.vignetting))
+        # The hemisphere is what light is taken from, so positive there is enough; not always to its very edge.
+        shares = self.transmission(np.linspace(0.0, self._seen_angle(), 181))
+        if not (np.isfinite(shares).all() and shares.min() > 0):
+            raise DeltalightError(
+                "the fish-eye's `vignetting` is not positive up to 90 degrees; give coefficients of the angle in "
+                "radians, [v1, v2, ...] of 1 + v1 a^2 + v2 a^4 + ..."
+            )
+
+    def _seen_angle(self) -> float:
+        """Largest angle from the axis that the picture shows, at most 90 degrees."""
+        lens = self.lens
+        angles = np.linspace(0.0, np.pi / 2, 181)
+        around = np.linspace(0.0, 2 * np.pi, 36, endpoint=False)
+        a, b = (v.ravel() for v in np.meshgrid(angles, around))
+        rays = np.column_stack([np.sin(a) * np.cos(b), np.sin(a) * np.sin(b), np.cos(a)])
+        seen = np.isfinite(lens.project(rays)).all(axis=1)
+        return float(a[seen].max(initial=0.0))
+
+    def transmission(self, angle: Float64[np.ndarray, "*shape"]) -> Float64[np.ndarray, "*shape"]:
+        """Return the vignetting at angles from the axis (radians): 1 on the axis."""
+        return np.asarray(polyval(np.square(angle), np.array([1.0, *self.vignetting])))
+
+    def __eq__(self, other: object) -> bool:
+        """Compare by value."""
+        return isinstance(other, FisheyeCalibration) and self.to_dict() == other.to_dict()
+
+    def __hash__(self) -> int:
+        return hash((repr(self.lens.to_dict()), self.vignetting))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values that msgpack, JSON and YAML can hold."""
+        return {
+            "lens": self.lens.to_dict(),
+            "vignetting": list(self.vignetting),
+            "response": None if self.response is None else self.response.tolist(),
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Self:
+        """Make the calibration again that `to_dict` described.
+
+        Raises:
+            DeltalightError: a key is missing or has a value that no camera can have.
+        """
+        lens = data.get("lens")
+        if not isinstance(lens, Mapping):
+            raise DeltalightError("a fish-eye calibration has no `lens`; send all of its fields.")
+        kind = lens.get("distortion_model")
+        return cls(
+            _lens_class(kind).from_dict(lens), data.get("response"), _coefficients(data.get("vignetting"))
+        )
+
+
+def _lens_class(kind: object) -> type[EquidistantLens] | type[OcamLens]:
+    if not isinstance(kind, str) or kind not in _LENSES:
+        hint = nearest(str(kind), _LENSES)
+        raise DeltalightError(
+            f"the fish-eye lens model `{kind}` is unknown; use {f'`{hint}`' if hint else 'equidistant or ocam'}."
+        )
+    return _LENSES[kind]
+
+
+def _coefficients(values: object) -> tuple[float, ...]:
+    try:
+        return tuple(float(v) for v in values) if values is not None else ()  # type: ignore[attr-defined]
+    except (TypeError, ValueError):
+        raise DeltalightError("the fish-eye's `vignetting` must be a list of numbers; correct it.") from None
+
+
+def load_fisheye_yaml(path: Path) -> FisheyeCalibration:
+    """Read calibration/fisheye.yaml: the keys of ROS camera_info with `distortion_model` equidistant or ocam.
+
+    Of an ocam lens `camera_matrix` and `distortion_coefficients` are replaced by `ocam: {polynomial, center [x, y],
+    affine [c, d, e]}`. Optional: `image_circle` (radius in pixels), `vignetting` (coefficients), `response` (256
+    rows of linear R G B, or the name of a text file with them beside this one).
+
+    Raises:
+        DeltalightError: the file or one of its keys is missing or wrong.
+    """
+    info = read_mapping(path)
+    try:
+        lens = _lens_from_info(info, path)
+        return FisheyeCalibration(lens, _response(info, path), _coefficients(info.get("vignetting")))
+    except DeltalightError as error:
+        sentence = str(error)
+        raise DeltalightError(sentence if str(path) in sentence else f"{path}: {sentence}") from error
+
+
+def _lens_from_info(info: Mapping[str, Any], path: Path) -> FisheyeLens:
+    kind = info.get("distortion_model")
+    if _lens_class(kind) is EquidistantLens:
+        return EquidistantLens(camera_from_info(info, path), info.get("image_circle"))
+    ocam = info.get("ocam")
+    if not isinstance(ocam, Mapping):
+        raise DeltalightError("an ocam lens needs the key `ocam` with polynomial, center and affine; add it.")
+    size = {"width": info.get("image_width"), "height": info.get("image_height")}
+    return OcamLens.from_dict({**ocam, **size, "image_circle": info.get("image_circle")})
+
+
+def _response(info: Mapping[str, Any], path: Path) -> Float32[np.ndarray, "256 3"] | None:
+    value = info.get("response")
+    if isinstance(value, str):
+        return load_response_table(path.parent / value)
+    return None if value is None else require_response(value, "`response`")
+
+
+def save_fisheye_yaml(path: Path, calibration: FisheyeCalibration) -> None:
+    """Write calibration/fisheye.yaml, which `load_fisheye_yaml` reads again to an equal calibration."""
+    lens, described = calibration.lens, calibration.to_dict()
+    extra: dict[str, object] = {}
+    if lens.image_circle is not None:
+        extra["image_circle"] = lens.image_circle
+    extra |= {key: described[key] for key in ("vignetting", "response") if described[key]}
+    if isinstance(lens, EquidistantLens):
+        save_camera_yaml(path, lens.camera, "fisheye", extra)
+        return
+    info = {
+        "image_width": lens.width,
+        "image_height": lens.height,
+        "camera_name": "fisheye",
+        "distortion_model": "ocam",
+        "ocam": {key: described["lens"][key] for key in ("polynomial", "center", "affine")},
+        **extra,
+    }
+    path.write_text(yaml.safe_dump(info, sort_keys=False, default_flow_style=None), encoding="utf-8")

@@ -1,0 +1,211 @@
+"""CURVE keys (CurveZMQ, ZeroMQ RFC 26): a key pair for each host and the public keys that it trusts, in a folder.
+
+NAME.key_secret     this host's own secret key, readable by its owner only
+NAME.key            its public key, for other hosts to trust
+trusted/NAME.key    public key of another host that is trusted
+"""
+
+import os
+import re
+import shutil
+import stat
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import zmq.auth
+from pydantic import Field
+
+from protocol.documents import StrictModel, nearest
+from protocol.endpoints import parse_endpoint
+from protocol.errors import DeltalightError
+
+PUBLIC, SECRET = ".key", ".key_secret"
+TRUSTED = "trusted"
+CREATE_HINT = "run `deltalight keys create NAME`"
+TRUST_HINT = "copy the other host's public key (NAME.key) here and run `deltalight keys trust NAME.key`"
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
+# Permission bits that let anybody but the owner at a secret key.
+_OTHERS = stat.S_IRWXG | stat.S_IRWXO
+
+
+@dataclass(frozen=True)
+class Keys:
+    """This host's key pair (Z85 text as bytes) and where the trusted public keys lie.
+
+    The folder is read at each use, so that a key is trusted, or no longer, without a restart. `on_loopback`
+    says that connections which stay on this host use keys too.
+    """
+
+    name: str
+    public: bytes
+    secret: bytes = field(repr=False)
+    folder: Path
+    on_loopback: bool = False
+
+    def trusted(self) -> dict[str, bytes]:
+        """Return the trusted public keys by name; a file that holds none is left out."""
+        return trusted_keys(self.folder)
+
+    def peer(self, name: str | None, endpoint: str) -> bytes:
+        """Return the public key of the host behind an endpoint: the one called `name`, or the only one.
+
+        Raises:
+            DeltalightError: no such key is trusted, or several are and no name says which.
+        """
+        trusted = self.trusted()
+        if name is not None and name not in trusted:
+            hint = nearest(name, trusted)
+            known = f"the nearest trusted name is {hint}" if hint else TRUST_HINT
+            raise DeltalightError(f"no key of `{name}` is trusted for {endpoint}: {known}")
+        if name is None and len(trusted) != 1:
+            advice = "write tcp://NAME@HOST:PORT with one of " + ", ".join(trusted) if trusted else TRUST_HINT
+            raise DeltalightError(
+                f"{endpoint} needs the key of its host, and {len(trusted)} are trusted: {advice}"
+            )
+        return trusted[name] if name is not None else next(iter(trusted.values()))
+
+
+class KeySettings(StrictModel):
+    """Which keys a process uses."""
+
+    name: str | None = Field(
+        default=None,
+        description="Own key pair (`deltalight keys create NAME`); null = the only one there is.",
+    )
+    folder: Path | None = Field(
+        default=None, description="Folder of the keys; null = `keys` in the user's configuration folder."
+    )
+    on_loopback: bool = Field(
+        default=False, description="Use keys also between processes of this host, and at the end of a tunnel."
+    )
+
+    def load(self, endpoints: Iterable[str]) -> Keys | None:
+        """Return the keys that a process with these endpoints uses, None where it needs none.
+
+        Raises:
+            DeltalightError: keys are needed and there are none, or they cannot be used.
+        """
+        parts = [parse_endpoint(endpoint) for endpoint in endpoints]
+        if not any(part.needs_keys or (self.on_loopback and part.is_tcp) for part in parts):
+            return None
+        folder = self.folder or key_folder()
+        first = next((part.address for part in parts if part.needs_keys), parts[0].address)
+        return load_keys(self.name, folder, purpose=first, on_loopback=self.on_loopback)
+
+
+def config_home() -> Path:
+    """Return the user's configuration folder of Deltalight (XDG base directory specification)."""
+    return Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config") / "deltalight"
+
+
+def key_folder() -> Path:
+    """Return the folder of keys where none is named."""
+    return config_home() / "keys"
+
+
+def create_keys(name: str, folder: Path) -> tuple[Path, Path]:
+    """Make a key pair; returns the public and the secret file.
+
+    Raises:
+        DeltalightError: the name is wrong or taken, or the folder cannot be written.
+    """
+    _check_name(name)
+    public, secret = folder / f"{name}{PUBLIC}", folder / f"{name}{SECRET}"
+    if public.exists() or secret.exists():
+        raise DeltalightError(f"{folder} has keys called `{name}`: choose another name, or remove them first")
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        # A temporary folder is closed to others, so the secret key is at no time readable by them.
+        with TemporaryDirectory(dir=folder, prefix=".new-") as closed:
+            made_public, made_secret = map(Path, zmq.auth.create_certificates(closed, name))
+            made_secret.chmod(0o600)
+            made_public.chmod(0o644)
+            made_secret.replace(secret)
+            made_public.replace(public)
+    except OSError as error:
+        raise DeltalightError(
+            f"keys cannot be written to {folder} ({error.strerror}): name another folder"
+        ) from error
+    return public, secret
+
+
+def load_keys(name: str | None, folder: Path, *, purpose: str = "this", on_loopback: bool = False) -> Keys:
+    """Read a key pair of this host: the one called `name`, or the only one.
+
+    Raises:
+        DeltalightError: there is none or several, or others can read the secret file.
+    """
+    own = own_keys(folder)
+    if name is None and len(own) > 1:
+        raise DeltalightError(f"{folder} has the keys {', '.join(own)}: say which with `name` of [keys]")
+    if (name is None and not own) or (name is not None and name not in own):
+        raise DeltalightError(
+            f"{purpose} needs keys and {folder} has none{f' called `{name}`' if name else ''}: {CREATE_HINT}"
+        )
+    chosen = name or own[0]
+    path = folder / f"{chosen}{SECRET}"
+    if path.stat().st_mode & _OTHERS:
+        raise DeltalightError(
+            f"others can read the secret key {path}: run `chmod 600 {path}`, or make a new one"
+        )
+    public, secret = _read(path)
+    if secret is None:
+        raise DeltalightError(f"{path} holds no secret key: {CREATE_HINT}")
+    return Keys(chosen, public, secret, folder, on_loopback)
+
+
+def trust(file: Path, folder: Path, name: str | None = None) -> Path:
+    """Trust another host's public key; returns where it is kept.
+
+    Raises:
+        DeltalightError: the file holds no public key or a secret one, or the name is taken by another key.
+    """
+    if not file.is_file():
+        raise DeltalightError(f"{file} is no file: {TRUST_HINT}")
+    public, secret = _read(file)
+    if secret is not None:
+        raise DeltalightError(f"{file} holds a secret key, which stays on its host: give its {PUBLIC} file")
+    chosen = name or file.name.removesuffix(PUBLIC)
+    _check_name(chosen)
+    kept = folder / TRUSTED / f"{chosen}{PUBLIC}"
+    if kept.is_file() and _read(kept)[0] != public:
+        raise DeltalightError(f"another key is trusted as `{chosen}`: give --name, or remove {kept} first")
+    try:
+        kept.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        shutil.copyfile(file, kept)
+    except OSError as error:
+        raise DeltalightError(f"{kept} cannot be written ({error.strerror}): name another folder") from error
+    return kept
+
+
+def own_keys(folder: Path) -> list[str]:
+    """Return the names of the key pairs in a folder."""
+    return sorted(path.name.removesuffix(SECRET) for path in folder.glob(f"*{SECRET}"))
+
+
+def trusted_keys(folder: Path) -> dict[str, bytes]:
+    """Return the public keys that are trusted in a folder by name; a file that holds none is left out."""
+    found = {}
+    for path in sorted((folder / TRUSTED).glob(f"*{PUBLIC}")):
+        try:
+            found[path.name.removesuffix(PUBLIC)] = _read(path)[0]
+        except DeltalightError:
+            continue
+    return found
+
+
+def _read(path: Path) -> tuple[bytes, bytes | None]:
+    """Public and secret key of a file in pyzmq's form."""
+    try:
+        return zmq.auth.load_certificate(path)
+    except (OSError, ValueError) as error:
+        raise DeltalightError(
+            f"{path} is no key file: give one that `deltalight keys create` made"
+        ) from error
+
+
+def _check_name(name: str) -> None:
+    if not _NAME.fullmatch(name):
+        raise DeltalightError(f"`{name}` is no name for keys: use letters, digits, - and _")

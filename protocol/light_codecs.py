@@ -1,0 +1,68 @@
+"""What messages of light hold: fish-eye pictures, radiance maps, lamps (SPEC.md, section 3)."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float32
+
+from protocol.codecs import decode_array, decode_color, decode_raw
+from protocol.envelope import EnvelopeError
+from protocol.fisheye_lens import FisheyeCalibration
+from protocol.fisheye_parts import calibration_of
+from protocol.frames import FisheyePictures, LampPose, RadianceMap
+from protocol.messages import FisheyeMessage, LampsMessage, RadianceMessage
+
+Parts = Sequence[memoryview]
+
+
+def fisheye_pictures(message: FisheyeMessage, parts: Parts) -> FisheyePictures:
+    """Return the pictures of a message; their time is its capture time.
+
+    Raises:
+        DeltalightError: a picture cannot be decoded, or the calibration is none.
+    """
+    pictures = tuple(_picture(message, part) for part in parts[: len(message.exposures_s)])
+    return FisheyePictures(message.capture_ns, pictures, message.exposures_s, _calibration(message, parts))
+
+
+def radiance_map(message: RadianceMessage, parts: Parts) -> RadianceMap:
+    """Return the map of a message; its time is its capture time.
+
+    Raises:
+        DeltalightError: a part cannot be decoded or holds values that cannot be, or the calibration is none.
+    """
+    size = message.size
+    radiance = decode_array(parts[0], message.encoding, (size, size, 3), "float32")
+    seen = decode_array(parts[1], message.encoding, (size, size), "uint8")
+    if seen.max() > 1:
+        raise EnvelopeError("the mask of a radiance map holds other values than 0 and 1: correct it")
+    return RadianceMap(
+        timestamp_ns=message.capture_ns,
+        radiance=_require_radiance(radiance),
+        seen=seen.astype(bool),
+        world_from_fisheye=np.array(message.world_from_fisheye),
+        clipped_share=message.clipped_share,
+        picture=decode_color(parts[2], "jpeg", message.picture_shape),
+        calibration=_calibration(message, parts),
+    )
+
+
+def lamp_poses(message: LampsMessage) -> tuple[LampPose, ...]:
+    """Return the lamps of a message."""
+    return tuple(LampPose(lamp.marker, np.array(lamp.world_from_marker)) for lamp in message.lamps)
+
+
+def _calibration(message: FisheyeMessage | RadianceMessage, parts: Parts) -> FisheyeCalibration:
+    return calibration_of(message.camera, bytes(parts[-1]) if message.has_response else None)
+
+
+def _picture(message: FisheyeMessage, part: memoryview) -> np.ndarray:
+    if message.dtype == "float32":
+        return _require_radiance(decode_raw(part, message.shape, "float32"))
+    return decode_color(part, message.encoding, message.shape)
+
+
+def _require_radiance(values: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
+    if not np.isfinite(values).all() or (values < 0).any():
+        raise EnvelopeError("the part holds negative or non-finite radiance: send zero or more")
+    return values

@@ -1,0 +1,76 @@
+"""Files of linear radiance: Radiance .hdr and OpenEXR."""
+
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float32
+
+from protocol.errors import DeltalightError
+
+LINEAR_SUFFIXES = (".hdr", ".exr")
+
+
+def read_linear(path: Path) -> Float32[np.ndarray, "h w 3"]:
+    """Read a .hdr or .exr picture as linear R G B; negative values (lossy compression leaves some) become 0.
+
+    Raises:
+        DeltalightError: it cannot be read, holds values that are not finite, or is .exr and the package OpenEXR
+            is not installed.
+    """
+    picture = _read_exr(path) if path.suffix.lower() == ".exr" else _read_hdr(path)
+    if not np.isfinite(picture).all():
+        raise DeltalightError(f"{path} holds values that are not finite; export it again.")
+    return np.asarray(np.maximum(picture, 0))
+
+
+def write_exr(path: Path, linear: Float32[np.ndarray, "h w 3"]) -> None:
+    """Write linear RGB as an OpenEXR file of 32-bit floats, without loss.
+
+    Raises:
+        DeltalightError: the package OpenEXR is not installed.
+    """
+    exr = require_openexr(f"writing {path}")
+    header = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
+    with exr.File(header, {"RGB": np.ascontiguousarray(linear)}) as file:
+        file.write(str(path))
+
+
+def require_openexr(purpose: str) -> ModuleType:
+    """Return the OpenEXR package; `purpose` begins the sentence that says who needs it.
+
+    Raises:
+        DeltalightError: it is not installed.
+    """
+    try:
+        return import_module("OpenEXR")  # it has no type information
+    except ImportError as error:
+        raise DeltalightError(
+            f"{purpose} needs the package OpenEXR: pip install 'deltalight[render]'."
+        ) from error
+
+
+def _read_hdr(path: Path) -> Float32[np.ndarray, "h w 3"]:
+    try:
+        picture: Any = cv2.imread(str(path), cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR)
+    except cv2.error:
+        picture = None
+    if picture is None or picture.dtype != np.float32:
+        raise DeltalightError(f"{path} cannot be read as a Radiance .hdr picture; export it again.")
+    return np.ascontiguousarray(picture[..., ::-1])
+
+
+def _read_exr(path: Path) -> Float32[np.ndarray, "h w 3"]:
+    exr = require_openexr(f"reading {path}")
+    try:
+        with exr.File(str(path)) as file:
+            channels = file.channels()
+            (stored,) = (channels[name].pixels for name in ("RGB", "RGBA") if name in channels)
+    except Exception as error:  # the package documents no closed set
+        raise DeltalightError(
+            f"{path} cannot be read as an OpenEXR picture of R, G and B; export it again."
+        ) from error
+    return np.ascontiguousarray(stored[..., :3], np.float32)

@@ -1,0 +1,121 @@
+"""The lights of one scene document from frame to frame: followed, then completed from what the picture shows."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from protocol import scene_lights as documents
+from protocol.frames import ViewFrame
+from render_server.light_registration import (
+    Relight,
+    find_surroundings,
+    ground_radiance,
+    register_lights,
+    surroundings_shape,
+)
+from render_server.lights_view import lights_picture
+from render_server.relight.frame import RelightInput
+from render_server.scene.light_sources import open_lights
+from render_server.scene.lights import LightSet
+
+Rgb = Float32[np.ndarray, "3"]
+VERSION_STEP = 8
+"""Versions between two light sets; while something is found from the picture, those between number trial sets."""
+
+
+class Lighting:
+    """Lights in camera units, and a number that changes with them.
+
+    Factor, ground and surroundings are found once from the first frame that can tell, and hold for all lights that
+    the source brings from then on. `versions` counts in steps of VERSION_STEP; `say` takes sentences for the user.
+
+    Raises:
+        DeltalightError: an environment map that cannot be read.
+    """
+
+    def __init__(self, wished: documents.Lights, versions: Iterator[int], say: Callable[[str], None]) -> None:
+        self._source = open_lights(wished)
+        self._versions, self._say = versions, say
+        self._follows_lamps = wished.mode == "tracked"
+        self._wants_registration = wished.resolved_registration == "auto"
+        given = wished.mode in ("manual", "tracked") and not self._wants_registration
+        self._wants_surroundings = given and wished.surroundings == "auto"
+        self._wants_ground = self._wants_surroundings or wished.mode == "fisheye"
+        self._raw: LightSet | None = None
+        self._forget()
+        self.lights: LightSet | None = None
+        self.version = 0
+
+    def _forget(self) -> None:
+        """Find everything anew."""
+        self._is_complete = False
+        self._factor: Rgb | None = None
+        self._ground: Rgb | None = None
+        self._sky: tuple[Rgb, Float32[np.ndarray, "n n 1"]] | None = None
+
+    def follow(self, frame: ViewFrame) -> bool:
+        """Take over a frame's lights; returns whether there are any lights yet."""
+        raw = self._source.follow(frame)
+        for sentence in self._source.remarks:
+            self._say(sentence)
+        if raw is not None:
+            if self._follows_lamps and self._raw is not None and raw.identities != self._raw.identities:
+                self._forget()  # another lamp explains more of what is seen
+            self._raw = raw
+            self._finish()
+        return self.lights is not None
+
+    def _finish(self) -> None:
+        """Apply to the source's lights what was found."""
+        assert self._raw is not None
+        lights = self._raw.registered(self._factor)
+        if self._ground is not None:
+            lights = lights.with_ground(self._ground)
+        if self._sky is not None:
+            lights = lights.with_sky(*self._sky)
+        self.lights, self.version = lights, next(self._versions)
+
+    def complete(self, frame: ViewFrame, scene: RelightInput, relight: Relight) -> RelightInput:
+        """Return the input with lights in camera units, all found that a picture can tell."""
+        assert self._raw is not None
+        shines = bool(self._raw.lights) or bool(self._raw.environment.any())
+        if self._is_complete or (self._follows_lamps and not shines):
+            return scene
+        self._is_complete = True
+        if self._wants_registration:
+            self._register(frame, replace(scene, lights=self._raw), relight)
+        if self._wants_ground:
+            self._ground = ground_radiance(frame, scene)
+        if self._wants_surroundings:
+            self._find_surroundings(frame, scene, relight)
+        self._finish()
+        assert self.lights is not None
+        return replace(scene, lights=self.lights, lights_version=self.version)
+
+    def picture(self, frame: ViewFrame) -> UInt8[np.ndarray, "h w 3"]:
+        """Draw the lights (view `lights`), once there are any."""
+        assert self.lights is not None
+        return lights_picture(frame, self.lights, self._source.split)
+
+    def _register(self, frame: ViewFrame, scene: RelightInput, relight: Relight) -> None:
+        """Find the lights' factor from this frame."""
+        found = register_lights(frame, scene, relight)
+        self._factor = found.factor
+        factor = ", ".join(f"{value:.3g}" for value in found.factor)
+        fit = "" if found.residual is None else f", residual {100 * found.residual:.1f} %"
+        self._say(f"lights registered by {found.source}: factor ({factor}){fit}")
+        if found.warning is not None:
+            self._say(found.warning)
+
+    def _find_surroundings(self, frame: ViewFrame, scene: RelightInput, relight: Relight) -> None:
+        """Find the light of what is out of sight, as this frame shows it."""
+        lights = scene.lights if self._ground is None else scene.lights.with_ground(self._ground)
+        scene = replace(scene, lights=lights, lights_version=self.version + VERSION_STEP // 2)
+        shape = surroundings_shape(frame, scene)
+        found = find_surroundings(frame, scene, shape, relight)
+        if found is not None:
+            self._sky = (found, shape)
+            radiance = ", ".join(f"{value:.3g}" for value in found)
+            self._say(f"surroundings out of sight: radiance up to ({radiance}), found on the board's paper")

@@ -1,0 +1,46 @@
+"""The albedo memory on the GPU: what real_radiance.glsl reads where the camera does not look."""
+
+from typing import Any
+
+import moderngl
+import numpy as np
+
+from render_server.gpu.context import GpuContext
+from render_server.scene.albedo_memory import MEAN_ALBEDO, AlbedoMemory
+
+
+class UnseenAlbedo:
+    """A 3-D texture of albedo over a cube in world axes; the mean of rooms until something was observed."""
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self._gpu = gpu
+        self._texture = self._uploaded(np.full((1, 1, 1, 3), MEAN_ALBEDO, np.float32))
+        self._cube = (0.0, 0.0, 0.0, 1.0)
+
+    def upload(self, memory: AlbedoMemory) -> None:
+        """Take over everything that was observed."""
+        self._texture.release()
+        self._texture = self._uploaded(memory.filled())
+        x, y, z = (float(v) for v in memory.origin)
+        self._cube = (x, y, z, 1 / memory.edge)
+
+    def _uploaded(self, albedo: np.ndarray) -> moderngl.Texture3D:
+        texels = np.concatenate([albedo, np.ones_like(albedo[..., :1])], axis=-1).astype(np.float16)
+        depth, height, width = albedo.shape[:3]
+        texture = self._gpu.ctx.texture3d(
+            (width, height, depth), 4, texels.tobytes(), dtype="f2", alignment=1
+        )
+        texture.repeat_x = texture.repeat_y = texture.repeat_z = False
+        return texture
+
+    def bind(self) -> None:
+        """Bind to the place that real_radiance.glsl names."""
+        self._texture.use(location=21)
+
+    def uniforms(self) -> dict[str, Any]:
+        """Every uniform that shaders read of it."""
+        return {"albedo_cube": self._cube}
+
+    def release(self) -> None:
+        """Free the texture."""
+        self._texture.release()

@@ -1,0 +1,252 @@
+"""Depth of many frames averaged into one signed distance field (Curless & Levoy 1996), in sparse blocks of voxels.
+
+Distances are taken to the plane that was fitted around each pixel, not along the ray: oblique surfaces and the
+rounding to whole pixels then leave no error. Weights are inverse variances of depth noise. What is seen to be free
+space is carved, so that things which moved away disappear.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int32, Int64
+
+from protocol.camera_model import CameraModel
+from render_server.scene.depth_surface import DepthSurface
+from render_server.view import NEAR_M, CameraView
+
+BLOCK = 8  # voxels an edge of a block
+GRID = 128  # blocks an edge of the largest box
+# What a frame adds counts at least this share, so that slow changes of the scene are followed.
+LONGEST_MEMORY_FRAMES = 32
+# Distances are kept so far from a surface: gradients lie within three voxels, depth noise within three sigma.
+REACH_VOXELS, REACH_SIGMAS = 3.0, 3.0
+CHUNK_BLOCKS = 128  # updated at once: their arrays fit a core's cache
+
+
+@dataclass(frozen=True)
+class FusedPlacement:
+    """A cube of voxels in world axes.
+
+    `origin` is the first voxel's centre (m), `voxel_m` the distance of voxels, `blocks` the cube's edge in blocks of
+    8 voxels. `max_blocks` bounds memory. Blocks inside `hole` (least and greatest coordinates, m) stay empty.
+    """
+
+    origin: tuple[float, float, float]
+    voxel_m: float
+    blocks: int
+    max_blocks: int
+    hole: Float64[np.ndarray, "2 3"] | None = None
+
+    @property
+    def block_m(self) -> float:
+        """Edge of a block, m."""
+        return BLOCK * self.voxel_m
+
+    @property
+    def box(self) -> Float64[np.ndarray, "2 3"]:
+        """Least and greatest coordinates of the cube, m."""
+        return np.array([self.origin, np.add(self.origin, self.blocks * self.block_m)])
+
+
+@dataclass(frozen=True, eq=False)
+class _Planes:
+    """Rows of (nx, ny, nz, n.P, reach, weight) a pixel in the optical frame; the last row is for no pixel at all."""
+
+    rows: Float32[np.ndarray, "n+1 6"]
+
+
+class FusedVolume:
+    """Signed distances to the nearest surface, m: positive in front, cut off at the reach of what was measured."""
+
+    def __init__(self, placement: FusedPlacement) -> None:
+        self.placement = placement
+        self.slots = np.full((placement.blocks,) * 3, -1, np.int32)
+        """Number of the block at each place of the cube (x, y, z), -1: none."""
+        self.places: Int32[np.ndarray, "b 3"] = np.zeros((0, 3), np.int32)
+        self.distance: Float32[np.ndarray, "b 512"] = np.zeros((0, BLOCK**3), np.float32)
+        self.weight: Float32[np.ndarray, "b 512"] = np.zeros((0, BLOCK**3), np.float32)
+
+    def integrate(self, surface: DepthSurface, view: CameraView, noise_sigma: float) -> None:
+        """Average one frame into the field.
+
+        Args:
+            surface: of the frame's clean depth, registered to the view's camera.
+            view: camera and pose of the frame.
+            noise_sigma: depth noise at 1 m, m.
+        """
+        planes = _pixel_planes(surface, view.camera, noise_sigma, self.placement.voxel_m)
+        self._allocate(planes, surface, view)
+        blocks = self._blocks_in_view(view)
+        for start in range(0, len(blocks), CHUNK_BLOCKS):
+            self._update(blocks[start : start + CHUNK_BLOCKS], planes, view)
+
+    def known_distance(self) -> Float32[np.ndarray, "b 512"]:
+        """Distances, NaN where nothing was measured."""
+        return np.where(self.weight > 0, self.distance, np.float32(np.nan))
+
+    def _allocate(self, planes: _Planes, surface: DepthSurface, view: CameraView) -> None:
+        """Make blocks wherever the distances around this frame's surfaces reach."""
+        half_block = self.placement.block_m / 2
+        chosen = _spread_pixels(planes, surface, view, half_block)
+        rows = planes.rows[chosen]
+        points = _towards(view.camera)[chosen] / surface.inverse_depth.ravel()[chosen, None]
+        reach = rows[:, 4]
+        count = int(np.ceil(2 * float(reach.max(initial=0)) / half_block)) + 1
+        steps = np.linspace(-1, 1, count, dtype=np.float32)[:, None, None] * reach[:, None]
+        around = (points + rows[:, :3] * steps).reshape(-1, 3)
+        matrix = view.world_from_camera.astype(np.float32)
+        self._add_blocks(around @ matrix[:3, :3].T + matrix[:3, 3])
+
+    def _add_blocks(self, world: Float32[np.ndarray, "n 3"]) -> None:
+        placement = self.placement
+        place = np.floor((world - placement.origin) / placement.block_m)
+        inside = ((place >= 0) & (place < placement.blocks)).all(axis=1)
+        wanted = np.zeros(self.slots.shape, bool)
+        wanted[tuple(place[inside].astype(np.intp).T)] = True
+        fresh = np.argwhere(wanted & (self.slots < 0)).astype(np.int32)
+        fresh = fresh[~_in_hole(fresh, placement)][: placement.max_blocks - len(self.places)]
+        self.slots[tuple(fresh.T)] = len(self.places) + np.arange(len(fresh), dtype=np.int32)
+        empty = np.zeros((len(fresh), BLOCK**3), np.float32)
+        self.places = np.concatenate([self.places, fresh])
+        self.distance = np.concatenate([self.distance, empty])
+        self.weight = np.concatenate([self.weight, empty])
+
+    def _blocks_in_view(self, view: CameraView) -> Int64[np.ndarray, " k"]:
+        """Blocks whose sphere touches the view's pyramid."""
+        edge = self.placement.block_m
+        centre = (self.places + (0.5 - 0.5 / BLOCK)) * edge + self.placement.origin
+        matrix = view.camera_from_world
+        seen = centre @ matrix[:3, :3].T + matrix[:3, 3]
+        (fx, fy, cx, cy), (width, height) = view.raster
+        # Inward normals of the pyramid's sides, not unit: (1, 0, slope) has length sqrt(1 + slope^2).
+        slopes = np.array([(cx + 0.5) / fx, (width - 0.5 - cx) / fx, (cy + 0.5) / fy, (height - 0.5 - cy) / fy])
+        x, y, z = seen.T
+        inside = np.stack([x, -x, y, -y]) + slopes[:, None] * z
+        radius = np.sqrt(3) / 2 * edge
+        near = (inside > -radius * np.sqrt(1 + slopes**2)[:, None]).all(axis=0) & (z > -radius)
+        return np.flatnonzero(near)
+
+    def _update(self, blocks: Int64[np.ndarray, " k"], planes: _Planes, view: CameraView) -> None:
+        points = _in_camera(self.places[blocks], self.placement, view)
+        row = _pixel_rows(points, view)
+        known = np.flatnonzero(planes.rows[row, 5] > 0)
+        x, y, z = points[:, known]
+        nx, ny, nz, offset, reach, weight = planes.rows[row[known]].T
+        distance = nx * x + ny * y + nz * z - offset
+        kept = distance > -reach  # what lies behind is not seen
+        known = known[kept]
+        at = blocks[known // BLOCK**3] * BLOCK**3 + known % BLOCK**3
+        self._average(at, np.minimum(distance, reach)[kept], reach[kept], weight[kept])
+
+    def _average(
+        self,
+        at: Int64[np.ndarray, " n"],
+        new: Float32[np.ndarray, " n"],
+        reach: Float32[np.ndarray, " n"],
+        weight: Float32[np.ndarray, " n"],
+    ) -> None:
+        distances, weights = self.distance.ravel(), self.weight.ravel()
+        old, before = distances[at], weights[at]
+        # More than the reach apart is no noise: something moved. What was known then counts half.
+        before = np.where(np.abs(new - old) > reach, before / 2, before)
+        total = before + weight
+        distances[at] = (old * before + new * weight) / total
+        weights[at] = np.minimum(total, np.maximum(before, LONGEST_MEMORY_FRAMES * weight))
+
+
+def _in_hole(places: Int32[np.ndarray, "n 3"], placement: FusedPlacement) -> Bool[np.ndarray, " n"]:
+    """Whether blocks lie inside the hole entirely."""
+    if placement.hole is None:
+        return np.zeros(len(places), bool)
+    low = places * placement.block_m + placement.origin
+    least, greatest = placement.hole
+    return np.asarray(((low >= least) & (low + placement.block_m <= greatest)).all(axis=1))
+
+
+def _spread_pixels(
+    planes: _Planes, surface: DepthSurface, view: CameraView, distance_m: float
+) -> Int64[np.ndarray, " k"]:
+    """Pixels whose points lie at most `distance_m` apart on the surface: each 1st, 2nd, 4th... by its footprint."""
+    camera, inverse = view.camera, surface.inverse_depth.ravel()
+    # A pixel is z / f wide, and longer by 1 / cos(slant) = z |towards| / |n.P|.
+    cosine = np.abs(planes.rows[:-1, 3]) * inverse / np.linalg.norm(_towards(camera), axis=1)
+    affordable = distance_m * float(camera.matrix[0, 0]) * inverse * cosine
+    stride = np.exp2(np.floor(np.log2(np.clip(affordable, 1, 64)))).astype(np.int32)
+    row, column = np.divmod(np.arange(inverse.size, dtype=np.int32), camera.width)
+    return np.flatnonzero((inverse > 0) & (((row | column) & (stride - 1)) == 0))
+
+
+@lru_cache(maxsize=4)
+def _towards(camera: CameraModel) -> Float32[np.ndarray, "n 3"]:
+    """(x/z, y/z, 1) of each pixel's ray."""
+    rays = camera.rays().reshape(-1, 2)
+    return np.column_stack([rays, np.ones(len(rays), np.float32)])
+
+
+def _columns(
+    rows: Float32[np.ndarray, "n 6"],
+) -> tuple[
+    Float32[np.ndarray, "n 3"], Float32[np.ndarray, " n"], Float32[np.ndarray, " n"], Float32[np.ndarray, " n"]
+]:
+    return rows[:, :3], rows[:, 3], rows[:, 4], rows[:, 5]
+
+
+def _pixel_planes(
+    surface: DepthSurface, camera: CameraModel, noise_sigma: float, voxel_m: float
+) -> _Planes:
+    """The plane seen at each pixel; weights are inverse variances relative to the noise at 1 m."""
+    inverse, towards = surface.inverse_depth.ravel(), _towards(camera)
+    z = np.divide(1, inverse, out=np.zeros_like(inverse), where=inverse > 0)
+    normals = surface.normals.reshape(-1, 3)
+    facing = -towards / np.linalg.norm(towards, axis=1, keepdims=True)
+    normals = np.where((normals == 0).all(axis=1, keepdims=True), facing, normals)
+    rows = np.zeros((len(z) + 1, 6), np.float32)
+    rows[:-1, :3] = normals
+    rows[:-1, 3] = np.einsum("ni,ni->n", normals, towards) * z
+    rows[:-1, 4] = np.maximum(REACH_VOXELS * voxel_m, REACH_SIGMAS * noise_sigma * z * z)
+    rows[:-1, 5] = inverse**4  # the variance of depth is (sigma z^2)^2
+    return _Planes(rows)
+
+
+def _in_camera(
+    places: Int32[np.ndarray, "k 3"], placement: FusedPlacement, view: CameraView
+) -> Float32[np.ndarray, "3 n"]:
+    """Voxels of blocks in the optical frame, m."""
+    matrix = view.camera_from_world
+    first = places * placement.block_m + np.array(placement.origin)
+    starts = (first @ matrix[:3, :3].T + matrix[:3, 3]).astype(np.float32)
+    steps = (_lattice() * placement.voxel_m @ matrix[:3, :3].T).astype(np.float32)
+    return np.stack([(starts[:, None, axis] + steps[None, :, axis]).ravel() for axis in range(3)])
+
+
+@lru_cache(maxsize=1)
+def _lattice() -> Int64[np.ndarray, "512 3"]:
+    return np.stack(np.unravel_index(np.arange(BLOCK**3), (BLOCK,) * 3), axis=1)
+
+
+def _pixel_rows(points: Float32[np.ndarray, "3 n"], view: CameraView) -> Int32[np.ndarray, " n"]:
+    """The pixel (row of `_Planes`) that looks at each point of the optical frame; the last row for none."""
+    (fx, fy, cx, cy), (width, height) = view.raster
+    table = _pixel_table(view.camera)
+    x, y, z = points
+    inverse = 1 / np.maximum(z, np.float32(NEAR_M))
+    column = x * inverse * np.float32(fx) + np.float32(cx + 0.5)
+    row = y * inverse * np.float32(fy) + np.float32(cy + 0.5)
+    seen = (z > NEAR_M) & (column >= 0) & (row >= 0) & (column < width) & (row < height)
+    flat = np.where(seen, row, 0).astype(np.int32) * width + np.where(seen, column, 0).astype(np.int32)
+    return np.where(seen, table[flat], np.int32(view.camera.width * view.camera.height))
+
+
+@lru_cache(maxsize=4)
+def _pixel_table(camera: CameraModel) -> Int32[np.ndarray, " n"]:
+    """For each texel of the view's raster (a pinhole) the pixel that looks the same way, width * height for none."""
+    (fx, fy, cx, cy), (width, height) = CameraView(camera, np.eye(4)).raster
+    none = camera.width * camera.height
+    if not camera.has_distortion:
+        return np.arange(none, dtype=np.int32)
+    columns, rows = np.meshgrid((np.arange(width) - cx) / fx, (np.arange(height) - cy) / fy)
+    rays = np.stack([columns, rows, np.ones_like(columns)], axis=-1).reshape(-1, 3)
+    pixels = np.rint(np.nan_to_num(camera.project(rays), nan=-1.0)).clip(-1, 2**20).astype(np.int64)
+    inside = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)
+    return np.where(inside, pixels[:, 1] * camera.width + pixels[:, 0], none).astype(np.int32)

@@ -1,0 +1,125 @@
+"""Joint refinement of a radial lens and all poses of a target (bundle adjustment with a free lens)."""
+
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Float64
+
+from protocol.errors import DeltalightError
+from protocol.poses import rigid_matrix
+from protocol.radial_lens import RadialLens
+from sensor_node.calibration.fits import noise_px
+from sensor_node.calibration.views import View
+
+Pixels = Float64[np.ndarray, "n 2"]
+Poses = Float64[np.ndarray, "v 6"]
+_Values = tuple[Float64[np.ndarray, " k"], Poses]
+# Makes a lens of its numbers, its picture enlarged by a margin on every side, so that predictions of corners
+# near the border never fall outside.
+LensMaker = Callable[[Float64[np.ndarray, " k"], int], RadialLens]
+# Step of the difference quotients, as a share of a number (at least of 1): about the cube root of 1e-16.
+STEP = 1e-5
+MAX_ROUNDS = 100
+
+
+class Bundle(NamedTuple):
+    """The refined numbers of the lens with their covariance, the poses and the remaining misses."""
+
+    numbers: Float64[np.ndarray, " k"]
+    covariance: Float64[np.ndarray, "k k"]
+    poses: tuple[Float64[np.ndarray, "4 4"], ...]
+    misses: tuple[Pixels, ...]
+
+
+def refine(
+    make_lens: LensMaker,
+    start: Float64[np.ndarray, " k"],
+    views: Sequence[View],
+    poses: Sequence[Float64[np.ndarray, "4 4"]],
+) -> Bundle:
+    """Minimise the squared distances in pixels over the lens and the poses.
+
+    Args:
+        make_lens: the lens of a list of numbers.
+        start: numbers to begin with.
+        views: what was seen, from everywhere.
+        poses: camera_from_target of each view to begin with.
+    """
+    from scipy.optimize import least_squares
+
+    problem = _Problem(make_lens, views, len(start))
+    vectors = [np.concatenate([cv2.Rodrigues(pose[:3, :3])[0].ravel(), pose[:3, 3]]) for pose in poses]
+    found = least_squares(
+        problem.misses,
+        np.concatenate([start, *vectors]),
+        problem.jacobian,
+        x_scale="jac",
+        max_nfev=MAX_ROUNDS,
+    )
+    numbers, placed = problem.split(found.x)
+    misses = found.fun.reshape(-1, 2)
+    slopes = np.asarray(found.jac)
+    covariance = np.linalg.pinv(slopes.T @ slopes, hermitian=True) * noise_px(misses, found.x.size) ** 2
+    ends = np.cumsum([len(view.points) for view in views])[:-1]
+    return Bundle(
+        numbers,
+        covariance[: len(start), : len(start)],
+        tuple(rigid_matrix(cv2.Rodrigues(pose[:3])[0], pose[3:]) for pose in placed),
+        tuple(-each for each in np.split(misses, ends)),
+    )
+
+
+class _Problem:
+    """Residuals (predicted minus found) and their block-sparse Jacobian by difference quotients."""
+
+    def __init__(self, make_lens: LensMaker, views: Sequence[View], numbers: int) -> None:
+        self._make_lens, self._views, self._count = make_lens, views, numbers
+        self._margin = int(max(view.gray.shape[1] for view in views))
+        self._found = np.concatenate([view.pixels for view in views])
+
+    def split(self, values: Float64[np.ndarray, " m"]) -> _Values:
+        return values[: self._count], values[self._count :].reshape(-1, 6)
+
+    def misses(self, values: Float64[np.ndarray, " m"]) -> Float64[np.ndarray, " r"]:
+        return np.asarray((self._predicted(*self.split(values)) - self._found).ravel())
+
+    def jacobian(self, values: Float64[np.ndarray, " m"]) -> Float64[np.ndarray, "r m"]:
+        numbers, poses = self.split(values)
+        result = np.zeros((self._found.size, values.size))
+        for column in range(self._count):
+            step = _step(numbers, column)
+            result[:, column] = self._slope((numbers + step, poses), (numbers - step, poses), step[column])
+        ends = np.cumsum([0, *(2 * len(view.points) for view in self._views)])
+        for column in range(6):
+            # A view depends on its own pose only, so all views' poses are moved at once.
+            steps = np.zeros_like(poses)
+            steps[:, column] = STEP
+            slope = self._slope((numbers, poses + steps), (numbers, poses - steps), STEP)
+            for view, (first, end) in enumerate(pairwise(ends)):
+                result[first:end, self._count + 6 * view + column] = slope[first:end]
+        return result
+
+    def _slope(self, after: _Values, before: _Values, step: float) -> Float64[np.ndarray, " r"]:
+        difference = self._predicted(*after) - self._predicted(*before)
+        # Where a step crosses the end of the lens there is no slope; the point itself is within reach.
+        return np.asarray(np.nan_to_num(difference.ravel() / (2 * step)))
+
+    def _predicted(self, numbers: Float64[np.ndarray, " k"], poses: Poses) -> Pixels:
+        points = [
+            view.points @ cv2.Rodrigues(pose[:3])[0].T + pose[3:]
+            for view, pose in zip(self._views, poses, strict=True)
+        ]
+        try:
+            lens = self._make_lens(numbers, self._margin)
+        except DeltalightError:  # a step to numbers that no lens has; the solver takes a shorter one
+            return np.full_like(self._found, np.nan)
+        return np.asarray(lens.project(np.concatenate(points)) - self._margin)
+
+
+def _step(numbers: Float64[np.ndarray, " k"], column: int) -> Float64[np.ndarray, " k"]:
+    step = np.zeros_like(numbers)
+    step[column] = STEP * max(abs(float(numbers[column])), 1.0)
+    return step

@@ -1,0 +1,144 @@
+"""Where the depth sensor is: the plane it measures on the marker board must be the plane the colour camera sees."""
+
+from collections.abc import Iterable, Iterator
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Float64
+
+from protocol.board import BoardSpec
+from protocol.errors import DeltalightError
+from protocol.frames import DepthImage, SensorFrame
+from protocol.poses import rigid_matrix
+from sensor_node.markers import BoardDetector
+
+Pose = Float64[np.ndarray, "4 4"]
+# Only depth well inside the board's outline is taken: at its border the table may be meant.
+INSIDE_SHARE = 0.9
+# What is farther from the board's plane than this lies on something else.
+NEAR_M = 0.05
+LEAST_POINTS = 200
+# Three tilts determine a transform; more show whether they agree.
+LEAST_VIEWS = 6
+ROUNDS = 20
+# Uncertainty above which the board's tilts did not determine the transform: more than a pixel at VGA and 1 m.
+MOST_SIGMA_M, MOST_SIGMA_DEG = 0.004, 0.3
+MOST_RMS_M = 0.01
+
+
+class DepthView(NamedTuple):
+    """One frame: the pose of the colour camera by the board, and its depth."""
+
+    world_from_camera: Pose
+    depth: DepthImage
+
+
+class DepthPlacement(NamedTuple):
+    """depth_from_rgb with the rms distance of the planes and the standard deviations of the transform."""
+
+    transform: Pose
+    views: int
+    rms_m: float
+    sigma_m: float
+    sigma_deg: float
+
+
+def depth_views(frames: Iterable[SensorFrame], board: BoardSpec) -> Iterator[DepthView]:
+    """Yield the frames with depth in which the colour camera sees the board."""
+    detector = None
+    for frame in frames:
+        detector = detector or BoardDetector(board, frame.camera, frame.response)
+        pose = None if frame.depth is None else detector.detect(frame.color)
+        if frame.depth is not None and pose is not None:
+            yield DepthView(pose.world_from_camera, frame.depth)
+
+
+def place_depth_sensor(views: Iterable[DepthView], board: BoardSpec, start: Pose) -> DepthPlacement:
+    """Return depth_from_rgb that puts the measured planes into the board's plane, by Gauss-Newton.
+
+    Each view counts as four points of the plane fitted to its depth, as errors of depth hold for a whole picture.
+
+    Args:
+        views: frames with the board tilted in different directions.
+        board: the board.
+        start: depth_from_rgb to begin with; the identity where the sensors lie beside each other.
+
+    Raises:
+        DeltalightError: there are too few views, or their tilts do not determine the transform.
+    """
+    listed, rgb_from_depth = list(views), np.linalg.inv(start)
+    for _ in range(ROUNDS):
+        patches = [(view, _patch(view, board, rgb_from_depth)) for view in listed]
+        seen = [(view, patch) for view, patch in patches if patch is not None]
+        if len(seen) < LEAST_VIEWS:
+            raise DeltalightError(
+                f"the depth sensor shows the board in {len(seen)} views only and {LEAST_VIEWS} are needed; record it "
+                "from 0.4 to 1.5 m at different tilts, or begin with a rough depth_from_rgb in extrinsics.yaml."
+            )
+        rows, misses = _equations(seen, rgb_from_depth)
+        turn, shift = np.split(np.linalg.lstsq(rows, -misses, rcond=None)[0], 2)
+        rgb_from_depth = rigid_matrix(cv2.Rodrigues(turn)[0], shift) @ rgb_from_depth
+        if np.abs(turn).max() < 1e-6 and np.abs(shift).max() < 1e-6:
+            break
+    return _checked(rows, misses, rgb_from_depth, len(seen))
+
+
+def _equations(
+    seen: list[tuple[DepthView, Float64[np.ndarray, "4 3"]]], rgb_from_depth: Pose
+) -> tuple[Float64[np.ndarray, "m 6"], Float64[np.ndarray, " m"]]:
+    """Heights of the patches' points over the board, and their derivatives by a turn and shift of the sensor."""
+    rows, misses = [], []
+    for view, patch in seen:
+        points = patch @ rgb_from_depth[:3, :3].T + rgb_from_depth[:3, 3]
+        normal, height = view.world_from_camera[2, :3], view.world_from_camera[2, 3]
+        rows.append(np.column_stack([np.cross(points, normal), np.tile(normal, (4, 1))]))
+        misses.append(points @ normal + height)
+    return np.concatenate(rows), np.concatenate(misses)
+
+
+def _patch(view: DepthView, board: BoardSpec, rgb_from_depth: Pose) -> Float64[np.ndarray, "4 3"] | None:
+    """Four corners (in the depth sensor's frame) of the plane that it measured on the board."""
+    points = _board_points(view, board, rgb_from_depth)
+    if len(points) < LEAST_POINTS:
+        return None
+    centre = points.mean(axis=0)
+    _, spreads, axes = np.linalg.svd(points - centre, full_matrices=False)
+    # The half edge of a uniform patch is its standard deviation times the square root of three.
+    half = axes[:2] * (spreads[:2, None] * np.sqrt(3 / len(points)))
+    return np.array([centre + a * half[0] + b * half[1] for a in (-1, 1) for b in (-1, 1)])
+
+
+def _board_points(view: DepthView, board: BoardSpec, rgb_from_depth: Pose) -> Float64[np.ndarray, "n 3"]:
+    depth = view.depth
+    known = depth.valid & (depth.depth_m > 0)
+    z = depth.depth_m[known].astype(np.float64)
+    points = np.column_stack([depth.camera.rays()[known] * z[:, None], z])
+    placed = view.world_from_camera @ rgb_from_depth
+    world = points @ placed[:3, :3].T + placed[:3, 3]
+    outline = board.sheet_outline()
+    middle, half = outline.mean(axis=0), np.ptp(outline, axis=0) / 2
+    inside = np.all(np.abs(world - middle)[:, :2] < INSIDE_SHARE * half[:2], axis=1)
+    return np.asarray(points[inside & (np.abs(world[:, 2]) < NEAR_M)])
+
+
+def _checked(
+    rows: Float64[np.ndarray, "m 6"], misses: Float64[np.ndarray, " m"], rgb_from_depth: Pose, views: int
+) -> DepthPlacement:
+    rms = float(np.sqrt(np.mean(misses**2)))
+    variance = np.sum(misses**2) / max(len(misses) - 6, 1)
+    # A millimetre is the least that a depth sensor is off by.
+    sigmas = np.sqrt(np.diag(np.linalg.pinv(rows.T @ rows, hermitian=True)) * max(variance, 1e-6))
+    rank = np.linalg.matrix_rank(rows, tol=1e-6 * np.linalg.norm(rows))
+    sigma_deg, sigma_m = float(np.degrees(sigmas[:3].max())), float(sigmas[3:].max())
+    if rank < 6 or sigma_m > MOST_SIGMA_M or sigma_deg > MOST_SIGMA_DEG:
+        raise DeltalightError(
+            f"the board's tilts leave depth_from_rgb uncertain by {1e3 * sigma_m:.1f} mm and {sigma_deg:.2f} degrees;"
+            " record it tilted by 20 to 45 degrees to the left, right, front and back."
+        )
+    if rms > MOST_RMS_M:
+        raise DeltalightError(
+            f"depth and colour disagree about the board by {1e3 * rms:.1f} mm rms; check depth_scale in "
+            "calibration/depth.yaml, the size of the printed markers and both lenses."
+        )
+    return DepthPlacement(np.linalg.inv(rgb_from_depth), views, rms, sigma_m, sigma_deg)

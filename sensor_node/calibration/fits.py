@@ -1,0 +1,52 @@
+"""What a calibration of a lens gives, whatever the model."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+
+from protocol.camera_model import CameraModel
+from protocol.fisheye_lens import FisheyeLens
+from sensor_node.calibration.views import View
+
+# Corners are found to a few hundredths of a pixel at best: a fit that claims less noise has too few views.
+LEAST_NOISE_PX = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class LensFit:
+    """A lens with the views that it was fitted to.
+
+    `misses` are, for each view, found minus predicted pixels (n, 2); `poses` camera_from_target; `focal_share` is
+    the standard deviation of the focal length as a share of it. `refused` says of views that were left out, why;
+    `refused_points` counts single points left out of views that were kept.
+    """
+
+    lens: CameraModel | FisheyeLens
+    views: tuple[View, ...]
+    poses: tuple[Float64[np.ndarray, "4 4"], ...]
+    misses: tuple[Float64[np.ndarray, "n 2"], ...]
+    focal_share: float
+    refused: tuple[tuple[str, str], ...] = ()
+    refused_points: int = 0
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square distance between found and predicted points."""
+        return rms(np.concatenate(self.misses))
+
+    @property
+    def view_rms_px(self) -> Float64[np.ndarray, " v"]:
+        """`rms_px` of every view alone."""
+        return np.array([rms(misses) for misses in self.misses])
+
+
+def rms(misses: Float64[np.ndarray, "n 2"]) -> float:
+    """Root mean square length of 2-D differences."""
+    return float(np.sqrt(np.mean(np.sum(misses**2, axis=-1))))
+
+
+def noise_px(misses: Float64[np.ndarray, "n 2"], parameters: int) -> float:
+    """Standard deviation of one coordinate of a point, from the residuals of a fit."""
+    freedom = max(misses.size - parameters, 1)
+    return max(float(np.sqrt(np.sum(misses**2) / freedom)), LEAST_NOISE_PX)

@@ -1,0 +1,215 @@
+"""Flat targets whose points are found in a picture without knowing the lens: chessboards and marker boards."""
+
+import re
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, Float64, Int64, UInt8
+
+from protocol.board import BoardSpec, load_board_yaml
+from protocol.camera_model import CameraModel
+from protocol.errors import DeltalightError
+from protocol.frames import decode_lut
+from sensor_node.marker_edges import refine_corners
+from sensor_node.markers import LEAST_SIDE_PX, REACH_SHARE
+
+CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 0.005)
+# Half the edge of the window about a corner, as a share of the way to the next one: it must not reach that.
+WINDOW_SHARE = 0.4
+WINDOW_HALF_PX = (2, 11)
+# A refined marker corner that moved farther than this was caught by another edge.
+CAUGHT_PX = 3.0
+CHESSBOARD = re.compile(r"chessboard:(\d{1,3})x(\d{1,3}):(\d*\.?\d+)")
+
+
+class Sighting(NamedTuple):
+    """Points of a target that were found: their numbers in `Target.points`, and the pixels."""
+
+    numbers: Int64[np.ndarray, " n"]
+    pixels: Float64[np.ndarray, "n 2"]
+
+
+class Target(Protocol):
+    """A flat target; `points` (m, 3) are all of its points in metres in its own frame."""
+
+    @property
+    def points(self) -> Float64[np.ndarray, "m 3"]:
+        """All points in metres, in the target's frame."""
+
+    def find(self, gray: UInt8[np.ndarray, "h w"]) -> Sighting | None:
+        """Find the target in a picture of a camera that is not known yet."""
+
+    def refined(self, gray: UInt8[np.ndarray, "h w"], sighting: Sighting, camera: CameraModel) -> Sighting:
+        """Return the same points, found better because the lens is nearly known."""
+
+
+class Chessboard:
+    """A chessboard of `columns` x `rows` inner corners; its frame is that of marker boards (y up, z out)."""
+
+    def __init__(self, columns: int, rows: int, square_m: float) -> None:
+        self._size = (columns, rows)
+        grid = np.mgrid[:rows, :columns].reshape(2, -1)
+        self._points = np.column_stack([grid[1], -grid[0], np.zeros(columns * rows)]) * square_m
+
+    @property
+    def points(self) -> Float64[np.ndarray, "m 3"]:
+        """Inner corners in metres, row by row."""
+        return self._points
+
+    def find(self, gray: UInt8[np.ndarray, "h w"]) -> Sighting | None:
+        """Find all inner corners, or nothing."""
+        flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+        found, corners = cv2.findChessboardCorners(gray, self._size, flags=flags)
+        if not found:
+            return None
+        start = np.asarray(corners, np.float32).reshape(-1, 2)
+        return Sighting(np.arange(len(start)), self._saddles(gray, start))
+
+    def refined(self, gray: UInt8[np.ndarray, "h w"], sighting: Sighting, camera: CameraModel) -> Sighting:
+        """Return the sighting as it is: a saddle is where it is whatever the lens."""
+        del gray, camera
+        return sighting
+
+    def _saddles(
+        self, gray: UInt8[np.ndarray, "h w"], start: Float32[np.ndarray, "n 2"]
+    ) -> Float64[np.ndarray, "n 2"]:
+        """Refine each corner in a window of its own: towards the rim of a fish-eye squares get small."""
+        grid = start.reshape(self._size[1], self._size[0], 2)
+        steps = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1) for axis in (0, 1)]
+        gaps = np.minimum(_least_beside(steps[0], 0), _least_beside(steps[1], 1)).ravel()
+        halves = np.clip(np.rint(WINDOW_SHARE * gaps), *WINDOW_HALF_PX).astype(int)
+        refined = [
+            cv2.cornerSubPix(gray, corner.reshape(1, 1, 2).copy(), (int(half),) * 2, (-1, -1), CRITERIA)
+            for corner, half in zip(start, halves, strict=True)
+        ]
+        return np.asarray(refined, np.float64).reshape(-1, 2)
+
+
+class MarkerBoard:
+    """A marker board; its frame is the world's (FORMATS 3)."""
+
+    def __init__(self, board: BoardSpec) -> None:
+        self.board = board
+        corners = board.corner_points()
+        self._first = {name: 4 * place for place, name in enumerate(corners)}
+        chess = board.chessboard_corners()
+        self._points = chess if len(chess) else np.concatenate(list(corners.values()))
+
+    @property
+    def points(self) -> Float64[np.ndarray, "m 3"]:
+        """Corners of the markers by order of the ids, or of a ChArUco board its inner corners."""
+        return self._points
+
+    def find(self, gray: UInt8[np.ndarray, "h w"]) -> Sighting | None:
+        """Find the board's markers, or of a ChArUco board the inner corners beside them."""
+        found, ids, _ = self._detector.detectMarkers(gray)
+        names = () if ids is None else tuple(int(name) for name in ids.ravel())
+        quads = {
+            name: quad.reshape(4, 2)
+            for name, quad in zip(names, found, strict=True)
+            if name in self._first and _shortest_side(quad.reshape(4, 2)) >= LEAST_SIDE_PX
+        }
+        if not quads:
+            return None
+        if self.board.type == "charuco":
+            return self._inner_corners(gray, quads)
+        numbers = np.concatenate([self._first[name] + np.arange(4) for name in quads])
+        start = Sighting(numbers, np.concatenate(list(quads.values())).astype(np.float64))
+        # A marker is small enough that its edges are nearly straight in any lens.
+        height, width = gray.shape
+        matrix = np.array([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1.0]])
+        return self.refined(gray, start, CameraModel(width, height, matrix))
+
+    def refined(self, gray: UInt8[np.ndarray, "h w"], sighting: Sighting, camera: CameraModel) -> Sighting:
+        """Fit the markers' edges where the lens makes them straight."""
+        board = self.board
+        if board.type == "charuco":
+            return sighting
+        # Paper and ink are grey, so their grey code decodes to their light.
+        light = decode_lut(None)[:, 0][gray]
+        cells = board.opencv_dictionary().markerSize + 2 * board.border_bits
+        thin = min(board.border_bits / cells, board.separation_m / board.marker_length_m or 1.0)
+        quads = sighting.pixels.reshape(-1, 4, 2)
+        better = refine_corners(light, camera, quads, REACH_SHARE * thin).reshape(-1, 2)
+        moved = np.linalg.norm(better - sighting.pixels, axis=1)
+        kept = np.where((moved < CAUGHT_PX)[:, None], better, sighting.pixels)
+        return Sighting(sighting.numbers, kept)
+
+    @cached_property
+    def _detector(self) -> Any:  # noqa: ANN401 - cv2 has no types
+        parameters = cv2.aruco.DetectorParameters()
+        parameters.markerBorderBits = self.board.border_bits
+        return cv2.aruco.ArucoDetector(self.board.opencv_dictionary(), parameters)
+
+    @cached_property
+    def _charuco(self) -> Any:  # noqa: ANN401 - cv2 has no types
+        board = self.board
+        square = board.marker_length_m + board.separation_m
+        size, ids = (board.columns, board.rows), np.array(board.marker_ids)
+        return cv2.aruco.CharucoDetector(
+            cv2.aruco.CharucoBoard(size, square, board.marker_length_m, board.opencv_dictionary(), ids)
+        )
+
+    def _inner_corners(
+        self, gray: UInt8[np.ndarray, "h w"], quads: dict[int, Float32[np.ndarray, "4 2"]]
+    ) -> Sighting | None:
+        names = np.array([[name] for name in quads], np.int32)
+        markers = [quad[None] for quad in quads.values()]
+        corners, ids, _, _ = self._charuco.detectBoard(gray, markerCorners=markers, markerIds=names)
+        if ids is None:
+            return None
+        # The window must not reach the markers, which begin half a separation away.
+        side = min(_shortest_side(quad) for quad in quads.values())
+        gap = side * self.board.separation_m / self.board.marker_length_m / 2
+        half = int(np.clip(round(2 * WINDOW_SHARE * gap), *WINDOW_HALF_PX))
+        start = np.ascontiguousarray(corners, np.float32).reshape(-1, 1, 2)
+        pixels = cv2.cornerSubPix(gray, start, (half, half), (-1, -1), CRITERIA)
+        return Sighting(ids.ravel().astype(np.int64), pixels.reshape(-1, 2).astype(np.float64))
+
+
+def parse_target(text: str | None, known: BoardSpec | None, folders: Sequence[Path | None]) -> Target:
+    """Return the target that `--target` names, or without it the board that is known.
+
+    Args:
+        text: `chessboard:COLUMNSxROWS:SQUARE_M` (inner corners, metres) or the path of a board.yaml.
+        known: the board that a recording describes.
+        folders: dataset folders whose calibration/board.yaml is taken, the first that has one.
+
+    Raises:
+        DeltalightError: none is given, or what is given is wrong.
+    """
+    if text is None:
+        boards = [folder / "calibration" / "board.yaml" for folder in folders if folder is not None]
+        found = next((path for path in boards if path.is_file()), None)
+        if known is None and found is None:
+            raise DeltalightError(
+                "the source has no calibration/board.yaml; name the target with --target board.yaml or "
+                "--target chessboard:8x6:0.117 (inner corners, edge of a square in metres)."
+            )
+        return MarkerBoard(known or load_board_yaml(found or Path()))
+    if not text.startswith("chessboard"):
+        return MarkerBoard(load_board_yaml(Path(text)))
+    match = CHESSBOARD.fullmatch(text)
+    columns, rows, square = (float(group) for group in match.groups()) if match else (0.0, 0.0, 0.0)
+    if min(columns, rows) < 3 or not 0 < square < 10:
+        raise DeltalightError(
+            f"'{text}' is no chessboard; write chessboard:COLUMNSxROWS:SQUARE with its inner corners (3 or more "
+            "each) and the edge of a square in metres, such as chessboard:8x6:0.117."
+        )
+    return Chessboard(int(columns), int(rows), square)
+
+
+def _least_beside(steps: Float64[np.ndarray, "r c"], axis: int) -> Float64[np.ndarray, "r c"]:
+    """Distance to the nearer neighbour along an axis, for every corner of the grid."""
+    ends = [(1, 0) if each == axis else (0, 0) for each in (0, 1)]
+    starts = [(0, 1) if each == axis else (0, 0) for each in (0, 1)]
+    pads = [np.pad(steps, width, constant_values=np.inf) for width in (ends, starts)]
+    return np.asarray(np.minimum(*pads))
+
+
+def _shortest_side(quad: Float32[np.ndarray, "4 2"]) -> float:
+    return float(np.linalg.norm(quad - np.roll(quad, 1, axis=0), axis=1).min())

@@ -1,0 +1,195 @@
+"""Fish-eye pictures from any camera, taken in a thread: one picture at a time, or an exposure bracket in turn."""
+
+import threading
+import time
+from contextlib import ExitStack
+from dataclasses import replace
+from types import TracebackType
+from typing import Self
+
+from protocol.errors import DeltalightError
+from protocol.fisheye_lens import FisheyeCalibration
+from protocol.frames import FisheyePictures, SensorFrame
+from sensor_node.cameras.base import Camera, EndOfStream, ImuSample, StreamState
+
+# A told exposure is the one asked for within 5 % or two lines of a usual rolling shutter (15 us each).
+SAME_EXPOSURE, SAME_EXPOSURE_S = 0.05, 30e-6
+# Frames to wait for a camera that tells its exposures: the slowest known take ten to follow.
+LONGEST_SETTLE = 15
+RETRY_S = 1.0
+
+
+class FisheyeCapture:
+    """Keeps the newest fish-eye pictures of a camera; use it as a context manager.
+
+    A frame that carries fish-eye pictures of its own (a replay) gives those; of any other its colour is taken. With
+    `exposures_s` the camera takes these in turn, each once the change is seen in the frames.
+
+    Args:
+        camera: not opened yet; this opens and closes it.
+        calibration: lens of the camera; may be None where the frames carry their own.
+        exposures_s: the bracket; empty = pictures as they come.
+        settle_frames: frames to leave out after a change, where the camera does not tell its exposures.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        calibration: FisheyeCalibration | None,
+        *,
+        exposures_s: tuple[float, ...] = (),
+        settle_frames: int = 3,
+    ) -> None:
+        self._camera, self._calibration = camera, calibration
+        self._exposures_s, self._settle_frames = exposures_s, settle_frames
+        self._newest: FisheyePictures | None = None
+        self._fault = ""
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="fisheye", daemon=True)
+
+    def __enter__(self) -> Self:
+        """Open the camera and begin.
+
+        Raises:
+            DeltalightError: the camera cannot be opened.
+        """
+        self._camera.open()
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Stop and close the camera."""
+        self._closing.set()
+        self._camera.interrupt()
+        self._thread.join()
+        self._camera.close()
+
+    def newest(self) -> FisheyePictures | None:
+        """Return the newest pictures (the same object until there are newer ones); None if there are none yet."""
+        return self._newest
+
+    @property
+    def state(self) -> StreamState | None:
+        """How the camera is doing; `stale` where its pictures cannot be used."""
+        state = self._camera.state
+        is_well = state is None or state.name == "live"
+        return StreamState("stale", self._fault) if is_well and self._fault else state
+
+    def _run(self) -> None:
+        while not self._closing.is_set():
+            try:
+                self._newest, self._fault = self._take(), ""
+            except EndOfStream:
+                return
+            except DeltalightError as error:  # the old pictures hold on, and `state` says why
+                self._fault = str(error)
+                self._closing.wait(RETRY_S)
+
+    def _take(self) -> FisheyePictures:
+        if not self._exposures_s:
+            frame = self._camera.read()
+            return frame.fisheye or self._pictures([frame])
+        return self._pictures([self._exposed(exposure_s) for exposure_s in self._exposures_s])
+
+    def _exposed(self, exposure_s: float) -> SensorFrame:
+        """Set an exposure and return the first frame that has it."""
+        self._camera.set_exposure(exposure_s)
+        if not self._camera.exposure_is_measured:
+            changed_ns = time.time_ns()
+            frame = self._camera.read()
+            while self._camera.capture_ns < changed_ns:  # still in the queue from before
+                frame = self._camera.read()
+            for _ in range(self._settle_frames):
+                frame = self._camera.read()
+            return frame if frame.exposure_s is not None else replace(frame, exposure_s=exposure_s)
+        tolerance_s = max(SAME_EXPOSURE * exposure_s, SAME_EXPOSURE_S)
+        for _ in range(LONGEST_SETTLE):
+            frame = self._camera.read()
+            if frame.exposure_s is not None and abs(frame.exposure_s - exposure_s) <= tolerance_s:
+                break
+        return frame
+
+    def _pictures(self, frames: list[SensorFrame]) -> FisheyePictures:
+        calibration = self._calibration
+        if calibration is None:
+            raise DeltalightError(
+                "the fish-eye camera has no calibration; run `deltalight calibrate fisheye`."
+            )
+        lens, size = calibration.lens, frames[0].color.shape[1::-1]
+        if size != (lens.width, lens.height):
+            raise DeltalightError(
+                f"the fish-eye camera gives {size[0]}x{size[1]} but its calibration says {lens.width}x"
+                f"{lens.height}; set its width and height to these."
+            )
+        return FisheyePictures(
+            timestamp_ns=frames[-1].timestamp_ns,
+            pictures=tuple(frame.color for frame in frames),
+            exposures_s=tuple(frame.exposure_s for frame in frames),
+            calibration=calibration,
+        )
+
+
+class CameraWithFisheye(Camera):
+    """A camera whose frames carry the newest fish-eye pictures of another one."""
+
+    def __init__(self, camera: Camera, fisheye: FisheyeCapture) -> None:
+        self._camera, self._fisheye = camera, fisheye
+        self._stack = ExitStack()
+
+    def open(self) -> None:
+        """Open both.
+
+        Raises:
+            DeltalightError: one of them cannot be opened.
+        """
+        with ExitStack() as stack:
+            stack.enter_context(self._fisheye)
+            stack.enter_context(self._camera)
+            self._stack = stack.pop_all()
+        camera = self._camera
+        self.camera, self.board, self.extrinsics = camera.camera, camera.board, camera.extrinsics
+        self.depth_scale, self.exposure_is_measured = camera.depth_scale, camera.exposure_is_measured
+
+    def close(self) -> None:
+        """Close both."""
+        self._stack.close()
+
+    def read(self) -> SensorFrame:
+        """Wait for the camera's next frame."""
+        return self._with_fisheye(self._camera.read())
+
+    def read_latest(self, max_age_s: float) -> SensorFrame:
+        """Return the camera's newest frame at once."""
+        return self._with_fisheye(self._camera.read_latest(max_age_s))
+
+    def imu_samples(self) -> list[ImuSample]:
+        """Return what the camera's inertial unit measured since the last call."""
+        return self._camera.imu_samples()
+
+    def interrupt(self) -> None:
+        """End a waiting `read`."""
+        self._camera.interrupt()
+
+    def set_exposure(self, seconds: float) -> None:
+        """Lock the camera's exposure."""
+        self._camera.set_exposure(seconds)
+
+    @property
+    def capture_ns(self) -> int:
+        """When the camera's frame was captured, in ns since 1970 by this host's clock."""
+        return self._camera.capture_ns
+
+    @property
+    def state(self) -> StreamState | None:
+        """The camera's state; while that is well, the fish-eye camera's if it is not."""
+        state, fisheye = self._camera.state, self._fisheye.state
+        is_well = state is None or state.name == "live"
+        if not is_well or fisheye is None or fisheye.name == "live":
+            return state
+        return StreamState("stale", f"the fish-eye pictures are old: {fisheye.detail}")
+
+    def _with_fisheye(self, frame: SensorFrame) -> SensorFrame:
+        newest = self._fisheye.newest()
+        return frame if newest is None else replace(frame, fisheye=newest)

@@ -1,0 +1,194 @@
+"""What live cameras share: their calibration folder, the host's clocks, and how they fail."""
+
+import threading
+import time
+from abc import abstractmethod
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32
+
+from protocol.board import BoardSpec, load_board_yaml
+from protocol.calibration import Extrinsics, load_extrinsics_yaml
+from protocol.camera_model import CameraModel, camera_from_info, load_camera_yaml
+from protocol.documents import read_mapping
+from protocol.errors import DeltalightError
+from protocol.frames import SensorFrame
+from protocol.response_table import load_response_table
+from sensor_node.cameras.base import Camera, EndOfStream, StaleFrameError
+from sensor_node.cameras.settings import CameraSettings
+
+MM = 0.001
+# One is filled while the other is decoded: with a single one drivers lose every second frame.
+DRIVER_BUFFERS = 2
+# A capture time of the driver that is further than this from now is by another clock than ours.
+PLAUSIBLE_AGE_NS = 5_000_000_000
+# Horizontal field of view of usual webcams lies between 55 and 80 degrees; only calibration starts from it.
+NOMINAL_FIELD_RAD = np.radians(65.0)
+
+
+class CameraFailure(DeltalightError):  # noqa: N818 - the camera's, not the program's
+    """A live camera cannot be opened, or gives no pictures any more; it may come back."""
+
+
+@dataclass(frozen=True)
+class LiveCalibration:
+    """What a calibration folder says of a live camera; None where it does not say it.
+
+    `depth_camera` is the depth image's own camera (None: registered to colour), `depth_scale` metres a step.
+    """
+
+    camera: CameraModel | None = None
+    response: Float32[np.ndarray, "256 3"] | None = None
+    depth_camera: CameraModel | None = None
+    depth_scale: float = MM
+    depth_noise_m: float | None = None
+    extrinsics: Extrinsics = field(default_factory=Extrinsics)
+    board: BoardSpec | None = None
+
+
+def yaml_folder(folder: Path) -> Path:
+    """Where the YAML files are: in `folder` itself, or in its `calibration` as in a dataset folder."""
+    return folder / "calibration" if (folder / "calibration").is_dir() else folder
+
+
+def load_calibration(folder: Path | None, board: BoardSpec | None = None) -> LiveCalibration:
+    """Read a calibration folder; `board` takes the place of its board.yaml.
+
+    Raises:
+        DeltalightError: there is no such folder, or a file in it is wrong.
+    """
+    if folder is None:
+        return LiveCalibration(board=board)
+    if not folder.is_dir():
+        raise DeltalightError(f"the calibration folder {folder} does not exist; run `deltalight calibrate`.")
+    place = yaml_folder(folder)
+    camera, depth, room = place / "rgb.yaml", place / "depth.yaml", place / "board.yaml"
+    responses = [path for path in (folder / "response.txt", place / "response.txt") if path.is_file()]
+    info = read_mapping(depth) if depth.is_file() else {}
+    extrinsics = place / "extrinsics.yaml"
+    return LiveCalibration(
+        camera=load_camera_yaml(camera) if camera.is_file() else None,
+        response=load_response_table(responses[0]) if responses else None,
+        depth_camera=camera_from_info(info, depth) if "camera_matrix" in info else None,
+        depth_scale=_positive(info, "depth_scale", depth) or MM,
+        depth_noise_m=_positive(info, "noise_sigma_m", depth),
+        extrinsics=load_extrinsics_yaml(extrinsics) if extrinsics.is_file() else Extrinsics(),
+        board=board or (load_board_yaml(room) if room.is_file() else None),
+    )
+
+
+def _positive(info: dict[str, object], key: str, path: Path) -> float | None:
+    value = info.get(key)
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < 1e3:
+        raise DeltalightError(f"{path}: `{key}` is {value!r}; write a positive number of metres.")
+    return float(value)
+
+
+def colour_camera(
+    source: str, known: CameraModel | None, settings: CameraSettings, *, calibrated: bool
+) -> CameraModel:
+    """Return the colour camera at the size to capture in; without calibration a nominal one, if that will do.
+
+    Raises:
+        DeltalightError: there is no calibration, or it is for pictures of another shape.
+    """
+    width, height = capture_size(known, settings)
+    if known is None and calibrated:
+        raise DeltalightError(
+            f"{source} has no calibration; run `deltalight calibrate camera`, then name the folder that holds "
+            "rgb.yaml with --calibration."
+        )
+    if known is None:
+        focal = width / 2 / np.tan(NOMINAL_FIELD_RAD / 2)
+        centre = (width - 1) / 2, (height - 1) / 2
+        return CameraModel(width, height, np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1]]))
+    if width * known.height != height * known.width:
+        raise DeltalightError(
+            f"{source} is calibrated for {known.width}x{known.height}, which {width}x{height} is no scaled copy "
+            "of; leave width and height out or calibrate at that size."
+        )
+    return known.resized(width, height)
+
+
+def capture_size(known: CameraModel | None, settings: CameraSettings) -> tuple[int, int]:
+    """Return (width, height) to capture in: as set, else as calibrated, else 1280x720."""
+    default = (1280, 720) if known is None else (known.width, known.height)
+    return settings.width or default[0], settings.height or default[1]
+
+
+class HostClock:
+    """Turns times of CLOCK_MONOTONIC into ns since 1970.
+
+    `stamp` rises steadily although the wall clock may be set meanwhile: it is the camera's own clock. `now` is the
+    moment by this host's clock as that stands at present.
+    """
+
+    def __init__(self) -> None:
+        self._offset_ns = time.time_ns() - time.monotonic_ns()
+
+    def stamp(self, monotonic_ns: int) -> int:
+        """Time of a frame by the camera's own clock, in ns since 1970 by the host's when it was opened first."""
+        return monotonic_ns + self._offset_ns
+
+    @staticmethod
+    def now(monotonic_ns: int) -> int:
+        """The same moment in ns since 1970 by the host's present clock."""
+        return time.time_ns() - (time.monotonic_ns() - monotonic_ns)
+
+    @staticmethod
+    def plausible(driver_ns: int, grabbed_ns: int) -> int:
+        """Return the driver's capture time if it is of this clock and recent, else when the frame was grabbed."""
+        return driver_ns if 0 <= grabbed_ns - driver_ns < PLAUSIBLE_AGE_NS else grabbed_ns
+
+
+class LiveCamera(Camera):
+    """A camera that captures now; `remark` says what of the settings it could not follow."""
+
+    def __init__(self, source: str) -> None:
+        self.source, self.remark = source, ""
+        self.clock = HostClock()
+        self._capture_monotonic_ns = time.monotonic_ns()
+        self._interrupted = threading.Event()
+
+    @abstractmethod
+    def capture(self) -> SensorFrame:
+        """Wait for the next frame and note when it was captured.
+
+        Raises:
+            CameraFailure: it gives none.
+        """
+
+    def read(self) -> SensorFrame:
+        """Wait for the next frame that the device gives; it keeps few, so read on."""
+        if self._interrupted.is_set():
+            raise EndOfStream
+        try:
+            return self.capture()
+        except CameraFailure:
+            if self._interrupted.is_set():
+                raise EndOfStream from None
+            raise
+
+    def read_latest(self, max_age_s: float) -> SensorFrame:
+        """Return the newest frame, leaving out older ones that the driver still holds."""
+        for _ in range(DRIVER_BUFFERS + 1):
+            frame = self.read()
+            age_s = (time.monotonic_ns() - self._capture_monotonic_ns) / 1e9
+            if age_s <= max_age_s:
+                return frame
+        raise StaleFrameError(
+            f"the newest frame of {self.source} is {age_s:.2f} s old, {max_age_s:g} s are allowed; see its cable."
+        )
+
+    @property
+    def capture_ns(self) -> int:
+        """When the frame returned last was captured, in ns since 1970 by this host's present clock."""
+        return self.clock.now(self._capture_monotonic_ns)
+
+    def interrupt(self) -> None:
+        """Make later `read`s end; one that waits for the driver ends with its frame or the driver's time-out."""
+        self._interrupted.set()

@@ -1,0 +1,181 @@
+"""OAK cameras (depthai 3): colour, stereo depth aligned to it, IMU."""
+
+from datetime import timedelta
+from typing import Any
+
+import numpy as np
+
+from protocol.errors import DeltalightError
+from protocol.frames import SensorFrame
+from sensor_node.cameras.base import EndOfStream, ImuSample
+from sensor_node.cameras.live import MM, CameraFailure, LiveCalibration, LiveCamera, capture_size
+from sensor_node.cameras.oak_device import STEREO_SIZE, OakDevice, OakStreams
+from sensor_node.cameras.oak_frames import (
+    Pairing,
+    camera_from_calibration,
+    camera_from_picture,
+    depth_noise_m,
+    depth_of,
+    exposure_of,
+    imu_samples,
+    nanoseconds,
+    picture_of,
+)
+from sensor_node.cameras.oak_sdk import load_depthai
+from sensor_node.cameras.settings import CameraSettings
+
+# How often a waiting read looks for `interrupt` and for a device that went away.
+POLL = timedelta(seconds=0.1)
+# Automatic exposure and white balance come to rest within a second.
+SETTLE_S = 1.0
+# Sensitivity of an exposure that the settings give, so that pictures are equally bright at every start.
+DEFAULT_ISO = 100
+
+
+class OakCamera(LiveCamera):
+    """An OAK by its id (empty: the first found). Its own calibration is used unless the folder has rgb.yaml.
+
+    Colour is freed of distortion on the device where there is stereo depth, which is aligned to it; else it comes
+    as the sensor sees it, with the full lens model. `exposure_s` of each frame is the sensor's own word.
+    """
+
+    exposure_is_measured = True
+
+    def __init__(
+        self,
+        device_id: str,
+        settings: CameraSettings,
+        calibration: LiveCalibration,
+        *,
+        with_depth: bool = True,
+        device: OakDevice | None = None,
+    ) -> None:
+        super().__init__(f"oak:{device_id}" if device_id else "oak")
+        load_depthai()
+        self.board, self.extrinsics = calibration.board, calibration.extrinsics
+        self.unpaired = 0
+        self._settings, self._known, self._with_depth = settings, calibration, with_depth
+        self._device = device or OakDevice(device_id)
+        self._streams: OakStreams | None = None
+        self._iso = DEFAULT_ISO
+
+    def open(self) -> None:
+        """Boot the device, learn its lens from the first picture, lock exposure and white balance as set.
+
+        Raises:
+            CameraFailure: it is not there or does not start.
+            DeltalightError: its calibration is missing or cannot be used.
+        """
+        self.close()
+        self._interrupted.clear()
+        size = capture_size(self._known.camera, self._settings)
+        self._streams = streams = self._device.open(self._settings, size, with_depth=self._with_depth)
+        self._pairing = Pairing(round(0.5e9 / self._settings.fps))
+        self.remark = "; ".join(streams.remarks)
+        self.depth_scale = MM if streams.depth is not None else None
+        try:
+            self._learn_lens(streams, size)
+            self._lock()
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Give the device back."""
+        if self._streams is not None:
+            self.unpaired += self._pairing.unpaired
+        self._streams = None
+        self._device.close()
+
+    def set_exposure(self, seconds: float) -> None:
+        """Lock the exposure, at the sensitivity (ISO) of the newest picture."""
+        control = load_depthai().CameraControl()
+        control.setManualExposure(round(seconds * 1e6), self._iso)
+        self._device.send(control)
+
+    def capture(self) -> SensorFrame:
+        """Wait for the next picture, with its depth if that comes in time."""
+        picture, depth = self._pair()
+        self._capture_monotonic_ns = nanoseconds(picture.getTimestamp())
+        self._iso = picture.getSensitivity() or self._iso
+        color, jpeg = picture_of(picture, self.source)
+        return SensorFrame(
+            frame_id=picture.getSequenceNum(),
+            timestamp_ns=self.clock.stamp(self._capture_monotonic_ns),
+            color=color,
+            camera=self.camera,
+            response=self._known.response,
+            exposure_s=exposure_of(picture),
+            depth=None if depth is None else depth_of(depth, self.camera, self._noise_m),
+            depth_timestamp_ns=None if depth is None else self.clock.stamp(nanoseconds(depth.getTimestamp())),
+            color_jpeg=jpeg,
+        )
+
+    def imu_samples(self) -> list[ImuSample]:
+        """Return what the IMU measured since the last call, the last seconds at most."""
+        queue = None if self._streams is None else self._streams.imu
+        if queue is None or queue.isClosed():
+            return []
+        return [sample for message in queue.tryGetAll() for sample in imu_samples(message, self.clock.stamp)]
+
+    def _learn_lens(self, streams: OakStreams, size: tuple[int, int]) -> None:
+        self._noise_m = self._known.depth_noise_m
+        if self._noise_m is None and streams.stereo_sockets is not None:
+            self._noise_m = depth_noise_m(streams.calibration, *streams.stereo_sockets, STEREO_SIZE)
+        picture, _ = self._pair()
+        own = camera_from_picture(picture, corrected=streams.corrected)
+        if self._known.camera is not None:
+            self.camera = self._known.camera.resized(*size)
+        elif own is not None and streams.corrected:
+            self.camera = own
+        else:
+            self.camera = camera_from_calibration(streams.calibration, streams.color_socket, *size)
+        given = np.shape(picture_of(picture, self.source)[0])[1::-1]
+        if given != (self.camera.width, self.camera.height):
+            raise DeltalightError(
+                f"{self.source} gives {given[0]}x{given[1]} where {self.camera.width}x{self.camera.height} was "
+                "asked for; set width and height to a size it has."
+            )
+
+    def _lock(self) -> None:
+        settings, dai = self._settings, load_depthai()
+        if settings.exposure_s is not None:
+            self.set_exposure(settings.exposure_s)
+        if not settings.lock or None not in (settings.exposure_s, settings.white_balance_k):
+            return
+        for _ in range(round(SETTLE_S * settings.fps)):
+            self._pair()
+        control = dai.CameraControl()
+        if settings.exposure_s is None:
+            control.setAutoExposureLock(True)
+        if settings.white_balance_k is None:
+            control.setAutoWhiteBalanceLock(True)
+        self._device.send(control)
+
+    def _pair(self) -> tuple[Any, Any]:
+        """Wait for the next picture and its depth (messages of the SDK)."""
+        dai, streams = load_depthai(), self._streams
+        while streams is not None and not self._interrupted.is_set():
+            queues = [streams.color] if streams.depth is None else [streams.color, streams.depth]
+            try:
+                dai.MessageQueue.waitAny(queues, POLL)
+                paired = self._collect(streams)
+            except (dai.MessageQueue.QueueException, RuntimeError) as error:
+                raise CameraFailure(
+                    f"{self.source} was unplugged or its connection broke ({error})."
+                ) from error
+            if paired is not None:
+                return paired
+            if not self._device.is_running:
+                raise CameraFailure(f"{self.source} was unplugged or its connection broke.")
+        raise EndOfStream
+
+    def _collect(self, streams: OakStreams) -> tuple[Any, Any] | None:
+        if streams.depth is None:
+            picture = streams.color.tryGet()
+            return None if picture is None else (picture, None)
+        for picture in streams.color.tryGetAll():
+            self._pairing.add_picture(picture)
+        for depth in streams.depth.tryGetAll():
+            self._pairing.add_depth(depth)
+        return self._pairing.next()

@@ -1,0 +1,127 @@
+"""From the words a user gives to a camera: `synthetic`, a folder, an .mcap file, `uvc:0`, `oak`, ..."""
+
+from pathlib import Path
+
+from protocol.board import BoardSpec
+from protocol.documents import nearest
+from protocol.errors import DeltalightError
+from protocol.fisheye_lens import FisheyeCalibration, load_fisheye_yaml
+from protocol.source import RECORDING_SUFFIXES, open_source
+from sensor_node.cameras.base import Camera
+from sensor_node.cameras.fisheye_capture import FisheyeCapture
+from sensor_node.cameras.live import load_calibration, yaml_folder
+from sensor_node.cameras.reconnect import ReconnectingCamera
+from sensor_node.cameras.replay import ReplayCamera
+from sensor_node.cameras.settings import CameraSettings, FisheyeSettings
+from sensor_node.cameras.synthetic import SyntheticCamera
+
+SYNTHETIC = "synthetic"
+LIVE_KINDS = ("uvc", "oak", "openni2", "orbbec")
+_DEFAULTS = CameraSettings()
+
+
+def is_live(source: str) -> bool:
+    """Whether `source` names a camera that captures now (`uvc:0`), not a replay or `synthetic`."""
+    return source.partition(":")[0] in LIVE_KINDS
+
+
+def open_camera(
+    source: str,
+    settings: CameraSettings = _DEFAULTS,
+    *,
+    board: BoardSpec | None = None,
+    calibrated: bool = True,
+    depth: bool = True,
+) -> Camera:
+    """Return the camera that `source` names, not opened yet (it is a context manager).
+
+    Args:
+        source: `synthetic`, a dataset folder, an .mcap recording, or a live camera: `uvc:0`,
+            `uvc:/dev/video2`, `oak`, `oak:<device id>`, `openni2:0`, `orbbec:0`.
+        settings: how to replay or capture.
+        board: takes the place of the board that the source describes.
+        calibrated: False gives a live camera without calibration a nominal lens, so that it can be calibrated.
+        depth: False asks an OAK for colour only, as the sensor sees it.
+
+    Raises:
+        DeltalightError: there is no such source, it cannot be read, or its calibration is missing.
+    """
+    if source == SYNTHETIC:
+        return SyntheticCamera(board, realtime=settings.realtime, loop=settings.loop)
+    if is_live(source):
+        return _open_live(source, settings, board, calibrated=calibrated, depth=depth)
+    path = Path(source)
+    if not path.exists() and not source.endswith(RECORDING_SUFFIXES) and len(path.parts) < 2:
+        raise _unknown(source)
+    return ReplayCamera(open_source(path, board), realtime=settings.realtime, loop=settings.loop)
+
+
+def _open_live(
+    source: str, settings: CameraSettings, board: BoardSpec | None, *, calibrated: bool, depth: bool
+) -> Camera:
+    calibration = load_calibration(settings.calibration, board)
+    kind, _, device = source.partition(":")
+    inner: Camera
+    match kind:
+        case "uvc":
+            from sensor_node.cameras.uvc import UvcCamera
+
+            inner = UvcCamera(device or "0", settings, calibration, calibrated=calibrated)
+        case "oak":
+            from sensor_node.cameras.oak import OakCamera
+
+            inner = OakCamera(device, settings, calibration, with_depth=depth)
+        case "openni2" | "orbbec":
+            from sensor_node.cameras.rgbd import RgbdCamera
+
+            inner = RgbdCamera(kind, _number(source), settings, calibration, calibrated=calibrated)
+        case _:
+            raise AssertionError(kind)
+    return ReconnectingCamera(inner, source, stall_s=settings.stall_s)
+
+
+def _number(source: str) -> int:
+    number = source.partition(":")[2] or "0"
+    if not number.isdecimal():
+        raise DeltalightError(f"{source} names no camera; write a number after the colon, such as 0.")
+    return int(number)
+
+
+def open_fisheye(settings: FisheyeSettings) -> FisheyeCapture:
+    """Return the camera that sees the light, not opened yet (it is a context manager).
+
+    Raises:
+        DeltalightError: there is no such source, or its fisheye.yaml is missing or wrong.
+    """
+    camera = open_camera(settings.source, settings.camera, calibrated=False, depth=False)
+    return FisheyeCapture(
+        camera,
+        _fisheye_calibration(settings),
+        exposures_s=settings.exposures_s,
+        settle_frames=settings.settle_frames,
+    )
+
+
+def _fisheye_calibration(settings: FisheyeSettings) -> FisheyeCalibration | None:
+    folder = settings.camera.calibration
+    path = None if folder is None else yaml_folder(folder) / "fisheye.yaml"
+    if path is not None and path.is_file():
+        return load_fisheye_yaml(path)
+    if path is not None or is_live(settings.source):
+        raise DeltalightError(
+            f"the fish-eye camera {settings.source} has no calibration; run `deltalight calibrate fisheye` and "
+            "name the folder that holds fisheye.yaml."
+        )
+    return None
+
+
+def _unknown(source: str) -> DeltalightError:
+    head, _, rest = source.partition(":")
+    hint = nearest(head, (SYNTHETIC, *LIVE_KINDS))
+    if hint is None:
+        advice = "give a dataset folder, an .mcap recording, `synthetic`, or a camera such as `uvc:0`"
+    else:
+        advice = f"the nearest is `{hint}{':' + rest if rest and hint != SYNTHETIC else ''}`"
+    return DeltalightError(
+        f"there is no file, folder or camera `{source}`; {advice} (`deltalight node --list` names cameras)."
+    )

@@ -1,0 +1,131 @@
+"""RGB-D cameras that OpenCV reads itself: OpenNI 2 (Asus Xtion, PrimeSense, Orbbec Astra) and Orbbec over UVC."""
+
+import time
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8, UInt16
+
+from protocol.errors import DeltalightError
+from protocol.frames import SensorFrame
+from protocol.pictures import depth_from_steps
+from sensor_node.cameras.live import CameraFailure, LiveCalibration, LiveCamera, colour_camera
+from sensor_node.cameras.settings import CameraSettings
+
+Kind = Literal["openni2", "orbbec"]
+
+
+@dataclass(frozen=True)
+class _Backend:
+    """OpenCV's numbers for one kind of camera."""
+
+    number: int
+    color: int
+    depth: int
+    build_option: str
+
+
+BACKENDS: dict[Kind, _Backend] = {
+    "openni2": _Backend(
+        cv2.CAP_OPENNI2, cv2.CAP_OPENNI_BGR_IMAGE, cv2.CAP_OPENNI_DEPTH_MAP, "WITH_OPENNI2=ON"
+    ),
+    "orbbec": _Backend(
+        cv2.CAP_OBSENSOR, cv2.CAP_OBSENSOR_BGR_IMAGE, cv2.CAP_OBSENSOR_DEPTH_MAP, "WITH_OBSENSOR=ON"
+    ),
+}
+
+
+def has_backend(kind: Kind) -> bool:
+    """Whether the OpenCV in use was built for a kind of camera."""
+    return bool(cv2.videoio_registry.hasBackend(BACKENDS[kind].number))
+
+
+def backend_hint(kind: Kind) -> str:
+    """What to do where it was not."""
+    return f"for such a camera, install an OpenCV built with {BACKENDS[kind].build_option}"
+
+
+class RgbdCamera(LiveCamera):
+    """Colour and depth of camera `number` of a kind; depth is registered to colour unless depth.yaml says otherwise.
+
+    Raises:
+        DeltalightError: this OpenCV cannot read such a camera, or it is not calibrated.
+    """
+
+    def __init__(
+        self,
+        kind: Kind,
+        number: int,
+        settings: CameraSettings,
+        calibration: LiveCalibration,
+        *,
+        calibrated: bool = True,
+    ) -> None:
+        super().__init__(f"{kind}:{number}")
+        if not has_backend(kind):
+            raise DeltalightError(
+                f"{self.source}: this OpenCV was built without {kind} cameras; {backend_hint(kind)}."
+            )
+        if settings.exposure_s is not None or settings.white_balance_k is not None:
+            raise DeltalightError(f"{self.source} has no exposure or white balance to set; leave them out.")
+        self.camera = colour_camera(self.source, calibration.camera, settings, calibrated=calibrated)
+        self.board, self.extrinsics = calibration.board, calibration.extrinsics
+        self.depth_scale = calibration.depth_scale
+        self._kind, self._number, self._calibration = kind, number, calibration
+        self._capture = cv2.VideoCapture()
+        self._frames = 0
+
+    def open(self) -> None:
+        """Open the device and ask for depth registered to colour.
+
+        Raises:
+            CameraFailure: it is not there, or another program has it.
+        """
+        self._interrupted.clear()
+        if not self._capture.open(self._number, BACKENDS[self._kind].number):
+            raise CameraFailure(f"{self.source} cannot be opened; see `deltalight node --list`.")
+        if self._calibration.depth_camera is None:
+            self._capture.set(cv2.CAP_PROP_OPENNI_REGISTRATION, 1)
+
+    def close(self) -> None:
+        """Give the device back."""
+        self._capture.release()
+
+    def capture(self) -> SensorFrame:
+        """Wait for the next pair of pictures."""
+        if not self._capture.grab():
+            raise CameraFailure(f"{self.source} gives no pictures any more; see if it is plugged in.")
+        self._capture_monotonic_ns = time.monotonic_ns()
+        backend = BACKENDS[self._kind]
+        has_color, color = self._capture.retrieve(flag=backend.color)
+        has_depth, steps = self._capture.retrieve(flag=backend.depth)
+        if not has_color:
+            raise CameraFailure(f"{self.source} gives no colour pictures; plug it into another USB port.")
+        self._frames += 1
+        return self._frame(np.asarray(color), np.asarray(steps) if has_depth else None)
+
+    def _frame(self, bgr: UInt8[np.ndarray, "h w 3"], steps: UInt16[np.ndarray, "h w"] | None) -> SensorFrame:
+        known, camera = self._calibration, self.camera
+        if bgr.shape[1::-1] != (camera.width, camera.height):
+            raise DeltalightError(
+                f"{self.source} gives {bgr.shape[1]}x{bgr.shape[0]} but is calibrated for "
+                f"{camera.width}x{camera.height}; calibrate at that size."
+            )
+        stamp_ns = self.clock.stamp(self._capture_monotonic_ns)
+        depth_camera = known.depth_camera or camera
+        depth = (
+            None
+            if steps is None
+            else depth_from_steps(steps, known.depth_scale, depth_camera, known.depth_noise_m)
+        )
+        return SensorFrame(
+            frame_id=self._frames - 1,
+            timestamp_ns=stamp_ns,
+            color=np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)),
+            camera=camera,
+            response=known.response,
+            depth=depth,
+            depth_timestamp_ns=None if depth is None else stamp_ns,
+        )

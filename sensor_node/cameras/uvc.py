@@ -1,0 +1,188 @@
+"""USB video (UVC) cameras, and whatever else OpenCV opens as a video, behind the camera interface."""
+
+import os
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from protocol.errors import DeltalightError
+from protocol.frames import SensorFrame
+from protocol.pictures import decode_rgb, is_jpeg
+from sensor_node.cameras.live import (
+    DRIVER_BUFFERS,
+    CameraFailure,
+    LiveCalibration,
+    LiveCamera,
+    colour_camera,
+)
+from sensor_node.cameras.settings import CameraSettings
+from sensor_node.cameras.uvc_controls import UvcControls
+
+MJPG = cv2.VideoWriter.fourcc(*"MJPG")
+# Automatic exposure and white balance of usual cameras come to rest within a second.
+SETTLE_S = 1.0
+# USB loses a packet now and then, and the JPEG is cut; so many one after the other are a broken cable.
+BROKEN_IN_A_ROW = 10
+# Marker of a JPEG's Huffman tables; many cameras leave them out, and then few programs can read it.
+HUFFMAN_TABLES = b"\xff\xc4"
+
+
+class UvcCamera(LiveCamera):
+    """Colour pictures of a UVC camera, without depth.
+
+    Args:
+        device: number or path of the video device (`0`, `/dev/video2`), or a video that OpenCV opens.
+        settings: size, rate, exposure and white balance to ask for.
+        calibration: the camera at the size to capture, its response, extrinsics, board.
+        calibrated: False = a nominal lens will do.
+
+    Raises:
+        DeltalightError: the camera is not calibrated.
+    """
+
+    def __init__(
+        self, device: str, settings: CameraSettings, calibration: LiveCalibration, *, calibrated: bool = True
+    ) -> None:
+        super().__init__(f"uvc:{device}")
+        self.camera = colour_camera(self.source, calibration.camera, settings, calibrated=calibrated)
+        self.board, self.extrinsics = calibration.board, calibration.extrinsics
+        self._device, self._settings, self._response = device, settings, calibration.response
+        self._is_v4l2 = sys.platform == "linux" and (device.isdecimal() or device.startswith("/dev/"))
+        self._capture: cv2.VideoCapture | None = None
+        self._frames = 0
+
+    def open(self) -> None:
+        """Open the device, lock exposure and white balance as set.
+
+        Raises:
+            CameraFailure: it is not there, or another program has it.
+            DeltalightError: it cannot do what the settings ask for.
+        """
+        self.close()
+        self._interrupted.clear()
+        self._capture = capture = self._open_device()
+        self._controls = UvcControls(self.source, capture, known=self._is_v4l2)
+        try:
+            self._ask_for(capture)
+            self._require_size(self._take()[0])
+            self._set_controls()
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Give the device back."""
+        if self._capture is not None:
+            self._capture.release()
+        self._capture = None
+
+    def set_exposure(self, seconds: float) -> None:
+        """Lock the exposure to the nearest step of 0.1 ms; the next frames but a few have it."""
+        self._controls.set_exposure(seconds)
+
+    def capture(self) -> SensorFrame:
+        """Wait for the next picture."""
+        exposure_s = self._controls.exposure_s
+        color, jpeg = self._take()
+        self._frames += 1
+        return SensorFrame(
+            frame_id=self._frames - 1,
+            timestamp_ns=self.clock.stamp(self._capture_monotonic_ns),
+            color=color,
+            camera=self.camera,
+            response=self._response,
+            exposure_s=exposure_s,
+            color_jpeg=jpeg,
+        )
+
+    def _open_device(self) -> cv2.VideoCapture:
+        path = Path(f"/dev/video{self._device}" if self._device.isdecimal() else self._device)
+        if self._is_v4l2 and not path.exists():
+            raise CameraFailure(f"{self.source}: there is no {path}; `deltalight node --list` names cameras.")
+        if self._is_v4l2 and not os.access(path, os.R_OK | os.W_OK):
+            raise CameraFailure(
+                f"{self.source}: no permission for {path}; add your user to the group `video`."
+            )
+        backend = cv2.CAP_V4L2 if self._is_v4l2 else cv2.CAP_ANY
+        capture = cv2.VideoCapture(int(self._device) if self._device.isdecimal() else self._device, backend)
+        if not capture.isOpened():
+            raise CameraFailure(
+                f"{self.source} cannot be opened; end the program that uses it, or choose another one from "
+                "`deltalight node --list`."
+            )
+        return capture
+
+    def _ask_for(self, capture: cv2.VideoCapture) -> None:
+        wanted = {
+            cv2.CAP_PROP_FOURCC: MJPG,  # uncompressed pictures of more than VGA do not fit USB 2 at 30 per second
+            cv2.CAP_PROP_FRAME_WIDTH: self.camera.width,
+            cv2.CAP_PROP_FRAME_HEIGHT: self.camera.height,
+            cv2.CAP_PROP_FPS: self._settings.fps,
+            cv2.CAP_PROP_BUFFERSIZE: DRIVER_BUFFERS,
+        }
+        for prop, value in wanted.items():
+            capture.set(prop, value)
+        if self._is_v4l2 and int(capture.get(cv2.CAP_PROP_FOURCC)) == MJPG:
+            capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)  # the JPEG as it comes, if it is a whole one
+            if HUFFMAN_TABLES not in self._grab().tobytes():
+                capture.set(cv2.CAP_PROP_CONVERT_RGB, 1)
+
+    def _require_size(self, color: UInt8[np.ndarray, "h w 3"]) -> None:
+        height, width = color.shape[:2]
+        if (width, height) != (self.camera.width, self.camera.height):
+            raise DeltalightError(
+                f"{self.source} gives {width}x{height} where {self.camera.width}x{self.camera.height} was asked "
+                "for; set width and height to a size it has, and calibrate at that size."
+            )
+
+    def _set_controls(self) -> None:
+        settings = self._settings
+        self._controls.release()
+        if settings.exposure_s is not None:
+            self._controls.set_exposure(settings.exposure_s)
+        if settings.white_balance_k is not None:
+            self._controls.set_white_balance(settings.white_balance_k)
+        if self._is_v4l2 and settings.lock and None in (settings.exposure_s, settings.white_balance_k):
+            for _ in range(round(SETTLE_S * settings.fps)):
+                self._grab()
+            self.remark = self._controls.keep(
+                exposure=settings.exposure_s is None, white_balance=settings.white_balance_k is None
+            )
+
+    def _grab(self) -> np.ndarray:
+        """Wait for the next picture as the backend gives it, and note when it was captured."""
+        capture = self._capture
+        if capture is None or not capture.grab():
+            raise CameraFailure(f"{self.source} gives no pictures any more; see if it is plugged in.")
+        grabbed_ns = time.monotonic_ns()
+        given, raw = capture.retrieve()
+        # V4L2 tells the time of the buffer by CLOCK_MONOTONIC in ms.
+        driver_ns = int(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6) if self._is_v4l2 else grabbed_ns
+        self._capture_monotonic_ns = self.clock.plausible(driver_ns, grabbed_ns)
+        return np.asarray(raw if given else np.empty(0, np.uint8))
+
+    def _take(self) -> tuple[UInt8[np.ndarray, "h w 3"], bytes | None]:
+        """Return the next whole picture, RGB, and its JPEG where that came."""
+        for _ in range(BROKEN_IN_A_ROW):
+            picture = decode(self._grab(), self.source)
+            if picture is not None:
+                return picture
+        raise CameraFailure(f"{self.source} gives broken pictures only; use a shorter cable or another port.")
+
+
+def decode(raw: np.ndarray, name: str) -> tuple[UInt8[np.ndarray, "h w 3"], bytes | None] | None:
+    """Return (RGB, JPEG or None) of what OpenCV gave: a BGR picture or a JPEG's bytes; None if it is broken."""
+    if raw.ndim == 3 and raw.shape[2] == 3:
+        return np.asarray(cv2.cvtColor(raw, cv2.COLOR_BGR2RGB)), None
+    data = raw.tobytes()
+    data = data[: data.rfind(b"\xff\xd9") + 2]  # the driver's buffer is longer than the JPEG in it
+    if not is_jpeg(data):
+        return None
+    try:
+        return decode_rgb(data, name), data
+    except DeltalightError:
+        return None

@@ -1,0 +1,97 @@
+"""Exposure and white balance of a V4L2 camera through OpenCV's properties."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Protocol
+
+import cv2
+
+from protocol.errors import DeltalightError
+
+# V4L2_CID_EXPOSURE_ABSOLUTE counts in 100 us; V4L2_CID_EXPOSURE_AUTO: 1 = manual, 3 = automatic at a fixed aperture
+# (the only two that USB cameras without an iris have). Source: Linux media documentation, camera controls.
+EXPOSURE_STEP_S = 1e-4
+MANUAL, AUTOMATIC = 1.0, 3.0
+
+
+class Properties(Protocol):
+    """What of `cv2.VideoCapture` is needed here."""
+
+    def get(self, prop: int, /) -> float:
+        """Value of a property; -1 or 0 where it is not known."""
+
+    def set(self, prop: int, value: float, /) -> bool:
+        """Change a property; False where it cannot be."""
+
+
+class UvcControls:
+    """The controls of an open camera; `known` False (another backend than V4L2): its units are not, use none."""
+
+    def __init__(self, source: str, capture: Properties, *, known: bool) -> None:
+        self._source, self._capture, self._known = source, capture, known
+        self._locked_s: float | None = None
+
+    @property
+    def exposure_s(self) -> float | None:
+        """Exposure of the frames that come now, in seconds, as locked or read back; None where it is not told."""
+        return self._locked_s if self._locked_s is not None else self._read_exposure()
+
+    def set_exposure(self, seconds: float) -> None:
+        """Lock the exposure to the nearest of the camera's steps.
+
+        Raises:
+            DeltalightError: the camera has no such control, or does not take this value.
+        """
+        steps = max(round(seconds / EXPOSURE_STEP_S), 1)
+        self._choose(cv2.CAP_PROP_AUTO_EXPOSURE, MANUAL)
+        if not (self._known and self._capture.set(cv2.CAP_PROP_EXPOSURE, float(steps))):
+            raise DeltalightError(
+                f"{self._source} does not let its exposure be set to {seconds:g} s; leave exposure_s out and set "
+                "lock = false."
+            )
+        self._locked_s = self._read_exposure()
+
+    def set_white_balance(self, kelvin: int) -> None:
+        """Lock the colour temperature.
+
+        Raises:
+            DeltalightError: the camera has no such control.
+        """
+        self._choose(cv2.CAP_PROP_AUTO_WB, 0.0)
+        if not (self._known and self._capture.set(cv2.CAP_PROP_WB_TEMPERATURE, float(kelvin))):
+            raise DeltalightError(
+                f"{self._source} does not let its white balance be set; leave white_balance_k out."
+            )
+
+    def release(self) -> None:
+        """Let the camera choose both by itself, so that it can settle; controls outlive the program before."""
+        self._locked_s = None
+        self._choose(cv2.CAP_PROP_AUTO_EXPOSURE, AUTOMATIC)
+        self._choose(cv2.CAP_PROP_AUTO_WB, 1.0)
+
+    def keep(self, *, exposure: bool, white_balance: bool) -> str:
+        """Lock what the camera has chosen; returns what could not be locked, for people."""
+        seconds, kelvin = self._read_exposure(), self._capture.get(cv2.CAP_PROP_WB_TEMPERATURE)
+        refused = []
+        # A value that the camera does not tell must not be guessed: the picture could become black.
+        if exposure and (seconds is None or not _taken(partial(self.set_exposure, seconds))):
+            refused.append("exposure")
+        if white_balance and (kelvin <= 0 or not _taken(partial(self.set_white_balance, int(kelvin)))):
+            refused.append("white balance")
+        return f"{' and '.join(refused)} cannot be locked" if refused else ""
+
+    def _read_exposure(self) -> float | None:
+        steps = self._capture.get(cv2.CAP_PROP_EXPOSURE) if self._known else 0.0
+        return steps * EXPOSURE_STEP_S if steps > 0 else None
+
+    def _choose(self, prop: int, value: float) -> None:
+        if self._known:
+            self._capture.set(prop, value)
+
+
+def _taken(change: Callable[[], None]) -> bool:
+    try:
+        change()
+    except DeltalightError:
+        return False
+    return True

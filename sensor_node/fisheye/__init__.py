@@ -1,0 +1,6 @@
+"""Fish-eye light: exposure bracket -> linear radiance on the hemisphere (METHOD 2)."""
+
+from sensor_node.fisheye.radiance import light_warnings, radiance_map
+from sensor_node.fisheye.response import estimate_response
+
+__all__ = ["estimate_response", "light_warnings", "radiance_map"]

@@ -1,0 +1,142 @@
+"""Exposure bracket -> one linear picture in camera units."""
+
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, UInt8
+
+from protocol.errors import DeltalightError
+from protocol.frames import FisheyePictures, decode_lut
+
+CLIPPED_CODE = 250
+"""Codes from here are white: the last 2 % of a code hold the shoulder of a response and the ringing of JPEG."""
+FULL_WELL = 1e4
+"""Electrons at white, which sets the Poisson noise: 5,000 to 50,000 for the sensors of webcams to reflex cameras.
+Beside the steps of an 8-bit code it matters little, so neither does the number."""
+READ_NOISE = 1e-3
+"""Of white: some 10 electrons; linear pictures have no steps that would bound their weight in the dark."""
+
+Picture = UInt8[np.ndarray, "h w 3"] | Float32[np.ndarray, "h w 3"]
+
+
+class LinearPicture(NamedTuple):
+    """What the sensor got, 1.0 = white at the reference exposure; `clipped` where it is a lower bound."""
+
+    linear: Float32[np.ndarray, "h w 3"]
+    clipped: Bool[np.ndarray, "h w"]
+
+
+def reference_exposure(exposures_s: Iterable[float | None]) -> float | None:
+    """Return the exposure in which 1.0 is white: the longest of a bracket, None where none is told."""
+    return max((each for each in exposures_s if each is not None), default=None)
+
+
+def merge_bracket(bracket: FisheyePictures, reference_s: float | None) -> LinearPicture:
+    """Merge exposures, each weighted by the inverse variance of the light that it says was there.
+
+    An exposure of t (in reference exposures) that shows the linear value c says c/t with a variance of v(c)/t^2, v
+    being Poisson noise, read noise and the rounding of the code. Clipped values weigh nothing, nor do values beside
+    clipped ones in the same exposure (demosaicing, JPEG and resizing mix them), except in the shortest exposure:
+    where that clips, the value is a lower bound. Linear (float32) pictures clip at 1.0 in a bracket; a single one is
+    taken as a finished picture that clips nowhere.
+
+    Args:
+        bracket: pictures of one moment.
+        reference_s: exposure in which white is 1.0; an exposure of None is this one.
+
+    Raises:
+        DeltalightError: pictures that fit neither each other nor the calibration, or values that are not finite.
+    """
+    _check(bracket)
+    scales = [_scale(exposure, reference_s) for exposure in bracket.exposures_s]
+    if len(scales) == 1:
+        return _single(bracket, scales[0])
+    lut = decode_lut(bracket.calibration.response)
+    total, weights, bound = np.zeros((3, *bracket.pictures[0].shape), np.float32)
+    for number, which in enumerate(np.argsort(scales)):  # the shortest first
+        light, weight, clipped = _read(bracket.pictures[which], lut)
+        scale = np.float32(scales[which])
+        if number == 0:
+            bound = light / scale
+        else:
+            clipped = cv2.dilate(clipped, np.ones((3, 3), np.uint8))
+        trust = np.where(clipped, np.float32(0), weight)
+        weights += trust * scale**2
+        total += trust * light * scale
+    known = weights > 0
+    linear = np.divide(total, weights, out=bound, where=known)
+    return LinearPicture(linear, np.asarray(~known.all(axis=-1)))
+
+
+class _Reading(NamedTuple):
+    linear: Float32[np.ndarray, "h w 3"]
+    weight: Float32[np.ndarray, "h w 3"]
+    clipped: UInt8[np.ndarray, "h w 3"]
+
+
+def _read(picture: Picture, lut: Float32[np.ndarray, "256 3"]) -> _Reading:
+    """Linear values of one exposure, their inverse variance, and which are white."""
+    if picture.dtype != np.uint8:
+        weight = 1 / (np.maximum(picture, 0) / FULL_WELL + READ_NOISE**2)
+        return _Reading(picture, weight.astype(np.float32), (picture >= 1).astype(np.uint8))
+    step = np.gradient(lut, axis=0)
+    variance = lut / FULL_WELL + READ_NOISE**2 + step**2 / 12
+    tables = lut[None].astype(np.float32), (1 / variance)[None].astype(np.float32)
+    light, weight = (cv2.LUT(picture, table) for table in tables)
+    return _Reading(light, weight, (picture >= CLIPPED_CODE).astype(np.uint8))
+
+
+def _single(bracket: FisheyePictures, scale: float) -> LinearPicture:
+    picture = bracket.pictures[0]
+    if picture.dtype != np.uint8:
+        return LinearPicture(picture / np.float32(scale), np.zeros(picture.shape[:2], bool))
+    light = cv2.LUT(picture, decode_lut(bracket.calibration.response)[None].astype(np.float32))
+    return LinearPicture(light / np.float32(scale), np.asarray((picture >= CLIPPED_CODE).any(axis=-1)))
+
+
+def _scale(exposure_s: float | None, reference_s: float | None) -> float:
+    """The exposure in units of the reference."""
+    return 1.0 if exposure_s is None or reference_s is None else exposure_s / reference_s
+
+
+def _check(bracket: FisheyePictures) -> None:
+    lens, pictures = bracket.calibration.lens, bracket.pictures
+    if not pictures or len(pictures) != len(bracket.exposures_s):
+        raise DeltalightError(
+            f"a fish-eye bracket of {len(pictures)} pictures has {len(bracket.exposures_s)} exposures; "
+            "give one for each picture."
+        )
+    for picture, exposure in zip(pictures, bracket.exposures_s, strict=True):
+        _check_picture(picture, lens.width, lens.height)
+        if exposure is not None and not 0 < exposure < np.inf:
+            raise DeltalightError(f"a fish-eye exposure of {exposure} s is impossible; give it in seconds.")
+
+
+def _check_picture(picture: Picture, width: int, height: int) -> None:
+    if picture.shape != (height, width, 3):
+        raise DeltalightError(
+            f"a fish-eye picture has the shape {picture.shape} but its calibration is for {width}x{height} pixels; "
+            "calibrate at the size that is recorded."
+        )
+    if picture.dtype not in (np.uint8, np.float32):
+        raise DeltalightError(f"a fish-eye picture holds {picture.dtype}; give uint8 or linear float32.")
+    if picture.dtype == np.float32 and not np.isfinite(picture).all():
+        raise DeltalightError("a linear fish-eye picture holds values that are not finite; export it again.")
+
+
+def display_picture(
+    pictures: Sequence[Picture], merged: LinearPicture, inside: Bool[np.ndarray, "h w"]
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Return a coded picture for people: the exposure nearest to middle grey, of linear ones a coded one.
+
+    `inside` is where the lens sees; what lies outside says nothing about the exposure.
+    """
+    coded = [picture for picture in pictures if picture.dtype == np.uint8]
+    if coded:
+        # sRGB codes 18 % grey as 118.
+        return min(coded, key=lambda picture: abs(float(picture[inside][::16].mean()) - 118))
+    middle = float(np.median(merged.linear[inside]))
+    light = merged.linear * np.float32(0.18 / middle if middle > 0 else 1.0)
+    return np.searchsorted(decode_lut(None)[:, 0], np.clip(light, 0, 1)).astype(np.uint8)

@@ -1,0 +1,67 @@
+"""Pictures of a fish-eye camera -> radiance map, and what is wrong with it in words."""
+
+import numpy as np
+from jaxtyping import Float64
+
+from protocol.frames import FisheyePictures, RadianceMap
+from protocol.hemisphere import texel_directions, texel_solid_angles
+from sensor_node.fisheye.exposures import display_picture, merge_bracket, reference_exposure
+from sensor_node.fisheye.resampling import hemisphere_sampler
+
+SIZE = 256
+LEAST_CLIPPED_SHARE = 1e-5
+"""The sun's disc (6.8e-5 sr) of the hemisphere: the smallest thing that lights a room."""
+LEAST_COSINE_SHARE = 0.95
+"""Of an even sky's irradiance; what is lost beyond is more than the 5 % within which light is measured here."""
+
+
+def radiance_map(
+    pictures: FisheyePictures,
+    world_from_fisheye: Float64[np.ndarray, "4 4"],
+    size: int = SIZE,
+    reference_s: float | None = None,
+) -> RadianceMap:
+    """Merge a bracket and resample it to the hemisphere about the lens's axis.
+
+    Args:
+        pictures: what the camera took at one moment.
+        world_from_fisheye: pose of its optical frame, (4, 4), metres.
+        size: texels an edge of the map.
+        reference_s: exposure in which white is 1.0, s; None = the longest of this bracket. Give the same for all
+            pictures of a camera, so that the map's units stay.
+
+    Raises:
+        DeltalightError: pictures that fit neither each other nor the calibration.
+    """
+    reference = reference_exposure(pictures.exposures_s) if reference_s is None else reference_s
+    merged = merge_bracket(pictures, reference)
+    sampler = hemisphere_sampler(pictures.calibration, size)
+    radiance, clipped_share = sampler.resample(merged)
+    return RadianceMap(
+        timestamp_ns=pictures.timestamp_ns,
+        radiance=radiance,
+        seen=sampler.seen,
+        world_from_fisheye=world_from_fisheye,
+        clipped_share=clipped_share,
+        picture=display_picture(pictures.pictures, merged, ~sampler.outside),
+        calibration=pictures.calibration,
+    )
+
+
+def light_warnings(radiance: RadianceMap) -> list[str]:
+    """Return a sentence for each thing that makes the light of a map wrong, and what to do."""
+    sentences = []
+    if radiance.clipped_share >= LEAST_CLIPPED_SHARE:
+        sentences.append(
+            f"the fish-eye picture is overexposed: {100 * radiance.clipped_share:.2g} % of what it sees is clipped "
+            "even at the shortest exposure, so its light is too weak; add a shorter exposure."
+        )
+    size = len(radiance.seen)
+    solid, cosine = texel_solid_angles(size), texel_directions(size)[..., 2]
+    if float((solid * cosine)[radiance.seen].sum()) < LEAST_COSINE_SHARE * np.pi:
+        share = float(solid[radiance.seen].sum()) / (2 * np.pi)
+        sentences.append(
+            f"the fish-eye lens sees {100 * share:.0f} % of the hemisphere about its axis; light from the rest is "
+            "guessed, so use a lens of 160 degrees or more, or correct `image_circle` in fisheye.yaml."
+        )
+    return sentences

@@ -1,0 +1,74 @@
+"""How a node is doing, in the words of its statistics: live, stale or lost, and what is not as it should be."""
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Literal
+
+from protocol.frames import BoardPose
+from sensor_node.cameras.base import Camera
+
+State = Literal["starting", "running", "waiting", "degraded"]
+
+
+class Health:
+    """Watches the frames of one camera.
+
+    Args:
+        camera: whose frames these are.
+        stale_after_s: age of the newest frame from which the stream is stale; without the board for so long, it is
+            lost from sight.
+        lost_after_s: age of the newest frame from which the camera is lost.
+        now_s: a clock that is never set, s.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        stale_after_s: float,
+        lost_after_s: float,
+        now_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._camera, self._stale_after_s, self._lost_after_s = camera, stale_after_s, lost_after_s
+        self._now_s = now_s
+        self._started_s = self._posed_s = now_s()
+        self._newest_s: float | None = None
+
+    def note(self, pose: BoardPose | None) -> None:
+        """Note that a frame was published, with its pose."""
+        self._newest_s = self._now_s()
+        if pose is not None:
+            self._posed_s = self._newest_s
+
+    def state(self, remarks: Sequence[str] = ()) -> tuple[State, str]:
+        """Return the state on the wire and its sentences: first live, stale or lost, then what else there is.
+
+        Args:
+            remarks: of others; empty ones are left out.
+        """
+        state, sentence = self._stream()
+        faults = [remark for remark in (self._board(), *remarks) if remark]
+        if state == "running" and faults:
+            state = "degraded"
+        return state, "; ".join([sentence, *faults])
+
+    def _stream(self) -> tuple[State, str]:
+        """What the camera says of itself, else what the age of the newest frame says."""
+        newest_s = self._started_s if self._newest_s is None else self._newest_s
+        said, age_s = self._camera.state, self._now_s() - newest_s
+        if said is not None and said.name != "live":
+            return ("degraded" if said.name == "lost" else "waiting"), f"{said.name}: {said.detail}"
+        if age_s >= self._lost_after_s:
+            return "degraded", f"lost: no frame for {age_s:.1f} s"
+        if self._newest_s is None:
+            return "starting", "no frame yet"
+        if age_s >= self._stale_after_s:
+            return "waiting", f"stale: the newest frame is {age_s:.1f} s old"
+        return "running", "live" if said is None or said.detail == "live" else f"live: {said.detail}"
+
+    def _board(self) -> str:
+        if self._newest_s is None or self._camera.board is None:
+            return ""
+        hidden_s = self._newest_s - self._posed_s
+        if hidden_s < self._stale_after_s:
+            return ""
+        return f"the marker board was not seen for {hidden_s:.1f} s, bring it into view"

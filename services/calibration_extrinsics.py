@@ -1,0 +1,103 @@
+"""`deltalight calibrate extrinsics`: one transform of calibration/extrinsics.yaml from a recording."""
+
+from collections.abc import Iterator
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Float64
+from rich.console import Console
+from rich.progress import track
+
+from protocol.board import BoardSpec, load_board_yaml
+from protocol.calibration import Extrinsics, load_extrinsics_yaml, save_extrinsics_yaml
+from protocol.errors import DeltalightError
+from protocol.frames import SensorFrame
+from protocol.source import Source, open_source
+from services.calibration import result_path, write_result
+
+TransformName = Literal["rgb_from_fisheye", "world_from_fisheye", "depth_from_rgb"]
+
+
+class ExtrinsicsJob(NamedTuple):
+    """What is wanted from which recording; `board` None = the recording's."""
+
+    source: Path
+    what: TransformName
+    out: Path
+    board: Path | None
+
+
+def find_transform(job: ExtrinsicsJob, *, force: bool) -> dict[str, Any]:
+    """Find a transform, write it beside the others, and return its figures.
+
+    Raises:
+        DeltalightError: the recording does not determine it, or it is known already and `force` is not given.
+    """
+    path = result_path(job.out, "extrinsics.yaml", force=True)
+    known = load_extrinsics_yaml(path) if path.exists() else Extrinsics()
+    if getattr(known, job.what) is not None and not force:
+        raise DeltalightError(f"{path} has {job.what} already; write over it with --force.")
+    board = None if job.board is None else load_board_yaml(job.board)
+    source = open_source(job.source, board)
+    transform, figures = _find(job.what, source, board_of(source, job.source))
+    others = {field.name: getattr(known, field.name) for field in fields(Extrinsics)}
+    result = Extrinsics(**{**others, job.what: transform})
+    write_result(path, lambda aside: save_extrinsics_yaml(aside, result))
+    return {"transform": job.what, **figures, "matrix": np.round(transform, 6).tolist(), "written": str(path)}
+
+
+def board_of(source: Source, path: Path) -> BoardSpec:
+    """The board of a source.
+
+    Raises:
+        DeltalightError: it describes none.
+    """
+    if source.board is None:
+        raise DeltalightError(f"{path} describes no marker board; name it with --target board.yaml.")
+    return source.board
+
+
+def _find(
+    what: TransformName, source: Source, board: BoardSpec
+) -> tuple[Float64[np.ndarray, "4 4"], dict[str, Any]]:
+    if what == "depth_from_rgb":
+        return _depth_from_rgb(source, board)
+    from sensor_node.calibration.extrinsics import (
+        mean_placement,
+        rgb_from_fisheye_poses,
+        world_from_fisheye_poses,
+    )
+
+    poses = rgb_from_fisheye_poses if what == "rgb_from_fisheye" else world_from_fisheye_poses
+    placement = mean_placement(list(poses(_watched(source), board)), what)
+    figures = {
+        "poses": placement.poses,
+        "outliers": placement.outliers,
+        "spread_mm": round(1e3 * placement.spread_m, 3),
+        "spread_deg": round(placement.spread_deg, 4),
+    }
+    return placement.transform, figures
+
+
+def _depth_from_rgb(source: Source, board: BoardSpec) -> tuple[Float64[np.ndarray, "4 4"], dict[str, Any]]:
+    from sensor_node.calibration.depth_extrinsics import depth_views, place_depth_sensor
+
+    start = source.extrinsics.depth_from_rgb
+    placement = place_depth_sensor(
+        depth_views(_watched(source), board), board, np.eye(4) if start is None else start
+    )
+    figures = {
+        "views": placement.views,
+        "rms_mm": round(1e3 * placement.rms_m, 3),
+        "uncertainty_mm": round(1e3 * placement.sigma_m, 3),
+        "uncertainty_deg": round(placement.sigma_deg, 4),
+    }
+    return placement.transform, figures
+
+
+def _watched(source: Source) -> Iterator[SensorFrame]:
+    """The frames of a source, with a bar on stderr."""
+    console = Console(stderr=True)
+    yield from track(source, "looking for the board", len(source), console=console, transient=True)

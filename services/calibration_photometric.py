@@ -1,0 +1,86 @@
+"""`deltalight calibrate photometric`: the camera's response, or the albedo of the board's paper."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float32
+
+from protocol.board import load_board_yaml, save_board_yaml
+from protocol.errors import DeltalightError
+from protocol.source import open_source
+from services.calibration import result_path, write_result
+from services.calibration_extrinsics import board_of
+from services.files import make_output_folder
+
+
+def find_response(source: Path, eye: Literal["rgb", "fisheye"], out: Path, *, force: bool) -> dict[str, Any]:
+    """Find a response; write `out`/response.txt, or the fish-eye's into its calibration/fisheye.yaml.
+
+    Raises:
+        DeltalightError: the bracket shows none, or there is one already and `force` is not given.
+    """
+    from sensor_node.calibration.photometric import calibrate_response, read_bracket
+
+    path = out / "calibration" / "fisheye.yaml" if eye == "fisheye" else out / "response.txt"
+    _require_free(path, eye, force=force)
+    response = calibrate_response(read_bracket(source, eye))
+    if eye == "fisheye":
+        _write_into_fisheye(path, response.table)
+    else:
+        make_output_folder(out)
+        write_result(path, lambda aside: np.savetxt(aside, response.table, fmt="%.9g"))
+    return {
+        "pictures": response.pictures,
+        "residual_percent": round(100 * response.residual, 2),
+        "light_of_code_128": [round(float(value), 4) for value in response.table[128]],
+        "written": str(path),
+    }
+
+
+def _require_free(path: Path, eye: str, *, force: bool) -> None:
+    from protocol.fisheye_lens import load_fisheye_yaml
+
+    if eye == "fisheye" and not path.exists():
+        raise DeltalightError(f"{path} does not exist; run `deltalight calibrate fisheye` first.")
+    has_one = path.exists() and (eye == "rgb" or load_fisheye_yaml(path).response is not None)
+    if has_one and not force:
+        raise DeltalightError(f"{path} holds a response already; write over it with --force.")
+
+
+def _write_into_fisheye(path: Path, table: Float32[np.ndarray, "256 3"]) -> None:
+    from protocol.fisheye_lens import load_fisheye_yaml, save_fisheye_yaml
+
+    calibration = replace(load_fisheye_yaml(path), response=table)
+    write_result(path, lambda aside: save_fisheye_yaml(aside, calibration))
+
+
+def find_paper_albedo(
+    source: Path, card: tuple[str, float], out: Path, board: Path | None, *, force: bool
+) -> dict[str, Any]:
+    """Find the paper's albedo by a grey card (place, albedo); write it into `out`/calibration/board.yaml.
+
+    Raises:
+        DeltalightError: the pictures do not show it, or the board has one already and `force` is not given.
+    """
+    from sensor_node.calibration.photometric import paper_albedo, parse_card
+
+    path = result_path(out, "board.yaml", force=True)
+    grey = parse_card(*card)
+    frames = open_source(source, None if board is None else load_board_yaml(board))
+    spec = load_board_yaml(path) if path.exists() and board is None else board_of(frames, source)
+    if spec.white_albedo is not None and not force:
+        raise DeltalightError(
+            f"{path} has white_albedo {spec.white_albedo} already; write over it with --force."
+        )
+    found = paper_albedo(frames, spec, grey)
+    result = spec.replaced(white_albedo=round(found.albedo, 4))
+    write_result(path, lambda aside: save_board_yaml(aside, result))
+    return {
+        "white_albedo": round(found.albedo, 4),
+        "pictures": found.pictures,
+        "spread_percent": round(100 * found.spread, 2),
+        "unevenness_percent": round(100 * found.residual, 2),
+        "written": str(path),
+    }

@@ -1,0 +1,118 @@
+"""`deltalight board`: a marker board to print, and its board.yaml."""
+
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NamedTuple
+
+import typer
+
+from protocol.errors import DeltalightError
+
+if TYPE_CHECKING:
+    from protocol.board import BoardSpec
+
+
+class BoardType(StrEnum):
+    """Kinds of boards that are printed."""
+
+    ARUCO_GRID = "aruco_grid"
+    CHARUCO = "charuco"
+    APRILTAG_GRID = "apriltag_grid"
+
+
+class Paper(StrEnum):
+    """Paper sizes."""
+
+    A4 = "a4"
+    A3 = "a3"
+    LETTER = "letter"
+
+
+class _Defaults(NamedTuple):
+    """A board of a type that fills A4 well."""
+
+    dictionary: str
+    rows: int
+    columns: int
+    marker_mm: float
+    separation_mm: float
+
+
+DEFAULTS = {
+    BoardType.ARUCO_GRID: _Defaults("DICT_4X4_50", 3, 4, 40.0, 10.0),
+    BoardType.APRILTAG_GRID: _Defaults("DICT_APRILTAG_36h11", 3, 4, 40.0, 10.0),
+    BoardType.CHARUCO: _Defaults("DICT_5X5_50", 5, 7, 24.0, 8.0),
+}
+
+
+def board(
+    *,
+    out: Annotated[Path, typer.Option(help="PDF file; board.yaml is written beside it, of the same name.")],
+    kind: Annotated[BoardType, typer.Option("--type", help="Kind of board.")] = BoardType.ARUCO_GRID,
+    paper: Annotated[
+        Paper, typer.Option(help="Paper; it is turned where the board fits only so.")
+    ] = Paper.A4,
+    rows: Annotated[
+        int | None, typer.Option(min=1, max=100, help="Rows of markers (charuco: of squares).")
+    ] = None,
+    columns: Annotated[int | None, typer.Option(min=1, max=100, help="Columns, likewise.")] = None,
+    marker_mm: Annotated[float | None, typer.Option(help="Outer edge of a marker, mm.")] = None,
+    separation_mm: Annotated[
+        float | None, typer.Option(help="White gap between markers, mm (charuco: square less marker).")
+    ] = None,
+    dictionary: Annotated[str | None, typer.Option(help="OpenCV's name of the dictionary.")] = None,
+    first_id: Annotated[int, typer.Option(min=0, help="Id of the first marker.")] = 0,
+    lamp_marker: Annotated[
+        list[int] | None,
+        typer.Option(help="Id of a marker to fix to a lamp, on a page of its own; repeat it."),
+    ] = None,
+    lamp_marker_mm: Annotated[float, typer.Option(help="Outer edge of the lamps' markers, mm.")] = 40.0,
+    force: Annotated[bool, typer.Option("--force", help="Write over older files.")] = False,
+) -> None:
+    """Write a marker board as true-scale PDF, with its board.yaml."""
+    from protocol.board import save_board_yaml
+    from services.board_pdf import write_board_pdf
+    from services.files import make_output_folder, replacing
+
+    described = out.with_suffix(".yaml")
+    if out.suffix.lower() != ".pdf":
+        raise DeltalightError(f"'{out}' is no PDF file; name one with --out, such as board.pdf.")
+    for path in (out, described):
+        if path.exists() and not force:
+            raise DeltalightError(f"{path} exists already; write over it with --force or name another --out.")
+    usual = DEFAULTS[kind]
+    spec = _spec(
+        kind,
+        _Defaults(
+            dictionary or usual.dictionary,
+            rows or usual.rows,
+            columns or usual.columns,
+            usual.marker_mm if marker_mm is None else marker_mm,
+            usual.separation_mm if separation_mm is None else separation_mm,
+        ),
+        first_id,
+        [(name, lamp_marker_mm) for name in lamp_marker or ()],
+    )
+    make_output_folder(out.parent)
+    with replacing(out) as aside:
+        write_board_pdf(aside, spec, paper.value)
+    with replacing(described) as aside:
+        save_board_yaml(aside, spec)
+    typer.echo(f"written to {out} and {described}; print at 100 % and measure the ruler")
+
+
+def _spec(kind: BoardType, size: _Defaults, first_id: int, lamps: list[tuple[int, float]]) -> "BoardSpec":
+    from protocol.board import BoardSpec
+    from protocol.documents import validate
+
+    data = {
+        "type": kind.value,
+        "dictionary": size.dictionary,
+        "marker_length_m": size.marker_mm / 1e3,
+        "separation_m": size.separation_mm / 1e3,
+        "rows": size.rows,
+        "columns": size.columns,
+        "first_id": first_id,
+        "lamp_markers": [{"id": name, "marker_length_m": edge / 1e3} for name, edge in lamps],
+    }
+    return validate(BoardSpec, data, "the board")

@@ -1,0 +1,68 @@
+"""`deltalight config`: the settings as they are resolved, and where each comes from."""
+
+import json
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from services.commands.options import ConfigFile
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+
+
+def config(
+    config_file: ConfigFile = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print values and origins as JSON.")] = False,
+) -> None:
+    """Print the settings of node, server and keys as a configuration file, with the origin of each value."""
+    from services.settings import load_configuration
+
+    configuration = load_configuration(config_file)
+    values: dict[str, Any] = {}
+    origins: dict[str, str] = {}
+    for name, model in _models().items():
+        settings, places = configuration.explained(name, model)
+        values[name] = settings.model_dump(mode="json")
+        origins.update({f"{name}.{key}": place for key, place in places.items()})
+    if as_json:
+        typer.echo(json.dumps({"values": values, "origins": origins}, indent=2))
+    else:
+        for name, section in values.items():
+            _print_table(name, section, origins)
+
+
+def _models() -> "dict[str, type[BaseModel]]":
+    """The sections whose programs are installed here."""
+    from protocol.keys import KeySettings
+    from sensor_node.node import NodeConfig
+
+    models: dict[str, type[BaseModel]] = {"node": NodeConfig, "keys": KeySettings}
+    try:
+        from render_server.server import ServerSettings
+    except ModuleNotFoundError:  # a host that only captures
+        return models
+    return {"node": NodeConfig, "server": ServerSettings, "keys": KeySettings}
+
+
+def _print_table(name: str, values: Mapping[str, Any], origins: Mapping[str, str]) -> None:
+    typer.echo(f"[{name}]")
+    tables = {key: value for key, value in values.items() if isinstance(value, dict) and value}
+    for key in [key for key in values if key not in tables]:
+        text = "" if values[key] is None else f"{key} = {_toml(values[key])}"
+        typer.echo(f"{text or f'# {key} is not set':<44} # {origins[f'{name}.{key}']}")
+    typer.echo()
+    for key, table in tables.items():
+        _print_table(f"{name}.{key}", table, origins)
+
+
+def _toml(value: object) -> str:
+    """A value in TOML: JSON's text, numbers and lists are TOML's too."""
+    if isinstance(value, dict):
+        return (
+            "{" + ", ".join(f"{key} = {_toml(each)}" for key, each in value.items() if each is not None) + "}"
+        )
+    if isinstance(value, list):
+        return "[" + ", ".join(_toml(each) for each in value if each is not None) + "]"
+    return json.dumps(value, ensure_ascii=False)

@@ -1,0 +1,69 @@
+"""`deltalight keys`: key pairs of this host and the keys of others that it trusts."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+keys = typer.Typer(no_args_is_help=True, help="Keys for connections that leave this host.")
+
+Folder = Annotated[
+    Path | None, typer.Option(help="Folder of the keys; default: as [keys] of the configuration says.")
+]
+
+
+@keys.command()
+def create(
+    name: Annotated[str, typer.Argument(help="Name of the key pair, for example this host's.")],
+    folder: Folder = None,
+) -> None:
+    """Make a key pair; the public file is for other hosts, the secret one stays here."""
+    from protocol.keys import create_keys
+
+    public, secret = create_keys(name, _folder(folder))
+    typer.echo(f"Secret key, for this host only: {secret}")
+    typer.echo(f"Public key: {public}")
+    typer.echo(f"Copy the public key to the other host and run there: deltalight keys trust {public.name}")
+
+
+@keys.command(name="list")
+def list_keys(
+    folder: Folder = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the keys as JSON.")] = False,
+) -> None:
+    """List this host's key pairs and the keys that it trusts."""
+    from protocol.keys import load_keys, own_keys, trusted_keys
+
+    place = _folder(folder)
+    own = {name: load_keys(name, place).public.decode() for name in own_keys(place)}
+    trusted = {name: key.decode() for name, key in trusted_keys(place).items()}
+    if as_json:
+        typer.echo(json.dumps({"folder": str(place), "own": own, "trusted": trusted}, indent=2))
+        return
+    typer.echo(f"Keys in {place}")
+    for title, found in (("own", own), ("trusted", trusted)):
+        for name, public in found.items():
+            typer.echo(f"{title:<8} {name:<24} {public}")
+        if not found:
+            typer.echo(f"{title:<8} none")
+
+
+@keys.command()
+def trust(
+    file: Annotated[Path, typer.Argument(help="Public key of the other host, NAME.key.")],
+    name: Annotated[str | None, typer.Option(help="Name to keep it by; default: that of the file.")] = None,
+    folder: Folder = None,
+) -> None:
+    """Let the host with this public key connect, and connect to it; holds at once, without a restart."""
+    from protocol.keys import trust as keep
+
+    kept = keep(file, _folder(folder), name)
+    typer.echo(f"Trusted from now on: {kept} (remove that file to end it)")
+
+
+def _folder(given: Path | None) -> Path:
+    from protocol.keys import KeySettings, key_folder
+    from services.settings import load_configuration
+
+    return given or load_configuration().section("keys", KeySettings).folder or key_folder()

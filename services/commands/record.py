@@ -1,0 +1,127 @@
+"""`deltalight record`: the raw streams of a node to an .mcap recording."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+from rich.live import Live
+from rich.text import Text
+
+from services.commands.options import ConfigFile
+from services.ports import NODE_PORT, endpoint
+
+if TYPE_CHECKING:
+    from protocol.keys import Keys
+    from protocol.scene import SceneDocument
+    from services.recorder import Recorder, RecordStatus
+
+SHOW_PERIOD_S = 0.25
+
+
+def record(
+    *,
+    out: Annotated[Path, typer.Option(help="Recording to write, NAME.mcap; it must not exist.")],
+    subscribe: Annotated[str, typer.Option(help="Endpoint of the node's streams.")] = endpoint(NODE_PORT),
+    node: Annotated[str | None, typer.Option(help="Name of the node, where several publish.")] = None,
+    scene: Annotated[Path | None, typer.Option(help="Scene document to attach.")] = None,
+    control: Annotated[
+        str | None, typer.Option(help="Control endpoint of the render server whose scene is attached.")
+    ] = None,
+    extrinsics: Annotated[
+        Path | None, typer.Option(help="calibration/extrinsics.yaml: transforms between the sensors.")
+    ] = None,
+    duration: Annotated[float | None, typer.Option(min=0.1, help="Seconds from the first frame.")] = None,
+    frames: Annotated[int | None, typer.Option(min=1, help="Frames to record.")] = None,
+    config_file: ConfigFile = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
+) -> None:
+    """Record every raw frame of a node until Ctrl-C, --duration or --frames."""
+    from protocol.calibration import load_extrinsics_yaml
+    from protocol.keys import KeySettings
+    from services.recorder import Recorder, RecordJob
+    from services.settings import load_configuration
+
+    endpoints = [subscribe] if control is None else [subscribe, control]
+    keys = load_configuration(config_file).section("keys", KeySettings).load(endpoints)
+    job = RecordJob(
+        out,
+        subscribe,
+        node=node,
+        scene=_scene(scene, control, keys),
+        extrinsics=None if extrinsics is None else load_extrinsics_yaml(extrinsics),
+        duration_s=duration,
+        frames=frames,
+        keys=keys,
+    )
+    console = Console(stderr=True, soft_wrap=True)
+    recorder = Recorder(job, lambda sentence: console.print(sentence, markup=False, highlight=False))
+    _run(recorder, console, lambda status: _print_summary(status, as_json=as_json))
+
+
+def _scene(path: Path | None, control: str | None, keys: "Keys | None") -> "SceneDocument | None":
+    from protocol.errors import DeltalightError
+    from protocol.scene import load_scene
+    from services.recorder_scene import scene_of_server
+
+    if path is not None and control is not None:
+        raise DeltalightError("--scene and --control both name a scene to attach; give one of them.")
+    if path is not None:
+        return load_scene(path)
+    return None if control is None else scene_of_server(control, keys)
+
+
+def _run(recorder: "Recorder", console: Console, summarize: "Callable[[RecordStatus], None]") -> None:
+    """Record in a thread, which no signal interrupts in the middle of a frame, and show how far it is."""
+    from concurrent.futures import ThreadPoolExecutor, wait
+    from threading import Event
+
+    from services.signals import Terminated
+
+    stop, ended_by = Event(), None
+    with ThreadPoolExecutor(1) as thread:
+        running = thread.submit(recorder.run, stop)
+        try:
+            with Live(console=console, transient=True, auto_refresh=False) as live:
+                while not wait([running], SHOW_PERIOD_S).done:
+                    live.update(_line(recorder.status), refresh=True)
+        except (KeyboardInterrupt, Terminated) as signal:
+            ended_by = signal
+        finally:
+            stop.set()
+        status = running.result()
+    summarize(status)
+    if ended_by is not None and (isinstance(ended_by, Terminated) or not status.frames):
+        raise ended_by  # Ctrl-C is how a recording ends; without a frame there is none
+
+
+def _line(status: "RecordStatus") -> Text:
+    words = (
+        f"{status.out.name}: {status.frames} frames, {status.seconds:.0f} s, {status.size_bytes / 1e6:.1f} MB,"
+        f" {status.bytes_per_s / 1e6:.1f} MB/s, lost {_losses(status)}, {status.free_bytes / 1e9:.1f} GB free"
+    )
+    return Text(words if status.frames else "waiting for the first frame", no_wrap=True, overflow="ellipsis")
+
+
+def _losses(status: "RecordStatus") -> str:
+    parts = [f"{count} {stream}" for stream, count in status.missing.items() if count]
+    if status.node_drops:
+        parts.append(f"{status.node_drops} dropped by the node itself")
+    parts += [f"{count} {cause} dropped here" for cause, count in status.dropped.items() if count]
+    return ", ".join(parts) or "nothing"
+
+
+def _print_summary(status: "RecordStatus", *, as_json: bool) -> None:
+    figures = status.as_dict()
+    if as_json:
+        typer.echo(json.dumps(figures))
+    elif not status.frames:
+        typer.echo("Nothing was recorded and no file was written.", err=True)
+    else:
+        typer.echo(
+            f"{status.frames} frames in {status.seconds:.1f} s ({figures['frames_per_s']:.1f} a second),"
+            f" {status.size_bytes / 1e6:.1f} MB ({figures['mb_per_s']:.1f} MB/s), lost {_losses(status)},"
+            f" {100 * figures['cpu_share']:.0f} % of a core, written to {status.out}"
+        )

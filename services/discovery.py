@@ -1,0 +1,151 @@
+"""Finds the sensor nodes that announce themselves on the local network."""
+
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+from protocol.documents import nearest
+from protocol.errors import DeltalightError
+from protocol.keys import TRUST_HINT, KeySettings, key_folder, trusted_keys
+from protocol.messages import SCHEMA_VERSION
+from sensor_node.announce import SERVICE_TYPE
+
+if TYPE_CHECKING:
+    from zeroconf import ServiceInfo, ServiceStateChange, Zeroconf
+
+# Answers come within 0.12 s (RFC 6762, section 6); the first question is asked again after one second.
+PATIENCE_S = 2.5
+ANSWER_MS = 1000
+ONLY_NODE = "auto"
+
+
+@dataclass(frozen=True)
+class FoundNode:
+    """A node as it announces itself; `key` is its public key (Z85), empty without keys."""
+
+    name: str
+    address: str
+    port: int
+    streams: tuple[str, ...]
+    schema_version: int
+    key: str = ""
+
+    def as_dict(self) -> dict[str, Any]:
+        """The node as plain data."""
+        return {**asdict(self), "endpoint": f"tcp://{self.address}:{self.port}", "curve": bool(self.key)}
+
+    def endpoint(self, trusted: Mapping[str, bytes]) -> str:
+        """Return the endpoint to subscribe to, with the name under which the node's key is trusted.
+
+        Raises:
+            DeltalightError: it speaks another version, has no keys, or its key is not trusted.
+        """
+        if self.schema_version != SCHEMA_VERSION:
+            raise DeltalightError(
+                f"node {self.name} speaks version {self.schema_version} and this program {SCHEMA_VERSION}: install"
+                " the same on both."
+            )
+        if not self.key:
+            raise DeltalightError(
+                f"node {self.name} has no keys: run `deltalight keys create NAME` on its host."
+            )
+        peer = next((name for name, key in trusted.items() if key.decode() == self.key), None)
+        if peer is None:
+            raise DeltalightError(f"the key of node {self.name} is not trusted: {TRUST_HINT}.")
+        host = f"[{self.address}]" if ":" in self.address else self.address
+        return f"tcp://{peer}@{host}:{self.port}"
+
+
+def find_nodes(
+    *, name: str | None = None, patience_s: float = PATIENCE_S, interfaces: Sequence[str] | None = None
+) -> list[FoundNode]:
+    """Return the nodes that announce themselves, by name.
+
+    Args:
+        name: stop as soon as this one is found; None = wait for all.
+        patience_s: how long to listen.
+        interfaces: addresses of this host to listen on; None = all but loopback.
+
+    Raises:
+        DeltalightError: this host has no network to listen on.
+    """
+    from zeroconf import InterfaceChoice, ServiceBrowser, Zeroconf
+
+    found: dict[str, FoundNode] = {}
+    is_found = threading.Event()
+
+    def changed(
+        zeroconf: "Zeroconf", service_type: str, name: str, state_change: "ServiceStateChange"
+    ) -> None:
+        info = zeroconf.get_service_info(service_type, name, ANSWER_MS)
+        node = None if info is None else _node(info)
+        if node is None or state_change.name == "Removed":
+            return
+        found[name] = node
+        if node.name == wanted:
+            is_found.set()
+
+    wanted = name
+    try:
+        zeroconf = Zeroconf(interfaces=InterfaceChoice.All if interfaces is None else list(interfaces))
+    except OSError as error:
+        raise DeltalightError(
+            f"there is no network to look for nodes on ({error.strerror}); name the node's endpoint."
+        ) from error
+    try:
+        ServiceBrowser(zeroconf, SERVICE_TYPE, handlers=[changed])
+        is_found.wait(patience_s)
+    finally:
+        zeroconf.close()
+    return sorted(found.values(), key=lambda node: (node.name, node.address))
+
+
+def _node(info: "ServiceInfo") -> FoundNode | None:
+    """What an announcement says, None where it does not say enough."""
+    texts = {key: value or "" for key, value in info.decoded_properties.items()}
+    addresses = info.parsed_addresses()
+    if not addresses or info.port is None or not texts.get("name") or not texts.get("schema", "").isdecimal():
+        return None
+    return FoundNode(
+        name=texts["name"],
+        address=addresses[0],
+        port=info.port,
+        streams=tuple(filter(None, texts.get("streams", "").split(","))),
+        schema_version=int(texts["schema"]),
+        key=texts.get("key", "") if texts.get("curve") == "1" else "",
+    )
+
+
+def choose(nodes: Sequence[FoundNode], name: str) -> FoundNode:
+    """Return the node called `name`, or for `auto` the only one.
+
+    Raises:
+        DeltalightError: it is not there, or `auto` and several are.
+    """
+    names = ", ".join(node.name for node in nodes)
+    if not nodes:
+        raise DeltalightError(
+            "no node announces itself on this network; see that it runs with an endpoint that leaves its host, or"
+            " name that endpoint with --subscribe."
+        )
+    if name == ONLY_NODE and len(nodes) == 1:
+        return nodes[0]
+    if name == ONLY_NODE:
+        raise DeltalightError(f"{len(nodes)} nodes announce themselves; say which with --node: {names}.")
+    chosen = next((node for node in nodes if node.name == name), None)
+    if chosen is None:
+        hint = nearest(name, [node.name for node in nodes])
+        advice = f"the nearest is {hint} of" if hint else "there are"
+        raise DeltalightError(f"no node called {name} announces itself; {advice} {names}.")
+    return chosen
+
+
+def node_endpoint(name: str, settings: KeySettings, *, interfaces: Sequence[str] | None = None) -> str:
+    """Return the endpoint of the node called `name` (`auto`: of the only one), found on the network.
+
+    Raises:
+        DeltalightError: there is no such node, or it is not trusted.
+    """
+    nodes = find_nodes(name=name, interfaces=interfaces)
+    return choose(nodes, name).endpoint(trusted_keys(settings.folder or key_folder()))

@@ -1,0 +1,77 @@
+"""Recordings and folders that appear whole or not at all, and never replace anything."""
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from protocol.errors import DeltalightError
+from protocol.recording_format import ACTIVE_SUFFIX
+from services.files import make_output_folder
+
+SUFFIX = ".mcap"
+
+
+def require_new_recording(path: Path) -> None:
+    """Check the name of a recording that is to grow there; its folder is created where missing.
+
+    Raises:
+        DeltalightError: the name is taken or not `*.mcap`, or the folder cannot be written.
+    """
+    require_absent(path.with_name(path.name + ACTIVE_SUFFIX))
+    require_recording_name(path)
+
+
+def require_recording_name(path: Path) -> None:
+    """Check the name of a recording that is to appear there; its folder is created where missing.
+
+    Raises:
+        DeltalightError: the name is taken or not `*.mcap`, or the folder cannot be written.
+    """
+    if path.suffix != SUFFIX:
+        raise DeltalightError(f"{path} must end in {SUFFIX}; choose another name.")
+    require_absent(path)
+    make_output_folder(path.parent)
+
+
+def require_absent(path: Path) -> None:
+    """Refuse to replace anything.
+
+    Raises:
+        DeltalightError: there is something of that name.
+    """
+    if path.exists() or path.is_symlink():
+        raise DeltalightError(f"{path} already exists; choose another name or remove it.")
+
+
+@contextmanager
+def appearing(path: Path) -> Iterator[Path]:
+    """Give a name beside `path` to write a file or folder to; put it in place at the end, remove it at a fault.
+
+    A killed process leaves it behind, hidden. The suffix is kept.
+
+    Raises:
+        DeltalightError: there is something at `path` already, or the disk refuses.
+    """
+    require_absent(path)
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
+    try:
+        yield temporary
+        require_absent(path)
+        temporary.rename(path)
+    except OSError as fault:
+        raise DeltalightError(
+            f"{path} cannot be written ({fault.strerror}); free some space or choose another name."
+        ) from fault
+    finally:
+        _remove(temporary)
+        _remove(temporary.with_name(temporary.name + ACTIVE_SUFFIX))
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with suppress(OSError):
+            path.unlink(missing_ok=True)

@@ -1,0 +1,251 @@
+"""Recording the raw streams of a node: every frame that comes, until somebody says stop."""
+
+import shutil
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, closing
+from dataclasses import dataclass, field
+from pathlib import Path
+from threading import Event
+from typing import Any
+
+from protocol.calibration import Extrinsics
+from protocol.envelope import decode
+from protocol.errors import DeltalightError
+from protocol.frames import SensorFrame
+from protocol.keys import Keys
+from protocol.messages import Message, StatsMessage
+from protocol.recording import RecordingWriter
+from protocol.scene import SceneDocument
+from services.new_files import require_new_recording
+from services.raw_frames import RAW_STREAMS, RawFrameAssembler
+from services.stream_queue import StreamQueue
+
+POLL_S = 0.1
+IDLE_POLLS = 3  # then frames whose partners are late are taken as they are
+SILENCE_S = 3.0
+LOOK_PERIOD_S = 0.5
+LEAST_SPACE_S = 60.0
+STEADY_AFTER_S = 2.0  # before, the rate says little about what is to come
+
+
+@dataclass(frozen=True)
+class RecordJob:
+    """What to record where; `node` None is the node whose colour picture comes first.
+
+    `duration_s` counts from the first frame. `extrinsics` are the transforms between the sensors, which the
+    streams do not carry.
+    """
+
+    out: Path
+    endpoint: str
+    node: str | None = None
+    scene: SceneDocument | None = None
+    extrinsics: Extrinsics | None = None
+    duration_s: float | None = None
+    frames: int | None = None
+    keys: Keys | None = None
+
+
+@dataclass
+class RecordStatus:
+    """How far a recording is; one thread changes it, others may read.
+
+    `missing` counts by stream what never came: `color` by the gaps in the frames' numbers, `depth` and `pose` by
+    the frames without. `dropped` counts what came and was left out: messages by stream because the queue was
+    full, `late` frames not later than the one before, `broken` messages. `node_drops` is what the node says that
+    it dropped itself since the recording began, which is part of `missing`.
+    """
+
+    out: Path
+    frames: int = 0
+    seconds: float = 0.0
+    size_bytes: int = 0
+    free_bytes: int = 0
+    cpu_s: float = 0.0
+    missing: dict[str, int] = field(default_factory=dict)
+    dropped: Counter[str] = field(default_factory=Counter)
+    node_drops: int = 0
+
+    @property
+    def bytes_per_s(self) -> float:
+        """Mean rate at which the file grows."""
+        return self.size_bytes / self.seconds if self.seconds > 0 else 0.0
+
+    def as_dict(self) -> dict[str, Any]:
+        """The figures as plain data."""
+        seconds = max(self.seconds, 1e-9)
+        return {
+            "out": str(self.out),
+            "frames": self.frames,
+            "seconds": round(self.seconds, 3),
+            "frames_per_s": round(self.frames / seconds, 2) if self.frames else 0.0,
+            "bytes": self.size_bytes,
+            "mb_per_s": round(self.bytes_per_s / 1e6, 3),
+            "missing": self.missing,
+            "dropped": dict(self.dropped),
+            "node_drops": self.node_drops,
+            "cpu_share": round(self.cpu_s / seconds, 3) if self.frames else 0.0,
+        }
+
+
+class Recorder:
+    """Records one take.
+
+    `notice(sentence)` tells what a user should read; it is called from the thread of `run`.
+
+    Raises:
+        DeltalightError: the name is taken, its folder cannot be written, or an endpoint is not understood.
+    """
+
+    def __init__(self, job: RecordJob, notice: Callable[[str], None]) -> None:
+        require_new_recording(job.out)
+        self.status = RecordStatus(job.out)
+        self._job, self._notice = job, notice
+        self._queue = StreamQueue(job.endpoint, ("stats", *RAW_STREAMS), job.keys)
+        self._assembler = RawFrameAssembler(job.node)
+        self._files = ExitStack()
+        self._writer: RecordingWriter | None = None
+        self._last_ns, self._idle_polls = -1, 0
+        self._silent_since_s = self._looked_s = time.monotonic()
+        self._is_silent = self._warned_of_space = False
+        self._node_drops_before: int | None = None
+        self._started_s = self._started_cpu_s = 0.0
+
+    def run(self, stop: Event) -> RecordStatus:
+        """Record until `stop` is set or enough was recorded; without any frame no file is left.
+
+        Raises:
+            DeltalightError: the disk refused; it says what of the recording is readable.
+        """
+        try:
+            with closing(self._queue), self._files:
+                while not stop.is_set() and not self._is_enough():
+                    self._receive(POLL_S)
+                    self._look_around()
+                self._queue.close()
+                while self._receive(0) and not self._is_enough():
+                    pass  # what had come before the end belongs to the recording
+                self._measure()
+        except DeltalightError as error:
+            raise self._explained(error) from error
+        if self._writer is not None:
+            self.status.size_bytes = self._writer.path.stat().st_size
+        return self.status
+
+    def _receive(self, timeout_s: float) -> bool:
+        """Take one message and write what became complete; False where none came."""
+        multipart = self._queue.take(timeout_s)
+        self._idle_polls = 0 if multipart is not None else self._idle_polls + 1
+        try:
+            if multipart is not None:
+                self._add(*decode(multipart))
+            frame = self._assembler.take(is_idle=self._idle_polls >= IDLE_POLLS)
+        except DeltalightError as error:
+            self._count_broken(error)
+            return True
+        if frame is not None:
+            self._write(frame)
+        return multipart is not None or frame is not None
+
+    def _add(self, message: Message, parts: Sequence[memoryview]) -> None:
+        if not isinstance(message, StatsMessage):
+            self._assembler.add(message, parts)
+        elif message.node == self._assembler.node:
+            told = message.drops.get("capture", 0)
+            if self._node_drops_before is None or told < self._node_drops_before:  # it was started again
+                self._node_drops_before = told - self.status.node_drops
+            self.status.node_drops = told - self._node_drops_before
+
+    def _count_broken(self, error: DeltalightError) -> None:
+        if not self.status.dropped["broken"]:
+            self._notice(f"A message is left out: {error}")
+        self.status.dropped["broken"] += 1
+
+    def _write(self, frame: SensorFrame) -> None:
+        if frame.timestamp_ns <= self._last_ns:
+            self.status.dropped["late"] += 1
+            return
+        if self._writer is None:
+            self._writer = self._begin(frame)
+        self._writer.add(frame)
+        self._last_ns = frame.timestamp_ns
+        self.status.frames += 1
+        self._silent_since_s = time.monotonic()
+        if self._is_silent:
+            self._is_silent = False
+            self._notice("Frames come again.")
+
+    def _begin(self, frame: SensorFrame) -> RecordingWriter:
+        job, depth = self._job, frame.depth
+        if depth is not None and depth.camera != frame.camera and _lacks_place(job.extrinsics):
+            self._notice(
+                "Depth is not registered to colour and no transform between them is known; the identity will be"
+                " used. Name calibration/extrinsics.yaml with --extrinsics."
+            )
+        self._started_s, self._started_cpu_s = time.monotonic(), time.process_time()
+        writer = RecordingWriter(
+            job.out, board=self._assembler.board, extrinsics=job.extrinsics, scene=job.scene
+        )
+        return self._files.enter_context(writer)
+
+    def _is_enough(self) -> bool:
+        job, status = self._job, self.status
+        if self._writer is None:
+            return False
+        is_long = job.duration_s is not None and time.monotonic() - self._started_s >= job.duration_s
+        return is_long or (job.frames is not None and status.frames >= job.frames)
+
+    def _look_around(self) -> None:
+        now_s = time.monotonic()
+        if now_s - self._looked_s < LOOK_PERIOD_S:
+            return
+        self._looked_s = now_s
+        self._measure()
+        if not self._is_silent and now_s - self._silent_since_s >= SILENCE_S:
+            self._is_silent = True
+            self._notice(self._silence())
+        status = self.status
+        if status.seconds >= STEADY_AFTER_S and not self._warned_of_space:
+            left_s = status.free_bytes / max(status.bytes_per_s, 1.0)
+            if left_s < LEAST_SPACE_S:
+                self._warned_of_space = True
+                self._notice(f"The disk has room for {left_s:.0f} s more; free some space.")
+
+    def _measure(self) -> None:
+        status = self.status
+        status.missing = dict(self._assembler.missing)
+        for stream, count in self._queue.drops.items():
+            status.dropped[stream] = count
+        status.free_bytes = shutil.disk_usage(self._job.out.parent).free
+        if self._writer is not None:
+            status.seconds = time.monotonic() - self._started_s
+            status.cpu_s = time.process_time() - self._started_cpu_s
+            status.size_bytes = self._writer.active_path.stat().st_size
+
+    def _silence(self) -> str:
+        where = self._job.endpoint
+        others = ", ".join(sorted(self._assembler.foreign))
+        if self.status.frames:
+            return f"No frame came from {where} for {SILENCE_S:g} s; what was recorded is kept. Waiting for more."
+        if others:
+            return f"No frame of node {self._assembler.node} comes from {where}, only of {others}. Waiting."
+        return f"No frame came from {where} for {SILENCE_S:g} s; start a node there or name its endpoint. Waiting."
+
+    def _explained(self, error: DeltalightError) -> DeltalightError:
+        active = None if self._writer is None else self._writer.active_path
+        if active is None or not self.status.frames:
+            if active is not None:
+                active.unlink(missing_ok=True)
+            return error
+        cause = error.__cause__
+        reason = cause.strerror if isinstance(cause, OSError) else str(error)
+        return DeltalightError(
+            f"The recording ended after {self.status.frames} frames, because {active} could not be written"
+            f" ({reason}); they are readable there, and `deltalight recordings recover {active}` finishes it."
+        )
+
+
+def _lacks_place(extrinsics: Extrinsics | None) -> bool:
+    return extrinsics is None or extrinsics.depth_from_rgb is None

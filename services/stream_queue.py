@@ -1,0 +1,112 @@
+"""Receiver for whoever wants every message: a thread that owns the SUB socket, and a bounded queue."""
+
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Sequence
+
+import zmq
+
+from protocol.curve import guard
+from protocol.envelope import MAX_PARTS, MAX_TOPIC_BYTES
+from protocol.errors import DeltalightError
+from protocol.keys import Keys
+from protocol.sockets import attach, open_socket
+from protocol.transport import ReceivedMultipart
+
+QUEUED_MESSAGES = 64  # of each topic: two seconds at 30 a second, which covers a disk that hesitates
+QUEUED_BYTES = 512 * 1024 * 1024  # of all topics together, where pictures are large and raw
+
+
+class StreamQueue:
+    """Messages in the order of their arrival; what comes while the queue is full is left out and counted.
+
+    It is the counterpart of `protocol.receiver.Receiver`, whose newest message wins. `topics` are stream names
+    (`color`); subscriptions go out in their order. `keys` are needed where the endpoint leaves the host.
+
+    Raises:
+        DeltalightError: an endpoint that leaves the host without keys, or is not understood.
+    """
+
+    def __init__(self, endpoint: str, topics: Sequence[str], keys: Keys | None = None) -> None:
+        self._messages: deque[ReceivedMultipart] = deque()
+        self._held: Counter[str] = Counter()
+        self._held_bytes = 0
+        self._drops: Counter[str] = Counter()
+        self._changed = threading.Condition()
+        self._closed = False
+        self._context = zmq.Context()
+        self._socket = open_socket(self._context, zmq.SUB, high_water_mark=QUEUED_MESSAGES)
+        self._guard = guard(self._context, self._socket, keys, bind=False)
+        for topic in topics:
+            self._socket.subscribe(topic + ".")
+        try:
+            attach(self._socket, endpoint, bind=False, keys=keys)
+        except DeltalightError:
+            self._close_guard()
+            self._context.destroy(0)
+            raise
+        self._thread = threading.Thread(target=self._run, name="stream-queue", daemon=True)
+        self._thread.start()
+
+    def take(self, timeout_s: float) -> ReceivedMultipart | None:
+        """Return the oldest message; None where none came within `timeout_s` seconds."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._messages or self._closed, timeout_s)
+            if not self._messages:
+                return None
+            message = self._messages.popleft()
+            self._held[_stream(message)] -= 1
+            self._held_bytes -= _size(message)
+        return message
+
+    @property
+    def drops(self) -> dict[str, int]:
+        """Messages of each stream that found the queue full."""
+        with self._changed:
+            return dict(self._drops)
+
+    def close(self) -> None:
+        """Stop the thread; what is queued can still be taken."""
+        self._close_guard()
+        self._context.term()  # interrupts the thread, which closes its own socket
+        self._thread.join()
+
+    def _close_guard(self) -> None:
+        if self._guard is not None:
+            self._guard.close()
+
+    def _run(self) -> None:
+        try:
+            while True:
+                frames = self._socket.recv_multipart(copy=False)
+                self._store(ReceivedMultipart([frame.buffer for frame in frames], time.time_ns()))
+        except zmq.ContextTerminated:
+            pass
+        finally:
+            self._socket.close(0)
+            with self._changed:
+                self._closed = True
+                self._changed.notify_all()
+
+    def _store(self, message: ReceivedMultipart) -> None:
+        if len(message) > MAX_PARTS + 2 or len(message[0]) > MAX_TOPIC_BYTES:
+            return  # no message of the wire
+        stream, size = _stream(message), _size(message)
+        with self._changed:
+            if self._held[stream] >= QUEUED_MESSAGES or self._held_bytes + size > QUEUED_BYTES:
+                self._drops[stream] += 1
+                return
+            self._messages.append(message)
+            self._held[stream] += 1
+            self._held_bytes += size
+            self._changed.notify()
+
+
+def _stream(message: ReceivedMultipart) -> str:
+    """Stream of a message; subscriptions end in a dot, so that each topic that comes has one."""
+    return bytes(message[0]).partition(b".")[0].decode("ascii", errors="replace")
+
+
+def _size(message: ReceivedMultipart) -> int:
+    return sum(piece.nbytes for piece in message)

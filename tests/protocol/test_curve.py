@@ -1,0 +1,163 @@
+"""Encrypted sockets on loopback, with keys forced on: who gets in, who gets nothing, what is counted."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import structlog
+
+from protocol.errors import DeltalightError
+from protocol.keys import Keys, create_keys, load_keys, trust
+from protocol.messages import ControlRequest
+from protocol.transport import Publisher, Receiver, ReplyServer, RequestClient
+
+ANY = "tcp://127.0.0.1:0"
+SETTLE_S = 5.0
+# What a refused receiver is given to get something by mistake: many reconnects and handshakes.
+PATIENCE_S = 0.8
+
+
+@dataclass(frozen=True)
+class Hosts:
+    """A node, a server that it trusts, and a stranger that trusts the node."""
+
+    node: Keys
+    server: Keys
+    stranger: Keys
+
+
+def keys_of(folder: Path, name: str) -> Keys:
+    create_keys(name, folder)
+    return replace(load_keys(name, folder), on_loopback=True)
+
+
+@pytest.fixture
+def hosts(tmp_path: Path) -> Hosts:
+    made = Hosts(*(keys_of(tmp_path / name, name) for name in ("node", "server", "stranger")))
+    trust(made.server.folder / "server.key", made.node.folder)
+    trust(made.node.folder / "node.key", made.server.folder)
+    trust(made.node.folder / "node.key", made.stranger.folder)
+    return made
+
+
+def gets_something(publisher: Publisher, receiver: Receiver, patience_s: float = SETTLE_S) -> bool:
+    deadline = time.monotonic() + patience_s
+    while time.monotonic() < deadline:
+        publisher.send([b"hello", b""])
+        if receiver.latest(0.05):
+            return True
+    return False
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + SETTLE_S
+    while not condition() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert condition()
+
+
+def test_a_trusted_key_gets_the_stream(hosts: Hosts, opened: Callable[[Any], Any]) -> None:
+    publisher = opened(Publisher(ANY, keys=hosts.node))
+    receiver = opened(Receiver([publisher.endpoint], ["hello"], keys=hosts.server))
+    assert gets_something(publisher, receiver)
+    assert publisher.refused == 0
+
+
+def test_an_unknown_key_gets_nothing_is_counted_and_told_at_both_ends(
+    hosts: Hosts, opened: Callable[[Any], Any]
+) -> None:
+    with structlog.testing.capture_logs() as lines:
+        publisher = opened(Publisher(ANY, keys=hosts.node))
+        stranger = opened(Receiver([publisher.endpoint], [], keys=hosts.stranger))
+        assert not gets_something(publisher, stranger, PATIENCE_S)
+        assert publisher.refused > 0
+        reasons = [line["reason"] for line in lines if line["event"] == "connection refused"]
+    assert sum("its key is not trusted" in reason for reason in reasons) == 1
+    assert sum("our key is not trusted there" in reason for reason in reasons) == 1
+    receiver = opened(Receiver([publisher.endpoint], ["hello"], keys=hosts.server))
+    assert gets_something(publisher, receiver)
+
+
+def test_no_keys_get_nothing_and_are_counted(hosts: Hosts, opened: Callable[[Any], Any]) -> None:
+    publisher = opened(Publisher(ANY, keys=hosts.node))
+    plain = opened(Receiver([publisher.endpoint], []))
+    assert not gets_something(publisher, plain, PATIENCE_S)
+    assert publisher.refused > 0
+
+
+def test_a_receiver_with_keys_takes_nothing_from_a_publisher_without(
+    hosts: Hosts, opened: Callable[[Any], Any]
+) -> None:
+    publisher = opened(Publisher(ANY))
+    receiver = opened(Receiver([publisher.endpoint], [], keys=hosts.server))
+    assert not gets_something(publisher, receiver, PATIENCE_S)
+
+
+def test_a_node_with_another_key_is_not_taken_for_the_trusted_one(
+    hosts: Hosts, opened: Callable[[Any], Any]
+) -> None:
+    trust(hosts.server.folder / "server.key", hosts.stranger.folder)
+    impostor = opened(Publisher(ANY, keys=hosts.stranger))
+    receiver = opened(Receiver([impostor.endpoint], [], keys=hosts.server))
+    assert not gets_something(impostor, receiver, PATIENCE_S)
+
+
+def test_trust_holds_from_the_next_connection_on_without_a_restart(
+    hosts: Hosts, opened: Callable[[Any], Any]
+) -> None:
+    publisher = opened(Publisher(ANY, keys=hosts.node))
+    before = opened(Receiver([publisher.endpoint], [], keys=hosts.stranger))
+    assert not gets_something(publisher, before, PATIENCE_S)
+    kept = trust(hosts.stranger.folder / "stranger.key", hosts.node.folder)
+    now = opened(Receiver([publisher.endpoint], [], keys=hosts.stranger))
+    assert gets_something(publisher, now)
+    kept.unlink()
+    later = opened(Receiver([publisher.endpoint], [], keys=hosts.stranger))
+    assert not gets_something(publisher, later, PATIENCE_S)
+
+
+def test_one_receiver_hears_a_node_of_this_host_and_one_with_keys(
+    hosts: Hosts, opened: Callable[[Any], Any]
+) -> None:
+    """Each order: the keys of one endpoint must not stick to the next."""
+    plain, coded = opened(Publisher(ANY)), opened(Publisher(ANY, keys=hosts.node))
+    named = coded.endpoint.replace("tcp://", "tcp://node@")
+    for endpoints in ([plain.endpoint, named], [named, plain.endpoint]):
+        receiver = opened(Receiver(endpoints, [], keys=replace(hosts.server, on_loopback=False)))
+        assert gets_something(plain, receiver)
+        assert gets_something(coded, receiver)
+
+
+def test_a_node_that_connects_to_a_bound_receiver_needs_a_trusted_key(
+    hosts: Hosts, opened: Callable[[Any], Any]
+) -> None:
+    receiver = opened(Receiver([ANY], [], bind=True, keys=hosts.node))
+    stranger = opened(Publisher(receiver.endpoints[0], bind=False, keys=hosts.stranger))
+    assert not gets_something(stranger, receiver, PATIENCE_S)
+    trusted = opened(Publisher(receiver.endpoints[0], bind=False, keys=hosts.server))
+    assert gets_something(trusted, receiver)
+
+
+def test_control_needs_a_trusted_key(hosts: Hosts, opened: Callable[[Any], Any]) -> None:
+    server = opened(ReplyServer(ANY, lambda request: {"op": request.op}, keys=hosts.node))
+    question = ControlRequest(node="a", id="1", op="status")
+    trusted = opened(RequestClient(server.endpoint, keys=hosts.server))
+    assert trusted.request(question, SETTLE_S).payload == {"op": "status"}
+    for keys in (None, hosts.stranger):
+        client = opened(RequestClient(server.endpoint, keys=keys))
+        with pytest.raises(DeltalightError, match="no answer"):
+            client.request(question, PATIENCE_S)
+    wait_until(lambda: server.refused > 0)
+    assert trusted.request(question.model_copy(update={"id": "2"}), SETTLE_S).ok
+
+
+def test_a_host_whose_key_is_unknown_is_refused_before_connecting(hosts: Hosts) -> None:
+    for build in (
+        lambda: Receiver(["tcp://shelf@10.0.0.5:5601"], [], keys=hosts.server),
+        lambda: RequestClient("tcp://shelf@10.0.0.5:5601", keys=hosts.server),
+    ):
+        with pytest.raises(DeltalightError, match="no key of `shelf` is trusted"):
+            build()

@@ -1,0 +1,161 @@
+"""Small frames with everything that a recording can hold, and the messages in which a node sends them."""
+
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from protocol.board import BoardSpec
+from protocol.calibration import Extrinsics
+from protocol.camera_model import CameraModel
+from protocol.frames import BoardPose, SensorFrame
+from protocol.pictures import depth_from_steps
+from protocol.recording import RecordingWriter
+from protocol.scene import SceneDocument
+from protocol.transport import Publisher
+from sensor_node.frame_messages import (
+    Stamps,
+    color_multipart,
+    depth_multipart,
+    fisheye_multipart,
+    pose_multipart,
+)
+from tests.protocol.fisheye_samples import assert_same_pictures, coded
+
+WIDTH, HEIGHT = 64, 48
+STARTED_NS = 1_700_000_000_000_000_000
+PERIOD_NS = 33_333_333
+BOARD = BoardSpec(
+    type="aruco_grid", dictionary="DICT_4X4_50", marker_length_m=0.04, separation_m=0.01, rows=3, columns=4
+)
+
+
+def camera(width: int = WIDTH, height: int = HEIGHT) -> CameraModel:
+    matrix = np.array([[60.0, 0, width / 2 - 0.5], [0, 61.0, height / 2 - 0.5], [0, 0, 1]])
+    return CameraModel(width, height, matrix)
+
+
+def frames(count: int, *, as_jpeg: bool = True, with_fisheye: bool = False) -> list[SensorFrame]:
+    """Thirty frames a second with depth in millimetres and given poses; a new fish-eye bracket every third."""
+    made: list[SensorFrame] = []
+    for index in range(count):
+        rng = np.random.default_rng(index)
+        color = cv2.resize(rng.integers(0, 256, (6, 8, 3), np.uint8), (WIDTH, HEIGHT))
+        jpeg = cv2.imencode(".jpg", color)[1].tobytes() if as_jpeg else None
+        if jpeg is not None:
+            color = np.asarray(cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR))[..., ::-1]
+        pose = np.eye(4)
+        pose[:3, 3] = rng.normal(size=3)
+        steps = rng.integers(0, 3000, (HEIGHT, WIDTH)).astype(np.uint16)
+        now_ns = STARTED_NS + index * PERIOD_NS
+        is_new = with_fisheye and index % 3 == 0
+        made.append(
+            SensorFrame(
+                frame_id=index,
+                timestamp_ns=now_ns,
+                color=np.ascontiguousarray(color),
+                camera=camera(),
+                response=np.sort(np.random.default_rng(1).random((256, 3), np.float32), axis=0),
+                exposure_s=0.0125,
+                depth=depth_from_steps(steps, 0.001, camera(), 0.002),
+                depth_timestamp_ns=now_ns,
+                world_from_camera=pose,
+                color_jpeg=jpeg,
+                fisheye=coded(now_ns) if is_new else made[-1].fisheye if made else None,
+            )
+        )
+    return made
+
+
+def write(path: Path, recorded: Sequence[SensorFrame], scene: SceneDocument | None = None) -> Path:
+    shift = np.eye(4)
+    shift[0, 3] = 0.05
+    extrinsics = Extrinsics(rgb_from_fisheye=shift)
+    with RecordingWriter(path, board=BOARD, extrinsics=extrinsics, scene=scene) as writer:
+        for frame in recorded:
+            writer.add(frame)
+    return path
+
+
+def assert_same(ours: SensorFrame, theirs: SensorFrame) -> None:
+    """Every field is the same to the bit."""
+    for name in ("frame_id", "timestamp_ns", "camera", "exposure_s", "depth_timestamp_ns", "color_jpeg"):
+        assert getattr(ours, name) == getattr(theirs, name), name
+    for name in ("color", "response", "world_from_camera"):
+        mine, other = getattr(ours, name), getattr(theirs, name)
+        assert (mine is None) == (other is None), name
+        assert mine is None or (mine.dtype == other.dtype and np.array_equal(mine, other)), name
+    assert (ours.depth is None) == (theirs.depth is None)
+    if ours.depth is not None and theirs.depth is not None:
+        assert ours.depth.camera == theirs.depth.camera
+        assert ours.depth.noise_sigma_m == theirs.depth.noise_sigma_m
+        assert np.array_equal(ours.depth.depth_m, theirs.depth.depth_m)
+        assert np.array_equal(ours.depth.valid, theirs.depth.valid)
+    assert_same_pictures(ours.fisheye, theirs.fisheye)
+
+
+def messages(
+    frame: SensorFrame, *, node: str = "cam", detected: BoardPose | None = None
+) -> dict[str, list[bytes]]:
+    """What a node sends for a frame, by stream in the order of sending."""
+    stamps = Stamps(
+        node=node,
+        frame_id=frame.frame_id,
+        capture_ns=frame.timestamp_ns,
+        clock_offset_ns=0,
+        clock_bound_ns=None,
+    )
+    sent = {}
+    if frame.fisheye is not None:
+        own = Stamps(**{**stamps, "capture_ns": frame.fisheye.timestamp_ns})
+        sent["fisheye"] = fisheye_multipart(frame.fisheye, own, "raw", 90)
+    if frame.depth is not None:
+        sent["depth"] = depth_multipart(frame.depth, stamps, "depth", 0.001)
+    pose = detected
+    if pose is None and frame.world_from_camera is not None:
+        pose = BoardPose(frame.world_from_camera)
+    sent["pose"] = pose_multipart(pose, BOARD, stamps)
+    sent["color"] = color_multipart(frame, stamps, "jpeg" if frame.color_jpeg else "raw", 90)
+    return sent
+
+
+class Feed:
+    """A node in a thread: sends frames at 30 a second with rising numbers and times, until told to pause."""
+
+    def __init__(self, publisher: Publisher, node: str = "cam") -> None:
+        self.paused = threading.Event()
+        self._publisher, self._node = publisher, node
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def close(self) -> None:
+        self._closing.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        source, number = frames(4), 0
+        while not self._closing.wait(PERIOD_NS / 1e9):
+            if self.paused.is_set():
+                continue
+            frame = replace(source[number % 4], frame_id=number, timestamp_ns=time.time_ns())
+            for multipart in messages(frame, node=self._node).values():
+                self._publisher.send(multipart)
+            number += 1
+
+
+@contextmanager
+def feeding() -> Iterator[tuple[str, Feed]]:
+    """The endpoint of a feed that runs, and the feed."""
+    publisher = Publisher("tcp://127.0.0.1:*")
+    feed = Feed(publisher)
+    try:
+        yield publisher.endpoint, feed
+    finally:
+        feed.close()
+        publisher.close()

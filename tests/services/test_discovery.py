@@ -1,0 +1,70 @@
+"""Nodes on the network, on loopback: announced, found, chosen, trusted."""
+
+from pathlib import Path
+
+import pytest
+
+from protocol.endpoints import parse_endpoint
+from protocol.errors import DeltalightError
+from protocol.keys import Keys, KeySettings, create_keys, load_keys, trust
+from protocol.messages import SCHEMA_VERSION
+from sensor_node.announce import announced, service_info
+from services.discovery import FoundNode, choose, find_nodes, node_endpoint
+
+LOOPBACK = ["127.0.0.1"]
+STREAMS = ("color", "pose")
+
+
+@pytest.fixture
+def keys(tmp_path: Path) -> Keys:
+    create_keys("desk-host", tmp_path / "node")
+    return load_keys(None, tmp_path / "node")
+
+
+def test_a_node_is_found_with_all_it_says_and_is_trusted_by_its_key(keys: Keys, tmp_path: Path) -> None:
+    with announced("desk", "tcp://127.0.0.1:5999", STREAMS, keys, interfaces=LOOPBACK):
+        found = find_nodes(name="desk", patience_s=10, interfaces=LOOPBACK)
+        node = FoundNode("desk", "127.0.0.1", 5999, STREAMS, SCHEMA_VERSION, keys.public.decode())
+        assert node in found
+        settings = KeySettings(folder=tmp_path / "server")
+        with pytest.raises(DeltalightError, match="deltalight keys trust"):
+            node_endpoint("desk", settings, interfaces=LOOPBACK)
+        trust(keys.folder / "desk-host.key", tmp_path / "server")
+        assert node_endpoint("desk", settings, interfaces=LOOPBACK) == "tcp://desk-host@127.0.0.1:5999"
+    assert "desk" not in [each.name for each in find_nodes(patience_s=1, interfaces=LOOPBACK)]
+
+
+def test_a_node_that_stays_on_its_host_is_not_announced() -> None:
+    with (
+        announced("hidden", "tcp://127.0.0.1:5998", STREAMS, None),
+        announced("x", "ipc:///run/x", STREAMS, None),
+    ):
+        assert find_nodes(name="hidden", patience_s=1, interfaces=LOOPBACK) == []
+
+
+def test_the_announcement_never_holds_a_secret(keys: Keys) -> None:
+    info = service_info("desk", parse_endpoint("tcp://127.0.0.1:5999"), STREAMS, keys, LOOPBACK)
+    assert keys.public in info.text
+    assert keys.secret not in info.text
+
+
+def test_one_node_is_chosen_by_name_or_because_it_is_the_only_one() -> None:
+    desk, shelf = (FoundNode(name, "10.0.0.5", 5601, STREAMS, SCHEMA_VERSION) for name in ("desk", "shelf"))
+    assert choose([desk], "auto") is desk
+    assert choose([desk, shelf], "shelf") is shelf
+    for nodes, name, sentence in (
+        ([], "auto", "no node announces itself"),
+        ([desk, shelf], "auto", "say which with --node: desk, shelf"),
+        ([desk, shelf], "shelve", "the nearest is shelf of desk, shelf"),
+    ):
+        with pytest.raises(DeltalightError, match=sentence):
+            choose(nodes, name)
+
+
+def test_another_version_and_missing_keys_are_sentences() -> None:
+    with pytest.raises(DeltalightError, match="speaks version 1"):
+        FoundNode("desk", "10.0.0.5", 5601, STREAMS, 1).endpoint({})
+    with pytest.raises(DeltalightError, match="has no keys"):
+        FoundNode("desk", "10.0.0.5", 5601, STREAMS, SCHEMA_VERSION).endpoint({})
+    node = FoundNode("desk", "fe80::1", 5601, STREAMS, SCHEMA_VERSION, "k")
+    assert node.endpoint({"desk": b"k"}) == "tcp://desk@[fe80::1]:5601"
