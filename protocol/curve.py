@@ -45,7 +45,7 @@ def secure(socket: zmq.Socket[bytes], endpoint: Endpoint, keys: Keys | None, *, 
         # With a domain libzmq refuses everybody while nobody answers for it; without, it would let them in.
         socket.zap_domain = ZAP_DOMAIN.encode()
     else:
-        socket.curve_serverkey = keys.peer(endpoint.peer, endpoint.address)
+        socket.curve_serverkey = keys.peer(endpoint)
 
 
 class Guard:

@@ -22,7 +22,7 @@ class EquidistantLens(RadialLens):
     angle is where the polynomial stops rising.
 
     Raises:
-        DeltalightError: the camera is not `equidistant`, or the image circle is not positive.
+        DeltalightError: the camera is not `equidistant`, or numbers that no lens has.
     """
 
     camera: CameraModel
@@ -41,6 +41,7 @@ class EquidistantLens(RadialLens):
         object.__setattr__(self, "width", self.camera.width)
         object.__setattr__(self, "height", self.camera.height)
         object.__setattr__(self, "centre", tuple(float(v) for v in self.camera.matrix[:2, 2]))
+        self._require_range()
 
     @property
     def largest_radius(self) -> float:

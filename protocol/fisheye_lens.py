@@ -1,7 +1,7 @@
 """Fish-eye cameras: lens, response, vignetting (calibration/fisheye.yaml of FORMATS 1)."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -14,7 +14,7 @@ from protocol.camera_model import camera_from_info, save_camera_yaml
 from protocol.documents import nearest, read_mapping
 from protocol.equidistant_lens import EquidistantLens
 from protocol.errors import DeltalightError
-from protocol.ocam_lens import OcamLens
+from protocol.ocam_lens import OcamLens, load_ocam_results
 from protocol.response_table import load_response_table, require_response
 
 FisheyeLens = EquidistantLens | OcamLens
@@ -44,7 +44,10 @@ class FisheyeCalibration:
         if self.response is not None:
             object.__setattr__(self, "response", require_response(self.response, "the fish-eye's `response`"))
         object.__setattr__(self, "vignetting", tuple(float(v) for v in self.vignetting))
-        # The hemisphere is what light is taken from, so positive there is enough; not always to its very edge.
+        if self.vignetting:
+            self._check_vignetting()
+
+    def _check_vignetting(self) -> None:
         shares = self.transmission(np.linspace(0.0, self._seen_angle(), 181))
         if not (np.isfinite(shares).all() and shares.min() > 0):
             raise DeltalightError(
@@ -116,9 +119,10 @@ def _coefficients(values: object) -> tuple[float, ...]:
 def load_fisheye_yaml(path: Path) -> FisheyeCalibration:
     """Read calibration/fisheye.yaml: the keys of ROS camera_info with `distortion_model` equidistant or ocam.
 
-    Of an ocam lens `camera_matrix` and `distortion_coefficients` are replaced by `ocam: {polynomial, center [x, y],
-    affine [c, d, e]}`. Optional: `image_circle` (radius in pixels), `vignetting` (coefficients), `response` (256
-    rows of linear R G B, or the name of a text file with them beside this one).
+    An ocam lens has, in place of `camera_matrix` and `distortion_coefficients`, `ocam: {polynomial, center [x, y],
+    affine [c, d, e]}` or the name of OCamCalib's calib_results.txt beside this file. Optional: `image_circle`
+    (radius in pixels), `vignetting` (coefficients), `response` (256 rows of linear R G B, or the name of a text
+    file with them beside this one).
 
     Raises:
         DeltalightError: the file or one of its keys is missing or wrong.
@@ -136,11 +140,13 @@ def _lens_from_info(info: Mapping[str, Any], path: Path) -> FisheyeLens:
     kind = info.get("distortion_model")
     if _lens_class(kind) is EquidistantLens:
         return EquidistantLens(camera_from_info(info, path), info.get("image_circle"))
-    ocam = info.get("ocam")
+    ocam, circle = info.get("ocam"), info.get("image_circle")
+    if isinstance(ocam, str):
+        return replace(load_ocam_results(path.parent / ocam), image_circle=circle)
     if not isinstance(ocam, Mapping):
         raise DeltalightError("an ocam lens needs the key `ocam` with polynomial, center and affine; add it.")
     size = {"width": info.get("image_width"), "height": info.get("image_height")}
-    return OcamLens.from_dict({**ocam, **size, "image_circle": info.get("image_circle")})
+    return OcamLens.from_dict({**ocam, **size, "image_circle": circle})
 
 
 def _response(info: Mapping[str, Any], path: Path) -> Float32[np.ndarray, "256 3"] | None:

@@ -18,7 +18,7 @@ import zmq.auth
 from pydantic import Field
 
 from protocol.documents import StrictModel, nearest
-from protocol.endpoints import parse_endpoint
+from protocol.endpoints import Endpoint, parse_endpoint
 from protocol.errors import DeltalightError
 
 PUBLIC, SECRET = ".key", ".key_secret"
@@ -45,26 +45,37 @@ class Keys:
     on_loopback: bool = False
 
     def trusted(self) -> dict[str, bytes]:
-        """Return the trusted public keys by name; a file that holds none is left out."""
-        return trusted_keys(self.folder)
+        """Return the public keys that are trusted, with the own one, by name."""
+        return {**trusted_keys(self.folder), self.name: self.public}
 
-    def peer(self, name: str | None, endpoint: str) -> bytes:
-        """Return the public key of the host behind an endpoint: the one called `name`, or the only one.
+    def peer(self, endpoint: Endpoint) -> bytes:
+        """Return the public key of the host behind an endpoint.
+
+        That is the one that the endpoint names; without a name, the own on loopback, else the only other one.
 
         Raises:
             DeltalightError: no such key is trusted, or several are and no name says which.
         """
         trusted = self.trusted()
-        if name is not None and name not in trusted:
-            hint = nearest(name, trusted)
-            known = f"the nearest trusted name is {hint}" if hint else TRUST_HINT
-            raise DeltalightError(f"no key of `{name}` is trusted for {endpoint}: {known}")
-        if name is None and len(trusted) != 1:
-            advice = "write tcp://NAME@HOST:PORT with one of " + ", ".join(trusted) if trusted else TRUST_HINT
+        if endpoint.peer is not None:
+            return self._named(endpoint.peer, endpoint, trusted)
+        if not endpoint.leaves_host:
+            return self.public
+        others = [name for name in trusted if name != self.name]
+        if len(others) != 1:
+            names = ", ".join(others)
+            advice = f"write tcp://NAME@HOST:PORT with one of {names}" if others else TRUST_HINT
             raise DeltalightError(
-                f"{endpoint} needs the key of its host, and {len(trusted)} are trusted: {advice}"
+                f"{endpoint.address} needs the key of its host, and {len(others)} are trusted: {advice}"
             )
-        return trusted[name] if name is not None else next(iter(trusted.values()))
+        return trusted[others[0]]
+
+    def _named(self, name: str, endpoint: Endpoint, trusted: dict[str, bytes]) -> bytes:
+        if name not in trusted:
+            hint = nearest(name, trusted)
+            known = f"the nearest trusted name is {hint}, else {TRUST_HINT}" if hint else TRUST_HINT
+            raise DeltalightError(f"no key of `{name}` is trusted for {endpoint.address}: {known}")
+        return trusted[name]
 
 
 class KeySettings(StrictModel):

@@ -52,6 +52,7 @@ class OcamLens(RadialLens):
                 "an ocam lens needs a polynomial that begins above 0 and an affine part that can be inverted; "
                 "correct the calibration."
             )
+        self._require_range()
 
     @cached_property
     def _affine_matrix(self) -> Float64[np.ndarray, "2 2"]:

@@ -99,6 +99,20 @@ class RadialLens(ABC):
         pixels[~(known & self._is_inside(pixels))] = np.nan
         return pixels
 
+    def _require_range(self) -> None:
+        """Compute how far the model goes, which fails for numbers that no lens has.
+
+        Raises:
+            DeltalightError: the polynomial overflows or does not rise at all.
+        """
+        with np.errstate(all="ignore"):
+            try:
+                ends = np.array([self.largest_radius, self._largest_model_angle])
+            except (ArithmeticError, ValueError):  # LinAlgError is a ValueError
+                ends = np.zeros(2)
+        if not (np.isfinite(ends).all() and (ends > 0).all()):
+            raise DeltalightError("the fish-eye lens's polynomial goes nowhere; calibrate the lens again.")
+
     @cached_property
     def _largest_model_angle(self) -> float:
         return float(self._angle(np.array([self.largest_radius]))[0])

@@ -240,8 +240,12 @@ class RecordingReader:
             return None
         name, folder = f"{self.path} ({SCENE_ATTACHMENT})", self.path.parent
         text = self._scene_json.decode("utf-8", errors="replace")
-        scene = parse_scene(parse_mapping(text, name, is_json=True), name)
-        return scene.with_assets(lambda _place, asset: resolve_asset(asset, folder))
+        try:
+            scene = parse_scene(parse_mapping(text, name, is_json=True), name)
+            return scene.with_assets(lambda _place, asset: resolve_asset(asset, folder))
+        except DeltalightError as error:  # the frames are good all the same
+            self.notes.append(f"the attached scene document is not used: {error}")
+            return None
 
     def _note_missing(self, first: FrameRecord) -> None:
         if self.board is None:

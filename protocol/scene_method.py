@@ -1,13 +1,14 @@
 """How the scene document's picture is computed and shown: `method`, `shading`, `output` (FORMATS 3)."""
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import ConfigDict, Discriminator, Field, Tag
+from pydantic import ConfigDict, Discriminator, Field, Tag, model_validator
 
 from protocol.documents import StrictModel
 
 DEFAULT_METHOD = "dvct"
+T = TypeVar("T")
 # Without `name` the method is dvct, so the others need the key for a document to match one method only.
 NEEDS_NAME = ConfigDict(json_schema_extra={"required": ["name"]})
 PictureSize = Annotated[int, Field(ge=16, le=8192)]
@@ -111,6 +112,119 @@ class DlpvMethod(StrictModel):
     model_config = NEEDS_NAME
 
     name: Literal["dlpv"] = "dlpv"
+    operator: Literal["difference", "paper"] = Field(
+        default="difference",
+        description="Two volumes, with and without objects, subtracted; or one volume of the change, as printed in "
+        "the paper. Settings that are null follow it.",
+    )
+    volume_size: int | None = Field(
+        default=None,
+        ge=16,
+        le=64,
+        multiple_of=8,
+        description="Cells an edge; null = 64 on a GPU, 32 in software.",
+    )
+    volume_edge_m: float | None = Field(
+        default=None,
+        ge=0.01,
+        le=20,
+        description="Edge of the volume, metres; null = twice the objects' longest edge.",
+    )
+    steps: int | None = Field(
+        default=None,
+        ge=1,
+        le=256,
+        description="Steps of propagation, a cell each; null = cells per edge. The result depends on their number.",
+    )
+    propagation: Literal["moments", "lobes"] | None = Field(
+        default=None,
+        description="What a cell keeps of light that enters it: its direction, or lobes about the faces that it "
+        "reaches; null = moments, lobes for paper.",
+    )
+    geometry_volume: bool | None = Field(
+        default=None, description="Surfaces block light between cells; null = yes, no for paper."
+    )
+    ambient: Literal["blocked", "open"] | None = Field(
+        default=None,
+        description="Surfaces in the volume keep off light from the surroundings, or none does; "
+        "null = blocked, open for paper.",
+    )
+    damping: float | None = Field(
+        default=None,
+        ge=0,
+        le=8,
+        description="How strongly light that grows towards the back of a surface is damped, "
+        "0 = not; null = 0, 1 for paper.",
+    )
+    shadow: Literal["map", "lobe"] | None = Field(
+        default=None,
+        description="Shadows of lights from shadow maps, or as negative light in the volume; "
+        "null = map, lobe for paper.",
+    )
+    query_scale: Literal[1, 2, 4] | None = Field(
+        default=None,
+        description="The volume is read at 1/scale of the picture; null = 2 on a GPU, 4 in software.",
+    )
+    rsm_size: int | None = Field(
+        default=None,
+        ge=128,
+        le=4096,
+        description="Texels an edge of a shadow map; null = 1024 GPU, 512 software.",
+    )
+    triangle_budget: int | None = Field(
+        default=None,
+        ge=1000,
+        le=4_000_000,
+        description="Triangles of the depth mesh; null = 400000 on a GPU, 40000 in software.",
+    )
+    shadow_samples: int = Field(
+        default=16, ge=1, le=64, description="Samples of a light's area for soft shadows."
+    )
+    composition: Literal["ratio", "additive"] | None = Field(
+        default=None,
+        description="How the delta meets the picture; null = ratio, additive for paper.",
+    )
+
+    @model_validator(mode="after")
+    def _one_volume_for_lobes(self) -> "DlpvMethod":
+        if self.shadow == "lobe" and self.operator != "paper":
+            raise ValueError("shadow `lobe` is part of operator `paper`: use shadow map, or operator paper")
+        return self
+
+    def _choice(self, value: T | None, default: T, printed: T) -> T:
+        if value is not None:
+            return value
+        return printed if self.operator == "paper" else default
+
+    @property
+    def resolved_propagation(self) -> Literal["moments", "lobes"]:
+        """Weights of a step as given, or the operator's default."""
+        return self._choice(self.propagation, "moments", "lobes")
+
+    @property
+    def resolved_geometry_volume(self) -> bool:
+        """Whether surfaces block light, as given or the operator's default."""
+        return self._choice(self.geometry_volume, True, False)
+
+    @property
+    def resolved_ambient(self) -> Literal["blocked", "open"]:
+        """Light of the surroundings as given, or the operator's default."""
+        return self._choice(self.ambient, "blocked", "open")
+
+    @property
+    def resolved_damping(self) -> float:
+        """Damping as given, or the operator's default."""
+        return self._choice(self.damping, 0.0, 1.0)
+
+    @property
+    def resolved_shadow(self) -> Literal["map", "lobe"]:
+        """Kind of shadow as given, or the operator's default."""
+        return self._choice(self.shadow, "map", "lobe")
+
+    @property
+    def resolved_composition(self) -> Literal["ratio", "additive"]:
+        """Composition as given, or the operator's default."""
+        return self._choice(self.composition, "ratio", "additive")
 
 
 class AroofMethod(StrictModel):

@@ -117,18 +117,17 @@ class PictureResources:
             assert real.frame is not None
             assert real.frame.depth is not None
             assert real.surface is not None
-            assert real.surface_view is not None
-            view = real.surface_view
             self.real_surface.from_depth(real.frame.depth, real.surface.normals, self.picture, view, count)
-            if not real.is_fused:
+            if real.fused_tolerance is None:
                 return
         if self._model_raster is None:
             self._model_raster = GeometryBuffer(self._gpu, self._raster.size)
         assert real.state is not None
         real.state.materials.bind()
         self._geometry.run(self._model_raster, real.state.buffers, view)
-        noise = real.noise_sigma if real.is_fused else None
-        self.real_surface.from_model(self._model_raster, self.picture, view, count, noise_sigma=noise)
+        self.real_surface.from_model(
+            self._model_raster, self.picture, view, count, tolerance=real.fused_tolerance
+        )
 
     def release(self) -> None:
         """Free the GL objects."""

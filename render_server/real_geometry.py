@@ -1,4 +1,4 @@
-"""The real scene's triangles: a mesh of the frame's depth, the fused surface of all frames so far, or a given model."""
+"""The real scene's triangles: a mesh of the frame's depth, the fused surface of all frames, or a given model."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -51,7 +51,8 @@ class RealGeometry:
         self.frame: ViewFrame | None = None
         self.view: CameraView | None = None
         self.surface: DepthSurface | None = None
-        self.surface_view: CameraView | None = None
+        self._world_from_fused = np.eye(4)
+        self._fused_meshes: tuple[list[TriangleMesh], list[TriangleMesh]] = [], []
         self._fused = FusedScene() if real.geometry == "fused" else None
         self._still_frames = 0
         if isinstance(real.geometry, ModelGeometry):
@@ -83,7 +84,7 @@ class RealGeometry:
             )
         moved = self._tracker.update(frame)
         if moved:
-            self.frame, self.view, self.surface_view = frame, view, view
+            self.frame, self.view = frame, view
         if self._fused is not None:
             return self._fuse(self._fused, frame, view, moved)
         if not moved:
@@ -98,9 +99,12 @@ class RealGeometry:
         return True
 
     @property
-    def is_fused(self) -> bool:
-        """Whether triangles show more than the frame's own depth does, so that they fill its holes."""
-        return self._fused is not None
+    def fused_tolerance(self) -> tuple[float, float] | None:
+        """Up to what difference the fused surface agrees with a frame's depth: m, and m at 1 m; None: not fused.
+
+        Half a voxel, and three standard deviations of the depth's noise.
+        """
+        return None if self._fused is None else (0.5 * self._fused.voxel_m, 3 * self.noise_sigma)
 
     def _fuse(self, fused: FusedScene, frame: ViewFrame, view: CameraView, moved: bool) -> bool:
         """Average a frame in, unless all stands still long enough; returns whether anything changed."""
@@ -109,23 +113,44 @@ class RealGeometry:
             return False
         assert frame.depth is not None
         surface = depth_surface(frame.depth, view.camera)
-        settle = self._still_frames == STILL_FRAMES
-        renewed = fused.add(surface, view, noise_sigma(frame.depth), settle=settle)
-        if moved:
-            self.surface, self.surface_view = surface, fused.view
+        renewed = fused.add(
+            surface,
+            view,
+            noise_sigma(frame.depth),
+            align=frame.pose is not None and frame.pose.reprojection_error_px is not None,
+            settle=self._still_frames == STILL_FRAMES,
+        )
         if renewed:
-            self._build_from_fused(fused)
+            fine, coarse = fused.meshes(self._budget, self._budget // COARSE_SHARE)
+            self._fused_meshes = fine, coarse
+        displaced = moved and self._follow_pose(fused, view)
+        if moved:
+            self.surface = surface
+        if renewed or displaced:
+            self._build_from_fused()
         elif moved and self.state is not None:
             self.state = replace(self.state, version=next(self._versions))
         return moved or renewed
 
-    def _build_from_fused(self, fused: FusedScene) -> None:
-        """Take over the fused surface, and once more in few triangles for what lies far from the objects."""
-        coarse = fused.meshes(self._budget // COARSE_SHARE)
+    def _follow_pose(self, fused: FusedScene, view: CameraView) -> bool:
+        """Whether the fused surface must be put elsewhere for this frame, because its pose is off.
+
+        The picture goes by the frame's pose; what its depth shows must lie where that pose puts it.
+        """
+        assert fused.view is not None
+        before = self._world_from_fused
+        exact = fused.view is view
+        self._world_from_fused = np.eye(4) if exact else view.world_from_camera @ fused.view.camera_from_world
+        return not np.array_equal(before, self._world_from_fused)
+
+    def _build_from_fused(self) -> None:
+        fine, coarse = (
+            [mesh.transformed(self._world_from_fused) for mesh in meshes] for meshes in self._fused_meshes
+        )
         if not any(len(mesh.triangles) for mesh in coarse):
             self.state = None
             return
-        self._build(fused.meshes(self._budget), triangle_corners(merge_for_gpu(coarse)))
+        self._build(fine, triangle_corners(merge_for_gpu(coarse)))
 
     def _build_from_depth(self, depth: DepthImage, view: CameraView) -> None:
         """Mesh the depth image, and once more with few triangles for what lies far from the objects."""

@@ -4,29 +4,23 @@ from dataclasses import dataclass, replace
 from itertools import count
 from typing import Any
 
-from protocol.errors import DeltalightError
 from protocol.frames import ViewFrame
 from protocol.scene import SceneDocument
-from protocol.scene_method import DvctMethod, NoneMethod
+from protocol.scene_method import NoneMethod
 from protocol.scene_objects import Material
 from render_server.gpu.context import GpuContext
 from render_server.gpu.timers import PassTimers
 from render_server.lighting import VERSION_STEP, Lighting
 from render_server.passes.composite import RelitLayers
 from render_server.passes.unseen_albedo import UnseenAlbedo
-from render_server.passes.volume import memory_statement
 from render_server.picture_resources import PictureResources
 from render_server.real_geometry import RealGeometry
-from render_server.relight.defaults import ResolvedDvct, resolve_dvct
-from render_server.relight.dvct import DvctExact
-from render_server.relight.dvct_base import DvctBase
-from render_server.relight.dvct_paper import DvctPaper
 from render_server.relight.frame import RelightInput
+from render_server.relight.methods import MethodChoice, choose_method
+from render_server.relight.relight_base import RelightBase
 from render_server.scene.surfaces import build_surface_table
 from render_server.view import CameraView
 from render_server.virtual_objects import VirtualObjects
-
-OPERATORS: dict[str, type[DvctBase]] = {"exact": DvctExact, "paper": DvctPaper}
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,8 +42,7 @@ class _Plan:
     """A scene whose files and memory were checked."""
 
     scene: SceneDocument
-    method: DvctMethod
-    resolved: ResolvedDvct
+    method: MethodChoice
     lighting: Lighting
 
 
@@ -65,7 +58,7 @@ class Relighting:
         self._real_versions = count(1)
         self._resources: PictureResources | None = None
         self._unseen_albedo = UnseenAlbedo(gpu)
-        self._method: DvctBase | None = None
+        self._method: RelightBase | None = None
         self._lights_versions = count(VERSION_STEP, VERSION_STEP)
         self._plan = self._planned(scene)
         self.lighting = self._plan.lighting
@@ -73,16 +66,13 @@ class Relighting:
 
     def _planned(self, scene: SceneDocument) -> _Plan:
         """Check everything that can fail before anything is replaced."""
-        method = DvctMethod() if isinstance(scene.method, NoneMethod) else scene.method
-        if not isinstance(method, DvctMethod):
-            raise DeltalightError(f"method `{scene.method.name}` arrives with a later release: use dvct.")
-        resolved = resolve_dvct(method, software=self._gpu.is_software)
-        directions = OPERATORS[method.operator].directions
-        self._say(memory_statement(resolved.volume_size, directions, method.memory_budget_mb))
+        method = choose_method(scene.method, software=self._gpu.is_software)
+        if method.remark is not None:
+            self._say(method.remark)
         self._objects.load(scene.objects)
         for sentence in ignored_wishes(scene):
             self._say(sentence)
-        return _Plan(scene, method, resolved, Lighting(scene.lights, self._lights_versions, self._say))
+        return _Plan(scene, method, Lighting(scene.lights, self._lights_versions, self._say))
 
     def _say(self, sentence: str) -> None:
         if sentence not in self._notices:
@@ -94,8 +84,12 @@ class Relighting:
 
     def _take(self, plan: _Plan) -> None:
         old = self._plan
-        if self._real is None or plan.scene.real != old.scene.real or plan.resolved != old.resolved:
-            budget = plan.resolved.triangle_budget
+        if (
+            self._real is None
+            or plan.scene.real != old.scene.real
+            or plan.method.resolved != old.method.resolved
+        ):
+            budget = plan.method.resolved.triangle_budget
             real = RealGeometry(self._gpu, plan.scene.real, budget, self._real_versions)
             if self._real is not None:
                 self._real.release()
@@ -160,7 +154,7 @@ class Relighting:
                 radiance = resources.with_inner_edges(layers.virtual_radiance)
             layers = replace(layers, virtual_radiance=radiance)
         uniforms = {
-            "additive": self._plan.method.resolved_composition == "additive",
+            "additive": self._plan.method.composition == "additive",
             "relights_real": not isinstance(self._plan.scene.method, NoneMethod),
             "sample_distance": self._sample_distance(view),
         }
@@ -168,7 +162,7 @@ class Relighting:
 
     def _sample_distance(self, view: CameraView) -> float:
         """What a texel of the cones' grid spans at 1 m, m."""
-        return float(1.5 * self._plan.resolved.cone_scale / view.camera.matrix[0, 0])
+        return float(1.5 * self._plan.method.resolved.cone_scale / view.camera.matrix[0, 0])
 
     def _resources_for(self, view: CameraView) -> PictureResources:
         """Textures of the picture's size; made anew when the lens or size changes."""
@@ -182,10 +176,9 @@ class Relighting:
             self._resources = PictureResources(self._gpu, view)
         return self._resources
 
-    def _method_for(self, view: CameraView) -> DvctBase:
+    def _method_for(self, view: CameraView) -> RelightBase:
         if self._method is None:
-            operator = OPERATORS[self._plan.method.operator]
-            self._method = operator(self._gpu, self._plan.method, self._plan.resolved, view.size)
+            self._method = self._plan.method.make(self._gpu, view.size)
         return self._method
 
     def describe_lights(self) -> list[dict[str, Any]]:

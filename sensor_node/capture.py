@@ -155,8 +155,10 @@ class ServerClock:
         if self._client is None:
             return
         exchange = clock_exchange(self._client.request, node, CLOCK_TIMEOUT_S)
-        while not self._closing.is_set():
+        while True:
             self._is_due.clear()
+            if self._closing.is_set():
+                return
             try:
                 sample = measure_offset(exchange, CLOCK_ROUNDS, self._now)
             except DeltalightError:  # no server yet; meanwhile the bound of what was measured grows

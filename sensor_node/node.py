@@ -37,6 +37,7 @@ from sensor_node.repeater import Repeater
 from sensor_node.view_frames import ViewFrameBuilder
 
 STATS_PERIOD_S = 1.0
+MAX_SENTENCE = 2000  # of the wire (SPEC.md, section 3)
 STREAMS = ("fisheye", "depth", "radiance", "clean_depth", "lamps", "pose", "color", "stats")
 # Fish-eye pictures that are further than this from their frame are stamped by another clock (a loop began again).
 LONGEST_HOLD_NS = 60_000_000_000
@@ -99,7 +100,9 @@ def node_camera(config: NodeConfig) -> Camera:
     """
     settings = config.camera.model_copy(update={"realtime": config.realtime, "loop": config.loop})
     camera = open_camera(config.source, settings)
-    return camera if config.fisheye is None else CameraWithFisheye(camera, open_fisheye(config.fisheye))
+    return camera if config.fisheye is None else CameraWithFisheye(
+        camera, open_fisheye(config.fisheye, config.camera.calibration)
+    )
 
 
 def run_node(config: NodeConfig, stop: threading.Event, keys: Keys | None = None) -> None:
@@ -221,7 +224,7 @@ class _Node:
             clock_offset_ns=offset_ns,
             clock_bound_ns=bound_ns,
             state="stopping" if is_ending else state,
-            detail=detail,
+            detail=detail[:MAX_SENTENCE],
             rates={"fps": self._frames / elapsed_s, "without_board": self._without_board / elapsed_s},
             drops={"capture": drops, "connections_refused": self._publisher.refused},
         )

@@ -111,6 +111,7 @@ def lens_report(result: "LensResult") -> dict[str, Any]:
         "views": len(fit.views),
         "rms_px": round(fit.rms_px, 4),
         "focal_uncertainty_percent": round(100 * fit.focal_share, 3),
+        "tilt_spread_deg": round(fit.tilt_spread_deg, 1),
         "coverage_percent": round(100 * result.coverage.share, 1),
         "per_view": [
             {"name": view.name, "points": len(view.points), "rms_px": round(float(error), 4)}

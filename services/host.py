@@ -1,5 +1,6 @@
 """The processes of one host and how they are joined: node -> render server -> viewer, on loopback."""
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -19,13 +20,14 @@ class HostPlan:
     """What runs on this host; `session_file` holds the scene document, which survives a server's restart.
 
     `source` is what the node of this host captures; None = there is none, and the server looks for the node called
-    `remote_node` on the network. `config` is the configuration file of all; None = the one they find.
+    `remote_node` on the network. `config` is the configuration file of all; None = the one they find, and what
+    stands here by default says nothing.
     """
 
     source: str | None
     session_file: Path
     remote_node: str = ""
-    config: Path | None = None
+    config: Path | None = Path(os.devnull)
     node_port: int = ports.NODE_PORT
     composite_port: int = ports.COMPOSITE_PORT
     control_port: int = ports.CONTROL_PORT
@@ -88,6 +90,7 @@ class HostPlan:
         return self._child(
             "viewer",
             "viewer",
+            *self._config,
             *("--subscribe", ports.endpoint(self.composite_port)),
             *("--control", ports.endpoint(self.control_port)),
             *("--port", str(port)),

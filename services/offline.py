@@ -110,18 +110,27 @@ def run_job(job: RenderJob, progress: Progress) -> RenderSummary:
 def _render_frames(
     job: RenderJob, renderer: "SceneRenderer", summary: RenderSummary, progress: Progress
 ) -> RenderSummary:
+    from sensor_node.fisheye import light_warnings
     from sensor_node.view_frames import ViewFrameBuilder
 
-    builder = ViewFrameBuilder(job.source, needs_depth=job.scene.real.geometry == "depth")
-    told = 0
+    builder = ViewFrameBuilder(
+        job.source,
+        needs_depth=job.scene.real.geometry in ("depth", "fused"),
+        needs_light=job.scene.lights.mode in ("fisheye", "tracked"),
+    )
+    said: set[str] = set()
+    warnings: list[str] | None = None
     for number in job.frames:
         frame = builder(job.source[number])
         started_s = time.perf_counter()
         composite = renderer.render(frame)
         summary.add(composite, 1000 * (time.perf_counter() - started_s))
-        for sentence in renderer.notices[told:]:
-            progress.notice(sentence)
-        told = len(renderer.notices)
+        if frame.radiance_map is not None and warnings is None:  # the first map speaks for all
+            warnings = light_warnings(frame.radiance_map)
+        for sentence in (*builder.notes, *(warnings or ()), *renderer.notices):
+            if sentence not in said:
+                progress.notice(sentence)
+                said.add(sentence)
         _write_frame(job, number, frame, composite)
         progress.frame_done()
     return summary

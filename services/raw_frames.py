@@ -54,6 +54,7 @@ class RawFrameAssembler:
         self._depths: deque[_Held[DepthMessage]] = deque(maxlen=KEPT_MESSAGES)
         self._poses: deque[PoseMessage] = deque(maxlen=KEPT_MESSAGES)
         self._fisheyes: deque[FisheyePictures] = deque(maxlen=KEPT_FISHEYES)
+        self._fisheye_ns: int | None = None
         self._streams: set[str] = set()
         self._last_id: int | None = None
         self._last: dict[str, Any] = {}
@@ -160,12 +161,16 @@ class RawFrameAssembler:
 
     def _add_fisheye(self, message: FisheyeMessage, parts: Sequence[memoryview]) -> None:
         """Decode fish-eye pictures, unless they are sent again for whoever came late."""
-        if self._fisheyes and self._fisheyes[-1].timestamp_ns == message.capture_ns:
+        if message.capture_ns == self._fisheye_ns:
             return
+        self._fisheye_ns = message.capture_ns
         response = parts[-1].tobytes() if message.has_response else None
         calibration = calibration_of(message.camera, response)
         pictures = tuple(_decoded(message, part) for part in parts[: len(message.exposures_s)])
-        self._fisheyes.append(FisheyePictures(message.capture_ns, pictures, message.exposures_s, calibration))
+        # A replay that began again stamps them by its first round, and recordings hold them in order.
+        earliest_ns = self._fisheyes[-1].timestamp_ns + 1 if self._fisheyes else 0
+        time_ns = max(message.capture_ns, earliest_ns)
+        self._fisheyes.append(FisheyePictures(time_ns, pictures, message.exposures_s, calibration))
 
     def _same(self, stream: str, made: Built) -> Built:
         """Give the instance of the message before while it is equal, so that its rays are computed once."""

@@ -125,13 +125,18 @@ class Recorder:
                     self._receive(POLL_S)
                     self._look_around()
                 self._queue.close()
-                while self._receive(0) and not self._is_enough():
+                while not self._is_enough() and self._receive(0):
                     pass  # what had come before the end belongs to the recording
                 self._measure()
+            if self._writer is not None:
+                self.status.size_bytes = self._writer.path.stat().st_size
         except DeltalightError as error:
             raise self._explained(error) from error
-        if self._writer is not None:
-            self.status.size_bytes = self._writer.path.stat().st_size
+        except OSError as error:
+            raise DeltalightError(
+                f"The recording ended because {error.filename} is not there any more ({error.strerror});"
+                " start it again."
+            ) from error
         return self.status
 
     def _receive(self, timeout_s: float) -> bool:

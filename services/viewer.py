@@ -23,6 +23,7 @@ from starlette.middleware.trustedhost import TrustedHostMiddleware
 
 from protocol.envelope import decode
 from protocol.errors import DeltalightError
+from protocol.keys import Keys
 from protocol.messages import CompositeMessage, ControlRequest, StatsMessage
 from protocol.transport import ReceivedMultipart, Receiver, RequestClient
 from services import ports
@@ -59,8 +60,8 @@ class Choice(BaseModel):
 class SceneControl:
     """Reads and changes the render server's scene through its control socket (any thread)."""
 
-    def __init__(self, control_endpoint: str) -> None:
-        self._client = RequestClient(control_endpoint)
+    def __init__(self, control_endpoint: str, keys: Keys | None = None) -> None:
+        self._client = RequestClient(control_endpoint, keys=keys)
 
     def choices(self) -> dict[str, Any]:
         """Name, view and operator of the current scene.
@@ -106,14 +107,14 @@ class SceneControl:
         return reply.payload
 
 
-def create_app(settings: ViewerSettings) -> FastAPI:
+def create_app(settings: ViewerSettings, keys: Keys | None = None) -> FastAPI:
     """The web application; its stream and control run while the application does."""
     hub = LiveHub()
-    control = SceneControl(settings.control)
+    control = SceneControl(settings.control, keys)
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
-        receiver = Receiver([settings.subscribe], ["composite", "stats"])
+        receiver = Receiver([settings.subscribe], ["composite", "stats"], keys=keys)
         loop = asyncio.get_running_loop()
         stop = threading.Event()
         feed = threading.Thread(target=_feed, args=(receiver, hub, loop, stop), name="feed", daemon=True)
@@ -133,15 +134,15 @@ def create_app(settings: ViewerSettings) -> FastAPI:
     return app
 
 
-def run_viewer(settings: ViewerSettings) -> None:
-    """Serve the page until SIGINT or SIGTERM.
+def run_viewer(settings: ViewerSettings, keys: Keys | None = None) -> None:
+    """Serve the page until SIGINT or SIGTERM; `keys` are needed where an endpoint leaves the host.
 
     Raises:
         DeltalightError: an endpoint is not understood, or the port is in use.
     """
     listener = ports.listen(settings.port)
     config = uvicorn.Config(
-        create_app(settings),
+        create_app(settings, keys),
         log_level="warning",
         timeout_graceful_shutdown=1,
         ws_max_size=1024,  # browsers send acknowledgements only

@@ -7,10 +7,16 @@ from typing import Any, Literal
 from protocol.documents import parse_mapping, validate
 from protocol.errors import DeltalightError
 from protocol.scene import SceneDocument
-from protocol.scene_method import DvctMethod, NoneMethod
+from protocol.scene_method import DlpvMethod, DvctMethod, NoneMethod
 
-Kind = Literal["camera", "none", "dvct", "path"]
-OPERATORS = ("exact", "paper")
+Kind = Literal["camera", "none", "dvct", "dlpv", "path"]
+ADJUSTABLE: dict[str, tuple[Literal["dvct", "dlpv"], str]] = {
+    "exact": ("dvct", "exact"),
+    "paper": ("dvct", "paper"),
+    "dlpv": ("dlpv", "difference"),
+    "dlpv-paper": ("dlpv", "paper"),
+}
+"""Variants that take settings: their method and its operator."""
 DEFAULT_METHODS = "camera,none,paper,exact,path"
 TIMED_VARIANT = "exact"
 """`path` takes the time of this one's frame."""
@@ -18,7 +24,7 @@ TIMED_VARIANT = "exact"
 
 @dataclass(frozen=True)
 class Variant:
-    """One way to make the picture; `settings` are changes of the scene document (dvct only).
+    """One way to make the picture; `settings` are changes of the scene document (dvct and dlpv).
 
     A key names a setting of `method`, or one of `lights` or `output` with that before a dot.
     """
@@ -32,7 +38,9 @@ class Variant:
         """Return the document with this variant's method; `volume_size` is used where no setting names one."""
         if self.kind == "none":
             return document.replaced(method=NoneMethod())
-        size = {} if volume_size is None else {"volume_size": volume_size}
+        if self.kind == "dlpv":
+            document = document.replaced(method=DlpvMethod())
+        size = {} if volume_size is None or self.kind == "dlpv" else {"volume_size": volume_size}
         parts: dict[str, dict[str, Any]] = {"method": size, "lights": {}, "output": {}}
         for key, value in self.settings.items():
             part, _, name = key.rpartition(".")
@@ -48,6 +56,14 @@ FIXED: dict[str, Variant] = {
         Variant("none", "objects drawn, the real scene left as it was", "none"),
         Variant("paper", "the operator as printed in [P1]", "dvct", {"operator": "paper"}),
         Variant("exact", "the exact operator, machine's defaults", "dvct", {"operator": "exact"}),
+        Variant(
+            "fisheye",
+            "`exact`, its lights found in the fish-eye picture and scaled by the board's paper",
+            "dvct",
+            {"operator": "exact", "lights.mode": "fisheye", "lights.registration": "auto"},
+        ),
+        Variant("dlpv", "light propagation volumes, machine's defaults", "dlpv", {"operator": "difference"}),
+        Variant("dlpv-paper", "the volume as printed in [P2]", "dlpv", {"operator": "paper"}),
         Variant("path", "path tracing with and without objects, in the time of an `exact` frame", "path"),
     )
 }
@@ -134,16 +150,15 @@ def _parse(text: str) -> Variant:
     name, _, changes = text.partition(":")
     if not changes and name in FIXED:
         return FIXED[name]
-    if not changes or name not in OPERATORS:
-        known = ", ".join(FIXED)
-        raise DeltalightError(
-            f"'{text}' is no method to compare; use {known}, or exact:KEY=VALUE or paper:KEY=VALUE."
-        )
-    settings: dict[str, Any] = {"operator": name}
+    if not changes or name not in ADJUSTABLE:
+        known, adjustable = ", ".join(FIXED), " or ".join(f"{one}:KEY=VALUE" for one in ADJUSTABLE)
+        raise DeltalightError(f"'{text}' is no method to compare; use {known}, or {adjustable}.")
+    kind, operator = ADJUSTABLE[name]
+    settings: dict[str, Any] = {"operator": operator}
     for pair in changes.split(","):
         settings |= _setting(pair, text)
-    validate(DvctMethod, settings, f"--methods {text}")
-    return Variant(text, f"{name} with {changes.replace(',', ', ')}", "dvct", settings)
+    validate(DvctMethod if kind == "dvct" else DlpvMethod, settings, f"--methods {text}")
+    return Variant(text, f"{name} with {changes.replace(',', ', ')}", kind, settings)
 
 
 def _setting(pair: str, variant: str) -> dict[str, Any]:

@@ -22,6 +22,9 @@ uniform bool everywhere;       // also where the objects do not reach (photometr
 #ifdef SHADOW_CONES
 bool shadow_may_reach(vec3 p, vec3 n, float bias) { return object_meets_cone(p, n); }
 vec2 light_share(Light light, vec3 p, vec3 n, float bias) { return cone_visibility(light, p, n, bias); }
+#elif defined(REAL_SHADOWS)
+bool shadow_may_reach(vec3 p, vec3 n, float bias) { return false; }
+vec2 light_share(Light light, vec3 p, vec3 n, float bias) { return vec2(real_visibility(light, p, n, bias)); }
 #else
 bool shadow_may_reach(vec3 p, vec3 n, float bias) { return object_may_shadow(p, bias); }
 vec2 light_share(Light light, vec3 p, vec3 n, float bias) { return visibility(light, p, n, bias, bias); }

@@ -1,6 +1,7 @@
 """Real geometry buffer: position and normal of the real surface at each pixel."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float32
@@ -50,17 +51,17 @@ class RealSurface:
         view: CameraView,
         surface_count: int,
         *,
-        noise_sigma: float | None = None,
+        tolerance: tuple[float, float] | None = None,
     ) -> None:
         """Fill from a raster of the given model or the fused surface, through the lens.
 
-        `noise_sigma` (m at 1 m) of the depth from which pixels were filled before: they keep it where the surface
-        differs by more than three times that (something moved), and take the surface, the mean of many frames,
-        where it agrees. None: everything is taken.
+        `tolerance` (m, and m at 1 m that grow with z^2): pixels that the frame's depth filled before keep it where
+        the surface differs by more (something moved), and take the surface, the mean of many frames, where it
+        agrees. None: everything is taken.
         """
         bind_samplers({6: raster.position, 7: raster.normal, 15: picture.rays})
         bind_images(self.position, self.normal)
-        depth = {"fused": noise_sigma is not None, "noise_sigma": noise_sigma or 0.0}
+        depth: dict[str, Any] = {"fused": tolerance is not None, "tolerance": tolerance or (0.0, 0.0)}
         self._from_model.run(self.size, surface_count=surface_count, **depth, **view.uniforms())
 
     def bind(self) -> None:

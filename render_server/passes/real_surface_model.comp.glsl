@@ -6,7 +6,7 @@ layout(local_size_x = 8, local_size_y = 8) in;
 layout(binding = 0, rgba32f) uniform image2D position_out;
 layout(binding = 1, rgba16f) writeonly uniform image2D normal_out;
 uniform bool fused;           // the frame's own depth is there already, and stays where it says something else
-uniform float noise_sigma;    // of that depth, m at 1 m
+uniform vec2 tolerance;       // up to which both say the same: m, and m at 1 m
 
 void main() {
     ivec2 pixel = ivec2(gl_GlobalInvocationID.xy);
@@ -20,7 +20,7 @@ void main() {
         normal = vec4(seen.xyz, float(surface_entry(position.xyz, seen.w)));
     }
     float own = fused ? imageLoad(position_out, pixel).w : 0.0;
-    if (own > 0.0 && abs(position.w - own) > 3.0 * noise_sigma * own * own) return;
+    if (own > 0.0 && abs(position.w - own) > tolerance.x + tolerance.y * own * own) return;
     imageStore(position_out, pixel, position);
     imageStore(normal_out, pixel, normal);
 }

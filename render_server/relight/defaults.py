@@ -2,18 +2,22 @@
 
 from dataclasses import dataclass
 
-from protocol.scene_method import DvctMethod
+from protocol.scene_method import DlpvMethod, DvctMethod
 
 # (software, GPU)
 VOLUME_SIZE = (64, 256)
+CELLS = (32, 64)
 CONE_SCALE = (4, 2)
 RSM_SIZE = (512, 1024)
 TRIANGLE_BUDGET = (40_000, 400_000)
 
 
 @dataclass(frozen=True)
-class ResolvedDvct:
-    """The settings of DVCT whose default depends on the machine."""
+class ResolvedSettings:
+    """The settings of a method whose default depends on the machine.
+
+    `volume_size`: voxels or cells an edge. `cone_scale`: cones and volumes are evaluated at 1/scale of the picture.
+    """
 
     volume_size: int
     cone_scale: int
@@ -30,12 +34,23 @@ def march_defines(settings: DvctMethod) -> dict[str, int]:
     return {name: 1 for name, wanted in defines.items() if wanted}
 
 
-def resolve_dvct(settings: DvctMethod, *, software: bool) -> ResolvedDvct:
+def resolve_dvct(settings: DvctMethod, *, software: bool) -> ResolvedSettings:
     """Take the document's values, or the machine's defaults where it says null."""
     column = 0 if software else 1
-    return ResolvedDvct(
+    return ResolvedSettings(
         settings.volume_size or VOLUME_SIZE[column],
         settings.cone_scale or CONE_SCALE[column],
+        settings.rsm_size or RSM_SIZE[column],
+        settings.triangle_budget or TRIANGLE_BUDGET[column],
+    )
+
+
+def resolve_dlpv(settings: DlpvMethod, *, software: bool) -> ResolvedSettings:
+    """Take the document's values, or the machine's defaults where it says null."""
+    column = 0 if software else 1
+    return ResolvedSettings(
+        settings.volume_size or CELLS[column],
+        settings.query_scale or CONE_SCALE[column],
         settings.rsm_size or RSM_SIZE[column],
         settings.triangle_budget or TRIANGLE_BUDGET[column],
     )

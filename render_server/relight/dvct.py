@@ -10,7 +10,7 @@ from render_server.gpu.context import GpuContext
 from render_server.passes.mirror_objects import MirrorObjectsPass
 from render_server.passes.trace_cones import TraceConesPass
 from render_server.passes.volume import Pyramid, VolumePlacement
-from render_server.relight.defaults import ResolvedDvct, march_defines
+from render_server.relight.defaults import ResolvedSettings, march_defines
 from render_server.relight.dvct_base import DvctBase
 from render_server.relight.frame import RelightInput
 from render_server.relight.voxel_scene import DIRECTIONS, VoxelScene
@@ -22,7 +22,7 @@ class DvctExact(DvctBase):
     directions = DIRECTIONS
 
     def __init__(
-        self, gpu: GpuContext, settings: DvctMethod, resolved: ResolvedDvct, size: tuple[int, int]
+        self, gpu: GpuContext, settings: DvctMethod, resolved: ResolvedSettings, size: tuple[int, int]
     ) -> None:
         super().__init__(gpu, settings, resolved, size)
         defines = march_defines(settings)

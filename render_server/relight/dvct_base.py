@@ -1,191 +1,27 @@
-"""What both operators of delta voxel cone tracing share: lights, maps, when to rebuild (METHOD 4)."""
-
-from abc import ABC, abstractmethod
-from typing import Any
-
-import moderngl
-import numpy as np
-from jaxtyping import Float64
+"""What both operators of delta voxel cone tracing share (METHOD 4)."""
 
 from protocol.scene_method import DvctMethod
 from render_server.gpu.context import GpuContext
-from render_server.passes.change_ratio import ChangeRatioPass
-from render_server.passes.composite import RelitLayers
 from render_server.passes.direct_light import DirectLightPass
-from render_server.passes.light_table import LightTable
-from render_server.passes.reflective_shadow_map import ReflectiveShadowMapPass
-from render_server.passes.sampling_grid import SamplingGrid
-from render_server.passes.trace_cones import ConeFields
-from render_server.passes.virtual_surface import VirtualSurfacePass
-from render_server.passes.volume import Pyramid, VolumePlacement, place_volume
-from render_server.relight.defaults import ResolvedDvct
+from render_server.passes.volume import VolumePlacement, place_volume
+from render_server.relight.defaults import ResolvedSettings
 from render_server.relight.frame import RelightInput
-
-SHADOW_REACH = 4.0  # in longest edges of the objects' bounds: how far around them real shadows are resolved
-LARGE_TRIANGLE = 0.1  # of that reach: from here on a triangle's own extent matters, not only its corners
-SELF_SHADOW_TEXELS = 1.5  # a virtual receiver is lifted by so many texels of the depth map
+from render_server.relight.relight_base import RelightBase
 
 
-class DvctBase(ABC):
-    """One frame as a list of passes; an operator says how its voxels are made and its cones traced."""
+class DvctBase(RelightBase):
+    """An operator says how its voxels are made and its cones traced."""
 
     directions: int  # of the operator's pyramids
 
     def __init__(
-        self, gpu: GpuContext, settings: DvctMethod, resolved: ResolvedDvct, size: tuple[int, int]
+        self, gpu: GpuContext, settings: DvctMethod, resolved: ResolvedSettings, size: tuple[int, int]
     ) -> None:
-        self._settings = settings
-        self._resolved = resolved
-        self.table = LightTable(gpu, resolved.rsm_size, settings.shadow_samples)
-        self._shadow_maps = ReflectiveShadowMapPass(gpu)
-        self._grid = SamplingGrid(gpu, size, resolved.cone_scale)
-        self._cones = ConeFields(gpu, self._grid.size)
         cones = self.directions if settings.resolved_shadow == "cone" else None
-        self._direct = DirectLightPass(gpu, size, shadow_cones=cones)
-        self._surface = VirtualSurfacePass(gpu, size)
-        self._change = ChangeRatioPass(gpu, self._grid.size)
-        self._reflection: moderngl.Texture | None = None
-        self._placed_key: object = None
-        self._real_key: object = None
-        self._object_key: object = None
-        self._virtual_map_key: object = None
-        self._shade_key: object = None
-        self._environment_version = -1
-
-    @abstractmethod
-    def _rebuild_real(
-        self, frame: RelightInput, placement: VolumePlacement, uniforms: dict[str, Any]
-    ) -> None:
-        """Make the voxels of the real scene anew."""
-
-    @abstractmethod
-    def _rebuild_virtual(self, frame: RelightInput, uniforms: dict[str, Any]) -> None:
-        """Make everything anew that depends on the objects."""
-
-    @abstractmethod
-    def _trace(self, frame: RelightInput, uniforms: dict[str, Any]) -> None:
-        """Fill the cone fields; geometry, lights and materials are bound."""
-
-    def _reflect(self, frame: RelightInput, uniforms: dict[str, Any]) -> moderngl.Texture | None:  # noqa: ARG002
-        """Objects in smooth real surfaces (passes/mirror_objects.py); None leaves these to the cones."""
-        return None
-
-    @abstractmethod
-    def _joint(self) -> Pyramid:
-        """The pyramid whose opacity is that of real and virtual geometry together."""
-
-    def relight(self, frame: RelightInput) -> RelitLayers:
-        """Compute everything that composition needs."""
-        placement = self._placement(frame)
-        scene_key = (frame.real.version, frame.lights_version, frame.everywhere, placement)
-        virtual_map_key = (frame.lights_version, frame.virtual.version)
-        if (scene_key, frame.virtual.version) != self._placed_key:
-            self._place_lights(frame)
-            self._placed_key = (scene_key, frame.virtual.version)
-        real_key = (scene_key, self.table.real_records)  # objects that move take the real views with them
-        object_key = (real_key, frame.virtual.version)
-        uniforms = self._uniforms(frame, placement)
-        if real_key != self._real_key:
-            self._draw_real_maps(frame)
-            self._rebuild_real(frame, placement, uniforms)
-        if virtual_map_key != self._virtual_map_key:
-            self._draw_virtual_maps(frame)
-        if object_key != self._object_key:
-            self._rebuild_virtual(frame, uniforms)
-        if (object_key, frame.view) != self._shade_key:
-            self._shade(frame, uniforms)
-        self._real_key, self._object_key, self._virtual_map_key = real_key, object_key, virtual_map_key
-        self._shade_key = (object_key, frame.view)
-        return RelitLayers(
-            frame.matte,
-            self._surface.radiance,
-            self._direct,
-            self._cones,
-            self._grid,
-            self._change,
-            self._joint(),
-            placement,
-            self.table,
-            self._reflection,
-        )
+        direct = DirectLightPass(gpu, size, shadow_cones=cones)
+        super().__init__(gpu, resolved, size, settings.shadow_samples, direct)
+        self._settings = settings
 
     def _placement(self, frame: RelightInput) -> VolumePlacement:
         low, high = frame.virtual.bounds
         return place_volume(low, high, self._resolved.volume_size, self._settings.volume_edge_m)
-
-    def _place_lights(self, frame: RelightInput) -> None:
-        if self._environment_version != frame.lights_version:
-            self.table.set_environment(frame.lights.environment)
-            self._environment_version = frame.lights_version
-        receivers = frame.real.points if frame.everywhere else shadow_receivers(frame)
-        self.table.place(list(frame.lights.lights), frame.real.points, receivers, frame.virtual.points)
-
-    def _draw_real_maps(self, frame: RelightInput) -> None:
-        with frame.timers.measure("RSM real"):
-            self.table.bind_records()
-            self._shadow_maps.run(self.table.real_atlas, frame.real.buffers, self.table.real_views, 0)
-
-    def _draw_virtual_maps(self, frame: RelightInput) -> None:
-        with frame.timers.measure("RSM virtual"):
-            self.table.bind_records()
-            first = self.table.first_virtual_view
-            self._shadow_maps.run(
-                self.table.virtual_atlas, frame.virtual.buffers, self.table.virtual_views, first
-            )
-
-    def _uniforms(self, frame: RelightInput, placement: VolumePlacement) -> dict[str, Any]:
-        centre = np.mean(np.stack(frame.virtual.bounds), axis=0)
-        pixel = frame.view.camera.matrix[0, 0]
-        bounds = placement.voxel_bounds(np.stack(frame.virtual.bounds)).astype(float)
-        return {
-            **frame.view.uniforms(),
-            **placement.uniforms(),
-            **self.table.uniforms(),
-            **frame.surface_uniforms,
-            "noise_sigma": frame.noise_sigma,
-            "normal_offset": SELF_SHADOW_TEXELS * self.table.virtual_texel_m(centre),
-            "sample_distance": 1.5 * self._resolved.cone_scale / pixel,
-            "object_low": tuple(bounds[:3]),
-            "object_high": tuple(1.0 - bounds[3:]),
-            "everywhere": frame.everywhere,
-        }
-
-    def _shade(self, frame: RelightInput, uniforms: dict[str, Any]) -> None:
-        """Cones at reduced resolution, direct light and virtual surfaces at full."""
-        frame.bind_geometry()
-        with frame.timers.measure("sampling grid"):
-            self._grid.run(frame.matte, uniforms)
-        self.table.bind()
-        frame.virtual.materials.bind()
-        self._trace(frame, uniforms)
-        with frame.timers.measure("direct light"):
-            self._joint().texture.use(location=3)
-            self._direct.run(uniforms)
-        self._reflection = self._reflect(frame, uniforms)
-        with frame.timers.measure("change of light"):
-            self._change.run(self._grid, self._direct, self._cones, self._reflection)
-        with frame.timers.measure("virtual surface"):
-            self._surface.run(frame.matte, frame.virtual_raster, self._cones, self._grid, uniforms)
-
-    def release(self) -> None:
-        """Free the GL objects."""
-        for item in vars(self).values():
-            if hasattr(item, "release"):
-                item.release()
-
-
-def shadow_receivers(frame: RelightInput) -> Float64[np.ndarray, "n 3"]:
-    """Real points around the objects; all of them where nothing is near.
-
-    Vertices within reach, and what triangles too large to have any there bring into the cube of that reach.
-    """
-    low, high = frame.virtual.bounds
-    centre, reach = (low + high) / 2, SHADOW_REACH * float(np.max(high - low))
-    points = frame.real.points
-    near = points[np.linalg.norm(points - centre, axis=1) <= reach]
-    corners = frame.real.corners[..., :3].astype(np.float64)
-    first, last = corners.min(axis=1), corners.max(axis=1)
-    meets = np.all((first <= centre + reach) & (last >= centre - reach), axis=1)
-    large = meets & (np.max(last - first, axis=1) > LARGE_TRIANGLE * reach)
-    clipped = np.clip(corners[large].reshape(-1, 3), centre - reach, centre + reach)
-    return np.concatenate([near, clipped]) if len(near) or len(clipped) else points

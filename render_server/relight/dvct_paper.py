@@ -6,7 +6,7 @@ from protocol.scene_method import DvctMethod
 from render_server.gpu.context import GpuContext
 from render_server.passes.trace_paper import TracePaperPass
 from render_server.passes.volume import Pyramid, VolumePlacement
-from render_server.relight.defaults import ResolvedDvct
+from render_server.relight.defaults import ResolvedSettings
 from render_server.relight.delta_volume import DIRECTIONS, DeltaVolume
 from render_server.relight.dvct_base import DvctBase
 from render_server.relight.frame import RelightInput
@@ -18,7 +18,7 @@ class DvctPaper(DvctBase):
     directions = DIRECTIONS
 
     def __init__(
-        self, gpu: GpuContext, settings: DvctMethod, resolved: ResolvedDvct, size: tuple[int, int]
+        self, gpu: GpuContext, settings: DvctMethod, resolved: ResolvedSettings, size: tuple[int, int]
     ) -> None:
         super().__init__(gpu, settings, resolved, size)
         self._tracing = TracePaperPass(gpu)

@@ -82,7 +82,7 @@ def _step(
     """One Gauss-Newton step of the motion; None where too few samples meet a known surface."""
     rows, residuals, information = [], [], []
     for volume in volumes:
-        found, distance, gradient = _look_up(volume, world)
+        found, distance, gradient = look_up(volume, world)
         # A voxel's interpolation is no better than a tenth of it.
         sigma = np.hypot(sigma_m[found], 0.1 * volume.placement.voxel_m)
         # Cauchy's weight: what moved must not pull the camera along.
@@ -97,7 +97,7 @@ def _step(
     return np.asarray(np.linalg.solve(normal, -(slopes * weight[:, None]).T @ missed - prior * total))
 
 
-def _look_up(
+def look_up(
     volume: FusedVolume, world: Float64[np.ndarray, "n 3"]
 ) -> tuple[Int64[np.ndarray, " m"], Float64[np.ndarray, " m"], Float64[np.ndarray, "m 3"]]:
     """Points whose voxel cell is known, their distances (m) and the unit gradient there, trilinear."""
@@ -113,7 +113,8 @@ def _look_up(
     distance = (corners * sides.prod(axis=2)).sum(axis=1)
     signs = 2.0 * CORNERS - 1
     slopes = [
-        (corners * signs[:, axis] * np.delete(sides, axis, axis=2).prod(axis=2)).sum(axis=1) for axis in range(3)
+        (corners * signs[:, axis] * np.delete(sides, axis, axis=2).prod(axis=2)).sum(axis=1)
+        for axis in range(3)
     ]
     gradient = np.stack(slopes, axis=1)
     length = np.linalg.norm(gradient, axis=1)

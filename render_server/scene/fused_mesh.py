@@ -10,12 +10,10 @@ from render_server.scene.fused_volume import BLOCK, GRID, FusedVolume
 from render_server.scene.mesh import TriangleMesh
 
 CORNERS = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)])
-EDGES = tuple(
-    (a, b) for a in range(8) for b in range(a + 1, 8) if np.abs(CORNERS[a] - CORNERS[b]).sum() == 1
-)
+EDGES = tuple((a, b) for a in range(8) for b in range(a + 1, 8) if np.abs(CORNERS[a] - CORNERS[b]).sum() == 1)
 VOXELS = GRID * BLOCK  # voxels an edge of the whole grid
 # Growth of the clusters where their triangles are still too many.
-CLUSTER_GROWTH = 1.1
+CLUSTER_GROWTH = 1.15
 
 
 class _Cells(NamedTuple):
@@ -42,9 +40,16 @@ def fused_mesh(volume: FusedVolume) -> TriangleMesh:
     return _only_used(positions, normals, triangles)
 
 
-def decimated(mesh: TriangleMesh, triangle_budget: int, voxel_m: float) -> TriangleMesh:
+def decimated(mesh: TriangleMesh, triangle_budget: int) -> TriangleMesh:
     """The mesh, or one of at most `triangle_budget` triangles: vertices within a cube become one (Rossignac 1993)."""
-    cell_m = voxel_m * max(1.0, float(np.sqrt(len(mesh.triangles) / max(triangle_budget, 1))))
+    if len(mesh.triangles) <= triangle_budget:
+        return mesh
+    corners = mesh.positions[mesh.triangles]
+    double_area = np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+    )
+    # A plane along the axes gives two triangles a cube's face; others give more.
+    cell_m = float(np.sqrt(double_area.sum(dtype=np.float64) / max(triangle_budget, 1)))
     result = mesh
     while len(result.triangles) > triangle_budget:
         result = _clustered(mesh, cell_m)
@@ -55,7 +60,9 @@ def decimated(mesh: TriangleMesh, triangle_budget: int, voxel_m: float) -> Trian
 def _clustered(mesh: TriangleMesh, cell_m: float) -> TriangleMesh:
     cube = np.floor(mesh.positions / cell_m).astype(np.int64)
     cube -= cube.min(axis=0)
-    _, cluster = np.unique(np.ravel_multi_index(tuple(cube.T), tuple(cube.max(axis=0) + 1)), return_inverse=True)
+    _, cluster = np.unique(
+        np.ravel_multi_index(tuple(cube.T), tuple(cube.max(axis=0) + 1)), return_inverse=True
+    )
     count = np.bincount(cluster)[:, None]
     positions = _sums(cluster, mesh.positions) / count
     normals = _unit(_sums(cluster, mesh.normals))
@@ -66,7 +73,9 @@ def _clustered(mesh: TriangleMesh, cell_m: float) -> TriangleMesh:
 
 def _without_copies(triangles: Int64[np.ndarray, "m 3"]) -> Int64[np.ndarray, "k 3"]:
     """One of the triangles that have the same corners."""
-    _, first = np.unique(np.sort(triangles, axis=1), axis=0, return_index=True)
+    low, middle, high = np.sort(triangles, axis=1).T
+    count = int(triangles.max(initial=0)) + 1
+    _, first = np.unique((low * count + middle) * count + high, return_index=True)
     return triangles[np.sort(first)]
 
 
@@ -105,7 +114,9 @@ def _with_border(volume: FusedVolume, blocks: Int64[np.ndarray, " k"]) -> Float3
         last = volume.placement.blocks - 1
         slot = np.where((place <= last).all(axis=1), volume.slots[tuple(np.minimum(place, last).T)], -1)
         there = np.flatnonzero(slot >= 0)
-        part = known[slot[there]].reshape(-1, *(BLOCK,) * 3)[:, *(slice(0, 1) if far else slice(None) for far in step)]
+        part = known[slot[there]].reshape(-1, *(BLOCK,) * 3)[
+            :, *(slice(0, 1) if far else slice(None) for far in step)
+        ]
         result[there, *(slice(BLOCK, None) if far else slice(0, BLOCK) for far in step)] = part
     return result
 
@@ -133,7 +144,12 @@ def _triangles(cells: _Cells) -> Int64[np.ndarray, "m 3"]:
     for axis, end in enumerate((4, 2, 1)):  # corner at the end of the edge from corner 0 along the axis
         across = [np.eye(3, dtype=np.int64)[(axis + turn) % 3] for turn in (1, 2)]
         crossed = np.flatnonzero(inside[:, 0] != inside[:, end])
-        ring = [-across[0] - across[1], -across[1], 0 * across[0], -across[0]]  # counter-clockwise about the axis
+        ring = [
+            -across[0] - across[1],
+            -across[1],
+            0 * across[0],
+            -across[0],
+        ]  # counter-clockwise about the axis
         found = np.stack([_find(keys, order, cells.voxel[crossed] + step) for step in ring], axis=1)
         whole = (found >= 0).all(axis=1)
         quads = found[whole]

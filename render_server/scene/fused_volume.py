@@ -7,6 +7,7 @@ space is carved, so that things which moved away disappear.
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Self
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64
@@ -50,10 +51,30 @@ class FusedPlacement:
 
 
 @dataclass(frozen=True, eq=False)
-class _Planes:
-    """Rows of (nx, ny, nz, n.P, reach, weight) a pixel in the optical frame; the last row is for no pixel at all."""
+class PixelPlanes:
+    """The plane seen at each pixel: rows of (nx, ny, nz, n.P, noise, weight), optical frame, and 1/z of the pixels.
+
+    The last row is for no pixel at all. `noise` is how far from the plane noise reaches, m; weights are inverse
+    variances relative to the noise at 1 m.
+    """
 
     rows: Float32[np.ndarray, "n+1 6"]
+    inverse_depth: Float32[np.ndarray, " n"]
+
+    @classmethod
+    def of(cls, surface: DepthSurface, camera: CameraModel, noise_sigma: float) -> Self:
+        """From a frame's depth, registered to `camera`, with noise of `noise_sigma` m at 1 m."""
+        inverse, towards = surface.inverse_depth.ravel(), _towards(camera)
+        z = np.divide(1, inverse, out=np.zeros_like(inverse), where=inverse > 0)
+        normals = surface.normals.reshape(-1, 3)
+        facing = -towards / np.linalg.norm(towards, axis=1, keepdims=True)
+        normals = np.where((normals == 0).all(axis=1, keepdims=True), facing, normals)
+        rows = np.zeros((len(z) + 1, 6), np.float32)
+        rows[:-1, :3] = normals
+        rows[:-1, 3] = np.einsum("ni,ni->n", normals, towards) * z
+        rows[:-1, 4] = REACH_SIGMAS * noise_sigma * z * z
+        rows[:-1, 5] = inverse**4  # the variance of depth is (sigma z^2)^2
+        return cls(rows, inverse)
 
 
 class FusedVolume:
@@ -67,16 +88,9 @@ class FusedVolume:
         self.distance: Float32[np.ndarray, "b 512"] = np.zeros((0, BLOCK**3), np.float32)
         self.weight: Float32[np.ndarray, "b 512"] = np.zeros((0, BLOCK**3), np.float32)
 
-    def integrate(self, surface: DepthSurface, view: CameraView, noise_sigma: float) -> None:
-        """Average one frame into the field.
-
-        Args:
-            surface: of the frame's clean depth, registered to the view's camera.
-            view: camera and pose of the frame.
-            noise_sigma: depth noise at 1 m, m.
-        """
-        planes = _pixel_planes(surface, view.camera, noise_sigma, self.placement.voxel_m)
-        self._allocate(planes, surface, view)
+    def integrate(self, planes: PixelPlanes, view: CameraView) -> None:
+        """Average one frame, seen from `view`, into the field."""
+        self._allocate(planes, view)
         blocks = self._blocks_in_view(view)
         for start in range(0, len(blocks), CHUNK_BLOCKS):
             self._update(blocks[start : start + CHUNK_BLOCKS], planes, view)
@@ -85,18 +99,21 @@ class FusedVolume:
         """Distances, NaN where nothing was measured."""
         return np.where(self.weight > 0, self.distance, np.float32(np.nan))
 
-    def _allocate(self, planes: _Planes, surface: DepthSurface, view: CameraView) -> None:
+    def _allocate(self, planes: PixelPlanes, view: CameraView) -> None:
         """Make blocks wherever the distances around this frame's surfaces reach."""
         half_block = self.placement.block_m / 2
-        chosen = _spread_pixels(planes, surface, view, half_block)
-        rows = planes.rows[chosen]
-        points = _towards(view.camera)[chosen] / surface.inverse_depth.ravel()[chosen, None]
-        reach = rows[:, 4]
+        chosen = _spread_pixels(planes, view, half_block)
+        matrix = view.world_from_camera.astype(np.float32)
+        points = _towards(view.camera)[chosen] / planes.inverse_depth[chosen, None]
+        world = points @ matrix[:3, :3].T + matrix[:3, 3]
+        held = _inside(world, self.placement.box)
+        if self.placement.hole is not None:
+            held &= ~_inside(world, self.placement.hole)
+        rows = planes.rows[chosen[held]]
+        reach = self._reach(rows[:, 4])
         count = int(np.ceil(2 * float(reach.max(initial=0)) / half_block)) + 1
         steps = np.linspace(-1, 1, count, dtype=np.float32)[:, None, None] * reach[:, None]
-        around = (points + rows[:, :3] * steps).reshape(-1, 3)
-        matrix = view.world_from_camera.astype(np.float32)
-        self._add_blocks(around @ matrix[:3, :3].T + matrix[:3, 3])
+        self._add_blocks((world[held] + rows[:, :3] @ matrix[:3, :3].T * steps).reshape(-1, 3))
 
     def _add_blocks(self, world: Float32[np.ndarray, "n 3"]) -> None:
         placement = self.placement
@@ -120,24 +137,31 @@ class FusedVolume:
         seen = centre @ matrix[:3, :3].T + matrix[:3, 3]
         (fx, fy, cx, cy), (width, height) = view.raster
         # Inward normals of the pyramid's sides, not unit: (1, 0, slope) has length sqrt(1 + slope^2).
-        slopes = np.array([(cx + 0.5) / fx, (width - 0.5 - cx) / fx, (cy + 0.5) / fy, (height - 0.5 - cy) / fy])
+        slopes = np.array(
+            [(cx + 0.5) / fx, (width - 0.5 - cx) / fx, (cy + 0.5) / fy, (height - 0.5 - cy) / fy]
+        )
         x, y, z = seen.T
         inside = np.stack([x, -x, y, -y]) + slopes[:, None] * z
         radius = np.sqrt(3) / 2 * edge
         near = (inside > -radius * np.sqrt(1 + slopes**2)[:, None]).all(axis=0) & (z > -radius)
         return np.flatnonzero(near)
 
-    def _update(self, blocks: Int64[np.ndarray, " k"], planes: _Planes, view: CameraView) -> None:
+    def _update(self, blocks: Int64[np.ndarray, " k"], planes: PixelPlanes, view: CameraView) -> None:
         points = _in_camera(self.places[blocks], self.placement, view)
         row = _pixel_rows(points, view)
         known = np.flatnonzero(planes.rows[row, 5] > 0)
         x, y, z = points[:, known]
-        nx, ny, nz, offset, reach, weight = planes.rows[row[known]].T
+        nx, ny, nz, offset, noise, weight = planes.rows[row[known]].T
+        reach = self._reach(noise)
         distance = nx * x + ny * y + nz * z - offset
         kept = distance > -reach  # what lies behind is not seen
         known = known[kept]
         at = blocks[known // BLOCK**3] * BLOCK**3 + known % BLOCK**3
         self._average(at, np.minimum(distance, reach)[kept], reach[kept], weight[kept])
+
+    def _reach(self, noise: Float32[np.ndarray, " n"]) -> Float32[np.ndarray, " n"]:
+        """How far from a surface distances are kept, m."""
+        return np.asarray(np.maximum(noise, np.float32(REACH_VOXELS * self.placement.voxel_m)))
 
     def _average(
         self,
@@ -155,6 +179,10 @@ class FusedVolume:
         weights[at] = np.minimum(total, np.maximum(before, LONGEST_MEMORY_FRAMES * weight))
 
 
+def _inside(points: Float32[np.ndarray, "n 3"], box: Float64[np.ndarray, "2 3"]) -> Bool[np.ndarray, " n"]:
+    return np.asarray(((points >= box[0]) & (points <= box[1])).all(axis=1))
+
+
 def _in_hole(places: Int32[np.ndarray, "n 3"], placement: FusedPlacement) -> Bool[np.ndarray, " n"]:
     """Whether blocks lie inside the hole entirely."""
     if placement.hole is None:
@@ -164,11 +192,9 @@ def _in_hole(places: Int32[np.ndarray, "n 3"], placement: FusedPlacement) -> Boo
     return np.asarray(((low >= least) & (low + placement.block_m <= greatest)).all(axis=1))
 
 
-def _spread_pixels(
-    planes: _Planes, surface: DepthSurface, view: CameraView, distance_m: float
-) -> Int64[np.ndarray, " k"]:
+def _spread_pixels(planes: PixelPlanes, view: CameraView, distance_m: float) -> Int64[np.ndarray, " k"]:
     """Pixels whose points lie at most `distance_m` apart on the surface: each 1st, 2nd, 4th... by its footprint."""
-    camera, inverse = view.camera, surface.inverse_depth.ravel()
+    camera, inverse = view.camera, planes.inverse_depth
     # A pixel is z / f wide, and longer by 1 / cos(slant) = z |towards| / |n.P|.
     cosine = np.abs(planes.rows[:-1, 3]) * inverse / np.linalg.norm(_towards(camera), axis=1)
     affordable = distance_m * float(camera.matrix[0, 0]) * inverse * cosine
@@ -187,26 +213,12 @@ def _towards(camera: CameraModel) -> Float32[np.ndarray, "n 3"]:
 def _columns(
     rows: Float32[np.ndarray, "n 6"],
 ) -> tuple[
-    Float32[np.ndarray, "n 3"], Float32[np.ndarray, " n"], Float32[np.ndarray, " n"], Float32[np.ndarray, " n"]
+    Float32[np.ndarray, "n 3"],
+    Float32[np.ndarray, " n"],
+    Float32[np.ndarray, " n"],
+    Float32[np.ndarray, " n"],
 ]:
     return rows[:, :3], rows[:, 3], rows[:, 4], rows[:, 5]
-
-
-def _pixel_planes(
-    surface: DepthSurface, camera: CameraModel, noise_sigma: float, voxel_m: float
-) -> _Planes:
-    """The plane seen at each pixel; weights are inverse variances relative to the noise at 1 m."""
-    inverse, towards = surface.inverse_depth.ravel(), _towards(camera)
-    z = np.divide(1, inverse, out=np.zeros_like(inverse), where=inverse > 0)
-    normals = surface.normals.reshape(-1, 3)
-    facing = -towards / np.linalg.norm(towards, axis=1, keepdims=True)
-    normals = np.where((normals == 0).all(axis=1, keepdims=True), facing, normals)
-    rows = np.zeros((len(z) + 1, 6), np.float32)
-    rows[:-1, :3] = normals
-    rows[:-1, 3] = np.einsum("ni,ni->n", normals, towards) * z
-    rows[:-1, 4] = np.maximum(REACH_VOXELS * voxel_m, REACH_SIGMAS * noise_sigma * z * z)
-    rows[:-1, 5] = inverse**4  # the variance of depth is (sigma z^2)^2
-    return _Planes(rows)
 
 
 def _in_camera(
@@ -226,7 +238,7 @@ def _lattice() -> Int64[np.ndarray, "512 3"]:
 
 
 def _pixel_rows(points: Float32[np.ndarray, "3 n"], view: CameraView) -> Int32[np.ndarray, " n"]:
-    """The pixel (row of `_Planes`) that looks at each point of the optical frame; the last row for none."""
+    """The pixel (row of `PixelPlanes`) that looks at each point of the optical frame; the last row for none."""
     (fx, fy, cx, cy), (width, height) = view.raster
     table = _pixel_table(view.camera)
     x, y, z = points

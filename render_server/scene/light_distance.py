@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
 from protocol.frames import ViewFrame, decode_lut
 from render_server.scene.known_surfaces import LEAST_PIXELS, known_albedo
@@ -17,9 +17,13 @@ from render_server.scene.registration import unclipped
 
 # Inverse distances tried, 1/m: from far away to 20 cm, finer than what the paper can tell.
 INVERSE_DISTANCES = np.linspace(0.0, 5.0, 101)
-# A near light is believed if what it leaves unexplained of the paper's light is at most this share of what far lights
-# leave: then it explains three quarters of the variance, which stains and uneven ambient light do not by chance.
-BELIEVED_SHARE = 0.5
+# Near lights are believed if they explain this share of all smooth differences (a plane over the paper) between its
+# light and that of far lights: uneven ambient light and shadows do not go the way of the lamps by chance ...
+BELIEVED_SHARE = 0.75
+# ... and if that is more than noise would do once in a thousand times (F-test with 1 and many degrees of freedom),
+# where four neighbouring values of pixels and channels count as one, because lens and demosaicing mix them.
+LEAST_F = 11.0
+MIXED_VALUES = 4
 OUTLIER_DEVIATIONS = 3.0
 
 
@@ -56,32 +60,60 @@ def fit_distance(
     """Find the distance of the lights from the fish-eye camera at `place`, m; None where they seem far away.
 
     The paper's irradiance is f (sum of E_i (D/d)^2 cos + ambient) with a factor f for each channel; the distance
-    D, one for all lights, is that of least squares. `ambient` is the irradiance of all else on paper, in the
-    units of the lights.
+    D, one for all lights, is that of least squares if it is believed. `ambient` is the irradiance of all else on
+    paper, in the units of the lights.
     """
-    misfits = [_misfit(paper, place, lights, ambient, inverse) for inverse in INVERSE_DISTANCES]
+    far = _predicted(paper, place, lights, ambient, 0.0)
+    misfits = [
+        _misfit(paper, _predicted(paper, place, lights, ambient, inverse)) for inverse in INVERSE_DISTANCES
+    ]
     best = int(np.argmin(misfits))
-    if best == 0 or misfits[best] > BELIEVED_SHARE * misfits[0]:
+    gain = misfits[0] - misfits[best]
+    explainable = misfits[0] - _misfit(paper, far * _plane(paper, far))
+    values = paper.irradiance.size / MIXED_VALUES
+    if gain < BELIEVED_SHARE * explainable or gain * values < LEAST_F * misfits[best] or best == 0:
         return None
     return float(1 / INVERSE_DISTANCES[best])
 
 
-def _misfit(
+def _predicted(
     paper: PaperLight,
     place: Float64[np.ndarray, "3"],
     lights: Sequence[RegionLight],
     ambient: Float64[np.ndarray, "3"],
     inverse: float,
-) -> float:
-    """Relative root-mean-square difference of predicted and measured irradiance."""
+) -> Float64[np.ndarray, "k 3"]:
+    """Irradiance of the paper under lights at an inverse distance."""
     predicted = np.tile(ambient, (len(paper.points), 1))
     for light in lights:
         way = light.toward - inverse * (paper.points - place)  # to the lamp, as a share of its distance
         share = np.maximum(way[:, 2], 0) / np.linalg.norm(way, axis=1) ** 3
         predicted += share[:, None] * light.irradiance
-    ratio = paper.irradiance / np.maximum(predicted, 1e-12)
-    deviation = np.abs(ratio - np.median(ratio, axis=0))
-    kept = (deviation <= OUTLIER_DEVIATIONS * 1.4826 * np.median(deviation, axis=0) + 1e-9).all(axis=1)
+    return np.asarray(np.maximum(predicted, 1e-12))
+
+
+def _plane(paper: PaperLight, predicted: Float64[np.ndarray, "k 3"]) -> Float64[np.ndarray, "k 3"]:
+    """Measured over predicted irradiance as a linear function of the place, each channel, by least squares."""
+    places = np.column_stack([np.ones(len(paper.points)), paper.points[:, :2]])
+    kept = _without_outliers(paper.irradiance / predicted)
+    return np.stack(
+        [
+            places @ np.linalg.lstsq(places[kept] * one[kept, None], measured[kept])[0]
+            for one, measured in zip(predicted.T, paper.irradiance.T, strict=True)
+        ],
+        axis=1,
+    )
+
+
+def _misfit(paper: PaperLight, predicted: Float64[np.ndarray, "k 3"]) -> float:
+    """Mean squared difference of predicted and measured irradiance, relative; a factor a channel is fitted."""
+    kept = _without_outliers(paper.irradiance / predicted)
     measured, predicted = paper.irradiance[kept], predicted[kept]
-    factor = (measured * predicted).sum(axis=0) / np.maximum((predicted**2).sum(axis=0), 1e-12)
-    return float(np.sqrt(((factor * predicted - measured) ** 2).mean() / (measured**2).mean()))
+    factor = (measured * predicted).sum(axis=0) / (predicted**2).sum(axis=0)
+    return float(((factor * predicted - measured) ** 2).mean() / (measured**2).mean())
+
+
+def _without_outliers(ratio: Float64[np.ndarray, "k 3"]) -> Bool[np.ndarray, " k"]:
+    deviation = np.abs(ratio - np.median(ratio, axis=0))
+    allowed = OUTLIER_DEVIATIONS * 1.4826 * np.median(deviation, axis=0) + 1e-9
+    return np.asarray((deviation <= allowed).all(axis=1))

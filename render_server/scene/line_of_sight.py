@@ -8,6 +8,9 @@ from protocol.frames import DepthImage
 STEP_M = 0.01  # as fine as the things on a table that can hide a light
 LONGEST_M = 10.0  # beyond, depth cameras see nothing
 TOLERANCE = 0.02  # of depth: beyond the noise of any depth camera in its range
+# How deep below a surface the first point behind it may lie: more than a step goes in, also where the camera looks
+# along the surface, and less than the things on a table are apart.
+THICKNESS_M = 0.05
 
 
 def is_hidden(
@@ -36,5 +39,5 @@ def is_hidden(
     slack = TOLERANCE * np.abs(points[:, 2])
     shown = inside & known[row, column]
     before = shown & (behind <= slack)
-    through = shown & (behind > slack) & (behind <= slack + 2 * STEP_M)
+    through = shown & (behind > slack) & (behind <= slack + THICKNESS_M)
     return bool((before[:-1] & through[1:]).any())

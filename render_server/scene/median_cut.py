@@ -111,9 +111,10 @@ def split_map(
 ) -> Split[MapT]:
     """Split a map into at most `count` lights and a residual (METHOD 2).
 
-    R = L min(1, c / lum L) with c = `threshold` times the solid-angle mean of what is known; P = L - R is cut into regions, each of which becomes a light.
-    Regions under 1 % of the map's energy go back to R, and those whose direction (unit, world) `is_hidden`. With
-    `whole_map` everything is cut and nothing but what is hidden is left (the papers' way).
+    R = L min(1, c / lum L) with c = `threshold` times the solid-angle mean of what is known; P = L - R is cut into
+    regions, each of which becomes a light. Regions under 1 % of the map's energy go back to R, and those whose
+    direction (unit, world) `is_hidden`. With `whole_map` everything is cut and nothing but what is hidden is left
+    (the papers' way).
     """
     luminance = _luminance(sky.radiance)
     energy = float(np.vdot(luminance, sky.grid.solid_angles))

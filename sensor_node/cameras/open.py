@@ -3,13 +3,14 @@
 from pathlib import Path
 
 from protocol.board import BoardSpec
+from protocol.dataset_fisheye import load_fisheye_calibration
 from protocol.documents import nearest
 from protocol.errors import DeltalightError
 from protocol.fisheye_lens import FisheyeCalibration, load_fisheye_yaml
 from protocol.source import RECORDING_SUFFIXES, open_source
 from sensor_node.cameras.base import Camera
 from sensor_node.cameras.fisheye_capture import FisheyeCapture
-from sensor_node.cameras.live import load_calibration, yaml_folder
+from sensor_node.cameras.live import load_calibration
 from sensor_node.cameras.reconnect import ReconnectingCamera
 from sensor_node.cameras.replay import ReplayCamera
 from sensor_node.cameras.settings import CameraSettings, FisheyeSettings
@@ -87,32 +88,43 @@ def _number(source: str) -> int:
     return int(number)
 
 
-def open_fisheye(settings: FisheyeSettings) -> FisheyeCapture:
+def open_fisheye(settings: FisheyeSettings, calibration: Path | None = None) -> FisheyeCapture:
     """Return the camera that sees the light, not opened yet (it is a context manager).
+
+    `calibration` is the folder to look in for fisheye.yaml where the settings name none.
 
     Raises:
         DeltalightError: there is no such source, or its fisheye.yaml is missing or wrong.
     """
-    camera = open_camera(settings.source, settings.camera, calibrated=False, depth=False)
+    known = _fisheye_calibration(settings.source, settings.camera.calibration or calibration)
     return FisheyeCapture(
-        camera,
-        _fisheye_calibration(settings),
+        open_camera(settings.source, _of_fisheye(settings.camera, known), calibrated=False, depth=False),
+        known,
         exposures_s=settings.exposures_s,
         settle_frames=settings.settle_frames,
     )
 
 
-def _fisheye_calibration(settings: FisheyeSettings) -> FisheyeCalibration | None:
-    folder = settings.camera.calibration
-    path = None if folder is None else yaml_folder(folder) / "fisheye.yaml"
-    if path is not None and path.is_file():
-        return load_fisheye_yaml(path)
-    if path is not None or is_live(settings.source):
+def _fisheye_calibration(source: str, folder: Path | None) -> FisheyeCalibration | None:
+    if folder is not None and (folder / "calibration").is_dir():
+        known = load_fisheye_calibration(folder)
+    elif folder is not None and (folder / "fisheye.yaml").is_file():
+        known = load_fisheye_yaml(folder / "fisheye.yaml")
+    else:
+        known = None
+    if known is None and is_live(source):
         raise DeltalightError(
-            f"the fish-eye camera {settings.source} has no calibration; run `deltalight calibrate fisheye` and "
-            "name the folder that holds fisheye.yaml."
+            f"the fish-eye camera {source} has no calibration; run `deltalight calibrate fisheye` and name the "
+            "folder that holds fisheye.yaml."
         )
-    return None
+    return known
+
+
+def _of_fisheye(settings: CameraSettings, known: FisheyeCalibration | None) -> CameraSettings:
+    """Settings at the size of the lens; the folder's rgb.yaml is another camera's."""
+    size = {} if known is None else {"width": known.lens.width, "height": known.lens.height}
+    chosen = settings.model_dump(include={"width", "height"}, exclude_none=True)
+    return settings.model_copy(update={"calibration": None, **size, **chosen})
 
 
 def _unknown(source: str) -> DeltalightError:

@@ -57,9 +57,11 @@ class ReconnectingCamera(Camera):
         """Open the camera and begin to read it.
 
         Raises:
-            DeltalightError: it cannot be opened.
+            DeltalightError: it cannot be opened, or its driver still hangs in the reading before.
         """
         self.close()
+        if self._thread is not None:
+            raise DeltalightError(f"{self._name} hangs in its driver; plug it in again or start anew.")
         self._inner.open()
         self._closing.clear()
         self._kept.clear()
@@ -72,7 +74,7 @@ class ReconnectingCamera(Camera):
         self.interrupt()
         if self._thread is not None:
             self._thread.join(CLOSE_S)
-        self._thread = None
+            self._thread = self._thread if self._thread.is_alive() else None
 
     def interrupt(self) -> None:
         """End a waiting `read` and the attempts to open the camera again."""

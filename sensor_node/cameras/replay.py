@@ -10,12 +10,14 @@ from itertools import pairwise
 import numpy as np
 
 from protocol.errors import DeltalightError
-from protocol.frames import SensorFrame
+from protocol.frames import FisheyePictures, SensorFrame
 from protocol.source import Source
 from sensor_node.cameras.base import Camera, EndOfStream, StaleFrameError
 
 # Gap between the last frame and the first of the next round where one frame alone tells no period.
 DEFAULT_PERIOD_NS = 33_333_333
+# A clock that is only steered drifts by less within an hour; then the stamps follow it in such steps.
+CLOCK_STEP_NS = 10_000_000
 
 
 class PacedCamera(Camera):
@@ -38,6 +40,7 @@ class PacedCamera(Camera):
         self._next = 0
         self._opened_monotonic_ns = self._opened_ns = self._capture_ns = 0
         self._interrupted = threading.Event()
+        self._repeated: tuple[FisheyePictures, int, FisheyePictures] | None = None
 
     @abstractmethod
     def frame_at(self, index: int) -> SensorFrame:
@@ -105,6 +108,9 @@ class PacedCamera(Camera):
     def _take(self, number: int) -> SensorFrame:
         rounds, index = divmod(number, len(self._times))
         elapsed = self._due_ns(number) if self._realtime else self._elapsed_ns()
+        opened_ns = time.time_ns() - self._elapsed_ns()
+        if abs(opened_ns - self._opened_ns) > CLOCK_STEP_NS:  # this host's clock was set meanwhile
+            self._opened_ns = opened_ns
         self._capture_ns = self._opened_ns + elapsed
         self._next = number + 1
         frame = self.frame_at(index)
@@ -117,7 +123,16 @@ class PacedCamera(Camera):
             frame_id=frame.frame_id + rounds * len(self._times),
             timestamp_ns=frame.timestamp_ns + later,
             depth_timestamp_ns=None if depth_ns is None else depth_ns + later,
+            fisheye=None if frame.fisheye is None else self._fisheye_of_round(frame.fisheye, later),
         )
+
+    def _fisheye_of_round(self, pictures: FisheyePictures, later_ns: int) -> FisheyePictures:
+        """Return the pictures with the time of this round, the same object for as long as they hold."""
+        known = self._repeated
+        if known is None or known[0] is not pictures or known[1] != later_ns:
+            shifted = replace(pictures, timestamp_ns=pictures.timestamp_ns + later_ns)
+            known = self._repeated = pictures, later_ns, shifted
+        return known[2]
 
 
 class ReplayCamera(PacedCamera):

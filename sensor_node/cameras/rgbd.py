@@ -24,15 +24,21 @@ class _Backend:
     number: int
     color: int
     depth: int
-    build_option: str
+    advice: str
 
 
 BACKENDS: dict[Kind, _Backend] = {
     "openni2": _Backend(
-        cv2.CAP_OPENNI2, cv2.CAP_OPENNI_BGR_IMAGE, cv2.CAP_OPENNI_DEPTH_MAP, "WITH_OPENNI2=ON"
+        cv2.CAP_OPENNI2,
+        cv2.CAP_OPENNI_BGR_IMAGE,
+        cv2.CAP_OPENNI_DEPTH_MAP,
+        "install an OpenCV built with WITH_OPENNI2=ON",
     ),
     "orbbec": _Backend(
-        cv2.CAP_OBSENSOR, cv2.CAP_OBSENSOR_BGR_IMAGE, cv2.CAP_OBSENSOR_DEPTH_MAP, "WITH_OBSENSOR=ON"
+        cv2.CAP_OBSENSOR,
+        cv2.CAP_OBSENSOR_BGR_IMAGE,
+        cv2.CAP_OBSENSOR_DEPTH_MAP,
+        "run pip install 'opencv-contrib-python-headless<5', as packages of OpenCV 4 have it",
     ),
 }
 
@@ -44,7 +50,7 @@ def has_backend(kind: Kind) -> bool:
 
 def backend_hint(kind: Kind) -> str:
     """What to do where it was not."""
-    return f"for such a camera, install an OpenCV built with {BACKENDS[kind].build_option}"
+    return f"for such a camera, {BACKENDS[kind].advice}"
 
 
 class RgbdCamera(LiveCamera):

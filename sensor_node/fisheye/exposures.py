@@ -54,46 +54,57 @@ def merge_bracket(bracket: FisheyePictures, reference_s: float | None) -> Linear
     if len(scales) == 1:
         return _single(bracket, scales[0])
     lut = decode_lut(bracket.calibration.response)
-    total, weights, bound = np.zeros((3, *bracket.pictures[0].shape), np.float32)
-    for number, which in enumerate(np.argsort(scales)):  # the shortest first
-        light, weight, clipped = _read(bracket.pictures[which], lut)
-        scale = np.float32(scales[which])
-        if number == 0:
-            bound = light / scale
-        else:
-            clipped = cv2.dilate(clipped, np.ones((3, 3), np.uint8))
-        trust = np.where(clipped, np.float32(0), weight)
-        weights += trust * scale**2
-        total += trust * light * scale
-    known = weights > 0
-    linear = np.divide(total, weights, out=bound, where=known)
-    return LinearPicture(linear, np.asarray(~known.all(axis=-1)))
+    order = np.argsort(scales)
+    height, width, _ = bracket.pictures[0].shape
+    total, weights = np.zeros((2, height, 3 * width), np.float32)
+    for which in order:
+        scale, picture = scales[which], bracket.pictures[which]
+        reading = _read(picture, scale, lut)
+        clipped = (
+            reading.clipped if which == order[0] else cv2.dilate(reading.clipped, np.ones((3, 3), np.uint8))
+        )
+        # As one channel, so that OpenCV takes a mask for each value.
+        trusted = (1 - clipped).reshape(height, -1)
+        cv2.accumulate(reading.weight.reshape(height, -1), weights, trusted)
+        cv2.accumulate(reading.weighted_light.reshape(height, -1), total, trusted)
+    unknown = (weights == 0).reshape(height, width, 3)
+    linear = (total / np.maximum(weights, np.finfo(np.float32).tiny)).reshape(height, width, 3)
+    if unknown.any():
+        shortest = _linear(bracket.pictures[order[0]], lut) / np.float32(scales[order[0]])
+        linear[unknown] = shortest[unknown]
+    return LinearPicture(linear, np.asarray(unknown.any(axis=-1)))
 
 
 class _Reading(NamedTuple):
-    linear: Float32[np.ndarray, "h w 3"]
+    """Of every value of one exposure: inverse variance of the light that it says, that times the light, and white."""
+
     weight: Float32[np.ndarray, "h w 3"]
+    weighted_light: Float32[np.ndarray, "h w 3"]
     clipped: UInt8[np.ndarray, "h w 3"]
 
 
-def _read(picture: Picture, lut: Float32[np.ndarray, "256 3"]) -> _Reading:
-    """Linear values of one exposure, their inverse variance, and which are white."""
+def _read(picture: Picture, scale: float, lut: Float32[np.ndarray, "256 3"]) -> _Reading:
     if picture.dtype != np.uint8:
-        weight = 1 / (np.maximum(picture, 0) / FULL_WELL + READ_NOISE**2)
-        return _Reading(picture, weight.astype(np.float32), (picture >= 1).astype(np.uint8))
+        weight = scale**2 / (np.maximum(picture, 0) / FULL_WELL + READ_NOISE**2)
+        light = weight * picture / scale
+        return _Reading(weight.astype(np.float32), light.astype(np.float32), (picture >= 1).astype(np.uint8))
     step = np.gradient(lut, axis=0)
-    variance = lut / FULL_WELL + READ_NOISE**2 + step**2 / 12
-    tables = lut[None].astype(np.float32), (1 / variance)[None].astype(np.float32)
-    light, weight = (cv2.LUT(picture, table) for table in tables)
-    return _Reading(light, weight, (picture >= CLIPPED_CODE).astype(np.uint8))
+    weight = scale**2 / (lut / FULL_WELL + READ_NOISE**2 + step**2 / 12)
+    weight_of, light_of = (table[None].astype(np.float32) for table in (weight, weight * lut / scale))
+    clipped = (picture >= CLIPPED_CODE).astype(np.uint8)
+    return _Reading(cv2.LUT(picture, weight_of), cv2.LUT(picture, light_of), clipped)
+
+
+def _linear(picture: Picture, lut: Float32[np.ndarray, "256 3"]) -> Float32[np.ndarray, "h w 3"]:
+    return picture if picture.dtype != np.uint8 else cv2.LUT(picture, lut[None])
 
 
 def _single(bracket: FisheyePictures, scale: float) -> LinearPicture:
     picture = bracket.pictures[0]
+    light = _linear(picture, decode_lut(bracket.calibration.response)) / np.float32(scale)
     if picture.dtype != np.uint8:
-        return LinearPicture(picture / np.float32(scale), np.zeros(picture.shape[:2], bool))
-    light = cv2.LUT(picture, decode_lut(bracket.calibration.response)[None].astype(np.float32))
-    return LinearPicture(light / np.float32(scale), np.asarray((picture >= CLIPPED_CODE).any(axis=-1)))
+        return LinearPicture(light, np.zeros(picture.shape[:2], bool))
+    return LinearPicture(light, np.asarray((picture >= CLIPPED_CODE).any(axis=-1)))
 
 
 def _scale(exposure_s: float | None, reference_s: float | None) -> float:
@@ -133,10 +144,11 @@ def display_picture(
 
     `inside` is where the lens sees; what lies outside says nothing about the exposure.
     """
+    some = inside[::4, ::4]
     coded = [picture for picture in pictures if picture.dtype == np.uint8]
     if coded:
         # sRGB codes 18 % grey as 118.
-        return min(coded, key=lambda picture: abs(float(picture[inside][::16].mean()) - 118))
-    middle = float(np.median(merged.linear[inside]))
+        return min(coded, key=lambda picture: abs(float(picture[::4, ::4][some].mean()) - 118))
+    middle = float(np.median(merged.linear[::4, ::4][some]))
     light = merged.linear * np.float32(0.18 / middle if middle > 0 else 1.0)
     return np.searchsorted(decode_lut(None)[:, 0], np.clip(light, 0, 1)).astype(np.uint8)

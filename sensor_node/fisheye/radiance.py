@@ -43,7 +43,7 @@ def radiance_map(
         seen=sampler.seen,
         world_from_fisheye=world_from_fisheye,
         clipped_share=clipped_share,
-        picture=display_picture(pictures.pictures, merged, ~sampler.outside),
+        picture=display_picture(pictures.pictures, merged, sampler.inside > 0),
         calibration=pictures.calibration,
     )
 

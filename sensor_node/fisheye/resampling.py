@@ -5,7 +5,7 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Bool, Float32, Float64, UInt8
 
 from protocol.fisheye_lens import FisheyeCalibration, FisheyeLens
 from protocol.hemisphere import hemisphere_direction, texel_solid_angles
@@ -19,32 +19,29 @@ class HemisphereSampler:
     The picture is averaged over squares of `shrink` pixels ("cells", about a texel wide), multiplied by `gain`, and
     sampled bilinearly at `per_texel`^2 places of each texel, whose mean is the texel's value. Samples do not meet
     all cells equally often, so `gain` holds, beside 1/vignetting, each cell's solid angle over the solid angle that
-    the map gives it: thus the flux of a lamp is kept wherever it stands, however small it is.
+    the map gives it: thus the flux of a lamp is kept wherever it stands, however small it is. Texels are `seen` where
+    the lens sees more than half of them; `scale` makes their values means of what it sees, 0 elsewhere.
     """
 
     size: int
     shrink: int
     per_texel: int
-    outside: Bool[np.ndarray, "h w"]
+    inside: UInt8[np.ndarray, "h w"]
     gain: Float32[np.ndarray, "cells_y cells_x"]
     weight: Float32[np.ndarray, "cells_y cells_x"]
     places: Float32[np.ndarray, "samples samples 2"]
-    coverage: Float32[np.ndarray, "size size"]
-
-    @property
-    def seen(self) -> Bool[np.ndarray, "size size"]:
-        """Texels of which the lens sees more than half."""
-        return np.asarray(self.coverage > 0.5)
+    seen: Bool[np.ndarray, "size size"]
+    scale: Float32[np.ndarray, "size size 1"]
 
     def resample(self, picture: LinearPicture) -> tuple[Float32[np.ndarray, "size size 3"], float]:
         """Return the radiance map, 0 where nothing is seen, and the clipped share of the seen solid angle."""
-        cells = _shrunk(np.where(self.outside[..., None], np.float32(0), picture.linear), self.shrink)
+        cells = _shrunk(cv2.copyTo(picture.linear, self.inside), self.shrink)
         samples = cv2.remap(
             cells * self.gain[..., None], self.places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT
         )
         texels = _shrunk(samples, self.per_texel)
-        texels *= np.where(self.seen, 1 / np.maximum(self.coverage, 0.5), 0).astype(np.float32)[..., None]
-        clipped = _shrunk((picture.clipped & ~self.outside).astype(np.float32), self.shrink)
+        texels *= self.scale
+        clipped = _shrunk((picture.clipped & (self.inside > 0)).astype(np.float32), self.shrink)
         share = float((clipped * self.weight).sum() / max(float(self.weight.sum()), 1e-12))
         return texels, min(share, 1.0)
 
@@ -54,19 +51,29 @@ def hemisphere_sampler(calibration: FisheyeCalibration, size: int) -> Hemisphere
     """Make the tables for a calibration (compared by value) and a map's size."""
     lens = calibration.lens
     pixel = np.stack(np.meshgrid(np.arange(lens.width), np.arange(lens.height)), axis=-1)
-    outside = ~lens.has_ray(pixel.reshape(-1, 2).astype(np.float64)).reshape(lens.height, lens.width)
+    inside = lens.has_ray(pixel.reshape(-1, 2).astype(np.float64)).reshape(lens.height, lens.width)
     ratio = np.sqrt(2 * np.pi) / size / _pixel_angle(lens)
     shrink = max(1, round(ratio))
     # Half a cell apart, samples meet all cells nearly equally, so that an even sky stays even.
     per_texel = int(np.ceil(2 * ratio / shrink))
-    inside = _shrunk((~outside).astype(np.float32), shrink)
+    share = _shrunk(inside.astype(np.float32), shrink)
     places = _places(lens, size * per_texel, shrink)
-    coverage = _shrunk(cv2.remap(inside, places, None, cv2.INTER_LINEAR), per_texel)
-    angle, solid, up = _cells(lens, inside.shape, shrink)
-    gain = _flux_gain(places, size, inside, solid) / calibration.transmission(np.minimum(angle, np.pi / 2))
-    weight = np.where(up, solid * inside, 0)
+    coverage = _shrunk(cv2.remap(share, places, None, cv2.INTER_LINEAR), per_texel)
+    seen = coverage > 0.5
+    scale = np.where(seen, 1 / np.maximum(coverage, 0.5), 0)
+    angle, solid, up = _cells(lens, share.shape, shrink)
+    gain = _flux_gain(places, size, share, solid) / calibration.transmission(angle)
+    weight = np.where(up, solid * share, 0)
     return HemisphereSampler(
-        size, shrink, per_texel, outside, gain.astype(np.float32), weight.astype(np.float32), places, coverage
+        size=size,
+        shrink=shrink,
+        per_texel=per_texel,
+        inside=inside.astype(np.uint8),
+        gain=gain.astype(np.float32),
+        weight=weight.astype(np.float32),
+        places=places,
+        seen=seen,
+        scale=scale.astype(np.float32)[..., None],
     )
 
 
@@ -101,7 +108,7 @@ def _places(lens: FisheyeLens, edge: int, shrink: int) -> Float32[np.ndarray, "e
 def _cells(
     lens: FisheyeLens, shape: tuple[int, ...], shrink: int
 ) -> tuple[Float64[np.ndarray, "y x"], Float64[np.ndarray, "y x"], Bool[np.ndarray, "y x"]]:
-    """Of every cell: angle of its centre from the axis, solid angle (0 at the rim), and whether it is in the map."""
+    """Of every cell: angle from the axis (at most 90 degrees), solid angle (0 at the rim), if it is in the map."""
     rows, columns = shape
     corner = np.stack(np.meshgrid(np.arange(columns + 1.0), np.arange(rows + 1.0)), axis=-1) * shrink - 0.5
     rays = lens.directions(corner.reshape(-1, 2)).reshape(rows + 1, columns + 1, 3)
@@ -110,7 +117,9 @@ def _cells(
     )
     middle = (corner[:-1, :-1] + corner[1:, 1:]) / 2
     z = lens.directions(middle.reshape(-1, 2))[:, 2].reshape(rows, columns)
-    angle = np.arccos(np.clip(np.nan_to_num(z), -1, 1))
+    angle = np.minimum(np.arccos(np.clip(z, -1, 1)), np.pi / 2)
+    # A cell on the rim may have its centre outside: it is as far from the axis as the lens sees.
+    angle = np.where(np.isfinite(angle), angle, np.nanmax(angle))
     return angle, np.nan_to_num(solid), np.asarray(z > 0)
 
 

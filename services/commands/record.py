@@ -10,11 +10,11 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from services.commands.options import ConfigFile
+from services.commands.options import ConfigFile, NodeName
 from services.ports import NODE_PORT, endpoint
 
 if TYPE_CHECKING:
-    from protocol.keys import Keys
+    from protocol.keys import Keys, KeySettings
     from protocol.scene import SceneDocument
     from services.recorder import Recorder, RecordStatus
 
@@ -24,8 +24,11 @@ SHOW_PERIOD_S = 0.25
 def record(
     *,
     out: Annotated[Path, typer.Option(help="Recording to write, NAME.mcap; it must not exist.")],
-    subscribe: Annotated[str, typer.Option(help="Endpoint of the node's streams.")] = endpoint(NODE_PORT),
-    node: Annotated[str | None, typer.Option(help="Name of the node, where several publish.")] = None,
+    subscribe: Annotated[
+        str | None, typer.Option(help="Endpoint of the node's streams. Default: tcp://127.0.0.1:5601.")
+    ] = None,
+    node: NodeName = None,
+    name: Annotated[str | None, typer.Option(help="Name of the node, where several publish there.")] = None,
     scene: Annotated[Path | None, typer.Option(help="Scene document to attach.")] = None,
     control: Annotated[
         str | None, typer.Option(help="Control endpoint of the render server whose scene is attached.")
@@ -44,12 +47,13 @@ def record(
     from services.recorder import Recorder, RecordJob
     from services.settings import load_configuration
 
-    endpoints = [subscribe] if control is None else [subscribe, control]
-    keys = load_configuration(config_file).section("keys", KeySettings).load(endpoints)
+    settings = load_configuration(config_file).section("keys", KeySettings)
+    place = _endpoint(subscribe, node, settings)
+    keys = settings.load([place] if control is None else [place, control])
     job = RecordJob(
         out,
-        subscribe,
-        node=node,
+        place,
+        node=name,
         scene=_scene(scene, control, keys),
         extrinsics=None if extrinsics is None else load_extrinsics_yaml(extrinsics),
         duration_s=duration,
@@ -59,6 +63,19 @@ def record(
     console = Console(stderr=True, soft_wrap=True)
     recorder = Recorder(job, lambda sentence: console.print(sentence, markup=False, highlight=False))
     _run(recorder, console, lambda status: _print_summary(status, as_json=as_json))
+
+
+def _endpoint(subscribe: str | None, node: str | None, settings: "KeySettings") -> str:
+    """The endpoint that is named, or that of the node that is to be found."""
+    from protocol.errors import DeltalightError
+
+    if node is None:
+        return subscribe or endpoint(NODE_PORT)
+    if subscribe is not None:
+        raise DeltalightError("--subscribe and --node both say where the node is; give one of them.")
+    from services.discovery import node_endpoint
+
+    return node_endpoint(node, settings)
 
 
 def _scene(path: Path | None, control: str | None, keys: "Keys | None") -> "SceneDocument | None":

@@ -43,6 +43,11 @@ def hosts(tmp_path: Path) -> Hosts:
     return made
 
 
+def at_node(endpoint: str) -> str:
+    """The endpoint as one whose host has the node's key."""
+    return endpoint.replace("tcp://", "tcp://node@")
+
+
 def gets_something(publisher: Publisher, receiver: Receiver, patience_s: float = SETTLE_S) -> bool:
     deadline = time.monotonic() + patience_s
     while time.monotonic() < deadline:
@@ -61,9 +66,15 @@ def wait_until(condition: Callable[[], bool]) -> None:
 
 def test_a_trusted_key_gets_the_stream(hosts: Hosts, opened: Callable[[Any], Any]) -> None:
     publisher = opened(Publisher(ANY, keys=hosts.node))
-    receiver = opened(Receiver([publisher.endpoint], ["hello"], keys=hosts.server))
+    receiver = opened(Receiver([at_node(publisher.endpoint)], ["hello"], keys=hosts.server))
     assert gets_something(publisher, receiver)
     assert publisher.refused == 0
+
+
+def test_processes_of_one_host_share_its_keys(hosts: Hosts, opened: Callable[[Any], Any]) -> None:
+    publisher = opened(Publisher(ANY, keys=hosts.node))
+    receiver = opened(Receiver([publisher.endpoint], ["hello"], keys=hosts.node))
+    assert gets_something(publisher, receiver)
 
 
 def test_an_unknown_key_gets_nothing_is_counted_and_told_at_both_ends(
@@ -71,13 +82,13 @@ def test_an_unknown_key_gets_nothing_is_counted_and_told_at_both_ends(
 ) -> None:
     with structlog.testing.capture_logs() as lines:
         publisher = opened(Publisher(ANY, keys=hosts.node))
-        stranger = opened(Receiver([publisher.endpoint], [], keys=hosts.stranger))
+        stranger = opened(Receiver([at_node(publisher.endpoint)], [], keys=hosts.stranger))
         assert not gets_something(publisher, stranger, PATIENCE_S)
         assert publisher.refused > 0
         reasons = [line["reason"] for line in lines if line["event"] == "connection refused"]
     assert sum("its key is not trusted" in reason for reason in reasons) == 1
     assert sum("our key is not trusted there" in reason for reason in reasons) == 1
-    receiver = opened(Receiver([publisher.endpoint], ["hello"], keys=hosts.server))
+    receiver = opened(Receiver([at_node(publisher.endpoint)], ["hello"], keys=hosts.server))
     assert gets_something(publisher, receiver)
 
 
@@ -92,7 +103,7 @@ def test_a_receiver_with_keys_takes_nothing_from_a_publisher_without(
     hosts: Hosts, opened: Callable[[Any], Any]
 ) -> None:
     publisher = opened(Publisher(ANY))
-    receiver = opened(Receiver([publisher.endpoint], [], keys=hosts.server))
+    receiver = opened(Receiver([at_node(publisher.endpoint)], [], keys=hosts.server))
     assert not gets_something(publisher, receiver, PATIENCE_S)
 
 
@@ -101,7 +112,7 @@ def test_a_node_with_another_key_is_not_taken_for_the_trusted_one(
 ) -> None:
     trust(hosts.server.folder / "server.key", hosts.stranger.folder)
     impostor = opened(Publisher(ANY, keys=hosts.stranger))
-    receiver = opened(Receiver([impostor.endpoint], [], keys=hosts.server))
+    receiver = opened(Receiver([at_node(impostor.endpoint)], [], keys=hosts.server))
     assert not gets_something(impostor, receiver, PATIENCE_S)
 
 
@@ -109,13 +120,13 @@ def test_trust_holds_from_the_next_connection_on_without_a_restart(
     hosts: Hosts, opened: Callable[[Any], Any]
 ) -> None:
     publisher = opened(Publisher(ANY, keys=hosts.node))
-    before = opened(Receiver([publisher.endpoint], [], keys=hosts.stranger))
+    before = opened(Receiver([at_node(publisher.endpoint)], [], keys=hosts.stranger))
     assert not gets_something(publisher, before, PATIENCE_S)
     kept = trust(hosts.stranger.folder / "stranger.key", hosts.node.folder)
-    now = opened(Receiver([publisher.endpoint], [], keys=hosts.stranger))
+    now = opened(Receiver([at_node(publisher.endpoint)], [], keys=hosts.stranger))
     assert gets_something(publisher, now)
     kept.unlink()
-    later = opened(Receiver([publisher.endpoint], [], keys=hosts.stranger))
+    later = opened(Receiver([at_node(publisher.endpoint)], [], keys=hosts.stranger))
     assert not gets_something(publisher, later, PATIENCE_S)
 
 
@@ -124,7 +135,7 @@ def test_one_receiver_hears_a_node_of_this_host_and_one_with_keys(
 ) -> None:
     """Each order: the keys of one endpoint must not stick to the next."""
     plain, coded = opened(Publisher(ANY)), opened(Publisher(ANY, keys=hosts.node))
-    named = coded.endpoint.replace("tcp://", "tcp://node@")
+    named = at_node(coded.endpoint)
     for endpoints in ([plain.endpoint, named], [named, plain.endpoint]):
         receiver = opened(Receiver(endpoints, [], keys=replace(hosts.server, on_loopback=False)))
         assert gets_something(plain, receiver)
@@ -135,19 +146,19 @@ def test_a_node_that_connects_to_a_bound_receiver_needs_a_trusted_key(
     hosts: Hosts, opened: Callable[[Any], Any]
 ) -> None:
     receiver = opened(Receiver([ANY], [], bind=True, keys=hosts.node))
-    stranger = opened(Publisher(receiver.endpoints[0], bind=False, keys=hosts.stranger))
+    stranger = opened(Publisher(at_node(receiver.endpoints[0]), bind=False, keys=hosts.stranger))
     assert not gets_something(stranger, receiver, PATIENCE_S)
-    trusted = opened(Publisher(receiver.endpoints[0], bind=False, keys=hosts.server))
+    trusted = opened(Publisher(at_node(receiver.endpoints[0]), bind=False, keys=hosts.server))
     assert gets_something(trusted, receiver)
 
 
 def test_control_needs_a_trusted_key(hosts: Hosts, opened: Callable[[Any], Any]) -> None:
     server = opened(ReplyServer(ANY, lambda request: {"op": request.op}, keys=hosts.node))
     question = ControlRequest(node="a", id="1", op="status")
-    trusted = opened(RequestClient(server.endpoint, keys=hosts.server))
+    trusted = opened(RequestClient(at_node(server.endpoint), keys=hosts.server))
     assert trusted.request(question, SETTLE_S).payload == {"op": "status"}
-    for keys in (None, hosts.stranger):
-        client = opened(RequestClient(server.endpoint, keys=keys))
+    for endpoint, keys in ((server.endpoint, None), (at_node(server.endpoint), hosts.stranger)):
+        client = opened(RequestClient(endpoint, keys=keys))
         with pytest.raises(DeltalightError, match="no answer"):
             client.request(question, PATIENCE_S)
     wait_until(lambda: server.refused > 0)
@@ -161,3 +172,12 @@ def test_a_host_whose_key_is_unknown_is_refused_before_connecting(hosts: Hosts) 
     ):
         with pytest.raises(DeltalightError, match="no key of `shelf` is trusted"):
             build()
+
+
+def test_on_loopback_keys_are_used_only_where_that_is_asked_for(
+    hosts: Hosts, opened: Callable[[Any], Any]
+) -> None:
+    publisher = opened(Publisher(ANY, keys=replace(hosts.node, on_loopback=False)))
+    plain = opened(Receiver([publisher.endpoint], ["hello"]))
+    assert gets_something(publisher, plain)
+    assert publisher.refused == 0

@@ -212,6 +212,12 @@ def test_wrong_files_are_refused_in_one_sentence(text: str, message: str, tmp_pa
     assert str(tmp_path) in str(caught.value)
 
 
+@pytest.mark.filterwarnings("error")
+def test_numbers_that_overflow_are_refused() -> None:
+    with pytest.raises(DeltalightError, match="goes nowhere"):
+        equidistant((1e300, -1e300, 1e308, 1e-300))
+
+
 def test_an_ocam_results_file_is_read_into_the_optical_frame(tmp_path: Path) -> None:
     path = tmp_path / "calib_results.txt"
     path.write_text(
@@ -219,6 +225,9 @@ def test_an_ocam_results_file_is_read_into_the_optical_frame(tmp_path: Path) -> 
         "#center: row and column\n\n147.2 156.1\n\n#affine\n\n1.001 -0.0003 0.0008\n\n#height, width\n\n300 312\n"
     )
     assert FisheyeCalibration(load_ocam_results(path)) == FisheyeCalibration(ocam())
+    named = tmp_path / "fisheye.yaml"
+    named.write_text("distortion_model: ocam\nocam: calib_results.txt\nimage_circle: 131.5\n")
+    assert load_fisheye_yaml(named) == FisheyeCalibration(ocam(131.5))
     # OCamCalib's own cam2world: row, column -> (x down, y right, z backwards).
     row, column = 220.0, 80.0
     x, y = np.linalg.solve([[1.001, -0.0003], [0.0008, 1.0]], [row - 147.2, column - 156.1])

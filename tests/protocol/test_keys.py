@@ -82,18 +82,26 @@ def test_settings_load_keys_only_where_an_endpoint_needs_them(tmp_path: Path) ->
 def test_the_key_behind_an_endpoint_is_the_named_or_the_only_one(tmp_path: Path) -> None:
     create_keys("gpu", tmp_path)
     keys = load_keys(None, tmp_path)
+    plain, named = parse_endpoint("tcp://10.0.0.5:5601"), parse_endpoint("tcp://shelf@10.0.0.5:5601")
     with pytest.raises(DeltalightError, match="deltalight keys trust"):
-        keys.peer(None, "tcp://10.0.0.5:5601")
-    desk, _ = create_keys("desk", tmp_path / "a")
-    trust(desk, tmp_path)
-    assert keys.peer(None, "tcp://10.0.0.5:5601") == load_keys("desk", tmp_path / "a").public
+        keys.peer(plain)
+    trust(create_keys("desk", tmp_path / "a")[0], tmp_path)
+    assert keys.peer(plain) == load_keys("desk", tmp_path / "a").public
     trust(create_keys("shelf", tmp_path / "b")[0], tmp_path)
-    assert keys.peer("shelf", "tcp://10.0.0.5:5601") == load_keys("shelf", tmp_path / "b").public
+    assert keys.peer(named) == load_keys("shelf", tmp_path / "b").public
     with pytest.raises(DeltalightError, match=r"tcp://NAME@HOST:PORT with one of desk, shelf"):
-        keys.peer(None, "tcp://10.0.0.5:5601")
+        keys.peer(plain)
     with pytest.raises(DeltalightError, match="nearest trusted name is shelf"):
-        keys.peer("shelv", "tcp://10.0.0.5:5601")
+        keys.peer(parse_endpoint("tcp://shelv@10.0.0.5:5601"))
     assert own_keys(tmp_path) == ["gpu"]
+
+
+def test_processes_of_one_host_know_each_other_by_its_own_key(tmp_path: Path) -> None:
+    create_keys("gpu", tmp_path)
+    keys = load_keys(None, tmp_path)
+    assert keys.peer(parse_endpoint("tcp://127.0.0.1:5601")) == keys.public
+    assert keys.peer(parse_endpoint("tcp://gpu@127.0.0.1:5601")) == keys.public
+    assert keys.trusted() == {"gpu": keys.public}
 
 
 def test_an_endpoint_may_name_its_hosts_key() -> None:

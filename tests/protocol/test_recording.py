@@ -211,6 +211,19 @@ def test_the_scene_is_attached_with_paths_relative_to_the_recording(tmp_path: Pa
     assert RecordingReader(record(tmp_path / "b.mcap", frames(1))).scene is None
 
 
+def test_a_damaged_scene_document_costs_no_frames(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with RecordingWriter(path, scene=parse_scene({"name": "kept-intact"})) as writer:
+        for frame in frames(2):
+            writer.add(frame)
+    data = path.read_bytes()
+    path.write_bytes(data.replace(b'"kept-intact"', b'"kept-intac\\x'))
+    reader = RecordingReader(path)
+    assert len(list(reader)) == 2
+    assert reader.scene is None
+    assert any("scene document" in note for note in reader.notes)
+
+
 @pytest.mark.parametrize("share", [0.25, 0.5, 0.75, 0.9, 0.999])
 def test_a_truncated_recording_gives_every_frame_that_was_written(tmp_path: Path, share: float) -> None:
     recorded, ends = frames(8), []

@@ -91,7 +91,7 @@ def test_a_map_becomes_a_directional_light_and_an_environment() -> None:
     lights = followed(source(), frame(radiance_map=seen()))
     (lamp,) = lights.lights
     assert isinstance(lamp, DirectionalLight)
-    assert -lamp.direction @ LAMP > np.cos(np.radians(0.5))
+    assert -lamp.direction @ LAMP > np.cos(np.radians(1.0))  # the disc covers few texels
     assert lights.registration_auto
     up = sample_octahedral(lights.environment, np.array([[[0.0, 0, 1]]]))[0, 0]
     assert up == pytest.approx([0.3] * 3, rel=1e-3)
@@ -108,7 +108,7 @@ def test_a_turned_camera_gives_the_same_light_in_the_world() -> None:
     turned.world_from_fisheye[:3, :3] = turn
     (lamp,) = followed(source(), frame(radiance_map=turned)).lights
     assert isinstance(lamp, DirectionalLight)
-    assert -lamp.direction @ LAMP > np.cos(np.radians(0.5))
+    assert -lamp.direction @ LAMP > np.cos(np.radians(1.0))  # the disc covers few texels
 
 
 def test_nothing_new_costs_nothing() -> None:

@@ -1,10 +1,11 @@
 """Targets seen by known cameras: exact views with noise, and pictures."""
 
 from collections.abc import Callable, Sequence
+from functools import cache
 
 import cv2
 import numpy as np
-from jaxtyping import Float64, UInt8
+from jaxtyping import Float32, Float64, UInt8
 
 from protocol.camera_model import CameraModel
 from protocol.poses import rigid_matrix
@@ -63,10 +64,15 @@ def views(
     return result
 
 
+@cache
+def fine_rays(camera: CameraModel) -> Float32[np.ndarray, "h w 3"]:
+    fine = camera.resized(2 * camera.width, 2 * camera.height)
+    return np.concatenate([fine.rays(), np.ones((fine.height, fine.width, 1), np.float32)], axis=-1)
+
+
 def picture(camera: CameraModel, pose: Float64[np.ndarray, "4 4"]) -> UInt8[np.ndarray, "h w 3"]:
     """A chessboard on white paper before grey, four samples a pixel."""
-    fine = camera.resized(2 * camera.width, 2 * camera.height)
-    rays = np.concatenate([fine.rays(), np.ones((fine.height, fine.width, 1), np.float32)], axis=-1)
+    rays = fine_rays(camera)
     normal, offset = pose[:3, 2], pose[:3, 2] @ pose[:3, 3]
     depth = offset / (rays @ normal)
     local = (rays * depth[..., None] - pose[:3, 3]) @ pose[:3, :3] / SQUARE_M

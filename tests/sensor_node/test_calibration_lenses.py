@@ -4,20 +4,24 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from jaxtyping import Float64
 
+from protocol.board import BoardSpec
 from protocol.camera_model import CameraModel
 from protocol.equidistant_lens import EquidistantLens
 from protocol.errors import DeltalightError
 from protocol.ocam_lens import OcamLens
 from protocol.radial_lens import RadialLens
 from sensor_node.calibration.coverage import image_circle, measure_coverage
+from sensor_node.calibration.fits import rms
 from sensor_node.calibration.lens_calibration import LensKind, LensResult, calibrate_lens, require_good
 from sensor_node.calibration.lens_fits import fit_equidistant
 from sensor_node.calibration.picture_sources import open_series
-from sensor_node.calibration.targets import parse_target
+from sensor_node.calibration.poses import target_pose
+from sensor_node.calibration.targets import MarkerBoard, parse_target
 from sensor_node.calibration.views import View, ViewCollector
 from tests.sensor_node.calibration_samples import BOARD, facing, poses, views
 
@@ -84,7 +88,7 @@ def test_the_stated_uncertainty_of_the_focal_length_is_true() -> None:
             [replace(view, pixels=view.pixels + random.normal(0, 0.3, view.pixels.shape)) for view in found],
             SIZE,
         )
-        for _ in range(8)
+        for _ in range(6)
     ]
     focals = [fit.lens.camera.matrix[0, 0] for fit in fits if isinstance(fit.lens, EquidistantLens)]
     stated = np.mean([fit.focal_share for fit in fits]) * 190
@@ -138,6 +142,11 @@ def frontal(count: int) -> list[Float64[np.ndarray, "4 4"]]:
     return [facing(middle, (0.0, 0.0), (0.0, 0.0), 0.5 + 0.03 * k, 0.2 * k) for k in range(count)]
 
 
+def leaning(count: int) -> list[Float64[np.ndarray, "4 4"]]:
+    middle = BOARD.points.mean(axis=0)
+    return [facing(middle, (0.0, 0.0), (0.26, 0.0), 0.5 + 0.03 * k, 0.0) for k in range(count)]
+
+
 def small(count: int) -> list[Float64[np.ndarray, "4 4"]]:
     middle = BOARD.points.mean(axis=0)
     tilts = [(0.6 * np.cos(k), 0.6 * np.sin(k)) for k in range(count)]
@@ -148,11 +157,13 @@ def small(count: int) -> list[Float64[np.ndarray, "4 4"]]:
     ("found", "sentence"),
     [
         (views(PINHOLE.project, SIZE, poses(7, NEAR, 0.55)), "only 7 of 7 pictures"),
-        (views(PINHOLE.project, SIZE, frontal(12)), "focal length uncertain"),
+        (views(PINHOLE.project, SIZE, frontal(12)), "one tilt in all views"),
+        (views(PINHOLE.project, SIZE, leaning(12)), "one tilt in all views"),
+        (views(PINHOLE.project, SIZE, poses(8, NEAR, 2.5), noise_px=0.6), "focal length uncertain"),
         (views(PINHOLE.project, SIZE, small(12)), r"% of the picture's cells"),
         (views(PINHOLE.project, SIZE, poses(16, NEAR, 0.55), noise_px=1.2), "misses the corners by"),
     ],
-    ids=["few", "one tilt", "only the middle", "blurred"],
+    ids=["few", "frontal", "one tilt", "far", "only the middle", "blurred"],
 )
 def test_misleading_sets_are_refused_with_a_reason(found: list[View], sentence: str) -> None:
     with pytest.raises(DeltalightError, match=sentence):
@@ -215,10 +226,11 @@ def collected(source: str, target: str) -> ViewCollector:
 def test_real_fisheye_set_of_large_squares(fisheye_sets: Path, kind: LensKind) -> None:
     target = parse_target("chessboard:8x6:0.117", None, ())
     views_found = collected(f"{fisheye_sets}/Fisheye2_*.jpg", "chessboard:8x6:0.117")
-    assert len(views_found.views) == 16
+    # OpenCV 5 and 4.14 find the board in all 16 pictures, 4.10 in fewer.
+    assert len(views_found.views) >= 13
     result = calibrate_lens(views_found, target, kind)
     require_good(result)
-    assert len(result.fit.views) == 16
+    assert len(result.fit.views) == len(views_found.views)
     assert result.fit.rms_px < 0.15
     assert not isinstance(result.fit.lens, CameraModel)
     assert result.fit.lens.image_circle == pytest.approx(298, abs=6)
@@ -261,3 +273,32 @@ def test_real_chessboard_series_agrees_with_the_published_result(shared_data: Pa
     eight = calibrate_lens(found, target, "plumb_bob_8")
     with pytest.raises(DeltalightError, match="fewer coefficients"):
         require_good(eight)
+
+
+@pytest.mark.data
+def test_real_charuco_photograph_fits_its_published_lens_but_calibrates_none(shared_data: Path) -> None:
+    target = MarkerBoard(
+        BoardSpec(
+            type="charuco",
+            dictionary="DICT_6X6_250",
+            marker_length_m=0.02,
+            separation_m=0.02,
+            rows=7,
+            columns=5,
+        )
+    )
+    photographs = shared_data / "aruco_photos" / "opencv"
+    collector = ViewCollector(target, moving=False)
+    for each in open_series(f"{photographs}/choriginal.jpg", "rgb").pictures:
+        collector.add(each)
+    assert [len(view.points) for view in collector.views] == [24]
+    file = cv2.FileStorage(str(photographs / "tutorial_camera_charuco.yml"), cv2.FILE_STORAGE_READ)
+    matrix, distortion = (file.getNode(name).mat() for name in ("camera_matrix", "distortion_coefficients"))
+    camera = CameraModel(640, 480, matrix, "plumb_bob", distortion.ravel())
+    view = collector.views[0]
+    rays = np.column_stack([camera.unproject(view.pixels), np.ones(24)])
+    pose = target_pose(view.points, rays / np.linalg.norm(rays, axis=1)[:, None])
+    assert pose is not None
+    assert rms(view.pixels - camera.project(view.points @ pose[:3, :3].T + pose[:3, 3])) < 0.2
+    with pytest.raises(DeltalightError, match="only 1 of 1 pictures"):
+        calibrate_lens(collector, target, "plumb_bob_5")

@@ -4,6 +4,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from protocol.errors import DeltalightError
 from sensor_node.cameras.base import EndOfStream, StaleFrameError
 from sensor_node.cameras.replay import ReplayCamera
 from sensor_node.cameras.synthetic import PERIOD_NS, SyntheticCamera, SyntheticNoise
+from tests.protocol.fisheye_samples import coded
 
 FRAMES = 4
 
@@ -49,6 +51,20 @@ def test_a_loop_goes_on_with_rising_ids_and_times(source: DatasetReader) -> None
     np.testing.assert_array_equal(frames[2].color, frames[0].color)
     offsets = [frame.depth_timestamp_ns - frame.timestamp_ns for frame in frames if frame.depth_timestamp_ns]
     assert offsets == [0] * 5
+
+
+def test_fish_eye_pictures_of_a_later_round_have_its_time(tmp_path: Path) -> None:
+    synthetic = SyntheticCamera()
+    with DatasetWriter(tmp_path / "take", board=synthetic.board) as writer:
+        for index in range(2):
+            frame = synthetic.frame_at(index)
+            writer.add(replace(frame, fisheye=coded(synthetic.frame_at(0).timestamp_ns)))
+    with ReplayCamera(open_dataset(tmp_path / "take"), realtime=False, loop=True) as camera:
+        first, _, second, third = (camera.read() for _ in range(4))
+    assert first.fisheye is not None
+    assert second.fisheye is not None
+    assert second.fisheye is third.fisheye
+    assert second.fisheye.timestamp_ns - first.fisheye.timestamp_ns == second.timestamp_ns - first.timestamp_ns
 
 
 def test_real_time_obeys_the_recorded_times_and_stamps_at_capture(source: DatasetReader) -> None:

@@ -364,6 +364,44 @@ def test_rgb_yaml_goes_before_the_devices_own_calibration(oak: Callable[..., Oak
     assert frame.depth.noise_sigma_m == 0.01
 
 
+def test_an_rgb_yaml_with_distortion_does_not_fit_corrected_pictures(oak: Callable[..., OakCamera]) -> None:
+    matrix = np.array([[50.0, 0, 30], [0, 50, 20], [0, 0, 1]])
+    known = LiveCalibration(camera=CameraModel(WIDTH, HEIGHT, matrix, "plumb_bob", [0.1, 0, 0, 0, 0]))
+    with pytest.raises(DeltalightError, match=r"take rgb\.yaml out"):
+        oak(HostOnlyDevice(), known=known).open()
+    with oak(HostOnlyDevice(), known=known, with_depth=False) as camera:
+        assert camera.read().camera == known.camera
+
+
+def test_the_sdk_has_what_the_device_is_driven_with() -> None:
+    """The pipeline of a device cannot be built without one; at least its words must be the SDK's."""
+    node, control = dai.node, dai.CameraControl
+    used = {
+        dai.DeviceBase: "close getConnectedCameras getConnectedIMU getPlatform getUsbSpeed isClosed readCalibration"
+        " setMaxReconnectionAttempts",
+        node.Camera: "build initialControl inputControl requestOutput",
+        node.StereoDepth: "build depth initialConfig inputAlignTo setLeftRightCheck setSubpixel"
+        " setSubpixelFractionalBits",
+        node.ImageAlign: "input inputAlignTo outputAligned",
+        node.VideoEncoder: "build out",
+        node.IMU: "enableIMUSensor out setBatchReportThreshold setMaxBatchReports",
+        control: "setAutoExposureLock setAutoWhiteBalanceLock setManualExposure setManualFocus"
+        " setManualWhiteBalance",
+        dai.IMUSensor: "ACCELEROMETER_RAW GYROSCOPE_RAW",
+        dai.Platform: "RVC4",
+        dai.UsbSpeed: "SUPER SUPER_PLUS",
+        dai.VideoEncoderProperties.Profile: "MJPEG",
+    }
+    missing = [
+        (owner, name) for owner, names in used.items() for name in names.split() if not hasattr(owner, name)
+    ]
+    assert missing == []
+    config = dai.StereoDepthConfig()
+    assert config.getDepthUnit().name == "MILLIMETER"
+    config.postProcessing.temporalFilter.enable = True
+    assert config.postProcessing.temporalFilter.enable
+
+
 def test_exposure_is_locked_as_set_or_as_it_came_to_rest(oak: Callable[..., OakCamera]) -> None:
     device = HostOnlyDevice()
     with oak(device, SETTINGS.replaced(exposure_s=0.004)) as camera:

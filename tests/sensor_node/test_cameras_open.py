@@ -1,7 +1,9 @@
 """What users write as a source: cameras, folders, recordings, and what is said of anything else."""
 
+import time
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -10,12 +12,22 @@ from protocol.dataset_writer import DatasetWriter
 from protocol.equidistant_lens import EquidistantLens
 from protocol.errors import DeltalightError
 from protocol.fisheye_lens import FisheyeCalibration, save_fisheye_yaml
-from sensor_node.cameras.live import load_calibration
+from sensor_node.cameras import rgbd
+from sensor_node.cameras.live import LiveCalibration, load_calibration
 from sensor_node.cameras.open import is_live, open_camera, open_fisheye
 from sensor_node.cameras.reconnect import ReconnectingCamera
 from sensor_node.cameras.replay import ReplayCamera
 from sensor_node.cameras.settings import CameraSettings, FisheyeSettings
 from sensor_node.cameras.synthetic import SyntheticCamera, default_board
+
+WAIT_S = 20.0
+
+
+def write_video(path: Path, width: int, height: int, frames: int) -> None:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 30, (width, height))
+    for index in range(frames):
+        writer.write(np.full((height, width, 3), 10 * index, np.uint8))
+    writer.release()
 
 
 def pinhole(width: int = 64, height: int = 48) -> CameraModel:
@@ -127,7 +139,34 @@ def test_a_fisheye_source_needs_fisheye_yaml_unless_a_replay_brings_its_own(cali
     lens = EquidistantLens(CameraModel(64, 64, matrix, "equidistant", np.zeros(4)), None)
     save_fisheye_yaml(calibration / "fisheye.yaml", FisheyeCalibration(lens))
     assert open_fisheye(settings).newest() is None
+    assert open_fisheye(FisheyeSettings(source="uvc:2"), calibration).newest() is None
     assert open_fisheye(FisheyeSettings(source="synthetic")).newest() is None
+
+
+def test_a_fisheye_camera_captures_at_the_size_of_its_lens(calibration: Path, tmp_path: Path) -> None:
+    matrix = np.array([[20.0, 0, 15.5], [0, 20, 15.5], [0, 0, 1]])
+    lens = EquidistantLens(CameraModel(32, 32, matrix, "equidistant", np.zeros(4)), None)
+    # In the same folder as the rgb.yaml of another camera, of another size.
+    save_fisheye_yaml(calibration / "fisheye.yaml", FisheyeCalibration(lens))
+    write_video(tmp_path / "sky.avi", 32, 32, frames=20)
+    settings = FisheyeSettings(source=f"uvc:{tmp_path / 'sky.avi'}")
+    with open_fisheye(settings, calibration) as capture:
+        end = time.monotonic() + WAIT_S
+        while (pictures := capture.newest()) is None:
+            assert time.monotonic() < end, capture.state
+            time.sleep(0.002)
+    assert pictures.pictures[0].shape == (32, 32, 3)
+    assert (pictures.calibration.lens.width, pictures.calibration.lens.height) == (32, 32)
+
+
+def test_a_live_camera_goes_on_over_the_end_of_its_stream(calibration: Path, tmp_path: Path) -> None:
+    write_video(tmp_path / "take.avi", 64, 48, frames=6)
+    with open_camera(f"uvc:{tmp_path / 'take.avi'}", CameraSettings(calibration=calibration)) as camera:
+        frames = [camera.read() for _ in range(2)]
+        while frames[-1].frame_id < 7:
+            frames.append(camera.read())
+    assert (np.diff([frame.frame_id for frame in frames]) > 0).all()
+    assert (np.diff([frame.timestamp_ns for frame in frames]) > 0).all()
 
 
 def test_rgbd_cameras_say_what_this_opencv_lacks(calibration: Path) -> None:
@@ -137,3 +176,28 @@ def test_rgbd_cameras_say_what_this_opencv_lacks(calibration: Path) -> None:
         pytest.skip("this OpenCV reads OpenNI 2 cameras")
     with pytest.raises(DeltalightError, match="WITH_OPENNI2=ON"):
         open_camera("openni2:0", CameraSettings(calibration=calibration))
+
+
+def test_colour_and_depth_of_an_rgbd_camera_become_one_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What OpenCV gives (BGR, 16-bit mm), without the backend that the packages lack."""
+    monkeypatch.setattr(rgbd, "has_backend", lambda _: True)
+    bgr, steps = np.zeros((48, 64, 3), np.uint8), np.full((48, 64), 750, np.uint16)
+    bgr[..., 0], steps[3, 4] = 200, 0
+    known = LiveCalibration(camera=pinhole(), depth_noise_m=0.003)
+    frame = rgbd.RgbdCamera("orbbec", 0, CameraSettings(), known)._frame(bgr, steps)
+    assert frame.color[0, 0].tolist() == [0, 0, 200]
+    assert frame.depth is not None
+    assert (frame.depth.camera, frame.depth.noise_sigma_m) == (pinhole(), 0.003)
+    assert frame.depth.depth_m[0, 0] == pytest.approx(0.75)
+    assert not frame.depth.valid[3, 4]
+    assert frame.depth_timestamp_ns == frame.timestamp_ns
+    apart = LiveCalibration(camera=pinhole(), depth_camera=pinhole(80, 60), depth_scale=0.0001)
+    unregistered = rgbd.RgbdCamera("openni2", 0, CameraSettings(), apart)._frame(bgr, steps)
+    assert unregistered.depth is not None
+    assert unregistered.depth.camera == pinhole(80, 60)
+    assert unregistered.depth.depth_m[0, 0] == pytest.approx(0.075)
+    assert rgbd.RgbdCamera("orbbec", 0, CameraSettings(), known)._frame(bgr, None).depth is None
+    with pytest.raises(DeltalightError, match="gives 32x24"):
+        rgbd.RgbdCamera("orbbec", 0, CameraSettings(), known)._frame(bgr[:24, :32], None)
+    with pytest.raises(DeltalightError, match="no exposure"):
+        rgbd.RgbdCamera("orbbec", 0, CameraSettings(exposure_s=0.01), known)

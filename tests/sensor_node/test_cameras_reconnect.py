@@ -235,3 +235,29 @@ def test_it_can_be_opened_again_after_it_was_closed() -> None:
         first = camera.read().frame_id
     with camera:
         assert camera.read().frame_id > first
+
+
+def test_a_driver_that_hangs_keeps_nobody_waiting_and_is_not_opened_twice(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Hanging(Scripted):
+        released = threading.Event()
+
+        def read(self) -> SensorFrame:
+            self.released.wait(WAIT_S)
+            raise CameraFailure("time-out of the driver.")
+
+    monkeypatch.setattr("sensor_node.cameras.reconnect.CLOSE_S", 0.05)
+    inner = Hanging()
+    camera = reconnecting(inner)
+    camera.open()
+    camera.close()
+    assert inner.is_open
+    with pytest.raises(DeltalightError, match="hangs in its driver"):
+        camera.open()
+    inner.released.set()
+    wait_for(lambda: not inner.is_open)
+    inner.released.clear()
+    monkeypatch.setattr(Hanging, "read", Scripted.read)
+    with camera:
+        camera.read()

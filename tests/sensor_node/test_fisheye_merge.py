@@ -123,7 +123,7 @@ def test_values_that_are_not_finite_are_refused() -> None:
         merge(FisheyePictures(0, (picture,), (None,), FisheyeCalibration(LENS)))
 
 
-@pytest.mark.parametrize("gamma", [1.0, 1.8, 2.4])
+@pytest.mark.parametrize("gamma", [1.0, 2.4])
 def test_a_response_is_found_from_a_bracket(gamma: float) -> None:
     """Codes of light^(1/gamma) in seven exposures a factor 4 apart; rms within 1.5 % of white."""
     light = smooth_light(0.01, 300)

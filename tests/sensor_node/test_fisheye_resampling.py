@@ -108,6 +108,16 @@ def test_vignetting_is_taken_out() -> None:
     assert mapped(picture, lens).radiance.min() < 0.8
 
 
+def test_vignetting_needs_to_hold_only_where_the_lens_sees() -> None:
+    """A polynomial that is negative from 82 degrees on, of a lens that sees 70: nothing of it shows."""
+    lens = equidistant(300, 190.0, circle=300 / 190 * 70)
+    result = mapped(even(lens), lens, (-0.49,))
+    assert np.isfinite(result.radiance).all()
+    assert result.radiance.min() >= 0
+    # A texel on the rim is a mean over 1.5 degrees.
+    assert result.radiance.max() == pytest.approx(1 / (1 - 0.49 * np.radians(70) ** 2), rel=0.06)
+
+
 def test_only_what_the_lens_sees_is_seen() -> None:
     lens = equidistant(300, 190.0, circle=300 / 190 * 70)
     result = mapped(even(lens), lens)

@@ -101,15 +101,15 @@ def test_a_source_that_breaks_in_the_middle_says_where_and_one_that_ends_is_no_f
 def test_wrong_settings_are_told_before_anything_starts(cli: RunCli, tmp_path: Path) -> None:
     wrong = tmp_path / "deltalight.toml"
     wrong.write_text("[node]\nsuorce = 'x'\n")
-    for command in ("node", "server", "config"):
-        arguments = ("--allow-software",) if command == "server" else ()
-        done = cli(command, "--config", wrong, *arguments)
-        if command == "server":
-            continue  # its own section is in order
-        assert_sentence(done, str(wrong), "unknown key `suorce`", "`source`")
+    for command in ("node", "config"):
+        assert_sentence(cli(command, "--config", wrong), str(wrong), "unknown key `suorce`", "`source`")
     assert_sentence(cli("node", "--config", tmp_path / "absent.toml"), "absent.toml")
     assert_sentence(cli("up", "--config", wrong), "unknown key `suorce`")
     assert_sentence(cli("up", "--source", "synthetic", "--node", "desk"), "one of them")
+    right = tmp_path / "right.toml"
+    right.write_text("[node]\nsource = 'absent.mcap'\n")
+    assert_sentence(cli("up", "--config", right), "absent.mcap does not exist")
+    assert_sentence(cli("up", "--config", os.devnull), "--source", "--node")
 
 
 def test_an_endpoint_that_leaves_the_host_needs_keys_first(
@@ -143,3 +143,19 @@ def test_keys_are_made_listed_and_trusted_by_commands(
     secret = (here / "desk.key_secret").read_text().split('secret-key = "')[1].split('"')[0]
     assert secret not in cli("keys", "list").stdout
     assert "XDG_CONFIG_HOME" in os.environ
+
+
+def test_cameras_and_nodes_are_listed_also_as_json(cli: RunCli) -> None:
+    done = cli("node", "--list", "--json")
+    assert done.returncode == 0, done.stderr
+    assert isinstance(json.loads(done.stdout)["cameras"], list)
+    words = cli("node", "--list")
+    assert words.returncode == 0
+    assert "uvc" in words.stdout
+
+
+def test_the_commands_of_settings_and_keys_have_help(cli: RunCli) -> None:
+    for command in (("config",), ("keys",), ("keys", "create"), ("keys", "list"), ("keys", "trust")):
+        done = cli(*command, "--help")
+        assert done.returncode == 0
+        assert "Usage" in done.stdout

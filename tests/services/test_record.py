@@ -277,6 +277,18 @@ def test_no_space_left_is_one_sentence_and_keeps_the_frames(
     assert len(open_source(tmp_path / "a.mcap.active")) == 3
 
 
+def test_a_file_that_somebody_removes_is_a_sentence(tmp_path: Path) -> None:
+    with (
+        feeding() as (endpoint, _),
+        recording(RecordJob(tmp_path / "a.mcap", endpoint)) as (_, _, end),
+    ):
+        wait_for((tmp_path / "a.mcap.active").exists)
+        (tmp_path / "a.mcap.active").unlink()
+        with pytest.raises(DeltalightError, match=r"a\.mcap\.active is not there any more") as caught:
+            end.result(PATIENCE_S)
+    assert "\n" not in str(caught.value)
+
+
 def test_little_space_is_told_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     usage = shutil.disk_usage(tmp_path)._replace(free=1000)
     monkeypatch.setattr("shutil.disk_usage", lambda _: usage)
@@ -370,6 +382,7 @@ def test_depth_of_another_camera_wants_the_transform(tmp_path: Path) -> None:
         (["--out", "{folder}/a.mcap", "--subscribe", "tcp://127.0.0.1"], "is not an endpoint"),
         (["--out", "{folder}/a.mcap", "--subscribe", "udp://127.0.0.1:1"], "is not an endpoint"),
         (["--out", "{folder}/a.mcap", "--scene", "a.json", "--control", "tcp://127.0.0.1:1"], "give one"),
+        (["--out", "{folder}/a.mcap", "--subscribe", "tcp://127.0.0.1:1", "--node", "desk"], "give one"),
         (["--out", "{folder}/a.mcap", "--scene", "{folder}/none.json"], "none.json"),
         (["--out", "{folder}/a.mcap", "--extrinsics", "{folder}/none.yaml"], "none.yaml"),
     ],

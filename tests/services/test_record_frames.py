@@ -63,6 +63,19 @@ def test_before_the_first_fisheye_picture_the_first_holds() -> None:
     assert_same_pictures(found[0].fisheye, later[0].fisheye)
 
 
+def test_fisheye_pictures_of_a_replay_that_began_again_stay_in_order() -> None:
+    sent = frames(6)
+    shown = [linear(frame.timestamp_ns) for frame in sent[:2]]
+    again = [replace(frame, fisheye=shown[index % 2]) for index, frame in enumerate(sent)]
+    found = assembled(again, RawFrameAssembler())
+    times = [frame.fisheye.timestamp_ns for frame in found if frame.fisheye is not None]
+    assert times == sorted(set(times))
+    for ours, theirs in zip(found, again[1:], strict=True):
+        assert ours.fisheye is not None
+        assert theirs.fisheye is not None
+        assert np.array_equal(ours.fisheye.pictures[0], theirs.fisheye.pictures[0])
+
+
 def test_a_pose_that_the_board_showed_is_left_to_the_replay() -> None:
     first, second = frames(2)
     detected = messages(second, detected=BoardPose(np.eye(4), reprojection_error_px=0.2))

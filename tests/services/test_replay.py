@@ -49,10 +49,12 @@ def test_what_is_replayed_and_recorded_again_is_the_same(tmp_path: Path) -> None
         assert frame.depth is not None
         assert source_frame.depth is not None
         assert np.array_equal(frame.depth.depth_m, source_frame.depth.depth_m)
-        assert frame.fisheye is not None
-        assert source_frame.fisheye is not None
-        assert frame.fisheye.exposures_s == source_frame.fisheye.exposures_s
-        assert frame.fisheye.calibration == source_frame.fisheye.calibration
+    # The fish-eye pictures that held when the recorder came had been sent before.
+    lit = [frame.fisheye for frame in again if frame.fisheye is not None]
+    assert len(lit) >= 18
+    assert original[0].fisheye is not None
+    assert {pictures.exposures_s for pictures in lit} == {original[0].fisheye.exposures_s}
+    assert all(pictures.calibration == original[0].fisheye.calibration for pictures in lit)
 
 
 def test_a_fast_replay_ends_and_takes_no_camera_from_the_configuration(cli: RunCli, tmp_path: Path) -> None:

@@ -1,0 +1,24 @@
+// Injected light -> state of a volume before the first step, and the total so far. A second set of sums may be added.
+#include "passes/common/light_cells.glsl"
+
+layout(local_size_x = 64) in;
+layout(std430, binding = 8) readonly buffer First { int first[]; };
+layout(std430, binding = 9) readonly buffer Second { int second[]; };
+layout(std430, binding = 10) writeonly buffer State { vec4 state[]; };   // channel by channel
+layout(std430, binding = 11) writeonly buffer Total { vec4 total[]; };
+uniform int cells;
+uniform bool has_second;
+
+void main() {
+    uint count = uint(cells * cells * cells), i = gl_GlobalInvocationID.x;
+    if (i >= count) return;
+    for (uint channel = 0u; channel < 3u; ++channel) {
+        vec4 light;
+        for (uint k = 0u; k < 4u; ++k) {
+            uint at = i * uint(INJECTED_SUMS) + 4u * channel + k;
+            light[k] = float(first[at] + (has_second ? second[at] : 0)) / INJECTED_STEPS;
+        }
+        state[channel * count + i] = light;
+        total[channel * count + i] = light;
+    }
+}

@@ -1,0 +1,33 @@
+// Covered faces -> share of light that gets into each cell from its six neighbours, of real surfaces alone (JOINT: of real
+// and virtual ones together), packed in 8 bits each: neighbours at -x, +x, -y, +y, and at -z, +z.
+#include "passes/common/light_cells.glsl"
+
+layout(local_size_x = 64) in;
+layout(std430, binding = 8) readonly buffer RealCovered { int real_covered[]; };
+layout(std430, binding = 9) readonly buffer VirtualCovered { int virtual_covered[]; };
+layout(std430, binding = 10) writeonly buffer Transmitted { uvec2 transmitted[]; };
+uniform int cells;
+
+const float FIXED_POINT_STEPS = 1048576.0;   // voxel_store.glsl's
+
+float open_share(int sum) { return 1.0 - clamp(float(sum) / FIXED_POINT_STEPS, 0.0, 1.0); }
+
+float through(ivec3 cell, int axis, int backwards) {
+    cell[axis] += backwards;
+    if (!in_grid(cell, cells)) return 1.0;
+    uint at = cell_index(cell, cells) * 6u + uint(2 * axis + backwards);
+    float open_share_here = open_share(real_covered[at]);
+#ifdef JOINT
+    open_share_here *= open_share(virtual_covered[at]);
+#endif
+    return open_share_here;
+}
+
+void main() {
+    uint i = gl_GlobalInvocationID.x;
+    if (i >= uint(cells * cells * cells)) return;
+    ivec3 cell = cell_of_index(i, cells);
+    vec4 xy = vec4(through(cell, 0, 0), through(cell, 0, 1), through(cell, 1, 0), through(cell, 1, 1));
+    vec4 z = vec4(through(cell, 2, 0), through(cell, 2, 1), 0.0, 0.0);
+    transmitted[i] = uvec2(packUnorm4x8(xy), packUnorm4x8(z));
+}

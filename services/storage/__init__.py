@@ -1,0 +1,1 @@
+"""What must survive: scenes with every revision, uploaded assets, tokens. `store.Store` is the way in."""

@@ -1,0 +1,292 @@
+"""Uploaded files, kept under the hash of their content: ASSETS/<sha256>/asset.<format>.
+
+Each has a folder of its own, so that a file which names others finds none.
+"""
+
+import hashlib
+import json
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from threading import BoundedSemaphore
+from typing import BinaryIO
+from uuid import uuid4
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from protocol.scene import DIGEST_PREFIX, SceneDocument
+from services.storage.asset_kinds import BY_NAME, HEAD_BYTES, AssetFormat, AssetKind, clean_name, recognise
+from services.storage.asset_probe import Facts, probe
+from services.storage.database import Database
+from services.storage.faults import ConflictError, NotFoundError, StorageFaultError, TooLargeError
+from services.storage.tables import AssetNameRow, AssetRow, AssetUseRow, SceneRow
+
+Probe = Callable[[Path, AssetKind, str], Facts]
+LEFT_OVER_AFTER_S = 24 * 3600  # no upload takes a day: what is older, a killed process left
+CONCURRENT_PROBES = 2  # each may take up to the memory limit of a probe
+
+
+@dataclass(frozen=True)
+class Asset:
+    """What is known of an uploaded file; `facts` are those of `asset_probe.probe`."""
+
+    digest: str
+    names: tuple[str, ...]
+    format: AssetFormat
+    size_bytes: int
+    facts: Facts
+    uploaded_ns: int
+
+    @property
+    def reference(self) -> str:
+        """How scene documents name it."""
+        return DIGEST_PREFIX + self.digest
+
+
+@dataclass
+class Incoming:
+    """A file that is being received."""
+
+    path: Path
+    file: BinaryIO
+    limit_bytes: int
+    size_bytes: int = 0
+    head: bytes = b""
+    digest: "hashlib._Hash" = field(default_factory=hashlib.sha256)
+
+    def write(self, chunk: bytes) -> None:
+        """Take the next bytes.
+
+        Raises:
+            TooLargeError: there are more than the limit.
+            StorageFaultError: the disk is full.
+        """
+        self.size_bytes += len(chunk)
+        if self.size_bytes > self.limit_bytes:
+            raise TooLargeError(f"the file is larger than {self.limit_bytes >> 20} MB; simplify it.")
+        self.head = (self.head + chunk)[:HEAD_BYTES] if len(self.head) < HEAD_BYTES else self.head
+        self.digest.update(chunk)
+        with _disk():
+            self.file.write(chunk)
+
+
+class AssetStore:
+    """The assets of a store; `probe` is replaced by tests that are about something else."""
+
+    def __init__(self, database: Database, folder: Path, probe: Probe = probe) -> None:
+        self._database = database
+        self._folder = folder
+        self._incoming = folder / ".incoming"
+        self._probe = probe
+        self._probing = BoundedSemaphore(CONCURRENT_PROBES)
+        with _disk():
+            self._incoming.mkdir(parents=True, exist_ok=True)
+            self._remove_left_over()
+
+    @contextmanager
+    def receiving(self, limit_bytes: int) -> Iterator[Incoming]:
+        """Give a place for an upload; it is gone at the end unless `keep` took it."""
+        path = self._incoming / uuid4().hex
+        try:
+            with _disk():
+                file = path.open("xb")
+            with file:
+                yield Incoming(path, file, limit_bytes)
+        finally:
+            path.unlink(missing_ok=True)
+
+    def keep(self, incoming: Incoming, name: str) -> tuple[Asset, bool]:
+        """Check a received file and keep it; says whether it is new.
+
+        Raises:
+            RejectedAssetError: it is not what it must be.
+        """
+        shown = clean_name(name)
+        found = recognise(incoming.head, incoming.size_bytes, shown)
+        digest = incoming.digest.hexdigest()
+        checked = incoming.path.with_suffix(found.suffix)
+        try:
+            with _disk():
+                incoming.file.flush()
+                os.fsync(incoming.file.fileno())
+                incoming.path.rename(checked)
+            facts = self._facts(digest, checked, found, shown)
+            return self._placed(
+                checked, AssetRow(**_columns(digest, found, incoming.size_bytes, facts)), shown
+            )
+        finally:
+            checked.unlink(missing_ok=True)
+
+    def get(self, digest: str) -> Asset:
+        """Return an asset.
+
+        Raises:
+            NotFoundError: there is none of this digest.
+        """
+        with self._database.reading() as session:
+            return _asset(session, _row(session, digest))
+
+    def all(self) -> list[Asset]:
+        """Return all assets, the newest first."""
+        with self._database.reading() as session:
+            rows = session.scalars(select(AssetRow).order_by(AssetRow.uploaded_ns.desc(), AssetRow.digest))
+            return [_asset(session, row) for row in rows]
+
+    def path(self, asset: Asset) -> Path:
+        """Where the file of an asset lies."""
+        return self._path(asset.digest, asset.format.name)
+
+    def remove(self, digest: str) -> None:
+        """Delete an asset that no scene names, now or in its past.
+
+        Raises:
+            NotFoundError: there is none of this digest.
+            ConflictError: a scene uses it.
+        """
+        with self._database.writing() as session:
+            row = _row(session, digest)
+            _require_unused(session, digest)
+            for each in session.scalars(select(AssetNameRow).where(AssetNameRow.digest == digest)):
+                session.delete(each)
+            session.flush()
+            session.delete(row)
+        with self._database.writing() as session:  # the lock keeps off whoever uploads the same file just now
+            if session.get(AssetRow, digest) is None:
+                shutil.rmtree(self._folder / digest, ignore_errors=True)
+
+    def localised(self, document: SceneDocument) -> SceneDocument:
+        """Return a stored document with the paths of its assets' files, for the render server."""
+        return document.with_assets(
+            lambda _place, reference: str(self.path(self.get(reference.removeprefix(DIGEST_PREFIX))))
+        )
+
+    def without_paths(self, sentence: str) -> str:
+        """Return a sentence of the render server as clients may read it: digests in place of files."""
+        return sentence.replace(f"{self._folder.absolute()}{os.sep}", DIGEST_PREFIX)
+
+    def _path(self, digest: str, format_name: str) -> Path:
+        return (self._folder / digest / f"asset{BY_NAME[format_name].suffix}").absolute()
+
+    def _facts(self, digest: str, path: Path, found: AssetFormat, name: str) -> Facts:
+        with self._database.reading() as session:
+            known = session.get(AssetRow, digest)
+            if known is not None:
+                return dict(json.loads(known.facts))
+        with self._probing:
+            return self._probe(path, found.kind, name)
+
+    def _placed(self, checked: Path, row: AssetRow, name: str) -> tuple[Asset, bool]:
+        """Put the file in place, then its row: a row without a file never exists."""
+        with self._database.writing() as session:
+            known = session.get(AssetRow, row.digest)
+            place = self._path(row.digest, row.format)
+            with _disk():
+                place.parent.mkdir(exist_ok=True)
+                checked.replace(place)
+                _sync_folder(place.parent)
+                _sync_folder(self._folder)
+            if known is None:
+                session.add(row)
+                session.flush()
+            session.merge(AssetNameRow(digest=row.digest, name=name))
+            session.flush()
+            return _asset(session, known or row), known is None
+
+    def _remove_left_over(self) -> None:
+        for path in self._incoming.iterdir():
+            if path.stat().st_mtime < time.time() - LEFT_OVER_AFTER_S:
+                path.unlink(missing_ok=True)
+
+
+def resolve_asset(session: Session, place: str, asset: str) -> str:
+    """Return `sha256:<hex>` of an asset that a document names so, or by its name.
+
+    Raises:
+        NotFoundError: there is no such asset, or it is of another kind than `place` needs.
+        ConflictError: several assets have this name.
+    """
+    row = session.get(AssetRow, _digest_of(session, place, asset))
+    if row is None:
+        raise NotFoundError(
+            f"`{place}` names {asset!r:.200}, which is no uploaded asset; upload the file, then name it as "
+            "sha256:..."
+        )
+    wanted = "map" if place == "lights.environment.map" else "mesh"
+    if row.format not in {each.name for each in BY_NAME.values() if each.kind == wanted}:
+        raise ConflictError(
+            f"`{place}` needs a {wanted} and {asset!r:.200} is a {row.kind}; name another asset."
+        )
+    return DIGEST_PREFIX + row.digest
+
+
+def _digest_of(session: Session, place: str, asset: str) -> str:
+    if asset.startswith(DIGEST_PREFIX):
+        return asset.removeprefix(DIGEST_PREFIX).lower()
+    query = select(AssetNameRow.digest).where(AssetNameRow.name == asset).limit(2)
+    digests = list(session.scalars(query))
+    if len(digests) > 1:
+        raise ConflictError(
+            f"`{place}` names {asset!r:.200} and several assets are called so; name one as {DIGEST_PREFIX}..."
+        )
+    return digests[0] if digests else ""
+
+
+def _require_unused(session: Session, digest: str) -> None:
+    query = (
+        select(AssetUseRow)
+        .join(SceneRow, SceneRow.id == AssetUseRow.scene_id)
+        .where(AssetUseRow.digest == digest, SceneRow.deleted_ns.is_(None))
+    )
+    use = session.scalars(query.limit(1)).first()
+    if use is not None:
+        raise ConflictError(
+            f"the asset is used by scene {use.scene_id} since revision {use.number}; delete that scene first "
+            "(undo needs the assets of all revisions)."
+        )
+
+
+def _row(session: Session, digest: str) -> AssetRow:
+    row = session.get(AssetRow, digest)
+    if row is None:
+        raise NotFoundError(f"there is no asset sha256:{digest:.64}; list the assets for their digests.")
+    return row
+
+
+def _asset(session: Session, row: AssetRow) -> Asset:
+    query = select(AssetNameRow.name).where(AssetNameRow.digest == row.digest).order_by(AssetNameRow.name)
+    names = tuple(session.scalars(query))
+    return Asset(
+        row.digest, names, BY_NAME[row.format], row.size_bytes, json.loads(row.facts), row.uploaded_ns
+    )
+
+
+def _columns(digest: str, found: AssetFormat, size_bytes: int, facts: Facts) -> dict[str, object]:
+    return {
+        "digest": digest,
+        "kind": found.kind,
+        "format": found.name,
+        "size_bytes": size_bytes,
+        "facts": json.dumps(facts),
+        "uploaded_ns": time.time_ns(),
+    }
+
+
+@contextmanager
+def _disk() -> Iterator[None]:
+    try:
+        yield
+    except OSError as fault:
+        raise StorageFaultError(f"The file cannot be kept ({fault.strerror}); free some space.") from fault
+
+
+def _sync_folder(folder: Path) -> None:
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

@@ -1,0 +1,92 @@
+"""The SQLite file: opened in WAL mode, written in whole transactions that are on the disk when they end."""
+
+import sqlite3
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from sqlalchemy import URL, Connection, create_engine, event
+from sqlalchemy.exc import DatabaseError, IntegrityError
+from sqlalchemy.orm import Session
+from sqlalchemy.pool import ConnectionPoolEntry
+
+from protocol.errors import DeltalightError
+from services.storage.faults import StorageFaultError
+from services.storage.tables import SCHEMA_VERSION, Base
+
+BUSY_TIMEOUT_S = 10.0
+_IMMEDIATE = "deltalight_immediate"
+
+
+class Database:
+    """A database file, shared by any number of threads and processes.
+
+    Raises:
+        DeltalightError: it is of a newer version, or no database, or cannot be written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        url = URL.create("sqlite", database=str(path))
+        self._engine = create_engine(url, connect_args={"timeout": BUSY_TIMEOUT_S})
+        event.listen(self._engine, "connect", _prepare)
+        event.listen(self._engine, "begin", _begin)
+        self._writing = self._engine.execution_options(**{_IMMEDIATE: True})
+        with self._explained(), self._engine.connect() as connection:
+            driver = connection.connection.driver_connection
+            assert driver is not None
+            driver.execute("PRAGMA journal_mode=WAL")
+        self._create_tables()
+
+    @contextmanager
+    def reading(self) -> Iterator[Session]:
+        """A consistent view of the data."""
+        with self._explained(), Session(self._engine) as session:
+            yield session
+
+    @contextmanager
+    def writing(self) -> Iterator[Session]:
+        """The only writer, of all threads and processes; everything or (after an exception) nothing is kept."""
+        with self._explained(), Session(self._writing) as session, session.begin():
+            yield session
+
+    def close(self) -> None:
+        """Close all connections."""
+        self._engine.dispose()
+
+    def _create_tables(self) -> None:
+        with self._explained(), self._writing.begin() as connection:
+            version = connection.exec_driver_sql("PRAGMA user_version").scalar_one()
+            if version == 0:
+                Base.metadata.create_all(connection)
+                connection.exec_driver_sql(f"PRAGMA user_version={SCHEMA_VERSION}")
+            elif version != SCHEMA_VERSION:
+                raise DeltalightError(
+                    f"{self._path} was written by another version of Deltalight (its layout is {version}, this one "
+                    f"reads {SCHEMA_VERSION}); start the version that wrote it, or name another --data folder."
+                )
+
+    @contextmanager
+    def _explained(self) -> Iterator[None]:
+        try:
+            yield
+        except IntegrityError:  # a fault of this program, not of the disk
+            raise
+        except DatabaseError as fault:
+            raise StorageFaultError(
+                f"The database cannot be used now ({fault.orig}); free some space, end other users of it, or name "
+                "another --data folder."
+            ) from fault
+
+
+def _prepare(connection: sqlite3.Connection, _entry: ConnectionPoolEntry) -> None:
+    """Leave transactions to us, and have each on the disk when it ends: WAL alone outlives a kill, not a power cut."""
+    connection.isolation_level = None
+    connection.execute("PRAGMA synchronous=FULL")
+    connection.execute("PRAGMA foreign_keys=ON")
+
+
+def _begin(connection: Connection) -> None:
+    """A writer locks at once: what it has read stays true until it has written."""
+    immediate = connection.get_execution_options().get(_IMMEDIATE, False)
+    connection.exec_driver_sql("BEGIN IMMEDIATE" if immediate else "BEGIN")

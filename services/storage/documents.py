@@ -1,0 +1,144 @@
+"""Changes to scene documents as plain JSON: merge patches, parts and objects (RFC 7396)."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from protocol.documents import validate
+from protocol.errors import DeltalightError
+from protocol.scene import SceneDocument
+from services.storage.faults import NotFoundError, StaleRevisionError
+
+Document = dict[str, Any]
+Edit = Callable[[Document], Any]
+
+
+def merge_patch(target: object, patch: object) -> Any:  # noqa: ANN401 - JSON
+    """Return `target` changed by a JSON merge patch: null removes a key, so that its default holds.
+
+    Raises:
+        DeltalightError: the patch is nested too deeply.
+    """
+    try:
+        return _merged(target, patch)
+    except RecursionError as error:
+        raise DeltalightError("the patch is nested too deeply; send the keys that change.") from error
+
+
+def _merged(target: object, patch: object) -> object:
+    if not isinstance(patch, Mapping):
+        return patch
+    merged = dict(target) if isinstance(target, Mapping) else {}
+    for key, value in patch.items():
+        if value is None:
+            merged.pop(key, None)
+        else:
+            merged[key] = _merged(merged.get(key), value)
+    return merged
+
+
+def patch_document(patch: object) -> Edit:
+    """The edit that merges a patch into the whole document.
+
+    A patch that names another method begins with that method's defaults, because the methods' keys differ.
+    """
+
+    def edit(document: Document) -> Any:  # noqa: ANN401 - JSON
+        return merge_patch(_prepared(document, patch), patch)
+
+    return edit
+
+
+def _prepared(document: Document, patch: object) -> Document:
+    method = patch.get("method") if isinstance(patch, Mapping) else None
+    name = method.get("name") if isinstance(method, Mapping) else None
+    return document if name in (None, document["method"]["name"]) else {**document, "method": {}}
+
+
+def patch_part(part: str, patch: object) -> Edit:
+    """The edit that merges a patch into one top-level part."""
+    return patch_document({part: patch})
+
+
+def replace_part(part: str, value: object) -> Edit:
+    """The edit that puts a top-level part in place of the old one."""
+    return lambda document: {**document, part: value}
+
+
+def replace_document(value: object) -> Edit:
+    """The edit that puts another document in place of the old one."""
+    return lambda _document: value
+
+
+def add_object(value: object) -> Edit:
+    """The edit that adds an object; one without an id gets a free one."""
+
+    def edit(document: Document) -> Document:
+        added = {"id": _free_id(document), **value} if isinstance(value, Mapping) else value
+        return {**document, "objects": [*document["objects"], added]}
+
+    return edit
+
+
+def _free_id(document: Document) -> str:
+    taken = {item["id"] for item in document["objects"]}
+    return next(name for name in map("object{}".format, range(len(taken) + 1)) if name not in taken)
+
+
+def replace_object(name: str, value: object) -> Edit:
+    """The edit that puts another object in place of one; without an id it keeps the old one."""
+    return _edit_object(name, lambda _old: {"id": name, **value} if isinstance(value, Mapping) else value)
+
+
+def patch_object(name: str, patch: object) -> Edit:
+    """The edit that merges a patch into one object."""
+    return _edit_object(name, lambda old: merge_patch(old, patch))
+
+
+def _edit_object(name: str, change: Callable[[Document], Any]) -> Edit:
+    def edit(document: Document) -> Document:
+        index = _index(document, name)
+        objects = list(document["objects"])
+        objects[index] = change(objects[index])
+        return {**document, "objects": objects}
+
+    return edit
+
+
+def remove_object(name: str) -> Edit:
+    """The edit that takes an object out."""
+
+    def edit(document: Document) -> Document:
+        index = _index(document, name)
+        return {**document, "objects": document["objects"][:index] + document["objects"][index + 1 :]}
+
+    return edit
+
+
+def _index(document: Document, name: str) -> int:
+    for index, item in enumerate(document["objects"]):
+        if item["id"] == name:
+            return index
+    raise NotFoundError(f"the scene has no object `{name}`; list its objects for their ids.")
+
+
+def checked_document(document: object, revision: int) -> SceneDocument:
+    """Validate a document and give it its revision.
+
+    Raises:
+        DeltalightError: the first fault, with its place.
+    """
+    numbered = {**document, "revision": revision} if isinstance(document, Mapping) else document
+    return validate(SceneDocument, numbered, "the scene")  # type: ignore[arg-type]
+
+
+def require_revision(expected: int | None, current: int) -> None:
+    """Refuse a change to an older revision; None = whatever is newest.
+
+    Raises:
+        StaleRevisionError: `expected` is not the newest.
+    """
+    if expected is not None and expected != current:
+        raise StaleRevisionError(
+            f"the scene is at revision {current} and the change was made to {expected}; get it and change it again.",
+            current,
+        )

@@ -1,0 +1,335 @@
+"""Scenes: documents whose every change is a revision that stays."""
+
+import secrets
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import func, select
+from sqlalchemy.orm import Session
+
+from protocol.documents import parse_mapping
+from protocol.scene import DIGEST_PREFIX, SceneDocument
+from services.storage.assets import resolve_asset
+from services.storage.database import Database
+from services.storage.documents import Edit, checked_document, require_revision
+from services.storage.faults import ConflictError, NotFoundError
+from services.storage.tables import AssetUseRow, ChoiceRow, RevisionRow, SceneRow
+
+ACTIVE = "active_scene"
+FIRST_REVISION = 1
+
+
+@dataclass(frozen=True)
+class SceneHead:
+    """The newest revision of a scene, without its document."""
+
+    id: str
+    name: str
+    revision: int
+    created_ns: int
+    changed_ns: int
+    is_active: bool
+
+
+@dataclass(frozen=True)
+class StoredScene:
+    """A scene at one revision (`document.revision`), and what its past allows."""
+
+    head: SceneHead
+    document: SceneDocument
+    what: str
+    can_undo: bool
+    can_redo: bool
+
+
+@dataclass(frozen=True)
+class Revision:
+    """One change: `what` names it for people."""
+
+    number: int
+    at_ns: int
+    what: str
+    name: str
+
+
+class SceneStore:
+    """The scenes of a store."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def create(self, document: object, what: str = "created") -> StoredScene:
+        """Store a new scene; its revisions begin at 1.
+
+        Raises:
+            DeltalightError: the document is wrong or names an asset that was not uploaded.
+        """
+        with self._database.writing() as session:
+            return self._add(session, document, what)
+
+    def get(self, scene_id: str) -> StoredScene:
+        """Return the newest revision of a scene.
+
+        Raises:
+            NotFoundError: there is no such scene.
+        """
+        with self._database.reading() as session:
+            return _stored(session, _scene(session, scene_id), _newest(session, scene_id))
+
+    def revision(self, scene_id: str, number: int) -> StoredScene:
+        """Return a scene as it was at a revision.
+
+        Raises:
+            NotFoundError: there is no such scene or revision.
+        """
+        with self._database.reading() as session:
+            scene = _scene(session, scene_id)
+            row = session.get(RevisionRow, (scene_id, number))
+            if row is None:
+                raise NotFoundError(f"the scene has no revision {number}; list its revisions.")
+            return _stored(session, scene, row)
+
+    def all(self) -> list[SceneHead]:
+        """Return all scenes, in the order in which they were made."""
+        newest = select(RevisionRow.scene_id, func.max(RevisionRow.number).label("number"))
+        heads = newest.group_by(RevisionRow.scene_id).subquery()
+        query = (
+            select(SceneRow, RevisionRow)
+            .join(heads, heads.c.scene_id == SceneRow.id)
+            .join(
+                RevisionRow,
+                (RevisionRow.scene_id == heads.c.scene_id) & (RevisionRow.number == heads.c.number),
+            )
+            .where(SceneRow.deleted_ns.is_(None))
+            .order_by(SceneRow.created_ns, SceneRow.id)
+        )
+        with self._database.reading() as session:
+            active = _active_id(session)
+            return [_head(scene, row, active) for scene, row in session.execute(query).tuples()]
+
+    def history(self, scene_id: str, before: int | None, limit: int) -> list[Revision]:
+        """Return up to `limit` revisions below `before`, the newest first.
+
+        Raises:
+            NotFoundError: there is no such scene.
+        """
+        query = select(RevisionRow).where(RevisionRow.scene_id == scene_id)
+        if before is not None:
+            query = query.where(RevisionRow.number < before)
+        with self._database.reading() as session:
+            _scene(session, scene_id)
+            rows = session.scalars(query.order_by(RevisionRow.number.desc()).limit(limit))
+            return [Revision(row.number, row.at_ns, row.what, row.name) for row in rows]
+
+    def change(self, scene_id: str, edit: Edit, what: str, expected: int | None = None) -> StoredScene:
+        """Add a revision, made by `edit` from the newest one; an edit that changes nothing adds none.
+
+        Raises:
+            NotFoundError: there is no such scene.
+            StaleRevisionError: `expected` is not the newest revision.
+            DeltalightError: the changed document is wrong.
+        """
+        with self._database.writing() as session:
+            scene, newest = _scene(session, scene_id), _newest(session, scene_id)
+            require_revision(expected, newest.number)
+            current = _document(session, newest)
+            edited = checked_document(edit(current.model_dump(mode="json")), newest.number)
+            document = edited.with_assets(lambda place, asset: resolve_asset(session, place, asset))
+            if document == current:
+                return _stored(session, scene, newest)
+            number = newest.number + 1
+            row = _row(scene_id, number, what, document.replaced(revision=number), newest.origin)
+            return _added(session, scene, row, document)
+
+    def undo(self, scene_id: str, expected: int | None = None) -> StoredScene:
+        """Add a revision that shows what was before the last change.
+
+        Raises:
+            ConflictError: there is nothing to undo; or as `change`.
+        """
+
+        def step(session: Session, newest: RevisionRow) -> RevisionRow:
+            shown = _origin(session, newest)
+            if shown.before is None:
+                raise ConflictError("there is nothing to undo; the scene is as it was made.")
+            return _shown_again(
+                newest, _revision(session, newest.scene_id, shown.before), "undo", newest.number
+            )
+
+        return self._step(scene_id, expected, step)
+
+    def redo(self, scene_id: str, expected: int | None = None) -> StoredScene:
+        """Add a revision that shows again what the last undo took back.
+
+        Raises:
+            ConflictError: there is nothing to redo; or as `change`.
+        """
+
+        def step(session: Session, newest: RevisionRow) -> RevisionRow:
+            if newest.redo is None:
+                raise ConflictError("there is nothing to redo; only undone changes can be made again.")
+            undone = _revision(session, newest.scene_id, newest.redo)
+            return _shown_again(newest, _origin(session, undone), "redo", undone.redo)
+
+        return self._step(scene_id, expected, step)
+
+    def duplicate(self, scene_id: str, name: str | None = None) -> StoredScene:
+        """Store a copy of the newest revision as a scene of its own.
+
+        Raises:
+            NotFoundError: there is no such scene.
+        """
+        with self._database.writing() as session:
+            _scene(session, scene_id)
+            document = _document(session, _newest(session, scene_id)).model_dump(mode="json")
+            document["name"] = f"{document['name']} (copy)"[-200:] if name is None else name
+            return self._add(session, document, f"copied from {scene_id}")
+
+    def delete(self, scene_id: str, expected: int | None = None) -> None:
+        """Delete a scene that is not active; its revisions stay in the database.
+
+        Raises:
+            NotFoundError: there is no such scene.
+            ConflictError: it is active, or `expected` is not its newest revision.
+        """
+        with self._database.writing() as session:
+            scene = _scene(session, scene_id)
+            require_revision(expected, _newest(session, scene_id).number)
+            if _active_id(session) == scene_id:
+                raise ConflictError("the scene is the active one; activate another, then delete it.")
+            scene.deleted_ns = time.time_ns()
+
+    def activate(self, scene_id: str) -> StoredScene:
+        """Make a scene the one that is rendered.
+
+        Raises:
+            NotFoundError: there is no such scene.
+        """
+        with self._database.writing() as session:
+            scene = _scene(session, scene_id)
+            session.merge(ChoiceRow(key=ACTIVE, value=scene_id))
+            session.flush()
+            return _stored(session, scene, _newest(session, scene_id))
+
+    def active(self) -> StoredScene | None:
+        """Return the scene that is rendered, if one was chosen."""
+        with self._database.reading() as session:
+            scene_id = _active_id(session)
+            if scene_id is None:
+                return None
+            return _stored(session, _scene(session, scene_id), _newest(session, scene_id))
+
+    def _add(self, session: Session, document: Any, what: str) -> StoredScene:  # noqa: ANN401 - JSON
+        checked = checked_document(document, FIRST_REVISION)
+        resolved = checked.with_assets(lambda place, asset: resolve_asset(session, place, asset))
+        scene = SceneRow(id=secrets.token_hex(8), created_ns=time.time_ns())
+        session.add(scene)
+        session.flush()
+        return _added(session, scene, _row(scene.id, FIRST_REVISION, what, resolved, None), resolved)
+
+    def _step(
+        self, scene_id: str, expected: int | None, step: Callable[[Session, RevisionRow], RevisionRow]
+    ) -> StoredScene:
+        with self._database.writing() as session:
+            scene, newest = _scene(session, scene_id), _newest(session, scene_id)
+            require_revision(expected, newest.number)
+            row = step(session, newest)
+            session.add(row)
+            session.flush()
+            return _stored(session, scene, row)
+
+
+def _added(session: Session, scene: SceneRow, row: RevisionRow, document: SceneDocument) -> StoredScene:
+    session.add(row)
+    session.flush()
+    for digest in sorted(_digests(document)):
+        if session.get(AssetUseRow, (digest, scene.id)) is None:
+            session.add(AssetUseRow(digest=digest, scene_id=scene.id, number=row.number))
+    session.flush()
+    return _stored(session, scene, row)
+
+
+def _digests(document: SceneDocument) -> set[str]:
+    found: set[str] = set()
+
+    def note(_place: str, asset: str) -> str:
+        found.add(asset.removeprefix(DIGEST_PREFIX))
+        return asset
+
+    document.with_assets(note)
+    return found
+
+
+def _row(scene_id: str, number: int, what: str, document: SceneDocument, before: int | None) -> RevisionRow:
+    return RevisionRow(
+        scene_id=scene_id,
+        number=number,
+        at_ns=time.time_ns(),
+        what=what,
+        name=document.name,
+        document=document.canonical_json(),
+        origin=number,
+        before=before,
+        redo=None,
+    )
+
+
+def _shown_again(newest: RevisionRow, origin: RevisionRow, what: str, redo: int | None) -> RevisionRow:
+    return RevisionRow(
+        scene_id=newest.scene_id,
+        number=newest.number + 1,
+        at_ns=time.time_ns(),
+        what=what,
+        name=origin.name,
+        document=None,
+        origin=origin.number,
+        before=None,
+        redo=redo,
+    )
+
+
+def _scene(session: Session, scene_id: str) -> SceneRow:
+    scene = session.get(SceneRow, scene_id)
+    if scene is None or scene.deleted_ns is not None:
+        raise NotFoundError(f"there is no scene {scene_id!r:.60}; list the scenes for their ids.")
+    return scene
+
+
+def _newest(session: Session, scene_id: str) -> RevisionRow:
+    query = select(RevisionRow).where(RevisionRow.scene_id == scene_id).order_by(RevisionRow.number.desc())
+    return session.scalars(query.limit(1)).one()
+
+
+def _revision(session: Session, scene_id: str, number: int) -> RevisionRow:
+    return session.get_one(RevisionRow, (scene_id, number))
+
+
+def _origin(session: Session, row: RevisionRow) -> RevisionRow:
+    return row if row.origin == row.number else _revision(session, row.scene_id, row.origin)
+
+
+def _document(session: Session, row: RevisionRow) -> SceneDocument:
+    text = _origin(session, row).document
+    assert text is not None
+    return checked_document(parse_mapping(text, "the stored scene", is_json=True), row.number)
+
+
+def _active_id(session: Session) -> str | None:
+    choice = session.get(ChoiceRow, ACTIVE)
+    return None if choice is None else choice.value
+
+
+def _head(scene: SceneRow, row: RevisionRow, active: str | None) -> SceneHead:
+    return SceneHead(scene.id, row.name, row.number, scene.created_ns, row.at_ns, scene.id == active)
+
+
+def _stored(session: Session, scene: SceneRow, row: RevisionRow) -> StoredScene:
+    return StoredScene(
+        _head(scene, row, _active_id(session)),
+        _document(session, row),
+        row.what,
+        can_undo=_origin(session, row).before is not None,
+        can_redo=row.redo is not None,
+    )

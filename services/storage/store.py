@@ -1,0 +1,49 @@
+"""The way into the storage: one folder with a database and a folder of assets."""
+
+import os
+from pathlib import Path
+from typing import Self
+
+from protocol.errors import DeltalightError
+from services.storage.asset_probe import probe as probe_asset
+from services.storage.assets import AssetStore, Probe
+from services.storage.database import Database
+from services.storage.scenes import SceneStore
+from services.storage.tokens import TokenStore
+
+
+class Store:
+    """Scenes, assets and tokens of one folder; usable by several threads and processes. A context manager.
+
+    What a call has stored is on the disk when it returns. `probe` loads an upload once, with limits.
+
+    Raises:
+        DeltalightError: the folder cannot be written, or holds something else.
+    """
+
+    def __init__(self, folder: Path, *, probe: Probe = probe_asset) -> None:
+        try:
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        except OSError as fault:
+            raise DeltalightError(
+                f"{folder} cannot be written ({fault.strerror}); name another folder with --data."
+            ) from fault
+        self._database = Database(folder / "store.sqlite3")
+        self.assets = AssetStore(self._database, folder / "assets", probe)
+        self.scenes = SceneStore(self._database)
+        self.tokens = TokenStore(self._database)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_fault: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the database."""
+        self._database.close()
+
+
+def default_folder() -> Path:
+    """Where the data lie unless a folder is named (XDG base directory specification)."""
+    return Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share") / "deltalight"

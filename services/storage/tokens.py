@@ -1,0 +1,133 @@
+"""Tokens of the REST API: shown once, kept as a salted scrypt hash (RFC 7914)."""
+
+import hashlib
+import hmac
+import re
+import secrets
+import threading
+import time
+from dataclasses import dataclass
+from typing import Literal
+
+from sqlalchemy import func, select
+
+from protocol.errors import DeltalightError
+from services.storage.database import Database
+from services.storage.faults import ConflictError, NotFoundError
+from services.storage.tables import TokenRow
+
+Role = Literal["view", "control"]
+PREFIX = "deltalight"
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
+_TOKEN = re.compile(PREFIX + r"-([0-9a-f]{12})-([A-Za-z0-9_-]{43})")
+_SALT_BYTES, _SECRET_BYTES = 16, 32
+# 16 MB and some 50 ms for one guess (RFC 7914, section 2: memory = 128 n r bytes).
+_COST = {"n": 1 << 14, "r": 8, "p": 1, "maxmem": 64 << 20}
+
+
+@dataclass(frozen=True)
+class Token:
+    """What is known of a token; the token itself is not."""
+
+    id: str
+    name: str
+    role: Role
+    created_ns: int
+
+
+class TokenStore:
+    """The tokens of a store."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+        self._verified: dict[str, bytes] = {}
+        self._hashing = threading.Lock()  # one guess at a time: guesses must not fill the memory
+
+    def create(self, name: str, role: Role) -> str:
+        """Make a token and return it; it cannot be shown again.
+
+        Raises:
+            DeltalightError: the name is wrong or taken.
+        """
+        if not _NAME.fullmatch(name):
+            raise DeltalightError(f"`{name}` is no name for a token; use letters, digits, dots and dashes.")
+        token_id, secret, salt = (
+            secrets.token_hex(6),
+            secrets.token_urlsafe(_SECRET_BYTES),
+            secrets.token_bytes(_SALT_BYTES),
+        )
+        with self._database.writing() as session:
+            if session.scalars(select(TokenRow).where(TokenRow.name == name)).first() is not None:
+                raise ConflictError(
+                    f"there is a token called `{name}`; revoke it first or choose another name."
+                )
+            session.add(
+                TokenRow(
+                    id=token_id,
+                    name=name,
+                    role=role,
+                    salt=salt,
+                    hash=_hash(secret, salt),
+                    created_ns=time.time_ns(),
+                )
+            )
+        return f"{PREFIX}-{token_id}-{secret}"
+
+    def all(self) -> list[Token]:
+        """Return all tokens, in the order in which they were made."""
+        with self._database.reading() as session:
+            return [_token(row) for row in session.scalars(select(TokenRow).order_by(TokenRow.created_ns))]
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether there is no token at all."""
+        with self._database.reading() as session:
+            return session.scalars(select(func.count()).select_from(TokenRow)).one() == 0
+
+    def revoke(self, name: str) -> None:
+        """End a token; it is refused from the next request on.
+
+        Raises:
+            NotFoundError: there is no token of this name.
+        """
+        with self._database.writing() as session:
+            row = session.scalars(select(TokenRow).where(TokenRow.name == name)).first()
+            if row is None:
+                raise NotFoundError(f"there is no token called `{name}`; list the tokens for their names.")
+            session.delete(row)
+
+    def verify(self, token: str) -> Token | None:
+        """Return what is known of a token, None where it is none of ours.
+
+        Its slow hash is computed once a process; later a fast hash of it is compared. Whether it was revoked is
+        looked up each time.
+        """
+        match = _TOKEN.fullmatch(token)
+        if match is None:
+            return None
+        token_id, secret = match.groups()
+        with self._database.reading() as session:
+            row = session.get(TokenRow, token_id)
+        if row is None or not self._matches(row, secret):
+            return None
+        return _token(row)
+
+    def _matches(self, row: TokenRow, secret: str) -> bool:
+        quick = hashlib.sha256(row.salt + secret.encode()).digest()
+        known = self._verified.get(row.id)
+        if known is not None:
+            return hmac.compare_digest(known, quick)
+        with self._hashing:
+            right = hmac.compare_digest(_hash(secret, row.salt), row.hash)
+        if right:
+            self._verified[row.id] = quick
+        return right
+
+
+def _hash(secret: str, salt: bytes) -> bytes:
+    return hashlib.scrypt(secret.encode(), salt=salt, **_COST)
+
+
+def _token(row: TokenRow) -> Token:
+    role: Role = "control" if row.role == "control" else "view"
+    return Token(row.id, row.name, role, row.created_ns)
