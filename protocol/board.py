@@ -8,7 +8,16 @@ import cv2
 import numpy as np
 import yaml
 from jaxtyping import Float64, UInt8
-from pydantic import Discriminator, Field, StringConstraints, Tag, field_validator, model_validator
+from pydantic import (
+    Discriminator,
+    Field,
+    SerializerFunctionWrapHandler,
+    StringConstraints,
+    Tag,
+    field_validator,
+    model_serializer,
+    model_validator,
+)
 
 from protocol.documents import StrictModel, nearest, read_mapping, validate
 from protocol.errors import DeltalightError
@@ -171,6 +180,11 @@ class BoardSpec(StrictModel):
             raise ValueError("lamp_markers name a marker twice; give each lamp an id of its own")
         if lamps and max(lamps) >= size:
             raise ValueError(f"the dictionary has {size} markers, so lamp_markers go from 0 to {size - 1}")
+
+    @model_serializer(mode="wrap")
+    def _without_empty_lists(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """A board without cards or lamps is described as it was before there were any."""
+        return {key: value for key, value in dump(self).items() if value not in ((), [])}
 
     @property
     def paper_albedo(self) -> float:

@@ -123,6 +123,16 @@ Registration = Annotated[
 ]
 
 
+def _distance_kind(value: Any) -> str:  # noqa: ANN401 - whatever the document holds
+    return "word" if isinstance(value, str) else "metres"
+
+
+Distance = Annotated[
+    Annotated[Literal["auto", "far"], Tag("word")] | Annotated[float, Field(gt=0, le=1000), Tag("metres")],
+    Discriminator(_distance_kind),
+]
+
+
 class FisheyeLights(StrictModel):
     """How lights are taken from the fish-eye picture (METHOD 2); environment maps are split alike."""
 
@@ -143,7 +153,7 @@ class FisheyeLights(StrictModel):
         le=60,
         description="Time constant with which lights follow what the fish-eye camera sees, seconds; 0 = at once.",
     )
-    distance_m: Annotated[float, Field(gt=0, le=1000)] | Literal["auto", "far"] = Field(
+    distance_m: Distance = Field(
         default="auto",
         description="Distance of the lights from the fish-eye camera, metres; `far` = as the sun; `auto` = from how "
         "light falls off over the board's paper, far where none is seen.",

@@ -8,6 +8,7 @@ from jaxtyping import Float32, UInt8
 
 from protocol import scene_lights as documents
 from protocol.frames import ViewFrame
+from render_server.growing_interval import GrowingInterval
 from render_server.light_registration import (
     Relight,
     find_surroundings,
@@ -19,6 +20,7 @@ from render_server.lights_view import lights_picture
 from render_server.relight.frame import RelightInput
 from render_server.scene.light_sources import open_lights
 from render_server.scene.lights import LightSet
+from render_server.scene.registration import RegistrationAverage
 
 Rgb = Float32[np.ndarray, "3"]
 VERSION_STEP = 8
@@ -28,8 +30,9 @@ VERSION_STEP = 8
 class Lighting:
     """Lights in camera units, and a number that changes with them.
 
-    Factor, ground and surroundings are found once from the first frame that can tell, and hold for all lights that
-    the source brings from then on. `versions` counts in steps of VERSION_STEP; `say` takes sentences for the user.
+    Factor, ground and surroundings are found from the first frame that can tell, and hold for all lights that the
+    source brings from then on; the factor is the mean of what later frames tell, after growing intervals.
+    `versions` counts in steps of VERSION_STEP; `say` takes sentences for the user.
 
     Raises:
         DeltalightError: an environment map that cannot be read.
@@ -51,6 +54,7 @@ class Lighting:
     def _forget(self) -> None:
         """Find everything anew."""
         self._is_complete = False
+        self._average, self._interval = RegistrationAverage(), GrowingInterval()
         self._factor: Rgb | None = None
         self._ground: Rgb | None = None
         self._sky: tuple[Rgb, Float32[np.ndarray, "n n 1"]] | None = None
@@ -77,21 +81,45 @@ class Lighting:
             lights = lights.with_sky(*self._sky)
         self.lights, self.version = lights, next(self._versions)
 
-    def complete(self, frame: ViewFrame, scene: RelightInput, relight: Relight) -> RelightInput:
-        """Return the input with lights in camera units, all found that a picture can tell."""
+    def complete(
+        self, frame: ViewFrame, scene: RelightInput, relight: Relight, *, moved: bool
+    ) -> RelightInput:
+        """Return the input with lights in camera units, all found that a picture can tell.
+
+        Frames are measured again only where the real scene or the camera has `moved`, so that still pictures stay.
+        """
         assert self._raw is not None
         shines = bool(self._raw.lights) or bool(self._raw.environment.any())
-        if self._is_complete or (self._follows_lamps and not shines):
+        if self._follows_lamps and not shines:
             return scene
+        if self._is_complete:
+            return self._measured_again(frame, scene, relight) if moved else scene
         self._is_complete = True
-        if self._wants_registration:
+        if self._wants_registration and self._interval.is_due(frame.timestamp_ns):
             self._register(frame, replace(scene, lights=self._raw), relight)
         if self._wants_ground:
             self._ground = ground_radiance(frame, scene)
         if self._wants_surroundings:
             self._find_surroundings(frame, scene, relight)
+        return self._finished(scene)
+
+    def _measured_again(self, frame: ViewFrame, scene: RelightInput, relight: Relight) -> RelightInput:
+        """Average the factor over one more frame, if it is time."""
+        assert self._raw is not None
+        if not self._wants_registration or not self._interval.is_due(frame.timestamp_ns):
+            return scene
+        trial = self.version + VERSION_STEP // 2
+        self._register(frame, replace(scene, lights=self._raw, lights_version=trial), relight)
+        return self._finished(scene)
+
+    def _finished(self, scene: RelightInput) -> RelightInput:
         self._finish()
+        return self.renewed(scene)
+
+    def renewed(self, scene: RelightInput) -> RelightInput:
+        """Return the input with the lights as they are now, under a number of their own."""
         assert self.lights is not None
+        self.version = next(self._versions)
         return replace(scene, lights=self.lights, lights_version=self.version)
 
     def picture(self, frame: ViewFrame) -> UInt8[np.ndarray, "h w 3"]:
@@ -100,14 +128,15 @@ class Lighting:
         return lights_picture(frame, self.lights, self._source.split)
 
     def _register(self, frame: ViewFrame, scene: RelightInput, relight: Relight) -> None:
-        """Find the lights' factor from this frame."""
+        """Find the lights' factor from this frame and average it with those before."""
         found = register_lights(frame, scene, relight)
-        self._factor = found.factor
-        factor = ", ".join(f"{value:.3g}" for value in found.factor)
-        fit = "" if found.residual is None else f", residual {100 * found.residual:.1f} %"
-        self._say(f"lights registered by {found.source}: factor ({factor}){fit}")
+        if self._factor is None:
+            factor = ", ".join(f"{value:.3g}" for value in found.factor)
+            fit = "" if found.residual is None else f", residual {100 * found.residual:.1f} %"
+            self._say(f"lights registered by {found.source}: factor ({factor}){fit}")
         if found.warning is not None:
             self._say(found.warning)
+        self._factor = self._average.add(found)
 
     def _find_surroundings(self, frame: ViewFrame, scene: RelightInput, relight: Relight) -> None:
         """Find the light of what is out of sight, as this frame shows it."""

@@ -64,6 +64,11 @@ class RealGeometry:
         return [mesh.transformed(matrix) for mesh in load_mesh(Path(model.model))]
 
     @property
+    def has_unseen(self) -> bool:
+        """Whether there are surfaces that the camera may not see: of a model or from earlier frames."""
+        return self.is_model or self._fused is not None
+
+    @property
     def noise_sigma(self) -> float:
         """Depth noise at 1 m, m; a model has none. Three of it are at least what voxels round off."""
         if self.is_model or self.frame is None or self.frame.depth is None:

@@ -8,11 +8,11 @@ from protocol.frames import ViewFrame
 from protocol.scene import SceneDocument
 from protocol.scene_method import NoneMethod
 from protocol.scene_objects import Material
+from render_server.albedo_watch import AlbedoWatch
 from render_server.gpu.context import GpuContext
 from render_server.gpu.timers import PassTimers
 from render_server.lighting import VERSION_STEP, Lighting
 from render_server.passes.composite import RelitLayers
-from render_server.passes.unseen_albedo import UnseenAlbedo
 from render_server.picture_resources import PictureResources
 from render_server.real_geometry import RealGeometry
 from render_server.relight.frame import RelightInput
@@ -57,7 +57,7 @@ class Relighting:
         self._real: RealGeometry | None = None
         self._real_versions = count(1)
         self._resources: PictureResources | None = None
-        self._unseen_albedo = UnseenAlbedo(gpu)
+        self._albedo = AlbedoWatch(gpu)
         self._method: RelightBase | None = None
         self._lights_versions = count(VERSION_STEP, VERSION_STEP)
         self._plan = self._planned(scene)
@@ -94,6 +94,7 @@ class Relighting:
             if self._real is not None:
                 self._real.release()
             self._real = real
+            self._albedo.forget()
         if plan.method != old.method and self._method is not None:
             self._method.release()
             self._method = None
@@ -143,11 +144,13 @@ class Relighting:
             self._real.noise_sigma,
             self._real.typical_depth,
             resources.surface_uniforms,
-            self._unseen_albedo,
+            self._albedo.texture,
             timers,
         )
         method = self._method_for(view)
-        relight_input = self.lighting.complete(frame, relight_input, method.relight)
+        relight_input = self.lighting.complete(frame, relight_input, method.relight, moved=moved)
+        if moved and self._real.has_unseen and self._albedo.look(frame, relight_input, method.relight):
+            relight_input = self.lighting.renewed(relight_input)
         layers = method.relight(relight_input)
         if antialiasing:
             with timers.measure("inner edges"):
@@ -187,7 +190,7 @@ class Relighting:
 
     def release(self) -> None:
         """Free all GL objects."""
-        for item in (self._objects, self._real, self._resources, self._unseen_albedo, self._method):
+        for item in (self._objects, self._real, self._resources, self._albedo, self._method):
             if item is not None:
                 item.release()
 

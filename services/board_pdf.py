@@ -77,10 +77,12 @@ def write_board_pdf(path: Path, board: BoardSpec, paper: str) -> None:
     """Write the board, and on further pages the markers for lamps.
 
     Raises:
-        DeltalightError: the board or a lamp's marker does not fit on the paper.
+        DeltalightError: the board or a lamp's marker does not fit on the paper, or reportlab is not installed.
     """
-    from reportlab.pdfgen.canvas import Canvas
-
+    try:
+        from reportlab.pdfgen.canvas import Canvas
+    except ImportError as error:
+        raise DeltalightError("boards need the package reportlab: pip install 'deltalight[node]'.") from error
     page = choose_page(board, paper)
     canvas = Canvas(str(path), pagesize=(page.width * MM, page.height * MM), invariant=True)
     canvas.setTitle(f"Deltalight marker board, {board.type}")

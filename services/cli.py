@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 from protocol.errors import DeltalightError
+from services.commands.api import api
 from services.commands.bench import bench
 from services.commands.board import board
 from services.commands.calibrate import calibrate
@@ -42,6 +43,7 @@ app = typer.Typer(
 )
 for command in (render, demo, node, server, viewer, up, record, replay, config, doctor, schema, board):
     app.command()(command)
+app.add_typer(api, name="api")
 app.add_typer(recordings, name="recordings")
 app.add_typer(calibrate, name="calibrate")
 app.add_typer(keys, name="keys")

@@ -28,6 +28,7 @@ COMMAND_DEFAULTS: dict[str, dict[str, Any]] = {
         "publish": endpoint(COMPOSITE_PORT),
         "control": endpoint(CONTROL_PORT),
     },
+    "api": {},
     "keys": {},
 }
 
@@ -40,6 +41,7 @@ class _File(StrictModel):
 
     node: dict[str, Any] = Field(default_factory=dict)
     server: dict[str, Any] = Field(default_factory=dict)
+    api: dict[str, Any] = Field(default_factory=dict)
     keys: dict[str, Any] = Field(default_factory=dict)
 
 

@@ -15,7 +15,7 @@ FUSED_STEPS = 2  # a dispatch: the rim of two cells still fits 32 KB of shared m
 
 
 class LpvPropagatePass:
-    """Steps of one light volume; `tiled`: in shared memory, several a dispatch (default on a GPU), else one by one."""
+    """Steps of one light volume; `tiled`: in shared memory, several a dispatch (default on a GPU), else singly."""
 
     def __init__(self, gpu: GpuContext, *, tiled: bool | None = None) -> None:
         self._tiled = not gpu.is_software if tiled is None else tiled

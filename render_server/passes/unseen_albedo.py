@@ -4,6 +4,7 @@ from typing import Any
 
 import moderngl
 import numpy as np
+from jaxtyping import Float32
 
 from render_server.gpu.context import GpuContext
 from render_server.scene.albedo_memory import MEAN_ALBEDO, AlbedoMemory
@@ -14,27 +15,33 @@ class UnseenAlbedo:
 
     def __init__(self, gpu: GpuContext) -> None:
         self._gpu = gpu
-        self._texture = self._uploaded(np.full((1, 1, 1, 3), MEAN_ALBEDO, np.float32))
+        self._texture: moderngl.Texture3D | None = None
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self._replace(np.full((1, 1, 1, 3), MEAN_ALBEDO, np.float32))
         self._cube = (0.0, 0.0, 0.0, 1.0)
 
     def upload(self, memory: AlbedoMemory) -> None:
         """Take over everything that was observed."""
-        self._texture.release()
-        self._texture = self._uploaded(memory.filled())
+        self._replace(memory.filled())
         x, y, z = (float(v) for v in memory.origin)
         self._cube = (x, y, z, 1 / memory.edge)
 
-    def _uploaded(self, albedo: np.ndarray) -> moderngl.Texture3D:
+    def _replace(self, albedo: Float32[np.ndarray, "z y x 3"]) -> None:
+        self.release()
         texels = np.concatenate([albedo, np.ones_like(albedo[..., :1])], axis=-1).astype(np.float16)
         depth, height, width = albedo.shape[:3]
         texture = self._gpu.ctx.texture3d(
             (width, height, depth), 4, texels.tobytes(), dtype="f2", alignment=1
         )
         texture.repeat_x = texture.repeat_y = texture.repeat_z = False
-        return texture
+        self._texture = texture
 
     def bind(self) -> None:
         """Bind to the place that real_radiance.glsl names."""
+        assert self._texture is not None
         self._texture.use(location=21)
 
     def uniforms(self) -> dict[str, Any]:
@@ -43,4 +50,5 @@ class UnseenAlbedo:
 
     def release(self) -> None:
         """Free the texture."""
-        self._texture.release()
+        if self._texture is not None:
+            self._texture.release()

@@ -22,7 +22,7 @@ FINE_TRIANGLES = (80_000, 20_000)
 # A surface of area A crosses A (|nx| + |ny| + |nz|) / h^2 edges of the lattice, 1.5 A / h^2 in the mean over
 # directions; each gives two triangles.
 TRIANGLES_PER_CELL = 3.0
-# Memory for four times the blocks that the first frame fills (measured: a block for 54 triangles), 25 MB for the near
+# Memory for four times the blocks that the first frame fills (measured: a block for 54 triangles), 36 MB for the near
 # volume; what would go beyond is left out.
 TRIANGLES_PER_BLOCK = 54 / 4
 # Share of a box's edge that the first frame fills: the camera will look elsewhere.

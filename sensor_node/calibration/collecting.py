@@ -1,7 +1,7 @@
 """Collecting views from a series of pictures, with Ctrl-C as the end of a live series."""
 
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import closing, suppress
 
 from sensor_node.calibration.picture_sources import Series
 from sensor_node.calibration.targets import Target
@@ -24,7 +24,8 @@ def collect_views(
     """
     collector = ViewCollector(target, moving=series.moving)
     live = series.total is None
-    with suppress(*(KeyboardInterrupt,) if live else ()):
+    # Closing gives a camera back before the long fit begins.
+    with suppress(*(KeyboardInterrupt,) if live else ()), closing(series.pictures):
         for picture in series.pictures:
             tell(collector, collector.add(picture))
             if live and len(collector.views) >= enough:

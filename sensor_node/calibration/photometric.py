@@ -85,8 +85,12 @@ def read_bracket(folder: Path, eye: Eye) -> Bracket:
 
 
 def _exif_exposure(path: Path) -> float | None:
-    from PIL import Image
-
+    try:
+        from PIL import Image
+    except ImportError as error:
+        raise DeltalightError(
+            "reading exposures from EXIF needs Pillow: pip install pillow, or list them as third column of rgb.txt."
+        ) from error
     with Image.open(path) as picture:
         exposure = picture.getexif().get_ifd(EXIF_BLOCK).get(EXPOSURE_TIME)
     return None if exposure is None else float(exposure)

@@ -2,7 +2,7 @@
 
 import re
 import statistics
-from collections.abc import Generator, Iterable, Iterator, Sequence
+from collections.abc import Generator, Iterable, Sequence
 from contextlib import closing
 from itertools import count, pairwise
 from pathlib import Path
@@ -30,7 +30,7 @@ class Series(NamedTuple):
     `folder` holds the pictures; `board` is what a recording describes.
     """
 
-    pictures: Iterator[Picture]
+    pictures: Generator[Picture]
     total: int | None
     moving: bool
     folder: Path | None = None
@@ -97,7 +97,7 @@ def _is_film(timestamps_ns: Sequence[int]) -> bool:
     return bool(periods) and statistics.median(periods) < FILM_PERIOD_NS
 
 
-def _of_frames(frames: Iterable[SensorFrame], eye: Eye) -> Iterator[Picture]:
+def _of_frames(frames: Iterable[SensorFrame], eye: Eye) -> Generator[Picture]:
     shown = None
     for frame in frames:
         if eye == "rgb":
@@ -111,7 +111,7 @@ def _of_frames(frames: Iterable[SensorFrame], eye: Eye) -> Iterator[Picture]:
                 )
 
 
-def _live(source: str, eye: Eye) -> Iterator[Picture]:
+def _live(source: str, eye: Eye) -> Generator[Picture]:
     from sensor_node.cameras.base import EndOfStream
     from sensor_node.cameras.open import open_camera
 

@@ -34,9 +34,10 @@ def probe(path: Path, kind: AssetKind, name: str, *, memory_bytes: int = MEMORY_
         RejectedAssetError: it cannot be loaded, or not within the limits.
     """
     command = [sys.executable, "-m", __name__, str(path), kind, str(memory_bytes)]
+    environment = {**os.environ, **_ENVIRONMENT}
     try:
         done = subprocess.run(
-            command, capture_output=True, text=True, timeout=TIME_LIMIT_S, check=False, env={**os.environ, **_ENVIRONMENT}
+            command, capture_output=True, text=True, timeout=TIME_LIMIT_S, check=False, env=environment
         )
     except subprocess.TimeoutExpired as fault:
         raise RejectedAssetError(

@@ -80,7 +80,7 @@ class Database:
 
 
 def _prepare(connection: sqlite3.Connection, _entry: ConnectionPoolEntry) -> None:
-    """Leave transactions to us, and have each on the disk when it ends: WAL alone outlives a kill, not a power cut."""
+    """Leave transactions to us, and have each on the disk when it ends (WAL alone outlives a kill, no power cut)."""
     connection.isolation_level = None
     connection.execute("PRAGMA synchronous=FULL")
     connection.execute("PRAGMA foreign_keys=ON")

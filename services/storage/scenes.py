@@ -107,7 +107,7 @@ class SceneStore:
         )
         with self._database.reading() as session:
             active = _active_id(session)
-            return [_head(scene, row, active) for scene, row in session.execute(query).tuples()]
+            return [_head(scene, row, active) for scene, row in session.execute(query)]
 
     def history(self, scene_id: str, before: int | None, limit: int) -> list[Revision]:
         """Return up to `limit` revisions below `before`, the newest first.

@@ -289,7 +289,7 @@ def test_real_charuco_photograph_fits_its_published_lens_but_calibrates_none(sha
     )
     photographs = shared_data / "aruco_photos" / "opencv"
     collector = ViewCollector(target, moving=False)
-    for each in open_series(f"{photographs}/choriginal.jpg", "rgb").pictures:
+    for each in open_series(f"{photographs}/choriginal.*", "rgb").pictures:
         collector.add(each)
     assert [len(view.points) for view in collector.views] == [24]
     file = cv2.FileStorage(str(photographs / "tutorial_camera_charuco.yml"), cv2.FILE_STORAGE_READ)

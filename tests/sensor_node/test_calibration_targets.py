@@ -1,6 +1,6 @@
 """Targets and views: what is found in pictures, which pictures of a series are taken, where they come from."""
 
-from collections.abc import Iterator
+from collections.abc import Generator
 from pathlib import Path
 
 import cv2
@@ -123,7 +123,7 @@ def test_pictures_of_two_sizes_are_refused() -> None:
 
 
 def test_ctrl_c_ends_a_live_series_with_what_there_is() -> None:
-    def pictures() -> Iterator[Picture]:
+    def pictures() -> Generator[Picture]:
         yield shot((0.0, 0.0))
         yield shot((0.0, 0.0))
         raise KeyboardInterrupt
@@ -149,10 +149,12 @@ def test_a_live_series_ends_at_enough_views_and_a_long_one_is_thinned() -> None:
     blank = np.zeros((300, 400, 3), np.uint8)
     many = [Picture(str(number), blank, number) for number in range(150)]
     known = Known(8, 6, 0.04)
-    collected = collect_views(Series(iter(many), 150, moving=False), known, enough=8, tell=lambda *_: None)
+    collected = collect_views(
+        Series((each for each in many), 150, moving=False), known, enough=8, tell=lambda *_: None
+    )
     assert 0.5 * MOST_VIEWS < len(collected.views) <= MOST_VIEWS
     assert int(collected.views[-1].name) > 140
-    live = Series(iter(many), None, moving=False)
+    live = Series((each for each in many), None, moving=False)
     assert len(collect_views(live, known, enough=8, tell=lambda *_: None).views) == 8
 
 
@@ -175,6 +177,47 @@ def test_a_dataset_without_calibration_is_a_film_or_single_shots(tmp_path: Path)
     assert film.moving
     assert not shots.moving
     assert [each.moment for each in shots.pictures] == [0, 0, 9 * 10**9]
+
+
+def test_a_live_camera_needs_no_calibration_and_is_closed_at_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    from sensor_node.cameras import open as opening
+
+    asked: list[tuple[str, dict[str, bool]]] = []
+    closed: list[bool] = []
+
+    class Known(SyntheticCamera):
+        def close(self) -> None:
+            closed.append(True)
+            super().close()
+
+    def open_camera(source: str, **options: bool) -> SyntheticCamera:
+        asked.append((source, options))
+        return Known()
+
+    monkeypatch.setattr(opening, "open_camera", open_camera)
+    series = open_series("uvc:0", "fisheye")
+    assert series.total is None
+    assert series.moving
+    names = [next(series.pictures).name for _ in range(2)]
+    assert names == ["frame 0", "frame 1"]
+    assert asked == [("uvc:0", {"calibrated": False, "depth": False})]
+    series.pictures.close()
+    assert closed == [True]
+
+
+def test_a_recording_gives_its_frames_and_its_board(tmp_path: Path, synthetic: SyntheticCamera) -> None:
+    from protocol.recording import RecordingWriter
+
+    frames = [synthetic.frame_at(index) for index in range(2)]
+    with RecordingWriter(tmp_path / "take.mcap", board=synthetic.board) as writer:
+        for frame in frames:
+            writer.add(frame)
+    series = open_series(str(tmp_path / "take.mcap"), "rgb")
+    assert series.board == synthetic.board
+    assert series.moving
+    assert series.total == 2
+    assert [each.moment for each in series.pictures] == [frame.timestamp_ns for frame in frames]
+    assert list(open_series(str(tmp_path / "take.mcap"), "fisheye").pictures) == []
 
 
 @pytest.mark.parametrize(

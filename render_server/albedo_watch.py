@@ -1,0 +1,35 @@
+"""Keeps what pictures show of the real scene's albedo for when the camera looks elsewhere (METHOD 2)."""
+
+from protocol.frames import ViewFrame
+from render_server.gpu.context import GpuContext
+from render_server.growing_interval import GrowingInterval
+from render_server.light_registration import Relight, observe_albedo
+from render_server.passes.unseen_albedo import UnseenAlbedo
+from render_server.relight.frame import RelightInput
+from render_server.scene.albedo_memory import AlbedoMemory
+
+
+class AlbedoWatch:
+    """The albedo memory of one real scene and its texture; looks again when the camera or the room has moved."""
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self.texture = UnseenAlbedo(gpu)
+        self._memory = AlbedoMemory()
+        self._interval = GrowingInterval()
+
+    def look(self, frame: ViewFrame, scene: RelightInput, relight: Relight) -> bool:
+        """Take over what this frame shows, if it is time; returns whether the texture changed."""
+        if not self._interval.is_due(frame.timestamp_ns):
+            return False
+        observe_albedo(frame, scene, self._memory, relight)
+        self.texture.upload(self._memory)
+        return True
+
+    def forget(self) -> None:
+        """Begin anew: another real scene."""
+        self._memory, self._interval = AlbedoMemory(), GrowingInterval()
+        self.texture.clear()
+
+    def release(self) -> None:
+        """Free the texture."""
+        self.texture.release()

@@ -1,0 +1,23 @@
+"""When to look again at what is averaged over time."""
+
+FIRST_WAIT_S = 1.0
+LONGEST_WAIT_S = 30.0
+
+
+class GrowingInterval:
+    """At once, then after waits that double from 1 to 30 s of the frames' own time: soon good, then nearly free."""
+
+    def __init__(self) -> None:
+        self._last_ns: int | None = None
+        self._wait_s = FIRST_WAIT_S
+
+    def is_due(self, timestamp_ns: int) -> bool:
+        """Whether it is time; if so, the next wait begins. A clock that was set back begins the wait anew."""
+        if self._last_ns is None:
+            self._last_ns = timestamp_ns
+            return True
+        self._last_ns = min(self._last_ns, timestamp_ns)
+        if timestamp_ns - self._last_ns < self._wait_s * 1e9:
+            return False
+        self._last_ns, self._wait_s = timestamp_ns, min(2 * self._wait_s, LONGEST_WAIT_S)
+        return True

@@ -1,0 +1,81 @@
+"""Routes of uploaded assets."""
+
+from typing import Annotated
+
+from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi.concurrency import run_in_threadpool
+from fastapi.responses import FileResponse
+
+from protocol.scene import DIGEST_PREFIX
+from services.api.context import Shared
+from services.api.models import AssetAnswer
+from services.api.problems import ProblemError, responses
+from services.storage.asset_kinds import FORMATS
+
+router = APIRouter(tags=["assets"], prefix="/assets")
+Digest = Annotated[
+    str, Path(description="`sha256:<hex>` or the digits alone.", examples=["sha256:2c26b46b68ffc68f..."])
+]
+UPLOAD_TYPE = "application/octet-stream"
+_KNOWN = ", ".join(each.name.upper() for each in FORMATS)
+_UPLOAD_BODY = {
+    "requestBody": {
+        "required": True,
+        "description": f"The file itself: {_KNOWN}.",
+        "content": {UPLOAD_TYPE: {"schema": {"type": "string", "format": "binary"}}},
+    }
+}
+
+
+@router.get("")
+def list_assets(shared: Shared) -> list[AssetAnswer]:
+    """List all assets, the newest first."""
+    return [AssetAnswer.of(asset) for asset in shared.store.assets.all()]
+
+
+@router.post("", status_code=201, responses=responses(400, 413, 415, 422), openapi_extra=_UPLOAD_BODY)
+async def upload_asset(
+    shared: Shared,
+    request: Request,
+    response: Response,
+    name: Annotated[str, Query(max_length=1000, description="Name of the file.", examples=["chair.glb"])],
+) -> AssetAnswer:
+    """Upload a mesh or an environment map as the body of the request; 200 where the same content is there already.
+
+    The file is recognised by its content and loaded once in a process of its own, with limits of memory and time.
+    """
+    if request.headers.get("content-type", "").partition(";")[0].strip().lower() != UPLOAD_TYPE:
+        raise ProblemError(415, "media-type", f"Send the file as the body, with Content-Type: {UPLOAD_TYPE}.")
+    assets = shared.store.assets
+    with assets.receiving(shared.settings.upload_limit_mb << 20) as incoming:
+        async for chunk in request.stream():
+            await run_in_threadpool(incoming.write, chunk)
+        asset, is_new = await run_in_threadpool(assets.keep, incoming, name)
+    response.status_code = 201 if is_new else 200
+    response.headers["Location"] = f"/api/v1/assets/{asset.reference}"
+    return AssetAnswer.of(asset)
+
+
+@router.get("/{digest}", responses=responses(404))
+def get_asset(shared: Shared, digest: Digest) -> AssetAnswer:
+    """Return what is known of an asset."""
+    return AssetAnswer.of(shared.store.assets.get(digest.removeprefix(DIGEST_PREFIX)))
+
+
+@router.get("/{digest}/content", response_class=FileResponse, responses=responses(404))
+def download_asset(shared: Shared, digest: Digest) -> FileResponse:
+    """Download the file."""
+    asset = shared.store.assets.get(digest.removeprefix(DIGEST_PREFIX))
+    headers = {
+        "Cache-Control": "private, max-age=31536000, immutable",
+        "X-Content-Type-Options": "nosniff",
+        "Content-Security-Policy": "sandbox; default-src 'none'",
+    }
+    path = shared.store.assets.path(asset)
+    return FileResponse(path, media_type=asset.format.media_type, filename=asset.names[0], headers=headers)
+
+
+@router.delete("/{digest}", status_code=204, responses=responses(404, 409))
+def delete_asset(shared: Shared, digest: Digest) -> None:
+    """Delete an asset that no scene uses, now or in a revision that undo may bring back."""
+    shared.store.assets.remove(digest.removeprefix(DIGEST_PREFIX))

@@ -1,0 +1,159 @@
+"""What the REST API answers; the documents themselves are the protocol's."""
+
+from datetime import UTC, datetime
+from typing import Any, Literal, Self
+
+from pydantic import BaseModel, Field
+
+from protocol.scene import SceneDocument
+from services.api.process_watch import Report
+from services.api.render_link import Picture
+from services.storage.asset_kinds import AssetKind
+from services.storage.assets import Asset
+from services.storage.scenes import Revision, SceneHead, StoredScene
+
+
+class SceneSummary(BaseModel):
+    """A scene in a list."""
+
+    id: str = Field(description="Name in addresses.", examples=["4f0c2a9be1d37785"])
+    name: str = Field(description="Title for people.")
+    revision: int = Field(description="The newest revision.")
+    created: datetime
+    changed: datetime
+    active: bool = Field(description="Whether it is the scene that is rendered.")
+
+    @classmethod
+    def of(cls, head: SceneHead) -> Self:
+        """Describe a scene."""
+        return cls(
+            id=head.id,
+            name=head.name,
+            revision=head.revision,
+            created=_time(head.created_ns),
+            changed=_time(head.changed_ns),
+            active=head.is_active,
+        )
+
+
+class PictureState(BaseModel):
+    """What the render server made of the active scene."""
+
+    state: Literal["shown", "pending", "refused"] = Field(
+        description="`shown` = from the next frame on; `pending` = the render server does not answer; `refused` = "
+        "it cannot render this and shows what it had."
+    )
+    revision: int = Field(description="The revision that was sent.")
+    detail: str = Field(description="Why it is not shown; else empty.")
+
+    @classmethod
+    def of(cls, picture: Picture) -> Self:
+        """Describe what a sending came to."""
+        return cls(state=picture.state, revision=picture.revision, detail=picture.detail)
+
+
+class SceneAnswer(BaseModel):
+    """A scene at one revision."""
+
+    id: str = Field(description="Name in addresses.", examples=["4f0c2a9be1d37785"])
+    revision: int = Field(description="The revision of the document; also the ETag.")
+    created: datetime
+    changed: datetime
+    active: bool = Field(description="Whether it is the scene that is rendered.")
+    what: str = Field(description="The change that made this revision.")
+    can_undo: bool
+    can_redo: bool
+    picture: PictureState | None = Field(description="null unless the scene is active.")
+    document: SceneDocument
+
+    @classmethod
+    def of(cls, scene: StoredScene, picture: Picture | None) -> Self:
+        """Describe a scene at a revision."""
+        return cls(
+            id=scene.head.id,
+            revision=scene.document.revision,
+            created=_time(scene.head.created_ns),
+            changed=_time(scene.head.changed_ns),
+            active=scene.head.is_active,
+            what=scene.what,
+            can_undo=scene.can_undo,
+            can_redo=scene.can_redo,
+            picture=None if picture is None else PictureState.of(picture),
+            document=scene.document,
+        )
+
+
+class RevisionEntry(BaseModel):
+    """One change of a scene."""
+
+    revision: int
+    at: datetime
+    what: str = Field(description="What was changed.", examples=["object knot changed"])
+    name: str = Field(description="Title of the scene then.")
+
+    @classmethod
+    def of(cls, revision: Revision) -> Self:
+        """Describe a revision."""
+        return cls(revision=revision.number, at=_time(revision.at_ns), what=revision.what, name=revision.name)
+
+
+class AssetAnswer(BaseModel):
+    """An uploaded file."""
+
+    asset: str = Field(description="How scene documents name it.", examples=["sha256:2c26b46b68ffc68f..."])
+    names: list[str] = Field(description="Names under which it was uploaded.")
+    kind: AssetKind = Field(description="`mesh` for objects and models, `map` for environment lights.")
+    format: str = Field(examples=["glb"])
+    size_bytes: int
+    uploaded: datetime
+    facts: dict[str, Any] = Field(
+        description="Mesh: triangles, vertices, minimum and maximum corner in the file's units and axes. "
+        "Map: width and height, pixels.",
+        examples=[{"triangles": 1000, "vertices": 502, "minimum": [0, 0, 0], "maximum": [0.1, 0.1, 0.2]}],
+    )
+
+    @classmethod
+    def of(cls, asset: Asset) -> Self:
+        """Describe an asset."""
+        return cls(
+            asset=asset.reference,
+            names=list(asset.names),
+            kind=asset.format.kind,
+            format=asset.format.name,
+            size_bytes=asset.size_bytes,
+            uploaded=_time(asset.uploaded_ns),
+            facts=asset.facts,
+        )
+
+
+class ProcessAnswer(BaseModel):
+    """What a node or render server said about itself last."""
+
+    name: str
+    state: str = Field(description="starting, running, waiting, degraded or stopping.")
+    detail: str
+    age_s: float = Field(description="Seconds since it said so.")
+    rates: dict[str, float] = Field(description="1/s.")
+    drops: dict[str, int] = Field(description="What was lost since its start, by cause.")
+    clock_bound_ms: float | None = Field(
+        description="Greatest error of its clock against the server's; null = not compared."
+    )
+
+    @classmethod
+    def of(cls, report: Report) -> Self:
+        """Describe a report."""
+        message = report.message
+        bound_ns = message.clock_bound_ns
+        return cls(
+            name=message.node,
+            state=message.state,
+            detail=message.detail,
+            age_s=round(report.age_s, 3),
+            rates=dict(message.rates),
+            drops=dict(message.drops),
+            clock_bound_ms=None if bound_ns is None else bound_ns / 1e6,
+        )
+
+
+def _time(nanoseconds: int) -> datetime:
+    return datetime.fromtimestamp(nanoseconds / 1e9, UTC)

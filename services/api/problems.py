@@ -1,0 +1,158 @@
+"""Errors as problem details (RFC 9457): one sentence each, refusals counted by kind."""
+
+from collections import Counter
+from collections.abc import Mapping
+from http import HTTPStatus
+from typing import Any
+
+import structlog
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from pydantic import BaseModel, Field
+from starlette.exceptions import HTTPException
+
+from protocol.errors import DeltalightError
+from services.storage.faults import (
+    ConflictError,
+    NotFoundError,
+    RejectedAssetError,
+    StaleRevisionError,
+    StorageFaultError,
+    TooLargeError,
+)
+
+MEDIA_TYPE = "application/problem+json"
+TYPE_PREFIX = "urn:deltalight:problem:"
+
+log = structlog.get_logger()
+
+# The first class that a fault is an instance of says its status and kind.
+_KINDS: tuple[tuple[type[DeltalightError], int, str], ...] = (
+    (NotFoundError, 404, "not-found"),
+    (StaleRevisionError, 409, "stale-revision"),
+    (ConflictError, 409, "conflict"),
+    (RejectedAssetError, 422, "rejected-asset"),
+    (TooLargeError, 413, "too-large"),
+    (StorageFaultError, 503, "storage-fault"),
+    (DeltalightError, 422, "invalid"),
+)
+
+
+class Problem(BaseModel):
+    """What is wrong and what to do."""
+
+    type: str = Field(
+        description="Kind of the problem, for programs.", examples=[TYPE_PREFIX + "stale-revision"]
+    )
+    title: str = Field(description="The status in words.", examples=["Conflict"])
+    status: int = Field(description="The HTTP status.", examples=[409])
+    detail: str = Field(
+        description="One sentence for people.",
+        examples=["the scene is at revision 7 and the change was made to 5; get it and change it again."],
+    )
+    revision: int | None = Field(default=None, description="With stale-revision: the newest revision.")
+
+
+class ProblemError(HTTPException):
+    """A refusal that is not the storage's: `kind` ends the problem's type."""
+
+    def __init__(
+        self, status: int, kind: str, sentence: str, headers: Mapping[str, str] | None = None
+    ) -> None:
+        super().__init__(status, sentence, dict(headers or {}))
+        self.kind = kind
+
+
+class Problems:
+    """Makes responses of faults and counts them by kind."""
+
+    def __init__(self) -> None:
+        self.counts: Counter[str] = Counter()
+
+    def response(
+        self,
+        status: int,
+        kind: str,
+        sentence: str,
+        *,
+        headers: Mapping[str, str] | None = None,
+        revision: int | None = None,
+    ) -> JSONResponse:
+        """The response that says this; a lone surrogate in `sentence` becomes a question mark."""
+        self.counts[kind] += 1
+        problem = Problem(
+            type=TYPE_PREFIX + kind,
+            title=HTTPStatus(status).phrase,
+            status=status,
+            detail=sentence.encode("utf-8", "replace").decode(),
+            revision=revision,
+        )
+        return JSONResponse(
+            problem.model_dump(exclude_none=True), status, dict(headers or {}), media_type=MEDIA_TYPE
+        )
+
+    def of_http(self, fault: HTTPException) -> JSONResponse:
+        """The response to a refusal of the framework or of a gate."""
+        kind = fault.kind if isinstance(fault, ProblemError) else _slug(fault.status_code)
+        return self.response(fault.status_code, kind, str(fault.detail), headers=fault.headers)
+
+    def of_fault(self, fault: DeltalightError) -> JSONResponse:
+        """The response to a refusal of the storage or of a document."""
+        status, kind = next((status, kind) for each, status, kind in _KINDS if isinstance(fault, each))
+        revision = fault.current if isinstance(fault, StaleRevisionError) else None
+        return self.response(status, kind, str(fault), revision=revision)
+
+    def install(self, app: FastAPI) -> None:
+        """Answer every fault of the application so."""
+
+        @app.exception_handler(HTTPException)
+        async def _http(_request: Request, fault: HTTPException) -> JSONResponse:
+            return self.of_http(fault)
+
+        @app.exception_handler(DeltalightError)
+        async def _refused(_request: Request, fault: DeltalightError) -> JSONResponse:
+            return self.of_fault(fault)
+
+        @app.exception_handler(RequestValidationError)
+        async def _invalid(_request: Request, fault: RequestValidationError) -> JSONResponse:
+            return self._of_request(fault)
+
+        @app.exception_handler(Exception)
+        async def _internal(_request: Request, fault: Exception) -> JSONResponse:
+            sentence = f"The service failed ({type(fault).__name__}); see its log and report it."
+            return self.response(500, "internal", sentence)
+
+    def _of_request(self, fault: RequestValidationError) -> JSONResponse:
+        first = fault.errors()[0]
+        if first["type"] == "json_invalid":
+            return self.response(400, "not-json", "The body is not valid JSON; correct it.")
+        return self.response(422, "invalid", f"`{_place(first['loc'])}` is wrong: {_lower(first['msg'])}.")
+
+
+def describe_problems(schema: dict[str, Any]) -> dict[str, Any]:
+    """Return an OpenAPI document whose errors have the media type of problem details."""
+    for path in schema["paths"].values():
+        for operation in path.values():
+            for status, response in operation.get("responses", {}).items():
+                content = response.get("content", {})
+                if status >= "400" and "application/json" in content:
+                    content[MEDIA_TYPE] = content.pop("application/json")
+    return schema
+
+
+def responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """The errors of a route, for its OpenAPI description."""
+    return {status: {"model": Problem, "description": HTTPStatus(status).phrase} for status in statuses}
+
+
+def _slug(status: int) -> str:
+    return HTTPStatus(status).phrase.lower().replace(" ", "-")
+
+
+def _place(steps: tuple[int | str, ...]) -> str:
+    return ".".join(map(str, steps))
+
+
+def _lower(message: str) -> str:
+    return (message[:1].lower() + message[1:]).rstrip(".")

@@ -1,0 +1,189 @@
+"""Keeps the render server at the newest revision of the active scene."""
+
+import threading
+import time
+import uuid
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import structlog
+
+from protocol.clock import CLOCK_OP
+from protocol.envelope import EnvelopeError
+from protocol.errors import DeltalightError
+from protocol.keys import Keys
+from protocol.messages import ControlRequest
+from protocol.transport import RequestClient
+from services.storage.scenes import StoredScene
+from services.storage.store import Store
+
+LOOK_INTERVAL_S = 1.0
+ALIVE_TIMEOUT_S = 1.0  # the server's own thread answers this, whatever the renderer does
+COMMAND_TIMEOUT_S = 25.0  # the server gives up after 20 s itself
+
+log = structlog.get_logger()
+
+
+@dataclass(frozen=True)
+class Picture:
+    """What became of the newest revision: `shown` = from the next frame on, `pending` = the server does not answer,
+    `refused` = it cannot render it and shows what it had before."""
+
+    state: Literal["shown", "pending", "refused"]
+    scene_id: str
+    revision: int
+    detail: str = ""
+
+
+class RenderLink:
+    """Sends the active scene to the render server, at once after a change and again after its restart.
+
+    The server counts revisions of its own, across scenes: each sending is its newest plus one.
+    """
+
+    def __init__(self, store: Store, control: str, keys: Keys | None = None) -> None:
+        self._store = store
+        self._client = RequestClient(control, keys=keys)
+        self._sending = threading.Lock()
+        self._is_reachable = True
+        self._server_revision: int | None = None
+        self._picture: Picture | None = None
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._look, name="render-link", daemon=True)
+
+    def start(self) -> None:
+        """Begin to watch the server."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop watching."""
+        self._stop.set()
+        if self._thread.is_alive():
+            self._thread.join(timeout=ALIVE_TIMEOUT_S)
+        if (
+            not self._thread.is_alive()
+        ):  # else it waits for a renderer that hangs: the process ends without it
+            self._client.close()
+
+    @property
+    def is_reachable(self) -> bool:
+        """Whether the server answered when it was last asked."""
+        return self._is_reachable
+
+    @property
+    def picture(self) -> Picture | None:
+        """What the last sending came to."""
+        return self._picture
+
+    def refresh(self) -> Picture | None:
+        """Send the newest revision of the active scene unless the server has it; None without an active scene.
+
+        While a server that did not answer is being looked for, this does not wait for it.
+        """
+        with self._sending:
+            active = self._store.scenes.active()
+            if active is None or self._is_settled(active):
+                return self._picture
+            self._picture = self._send(active) if self._is_reachable else _pending(active)
+            return self._picture
+
+    def _is_settled(self, active: StoredScene) -> bool:
+        picture = self._picture
+        return (
+            picture is not None
+            and picture.state != "pending"
+            and (picture.scene_id, picture.revision) == (active.head.id, active.document.revision)
+        )
+
+    def _send(self, active: StoredScene) -> Picture:
+        revision = active.document.revision
+        try:
+            self._ask(CLOCK_OP, ALIVE_TIMEOUT_S)
+            self._set_scene(active)
+        except _UnansweredError:
+            self._note_reachable(False)
+            return _pending(active)
+        except DeltalightError as refusal:
+            detail = self._store.assets.without_paths(str(refusal))
+            return Picture("refused", active.head.id, revision, detail)
+        return Picture("shown", active.head.id, revision)
+
+    def _set_scene(self, active: StoredScene) -> None:
+        scene = self._store.assets.localised(active.document).model_dump(mode="json")
+        sent = (self._seen_revision() if self._server_revision is None else self._server_revision) + 1
+        try:
+            self._ask("set_scene", COMMAND_TIMEOUT_S, {"scene": scene}, revision=sent)
+        except _UnansweredError:
+            raise
+        except DeltalightError:
+            newest = self._seen_revision()
+            if newest < sent:  # refused for what it is, not because somebody else changed the scene meanwhile
+                raise
+            sent = newest + 1
+            self._ask("set_scene", COMMAND_TIMEOUT_S, {"scene": scene}, revision=sent)
+        self._server_revision = sent
+
+    def _seen_revision(self) -> int:
+        scene: Any = self._ask("get_scene", COMMAND_TIMEOUT_S)["scene"]
+        return int(scene["revision"])
+
+    def _look(self) -> None:
+        """Once a second: a server that came (back) gets the scene."""
+        while not self._stop.wait(LOOK_INTERVAL_S):
+            try:
+                self._look_once()
+            except DeltalightError as fault:
+                log.warning("the render server cannot be kept up to date", fault=str(fault))
+
+    def _look_once(self) -> None:
+        with self._sending:
+            try:
+                self._ask(CLOCK_OP, ALIVE_TIMEOUT_S)
+                seen = self._seen_revision()
+            except _UnansweredError:
+                self._note_reachable(False)
+                return
+            self._note_reachable(True)
+            if self._server_revision is None or seen < self._server_revision:  # it was started (again)
+                self._picture = None
+            self._server_revision = seen
+        self.refresh()
+
+    def _note_reachable(self, reachable: bool) -> None:
+        if reachable != self._is_reachable:
+            log.info("render server answers" if reachable else "render server does not answer")
+        self._is_reachable = reachable
+
+    def _ask(
+        self,
+        op: str,
+        timeout_s: float,
+        payload: dict[str, object] | None = None,
+        revision: int | None = None,
+    ) -> dict[str, object]:
+        request = ControlRequest(
+            node="api",
+            capture_ns=time.time_ns(),
+            id=uuid.uuid4().hex,
+            op=op,
+            payload=payload or {},
+            revision=revision,
+        )
+        try:
+            reply = self._client.request(request, timeout_s)
+        except EnvelopeError:
+            raise
+        except DeltalightError as fault:
+            raise _UnansweredError(str(fault)) from fault
+        if reply.error is not None:
+            raise DeltalightError(reply.error)
+        return reply.payload
+
+
+class _UnansweredError(DeltalightError):
+    """The server did not answer in time."""
+
+
+def _pending(active: StoredScene) -> Picture:
+    detail = "The render server does not answer; the scene is shown as soon as it does."
+    return Picture("pending", active.head.id, active.document.revision, detail)

@@ -1,0 +1,67 @@
+"""The REST API's process."""
+
+import socket
+from pathlib import Path
+
+import structlog
+import uvicorn
+
+from protocol.errors import DeltalightError
+from protocol.keys import Keys
+from services.api.app import create_app
+from services.api.settings import ApiSettings
+from services.storage.scene_files import import_scene
+from services.storage.store import Store, default_folder
+
+FIRST_TOKEN = "first"
+MAX_CONNECTIONS = 256
+
+log = structlog.get_logger()
+
+
+def run_api(settings: ApiSettings, keys: Keys | None = None, scene: Path | None = None) -> None:
+    """Serve until SIGINT or SIGTERM; `scene` is imported and rendered first.
+
+    Where the address leaves the host and there is no token yet, one is made and printed.
+
+    Raises:
+        DeltalightError: the port is in use, the data folder cannot be used, or the scene is wrong.
+    """
+    with _listener(settings) as listener, Store(settings.data or default_folder()) as store:
+        if scene is not None:
+            store.scenes.activate(import_scene(store, scene))
+        if settings.leaves_host:
+            _say_who_may_enter(settings, store)
+        config = uvicorn.Config(
+            create_app(settings, store, keys),
+            log_level="warning",
+            access_log=False,
+            server_header=False,
+            proxy_headers=False,  # anybody could send them, and would choose the address that is counted
+            limit_concurrency=MAX_CONNECTIONS,
+            timeout_graceful_shutdown=1,
+        )
+        log.info("REST API runs", address=f"http://{settings.host}:{settings.port}/api/v1")
+        uvicorn.Server(config).run(sockets=[listener])
+
+
+def _listener(settings: ApiSettings) -> socket.socket:
+    family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
+    try:
+        return socket.create_server((settings.host, settings.port), family=family, backlog=128)
+    except OSError as fault:
+        raise DeltalightError(
+            f"{settings.host} port {settings.port} cannot be listened on ({fault.strerror}); end the program that "
+            "uses it, or choose others with --host and --port."
+        ) from fault
+
+
+def _say_who_may_enter(settings: ApiSettings, store: Store) -> None:
+    log.warning(
+        "other hosts can connect; every request needs a token, and nothing is encrypted: put a TLS proxy in front "
+        "or use an SSH tunnel",
+        host=settings.host,
+    )
+    if store.tokens.is_empty:
+        token = store.tokens.create(FIRST_TOKEN, "control")
+        print(f"Token `{FIRST_TOKEN}` (role control), shown this once: {token}", flush=True)

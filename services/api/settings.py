@@ -1,0 +1,50 @@
+"""Settings of the REST API's process."""
+
+from ipaddress import ip_address
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field, field_validator
+
+from protocol.documents import StrictModel
+from services.ports import COMPOSITE_PORT, CONTROL_PORT, LOOPBACK, NODE_PORT, endpoint
+
+API_PORT = 8001
+
+
+class ApiSettings(StrictModel):
+    """Settings of the REST API."""
+
+    host: str = Field(
+        default=LOOPBACK,
+        description="Address to listen on; one that leaves this host (0.0.0.0 for all) needs tokens.",
+    )
+    port: int = Field(default=API_PORT, ge=1, le=65535, description="Port to listen on.")
+    data: Path | None = Field(
+        default=None,
+        description="Folder of scenes and assets; null = `deltalight` in the user's data folder.",
+    )
+    control: str = Field(
+        default=endpoint(CONTROL_PORT), description="Endpoint of the render server's commands."
+    )
+    subscribe: tuple[str, ...] = Field(
+        default=(endpoint(COMPOSITE_PORT), endpoint(NODE_PORT)),
+        description="Endpoints of the render server and of the nodes, which tell how they are doing.",
+    )
+    upload_limit_mb: int = Field(default=256, ge=1, le=512, description="Greatest size of an upload, MB.")
+    requests_per_s: Annotated[float, Field(ge=1, le=10_000)] = Field(
+        default=100.0,
+        description="Requests a second that one client may send for long; twice as many at once.",
+    )
+
+    @field_validator("host")
+    @classmethod
+    def _check_host(cls, host: str) -> str:
+        if host != "localhost":
+            ip_address(host)  # a name would be looked up, and could change what it means
+        return host
+
+    @property
+    def leaves_host(self) -> bool:
+        """Whether other hosts can connect."""
+        return self.host != "localhost" and not ip_address(self.host).is_loopback

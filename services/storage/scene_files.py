@@ -1,0 +1,35 @@
+"""Taking over a scene document with the files that it names (the command line may; REST clients may not)."""
+
+from pathlib import Path
+
+from protocol.scene import DIGEST_PREFIX, SceneDocument, load_scene
+from services.storage.store import Store
+
+CHUNK_BYTES = 1 << 20
+LIMIT_BYTES = 512 << 20
+
+
+def import_scene(store: Store, path: Path) -> str:
+    """Store a scene document and its assets; returns the id of the scene, of an old one where nothing differs.
+
+    Raises:
+        DeltalightError: the document or one of its files is wrong.
+    """
+    document = load_scene(path).with_assets(lambda _place, asset: _keep(store, asset))
+    for head in store.scenes.all():
+        if _same(store.scenes.get(head.id).document, document):
+            return head.id
+    return store.scenes.create(document.model_dump(mode="json"), f"imported from {path.name}").head.id
+
+
+def _same(one: SceneDocument, other: SceneDocument) -> bool:
+    return one.replaced(revision=0) == other.replaced(revision=0)
+
+
+def _keep(store: Store, asset: str) -> str:
+    if asset.startswith(DIGEST_PREFIX):
+        return asset
+    with Path(asset).open("rb") as file, store.assets.receiving(LIMIT_BYTES) as incoming:
+        while chunk := file.read(CHUNK_BYTES):
+            incoming.write(chunk)
+        return store.assets.keep(incoming, Path(asset).name)[0].reference

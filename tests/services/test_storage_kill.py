@@ -1,0 +1,86 @@
+"""Nothing is lost by kill -9: a process that writes in a loop is killed 50 times at any point."""
+
+import multiprocessing
+import os
+import random
+import signal
+import sqlite3
+import time
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+from services.storage.documents import patch_document
+from services.storage.store import Store
+from tests.services.storage_samples import TETRAHEDRON, trusting_probe, upload
+
+CYCLES = 50
+LONGEST_LIFE_S = 0.06
+# Makes a revision some 30 kB, so that the log is moved into the database several times during the test.
+LAMPS = [{"type": "sphere", "position_m": [0, 0, 1 + index / 100]} for index in range(64)]
+
+
+def write_until_killed(folder: Path, acknowledge: Connection, seed: int) -> None:
+    """Makes revisions, undoes some, uploads assets; tells of each when the store has said that it is done."""
+    with Store(folder, probe=trusting_probe) as store:
+        scene_id = store.scenes.create({"name": f"process {seed}", "lights": {"manual": LAMPS}}).head.id
+        acknowledge.send((scene_id, 1, f"process {seed}"))
+        number = 0
+        while True:
+            number += 1
+            name = f"{seed}-{number}"
+            scene = store.scenes.change(scene_id, patch_document({"name": name}), "renamed")
+            acknowledge.send((scene_id, scene.document.revision, name))
+            if number % 3 == 0:
+                scene = store.scenes.undo(scene_id)
+                acknowledge.send((scene_id, scene.document.revision, scene.document.name))
+            if number % 4 == 0:
+                asset = upload(store, TETRAHEDRON + f"# {name}\n".encode(), f"{name}.obj")
+                acknowledge.send((asset.digest,))
+
+
+def run_and_kill(context: multiprocessing.context.ForkServerContext, folder: Path, seed: int) -> list[tuple]:
+    """Kills a writing process at a random moment; returns what it had acknowledged."""
+    receiver, sender = context.Pipe(duplex=False)
+    process = context.Process(target=write_until_killed, args=(folder, sender, seed))
+    process.start()
+    sender.close()
+    acknowledged = [receiver.recv()]
+    time.sleep(random.Random(seed).uniform(0, LONGEST_LIFE_S))
+    assert process.pid is not None
+    os.kill(process.pid, signal.SIGKILL)
+    process.join()
+    assert process.exitcode == -signal.SIGKILL
+    try:
+        while True:
+            acknowledged.append(receiver.recv())
+    except EOFError:
+        return acknowledged
+
+
+def test_nothing_acknowledged_is_lost_by_kill_9(tmp_path: Path) -> None:
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["tests.services.test_storage_kill"])
+    revisions: list[tuple[str, int, str]] = []
+    digests: list[str] = []
+    for seed in range(CYCLES):
+        for entry in run_and_kill(context, tmp_path, seed):
+            if len(entry) == 1:
+                digests += entry
+            else:
+                revisions.append(entry)
+    connection = sqlite3.connect(tmp_path / "store.sqlite3")
+    assert connection.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
+    assert connection.execute("PRAGMA foreign_key_check").fetchall() == []
+    connection.close()
+    with Store(tmp_path, probe=trusting_probe) as store:
+        assert len({scene_id for scene_id, _, _ in revisions}) == CYCLES
+        for scene_id, number, name in revisions:
+            assert store.scenes.revision(scene_id, number).document.name == name
+        for head in store.scenes.all():
+            numbers = [each.number for each in store.scenes.history(head.id, None, 100_000)]
+            assert numbers == list(range(head.revision, 0, -1))
+        for asset in store.assets.all():
+            assert store.assets.path(asset).stat().st_size == asset.size_bytes
+        assert {asset.digest for asset in store.assets.all()} >= set(digests)
+    assert len(revisions) > 2 * CYCLES  # the processes did live long enough to be caught at work
+    assert len(digests) > 0
