@@ -1,5 +1,6 @@
 """Files of linear radiance: Radiance .hdr and OpenEXR."""
 
+import errno
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -32,11 +33,15 @@ def write_exr(path: Path, linear: Float32[np.ndarray, "h w 3"]) -> None:
 
     Raises:
         DeltalightError: the package OpenEXR is not installed.
+        OSError: the file cannot be written.
     """
     exr = require_openexr(f"writing {path}")
     header = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
     with exr.File(header, {"RGB": np.ascontiguousarray(linear)}) as file:
-        file.write(str(path))
+        try:
+            file.write(str(path))
+        except RuntimeError as error:  # how the package reports a full disk
+            raise OSError(errno.EIO, str(error).rstrip(". ")) from error
 
 
 def require_openexr(purpose: str) -> ModuleType:

@@ -117,12 +117,12 @@ class DlpvMethod(StrictModel):
         description="Two volumes, with and without objects, subtracted; or one volume of the change, as printed in "
         "the paper. Settings that are null follow it.",
     )
-    volume_size: int | None = Field(
-        default=None,
+    volume_size: int = Field(
+        default=32,
         ge=16,
         le=64,
         multiple_of=8,
-        description="Cells an edge; null = 64 on a GPU, 32 in software.",
+        description="Cells an edge; more make it costlier, not better.",
     )
     volume_edge_m: float | None = Field(
         default=None,

@@ -16,7 +16,7 @@ from pathlib import Path
 import structlog
 from pydantic import Field
 
-from protocol.clock import CLOCK_OP
+from protocol.clock import CLOCK_OP, clock_payload
 from protocol.codecs import encode_color
 from protocol.documents import StrictModel
 from protocol.envelope import encode
@@ -82,7 +82,7 @@ class CommandDesk:
         """
         answer: Future[Payload] = Future()
         if request.op == CLOCK_OP:  # answered here, because waiting for a frame would blur the times
-            return {"received_ns": time.time_ns(), "sent_ns": time.time_ns()}
+            return clock_payload(time.time_ns())
         self._pending.put((request, answer))
         if self._closed:
             self.serve(_refuse)

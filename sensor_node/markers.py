@@ -70,10 +70,6 @@ class BoardDetector:
         self._chessboard = board.chessboard_corners()
         self._previous: Float64[np.ndarray, "4 4"] | None = None
 
-    def reset(self) -> None:
-        """Forget the last pose (the camera was moved unseen, or another sequence begins)."""
-        self._previous = None
-
     def detect(self, color: UInt8[np.ndarray, "h w 3"]) -> BoardPose | None:
         """Return the pose in a picture (RGB), or None where the board is not seen.
 

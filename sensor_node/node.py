@@ -100,8 +100,10 @@ def node_camera(config: NodeConfig) -> Camera:
     """
     settings = config.camera.model_copy(update={"realtime": config.realtime, "loop": config.loop})
     camera = open_camera(config.source, settings)
-    return camera if config.fisheye is None else CameraWithFisheye(
-        camera, open_fisheye(config.fisheye, config.camera.calibration)
+    return (
+        camera
+        if config.fisheye is None
+        else CameraWithFisheye(camera, open_fisheye(config.fisheye, config.camera.calibration))
     )
 
 

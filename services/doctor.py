@@ -12,7 +12,10 @@ from services import ports
 
 PROBE_TIMEOUT_S = 60
 MAXIMUM_DEVICES = 16
-PACKAGES = {"render": ("moderngl", "trimesh", "scipy"), "api": ("fastapi", "uvicorn", "websockets")}
+PACKAGES = {
+    "render": ("moderngl", "trimesh", "scipy", "OpenEXR"),
+    "api": ("fastapi", "uvicorn", "websockets"),
+}
 
 NAMES_OF_KINDS = {"uvc": "USB (UVC)", "oak": "OAK", "openni2": "OpenNI 2", "orbbec": "Orbbec"}
 

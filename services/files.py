@@ -3,13 +3,11 @@
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib import import_module
 from pathlib import Path
-from types import ModuleType
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import UInt8
 
 from protocol.errors import DeltalightError
 
@@ -68,27 +66,3 @@ def write_png(path: Path, color: UInt8[np.ndarray, "h w 3"]) -> None:
     bgr = cv2.cvtColor(color, cv2.COLOR_RGB2BGR)
     _, encoded = cv2.imencode(".png", bgr, [cv2.IMWRITE_PNG_COMPRESSION, PNG_COMPRESSION])
     write_bytes(path, encoded.tobytes())
-
-
-def write_exr(path: Path, linear: Float32[np.ndarray, "h w 3"]) -> None:
-    """Write linear RGB as an OpenEXR file of 32-bit floats.
-
-    Raises:
-        DeltalightError: the package OpenEXR is not installed.
-    """
-    exr = require_openexr()
-    header = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
-    with replacing(path) as temporary, exr.File(header, {"RGB": np.ascontiguousarray(linear)}) as picture:
-        picture.write(str(temporary))
-
-
-def require_openexr() -> ModuleType:
-    """The OpenEXR package.
-
-    Raises:
-        DeltalightError: it is not installed.
-    """
-    try:
-        return import_module("OpenEXR")  # it has no type information
-    except ImportError as fault:
-        raise DeltalightError("--exr needs the package OpenEXR: pip install 'deltalight[render]'.") from fault

@@ -10,9 +10,10 @@ import numpy as np
 from jaxtyping import Float32
 
 from protocol.frames import BoardPose, ViewFrame, decode_lut
+from protocol.radiance_files import require_openexr, write_exr
 from protocol.scene import SceneDocument
 from protocol.source import Source
-from services.files import make_output_folder, require_openexr, write_exr, write_png
+from services.files import make_output_folder, replacing, write_png
 
 if TYPE_CHECKING:
     from render_server.renderer import CompositeFrame, SceneRenderer
@@ -93,7 +94,7 @@ def run_job(job: RenderJob, progress: Progress) -> RenderSummary:
     from render_server.renderer import SceneRenderer
 
     if job.with_exr:
-        require_openexr()
+        require_openexr("--exr")
     make_output_folder(job.out)
     gpu = create_context(job.device, allow_software=True)
     try:
@@ -139,7 +140,8 @@ def _render_frames(
 def _write_frame(job: RenderJob, number: int, frame: ViewFrame, composite: "CompositeFrame") -> None:
     write_png(job.out / f"{number:06d}.png", composite.color)
     if job.with_exr:
-        write_exr(job.out / f"{number:06d}.exr", _linear(frame, composite))
+        with replacing(job.out / f"{number:06d}.exr") as temporary:
+            write_exr(temporary, _linear(frame, composite))
     mode = "w" if number == job.frames.start else "a"  # an older run's index goes with the first picture
     with (job.out / INDEX_FILE).open(mode, encoding="utf-8") as index:
         index.write(json.dumps(frame_record(number, frame, composite)) + "\n")

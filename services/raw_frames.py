@@ -6,17 +6,17 @@ that was given; a pose that was found by the marker board is found again when th
 
 from collections import Counter, deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Generic, TypeVar
 
 import numpy as np
 
 from protocol.board import BoardSpec
 from protocol.camera_model import CameraModel
-from protocol.codecs import decode_color, decode_depth, decode_raw, decode_response
+from protocol.codecs import decode_color, decode_depth, decode_response
 from protocol.documents import validate
-from protocol.fisheye_parts import calibration_of
 from protocol.frames import DepthImage, FisheyePictures, SensorFrame
+from protocol.light_codecs import fisheye_pictures
 from protocol.messages import ColorMessage, DepthMessage, FisheyeMessage, Message, MessageBase, PoseMessage
 
 # A SUB socket subscribes one by one: colour last, so that whoever gets a colour picture gets its partners.
@@ -164,13 +164,10 @@ class RawFrameAssembler:
         if message.capture_ns == self._fisheye_ns:
             return
         self._fisheye_ns = message.capture_ns
-        response = parts[-1].tobytes() if message.has_response else None
-        calibration = calibration_of(message.camera, response)
-        pictures = tuple(_decoded(message, part) for part in parts[: len(message.exposures_s)])
+        pictures = fisheye_pictures(message, parts)
         # A replay that began again stamps them by its first round, and recordings hold them in order.
         earliest_ns = self._fisheyes[-1].timestamp_ns + 1 if self._fisheyes else 0
-        time_ns = max(message.capture_ns, earliest_ns)
-        self._fisheyes.append(FisheyePictures(time_ns, pictures, message.exposures_s, calibration))
+        self._fisheyes.append(replace(pictures, timestamp_ns=max(message.capture_ns, earliest_ns)))
 
     def _same(self, stream: str, made: Built) -> Built:
         """Give the instance of the message before while it is equal, so that its rays are computed once."""
@@ -184,9 +181,3 @@ def _given_pose(pose: PoseMessage) -> np.ndarray | None:
     if pose.world_from_camera is None or pose.reprojection_error_px is not None:
         return None
     return np.array(pose.world_from_camera)
-
-
-def _decoded(message: FisheyeMessage, part: memoryview) -> np.ndarray:
-    if message.dtype == "float32":
-        return decode_raw(part, message.shape, "float32")
-    return decode_color(part, message.encoding, message.shape)

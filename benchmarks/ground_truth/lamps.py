@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
+from jaxtyping import Float64
 
 from benchmarks.ground_truth.parts import Triple, placed, rgb, shape
 
@@ -69,7 +70,7 @@ class Spot:
     """Lamp with a cone: full within the inner part of the half angle, then falling linearly in angle to zero.
 
     `angle_deg` is the full opening angle, `blend` the share of the half angle in which the light falls.
-    Mitsuba's spot is a point; the document gives it a radius of 0.
+    Mitsuba's spot is a point; the document gives it a radius of 0, and cameras see it by `point_lamps` alone.
     """
 
     position_m: Triple
@@ -97,6 +98,16 @@ class Spot:
             "cutoff_angle": half,
             "beam_width": half * (1 - self.blend),
         }
+
+    def irradiance(self, point: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3"]:
+        """Return the unshadowed irradiance across the beam at a point, linear R G B."""
+        way = point - np.array(self.position_m)
+        squared = float(way @ way)
+        axis = np.array(self.direction) / np.linalg.norm(self.direction)
+        angle = float(np.degrees(np.arccos(np.clip(way @ axis / np.sqrt(squared), -1, 1))))
+        half = self.angle_deg / 2
+        share = np.clip((half - angle) / (half * self.blend), 0, 1)
+        return np.asarray(np.array(self.color_linear) * self.intensity * share / squared)
 
     def document(self) -> dict[str, Any]:
         """Return it as a spot light."""

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Float64
 
 from benchmarks.ground_truth.fisheye import fisheye_sensor
 from benchmarks.ground_truth.parts import Matrix
@@ -130,6 +130,16 @@ class RoomRenderer:
         x, y = np.moveaxis(self._camera.rays(), -1, 0)
         depth = distance / np.sqrt(1 + x * x + y * y) + NEAR_CLIP_M
         return np.where(distance > 0, depth, 0).astype(np.float32)
+
+    def is_free(self, start: Float64[np.ndarray, "3"], end: Float64[np.ndarray, "3"]) -> bool:
+        """Whether nothing stands between two points (m, world)."""
+        import mitsuba as mi
+
+        way = end - start
+        length = float(np.linalg.norm(way))
+        origin, toward = mi.Point3f(*start.tolist()), mi.Vector3f(*(way / length).tolist())
+        hit = self._scene.ray_intersect_preliminary(mi.Ray3f(origin, toward))
+        return float(np.array(hit.t).ravel()[0]) >= length
 
     def _mean(
         self,

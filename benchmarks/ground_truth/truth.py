@@ -19,6 +19,7 @@ from benchmarks.ground_truth.assembly import Assembly
 from benchmarks.ground_truth.benchmark_scene import BenchmarkScene
 from benchmarks.ground_truth.content_hash import content_hash
 from benchmarks.ground_truth.document import document_path, scene_document
+from benchmarks.ground_truth.point_lamps import LENS_BLUR_PX, point_lamps
 from benchmarks.ground_truth.render import INTEGRATORS, SUBPIXELS, choose_variant
 from benchmarks.ground_truth.sensors import ColorSensor, StereoDepthSensor
 from benchmarks.ground_truth.truth_pictures import TruthRenderer
@@ -169,7 +170,8 @@ def _determining(assembly: Assembly, camera: CameraModel) -> list[object]:
     documents = [scene_document(scene, 0), scene.board.model_dump(mode="json")]
     lenses = [camera.to_dict(), fisheye.CAMERA.to_dict(), fisheye.EXPOSURES_S]
     sensors = [repr(ColorSensor()), repr(StereoDepthSensor())]
-    return [assembly.with_objects(0), poses, documents, lenses, sensors, INTEGRATORS]
+    blur = [LENS_BLUR_PX] if point_lamps(scene.lamps) else []
+    return [assembly.with_objects(0), poses, documents, lenses, sensors, INTEGRATORS, *blur]
 
 
 def _render(

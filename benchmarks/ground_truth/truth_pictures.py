@@ -10,9 +10,11 @@ from jaxtyping import Float32
 from benchmarks.ground_truth import fisheye
 from benchmarks.ground_truth.assembly import Assembly
 from benchmarks.ground_truth.parts import Matrix
+from benchmarks.ground_truth.point_lamps import with_point_lamps
 from benchmarks.ground_truth.render import RoomRenderer, passes
 from benchmarks.ground_truth.sensors import srgb_coded
 from protocol.camera_model import CameraModel
+from protocol.equidistant_lens import EquidistantLens
 
 SEED = 3000
 DEPTH_SAMPLES = 16
@@ -73,10 +75,13 @@ class TruthRenderer:
         return FramePictures(room.color, _mean(halves), coded_psnr(*halves), cover, room.depth_m)
 
     def fisheye(self) -> Float32[np.ndarray, "h w 3"]:
-        """Render the empty room as the fish-eye camera sees it."""
+        """Render the empty room as the fish-eye camera sees it, lamps without extent blurred by its lens."""
         room = RoomRenderer(self.assembly.without(), fisheye.CAMERA)
         pose = world_from_fisheye(self.assembly)
-        return room.color(pose, spp=FISHEYE_SAMPLES, seed=SEED, advance=self.advance)
+        picture = room.color(pose, spp=FISHEYE_SAMPLES, seed=SEED, advance=self.advance)
+        return with_point_lamps(
+            picture, self.assembly.scene.lamps, room, EquidistantLens(fisheye.CAMERA), pose
+        )
 
     def _room(self, pose: Matrix) -> RoomPictures:
         """Render the room, or remember it: cameras on a tripod see the same room in every frame."""

@@ -17,7 +17,6 @@ ADJUSTABLE: dict[str, tuple[Literal["dvct", "dlpv"], str]] = {
     "dlpv-paper": ("dlpv", "paper"),
 }
 """Variants that take settings: their method and its operator."""
-DEFAULT_METHODS = "camera,none,paper,exact,path"
 TIMED_VARIANT = "exact"
 """`path` takes the time of this one's frame."""
 

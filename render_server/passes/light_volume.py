@@ -15,7 +15,7 @@ COVERED_SUMS = 6  # a cell: its low faces on three axes, light along + and -
 CONSTANT, LINEAR = 0.5 / math.sqrt(math.pi), math.sqrt(3 / (4 * math.pi))  # Y_0 and Y_1 along its axis
 LOBE = (math.sqrt(math.pi) / 2, math.sqrt(math.pi / 3))  # clamped cosine in them
 FAR_FACE_SR, SIDE_FACE_SR = 0.40067, 0.42343  # as seen from the centre of the neighbouring cell
-KEPT_DIRECTION = 0.9
+DIRECTION_LENGTH = 10 / 32  # of the volume's edge: over so much a step's filter lets directions fade
 
 
 @dataclass(frozen=True)
@@ -45,14 +45,15 @@ def lobe_weights() -> StepWeights:
     return StepWeights(transfer, sideways)
 
 
-def moment_weights() -> StepWeights:
+def moment_weights(cells: int) -> StepWeights:
     """Light keeps its direction: the integral of y_i y_j over the directions that pass the shared face.
 
-    A sixth of the sphere each, so the six matrices sum to the identity; then only KEPT_DIRECTION of the linear part
-    is kept (a filter as for P_N transport, McClarren & Hauck 2010). Without it, steps of the truncated series
-    overshoot: with it a square emitter of 8 cells does not light itself, and lights a floor before it within 0.02 of
-    the form factor; cosine lobes light the emitter itself with half of its own radiosity.
+    A sixth of the sphere each, so the six matrices sum to the identity. Then a small share of the linear part is left
+    out (a filter as for P_N transport, McClarren & Hauck 2010): without it, steps of the truncated series overshoot.
+    DIRECTION_LENGTH is such that a square emitter of a quarter of the volume's edge does not light itself; it then
+    lights a floor before it within 0.02 of the form factor. Cosine lobes light it with half of its own radiosity.
     """
+    kept = 1 - 1 / (DIRECTION_LENGTH * cells)
     nodes, weights = np.polynomial.legendre.leggauss(32)
     u, v = np.meshgrid(nodes, nodes)
     distance2 = 1 + u**2 + v**2
@@ -65,8 +66,8 @@ def moment_weights() -> StepWeights:
     one = np.full_like(u, CONSTANT)
     along, aside = LINEAR * cosine, LINEAR * lateral
     mixed = moment(one, along)
-    transfer = (moment(one, one), mixed, KEPT_DIRECTION * mixed, KEPT_DIRECTION * moment(along, along))
-    return StepWeights(transfer, KEPT_DIRECTION * moment(aside, aside))
+    transfer = (moment(one, one), mixed, kept * mixed, kept * moment(along, along))
+    return StepWeights(transfer, kept * moment(aside, aside))
 
 
 class LightVolume:

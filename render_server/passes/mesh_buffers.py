@@ -10,7 +10,6 @@ from render_server.gpu.context import GpuContext
 from render_server.scene.mesh import VERTEX_ATTRIBUTES, VERTEX_LAYOUT, GpuMesh
 
 UV, COLOR, MATERIAL = slice(6, 8), slice(8, 11), 11  # columns of a vertex
-DOUBLE_SIDED = 9  # column of a triangle corner
 
 
 def triangle_corners(mesh: GpuMesh) -> Float32[np.ndarray, "m 3 10"]:

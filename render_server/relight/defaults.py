@@ -6,7 +6,6 @@ from protocol.scene_method import DlpvMethod, DvctMethod
 
 # (software, GPU)
 VOLUME_SIZE = (64, 256)
-CELLS = (32, 64)
 CONE_SCALE = (4, 2)
 RSM_SIZE = (512, 1024)
 TRIANGLE_BUDGET = (40_000, 400_000)
@@ -49,7 +48,7 @@ def resolve_dlpv(settings: DlpvMethod, *, software: bool) -> ResolvedSettings:
     """Take the document's values, or the machine's defaults where it says null."""
     column = 0 if software else 1
     return ResolvedSettings(
-        settings.volume_size or CELLS[column],
+        settings.volume_size,
         settings.query_scale or CONE_SCALE[column],
         settings.rsm_size or RSM_SIZE[column],
         settings.triangle_budget or TRIANGLE_BUDGET[column],

@@ -42,7 +42,9 @@ class DlpvVolumes:
     def __init__(self, gpu: GpuContext, settings: DlpvMethod, cells: int) -> None:
         self._settings = settings
         self._steps = settings.steps or cells
-        self._weights = moment_weights() if settings.resolved_propagation == "moments" else lobe_weights()
+        self._weights = (
+            moment_weights(cells) if settings.resolved_propagation == "moments" else lobe_weights()
+        )
         self.placement = VolumePlacement((0.0, 0.0, 0.0), 1.0, cells)
         self.rho = LightVolume(gpu, cells)
         is_paper = settings.operator == "paper"

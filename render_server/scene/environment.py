@@ -11,6 +11,8 @@ from jaxtyping import Float, Float32, Float64
 
 from protocol.errors import DeltalightError
 from protocol.frames import decode_lut
+from protocol.pictures import decode_rgb, read_bytes
+from protocol.radiance_files import LINEAR_SUFFIXES, read_linear
 from protocol.scene_lights import EnvironmentLights
 from render_server.scene.sky_grid import SkyGrid
 
@@ -125,13 +127,14 @@ def orientation(up: tuple[float, float, float], rotation_deg: float) -> Float64[
 def load_environment(settings: EnvironmentLights) -> EnvironmentMap:
     """Read the environment map that a scene document names, scaled by its intensity.
 
-    `.hdr` files are linear; `.png` and `.jpg` are read as sRGB and hold no light brighter than 1.
+    `.hdr` and `.exr` files are linear; `.png` and `.jpg` are read as sRGB and hold no light brighter than 1.
 
     Raises:
-        DeltalightError: the file is missing, unreadable, not twice as wide as high, or of another type.
+        DeltalightError: the file is missing, unreadable, not twice as wide as high, or of another type; or it is
+            `.exr` and the package OpenEXR is not installed.
     """
     if settings.map is None:
-        raise DeltalightError("lights of mode environment need `environment.map`; name a .hdr file.")
+        raise DeltalightError("lights of mode environment need `environment.map`; name a .hdr or .exr file.")
     radiance = read_radiance(Path(settings.map)) * np.float32(settings.intensity)
     return EnvironmentMap(radiance, orientation(settings.up, settings.rotation_deg))
 
@@ -145,26 +148,20 @@ def read_radiance(path: Path) -> Float32[np.ndarray, "h w 3"]:
     suffix = path.suffix.lower()
     if not path.is_file():
         raise DeltalightError(f"the environment map {path} does not exist; correct the path.")
-    if suffix == ".exr":
-        raise DeltalightError(f"{path}: OpenEXR files are not read here; convert the map to .hdr.")
-    if suffix not in (".hdr", *_CODED_SUFFIXES):
-        raise DeltalightError(f"{path} is not an environment map; use a .hdr file (or .png, .jpg).")
-    flags = cv2.IMREAD_COLOR if suffix in _CODED_SUFFIXES else cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR
-    picture = cv2.imread(str(path), flags)
-    if picture is None:
-        raise DeltalightError(f"{path} cannot be read as a picture; export the environment map again.")
-    rgb = np.ascontiguousarray(picture[..., ::-1])
-    radiance = decode_lut(None)[:, 0][rgb] if rgb.dtype == np.uint8 else rgb.astype(np.float32)
-    _check_map(radiance, path)
-    return np.asarray(np.maximum(radiance, 0))
+    if suffix in LINEAR_SUFFIXES:
+        radiance = read_linear(path)
+    elif suffix in _CODED_SUFFIXES:
+        radiance = decode_lut(None)[:, 0][decode_rgb(read_bytes(path), str(path))]
+    else:
+        raise DeltalightError(f"{path} is not an environment map; use a .hdr or .exr file (or .png, .jpg).")
+    _check_shape(radiance, path)
+    return radiance
 
 
-def _check_map(radiance: Float32[np.ndarray, "h w 3"], path: Path) -> None:
+def _check_shape(radiance: Float32[np.ndarray, "h w 3"], path: Path) -> None:
     rows, columns = radiance.shape[:2]
     if columns != 2 * rows or columns > MAX_EDGE or rows < 2:
         raise DeltalightError(
             f"{path} has {columns}x{rows} pixels; a latitude-longitude map is twice as wide as high "
             f"(and at most {MAX_EDGE} wide)."
         )
-    if not np.isfinite(radiance).all():
-        raise DeltalightError(f"{path} holds values that are not finite; repair the environment map.")

@@ -62,13 +62,12 @@ class GpuMesh:
     """Several meshes in one vertex buffer.
 
     A row of `vertices` is position 3, normal 3, uv 2, colour 3, material index 1 (`VERTEX_LAYOUT`).
-    `material_ids` has an entry for each triangle; `material_table` is described where it is made;
-    `textures` are the base-colour textures in the order of its texture indices.
+    `material_table` is described where it is made; `textures` are the base-colour textures in the order of its
+    texture indices.
     """
 
     vertices: Float32[np.ndarray, "n 12"]
     triangles: Int32[np.ndarray, "m 3"]
-    material_ids: Int32[np.ndarray, " m"]
     materials: tuple[Material, ...]
     material_table: Float32[np.ndarray, "k 16"]
     textures: tuple[np.ndarray, ...]
@@ -258,12 +257,10 @@ def merge_for_gpu(meshes: Sequence[TriangleMesh]) -> GpuMesh:
     materials = tuple(mesh.material for mesh in meshes)
     starts = np.cumsum([0] + [len(mesh.positions) for mesh in meshes[:-1]])
     triangles = [mesh.triangles + start for mesh, start in zip(meshes, starts, strict=True)]
-    counts = [len(mesh.triangles) for mesh in meshes]
     textures = [material.base_color_texture for material in materials]
     return GpuMesh(
         np.concatenate([_interleaved(mesh, index) for index, mesh in enumerate(meshes)]),
         np.concatenate(triangles).astype(np.int32),
-        np.repeat(np.arange(len(meshes), dtype=np.int32), counts),
         materials,
         material_table(materials),
         tuple(texture for texture in textures if texture is not None),

@@ -230,27 +230,3 @@ def irradiance(
     weighted = radiance.reshape(-1, 3) * texel_solid_angles(len(radiance)).reshape(-1, 1)
     directions = octahedral_grid(len(radiance)).reshape(-1, 3)
     return np.asarray(np.maximum(normals @ directions.T, 0) @ weighted.astype(np.float64))
-
-
-def irradiance_sh9(radiance: Float32[np.ndarray, "n n 3"]) -> Float64[np.ndarray, "9 3"]:
-    """Return the nine spherical-harmonic coefficients of irradiance (Ramamoorthi & Hanrahan 2001).
-
-    Irradiance of a unit normal = `sh9_basis(normal) @ coefficients`, exact to about 1 % for smooth maps.
-    """
-    weighted = radiance.reshape(-1, 3) * texel_solid_angles(len(radiance)).reshape(-1, 1)
-    basis = sh9_basis(octahedral_grid(len(radiance)).reshape(-1, 3))
-    lobe = np.pi * np.array([1, *[2 / 3] * 3, *[1 / 4] * 5])
-    return np.asarray(lobe[:, None] * (basis.T @ weighted))
-
-
-def sh9_basis(directions: Float[np.ndarray, "k 3"]) -> Float64[np.ndarray, "k 9"]:
-    """Return the real spherical harmonics of bands 0..2 of unit directions."""
-    x, y, z = np.asarray(directions, np.float64).T
-    first, second = np.sqrt(3 / (4 * np.pi)), np.sqrt(15 / (4 * np.pi))
-    columns = [
-        np.full_like(x, np.sqrt(1 / (4 * np.pi))),
-        *(first * y, first * z, first * x),
-        *(second * x * y, second * y * z, second / np.sqrt(12) * (3 * z * z - 1)),
-        *(second * x * z, second / 2 * (x * x - y * y)),
-    ]
-    return np.stack(columns, axis=1)

@@ -13,7 +13,7 @@ from protocol.keys import Keys
 from services.api import assets, objects, parts, scenes, state
 from services.api.context import Context
 from services.api.gate import Gate, GateRules
-from services.api.problems import Problems, describe_problems
+from services.api.problems import Problems, describe_problems, responses
 from services.api.process_watch import ProcessWatch
 from services.api.render_link import RenderLink
 from services.api.settings import ApiSettings
@@ -40,12 +40,15 @@ TAGS = [
 
 
 class _App(FastAPI):
-    """FastAPI whose OpenAPI document names the media type of problems."""
+    """FastAPI whose OpenAPI document names the media type of problems, and tokens."""
 
     def openapi(self) -> dict[str, Any]:
         """Return the OpenAPI document."""
         if self.openapi_schema is None:
-            self.openapi_schema = describe_problems(super().openapi())
+            schema = describe_problems(super().openapi())
+            schema["components"]["securitySchemes"] = {"token": {"type": "http", "scheme": "bearer"}}
+            schema["security"] = [{}, {"token": []}]
+            self.openapi_schema = schema
         return self.openapi_schema
 
 
@@ -82,10 +85,11 @@ def create_app(settings: ApiSettings, store: Store, keys: Keys | None = None) ->
         redoc_url=None,
         lifespan=lifespan,
         separate_input_output_schemas=False,
+        generate_unique_id_function=lambda route: route.name,
         middleware=[Middleware(Gate, rules=rules, tokens=store.tokens, problems=problems)],
     )
     app.state.context = context
     problems.install(app)
     for resource in (scenes, objects, parts, assets, state):
-        app.include_router(resource.router, prefix=PREFIX)
+        app.include_router(resource.router, prefix=PREFIX, responses=responses(401, 403, 422, 429))
     return app

@@ -46,6 +46,7 @@ def get_object(shared: Shared, scene_id: SceneId, object_id: ObjectId, response:
 
 @router.put("/{object_id:path}", responses=CHANGE_PROBLEMS)
 def put_object(
+    *,
     shared: Shared,
     scene_id: SceneId,
     object_id: ObjectId,
@@ -61,6 +62,7 @@ def put_object(
 
 @router.patch("/{object_id:path}", responses=CHANGE_PROBLEMS)
 def change_object(
+    *,
     shared: Shared,
     scene_id: SceneId,
     object_id: ObjectId,

@@ -1,5 +1,6 @@
 """Routes of a scene's parts: the real scene, lights, method, shading, output."""
 
+from enum import Enum
 from typing import Any
 
 from fastapi import APIRouter, Response
@@ -40,7 +41,7 @@ def _add_part(part: str, model: Any, body: Any, text: str) -> None:  # noqa: ANN
         scene = shared.store.scenes.change(scene_id, edit, f"{part} changed", if_match)
         return shared.answer(scene, response, changed=True)
 
-    shared = {"tags": [part if part in ("lights", "method", "output") else "scenes"]}
+    tags: list[str | Enum] = [part if part in ("lights", "method", "output") else "scenes"]
     router.add_api_route(
         f"/{part}",
         get,
@@ -48,7 +49,7 @@ def _add_part(part: str, model: Any, body: Any, text: str) -> None:  # noqa: ANN
         summary=f"Get {text}",
         response_model=model,
         responses=responses(404),
-        **shared,
+        tags=tags,
     )
     for method, route, verb in (("PUT", put, "Replace"), ("PATCH", patch, "Change keys of")):
         router.add_api_route(
@@ -58,7 +59,7 @@ def _add_part(part: str, model: Any, body: Any, text: str) -> None:  # noqa: ANN
             name=f"{method.lower()}_{part}",
             summary=f"{verb} {text}",
             responses=CHANGE_PROBLEMS,
-            **shared,
+            tags=tags,
         )
 
 

@@ -11,6 +11,7 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, Field
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 
 from protocol.errors import DeltalightError
 from services.storage.faults import (
@@ -117,6 +118,12 @@ class Problems:
         @app.exception_handler(RequestValidationError)
         async def _invalid(_request: Request, fault: RequestValidationError) -> JSONResponse:
             return self._of_request(fault)
+
+        @app.exception_handler(ClientDisconnect)
+        async def _gone(_request: Request, _fault: ClientDisconnect) -> JSONResponse:
+            return self.response(
+                400, "incomplete", "The connection ended before the body did; send it again."
+            )
 
         @app.exception_handler(Exception)
         async def _internal(_request: Request, fault: Exception) -> JSONResponse:

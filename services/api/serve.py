@@ -5,6 +5,7 @@ from pathlib import Path
 
 import structlog
 import uvicorn
+from fastapi import FastAPI
 
 from protocol.errors import DeltalightError
 from protocol.keys import Keys
@@ -32,17 +33,23 @@ def run_api(settings: ApiSettings, keys: Keys | None = None, scene: Path | None 
             store.scenes.activate(import_scene(store, scene))
         if settings.leaves_host:
             _say_who_may_enter(settings, store)
-        config = uvicorn.Config(
-            create_app(settings, store, keys),
-            log_level="warning",
-            access_log=False,
-            server_header=False,
-            proxy_headers=False,  # anybody could send them, and would choose the address that is counted
-            limit_concurrency=MAX_CONNECTIONS,
-            timeout_graceful_shutdown=1,
-        )
+        server = http_server(create_app(settings, store, keys))
         log.info("REST API runs", address=f"http://{settings.host}:{settings.port}/api/v1")
-        uvicorn.Server(config).run(sockets=[listener])
+        server.run(sockets=[listener])
+
+
+def http_server(app: FastAPI) -> uvicorn.Server:
+    """The web server that runs the application."""
+    config = uvicorn.Config(
+        app,
+        log_level="warning",
+        access_log=False,
+        server_header=False,
+        proxy_headers=False,  # anybody could send them, and would choose the address that is counted
+        limit_concurrency=MAX_CONNECTIONS,
+        timeout_graceful_shutdown=1,
+    )
+    return uvicorn.Server(config)
 
 
 def _listener(settings: ApiSettings) -> socket.socket:

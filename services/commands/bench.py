@@ -9,6 +9,9 @@ import typer
 from protocol.errors import DeltalightError
 from services.commands.options import Method
 
+DEFAULT_METHODS = "camera,none,paper,exact,path"
+"""What `bench quality` compares."""
+
 bench = typer.Typer(
     no_args_is_help=True, help="Measure speed on this machine, and agreement with ground truth."
 )
@@ -56,8 +59,11 @@ def quality(
     ] = None,
     methods: Annotated[
         str,
-        typer.Option(help="camera, none, paper, exact, path, or exact:KEY=VALUE[,KEY=VALUE] (also paper:)."),
-    ] = "camera,none,paper,exact,path",
+        typer.Option(
+            help="camera, none, paper, exact, fisheye (exact with the lights of the fish-eye picture), dlpv, "
+            "dlpv-paper, path; or exact:KEY=VALUE[,KEY=VALUE], likewise for paper, dlpv, dlpv-paper."
+        ),
+    ] = DEFAULT_METHODS,
     ablation: Annotated[
         bool, typer.Option("--ablation", help="Compare the paper's operator with ours, one switch a row.")
     ] = False,

@@ -60,6 +60,10 @@ def _limit(memory_bytes: int) -> None:
 
 
 def _mesh_facts(path: Path) -> Facts:
+    from render_server.scene.asset_check import check_mesh_file, read_gltf
+
+    if check_mesh_file(path) == ".glb":
+        read_gltf(path)  # a file that lies is refused before the loader's second of imports
     import numpy as np
 
     from render_server.scene.mesh import load_mesh

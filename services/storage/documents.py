@@ -128,7 +128,10 @@ def checked_document(document: object, revision: int) -> SceneDocument:
         DeltalightError: the first fault, with its place.
     """
     numbered = {**document, "revision": revision} if isinstance(document, Mapping) else document
-    return validate(SceneDocument, numbered, "the scene")  # type: ignore[arg-type]
+    try:
+        return validate(SceneDocument, numbered, "the scene")  # type: ignore[arg-type]
+    except UnicodeEncodeError as error:
+        raise DeltalightError("the scene holds text that is not valid Unicode; correct it.") from error
 
 
 def require_revision(expected: int | None, current: int) -> None:

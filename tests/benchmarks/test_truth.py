@@ -11,16 +11,25 @@ import trimesh
 from rich.progress import Progress
 
 from benchmarks.ground_truth import fisheye
+from benchmarks.ground_truth.assembly import Assembly
 from benchmarks.ground_truth.benchmark_scene import BOARD, CAMERA, BenchmarkScene, Finish, VirtualObject
 from benchmarks.ground_truth.lamps import Ambient, SphereLamp
 from benchmarks.ground_truth.parts import MeshFolder, box, looking, placed, rectangle, sheet
+from benchmarks.ground_truth.point_lamps import point_lamps, with_point_lamps
 from benchmarks.ground_truth.render import RoomRenderer, choose_variant
+from benchmarks.ground_truth.scenes import scene_named
 from benchmarks.ground_truth.truth import Truth, default_cache, ensure_truth
+from benchmarks.ground_truth.truth_pictures import world_from_fisheye
 from protocol.camera_model import load_camera_yaml
 from protocol.dataset import open_dataset
+from protocol.equidistant_lens import EquidistantLens
 from protocol.errors import DeltalightError
+from protocol.fisheye_lens import FisheyeCalibration
+from protocol.frames import FisheyePictures
+from protocol.hemisphere import texel_solid_angles
 from protocol.pictures import decode_rgb
 from protocol.source import open_source
+from sensor_node.fisheye import radiance_map
 
 if importlib.util.find_spec("mitsuba") is None:
     pytest.skip("Mitsuba is not installed (dev extra)", allow_module_level=True)
@@ -249,3 +258,27 @@ def test_cache_that_cannot_be_made_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(DeltalightError, match="DELTALIGHT_CACHE"):
         make(SCENE, tmp_path / "file")
+
+
+def test_a_lamp_without_extent_is_a_blur_of_its_irradiance_in_the_fish_eye_picture(tmp_path: Path) -> None:
+    choose_variant()
+    scene = scene_named("studio")
+    assembly = Assembly(scene, tmp_path)
+    room, lens = RoomRenderer(assembly.without(), fisheye.CAMERA), EquidistantLens(fisheye.CAMERA)
+    pose = world_from_fisheye(assembly)
+    black = np.zeros((lens.height, lens.width, 3), np.float32)
+    seen = with_point_lamps(black, scene.lamps, room, lens, pose)
+
+    (spot,) = point_lamps(scene.lamps)
+    calibration = FisheyeCalibration(lens, None, ())
+    sky = radiance_map(FisheyePictures(0, (seen,), (None,), calibration), pose)
+    found = np.tensordot(texel_solid_angles(len(sky.radiance)), sky.radiance, axes=2)
+    assert found == pytest.approx(spot.irradiance(pose[:3, 3]), rel=0.02)
+    row, column = np.unravel_index(int(seen[..., 0].argmax()), seen.shape[:2])
+    toward = pose[:3, :3] @ lens.directions(np.array([[column, row]], float))[0]
+    way = np.array(spot.position_m) - pose[:3, 3]
+    assert toward @ way / np.linalg.norm(way) > np.cos(np.radians(1))
+
+    below = pose.copy()
+    below[2, 3] -= 0.5  # under the table's top
+    assert not with_point_lamps(black, scene.lamps, room, lens, below).any()

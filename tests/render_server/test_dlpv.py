@@ -13,6 +13,7 @@ from protocol.frames import BoardPose, ViewFrame, decode_lut
 from protocol.scene import SceneDocument, parse_scene
 from protocol.scene_method import DlpvMethod
 from protocol.scene_objects import Pose
+from render_server.albedo_watch import AlbedoWatch
 from render_server.gpu.context import GpuContext
 from render_server.passes.light_volume import (
     CONSTANT,
@@ -49,7 +50,7 @@ from tests.render_server.scenes import (
 
 pytestmark = pytest.mark.usefixtures("clean_gl")
 CELLS = 16
-WEIGHTS = {"lobes": lobe_weights(), "moments": moment_weights()}
+WEIGHTS = {"lobes": lobe_weights(), "moments": moment_weights(CELLS)}
 FIXED = 2**20  # steps a unit of injected light
 
 
@@ -152,7 +153,7 @@ def test_directions_are_kept_where_lobes_lose_them(gpu: GpuContext) -> None:
     through = np.ones((32, 32, 32, 8), np.float32)
     through[7, 12:20, 12:20, 5] = 0.0  # from above into the cells behind it
     own = {}
-    for name, weights in WEIGHTS.items():
+    for name, weights in {"lobes": lobe_weights(), "moments": moment_weights(32)}.items():
         _, total = propagated(gpu, light, weights, 32, through=through)
         up = total[0, 8, 12:20, 12:20] @ np.array([LOBE[0], 0, 0, -LOBE[1]])
         own[name] = 2 / 3 * up.mean()
@@ -296,9 +297,12 @@ def test_fields_are_linear_in_light_and_picture(gpu: GpuContext, stage: Stage, o
         assert np.abs(a - b).max() < 3e-3 * b.max(), name
 
 
-def test_the_delta_is_the_difference_of_two_full_solutions(gpu: GpuContext, stage: Stage) -> None:
+def test_the_delta_is_the_difference_of_two_full_solutions(
+    gpu: GpuContext, stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """E_rho of an inserted box is E_mu of a renderer to which it is part of the given model (its own object is a
     speck inside): so removal is the negative of insertion. The picture shows albedo 0.5 under even light."""
+    monkeypatch.setattr(AlbedoWatch, "look", lambda *_: False)  # what is out of sight has albedo 0.5 too
     mesh = cube(0.12)
     speck = shifted(trimesh.creation.box((0.002,) * 3), *mesh.bounds.mean(axis=0))
     room = floor(1.0) + shifted(trimesh.creation.box((0.02, 1, 0.4)), -0.2, 0, 0.2)
@@ -353,6 +357,26 @@ def test_tilting_the_scene_does_not_change_its_light(gpu: GpuContext, stage: Sta
         share = means[1][name][1] / before
         print(f"tilted by 30 degrees, {name}: {share:.3f} of the straight scene's light")
         assert share == pytest.approx(1.0, abs=tolerance), name
+
+
+@pytest.mark.parametrize(
+    ("key", "sizes", "goal"), [("volume_size", (16, 32), 0.05), ("rsm_size", (256, 512), 0.02)]
+)
+def test_resolution_does_not_change_the_light(
+    gpu: GpuContext, stage: Stage, key: str, sizes: tuple[int, int], goal: float
+) -> None:
+    """Means over pixels, within the goals of METHOD 7."""
+    document = everyday(stage)
+    coarse, fine = (solve(gpu, dlpv(document, **{key: value})) for value in sizes)
+    seen = (coarse.fade == 1) & (fine.fade == 1) & (coarse.matte == 0)
+    shares = {
+        "without objects": coarse.cones_mu[seen].mean() / fine.cones_mu[seen].mean(),
+        "with objects": coarse.cones_rho[seen].mean() / fine.cones_rho[seen].mean(),
+        "objects": coarse.on_object[fine.matte == 1].mean() / fine.on_object[fine.matte == 1].mean(),
+    }
+    for name, share in shares.items():
+        print(f"{key} {sizes[0]} against {sizes[1]}, {name}: {share:.3f}")
+        assert share == pytest.approx(1.0, abs=goal), name
 
 
 @pytest.mark.parametrize("composition", ["ratio", "additive"])

@@ -274,7 +274,6 @@ def test_merging_keeps_every_triangle_and_its_material() -> None:
     merged = merge_for_gpu([triangle(), triangle(material=textured, uv=np.full((3, 2), 0.25, np.float32))])
     assert merged.vertices.shape == (6, 12)
     assert merged.triangles.tolist() == [[0, 1, 2], [3, 4, 5]]
-    assert merged.material_ids.tolist() == [0, 1]
     assert merged.vertices[:, 11].tolist() == [0, 0, 0, 1, 1, 1]
     assert merged.vertices[3:, 6:8].min() == 0.25
     assert merged.vertices[:, 8:11].min() == 1

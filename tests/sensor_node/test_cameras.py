@@ -64,7 +64,9 @@ def test_fish_eye_pictures_of_a_later_round_have_its_time(tmp_path: Path) -> Non
     assert first.fisheye is not None
     assert second.fisheye is not None
     assert second.fisheye is third.fisheye
-    assert second.fisheye.timestamp_ns - first.fisheye.timestamp_ns == second.timestamp_ns - first.timestamp_ns
+    assert (
+        second.fisheye.timestamp_ns - first.fisheye.timestamp_ns == second.timestamp_ns - first.timestamp_ns
+    )
 
 
 def test_real_time_obeys_the_recorded_times_and_stamps_at_capture(source: DatasetReader) -> None:

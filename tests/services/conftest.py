@@ -2,11 +2,12 @@
 
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+import structlog
 
 from protocol.camera_model import CameraModel
 from protocol.codecs import encode_color, encode_depth
@@ -19,6 +20,13 @@ WIDTH, HEIGHT = 64, 48
 IDENTITY = tuple(tuple(float(value) for value in row) for row in np.eye(4))
 
 RunCli = Callable[..., subprocess.CompletedProcess[str]]
+
+
+@pytest.fixture(autouse=True)
+def fresh_logs() -> Iterator[None]:
+    """A command that runs in this process sends log lines to a stderr that pytest closes after the test."""
+    yield
+    structlog.reset_defaults()
 
 
 @pytest.fixture

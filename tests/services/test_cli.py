@@ -3,36 +3,90 @@
 import json
 import subprocess
 import sys
+from collections.abc import Iterator
 
 import pytest
+from typer.main import get_command
+from typer.testing import CliRunner
 
 from services import doctor, ports
+from services.cli import app
 from tests.services.conftest import ROOT, RunCli
 
-COMMANDS = (
+COMMANDS = {
     "render",
     "demo",
     "node",
     "server",
     "viewer",
     "up",
+    "record",
+    "replay",
+    "recordings info",
+    "recordings recover",
+    "recordings import",
+    "recordings export",
+    "board",
+    "calibrate camera",
+    "calibrate fisheye",
+    "calibrate extrinsics",
+    "calibrate photometric",
+    "api",
+    "api token",
+    "api tokens",
+    "api revoke",
+    "keys create",
+    "keys list",
+    "keys trust",
+    "config",
     "doctor",
     "schema",
-    "bench",
     "bench speed",
     "bench quality",
-)
+}
 
 
-def test_every_command_has_help(cli: RunCli) -> None:
+def commands_below(command: object, names: tuple[str, ...] = ()) -> Iterator[str]:
+    """All commands that can be called, with those of groups that do something by themselves."""
+    below = getattr(command, "commands", {})
+    if names and (not below or getattr(command, "invoke_without_command", False)):
+        yield " ".join(names)
+    for name, each in below.items():
+        yield from commands_below(each, (*names, name))
+
+
+def test_every_command_is_there_and_has_help() -> None:
+    assert set(commands_below(get_command(app))) == COMMANDS
+    for command in sorted(COMMANDS | {command.split()[0] for command in COMMANDS}):
+        done = CliRunner().invoke(app, [*command.split(), "--help"], prog_name="deltalight")
+        assert done.exit_code == 0, done.output
+        assert f"Usage: deltalight {command} " in " ".join(done.output.split())
+
+
+def test_overview_lists_the_commands(cli: RunCli) -> None:
     overview = cli("--help")
     assert overview.returncode == 0
     for command in COMMANDS:
         assert command.split()[0] in overview.stdout
-    for command in COMMANDS:
-        done = cli(*command.split(), "--help")
-        assert done.returncode == 0
-        assert "Usage" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (("rendr",), "rendr"),
+        (("render", "--scenes", "x"), "--scenes"),
+        (("calibrate", "everything"), "everything"),
+        (("bench", "speed", "--frames", "0"), "--frames"),
+        (("node", "--source"), "--source"),
+    ],
+)
+def test_wrong_use_ends_with_2_and_names_what_is_wrong(
+    cli: RunCli, arguments: tuple[str, ...], named: str
+) -> None:
+    done = cli(*arguments)
+    assert done.returncode == 2
+    assert named in done.stderr
+    assert "Traceback" not in done.stderr
 
 
 def test_help_loads_no_heavy_module() -> None:

@@ -1,0 +1,87 @@
+"""A REST API for tests: real uvicorn on loopback, a real render session behind a real control socket."""
+
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import httpx
+
+from protocol.scene import SceneDocument
+from protocol.transport import ReplyServer
+from render_server.session import RenderSession
+from services import ports
+from services.api.app import create_app
+from services.api.serve import http_server
+from services.api.settings import ApiSettings
+from services.storage.assets import Probe
+from services.storage.store import Store
+from tests.services.storage_samples import trusting_probe
+from tests.services.test_session import InvertingRenderer
+
+UPLOAD = {"Content-Type": "application/octet-stream"}
+
+
+class RenderServer:
+    """Answers commands with a render session, as the process does, without OpenGL."""
+
+    def __init__(self, port: int) -> None:
+        self.renderer = InvertingRenderer()
+        self.session = RenderSession(self.renderer, SceneDocument(name="as started", revision=7))
+        self._replies = ReplyServer(ports.endpoint(port), self._carry_out)
+
+    def _carry_out(self, request: object) -> dict[str, object]:
+        if getattr(request, "op", "") == "clock":
+            return {}
+        return self.session.carry_out(request)  # type: ignore[arg-type]
+
+    def close(self) -> None:
+        self._replies.close()
+
+
+@dataclass(frozen=True)
+class RunningApi:
+    client: httpx.Client
+    store: Store
+    control_port: int
+    app: object
+
+
+@contextmanager
+def running_api(
+    folder: Path, *, probe: Probe = trusting_probe, requests_per_s: float = 1000, **settings: object
+) -> Iterator[RunningApi]:
+    """Serves until the end of the block; `settings` go to `ApiSettings`."""
+    port, control_port, stats_port = ports.private_ports(3)
+    defaults = {
+        "port": port,
+        "control": ports.endpoint(control_port),
+        "subscribe": [ports.endpoint(stats_port)],
+        "requests_per_s": requests_per_s,
+    }
+    chosen = ApiSettings.model_validate({**defaults, **settings})
+    with Store(folder, probe=probe) as store:
+        app = create_app(chosen, store)
+        server = http_server(app)
+        listener = ports.listen(port)
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
+        thread.start()
+        while not server.started:
+            time.sleep(0.01)
+        with httpx.Client(base_url=f"http://{ports.LOOPBACK}:{port}/api/v1", timeout=30) as client:
+            yield RunningApi(client, store, control_port, app)
+        server.should_exit = True
+        thread.join()
+        listener.close()
+
+
+def sentence(response: httpx.Response, status: int) -> str:
+    """The sentence of a problem; checks its form."""
+    assert response.status_code == status, response.text
+    assert response.headers["content-type"] == "application/problem+json"
+    problem = response.json()
+    assert problem["status"] == status
+    assert problem["type"].startswith("urn:deltalight:problem:")
+    return str(problem["detail"])

@@ -1,0 +1,145 @@
+"""`deltalight api` as a process: with a real render server, killed and started again, its tokens and faults."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import httpx
+import pytest
+
+from protocol.messages import ControlRequest
+from protocol.transport import RequestClient
+from services import ports
+from tests.services.api_samples import sentence
+from tests.services.conftest import ROOT, RunCli
+
+SCENE = ROOT / "services" / "demo_assets" / "scene.json"
+ENDED_BY_SIGTERM = 143
+
+
+@contextmanager
+def process(*arguments: object) -> Iterator[subprocess.Popen[bytes]]:
+    command = [sys.executable, "-m", "services.cli", *map(str, arguments)]
+    running = subprocess.Popen(command, cwd=ROOT)
+    try:
+        yield running
+    finally:
+        running.kill()
+        running.wait()
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    for _ in range(600):
+        with suppress(httpx.TransportError):
+            if condition():
+                return
+        time.sleep(0.1)
+    pytest.fail("it never came")
+
+
+def test_a_change_is_in_the_real_render_server_and_outlives_kill_9_of_both(tmp_path: Path) -> None:
+    port, control_port, publish_port, node_port = ports.private_ports(4)
+    control = ports.endpoint(control_port)
+    server = ("server", "--control", control, "--publish", ports.endpoint(publish_port))
+    server += ("--subscribe", ports.endpoint(node_port), "--allow-software")
+    api = ("api", "--port", port, "--data", tmp_path, "--control", control)
+    api += ("--subscribe", ports.endpoint(publish_port))
+    client = httpx.Client(base_url=f"http://{ports.LOOPBACK}:{port}/api/v1", timeout=60)
+    control_client = RequestClient(control)
+
+    def rendered() -> dict[str, object]:
+        asked = ControlRequest(node="test", id=f"{time.time_ns()}", op="get_scene")
+        return dict(control_client.request(asked, 30).payload["scene"])  # type: ignore[call-overload]
+
+    with process(*server) as first_server:
+        with process(*api, "--scene", SCENE) as first_api:
+            wait_for(lambda: (client.get("/state").json()["picture"] or {}).get("state") == "shown")
+            scene = client.get("/active-scene").json()
+            address = f"/scenes/{scene['id']}"
+            item = scene["document"]["objects"][0]
+            assert item["asset"].startswith("sha256:")
+            moved = client.patch(
+                f"{address}/objects/{item['id']}", json={"pose": {"translation_m": [0, 0, 0.5]}}
+            )
+            assert moved.json()["picture"] == {"state": "shown", "revision": 2, "detail": ""}
+            before = rendered()
+            assert before["objects"][0]["pose"]["translation_m"] == [0, 0, 0.5]  # type: ignore[index]
+            assert (
+                client.patch(f"{address}/output", json={"view": "delta"}).json()["picture"]["state"]
+                == "shown"
+            )
+            after = rendered()
+            assert after["revision"] == before["revision"] + 1  # type: ignore[operator]
+            wait_for(
+                lambda: (
+                    [each["name"] for each in client.get("/state").json()["processes"]] == ["render-server"]
+                )
+            )
+            first_server.kill()
+            first_api.send_signal(signal.SIGKILL)
+            first_api.wait()
+        with process(*api) as second_api, process(*server):
+            wait_for(lambda: (client.get("/state").json()["picture"] or {}).get("state") == "shown")
+            assert rendered()["output"]["view"] == "delta"  # type: ignore[index]
+            assert client.get(address).json()["revision"] == 3
+            second_api.send_signal(signal.SIGTERM)
+            assert second_api.wait(timeout=20) == ENDED_BY_SIGTERM
+    control_client.close()
+
+
+def test_tokens_are_made_listed_and_revoked(cli: RunCli, tmp_path: Path) -> None:
+    made = cli("api", "token", "wall", "--role", "view", "--data", tmp_path)
+    assert made.stdout.startswith("deltalight-")
+    rows = json.loads(cli("api", "tokens", "--data", tmp_path, "--json").stdout)
+    assert [(row["name"], row["role"]) for row in rows] == [("wall", "view")]
+    again = cli("api", "token", "wall", "--data", tmp_path)
+    assert again.returncode == 2
+    assert "there is a token called `wall`" in again.stderr
+    assert cli("api", "revoke", "wall", "--data", tmp_path).returncode == 0
+    assert "no token called" in cli("api", "revoke", "wall", "--data", tmp_path).stderr
+
+
+def test_leaving_loopback_makes_and_prints_a_token_once(tmp_path: Path) -> None:
+    (port,) = ports.private_ports(1)
+    command = [sys.executable, "-m", "services.cli", "api", "--host", "0.0.0.0", "--port", str(port)]
+    outputs = []
+    for _ in range(2):
+        running = subprocess.Popen(
+            [*command, "--data", str(tmp_path)],
+            cwd=ROOT,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        url = f"http://{ports.LOOPBACK}:{port}/api/v1"
+        wait_for(lambda url=url: httpx.get(f"{url}/health").status_code == 200)  # type: ignore[misc]
+        assert "token is needed" in sentence(httpx.get(f"{url}/scenes"), 401)
+        if outputs:
+            token = outputs[0][0].split()[-1]
+            assert httpx.get(f"{url}/scenes", headers={"Authorization": f"Bearer {token}"}).json() == []
+        running.terminate()
+        outputs.append(running.communicate(timeout=20))
+    assert "shown this once: deltalight-" in outputs[0][0]
+    assert outputs[1][0] == ""
+    assert "nothing is encrypted" in outputs[1][1]
+
+
+def test_wrong_use_is_a_sentence(cli: RunCli, tmp_path: Path) -> None:
+    (port,) = ports.private_ports(1)
+    with ports.listen(port) as taken:
+        taken.listen()
+        done = cli("api", "--port", port, "--data", tmp_path)
+    assert done.returncode == 2
+    assert f"port {port} cannot be listened on" in done.stderr
+    (tmp_path / "file").touch()
+    done = cli("api", "--data", tmp_path / "file")
+    assert done.returncode == 2
+    assert "--data" in done.stderr
+    done = cli("api", "--host", "somewhere.example", "--data", tmp_path)
+    assert done.returncode == 2
+    assert "`host` is wrong" in done.stderr

@@ -1,0 +1,245 @@
+"""REST over a real server: scenes, revisions, objects, parts, and what reaches the render server."""
+
+import time
+from collections.abc import Callable, Iterator
+
+import httpx
+import pytest
+
+from services.api.render_link import ALIVE_TIMEOUT_S
+from tests.services.api_samples import UPLOAD, RenderServer, RunningApi, running_api, sentence
+from tests.services.storage_samples import TETRAHEDRON
+
+
+@pytest.fixture(scope="module")
+def api(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningApi]:
+    with running_api(tmp_path_factory.mktemp("data")) as running:
+        running.client.post("/assets?name=t.obj", content=TETRAHEDRON, headers=UPLOAD).raise_for_status()
+        yield running
+
+
+@pytest.fixture
+def client(api: RunningApi) -> httpx.Client:
+    return api.client
+
+
+def make(client: httpx.Client, **document: object) -> dict[str, object]:
+    response = client.post("/scenes", json=document)
+    assert response.status_code == 201, response.text
+    return dict(response.json())
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    for _ in range(400):
+        if condition():
+            return
+        time.sleep(0.02)
+    pytest.fail("it never came")
+
+
+def test_a_scene_is_made_read_changed_and_deleted(client: httpx.Client) -> None:
+    made = client.post("/scenes", json={"name": "room"})
+    assert (made.status_code, made.headers["etag"]) == (201, '"1"')
+    address = made.headers["location"].removeprefix("/api/v1")
+    assert client.get(address).json()["document"]["name"] == "room"
+    patched = client.patch(address, json={"output": {"view": "delta"}}, headers={"If-Match": '"1"'})
+    assert (patched.json()["revision"], patched.headers["etag"]) == (2, '"2"')
+    assert patched.json()["what"] == "output changed"
+    stale = client.patch(address, json={"name": "late"}, headers={"If-Match": '"1"'})
+    assert "revision 2 and the change was made to 1" in sentence(stale, 409)
+    assert stale.json()["revision"] == 2
+    assert "revision 2" in sentence(client.put(address, json={"name": "late", "revision": 1}), 409)
+    replaced = client.put(address, json={"name": "other", "revision": 2})
+    assert replaced.json()["document"]["output"]["view"] == "composite"
+    assert client.delete(address).status_code == 204
+    assert "no scene" in sentence(client.get(address), 404)
+
+
+def test_undo_redo_history_and_copies(client: httpx.Client) -> None:
+    address = f"/scenes/{make(client, name='one')['id']}"
+    assert "nothing to undo" in sentence(client.post(f"{address}/undo"), 409)
+    client.patch(address, json={"name": "two"}).raise_for_status()
+    undone = client.post(f"{address}/undo").json()
+    assert (undone["document"]["name"], undone["can_undo"], undone["can_redo"]) == ("one", False, True)
+    assert client.post(f"{address}/redo").json()["document"]["name"] == "two"
+    history = client.get(f"{address}/revisions", params={"limit": 3}).json()
+    assert [(each["revision"], each["what"]) for each in history] == [
+        (4, "redo"),
+        (3, "undo"),
+        (2, "name changed"),
+    ]
+    assert client.get(f"{address}/revisions/1").json()["document"]["name"] == "one"
+    copy = client.post(f"{address}/duplicate", params={"name": "copy"}).json()
+    assert (copy["document"]["name"], copy["revision"]) == ("copy", 1)
+
+
+def test_an_exported_document_can_be_imported(client: httpx.Client) -> None:
+    scene = make(client, name="room", objects=[{"asset": "t.obj", "id": "a"}], output={"tone": "aces"})
+    exported = client.get(f"/scenes/{scene['id']}/document")
+    assert exported.headers["content-disposition"].startswith("attachment")
+    imported = client.post("/scenes", json=exported.json()).json()
+    assert imported["id"] != scene["id"]
+    assert imported["document"] == scene["document"]
+
+
+def test_objects_by_id(client: httpx.Client) -> None:
+    address = f"/scenes/{make(client)['id']}/objects"
+    added = client.post(address, json={"asset": "t.obj", "id": "shelf/left cup"})
+    assert (added.status_code, added.json()["revision"]) == (201, 2)
+    cup = f"{address}/shelf%2Fleft%20cup"
+    moved = client.patch(cup, json={"pose": {"translation_m": [0, 0, 0.1]}}, headers={"If-Match": '"2"'})
+    assert moved.json()["what"] == "object shelf/left cup changed"
+    coloured = client.patch(cup, json={"material": {"roughness": 0.2}})
+    assert coloured.json()["document"]["objects"][0]["pose"]["translation_m"] == [0, 0, 0.1]
+    assert client.get(cup).json()["material"]["roughness"] == 0.2
+    assert client.put(cup, json={"asset": "t.obj"}).json()["document"]["objects"][0]["material"] is None
+    taken = client.post(address, json={"asset": "t.obj", "id": "shelf/left cup"})
+    assert "two objects have the id" in sentence(taken, 422)
+    assert client.delete(cup).status_code == 200
+    assert "no object `shelf/left cup`" in sentence(client.get(cup), 404)
+    assert "no object" in sentence(client.patch(cup, json={}), 404)
+
+
+@pytest.mark.parametrize(
+    ("part", "value", "patch", "expected"),
+    [
+        ("method", {"name": "dvct", "bounces": 3}, {"cone_count": 8}, {"bounces": 3, "cone_count": 8}),
+        ("method", {"name": "dvct", "bounces": 3}, {"name": "none"}, {"name": "none"}),
+        ("output", {"view": "delta"}, {"tone": "aces"}, {"view": "delta", "tone": "aces"}),
+        ("lights", {"manual": []}, {"registration": "auto"}, {"manual": [], "registration": "auto"}),
+        ("real", {"geometry": "fused"}, {"geometry": None}, {"geometry": "depth"}),
+        ("shading", {}, {"name": "volume"}, {"name": "volume"}),
+    ],
+)
+def test_parts_are_replaced_and_patched(
+    client: httpx.Client, part: str, value: object, patch: object, expected: dict[str, object]
+) -> None:
+    address = f"/scenes/{make(client, name='kept')['id']}"
+    client.put(f"{address}/{part}", json=value).raise_for_status()
+    answer = client.patch(f"{address}/{part}", json=patch)
+    assert expected.items() <= answer.json()["document"][part].items()
+    assert answer.json()["document"]["name"] == "kept"
+    got = client.get(f"{address}/{part}")
+    assert expected.items() <= got.json().items()
+    assert got.headers["etag"] == answer.headers["etag"]
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "body", "status", "expected"),
+    [
+        ("PATCH", "", {"metod": {}}, 422, "unknown key `metod`; the nearest known key is `method`"),
+        ("PATCH", "", {"objects": [{"asset": "t.obj", "pose": {"scale": -1}}]}, 422, "objects[0].pose.scale"),
+        ("PATCH", "", {"objects": [{"asset": "/etc/passwd"}]}, 404, "no uploaded asset"),
+        ("PATCH", "", {"objects": [{"asset": "../../store.sqlite3"}]}, 404, "no uploaded asset"),
+        ("PATCH", "", {"lights": {"environment": {"map": "t.obj"}}}, 409, "needs a map"),
+        ("PATCH", "", [1, 2], 422, "`body` is wrong"),
+        ("PUT", "", [1, 2], 422, "the scene"),
+        ("PUT", "/method", {"name": "dvctt"}, 422, "the nearest is `dvct`"),
+        ("PUT", "/method", "fast", 422, "the scene"),
+        ("PUT", "/output", {"width": 1e300}, 422, "output.width"),
+        ("POST", "/objects", {}, 422, "`objects[0].asset` is missing"),
+        ("POST", "/objects", None, 422, "`body` is wrong: field required"),
+        ("POST", "/objects", 7, 422, "`objects[0]` is wrong"),
+        ("GET", "/revisions?limit=0", None, 422, "limit"),
+        ("GET", "/revisions/9", None, 404, "no revision 9"),
+        ("GET", "/nothing", None, 404, "Not Found"),
+        ("POST", "", None, 405, "Method Not Allowed"),
+    ],
+)
+def test_wrong_requests_are_one_sentence(
+    *, client: httpx.Client, method: str, path: str, body: object, status: int, expected: str
+) -> None:
+    scene = make(client)
+    response = client.request(method, f"/scenes/{scene['id']}{path}", json=body)
+    assert expected in sentence(response, status)
+    assert client.get(f"/scenes/{scene['id']}").json()["revision"] == 1
+
+
+@pytest.mark.parametrize(
+    ("content", "status"),
+    [
+        (b"{", 400),
+        (b"\xff\xfe", 400),
+        (b"[" * 100_000, 400),
+        (b'{"name": NaN}', 422),
+        (b'{"output": {"width": NaN}}', 422),
+        (b'{"name": "\\ud800"}', 422),
+        (b'{"\\ud800": 1}', 422),
+        (b'{"a": ' * 900 + b"1" + b"}" * 900, 422),
+        (b'{"output": {"width": 1' + b"0" * 4000 + b"}}", 422),
+        (b"", 422),
+    ],
+)
+def test_malformed_bodies_never_break_it(client: httpx.Client, content: bytes, status: int) -> None:
+    address = f"/scenes/{make(client)['id']}"
+    json_type = {"Content-Type": "application/json"}
+    assert sentence(client.patch(address, content=content, headers=json_type), status)
+    assert sentence(client.post("/scenes", content=content, headers=json_type), status)
+
+
+def test_merge_patch_has_its_own_media_type_and_forms_are_refused(client: httpx.Client) -> None:
+    address = f"/scenes/{make(client)['id']}"
+    patch = {"Content-Type": "application/merge-patch+json"}
+    assert client.patch(address, content=b'{"name": "a"}', headers=patch).json()["revision"] == 2
+    for simple in ("text/plain", "application/x-www-form-urlencoded"):  # what pages of other sites may send
+        assert (
+            client.patch(address, content=b'{"name": "b"}', headers={"Content-Type": simple}).status_code
+            == 422
+        )
+    assert client.get(address).json()["revision"] == 2
+
+
+def test_wrong_if_match_is_refused(client: httpx.Client) -> None:
+    address = f"/scenes/{make(client)['id']}"
+    assert "in quotes" in sentence(client.patch(address, json={}, headers={"If-Match": "new"}), 400)
+    assert client.patch(address, json={"name": "x"}, headers={"If-Match": "*"}).json()["revision"] == 2
+
+
+def test_a_change_reaches_the_render_server_before_its_answer(api: RunningApi) -> None:
+    server = RenderServer(api.control_port)
+    client = api.client
+    scene = make(client, name="shown", objects=[{"asset": "t.obj", "id": "a"}])
+    address = f"/scenes/{scene['id']}"
+    wait_for(lambda: client.get("/state").json()["render_server"] == "answers")
+    assert client.post(f"{address}/activate").json()["picture"] == {
+        "state": "shown",
+        "revision": 1,
+        "detail": "",
+    }
+    assert server.session.scene.revision > 7  # above what the server had of its own
+    for revision in (2, 3):
+        answer = client.patch(address, json={"name": f"change {revision}"}).json()
+        assert answer["picture"] == {"state": "shown", "revision": revision, "detail": ""}
+        assert server.session.scene.name == f"change {revision}"
+    shown = server.session.scene.objects[0].asset
+    assert shown.endswith("asset.obj")
+    assert client.post(f"{address}/undo").json()["picture"]["state"] == "shown"
+    assert server.session.scene.name == "change 2"
+
+    refused = client.patch(address, json={"name": "refused"}).json()
+    assert refused["picture"]["state"] == "refused"
+    assert "cannot be shown" in refused["picture"]["detail"]
+    assert server.session.scene.name == "change 2"
+
+    make(client, name="another")  # it is not active: the server hears nothing of it
+    assert server.session.scene.name == "change 2"
+    assert "active" in sentence(client.delete(address), 409)
+    server.close()
+
+    gone = client.patch(address, json={"name": "while it was away"}).json()
+    assert gone["picture"]["state"] == "pending"
+    again = RenderServer(api.control_port)  # as started, knows nothing
+    wait_for(lambda: again.session.scene.name == "while it was away")
+    wait_for(lambda: client.get(address).json()["picture"]["state"] == "shown")
+    again.session.carry_out(_view_request())  # the viewer's page changes the scene too
+    assert client.patch(address, json={"name": "last"}).json()["picture"]["state"] == "shown"
+    assert again.session.scene.name == "last"
+    again.close()
+    wait_for(lambda: client.get("/health").json()["status"] == "degraded")
+    assert ALIVE_TIMEOUT_S < 2
+
+
+def _view_request() -> object:
+    from tests.services.test_session import request
+
+    return request("set_view", view="delta")

@@ -1,0 +1,143 @@
+"""Who may do what: loopback, tokens and roles, other sites' pages, rates, sizes."""
+
+from collections.abc import Iterator
+
+import httpx
+import pytest
+
+from services.api.gate import WRONG_TOKENS_AT_ONCE
+from services.api.rate import REMEMBERED_CLIENTS, RateLimit
+from services.api.settings import ApiSettings
+from tests.services.api_samples import RunningApi, running_api, sentence
+
+
+@pytest.fixture
+def open_api(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningApi]:
+    """As it is by default, on loopback."""
+    with running_api(tmp_path_factory.mktemp("data")) as running:
+        yield running
+
+
+@pytest.fixture
+def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningApi]:
+    """With the rules of an address that leaves the host (the test itself listens on loopback)."""
+    with running_api(tmp_path_factory.mktemp("data"), host="0.0.0.0") as running:
+        yield running
+
+
+def bearer(token: str) -> dict[str, str]:
+    return {"Authorization": f"Bearer {token}"}
+
+
+@pytest.mark.parametrize(
+    ("host", "leaves"),
+    [("127.0.0.1", False), ("127.8.8.8", False), ("::1", False), ("localhost", False), ("0.0.0.0", True)],
+)
+def test_which_addresses_leave_the_host(host: str, leaves: bool) -> None:
+    assert ApiSettings(host=host).leaves_host is leaves
+
+
+def test_loopback_needs_no_token_but_refuses_a_wrong_one(open_api: RunningApi) -> None:
+    client = open_api.client
+    assert client.get("/scenes").json() == []
+    assert "not known" in sentence(client.get("/scenes", headers=bearer("guess")), 401)
+    assert client.get("/settings").json()["needs_token"] is False
+
+
+def test_elsewhere_every_request_needs_a_token(guarded: RunningApi) -> None:
+    client = guarded.client
+    for method, path in (("GET", "/scenes"), ("POST", "/scenes"), ("GET", "/state"), ("GET", "/nothing")):
+        answer = client.request(method, path)
+        assert "token is needed" in sentence(answer, 401)
+        assert answer.headers["www-authenticate"] == "Bearer"
+    assert client.get("/health").status_code == 200
+    token = guarded.store.tokens.create("me", "control")
+    assert client.post("/scenes", json={}, headers=bearer(token)).status_code == 201
+    assert "token is needed" in sentence(client.get("/scenes", headers={"Cookie": f"token={token}"}), 401)
+    assert client.get(f"/scenes?token={token}").status_code == 401
+    guarded.store.tokens.revoke("me")
+    assert "not known" in sentence(client.get("/scenes", headers=bearer(token)), 401)
+
+
+def test_role_view_may_look_only(guarded: RunningApi) -> None:
+    client, headers = guarded.client, bearer(guarded.store.tokens.create("wall", "view"))
+    scene_id = guarded.store.scenes.create({"name": "room"}).head.id
+    assert client.get(f"/scenes/{scene_id}", headers=headers).status_code == 200
+    for method, path in (
+        ("PATCH", f"/scenes/{scene_id}"),
+        ("DELETE", f"/scenes/{scene_id}"),
+        ("POST", "/assets?name=a.glb"),
+        ("POST", f"/scenes/{scene_id}/activate"),
+    ):
+        assert "may only look" in sentence(client.request(method, path, headers=headers), 403)
+    assert guarded.store.scenes.get(scene_id).document.revision == 1
+
+
+def test_guessing_tokens_is_slowed_down_and_counted(guarded: RunningApi) -> None:
+    client = guarded.client
+    for number in range(WRONG_TOKENS_AT_ONCE):
+        assert client.get("/scenes", headers=bearer(f"guess{number}")).status_code == 401
+    answer = client.get("/scenes", headers=bearer(guarded.store.tokens.create("me", "view")))
+    assert "Too many wrong tokens" in sentence(answer, 429)
+    assert int(answer.headers["retry-after"]) >= 1
+    assert client.get("/health").status_code == 200
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://127.0.0.1:1", "http://[", ""])
+def test_pages_of_other_sites_are_refused(open_api: RunningApi, origin: str) -> None:
+    client = open_api.client
+    assert "other sites" in sentence(client.post("/scenes", json={}, headers={"Origin": origin}), 403)
+    assert client.get("/scenes").json() == []
+    own = f"http://{client.base_url.host}:{client.base_url.port}"
+    assert client.post("/scenes", json={}, headers={"Origin": own}).status_code == 201
+
+
+@pytest.mark.parametrize("host", ["evil.example", "127.0.0.1.evil.example", "", "["])
+def test_names_that_only_resolve_to_loopback_are_refused(open_api: RunningApi, host: str) -> None:
+    assert "on loopback" in sentence(open_api.client.get("/scenes", headers={"Host": host}), 400)
+
+
+def test_no_answer_carries_cross_origin_rights_or_cookies(open_api: RunningApi) -> None:
+    answer = open_api.client.options("/scenes", headers={"Access-Control-Request-Method": "DELETE"})
+    assert answer.status_code == 405
+    for response in (answer, open_api.client.get("/scenes")):
+        assert not {"access-control-allow-origin", "set-cookie", "server"} & set(response.headers)
+
+
+def test_too_many_requests_are_told_when_to_come_again(tmp_path_factory: pytest.TempPathFactory) -> None:
+    with running_api(tmp_path_factory.mktemp("data"), requests_per_s=1) as running:
+        answers = [running.client.get("/health") for _ in range(12)]
+    assert answers[0].status_code == 200
+    late = next(answer for answer in answers if answer.status_code == 429)
+    assert "Too many requests" in sentence(late, 429)
+    assert int(late.headers["retry-after"]) >= 1
+
+
+def test_a_bucket_refills_and_forgets_old_clients() -> None:
+    now_s = 0.0
+    limit = RateLimit(2, 3, lambda: now_s)
+    for _ in range(3):
+        assert limit.wait_s("a") == 0
+        limit.take("a")
+    assert limit.wait_s("a") == 0.5
+    assert limit.wait_s("b") == 0
+    now_s = 0.5
+    assert limit.wait_s("a") == 0
+    now_s = 100.0
+    for client in range(REMEMBERED_CLIENTS + 5):
+        limit.take(str(client))
+    assert len(limit._buckets) == REMEMBERED_CLIENTS
+
+
+def test_large_documents_are_refused_before_they_are_read(open_api: RunningApi) -> None:
+    answer = open_api.client.post("/scenes", json={"name": "x" * (3 << 20)})
+    assert "larger than 2 MB" in sentence(answer, 413)
+
+
+def test_the_description_is_open_and_names_no_secret(guarded: RunningApi) -> None:
+    root = f"http://{guarded.client.base_url.host}:{guarded.client.base_url.port}"
+    schema = httpx.get(f"{root}/openapi.json").json()
+    assert "/api/v1/scenes/{scene_id}" in schema["paths"]
+    assert (
+        httpx.get(f"{root}/docs", headers=bearer(guarded.store.tokens.create("a", "view"))).status_code == 404
+    )
