@@ -9,17 +9,10 @@ from jaxtyping import Float32, Float64, UInt8
 
 from protocol.board import BoardSpec, LampMarker
 from protocol.camera_model import CameraModel
-from protocol.frames import LampPose, decode_lut
-from protocol.poses import rigid_matrix
+from protocol.frames import LampPose
 from sensor_node.marker_edges import refine_corners
-from sensor_node.markers import (
-    AMBIGUOUS_RATIO,
-    CORNER_NOISE_PX,
-    LEAST_SIDE_PX,
-    LUMINANCE,
-    MAX_ERROR_PX,
-    REACH_SHARE,
-)
+from sensor_node.marker_finder import REACH_SHARE, MarkerFinder, linear_luminance, planar_poses
+from sensor_node.markers import AMBIGUOUS_RATIO, CORNER_NOISE_PX, MAX_ERROR_PX
 
 
 class _Solution(NamedTuple):
@@ -53,14 +46,15 @@ def detect_lamps(
     """
     if not board.lamp_markers:
         return ()
-    quads = _find(color, board)
+    finder = MarkerFinder(board)
+    gray = cv2.cvtColor(np.ascontiguousarray(color), cv2.COLOR_RGB2GRAY)
+    quads = finder.quads(gray, [lamp.id for lamp in board.lamp_markers])
     lamps = [lamp for lamp in board.lamp_markers if lamp.id in quads]
     if not lamps:
         return ()
-    cells = board.opencv_dictionary().markerSize + 2 * board.border_bits
-    light = _linear_luminance(color, response)
+    light = linear_luminance(color, response)
     corners = np.array([quads[lamp.id] for lamp in lamps])
-    refined = refine_corners(light, camera, corners, REACH_SHARE * board.border_bits / cells)
+    refined = refine_corners(light, camera, corners, REACH_SHARE * finder.border_share)
     before = {pose.marker: pose.world_from_marker for pose in previous}
     camera_from_world = np.linalg.inv(world_from_camera)
     poses = []
@@ -73,44 +67,13 @@ def detect_lamps(
     return tuple(poses)
 
 
-def _find(color: UInt8[np.ndarray, "h w 3"], board: BoardSpec) -> dict[int, Float64[np.ndarray, "4 2"]]:
-    """Corners in the picture of every marker that is large enough to be read, by id."""
-    parameters = cv2.aruco.DetectorParameters()
-    parameters.markerBorderBits = board.border_bits
-    gray = cv2.cvtColor(np.ascontiguousarray(color), cv2.COLOR_RGB2GRAY)
-    found, ids, _ = cv2.aruco.ArucoDetector(board.opencv_dictionary(), parameters).detectMarkers(gray)
-    quads = [quad.reshape(4, 2).astype(np.float64) for quad in found]
-    return {
-        int(name): quad
-        for quad, name in zip(quads, () if ids is None else ids.ravel(), strict=True)
-        if np.linalg.norm(quad - np.roll(quad, 1, axis=0), axis=1).min() >= LEAST_SIDE_PX
-    }
-
-
-def _linear_luminance(
-    color: UInt8[np.ndarray, "h w 3"], response: Float32[np.ndarray, "256 3"] | None
-) -> Float32[np.ndarray, "h w"]:
-    table = (decode_lut(response) * LUMINANCE).astype(np.float32)
-    red, green, blue = (table[:, channel][color[..., channel]] for channel in range(3))
-    return np.asarray(red + green + blue)
-
-
 def _solve(lamp: LampMarker, camera: CameraModel, pixels: Float64[np.ndarray, "4 2"]) -> list[_Solution]:
     """Both poses of a square that show its printed side, refined, the better one first."""
-    points, rays = lamp.corner_points(), np.ascontiguousarray(camera.unproject(pixels))
-    try:
-        _, rotations, translations, _ = cv2.solvePnPGeneric(
-            points, rays, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE_SQUARE
-        )
-    except cv2.error:  # corners on one line
-        return []
-    solutions = []
-    for rotation, translation in zip(rotations, translations, strict=True):
-        turn, shift = cv2.solvePnPRefineLM(points, rays, np.eye(3), None, rotation, translation)
-        matrix = rigid_matrix(cv2.Rodrigues(turn)[0], shift.ravel())
+    points, solutions = lamp.corner_points(), []
+    for matrix in planar_poses(points, camera.unproject(pixels), is_square=True):
         misses = camera.project(points @ matrix[:3, :3].T + matrix[:3, 3]) - pixels
         error_px = float(np.nan_to_num(np.linalg.norm(misses, axis=1), nan=np.inf).mean())
-        if np.linalg.inv(matrix)[2, 3] > 0 and error_px <= MAX_ERROR_PX:
+        if error_px <= MAX_ERROR_PX:
             solutions.append(_Solution(matrix, error_px))
     return sorted(solutions, key=lambda solution: solution.error_px)
 

@@ -1,11 +1,13 @@
 """The loop of a sensor node: captures, cleans, finds poses and light, publishes."""
 
+import re
 import threading
 import time
 from contextlib import ExitStack
 from dataclasses import replace
 from typing import Literal
 
+import structlog
 from pydantic import Field, field_serializer, field_validator
 
 from protocol.documents import StrictModel
@@ -36,6 +38,7 @@ from sensor_node.pose_filter import PoseFilter, PoseFilterSettings
 from sensor_node.repeater import Repeater
 from sensor_node.view_frames import ViewFrameBuilder
 
+_log = structlog.get_logger(__name__)
 STATS_PERIOD_S = 1.0
 MAX_SENTENCE = 2000  # of the wire (SPEC.md, section 3)
 STREAMS = ("fisheye", "depth", "radiance", "clean_depth", "lamps", "pose", "color", "stats")
@@ -127,6 +130,7 @@ def run_node(config: NodeConfig, stop: threading.Event, keys: Keys | None = None
         if config.announce:
             stack.enter_context(announced(config.name, publisher.endpoint, STREAMS, keys))
         capture = stack.enter_context(CaptureThread(camera, keep_all=not config.realtime))
+        _log.info("sensor node runs", publish=publisher.endpoint, source=config.source)
         _Node(config, camera, publisher, clock).run(capture, stop)
 
 
@@ -141,6 +145,7 @@ class _Node:
         self._fisheye: Repeater[FisheyePictures] = Repeater()
         self._radiance: Repeater[RadianceMap] = Repeater()
         self._light_remarks: list[str] = []
+        self._heard = self._logged = ""
         self._period_s = time.monotonic()
         self._frames = self._without_board = 0
 
@@ -220,6 +225,7 @@ class _Node:
         now_ns, elapsed_s = time.time_ns(), max(time.monotonic() - self._period_s, 1e-3)
         offset_ns, bound_ns = self._clock.at(now_ns)
         state, detail = self._health.state([self._clock.remark, *self._builder.notes, *self._light_remarks])
+        self._log_state(state, detail)
         message = StatsMessage(
             node=self._config.name,
             capture_ns=now_ns,
@@ -232,3 +238,11 @@ class _Node:
         )
         self._publisher.send(encode(message))
         self._period_s, self._frames, self._without_board = time.monotonic(), 0, 0
+
+    def _log_state(self, state: str, detail: str) -> None:
+        """Log what the statistics say, once it stays for two of them and differs in more than its numbers."""
+        words = re.sub(r"[\d.]+", "", detail)
+        if words == self._heard != self._logged:
+            self._logged = words
+            (_log.info if state == "running" else _log.warning)(detail)
+        self._heard = words

@@ -11,7 +11,7 @@ from render_server.gpu.context import GpuContext
 
 COEFFICIENT_BYTES = 16  # a cell and channel: 4 floats
 INJECTED_SUMS = 12  # a cell: 4 coefficients x 3 channels
-COVERED_SUMS = 6  # a cell: its low faces on three axes, light along + and -
+COVERED_SUMS = 6  # a cell: its low faces on three axes, surfaces that face - and +
 CONSTANT, LINEAR = 0.5 / math.sqrt(math.pi), math.sqrt(3 / (4 * math.pi))  # Y_0 and Y_1 along its axis
 LOBE = (math.sqrt(math.pi) / 2, math.sqrt(math.pi / 3))  # clamped cosine in them
 FAR_FACE_SR, SIDE_FACE_SR = 0.40067, 0.42343  # as seen from the centre of the neighbouring cell

@@ -1,12 +1,13 @@
 // Geometry volume: how much of each cell face surfaces cover (after Kaplanyan & Dachsbacher 2010). A face stands for the
 // cube of a cell's edge about its centre, so that a surface blocks between the cell in which its light starts and the one
-// behind it. Surfels were clipped to half cells, so each lies in one such cube an axis. Kept are the areas across the
-// six axis directions, each one-sided, rather than spherical harmonics of them: only these six are ever asked for.
+// behind it. Surfels were clipped to half cells, so each lies in one such cube an axis. Kept are the areas across each
+// axis rather than spherical harmonics of them: only these are ever asked for. The two sides are summed apart, so that
+// both sides of a thin body do not count as two bodies.
 #include "passes/common/voxel_store.glsl"
 #include "passes/common/light_cells.glsl"
 
 layout(local_size_x = 64) in;
-layout(std430, binding = 8) buffer Covered { int covered[]; };   // 6 a cell: its low faces on x, y, z; light along +, -
+layout(std430, binding = 8) buffer Covered { int covered[]; };   // 6 a cell: its low faces on x, y, z; by surfaces that face -, +
 uniform int cells;
 uniform float cell_edge;   // m
 

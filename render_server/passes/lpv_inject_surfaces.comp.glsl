@@ -44,7 +44,7 @@ vec3 emission_of(Surfel s) { return materials[int(s.normal_material.w)].emission
 void inject_side(Surfel s, vec3 n) {
     vec3 radiosity = PI * emission_of(s);
     if (blocks_surroundings) radiosity += albedo_at(s, n) * environment_irradiance(n) - environment_irradiance(-n);
-    inject(s.position_area.xyz, n, radiosity * s.position_area.w);
+    if (radiosity != vec3(0.0)) inject(s.position_area.xyz, n, radiosity * s.position_area.w);
 }
 
 void main() {

@@ -10,17 +10,20 @@ uniform int cells;
 
 const float FIXED_POINT_STEPS = 1048576.0;   // voxel_store.glsl's
 
-float open_share(int sum) { return 1.0 - clamp(float(sum) / FIXED_POINT_STEPS, 0.0, 1.0); }
+// Surfaces block from both sides: what is inside a body does not get out either.
+float open_share(int one_side, int other_side) {
+    return 1.0 - clamp(float(max(one_side, other_side)) / FIXED_POINT_STEPS, 0.0, 1.0);
+}
 
-float through(ivec3 cell, int axis, int backwards) {
-    cell[axis] += backwards;
+float through(ivec3 cell, int axis, int upper) {
+    cell[axis] += upper;
     if (!in_grid(cell, cells)) return 1.0;
-    uint at = cell_index(cell, cells) * 6u + uint(2 * axis + backwards);
-    float open_share_here = open_share(real_covered[at]);
+    uint at = cell_index(cell, cells) * 6u + uint(2 * axis);
+    float share = open_share(real_covered[at], real_covered[at + 1u]);
 #ifdef JOINT
-    open_share_here *= open_share(virtual_covered[at]);
+    share *= open_share(virtual_covered[at], virtual_covered[at + 1u]);
 #endif
-    return open_share_here;
+    return share;
 }
 
 void main() {

@@ -137,16 +137,14 @@ class LightSet:
 
     `environment` is the residual radiance map R, octahedral, world axes; the lights are not in it. Of it,
     `ground_share` (0..1) is the share of each texel where the real ground's radiance belongs, because nothing else
-    is known to be there. `registration` is the factor R G B that `lights` and `environment` still lack; where
-    `registration_auto` is set it is to be found from the picture first. `identities` number the lights where they
-    are followed over time.
+    is known to be there. `registration` is the factor R G B that `lights` and `environment` still lack, ones where
+    it is to be found from the picture first. `identities` number the lights where they are followed over time.
     """
 
     lights: tuple[Light, ...]
     environment: Float32[np.ndarray, "n n 3"]
     ground_share: Float32[np.ndarray, "n n 1"]
     registration: Float32[np.ndarray, "3"]
-    registration_auto: bool
     identities: tuple[int, ...] = ()
 
     def registered(self, factor: Float32[np.ndarray, "3"] | None = None) -> "LightSet":
@@ -157,7 +155,6 @@ class LightSet:
             lights=tuple(light.scaled(chosen) for light in self.lights),
             environment=self.environment * chosen,
             registration=np.ones(3, np.float32),
-            registration_auto=False,
         )
 
     def with_ground(self, radiance: Float32[np.ndarray, "3"]) -> "LightSet":
@@ -205,9 +202,8 @@ def complete_set(
 ) -> LightSet:
     """Add the registration that a scene document wishes."""
     given = lights.resolved_registration
-    auto = given == "auto"
-    factor = np.ones(3, np.float32) if auto else np.array(given, np.float32)
-    return LightSet(shining, environment, ground_share, factor, auto, identities)
+    factor = np.ones(3, np.float32) if given == "auto" else np.array(given, np.float32)
+    return LightSet(shining, environment, ground_share, factor, identities)
 
 
 def _manual(

@@ -15,7 +15,8 @@ from protocol.frames import SensorFrame, decode_lut
 from protocol.pictures import decode_rgb, read_bytes
 from sensor_node.calibration.picture_sources import PICTURE_SUFFIXES, Eye
 from sensor_node.fisheye.response import estimate_response
-from sensor_node.markers import LUMINANCE, BoardDetector
+from sensor_node.marker_finder import LUMINANCE
+from sensor_node.markers import BoardDetector
 
 # Codes between which a pixel says how much light there was: not noise, not white.
 USABLE_CODES = (20, 235)

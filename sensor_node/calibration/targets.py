@@ -2,9 +2,8 @@
 
 import re
 from collections.abc import Sequence
-from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import cv2
 import numpy as np
@@ -14,8 +13,7 @@ from protocol.board import BoardSpec, load_board_yaml
 from protocol.camera_model import CameraModel
 from protocol.errors import DeltalightError
 from protocol.frames import decode_lut
-from sensor_node.marker_edges import refine_corners
-from sensor_node.markers import LEAST_SIDE_PX, REACH_SHARE
+from sensor_node.marker_finder import MarkerFinder
 
 CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 0.005)
 # Half the edge of the window about a corner, as a share of the way to the next one: it must not reach that.
@@ -94,6 +92,7 @@ class MarkerBoard:
 
     def __init__(self, board: BoardSpec) -> None:
         self.board = board
+        self._finder = MarkerFinder(board)
         corners = board.corner_points()
         self._first = {name: 4 * place for place, name in enumerate(corners)}
         chess = board.chessboard_corners()
@@ -106,19 +105,14 @@ class MarkerBoard:
 
     def find(self, gray: UInt8[np.ndarray, "h w"]) -> Sighting | None:
         """Find the board's markers, or of a ChArUco board the inner corners beside them."""
-        found, ids, _ = self._detector.detectMarkers(gray)
-        names = () if ids is None else tuple(int(name) for name in ids.ravel())
-        quads = {
-            name: quad.reshape(4, 2)
-            for name, quad in zip(names, found, strict=True)
-            if name in self._first and _shortest_side(quad.reshape(4, 2)) >= LEAST_SIDE_PX
-        }
+        quads = self._finder.quads(gray, self._first)
         if not quads:
             return None
         if self.board.type == "charuco":
-            return self._inner_corners(gray, quads)
+            numbers, pixels = self._finder.inner_corners(gray, gray, quads)
+            return Sighting(numbers, pixels) if len(numbers) else None
         numbers = np.concatenate([self._first[name] + np.arange(4) for name in quads])
-        start = Sighting(numbers, np.concatenate(list(quads.values())).astype(np.float64))
+        start = Sighting(numbers, np.concatenate(list(quads.values())))
         # A marker is small enough that its edges are nearly straight in any lens.
         height, width = gray.shape
         matrix = np.array([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1.0]])
@@ -126,49 +120,14 @@ class MarkerBoard:
 
     def refined(self, gray: UInt8[np.ndarray, "h w"], sighting: Sighting, camera: CameraModel) -> Sighting:
         """Fit the markers' edges where the lens makes them straight."""
-        board = self.board
-        if board.type == "charuco":
+        if self.board.type == "charuco":
             return sighting
         # Paper and ink are grey, so their grey code decodes to their light.
         light = decode_lut(None)[:, 0][gray]
-        cells = board.opencv_dictionary().markerSize + 2 * board.border_bits
-        thin = min(board.border_bits / cells, board.separation_m / board.marker_length_m or 1.0)
-        quads = sighting.pixels.reshape(-1, 4, 2)
-        better = refine_corners(light, camera, quads, REACH_SHARE * thin).reshape(-1, 2)
+        better = self._finder.refined(light, camera, sighting.pixels.reshape(-1, 4, 2)).reshape(-1, 2)
         moved = np.linalg.norm(better - sighting.pixels, axis=1)
         kept = np.where((moved < CAUGHT_PX)[:, None], better, sighting.pixels)
         return Sighting(sighting.numbers, kept)
-
-    @cached_property
-    def _detector(self) -> Any:  # noqa: ANN401 - cv2 has no types
-        parameters = cv2.aruco.DetectorParameters()
-        parameters.markerBorderBits = self.board.border_bits
-        return cv2.aruco.ArucoDetector(self.board.opencv_dictionary(), parameters)
-
-    @cached_property
-    def _charuco(self) -> Any:  # noqa: ANN401 - cv2 has no types
-        board = self.board
-        square = board.marker_length_m + board.separation_m
-        size, ids = (board.columns, board.rows), np.array(board.marker_ids)
-        return cv2.aruco.CharucoDetector(
-            cv2.aruco.CharucoBoard(size, square, board.marker_length_m, board.opencv_dictionary(), ids)
-        )
-
-    def _inner_corners(
-        self, gray: UInt8[np.ndarray, "h w"], quads: dict[int, Float32[np.ndarray, "4 2"]]
-    ) -> Sighting | None:
-        names = np.array([[name] for name in quads], np.int32)
-        markers = [quad[None] for quad in quads.values()]
-        corners, ids, _, _ = self._charuco.detectBoard(gray, markerCorners=markers, markerIds=names)
-        if ids is None:
-            return None
-        # The window must not reach the markers, which begin half a separation away.
-        side = min(_shortest_side(quad) for quad in quads.values())
-        gap = side * self.board.separation_m / self.board.marker_length_m / 2
-        half = int(np.clip(round(2 * WINDOW_SHARE * gap), *WINDOW_HALF_PX))
-        start = np.ascontiguousarray(corners, np.float32).reshape(-1, 1, 2)
-        pixels = cv2.cornerSubPix(gray, start, (half, half), (-1, -1), CRITERIA)
-        return Sighting(ids.ravel().astype(np.int64), pixels.reshape(-1, 2).astype(np.float64))
 
 
 def parse_target(text: str | None, known: BoardSpec | None, folders: Sequence[Path | None]) -> Target:
@@ -209,7 +168,3 @@ def _least_beside(steps: Float64[np.ndarray, "r c"], axis: int) -> Float64[np.nd
     starts = [(0, 1) if each == axis else (0, 0) for each in (0, 1)]
     pads = [np.pad(steps, width, constant_values=np.inf) for width in (ends, starts)]
     return np.asarray(np.minimum(*pads))
-
-
-def _shortest_side(quad: Float32[np.ndarray, "4 2"]) -> float:
-    return float(np.linalg.norm(quad - np.roll(quad, 1, axis=0), axis=1).min())

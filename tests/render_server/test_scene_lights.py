@@ -217,7 +217,7 @@ def test_environment_mode_puts_lamps_where_the_document_turns_them(tmp_path: Pat
     light = built.lights[0]
     assert isinstance(light, DirectionalLight)
     assert light.direction == pytest.approx([0, -np.sqrt(0.5), -np.sqrt(0.5)], abs=0.01)
-    assert built.registration_auto
+    assert built.registration.tolist() == [1, 1, 1]
     assert built.environment.shape == (256, 256, 3)
     single = build_lights(environment_lights(path))
     assert light.irradiance == pytest.approx(2 * single.lights[0].irradiance, rel=1e-3)
@@ -240,7 +240,6 @@ def test_manual_lights_take_their_colour_and_ambient_adds_up() -> None:
     assert isinstance(sphere, SphereLight)
     assert sphere.intensity.tolist() == [8, 4, 4]
     assert np.unique(built.environment.reshape(-1, 3), axis=0).tolist() == [[1.0, 0.75, 0.25]]
-    assert not built.registration_auto
     assert [item["type"] for item in built.describe()] == ["directional", "sphere", "environment"]
 
 

@@ -11,10 +11,16 @@ from pathlib import Path
 
 import httpx
 import pytest
+from typer.testing import CliRunner
 
+from protocol.documents import validate
+from protocol.errors import DeltalightError
 from protocol.messages import ControlRequest
 from protocol.transport import RequestClient
 from services import ports
+from services.api.serve import run_api
+from services.api.settings import ApiSettings
+from services.commands.api import api
 from tests.services.api_samples import sentence
 from tests.services.conftest import ROOT, RunCli
 
@@ -47,8 +53,8 @@ def test_a_change_is_in_the_real_render_server_and_outlives_kill_9_of_both(tmp_p
     control = ports.endpoint(control_port)
     server = ("server", "--control", control, "--publish", ports.endpoint(publish_port))
     server += ("--subscribe", ports.endpoint(node_port), "--allow-software")
-    api = ("api", "--port", port, "--data", tmp_path, "--control", control)
-    api += ("--subscribe", ports.endpoint(publish_port))
+    rest = ("api", "--port", port, "--data", tmp_path, "--control", control)
+    rest += ("--subscribe", ports.endpoint(publish_port))
     client = httpx.Client(base_url=f"http://{ports.LOOPBACK}:{port}/api/v1", timeout=60)
     control_client = RequestClient(control)
 
@@ -57,7 +63,7 @@ def test_a_change_is_in_the_real_render_server_and_outlives_kill_9_of_both(tmp_p
         return dict(control_client.request(asked, 30).payload["scene"])  # type: ignore[call-overload]
 
     with process(*server) as first_server:
-        with process(*api, "--scene", SCENE) as first_api:
+        with process(*rest, "--scene", SCENE) as first_api:
             wait_for(lambda: (client.get("/state").json()["picture"] or {}).get("state") == "shown")
             scene = client.get("/active-scene").json()
             address = f"/scenes/{scene['id']}"
@@ -83,7 +89,7 @@ def test_a_change_is_in_the_real_render_server_and_outlives_kill_9_of_both(tmp_p
             first_server.kill()
             first_api.send_signal(signal.SIGKILL)
             first_api.wait()
-        with process(*api) as second_api, process(*server):
+        with process(*rest) as second_api, process(*server):
             wait_for(lambda: (client.get("/state").json()["picture"] or {}).get("state") == "shown")
             assert rendered()["output"]["view"] == "delta"  # type: ignore[index]
             assert client.get(address).json()["revision"] == 3
@@ -92,16 +98,22 @@ def test_a_change_is_in_the_real_render_server_and_outlives_kill_9_of_both(tmp_p
     control_client.close()
 
 
-def test_tokens_are_made_listed_and_revoked(cli: RunCli, tmp_path: Path) -> None:
-    made = cli("api", "token", "wall", "--role", "view", "--data", tmp_path)
-    assert made.stdout.startswith("deltalight-")
-    rows = json.loads(cli("api", "tokens", "--data", tmp_path, "--json").stdout)
+def test_tokens_are_made_listed_and_revoked(tmp_path: Path) -> None:
+    def run(*arguments: str) -> str:
+        done = CliRunner().invoke(api, [*arguments, "--data", str(tmp_path)], catch_exceptions=False)
+        assert done.exit_code == 0
+        return done.stdout
+
+    assert "make one with" in run("tokens")
+    assert run("token", "wall", "--role", "view").startswith("deltalight-")
+    rows = json.loads(run("tokens", "--json"))
     assert [(row["name"], row["role"]) for row in rows] == [("wall", "view")]
-    again = cli("api", "token", "wall", "--data", tmp_path)
-    assert again.returncode == 2
-    assert "there is a token called `wall`" in again.stderr
-    assert cli("api", "revoke", "wall", "--data", tmp_path).returncode == 0
-    assert "no token called" in cli("api", "revoke", "wall", "--data", tmp_path).stderr
+    assert "wall" in run("tokens")
+    with pytest.raises(DeltalightError, match="there is a token called `wall`"):
+        run("token", "wall")
+    run("revoke", "wall")
+    with pytest.raises(DeltalightError, match="no token called `wall`"):
+        run("revoke", "wall")
 
 
 def test_leaving_loopback_makes_and_prints_a_token_once(tmp_path: Path) -> None:
@@ -137,9 +149,7 @@ def test_wrong_use_is_a_sentence(cli: RunCli, tmp_path: Path) -> None:
     assert done.returncode == 2
     assert f"port {port} cannot be listened on" in done.stderr
     (tmp_path / "file").touch()
-    done = cli("api", "--data", tmp_path / "file")
-    assert done.returncode == 2
-    assert "--data" in done.stderr
-    done = cli("api", "--host", "somewhere.example", "--data", tmp_path)
-    assert done.returncode == 2
-    assert "`host` is wrong" in done.stderr
+    with pytest.raises(DeltalightError, match="--data"):
+        run_api(ApiSettings(port=port, data=tmp_path / "file"))
+    with pytest.raises(DeltalightError, match="`host` is wrong"):
+        validate(ApiSettings, {"host": "somewhere.example"}, "api")

@@ -1,0 +1,129 @@
+"""Finding markers in pictures, and the two poses of a flat target: what board, lamps and calibration share."""
+
+from collections.abc import Collection
+from functools import cached_property
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, Float64, Int64, UInt8
+
+from protocol.board import BoardSpec
+from protocol.camera_model import CameraModel
+from protocol.frames import decode_lut
+from protocol.poses import rigid_matrix
+from sensor_node.marker_edges import refine_corners
+
+# How far from a marker's edge it is looked for, as a share of the border cell or the white gap.
+REACH_SHARE = 0.6
+# Half the edge of the window that refines a chessboard corner, as a share of the way to the next marker.
+WINDOW_SHARE = 0.8
+WINDOW_HALF_PX = (2, 8)
+WINDOW_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 0.005)
+# Markers narrower than this cannot be read.
+LEAST_SIDE_PX = 10
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
+
+Quads = dict[int, Float64[np.ndarray, "4 2"]]
+
+
+class MarkerFinder:
+    """Finds the markers of one board's dictionary and refines their corners."""
+
+    def __init__(self, board: BoardSpec) -> None:
+        self._board = board
+
+    def quads(self, gray: UInt8[np.ndarray, "h w"], wanted: Collection[int]) -> Quads:
+        """Return the corners of every wanted marker that is large enough to be read, by id."""
+        found, ids, _ = self._detector.detectMarkers(gray)
+        named = zip(() if ids is None else ids.ravel(), found, strict=True)
+        quads = {int(name): quad.reshape(4, 2).astype(np.float64) for name, quad in named}
+        return {
+            name: quad
+            for name, quad in quads.items()
+            if name in wanted and shortest_side(quad) >= LEAST_SIDE_PX
+        }
+
+    def refined(
+        self, light: Float32[np.ndarray, "h w"], camera: CameraModel, corners: Float64[np.ndarray, "n 4 2"]
+    ) -> Float64[np.ndarray, "n 4 2"]:
+        """Return the board's markers' corners where straight lines fitted to their edges meet (linear light)."""
+        board = self._board
+        thin = min(self.border_share, board.separation_m / board.marker_length_m or 1.0)
+        return refine_corners(light, camera, corners, REACH_SHARE * thin)
+
+    @property
+    def border_share(self) -> float:
+        """Width of the black border as a share of a marker's edge."""
+        cells = self._board.opencv_dictionary().markerSize + 2 * self._board.border_bits
+        return float(self._board.border_bits / cells)
+
+    def inner_corners(
+        self, gray: UInt8[np.ndarray, "h w"], light: np.ndarray, quads: Quads
+    ) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 2"]]:
+        """Return numbers and pixels of a ChArUco board's inner corners, refined on `light`."""
+        markers = [quad[None].astype(np.float32) for quad in quads.values()]
+        names = np.array([[name] for name in quads], np.int32)
+        corners, ids, _, _ = self._charuco.detectBoard(gray, markerCorners=markers, markerIds=names)
+        if ids is None:
+            return np.zeros(0, np.int64), np.zeros((0, 2))
+        # The window must not reach the markers, which begin half a separation away.
+        side = min(shortest_side(quad) for quad in quads.values())
+        gap = side * self._board.separation_m / self._board.marker_length_m / 2
+        half = int(np.clip(round(WINDOW_SHARE * gap), *WINDOW_HALF_PX))
+        start = np.ascontiguousarray(corners, np.float32).reshape(-1, 1, 2)
+        pixels = cv2.cornerSubPix(light, start, (half, half), (-1, -1), WINDOW_CRITERIA)
+        return ids.ravel().astype(np.int64), pixels.reshape(-1, 2).astype(np.float64)
+
+    @cached_property
+    def _detector(self) -> Any:  # noqa: ANN401 - cv2 has no types
+        parameters = cv2.aruco.DetectorParameters()
+        parameters.markerBorderBits = self._board.border_bits
+        parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
+        return cv2.aruco.ArucoDetector(self._board.opencv_dictionary(), parameters)
+
+    @cached_property
+    def _charuco(self) -> Any:  # noqa: ANN401 - cv2 has no types
+        board = self._board
+        square = board.marker_length_m + board.separation_m
+        size, ids = (board.columns, board.rows), np.array(board.marker_ids)
+        return cv2.aruco.CharucoDetector(
+            cv2.aruco.CharucoBoard(size, square, board.marker_length_m, board.opencv_dictionary(), ids)
+        )
+
+
+def shortest_side(quad: Float64[np.ndarray, "4 2"]) -> float:
+    """Return the shortest side of a quad, in pixels."""
+    return float(np.linalg.norm(quad - np.roll(quad, 1, axis=0), axis=1).min())
+
+
+def linear_luminance(
+    color: UInt8[np.ndarray, "h w 3"], response: Float32[np.ndarray, "256 3"] | None
+) -> Float32[np.ndarray, "h w"]:
+    """Return the linear luminance of a coded picture: a sum of three look-ups."""
+    table = (decode_lut(response) * LUMINANCE).astype(np.float32)
+    red, green, blue = (table[:, channel][color[..., channel]] for channel in range(3))
+    return np.asarray(red + green + blue)
+
+
+def planar_poses(
+    points: Float64[np.ndarray, "n 3"], rays: Float64[np.ndarray, "n 2"], *, is_square: bool
+) -> list[Float64[np.ndarray, "4 4"]]:
+    """Return both poses (camera from target) of the planar ambiguity, refined, that show the printed side.
+
+    Args:
+        points: in the plane z = 0 of the target, whose printed side is towards +z; about the origin.
+        rays: where they are seen, (x/z, y/z).
+        is_square: they are the corners of a square in OpenCV's order.
+    """
+    method = cv2.SOLVEPNP_IPPE_SQUARE if is_square else cv2.SOLVEPNP_IPPE
+    points, rays = np.ascontiguousarray(points), np.ascontiguousarray(rays)
+    try:
+        _, rotations, translations, _ = cv2.solvePnPGeneric(points, rays, np.eye(3), None, flags=method)
+    except cv2.error:  # corners on one line
+        return []
+    poses = []
+    for rotation, translation in zip(rotations, translations, strict=True):
+        turn, shift = cv2.solvePnPRefineLM(points, rays, np.eye(3), None, rotation, translation)
+        poses.append(rigid_matrix(cv2.Rodrigues(turn)[0], shift.ravel()))
+    return [pose for pose in poses if np.linalg.inv(pose)[2, 3] > 0]
