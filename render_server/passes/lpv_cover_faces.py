@@ -22,9 +22,7 @@ class LpvCoverFacesPass:
         covered.clear()
         store.bind()
         covered.bind_to_storage_buffer(8)
-        self._program.run(
-            (self._threads,), cells=cells.size, cell_edge=cells.voxel_edge, both_sides=both_sides
-        )
+        self._program.run((self._threads,), cells=cells.size, cell_edge=cells.voxel_edge)
 
     def release(self) -> None:
         """Free the program."""

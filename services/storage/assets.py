@@ -19,6 +19,7 @@ from uuid import uuid4
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from protocol.errors import DeltalightError
 from protocol.scene import DIGEST_PREFIX, SceneDocument
 from services.storage.asset_kinds import BY_NAME, HEAD_BYTES, AssetFormat, AssetKind, clean_name, recognise
 from services.storage.asset_probe import Facts, probe
@@ -203,25 +204,39 @@ class AssetStore:
                 path.unlink(missing_ok=True)
 
 
-def resolve_asset(session: Session, place: str, asset: str) -> str:
-    """Return `sha256:<hex>` of an asset that a document names so, or by its name.
+class AssetNames:
+    """Turns what a document calls an asset into `sha256:<hex>`; asks the database once for each."""
 
-    Raises:
-        NotFoundError: there is no such asset, or it is of another kind than `place` needs.
-        ConflictError: several assets have this name.
-    """
-    row = session.get(AssetRow, _digest_of(session, place, asset))
-    if row is None:
-        raise NotFoundError(
-            f"`{place}` names {asset!r:.200}, which is no uploaded asset; upload the file, then name it as "
-            "sha256:..."
-        )
-    wanted = "map" if place == "lights.environment.map" else "mesh"
-    if row.format not in {each.name for each in BY_NAME.values() if each.kind == wanted}:
-        raise ConflictError(
-            f"`{place}` needs a {wanted} and {asset!r:.200} is a {row.kind}; name another asset."
-        )
-    return DIGEST_PREFIX + row.digest
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._rows: dict[str, AssetRow | None] = {}
+
+    def resolved(self, place: str, asset: str) -> str:
+        """Return the reference of the asset that a document names at `place`, by digest or by uploaded name.
+
+        Raises:
+            DeltalightError: there is no such asset, several have this name, or it is of another kind than `place`
+                needs.
+        """
+        if asset not in self._rows:
+            self._rows[asset] = self._session.get(AssetRow, _digest_of(self._session, place, asset))
+        row = self._rows[asset]
+        if row is None:
+            raise DeltalightError(
+                f"`{place}` names {asset!r:.200}, which is no uploaded asset; upload the file, then name it as "
+                "sha256:..."
+            )
+        if row.kind != _needed_kind(place):
+            raise DeltalightError(
+                f"`{place}` needs a {_needed_kind(place)} and {asset!r:.200} is a {row.kind}; name another asset."
+            )
+        return DIGEST_PREFIX + row.digest
+
+
+def _needed_kind(place: str) -> str:
+    if place == "lights.environment.map":
+        return "map"
+    return "precomputed" if place.endswith(".precomputed") else "mesh"
 
 
 def _digest_of(session: Session, place: str, asset: str) -> str:
@@ -230,7 +245,7 @@ def _digest_of(session: Session, place: str, asset: str) -> str:
     query = select(AssetNameRow.digest).where(AssetNameRow.name == asset).limit(2)
     digests = list(session.scalars(query))
     if len(digests) > 1:
-        raise ConflictError(
+        raise DeltalightError(
             f"`{place}` names {asset!r:.200} and several assets are called so; name one as {DIGEST_PREFIX}..."
         )
     return digests[0] if digests else ""

@@ -11,7 +11,7 @@ from sqlalchemy.orm import Session
 
 from protocol.documents import parse_mapping
 from protocol.scene import DIGEST_PREFIX, SceneDocument
-from services.storage.assets import resolve_asset
+from services.storage.assets import AssetNames
 from services.storage.database import Database
 from services.storage.documents import Edit, checked_document, require_revision
 from services.storage.faults import ConflictError, NotFoundError
@@ -136,12 +136,11 @@ class SceneStore:
             require_revision(expected, newest.number)
             current = _document(session, newest)
             edited = checked_document(edit(current.model_dump(mode="json")), newest.number)
-            document = edited.with_assets(lambda place, asset: resolve_asset(session, place, asset))
+            document = edited.with_assets(AssetNames(session).resolved)
             if document == current:
-                return _stored(session, scene, newest)
-            number = newest.number + 1
-            row = _row(scene_id, number, what, document.replaced(revision=number), newest.origin)
-            return _added(session, scene, row, document)
+                return _stored(session, scene, newest, current)
+            changed = document.replaced(revision=newest.number + 1)
+            return _added(session, scene, _row(scene_id, changed, what, newest.origin), changed)
 
     def undo(self, scene_id: str, expected: int | None = None) -> StoredScene:
         """Add a revision that shows what was before the last change.
@@ -223,11 +222,11 @@ class SceneStore:
 
     def _add(self, session: Session, document: Any, what: str) -> StoredScene:  # noqa: ANN401 - JSON
         checked = checked_document(document, FIRST_REVISION)
-        resolved = checked.with_assets(lambda place, asset: resolve_asset(session, place, asset))
+        resolved = checked.with_assets(AssetNames(session).resolved)
         scene = SceneRow(id=secrets.token_hex(8), created_ns=time.time_ns())
         session.add(scene)
         session.flush()
-        return _added(session, scene, _row(scene.id, FIRST_REVISION, what, resolved, None), resolved)
+        return _added(session, scene, _row(scene.id, resolved, what, None), resolved)
 
     def _step(
         self, scene_id: str, expected: int | None, step: Callable[[Session, RevisionRow], RevisionRow]
@@ -248,7 +247,7 @@ def _added(session: Session, scene: SceneRow, row: RevisionRow, document: SceneD
         if session.get(AssetUseRow, (digest, scene.id)) is None:
             session.add(AssetUseRow(digest=digest, scene_id=scene.id, number=row.number))
     session.flush()
-    return _stored(session, scene, row)
+    return _stored(session, scene, row, document)
 
 
 def _digests(document: SceneDocument) -> set[str]:
@@ -262,7 +261,8 @@ def _digests(document: SceneDocument) -> set[str]:
     return found
 
 
-def _row(scene_id: str, number: int, what: str, document: SceneDocument, before: int | None) -> RevisionRow:
+def _row(scene_id: str, document: SceneDocument, what: str, before: int | None) -> RevisionRow:
+    number = document.revision
     return RevisionRow(
         scene_id=scene_id,
         number=number,
@@ -325,10 +325,13 @@ def _head(scene: SceneRow, row: RevisionRow, active: str | None) -> SceneHead:
     return SceneHead(scene.id, row.name, row.number, scene.created_ns, row.at_ns, scene.id == active)
 
 
-def _stored(session: Session, scene: SceneRow, row: RevisionRow) -> StoredScene:
+def _stored(
+    session: Session, scene: SceneRow, row: RevisionRow, document: SceneDocument | None = None
+) -> StoredScene:
+    """Describe a scene at a revision, whose document need not be read where it is at hand."""
     return StoredScene(
         _head(scene, row, _active_id(session)),
-        _document(session, row),
+        document or _document(session, row),
         row.what,
         can_undo=_origin(session, row).before is not None,
         can_redo=row.redo is not None,
