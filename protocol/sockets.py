@@ -66,6 +66,6 @@ def attach(socket: zmq.Socket[bytes], endpoint: str, *, bind: bool, keys: Keys |
     except zmq.ZMQError as error:
         verb = "listen at" if bind else "connect to"
         raise DeltalightError(
-            f"cannot {verb} {endpoint} ({error.strerror}): choose another, or stop the program that holds it"
+            f"cannot {verb} {endpoint} ({zmq.strerror(error.errno or 0)}): choose another, or stop the program that holds it"
         ) from error
     return socket.get_string(zmq.LAST_ENDPOINT)

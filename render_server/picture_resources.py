@@ -12,6 +12,7 @@ from render_server.passes.inner_edges import InnerEdgesPass
 from render_server.passes.matte import MattePass
 from render_server.passes.picture import Picture
 from render_server.passes.real_surface import RealSurface
+from render_server.passes.rims import RimsPass
 from render_server.real_geometry import RealGeometry
 from render_server.relight.frame import GeometryState
 from render_server.scene.surfaces import DIFFUSE_BOX, MAX_SURFACES, SurfaceTable
@@ -33,6 +34,7 @@ class PictureResources:
         self._rectangle: Rectangle = 0, 0, 0, 0
         self._model_raster: GeometryBuffer | None = None
         self.matte = MattePass(gpu, size)
+        self._rims = RimsPass(gpu, self.picture)
         self._geometry = GeometryPass(gpu)
         self._gpu = gpu
         self._rastered: object = None
@@ -80,7 +82,9 @@ class PictureResources:
         self._raster.normal.use(location=7)
         self.picture.rays.use(location=15)
         rectangle = view.rectangle_around(virtual.points)
-        self.matte.run(self.picture, rectangle, {**view.uniforms(), "noise_sigma": noise_sigma})
+        uniforms = {**view.uniforms(), "noise_sigma": noise_sigma}
+        self.matte.run(self.picture, rectangle, uniforms)
+        self._rims.run(self.matte, uniforms)
 
     def _draw_samples(self, virtual: GeometryState, view: CameraView, noise_sigma: float) -> None:
         """The same of several samples a pixel."""
@@ -102,6 +106,7 @@ class PictureResources:
         self.virtual_raster.position.use(location=6)
         uniforms = {**view.with_antialiasing.uniforms(), "noise_sigma": noise_sigma}
         self.matte.run(self.picture, rectangle, uniforms, coverage.texture)
+        self._rims.run(self.matte, uniforms, coverage.texture)
 
     def with_inner_edges(self, radiance: moderngl.Texture) -> moderngl.Texture:
         """The objects' shaded radiance with the edges before each other antialiased; after `rasterise` with it."""
@@ -132,6 +137,7 @@ class PictureResources:
     def release(self) -> None:
         """Free the GL objects."""
         for item in (
+            self._rims,
             self.picture,
             self.real_surface,
             self._raster,

@@ -131,6 +131,8 @@ def run_node(config: NodeConfig, stop: threading.Event, keys: Keys | None = None
             stack.enter_context(announced(config.name, publisher.endpoint, STREAMS, keys))
         capture = stack.enter_context(CaptureThread(camera, keep_all=not config.realtime))
         _log.info("sensor node runs", publish=publisher.endpoint, source=config.source)
+        for note in camera.notes:
+            _log.info(note)
         _Node(config, camera, publisher, clock).run(capture, stop)
 
 

@@ -14,7 +14,7 @@ PROBE_TIMEOUT_S = 60
 MAXIMUM_DEVICES = 16
 PACKAGES = {
     "render": ("moderngl", "trimesh", "scipy", "OpenEXR"),
-    "api": ("fastapi", "uvicorn", "websockets"),
+    "api": ("fastapi", "uvicorn", "websockets", "sqlalchemy", "prometheus-client"),
 }
 
 NAMES_OF_KINDS = {"uvc": "USB (UVC)", "oak": "OAK", "openni2": "OpenNI 2", "orbbec": "Orbbec"}

@@ -24,6 +24,7 @@ layout(binding = 17) uniform sampler2D lobe_mu;
 layout(binding = 18) uniform sampler2D lobe_rho;
 layout(binding = 19) uniform sampler2D change_ratio;
 layout(binding = 20) uniform sampler2D reflection;    // of objects in smooth surfaces, by rays; a: share of the lobe
+layout(binding = 21) uniform sampler2D rims;          // rims.comp.glsl
 uniform bool has_reflection;
 uniform float exposure_scale;
 uniform float sample_distance;   // m at 1 m depth
@@ -157,18 +158,25 @@ uvec3 encode(vec3 x) {
 // ACES tone curve (Narkowicz's fit, 2015).
 vec3 aces(vec3 x) { return clamp(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 0.0, 1.0); }
 
+// The pixel that shows the surface which a pixel shows: another one at the rims of real things before objects.
+ivec2 surface_pixel(ivec2 pixel) {
+    int code = int(texelFetch(rims, pixel, 0).a) - 1, width = 2 * RIM_SIGHT + 1;
+    return code < 0 ? pixel : pixel + ivec2(code % width, code / width) - RIM_SIGHT;
+}
+
 void compose(ivec2 pixel) {
     uvec4 code = uvec4(texelFetch(picture, pixel, 0).rgb, 255u);
-    vec3 b = texelFetch(linear_picture, pixel, 0).rgb;
+    vec3 b = max(texelFetch(linear_picture, pixel, 0).rgb + texelFetch(rims, pixel, 0).rgb, vec3(0.0));
     vec3 result = b;
     bool changed = filmic;
-    vec4 position = texelFetch(real_surface_position, pixel, 0);
+    ivec2 at = surface_pixel(pixel);
+    vec4 position = texelFetch(real_surface_position, at, 0);
     float shown = texelFetch(matte, pixel, 0).r;
     bool relights = relights_real && shown < 1.0;
     if (relights && position.w > 0.0) {
-        vec4 normal = texelFetch(real_surface_normal, pixel, 0);
-        Change c = change_at(pixel, position, normal);
-        if (c.any_change) { result = relit(pixel, c, normal, b); changed = true; }
+        vec4 normal = texelFetch(real_surface_normal, at, 0);
+        Change c = change_at(at, position, normal);
+        if (c.any_change) { result = relit(at, c, normal, b); changed = true; }
     }
     if (relights && position.w <= 0.0) {
         vec3 ratio = surrounding_ratio(pixel, b);

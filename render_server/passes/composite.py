@@ -14,6 +14,7 @@ from render_server.passes.direct_light import DirectLightPass
 from render_server.passes.light_table import LightTable
 from render_server.passes.mirror_objects import RAY_ROUGHNESS
 from render_server.passes.picture import Picture
+from render_server.passes.rims import RIM_SIGHT
 from render_server.passes.sampling_grid import SamplingGrid
 from render_server.passes.trace_cones import ConeFields
 from render_server.passes.volume import Pyramid, VolumePlacement
@@ -44,7 +45,7 @@ class CompositePass:
         self._threads = list_threads(gpu, size[0] * size[1])
         self.code = texture_2d(gpu, size, 4, "u1")
         self.linear = texture_2d(gpu, size, 4, "f2")
-        defines = {"FILL_RADIUS": FILL_RADIUS, "RAY_ROUGHNESS": RAY_ROUGHNESS}
+        defines = {"FILL_RADIUS": FILL_RADIUS, "RIM_SIGHT": RIM_SIGHT, "RAY_ROUGHNESS": RAY_ROUGHNESS}
         self._program = ComputeProgram(gpu, Path(__file__).with_name("composite.comp.glsl"), defines)
 
     def run(self, picture: Picture, layers: RelitLayers, uniforms: dict[str, Any]) -> None:
@@ -60,7 +61,7 @@ class CompositePass:
             }
             | {9: layers.virtual_radiance, 10: direct.mu, 11: direct.rho, 12: cones.mu, 13: cones.rho}
             | {14: cones.specular_mu, 16: cones.specular_rho, 17: direct.lobe_mu, 18: direct.lobe_rho}
-            | {19: layers.change.ratio}
+            | {19: layers.change.ratio, 21: picture.rims}
         )
         self.code.write(picture.bytes, alignment=1)
         layers.change.texels.bind_to_storage_buffer(6)

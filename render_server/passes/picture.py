@@ -15,7 +15,11 @@ INVERSE_SIZE = 8192  # steps of the inverse response: a code is at least 16 of t
 
 
 class Picture:
-    """Code (RGBA8UI), linear radiance in camera units with levels (RGBA16F), response (256 x 1), pixel rays."""
+    """Code (RGBA8UI), linear radiance in camera units with levels (RGBA16F), response (256 x 1), pixel rays.
+
+    `rims` (RGBA16F, by passes/rims.py): what takes the old background out of a pixel's radiance at the rim of a real
+    thing before an object, and which pixel shows that thing's surface.
+    """
 
     def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
         self._ctx = gpu.ctx
@@ -27,6 +31,7 @@ class Picture:
         self.response = texture_2d(gpu, (256, 1), 4, "f4")
         self.inverse_response = texture_2d(gpu, (INVERSE_SIZE, 1), 4, "f4")
         self.rays = texture_2d(gpu, size, 2, "f4")
+        self.rims = texture_2d(gpu, size, 4, "f2")
         self.exposure_scale = 1.0
         self.bytes = b""
         self._program = ComputeProgram(gpu, Path(__file__).with_name("linearize.comp.glsl"))
@@ -67,7 +72,8 @@ class Picture:
 
     def release(self) -> None:
         """Free the GL objects."""
-        for item in (self.code, self.linear, self.response, self.inverse_response, self.rays, self._program):
+        textures = self.code, self.linear, self.response, self.inverse_response, self.rays, self.rims
+        for item in (*textures, self._program):
             item.release()
 
 

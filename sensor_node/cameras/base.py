@@ -1,6 +1,7 @@
 """The interface of every camera."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Literal, Self
@@ -46,7 +47,8 @@ class Camera(ABC):
     One thread uses a camera. `timestamp_ns` of a frame is when it was captured, by the camera's own clock;
     `capture_ns` is the same moment by this host's clock. `depth_scale` is metres for each step of the depth,
     None where it does not come in steps. A live camera may know these, and `camera`, only once it is open.
-    `exposure_is_measured` says that each frame's `exposure_s` is what the sensor did, not what was asked.
+    `exposure_is_measured` says that each frame's `exposure_s` is what the sensor did, not what was asked. `notes` are
+    sentences about missing optional parts and what is used instead, complete once it is open.
     """
 
     camera: CameraModel
@@ -54,6 +56,7 @@ class Camera(ABC):
     extrinsics: Extrinsics = Extrinsics()
     depth_scale: float | None = None
     exposure_is_measured: bool = False
+    notes: Sequence[str] = ()
 
     @abstractmethod
     def open(self) -> None:

@@ -151,6 +151,7 @@ class CameraWithFisheye(Camera):
         camera = self._camera
         self.camera, self.board, self.extrinsics = camera.camera, camera.board, camera.extrinsics
         self.depth_scale, self.exposure_is_measured = camera.depth_scale, camera.exposure_is_measured
+        self.notes = camera.notes
 
     def close(self) -> None:
         """Close both."""

@@ -160,7 +160,7 @@ class ReplayCamera(PacedCamera):
         super().__init__([times[index] for index in self._frames], realtime=realtime, loop=loop)
         self._source = source
         self.camera, self.board, self.extrinsics = source.camera, source.board, source.extrinsics
-        self.depth_scale = source.depth_scale
+        self.depth_scale, self.notes = source.depth_scale, source.notes
 
     def frame_at(self, index: int) -> SensorFrame:
         """Return the frame as recorded; its `frame_id` is that of the source."""

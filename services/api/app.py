@@ -13,6 +13,7 @@ from protocol.keys import Keys
 from services.api import assets, objects, parts, scenes, state
 from services.api.context import Context
 from services.api.gate import Gate, GateRules
+from services.api.metrics import Meter, Metrics
 from services.api.problems import Problems, describe_problems, responses
 from services.api.process_watch import ProcessWatch
 from services.api.render_link import RenderLink
@@ -55,21 +56,18 @@ class _App(FastAPI):
 def create_app(settings: ApiSettings, store: Store, keys: Keys | None = None) -> FastAPI:
     """The application; it speaks with the render server while it runs. The store stays the caller's."""
     problems = Problems()
-    context = Context(
-        store=store,
-        link=RenderLink(store, settings.control, keys),
-        watch=ProcessWatch(settings.subscribe, keys),
-        settings=settings,
-        problems=problems,
-    )
+    link = RenderLink(store, settings.control, keys)
+    watch = ProcessWatch(settings.subscribe, keys)
+    metrics = Metrics(problems, watch, link)
+    context = Context(store, link, watch, settings, problems, metrics)
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
-        context.link.start()
-        context.watch.start()
+        link.start()
+        watch.start()
         yield
-        await run_in_threadpool(context.watch.close)
-        await run_in_threadpool(context.link.close)
+        await run_in_threadpool(watch.close)
+        await run_in_threadpool(link.close)
 
     rules = GateRules(
         needs_token=settings.leaves_host,
@@ -86,7 +84,10 @@ def create_app(settings: ApiSettings, store: Store, keys: Keys | None = None) ->
         lifespan=lifespan,
         separate_input_output_schemas=False,
         generate_unique_id_function=lambda route: route.name,
-        middleware=[Middleware(Gate, rules=rules, tokens=store.tokens, problems=problems)],
+        middleware=[
+            Middleware(Meter, metrics=metrics),
+            Middleware(Gate, rules=rules, tokens=store.tokens, problems=problems),
+        ],
     )
     app.state.context = context
     problems.install(app)

@@ -7,6 +7,7 @@ from typing import Annotated
 
 from fastapi import Depends, Header, Request, Response
 
+from services.api.metrics import Metrics
 from services.api.models import SceneAnswer
 from services.api.problems import ProblemError, Problems
 from services.api.process_watch import ProcessWatch
@@ -27,6 +28,7 @@ class Context:
     watch: ProcessWatch
     settings: ApiSettings
     problems: Problems
+    metrics: Metrics
 
     def answer(self, scene: StoredScene, response: Response, *, changed: bool = False) -> SceneAnswer:
         """Describe a scene, with its revision as entity tag; after a change the render server gets it first."""

@@ -142,9 +142,9 @@ def describe_problems(schema: dict[str, Any]) -> dict[str, Any]:
     for path in schema["paths"].values():
         for operation in path.values():
             for status, response in operation.get("responses", {}).items():
-                content = response.get("content", {})
-                if status >= "400" and "application/json" in content:
-                    content[MEDIA_TYPE] = content.pop("application/json")
+                if status >= "400" and "content" in response:
+                    (described,) = response["content"].values()
+                    response["content"] = {MEDIA_TYPE: described}
     return schema
 
 

@@ -3,10 +3,12 @@
 from importlib.metadata import version
 from typing import Literal
 
-from fastapi import APIRouter
+from fastapi import APIRouter, Response
+from fastapi.responses import PlainTextResponse
 from pydantic import BaseModel, Field
 
 from services.api.context import Shared
+from services.api.metrics import MEDIA_TYPE
 from services.api.models import PictureState, ProcessAnswer
 from services.api.problems import responses
 
@@ -60,6 +62,12 @@ def state(shared: Shared) -> State:
         processes=[ProcessAnswer.of(report) for report in shared.watch.reports()],
         refused=dict(shared.problems.counts),
     )
+
+
+@router.get("/metrics", response_class=PlainTextResponse)
+def metrics(shared: Shared) -> Response:
+    """Measurements for Prometheus."""
+    return Response(shared.metrics.text(), media_type=MEDIA_TYPE)
 
 
 @router.get("/settings")

@@ -16,7 +16,7 @@ def config(
     config_file: ConfigFile = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print values and origins as JSON.")] = False,
 ) -> None:
-    """Print the settings of node, server and keys as a configuration file, with the origin of each value."""
+    """Print the settings of node, server, API and keys as a configuration file, with the origin of each value."""
     from services.settings import load_configuration
 
     configuration = load_configuration(config_file)
@@ -41,9 +41,10 @@ def _models() -> "dict[str, type[BaseModel]]":
     models: dict[str, type[BaseModel]] = {"node": NodeConfig, "keys": KeySettings}
     try:
         from render_server.server import ServerSettings
+        from services.api.settings import ApiSettings
     except ModuleNotFoundError:  # a host that only captures
         return models
-    return {"node": NodeConfig, "server": ServerSettings, "keys": KeySettings}
+    return {"node": NodeConfig, "server": ServerSettings, "api": ApiSettings, "keys": KeySettings}
 
 
 def _print_table(name: str, values: Mapping[str, Any], origins: Mapping[str, str]) -> None:

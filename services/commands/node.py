@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -97,6 +98,7 @@ def _print_lists(*, cameras: bool, nodes: bool, as_json: bool) -> None:
 
         found = discover()
         data["cameras"] = [camera.as_dict() for camera in found.cameras]
+        data["missing"] = [asdict(missing) for missing in found.missing]
         if not as_json:
             _print_cameras(found)
     if nodes:

@@ -35,8 +35,7 @@ def replay(
     from sensor_node.node import NodeConfig, run_node
     from services.settings import load_configuration
 
-    for note in open_source(source).notes:  # also refuses here what a node would take for a live camera
-        typer.echo(note, err=True)
+    open_source(source)  # refuses here what a node would take for a live camera
     given = {"source": str(source), "endpoint": publish, "name": name, "clock_endpoint": clock}
     settings: dict[str, object] = {key: value for key, value in given.items() if value is not None}
     # The light is what was recorded, whatever camera the configuration file names for it.

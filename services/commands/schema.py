@@ -13,6 +13,7 @@ class Document(StrEnum):
     SCENE = "scene"
     NODE = "node"
     SERVER = "server"
+    API = "api"
     VIEWER = "viewer"
 
 
@@ -39,6 +40,10 @@ def _schema(document: Document) -> dict[str, Any]:
             from render_server.server import ServerSettings
 
             return ServerSettings.model_json_schema()
+        case Document.API:
+            from services.api.settings import ApiSettings
+
+            return ApiSettings.model_json_schema()
         case Document.VIEWER:
             from services.viewer import ViewerSettings
 

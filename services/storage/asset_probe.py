@@ -95,6 +95,8 @@ def _main(path: str, kind: str, memory_bytes: str) -> None:
         facts = (_mesh_facts if kind == "mesh" else _map_facts)(Path(path))
     except DeltalightError as fault:
         facts = {"fault": str(fault)}
+    except ModuleNotFoundError as fault:
+        facts = {"fault": f"{path} cannot be checked without {fault.name}: pip install 'deltalight[render]'."}
     except MemoryError:
         facts = {"fault": f"{path} needs more than {int(memory_bytes) >> 20} MB to load; simplify it."}
     print(json.dumps(facts))

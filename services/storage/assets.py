@@ -9,7 +9,7 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import BoundedSemaphore
@@ -200,8 +200,9 @@ class AssetStore:
 
     def _remove_left_over(self) -> None:
         for path in self._incoming.iterdir():
-            if path.stat().st_mtime < time.time() - LEFT_OVER_AFTER_S:
-                path.unlink(missing_ok=True)
+            with suppress(FileNotFoundError):  # another process has finished its upload meanwhile
+                if path.stat().st_mtime < time.time() - LEFT_OVER_AFTER_S:
+                    path.unlink()
 
 
 class AssetNames:

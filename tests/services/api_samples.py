@@ -14,7 +14,7 @@ from protocol.transport import ReplyServer
 from render_server.session import RenderSession
 from services import ports
 from services.api.app import create_app
-from services.api.serve import http_server
+from services.api.serve import http_server, listening
 from services.api.settings import ApiSettings
 from services.storage.assets import Probe
 from services.storage.store import Store
@@ -65,7 +65,7 @@ def running_api(
     with Store(folder, probe=probe) as store:
         app = create_app(chosen, store)
         server = http_server(app)
-        listener = ports.listen(port)
+        listener = listening(ports.LOOPBACK, port)
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
         thread.start()
         while not server.started:

@@ -239,6 +239,18 @@ def test_a_change_reaches_the_render_server_before_its_answer(api: RunningApi) -
     assert ALIVE_TIMEOUT_S < 2
 
 
+def test_requests_and_refusals_are_measured(client: httpx.Client) -> None:
+    address = f"/scenes/{make(client)['id']}"
+    client.get(address).raise_for_status()
+    sentence(client.patch(address, json={"metod": 1}), 422)
+    lines = client.get("/metrics").text.splitlines()
+    assert any('requests_total{operation="get_scene",status="200"}' in line for line in lines)
+    assert any('requests_total{operation="patch_scene",status="422"}' in line for line in lines)
+    assert any(line.startswith('deltalight_api_refused_total{kind="invalid"}') for line in lines)
+    assert any(line.startswith("deltalight_render_server_answers") for line in lines)
+    assert not any(address in line for line in lines)  # each scene of its own would be endless labels
+
+
 def _view_request() -> object:
     from tests.services.test_session import request
 

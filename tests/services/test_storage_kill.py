@@ -14,7 +14,9 @@ from services.storage.store import Store
 from tests.services.storage_samples import TETRAHEDRON, trusting_probe, upload
 
 CYCLES = 50
-LONGEST_LIFE_S = 0.06
+MOST_AWAITED = 8
+# About what a change takes, so that the kill falls at any point of one.
+LONGEST_DELAY_S = 0.02
 # Makes a revision some 30 kB, so that the log is moved into the database several times during the test.
 LAMPS = [{"type": "sphere", "position_m": [0, 0, 1 + index / 100]} for index in range(64)]
 
@@ -33,19 +35,20 @@ def write_until_killed(folder: Path, acknowledge: Connection, seed: int) -> None
             if number % 3 == 0:
                 scene = store.scenes.undo(scene_id)
                 acknowledge.send((scene_id, scene.document.revision, scene.document.name))
-            if number % 4 == 0:
+            if number % 2 == 0:
                 asset = upload(store, TETRAHEDRON + f"# {name}\n".encode(), f"{name}.obj")
                 acknowledge.send((asset.digest,))
 
 
 def run_and_kill(context: multiprocessing.context.ForkServerContext, folder: Path, seed: int) -> list[tuple]:
-    """Kills a writing process at a random moment; returns what it had acknowledged."""
+    """Kills a writing process at a random moment of its work; returns what it had acknowledged."""
+    choice = random.Random(seed)
     receiver, sender = context.Pipe(duplex=False)
     process = context.Process(target=write_until_killed, args=(folder, sender, seed))
     process.start()
     sender.close()
-    acknowledged = [receiver.recv()]
-    time.sleep(random.Random(seed).uniform(0, LONGEST_LIFE_S))
+    acknowledged = [receiver.recv() for _ in range(choice.randint(1, MOST_AWAITED))]
+    time.sleep(choice.uniform(0, LONGEST_DELAY_S))
     assert process.pid is not None
     os.kill(process.pid, signal.SIGKILL)
     process.join()
@@ -82,5 +85,4 @@ def test_nothing_acknowledged_is_lost_by_kill_9(tmp_path: Path) -> None:
         for asset in store.assets.all():
             assert store.assets.path(asset).stat().st_size == asset.size_bytes
         assert {asset.digest for asset in store.assets.all()} >= set(digests)
-    assert len(revisions) > 2 * CYCLES  # the processes did live long enough to be caught at work
-    assert len(digests) > 0
+    assert len(digests) > 0  # the processes did live long enough to be caught at all of their work

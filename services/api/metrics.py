@@ -1,0 +1,120 @@
+"""Measurements for Prometheus: requests of this service, and what the processes report."""
+
+import time
+from collections.abc import Iterable
+from typing import Protocol
+
+from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.registry import Collector
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from services.api.problems import Problems
+from services.api.process_watch import ProcessWatch
+
+MEDIA_TYPE = "text/plain; version=0.0.4; charset=utf-8"
+# From a read out of the cache to a mesh that takes the time limit of its check.
+_SECONDS = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 5, 20, 60)
+NO_OPERATION = "none"  # refused before a route was found
+
+
+class Reachable(Protocol):
+    """What says whether the render server answers."""
+
+    @property
+    def is_reachable(self) -> bool:
+        """Whether it does."""
+
+
+class Metrics:
+    """The measurements of one application."""
+
+    def __init__(self, problems: Problems, watch: ProcessWatch, link: Reachable) -> None:
+        self._registry = CollectorRegistry()
+        self._requests = Counter(
+            "deltalight_api_requests", "Requests answered.", ("operation", "status"), registry=self._registry
+        )
+        self._seconds = Histogram(
+            "deltalight_api_request_seconds",
+            "Time from a request's head to the end of its answer, seconds.",
+            ("operation",),
+            buckets=_SECONDS,
+            registry=self._registry,
+        )
+        self._registry.register(_Reported(problems, watch, link))
+
+    def note(self, scope: Scope, status: int, seconds: float) -> None:
+        """Count a request that was answered."""
+        # Not by address: those would be endless labels.
+        operation = getattr(scope.get("route"), "name", NO_OPERATION)
+        self._requests.labels(operation, status).inc()
+        self._seconds.labels(operation).observe(seconds)
+
+    def text(self) -> bytes:
+        """All measurements as Prometheus reads them."""
+        return generate_latest(self._registry)
+
+
+class Meter:
+    """Middleware that measures every request, refused ones too."""
+
+    def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
+        self._app = app
+        self._metrics = metrics
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a request on and note how it ended."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        began_s, status = time.perf_counter(), 500
+
+        async def noting(message: Message) -> None:
+            nonlocal status
+            if message["type"] == "http.response.start":
+                status = message["status"]
+            await send(message)
+
+        try:
+            await self._app(scope, receive, noting)
+        finally:
+            self._metrics.note(scope, status, time.perf_counter() - began_s)
+
+
+class _Reported(Collector):
+    """What others count, read when Prometheus asks."""
+
+    def __init__(self, problems: Problems, watch: ProcessWatch, link: Reachable) -> None:
+        self._problems = problems
+        self._watch = watch
+        self._link = link
+
+    def collect(self) -> Iterable[Metric]:
+        """Give all families."""
+        refused = CounterMetricFamily(
+            "deltalight_api_refused", "Requests refused, by kind of problem.", labels=["kind"]
+        )
+        for kind, count in self._problems.counts.copy().items():
+            refused.add_metric([kind], count)
+        answers = GaugeMetricFamily("deltalight_render_server_answers", "1 = the render server answers.")
+        answers.add_metric([], float(self._link.is_reachable))
+        return [refused, answers, *self._processes()]
+
+    def _processes(self) -> Iterable[Metric]:
+        age = GaugeMetricFamily(
+            "deltalight_process_report_age_seconds", "Age of a process's newest report.", labels=["process"]
+        )
+        rate = GaugeMetricFamily(
+            "deltalight_process_rate", "Rates that a process reports, 1/s.", labels=["process", "rate"]
+        )
+        drops = CounterMetricFamily(
+            "deltalight_process_drops", "What a process lost, by cause.", labels=["process", "cause"]
+        )
+        for report in self._watch.reports():
+            process = report.message.node
+            age.add_metric([process], report.age_s)
+            for name, value in report.message.rates.items():
+                rate.add_metric([process, name], value)
+            for cause, count in report.message.drops.items():
+                drops.add_metric([process, cause], count)
+        return [age, rate, drops]
