@@ -205,3 +205,8 @@ class RealScene(StrictModel):
     surfaces: tuple[Surface, ...] = Field(
         default=(), max_length=16, description="First match wins; the rest is diffuse."
     )
+    unseen_albedo: Annotated[float, Field(ge=0, le=0.95)] | None = Field(
+        default=None,
+        description="Albedo of surfaces of a model or of fused depth that the camera does not see now; null = as it "
+        "saw them before, else as their surroundings. A number makes each picture independent of earlier ones.",
+    )

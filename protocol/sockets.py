@@ -65,7 +65,8 @@ def attach(socket: zmq.Socket[bytes], endpoint: str, *, bind: bool, keys: Keys |
         (socket.bind if bind else socket.connect)(parts.address)
     except zmq.ZMQError as error:
         verb = "listen at" if bind else "connect to"
+        reason = zmq.strerror(error.errno or 0)  # the error's own words would name the endpoint again
         raise DeltalightError(
-            f"cannot {verb} {endpoint} ({zmq.strerror(error.errno or 0)}): choose another, or stop the program that holds it"
+            f"cannot {verb} {endpoint} ({reason}): choose another, or stop the program that holds it"
         ) from error
     return socket.get_string(zmq.LAST_ENDPOINT)

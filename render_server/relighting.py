@@ -94,7 +94,7 @@ class Relighting:
             if self._real is not None:
                 self._real.release()
             self._real = real
-            self._albedo.forget()
+            self._albedo.begin(plan.scene.real.unseen_albedo)
         if plan.method != old.method and self._method is not None:
             self._method.release()
             self._method = None

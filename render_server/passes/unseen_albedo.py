@@ -16,11 +16,11 @@ class UnseenAlbedo:
     def __init__(self, gpu: GpuContext) -> None:
         self._gpu = gpu
         self._texture: moderngl.Texture3D | None = None
-        self.clear()
+        self.clear(MEAN_ALBEDO)
 
-    def clear(self) -> None:
-        """Forget everything."""
-        self._replace(np.full((1, 1, 1, 3), MEAN_ALBEDO, np.float32))
+    def clear(self, albedo: float) -> None:
+        """Take the same albedo everywhere."""
+        self._replace(np.full((1, 1, 1, 3), albedo, np.float32))
         self._cube = (0.0, 0.0, 0.0, 1.0)
 
     def upload(self, memory: AlbedoMemory) -> None:

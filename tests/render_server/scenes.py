@@ -156,12 +156,12 @@ class Stage:
         real: trimesh.Trimesh | None = None,
         **method: object,
     ) -> SceneDocument:
-        """`real`: the given model; None: the depth of each frame. Nothing but the lights shines."""
+        """`real`: the given model; None: the depth of each frame. Nothing but the lights shines, nothing is learnt."""
         geometry: Any = "depth" if real is None else {"model": self.asset(real)}
         settings = {"volume_size": 32, "volume_edge_m": 0.6, "cone_scale": 1, "rsm_size": 256, **method}
         return parse_scene(
             {
-                "real": {"geometry": geometry},
+                "real": {"geometry": geometry, "unseen_albedo": 0.5},
                 "objects": objects,
                 "lights": {"manual": lights, "surroundings": "none"},
                 "method": settings,

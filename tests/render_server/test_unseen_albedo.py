@@ -32,9 +32,10 @@ BESIDE = look_at((-0.33, -0.3, 0.9), (-0.12, 0, 0))  # sees the wall's back and 
 def room(stage: Stage) -> SceneDocument:
     wall = shifted(trimesh.creation.box((0.02, 1.2, 0.5)), FRONT - 0.01, 0, 0.25)
     white = stage.virtual(cube(0.1, (-0.12, 0, 0)), (0.8, 0.8, 0.8))
-    return stage.document(
+    document = stage.document(
         [white], [directional((-0.9, 0.1, -0.5))], trimesh.util.concatenate([floor(1.0), wall])
     )
+    return document.replaced(real=document.real.model_copy(update={"unseen_albedo": None}))
 
 
 def red_wall(pose: BoardPose) -> np.ndarray:
@@ -69,6 +70,8 @@ def test_a_wall_out_of_sight_keeps_its_colour(gpu: GpuContext, tmp_path: Path) -
     now = frame(plain(120), pose=BESIDE, timestamp_ns=2_000_000_000, frame_id=1)
     assert redness(gpu, scene, [now]) == pytest.approx(1, abs=0.02)
     assert redness(gpu, scene, [before, now]) > 1.05
+    given = scene.replaced(real=scene.real.model_copy(update={"unseen_albedo": 0.5}))
+    assert redness(gpu, given, [before, now]) == pytest.approx(1, abs=0.02)
 
 
 @pytest.mark.usefixtures("clean_gl")
