@@ -99,7 +99,18 @@ class CameraView:
         The whole picture if one of them lies behind the camera; none (0, 0) if all lie beside the picture.
         """
         seen = self._in_camera(points)
-        return _rectangle(self.camera.project(seen) if seen is not None else None, self.size)
+        if seen is None:
+            return _rectangle(None, self.size)
+        # Far beside the picture a lens model may fold back into it.
+        low, high = self._ray_bounds
+        rays = np.clip(seen[:, :2] / seen[:, 2:], low, high)
+        return _rectangle(self.camera.project(np.column_stack([rays, np.ones(len(rays))])), self.size)
+
+    @cached_property
+    def _ray_bounds(self) -> tuple[Float64[np.ndarray, "2"], Float64[np.ndarray, "2"]]:
+        """Least and greatest (x/z, y/z) that the picture shows, two pixels wider."""
+        rays, margin = self.camera.rays().reshape(-1, 2), 2 / self.camera.matrix[[0, 1], [0, 1]]
+        return rays.min(axis=0) - margin, rays.max(axis=0) + margin
 
     def raster_rectangle_around(self, points: Float64[np.ndarray, "n 3"]) -> Rectangle:
         """The same of the raster's texels."""

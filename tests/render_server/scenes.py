@@ -156,7 +156,7 @@ class Stage:
         real: trimesh.Trimesh | None = None,
         **method: object,
     ) -> SceneDocument:
-        """`real`: the given model; None: the depth of each frame. Nothing but the lights shines, nothing is learnt."""
+        """`real`: the given model; None: the depth of each frame. Only the lights shine, nothing is learnt."""
         geometry: Any = "depth" if real is None else {"model": self.asset(real)}
         settings = {"volume_size": 32, "volume_edge_m": 0.6, "cone_scale": 1, "rsm_size": 256, **method}
         return parse_scene(

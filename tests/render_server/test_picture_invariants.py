@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from protocol.scene_method import NoneMethod
 from protocol.scene_objects import Pose
@@ -237,6 +238,16 @@ def test_camera_that_moves_and_returns_leaves_no_trace(gpu: GpuContext, stage: S
     renderer.release()
     assert np.array_equal(moved, composite(gpu, document, aside))
     assert np.array_equal(first, back)
+
+
+def test_an_object_wider_than_a_bent_lens_sees_is_there(gpu: GpuContext, stage: Stage) -> None:
+    """Far beside the picture, barrel distortion would fold its corners back into it."""
+    sheet = stage.virtual(shifted(trimesh.creation.box((2, 2, 0.002)), 0, 0, 0.02), (0.8, 0.1, 0.1))
+    document = stage.document([sheet], [directional()], floor())
+    bent = replace(frame().camera, distortion=np.array([-0.3, 0.0, 0.0, 0.0, 0.0]))
+    above = look_at((0, 0, 0.8), (0, 0, 0))
+    shown = composite(gpu, document, frame(pose=above, camera=bent))
+    assert (shown != plain()).any(axis=-1).all()
 
 
 def test_lens_distortion_moves_the_object_not_the_picture(gpu: GpuContext, stage: Stage) -> None:

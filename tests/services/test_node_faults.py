@@ -98,6 +98,21 @@ def test_a_source_that_breaks_in_the_middle_says_where_and_one_that_ends_is_no_f
     assert_sentence(cli("node", "--source", broken, "--publish", endpoint), picture.name)
 
 
+def test_a_node_tells_its_state_and_what_its_source_lacks(take: Path, endpoint: str, tmp_path: Path) -> None:
+    import shutil
+
+    unlit = tmp_path / "unlit"
+    shutil.copytree(take, unlit)
+    (unlit / "fisheye.txt").write_text("0.0 rgb/000000.png 0.1\n")
+    with node_process("--source", str(unlit), "--publish", endpoint, "--loop") as process:
+        assert process.stderr is not None
+        said: list[str] = []
+        while "live" not in "".join(said[-1:]):
+            said.append(process.stderr.readline())
+            assert said[-1], "the node ended"
+    assert any(line.rstrip().endswith("no calibration/fisheye.yaml; they are not used.") for line in said)
+
+
 def test_wrong_settings_are_told_before_anything_starts(cli: RunCli, tmp_path: Path) -> None:
     wrong = tmp_path / "deltalight.toml"
     wrong.write_text("[node]\nsuorce = 'x'\n")
