@@ -2,6 +2,7 @@
 
 import json
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from jaxtyping import Float32
 
+from protocol.errors import DeltalightError
 from protocol.frames import BoardPose, ViewFrame, decode_lut
 from protocol.radiance_files import require_openexr, write_exr
 from protocol.scene import SceneDocument
@@ -123,6 +125,8 @@ def _render_frames(
     warnings: list[str] | None = None
     for number in job.frames:
         frame = builder(job.source[number])
+        if number == job.frames.start:
+            _require_light(job.scene, frame, builder.notes)
         started_s = time.perf_counter()
         composite = renderer.render(frame)
         summary.add(composite, 1000 * (time.perf_counter() - started_s))
@@ -135,6 +139,16 @@ def _render_frames(
         _write_frame(job, number, frame, composite)
         progress.frame_done()
     return summary
+
+
+def _require_light(scene: SceneDocument, frame: ViewFrame, notes: Sequence[str]) -> None:
+    """Refuse a source without fish-eye light for a scene that wants it; the first pictures hold for all before."""
+    if scene.lights.mode == "fisheye" and frame.radiance_map is None and frame.pose is not None:
+        reason = "".join(f" ({note.rstrip('.')})" for note in notes)
+        raise DeltalightError(
+            f"the scene's light is the fish-eye camera's but the source shows none{reason}; give fisheye.txt with "
+            "its pictures and calibration, or another lights.mode."
+        )
 
 
 def _write_frame(job: RenderJob, number: int, frame: ViewFrame, composite: "CompositeFrame") -> None:

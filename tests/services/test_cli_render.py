@@ -256,6 +256,14 @@ def test_broken_scenes_are_sentences(
     assert not list(out.glob("*"))
 
 
+def test_fish_eye_light_that_the_source_lacks_is_a_sentence(cli: RunCli, take: Path, tmp_path: Path) -> None:
+    scene = write_scene(tmp_path / "scene.json", lights={"mode": "fisheye"})
+    shutil.copy(take / "box.glb", tmp_path)
+    done = cli("render", str(take / "take"), "--scene", str(scene), "--out", str(tmp_path / "out"))
+    assert_refused(done, "the source shows none")
+    assert list((tmp_path / "out").glob("*.png")) == []
+
+
 def triangles(vertices: list[list[float]]) -> str:
     lines = [f"v {x} {y} {z}" for x, y, z in vertices]
     return "\n".join([*lines, *(["f 1 2 3"] if vertices else [])]) + "\n"
