@@ -1,32 +1,16 @@
-"""Receiver of streams: a thread that owns the SUB socket and keeps the newest message of each topic."""
+"""Receiver of streams: keeps the newest message of each topic."""
 
-import threading
-import time
 from collections import Counter
 from collections.abc import Sequence
 
-import zmq
-
-from protocol.curve import guard
 from protocol.envelope import MAX_PARTS, MAX_TOPIC_BYTES
-from protocol.errors import DeltalightError
 from protocol.keys import Keys
-from protocol.sockets import attach, open_socket
+from protocol.subscriber import ReceivedMultipart, Subscriber
 
 MAX_TOPICS = 256
 
 
-class ReceivedMultipart(list[memoryview]):
-    """Pieces of one message, [topic, header, part...], and when it arrived."""
-
-    received_ns: int
-
-    def __init__(self, pieces: Sequence[memoryview], received_ns: int) -> None:
-        super().__init__(pieces)
-        self.received_ns = received_ns
-
-
-class Receiver:
+class Receiver(Subscriber):
     """Mailbox with one slot for each topic: the newest message wins, and each never taken is counted.
 
     The thread empties the socket at once: a slow consumer meets new frames and not a queue of old ones.
@@ -47,37 +31,22 @@ class Receiver:
         self._drops: Counter[str] = Counter()
         self._refused = 0
         self._seen: set[str] = set()
-        self._fresh = threading.Condition()
-        self._closed = False
-        self._context = zmq.Context()
-        self._socket = open_socket(self._context, zmq.SUB)
-        self._guard = guard(self._context, self._socket, keys, bind=bind)
-        for topic in self._topics or ("",):
-            self._socket.subscribe(topic)
-        try:
-            self.endpoints = tuple(attach(self._socket, each, bind=bind, keys=keys) for each in endpoints)
-        except DeltalightError:
-            if self._guard is not None:
-                self._guard.close()
-            self._context.destroy(0)
-            raise
-        self._thread = threading.Thread(target=self._run, name="receiver", daemon=True)
-        self._thread.start()
+        super().__init__(endpoints, self._topics or ("",), bind=bind, keys=keys)
 
     def latest(self, timeout_s: float) -> dict[str, ReceivedMultipart] | None:
         """Newest message of every topic that has one not taken yet, by topic; taking empties the slots.
 
         Waits until there is one; None after `timeout_s` seconds without any, or when the receiver is closed.
         """
-        with self._fresh:
-            self._fresh.wait_for(lambda: self._slots or self._closed, timeout_s)
+        with self._changed:
+            self._changed.wait_for(lambda: self._slots or self._closed, timeout_s)
             taken, self._slots = self._slots, {}
         return taken or None
 
     @property
     def drops(self) -> dict[str, int]:
         """Messages of each topic that a newer one replaced before they were taken."""
-        with self._fresh:
+        with self._changed:
             return dict(self._drops)
 
     @property
@@ -85,36 +54,16 @@ class Receiver:
         """Messages thrown away because they had no readable topic, too many parts, or one topic too many."""
         return self._refused
 
-    def close(self) -> None:
-        """Stop the thread and wake whoever waits."""
-        if self._guard is not None:
-            self._guard.close()
-        self._context.term()  # interrupts the thread, which closes its own socket
-        self._thread.join()
-
-    def _run(self) -> None:
-        try:
-            while True:
-                frames = self._socket.recv_multipart(copy=False)
-                self._store(ReceivedMultipart([frame.buffer for frame in frames], time.time_ns()))
-        except zmq.ContextTerminated:
-            pass
-        finally:
-            self._socket.close(0)
-            with self._fresh:
-                self._closed = True
-                self._fresh.notify_all()
-
     def _store(self, message: ReceivedMultipart) -> None:
         topic = bytes(message[0][: MAX_TOPIC_BYTES + 1]).decode("ascii", errors="replace")
         if not self._accepts(topic, len(message)):
             self._refused += 1
             return
-        with self._fresh:
+        with self._changed:
             if topic in self._slots:
                 self._drops[topic] += 1
             self._slots[topic] = message
-            self._fresh.notify()
+            self._changed.notify()
 
     def _accepts(self, topic: str, pieces: int) -> bool:
         """Whether a message is wanted: subscriptions are prefixes, so `color.a` also brings `color.ab`."""

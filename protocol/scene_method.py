@@ -14,6 +14,21 @@ NEEDS_NAME = ConfigDict(json_schema_extra={"required": ["name"]})
 PictureSize = Annotated[int, Field(ge=16, le=8192)]
 
 
+VolumeEdge = Annotated[
+    Annotated[float, Field(ge=0.01, le=20)] | None,
+    Field(description="Edge of the volume, metres; null = twice the objects' longest edge."),
+]
+ShadowMapSize = Annotated[
+    Annotated[int, Field(ge=128, le=4096)] | None,
+    Field(description="Texels an edge of a shadow map; null = 1024 GPU, 512 software."),
+]
+TriangleBudget = Annotated[
+    Annotated[int, Field(ge=1000, le=4_000_000)] | None,
+    Field(description="Triangles of the depth mesh; null = 400000 on a GPU, 40000 in software."),
+]
+ShadowSamples = Annotated[int, Field(ge=1, le=64, description="Samples of a light's area for soft shadows.")]
+
+
 class DvctMethod(StrictModel):
     """Delta voxel cone tracing (METHOD 4)."""
 
@@ -28,12 +43,7 @@ class DvctMethod(StrictModel):
         multiple_of=8,
         description="Voxels an edge; null = 256 on a GPU, 64 in software.",
     )
-    volume_edge_m: float | None = Field(
-        default=None,
-        ge=0.01,
-        le=20,
-        description="Edge of the volume, metres; null = twice the objects' longest edge.",
-    )
+    volume_edge_m: VolumeEdge = None
     cone_scale: Literal[1, 2, 4] | None = Field(
         default=None,
         description="Cones are traced at 1/scale of the picture; null = 2 on a GPU, 4 in software.",
@@ -46,18 +56,8 @@ class DvctMethod(StrictModel):
         description="Gathers of light from voxel to voxel, after the light that the camera measured and the lights' "
         "own; 0 = direct and unoccluded ambient only (exact operator).",
     )
-    rsm_size: int | None = Field(
-        default=None,
-        ge=128,
-        le=4096,
-        description="Texels an edge of a shadow map; null = 1024 GPU, 512 software.",
-    )
-    triangle_budget: int | None = Field(
-        default=None,
-        ge=1000,
-        le=4_000_000,
-        description="Triangles of the depth mesh; null = 400000 on a GPU, 40000 in software.",
-    )
+    rsm_size: ShadowMapSize = None
+    triangle_budget: TriangleBudget = None
     voxels: Literal["directional", "isotropic"] = Field(
         default="directional",
         description="Of the exact operator: six one-sided directions a voxel, or one for all (as in the paper).",
@@ -81,9 +81,7 @@ class DvctMethod(StrictModel):
         default=None,
         description="Shadows from shadow maps, or from shadow cones; null = map for exact, cone for paper.",
     )
-    shadow_samples: int = Field(
-        default=16, ge=1, le=64, description="Samples of a light's area for soft shadows."
-    )
+    shadow_samples: ShadowSamples = 16
     composition: Literal["ratio", "additive"] | None = Field(
         default=None,
         description="How the delta meets the picture; null = ratio for exact, additive for paper.",
@@ -124,12 +122,7 @@ class DlpvMethod(StrictModel):
         multiple_of=8,
         description="Cells an edge; more make it costlier, not better.",
     )
-    volume_edge_m: float | None = Field(
-        default=None,
-        ge=0.01,
-        le=20,
-        description="Edge of the volume, metres; null = twice the objects' longest edge.",
-    )
+    volume_edge_m: VolumeEdge = None
     steps: int | None = Field(
         default=None,
         ge=1,
@@ -165,21 +158,9 @@ class DlpvMethod(StrictModel):
         default=None,
         description="The volume is read at 1/scale of the picture; null = 2 on a GPU, 4 in software.",
     )
-    rsm_size: int | None = Field(
-        default=None,
-        ge=128,
-        le=4096,
-        description="Texels an edge of a shadow map; null = 1024 GPU, 512 software.",
-    )
-    triangle_budget: int | None = Field(
-        default=None,
-        ge=1000,
-        le=4_000_000,
-        description="Triangles of the depth mesh; null = 400000 on a GPU, 40000 in software.",
-    )
-    shadow_samples: int = Field(
-        default=16, ge=1, le=64, description="Samples of a light's area for soft shadows."
-    )
+    rsm_size: ShadowMapSize = None
+    triangle_budget: TriangleBudget = None
+    shadow_samples: ShadowSamples = 16
     composition: Literal["ratio", "additive"] | None = Field(
         default=None,
         description="How the delta meets the picture; null = ratio, additive for paper.",

@@ -1,24 +1,17 @@
-"""Receiver for whoever wants every message: a thread that owns the SUB socket, and a bounded queue."""
+"""Receiver for whoever wants every message: a bounded queue."""
 
-import threading
-import time
 from collections import Counter, deque
 from collections.abc import Sequence
 
-import zmq
-
-from protocol.curve import guard
 from protocol.envelope import MAX_PARTS, MAX_TOPIC_BYTES
-from protocol.errors import DeltalightError
 from protocol.keys import Keys
-from protocol.sockets import attach, open_socket
-from protocol.transport import ReceivedMultipart
+from protocol.subscriber import ReceivedMultipart, Subscriber
 
 QUEUED_MESSAGES = 64  # of each topic: two seconds at 30 a second, which covers a disk that hesitates
 QUEUED_BYTES = 512 * 1024 * 1024  # of all topics together, where pictures are large and raw
 
 
-class StreamQueue:
+class StreamQueue(Subscriber):
     """Messages in the order of their arrival; what comes while the queue is full is left out and counted.
 
     It is the counterpart of `protocol.receiver.Receiver`, whose newest message wins. `topics` are stream names
@@ -33,21 +26,8 @@ class StreamQueue:
         self._held: Counter[str] = Counter()
         self._held_bytes = 0
         self._drops: Counter[str] = Counter()
-        self._changed = threading.Condition()
-        self._closed = False
-        self._context = zmq.Context()
-        self._socket = open_socket(self._context, zmq.SUB, high_water_mark=QUEUED_MESSAGES)
-        self._guard = guard(self._context, self._socket, keys, bind=False)
-        for topic in topics:
-            self._socket.subscribe(topic + ".")
-        try:
-            attach(self._socket, endpoint, bind=False, keys=keys)
-        except DeltalightError:
-            self._close_guard()
-            self._context.destroy(0)
-            raise
-        self._thread = threading.Thread(target=self._run, name="stream-queue", daemon=True)
-        self._thread.start()
+        subscriptions = [topic + "." for topic in topics]
+        super().__init__([endpoint], subscriptions, keys=keys, high_water_mark=QUEUED_MESSAGES)
 
     def take(self, timeout_s: float) -> ReceivedMultipart | None:
         """Return the oldest message; None where none came within `timeout_s` seconds."""
@@ -65,29 +45,6 @@ class StreamQueue:
         """Messages of each stream that found the queue full."""
         with self._changed:
             return dict(self._drops)
-
-    def close(self) -> None:
-        """Stop the thread; what is queued can still be taken."""
-        self._close_guard()
-        self._context.term()  # interrupts the thread, which closes its own socket
-        self._thread.join()
-
-    def _close_guard(self) -> None:
-        if self._guard is not None:
-            self._guard.close()
-
-    def _run(self) -> None:
-        try:
-            while True:
-                frames = self._socket.recv_multipart(copy=False)
-                self._store(ReceivedMultipart([frame.buffer for frame in frames], time.time_ns()))
-        except zmq.ContextTerminated:
-            pass
-        finally:
-            self._socket.close(0)
-            with self._changed:
-                self._closed = True
-                self._changed.notify_all()
 
     def _store(self, message: ReceivedMultipart) -> None:
         if len(message) > MAX_PARTS + 2 or len(message[0]) > MAX_TOPIC_BYTES:
