@@ -101,12 +101,13 @@ class FisheyeTrack:
         self._kept: tuple[int, FisheyePictures] | None = None
 
     def at(self, time_ns: int) -> FisheyePictures | None:
-        """Return the newest pictures recorded up to a log time that are whole, None without.
+        """Return the newest whole pictures recorded up to a log time; before the first, the first (FORMATS 1).
 
         Raises:
             DeltalightError: a group was written by something else than `fisheye_messages`.
         """
-        while index := bisect_right(self._times, time_ns):
+        while self._times:
+            index = max(bisect_right(self._times, time_ns), 1)
             start = self._times[index - 1]
             if self._kept is None or self._kept[0] != start:
                 pictures = self._decode(start)

@@ -129,7 +129,7 @@ class RecordingReader:
             depth_timestamp_ns=None if record.depth is None else record.depth.timestamp_ns,
             world_from_camera=None if pose is None else np.array(pose).reshape(4, 4),
             color_jpeg=data if is_jpeg(data) else None,
-            fisheye=None if record.fisheye_ns is None else self._fisheye.at(record.timestamp_ns),
+            fisheye=self._fisheye.at(record.timestamp_ns),
         )
 
     def _camera(self, record: FrameRecord) -> CameraModel:

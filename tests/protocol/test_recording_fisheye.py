@@ -67,12 +67,11 @@ def test_pictures_come_back_to_the_bit_and_are_written_once(tmp_path: Path) -> N
     record(tmp_path / "a.mcap", made)
     source = RecordingReader(tmp_path / "a.mcap")
     read = [frame.fisheye for frame in source]
-    for ours, frame in zip(read, made, strict=True):
+    for ours, frame in zip(read[1:], made[1:], strict=True):
         assert_same_pictures(ours, frame.fisheye)
-    assert read[1] is read[2]
+    assert read[0] is read[1] is read[2]  # before the first, the first holds
     assert read[3] is read[4]
     assert_same_pictures(source[2].fisheye, first)  # going back finds the earlier ones again
-    assert_same_pictures(source[0].fisheye, None)
     with (tmp_path / "a.mcap").open("rb") as file:
         topics = [channel.topic for _, channel, _ in make_reader(file).iter_messages()]
     assert topics.count("/fisheye/image") == len(BRACKET_S)
@@ -193,7 +192,7 @@ def test_pictures_that_were_lost_leave_the_earlier_ones(tmp_path: Path, is_finis
     ends = record(tmp_path / "a.mcap", made)
     places = chunks_of(tmp_path / "a.mcap", "/fisheye/image")
     damaged = bytearray((tmp_path / "a.mcap").read_bytes()[: None if is_finished else ends[-1]])
-    for frame, expected in ((1, [0, 0, 0, 2]), (0, [None, None, None, 2])):
+    for frame, expected in ((1, [0, 0, 0, 2]), (0, [2, 2, 2, 2])):
         start, end = ([0, *ends][frame], ends[frame])
         first = next(place for place in places if start <= place < end)
         damaged[first + 5000] ^= 0xFF
