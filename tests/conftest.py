@@ -1,8 +1,14 @@
 """Fixtures that every room's tests share."""
 
+import signal
 from pathlib import Path
 
 import pytest
+
+# A shell starts what it puts into the background with SIGINT ignored, and children inherit that: no test of Ctrl-C
+# could pass.
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")
