@@ -67,28 +67,9 @@ def node(
         "camera": None if calibration is None else {"calibration": calibration},
         "fisheye": None if fisheye is None else {"source": fisheye},
     }
-    _run({key: value for key, value in given.items() if value is not None}, config_file)
+    from services.node_process import run_configured_node
 
-
-def _run(given: dict[str, Any], config_file: Path | None) -> None:
-    from concurrent.futures import ThreadPoolExecutor
-    from threading import Event
-
-    from protocol.keys import KeySettings
-    from sensor_node.node import NodeConfig, run_node
-    from services.settings import load_configuration
-
-    configuration = load_configuration(config_file)
-    config = configuration.section("node", NodeConfig, given)
-    endpoints = [each for each in (config.endpoint, config.clock_endpoint) if each is not None]
-    keys = configuration.section("keys", KeySettings).load(endpoints)
-    stop = Event()
-    with ThreadPoolExecutor(1) as thread:
-        running = thread.submit(run_node, config, stop, keys)
-        try:
-            running.result()  # signals interrupt this wait, not the node's work
-        finally:
-            stop.set()
+    run_configured_node({key: value for key, value in given.items() if value is not None}, config_file)
 
 
 def _print_lists(*, cameras: bool, nodes: bool, as_json: bool) -> None:

@@ -27,27 +27,12 @@ def replay(
     config_file: ConfigFile = None,
 ) -> None:
     """Publish a recording or dataset folder as its node did, until its end or Ctrl-C."""
-    from concurrent.futures import ThreadPoolExecutor
-    from threading import Event
-
-    from protocol.keys import KeySettings
     from protocol.source import open_source
-    from sensor_node.node import NodeConfig, run_node
-    from services.settings import load_configuration
+    from services.node_process import run_configured_node
 
     open_source(source)  # refuses here what a node would take for a live camera
     given = {"source": str(source), "endpoint": publish, "name": name, "clock_endpoint": clock}
     settings: dict[str, object] = {key: value for key, value in given.items() if value is not None}
     # The light is what was recorded, whatever camera the configuration file names for it.
     settings |= {"loop": loop, "realtime": not fast, "fisheye": None}
-    configuration = load_configuration(config_file)
-    config = configuration.section("node", NodeConfig, settings)
-    endpoints = [each for each in (config.endpoint, config.clock_endpoint) if each is not None]
-    keys = configuration.section("keys", KeySettings).load(endpoints)
-    stop = Event()
-    with ThreadPoolExecutor(1) as thread:
-        running = thread.submit(run_node, config, stop, keys)
-        try:
-            running.result()  # signals interrupt this wait, not the node's work
-        finally:
-            stop.set()
+    run_configured_node(settings, config_file)

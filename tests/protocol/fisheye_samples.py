@@ -1,4 +1,4 @@
-"""Small fish-eye pictures with everything that a calibration can hold."""
+"""Small fish-eye pictures with everything that a calibration can hold, and comparison to the bit."""
 
 from dataclasses import replace
 
@@ -7,7 +7,7 @@ import numpy as np
 from protocol.camera_model import CameraModel
 from protocol.equidistant_lens import EquidistantLens
 from protocol.fisheye_lens import FisheyeCalibration
-from protocol.frames import FisheyePictures
+from protocol.frames import FisheyePictures, SensorFrame
 from protocol.ocam_lens import OcamLens
 
 WIDTH, HEIGHT = 40, 36
@@ -66,3 +66,20 @@ def assert_same_pictures(ours: FisheyePictures | None, theirs: FisheyePictures |
     for mine, other in zip(ours.pictures, theirs.pictures, strict=True):
         assert mine.dtype == other.dtype
         assert np.array_equal(mine, other)
+
+
+def assert_same_frames(ours: SensorFrame, theirs: SensorFrame) -> None:
+    """Every field is the same to the bit."""
+    for name in ("frame_id", "timestamp_ns", "camera", "exposure_s", "depth_timestamp_ns", "color_jpeg"):
+        assert getattr(ours, name) == getattr(theirs, name), name
+    for name in ("color", "response", "world_from_camera"):
+        mine, other = getattr(ours, name), getattr(theirs, name)
+        assert (mine is None) == (other is None), name
+        assert mine is None or (mine.dtype == other.dtype and np.array_equal(mine, other)), name
+    assert (ours.depth is None) == (theirs.depth is None)
+    if ours.depth is not None and theirs.depth is not None:
+        assert ours.depth.camera == theirs.depth.camera
+        assert ours.depth.noise_sigma_m == theirs.depth.noise_sigma_m
+        assert np.array_equal(ours.depth.depth_m, theirs.depth.depth_m)
+        assert np.array_equal(ours.depth.valid, theirs.depth.valid)
+    assert_same_pictures(ours.fisheye, theirs.fisheye)

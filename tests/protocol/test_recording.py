@@ -23,6 +23,7 @@ from protocol.pictures import depth_from_steps
 from protocol.recording import RecordingReader, RecordingWriter
 from protocol.scene import parse_scene
 from protocol.source import open_source
+from tests.protocol.fisheye_samples import assert_same_frames
 
 ROOT = Path(__file__).resolve().parents[2]
 WIDTH, HEIGHT = 64, 48
@@ -71,22 +72,6 @@ def frames(count: int) -> list[SensorFrame]:
     return made
 
 
-def assert_same(ours: SensorFrame, theirs: SensorFrame) -> None:
-    """Every field is the same to the bit."""
-    for name in ("frame_id", "timestamp_ns", "camera", "exposure_s", "depth_timestamp_ns", "color_jpeg"):
-        assert getattr(ours, name) == getattr(theirs, name), name
-    for name in ("color", "response", "world_from_camera"):
-        mine, other = getattr(ours, name), getattr(theirs, name)
-        assert (mine is None) == (other is None), name
-        assert mine is None or (mine.dtype == other.dtype and np.array_equal(mine, other)), name
-    assert (ours.depth is None) == (theirs.depth is None)
-    if ours.depth is not None and theirs.depth is not None:
-        assert ours.depth.camera == theirs.depth.camera
-        assert ours.depth.noise_sigma_m == theirs.depth.noise_sigma_m
-        assert np.array_equal(ours.depth.depth_m, theirs.depth.depth_m)
-        assert np.array_equal(ours.depth.valid, theirs.depth.valid)
-
-
 def record(path: Path, recorded: list[SensorFrame]) -> Path:
     with RecordingWriter(path, board=board()) as writer:
         for frame in recorded:
@@ -107,9 +92,9 @@ def test_frames_board_and_transforms_come_back_bit_for_bit(tmp_path: Path) -> No
     assert [path.name for path in tmp_path.iterdir()] == ["a.mcap"]
     source = open_source(tmp_path / "a.mcap")
     for ours, theirs in zip(source, recorded, strict=True):
-        assert_same(ours, theirs)
-    assert_same(source[4], recorded[4])
-    assert_same(source[-1], recorded[-1])
+        assert_same_frames(ours, theirs)
+    assert_same_frames(source[4], recorded[4])
+    assert_same_frames(source[-1], recorded[-1])
     with pytest.raises(IndexError):
         source[9]
     assert source.board == board()
@@ -126,7 +111,7 @@ def test_jpeg_bytes_are_kept_and_decoded(tmp_path: Path) -> None:
     jpeg = cv2.imencode(".jpg", frames(1)[0].color)[1].tobytes()
     decoded = np.asarray(cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR))[..., ::-1]
     frame = replace(frames(1)[0], color=decoded, color_jpeg=jpeg)
-    assert_same(RecordingReader(record(tmp_path / "a.mcap", [frame]))[0], frame)
+    assert_same_frames(RecordingReader(record(tmp_path / "a.mcap", [frame]))[0], frame)
 
 
 def test_a_picture_of_another_size_than_its_camera_is_told(tmp_path: Path) -> None:
@@ -141,7 +126,7 @@ def test_depth_that_fits_no_step_is_kept_as_floats_unless_a_step_is_given(tmp_pa
     valid = rng.random((HEIGHT, WIDTH)) > 0.1
     depth = DepthImage(np.where(valid, depth_m, 0).astype(np.float32), valid, camera(distortion=LENS))
     frame = replace(frames(1)[0], depth=depth)
-    assert_same(RecordingReader(record(tmp_path / "a.mcap", [frame]))[0], frame)
+    assert_same_frames(RecordingReader(record(tmp_path / "a.mcap", [frame]))[0], frame)
     with RecordingWriter(tmp_path / "b.mcap", depth_scale=0.002) as writer:
         writer.add(frame)
     rounded = RecordingReader(tmp_path / "b.mcap")[0].depth
@@ -159,7 +144,7 @@ def test_a_real_dataset_is_the_same_as_its_recording(shared_data: Path, tmp_path
             writer.add(frame)
     source = open_source(tmp_path / "a.mcap")
     for ours, theirs in zip(source, recorded, strict=True):
-        assert_same(ours, theirs)
+        assert_same_frames(ours, theirs)
     assert source.board == dataset.board
     assert source.depth_scale == dataset.depth_scale
 
@@ -240,7 +225,7 @@ def test_a_truncated_recording_gives_every_frame_that_was_written(tmp_path: Path
     assert len(source) >= sum(end <= cut for end in ends) > 0
     assert any(f"{len(source)} frames were recovered" in note for note in source.notes)
     for ours, theirs in zip(source, recorded, strict=False):
-        assert_same(ours, theirs)
+        assert_same_frames(ours, theirs)
     assert source.board == board()
     assert source.scene == scene
 

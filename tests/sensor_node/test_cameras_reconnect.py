@@ -66,8 +66,8 @@ class Scripted(Camera):
         stamp_ns = 1_000_000_000 + self._number * 5_000_000
         return SensorFrame(self._number - 1, stamp_ns, color, CAMERA, depth_timestamp_ns=stamp_ns + 7)
 
-    def read_latest(self, max_age_s: float) -> SensorFrame:
-        raise NotImplementedError
+    def read_latest(self, max_age_s: float) -> SensorFrame:  # noqa: ARG002 - each frame is new
+        return self.read()
 
     @property
     def capture_ns(self) -> int:

@@ -25,7 +25,7 @@ from sensor_node.frame_messages import (
     fisheye_multipart,
     pose_multipart,
 )
-from tests.protocol.fisheye_samples import assert_same_pictures, coded
+from tests.protocol.fisheye_samples import coded
 
 WIDTH, HEIGHT = 64, 48
 STARTED_NS = 1_700_000_000_000_000_000
@@ -80,23 +80,6 @@ def write(path: Path, recorded: Sequence[SensorFrame], scene: SceneDocument | No
         for frame in recorded:
             writer.add(frame)
     return path
-
-
-def assert_same(ours: SensorFrame, theirs: SensorFrame) -> None:
-    """Every field is the same to the bit."""
-    for name in ("frame_id", "timestamp_ns", "camera", "exposure_s", "depth_timestamp_ns", "color_jpeg"):
-        assert getattr(ours, name) == getattr(theirs, name), name
-    for name in ("color", "response", "world_from_camera"):
-        mine, other = getattr(ours, name), getattr(theirs, name)
-        assert (mine is None) == (other is None), name
-        assert mine is None or (mine.dtype == other.dtype and np.array_equal(mine, other)), name
-    assert (ours.depth is None) == (theirs.depth is None)
-    if ours.depth is not None and theirs.depth is not None:
-        assert ours.depth.camera == theirs.depth.camera
-        assert ours.depth.noise_sigma_m == theirs.depth.noise_sigma_m
-        assert np.array_equal(ours.depth.depth_m, theirs.depth.depth_m)
-        assert np.array_equal(ours.depth.valid, theirs.depth.valid)
-    assert_same_pictures(ours.fisheye, theirs.fisheye)
 
 
 def messages(

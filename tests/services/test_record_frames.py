@@ -14,8 +14,8 @@ from protocol.messages import ColorMessage
 from protocol.transport import Publisher
 from services.raw_frames import RawFrameAssembler
 from services.stream_queue import QUEUED_MESSAGES, StreamQueue
-from tests.protocol.fisheye_samples import assert_same_pictures, linear
-from tests.services.record_samples import BOARD, PERIOD_NS, assert_same, frames, messages
+from tests.protocol.fisheye_samples import assert_same_frames, assert_same_pictures, linear
+from tests.services.record_samples import BOARD, PERIOD_NS, frames, messages
 
 
 def assembled(
@@ -42,7 +42,7 @@ def test_frames_come_back_bit_for_bit_without_the_first(as_jpeg: bool) -> None:
     assembler = RawFrameAssembler()
     found = assembled(sent, assembler)
     for ours, theirs in zip(found, sent[1:], strict=True):
-        assert_same(ours, theirs)
+        assert_same_frames(ours, theirs)
     assert found[0].fisheye is not found[-1].fisheye
     assert found[0].fisheye is found[1].fisheye, "the same pictures are one object"
     assert found[0].camera is found[1].camera
@@ -88,7 +88,7 @@ def test_partners_may_come_after_their_colour_picture() -> None:
     late = [only(second, "color"), only(third, "depth", "pose", "color"), only(second, "pose", "depth")]
     found = assembled([first, *late], RawFrameAssembler())
     for ours, theirs in zip(found, (second, third), strict=True):
-        assert_same(ours, theirs)
+        assert_same_frames(ours, theirs)
 
 
 def test_a_lost_partner_is_waited_for_two_pictures_long_and_counted() -> None:
@@ -133,7 +133,7 @@ def test_a_broken_picture_costs_its_own_frame_only() -> None:
     assembler = RawFrameAssembler()
     with pytest.raises(DeltalightError, match="jpeg"):
         assembled([first, list(broken.values())], assembler)
-    assert_same(assembled([third], assembler)[0], third)
+    assert_same_frames(assembled([third], assembler)[0], third)
 
 
 def test_the_queue_keeps_order_and_counts_what_finds_no_room() -> None:

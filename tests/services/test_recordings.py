@@ -26,9 +26,9 @@ from services.recording_copies import (
     recovered_name,
 )
 from services.recording_info import describe_recording
-from tests.protocol.fisheye_samples import linear
+from tests.protocol.fisheye_samples import assert_same_frames, linear
 from tests.services.conftest import RunCli
-from tests.services.record_samples import BOARD, PERIOD_NS, assert_same, camera, frames, write
+from tests.services.record_samples import BOARD, PERIOD_NS, camera, frames, write
 
 SCENE = parse_scene({"name": "kept"})
 CUT_EVERY = 4096
@@ -133,7 +133,7 @@ def test_a_recording_cut_anywhere_is_mended(tmp_path: Path) -> None:
         assert_finished(out, copied.frames)
         source = open_source(out)
         for ours, theirs in zip(source, recorded, strict=False):
-            assert_same(ours, theirs)
+            assert_same_frames(ours, theirs)
         assert (source.board, source.scene) == (BOARD, SCENE)
         mended += 1
     assert mended >= 10
@@ -219,9 +219,9 @@ def both_ways(folder: Path, recorded: list[SensorFrame]) -> None:
     first, dataset, second = (open_source(folder / name) for name in ("a.mcap", "take", "b.mcap"))
     for original, middle, last in zip(first, dataset, second, strict=True):
         same_pose = replace(middle, world_from_camera=original.world_from_camera)
-        assert_same(same_pose, original)
+        assert_same_frames(same_pose, original)
         assert np.asarray(middle.world_from_camera) == pytest.approx(original.world_from_camera, abs=1e-12)
-        assert_same(replace(last, world_from_camera=original.world_from_camera), original)
+        assert_same_frames(replace(last, world_from_camera=original.world_from_camera), original)
     assert first.board == dataset.board == second.board == BOARD
     assert first.scene == second.scene == SCENE
     assert first.depth_scale == second.depth_scale == 0.001
@@ -245,7 +245,7 @@ def test_a_real_dataset_survives_both_ways(shared_data: Path, tmp_path: Path) ->
     export_recording(tmp_path / "a.mcap", tmp_path / "take", lambda numbers: numbers[:3])
     original, again = open_source(folder), open_source(tmp_path / "take")
     for index in range(3):
-        assert_same(again[index], original[index])
+        assert_same_frames(again[index], original[index])
 
 
 def test_depth_without_steps_is_rounded_and_told(tmp_path: Path) -> None:
