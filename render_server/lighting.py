@@ -114,13 +114,13 @@ class Lighting:
 
     def _finished(self, scene: RelightInput) -> RelightInput:
         self._finish()
-        return self.renewed(scene)
+        assert self.lights is not None
+        return replace(scene, lights=self.lights, lights_version=self.version)
 
     def renewed(self, scene: RelightInput) -> RelightInput:
-        """Return the input with the lights as they are now, under a number of their own."""
-        assert self.lights is not None
+        """Return the input under a new number: what the lights fall on is not what it was."""
         self.version = next(self._versions)
-        return replace(scene, lights=self.lights, lights_version=self.version)
+        return replace(scene, lights_version=self.version)
 
     def picture(self, frame: ViewFrame) -> UInt8[np.ndarray, "h w 3"]:
         """Draw the lights (view `lights`), once there are any."""
