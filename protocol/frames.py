@@ -128,6 +128,12 @@ def decode_lut(response: Float32[np.ndarray, "256 3"] | None) -> Float32[np.ndar
     return _srgb_lut() if response is None else response
 
 
+def linear_color(frame: ViewFrame, color: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
+    """Return a camera-coded picture of a frame in linear camera units (1.0 = sensor white, reference exposure)."""
+    lut = decode_lut(frame.response) / np.float32(frame.exposure_scale)
+    return np.stack([lut[color[..., channel], channel] for channel in range(3)], axis=-1)
+
+
 @cache
 def _srgb_lut() -> Float32[np.ndarray, "256 3"]:
     code = np.arange(256) / 255.0

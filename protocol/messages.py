@@ -12,9 +12,10 @@ from typing import Annotated, Final, Literal, Self, get_args
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints, model_validator
 
-SCHEMA_VERSION: Final = 2
+SCHEMA_VERSION: Final = 3
 MAX_HEADER_BYTES = 64 * 1024
 MAX_PART_BYTES = 64 * 1024 * 1024
+MAX_PAYLOAD_BYTES = 4 * 1024 * 1024
 MAX_EDGE_PX = 16384
 MAX_LIGHTS = 64
 MAX_EXPOSURES = 24
@@ -119,7 +120,7 @@ class MessageBase(BaseModel):
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
-    schema_version: Literal[2] = SCHEMA_VERSION
+    schema_version: Literal[3] = SCHEMA_VERSION
     node: Name
     stream: Stream
     frame_id: Count
@@ -287,7 +288,8 @@ class CompositeMessage(MessageBase):
     """The finished picture of the colour frame `frame_id` (sRGB, RGB order); one part.
 
     `capture_ns` and the clock fields are those of that frame; `received_ns` and `rendered_ns` are by the
-    server's clock.
+    server's clock. `scene_revision` is the server's, of the scene that the frame was begun with. `camera`
+    (`CameraModel.to_dict()` at the picture's size) and pose are those that it was made with.
     """
 
     stream: Literal["composite"] = "composite"
@@ -295,6 +297,9 @@ class CompositeMessage(MessageBase):
     shape: PictureShape
     dtype: Literal["uint8"] = "uint8"
     status: Literal["ok", "no_pose"]
+    scene_revision: Count | None = None
+    camera: PlainDict
+    world_from_camera: RigidMatrix | None = None
     received_ns: Nanoseconds
     rendered_ns: Nanoseconds
     pass_times_ms: Durations = Field(default_factory=dict)
@@ -317,31 +322,43 @@ class StatsMessage(MessageBase):
     drops: Counts = Field(default_factory=dict)
 
 
-class ControlRequest(MessageBase):
+class ControlMessage(MessageBase):
+    """What request and reply share; `payload_bytes`: the payload is not in the header but in a part (JSON text)."""
+
+    frame_id: Count = 0
+    capture_ns: Nanoseconds = 0
+    id: Name
+    payload: PlainDict = Field(default_factory=dict)
+    payload_bytes: Annotated[int, Field(ge=1, le=MAX_PAYLOAD_BYTES)] | None = None
+
+    def part_rules(self) -> tuple[PartRule, ...]:
+        """The payload, where it is long."""
+        return () if self.payload_bytes is None else (PartRule("payload", (self.payload_bytes,), "uint8"),)
+
+    @model_validator(mode="after")
+    def _payload_once(self) -> Self:
+        if self.payload and self.payload_bytes is not None:
+            raise ValueError("payload must be empty where payload_bytes is given")
+        return self
+
+
+class ControlRequest(ControlMessage):
     """A command: `op` with `payload`.
 
     A repeated `id`, or a repeated `revision` of one op, is not carried out twice.
     """
 
     stream: Literal["request"] = "request"
-    frame_id: Count = 0
-    capture_ns: Nanoseconds = 0
-    id: Name
     op: Name
     revision: Count | None = None
-    payload: PlainDict = Field(default_factory=dict)
 
 
-class ControlReply(MessageBase):
+class ControlReply(ControlMessage):
     """The answer to the request of the same `id`; `error` is one sentence where `ok` is false."""
 
     stream: Literal["reply"] = "reply"
-    frame_id: Count = 0
-    capture_ns: Nanoseconds = 0
-    id: Name
     ok: bool
     error: Sentence | None = None
-    payload: PlainDict = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _error_agrees(self) -> Self:

@@ -10,14 +10,17 @@ import structlog
 import zmq
 
 from protocol.curve import guard
-from protocol.envelope import EnvelopeError, decode, encode
+from protocol.envelope import EnvelopeError
 from protocol.errors import DeltalightError
 from protocol.keys import Keys
-from protocol.messages import MAX_HEADER_BYTES, ControlReply, ControlRequest
+from protocol.messages import MAX_PAYLOAD_BYTES, ControlReply, ControlRequest
+from protocol.payloads import decode_control, encode_control
 from protocol.sockets import attach, open_socket
 
 UNREADABLE_ID = "unreadable"
 REMEMBERED_REPLIES = 256
+MAX_PIECE_BYTES = MAX_PAYLOAD_BYTES + 4096  # CURVE adds to each piece
+REMEMBERED_BYTES = 16 * 1024 * 1024
 
 Handler = Callable[[ControlRequest], dict[str, object]]
 _log = structlog.get_logger(__name__)
@@ -35,7 +38,8 @@ class ReplyMemory:
 
     def __init__(self, size: int = REMEMBERED_REPLIES) -> None:
         self._size = size
-        self._by_id: OrderedDict[str, ControlReply] = OrderedDict()
+        self._by_id: OrderedDict[str, tuple[ControlReply, int]] = OrderedDict()
+        self._bytes = 0
         self._applied: dict[str, _Applied] = {}
 
     def find(self, request: ControlRequest) -> ControlReply | None:
@@ -45,7 +49,7 @@ class ReplyMemory:
             DeltalightError: its revision is older than the applied one, or is the same with other content.
         """
         if request.id in self._by_id:
-            return self._by_id[request.id]
+            return self._by_id[request.id][0]
         last = self._applied.get(request.op)
         if last is None or request.revision is None or request.revision > last.revision:
             return None
@@ -56,11 +60,12 @@ class ReplyMemory:
             )
         return last.reply.model_copy(update={"id": request.id})
 
-    def remember(self, request: ControlRequest, reply: ControlReply) -> None:
-        """Keep a reply; a refused request may come again with the same revision."""
-        self._by_id[request.id] = reply
-        if len(self._by_id) > self._size:
-            self._by_id.popitem(last=False)
+    def remember(self, request: ControlRequest, reply: ControlReply, length: int) -> None:
+        """Keep a reply of `length` bytes; a refused request may come again with the same revision."""
+        self._by_id[request.id] = reply, length
+        self._bytes += length
+        while len(self._by_id) > self._size or self._bytes > REMEMBERED_BYTES:
+            self._bytes -= self._by_id.popitem(last=False)[1][1]
         if reply.ok and request.revision is not None:
             self._applied[request.op] = _Applied(request.revision, request.payload, reply)
 
@@ -83,7 +88,7 @@ class ReplyServer:
         self._memory = ReplyMemory()
         self._answering = threading.Lock()
         self._context = zmq.Context()
-        self._socket = open_socket(self._context, zmq.REP, max_bytes=MAX_HEADER_BYTES)
+        self._socket = open_socket(self._context, zmq.REP, max_bytes=MAX_PIECE_BYTES)
         self._guard = guard(self._context, self._socket, keys, bind=True)
         try:
             self.endpoint = attach(self._socket, endpoint, bind=True, keys=keys)
@@ -122,34 +127,36 @@ class ReplyServer:
 
     def _answer(self, multipart: list[bytes]) -> list[bytes]:
         try:
-            request, _ = decode(multipart)
-            if not isinstance(request, ControlRequest):
-                raise EnvelopeError(
-                    f"a {request.stream} message came to the control endpoint: send a request"
-                )
+            request = decode_control(multipart, ControlRequest)
         except EnvelopeError as error:
-            return encode(self._reply(UNREADABLE_ID, error=str(error)))
-        reply = self._answered(request)
+            return encode_control(self._reply(UNREADABLE_ID, error=str(error)))
         try:
-            return encode(reply)
+            earlier = self._memory.find(request)
+        except DeltalightError as error:
+            return encode_control(self._reply(request.id, error=str(error)))
+        if earlier is not None:
+            return encode_control(earlier)
+        reply, pieces = self._encoded(self._answered(request))
+        self._memory.remember(request, reply, sum(len(piece) for piece in pieces))
+        return pieces
+
+    def _encoded(self, reply: ControlReply) -> tuple[ControlReply, list[bytes]]:
+        try:
+            return reply, encode_control(reply)
         except EnvelopeError as error:
-            return encode(self._reply(request.id, error=f"the answer cannot be sent: {error}"))
+            refusal = self._reply(reply.id, error=f"the answer cannot be sent: {error}")
+            return refusal, encode_control(refusal)
 
     def _answered(self, request: ControlRequest) -> ControlReply:
         try:
-            earlier = self._memory.find(request)
-            if earlier is not None:
-                return earlier
-            reply = self._reply(request.id, payload=self._handler(request))
+            return self._reply(request.id, payload=self._handler(request))
         except DeltalightError as error:
-            reply = self._reply(request.id, error=str(error))
+            return self._reply(request.id, error=str(error))
         except Exception as error:  # the thread must outlive a fault of the handler
             _log.exception("control handler failed", op=request.op)
-            reply = self._reply(
+            return self._reply(
                 request.id, error=f"{request.op} failed with {error!r}: see the log of {self._node}"
             )
-        self._memory.remember(request, reply)
-        return reply
 
     def _reply(
         self, request_id: str, *, payload: dict[str, object] | None = None, error: str | None = None
@@ -189,7 +196,7 @@ class RequestClient:
         Raises:
             DeltalightError: no answer within `timeout_s` seconds, or the server could not read the request.
         """
-        multipart = encode(control)
+        multipart = encode_control(control)
         deadline = time.monotonic() + timeout_s
         if not self._lock.acquire(timeout=timeout_s):
             raise DeltalightError(f"{self.endpoint} is still busy with another request: try again")
@@ -217,7 +224,7 @@ class RequestClient:
         if self._context.closed:
             raise DeltalightError(f"the client of {self.endpoint} is closed: open a new one to ask")
         if self._socket is None:
-            self._socket = open_socket(self._context, zmq.REQ, max_bytes=MAX_HEADER_BYTES)
+            self._socket = open_socket(self._context, zmq.REQ, max_bytes=MAX_PIECE_BYTES)
             attach(self._socket, self.endpoint, bind=False, keys=self._keys)
         return self._socket
 
@@ -229,9 +236,7 @@ class RequestClient:
 
 
 def _matched(control: ControlRequest, multipart: list[bytes]) -> ControlReply:
-    reply, _ = decode(multipart)
-    if not isinstance(reply, ControlReply):
-        raise EnvelopeError(f"a {reply.stream} message came as the answer: see what listens at the endpoint")
+    reply = decode_control(multipart, ControlReply)
     if reply.id == UNREADABLE_ID:
         raise EnvelopeError(f"the server cannot read the request: {reply.error}")
     if reply.id != control.id:

@@ -29,13 +29,9 @@ TriangleBudget = Annotated[
 ShadowSamples = Annotated[int, Field(ge=1, le=64, description="Samples of a light's area for soft shadows.")]
 
 
-class DvctMethod(StrictModel):
-    """Delta voxel cone tracing (METHOD 4)."""
+class VoxelConeSettings(StrictModel):
+    """What every method has that traces cones through voxels (METHOD 4)."""
 
-    name: Literal["dvct"] = "dvct"
-    operator: Literal["exact", "paper"] = Field(
-        default="exact", description="Dual march (METHOD 3), or the operator as printed in the paper."
-    )
     volume_size: int | None = Field(
         default=None,
         ge=32,
@@ -77,20 +73,42 @@ class DvctMethod(StrictModel):
         default="rays",
         description="Of the exact operator: objects in smooth real surfaces by rays, or by cones.",
     )
-    shadow: Literal["map", "cone"] | None = Field(
-        default=None,
-        description="Shadows from shadow maps, or from shadow cones; null = map for exact, cone for paper.",
+    screen_space: bool = Field(
+        default=True,
+        description="Of the exact operator: smooth objects reflect what the picture shows; false = voxels alone.",
     )
     shadow_samples: ShadowSamples = 16
-    composition: Literal["ratio", "additive"] | None = Field(
-        default=None,
-        description="How the delta meets the picture; null = ratio for exact, additive for paper.",
-    )
     memory_budget_mb: int = Field(
         default=4096,
         ge=16,
         le=65536,
         description="Greatest memory of the volumes, MB; beyond it rendering is refused.",
+    )
+
+
+class DvctMethod(VoxelConeSettings):
+    """Delta voxel cone tracing (METHOD 4)."""
+
+    name: Literal["dvct"] = "dvct"
+    operator: Literal["exact", "paper"] = Field(
+        default="exact", description="Dual march (METHOD 3), or the operator as printed in the paper."
+    )
+    shadow: Literal["map", "cone"] | None = Field(
+        default=None,
+        description="Shadows from shadow maps, or from shadow cones; null = map for exact, cone for paper.",
+    )
+    composition: Literal["ratio", "additive"] | None = Field(
+        default=None,
+        description="How the delta meets the picture; null = ratio for exact, additive for paper.",
+    )
+    mirrored_lights: bool = Field(
+        default=True,
+        description="Of the exact operator: smooth declared planes throw the lights back at what stands before them.",
+    )
+    caustics: bool = Field(
+        default=True,
+        description="Of the exact operator: what smooth objects reflect of the lights falls on other surfaces as "
+        "beams; false = it is spread evenly, as if they were matt.",
     )
 
     @property
@@ -154,6 +172,20 @@ class DlpvMethod(StrictModel):
         description="Shadows of lights from shadow maps, or as negative light in the volume; "
         "null = map, lobe for paper.",
     )
+    caustics: bool | None = Field(
+        default=None,
+        description="What smooth objects reflect of the lights falls on other surfaces as beams, or is injected "
+        "into the volume; null = beams, the volume for paper.",
+    )
+    screen_space: bool | None = Field(
+        default=None,
+        description="Smooth objects reflect what the picture shows, or the surroundings alone; "
+        "null = the picture, the surroundings for paper.",
+    )
+    reflections: Literal["rays", "none"] | None = Field(
+        default=None,
+        description="Objects in smooth real surfaces by rays, or not at all; null = rays, none for paper.",
+    )
     query_scale: Literal[1, 2, 4] | None = Field(
         default=None,
         description="The volume is read at 1/scale of the picture; null = 2 on a GPU, 4 in software.",
@@ -193,6 +225,21 @@ class DlpvMethod(StrictModel):
         return self._choice(self.ambient, "blocked", "open")
 
     @property
+    def resolved_screen_space(self) -> bool:
+        """Whether objects reflect the picture, as given or the operator's default."""
+        return self._choice(self.screen_space, True, False)
+
+    @property
+    def resolved_reflections(self) -> Literal["rays", "none"]:
+        """Objects in smooth real surfaces, as given or the operator's default."""
+        return self._choice(self.reflections, "rays", "none")
+
+    @property
+    def resolved_caustics(self) -> bool:
+        """Whether there are beams, as given or the operator's default."""
+        return self._choice(self.caustics, True, False)
+
+    @property
     def resolved_damping(self) -> float:
         """Damping as given, or the operator's default."""
         return self._choice(self.damping, 0.0, 1.0)
@@ -209,19 +256,86 @@ class DlpvMethod(StrictModel):
 
 
 class AroofMethod(StrictModel):
-    """Object occlusion fields (METHOD 6)."""
+    """Object occlusion fields (METHOD 6): what rigid objects hide of natural light is precomputed."""
 
     model_config = NEEDS_NAME
 
     name: Literal["aroof"] = "aroof"
+    sh_order: int = Field(
+        default=4,
+        ge=3,
+        le=5,
+        description="Bands of spherical harmonics of what an object hides: 9, 16 or 25 coefficients a sample.",
+    )
+    shells: int = Field(
+        default=4, ge=2, le=6, description="Grids of samples around an object, each within the next."
+    )
+    resolution: int = Field(
+        default=32,
+        ge=12,
+        le=48,
+        multiple_of=4,
+        description="Samples an edge of each shell.",
+    )
+    reach: float = Field(
+        default=8.0,
+        ge=2,
+        le=32,
+        description="How far the outermost shell reaches from the object's middle, in radii of the sphere around it.",
+    )
+    rays: int = Field(
+        default=256,
+        ge=64,
+        le=4096,
+        description="Rays from each sample over the whole sphere; more take longer once.",
+    )
+    indirect: bool = Field(
+        default=True,
+        description="Objects also reflect light onto what is around them (radiance transfer field).",
+    )
+    near_light: Literal["measured", "none"] = Field(
+        default="measured",
+        description="What the camera sees around an object counts as light there, or the environment map alone.",
+    )
+    caustics: bool = Field(
+        default=True,
+        description="What smooth objects reflect of the lights falls on other surfaces as beams; false = nowhere.",
+    )
+    screen_space: bool = Field(
+        default=True,
+        description="Smooth objects reflect what the picture shows; false = the surroundings alone.",
+    )
+    shading_scale: Literal[1, 2, 4] | None = Field(
+        default=None,
+        description="Fields are read at 1/scale of the picture; null = 2 on a GPU, 4 in software.",
+    )
+    rsm_size: ShadowMapSize = None
+    triangle_budget: TriangleBudget = None
+    shadow_samples: ShadowSamples = 16
+    composition: Literal["ratio", "additive"] = Field(
+        default="ratio", description="How the delta meets the picture."
+    )
+
+    @property
+    def resolved_composition(self) -> Literal["ratio", "additive"]:
+        """Composition as given."""
+        return self.composition
 
 
-class DifferentialMethod(StrictModel):
+class DifferentialMethod(VoxelConeSettings):
     """Differential rendering: two full solutions, the reference (METHOD 6)."""
 
     model_config = NEEDS_NAME
 
     name: Literal["differential"] = "differential"
+    composition: Literal["ratio", "additive"] = Field(
+        default="ratio", description="How the difference meets the picture."
+    )
+
+    @property
+    def resolved_composition(self) -> Literal["ratio", "additive"]:
+        """Composition as given."""
+        return self.composition
 
 
 class NoneMethod(StrictModel):

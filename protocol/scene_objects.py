@@ -81,6 +81,31 @@ AnyMaterial = Annotated[
 ]
 
 
+class Animation(StrictModel):
+    """Plays a clip of the asset; what it shows follows from a frame's capture time alone."""
+
+    clip: Annotated[int, Field(ge=0)] | Annotated[str, Field(min_length=1)] | None = Field(
+        default=None, description="Name or number (from 0) of the asset's clip; null = the first."
+    )
+    speed: float = Field(
+        default=1.0,
+        ge=-100,
+        le=100,
+        description="Clip seconds a second; 0 holds `offset_s`, below 0 backwards.",
+    )
+    offset_s: float = Field(
+        default=0.0, ge=-1e12, le=1e12, description="Clip time at capture time 0, seconds."
+    )
+    loop: bool = Field(default=True, description="Begin again at the end; false = hold the ends.")
+
+    def time_s(self, capture_ns: int, duration_s: float) -> float:
+        """Clip time, s, 0..duration, of a frame that was captured at `capture_ns`."""
+        time_s = capture_ns / 1e9 * self.speed + self.offset_s
+        if self.loop and duration_s > 0:
+            return time_s % duration_s
+        return min(max(time_s, 0.0), duration_s)
+
+
 class SceneObject(StrictModel):
     """A virtual object."""
 
@@ -98,7 +123,12 @@ class SceneObject(StrictModel):
     )
     material: AnyMaterial | None = Field(default=None, description="null = from the asset.")
     rigid: bool = Field(
-        default=True, description="Whether the shape never changes (then its transfer may be precomputed)."
+        default=True,
+        description="true = the asset as it rests (its transfer may be precomputed), unless `animation` is given; "
+        "false = it plays its first clip, if it has one.",
+    )
+    animation: Animation | None = Field(
+        default=None, description="How a glTF asset's clip is played; null = as `rigid` says."
     )
     visible: bool = Field(default=True, description="Whether the object takes part at all.")
 
@@ -108,6 +138,11 @@ class SceneObject(StrictModel):
         if self.up_axis is not None:
             return self.up_axis
         return "y" if PurePosixPath(self.asset).suffix.lower() in GLTF_SUFFIXES else "z"
+
+    @property
+    def playing(self) -> Animation | None:
+        """How a clip is played, if the asset has any; None = the object keeps its shape."""
+        return Animation() if self.animation is None and not self.rigid else self.animation
 
     def world_from_object(self) -> Float64[np.ndarray, "4 4"]:
         """Return the 4x4 matrix from asset coordinates to `frame` (the world unless it is a marker).

@@ -16,18 +16,17 @@ from render_server.relighting import RelitFrame
 class Composer:
     """Owns the composite's textures and reads them back."""
 
-    def __init__(self, gpu: GpuContext, *, with_linear: bool) -> None:
-        self._with_linear = with_linear
+    def __init__(self, gpu: GpuContext) -> None:
         self._gpu = gpu
         self._pass: CompositePass | None = None
         self._size: tuple[int, int] | None = None
         self._readback = AsyncReadback(gpu)
         self._views = ViewPasses(gpu)
 
-    def start(self, relit: RelitFrame, output: Output) -> None:
+    def start(self, relit: RelitFrame, output: Output, *, with_linear: bool) -> None:
         """Compose and begin to read back; `finish` gives the oldest picture that was started."""
         composite = self._pass_for(relit.input.view.size)
-        needs_linear = self._with_linear or output.view in ("effects", "delta")
+        needs_linear = with_linear or output.view in ("effects", "delta")
         uniforms: dict[str, Any] = {
             **relit.input.view.uniforms(),
             **relit.input.surface_uniforms,
@@ -42,13 +41,15 @@ class Composer:
         self._show_view(composite, relit, output.view)
         with relit.timers.measure("readback"):
             self._readback.push(composite.code, "u1")
-            if self._with_linear:
+            if with_linear:
                 self._readback.push(composite.linear, "f2")
 
-    def finish(self) -> tuple[UInt8[np.ndarray, "h w 3"], Float32[np.ndarray, "h w 3"] | None]:
-        """Picture in camera codes, and linear if that was asked for; waits only if the GPU is not done with it."""
+    def finish(
+        self, *, with_linear: bool
+    ) -> tuple[UInt8[np.ndarray, "h w 3"], Float32[np.ndarray, "h w 3"] | None]:
+        """Picture in camera codes, and linear if it was started so; waits only if the GPU is not done with it."""
         color = np.ascontiguousarray(self._readback.pop()[..., :3])
-        linear = self._readback.pop()[..., :3].astype(np.float32) if self._with_linear else None
+        linear = self._readback.pop()[..., :3].astype(np.float32) if with_linear else None
         return color, linear
 
     def _show_view(self, composite: CompositePass, relit: RelitFrame, view: str) -> None:

@@ -90,6 +90,12 @@ class FrameAssembler:
         self._depth_camera = _Unchanged(CameraModel.from_dict)
         self._board = _Unchanged(_board_spec)
 
+    def begun_anew(self) -> "FrameAssembler":
+        """Return an assembler without any message, for another source; it goes on counting."""
+        fresh = FrameAssembler(self._settings, needs_depth=self.needs_depth)
+        fresh.counts = self.counts
+        return fresh
+
     def add(self, message: Message, parts: Sequence[memoryview], received_ns: int) -> None:
         """Keep a message until its partners come; other streams than `TOPICS` are ignored."""
         match message:

@@ -40,9 +40,11 @@ class PictureResources:
         self._rastered: object = None
         self._surfaces = gpu.ctx.buffer(reserve=MAX_SURFACES * 80 + 80)
         self.surface_uniforms: dict[str, Any] = {"surface_count": 0, "specular_surfaces": False}
+        self.surface_table: SurfaceTable | None = None
 
     def declare_surfaces(self, table: SurfaceTable) -> None:
         """Take over the declared surfaces of the real scene."""
+        self.surface_table = table
         if len(table):
             self._surfaces.write(np.ascontiguousarray(table.packed, np.float32).tobytes())
         specular = bool((table.packed[:, 3, 3] < DIFFUSE_BOX).any())

@@ -40,7 +40,7 @@ class RealGeometry:
         self, gpu: GpuContext, real: RealScene, triangle_budget: int, versions: Iterator[int]
     ) -> None:
         self._gpu = gpu
-        self._budget = triangle_budget
+        self.budget = triangle_budget
         self._tracker = RealSceneTracker()
         self._buffers = MeshBuffers(gpu)
         self._materials: MaterialTable | None = None
@@ -55,9 +55,10 @@ class RealGeometry:
         self._fused_meshes: tuple[list[TriangleMesh], list[TriangleMesh]] = [], []
         self._fused = FusedScene() if real.geometry == "fused" else None
         self._still_frames = 0
+        self.model: list[TriangleMesh] = []
         if isinstance(real.geometry, ModelGeometry):
-            self._model = self._load_model(real.geometry)
-            self.material_names = tuple(mesh.material.name for mesh in self._model)
+            self.model = self._load_model(real.geometry)
+            self.material_names = tuple(mesh.material.name for mesh in self.model)
 
     def _load_model(self, model: ModelGeometry) -> list[TriangleMesh]:
         matrix = model.pose.matrix()
@@ -97,7 +98,7 @@ class RealGeometry:
         if self.is_model and self.state is not None:
             self.state = replace(self.state, version=next(self._versions))
         elif self.is_model:
-            self._build(self._model, None)
+            self._build(self.model, None)
         else:
             assert frame.depth is not None
             self._build_from_depth(frame.depth, view)
@@ -126,7 +127,7 @@ class RealGeometry:
             settle=self._still_frames == STILL_FRAMES,
         )
         if renewed:
-            fine, coarse = fused.meshes(self._budget, self._budget // COARSE_SHARE)
+            fine, coarse = fused.meshes(self.budget, self.budget // COARSE_SHARE)
             self._fused_meshes = fine, coarse
         displaced = moved and self._follow_pose(fused, view)
         if moved:
@@ -161,11 +162,11 @@ class RealGeometry:
         """Mesh the depth image, and once more with few triangles for what lies far from the objects."""
         self.surface = depth_surface(depth, view.camera)
         place = view.world_from_camera
-        fine = depth_mesh(depth, view.camera, place, self._budget, self.surface)
+        fine = depth_mesh(depth, view.camera, place, self.budget, self.surface)
         if not len(fine.triangles):
             self.state = None
             return
-        coarse = depth_mesh(depth, view.camera, place, self._budget // COARSE_SHARE, self.surface)
+        coarse = depth_mesh(depth, view.camera, place, self.budget // COARSE_SHARE, self.surface)
         self._build([fine], triangle_corners(merge_for_gpu([coarse])))
 
     def _build(

@@ -1,5 +1,6 @@
 """From a frame and a scene to relit layers: geometry, lights, registration, and the method that the scene names."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import count
 from typing import Any
@@ -12,12 +13,14 @@ from render_server.albedo_watch import AlbedoWatch
 from render_server.gpu.context import GpuContext
 from render_server.gpu.timers import PassTimers
 from render_server.lighting import VERSION_STEP, Lighting
+from render_server.occlusion_fields import OcclusionFields
 from render_server.passes.composite import RelitLayers
 from render_server.picture_resources import PictureResources
 from render_server.real_geometry import RealGeometry
 from render_server.relight.frame import RelightInput
 from render_server.relight.methods import MethodChoice, choose_method
 from render_server.relight.relight_base import RelightBase
+from render_server.scene.mesh import TriangleMesh
 from render_server.scene.surfaces import build_surface_table
 from render_server.view import CameraView
 from render_server.virtual_objects import VirtualObjects
@@ -59,7 +62,9 @@ class Relighting:
         self._resources: PictureResources | None = None
         self._albedo = AlbedoWatch(gpu)
         self._method: RelightBase | None = None
+        self._fields = OcclusionFields(self._say)
         self._lights_versions = count(VERSION_STEP, VERSION_STEP)
+        self._relit: ViewFrame | None = None  # the last frame, as far as what it shows was taken over
         self._plan = self._planned(scene)
         self.lighting = self._plan.lighting
         self._take(self._plan)
@@ -69,6 +74,7 @@ class Relighting:
         method = choose_method(scene.method, software=self._gpu.is_software)
         if method.remark is not None:
             self._say(method.remark)
+        method.require(scene.objects)
         self._objects.load(scene.objects)
         for sentence in ignored_wishes(scene):
             self._say(sentence)
@@ -79,40 +85,60 @@ class Relighting:
             self._notices.append(sentence)
 
     def set_scene(self, scene: SceneDocument) -> None:
-        """Replace the scene; nothing changes if it cannot be used."""
+        """Replace the scene; nothing changes if it cannot be used. Pictures do not wait for what is precomputed."""
         self._take(self._planned(scene))
+        self._fields.waits = False
 
     def _take(self, plan: _Plan) -> None:
         old = self._plan
-        if (
-            self._real is None
-            or plan.scene.real != old.scene.real
-            or plan.method.resolved != old.method.resolved
-        ):
-            budget = plan.method.resolved.triangle_budget
+        budget = plan.method.resolved.triangle_budget
+        if self._real is not None and isinstance(plan.scene.method, NoneMethod):
+            budget = self._real.budget  # it asks for none
+        if self._real is None or plan.scene.real != old.scene.real or budget != self._real.budget:
             real = RealGeometry(self._gpu, plan.scene.real, budget, self._real_versions)
             if self._real is not None:
                 self._real.release()
             self._real = real
             self._albedo.begin(plan.scene.real.unseen_albedo)
+            self._relit = None
         if plan.method != old.method and self._method is not None:
             self._method.release()
             self._method = None
         if plan.scene.lights != old.scene.lights:
             self.lighting = plan.lighting
+            self._relit = None
         self._plan = plan
 
+    def begin_source(self) -> None:
+        """Forget all that was seen and found: another camera shows another room."""
+        plan = self._planned(self._plan.scene)
+        for item in (self._real, self._resources, self._method):
+            if item is not None:
+                item.release()
+        self._real = self._resources = self._method = None
+        self.lighting = plan.lighting
+        self._take(plan)
+
+    @property
+    def model(self) -> Sequence[TriangleMesh]:
+        """The real scene's, if it is given."""
+        return () if self._real is None else self._real.model
+
     def relight(self, frame: ViewFrame, view: CameraView) -> RelitFrame | None:
-        """Relit layers of one frame; None if no object is visible, or no light yet."""
-        lit = self.lighting.follow(frame)
-        virtual = self._objects.update(self._plan.scene.objects, frame.board)
+        """Relit layers of one frame; None if no object is visible, or no light yet.
+
+        The same frame again, in another view or by another method, adds nothing to what is averaged over frames.
+        """
+        again, self._relit = frame is self._relit, None
+        lit = again or self.lighting.follow(frame)
+        virtual = self._objects.update(self._plan.scene.objects, frame.board, frame.timestamp_ns)
         if virtual is None or self._real is None or not lit:
             return None
         resources = self._resources_for(view)
         timers = self._timers
         with timers.measure("upload"):
             resources.picture.upload(frame)
-        moved = self._real.update(frame, view)
+        moved = not again and self._real.update(frame, view)
         assert self._real.view is not None
         view = self._real.view  # while nothing moves, the pose's own jitter must not shake the picture
         if self._real.state is None:
@@ -146,6 +172,7 @@ class Relighting:
             resources.surface_uniforms,
             self._albedo.texture,
             timers,
+            resources.surface_table,
         )
         method = self._method_for(view)
         relight_input = self.lighting.complete(frame, relight_input, method.relight, moved=moved)
@@ -156,6 +183,7 @@ class Relighting:
             with timers.measure("inner edges"):
                 radiance = resources.with_inner_edges(layers.virtual_radiance)
             layers = replace(layers, virtual_radiance=radiance)
+        self._relit = frame
         uniforms = {
             "additive": self._plan.method.composition == "additive",
             "relights_real": not isinstance(self._plan.scene.method, NoneMethod),
@@ -181,7 +209,7 @@ class Relighting:
 
     def _method_for(self, view: CameraView) -> RelightBase:
         if self._method is None:
-            self._method = self._plan.method.make(self._gpu, view.size)
+            self._method = self._plan.method.make(self._gpu, view.size, self._fields)
         return self._method
 
     def describe_lights(self) -> list[dict[str, Any]]:
@@ -190,7 +218,7 @@ class Relighting:
 
     def release(self) -> None:
         """Free all GL objects."""
-        for item in (self._objects, self._real, self._resources, self._albedo, self._method):
+        for item in (self._objects, self._real, self._resources, self._albedo, self._method, self._fields):
             if item is not None:
                 item.release()
 

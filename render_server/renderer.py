@@ -6,14 +6,17 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32, Float64, UInt8
 
+from protocol.camera_model import CameraModel
+from protocol.errors import DeltalightError
 from protocol.frames import DepthImage, ViewFrame
 from protocol.scene import SceneDocument
 from protocol.scene_method import Output
 from render_server.compose import Composer
 from render_server.gpu.context import GpuContext
-from render_server.relighting import Relighting
+from render_server.picking import Pick, ShownFrame
+from render_server.relighting import Relighting, RelitFrame
 from render_server.view import CameraView
 
 
@@ -22,6 +25,8 @@ class CompositeFrame:
     """The finished picture of one frame.
 
     `color` is camera-coded, `linear` the same in camera units (before the response). `lights` are plain values.
+    `camera` and `world_from_camera` are those that it was made with: while nothing moves, the pose stays that of the
+    frame that the real scene was built from. No pose: the frame has none, or the picture is no camera's.
     """
 
     frame_id: int
@@ -29,6 +34,8 @@ class CompositeFrame:
     color: UInt8[np.ndarray, "h w 3"]
     linear: Float32[np.ndarray, "h w 3"] | None
     status: str
+    camera: CameraModel
+    world_from_camera: Float64[np.ndarray, "4 4"] | None
     pass_times_ms: dict[str, float] = field(default_factory=dict)
     lights: list[dict[str, Any]] = field(default_factory=list)
 
@@ -55,7 +62,10 @@ class SceneRenderer:
         self._gpu = gpu
         self.notices: list[str] = []
         self._relighting = Relighting(gpu, scene, self.notices)
-        self._composer = Composer(gpu, with_linear=with_linear)
+        self._composer = Composer(gpu)
+        self._with_linear = with_linear
+        self._sized: tuple[ViewFrame, ViewFrame] | None = None
+        self._shown: ShownFrame | None = None
         self.scene = scene
 
     def set_scene(self, scene: SceneDocument) -> None:
@@ -67,32 +77,71 @@ class SceneRenderer:
         self._relighting.set_scene(scene)
         self.scene = scene
 
-    def render(self, frame: ViewFrame) -> CompositeFrame:
-        """The composite of one frame; without pose or visible object it is the camera's picture, byte for byte."""
-        return self.start(frame).finish()
+    def begin_source(self) -> None:
+        """Forget all that earlier frames showed: the next ones come from elsewhere."""
+        self._shown = self._sized = None
+        self._relighting.begin_source()
 
-    def start(self, frame: ViewFrame) -> PendingComposite:
+    def render(self, frame: ViewFrame, *, with_linear: bool = False) -> CompositeFrame:
+        """The composite of one frame; without pose or visible object it is the camera's picture, byte for byte."""
+        return self.start(frame, with_linear=with_linear).finish()
+
+    def start(self, frame: ViewFrame, *, with_linear: bool = False) -> PendingComposite:
         """Hand a frame to the GPU; reading its picture back does not stall the frames after it."""
-        output = self.scene.output
-        size = output_size(frame, output)
-        if size != (frame.camera.width, frame.camera.height):
-            frame = resized_frame(frame, *size)
+        frame, self._shown = self.sized(frame), None
         if frame.pose is None:
-            return _untouched(frame, "no_pose")
+            self._shown = ShownFrame(frame, None, None)
+            return _at_once(self._shown, frame.color)
         view = CameraView(frame.camera, frame.pose.world_from_camera)
         relit = self._relighting.relight(frame, view)
         lights = self._relighting.describe_lights()
-        if output.view == "lights" and lights:
+        name = self.scene.output.view
+        shows_lights = name == "lights" and bool(lights)
+        is_cameras = frame.radiance_map is None if shows_lights else relit is None or name != "rsm"
+        seen = view if relit is None else relit.input.view
+        buffers = None if relit is None else relit.input
+        shown = ShownFrame(frame, seen if is_cameras else None, buffers, self._relighting.model)
+        self._shown = shown
+        if shows_lights:
             times = {} if relit is None else dict(relit.timers.end_frame())
-            return _at_once(frame, self._relighting.lighting.picture(frame), lights, times)
+            return _at_once(shown, self._relighting.lighting.picture(frame), times, lights)
         if relit is None:
-            return _untouched(frame, "ok")
-        self._composer.start(relit, output)
-        times = dict(relit.timers.end_frame())
+            return _at_once(shown, frame.color)
+        return self._composed(shown, relit, lights, with_linear=with_linear or self._with_linear)
+
+    def sized(self, frame: ViewFrame) -> ViewFrame:
+        """The frame at the composite's size; of the same frame the same one again."""
+        size = output_size(frame, self.scene.output)
+        if size == (frame.camera.width, frame.camera.height):
+            return frame
+        if self._sized is not None and self._sized[0] is frame:
+            camera = self._sized[1].camera
+            if (camera.width, camera.height) == size:
+                return self._sized[1]
+        self._sized = frame, resized_frame(frame, *size)
+        return self._sized[1]
+
+    def pick(self, x: float, y: float) -> Pick:
+        """What the newest picture shows at a pixel.
+
+        Raises:
+            DeltalightError: there is no picture yet, it has no pose, or the pixel lies outside.
+        """
+        if self._shown is None:
+            raise DeltalightError("Nothing was rendered yet; ask again when there is a picture.")
+        return self._shown.pick(x, y)
+
+    def _composed(
+        self, shown: ShownFrame, relit: RelitFrame, lights: list[dict[str, Any]], *, with_linear: bool
+    ) -> PendingComposite:
+        self._composer.start(relit, self.scene.output, with_linear=with_linear)
+        times, frame, pose = dict(relit.timers.end_frame()), shown.frame, shown.world_from_camera
 
         def finish() -> CompositeFrame:
-            color, linear = self._composer.finish()
-            return CompositeFrame(frame.frame_id, frame.timestamp_ns, color, linear, "ok", times, lights)
+            color, linear = self._composer.finish(with_linear=with_linear)
+            return CompositeFrame(
+                frame.frame_id, frame.timestamp_ns, color, linear, "ok", frame.camera, pose, times, lights
+            )
 
         return PendingComposite(finish, self._gpu.is_software)
 
@@ -103,19 +152,18 @@ class SceneRenderer:
 
 
 def _at_once(
-    frame: ViewFrame,
+    shown: ShownFrame,
     color: UInt8[np.ndarray, "h w 3"],
-    lights: list[dict[str, Any]],
-    times: dict[str, float],
+    times: dict[str, float] | None = None,
+    lights: list[dict[str, Any]] | None = None,
 ) -> PendingComposite:
-    """A picture that the GPU had no part in."""
-    composite = CompositeFrame(frame.frame_id, frame.timestamp_ns, color, None, "ok", times, lights)
-    return PendingComposite(lambda: composite, immediate=True)
-
-
-def _untouched(frame: ViewFrame, status: str) -> PendingComposite:
-    """The camera's picture itself."""
-    composite = CompositeFrame(frame.frame_id, frame.timestamp_ns, frame.color, None, status)
+    """A picture that the GPU had no part in: the camera's own, or that of the lights."""
+    frame = shown.frame
+    status = "no_pose" if frame.pose is None else "ok"
+    pose = shown.world_from_camera
+    composite = CompositeFrame(
+        frame.frame_id, frame.timestamp_ns, color, None, status, frame.camera, pose, times or {}, lights or []
+    )
     return PendingComposite(lambda: composite, immediate=True)
 
 

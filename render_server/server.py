@@ -7,7 +7,7 @@ which owns the OpenGL context and does nothing but render and carry out commands
 import queue
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as FutureTimeoutError
 from contextlib import ExitStack
@@ -21,19 +21,22 @@ from protocol.codecs import encode_color
 from protocol.documents import StrictModel
 from protocol.envelope import encode
 from protocol.errors import DeltalightError
+from protocol.files import write_bytes
 from protocol.keys import Keys
 from protocol.messages import ControlRequest, StatsMessage
 from protocol.scene import SceneDocument, load_scene
-from protocol.transport import Publisher, Receiver, ReplyServer
-from render_server.frame_assembly import TOPICS, FrameAssembler, PairingSettings
+from protocol.transport import Publisher, ReplyServer
+from render_server.frame_assembly import FrameAssembler, PairingSettings
+from render_server.frame_source import FrameSource
 from render_server.gpu.context import create_context
 from render_server.renderer import SceneRenderer
-from render_server.session import RenderedFrame, RenderSession
+from render_server.session import RenderedFrame, Renderer, RenderSession, SourceInUse
 
 GPU_TIMEOUT_S = 0.002  # a started frame is read back after so long, should no other follow
 RECEIVE_TIMEOUT_S = 0.05  # bounds how long a command waits while no frames come
 STATS_INTERVAL_S = 1.0
 ANSWER_TIMEOUT_S = 20.0
+SNAPSHOT_TIMEOUT_S = 120.0  # a frame in many views and by several methods, in software
 
 Payload = dict[str, object]
 
@@ -86,11 +89,12 @@ class CommandDesk:
         self._pending.put((request, answer))
         if self._closed:
             self.serve(_refuse)
+        timeout_s = SNAPSHOT_TIMEOUT_S if request.op == "snapshot" else ANSWER_TIMEOUT_S
         try:
-            return answer.result(ANSWER_TIMEOUT_S)
+            return answer.result(timeout_s)
         except FutureTimeoutError as fault:
             raise DeltalightError(
-                f"The renderer did not answer within {ANSWER_TIMEOUT_S:.0f} s; try again or restart it."
+                f"The renderer did not answer within {timeout_s:.0f} s; try again or restart it."
             ) from fault
 
     def serve(self, carry_out: Callable[[ControlRequest], Payload]) -> None:
@@ -122,26 +126,36 @@ class Sender:
         self.dropped = 0
         self._publisher = publisher
         self._quality = jpeg_quality
-        self._waiting: queue.Queue[RenderedFrame | StatsMessage | None] = queue.Queue(maxsize=2)
+        self._generation = 0  # pictures of an earlier one are not sent
+        self._waiting: queue.Queue[tuple[RenderedFrame | StatsMessage | None, int]] = queue.Queue(maxsize=2)
         self._thread = threading.Thread(target=self._run, name="sender", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
         """Send what waits, then end the thread."""
-        self._waiting.put(None)
+        self._waiting.put((None, self._generation))
         self._thread.join(timeout=1.0)
 
     def offer(self, item: RenderedFrame | StatsMessage) -> None:
         """Send it soon, or count it as dropped where sending is slower than rendering."""
         try:
-            self._waiting.put_nowait(item)
+            self._waiting.put_nowait((item, self._generation))
         except queue.Full:
             self.dropped += 1
 
+    def forget(self) -> None:
+        """Send no picture that was offered before."""
+        self._generation += 1
+
     def _run(self) -> None:
-        while (item := self._waiting.get()) is not None:
+        while True:
+            item, generation = self._waiting.get()
+            if item is None:
+                return
             try:
-                self._publisher.send(self._multipart(item))
+                pieces = self._multipart(item)
+                if generation == self._generation or isinstance(item, StatsMessage):
+                    self._publisher.send(pieces)
             except DeltalightError as fault:
                 log.warning("not sent", fault=str(fault))
 
@@ -168,27 +182,52 @@ def run_server(settings: ServerSettings, keys: Keys | None = None) -> None:
             log.warning("no GPU found, rendering slowly in software", renderer=gpu.renderer_name)
         renderer = SceneRenderer(gpu, scene)
         stack.callback(renderer.release)
+        serve(settings, renderer, scene, renderer_name=gpu.renderer_name, keys=keys)
+
+
+def serve(
+    settings: ServerSettings,
+    renderer: Renderer,
+    scene: SceneDocument,
+    *,
+    renderer_name: str,
+    keys: Keys | None = None,
+) -> None:
+    """Open the sockets around a renderer that shows `scene`; serve until a `shutdown` command. This thread renders.
+
+    Raises:
+        DeltalightError: a port in use, or an endpoint that leaves the host without keys.
+    """
+    with ExitStack() as stack:
         publisher = Publisher(settings.publish, keys=keys)
         stack.callback(publisher.close)
         sender = Sender(publisher, settings.jpeg_quality)
         stack.callback(sender.close)
-        receiver = Receiver(settings.subscribe, TOPICS, keys=keys)
-        stack.callback(receiver.close)
+        source = FrameSource(settings.subscribe, keys)
+        stack.callback(source.close)
+
+        def use_source(endpoints: Sequence[str] | None) -> SourceInUse:
+            is_another = source.use(endpoints)
+            if is_another:
+                sender.forget()
+            return SourceInUse(source.endpoints, is_another)
+
         session = RenderSession(
             renderer,
             scene,
             assembler=FrameAssembler(settings.pairing),
             name=settings.name,
-            renderer_name=gpu.renderer_name,
+            renderer_name=renderer_name,
             keep_scene=lambda kept: _keep(settings.session, kept),
-            mailbox_drops=lambda: {**receiver.drops, "send": sender.dropped},
+            use_source=use_source,
+            mailbox_drops=lambda: {**source.drops, "send": sender.dropped},
         )
         desk = CommandDesk()
         replies = ReplyServer(settings.control, desk.ask, node=settings.name, keys=keys)
         stack.callback(replies.close)
         stack.callback(desk.close)
-        log.info("render server runs", renderer=gpu.renderer_name, publish=settings.publish)
-        _loop(session, receiver, sender, desk)
+        log.info("render server runs", renderer=renderer_name, publish=settings.publish)
+        _loop(session, source, sender, desk)
 
 
 def _patience_s(session: RenderSession) -> float:
@@ -196,10 +235,10 @@ def _patience_s(session: RenderSession) -> float:
     return GPU_TIMEOUT_S if session.is_waiting_for_gpu else RECEIVE_TIMEOUT_S
 
 
-def _loop(session: RenderSession, receiver: Receiver, sender: Sender, desk: CommandDesk) -> None:
+def _loop(session: RenderSession, source: FrameSource, sender: Sender, desk: CommandDesk) -> None:
     stats_due_s = time.monotonic()
     while not session.stopping:
-        for multipart in (receiver.latest(_patience_s(session)) or {}).values():
+        for multipart in (source.latest(_patience_s(session)) or {}).values():
             session.receive(multipart)
         rendered = session.step()
         if rendered is not None:
@@ -212,6 +251,4 @@ def _loop(session: RenderSession, receiver: Receiver, sender: Sender, desk: Comm
 
 def _keep(path: Path | None, scene: SceneDocument) -> None:
     if path is not None:
-        temporary = path.with_name(f".{path.name}.tmp")
-        temporary.write_text(scene.model_dump_json(indent=1), encoding="utf-8")
-        temporary.replace(path)
+        write_bytes(path, scene.model_dump_json(indent=1).encode())

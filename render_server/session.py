@@ -11,9 +11,11 @@ from typing import Any, Protocol
 
 import numpy as np
 import structlog
-from jaxtyping import UInt8
+from jaxtyping import Float32, Float64, UInt8
+from pydantic import ConfigDict
 
-from protocol.documents import nearest
+from protocol.camera_model import CameraModel
+from protocol.documents import StrictModel, nearest, validate
 from protocol.envelope import decode
 from protocol.errors import DeltalightError
 from protocol.frames import ViewFrame
@@ -21,6 +23,8 @@ from protocol.messages import CompositeMessage, ControlRequest, StatsMessage
 from protocol.scene import SceneDocument, parse_scene
 from protocol.transport import ReceivedMultipart
 from render_server.frame_assembly import AssembledFrame, FrameAssembler
+from render_server.frame_source import SourceOrder
+from render_server.snapshot import SnapshotOrder, take_snapshot
 
 RATE_WINDOW_S = 5.0
 WAITING_AFTER_S = 2.0
@@ -41,12 +45,31 @@ class Composite(Protocol):
         """`ok` or `no_pose`."""
 
     @property
+    def camera(self) -> CameraModel:
+        """The camera at the picture's size."""
+
+    @property
+    def world_from_camera(self) -> Float64[np.ndarray, "4 4"] | None:
+        """Where it stood; None without a pose."""
+
+    @property
     def pass_times_ms(self) -> dict[str, float]:
         """Milliseconds of each pass."""
 
     @property
     def lights(self) -> Sequence[dict[str, Any]]:
         """The lights that the picture was made with."""
+
+    @property
+    def linear(self) -> Float32[np.ndarray, "h w 3"] | None:
+        """The picture before the camera's response, where that was asked for."""
+
+
+class Pick(Protocol):
+    """What a pixel shows (`picking.Pick`)."""
+
+    def as_dict(self) -> dict[str, object]:
+        """The pick as plain data."""
 
 
 class Pending(Protocol):
@@ -68,8 +91,17 @@ class Renderer(Protocol):
     def notices(self) -> Sequence[str]:
         """Sentences that a user should read; the list only grows."""
 
-    def start(self, frame: ViewFrame) -> Pending:
+    def start(self, frame: ViewFrame, *, with_linear: bool = False) -> Pending:
         """Begin the composite of one frame; frames finish in the order in which they were started."""
+
+    def sized(self, frame: ViewFrame) -> ViewFrame:
+        """The frame at the composite's size."""
+
+    def pick(self, x: float, y: float) -> Pick:
+        """What the newest picture shows at a pixel."""
+
+    def begin_source(self) -> None:
+        """Forget what earlier frames showed."""
 
     def set_scene(self, scene: SceneDocument) -> None:
         """Use another scene from the next frame on."""
@@ -83,11 +115,42 @@ class RenderedFrame:
     pixels: UInt8[np.ndarray, "h w 3"]
 
 
+@dataclass(frozen=True)
+class _Started:
+    """A frame at the GPU, and the revision of the scene that it was begun with."""
+
+    frame: AssembledFrame
+    pending: Pending
+    revision: int
+
+
+@dataclass(frozen=True)
+class SourceInUse:
+    """Endpoints that are read now, and whether they are others than before."""
+
+    endpoints: Sequence[str]
+    is_another: bool
+
+
+class PickOrder(StrictModel):
+    """A pixel of the composite; centres are at integers."""
+
+    model_config = ConfigDict(strict=True)
+
+    x: float
+    y: float
+
+
+def _only_configured(_endpoints: Sequence[str] | None) -> SourceInUse:
+    raise DeltalightError("This render session cannot change its source; start it with other endpoints.")
+
+
 class RenderSession:
     """Keeps one scene, its renderer and the frames that wait for it.
 
     `keep_scene` is called with every scene that was accepted, so that a restart can go on with it;
-    `mailbox_drops` tells what the receiver dropped, by topic.
+    `mailbox_drops` tells what the receiver dropped, by topic; `use_source` makes it read other endpoints (None: those
+    configured).
     """
 
     def __init__(
@@ -100,6 +163,7 @@ class RenderSession:
         renderer_name: str = "",
         keep_scene: Callable[[SceneDocument], None] = lambda _scene: None,
         mailbox_drops: Callable[[], Mapping[str, int]] = dict,
+        use_source: Callable[[Sequence[str] | None], SourceInUse] = _only_configured,
         clock_ns: Callable[[], int] = time.time_ns,
     ) -> None:
         self.scene = scene
@@ -112,8 +176,11 @@ class RenderSession:
         self._renderer_name = renderer_name
         self._keep_scene = keep_scene
         self._mailbox_drops = mailbox_drops
+        self._use_source = use_source
         self._clock_ns = clock_ns
-        self._started: tuple[AssembledFrame, Pending] | None = None
+        self._newest: AssembledFrame | None = None
+        self._finished: RenderedFrame | None = None
+        self._started: _Started | None = None
         self._rendered_ns: deque[int] = deque()
         self._last_fault = ""
         self._faults_in_a_row = 0
@@ -136,12 +203,17 @@ class RenderSession:
     def step(self) -> RenderedFrame | None:
         """Start the newest frame, if one is ready, and give the one that was started before (in software: itself).
 
+        A picture that a command finished comes first.
+
         A frame that cannot be rendered is counted and logged.
 
         Raises:
             Exception: nothing but unexpected faults `MAXIMUM_FAULTS_IN_A_ROW` times: the renderer is broken,
                 not the frames, and only a restart of the process helps.
         """
+        if self._finished is not None:
+            finished, self._finished = self._finished, None
+            return finished
         try:
             frame = self._assembler.take(self._clock_ns())
             return self._render(frame)
@@ -179,34 +251,71 @@ class RenderSession:
         Raises:
             DeltalightError: an unknown command, or one that is refused.
         """
-        match request.op:
-            case "ping":
-                return {}
-            case "get_scene":
-                return {"scene": self.scene.model_dump(mode="json")}
-            case "set_scene":
-                return self._set_scene(request)
-            case "set_view":
-                return self._use_scene(_with_view(self.scene, request.payload.get("view")))
-            case "stats":
-                return {"stats": self.stats().model_dump(mode="json")}
-            case "shutdown":
-                self.stopping = True
-                return {}
-        known = ("ping", "get_scene", "set_scene", "set_view", "stats", "shutdown")
-        hint = nearest(request.op, known) or ", ".join(known)
-        raise DeltalightError(f"There is no command '{request.op}'; did you mean {hint}?")
+        commands: dict[str, Callable[[ControlRequest], dict[str, object]]] = {
+            "ping": lambda _: {"revision": self.scene.revision},
+            "get_scene": lambda _: {"scene": self.scene.model_dump(mode="json")},
+            "set_scene": self._set_scene,
+            "set_view": lambda asked: self._use_scene(_with_view(self.scene, asked.payload.get("view"))),
+            "pick": self._pick,
+            "snapshot": self._snapshot,
+            "set_source": self._set_source,
+            "stats": lambda _: {"stats": self.stats().model_dump(mode="json")},
+            "shutdown": self._shut_down,
+        }
+        if request.op not in commands:
+            hint = nearest(request.op, commands) or ", ".join(commands)
+            raise DeltalightError(f"There is no command '{request.op}'; did you mean {hint}?")
+        return commands[request.op](request)
+
+    def _shut_down(self, _request: ControlRequest) -> dict[str, object]:
+        self.stopping = True
+        return {}
+
+    def _pick(self, request: ControlRequest) -> dict[str, object]:
+        pixel = validate(PickOrder, request.payload, "the command pick")
+        return self._renderer.pick(pixel.x, pixel.y).as_dict()
+
+    def _snapshot(self, request: ControlRequest) -> dict[str, object]:
+        order = validate(SnapshotOrder, request.payload, "the command snapshot")
+        frame = self._newest
+        if frame is None:
+            raise DeltalightError("No frame has come yet; take the snapshot when there is a picture.")
+        self._finish_started()
+        taken = take_snapshot(self._renderer, self.scene, frame.view, order)
+        return {
+            "frame_id": frame.color.frame_id,
+            "capture_ns": frame.color.capture_ns,
+            "files": taken.files,
+            "errors": taken.errors,
+        }
+
+    def _set_source(self, request: ControlRequest) -> dict[str, object]:
+        order = validate(SourceOrder, request.payload, "the command set_source")
+        self._finish_started()
+        source = self._use_source(order.endpoints)
+        if source.is_another:
+            self._finished = self._newest = None  # of the source before
+            self._assembler = self._assembler.begun_anew()
+            self._renderer.begin_source()
+        return {"endpoints": list(source.endpoints)}
+
+    def _finish_started(self) -> None:
+        """Wait for the frame at the GPU, so that a command may use it; its picture comes with the next step."""
+        before, self._started = self._started, None
+        if before is not None:
+            self._finished = self._finish(before)
 
     def _render(self, frame: AssembledFrame | None) -> RenderedFrame | None:
         before, self._started = self._started, None
         if frame is not None:
-            self._started = frame, self._renderer.start(frame.view)
-        if before is None and self._started is not None and self._started[1].immediate:
+            self._newest = frame
+            self._started = _Started(frame, self._renderer.start(frame.view), self.scene.revision)
+        if before is None and self._started is not None and self._started.pending.immediate:
             before, self._started = self._started, None
-        return None if before is None else self._finish(*before)
+        return None if before is None else self._finish(before)
 
-    def _finish(self, frame: AssembledFrame, pending: Pending) -> RenderedFrame:
-        composite = pending.finish()
+    def _finish(self, started: "_Started") -> RenderedFrame:
+        composite, frame = started.pending.finish(), started.frame
         self._last_fault = ""
         self._faults_in_a_row = 0
         self._log_notices()
@@ -221,6 +330,9 @@ class RenderSession:
             encoding="raw",
             shape=(*composite.color.shape[:2], 3),
             status="ok" if composite.status == "ok" else "no_pose",
+            scene_revision=started.revision,
+            camera=composite.camera.to_dict(),
+            world_from_camera=_rows(composite.world_from_camera),
             received_ns=frame.received_ns,
             rendered_ns=self._rendered_ns[-1],
             pass_times_ms=composite.pass_times_ms,
@@ -262,6 +374,10 @@ class RenderSession:
             log.warning(kind, fault=sentence)
             log.debug("traceback", exc_info=fault)
         self._last_fault = sentence
+
+
+def _rows(matrix: Float64[np.ndarray, "4 4"] | None) -> Any:  # noqa: ANN401 - pydantic makes tuples of four of it
+    return None if matrix is None else matrix.tolist()
 
 
 def _needs_depth(scene: SceneDocument) -> bool:

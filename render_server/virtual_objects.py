@@ -12,25 +12,29 @@ from protocol.errors import DeltalightError
 from protocol.scene_objects import Material as MaterialDocument
 from protocol.scene_objects import SceneObject
 from render_server.gpu.context import GpuContext
+from render_server.moving_object import MovingObject, clip_of
 from render_server.passes.materials import MaterialTable
 from render_server.passes.mesh_buffers import MeshBuffers, triangle_corners
-from render_server.relight.frame import GeometryState
+from render_server.relight.frame import GeometryState, PlacedObject
 from render_server.scene.materials import Material
-from render_server.scene.mesh import TriangleMesh, load_mesh, merge_for_gpu
+from render_server.scene.mesh import Asset, GpuMesh, TriangleMesh, load_asset, merge_for_gpu
 
 MARKER_FRAME = "marker:"
 
 
 class VirtualObjects:
-    """Loads assets once, moves them when the document does."""
+    """Loads assets once, moves them when the document or their clips do."""
 
     def __init__(self, gpu: GpuContext) -> None:
         self._gpu = gpu
-        self._assets: dict[str, list[TriangleMesh]] = {}
+        self._assets: dict[str, Asset] = {}
         self._buffers = MeshBuffers(gpu)
-        self._materials: MaterialTable | None = None
+        self._materials: tuple[tuple[Material, ...], MaterialTable] | None = None
+        self._given: dict[MaterialDocument, Material] = {}
         self._shown: tuple[SceneObject, ...] = ()
         self._board: BoardSpec | None = None
+        self._moving: dict[str, MovingObject] = {}
+        self._standing: dict[str, list[TriangleMesh]] = {}
         self._version = 0
         self.state: GeometryState | None = None
 
@@ -38,50 +42,127 @@ class VirtualObjects:
         """Read the assets of all visible objects now, so that a bad file is found before the first frame.
 
         Raises:
-            DeltalightError: an asset cannot be read, or a material that this release lacks.
+            DeltalightError: an asset cannot be read, has not the clip that is wanted, or a material that this release
+                lacks.
         """
         for item in objects:
-            if item.visible and item.asset not in self._assets:
-                self._assets[item.asset] = load_mesh(Path(item.asset))
+            if item.visible:
+                if item.asset not in self._assets:
+                    self._assets[item.asset] = load_asset(Path(item.asset))
+                moving = self._animated(item)
+                if moving is not None:
+                    _ = moving.bounds
             if item.material is not None and not isinstance(item.material, MaterialDocument):
                 raise DeltalightError(
                     f"object `{item.id}`: precomputed materials arrive with a later release; give base_color instead."
                 )
 
-    def update(self, objects: Sequence[SceneObject], board: BoardSpec | None) -> GeometryState | None:
-        """The visible objects' triangles; None if there are none."""
+    def _animated(self, item: SceneObject) -> MovingObject | None:
+        """The object as its clip moves it; None if it plays none."""
+        asset = self._assets[item.asset].animated
+        clip = clip_of(item, asset)
+        if asset is None or clip is None or item.playing is None:
+            return None
+        return MovingObject(asset, clip, item.playing)
+
+    def update(
+        self, objects: Sequence[SceneObject], board: BoardSpec | None, capture_ns: int
+    ) -> GeometryState | None:
+        """The visible objects' triangles as a frame of that capture time shows them; None if there are none."""
         shown = tuple(item for item in objects if item.visible)
-        if shown == self._shown and board == self._board:
-            return self.state
-        self._shown, self._board = shown, board
-        self._version += 1
-        self.state = self._build(shown, board) if shown else None
+        is_new = shown != self._shown or board != self._board
+        if is_new:
+            self._shown, self._board = shown, board
+            animated = {item.id: self._animated(item) for item in shown}
+            self._moving = {name: moving for name, moving in animated.items() if moving is not None}
+            self._standing = {}
+            self._given = {each: made for each, made in self._given.items() if each in _materials(shown)}
+        moved = [moving.follow(capture_ns) for moving in self._moving.values()]
+        if is_new or any(moved):
+            self._version += 1
+            self.state = self._build() if shown else None
         return self.state
 
-    def _build(self, shown: tuple[SceneObject, ...], board: BoardSpec | None) -> GeometryState:
-        meshes = [mesh for item in shown for mesh in self._placed(item, board)]
-        merged = merge_for_gpu(meshes)
+    def _build(self) -> GeometryState | None:
+        """Merge and upload; None if all has shrunk to a point."""
+        objects = [self._described(item) for item in self._shown]
+        each = [self._placed(item) for item in objects]
+        merged = merge_for_gpu([mesh for meshes in each for mesh in meshes])
+        points = [np.vstack([_box_corners(mesh.bounds()) for mesh in meshes]) for meshes in each]
+        swept = [self._swept(item, held) for item, held in zip(objects, points, strict=True)]
+        if not np.ptp(np.vstack(swept), axis=0).any():
+            return None
         self._buffers.write(merged)
-        if self._materials is not None:
-            self._materials.release()
-        self._materials = MaterialTable(self._gpu, merged)
-        points = np.vstack([_box_corners(mesh.bounds()) for mesh in meshes])
-        return GeometryState(self._version, self._buffers, triangle_corners(merged), points, self._materials)
+        return GeometryState(
+            self._version,
+            self._buffers,
+            triangle_corners(merged),
+            np.vstack(points),
+            self._material_table(merged),
+            objects=tuple(objects),
+            swept_points=np.vstack(swept) if any(item.moves for item in objects) else None,
+        )
 
-    def _placed(self, item: SceneObject, board: BoardSpec | None) -> list[TriangleMesh]:
-        """An object's meshes in the world, with the document's material if it gives one."""
-        matrix = world_from_frame(item, board) @ item.world_from_object()
-        meshes = [mesh.transformed(matrix) for mesh in self._assets[item.asset]]
+    def _material_table(self, merged: GpuMesh) -> MaterialTable:
+        """The table on the GPU, filled anew only if the materials are others than before."""
+        before = self._materials
+        if before is not None:
+            same = len(before[0]) == len(merged.materials)
+            if same and all(a is b for a, b in zip(before[0], merged.materials, strict=True)):
+                return before[1]
+            before[1].release()
+        table = MaterialTable(self._gpu, merged)
+        self._materials = merged.materials, table
+        return table
+
+    def _described(self, item: SceneObject) -> PlacedObject:
+        """The object by itself, for what is precomputed of its asset."""
+        moving = self._moving.get(item.id)
+        return PlacedObject(
+            item.id,
+            tuple(self._assets[item.asset].meshes if moving is None else moving.meshes),
+            world_from_frame(item, self._board) @ item.world_from_object(),
+            self._given_material(item),
+            moves=moving is not None and not moving.is_still,
+        )
+
+    def _given_material(self, item: SceneObject) -> Material | None:
+        """The document's material if it gives one; the same object for the same document."""
         if not isinstance(item.material, MaterialDocument):
-            return meshes
-        material = Material.from_document(item.material)
-        return [replace(mesh, material=material, colors=None) for mesh in meshes]
+            return None
+        if item.material not in self._given:
+            self._given[item.material] = Material.from_document(item.material)
+        return self._given[item.material]
+
+    def _placed(self, item: PlacedObject) -> list[TriangleMesh]:
+        """An object's meshes in the world."""
+        if item.id in self._standing:
+            return self._standing[item.id]
+        meshes = [mesh.transformed(item.world_from_asset) for mesh in item.meshes]
+        if item.material is not None:
+            meshes = [replace(mesh, material=item.material, colors=None) for mesh in meshes]
+        if not item.moves:
+            self._standing[item.id] = meshes
+        return meshes
+
+    def _swept(self, item: PlacedObject, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "k 3"]:
+        """Points that enclose the object at all times."""
+        if not item.moves:
+            return points
+        matrix = item.world_from_asset
+        corners = _box_corners(self._moving[item.id].bounds)
+        return np.asarray(corners @ matrix[:3, :3].T + matrix[:3, 3])
 
     def release(self) -> None:
         """Free the GL objects."""
         self._buffers.release()
         if self._materials is not None:
-            self._materials.release()
+            self._materials[1].release()
+
+
+def _materials(objects: Sequence[SceneObject]) -> set[MaterialDocument]:
+    """Materials that the document gives its objects."""
+    return {item.material for item in objects if isinstance(item.material, MaterialDocument)}
 
 
 def world_from_frame(item: SceneObject, board: BoardSpec | None) -> Float64[np.ndarray, "4 4"]:

@@ -110,17 +110,19 @@ def node_camera(config: NodeConfig) -> Camera:
     )
 
 
-def run_node(config: NodeConfig, stop: threading.Event, keys: Keys | None = None) -> None:
+def run_node(
+    config: NodeConfig, stop: threading.Event, keys: Keys | None = None, camera: Camera | None = None
+) -> None:
     """Publish frames until `stop` is set or the source ends; returns within a second of `stop`.
 
     For each frame: fish-eye pictures and radiance where there are new ones, raw depth, clean depth, lamps, pose, then
     colour, all with its `frame_id` and capture time; so whoever has the colour has had the rest. Statistics go out
-    once a second. `keys` are needed where an endpoint leaves the host.
+    once a second. `keys` are needed where an endpoint leaves the host; `camera` stands for the configured source.
 
     Raises:
         DeltalightError: the source or the endpoint cannot be used, or a frame of the source is broken.
     """
-    camera = node_camera(config)
+    camera = node_camera(config) if camera is None else camera
     with ExitStack() as stack:
         publisher = Publisher(config.endpoint, keys=keys)
         stack.callback(publisher.close)

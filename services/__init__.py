@@ -1,1 +1,1 @@
-"""What people and programs start: command line, supervisor, demo, viewer page."""
+"""What people and programs start: command line, supervisor, demo, web process."""

@@ -20,6 +20,7 @@ from services.commands.demo import demo
 from services.commands.doctor import doctor
 from services.commands.keys import keys
 from services.commands.node import node
+from services.commands.ping import ping
 from services.commands.record import record
 from services.commands.recordings import recordings
 from services.commands.render import render
@@ -27,7 +28,6 @@ from services.commands.replay import replay
 from services.commands.schema import schema
 from services.commands.server import server
 from services.commands.up import up
-from services.commands.viewer import viewer
 from services.lifeline import end_with_supervisor
 from services.logs import configure_logging
 from services.signals import Terminated, raise_on_sigterm
@@ -41,7 +41,7 @@ app = typer.Typer(
     rich_markup_mode="rich",
     help="Mixed-reality relighting: virtual objects in a camera picture, with light that agrees both ways.",
 )
-for command in (render, demo, node, server, viewer, up, record, replay, config, doctor, schema, board):
+for command in (render, demo, node, server, up, record, replay, config, doctor, schema, board, ping):
     app.command()(command)
 app.add_typer(api, name="api")
 app.add_typer(recordings, name="recordings")

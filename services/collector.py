@@ -18,7 +18,7 @@ from protocol.errors import DeltalightError
 from protocol.messages import CompositeMessage, ControlRequest
 from protocol.transport import ReceivedMultipart, Receiver, RequestClient
 from services.files import replacing, write_bytes, write_png
-from services.live import age_ms
+from services.frame_age import age_ms
 
 CONTROL_TIMEOUT_S = 10.0
 SHEET_PICTURES = 20

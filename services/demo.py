@@ -1,11 +1,15 @@
-"""The demo: the shipped recording through node, render server and viewer, each a process of its own."""
+"""The demo: the shipped recording through node, render server and web process, each a process of its own."""
 
 import json
 import os
 import sys
 import time
 import webbrowser
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from protocol.errors import DeltalightError
@@ -13,12 +17,15 @@ from protocol.scene import SceneDocument, load_scene
 from services import ports
 from services.collector import CompositeCollector, summarize
 from services.files import make_output_folder
-from services.host import HostPlan, session_file
+from services.host import HostPlan
+from services.host_store import activate_document, session_file
+from services.storage.store import Store
 from services.supervisor import POLL_INTERVAL_S, Supervisor
 
 ASSETS = Path(__file__).parent / "demo_assets"
 RECORDING = ASSETS / "demo.mcap"
 SCENE = ASSETS / "scene.json"
+NAME = "Demo"
 FIRST_FRAME_TIMEOUT_S = 120.0  # a cold shader cache on a slow machine takes a while
 BETWEEN_FRAMES_TIMEOUT_S = 60.0
 
@@ -36,26 +43,41 @@ def demo_scene(method: str) -> SceneDocument:
 
 
 def with_method(scene: SceneDocument, method: str) -> SceneDocument:
-    """The scene with another method: `dvct` (as it is), dvct's operator `exact` or `paper`."""
-    return scene if method == "dvct" else scene.replaced(method=scene.method.replaced(operator=method))
+    """The scene with another method: `dvct` (as it is), dvct's operator `exact` or `paper`, or NAME[-OPERATOR]."""
+    if method == "dvct":
+        return scene
+    if method in ("exact", "paper"):
+        return scene.replaced(method=scene.method.replaced(operator=method))
+    name, _, operator = method.partition("-")
+    return scene.replaced(method={"name": name, **({"operator": operator} if operator else {})})
 
 
 def run_live(method: str, *, port: int, with_browser: bool) -> None:
-    """Run the demo with its page until Ctrl-C.
+    """Run the demo with its dashboard until Ctrl-C; what is changed in it is not kept.
 
     Raises:
         DeltalightError: a port is in use, or a process died for good.
     """
-    with session_file(demo_scene(method)) as session:
-        plan = demo_plan(session, page_port=port)
+    ports.require_free(port, "dashboard", "--port")
+    with TemporaryDirectory(prefix="deltalight-demo-") as data, _kept(method, Path(data)) as session:
+        plan = replace(demo_plan(session), data=Path(data), page_port=port)
         plan.require_free_ports()
         address = f"http://{ports.LOOPBACK}:{port}"
         with Supervisor(plan.specs()) as supervisor:
-            print(f"The live picture is at {address} (Ctrl-C ends the demo).", flush=True)
+            print(f"The dashboard is at {address} (Ctrl-C ends the demo).", flush=True)
             supervisor.run(until=lambda: ports.answers(port))
             if with_browser and _has_display():
                 webbrowser.open(address)
             supervisor.run()
+
+
+@contextmanager
+def _kept(method: str, data: Path) -> Iterator[Path]:
+    """The session's file of the demo's scene, which is also kept in a data folder, as the one that is shown."""
+    with Store(data) as store:
+        scene = activate_document(store, demo_scene(method).replaced(name=NAME))
+    with session_file(scene) as session:
+        yield session
 
 
 def run_headless(method: str, frames: int, out: Path, *, as_json: bool) -> None:
@@ -80,7 +102,7 @@ def collect_composites(scene: SceneDocument, frames: int, out: Path | None) -> d
         DeltalightError: a process died for good, or composites stopped coming.
     """
     with session_file(scene) as session:
-        plan = demo_plan(session, page_port=None)
+        plan = demo_plan(session)
         with Supervisor(plan.specs()) as supervisor:
             collector = CompositeCollector(
                 ports.endpoint(plan.composite_port), ports.endpoint(plan.control_port), out
@@ -108,8 +130,8 @@ def _collect(collector: CompositeCollector, supervisor: Supervisor, frames: int)
             )
 
 
-def demo_plan(session: Path, *, page_port: int | None) -> HostPlan:
-    """The demo's processes, joined by ports of their own."""
+def demo_plan(session: Path) -> HostPlan:
+    """The demo's processes without the web process, joined by ports of their own."""
     node_port, composite_port, control_port = ports.private_ports(3)
     return HostPlan(
         str(RECORDING),
@@ -117,7 +139,6 @@ def demo_plan(session: Path, *, page_port: int | None) -> HostPlan:
         node_port=node_port,
         composite_port=composite_port,
         control_port=control_port,
-        page_port=page_port,
         allow_software=True,
         log_level="warning",
     )

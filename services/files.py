@@ -1,17 +1,12 @@
-"""Files that appear whole or not at all, and the picture formats that commands write."""
+"""Output folders of commands; what is written there appears whole or not at all (protocol/files.py)."""
 
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
-import cv2
-import numpy as np
-from jaxtyping import UInt8
-
 from protocol.errors import DeltalightError
+from protocol.files import replacing, write_bytes, write_png
 
-PNG_COMPRESSION = 1  # zlib level; higher levels cost more time than a frame takes to render
+__all__ = ["make_output_folder", "replacing", "write_bytes", "write_png"]
 
 
 def make_output_folder(folder: Path) -> Path:
@@ -32,37 +27,3 @@ def make_output_folder(folder: Path) -> Path:
             f"The output folder '{folder}' cannot be written ({fault.strerror}); choose another with --out."
         ) from fault
     return folder
-
-
-@contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """Give a temporary path beside `path`; put it in place at the end, remove it at a fault.
-
-    The suffix is kept, because encoders choose their format by it.
-
-    Raises:
-        DeltalightError: the file cannot be written (a full disk, no rights).
-    """
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
-    try:
-        yield temporary
-        temporary.replace(path)
-    except OSError as fault:
-        raise DeltalightError(
-            f"'{path}' cannot be written ({fault.strerror}); free some space or name another --out."
-        ) from fault
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def write_bytes(path: Path, content: bytes) -> None:
-    """Write `content` to `path`, whole or not at all."""
-    with replacing(path) as temporary:
-        temporary.write_bytes(content)
-
-
-def write_png(path: Path, color: UInt8[np.ndarray, "h w 3"]) -> None:
-    """Write an RGB picture losslessly, at a low compression level."""
-    bgr = cv2.cvtColor(color, cv2.COLOR_RGB2BGR)
-    _, encoded = cv2.imencode(".png", bgr, [cv2.IMWRITE_PNG_COMPRESSION, PNG_COMPRESSION])
-    write_bytes(path, encoded.tobytes())

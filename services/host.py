@@ -1,17 +1,13 @@
-"""The processes of one host and how they are joined: node -> render server -> viewer, on loopback."""
+"""The processes of one host and how they are joined: node -> render server -> web process, on loopback."""
 
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 from protocol.errors import DeltalightError
 from protocol.scene import SceneDocument, load_scene
 from protocol.source import Source
 from services import ports
-from services.files import write_bytes
 from services.supervisor import ChildSpec
 
 
@@ -21,7 +17,8 @@ class HostPlan:
 
     `source` is what the node of this host captures; None = there is none, and the server looks for the node called
     `remote_node` on the network. `config` is the configuration file of all; None = the one they find, and what
-    stands here by default says nothing.
+    stands here by default says nothing. `data` is the folder of scenes of the web process, which runs where it is
+    given.
     """
 
     source: str | None
@@ -31,7 +28,8 @@ class HostPlan:
     node_port: int = ports.NODE_PORT
     composite_port: int = ports.COMPOSITE_PORT
     control_port: int = ports.CONTROL_PORT
-    page_port: int | None = ports.PAGE_PORT
+    data: Path | None = None
+    page_port: int = ports.PAGE_PORT
     device: int | None = None
     allow_software: bool = False
     loop: bool = True
@@ -40,7 +38,7 @@ class HostPlan:
     def specs(self) -> list[ChildSpec]:
         """The children to supervise, in the order of the stream."""
         specs = [self._server()] if self.source is None else [self._node(self.source), self._server()]
-        return specs if self.page_port is None else [*specs, self._viewer(self.page_port)]
+        return specs if self.data is None else [*specs, self._web(self.data)]
 
     def require_free_ports(self) -> None:
         """Check every port before a child is started.
@@ -52,8 +50,8 @@ class HostPlan:
             ports.require_free(self.node_port, "sensor node", "--node-port")
         ports.require_free(self.composite_port, "composite of the render server", "--composite-port")
         ports.require_free(self.control_port, "control of the render server", "--control-port")
-        if self.page_port is not None:
-            ports.require_free(self.page_port, "viewer page", "--port")
+        if self.data is not None:
+            ports.require_free(self.page_port, "dashboard", "--port")
 
     def _child(self, name: str, command: str, *options: str) -> ChildSpec:
         return ChildSpec.deltalight(name, "--log-level", self.log_level, command, *options)
@@ -86,24 +84,20 @@ class HostPlan:
             options += ["--allow-software"]
         return self._child("render server", "server", *options)
 
-    def _viewer(self, port: int) -> ChildSpec:
-        return self._child(
-            "viewer",
-            "viewer",
-            *self._config,
-            *("--subscribe", ports.endpoint(self.composite_port)),
-            *("--control", ports.endpoint(self.control_port)),
-            *("--port", str(port)),
+    def _web(self, data: Path) -> ChildSpec:
+        node = (
+            ("--subscribe", ports.endpoint(self.node_port)) if self.source else ("--node", self.remote_node)
         )
-
-
-@contextmanager
-def session_file(scene: SceneDocument) -> Iterator[Path]:
-    """A temporary file with the scene document, as the render server's `--session` wants it."""
-    with TemporaryDirectory(prefix="deltalight-") as folder:
-        path = Path(folder) / "scene.json"
-        write_bytes(path, scene.model_dump_json(indent=1).encode())
-        yield path
+        return self._child(
+            "web process",
+            "api",
+            *self._config,
+            *("--data", str(data.absolute())),
+            *("--control", ports.endpoint(self.control_port)),
+            *("--subscribe", ports.endpoint(self.composite_port)),
+            *node,
+            *("--port", str(self.page_port)),
+        )
 
 
 def choose_scene(source: Source | None, path: Path | None) -> SceneDocument:

@@ -2,27 +2,43 @@
 
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
 from threading import Event
 
 from protocol.keys import KeySettings
+from sensor_node.cameras.playback import PlaybackCamera
 from sensor_node.node import NodeConfig, run_node
+from services.replay_control import playback_control
 from services.settings import load_configuration
 
 
-def run_configured_node(given: Mapping[str, object], config_file: Path | None) -> None:
+def run_configured_node(
+    given: Mapping[str, object],
+    config_file: Path | None,
+    camera: PlaybackCamera | None = None,
+    control: str | None = None,
+) -> None:
     """Run a node until Ctrl-C or its end; `given` settings win over the file's.
+
+    Args:
+        given: settings of the node.
+        config_file: configuration file; None = the one that is found.
+        camera: stands for the source that the settings name.
+        control: endpoint where that camera is controlled.
 
     Raises:
         DeltalightError: wrong settings, or the source, an endpoint or a key cannot be used.
     """
     configuration = load_configuration(config_file)
     config = configuration.section("node", NodeConfig, given)
-    endpoints = [each for each in (config.endpoint, config.clock_endpoint) if each is not None]
+    endpoints = [each for each in (config.endpoint, config.clock_endpoint, control) if each is not None]
     keys = configuration.section("keys", KeySettings).load(endpoints)
     stop = Event()
-    with ThreadPoolExecutor(1) as thread:
-        running = thread.submit(run_node, config, stop, keys)
+    with ExitStack() as stack, ThreadPoolExecutor(1) as thread:
+        if camera is not None and control is not None:
+            stack.enter_context(playback_control(camera, control, keys))
+        running = thread.submit(run_node, config, stop, keys, camera)
         try:
             running.result()  # signals interrupt this wait, not the node's work
         finally:

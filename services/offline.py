@@ -7,15 +7,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-import numpy as np
-from jaxtyping import Float32
-
 from protocol.errors import DeltalightError
-from protocol.frames import BoardPose, ViewFrame, decode_lut
+from protocol.files import replacing, write_png
+from protocol.frames import BoardPose, ViewFrame, linear_color
 from protocol.radiance_files import require_openexr, write_exr
 from protocol.scene import SceneDocument
 from protocol.source import Source
-from services.files import make_output_folder, replacing, write_png
+from services.files import make_output_folder
 
 if TYPE_CHECKING:
     from render_server.renderer import CompositeFrame, SceneRenderer
@@ -154,19 +152,12 @@ def _require_light(scene: SceneDocument, frame: ViewFrame, notes: Sequence[str])
 def _write_frame(job: RenderJob, number: int, frame: ViewFrame, composite: "CompositeFrame") -> None:
     write_png(job.out / f"{number:06d}.png", composite.color)
     if job.with_exr:
+        linear = linear_color(frame, composite.color) if composite.linear is None else composite.linear
         with replacing(job.out / f"{number:06d}.exr") as temporary:
-            write_exr(temporary, _linear(frame, composite))
+            write_exr(temporary, linear)
     mode = "w" if number == job.frames.start else "a"  # an older run's index goes with the first picture
     with (job.out / INDEX_FILE).open(mode, encoding="utf-8") as index:
         index.write(json.dumps(frame_record(number, frame, composite)) + "\n")
-
-
-def _linear(frame: ViewFrame, composite: "CompositeFrame") -> Float32[np.ndarray, "h w 3"]:
-    """The composite before the camera's response; an untouched picture is decoded by that response."""
-    if composite.linear is not None:
-        return composite.linear
-    lut = decode_lut(frame.response) / np.float32(frame.exposure_scale)
-    return np.stack([lut[composite.color[..., channel], channel] for channel in range(3)], axis=-1)
 
 
 def frame_record(number: int, frame: ViewFrame, composite: "CompositeFrame") -> dict[str, Any]:

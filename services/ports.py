@@ -9,7 +9,7 @@ LOOPBACK = "127.0.0.1"
 NODE_PORT = 5601  # a sensor node publishes
 COMPOSITE_PORT = 5602  # the render server publishes
 CONTROL_PORT = 5603  # the render server answers
-PAGE_PORT = 8000  # the viewer page
+PAGE_PORT = 8000  # the web process serves dashboard, REST API and live video
 PRIVATE_PORTS = range(20_000, 32_000)  # below the range that the kernel hands to outgoing connections
 
 
@@ -64,23 +64,3 @@ def private_ports(count: int) -> list[int]:
         if len(found) == count:
             return found
     raise DeltalightError(f"No {count} free ports between {PRIVATE_PORTS.start} and {PRIVATE_PORTS.stop}.")
-
-
-def listen(port: int) -> socket.socket:
-    """A socket bound to the loopback port.
-
-    Raises:
-        DeltalightError: another program listens on it.
-    """
-    bound = socket.socket()
-    bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    # asyncio sets it only on sockets that it made itself; without, small answers wait 40 ms for an acknowledgement.
-    bound.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    try:
-        bound.bind((LOOPBACK, port))
-    except OSError as fault:
-        bound.close()
-        raise DeltalightError(
-            f"Port {port} is in use by another program; end that one or choose another with --port."
-        ) from fault
-    return bound

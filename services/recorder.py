@@ -32,14 +32,14 @@ STEADY_AFTER_S = 2.0  # before, the rate says little about what is to come
 
 @dataclass(frozen=True)
 class RecordJob:
-    """What to record where; `node` None is the node whose colour picture comes first.
+    """What to record where; `node` None is the node at the endpoints whose colour picture comes first.
 
     `duration_s` counts from the first frame. `extrinsics` are the transforms between the sensors, which the
     streams do not carry.
     """
 
     out: Path
-    endpoint: str
+    endpoints: tuple[str, ...]
     node: str | None = None
     scene: SceneDocument | None = None
     extrinsics: Extrinsics | None = None
@@ -103,7 +103,7 @@ class Recorder:
         require_new_recording(job.out)
         self.status = RecordStatus(job.out)
         self._job, self._notice = job, notice
-        self._queue = StreamQueue(job.endpoint, ("stats", *RAW_STREAMS), job.keys)
+        self._queue = StreamQueue(job.endpoints, ("stats", *RAW_STREAMS), job.keys)
         self._assembler = RawFrameAssembler(job.node)
         self._files = ExitStack()
         self._writer: RecordingWriter | None = None
@@ -230,7 +230,7 @@ class Recorder:
             status.size_bytes = self._writer.active_path.stat().st_size
 
     def _silence(self) -> str:
-        where = self._job.endpoint
+        where = " and ".join(self._job.endpoints)
         others = ", ".join(sorted(self._assembler.foreign))
         if self.status.frames:
             return f"No frame came from {where} for {SILENCE_S:g} s; what was recorded is kept. Waiting for more."

@@ -15,19 +15,19 @@ class StreamQueue(Subscriber):
     """Messages in the order of their arrival; what comes while the queue is full is left out and counted.
 
     It is the counterpart of `protocol.receiver.Receiver`, whose newest message wins. `topics` are stream names
-    (`color`); subscriptions go out in their order. `keys` are needed where the endpoint leaves the host.
+    (`color`); subscriptions go out in their order. `keys` are needed where an endpoint leaves the host.
 
     Raises:
         DeltalightError: an endpoint that leaves the host without keys, or is not understood.
     """
 
-    def __init__(self, endpoint: str, topics: Sequence[str], keys: Keys | None = None) -> None:
+    def __init__(self, endpoints: Sequence[str], topics: Sequence[str], keys: Keys | None = None) -> None:
         self._messages: deque[ReceivedMultipart] = deque()
         self._held: Counter[str] = Counter()
         self._held_bytes = 0
         self._drops: Counter[str] = Counter()
         subscriptions = [topic + "." for topic in topics]
-        super().__init__([endpoint], subscriptions, keys=keys, high_water_mark=QUEUED_MESSAGES)
+        super().__init__(endpoints, subscriptions, keys=keys, high_water_mark=QUEUED_MESSAGES)
 
     def take(self, timeout_s: float) -> ReceivedMultipart | None:
         """Return the oldest message; None where none came within `timeout_s` seconds."""

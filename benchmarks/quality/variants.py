@@ -7,23 +7,32 @@ from typing import Any, Literal
 from protocol.documents import parse_mapping, validate
 from protocol.errors import DeltalightError
 from protocol.scene import SceneDocument
-from protocol.scene_method import DlpvMethod, DvctMethod, NoneMethod
+from protocol.scene_method import AroofMethod, DifferentialMethod, DlpvMethod, DvctMethod, NoneMethod
 
-Kind = Literal["camera", "none", "dvct", "dlpv", "path"]
-ADJUSTABLE: dict[str, tuple[Literal["dvct", "dlpv"], str]] = {
-    "exact": ("dvct", "exact"),
-    "paper": ("dvct", "paper"),
-    "dlpv": ("dlpv", "difference"),
-    "dlpv-paper": ("dlpv", "paper"),
+Kind = Literal["camera", "none", "dvct", "dlpv", "aroof", "differential", "path"]
+METHODS: dict[str, type[DvctMethod | DlpvMethod | AroofMethod | DifferentialMethod]] = {
+    "dvct": DvctMethod,
+    "dlpv": DlpvMethod,
+    "aroof": AroofMethod,
+    "differential": DifferentialMethod,
 }
-"""Variants that take settings: their method and its operator."""
+"""Kinds that the renderer makes with settings."""
+ADJUSTABLE: dict[str, tuple[Kind, dict[str, Any]]] = {
+    "exact": ("dvct", {"operator": "exact"}),
+    "paper": ("dvct", {"operator": "paper"}),
+    "differential": ("differential", {}),
+    "dlpv": ("dlpv", {"operator": "difference"}),
+    "dlpv-paper": ("dlpv", {"operator": "paper"}),
+    "aroof": ("aroof", {}),
+}
+"""Variants that take settings: their kind and what they set themselves."""
 TIMED_VARIANT = "exact"
 """`path` takes the time of this one's frame."""
 
 
 @dataclass(frozen=True)
 class Variant:
-    """One way to make the picture; `settings` are changes of the scene document (dvct and dlpv).
+    """One way to make the picture; `settings` are changes of the scene document (kinds in METHODS).
 
     A key names a setting of `method`, or one of `lights` or `output` with that before a dot.
     """
@@ -37,9 +46,9 @@ class Variant:
         """Return the document with this variant's method; `volume_size` is used where no setting names one."""
         if self.kind == "none":
             return document.replaced(method=NoneMethod())
-        if self.kind == "dlpv":
-            document = document.replaced(method=DlpvMethod())
-        size = {} if volume_size is None or self.kind == "dlpv" else {"volume_size": volume_size}
+        if self.kind in METHODS and not isinstance(document.method, METHODS[self.kind]):
+            document = document.replaced(method=METHODS[self.kind]())
+        size = {} if volume_size is None or self.kind in ("dlpv", "aroof") else {"volume_size": volume_size}
         parts: dict[str, dict[str, Any]] = {"method": size, "lights": {}, "output": {}}
         for key, value in self.settings.items():
             part, _, name = key.rpartition(".")
@@ -61,6 +70,8 @@ FIXED: dict[str, Variant] = {
             "dvct",
             {"operator": "exact", "lights.mode": "fisheye", "lights.registration": "auto"},
         ),
+        Variant("aroof", "object occlusion fields, machine's defaults", "aroof"),
+        Variant("differential", "two full solutions, subtracted, machine's defaults", "differential"),
         Variant("dlpv", "light propagation volumes, machine's defaults", "dlpv", {"operator": "difference"}),
         Variant("dlpv-paper", "the volume as printed in [P2]", "dlpv", {"operator": "paper"}),
         Variant("path", "path tracing with and without objects, in the time of an `exact` frame", "path"),
@@ -152,11 +163,11 @@ def _parse(text: str) -> Variant:
     if not changes or name not in ADJUSTABLE:
         known, adjustable = ", ".join(FIXED), " or ".join(f"{one}:KEY=VALUE" for one in ADJUSTABLE)
         raise DeltalightError(f"'{text}' is no method to compare; use {known}, or {adjustable}.")
-    kind, operator = ADJUSTABLE[name]
-    settings: dict[str, Any] = {"operator": operator}
+    kind, own = ADJUSTABLE[name]
+    settings = dict(own)
     for pair in changes.split(","):
         settings |= _setting(pair, text)
-    validate(DvctMethod if kind == "dvct" else DlpvMethod, settings, f"--methods {text}")
+    validate(METHODS[kind], settings, f"--methods {text}")
     return Variant(text, f"{name} with {changes.replace(',', ', ')}", kind, settings)
 
 

@@ -135,6 +135,9 @@ def _picture_examples() -> Iterator[Example]:
             encoding="raw",
             shape=shape,
             status="ok",
+            scene_revision=4,
+            camera=CAMERA,
+            world_from_camera=POSE,
             received_ns=CAPTURE_NS + 2_000_000,
             rendered_ns=CAPTURE_NS + 30_000_000,
             pass_times_ms={"voxelize": 1.25, "cones": 20.5},
@@ -212,6 +215,11 @@ def _small_examples() -> Iterator[Example]:
         node="api", capture_ns=CAPTURE_NS, id="a1", op="set_scene", revision=4, payload={"name": "table"}
     )
     yield "request", request, [], []
+    text = b'{"scene": {"name": "table"}}'
+    long = ControlRequest(
+        node="api", capture_ns=CAPTURE_NS, id="a2", op="set_scene", revision=5, payload_bytes=len(text)
+    )
+    yield "request_long", long, [text], []
     accepted = ControlReply(node="server", capture_ns=CAPTURE_NS, id="a1", ok=True, payload={"revision": 4})
     yield "reply_ok", accepted, [], []
     refused = ControlReply(

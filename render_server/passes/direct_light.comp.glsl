@@ -5,6 +5,7 @@
 #include "passes/common/geometry.glsl"
 #include "passes/common/surfaces.glsl"
 #include "passes/common/volume.glsl"
+#include "passes/common/caustics.glsl"
 #ifdef SHADOW_CONES
 #include "passes/common/shadow_cone.glsl"
 #endif
@@ -62,6 +63,9 @@ void main() {
             }
         }
     }
+    float fade = volume_fade(volume_coordinate(position.xyz));
+    if (reached && fade > 0.0)
+        e_rho += fade * caustic_irradiance(pixel, size, REAL_LAYER, position.xyz, normal.xyz, position.w);
     imageStore(direct_mu, pixel, vec4(e_mu, unshadowed));
     imageStore(direct_rho, pixel, vec4(e_rho, 0.0));
     if (specular_surfaces) {

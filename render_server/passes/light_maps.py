@@ -9,12 +9,15 @@ import numpy as np
 from jaxtyping import Float64
 
 from render_server.scene.lights import DirectionalLight, Light, RectangleLight, SpotLight
+from render_server.scene.mirror_lights import MirrorLight
 
 NEAR_MARGIN = 0.98  # near and far planes lie a little outside of what they enclose
 FAR_MARGIN = 1.02
 WIDEST_SINGLE_TANGENT = math.tan(math.radians(65))  # wider needs the six faces of a cube
 NEAREST_M = 1e-3
 EVERYWHERE = (0.0, 0.0, 0.0, 1.0)  # the plane before which everything lies
+SHARE_TEXELS = 256  # an edge of the map of what a plane mirrors
+NOT_MIRRORED = (0.0,) * 7 + (-1.0,) + (0.0,) * 8
 NARROWEST_BLEND_RAD = 1e-4  # what a spot without blend falls off over
 
 
@@ -55,6 +58,43 @@ def light_views(
     if isinstance(light, SpotLight):
         return _spot_views(light, position, receivers, occluders)
     return _views_around(position, receivers, occluders)
+
+
+def mirror_views(
+    mirror: MirrorLight,
+    receivers: Float64[np.ndarray, "n 3"],
+    occluders: Float64[np.ndarray, "m 3"],
+    above_m: float = 0.0,
+) -> list[LightView]:
+    """Views of an image of a light, of what stands before its plane by more than `above_m`."""
+    front = mirror.plane - np.array([0.0, 0.0, 0.0, above_m])
+    receivers, occluders = (points[points @ front[:3] + front[3] > 0] for points in (receivers, occluders))
+    if not len(receivers):
+        return []
+    return [replace(view, front=front) for view in light_views(mirror.light, receivers, occluders)]
+
+
+def share_map(
+    mirror: MirrorLight, points: Float64[np.ndarray, "n 3"]
+) -> tuple[Float64[np.ndarray, "4"], Float64[np.ndarray, "4"]]:
+    """Coordinates (0..1) on the plane, as rows that multiply (x, y, z, 1): where it shows the light to the points."""
+    normal, plane = mirror.plane[:3], mirror.plane
+    heights = points @ normal + plane[3]
+    points, heights = points[heights > 0], heights[heights > 0, None]
+    if isinstance(mirror.light, DirectionalLight):
+        way = np.broadcast_to(-mirror.light.direction.astype(float), points.shape)
+    else:
+        way = mirror.light.position.astype(float) - points
+    met = points + way * (heights / -(way @ normal)[:, None])
+    axes = _frame(normal)[:2]
+    local = met @ axes.T
+    if not len(local):
+        local = np.zeros((1, 2))
+    low, high = local.min(axis=0), local.max(axis=0)
+    extent = max(float((high - low).max()), NEAREST_M) * 1.1
+    offset = 0.5 - (low + high) / 2 / extent
+    rows = [np.append(axis / extent, shift) for axis, shift in zip(axes, offset, strict=True)]
+    return rows[0], rows[1]
 
 
 def _views_around(
@@ -208,8 +248,22 @@ def pack_view(view: LightView, tile: int, columns: int, tile_size: int) -> Float
     )
 
 
-def pack_light(light: Light, ranges: Sequence[int]) -> bytes:
-    """std430 Light: place, colour, shape, two axes as floats, the ranges of its views as integers."""
+def pack_mirror(
+    mirror: MirrorLight, layer: int, rows: Sequence[Float64[np.ndarray, "4"]], ranges: Sequence[int]
+) -> bytes:
+    """std430 Light of an image of a light; `rows` are those of `share_map`."""
+    own = mirror.tolerance_m, mirror.roughness, float(mirror.surface), float(mirror.source)
+    tail = [*mirror.plane, *mirror.f0, float(layer), *rows[0], *rows[1]]
+    return pack_light(mirror.light, ranges, own, tail)
+
+
+def pack_light(
+    light: Light,
+    ranges: Sequence[int],
+    own: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0),
+    tail: Sequence[float] = NOT_MIRRORED,
+) -> bytes:
+    """std430 Light: place, colour, shape, two axes and an image's own as floats, the ranges of its views as integers."""
     axis_u = axis_v = np.zeros(3)
     shape = (0.0, 1.0, 0.0)
     if isinstance(light, DirectionalLight):
@@ -225,6 +279,6 @@ def pack_light(light: Light, ranges: Sequence[int]) -> bytes:
     else:
         kind, place, color = 1, light.position, light.intensity
         shape = (light.radius_m, 1.0, 0.0)
-    floats = [*place, kind, *color, 0.0, *shape, 0.0, *axis_u, 0.0, *axis_v, 0.0]
+    floats = [*place, kind, *color, own[0], *shape, own[1], *axis_u, own[2], *axis_v, own[3], *tail]
     integers: np.ndarray[Any, np.dtype[np.int32]] = np.array(ranges, np.int32)
     return np.array(floats, np.float32).tobytes() + integers.tobytes()

@@ -1,5 +1,6 @@
 """Lights, their depth maps and the environment, bound for every pass that shades."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import moderngl
@@ -7,12 +8,24 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from render_server.gpu.context import GpuContext
-from render_server.passes.light_maps import LightView, light_views, pack_light, pack_view, tile_columns
+from render_server.passes.light_maps import (
+    SHARE_TEXELS,
+    LightView,
+    light_views,
+    mirror_views,
+    pack_light,
+    pack_mirror,
+    pack_view,
+    share_map,
+    tile_columns,
+)
 from render_server.passes.reflective_shadow_map import ShadowMapAtlas, texel_size_m
 from render_server.scene.lights import Light
+from render_server.scene.mirror_lights import MirrorLight
 from render_server.scene.octahedral import octahedral_grid, prefilter, sample_octahedral
 
-EMPTY = b"\0" * 128
+LIGHT_BYTES = 160  # of a std430 Light (passes/common/lights.glsl)
+EMPTY = b"\0" * 256
 
 
 class LightTable:
@@ -23,6 +36,8 @@ class LightTable:
         self.tile_size = tile_size
         self.shadow_samples = shadow_samples
         self.lights: list[Light] = []
+        self.mirrors: list[MirrorLight] = []  # the last of the lights
+        self.mirror_shares = gpu.ctx.texture_array((1, 1, 1), 2, dtype="f2")
         self.real_views: list[LightView] = []
         self.virtual_views: list[LightView] = []
         self.real_records = b""  # of the real views, as shaders read them: changes when these do
@@ -57,21 +72,38 @@ class LightTable:
         real_points: Float64[np.ndarray, "n 3"],
         receivers: Float64[np.ndarray, "k 3"],
         virtual_points: Float64[np.ndarray, "m 3"],
+        mirrors: Sequence[MirrorLight] = (),
     ) -> None:
         """Fit each light's views: around the real points that may receive the objects' shadow, and closely around
-        the virtual objects.
+        the virtual objects; those of mirror images before their planes.
         """
-        self.lights = lights
+        self.mirrors = list(mirrors)
+        self._make_shares()
+        self._maps = [share_map(mirror, np.concatenate([receivers, virtual_points])) for mirror in mirrors]
         real = [light_views(light, receivers, real_points) if len(receivers) else [] for light in lights]
         virtual = [
             light_views(light, virtual_points, virtual_points) if len(virtual_points) else []
             for light in lights
         ]
+        for mirror in mirrors:
+            real.append(mirror_views(mirror, receivers, real_points, mirror.tolerance_m))
+            virtual.append(mirror_views(mirror, virtual_points, virtual_points))
+        self.lights = [*lights, *(mirror.light for mirror in mirrors)]
         self.real_views = [view for views in real for view in views]
         self.virtual_views = [view for views in virtual for view in views]
         self.real_atlas = self._atlas_for(self.real_atlas, len(self.real_views))
         self.virtual_atlas = self._atlas_for(self.virtual_atlas, len(self.virtual_views))
         self._write_records(real, virtual)
+
+    def _make_shares(self) -> None:
+        old, count = self.mirror_shares, len(self.mirrors)
+        if not count or (old.width, old.layers) == (SHARE_TEXELS, count):
+            return
+        old.release()
+        self.mirror_shares = self._gpu.ctx.texture_array((SHARE_TEXELS, SHARE_TEXELS, count), 2, dtype="f2")
+        self.mirror_shares.build_mipmaps()
+        self.mirror_shares.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
+        self.mirror_shares.repeat_x = self.mirror_shares.repeat_y = False
 
     def _atlas_for(self, atlas: ShadowMapAtlas, tiles: int) -> ShadowMapAtlas:
         if atlas.tiles == max(tiles, 1):
@@ -83,9 +115,14 @@ class LightTable:
         """Records of all lights and views; the real views come first."""
         records = b""
         first_real, first_virtual = 0, len(self.real_views)
+        first_mirror = len(self.lights) - len(self.mirrors)
         for light, real_part, virtual_part in zip(self.lights, real, virtual, strict=True):
             ranges = (first_real, len(real_part), first_virtual, len(virtual_part))
-            records += pack_light(light, ranges)
+            layer = len(records) // LIGHT_BYTES - first_mirror
+            if layer < 0:
+                records += pack_light(light, ranges)
+            else:
+                records += pack_mirror(self.mirrors[layer], layer, self._maps[layer], ranges)
             first_real += len(real_part)
             first_virtual += len(virtual_part)
         self.real_records = self._packed(self.real_views)
@@ -107,8 +144,15 @@ class LightTable:
 
     def virtual_texel_m(self, point: Float64[np.ndarray, "3"]) -> float:
         """Largest texel of the virtual depth maps at `point`, m."""
+        return self._texel_m(self.virtual_views, point)
+
+    def real_texel_m(self, point: Float64[np.ndarray, "3"]) -> float:
+        """Largest texel of the real depth maps at `point`, m."""
+        return self._texel_m(self.real_views, point)
+
+    def _texel_m(self, views: list[LightView], point: Float64[np.ndarray, "3"]) -> float:
         sizes = []
-        for view in self.virtual_views:
+        for view in views:
             depth = (view.view_from_world @ np.append(point, 1.0))[2]
             sizes.append(texel_size_m(view, self.tile_size, float(depth)))
         return max(sizes, default=0.0)
@@ -123,6 +167,7 @@ class LightTable:
         self.bind_records()
         self.real_atlas.depth.use(location=10)
         self.virtual_atlas.depth.use(location=11)
+        self.mirror_shares.use(location=22)
         if self._environment is not None:
             self._environment.use(location=12)
 
@@ -138,6 +183,7 @@ class LightTable:
         """Free the GL objects."""
         self.real_atlas.release()
         self.virtual_atlas.release()
+        self.mirror_shares.release()
         self._light_buffer.release()
         self._view_buffer.release()
         if self._environment is not None:

@@ -5,6 +5,8 @@
 // VIRTUAL: L_rho = albedo / pi E_rho + emission.
 // E is direct + ambient light at first; GATHERED: the direct light found then + what the surfel's group gathered;
 // REAL and VIRTUAL then add by how much L grows.
+// REAL_MU and REAL_RHO sum all of L, each under the maps of its own solution (relight/differential.py): L_mu as REAL,
+// L_rho = L_mu E_rho / E_mu where the camera measured L_mu, albedo / pi E_rho where it does not look.
 #include "passes/common/volume.glsl"
 #include "passes/common/voxel_store.glsl"
 #include "passes/common/surfel_light.glsl"
@@ -16,8 +18,12 @@ layout(local_size_x = 64) in;
 uniform float bias_real;      // m
 uniform float bias_virtual;   // m
 uniform bool keep_light;      // in SurfelLights, for what is summed later
+uniform bool has_caustics;    // beams carry what smooth virtual surfaces reflect of the lights
 const float WHITEST = 0.95;   // albedo of the brightest diffuse surfaces: no surface gives back more than it gets
-#ifdef REAL
+#if defined(REAL_MU) || defined(REAL_RHO)
+#define SOLUTION
+#endif
+#if defined(REAL) || defined(SOLUTION)
 #include "passes/common/real_radiance.glsl"
 #endif
 #ifdef REAL_DELTA
@@ -41,8 +47,8 @@ const float LIFT = 0.1;       // voxels, so that a curved surface does not shado
 const float LIFT = 0.0;
 #endif
 
-#ifdef REAL
-// Without the objects, whose maps may be those of an earlier frame.
+#if defined(REAL) || defined(SOLUTION)
+// Without the objects, whose maps may be those of an earlier frame; a solution's own maps hold all of its geometry.
 vec2 light_share(Light light, vec3 p, vec3 n) { return vec2(real_visibility(light, p, n, bias_real)); }
 #else
 vec2 light_share(Light light, vec3 p, vec3 n) { return visibility(light, p, n, bias_real, bias_virtual); }
@@ -61,9 +67,14 @@ void irradiances(Surfel s, vec3 n, uint own, out vec3 mu, out vec3 rho) {
         rho += across * cosine * v.y;
     }
     if (keep_light) {
+#ifndef REAL_RHO
         surfel_lights[own].direct_mu = vec4(mu, 0.0);
+#endif
         surfel_lights[own].direct_rho = vec4(rho, 0.0);
     }
+#ifdef REAL_RHO
+    mu = surfel_lights[own].direct_mu.rgb;
+#endif
     vec3 ambient = environment_irradiance(n);
     mu += ambient;
     rho += ambient;
@@ -81,7 +92,7 @@ void add(uint voxel, vec3 n, float area, vec3 radiance) {
         for (int j = 0; j < 3; ++j) atomicAdd(delta_sums[at + j], fixed_point(radiance[j] * share));
 #else
         int at = slot * SUMS_PER_SLOT;
-#ifndef GATHERED
+#if !defined(GATHERED) || defined(SOLUTION)
         atomicAdd(sums[at + COVERAGE + k], fixed_point(share));
 #endif
         for (int j = 0; j < 3; ++j) atomicAdd(sums[at + RADIANCE + k * 3 + j], fixed_point(radiance[j] * share));
@@ -89,7 +100,7 @@ void add(uint voxel, vec3 n, float area, vec3 radiance) {
     }
 }
 
-#ifndef REAL_DELTA
+#if !defined(REAL_DELTA) && !defined(SOLUTION)
 // What the sums lack: all of it at first, what it gained when light was gathered. w: 1 where the camera measured it.
 vec3 unsummed(uint own, vec4 radiance) {
 #ifdef GATHERED
@@ -107,7 +118,10 @@ vec3 outgoing(Surfel s, vec3 n, uint own) {
     vec3 mu, rho;
     irradiances(s, n, own, mu, rho);
     Material m = material_of(int(s.normal_material.w), s.uv_voxel.xy, s.tint.rgb);
-    return unsummed(own, vec4(min(m.diffuse + m.f0, vec3(WHITEST)) / PI * rho + m.emission, 0.0));
+    vec3 albedo = min(m.diffuse + m.f0, vec3(WHITEST));
+    bool in_beams = has_caustics && keep_light && m.roughness * m.roughness < GREATEST_ALPHA;
+    vec3 carried = in_beams ? (albedo - min(m.diffuse, albedo)) * surfel_lights[own].direct_rho.rgb : vec3(0.0);
+    return unsummed(own, vec4((albedo * rho - carried) / PI + m.emission, 0.0));
 }
 #endif
 
@@ -125,21 +139,43 @@ vec3 outgoing(Surfel s, vec3 n, uint own) {
 }
 #endif
 
+#if defined(REAL_DELTA) || defined(REAL_RHO)
+// What a surface that gives back `back` of its irradiance sends out more under rho. A ratio is right whatever the
+// light's scale; gained light comes back by at most the greatest albedo.
+vec3 change_of(vec3 back, vec3 mu, vec3 rho) {
+    vec3 change = rho - mu;
+    return change * mix(back, min(back, vec3(WHITEST / PI)), greaterThan(change, vec3(0.0)));
+}
+#endif
+
+#ifdef SOLUTION
+vec3 outgoing(Surfel s, vec3 n, uint own) {
+    vec3 p = s.position_area.xyz, mu, rho;
+    irradiances(s, n, own, mu, rho);
+    bool seen = camera_sees(p);
+    vec3 back = unseen_albedo(p) / PI;
+    vec3 radiance = seen ? measured_radiance(p) : back * mu;
+#ifdef REAL_RHO
+    if (seen) back = radiance / (mu + 1e-6);
+    radiance += change_of(back, mu, rho);
+#endif
+    return radiance;
+}
+#endif
+
 #ifdef REAL_DELTA
 // Changes of gathered light below this share of it would not show in 8-bit pictures; mu and rho are then taken as the
 // same there, and need no two marches.
 const float LEAST_CHANGE = 1.0 / 512.0;
 
-// L_rho - L_mu. A ratio is right whatever the light's scale; gained light comes back by at most the greatest albedo.
+// L_rho - L_mu.
 vec3 outgoing(Surfel s, vec3 n, uint own) {
     vec3 mu, rho;
     irradiances(s, n, own, mu, rho);
-    vec3 change = rho - mu;
 #ifdef GATHERED
-    if (all(lessThanEqual(abs(change), LEAST_CHANGE * max(mu, rho)))) return vec3(0.0);
+    if (all(lessThanEqual(abs(rho - mu), LEAST_CHANGE * max(mu, rho)))) return vec3(0.0);
 #endif
-    vec3 back = surfel_lights[own].radiance.rgb / (mu + 1e-6);
-    return change * mix(back, min(back, vec3(WHITEST / PI)), greaterThan(change, vec3(0.0)));
+    return change_of(surfel_lights[own].radiance.rgb / (mu + 1e-6), mu, rho);
 }
 #endif
 

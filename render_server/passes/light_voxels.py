@@ -8,6 +8,7 @@ import numpy as np
 
 from render_server.gpu.context import GpuContext
 from render_server.gpu.program import ComputeProgram, list_threads
+from render_server.passes.caustics import GREATEST_ALPHA
 from render_server.passes.group_surfels import SurfelGroups
 from render_server.passes.voxel_store import VoxelStore
 
@@ -15,7 +16,7 @@ SHADER = Path(__file__).with_name("light_voxels.comp.glsl")
 
 
 class LightVoxelsPass:
-    """Three variants of one walk over the surfels: real without objects, real's change, virtual.
+    """Variants of one walk over the surfels: real without objects, real's change, virtual; real of a full solution.
 
     With `gathered`, what the surfels' groups gathered takes the place of the unoccluded ambient light, and the sums
     change by that; direct light is that of the last walk without.
@@ -58,6 +59,21 @@ class LightVoxelsPass:
         """Sum c and a of the virtual surfaces; `groups` keep each surfel's light."""
         self._run("VIRTUAL", store, groups, uniforms, gathered=gathered)
 
+    def light_solution(
+        self,
+        store: VoxelStore,
+        uniforms: dict[str, Any],
+        groups: SurfelGroups,
+        *,
+        with_objects: bool,
+        gathered: bool = False,
+    ) -> None:
+        """Sum anew all light and opacity of real surfaces under the maps that are bound; without objects first, as
+        `groups` keep E_mu for the other.
+        """
+        store.sums.clear()
+        self._run("REAL_RHO" if with_objects else "REAL_MU", store, groups, uniforms, gathered=gathered)
+
     def _run(
         self,
         kind: str,
@@ -76,7 +92,7 @@ class LightVoxelsPass:
     def _program(self, kind: str, *, gathered: bool) -> ComputeProgram:
         """Compiled when it is first needed."""
         if (kind, gathered) not in self._programs:
-            defines = {kind: 1, **({"GATHERED": 1} if gathered else {})}
+            defines = {kind: 1, "GREATEST_ALPHA": GREATEST_ALPHA, **({"GATHERED": 1} if gathered else {})}
             self._programs[kind, gathered] = ComputeProgram(self._gpu, SHADER, defines)
         return self._programs[kind, gathered]
 

@@ -15,6 +15,7 @@ layout(binding = 16) uniform sampler2D virtual_light_uv;
 layout(binding = 17) uniform sampler2D virtual_light_normal;
 uniform int view_index;
 uniform float bias_real;   // m: how far behind the real map an object's surface may lie and still be lit
+uniform bool has_caustics; // beams carry what smooth virtual surfaces reflect of the lights
 
 vec3 way_to_light(Light light, vec3 p) {
     vec3 to_light; float radius;
@@ -34,7 +35,8 @@ void inject_texel(Light light, LightView view, ivec2 texel, vec2 s, float depth,
 vec3 virtual_albedo(ivec2 texel) {
     vec4 uv = texelFetch(virtual_light_uv, texel, 0);
     Material m = material_of(int(texelFetch(virtual_light_normal, texel, 0).w), uv.xy, unpack_color(uv.z));
-    return m.diffuse + m.f0;
+    bool in_beams = has_caustics && m.roughness * m.roughness < GREATEST_ALPHA;   // those carry the rest
+    return m.diffuse + (in_beams ? vec3(0.0) : m.f0);
 }
 
 void inject_texel(Light light, LightView view, ivec2 texel, vec2 s, float depth, vec3 p) {

@@ -8,6 +8,7 @@ import moderngl
 from render_server.gpu.context import GpuContext
 from render_server.gpu.program import ComputeProgram
 from render_server.gpu.textures import bind_samplers
+from render_server.passes.caustics import GREATEST_ALPHA
 from render_server.passes.light_table import LightTable
 
 SHADER = Path(__file__).with_name("lpv_inject_maps.comp.glsl")
@@ -17,9 +18,10 @@ class LpvInjectMapsPass:
     """Adds to fixed-point sums; lights and the objects' materials must be bound."""
 
     def __init__(self, gpu: GpuContext) -> None:
-        self._real = ComputeProgram(gpu, SHADER, {"REAL": 1})
-        self._change = ComputeProgram(gpu, SHADER)
-        self._direct = ComputeProgram(gpu, SHADER, {"DIRECT": 1})
+        limit = {"GREATEST_ALPHA": GREATEST_ALPHA}
+        self._real = ComputeProgram(gpu, SHADER, {"REAL": 1, **limit})
+        self._change = ComputeProgram(gpu, SHADER, limit)
+        self._direct = ComputeProgram(gpu, SHADER, {"DIRECT": 1, **limit})
 
     def add_real(
         self,

@@ -14,6 +14,11 @@ from render_server.passes.voxel_store import bind_storage
 SHADER = Path(__file__).with_name("lpv_query.comp.glsl")
 
 
+def bind_light_volumes(mu: LightVolume, rho: LightVolume) -> None:
+    """Bind the light without and with objects to the places that lpv_light.glsl names."""
+    bind_storage({8: mu.total, 9: rho.total})
+
+
 class LpvQueryPass:
     """Fills the fields that cones fill elsewhere; lights, geometry and materials must be bound."""
 
@@ -33,7 +38,7 @@ class LpvQueryPass:
         """E_mu and E_rho of real surfaces; without `mu`, `rho` is the change itself."""
         bind_samplers({0: grid.pixels})
         bind_images(fields.mu, fields.rho, fields.specular_mu, fields.specular_rho)
-        bind_storage({8: rho.total if mu is None else mu.total, 9: rho.total})
+        bind_light_volumes(rho if mu is None else mu, rho)
         program = self._change if mu is None else self._real
         program.run(grid.size, low_resolution_size=grid.size, **uniforms)
 
@@ -44,7 +49,7 @@ class LpvQueryPass:
         bind_samplers({0: grid.pixels})
         bind_images(fields.virtual)
         bind_images(fields.virtual_specular, first=3)
-        bind_storage({8: rho.total, 9: rho.total})
+        bind_light_volumes(rho, rho)
         self._virtual.run(grid.size, low_resolution_size=grid.size, **uniforms)
 
     def release(self) -> None:

@@ -9,12 +9,17 @@ from render_server.gpu.context import GpuContext
 from render_server.scene.mesh import GpuMesh
 
 TEXTURE_SIZE = 1024  # texels an edge of a base-colour texture
+METALLIC, REFLECTANCE, ROUGHNESS = 3, slice(4, 7), 7  # columns of the table, as materials.glsl has them
 
 
 class MaterialTable:
-    """Materials in a storage buffer, their base-colour textures in one array."""
+    """Materials in a storage buffer, their base-colour textures in one array.
+
+    `smoothest`: least roughness of those that reflect at all, 1 if none does.
+    """
 
     def __init__(self, gpu: GpuContext, mesh: GpuMesh) -> None:
+        self.smoothest = _smoothest(mesh)
         self._buffer = gpu.ctx.buffer(np.ascontiguousarray(mesh.material_table, np.float32).tobytes())
         size = TEXTURE_SIZE if mesh.textures else 1
         self._textures = gpu.ctx.texture_array((size, size, max(len(mesh.textures), 1)), 4, dtype="f2")
@@ -31,6 +36,12 @@ class MaterialTable:
         """Free the GL objects."""
         self._buffer.release()
         self._textures.release()
+
+
+def _smoothest(mesh: GpuMesh) -> float:
+    table = mesh.material_table
+    reflects = (table[:, METALLIC] > 0) | (table[:, REFLECTANCE] > 0).any(axis=1)
+    return float(min(table[reflects, ROUGHNESS], default=1.0))
 
 
 def _resampled(texture: Float16[np.ndarray, "h w 3"], size: int) -> bytes:

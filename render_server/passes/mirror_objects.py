@@ -1,5 +1,6 @@
 """Virtual objects in smooth real surfaces, by rays: cones through voxels would blur them."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,6 @@ from render_server.gpu.program import ComputeProgram
 from render_server.gpu.textures import bind_images, bind_samplers, texture_2d
 from render_server.passes.object_tree import ObjectTree
 from render_server.passes.sampling_grid import SamplingGrid
-from render_server.passes.volume import Pyramid
 
 FOLDER = Path(__file__).parent
 # Of equal energy each: up to RAY_ROUGHNESS they stand closer than voxels do. There the cone of the lobe is 48 degrees
@@ -27,12 +27,18 @@ ROW = 256  # workgroups a row: OpenGL promises no more than 65535
 class MirrorObjectsPass:
     """`reflection` (RGBA16F): radiance of the objects times the share of the lobe that they fill, and that share.
 
-    `defines`: those of march.glsl.
+    `gather`: the pass (mirror_gather...) that finds the light of reflected points; `defines`: those that it needs.
     """
 
-    def __init__(self, gpu: GpuContext, grid: SamplingGrid, defines: dict[str, int]) -> None:
-        self._grid = grid
-        self.objects = ObjectTree(gpu)
+    def __init__(
+        self,
+        gpu: GpuContext,
+        grid: SamplingGrid,
+        objects: ObjectTree,
+        gather: str,
+        defines: dict[str, int],
+    ) -> None:
+        self._grid, self._objects = grid, objects
         self.reflection = texture_2d(gpu, grid.picture_size, 4, "f2")
         self._traced = texture_2d(gpu, grid.picture_size, 4, "f2")
         self._way = texture_2d(gpu, grid.picture_size, 1, "f2")
@@ -44,19 +50,20 @@ class MirrorObjectsPass:
         self._texels = gpu.ctx.buffer(reserve=4 + 4 * grid.size[0] * grid.size[1])
         self._select, self._hits, self._gather, self._trace, self._smooth = (
             ComputeProgram(gpu, FOLDER / f"mirror_{name}.comp.glsl", {**DEFINES, **defines})
-            for name in ("select", "hits", "gather", "objects", "smooth")
+            for name in ("select", "hits", gather, "objects", "smooth")
         )
 
-    def run(self, matte: moderngl.Texture, mu: Pyramid, rho: Pyramid, uniforms: dict[str, Any]) -> None:
-        """Fill `reflection`; lights, geometry, surfaces, materials, support and the far volume must be bound.
+    def run(self, matte: moderngl.Texture, bind_light: Callable[[], None], uniforms: dict[str, Any]) -> None:
+        """Fill `reflection`; lights, geometry, surfaces and materials must be bound.
 
-        Waits for the GPU to say how many pixels need rays: where none do, nothing is built or traced.
+        `bind_light` binds what the gathering pass reads beside them. Waits for the GPU to say how many pixels need
+        rays: where none do, nothing is built or traced.
         """
         count = self._list_pixels(matte, uniforms)
         if not count:
             return
-        self.objects.bind()
-        self._gather_light(mu, rho, uniforms)
+        self._objects.bind()
+        self._gather_light(bind_light, uniforms)
         self._pixels.bind_to_storage_buffer(6)
         self._trace_rays(count, uniforms)
         bind_samplers({1: matte, 2: self._traced, 3: self._way})
@@ -68,19 +75,20 @@ class MirrorObjectsPass:
         bind_samplers({1: matte})
         bind_images(self.reflection, self._traced, self._way)
         sphere: dict[str, Any] = {
-            "bounds_centre": tuple(self.objects.centre),
-            "bounds_radius": self.objects.radius,
+            "bounds_centre": tuple(self._objects.centre),
+            "bounds_radius": self._objects.radius,
         }
         self._select.run(self._grid.picture_size, **sphere, **uniforms)
         return _count(self._pixels)
 
-    def _gather_light(self, mu: Pyramid, rho: Pyramid, uniforms: dict[str, Any]) -> None:
+    def _gather_light(self, bind_light: Callable[[], None], uniforms: dict[str, Any]) -> None:
         """Light at reflected points, at the resolution of the cones."""
         _empty(self._texels)
         bind_samplers({0: self._grid.pixels})
         bind_images(self._position, self._normal)
         self._hits.run(self._grid.size, scale=self._grid.scale, **uniforms)
-        bind_samplers({1: self._position, 2: mu.texture, 3: rho.texture, 8: self._normal})
+        bind_light()
+        bind_samplers({1: self._position, 8: self._normal})
         bind_images(self._irradiance, self._specular)
         self._gather.run((_count(self._texels),), **uniforms)
 
@@ -95,7 +103,7 @@ class MirrorObjectsPass:
     def release(self) -> None:
         """Free the GL objects."""
         for item in vars(self).values():
-            if hasattr(item, "release") and item is not self._grid:
+            if hasattr(item, "release") and item not in (self._grid, self._objects):
                 item.release()
 
 

@@ -59,23 +59,28 @@ class ShadowMapAtlas:
 
 
 class ReflectiveShadowMapPass:
-    """Draws a mesh into the tiles of an atlas."""
+    """Draws meshes into the tiles of an atlas."""
 
     def __init__(self, gpu: GpuContext) -> None:
         self._ctx = gpu.ctx
         self._program = raster_program(gpu, Path(__file__).with_name("reflective_shadow_map"))
 
     def run(
-        self, atlas: ShadowMapAtlas, mesh: MeshBuffers, views: Sequence[LightView], first_view: int
+        self,
+        atlas: ShadowMapAtlas,
+        meshes: Sequence[MeshBuffers],
+        views: Sequence[LightView],
+        first_view: int,
     ) -> None:
-        """Draw `mesh` for each view; the views' records begin at `first_view` of the bound storage buffer."""
+        """Draw all `meshes` for each view; the views' records begin at `first_view` of the bound storage buffer."""
         atlas.clear()
         for tile, view in enumerate(views):
             atlas.begin_tile(tile)
             if view.front is not None:
                 self._ctx.enable_direct(CLIP_DISTANCE0)
             set_uniforms(self._program, {"view_index": first_view + tile})
-            mesh.draw(self._program)
+            for mesh in meshes:
+                mesh.draw(self._program)
             if view.front is not None:
                 self._ctx.disable_direct(CLIP_DISTANCE0)
         atlas.end()

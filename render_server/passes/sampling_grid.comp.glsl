@@ -1,5 +1,5 @@
 // For each texel of the reduced resolution, the picture pixel nearest to its centre that shows a real surface with
-// depth, and the one that shows a virtual object.
+// depth, and the one that shows a virtual object. Where objects hide all real surfaces, one of these as -2 - pixel.
 #include "passes/common/geometry.glsl"
 #include "passes/common/texel_list.glsl"
 
@@ -14,7 +14,8 @@ void main() {
     ivec2 low = (picture_pixels + scale - 1) / scale;
     if (any(greaterThanEqual(texel, low))) return;
     ivec4 best = ivec4(-1);
-    vec2 nearest = vec2(1e9);
+    ivec2 hidden = ivec2(-1);
+    vec3 nearest = vec3(1e9);
     for (int j = 0; j < scale; ++j)
         for (int i = 0; i < scale; ++i) {
             ivec2 pixel = texel * scale + ivec2(i, j);
@@ -22,11 +23,12 @@ void main() {
             vec2 d = vec2(i, j) - 0.5 * float(scale - 1);
             float away = dot(d, d);
             float shown = texelFetch(matte, pixel, 0).r;
-            if (away < nearest.x && shown < 1.0 && texelFetch(real_surface_position, pixel, 0).w > 0.0) {
-                nearest.x = away; best.xy = pixel;
-            }
+            bool known = texelFetch(real_surface_position, pixel, 0).w > 0.0;
+            if (away < nearest.x && shown < 1.0 && known) { nearest.x = away; best.xy = pixel; }
+            if (away < nearest.z && shown == 1.0 && known) { nearest.z = away; hidden = -2 - pixel; }
             if (away < nearest.y && shown > 0.0) { nearest.y = away; best.zw = pixel; }
         }
+    if (best.x < 0) best.xy = hidden;
     imageStore(sample_pixels_out, texel, best);
     if (best.z >= 0) append_texel(texel, low.x);
 }

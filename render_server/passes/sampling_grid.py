@@ -13,6 +13,8 @@ from render_server.gpu.textures import bind_images, bind_samplers, texture_2d
 class SamplingGrid:
     """RGBA16I: pixel of a real surface (x, y) and of a virtual one (x, y), -1 where the block shows none.
 
+    Where objects hide the block's real surfaces, -2 - pixel stands for one of them.
+
     `virtual_texels` lists the texels that show an object (count, then indices).
     """
 

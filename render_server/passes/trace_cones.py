@@ -30,6 +30,11 @@ class ConeFields:
             texture.release()
 
 
+def bind_pyramids(mu: Pyramid, rho: Pyramid) -> None:
+    """Bind the voxels without and with objects to the places that march.glsl names."""
+    bind_samplers({2: mu.texture, 3: rho.texture})
+
+
 class TraceConesPass:
     """Dual march on real surfaces, rho march on virtual ones; lights, geometry and support must be bound.
 

@@ -4,8 +4,8 @@
 #include "passes/common/brdf.glsl"
 #include "passes/common/geometry.glsl"
 #include "passes/common/object_light.glsl"
-#include "passes/common/upsample.glsl"
 #include "passes/common/texel_list.glsl"
+#include "passes/common/caustics.glsl"
 
 layout(local_size_x = 64) in;
 layout(binding = 0, rgba16f) writeonly uniform image2D radiance_out;
@@ -14,8 +14,9 @@ layout(binding = 2) uniform sampler2D cone_irradiance;
 layout(binding = 3) uniform sampler2D cone_specular;
 layout(binding = 8) uniform sampler2D virtual_raster_uv;
 layout(binding = 9) uniform sampler2D virtual_raster_tint;
+layout(binding = 16) uniform sampler2D screen_reflection;   // rgb radiance times share; a: share of the specular lobe
+uniform bool has_screen_reflection;
 uniform vec3 camera_position;
-uniform float sample_distance;  // m at 1 m depth: what a texel of the reduced resolution spans
 
 Indirect indirect_at(ivec2 pixel, vec4 position, vec3 normal) {
     Indirect sum = Indirect(vec3(0.0), vec3(0.0));
@@ -45,6 +46,11 @@ void shade(ivec2 pixel) {
         int(normal.w), texelFetch(virtual_raster_uv, raster, 0).xy, texelFetch(virtual_raster_tint, raster, 0).rgb);
     vec3 v = normalize(camera_position - position.xyz);
     Indirect indirect = indirect_at(pixel, position, normal.xyz);
+    if (has_screen_reflection) {
+        vec4 seen = texelFetch(screen_reflection, pixel, 0);
+        indirect.specular = seen.rgb + (1.0 - seen.a) * indirect.specular;
+    }
+    indirect.irradiance += caustic_irradiance(pixel, textureSize(matte, 0), OBJECT_LAYER, position.xyz, normal.xyz, position.w);
     vec3 radiance = object_radiance(position.xyz, position.w, normal.xyz, v, m, indirect);
     imageStore(radiance_out, pixel, vec4(radiance, 1.0));
 }

@@ -28,8 +28,10 @@ class VirtualSurfacePass:
         cones: ConeFields,
         grid: SamplingGrid,
         uniforms: dict[str, Any],
+        *,
+        screen: moderngl.Texture | None = None,
     ) -> None:
-        """Shade; lights, materials and geometry must be bound."""
+        """Shade; lights, materials and geometry must be bound. `screen`: of passes/screen_cones.py, if it ran."""
         bind_samplers(
             {
                 0: grid.pixels,
@@ -40,9 +42,12 @@ class VirtualSurfacePass:
                 9: raster.tint,
             }
         )
+        if screen is not None:
+            screen.use(location=16)
         bind_images(self.radiance)
         grid.virtual_texels.bind_to_storage_buffer(6)
-        self._program.run((self._threads,), scale=grid.scale, **uniforms)
+        own = {"scale": grid.scale, "has_screen_reflection": screen is not None}
+        self._program.run((self._threads,), **own, **uniforms)
 
     def release(self) -> None:
         """Free the GL objects."""

@@ -2,13 +2,15 @@
 
 from dataclasses import dataclass
 
-from protocol.scene_method import DlpvMethod, DvctMethod
+from protocol.scene_method import AroofMethod, DlpvMethod, VoxelConeSettings
 
 # (software, GPU)
 VOLUME_SIZE = (64, 256)
 CONE_SCALE = (4, 2)
 RSM_SIZE = (512, 1024)
 TRIANGLE_BUDGET = (40_000, 400_000)
+SHOWN_CELLS = 64  # of method aroof, which has no volume: for view `volume` alone
+JOINT_RSM_SIZE = (1024, 2048)  # of maps that hold objects and room at once, and so resolve objects less
 
 
 @dataclass(frozen=True)
@@ -24,7 +26,7 @@ class ResolvedSettings:
     triangle_budget: int
 
 
-def march_defines(settings: DvctMethod) -> dict[str, int]:
+def march_defines(settings: VoxelConeSettings) -> dict[str, int]:
     """What march.glsl is compiled with."""
     defines = {
         "ISOTROPIC_VOXELS": settings.voxels == "isotropic",
@@ -33,13 +35,15 @@ def march_defines(settings: DvctMethod) -> dict[str, int]:
     return {name: 1 for name, wanted in defines.items() if wanted}
 
 
-def resolve_dvct(settings: DvctMethod, *, software: bool) -> ResolvedSettings:
+def resolve_voxel_cones(
+    settings: VoxelConeSettings, *, software: bool, rsm_size: tuple[int, int] = RSM_SIZE
+) -> ResolvedSettings:
     """Take the document's values, or the machine's defaults where it says null."""
     column = 0 if software else 1
     return ResolvedSettings(
         settings.volume_size or VOLUME_SIZE[column],
         settings.cone_scale or CONE_SCALE[column],
-        settings.rsm_size or RSM_SIZE[column],
+        settings.rsm_size or rsm_size[column],
         settings.triangle_budget or TRIANGLE_BUDGET[column],
     )
 
@@ -50,6 +54,17 @@ def resolve_dlpv(settings: DlpvMethod, *, software: bool) -> ResolvedSettings:
     return ResolvedSettings(
         settings.volume_size,
         settings.query_scale or CONE_SCALE[column],
+        settings.rsm_size or RSM_SIZE[column],
+        settings.triangle_budget or TRIANGLE_BUDGET[column],
+    )
+
+
+def resolve_aroof(settings: AroofMethod, *, software: bool) -> ResolvedSettings:
+    """Take the document's values, or the machine's defaults where it says null."""
+    column = 0 if software else 1
+    return ResolvedSettings(
+        SHOWN_CELLS,
+        settings.shading_scale or CONE_SCALE[column],
         settings.rsm_size or RSM_SIZE[column],
         settings.triangle_budget or TRIANGLE_BUDGET[column],
     )

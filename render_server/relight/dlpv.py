@@ -2,14 +2,17 @@
 
 from typing import Any
 
+import moderngl
+
 from protocol.scene_method import DlpvMethod
 from render_server.gpu.context import GpuContext
 from render_server.passes.direct_light import DirectLightPass
-from render_server.passes.lpv_query import LpvQueryPass
+from render_server.passes.lpv_query import LpvQueryPass, bind_light_volumes
 from render_server.passes.volume import Pyramid, VolumePlacement, place_volume
 from render_server.relight.defaults import ResolvedSettings
 from render_server.relight.dlpv_volumes import DlpvVolumes
 from render_server.relight.frame import RelightInput
+from render_server.relight.mirrored_objects import MirroredObjects
 from render_server.relight.relight_base import RelightBase
 
 
@@ -21,13 +24,22 @@ class Dlpv(RelightBase):
     ) -> None:
         objects_shadow = settings.resolved_shadow == "map"
         direct = DirectLightPass(gpu, size, objects_shadow=objects_shadow)
-        super().__init__(gpu, resolved, size, settings.shadow_samples, direct)
+        super().__init__(
+            gpu,
+            resolved,
+            size,
+            settings.shadow_samples,
+            direct,
+            caustics=settings.resolved_caustics,
+            screen_space=settings.resolved_screen_space,
+        )
         self._settings = settings
         self.volumes = DlpvVolumes(gpu, settings, resolved.volume_size)
         self._query = LpvQueryPass(gpu)
+        self._mirrored = MirroredObjects(gpu, self._grid, self._objects, "gather_lpv", {})
 
     def _placement(self, frame: RelightInput) -> VolumePlacement:
-        low, high = frame.virtual.bounds
+        low, high = frame.virtual.lasting_bounds
         return place_volume(low, high, self._resolved.volume_size, self._settings.volume_edge_m)
 
     def _rebuild_real(
@@ -40,13 +52,23 @@ class Dlpv(RelightBase):
 
     def _trace(self, frame: RelightInput, uniforms: dict[str, Any]) -> None:
         volumes = self.volumes
-        own = {"has_geometry": volumes.has_geometry, "damping": self._settings.resolved_damping}
-        uniforms = {**uniforms, **own}
+        uniforms = {**uniforms, **self._query_uniforms()}
         seen = volumes.rho if volumes.change is None else volumes.change
         with frame.timers.measure("query real"):
             self._query.read_real(self._cones, self._grid, volumes.mu, seen, uniforms)
         with frame.timers.measure("query virtual"):
             self._query.read_virtual(self._cones, self._grid, volumes.rho, uniforms)
+
+    def _query_uniforms(self) -> dict[str, Any]:
+        return {"has_geometry": self.volumes.has_geometry, "damping": self._settings.resolved_damping}
+
+    def _reflect(self, frame: RelightInput, uniforms: dict[str, Any]) -> moderngl.Texture | None:
+        own = {**uniforms, **self._query_uniforms()}
+        wanted = self._settings.resolved_reflections == "rays"
+        return self._mirrored.run(frame, self._bind_light, own, wanted=wanted)
+
+    def _bind_light(self) -> None:
+        bind_light_volumes(self.volumes.rho, self.volumes.rho)
 
     def _joint(self) -> Pyramid:
         return self.volumes.shown

@@ -7,12 +7,12 @@ import moderngl
 
 from protocol.scene_method import DvctMethod
 from render_server.gpu.context import GpuContext
-from render_server.passes.mirror_objects import MirrorObjectsPass
-from render_server.passes.trace_cones import TraceConesPass
+from render_server.passes.trace_cones import TraceConesPass, bind_pyramids
 from render_server.passes.volume import Pyramid, VolumePlacement
 from render_server.relight.defaults import ResolvedSettings, march_defines
 from render_server.relight.dvct_base import DvctBase
 from render_server.relight.frame import RelightInput
+from render_server.relight.mirrored_objects import MirroredObjects
 from render_server.relight.voxel_scene import DIRECTIONS, VoxelScene
 
 
@@ -27,8 +27,7 @@ class DvctExact(DvctBase):
         super().__init__(gpu, settings, resolved, size)
         defines = march_defines(settings)
         self._tracing = TraceConesPass(gpu, defines)
-        self._make_mirror = partial(MirrorObjectsPass, gpu, self._grid, defines)
-        self._mirror: MirrorObjectsPass | None = None
+        self._mirrored = MirroredObjects(gpu, self._grid, self._objects, "gather", defines)
         placement = VolumePlacement((0.0, 0.0, 0.0), 1.0, resolved.volume_size)
         self._voxels = VoxelScene(gpu, placement, settings)
 
@@ -48,18 +47,9 @@ class DvctExact(DvctBase):
             self._tracing.trace_virtual(self._cones, self._grid, voxels.mu, voxels.rho, own)
 
     def _reflect(self, frame: RelightInput, uniforms: dict[str, Any]) -> moderngl.Texture | None:
-        if self._settings.reflections == "cones" or not frame.surface_uniforms["specular_surfaces"]:
-            if self._mirror is not None:
-                self._mirror.release()
-            self._mirror = None
-            return None
-        if self._mirror is None:
-            self._mirror = self._make_mirror()
-        virtual = frame.virtual
-        self._mirror.objects.follow(virtual.version, virtual.corners, virtual.bounds, virtual.buffers)
-        with frame.timers.measure("mirror"):
-            self._mirror.run(frame.matte, self._voxels.mu, self._voxels.rho, self._bind_march(uniforms))
-        return self._mirror.reflection
+        voxels, own = self._voxels, self._bind_march(uniforms)
+        wanted = self._settings.reflections == "rays"
+        return self._mirrored.run(frame, partial(bind_pyramids, voxels.mu, voxels.rho), own, wanted=wanted)
 
     def _bind_march(self, uniforms: dict[str, Any]) -> dict[str, Any]:
         """Bind what march.glsl reads beside mu and rho; return the uniforms of passes that march."""

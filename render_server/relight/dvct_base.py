@@ -19,9 +19,19 @@ class DvctBase(RelightBase):
     ) -> None:
         cones = self.directions if settings.resolved_shadow == "cone" else None
         direct = DirectLightPass(gpu, size, shadow_cones=cones)
-        super().__init__(gpu, resolved, size, settings.shadow_samples, direct)
+        exact = settings.operator == "exact"
+        super().__init__(
+            gpu,
+            resolved,
+            size,
+            settings.shadow_samples,
+            direct,
+            caustics=settings.caustics and exact,
+            mirrors_lights=exact and settings.mirrored_lights,
+            screen_space=settings.screen_space and exact,
+        )
         self._settings = settings
 
     def _placement(self, frame: RelightInput) -> VolumePlacement:
-        low, high = frame.virtual.bounds
+        low, high = frame.virtual.lasting_bounds
         return place_volume(low, high, self._resolved.volume_size, self._settings.volume_edge_m)

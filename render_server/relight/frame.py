@@ -15,14 +15,33 @@ from render_server.passes.picture import Picture
 from render_server.passes.real_surface import RealSurface
 from render_server.passes.unseen_albedo import UnseenAlbedo
 from render_server.scene.lights import LightSet
+from render_server.scene.materials import Material
+from render_server.scene.mesh import TriangleMesh
+from render_server.scene.surfaces import SurfaceTable
 from render_server.view import CameraView
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedObject:
+    """One virtual object: its asset as the file has it, and where that stands (turned, scaled evenly, moved; m).
+
+    `material`: what the scene document gives it in place of the asset's own, if it does. `moves`: whether it plays an
+    animation, so that `meshes` hold for this frame alone.
+    """
+
+    id: str
+    meshes: tuple[TriangleMesh, ...]
+    world_from_asset: Float64[np.ndarray, "4 4"]
+    material: Material | None
+    moves: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class GeometryState:
     """One set of triangles in the world and a number that changes with them.
 
-    `corners` are for the voxeliser (passes/mesh_buffers.py), `points` enclose the set (for fitting light views).
+    `corners` are for the voxeliser (passes/mesh_buffers.py), `points` enclose the set. `swept_points` enclose it at
+    all times of the animations that it plays: what is fitted around them stands still while it moves.
     """
 
     version: int
@@ -33,11 +52,23 @@ class GeometryState:
     coarse_corners: Float32[np.ndarray, "k 3 10"] | None = (
         None  # fewer triangles for what lies far; None: all
     )
+    objects: tuple[PlacedObject, ...] = ()  # what the triangles of virtual geometry were made from
+    swept_points: Float64[np.ndarray, "k 3"] | None = None  # None: nothing is animated
 
     @property
     def bounds(self) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
         """Least and greatest coordinates, m."""
         return self.points.min(axis=0), self.points.max(axis=0)
+
+    @property
+    def lasting_points(self) -> Float64[np.ndarray, "k 3"]:
+        """Points that enclose the set now and later."""
+        return self.points if self.swept_points is None else self.swept_points
+
+    @property
+    def lasting_bounds(self) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
+        """Least and greatest coordinates now and later, m: volumes and light views are placed by them."""
+        return self.lasting_points.min(axis=0), self.lasting_points.max(axis=0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +89,7 @@ class RelightInput:
     surface_uniforms: dict[str, Any]
     unseen_albedo: UnseenAlbedo
     timers: PassTimers
+    surfaces: SurfaceTable | None = None  # declared ones of the real scene
     everywhere: bool = False  # light every pixel, not only where the objects reach (photometric registration)
 
     def bind_geometry(self) -> None:

@@ -1,37 +1,32 @@
 """Checks of mesh files before a loader may trust them: sizes, references, glTF structure."""
 
-import io
 import json
 import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote
 
 from protocol.errors import DeltalightError
+from render_server.scene.gltf_file import (
+    COMPONENT_TYPES,
+    COMPONENTS,
+    GltfFaultError,
+    GltfFile,
+    faults_named,
+    file_inside,
+    uri_bytes,
+)
 
 MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
 MAX_FILE_BYTES = 512 << 20
 MAX_TRIANGLES = 20_000_000
 _GLB_MAGIC, _JSON_CHUNK, _BIN_CHUNK = b"glTF", 0x4E4F534A, 0x004E4942
-_COMPONENT_BYTES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
-_COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
-_FLOAT = 5126
+_COMPONENT_BYTES = {kind: int(name[-1]) for kind, name in COMPONENT_TYPES.items()}
+_INDEX_TYPES = (5121, 5123, 5125)
 # Extensions that a file may call required although only part of them (or none) changes what is loaded.
-_HARMLESS_EXTENSIONS = re.compile(r"KHR_materials_\w+|KHR_lights_punctual|EXT_texture_webp")
-
-
-class _FaultError(Exception):
-    """What is wrong inside a glTF document; becomes a sentence with the file's name."""
-
-
-@dataclass(frozen=True)
-class CheckedGltf:
-    """A glTF document whose sizes hold, and a stream of it whose materials are named by their index."""
-
-    document: dict[str, Any]
-    stream: io.BytesIO
-    file_type: str
+_HARMLESS_EXTENSIONS = re.compile(
+    r"KHR_materials_\w+|KHR_lights_punctual|EXT_texture_webp|KHR_mesh_quantization"
+)
 
 
 def check_mesh_file(path: Path) -> str:
@@ -61,7 +56,7 @@ def _check_ply_counts(path: Path) -> None:
         raise DeltalightError(f"{path} announces more elements than it can hold; export the mesh again.")
 
 
-def read_gltf(path: Path) -> CheckedGltf:
+def read_gltf(path: Path) -> GltfFile:
     """Read a .gltf or .glb file and check every count in it against the bytes that are there.
 
     Loaders allocate by accessor counts; a few hundred bytes can otherwise ask for gigabytes.
@@ -70,40 +65,28 @@ def read_gltf(path: Path) -> CheckedGltf:
         DeltalightError: the document is malformed, refers to files outside its folder, or needs extensions
             that are not supported.
     """
-    try:
-        is_binary = path.suffix.lower() == ".glb"
-        document, binary = _split_glb(path.read_bytes()) if is_binary else (_json(path.read_bytes()), b"")
-        _check_document(document, binary, path.parent)
-    except _FaultError as fault:
-        raise DeltalightError(f"{path}: {fault}; export the mesh again.") from fault
-    except (KeyError, IndexError, TypeError, ValueError, AttributeError, RecursionError) as error:
-        raise DeltalightError(f"{path} is not a valid glTF 2 file ({error!r}); export it again.") from error
-    named = {**document, "materials": _named_by_index(document.get("materials", []))}
-    text = json.dumps(named).encode()
-    stream = io.BytesIO(_join_glb(text, binary) if is_binary else text)
-    return CheckedGltf(document, stream, path.suffix.lower()[1:])
-
-
-def _named_by_index(materials: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    return [{**material, "name": str(index)} for index, material in enumerate(materials)]
+    with faults_named(path):
+        data = path.read_bytes()
+        document, binary = _split_glb(data) if path.suffix.lower() == ".glb" else (_json(data), None)
+        return _checked(path, document, binary)
 
 
 def _json(data: bytes) -> dict[str, Any]:
     document = json.loads(data.decode("utf-8-sig"))
     if not isinstance(document, dict):
-        raise _FaultError("it does not hold a JSON object")
+        raise GltfFaultError("it does not hold a JSON object")
     return document
 
 
 def _split_glb(data: bytes) -> tuple[dict[str, Any], bytes]:
     if data[:4] != _GLB_MAGIC or _uint32(data, 4) != 2:
-        raise _FaultError("it is not a binary glTF 2 file")
+        raise GltfFaultError("it is not a binary glTF 2 file")
     chunks: dict[int, bytes] = {}
     offset = 12
     while offset + 8 <= len(data):
         size, kind = _uint32(data, offset), _uint32(data, offset + 4)
         if offset + 8 + size > len(data):
-            raise _FaultError("a chunk reaches beyond the end of the file")
+            raise GltfFaultError("a chunk reaches beyond the end of the file")
         chunks.setdefault(kind, data[offset + 8 : offset + 8 + size])
         offset += 8 + size
     return _json(chunks[_JSON_CHUNK]), chunks.get(_BIN_CHUNK, b"")
@@ -113,106 +96,132 @@ def _uint32(data: bytes, offset: int) -> int:
     return int.from_bytes(data[offset : offset + 4], "little")
 
 
-def _join_glb(text: bytes, binary: bytes) -> bytes:
-    text += b" " * (-len(text) % 4)
-    chunks = _chunk(_JSON_CHUNK, text) + (_chunk(_BIN_CHUNK, binary) if binary else b"")
-    return _GLB_MAGIC + (2).to_bytes(4, "little") + (12 + len(chunks)).to_bytes(4, "little") + chunks
-
-
-def _chunk(kind: int, data: bytes) -> bytes:
-    return len(data).to_bytes(4, "little") + kind.to_bytes(4, "little") + data
-
-
-def _check_document(document: dict[str, Any], binary: bytes, folder: Path) -> None:
+def _checked(path: Path, document: dict[str, Any], binary: bytes | None) -> GltfFile:
     version = str(document["asset"]["version"])
     if not version.startswith("2."):
-        raise _FaultError(f"glTF {version} is not supported, only 2.x")
+        raise GltfFaultError(f"glTF {version} is not supported, only 2.x")
     for name in document.get("extensionsRequired", []):
         if not _HARMLESS_EXTENSIONS.fullmatch(str(name)):
-            raise _FaultError(f"the extension {name} that it requires is not supported")
-    _check_uris(document.get("images", []), folder)
-    sizes = [_buffer_size(buffer, binary, folder) for buffer in document.get("buffers", [])]
-    views = [_check_view(view, sizes) for view in document.get("bufferViews", [])]
-    for index, accessor in enumerate(document.get("accessors", [])):
-        _check_accessor(index, accessor, document["bufferViews"], views)
+            raise GltfFaultError(f"the extension {name} that it requires is not supported")
+    _check_uris(document.get("images", []), path.parent)
+    buffers = [_buffer(buffer, binary, path.parent) for buffer in document.get("buffers", [])]
+    views = document.get("bufferViews", [])
+    sizes = [_check_view(view, [len(data) for data in buffers]) for view in views]
+    _check_accessors(document.get("accessors", []), _Views(views, sizes))
+    _check_nodes(document.get("nodes", []))
     _check_triangles(document)
+    return GltfFile(path, document, tuple(buffers))
 
 
 def _count(value: object) -> int:
     if type(value) is not int or value < 0:
-        raise _FaultError(f"{value!r} stands where a count belongs")
+        raise GltfFaultError(f"{value!r} stands where a count belongs")
     return value
 
 
 def _check_uris(images: list[dict[str, Any]], folder: Path) -> None:
     for image in images:
         if "uri" in image and not image["uri"].startswith("data:"):
-            _file_inside(image["uri"], folder)
+            file_inside(image["uri"], folder)
 
 
-def _file_inside(uri: str, folder: Path) -> Path:
-    path = (folder / unquote(uri)).resolve()
-    if not path.is_relative_to(folder.resolve()):
-        raise _FaultError(f"it refers to {uri}, outside its own folder")
-    return path
-
-
-def _buffer_size(buffer: dict[str, Any], binary: bytes, folder: Path) -> int:
+def _buffer(buffer: dict[str, Any], binary: bytes | None, folder: Path) -> bytes:
     size, uri = _count(buffer["byteLength"]), buffer.get("uri")
     if uri is None:
-        held = len(binary)
-    elif uri.startswith("data:"):
-        held = len(uri.partition("base64,")[2]) * 3 // 4
+        held = binary or b""
+    elif not uri.startswith("data:") and _file_size(uri, folder) > MAX_FILE_BYTES:
+        raise GltfFaultError(f"its buffer {uri} is too large")
     else:
-        path = _file_inside(uri, folder)
-        held = path.stat().st_size if path.is_file() else -1
-        if held < 0 or held > MAX_FILE_BYTES:
-            raise _FaultError(f"its buffer {uri} is missing or too large")
-    if size > held:
-        raise _FaultError(f"a buffer of {size} bytes holds only {held}")
-    return size
+        held = uri_bytes(uri, folder)
+    if size > len(held):
+        raise GltfFaultError(f"a buffer of {size} bytes holds only {len(held)}")
+    return held
+
+
+def _file_size(uri: str, folder: Path) -> int:
+    path = file_inside(uri, folder)
+    return path.stat().st_size if path.is_file() else 0
 
 
 def _check_view(view: dict[str, Any], buffer_sizes: list[int]) -> int:
     offset, size = _count(view.get("byteOffset", 0)), _count(view["byteLength"])
     if offset + size > buffer_sizes[_count(view["buffer"])]:
-        raise _FaultError("a buffer view reaches beyond its buffer")
+        raise GltfFaultError("a buffer view reaches beyond its buffer")
     if not 1 <= _count(view.get("byteStride", 1)) <= 252:
-        raise _FaultError("a buffer view has a stride outside 1..252 bytes")
+        raise GltfFaultError("a buffer view has a stride outside 1..252 bytes")
     return size
 
 
-def _check_accessor(
-    index: int, accessor: dict[str, Any], views: list[dict[str, Any]], sizes: list[int]
-) -> None:
-    if "sparse" in accessor or "bufferView" not in accessor:
-        raise _FaultError(f"accessor {index} is sparse or has no data, which is not supported")
-    view = _count(accessor["bufferView"])
-    element = _COMPONENT_BYTES[accessor["componentType"]] * _COMPONENTS[accessor["type"]]
-    count, stride = _count(accessor["count"]), _count(views[view].get("byteStride", element))
-    needed = _count(accessor.get("byteOffset", 0)) + max(count - 1, 0) * stride + element * (count > 0)
-    if needed > sizes[view]:
-        raise _FaultError(f"accessor {index} wants {needed} bytes where {sizes[view]} are")
+@dataclass(frozen=True)
+class _Views:
+    """Buffer views and how many bytes each has."""
+
+    views: list[dict[str, Any]]
+    sizes: list[int]
+
+    def check(self, index: int, place: dict[str, Any], count: int, element: int) -> None:
+        """Whether so many elements, each of `element` bytes, lie in the view that a part of an accessor names."""
+        view = _count(place["bufferView"])
+        stride = _count(self.views[view].get("byteStride", element))
+        needed = _count(place.get("byteOffset", 0)) + max(count - 1, 0) * stride + element * (count > 0)
+        if needed > self.sizes[view]:
+            raise GltfFaultError(f"accessor {index} wants {needed} bytes where {self.sizes[view]} are")
+
+
+def _check_accessors(accessors: list[dict[str, Any]], views: _Views) -> None:
+    stored, added = 0, 0
+    for index, accessor in enumerate(accessors):
+        element = _COMPONENT_BYTES[accessor["componentType"]] * COMPONENTS[accessor["type"]]
+        count = _count(accessor["count"])
+        if "bufferView" in accessor:
+            views.check(index, accessor, count, element)
+            stored = max(stored, count)
+        elif "sparse" not in accessor:
+            raise GltfFaultError(f"accessor {index} has no data, which is not supported")
+        if "sparse" in accessor:
+            _check_sparse(index, accessor, element, views)
+            added += count * element
+    longest = max((accessor["count"] for accessor in accessors), default=0)
+    if longest > stored or added > MAX_FILE_BYTES:
+        raise GltfFaultError("its sparse accessors grow beyond what the file holds")
+
+
+def _check_sparse(index: int, accessor: dict[str, Any], element: int, views: _Views) -> None:
+    sparse = accessor["sparse"]
+    count, kind = _count(sparse["count"]), sparse["indices"]["componentType"]
+    if count > accessor["count"] or kind not in _INDEX_TYPES:
+        raise GltfFaultError(f"accessor {index} has malformed sparse values")
+    views.check(index, sparse["indices"], count, _COMPONENT_BYTES[kind])
+    views.check(index, sparse["values"], count, element)
+
+
+def _check_nodes(nodes: list[dict[str, Any]]) -> None:
+    """Nodes must form trees, or whoever follows them may never end."""
+    children = [_count(child) for node in nodes for child in node.get("children", [])]
+    if len(set(children)) != len(children) or any(child >= len(nodes) for child in children):
+        raise GltfFaultError("its nodes do not form a tree")
+    reached = sorted(set(range(len(nodes))) - set(children))
+    for index in reached:
+        reached.extend(nodes[index].get("children", []))
+    if len(reached) < len(nodes):
+        raise GltfFaultError("its nodes form a circle")
 
 
 def _check_triangles(document: dict[str, Any]) -> None:
-    """Bound the triangles of all instances; nodes must form trees, or a loader may never end."""
-    nodes = document.get("nodes", [])
-    children = [_count(child) for node in nodes for child in node.get("children", [])]
-    if len(set(children)) != len(children) or any(child >= len(nodes) for child in children):
-        raise _FaultError("its nodes do not form a tree")
+    """Bound the triangles of all instances."""
     accessors = document.get("accessors", [])
     sizes = [
         sum(_primitive_triangles(primitive, accessors) for primitive in mesh["primitives"])
         for mesh in document.get("meshes", [])
     ]
+    nodes = document.get("nodes", [])
     if sum(sizes[_count(node["mesh"])] for node in nodes if "mesh" in node) > MAX_TRIANGLES:
-        raise _FaultError(f"its nodes show more than {MAX_TRIANGLES} triangles")
+        raise GltfFaultError(f"its nodes show more than {MAX_TRIANGLES} triangles")
 
 
 def _primitive_triangles(primitive: dict[str, Any], accessors: list[dict[str, Any]]) -> int:
     position = accessors[_count(primitive["attributes"]["POSITION"])]
-    if position["type"] != "VEC3" or position["componentType"] != _FLOAT:
-        raise _FaultError("its positions are not three floats each (quantised meshes are not supported)")
+    if position["type"] != "VEC3":
+        raise GltfFaultError("its positions are not three numbers each")
     indexed = accessors[_count(primitive["indices"])] if "indices" in primitive else position
     return int(indexed["count"])

@@ -1,6 +1,6 @@
 """Bounding volume hierarchy over triangles, flattened for loops without a stack (passes/common/ray_mesh.glsl)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int32, Int64
@@ -40,6 +40,32 @@ class Bvh:
         rows[:, 1:, :3] = corners[self.order, 1:] - first[:, None]
         rows.view(np.int32)[:, 0, 3] = self.order
         return rows.tobytes()
+
+    @property
+    def cost(self) -> float:
+        """Boxes that a ray through the tree must be expected to open: their surfaces relative to the whole's."""
+        extent = self.high.astype(np.float64) - self.low
+        areas = (extent * np.roll(extent, 1, axis=1)).sum(axis=1)
+        return float(areas.sum() / areas[0])
+
+    def refitted(self, corners: Float32[np.ndarray, "m 3 3"]) -> "Bvh":
+        """The same tree around triangles that moved: correct always, good while neighbours stay neighbours."""
+        held = self.leaf & ((1 << COUNT_BITS) - 1)
+        firsts = np.concatenate([[0], np.cumsum(np.where(self.leaf < 0, 0, held))])
+        # A node's triangles follow each other in `order`, up to the first of what comes after its last descendant.
+        spans = np.stack([firsts[:-1], firsts[self.skip]], axis=1).ravel()
+        ordered = corners[self.order]
+        margin = np.float32(ROUNDING * float(np.abs(corners).max()))
+        low = _over_spans(np.minimum, ordered.min(axis=1), spans) - margin
+        high = _over_spans(np.maximum, ordered.max(axis=1), spans) + margin
+        return replace(self, low=low, high=high)
+
+
+def _over_spans(
+    reduce: np.ufunc, rows: Float32[np.ndarray, "m 3"], spans: Int64[np.ndarray, " 2k"]
+) -> Float32[np.ndarray, "k 3"]:
+    """Reduce rows from each span's start to its end; the last row stands twice, so that an end may lie behind all."""
+    return np.asarray(reduce.reduceat(np.concatenate([rows, rows[-1:]]), spans)[::2])
 
 
 @dataclass(frozen=True, eq=False)

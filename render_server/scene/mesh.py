@@ -2,59 +2,31 @@
 
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import trimesh
-from jaxtyping import Float32, Float64, Int32
+from jaxtyping import Float32, Int32
 
 from protocol.errors import DeltalightError
 from protocol.frames import decode_lut
-from render_server.scene.asset_check import MAX_TRIANGLES, CheckedGltf, check_mesh_file, read_gltf
+from protocol.scene_objects import GLTF_SUFFIXES
+from render_server.scene.asset_check import check_mesh_file
+from render_server.scene.gltf_asset import GltfAsset, load_gltf
 from render_server.scene.materials import Material, material_table
-from render_server.scene.normals import face_normals, smooth_normals
+from render_server.scene.triangle_mesh import (
+    FileGeometry,
+    TriangleMesh,
+    converted,
+    joined,
+    joined_triangles,
+)
 
-MAX_COORDINATE_M = 1e4
+__all__ = ["Asset", "GpuMesh", "TriangleMesh", "load_asset", "load_mesh", "merge_for_gpu", "split_triangles"]
 MAX_PIECES = 4_000_000
 VERTEX_LAYOUT = "3f 3f 2f 3f 1f"
 VERTEX_ATTRIBUTES = ("in_position", "in_normal", "in_uv", "in_color", "in_material")
-
-
-@dataclass(frozen=True, eq=False)
-class TriangleMesh:
-    """Triangles of one material, counter-clockwise seen from outside.
-
-    `normals` are unit vectors. `uv` (0, 0) is the top-left corner of the texture array. `colors` are linear
-    R G B that multiply the material's base colour.
-    """
-
-    positions: Float32[np.ndarray, "n 3"]
-    normals: Float32[np.ndarray, "n 3"]
-    triangles: Int32[np.ndarray, "m 3"]
-    uv: Float32[np.ndarray, "n 2"] | None
-    material: Material
-    colors: Float32[np.ndarray, "n 3"] | None = None
-
-    def bounds(self) -> Float32[np.ndarray, "2 3"]:
-        """Return the least and greatest coordinates of the vertices that triangles use."""
-        used = self.positions[self.triangles.ravel()]
-        return np.stack([used.min(axis=0), used.max(axis=0)])
-
-    def transformed(self, matrix: Float64[np.ndarray, "4 4"]) -> "TriangleMesh":
-        """Return the mesh in another frame; a mirroring matrix turns the winding round."""
-        linear = matrix[:3, :3]
-        positions = self.positions @ linear.T + matrix[:3, 3]
-        normals = self.normals @ np.linalg.inv(linear)
-        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
-        mirrored = np.linalg.det(linear) < 0
-        return replace(
-            self,
-            positions=positions.astype(np.float32),
-            normals=normals.astype(np.float32),
-            triangles=np.ascontiguousarray(self.triangles[:, ::-1]) if mirrored else self.triangles,
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,42 +45,55 @@ class GpuMesh:
     textures: tuple[np.ndarray, ...]
 
 
+@dataclass(frozen=True, eq=False)
+class Asset:
+    """The meshes of a file as they rest, and what poses them if the file has clips."""
+
+    meshes: list[TriangleMesh]
+    animated: GltfAsset | None
+
+
 def load_mesh(path: Path) -> list[TriangleMesh]:
     """Read a GLB, glTF, OBJ, PLY or STL file: one mesh a material, in the file's own axes and units.
 
-    The scene graph's transforms are applied, degenerate triangles dropped, missing normals computed (sharp
-    at edges beyond 60 degrees). Vertex colours are sRGB bytes, in glTF linear.
+    The scene graph's transforms are applied (and the skins and morph targets of glTF, as they rest), degenerate
+    triangles dropped, missing normals computed (sharp at edges beyond 60 degrees). Vertex colours are sRGB bytes, in
+    glTF linear.
 
     Raises:
         DeltalightError: the file is missing, of an unknown type, damaged, empty, or has coordinates that
             are not finite or beyond 10 km.
     """
-    suffix = check_mesh_file(path)
-    checked = read_gltf(path) if suffix in (".glb", ".gltf") else None
-    parts: dict[int, list[TriangleMesh]] = defaultdict(list)
-    for key, part in _parts(_open_scene(path, checked), checked, path):
-        parts[key].append(part)
-    meshes = [_joined(same) for same in parts.values()]
-    if not meshes:
+    return load_asset(path).meshes
+
+
+def load_asset(path: Path) -> Asset:
+    """Read a mesh file as `load_mesh` does, and the clips of a glTF file.
+
+    Raises:
+        DeltalightError: as `load_mesh`, or a clip that does not hold together.
+    """
+    if check_mesh_file(path) in GLTF_SUFFIXES:
+        gltf = load_gltf(path)
+        return Asset(gltf.meshes(gltf.pose(None, 0.0)), gltf if gltf.clips else None)
+    together: dict[int, list[TriangleMesh]] = defaultdict(list)
+    for key, part in _parts(_open_scene(path), path):
+        together[key].append(part)
+    if not together:
         raise DeltalightError(f"{path} has no triangle with an area; export a triangle mesh.")
-    return meshes
+    return Asset([joined(same) for same in together.values()], None)
 
 
-def _open_scene(path: Path, checked: CheckedGltf | None) -> trimesh.Scene:
+def _open_scene(path: Path) -> trimesh.Scene:
     try:
-        if checked is None:
-            return trimesh.load_scene(path, process=False, maintain_order=True)
-        resolver = trimesh.resolvers.FilePathResolver(path)
-        return trimesh.load_scene(
-            checked.stream, file_type=checked.file_type, resolver=resolver, process=False
-        )
+        return trimesh.load_scene(path, process=False, maintain_order=True)
     except MemoryError:
         raise
     except Exception as error:  # a damaged file can make the loader fail in any way
         raise DeltalightError(f"{path} cannot be read as a mesh ({error}); export it again.") from error
 
 
-def _parts(scene: trimesh.Scene, checked: CheckedGltf | None, path: Path) -> list[tuple[int, TriangleMesh]]:
+def _parts(scene: trimesh.Scene, path: Path) -> list[tuple[int, TriangleMesh]]:
     """Return (material key, mesh in the file's frame) of every node that shows triangles."""
     materials: dict[int, Material] = {}
     parts = []
@@ -119,27 +104,23 @@ def _parts(scene: trimesh.Scene, checked: CheckedGltf | None, path: Path) -> lis
             continue
         key = id(getattr(geometry.visual, "material", None))
         if key not in materials:
-            materials[key] = _material(geometry, checked, path)
-        mesh = _converted(geometry, materials[key], path)
-        if mesh is not None:
+            materials[key] = _material(geometry, path)
+        made = converted(_file_geometry(geometry), materials[key], path)
+        if made is not None:
+            mesh = made.mesh
             parts.append((key, mesh if np.array_equal(matrix, np.eye(4)) else mesh.transformed(matrix)))
     return parts
 
 
-def _material(geometry: trimesh.Trimesh, checked: CheckedGltf | None, path: Path) -> Material:
+def _material(geometry: trimesh.Trimesh, path: Path) -> Material:
     try:
-        return _described_material(geometry, checked).checked(str(path))
+        return _described_material(geometry).checked(str(path))
     except (TypeError, ValueError, AttributeError) as error:
         raise DeltalightError(f"{path} has a malformed material ({error}); export it again.") from error
 
 
-def _described_material(geometry: trimesh.Trimesh, checked: CheckedGltf | None) -> Material:
+def _described_material(geometry: trimesh.Trimesh) -> Material:
     loaded = getattr(geometry.visual, "material", None)
-    if checked is not None:
-        if loaded is None or not str(loaded.name).isdigit():
-            return Material(base_color=np.ones(3, np.float32), name="default")
-        description = checked.document["materials"][int(loaded.name)]
-        return Material.from_gltf(description, loaded.baseColorTexture)
     if loaded is not None and isinstance(loaded, trimesh.visual.material.SimpleMaterial):
         # An image that no file names is the loader's own placeholder.
         image = loaded.image if loaded.image is not None and "file_path" in loaded.image.info else None
@@ -148,51 +129,16 @@ def _described_material(geometry: trimesh.Trimesh, checked: CheckedGltf | None) 
     return Material(base_color=np.ones(3, np.float32)) if has_colors else Material()
 
 
-def _converted(geometry: trimesh.Trimesh, material: Material, path: Path) -> TriangleMesh | None:
-    """Take over a loaded mesh; None if all its triangles are degenerate."""
+def _file_geometry(geometry: trimesh.Trimesh) -> FileGeometry:
     positions = np.asarray(geometry.vertices, np.float32)
-    triangles = np.asarray(geometry.faces, np.int64)
-    _check_geometry(positions, triangles, path)
-    triangles = triangles[face_normals(positions, triangles.astype(np.int32))[1]].astype(np.int32)
-    if len(triangles) == 0:
-        return None
-    normals = _given_normals(geometry, len(positions), path)
-    source = np.arange(len(positions))
-    if normals is None:
-        source, triangles, normals = smooth_normals(positions, triangles)
-    uv, colors = _uv(geometry, len(positions)), _colors(geometry, len(positions))
-    return TriangleMesh(
-        np.ascontiguousarray(positions[source]),
-        normals,
-        triangles,
-        None if uv is None else uv[source],
-        material,
-        None if colors is None else colors[source],
+    has_normals = "vertex_normals" in geometry._cache
+    return FileGeometry(
+        positions,
+        np.asarray(geometry.faces, np.int64),
+        np.asarray(geometry._cache["vertex_normals"], np.float32) if has_normals else None,
+        _uv(geometry, len(positions)),
+        _colors(geometry),
     )
-
-
-def _check_geometry(positions: Float32[np.ndarray, "n 3"], triangles: np.ndarray, path: Path) -> None:
-    if triangles.min() < 0 or triangles.max() >= len(positions):
-        raise DeltalightError(f"{path} has triangles whose vertices do not exist; export the mesh again.")
-    if len(triangles) > MAX_TRIANGLES:
-        raise DeltalightError(f"{path} has more than {MAX_TRIANGLES} triangles; simplify the mesh.")
-    if not np.isfinite(positions).all():
-        raise DeltalightError(f"{path} has coordinates that are not finite; repair the mesh.")
-    if np.abs(positions).max() > MAX_COORDINATE_M:
-        raise DeltalightError(f"{path} has coordinates beyond 10 km; scale the mesh to metres.")
-
-
-def _given_normals(geometry: trimesh.Trimesh, count: int, path: Path) -> Float32[np.ndarray, "n 3"] | None:
-    """Return the file's own normals, normalised; None where it has none or some of length zero."""
-    if "vertex_normals" not in geometry._cache:
-        return None
-    normals = np.asarray(geometry._cache["vertex_normals"], np.float32)
-    if normals.shape != (count, 3):
-        return None
-    if not np.isfinite(normals).all():
-        raise DeltalightError(f"{path} has normals that are not finite; repair the mesh.")
-    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-    return normals / lengths if (lengths > 1e-6).all() else None
 
 
 def _uv(geometry: trimesh.Trimesh, count: int) -> Float32[np.ndarray, "n 2"] | None:
@@ -203,47 +149,12 @@ def _uv(geometry: trimesh.Trimesh, count: int) -> Float32[np.ndarray, "n 2"] | N
     return np.column_stack([uv[:, 0], 1 - uv[:, 1]]).astype(np.float32)
 
 
-def _colors(geometry: trimesh.Trimesh, count: int) -> Float32[np.ndarray, "n 3"] | None:
-    """Return linear vertex colours: sRGB bytes of PLY, STL and OBJ, linear attributes of glTF."""
-    attributes: dict[str, Any] = getattr(geometry.visual, "vertex_attributes", {})
-    values = np.asarray(attributes.get("color", np.zeros(0)))
-    if values.shape[:1] == (count,):
-        scale = np.iinfo(values.dtype).max if values.dtype.kind == "u" else 1.0
-        return (values[:, :3] / np.float32(scale)).astype(np.float32)
+def _colors(geometry: trimesh.Trimesh) -> Float32[np.ndarray, "n 3"] | None:
+    """Return linear vertex colours: sRGB bytes of PLY, STL and OBJ."""
     if geometry.visual.kind != "vertex":
         return None
     codes = np.asarray(geometry.visual.vertex_colors, np.uint8)[:, :3]
     return decode_lut(None)[:, 0][codes]
-
-
-def _joined(parts: Sequence[TriangleMesh]) -> TriangleMesh:
-    """Concatenate meshes of one material."""
-    if len(parts) == 1:
-        return parts[0]
-    starts = np.cumsum([0] + [len(part.positions) for part in parts[:-1]])
-    triangles = [part.triangles + start for part, start in zip(parts, starts, strict=True)]
-    return TriangleMesh(
-        np.concatenate([part.positions for part in parts]),
-        np.concatenate([part.normals for part in parts]),
-        np.concatenate(triangles).astype(np.int32),
-        _joined_attribute([part.uv for part in parts], parts, 0.0),
-        parts[0].material,
-        _joined_attribute([part.colors for part in parts], parts, 1.0),
-    )
-
-
-def _joined_attribute(
-    values: Sequence[np.ndarray | None], parts: Sequence[TriangleMesh], default: float
-) -> np.ndarray | None:
-    """Concatenate an attribute; parts without it get the default; None if no part has it."""
-    width = next((value.shape[1] for value in values if value is not None), None)
-    if width is None:
-        return None
-    filled = [
-        np.full((len(part.positions), width), default, np.float32) if value is None else value
-        for value, part in zip(values, parts, strict=True)
-    ]
-    return np.concatenate(filled)
 
 
 def merge_for_gpu(meshes: Sequence[TriangleMesh]) -> GpuMesh:
@@ -255,12 +166,10 @@ def merge_for_gpu(meshes: Sequence[TriangleMesh]) -> GpuMesh:
     if not meshes:
         raise DeltalightError("there is no mesh to draw; give the scene an object.")
     materials = tuple(mesh.material for mesh in meshes)
-    starts = np.cumsum([0] + [len(mesh.positions) for mesh in meshes[:-1]])
-    triangles = [mesh.triangles + start for mesh, start in zip(meshes, starts, strict=True)]
     textures = [material.base_color_texture for material in materials]
     return GpuMesh(
         np.concatenate([_interleaved(mesh, index) for index, mesh in enumerate(meshes)]),
-        np.concatenate(triangles).astype(np.int32),
+        joined_triangles([mesh.triangles for mesh in meshes], [len(mesh.positions) for mesh in meshes]),
         materials,
         material_table(materials),
         tuple(texture for texture in textures if texture is not None),

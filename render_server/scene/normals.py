@@ -1,7 +1,9 @@
 """Vertex normals for meshes that come without: smooth inside a crease angle, sharp beyond."""
 
+from dataclasses import dataclass
+
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int32, Int64
+from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -9,6 +11,9 @@ from scipy.sparse.csgraph import connected_components
 CREASE_ANGLE_DEG = 60.0
 # Twice the area relative to the longest edge squared, below which a triangle has no direction in float32.
 DEGENERATE_RATIO = 1e-9
+UNIT_ROUNDING = (
+    2.5e-7  # three components of a unit vector are rounded by up to 6e-8 each, and once more by a length
+)
 
 
 def face_normals(
@@ -25,32 +30,68 @@ def face_normals(
     return normals, proper
 
 
+@dataclass(frozen=True, eq=False)
+class Smoothing:
+    """Which vertices share a normal: numbers of their groups. Edges stay sharp or smooth while a mesh bends."""
+
+    group: Int32[np.ndarray, " n"]
+
+    def normals(
+        self, positions: Float32[np.ndarray, "n 3"], triangles: Int32[np.ndarray, "m 3"]
+    ) -> Float32[np.ndarray, "n 3"]:
+        """Angle-weighted means of the triangles' normals (Thuermer & Wuethrich 1998) over each group."""
+        normals, _ = face_normals(positions, triangles)
+        weights = _corner_angles(positions.astype(np.float64)[triangles]).ravel()[:, None]
+        weighted = weights * np.repeat(normals, 3, axis=0)
+        groups = self.group[triangles.ravel()]
+        sums = np.stack([np.bincount(groups, weighted[:, axis]) for axis in range(3)], axis=1)
+        lengths = np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-30)
+        return np.asarray((sums / lengths)[self.group], np.float32)
+
+
+def split_at_creases(
+    positions: Float32[np.ndarray, "n 3"],
+    triangles: Int32[np.ndarray, "m 3"],
+    crease_deg: float = CREASE_ANGLE_DEG,
+) -> tuple[Int64[np.ndarray, " k"], Int32[np.ndarray, "m 3"], Smoothing]:
+    """Split vertices where normals must not be smoothed over a crease.
+
+    Vertices at one position count as one. Around each, triangles that hang together over edges with less
+    than `crease_deg` between their normals share a normal. Triangles must not be degenerate.
+
+    Returns:
+        (source, triangles, smoothing): vertex i of the result is vertex source[i] of the input.
+    """
+    normals, _ = face_normals(positions, triangles)
+    welded = weld(positions)[triangles]
+    groups = _smoothing_groups(welded, normals, np.cos(np.radians(crease_deg)))
+    keys = groups.astype(np.int64) * len(positions) + triangles.ravel()
+    _, first, index = np.unique(keys, return_index=True, return_inverse=True)
+    source = triangles.ravel()[first].astype(np.int64)
+    return source, index.reshape(-1, 3).astype(np.int32), Smoothing(groups[first])
+
+
 def smooth_normals(
     positions: Float32[np.ndarray, "n 3"],
     triangles: Int32[np.ndarray, "m 3"],
     crease_deg: float = CREASE_ANGLE_DEG,
 ) -> tuple[Int64[np.ndarray, " k"], Int32[np.ndarray, "m 3"], Float32[np.ndarray, "k 3"]]:
-    """Compute angle-weighted normals (Thuermer & Wuethrich 1998) that do not smooth over creases.
-
-    Vertices at one position count as one. Around each, triangles that hang together over edges with less
-    than `crease_deg` between their normals share a normal; vertices are split where they do not. Triangles
-    must not be degenerate.
+    """Compute normals that do not smooth over creases.
 
     Returns:
-        (source, triangles, normals): vertex i of the result is vertex source[i] of the input.
+        (source, triangles, normals): as of `split_at_creases`.
     """
-    normals, _ = face_normals(positions, triangles)
-    welded = weld(positions)[triangles]
-    groups = _smoothing_groups(welded, normals, np.cos(np.radians(crease_deg)))
-    weights = _corner_angles(positions.astype(np.float64)[triangles]).ravel()[:, None]
-    weighted = weights * np.repeat(normals, 3, axis=0)
-    sums = np.stack([np.bincount(groups, weighted[:, axis]) for axis in range(3)], axis=1)
-    lengths = np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-30)
-    keys = groups.astype(np.int64) * len(positions) + triangles.ravel()
-    _, first, index = np.unique(keys, return_index=True, return_inverse=True)
-    source = triangles.ravel()[first].astype(np.int64)
-    unit = (sums / lengths)[groups[first]].astype(np.float32)
-    return source, index.reshape(-1, 3).astype(np.int32), unit
+    source, split, smoothing = split_at_creases(positions, triangles, crease_deg)
+    return source, split, smoothing.normals(positions[source], split)
+
+
+def unit_or(
+    vectors: Float[np.ndarray, "n 3"], instead: Float[np.ndarray, "n 3"]
+) -> Float32[np.ndarray, "n 3"]:
+    """Vectors at length 1, those of length 0 replaced. What float32 cannot bring nearer to 1 keeps its bits."""
+    lengths = np.linalg.norm(vectors.astype(np.float64), axis=1, keepdims=True)
+    lengths[np.abs(lengths - 1) < UNIT_ROUNDING] = 1
+    return np.where(lengths > 0, vectors / np.maximum(lengths, 1e-300), instead).astype(np.float32)
 
 
 def weld(positions: Float32[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:

@@ -1,6 +1,6 @@
 """Routes of uploaded assets."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
@@ -17,11 +17,19 @@ Digest = Annotated[
     str, Path(description="`sha256:<hex>` or the digits alone.", examples=["sha256:2c26b46b68ffc68f..."])
 ]
 UPLOAD_TYPE = "application/octet-stream"
+UNCHANGING = {
+    "Cache-Control": "private, max-age=31536000, immutable",
+    "X-Content-Type-Options": "nosniff",
+    "Content-Security-Policy": "sandbox; default-src 'none'",
+}
+PNG: dict[int | str, dict[str, Any]] = {
+    200: {"content": {"image/png": {"schema": {"type": "string", "format": "binary"}}}}
+}
 _KNOWN = ", ".join(each.name.upper() for each in FORMATS)
 _UPLOAD_BODY = {
     "requestBody": {
         "required": True,
-        "description": f"The file itself: {_KNOWN}.",
+        "description": f"The file itself: {_KNOWN}, or a ZIP of one glTF and its files.",
         "content": {UPLOAD_TYPE: {"schema": {"type": "string", "format": "binary"}}},
     }
 }
@@ -43,6 +51,7 @@ async def upload_asset(
     """Upload a mesh or an environment map as the body of the request; 200 where the same content is there already.
 
     The file is recognised by its content and loaded once in a process of its own, with limits of memory and time.
+    A .zip of one glTF and its files is kept as one .glb.
     """
     if request.headers.get("content-type", "").partition(";")[0].strip().lower() != UPLOAD_TYPE:
         raise ProblemError(415, "media-type", f"Send the file as the body, with Content-Type: {UPLOAD_TYPE}.")
@@ -51,6 +60,7 @@ async def upload_asset(
         async for chunk in request.stream():
             await run_in_threadpool(incoming.write, chunk)
         asset, is_new = await run_in_threadpool(assets.keep, incoming, name)
+    shared.events.publish("asset", {"digest": asset.reference, "name": asset.names[0]})
     response.status_code = 201 if is_new else 200
     response.headers["Location"] = f"/api/v1/assets/{asset.reference}"
     return AssetAnswer.of(asset)
@@ -66,16 +76,20 @@ def get_asset(shared: Shared, digest: Digest) -> AssetAnswer:
 def download_asset(shared: Shared, digest: Digest) -> FileResponse:
     """Download the file."""
     asset = shared.store.assets.get(digest.removeprefix(DIGEST_PREFIX))
-    headers = {
-        "Cache-Control": "private, max-age=31536000, immutable",
-        "X-Content-Type-Options": "nosniff",
-        "Content-Security-Policy": "sandbox; default-src 'none'",
-    }
     path = shared.store.assets.path(asset)
-    return FileResponse(path, media_type=asset.format.media_type, filename=asset.names[0], headers=headers)
+    return FileResponse(path, media_type=asset.format.media_type, filename=asset.names[0], headers=UNCHANGING)
+
+
+@router.get("/{digest}/thumbnail.png", response_class=FileResponse, responses=responses(404, 422) | PNG)
+def thumbnail(shared: Shared, digest: Digest) -> FileResponse:
+    """Return a picture of a mesh or map, 256 x 256 pixels on a transparent ground."""
+    path = shared.store.assets.thumbnail(digest.removeprefix(DIGEST_PREFIX))
+    return FileResponse(path, media_type="image/png", headers=UNCHANGING)
 
 
 @router.delete("/{digest}", status_code=204, responses=responses(404, 409))
 def delete_asset(shared: Shared, digest: Digest) -> None:
     """Delete an asset that no scene uses, now or in a revision that undo may bring back."""
+    asset = shared.store.assets.get(digest.removeprefix(DIGEST_PREFIX))
     shared.store.assets.remove(digest.removeprefix(DIGEST_PREFIX))
+    shared.events.publish("asset", {"digest": asset.reference, "name": asset.names[0], "deleted": True})

@@ -5,17 +5,25 @@ from dataclasses import dataclass
 from urllib.parse import urlsplit
 
 from starlette.concurrency import run_in_threadpool
-from starlette.datastructures import Headers
+from starlette.datastructures import Headers, QueryParams
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from services.api.passes import Pass, give_pass, pass_of
+from services.api.places import StreamPlaces, run_while
 from services.api.problems import ProblemError, Problems
 from services.api.rate import RateLimit
+from services.api.secret_token import SecretToken
+from services.api.tickets import TicketBox
 from services.ports import LOOPBACK
-from services.storage.tokens import Token, TokenStore
+from services.storage.tokens import TokenStore
 
 BODY_LIMIT_BYTES = 2 << 20  # three times a document with the most objects that one may have
 UPLOAD_PATH = "/api/v1/assets"
-OPEN_PATHS = frozenset({"/api/v1/health", "/openapi.json"})  # they tell nothing that needs a token
+PROTECTED = "/api/"  # all else is the page's files and the API's description, which anybody may have
+OPEN_PATHS = frozenset({"/api/v1/health"})  # it tells nothing that needs a token
+STREAM_PATHS = frozenset({"/api/v1/live.mjpg"})  # these answers do not end by themselves; no WebSocket does
+# They change nothing, though they are posted.
+LOOKING_PATHS = frozenset({"/api/v1/tickets", "/api/v1/live/pick"})
 WRONG_TOKENS_PER_S, WRONG_TOKENS_AT_ONCE = 1 / 6, 10
 LOOPBACK_NAMES = frozenset({LOOPBACK, "localhost", "::1"})
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
@@ -38,35 +46,63 @@ class Gate:
     loopback which needs no token is stopped by Origin and Host.
     """
 
-    def __init__(self, app: ASGIApp, rules: GateRules, tokens: TokenStore, problems: Problems) -> None:
+    def __init__(
+        self,
+        app: ASGIApp,
+        *,
+        rules: GateRules,
+        tokens: TokenStore,
+        tickets: TicketBox,
+        problems: Problems,
+        secret: SecretToken | None = None,
+    ) -> None:
         self._app = app
         self._rules = rules
         self._tokens = tokens
+        self._tickets = tickets
+        self._secret = secret
         self._problems = problems
         self._rate = RateLimit(rules.requests_per_s, 2 * rules.requests_per_s)
         self._wrong_tokens = RateLimit(WRONG_TOKENS_PER_S, WRONG_TOKENS_AT_ONCE)
+        self._places = StreamPlaces()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on, or answer it here."""
         if scope["type"] == "lifespan":
             await self._app(scope, receive, send)
-        elif scope["type"] != "http":
-            await send({"type": "websocket.close", "code": POLICY_VIOLATION})
-        else:
-            await self._pass(scope, receive, send)
-
-    async def _pass(self, scope: Scope, receive: Receive, send: Send) -> None:
-        headers = Headers(scope=scope)
+            return
         try:
-            self._check_names(headers)
-            self._check_rate(scope)
-            await self._check_token(scope, headers)
+            await self._admit(scope)
+            if scope["type"] == "websocket" or scope["path"] in STREAM_PATHS:
+                await self._stream(scope, receive, send)
+                return
             limit = _Limit(self._body_limit(scope), receive)
-            limit.check_announced(headers)
+            limit.check_announced(Headers(scope=scope))
         except ProblemError as refusal:
             await self._problems.of_http(refusal)(scope, receive, send)
             return
         await self._app(scope, limit.receive, send)
+
+    async def _admit(self, scope: Scope) -> None:
+        headers = Headers(scope=scope)
+        self._check_names(headers)
+        self._check_rate(scope)
+        rights = await self._rights(scope, headers)
+        if rights.role == "view" and not _only_looks(scope):
+            raise _may_only_look(rights)
+        give_pass(scope, rights)
+
+    async def _stream(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass on a connection that stays open: it takes a place, and ends when its token is revoked."""
+        token_id = pass_of(scope).token_id
+
+        async def is_allowed() -> bool:
+            return token_id is None or await run_in_threadpool(self._tokens.knows, token_id)
+
+        with self._places.taken(_client(scope)):
+            came_to_its_end = await run_while(self._app(scope, receive, send), is_allowed)
+        if not came_to_its_end and scope["type"] == "websocket":
+            await send({"type": "websocket.close", "code": POLICY_VIOLATION, "reason": "token revoked"})
 
     def _check_names(self, headers: Headers) -> None:
         host = headers.get("host", "")
@@ -75,7 +111,7 @@ class Gate:
                 400, "host", "This service is on loopback; address it as 127.0.0.1 or localhost."
             )
         origin = headers.get("origin")
-        if origin is not None and (_host_of(origin) or " ") != host.lower():
+        if (origin is not None and (_host_of(origin) or " ") != host.lower()) or _is_embedded(headers):
             raise ProblemError(
                 403,
                 "origin",
@@ -89,25 +125,32 @@ class Gate:
             raise _too_many(wait_s, "rate", "Too many requests; send fewer a second.")
         self._rate.take(client)
 
-    async def _check_token(self, scope: Scope, headers: Headers) -> None:
-        """A token that is sent must be right, even where none is needed."""
-        scheme, _, given = headers.get("authorization", "").partition(" ")
-        if not scheme and (not self._rules.needs_token or scope["path"] in OPEN_PATHS):
-            return
+    async def _rights(self, scope: Scope, headers: Headers) -> Pass:
+        """A token or ticket that is sent must be right, even where none is needed."""
+        scheme, _, token = headers.get("authorization", "").partition(" ")
+        ticket = QueryParams(scope["query_string"]).get("ticket")
+        if not scheme and (ticket is None or not _takes_tickets(scope)):
+            if self._rules.needs_token and _is_protected(scope):
+                raise _unknown_token(False)
+            return Pass("control")
         client = _client(scope)
         wait_s = self._wrong_tokens.wait_s(client)
         if wait_s > 0:
             raise _too_many(wait_s, "wrong-tokens", "Too many wrong tokens came from this address; wait.")
-        token = (
-            await run_in_threadpool(self._tokens.verify, given.strip())
-            if scheme.lower() == "bearer"
-            else None
-        )
-        if token is None:
-            if scheme:
-                self._wrong_tokens.take(client)
-            raise _unknown_token(bool(scheme))
-        _check_role(token, scope)
+        rights = await self._verified(scheme, token) if scheme else self._tickets.take(ticket or "")
+        if rights is None:
+            self._wrong_tokens.take(client)
+            raise _unknown_token(True)
+        return rights
+
+    async def _verified(self, scheme: str, given: str) -> Pass | None:
+        if scheme.lower() != "bearer":
+            return None
+        rights = None if self._secret is None else self._secret.verify(given.strip())
+        if rights is not None:
+            return rights
+        token = await run_in_threadpool(self._tokens.verify, given.strip())
+        return None if token is None else Pass(token.role, token.id, token.name)
 
     def _body_limit(self, scope: Scope) -> int:
         is_upload = scope["path"] == UPLOAD_PATH and scope["method"] == "POST"
@@ -139,18 +182,35 @@ class _Limit:
         return ProblemError(413, "too-large", sentence, {"Connection": "close"})
 
 
-def _check_role(token: Token, scope: Scope) -> None:
-    if token.role == "view" and scope["method"] not in SAFE_METHODS:
-        raise ProblemError(
-            403,
-            "role",
-            f"The token `{token.name}` may only look; use one of role control to change something.",
-        )
+def _takes_tickets(scope: Scope) -> bool:
+    return scope["type"] == "websocket" or scope["method"] in SAFE_METHODS
+
+
+def _only_looks(scope: Scope) -> bool:
+    return _takes_tickets(scope) or scope["path"] in LOOKING_PATHS
+
+
+def _is_protected(scope: Scope) -> bool:
+    return scope["path"].startswith(PROTECTED) and scope["path"] not in OPEN_PATHS
+
+
+def _is_embedded(headers: Headers) -> bool:
+    """Whether a page of another site loads this as a part of it, which says no Origin for pictures and frames."""
+    return (
+        headers.get("sec-fetch-site") in ("cross-site", "same-site")
+        and headers.get("sec-fetch-dest") != "document"
+    )
+
+
+def _may_only_look(rights: Pass) -> ProblemError:
+    return ProblemError(
+        403, "role", f"The token `{rights.name}` may only look; use one of role control to change something."
+    )
 
 
 def _unknown_token(was_given: bool) -> ProblemError:
     sentence = (
-        "The token is not known; make one with `deltalight api token NAME`."
+        "The token or ticket is not known; make a token with `deltalight api token NAME`."
         if was_given
         else "A token is needed; send it as `Authorization: Bearer TOKEN`."
     )

@@ -9,6 +9,8 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from prometheus_client.registry import Collector
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from services.api.events import EventHub
+from services.api.live_hub import LiveHub
 from services.api.problems import Problems
 from services.api.process_watch import ProcessWatch
 
@@ -29,7 +31,9 @@ class Reachable(Protocol):
 class Metrics:
     """The measurements of one application."""
 
-    def __init__(self, problems: Problems, watch: ProcessWatch, link: Reachable) -> None:
+    def __init__(
+        self, problems: Problems, watch: ProcessWatch, link: Reachable, live: LiveHub, events: EventHub
+    ) -> None:
         self._registry = CollectorRegistry()
         self._requests = Counter(
             "deltalight_api_requests", "Requests answered.", ("operation", "status"), registry=self._registry
@@ -42,6 +46,7 @@ class Metrics:
             registry=self._registry,
         )
         self._registry.register(_Reported(problems, watch, link))
+        self._registry.register(_Streams(live, events))
 
     def note(self, scope: Scope, status: int, seconds: float) -> None:
         """Count a request that was answered."""
@@ -118,3 +123,34 @@ class _Reported(Collector):
             for cause, count in report.message.drops.items():
                 drops.add_metric([process, cause], count)
         return [age, rate, drops]
+
+
+class _Streams(Collector):
+    """How many look and listen, and what they were sent."""
+
+    def __init__(self, live: LiveHub, events: EventHub) -> None:
+        self._live = live
+        self._events = events
+
+    def collect(self) -> Iterable[Metric]:
+        """Give all families."""
+        live = self._live
+        yield _gauge("deltalight_live_viewers", "Viewers of the live video.", live.viewers)
+        yield _counter("deltalight_live_frames_received", "Composites that came.", live.received)
+        yield _counter("deltalight_live_frames_sent", "Frames sent, to all viewers together.", live.sent)
+        yield _counter(
+            "deltalight_live_frames_skipped", "Frames that viewers were too slow for.", live.skipped
+        )
+        yield _gauge("deltalight_event_listeners", "Clients that hear events.", self._events.listeners)
+        since_s = live.state()[1]
+        if since_s is not None:
+            text = "Time since the newest composite came, seconds."
+            yield _gauge("deltalight_live_frame_age_seconds", text, since_s)
+
+
+def _gauge(name: str, text: str, value: float) -> GaugeMetricFamily:
+    return GaugeMetricFamily(name, text, value=value)
+
+
+def _counter(name: str, text: str, value: float) -> CounterMetricFamily:
+    return CounterMetricFamily(name, text, value=value)

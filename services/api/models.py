@@ -90,11 +90,18 @@ class RevisionEntry(BaseModel):
     at: datetime
     what: str = Field(description="What was changed.", examples=["object knot changed"])
     name: str = Field(description="Title of the scene then.")
+    gesture: str | None = Field(description="Changes in a row with the same one are undone together.")
 
     @classmethod
     def of(cls, revision: Revision) -> Self:
         """Describe a revision."""
-        return cls(revision=revision.number, at=_time(revision.at_ns), what=revision.what, name=revision.name)
+        return cls(
+            revision=revision.number,
+            at=_time(revision.at_ns),
+            what=revision.what,
+            name=revision.name,
+            gesture=revision.gesture,
+        )
 
 
 class AssetAnswer(BaseModel):
@@ -107,8 +114,8 @@ class AssetAnswer(BaseModel):
     size_bytes: int
     uploaded: datetime
     facts: dict[str, Any] = Field(
-        description="Mesh: triangles, vertices, minimum and maximum corner in the file's units and axes. "
-        "Map: width and height, pixels.",
+        description="Mesh: triangles, vertices, minimum and maximum corner in the file's units and axes, and the "
+        "clips that it can play (name, duration_s). Map: width and height, pixels.",
         examples=[{"triangles": 1000, "vertices": 502, "minimum": [0, 0, 0], "maximum": [0.1, 0.1, 0.2]}],
     )
 

@@ -6,7 +6,7 @@ from fastapi import APIRouter, Path, Response
 
 from protocol.scene_objects import SceneObject
 from services.api.bodies import ObjectBody, ObjectPatch
-from services.api.context import Expected, Shared
+from services.api.context import OnTerms, Shared
 from services.api.models import SceneAnswer
 from services.api.problems import responses
 from services.api.scenes import CHANGE_PROBLEMS, SceneId
@@ -26,11 +26,10 @@ def list_objects(shared: Shared, scene_id: SceneId) -> list[SceneObject]:
 
 @router.post("", status_code=201, responses=CHANGE_PROBLEMS)
 def create_object(
-    shared: Shared, scene_id: SceneId, item: ObjectBody, response: Response, if_match: Expected
+    shared: Shared, scene_id: SceneId, item: ObjectBody, response: Response, terms: OnTerms
 ) -> SceneAnswer:
     """Add an object; without an `id` it gets a free one."""
-    scene = shared.store.scenes.change(scene_id, add_object(item), "object added", if_match)
-    return shared.answer(scene, response, changed=True)
+    return shared.change(scene_id, add_object(item), "object added", terms, response)
 
 
 @router.get("/{object_id:path}", responses=responses(404))
@@ -52,12 +51,11 @@ def put_object(
     object_id: ObjectId,
     item: ObjectBody,
     response: Response,
-    if_match: Expected,
+    terms: OnTerms,
 ) -> SceneAnswer:
     """Put another object in place of one."""
     edit = replace_object(object_id, item)
-    scene = shared.store.scenes.change(scene_id, edit, f"object {object_id} replaced", if_match)
-    return shared.answer(scene, response, changed=True)
+    return shared.change(scene_id, edit, f"object {object_id} replaced", terms, response)
 
 
 @router.patch("/{object_id:path}", responses=CHANGE_PROBLEMS)
@@ -68,19 +66,17 @@ def change_object(
     object_id: ObjectId,
     patch: ObjectPatch,
     response: Response,
-    if_match: Expected,
+    terms: OnTerms,
 ) -> SceneAnswer:
     """Change keys of an object: its pose, its material, whether it is seen."""
     edit = patch_object(object_id, patch)
-    scene = shared.store.scenes.change(scene_id, edit, f"object {object_id} changed", if_match)
-    return shared.answer(scene, response, changed=True)
+    return shared.change(scene_id, edit, f"object {object_id} changed", terms, response)
 
 
 @router.delete("/{object_id:path}", responses=CHANGE_PROBLEMS)
 def delete_object(
-    shared: Shared, scene_id: SceneId, object_id: ObjectId, response: Response, if_match: Expected
+    shared: Shared, scene_id: SceneId, object_id: ObjectId, response: Response, terms: OnTerms
 ) -> SceneAnswer:
     """Take an object out of the scene; undo brings it back."""
     edit = remove_object(object_id)
-    scene = shared.store.scenes.change(scene_id, edit, f"object {object_id} removed", if_match)
-    return shared.answer(scene, response, changed=True)
+    return shared.change(scene_id, edit, f"object {object_id} removed", terms, response)

@@ -9,7 +9,7 @@ from protocol.scene_lights import Lights
 from protocol.scene_method import Method, Output, Shading
 from protocol.scene_objects import RealScene
 from services.api.bodies import LightsBody, MethodBody, OutputBody, PartPatch, RealBody, ShadingBody
-from services.api.context import Expected, Shared
+from services.api.context import OnTerms, Shared
 from services.api.models import SceneAnswer
 from services.api.problems import responses
 from services.api.scenes import CHANGE_PROBLEMS, SceneId
@@ -28,18 +28,14 @@ def _add_part(part: str, model: Any, body: Any, text: str) -> None:  # noqa: ANN
         return value
 
     def put(
-        shared: Shared, scene_id: SceneId, value: body, response: Response, if_match: Expected
+        shared: Shared, scene_id: SceneId, value: body, response: Response, terms: OnTerms
     ) -> SceneAnswer:
-        edit = replace_part(part, value)
-        scene = shared.store.scenes.change(scene_id, edit, f"{part} replaced", if_match)
-        return shared.answer(scene, response, changed=True)
+        return shared.change(scene_id, replace_part(part, value), f"{part} replaced", terms, response)
 
     def patch(
-        shared: Shared, scene_id: SceneId, value: PartPatch, response: Response, if_match: Expected
+        shared: Shared, scene_id: SceneId, value: PartPatch, response: Response, terms: OnTerms
     ) -> SceneAnswer:
-        edit = patch_part(part, value)
-        scene = shared.store.scenes.change(scene_id, edit, f"{part} changed", if_match)
-        return shared.answer(scene, response, changed=True)
+        return shared.change(scene_id, patch_part(part, value), f"{part} changed", terms, response)
 
     tags: list[str | Enum] = [part if part in ("lights", "method", "output") else "scenes"]
     router.add_api_route(

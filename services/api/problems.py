@@ -14,6 +14,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
 from protocol.errors import DeltalightError
+from services.api.render_link import UnansweredError
 from services.storage.faults import (
     ConflictError,
     NotFoundError,
@@ -36,6 +37,7 @@ _KINDS: tuple[tuple[type[DeltalightError], int, str], ...] = (
     (RejectedAssetError, 422, "rejected-asset"),
     (TooLargeError, 413, "too-large"),
     (StorageFaultError, 503, "storage-fault"),
+    (UnansweredError, 503, "render-server"),
     (DeltalightError, 422, "invalid"),
 )
 

@@ -3,6 +3,8 @@
 import threading
 import time
 import uuid
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -14,12 +16,14 @@ from protocol.errors import DeltalightError
 from protocol.keys import Keys
 from protocol.messages import ControlRequest
 from protocol.transport import RequestClient
+from services.api.live_hub import ShownScene
 from services.storage.scenes import StoredScene
 from services.storage.store import Store
 
 LOOK_INTERVAL_S = 1.0
 ALIVE_TIMEOUT_S = 1.0  # the server's own thread answers this, whatever the renderer does
 COMMAND_TIMEOUT_S = 25.0  # the server gives up after 20 s itself
+REMEMBERED_REVISIONS = 1024  # half a minute of a gesture's changes; pictures are a few frames behind
 
 log = structlog.get_logger()
 
@@ -41,13 +45,24 @@ class RenderLink:
     The server counts revisions of its own, across scenes: each sending is its newest plus one.
     """
 
-    def __init__(self, store: Store, control: str, keys: Keys | None = None) -> None:
+    def __init__(
+        self,
+        store: Store,
+        control: str,
+        keys: Keys | None = None,
+        *,
+        on_picture: Callable[[Picture], None] = lambda _picture: None,
+    ) -> None:
         self._store = store
+        self._on_picture = on_picture
         self._client = RequestClient(control, keys=keys)
         self._sending = threading.Lock()
         self._is_reachable = True
         self._server_revision: int | None = None
         self._picture: Picture | None = None
+        self._source: list[str] | None = None
+        self.on_source: Callable[[Sequence[str] | None], None] = lambda _endpoints: None
+        self._sent: OrderedDict[int, ShownScene] = OrderedDict()  # by the server's revision
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._look, name="render-link", daemon=True)
 
@@ -84,8 +99,42 @@ class RenderLink:
             active = self._store.scenes.active()
             if active is None or self._is_settled(active):
                 return self._picture
-            self._picture = self._send(active) if self._is_reachable else _pending(active)
-            return self._picture
+            picture = self._send(active) if self._is_reachable else _pending(active)
+            if picture != self._picture:
+                self._picture = picture
+                self._on_picture(picture)
+            return picture
+
+    def shown(self, server_revision: int | None) -> ShownScene | None:
+        """Which scene a picture shows, made with a revision of the server's; None where that came from elsewhere."""
+        return None if server_revision is None else self._sent.get(server_revision)
+
+    def command(
+        self, op: str, payload: dict[str, object] | None = None, timeout_s: float = COMMAND_TIMEOUT_S
+    ) -> dict[str, object]:
+        """Carry out a command at the render server, after those that wait; gives the payload of the reply.
+
+        Raises:
+            UnansweredError: it does not answer.
+            DeltalightError: it refused the command.
+        """
+        if not self._is_reachable:
+            raise UnansweredError("The render server does not answer; see that it runs, then try again.")
+        with self._sending:
+            return self._ask(op, timeout_s, payload)
+
+    def use_source(self, endpoints: Sequence[str] | None) -> None:
+        """Let the server read frames from there, None = from its own nodes; a server that was restarted too.
+
+        `on_source` hears of it.
+
+        Raises:
+            UnansweredError: it does not answer, and is told as soon as it does.
+            DeltalightError: it refused the endpoints.
+        """
+        self._source = None if endpoints is None else list(endpoints)
+        self.on_source(self._source)
+        self.command("set_source", {"endpoints": self._source})
 
     def _is_settled(self, active: StoredScene) -> bool:
         picture = self._picture
@@ -100,7 +149,7 @@ class RenderLink:
         try:
             self._ask(CLOCK_OP, ALIVE_TIMEOUT_S)
             self._set_scene(active)
-        except _UnansweredError:
+        except UnansweredError:
             self._note_reachable(False)
             return _pending(active)
         except DeltalightError as refusal:
@@ -110,22 +159,35 @@ class RenderLink:
 
     def _set_scene(self, active: StoredScene) -> None:
         scene = self._store.assets.localised(active.document).model_dump(mode="json")
+        shown = ShownScene(active.head.id, active.document.revision)
         sent = (self._seen_revision() if self._server_revision is None else self._server_revision) + 1
         try:
-            self._ask("set_scene", COMMAND_TIMEOUT_S, {"scene": scene}, revision=sent)
-        except _UnansweredError:
+            self._set_revision(sent, scene, shown)
+        except UnansweredError:
             raise
         except DeltalightError:
             newest = self._seen_revision()
             if newest < sent:  # refused for what it is, not because somebody else changed the scene meanwhile
                 raise
-            sent = newest + 1
-            self._ask("set_scene", COMMAND_TIMEOUT_S, {"scene": scene}, revision=sent)
-        self._server_revision = sent
+            self._set_revision(newest + 1, scene, shown)
+
+    def _set_revision(self, number: int, scene: object, shown: ShownScene) -> None:
+        """Noted before the server answers: a picture of it may come earlier than the answer."""
+        self._sent[number] = shown
+        while len(self._sent) > REMEMBERED_REVISIONS:
+            self._sent.popitem(last=False)
+        try:
+            self._ask("set_scene", COMMAND_TIMEOUT_S, {"scene": scene}, revision=number)
+        except UnansweredError:
+            raise
+        except DeltalightError:
+            del self._sent[number]
+            raise
+        self._server_revision = number
 
     def _seen_revision(self) -> int:
-        scene: Any = self._ask("get_scene", COMMAND_TIMEOUT_S)["scene"]
-        return int(scene["revision"])
+        revision: Any = self._ask("ping", COMMAND_TIMEOUT_S)["revision"]
+        return int(revision)
 
     def _look(self) -> None:
         """Once a second: a server that came (back) gets the scene."""
@@ -140,14 +202,26 @@ class RenderLink:
             try:
                 self._ask(CLOCK_OP, ALIVE_TIMEOUT_S)
                 seen = self._seen_revision()
-            except _UnansweredError:
+            except UnansweredError:
                 self._note_reachable(False)
                 return
+            if self._server_revision is None or not self._is_reachable:
+                self._restore_source()
             self._note_reachable(True)
             if self._server_revision is None or seen < self._server_revision:  # it was started (again)
                 self._picture = None
+                self._sent.clear()
             self._server_revision = seen
         self.refresh()
+
+    def _restore_source(self) -> None:
+        """Tell a server that came (back) where to read from; one that is left from a killed service too."""
+        try:
+            self._ask("set_source", COMMAND_TIMEOUT_S, {"endpoints": self._source})
+        except UnansweredError:
+            raise
+        except DeltalightError as fault:  # pictures of elsewhere are better than no scene
+            log.warning("the render server keeps its source", fault=str(fault))
 
     def _note_reachable(self, reachable: bool) -> None:
         if reachable != self._is_reachable:
@@ -174,14 +248,14 @@ class RenderLink:
         except EnvelopeError:
             raise
         except DeltalightError as fault:
-            raise _UnansweredError(str(fault)) from fault
+            raise UnansweredError(str(fault)) from fault
         if reply.error is not None:
             raise DeltalightError(reply.error)
         return reply.payload
 
 
-class _UnansweredError(DeltalightError):
-    """The server did not answer in time."""
+class UnansweredError(DeltalightError):
+    """The render server did not answer in time."""
 
 
 def _pending(active: StoredScene) -> Picture:

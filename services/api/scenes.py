@@ -1,14 +1,15 @@
 """Routes of scenes and their revisions."""
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from fastapi import APIRouter, Path, Query, Response
 
 from protocol.scene import SceneDocument
 from services.api.bodies import SceneBody, ScenePatch
-from services.api.context import Expected, Shared, expected_revision
+from services.api.context import Expected, OnTerms, Shared, with_revision_of
 from services.api.models import RevisionEntry, SceneAnswer, SceneSummary
 from services.api.problems import responses
+from services.api.sent_documents import DOCUMENT_BODY, DOCUMENT_FILES, SentDocument, document_file
 from services.storage.documents import patch_document, replace_document
 from services.storage.faults import NotFoundError
 
@@ -26,12 +27,12 @@ def list_scenes(shared: Shared) -> list[SceneSummary]:
     return [SceneSummary.of(head) for head in shared.store.scenes.all()]
 
 
-@router.post("/scenes", status_code=201, responses=responses(400, 409, 422))
-def create_scene(shared: Shared, document: SceneBody, response: Response) -> SceneAnswer:
+@router.post("/scenes", status_code=201, responses=responses(400, 409, 415, 422), openapi_extra=DOCUMENT_BODY)
+def create_scene(shared: Shared, document: SentDocument, response: Response) -> SceneAnswer:
     """Make a scene of a document (an exported one too); assets are named by digest or uploaded name."""
     scene = shared.store.scenes.create(document)
     response.headers["Location"] = f"/api/v1/scenes/{scene.head.id}"
-    return shared.answer(scene, response)
+    return shared.answer(scene, response, changed=True)
 
 
 @router.get("/active-scene", responses=responses(404))
@@ -51,39 +52,45 @@ def get_scene(shared: Shared, scene_id: SceneId, response: Response) -> SceneAns
 
 @router.put("/scenes/{scene_id}", responses=CHANGE_PROBLEMS)
 def replace_scene(
-    shared: Shared, scene_id: SceneId, document: SceneBody, response: Response, if_match: Expected
+    shared: Shared, scene_id: SceneId, document: SceneBody, response: Response, terms: OnTerms
 ) -> SceneAnswer:
     """Put another document in place of a scene's; a `revision` in it counts as If-Match."""
-    expected = expected_revision(if_match, document)
-    scene = shared.store.scenes.change(scene_id, replace_document(document), "document replaced", expected)
-    return shared.answer(scene, response, changed=True)
+    terms = with_revision_of(document, terms)
+    return shared.change(scene_id, replace_document(document), "document replaced", terms, response)
 
 
 @router.patch("/scenes/{scene_id}", responses=CHANGE_PROBLEMS)
 def patch_scene(
-    shared: Shared, scene_id: SceneId, patch: ScenePatch, response: Response, if_match: Expected
+    shared: Shared, scene_id: SceneId, patch: ScenePatch, response: Response, terms: OnTerms
 ) -> SceneAnswer:
     """Change keys of a scene's document; a `revision` in the patch counts as If-Match."""
-    expected = expected_revision(if_match, patch)
     what = f"{', '.join(sorted(set(patch) - {'revision'})) or 'nothing'} changed"[:200]
-    scene = shared.store.scenes.change(scene_id, patch_document(patch), what, expected)
-    return shared.answer(scene, response, changed=True)
+    return shared.change(scene_id, patch_document(patch), what, with_revision_of(patch, terms), response)
 
 
 @router.delete("/scenes/{scene_id}", status_code=204, responses=responses(400, 404, 409))
 def delete_scene(shared: Shared, scene_id: SceneId, if_match: Expected) -> None:
     """Delete a scene that is not active."""
+    revision = shared.store.scenes.get(scene_id).head.revision
     shared.store.scenes.delete(scene_id, if_match)
+    body = {"id": scene_id, "revision": revision, "what": "deleted", "active": False, "deleted": True}
+    shared.events.publish("scene", body)
 
 
-@router.get("/scenes/{scene_id}/document", responses=responses(404))
-def export_document(shared: Shared, scene_id: SceneId, response: Response) -> SceneDocument:
+@router.get(
+    "/scenes/{scene_id}/document", response_model=SceneDocument, responses=responses(404) | DOCUMENT_FILES
+)
+def export_document(
+    shared: Shared,
+    scene_id: SceneId,
+    kind: Annotated[
+        Literal["json", "yaml"], Query(alias="format", description="How it is written.")
+    ] = "json",
+) -> Response:
     """Return the document alone, as a file to keep or to import."""
     document = shared.store.scenes.get(scene_id).document
-    response.headers["Content-Disposition"] = (
-        f'attachment; filename="scene-{scene_id}-{document.revision}.json"'
-    )
-    return document
+    name = f"scene-{scene_id}-{document.revision}"
+    return document_file(document, name, as_yaml=kind == "yaml")
 
 
 @router.get("/scenes/{scene_id}/revisions", responses=responses(404))
@@ -131,7 +138,7 @@ def duplicate(
     """Make a copy of a scene."""
     scene = shared.store.scenes.duplicate(scene_id, name)
     response.headers["Location"] = f"/api/v1/scenes/{scene.head.id}"
-    return shared.answer(scene, response)
+    return shared.answer(scene, response, changed=True)
 
 
 @router.post("/scenes/{scene_id}/activate", responses=responses(404))

@@ -7,29 +7,32 @@ from typing import Annotated
 from pydantic import Field, field_validator
 
 from protocol.documents import StrictModel
-from services.ports import COMPOSITE_PORT, CONTROL_PORT, LOOPBACK, NODE_PORT, endpoint
-
-API_PORT = 8001
+from services.ports import COMPOSITE_PORT, CONTROL_PORT, LOOPBACK, NODE_PORT, PAGE_PORT, endpoint
 
 
 class ApiSettings(StrictModel):
-    """Settings of the REST API."""
+    """Settings of the web process: dashboard, REST API, live video."""
 
     host: str = Field(
         default=LOOPBACK,
         description="Address to listen on; one that leaves this host (0.0.0.0 for all) needs tokens.",
     )
-    port: int = Field(default=API_PORT, ge=1, le=65535, description="Port to listen on.")
+    port: int = Field(default=PAGE_PORT, ge=1, le=65535, description="Port to listen on.")
     data: Path | None = Field(
         default=None,
         description="Folder of scenes and assets; null = `deltalight` in the user's data folder.",
+    )
+    token_file: Path | None = Field(
+        default=None,
+        description="File with one more token, of role control, which is never stored: a secret of the container "
+        "engine or of systemd.",
     )
     control: str = Field(
         default=endpoint(CONTROL_PORT), description="Endpoint of the render server's commands."
     )
     subscribe: tuple[str, ...] = Field(
         default=(endpoint(COMPOSITE_PORT), endpoint(NODE_PORT)),
-        description="Endpoints of the render server and of the nodes, which tell how they are doing.",
+        description="Endpoints of the render server and of the nodes: pictures, and how they are doing.",
     )
     upload_limit_mb: int = Field(default=256, ge=1, le=512, description="Greatest size of an upload, MB.")
     requests_per_s: Annotated[float, Field(ge=1, le=10_000)] = Field(

@@ -15,11 +15,23 @@ from services.api.problems import responses
 router = APIRouter(tags=["state"])
 
 
+class StreamState(BaseModel):
+    """Whether pictures come."""
+
+    status: Literal["waiting", "ok", "stale"] = Field(
+        description="`waiting` = none came yet; `stale` = none for two seconds."
+    )
+    frame_id: int | None = Field(description="Of the newest.")
+    last_frame_s: float | None = Field(description="Seconds since it came.")
+    frames_per_s: float | None
+
+
 class Health(BaseModel):
     """Whether the service works; it needs no token."""
 
     status: Literal["ok", "degraded"] = Field(description="`degraded` = the render server does not answer.")
     render_server: Literal["answers", "silent"]
+    stream: StreamState
     version: str
 
 
@@ -48,6 +60,7 @@ def health(shared: Shared) -> Health:
     return Health(
         status="ok" if shared.link.is_reachable else "degraded",
         render_server=_server(shared),
+        stream=_stream(shared),
         version=version("deltalight"),
     )
 
@@ -78,6 +91,17 @@ def settings(shared: Shared) -> Settings:
         needs_token=shared.settings.leaves_host,
         upload_limit_bytes=shared.settings.upload_limit_mb << 20,
         requests_per_s=shared.settings.requests_per_s,
+    )
+
+
+def _stream(shared: Shared) -> StreamState:
+    status, since_s = shared.live.state()
+    frame = shared.live.newest
+    return StreamState(
+        status=status,
+        frame_id=None if frame is None else frame.message.frame_id,
+        last_frame_s=None if since_s is None else round(since_s, 3),
+        frames_per_s=shared.live.frames_per_s(),
     )
 
 

@@ -1,4 +1,4 @@
-"""`deltalight api`: the REST API, and its tokens."""
+"""`deltalight api`: the web process, and its tokens."""
 
 import json
 from datetime import UTC, datetime
@@ -8,12 +8,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from services.commands.options import ConfigFile
+from services.commands.options import ConfigFile, NodeName
+from services.ports import COMPOSITE_PORT, endpoint
 
 if TYPE_CHECKING:
+    from protocol.keys import KeySettings
     from services.storage.store import Store
 
-api = typer.Typer(invoke_without_command=True, help="Serve the REST API, or manage its tokens.")
+api = typer.Typer(
+    invoke_without_command=True, help="Serve dashboard, REST API and live video, or manage their tokens."
+)
 Data = Annotated[
     Path | None, typer.Option(help="Folder of scenes and assets; default: the user's data folder.")
 ]
@@ -34,10 +38,13 @@ def serve(
         str | None,
         typer.Option(help="Address to listen on; others than loopback need tokens. Default: 127.0.0.1."),
     ] = None,
-    port: Annotated[int | None, typer.Option(min=1, max=65535, help="Port. Default: 8001.")] = None,
+    port: Annotated[int | None, typer.Option(min=1, max=65535, help="Port. Default: 8000.")] = None,
     data: Data = None,
     scene: Annotated[
         Path | None, typer.Option(help="Scene document to import with its files, and to render.")
+    ] = None,
+    token_file: Annotated[
+        Path | None, typer.Option(help="File with one more token, of role control: a container's secret.")
     ] = None,
     control: Annotated[
         str | None,
@@ -46,12 +53,13 @@ def serve(
     subscribe: Annotated[
         list[str] | None,
         typer.Option(
-            help="Endpoint that reports come from; may be given several times. Default: 5602 and 5601."
+            help="Endpoint of pictures and reports; may be given several times. Default: 5602 and 5601."
         ),
     ] = None,
+    node: NodeName = None,
     config_file: ConfigFile = None,
 ) -> None:
-    """Serve scenes, assets and state over HTTP at /api/v1, until Ctrl-C."""
+    """Serve the dashboard at /, and scenes, assets, live video and state at /api/v1, until Ctrl-C."""
     if context.invoked_subcommand is not None:
         return
     from protocol.keys import KeySettings
@@ -63,13 +71,14 @@ def serve(
         "host": host,
         "port": port,
         "data": data,
+        "token_file": token_file,
         "control": control,
-        "subscribe": subscribe or None,
     }
     configuration = load_configuration(config_file)
+    key_settings = configuration.section("keys", KeySettings)
+    given["subscribe"] = _subscriptions(subscribe, node, key_settings)
     settings = configuration.section("api", ApiSettings, {k: v for k, v in given.items() if v is not None})
-    keys = configuration.section("keys", KeySettings).load([settings.control, *settings.subscribe])
-    run_api(settings, keys, scene)
+    run_api(settings, key_settings.load([settings.control, *settings.subscribe]), scene)
 
 
 @api.command()
@@ -115,6 +124,15 @@ def revoke(
     with _store(data) as store:
         store.tokens.revoke(name)
     typer.echo(f"The token `{name}` is no longer taken.")
+
+
+def _subscriptions(subscribe: list[str] | None, node: str | None, keys: "KeySettings") -> list[str] | None:
+    """Endpoints that are named, and that of the node that is to be found beside the render server."""
+    if node is None:
+        return subscribe or None
+    from services.discovery import node_endpoint
+
+    return [*(subscribe or [endpoint(COMPOSITE_PORT)]), node_endpoint(node, keys)]
 
 
 def _store(data: Path | None) -> "Store":

@@ -23,7 +23,9 @@ def speed(
     size: Annotated[
         str | None, typer.Option(metavar="WxH", help="Size of the pictures; default the demo's.")
     ] = None,
-    methods: Annotated[str, typer.Option(help="Methods, separated by commas: exact, paper.")] = "exact,paper",
+    methods: Annotated[
+        str, typer.Option(help="Methods, separated by commas, as for `demo --method`.")
+    ] = "exact,paper,dlpv",
     frames: Annotated[int, typer.Option(min=1, max=10_000, help="Frames of each measurement.")] = 30,
     device: Annotated[
         int | None, typer.Option(min=0, help="EGL device; `deltalight doctor` lists them.")

@@ -14,7 +14,9 @@ def demo(
     *,
     headless: Annotated[
         bool,
-        typer.Option("--headless", help="No page: write composites, a contact sheet and a video to --out."),
+        typer.Option(
+            "--headless", help="No dashboard: write composites, a contact sheet and a video to --out."
+        ),
     ] = False,
     frames: Annotated[int, typer.Option(min=1, max=100_000, help="Composites of a headless demo.")] = 30,
     out: Annotated[Path | None, typer.Option(help="Folder of a headless demo.")] = None,
@@ -22,10 +24,10 @@ def demo(
         Method, typer.Option(help="Relighting method; dvct is as the demo's scene says.")
     ] = Method.DVCT,
     no_browser: Annotated[bool, typer.Option("--no-browser", help="Do not open a browser.")] = False,
-    port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the page.")] = PAGE_PORT,
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the dashboard.")] = PAGE_PORT,
     as_json: Annotated[bool, typer.Option("--json", help="Print a headless demo's summary as JSON.")] = False,
 ) -> None:
-    """Play the shipped recording through node, render server and viewer, each a process of its own."""
+    """Play the shipped recording through node, render server and web process, and open the dashboard."""
     from services.demo import run_headless, run_live
 
     if not headless:

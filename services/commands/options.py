@@ -19,11 +19,16 @@ class View(StrEnum):
 
 
 class Method(StrEnum):
-    """A relighting method that is built: dvct as the scene says, or with one of its operators."""
+    """A relighting method: dvct as the scene says, or with one of its operators, or another one with its defaults."""
 
     DVCT = "dvct"
     EXACT = "exact"
     PAPER = "paper"
+    DLPV = "dlpv"
+    DLPV_PAPER = "dlpv-paper"
+    AROOF = "aroof"
+    DIFFERENTIAL = "differential"
+    NONE = "none"
 
 
 ConfigFile = Annotated[

@@ -1,7 +1,9 @@
 """`deltalight record`: the raw streams of a node to an .mcap recording."""
 
 import json
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -18,14 +20,19 @@ if TYPE_CHECKING:
     from protocol.scene import SceneDocument
     from services.recorder import Recorder, RecordStatus
 
-SHOW_PERIOD_S = 0.25
+SHOW_PERIOD_S, LINE_PERIOD_S = 0.25, 1.0
+
+Show = Callable[["RecordStatus"], None]
 
 
 def record(
     *,
     out: Annotated[Path, typer.Option(help="Recording to write, NAME.mcap; it must not exist.")],
     subscribe: Annotated[
-        str | None, typer.Option(help="Endpoint of the node's streams. Default: tcp://127.0.0.1:5601.")
+        list[str] | None,
+        typer.Option(
+            help="Endpoint of the node's streams; may be given several times. Default: tcp://127.0.0.1:5601."
+        ),
     ] = None,
     node: NodeName = None,
     name: Annotated[str | None, typer.Option(help="Name of the node, where several publish there.")] = None,
@@ -39,6 +46,9 @@ def record(
     duration: Annotated[float | None, typer.Option(min=0.1, help="Seconds from the first frame.")] = None,
     frames: Annotated[int | None, typer.Option(min=1, help="Frames to record.")] = None,
     config_file: ConfigFile = None,
+    progress: Annotated[
+        bool, typer.Option("--progress", help="Print how far it is as a line of JSON, once a second.")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
     """Record every raw frame of a node until Ctrl-C, --duration or --frames."""
@@ -48,11 +58,11 @@ def record(
     from services.settings import load_configuration
 
     settings = load_configuration(config_file).section("keys", KeySettings)
-    place = _endpoint(subscribe, node, settings)
-    keys = settings.load([place] if control is None else [place, control])
+    places = _endpoints(subscribe, node, settings)
+    keys = settings.load(places if control is None else [*places, control])
     job = RecordJob(
         out,
-        place,
+        tuple(places),
         node=name,
         scene=_scene(scene, control, keys),
         extrinsics=None if extrinsics is None else load_extrinsics_yaml(extrinsics),
@@ -62,20 +72,21 @@ def record(
     )
     console = Console(stderr=True, soft_wrap=True)
     recorder = Recorder(job, lambda sentence: console.print(sentence, markup=False, highlight=False))
-    _run(recorder, console, lambda status: _print_summary(status, as_json=as_json))
+    shown = _progress_lines() if progress else _progress_on(console)
+    _run(recorder, shown, lambda status: _print_summary(status, as_json=as_json))
 
 
-def _endpoint(subscribe: str | None, node: str | None, settings: "KeySettings") -> str:
-    """The endpoint that is named, or that of the node that is to be found."""
+def _endpoints(subscribe: list[str] | None, node: str | None, settings: "KeySettings") -> list[str]:
+    """The endpoints that are named, or that of the node that is to be found."""
     from protocol.errors import DeltalightError
 
     if node is None:
-        return subscribe or endpoint(NODE_PORT)
-    if subscribe is not None:
+        return subscribe or [endpoint(NODE_PORT)]
+    if subscribe:
         raise DeltalightError("--subscribe and --node both say where the node is; give one of them.")
     from services.discovery import node_endpoint
 
-    return node_endpoint(node, settings)
+    return [node_endpoint(node, settings)]
 
 
 def _scene(path: Path | None, control: str | None, keys: "Keys | None") -> "SceneDocument | None":
@@ -90,7 +101,26 @@ def _scene(path: Path | None, control: str | None, keys: "Keys | None") -> "Scen
     return None if control is None else scene_of_server(control, keys)
 
 
-def _run(recorder: "Recorder", console: Console, summarize: "Callable[[RecordStatus], None]") -> None:
+@contextmanager
+def _progress_on(console: Console) -> "Iterator[Show]":
+    with Live(console=console, transient=True, auto_refresh=False) as live:
+        yield lambda status: live.update(_line(status), refresh=True)
+
+
+@contextmanager
+def _progress_lines() -> "Iterator[Show]":
+    printed_s = -LINE_PERIOD_S
+
+    def show(status: "RecordStatus") -> None:
+        nonlocal printed_s
+        if time.monotonic() - printed_s >= LINE_PERIOD_S:
+            printed_s = time.monotonic()
+            print(json.dumps(status.as_dict()), flush=True)
+
+    yield show
+
+
+def _run(recorder: "Recorder", progress: "AbstractContextManager[Show]", summarize: "Show") -> None:
     """Record in a thread, which no signal interrupts in the middle of a frame, and show how far it is."""
     from concurrent.futures import ThreadPoolExecutor, wait
     from threading import Event
@@ -101,9 +131,9 @@ def _run(recorder: "Recorder", console: Console, summarize: "Callable[[RecordSta
     with ThreadPoolExecutor(1) as thread:
         running = thread.submit(recorder.run, stop)
         try:
-            with Live(console=console, transient=True, auto_refresh=False) as live:
+            with progress as show:
                 while not wait([running], SHOW_PERIOD_S).done:
-                    live.update(_line(recorder.status), refresh=True)
+                    show(recorder.status)
         except (KeyboardInterrupt, Terminated) as signal:
             ended_by = signal
         finally:

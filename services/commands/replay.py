@@ -1,11 +1,14 @@
 """`deltalight replay`: a recording or dataset folder, published as a sensor node does."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from services.commands.options import ConfigFile
+
+if TYPE_CHECKING:
+    pass
 
 
 def replay(
@@ -21,18 +24,43 @@ def replay(
         str | None, typer.Option(help="Control endpoint of the render server whose clock stamps refer to.")
     ] = None,
     loop: Annotated[bool, typer.Option("--loop", help="Start again at the end.")] = False,
+    rate: Annotated[float | None, typer.Option(help="Recorded seconds a second. Default: 1.")] = None,
+    start: Annotated[
+        float | None, typer.Option(min=0, help="Where to begin, seconds from the first frame.")
+    ] = None,
+    paused: Annotated[bool, typer.Option("--paused", help="Begin paused; needs --control.")] = False,
+    control: Annotated[
+        str | None,
+        typer.Option(help="Endpoint for pause, seek and rate; the replay then waits at its end."),
+    ] = None,
     fast: Annotated[
         bool, typer.Option("--fast", help="As fast as frames can be made ready, not at the recorded times.")
     ] = False,
     config_file: ConfigFile = None,
 ) -> None:
     """Publish a recording or dataset folder as its node did, until its end or Ctrl-C."""
+    from protocol.errors import DeltalightError
     from protocol.source import open_source
+    from sensor_node.cameras.playback import PlaybackCamera
     from services.node_process import run_configured_node
 
-    open_source(source)  # refuses here what a node would take for a live camera
+    frames = open_source(source)  # refuses here what a node would take for a live camera
+    if fast and (rate is not None or start is not None or control is not None):
+        raise DeltalightError("--fast knows no times; leave --rate, --start and --control out.")
+    if paused and control is None:
+        raise DeltalightError("--paused needs --control, the endpoint at which it is told to go on.")
+    camera: PlaybackCamera | None = None
+    if not fast:
+        camera = PlaybackCamera(
+            frames,
+            loop=loop,
+            rate=1.0 if rate is None else rate,
+            start_s=start or 0.0,
+            playing=not paused,
+            stays=control is not None,
+        )
     given = {"source": str(source), "endpoint": publish, "name": name, "clock_endpoint": clock}
     settings: dict[str, object] = {key: value for key, value in given.items() if value is not None}
     # The light is what was recorded, whatever camera the configuration file names for it.
     settings |= {"loop": loop, "realtime": not fast, "fisheye": None}
-    run_configured_node(settings, config_file)
+    run_configured_node(settings, config_file, camera, control)

@@ -14,7 +14,6 @@ class Document(StrEnum):
     NODE = "node"
     SERVER = "server"
     API = "api"
-    VIEWER = "viewer"
 
 
 def schema(
@@ -44,7 +43,3 @@ def _schema(document: Document) -> dict[str, Any]:
             from services.api.settings import ApiSettings
 
             return ApiSettings.model_json_schema()
-        case Document.VIEWER:
-            from services.viewer import ViewerSettings
-
-            return ViewerSettings.model_json_schema()

@@ -23,9 +23,15 @@ def up(
     ] = None,
     node: NodeName = None,
     scene: Annotated[
-        Path | None, typer.Option(help="Scene document; default: the one that the recording carries.")
+        Path | None,
+        typer.Option(
+            help="Scene document to import and show; default: the scene shown last, else the recording's."
+        ),
     ] = None,
-    port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the viewer page.")] = PAGE_PORT,
+    data: Annotated[
+        Path | None, typer.Option(help="Folder of scenes and assets; default: the user's data folder.")
+    ] = None,
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the dashboard.")] = PAGE_PORT,
     node_port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the node's streams.")] = NODE_PORT,
     composite_port: Annotated[
         int, typer.Option(min=1, max=65535, help="Port of the composites.")
@@ -39,18 +45,23 @@ def up(
     ] = False,
     config_file: ConfigFile = None,
 ) -> None:
-    """Run node, render server and viewer on this host and restart what dies, until Ctrl-C.
+    """Run node, render server and web process on this host and restart what dies, until Ctrl-C.
 
     With --node no node is started: the server takes the streams of one that is found on the network.
     """
-    from services.host import HostPlan, choose_scene, session_file
+    from services.host import HostPlan
+    from services.host_store import scene_to_show, session_file
+    from services.storage.store import Store
     from services.supervisor import Supervisor
 
     if node is None:
         source = source or _configured_source(config_file)
     elif source is not None:
         raise DeltalightError("--source starts a node here and --node names one elsewhere; give one of them.")
-    with session_file(choose_scene(_recording(source), scene)) as session:
+    folder = _data_folder(data, config_file)
+    with Store(folder) as store:
+        shown = scene_to_show(store, _recording(source), scene)
+    with session_file(shown) as session:
         plan = HostPlan(
             source,
             session,
@@ -59,14 +70,24 @@ def up(
             node_port=node_port,
             composite_port=composite_port,
             control_port=control_port,
+            data=folder,
             page_port=port,
             device=device,
             allow_software=allow_software,
         )
         plan.require_free_ports()
         with Supervisor(plan.specs()) as supervisor:
-            typer.echo(f"The live picture is at http://{LOOPBACK}:{port} (Ctrl-C ends everything).")
+            typer.echo(f"The dashboard is at http://{LOOPBACK}:{port} (Ctrl-C ends everything).")
             supervisor.run()
+
+
+def _data_folder(data: Path | None, config_file: Path | None) -> Path:
+    """Where the web process keeps scenes: as the command line says, the configuration, or by default."""
+    from services.api.settings import ApiSettings
+    from services.settings import load_configuration
+    from services.storage.store import default_folder
+
+    return data or load_configuration(config_file).section("api", ApiSettings).data or default_folder()
 
 
 def _configured_source(config_file: Path | None) -> str:

@@ -73,6 +73,11 @@ FORMATS = (
 BY_NAME = {each.name: each for each in FORMATS}
 
 
+def is_archive(head: bytes) -> bool:
+    """Whether a file with this beginning is a .zip (APPNOTE 4.3.7; an empty one has no such record)."""
+    return head[:4] == b"PK\x03\x04"
+
+
 def recognise(head: bytes, size_bytes: int, name: str) -> AssetFormat:
     """Return the format of a file with this beginning.
 
@@ -90,7 +95,7 @@ def recognise(head: bytes, size_bytes: int, name: str) -> AssetFormat:
 
 def _advice(head: bytes, name: str) -> str:
     if head.lstrip()[:1] == b"{":
-        return f"{name} looks like a glTF document, which names other files; export it as one .glb file."
+        return f"{name} looks like a glTF document, which names other files; pack all in a .zip, or export a .glb."
     known = ", ".join(each.name.upper() for each in FORMATS)
     return f"{name} is no file of a known format; upload one of {known}."
 

@@ -21,15 +21,27 @@ from sqlalchemy.orm import Session
 
 from protocol.errors import DeltalightError
 from protocol.scene import DIGEST_PREFIX, SceneDocument
-from services.storage.asset_kinds import BY_NAME, HEAD_BYTES, AssetFormat, AssetKind, clean_name, recognise
-from services.storage.asset_probe import Facts, probe
+from services.storage.asset_child import Facts, Task, run_limited
+from services.storage.asset_kinds import (
+    BY_NAME,
+    HEAD_BYTES,
+    AssetFormat,
+    AssetKind,
+    clean_name,
+    is_archive,
+    recognise,
+)
+from services.storage.asset_probe import probe
 from services.storage.database import Database
 from services.storage.faults import ConflictError, NotFoundError, StorageFaultError, TooLargeError
 from services.storage.tables import AssetNameRow, AssetRow, AssetUseRow, SceneRow
 
 Probe = Callable[[Path, AssetKind, str], Facts]
 LEFT_OVER_AFTER_S = 24 * 3600  # no upload takes a day: what is older, a killed process left
-CONCURRENT_PROBES = 2  # each may take up to the memory limit of a probe
+CONCURRENT_CHILDREN = 2  # each may take up to the memory limit of a child
+THUMBNAIL = "thumbnail.png"
+THUMBNAIL_BYTES = 1 << 20  # more than 256 x 256 pixels take without any compression
+CHUNK_BYTES = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -67,13 +79,27 @@ class Incoming:
             TooLargeError: there are more than the limit.
             StorageFaultError: the disk is full.
         """
+        self._note(chunk)
+        with _disk():
+            self.file.write(chunk)
+
+    def take_over(self) -> None:
+        """Take what another process wrote to the file.
+
+        Raises:
+            TooLargeError: it is more than the limit.
+            StorageFaultError: the disk refuses.
+        """
+        with _disk(), self.path.open("rb") as file:
+            while chunk := file.read(CHUNK_BYTES):
+                self._note(chunk)
+
+    def _note(self, chunk: bytes) -> None:
         self.size_bytes += len(chunk)
         if self.size_bytes > self.limit_bytes:
             raise TooLargeError(f"the file is larger than {self.limit_bytes >> 20} MB; simplify it.")
         self.head = (self.head + chunk)[:HEAD_BYTES] if len(self.head) < HEAD_BYTES else self.head
         self.digest.update(chunk)
-        with _disk():
-            self.file.write(chunk)
 
 
 class AssetStore:
@@ -84,7 +110,7 @@ class AssetStore:
         self._folder = folder
         self._incoming = folder / ".incoming"
         self._probe = probe
-        self._probing = BoundedSemaphore(CONCURRENT_PROBES)
+        self._children = BoundedSemaphore(CONCURRENT_CHILDREN)
         with _disk():
             self._incoming.mkdir(parents=True, exist_ok=True)
             self._remove_left_over()
@@ -104,10 +130,27 @@ class AssetStore:
     def keep(self, incoming: Incoming, name: str) -> tuple[Asset, bool]:
         """Check a received file and keep it; says whether it is new.
 
+        A .zip with one glTF and its files is kept as the .glb that it makes.
+
         Raises:
             RejectedAssetError: it is not what it must be.
         """
         shown = clean_name(name)
+        if not is_archive(incoming.head):
+            return self._keep(incoming, shown)
+        with self.receiving(incoming.limit_bytes) as unpacked:
+            self._unpack(incoming, unpacked, shown)
+            return self._keep(unpacked, Path(shown).stem + ".glb")
+
+    def _unpack(self, incoming: Incoming, unpacked: Incoming, name: str) -> None:
+        with _disk():
+            incoming.file.flush()
+        limit = incoming.limit_bytes
+        with self._children:
+            run_limited("unzip", incoming.path, name, str(unpacked.path), str(limit), output_bytes=limit)
+        unpacked.take_over()
+
+    def _keep(self, incoming: Incoming, shown: str) -> tuple[Asset, bool]:
         found = recognise(incoming.head, incoming.size_bytes, shown)
         digest = incoming.digest.hexdigest()
         checked = incoming.path.with_suffix(found.suffix)
@@ -141,6 +184,31 @@ class AssetStore:
     def path(self, asset: Asset) -> Path:
         """Where the file of an asset lies."""
         return self._path(asset.digest, asset.format.name)
+
+    def thumbnail(self, digest: str) -> Path:
+        """Return the file of an asset's small picture; it is drawn when it is first asked for.
+
+        Raises:
+            NotFoundError: there is no asset of this digest.
+            RejectedAssetError: it cannot be drawn within the limits.
+        """
+        asset = self.get(digest)
+        path = self.path(asset)
+        place = path.with_name(THUMBNAIL)
+        with self._children:
+            if not place.is_file():
+                task: Task = "mesh-thumbnail" if asset.format.kind == "mesh" else "map-thumbnail"
+                self._draw(task, path, place, asset.names[0])
+        return place
+
+    def _draw(self, task: Task, path: Path, place: Path, name: str) -> None:
+        drawn = self._incoming / uuid4().hex
+        try:
+            run_limited(task, path, name, str(drawn), output_bytes=THUMBNAIL_BYTES)
+            with _disk():
+                drawn.replace(place)
+        finally:
+            drawn.unlink(missing_ok=True)
 
     def remove(self, digest: str) -> None:
         """Delete an asset that no scene names, now or in its past.
@@ -178,7 +246,7 @@ class AssetStore:
             known = session.get(AssetRow, digest)
             if known is not None:
                 return dict(json.loads(known.facts))
-        with self._probing:
+        with self._children:
             return self._probe(path, found.kind, name)
 
     def _placed(self, checked: Path, row: AssetRow, name: str) -> tuple[Asset, bool]:

@@ -12,7 +12,7 @@ from sqlalchemy.pool import ConnectionPoolEntry
 
 from protocol.errors import DeltalightError
 from services.storage.faults import StorageFaultError
-from services.storage.tables import SCHEMA_VERSION, Base
+from services.storage.tables import MIGRATIONS, SCHEMA_VERSION, Base
 
 BUSY_TIMEOUT_S = 10.0
 _IMMEDIATE = "deltalight_immediate"
@@ -23,6 +23,8 @@ class Database:
 
     Raises:
         DeltalightError: it is of a newer version, or no database, or cannot be written.
+
+    A file of an older version is brought to this one's, in one transaction.
     """
 
     def __init__(self, path: Path) -> None:
@@ -59,12 +61,15 @@ class Database:
             version = connection.exec_driver_sql("PRAGMA user_version").scalar_one()
             if version == 0:
                 Base.metadata.create_all(connection)
-                connection.exec_driver_sql(f"PRAGMA user_version={SCHEMA_VERSION}")
-            elif version != SCHEMA_VERSION:
+            elif not 0 < version <= SCHEMA_VERSION:
                 raise DeltalightError(
                     f"{self._path} was written by another version of Deltalight (its layout is {version}, this one "
                     f"reads {SCHEMA_VERSION}); start the version that wrote it, or name another --data folder."
                 )
+            for older in range(version or SCHEMA_VERSION, SCHEMA_VERSION):
+                for statement in MIGRATIONS[older]:
+                    connection.exec_driver_sql(statement)
+            connection.exec_driver_sql(f"PRAGMA user_version={SCHEMA_VERSION}")
 
     @contextmanager
     def _explained(self) -> Iterator[None]:

@@ -1,7 +1,7 @@
-"""Changes to scene documents as plain JSON: merge patches, parts and objects (RFC 7396)."""
+"""Changes to scene documents as plain JSON: merge patches (RFC 7396), parts, objects and manual lights."""
 
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeVar
 
 from protocol.documents import validate
 from protocol.errors import DeltalightError
@@ -10,6 +10,7 @@ from services.storage.faults import NotFoundError, StaleRevisionError
 
 Document = dict[str, Any]
 Edit = Callable[[Document], Any]
+Item = TypeVar("Item")
 
 
 def merge_patch(target: object, patch: object) -> Any:  # noqa: ANN401 - JSON
@@ -119,6 +120,55 @@ def _index(document: Document, name: str) -> int:
         if item["id"] == name:
             return index
     raise NotFoundError(f"the scene has no object `{name}`; list its objects for their ids.")
+
+
+def add_light(value: object) -> Edit:
+    """The edit that adds a manual light after the others."""
+    return _edit_lights(lambda lights: [*lights, value])
+
+
+def replace_light(index: int, value: object) -> Edit:
+    """The edit that puts another manual light in place of one."""
+    return _edit_lights(lambda lights: _with_lights(lights, index, [value]))
+
+
+def patch_light(index: int, patch: object) -> Edit:
+    """The edit that merges a patch into one manual light."""
+    return _edit_lights(
+        lambda lights: _with_lights(lights, index, [merge_patch(light_at(lights, index), patch)])
+    )
+
+
+def remove_light(index: int) -> Edit:
+    """The edit that takes a manual light out; those after it move up."""
+    return _edit_lights(lambda lights: _with_lights(lights, index, []))
+
+
+def light_at(lights: Sequence[Item], index: int) -> Item:
+    """Return one of the manual lights.
+
+    Raises:
+        NotFoundError: there are fewer.
+    """
+    if not 0 <= index < len(lights):
+        raise NotFoundError(
+            f"the scene has {len(lights)} manual lights, counted from 0, and none at {index}."
+        )
+    return lights[index]
+
+
+def _edit_lights(change: Callable[[list[Any]], list[Any]]) -> Edit:
+    def edit(document: Document) -> Document:
+        lights = document["lights"]
+        return {**document, "lights": {**lights, "manual": change(lights["manual"])}}
+
+    return edit
+
+
+def _with_lights(lights: list[Any], index: int, values: list[Any]) -> list[Any]:
+    """Put any number of lights in place of one."""
+    light_at(lights, index)
+    return [*lights[:index], *values, *lights[index + 1 :]]
 
 
 def checked_document(document: object, revision: int) -> SceneDocument:

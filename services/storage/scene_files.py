@@ -15,11 +15,16 @@ def import_scene(store: Store, path: Path) -> str:
     Raises:
         DeltalightError: the document or one of its files is wrong.
     """
-    document = load_scene(path).with_assets(lambda _place, asset: _keep(store, asset))
+    return import_document(store, load_scene(path), f"imported from {path.name}")
+
+
+def import_document(store: Store, document: SceneDocument, what: str = "imported") -> str:
+    """As `import_scene`, of a document whose assets are absolute paths."""
+    kept = document.with_assets(lambda _place, asset: _keep(store, asset))
     for head in store.scenes.all():
-        if _same(store.scenes.get(head.id).document, document):
+        if _same(store.scenes.get(head.id).document, kept):
             return head.id
-    return store.scenes.create(document.model_dump(mode="json"), f"imported from {path.name}").head.id
+    return store.scenes.create(kept.model_dump(mode="json"), what).head.id
 
 
 def _same(one: SceneDocument, other: SceneDocument) -> bool:

@@ -52,6 +52,7 @@ class Revision:
     at_ns: int
     what: str
     name: str
+    gesture: str | None
 
 
 class SceneStore:
@@ -121,10 +122,14 @@ class SceneStore:
         with self._database.reading() as session:
             _scene(session, scene_id)
             rows = session.scalars(query.order_by(RevisionRow.number.desc()).limit(limit))
-            return [Revision(row.number, row.at_ns, row.what, row.name) for row in rows]
+            return [Revision(row.number, row.at_ns, row.what, row.name, row.gesture) for row in rows]
 
-    def change(self, scene_id: str, edit: Edit, what: str, expected: int | None = None) -> StoredScene:
+    def change(
+        self, scene_id: str, edit: Edit, what: str, expected: int | None = None, gesture: str | None = None
+    ) -> StoredScene:
         """Add a revision, made by `edit` from the newest one; an edit that changes nothing adds none.
+
+        One undo takes back all changes in a row that carry the same `gesture`.
 
         Raises:
             NotFoundError: there is no such scene.
@@ -140,7 +145,9 @@ class SceneStore:
             if document == current:
                 return _stored(session, scene, newest, current)
             changed = document.replaced(revision=newest.number + 1)
-            return _added(session, scene, _row(scene_id, changed, what, newest.origin), changed)
+            is_continued = gesture is not None and gesture == newest.gesture
+            before = newest.before if is_continued else newest.origin
+            return _added(session, scene, _row(scene_id, changed, what, before, gesture), changed)
 
     def undo(self, scene_id: str, expected: int | None = None) -> StoredScene:
         """Add a revision that shows what was before the last change.
@@ -261,7 +268,9 @@ def _digests(document: SceneDocument) -> set[str]:
     return found
 
 
-def _row(scene_id: str, document: SceneDocument, what: str, before: int | None) -> RevisionRow:
+def _row(
+    scene_id: str, document: SceneDocument, what: str, before: int | None, gesture: str | None = None
+) -> RevisionRow:
     number = document.revision
     return RevisionRow(
         scene_id=scene_id,
@@ -273,6 +282,7 @@ def _row(scene_id: str, document: SceneDocument, what: str, before: int | None) 
         origin=number,
         before=before,
         redo=None,
+        gesture=gesture,
     )
 
 
@@ -287,6 +297,7 @@ def _shown_again(newest: RevisionRow, origin: RevisionRow, what: str, redo: int 
         origin=origin.number,
         before=None,
         redo=redo,
+        gesture=None,
     )
 
 

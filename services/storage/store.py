@@ -13,7 +13,7 @@ from services.storage.tokens import TokenStore
 
 
 class Store:
-    """Scenes, assets and tokens of one folder; usable by several threads and processes. A context manager.
+    """Scenes, assets and tokens of one `folder`; usable by several threads and processes. A context manager.
 
     What a call has stored is on the disk when it returns. `probe` loads an upload once, with limits.
 
@@ -28,6 +28,7 @@ class Store:
             raise DeltalightError(
                 f"{folder} cannot be written ({fault.strerror}); name another folder with --data."
             ) from fault
+        self.folder = folder
         self._database = Database(folder / "store.sqlite3")
         self.assets = AssetStore(self._database, folder / "assets", probe)
         self.scenes = SceneStore(self._database)

@@ -3,7 +3,9 @@
 from sqlalchemy import ForeignKey, ForeignKeyConstraint
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
+# What turns a store of a version into one of the next.
+MIGRATIONS = {1: ("ALTER TABLE revisions ADD COLUMN gesture VARCHAR",)}
 
 
 class Base(DeclarativeBase):
@@ -25,7 +27,7 @@ class RevisionRow(Base):
 
     `origin` is the revision whose document this one shows: itself, or for undo and redo (which then have no
     document of their own) an earlier one. `before` is the origin that undo goes back to, `redo` the row that redo
-    shows again.
+    shows again. Revisions of one `gesture` in a row go back to what was before the first of them.
     """
 
     __tablename__ = "revisions"
@@ -39,6 +41,7 @@ class RevisionRow(Base):
     origin: Mapped[int]
     before: Mapped[int | None]
     redo: Mapped[int | None]
+    gesture: Mapped[str | None]
 
 
 class AssetRow(Base):

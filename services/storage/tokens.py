@@ -96,6 +96,11 @@ class TokenStore:
                 raise NotFoundError(f"there is no token called `{name}`; list the tokens for their names.")
             session.delete(row)
 
+    def knows(self, token_id: str) -> bool:
+        """Whether there still is a token of this id."""
+        with self._database.reading() as session:
+            return session.get(TokenRow, token_id) is not None
+
     def verify(self, token: str) -> Token | None:
         """Return what is known of a token, None where it is none of ours.
 

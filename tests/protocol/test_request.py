@@ -10,7 +10,8 @@ import zmq
 
 from protocol.envelope import EnvelopeError, decode, encode
 from protocol.errors import DeltalightError
-from protocol.messages import ControlReply, ControlRequest, StatsMessage
+from protocol.messages import MAX_HEADER_BYTES, ControlReply, ControlRequest, StatsMessage
+from protocol.payloads import INLINE_CHARACTERS, decode_control, encode_control
 from protocol.request import ReplyMemory
 from protocol.transport import ReplyServer, RequestClient
 
@@ -27,6 +28,63 @@ def test_request_and_reply(opened: Callable[[Any], Any]) -> None:
     reply = client.request(request(payload={"a": [1, 2.5, None]}), 5)
     assert (reply.id, reply.ok, reply.error, reply.node) == ("r1", True, None, "gpu")
     assert reply.payload == {"echo": {"a": [1, 2.5, None]}, "op": "set_scene"}
+
+
+@pytest.mark.parametrize("length", [INLINE_CHARACTERS - 100, INLINE_CHARACTERS, MAX_HEADER_BYTES, 4_000_000])
+def test_payloads_up_to_4_mb_pass_both_ways(opened: Callable[[Any], Any], length: int) -> None:
+    server = opened(ReplyServer(ANY, lambda control: control.payload))
+    client = opened(RequestClient(server.endpoint))
+    payload: dict[str, object] = {"scene": {"name": "\u00e4" + "x" * length, "numbers": [1.0] * 100}}
+    reply = client.request(request(payload=payload), 20)
+    assert (reply.ok, reply.error, reply.payload_bytes) == (True, None, None)
+    assert reply.payload == payload
+
+
+def test_a_header_of_numbers_that_is_not_a_part_yet_still_fits() -> None:
+    numbers = [1.0] * ((INLINE_CHARACTERS - 20) // len("1.0, "))
+    assert len(encode_control(request(payload={"n": numbers}))) == 2
+    assert len(encode_control(request(payload={"n": [*numbers, *numbers]}))) == 3
+
+
+def test_a_payload_beyond_4_mb_is_refused_before_it_is_sent(opened: Callable[[Any], Any]) -> None:
+    client = opened(RequestClient("tcp://127.0.0.1:9"))
+    with pytest.raises(EnvelopeError, match="4194304 are allowed"):
+        client.request(request(payload={"text": "x" * 4_200_000}), 0.1)
+
+
+def test_a_long_payload_is_not_carried_out_twice(opened: Callable[[Any], Any]) -> None:
+    done: list[str] = []
+    server = opened(ReplyServer(ANY, lambda control: {"n": done.append(control.id)}))
+    client = opened(RequestClient(server.endpoint))
+    payload: dict[str, object] = {"text": "x" * 100_000}
+    for name in ("r1", "r1", "r2"):
+        assert client.request(request(id=name, revision=3, payload=payload), 5).ok
+    assert not client.request(request(id="r3", revision=3, payload={"text": "y" * 100_000}), 5).ok
+    assert done == ["r1"]
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        (b"{", "not JSON"),
+        (b"\xff\xfe", "not JSON"),
+        (b"[1]", "no plain data"),
+        (b'{"n": NaN}', "no plain data"),
+        (b'{"n": 1e999}', "no plain data"),
+        (b'{"a": ' * 30 + b"1" + b"}" * 30, "no plain data"),
+        (b'{"a": ' * 100_000 + b"1" + b"}" * 100_000, "not JSON"),
+        (b'{"n": ' + b"9" * 5000 + b"}", "not JSON"),
+    ],
+)
+def test_a_payload_that_is_no_plain_data_is_one_sentence(text: bytes, reason: str) -> None:
+    pieces = encode(request(payload_bytes=len(text)), [text])
+    with pytest.raises(EnvelopeError, match=reason):
+        decode_control(pieces, ControlRequest)
+
+
+def test_a_payload_is_given_once() -> None:
+    with pytest.raises(ValueError, match="must be empty"):
+        request(payload={"a": 1}, payload_bytes=2)
 
 
 def test_a_server_that_is_closed_by_a_request_still_answers_it(opened: Callable[[Any], Any]) -> None:
@@ -53,7 +111,7 @@ def test_refusals_faults_and_bad_answers_are_sentences_and_the_server_lives_on(
             raise DeltalightError("the scene has no object: add one")
         if control.op == "fault":
             raise ZeroDivisionError("oops")
-        return {"large": "x" * 70_000} if control.op == "large" else {"object": object()}
+        return {"large": "x" * 5_000_000} if control.op == "large" else {"object": object()}
 
     server = opened(ReplyServer(ANY, handler))
     client = opened(RequestClient(server.endpoint))
@@ -90,12 +148,21 @@ def test_repeats_are_not_carried_out_twice(opened: Callable[[Any], Any]) -> None
 def test_memory_forgets_old_ids_and_a_refused_revision_may_come_again() -> None:
     memory = ReplyMemory(size=2)
     refused = request(id="a", revision=1)
-    memory.remember(refused, ControlReply(node="s", id="a", ok=False, error="no"))
+    memory.remember(refused, ControlReply(node="s", id="a", ok=False, error="no"), 0)
     assert memory.find(request(id="b", revision=1)) is None
     for name in ("b", "c"):
-        memory.remember(request(id=name), ControlReply(node="s", id=name, ok=True))
+        memory.remember(request(id=name), ControlReply(node="s", id=name, ok=True), 0)
     assert memory.find(refused) is None
     assert memory.find(request(id="c")) is not None
+
+
+def test_memory_of_long_replies_is_bounded() -> None:
+    memory = ReplyMemory()
+    for number in range(20):
+        name = f"r{number}"
+        memory.remember(request(id=name), ControlReply(node="s", id=name, ok=True), 1_000_000)
+    kept = [number for number in range(20) if memory.find(request(id=f"r{number}")) is not None]
+    assert kept == list(range(4, 20))
 
 
 def test_a_silent_server_is_named_in_time_and_its_queue_is_forgotten(opened: Callable[[Any], Any]) -> None:

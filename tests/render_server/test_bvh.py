@@ -8,6 +8,8 @@ import trimesh
 
 from render_server.gpu.context import GpuContext
 from render_server.gpu.program import ComputeProgram
+from render_server.passes.mesh_buffers import MeshBuffers
+from render_server.passes.object_tree import ObjectTree
 from render_server.scene.bvh import LEAF_SIZE, Bvh, build_bvh
 
 pytestmark = pytest.mark.usefixtures("clean_gl")
@@ -53,9 +55,11 @@ def brute_force(corners: np.ndarray, origins: np.ndarray, ways: np.ndarray) -> n
     return closest
 
 
-def traced(gpu: GpuContext, corners: np.ndarray, origins: np.ndarray, ways: np.ndarray) -> np.ndarray:
+def traced(
+    gpu: GpuContext, corners: np.ndarray, origins: np.ndarray, ways: np.ndarray, tree: Bvh | None = None
+) -> np.ndarray:
     """Rows of (distance, triangle, two barycentric coordinates)."""
-    tree = build_bvh(corners)
+    tree = tree or build_bvh(corners)
     rows = np.zeros((len(origins), 2, 4), np.float32)
     rows[:, 0, :3], rows[:, 1, :3] = origins, ways
     contents = [rows.tobytes(), bytes(16 * len(origins)), tree.packed(), tree.packed_triangles(corners)]
@@ -146,3 +150,34 @@ def _boxes_met(tree: Bvh, origin: np.ndarray, way: np.ndarray) -> int:
         turns += 1
         node = node + 1 if met[node] else int(tree.skip[node])
     return turns
+
+
+def test_a_refitted_tree_is_the_built_one_and_finds_what_moved(gpu: GpuContext) -> None:
+    corners = torus()
+    tree = build_bvh(corners)
+    same = tree.refitted(corners)
+    assert (same.packed(), same.cost) == (tree.packed(), tree.cost)
+    bent = corners + np.float32(0.3) * np.sin(4 * corners[..., [1, 2, 0]])
+    moved = tree.refitted(bent)
+    assert moved.cost < 2 * build_bvh(bent).cost
+    origins, ways = random_rays()
+    found, expected = traced(gpu, bent, origins, ways, moved), brute_force(bent, origins, ways)
+    hit = found[:, 1] >= 0
+    assert np.mean(hit != np.isfinite(expected)) < 0.002, "only rays along an edge may differ"
+    both = hit & np.isfinite(expected)
+    np.testing.assert_allclose(found[both, 0], expected[both], rtol=1e-4, atol=1e-4)
+
+
+def test_a_refitted_tree_of_shuffled_triangles_is_worn(gpu: GpuContext) -> None:
+    """What has the same number of triangles but nothing in common costs so much that it is built anew."""
+    corners = torus()
+    shuffled = np.random.default_rng(0).permutation(corners)
+    assert build_bvh(corners).refitted(shuffled).cost > 10 * build_bvh(corners).cost
+    follower = ObjectTree(gpu)
+    empty = MeshBuffers(gpu)
+    bounds = (corners.min(axis=(0, 1)), corners.max(axis=(0, 1)))
+    for version, each in enumerate((corners, shuffled), start=1):
+        follower.follow(version, each, bounds, empty)
+        assert follower._renewed().cost == pytest.approx(build_bvh(each).cost)
+    follower.release()
+    empty.release()

@@ -1,5 +1,6 @@
 """What the tests of services share: messages of a small camera, a command-line runner."""
 
+import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -30,13 +31,20 @@ def fresh_logs() -> Iterator[None]:
 
 
 @pytest.fixture
-def cli() -> RunCli:
-    """Runs `deltalight` in a process of its own."""
+def cli(tmp_path_factory: pytest.TempPathFactory) -> RunCli:
+    """Runs `deltalight` in a process of its own, with a data folder of its own."""
+    environment = {**os.environ, "XDG_DATA_HOME": str(tmp_path_factory.mktemp("data-home"))}
 
     def run(*arguments: object, timeout_s: float = 60) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, "-m", "services.cli", *(str(argument) for argument in arguments)]
         return subprocess.run(
-            command, cwd=ROOT, capture_output=True, text=True, timeout=timeout_s, check=False
+            command,
+            cwd=ROOT,
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=timeout_s,
+            check=False,
         )
 
     return run

@@ -140,7 +140,7 @@ def test_an_asset_in_use_is_not_deleted(api: RunningApi) -> None:
             "missing",
         ),
         (glb({"asset": {"version": "2.0"}})[:-3], "cut.glb", "cut.glb"),
-        (b'{"asset": {"version": "2.0"}}', "chair.gltf", "export it as one .glb file"),
+        (b'{"asset": {"version": "2.0"}}', "chair.gltf", "pack all in a .zip"),
         (gzip.compress(bytes(1 << 20)), "chair.glb", "no file of a known format"),
         (b"MZ" + bytes(100), "chair.glb", "no file of a known format"),
         (PLY.replace(b"vertex 3", b"vertex 900000000"), "bomb.ply", "announces more elements"),

@@ -144,7 +144,8 @@ def test_no_request_is_answered_by_5xx(api: RunningApi, data: st.DataObject) -> 
     known = {"scene_id": scene.head.id, "object_id": "a", "revision": "1"}
     request = request_for(data, Values(description), path, operation, known)
     answer = api.client.request(method, **request)
-    assert answer.status_code < 500, answer.text
+    # No render server runs here: what needs one says so, where its description says that it may.
+    assert answer.status_code < 500 or answer.status_code == 503, answer.text
     assert str(answer.status_code) in {*operation["responses"], "405"}, answer.text
     described = operation["responses"].get(str(answer.status_code), {"content": {PROBLEM: {}}})
     if "content" in described:

@@ -18,7 +18,7 @@ from protocol.errors import DeltalightError
 from protocol.messages import ControlRequest
 from protocol.transport import RequestClient
 from services import ports
-from services.api.serve import run_api
+from services.api.serve import listening, run_api
 from services.api.settings import ApiSettings
 from services.commands.api import api
 from tests.services.api_samples import sentence
@@ -133,7 +133,8 @@ def test_leaving_loopback_makes_and_prints_a_token_once(tmp_path: Path) -> None:
         assert "token is needed" in sentence(httpx.get(f"{url}/scenes"), 401)
         if outputs:
             token = outputs[0][0].split()[-1]
-            assert httpx.get(f"{url}/scenes", headers={"Authorization": f"Bearer {token}"}).json() == []
+            scenes = httpx.get(f"{url}/scenes", headers={"Authorization": f"Bearer {token}"}).json()
+            assert [scene["active"] for scene in scenes] == [True]  # there is something to begin with
         running.terminate()
         outputs.append(running.communicate(timeout=20))
     assert "shown this once: deltalight-" in outputs[0][0]
@@ -143,8 +144,7 @@ def test_leaving_loopback_makes_and_prints_a_token_once(tmp_path: Path) -> None:
 
 def test_wrong_use_is_a_sentence(cli: RunCli, tmp_path: Path) -> None:
     (port,) = ports.private_ports(1)
-    with ports.listen(port) as taken:
-        taken.listen()
+    with listening(ports.LOOPBACK, port):
         done = cli("api", "--port", port, "--data", tmp_path)
     assert done.returncode == 2
     assert f"port {port} cannot be listened on" in done.stderr

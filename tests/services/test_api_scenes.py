@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator
 
 import httpx
 import pytest
+import yaml
 
 from services.api.render_link import ALIVE_TIMEOUT_S
 from tests.services.api_samples import UPLOAD, RenderServer, RunningApi, running_api, sentence
@@ -80,6 +81,76 @@ def test_an_exported_document_can_be_imported(client: httpx.Client) -> None:
     imported = client.post("/scenes", json=exported.json()).json()
     assert imported["id"] != scene["id"]
     assert imported["document"] == scene["document"]
+
+
+def test_a_document_comes_and_goes_as_yaml(client: httpx.Client) -> None:
+    text = "name: straße\nobjects:\n- {id: a, asset: t.obj}\n"
+    made = client.post("/scenes", content=text.encode(), headers={"Content-Type": "application/yaml"})
+    assert made.status_code == 201, made.text
+    address = f"/scenes/{made.json()['id']}/document"
+    answer = client.get(address, params={"format": "yaml"})
+    assert answer.headers["content-type"].startswith("application/yaml")
+    assert answer.headers["content-disposition"].endswith('-1.yaml"')
+    assert yaml.safe_load(answer.text) == client.get(address).json() == made.json()["document"]
+    again = client.post("/scenes", content=answer.content, headers={"Content-Type": "application/yaml"})
+    assert again.json()["document"] == made.json()["document"]
+
+
+@pytest.mark.parametrize(
+    ("content", "media_type", "status", "text"),
+    [
+        (b"name: [", "application/yaml", 422, "not valid YAML"),
+        (b"- a", "application/yaml", 422, "must hold keys and values"),
+        (b"&a [*a]", "application/yaml", 422, "must hold keys"),
+        (b"!!python/object/apply:os.system ['id']", "application/yaml", 422, "not valid YAML"),
+        (b"\xff\xfe", "application/yaml", 400, "UTF-8"),
+        (b"nme: x", "text/yaml", 422, "the nearest known key is `name`"),
+        (b"{}", "text/plain", 415, "application/yaml"),
+    ],
+)
+def test_wrong_documents_are_refused(
+    client: httpx.Client, content: bytes, media_type: str, status: int, text: str
+) -> None:
+    answer = client.post("/scenes", content=content, headers={"Content-Type": media_type})
+    assert text in sentence(answer, status)
+
+
+def test_manual_lights_one_by_one(client: httpx.Client) -> None:
+    scene = make(client, lights={"manual": [{"type": "ambient", "radiance": 0.2}]})
+    address = f"/scenes/{scene['id']}/lights/manual"
+    lamp = {"type": "sphere", "position_m": [0, 0, 1], "intensity": 2}
+    added = client.post(address, json=lamp)
+    assert (added.status_code, added.json()["what"]) == (201, "light added")
+    assert [light["type"] for light in client.get(address).json()] == ["ambient", "sphere"]
+    stale = client.patch(f"{address}/1", json={"intensity": 3}, headers={"If-Match": '"1"'})
+    assert "revision 2" in sentence(stale, 409)
+    client.patch(f"{address}/1", json={"intensity": 3}).raise_for_status()
+    one = client.get(f"{address}/1")
+    assert (one.json()["intensity"], one.json()["position_m"], one.headers["etag"]) == (3, [0, 0, 1], '"3"')
+    assert "lights.manual[1].intensity" in sentence(client.patch(f"{address}/1", json={"intensity": -1}), 422)
+    client.put(f"{address}/1", json={"type": "directional", "direction": [0, 0, -1]}).raise_for_status()
+    assert client.delete(f"{address}/0").status_code == 200
+    assert [light["type"] for light in client.get(address).json()] == ["directional"]
+    for method in ("GET", "DELETE", "PUT", "PATCH"):
+        answer = client.request(method, f"{address}/1", json=None if method == "GET" else lamp)
+        assert "has 1 manual lights" in sentence(answer, 404)
+
+
+def test_changes_of_a_gesture_are_undone_together(client: httpx.Client) -> None:
+    address = f"/scenes/{make(client, objects=[{'id': 'a', 'asset': 't.obj'}])['id']}"
+    for x in (0.1, 0.2, 0.3):
+        moved = client.patch(
+            f"{address}/objects/a",
+            json={"pose": {"translation_m": [x, 0, 0]}},
+            headers={"Deltalight-Gesture": "drag-1"},
+        )
+        assert moved.status_code == 200, moved.text
+    undone = client.post(f"{address}/undo").json()
+    assert undone["document"]["objects"][0]["pose"]["translation_m"] == [0, 0, 0]
+    assert not undone["can_undo"]
+    assert client.get(f"{address}/revisions").json()[1]["gesture"] == "drag-1"
+    wrong = client.patch(address, json={"name": "x"}, headers={"Deltalight-Gesture": "a b"})
+    assert "Deltalight-Gesture" in sentence(wrong, 400)
 
 
 def test_objects_by_id(client: httpx.Client) -> None:
@@ -196,8 +267,9 @@ def test_wrong_if_match_is_refused(client: httpx.Client) -> None:
 
 
 def test_a_change_reaches_the_render_server_before_its_answer(api: RunningApi) -> None:
-    server = RenderServer(api.control_port)
     client = api.client
+    wait_for(lambda: client.get("/state").json()["render_server"] == "silent")
+    server = RenderServer(api.control_port)
     scene = make(client, name="shown", objects=[{"asset": "t.obj", "id": "a"}])
     address = f"/scenes/{scene['id']}"
     wait_for(lambda: client.get("/state").json()["render_server"] == "answers")
@@ -231,7 +303,7 @@ def test_a_change_reaches_the_render_server_before_its_answer(api: RunningApi) -
     again = RenderServer(api.control_port)  # as started, knows nothing
     wait_for(lambda: again.session.scene.name == "while it was away")
     wait_for(lambda: client.get(address).json()["picture"]["state"] == "shown")
-    again.session.carry_out(_view_request())  # the viewer's page changes the scene too
+    again.session.carry_out(_view_request())  # somebody else changes the scene at the server too
     assert client.patch(address, json={"name": "last"}).json()["picture"]["state"] == "shown"
     assert again.session.scene.name == "last"
     again.close()

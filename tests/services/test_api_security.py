@@ -1,12 +1,15 @@
 """Who may do what: loopback, tokens and roles, other sites' pages, rates, sizes."""
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import httpx
 import pytest
 
+from protocol.errors import DeltalightError
 from services.api.gate import WRONG_TOKENS_AT_ONCE
 from services.api.rate import REMEMBERED_CLIENTS, RateLimit
+from services.api.secret_token import SecretToken
 from services.api.settings import ApiSettings
 from tests.services.api_samples import RunningApi, running_api, sentence
 
@@ -141,3 +144,21 @@ def test_the_description_is_open_and_names_no_secret(guarded: RunningApi) -> Non
     assert (
         httpx.get(f"{root}/docs", headers=bearer(guarded.store.tokens.create("a", "view"))).status_code == 404
     )
+
+
+def test_a_token_file_lets_in_with_role_control(tmp_path: Path) -> None:
+    secret, other = "s" * 40, "t" * 40
+    (tmp_path / "token").write_text(f"{secret}\n")
+    with running_api(tmp_path / "data", host="0.0.0.0", token_file=str(tmp_path / "token")) as running:
+        assert running.client.post("/scenes", json={}, headers=bearer(secret)).status_code == 201
+        assert "not known" in sentence(running.client.get("/scenes", headers=bearer(other)), 401)
+        assert running.store.tokens.all() == []
+
+
+@pytest.mark.parametrize("content", [b"", b"short", b"two words " * 4, b"\xff" * 40])
+def test_a_token_file_that_holds_no_secret_is_refused(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "token").write_bytes(content)
+    with pytest.raises(DeltalightError, match="the token file"):
+        SecretToken(tmp_path / "token")
+    with pytest.raises(DeltalightError, match="cannot be read"):
+        SecretToken(tmp_path / "absent")

@@ -10,6 +10,7 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 from services import doctor, ports
+from services.api.serve import listening
 from services.cli import app
 from tests.services.conftest import ROOT, RunCli
 
@@ -18,7 +19,6 @@ COMMANDS = {
     "demo",
     "node",
     "server",
-    "viewer",
     "up",
     "record",
     "replay",
@@ -27,6 +27,7 @@ COMMANDS = {
     "recordings import",
     "recordings export",
     "board",
+    "ping",
     "calibrate camera",
     "calibrate fisheye",
     "calibrate extrinsics",
@@ -99,7 +100,7 @@ def test_help_loads_no_heavy_module() -> None:
 
 
 def test_schema_is_json_schema(cli: RunCli) -> None:
-    keys = {"scene": "objects", "server": "subscribe", "viewer": "port", "node": "source"}
+    keys = {"scene": "objects", "server": "subscribe", "api": "port", "node": "source"}
     for document, key in keys.items():
         done = cli("schema", document)
         assert done.returncode == 0, done.stderr
@@ -135,7 +136,7 @@ def test_server_and_up_refuse_wrong_input_in_a_sentence(cli: RunCli, tmp_path: o
     for arguments, sentence in (
         (("server", "--scene", f"{tmp_path}/absent.json", "--allow-software"), "absent.json"),
         (("up", "--source", f"{tmp_path}/absent.mcap"), "absent.mcap"),
-        (("up", "--source", "synthetic"), "--scene"),
+        (("up", "--source", "synthetic", "--scene", f"{tmp_path}/absent.json"), "absent.json"),
         (("--log-level", "loud", "doctor"), "log level"),
         (("bench", "speed", "--methods", "guess"), "exact"),
         (("bench", "quality", "--methods", "exact:cone_cont=9"), "cone_count"),
@@ -159,12 +160,10 @@ def test_server_and_up_refuse_wrong_input_in_a_sentence(cli: RunCli, tmp_path: o
     ],
 )
 def test_port_in_use_is_a_sentence_that_names_it(cli: RunCli, command: tuple[str, ...]) -> None:
-    taken, own = ports.listen(ports.private_ports(1)[0]), ports.endpoint(ports.private_ports(1)[0])
-    taken.listen()
-    port = taken.getsockname()[1]
-    rest = ("--publish", own) if command[-1] == "--control" else ()
-    done = cli(*command, ports.endpoint(port), *rest)
-    taken.close()
+    port, own = ports.private_ports(2)
+    rest = ("--publish", ports.endpoint(own)) if command[-1] == "--control" else ()
+    with listening(ports.LOOPBACK, port):
+        done = cli(*command, ports.endpoint(port), *rest)
     assert done.returncode == 2, done.stderr
     assert str(port) in done.stderr
     assert "Traceback" not in done.stderr

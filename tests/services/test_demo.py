@@ -6,8 +6,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -19,11 +18,13 @@ from protocol.envelope import decode
 from protocol.messages import CompositeMessage, ControlRequest
 from protocol.transport import Receiver, RequestClient
 from services import ports
+from services.api.serve import listening
 from services.demo import RECORDING, SCENE, demo_plan, demo_scene
-from services.host import HostPlan, session_file
+from services.host import HostPlan
+from services.host_store import session_file
 from services.supervisor import Supervisor
-from services.viewer import Choice, SceneControl
 from tests.services.conftest import ROOT, RunCli
+from tests.services.live_samples import live_socket, read_frame, wait_for_frames
 
 pytestmark = pytest.mark.skipif(
     not (RECORDING.is_file() and SCENE.is_file()), reason="the demo's recording is not in this checkout"
@@ -63,7 +64,7 @@ def test_headless_demo_needs_a_folder(cli: RunCli) -> None:
 
 def test_picture_returns_after_node_and_server_are_killed() -> None:
     with session_file(demo_scene("paper")) as session:
-        plan = demo_plan(session, page_port=None)
+        plan = demo_plan(session)
         lines: list[str] = []
         with Supervisor(plan.specs(), forward=lines.append) as supervisor:
             receiver = Receiver([ports.endpoint(plan.composite_port)], ["composite"])
@@ -116,23 +117,46 @@ def current_view(plan: HostPlan) -> str:
     return str(scene["output"]["view"])
 
 
-def test_operator_and_view_are_switched_while_the_picture_runs() -> None:
-    with session_file(demo_scene("paper")) as session:
-        plan = demo_plan(session, page_port=None)
-        control = SceneControl(ports.endpoint(plan.control_port))
-        with Supervisor(plan.specs()) as supervisor:
-            receiver = Receiver([ports.endpoint(plan.composite_port)], ["composite"])
-            try:
-                wait_for_composite(supervisor, receiver, after_ns=0)
-                for choice in (Choice(operator="exact"), Choice(view="delta"), Choice(operator="paper")):
-                    chosen = control.choose(choice)
-                    assert choice.view in (None, chosen["view"])
-                    assert choice.operator in (None, chosen["operator"])
-                    wait_for_composite(supervisor, receiver, after_ns=time.time_ns())
-            finally:
-                receiver.close()
-                control.close()
-    assert supervisor.restarts() == {"sensor node": 0, "render server": 0}
+def test_a_change_by_rest_is_in_the_next_picture_that_is_begun(demo: str) -> None:
+    """Of all frames that were captured after the answer, each shows the new revision."""
+    client = httpx.Client(base_url=f"http://{demo}/api/v1", timeout=30)
+    scene = client.get("/active-scene").json()
+    assert scene["document"]["name"] == "Demo"
+    path, knot = f"/scenes/{scene['id']}", scene["document"]["objects"][0]["id"]
+    changes: list[tuple[str, object]] = [
+        (f"{path}/objects/{knot}", {"pose": {"translation_m": [0.2, -0.1, 0.02]}}),
+        (f"{path}/output", {"view": "delta"}),
+        (f"{path}/method", {"name": "dvct", "operator": "exact"}),
+    ]
+    with live_socket(demo) as socket:
+        for address, patch in changes:
+            answer = client.patch(address, json=patch).json()
+            assert answer["picture"]["state"] == "shown"
+            answered_ns, expected = time.time_ns(), {"id": scene["id"], "revision": answer["revision"]}
+            header = read_frame(socket, PATIENCE_S)
+            while header["capture_ns"] <= answered_ns:
+                assert header["status"] == "ok"
+                socket.send("ack")
+                header = read_frame(socket, PATIENCE_S)
+            assert header["scene"] == expected
+            socket.send("ack")
+    assert header["camera"]["width"] == 640
+    assert header["renderer"]
+    assert client.post(f"{path}/undo").json()["document"]["output"]["view"] == "delta"
+
+
+@pytest.fixture
+def demo() -> Iterator[str]:
+    """A demo that shows frames; its address is host:port."""
+    (port,) = ports.private_ports(1)
+    command = [sys.executable, "-m", "services.cli", "demo", "--no-browser", "--method", "paper"]
+    process = subprocess.Popen([*command, "--port", str(port)], cwd=ROOT)
+    try:
+        wait_for_frames(f"{ports.LOOPBACK}:{port}", PATIENCE_S)
+        yield f"{ports.LOOPBACK}:{port}"
+    finally:
+        process.send_signal(signal.SIGINT)
+        process.wait(timeout=20)
 
 
 def test_ctrl_c_ends_the_demo_without_orphans_and_it_starts_again() -> None:
@@ -140,7 +164,7 @@ def test_ctrl_c_ends_the_demo_without_orphans_and_it_starts_again() -> None:
     for _ in range(2):
         command = [sys.executable, "-m", "services.cli", "demo", "--no-browser", "--port", str(page_port)]
         demo = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-        wait_until(lambda: health(page_port) == "ok")
+        wait_for_frames(f"{ports.LOOPBACK}:{page_port}", PATIENCE_S)
         children = psutil.Process(demo.pid).children(recursive=True)
         assert len(children) == 3
         demo.send_signal(signal.SIGINT)
@@ -153,41 +177,27 @@ def test_ctrl_c_ends_the_demo_without_orphans_and_it_starts_again() -> None:
 
 
 def test_page_port_in_use_is_a_sentence(cli: RunCli) -> None:
-    taken = ports.listen(ports.private_ports(1)[0])
-    taken.listen()
-    port = taken.getsockname()[1]
-    done = cli("demo", "--no-browser", "--port", port)
-    taken.close()
+    (port,) = ports.private_ports(1)
+    with listening(ports.LOOPBACK, port):
+        done = cli("demo", "--no-browser", "--port", port)
     assert done.returncode == 2
     assert f"Port {port}" in done.stderr
     assert "--port" in done.stderr
 
 
-def test_up_without_a_gpu_refuses_in_a_sentence(cli: RunCli) -> None:
+def test_up_without_a_gpu_refuses_in_a_sentence(cli: RunCli, tmp_path: Path) -> None:
     """The server's own sentence ends the command; no restarts are tried."""
     if "llvmpipe" not in cli("doctor", "--json").stdout:
         pytest.skip("this machine has a GPU")
     numbers = ports.private_ports(4)
     names = ("--port", "--node-port", "--composite-port", "--control-port")
     options = [str(part) for pair in zip(names, numbers, strict=True) for part in pair]
+    options += ["--data", str(tmp_path)]
     done = cli("up", "--source", RECORDING, "--scene", SCENE, *options, timeout_s=PATIENCE_S)
     assert done.returncode == 2
     last_line = done.stderr.strip().splitlines()[-1]
     assert "--allow-software" in last_line
     assert "started again" not in done.stderr
-
-
-def health(port: int) -> str:
-    with suppress(httpx.TransportError):
-        return str(httpx.get(f"http://127.0.0.1:{port}/api/v1/health").json()["status"])
-    return "no answer"
-
-
-def wait_until(condition: Callable[[], bool]) -> None:
-    deadline_s = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.1)
 
 
 def test_bench_speed_reports_every_pass(cli: RunCli, tmp_path: Path) -> None:

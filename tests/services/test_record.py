@@ -88,7 +88,7 @@ class Published:
 
     def __init__(self, endpoint: str) -> None:
         self.captured_ns: dict[int, int] = {}
-        self._queue = StreamQueue(endpoint, ["color"])
+        self._queue = StreamQueue([endpoint], ["color"])
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
@@ -211,9 +211,9 @@ def recording(job: RecordJob) -> "Iterator[tuple[Recorder, list[str], Future[Rec
 
 def test_frames_and_duration_end_a_recording(tmp_path: Path) -> None:
     with feeding() as (endpoint, _):
-        with recording(RecordJob(tmp_path / "a.mcap", endpoint, frames=5)) as (_, notices, end):
+        with recording(RecordJob(tmp_path / "a.mcap", (endpoint,), frames=5)) as (_, notices, end):
             status = end.result(PATIENCE_S)
-        with recording(RecordJob(tmp_path / "b.mcap", endpoint, duration_s=0.5)) as (_, _, end):
+        with recording(RecordJob(tmp_path / "b.mcap", (endpoint,), duration_s=0.5)) as (_, _, end):
             longer = end.result(PATIENCE_S)
     assert (status.frames, status.as_dict()["frames"], notices) == (5, 5, [])
     assert status.missing == {"color": 0, "depth": 0, "pose": 0}
@@ -226,7 +226,7 @@ def test_a_node_that_goes_and_comes_back_is_told(tmp_path: Path, monkeypatch: py
     monkeypatch.setattr(recorder, "SILENCE_S", 0.6)
     with (
         feeding() as (endpoint, feed),
-        recording(RecordJob(tmp_path / "a.mcap", endpoint)) as (running, notices, end),
+        recording(RecordJob(tmp_path / "a.mcap", (endpoint,))) as (running, notices, end),
     ):
         wait_for(lambda: running.status.frames >= 3)
         feed.paused.set()
@@ -243,7 +243,7 @@ def test_another_node_than_the_wanted_is_named(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(recorder, "SILENCE_S", 0.6)
     with (
         feeding() as (endpoint, _),
-        recording(RecordJob(tmp_path / "a.mcap", endpoint, node="desk")) as (_, notices, end),
+        recording(RecordJob(tmp_path / "a.mcap", (endpoint,), node="desk")) as (_, notices, end),
     ):
         wait_for(lambda: notices)
     assert "No frame of node desk" in notices[0]
@@ -268,7 +268,7 @@ def test_no_space_left_is_one_sentence_and_keeps_the_frames(
     monkeypatch.setattr(Writer, "add_message", fill)
     with (
         feeding() as (endpoint, _),
-        recording(RecordJob(tmp_path / "a.mcap", endpoint)) as (_, _, end),
+        recording(RecordJob(tmp_path / "a.mcap", (endpoint,))) as (_, _, end),
         pytest.raises(DeltalightError, match=r"after 3 frames.*No space left on device") as caught,
     ):
         end.result(PATIENCE_S)
@@ -280,7 +280,7 @@ def test_no_space_left_is_one_sentence_and_keeps_the_frames(
 def test_a_file_that_somebody_removes_is_a_sentence(tmp_path: Path) -> None:
     with (
         feeding() as (endpoint, _),
-        recording(RecordJob(tmp_path / "a.mcap", endpoint)) as (_, _, end),
+        recording(RecordJob(tmp_path / "a.mcap", (endpoint,))) as (_, _, end),
     ):
         wait_for((tmp_path / "a.mcap.active").exists)
         (tmp_path / "a.mcap.active").unlink()
@@ -296,7 +296,7 @@ def test_little_space_is_told_once(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(recorder, "LOOK_PERIOD_S", 0.1)
     with (
         feeding() as (endpoint, _),
-        recording(RecordJob(tmp_path / "a.mcap", endpoint, duration_s=1.0)) as (_, notices, end),
+        recording(RecordJob(tmp_path / "a.mcap", (endpoint,), duration_s=1.0)) as (_, notices, end),
     ):
         end.result(PATIENCE_S)
     assert len(notices) == 1
@@ -306,7 +306,7 @@ def test_little_space_is_told_once(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 def test_broken_and_late_messages_are_counted(tmp_path: Path) -> None:
     publisher = Publisher("tcp://127.0.0.1:*")
     numbered = frames(40)
-    with recording(RecordJob(tmp_path / "a.mcap", publisher.endpoint)) as (running, notices, end):
+    with recording(RecordJob(tmp_path / "a.mcap", (publisher.endpoint,))) as (running, notices, end):
         sent = 0
         while running.status.frames < 2:  # until the subscription has arrived
             for multipart in messages(numbered[sent]).values():
@@ -357,7 +357,7 @@ def test_depth_of_another_camera_wants_the_transform(tmp_path: Path) -> None:
     save_extrinsics_yaml(tmp_path / "extrinsics.yaml", Extrinsics(depth_from_rgb=shift))
     publisher = Publisher("tcp://127.0.0.1:*")
     for name, extrinsics in {"a.mcap": None, "b.mcap": Extrinsics(depth_from_rgb=shift)}.items():
-        job = RecordJob(tmp_path / name, publisher.endpoint, extrinsics=extrinsics, frames=1)
+        job = RecordJob(tmp_path / name, (publisher.endpoint,), extrinsics=extrinsics, frames=1)
         with recording(job) as (_, notices, end):
             for frame in frames(200):
                 for multipart in messages(replace(frame, depth=depth)).values():

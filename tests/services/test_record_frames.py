@@ -139,7 +139,7 @@ def test_a_broken_picture_costs_its_own_frame_only() -> None:
 def test_the_queue_keeps_order_and_counts_what_finds_no_room() -> None:
     frame = frames(1)[0]
     publisher = Publisher("tcp://127.0.0.1:*", streams=100)
-    queue = StreamQueue(publisher.endpoint, ["depth", "color"])
+    queue = StreamQueue([publisher.endpoint], ["depth", "color"])
     try:
         waited_until_s = time.monotonic() + 20
         while queue.take(0.05) is None:  # until the subscription has arrived

@@ -27,7 +27,7 @@ def test_what_is_replayed_and_recorded_again_is_the_same(tmp_path: Path) -> None
     command = [sys.executable, "-m", "services.cli", "replay", str(source), "--loop", "--publish", endpoint]
     with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True) as process:
         try:
-            status = Recorder(RecordJob(tmp_path / "b.mcap", endpoint, frames=20), print).run(Event())
+            status = Recorder(RecordJob(tmp_path / "b.mcap", (endpoint,), frames=20), print).run(Event())
         finally:
             process.send_signal(signal.SIGINT)
         _, error = process.communicate(timeout=20)

@@ -8,13 +8,14 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 
+from protocol.camera_model import CameraModel
 from protocol.errors import DeltalightError
 from protocol.frames import ViewFrame
 from protocol.messages import ControlRequest
 from protocol.scene import SceneDocument
 from render_server.frame_assembly import FrameAssembler
-from render_server.session import MAXIMUM_FAULTS_IN_A_ROW, RenderSession
-from tests.services.conftest import color, depth, pose, received
+from render_server.session import MAXIMUM_FAULTS_IN_A_ROW, RenderSession, SourceInUse
+from tests.services.conftest import IDENTITY, camera, color, depth, pose, received
 
 START = 10**15
 
@@ -23,8 +24,20 @@ START = 10**15
 class Picture:
     color: np.ndarray
     status: Literal["ok", "no_pose"]
+    camera: CameraModel
+    world_from_camera: np.ndarray | None
     pass_times_ms: dict[str, float] = field(default_factory=lambda: {"linearize": 1.5})
     lights: list[dict[str, Any]] = field(default_factory=list)
+    linear: np.ndarray | None = None
+
+
+@dataclass
+class Picked:
+    frame_id: int
+    pixel: tuple[float, float]
+
+    def as_dict(self) -> dict[str, object]:
+        return {"frame_id": self.frame_id, "kind": "nothing", "pixel": list(self.pixel)}
 
 
 @dataclass
@@ -41,12 +54,37 @@ class InvertingRenderer:
         self.immediate = True
         self.notices: list[str] = []
         self.scenes: list[SceneDocument] = []
+        self.sources_begun = 0
+        self.newest: ViewFrame | None = None
+        self.unfinished: list[int] = []
 
-    def start(self, frame: ViewFrame) -> Started:
+    def start(self, frame: ViewFrame, *, with_linear: bool = False) -> Started:
+        self.newest = frame
         if frame.frame_id in self.fails_at:
             raise RuntimeError("the volume fell over")
-        picture = Picture(255 - frame.color, "no_pose" if frame.pose is None else "ok")
-        return Started(lambda: picture, self.immediate)
+        pose = None if frame.pose is None else frame.pose.world_from_camera
+        picture = Picture(255 - frame.color, "no_pose" if pose is None else "ok", frame.camera, pose)
+        if with_linear:
+            picture.linear = picture.color.astype(np.float32) / 255
+        self.unfinished.append(frame.frame_id)
+
+        def finish() -> Picture:
+            assert self.unfinished.pop(0) == frame.frame_id, "frames are finished in the order of their start"
+            return picture
+
+        return Started(finish, self.immediate)
+
+    def sized(self, frame: ViewFrame) -> ViewFrame:
+        return frame
+
+    def pick(self, x: float, y: float) -> Picked:
+        if self.newest is None:
+            raise DeltalightError("Nothing was rendered yet; ask again when there is a picture.")
+        return Picked(self.newest.frame_id, (x, y))
+
+    def begin_source(self) -> None:
+        self.sources_begun += 1
+        self.newest = None
 
     def set_scene(self, scene: SceneDocument) -> None:
         if scene.name == "refused":
@@ -100,6 +138,39 @@ def test_composite_carries_its_own_frames_header(session: RenderSession) -> None
     assert rendered.message.drops["color.cam"] == 4
     assert np.all(rendered.pixels == 250)
     assert session.step() is None
+
+
+def test_composite_says_with_which_camera_pose_and_scene_it_was_made(session: RenderSession) -> None:
+    feed(session, 5)
+    rendered = session.step()
+    assert rendered is not None
+    assert rendered.message.scene_revision == 3
+    assert rendered.message.camera == camera().to_dict()
+    assert rendered.message.world_from_camera == IDENTITY
+    session.receive(color(6, START + 6, START))
+    session.receive(depth(6, START + 6))
+    session.receive(pose(6, START + 6, "no_board"))
+    without = session.step()
+    assert without is not None
+    assert (without.message.status, without.message.world_from_camera) == ("no_pose", None)
+
+
+def test_the_revision_is_that_of_the_frames_start(
+    session: RenderSession, renderer: InvertingRenderer
+) -> None:
+    renderer.immediate = False
+    revisions = []
+    for number in range(3):
+        feed(session, number)
+        rendered = session.step()
+        if rendered is not None:
+            revisions.append((rendered.message.frame_id, rendered.message.scene_revision))
+        if number == 1:  # frame 1 waits for the GPU
+            assert session.carry_out(request("set_view", view="delta")) == {"revision": 4}
+    last = session.step()
+    assert last is not None
+    revisions.append((last.message.frame_id, last.message.scene_revision))
+    assert revisions == [(0, 3), (1, 3), (2, 4)]
 
 
 def test_bad_frame_is_counted_and_the_next_is_rendered(
@@ -166,7 +237,7 @@ def test_set_view_and_get_scene(session: RenderSession) -> None:
 
 
 def test_other_commands(session: RenderSession) -> None:
-    assert session.carry_out(request("ping")) == {}
+    assert session.carry_out(request("ping")) == {"revision": 3}
     stats = session.carry_out(request("stats"))["stats"]
     assert isinstance(stats, dict)
     assert stats["detail"] == "abacus"
@@ -197,3 +268,96 @@ def test_on_a_gpu_a_frame_is_read_back_after_the_next_was_started(
     assert last is not None
     assert last.message.frame_id == 1
     assert not session.is_waiting_for_gpu
+
+
+def test_pick_asks_the_renderer(session: RenderSession) -> None:
+    with pytest.raises(DeltalightError, match="Nothing was rendered yet"):
+        session.carry_out(request("pick", x=3, y=4))
+    feed(session, 5)
+    session.step()
+    picked = session.carry_out(request("pick", x=3, y=4.5))
+    assert picked == {"frame_id": 5, "kind": "nothing", "pixel": [3.0, 4.5]}
+    for wrong in ({"x": 3}, {"x": 3, "y": "4"}, {"x": True, "y": 1}, {"x": 1, "y": 2, "z": 3}):
+        with pytest.raises(DeltalightError, match="the command pick"):
+            session.carry_out(request("pick", **wrong))
+
+
+def test_a_snapshot_loses_no_frame_and_no_scene(
+    session: RenderSession, renderer: InvertingRenderer, tmp_path: Path
+) -> None:
+    renderer.immediate = False
+    order: dict[str, Any] = {
+        "folder": str(tmp_path),
+        "pictures": [{"name": "a", "view": "delta"}],
+        "exr": True,
+    }
+    with pytest.raises(DeltalightError, match="No frame has come yet"):
+        session.carry_out(request("snapshot", **order))
+    feed(session, 7)
+    assert session.step() is None  # it waits for the GPU
+    taken = session.carry_out(request("snapshot", **order))
+    assert taken == {
+        "frame_id": 7,
+        "capture_ns": START + 7,
+        "files": ["a.png", "composite.exr"],
+        "errors": {},
+    }
+    assert [scene.output.view for scene in renderer.scenes] == ["delta", "composite", "composite"]
+    assert renderer.scenes[-1] == session.scene
+    assert session.scene.revision == 3
+    feed(session, 8)
+    numbers = []
+    for _ in range(3):
+        rendered = session.step()
+        numbers.append(None if rendered is None else rendered.message.frame_id)
+    assert numbers == [7, None, 8]
+    assert renderer.unfinished == []
+
+
+def test_a_refused_snapshot_is_one_sentence(session: RenderSession, tmp_path: Path) -> None:
+    feed(session, 7)
+    session.step()
+    for wrong, words in (
+        ({"folder": str(tmp_path / "missing"), "exr": True}, "There is no folder"),
+        ({"pictures": []}, "`folder` is missing"),
+        ({"folder": str(tmp_path), "pictures": [{"name": "../a"}]}, "name"),
+    ):
+        with pytest.raises(DeltalightError, match=words):
+            session.carry_out(request("snapshot", **wrong))
+
+
+def test_another_source_begins_with_nothing_of_the_one_before(renderer: InvertingRenderer) -> None:
+    used: list[object] = []
+
+    def use_source(endpoints: object) -> SourceInUse:
+        if endpoints == ("bad",):
+            raise DeltalightError("bad is not an endpoint")
+        is_another = endpoints not in used[-1:]
+        used.append(endpoints)
+        return SourceInUse(("tcp://configured",), is_another)
+
+    renderer.immediate = False
+    session = RenderSession(renderer, SceneDocument(), use_source=use_source, clock_ns=lambda: START)
+    feed(session, 1)
+    session.step()  # waits for the GPU
+    session.receive(color(2, START + 2, START))  # waits for its pose and depth
+    with pytest.raises(DeltalightError, match="bad is not an endpoint"):
+        session.carry_out(request("set_source", endpoints=["bad"]))
+    assert renderer.sources_begun == 0
+    counted = dict(session.drops())
+    answer = session.carry_out(request("set_source", endpoints=None))
+    assert (answer, used, renderer.sources_begun) == ({"endpoints": ["tcp://configured"]}, [None], 1)
+    assert session.drops() == counted
+    session.receive(depth(2, START + 2))
+    session.receive(pose(2, START + 2))
+    assert session.step() is None
+    assert renderer.unfinished == []
+    with pytest.raises(DeltalightError, match="Nothing was rendered"):
+        session.carry_out(request("pick", x=1, y=1))
+    for wrong in ({}, {"endpoints": []}, {"endpoints": "tcp://127.0.0.1:1"}, {"endpoints": ["a"] * 17}):
+        with pytest.raises(DeltalightError, match="the command set_source"):
+            session.carry_out(request("set_source", **wrong))
+    for _ in range(2):  # the same again changes nothing
+        assert session.carry_out(request("set_source", endpoints=["x"]))
+    assert used == [None, ("x",), ("x",)]
+    assert renderer.sources_begun == 2

@@ -89,6 +89,29 @@ def test_undo_and_redo_walk_as_a_list_of_states_does(store: Store, steps: list[s
         assert (after.can_undo, after.can_redo) == (len(past) > 1, bool(future))
 
 
+def test_one_undo_takes_a_whole_gesture_back(store: Store) -> None:
+    scene_id = store.scenes.create({"name": "start"}).head.id
+
+    def rename(name: str, gesture: str | None = None) -> None:
+        store.scenes.change(scene_id, patch_document({"name": name}), f"to {name}", None, gesture)
+
+    rename("a")
+    for name in ("b", "c", "d"):
+        rename(name, "drag-1")
+    for name in ("e", "f"):
+        rename(name, "drag-2")
+    rename("g")
+    undone = [store.scenes.undo(scene_id).document.name for _ in range(4)]
+    assert undone == ["f", "d", "a", "start"]
+    redone = [store.scenes.redo(scene_id).document.name for _ in range(4)]
+    assert redone == ["a", "d", "f", "g"]
+    history = store.scenes.history(scene_id, 9, 50)
+    assert [each.gesture for each in history] == [None, "drag-2", "drag-2", *["drag-1"] * 3, None, None]
+    store.scenes.undo(scene_id)
+    rename("h", "drag-2")
+    assert store.scenes.undo(scene_id).document.name == "f", "after an undo a gesture begins anew"
+
+
 def test_changes_of_many_threads_all_arrive(store: Store) -> None:
     scene_id = store.scenes.create({}).head.id
     asset = upload(store, TETRAHEDRON, "t.obj").reference
@@ -205,7 +228,7 @@ def test_the_same_content_is_kept_once_under_both_names(store: Store) -> None:
     ("content", "name", "sentence"),
     [
         (b"MZ\x90\x00 program", "chair.glb", "no file of a known format"),
-        (b'{"asset": {"version": "2.0"}}', "chair.gltf", "export it as one .glb"),
+        (b'{"asset": {"version": "2.0"}}', "chair.gltf", "pack all in a .zip"),
         (TETRAHEDRON, "chair.ply", "is a OBJ file and not PLY"),
         (b"", "chair.obj", "no file of a known format"),
         (TETRAHEDRON, "..", "needs the file's own name"),
@@ -299,6 +322,26 @@ def test_tokens_are_shown_once_and_kept_as_hashes(store: Store, tmp_path: Path) 
         elsewhere.tokens.revoke("wall")
     assert store.tokens.verify(token) is None
     assert store.tokens.is_empty
+
+
+def test_a_store_of_the_version_before_is_opened_and_goes_on(tmp_path: Path) -> None:
+    with sqlite3.connect(tmp_path / "store.sqlite3") as connection:
+        connection.executescript(Path(__file__).with_name("store_version_1.sql").read_text())
+    connection.close()
+    for _ in range(2):  # the second time there is nothing to bring up to date
+        with Store(tmp_path) as store:
+            active = store.scenes.active()
+            assert active is not None
+            assert active.document.name == "new"
+            assert [each.gesture for each in store.scenes.history(active.head.id, None, 9)][-2:] == [
+                None,
+                None,
+            ]
+            for name in ("x", "y"):
+                store.scenes.change(active.head.id, patch_document({"name": name}), "", None, "drag")
+            assert store.scenes.undo(active.head.id).document.name == "new"
+    with Store(tmp_path) as store:
+        assert store.scenes.undo(active.head.id).document.name == "old"
 
 
 def test_a_store_of_another_version_is_refused(tmp_path: Path) -> None:

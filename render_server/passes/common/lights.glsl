@@ -1,5 +1,6 @@
 // Lights, their depth maps, and soft visibility with and without the virtual objects (METHOD 3, direct).
 #include "passes/common/basis.glsl"
+#include "passes/common/brdf.glsl"
 
 struct Light {
     vec4 place;    // xyz: direction of travel (directional) or position in m; w: kind
@@ -7,6 +8,12 @@ struct Light {
     vec4 shape;    // x: tan(angular radius) (directional), radius in m (sphere, spot); y - z angle: share of I (spot)
     vec4 axis_u;   // xyz: half an edge in m (rectangle) or direction of travel on the axis (spot)
     vec4 axis_v;   // xyz: half the other edge in m (rectangle)
+    vec4 plane;    // of a mirror image: the plane (world) before which it shines
+    vec4 mirror;   // of a mirror image: F0 rgb, layer of its map of shares; layer -1: no image. color.w: m, how far from
+                   // the plane points still belong to it; shape.w: roughness; axis_u.w: entry of the surface table;
+                   // axis_v.w: the light that it is an image of
+    vec4 map_u;    // of a mirror image: its map's coordinates of a world point are dot(xyz, p) + w
+    vec4 map_v;
     ivec4 views;   // first view and count in the real atlas, first and count in the virtual atlas
 };
 const float DIRECTIONAL = 0.0, SPHERE = 1.0, SPOT = 2.0, RECTANGLE = 3.0;   // kinds
@@ -22,6 +29,7 @@ layout(std430, binding = 0) readonly buffer Lights { Light lights[]; };
 layout(std430, binding = 1) readonly buffer LightViews { LightView light_views[]; };
 layout(binding = 10) uniform sampler2D real_light_depth;
 layout(binding = 11) uniform sampler2D virtual_light_depth;
+layout(binding = 22) uniform sampler2DArray mirror_shares;   // r, g: share of an image that a plane shows without and with objects
 uniform int light_count;
 uniform int shadow_samples;
 
@@ -66,7 +74,7 @@ vec3 rectangle_vector(Light light, int edges, vec3 p, vec3 n) {
 // Irradiance across the beam at p of a surface with normal n, and the direction towards the light: the irradiance is
 // across * dot(n, to_light). A rectangle is one beam along its vector irradiance; its angular radius is that of the
 // disc with the same. Without a normal (0) no horizon cuts it.
-vec3 light_at(Light light, vec3 p, vec3 n, out vec3 to_light, out float angular_radius) {
+vec3 unmirrored_light_at(Light light, vec3 p, vec3 n, out vec3 to_light, out float angular_radius) {
     vec3 d = light.place.xyz - p;
     float distance2 = max(dot(d, d), 1e-8);
     vec3 vector = rectangle_vector(light, light.place.w == RECTANGLE ? 5 : 0, p, n);
@@ -84,6 +92,30 @@ vec3 light_at(Light light, vec3 p, vec3 n, out vec3 to_light, out float angular_
     to_light = d * inversesqrt(distance2);
     angular_radius = asin(min(light.shape.x * inversesqrt(distance2), 1.0));
     return light.color.rgb / distance2 * spot_share(light, -to_light);
+}
+
+bool is_image(Light light) { return light.mirror.w >= 0.0; }
+
+vec3 light_at(Light light, vec3 p, vec3 n, out vec3 to_light, out float angular_radius) {
+    vec3 across = unmirrored_light_at(light, p, n, to_light, angular_radius);
+    if (!is_image(light)) return across;
+    bool before = dot(light.plane.xyz, p) + light.plane.w > 0.0;
+    float cosine = max(-dot(light.plane.xyz, to_light), 1e-3);
+    return before ? across * specular_reflectance(light.mirror.rgb, light.shape.w, cosine) : vec3(0.0);
+}
+
+// Shares of a mirror image that its plane shows to p without and with the objects; 1 for other lights.
+vec2 mirror_share(Light light, vec3 p) {
+    if (!is_image(light)) return vec2(1.0);
+    vec3 n = light.plane.xyz;
+    bool distant = light.place.w == DIRECTIONAL;
+    vec3 way = distant ? -light.place.xyz : light.place.xyz - p;
+    float part = max(dot(n, p) + light.plane.w, 0.0) / max(-dot(n, way), 1e-6);   // of the way, up to the plane
+    vec3 q = p + part * way;
+    float radius = light.place.w == RECTANGLE ? sqrt(length(light.axis_u.xyz) * length(light.axis_v.xyz)) : light.shape.x;
+    float texels = 2.0 * radius * part * length(light.map_u.xyz) * float(textureSize(mirror_shares, 0).x);
+    vec2 uv = vec2(dot(light.map_u.xyz, q) + light.map_u.w, dot(light.map_v.xyz, q) + light.map_v.w);
+    return textureLod(mirror_shares, vec3(uv, light.mirror.w), log2(max(texels, 1.0))).rg;
 }
 
 vec3 light_at(Light light, vec3 p, out vec3 to_light, out float angular_radius) {
@@ -281,6 +313,8 @@ float passes(sampler2D map, Occluder o, vec2 offset) {
 bool object_may_shadow(vec3 p, float bias) {
     for (int i = 0; i < light_count; ++i) {
         Light light = lights[i];
+        vec2 shown = mirror_share(light, p);
+        if (shown.x != shown.y) return true;
         for (int j = light.views.z; j < light.views.z + light.views.w; ++j) {
             LightView view = light_views[j];
             vec3 v = (view.view_from_world * vec4(p, 1.0)).xyz;
@@ -337,8 +371,8 @@ vec2 seen_share(Light light, Occluder real, Occluder object, vec3 p, vec3 n) {
 float real_visibility(Light light, vec3 p, vec3 n, float bias) {
     Occluder none;
     none.present = false;
-    return seen_share(
-        light, occluder(real_light_depth, light, light.views.x, light.views.y, p, n, bias), none, p, n).x;
+    Occluder real = occluder(real_light_depth, light, light.views.x, light.views.y, p, n, bias);
+    return mirror_share(light, p).x * seen_share(light, real, none, p, n).x;
 }
 
 // (V_mu, V_rho) at p with normal n: averages over the same samples of the light; v_rho = v_mu v_obj (METHOD 3).
@@ -346,5 +380,5 @@ float real_visibility(Light light, vec3 p, vec3 n, float bias) {
 vec2 visibility(Light light, vec3 p, vec3 n, float bias_real, float bias_virtual) {
     Occluder real = occluder(real_light_depth, light, light.views.x, light.views.y, p, n, bias_real);
     Occluder object = occluder(virtual_light_depth, light, light.views.z, light.views.w, p, n, bias_virtual);
-    return seen_share(light, real, object, p, n);
+    return mirror_share(light, p) * seen_share(light, real, object, p, n);
 }

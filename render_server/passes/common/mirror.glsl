@@ -2,13 +2,11 @@
 #include "passes/common/geometry.glsl"
 #include "passes/common/surfaces.glsl"
 #include "passes/common/ray_mesh.glsl"
-#include "passes/common/basis.glsl"
+#include "passes/common/lobe.glsl"
 
 uniform mat4 world_from_camera;
 uniform vec3 camera_position;
-uniform vec4 camera_pinhole;   // fx, fy, cx, cy
-
-const float LEAST_ALPHA = 1e-4;   // a sharper lobe is narrower than any pixel
+uniform vec4 camera_pinhole;   // fx, fy, cx, cy (pixel centres at integers)
 
 struct Mirror { bool present; vec3 point; vec3 normal; float depth; float alpha; };
 
@@ -39,15 +37,6 @@ vec4 ray_numbers(ivec2 pixel, int j) {
     vec3 even = float(j) * vec3(0.6180339887, 0.7548776662, 0.5698402910);   // golden ratio; Roberts 2018
     vec2 turn = vec2(pixel_noise(vec2(pixel)), pixel_noise(vec2(pixel.yx) + 47.0));
     return vec4(fract(even.x + turn.x), (float(j) + 0.5) / float(RAY_COUNT), fract(even.yz + turn.yx));
-}
-
-// Half-vector about z of the lobe's visible normals, seen from v (Dupuy and Benyoub 2023).
-vec3 visible_normal(vec2 u, vec3 v, float alpha) {
-    vec3 stretched = normalize(vec3(alpha * v.xy, v.z));
-    float z = (1.0 - u.y) * (1.0 + stretched.z) - stretched.z;
-    float phi = 2.0 * PI * u.x;
-    vec3 h = vec3(sqrt(clamp(1.0 - z * z, 0.0, 1.0)) * vec2(cos(phi), sin(phi)), z) + stretched;
-    return normalize(vec3(alpha * h.xy, h.z));
 }
 
 const float DEPTH_RANGE = 1.5;   // change of depth within the rays' pixels; beyond, the surface's own point serves

@@ -1,16 +1,18 @@
 // Which picture pixel stands for each texel of the reduced resolution.
 #include "passes/common/geometry.glsl"
 
-layout(binding = 0) uniform isampler2D sample_pixels;   // real x, y; virtual x, y; -1 where there is none
+layout(binding = 0) uniform isampler2D sample_pixels;   // real x, y; virtual x, y; -1: none; below: hidden by objects
 uniform ivec2 low_resolution_size;
 
 struct SurfacePoint { bool present; vec3 position; vec3 normal; float roughness; };
 
 #ifdef REAL
 #include "passes/common/surfaces.glsl"
+uniform bool hidden_too;   // virtual surfaces reflect what they hide
 
 SurfacePoint surface_point(ivec2 texel) {
     ivec2 pixel = texelFetch(sample_pixels, texel, 0).xy;
+    if (hidden_too && pixel.x < -1) pixel = -2 - pixel;
     if (pixel.x < 0) return SurfacePoint(false, vec3(0.0), vec3(0.0, 0.0, 1.0), -1.0);
     vec4 normal = texelFetch(real_surface_normal, pixel, 0);
     float roughness = normal.w < 0.0 ? -1.0 : surfaces[int(normal.w)].surface.x;

@@ -1,0 +1,48 @@
+"""Files that appear whole or not at all, and the picture format that is written without loss."""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from protocol.errors import DeltalightError
+
+PNG_COMPRESSION = 1  # zlib level; higher levels cost more time than a frame takes to render
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Give a temporary path beside `path`; put it in place at the end, remove it at a fault.
+
+    The suffix is kept, because encoders choose their format by it.
+
+    Raises:
+        DeltalightError: the file cannot be written (a full disk, no rights).
+    """
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
+    try:
+        yield temporary
+        temporary.replace(path)
+    except OSError as fault:
+        raise DeltalightError(
+            f"'{path}' cannot be written ({fault.strerror}); free some space or choose another folder."
+        ) from fault
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write `content` to `path`, whole or not at all."""
+    with replacing(path) as temporary:
+        temporary.write_bytes(content)
+
+
+def write_png(path: Path, color: UInt8[np.ndarray, "h w 3"]) -> None:
+    """Write an RGB picture losslessly, at a low compression level."""
+    bgr = cv2.cvtColor(color, cv2.COLOR_RGB2BGR)
+    _, encoded = cv2.imencode(".png", bgr, [cv2.IMWRITE_PNG_COMPRESSION, PNG_COMPRESSION])
+    write_bytes(path, encoded.tobytes())

@@ -1,0 +1,134 @@
+"""The occlusion fields of a scene's objects: found on disk, or computed before rendering begins or beside it."""
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import structlog
+from rich.console import Console
+from rich.progress import Progress
+
+from protocol.errors import DeltalightError
+from protocol.scene_objects import SceneObject
+from render_server.relight.frame import PlacedObject
+from render_server.scene.mesh import TriangleMesh
+from render_server.scene.occlusion_field import FieldSettings, OcclusionField, Step
+from render_server.scene.occlusion_field_cache import (
+    compute_field,
+    default_folder,
+    field_digest,
+    load_field,
+    store_field,
+)
+from render_server.scene.occlusion_transfer import object_surface
+
+log = structlog.get_logger()
+
+
+class _EndedError(Exception):
+    """The renderer is gone; nobody waits for the field."""
+
+
+@dataclass(eq=False)
+class _Entry:
+    """One asset's field with one set of settings; `meshes` are held so that their identity stays theirs."""
+
+    meshes: tuple[TriangleMesh, ...]
+    name: str
+    field: OcclusionField | None = None
+    fault: str | None = None
+    thread: threading.Thread | None = None
+
+
+class OcclusionFields:
+    """Keeps fields as long as a renderer lives; `say` takes sentences for the user.
+
+    `waits`: who asks for a field gets it, with a progress bar on a terminal. Otherwise it is computed in a thread
+    (embree and matrix products leave the interpreter to others), and until it is there None is the answer.
+    """
+
+    def __init__(self, say: Callable[[str], None], folder: Path | None = None) -> None:
+        self.waits = True
+        self._say = say
+        self._folder = folder or default_folder()
+        self._entries: dict[tuple[object, ...], _Entry] = {}
+        self._one_at_a_time = threading.Lock()
+        self._ended = threading.Event()
+
+    def find(self, item: PlacedObject, settings: FieldSettings) -> OcclusionField | None:
+        """The field of an object's asset; None while it is being computed.
+
+        Raises:
+            DeltalightError: it cannot be computed.
+        """
+        plain = item.material is not None
+        key = (*(id(mesh) for mesh in item.meshes), plain, settings)
+        entry = self._entries.get(key)
+        if entry is None:
+            entry = self._entries[key] = _Entry(item.meshes, item.id)
+            self._begin(entry, settings, plain=plain)
+        if entry.thread is not None and self.waits:
+            entry.thread.join()
+        if entry.fault is not None:
+            self._say(entry.fault)
+        return entry.field
+
+    def _begin(self, entry: _Entry, settings: FieldSettings, *, plain: bool) -> None:
+        surface = object_surface(entry.meshes, plain=plain)
+        digest = field_digest(surface, settings)
+        entry.field = load_field(self._folder, digest, settings)
+        if entry.field is not None:
+            return
+
+        def make(step: Step) -> None:
+            made = compute_field(surface, settings, step)
+            try:
+                store_field(self._folder, digest, made)
+            except DeltalightError as error:
+                entry.fault = f"object `{entry.name}`: its occlusion field is not kept: {error}"
+            entry.field = made
+
+        if self.waits:
+            with Progress(console=Console(stderr=True), transient=True) as progress:
+                task = progress.add_task(f"occlusion field of `{entry.name}`", total=1.0)
+                make(lambda share: progress.update(task, completed=share))
+            return
+        self._say(
+            f"object `{entry.name}`: its occlusion field is being computed, once; until then it keeps off no natural "
+            "light."
+        )
+        entry.thread = threading.Thread(target=self._beside, args=(entry, make), daemon=True)
+        entry.thread.start()
+
+    def _beside(self, entry: _Entry, make: Callable[[Step], None]) -> None:
+        def step(_share: float) -> None:
+            if self._ended.is_set():
+                raise _EndedError
+
+        try:
+            with self._one_at_a_time:
+                step(0.0)
+                make(step)
+        except _EndedError:
+            pass
+        except Exception as error:  # whatever it is, the picture goes on without this shadow
+            entry.fault = f"object `{entry.name}`: its occlusion field cannot be computed ({error})."
+            log.debug("occlusion field", exc_info=error)
+
+    def release(self) -> None:
+        """Let threads end at their next step."""
+        self._ended.set()
+
+
+def require_rigid(item: SceneObject) -> None:
+    """Refuse an object whose shape may change: what it hides is precomputed.
+
+    Raises:
+        DeltalightError: it plays an animation, or is not rigid.
+    """
+    if item.playing is not None:
+        raise DeltalightError(
+            f"object `{item.id}` is animated or not rigid, and method aroof precomputes what objects hide: "
+            "use dvct or dlpv, or give it `rigid: true` and no animation."
+        )

@@ -1,0 +1,149 @@
+"""What a pixel of the newest picture shows: an object, or a point of the real scene with its normal."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float64
+
+from protocol.errors import DeltalightError
+from protocol.frames import ViewFrame
+from render_server.gpu.texel import read_texel
+from render_server.relight.frame import PlacedObject, RelightInput
+from render_server.scene.depth_surface import depth_surface
+from render_server.scene.mesh import TriangleMesh
+from render_server.scene.ray_mesh import first_hit
+from render_server.view import CameraView
+
+SHOWN_SHARE = 0.5  # of a pixel that an object must cover to be what the pixel shows
+
+Vector = Float64[np.ndarray, "3"]
+Pixel = tuple[int, int]
+Surface = tuple[Vector, Vector]  # place, m; normal
+
+
+@dataclass(frozen=True, eq=False)
+class Pick:
+    """What a pixel of frame `frame_id` shows; place (world, m), unit normal and distance (m) unless `nothing`.
+
+    `object_id` is that of the scene document, where a virtual object is in front. A normal faces the camera.
+    """
+
+    frame_id: int
+    kind: Literal["real", "object", "nothing"]
+    object_id: str | None = None
+    point_m: Vector | None = None
+    normal: Vector | None = None
+    distance_m: float | None = None
+
+    def as_dict(self) -> dict[str, object]:
+        """The pick as plain data."""
+        return {
+            "frame_id": self.frame_id,
+            "kind": self.kind,
+            "object": self.object_id,
+            "point_m": None if self.point_m is None else self.point_m.tolist(),
+            "normal": None if self.normal is None else self.normal.tolist(),
+            "distance_m": self.distance_m,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class ShownFrame:
+    """The frame that was rendered last (at the picture's size).
+
+    `view`: with which camera and pose, None if it has no pose or the picture is not the camera's. `buffers`: what was
+    drawn of it, None if nothing was, because the scene shows no object. `model`: the real scene's, if it is given.
+    """
+
+    frame: ViewFrame
+    view: CameraView | None
+    buffers: RelightInput | None
+    model: Sequence[TriangleMesh] = ()
+
+    @property
+    def world_from_camera(self) -> Float64[np.ndarray, "4 4"] | None:
+        """The pose that the picture was made with."""
+        return None if self.view is None else self.view.world_from_camera
+
+    def pick(self, x: float, y: float) -> Pick:
+        """What the pixel around (x, y) shows; pixel centres are at integers.
+
+        Raises:
+            DeltalightError: it lies outside of the picture, or the picture has no pose.
+        """
+        camera = self.frame.camera
+        pixel = int(np.floor(x + 0.5)), int(np.floor(y + 0.5))
+        if not (0 <= pixel[0] < camera.width and 0 <= pixel[1] < camera.height):
+            raise DeltalightError(
+                f"The pixel ({x:g}, {y:g}) lies outside of the picture of {camera.width}x{camera.height}; "
+                "name one inside."
+            )
+        if self.view is None:
+            raise DeltalightError(
+                "The newest picture has no place in the world (no marker board in view, or a view that is not the "
+                "camera's); show the board, or another view."
+            )
+        owner, found = self._look(self.view, pixel)
+        if found is None:
+            return Pick(self.frame.frame_id, "nothing")
+        point, normal = found
+        distance_m = float(np.linalg.norm(point - self.view.position))
+        kind: Literal["real", "object"] = "real" if owner is None else "object"
+        return Pick(self.frame.frame_id, kind, owner, point, normal / np.linalg.norm(normal), distance_m)
+
+    def _look(self, view: CameraView, pixel: Pixel) -> tuple[str | None, Surface | None]:
+        """Id of the object in front, if there is one, and the surface there."""
+        if self.buffers is None:
+            return None, self._in_frame(view, pixel)
+        owner = _object_in_front(self.buffers, pixel)
+        return owner, _surface_in_buffers(self.buffers, pixel, of_object=owner is not None)
+
+    def _in_frame(self, view: CameraView, pixel: Pixel) -> Surface | None:
+        """The real scene where nothing was drawn: the given model, or the frame's own depth."""
+        rotation = view.world_from_camera[:3, :3]
+        ray = np.array([*view.camera.unproject(np.array([pixel], np.float64))[0], 1.0])
+        if self.model:
+            corners = np.concatenate([mesh.positions[mesh.triangles] for mesh in self.model])
+            hit = first_hit(corners, view.position, rotation @ ray)
+            return None if hit is None else (view.position + hit[0] * (rotation @ ray), hit[1])
+        depth = self.frame.depth
+        if depth is None or not depth.valid[pixel[1], pixel[0]] or depth.depth_m[pixel[1], pixel[0]] <= 0:
+            return None
+        fitted = depth_surface(depth, view.camera).normals[pixel[1], pixel[0]].astype(np.float64)
+        point = view.position + rotation @ (ray * float(depth.depth_m[pixel[1], pixel[0]]))
+        return point, rotation @ (fitted if fitted.any() else -ray)
+
+
+def _object_in_front(scene: RelightInput, pixel: Pixel) -> str | None:
+    """Id of the virtual object that the pixel shows."""
+    if read_texel(scene.matte, pixel)[0] < SHOWN_SHARE:
+        return None
+    material = read_texel(scene.virtual_raster.normal, _raster_texel(scene.view, pixel))[3]
+    return _owner(scene.virtual.objects, round(float(material)))
+
+
+def _surface_in_buffers(scene: RelightInput, pixel: Pixel, *, of_object: bool) -> Surface | None:
+    """Place and normal in one of the geometry buffers; None where the real surface is unknown."""
+    texel = _raster_texel(scene.view, pixel) if of_object else pixel
+    buffer = scene.virtual_raster if of_object else scene.real_surface
+    place = read_texel(buffer.position, texel).astype(np.float64)
+    if place[3] <= 0:
+        return None
+    return place[:3], read_texel(buffer.normal, texel)[:3].astype(np.float64)
+
+
+def _raster_texel(view: CameraView, pixel: Pixel) -> Pixel:
+    """Texel of the objects' raster that a pixel sees (passes/common/geometry.glsl)."""
+    if view.antialiased or not view.camera.has_distortion:
+        return pixel
+    (fx, fy, cx, cy), _ = view.raster
+    x, y = view.camera.rays()[pixel[1], pixel[0]]
+    return int(np.floor(fx * x + cx + 0.5)), int(np.floor(fy * y + cy + 0.5))
+
+
+def _owner(objects: Sequence[PlacedObject], material: int) -> str:
+    """Id of the object that a material of the merged meshes belongs to: one a mesh, in the objects' order."""
+    ends = np.cumsum([len(item.meshes) for item in objects])
+    return objects[int(np.searchsorted(ends, material, side="right"))].id

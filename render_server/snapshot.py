@@ -1,0 +1,162 @@
+"""One frame rendered several ways into files: other views, other methods, the camera's picture, linear radiance."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+from pydantic import Field, model_validator
+
+from protocol.documents import StrictModel
+from protocol.errors import DeltalightError
+from protocol.files import replacing, write_png
+from protocol.frames import ViewFrame, linear_color
+from protocol.messages import Name
+from protocol.radiance_files import write_exr
+from protocol.scene import SceneDocument, parse_scene
+
+CAMERA_VIEW = "camera"
+EXR_NAME = "composite.exr"
+MAX_PICTURES = 32
+
+
+class SnapshotPicture(StrictModel):
+    """One picture, NAME.png: a view of the scene document, or `camera`; `method` = a document to use instead."""
+
+    name: Name
+    view: str = "composite"
+    method: dict[str, Any] | None = None
+
+
+class SnapshotOrder(StrictModel):
+    """What to write into an existing folder; `exr` adds composite.exr (linear, the scene's own method)."""
+
+    folder: Path
+    pictures: tuple[SnapshotPicture, ...] = Field(default=(), max_length=MAX_PICTURES)
+    exr: bool = False
+
+    @model_validator(mode="after")
+    def _names_differ(self) -> "SnapshotOrder":
+        names = [picture.name for picture in self.pictures]
+        if len(set(names)) < len(names):
+            raise ValueError("two pictures have the same name, but every name must be unique")
+        return self
+
+
+class RenderedPicture(Protocol):
+    """What a snapshot needs of a composite; `linear` is None where nothing was rendered."""
+
+    @property
+    def color(self) -> UInt8[np.ndarray, "h w 3"]:
+        """The picture in the camera's code."""
+
+    @property
+    def linear(self) -> Float32[np.ndarray, "h w 3"] | None:
+        """The same before the camera's response."""
+
+
+class StartedPicture(Protocol):
+    """A frame that was handed to the GPU."""
+
+    @property
+    def finish(self) -> Callable[[], RenderedPicture]:
+        """Gives the composite."""
+
+
+class SnapshotRenderer(Protocol):
+    """What a snapshot needs of `renderer.SceneRenderer`."""
+
+    def set_scene(self, scene: SceneDocument) -> None:
+        """Use another scene."""
+
+    def sized(self, frame: ViewFrame) -> ViewFrame:
+        """The frame at the composite's size."""
+
+    def start(self, frame: ViewFrame, *, with_linear: bool = False) -> StartedPicture:
+        """Begin a composite."""
+
+
+@dataclass
+class Snapshot:
+    """Names of the files that were written, and by a picture's name why it was not."""
+
+    files: list[str] = field(default_factory=list)
+    errors: dict[str, str] = field(default_factory=dict)
+
+    @contextmanager
+    def writing(self, name: str, file: str) -> Iterator[None]:
+        """Note `file` as written, or what kept it from being."""
+        try:
+            yield
+        except DeltalightError as fault:
+            self.errors[name] = str(fault)
+        else:
+            self.files.append(file)
+
+
+def take_snapshot(
+    renderer: SnapshotRenderer, scene: SceneDocument, frame: ViewFrame, order: SnapshotOrder
+) -> Snapshot:
+    """Write what was ordered of one frame; the renderer is back at `scene`, with that frame rendered, afterwards.
+
+    No frame may wait to be finished. The same frame again adds nothing to what is averaged over frames.
+
+    Raises:
+        DeltalightError: there is no such folder.
+    """
+    folder = order.folder
+    if not folder.is_dir():
+        raise DeltalightError(
+            f"There is no folder {folder}; name one that exists on the render server's host."
+        )
+    snapshot = Snapshot()
+    try:
+        for picture in order.pictures:
+            file = f"{picture.name}.png"
+            with snapshot.writing(picture.name, file):
+                write_png(folder / file, _picture(renderer, scene, frame, picture))
+        if order.exr:
+            with snapshot.writing(EXR_NAME, EXR_NAME), replacing(folder / EXR_NAME) as temporary:
+                write_exr(temporary, _linear(renderer, scene, frame))
+    finally:
+        renderer.set_scene(scene)
+        with suppress(DeltalightError):  # it was reported when the frame came
+            renderer.start(frame).finish()
+    return snapshot
+
+
+def _picture(
+    renderer: SnapshotRenderer, scene: SceneDocument, frame: ViewFrame, picture: SnapshotPicture
+) -> UInt8[np.ndarray, "h w 3"]:
+    if picture.view == CAMERA_VIEW:
+        return renderer.sized(frame).color
+    renderer.set_scene(_variant(scene, picture.view, picture.method))
+    return renderer.start(frame).finish().color
+
+
+def _linear(
+    renderer: SnapshotRenderer, scene: SceneDocument, frame: ViewFrame
+) -> Float32[np.ndarray, "h w 3"]:
+    renderer.set_scene(_variant(scene, "composite", None))
+    composite = renderer.start(frame, with_linear=True).finish()
+    return linear_color(frame, composite.color) if composite.linear is None else composite.linear
+
+
+def _variant(scene: SceneDocument, view: str, method: dict[str, Any] | None) -> SceneDocument:
+    """The scene in another view, by another method.
+
+    The mesh of the real scene stays as fine as it is: with another triangle budget it would be begun anew, and what
+    earlier frames showed would be lost.
+    """
+    document = scene.model_dump(mode="json")
+    document["output"]["view"] = view
+    if method is not None:
+        document["method"] = method
+    variant = parse_scene(document, "the picture")
+    if "triangle_budget" not in type(variant.method).model_fields:
+        return variant
+    budget = getattr(scene.method, "triangle_budget", None)
+    return variant.replaced(method=variant.method.replaced(triangle_budget=budget))

@@ -1,0 +1,89 @@
+"""What happens in the service, told to every client that listens on the events WebSocket."""
+
+import asyncio
+import threading
+from collections import deque
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Literal
+
+from pydantic_core import to_json
+
+QUEUE_EVENTS = 256  # what a client may be behind: a minute of four processes' reports
+
+EventType = Literal[
+    "hello", "scene", "asset", "picture", "process", "recording", "replay", "snapshot", "notice", "lost"
+]
+
+
+@dataclass(eq=False)
+class EventQueue:
+    """What one client was not sent yet; where it is full the oldest is lost, and counted."""
+
+    loop: asyncio.AbstractEventLoop
+    lost: int = 0
+    _waiting: deque[str] = field(default_factory=deque)
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+    _arrived: asyncio.Event = field(default_factory=asyncio.Event)
+
+    def put(self, text: str) -> None:
+        """Add an event (any thread)."""
+        with self._lock:
+            if len(self._waiting) == QUEUE_EVENTS:
+                self._waiting.popleft()
+                self.lost += 1
+            self._waiting.append(text)
+        if not self.loop.is_closed():
+            self.loop.call_soon_threadsafe(self._arrived.set)
+
+    async def next(self) -> str:
+        """The oldest event, as soon as there is one; how many were lost before it comes first."""
+        while True:
+            with self._lock:
+                if self.lost:
+                    count, self.lost = self.lost, 0
+                    return packed("lost", {"count": count})
+                if self._waiting:
+                    return self._waiting.popleft()
+                self._arrived.clear()
+            await self._arrived.wait()
+
+
+class EventHub:
+    """Passes each event to all who listen; it is encoded once, and nobody waits for a slow one."""
+
+    def __init__(self) -> None:
+        self._queues: set[EventQueue] = set()
+        self._lock = threading.Lock()
+
+    def publish(self, type: EventType, body: Mapping[str, object]) -> None:
+        """Tell all clients (any thread); `body` is what pydantic makes JSON of, models and times included."""
+        with self._lock:
+            queues = tuple(self._queues)
+        if queues:
+            text = packed(type, body)
+            for queue in queues:
+                queue.put(text)
+
+    @property
+    def listeners(self) -> int:
+        """How many listen."""
+        return len(self._queues)
+
+    @contextmanager
+    def listening(self) -> Iterator[EventQueue]:
+        """A queue of all events from now on; in the event loop that takes them."""
+        queue = EventQueue(asyncio.get_running_loop())
+        with self._lock:
+            self._queues.add(queue)
+        try:
+            yield queue
+        finally:
+            with self._lock:
+                self._queues.remove(queue)
+
+
+def packed(type: EventType, body: Mapping[str, object]) -> str:
+    """An event as it is sent: a JSON object with its type."""
+    return to_json({"type": type, **body}, inf_nan_mode="null").decode()

@@ -1,0 +1,130 @@
+"""Live video: the newest composite over WebSocket, as MJPEG, as one picture; and what a place in it shows."""
+
+import asyncio
+from collections.abc import AsyncIterator, Coroutine
+from typing import Annotated, Any, Literal
+
+from fastapi import APIRouter, Body, Request, Response, WebSocket, WebSocketDisconnect
+from fastapi.responses import StreamingResponse
+from pydantic import BaseModel, Field
+
+from protocol.messages import MAX_EDGE_PX
+from services.api.context import Shared
+from services.api.live_hub import LiveFrame, LiveHub
+from services.api.passes import pass_of
+from services.api.problems import ProblemError, responses
+from services.api.tickets import TICKET_LIFE_S
+
+WINDOW = 2  # frames on their way to one viewer before it has to acknowledge
+PICK_TIMEOUT_S = 5.0  # some frames of the slowest renderer
+POLICY_VIOLATION, GOING_AWAY = 1008, 1001  # WebSocket close codes (RFC 6455, 7.4.1)
+BOUNDARY = "frame"
+PICTURE_HEADERS = {"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff"}
+JPEG_ANSWER: dict[int | str, dict[str, Any]] = {200: {"content": {"image/jpeg": {}}}}
+
+router = APIRouter(tags=["live"])
+
+
+class TicketAnswer(BaseModel):
+    """A ticket for one address."""
+
+    ticket: str = Field(description="To be added to the address as `?ticket=...`.")
+    expires_s: float = Field(description="Seconds within which it lets in, once.", examples=[TICKET_LIFE_S])
+
+
+class Pick(BaseModel):
+    """What a pixel of the newest composite shows; points are metres in the world."""
+
+    frame_id: int = Field(description="The frame that was looked at.")
+    kind: Literal["real", "object", "nothing"]
+    object: str | None = Field(description="Id of the virtual object; else null.")
+    point_m: tuple[float, float, float] | None = Field(description="Where the surface is; null for nothing.")
+    normal: tuple[float, float, float] | None = Field(description="Its unit normal; null where unknown.")
+    distance_m: float | None = Field(description="From the camera; null for nothing.")
+
+
+class Pixel(BaseModel):
+    """A place in the composite."""
+
+    x: float = Field(ge=-0.5, le=MAX_EDGE_PX, description="To the right; the first pixel's centre is 0.")
+    y: float = Field(ge=-0.5, le=MAX_EDGE_PX, description="Down; the first pixel's centre is 0.")
+
+
+@router.post("/tickets", status_code=201)
+def create_ticket(shared: Shared, request: Request) -> TicketAnswer:
+    """Get a ticket with the caller's role, for addresses that cannot carry a token: WebSockets and pictures."""
+    return TicketAnswer(ticket=shared.tickets.give(pass_of(request.scope)), expires_s=TICKET_LIFE_S)
+
+
+@router.websocket("/live")
+async def live(socket: WebSocket, shared: Shared) -> None:
+    """Send the newest frame whenever this viewer acknowledged enough; others are not affected."""
+    await socket.accept()
+    credits = asyncio.BoundedSemaphore(WINDOW)
+    await first_of(_send_frames(socket, shared.live, credits), _take_acknowledgements(socket, credits))
+
+
+@router.get("/live.mjpg", include_in_schema=False)  # it never ends, which its description could not say
+async def live_mjpeg(shared: Shared) -> StreamingResponse:
+    """The newest frames as one endless multipart answer, for pictures in pages."""
+    media_type = f"multipart/x-mixed-replace; boundary={BOUNDARY}"
+    return StreamingResponse(_mjpeg(shared.live), media_type=media_type, headers=PICTURE_HEADERS)
+
+
+@router.get("/live.jpg", response_class=Response, responses={**responses(503), **JPEG_ANSWER})
+async def live_picture(shared: Shared) -> Response:
+    """Return the newest composite."""
+    frame = shared.live.newest
+    if frame is None:
+        raise ProblemError(503, "no-picture", "No picture has come from the render server yet; see /state.")
+    return Response(frame.jpeg, media_type="image/jpeg", headers=PICTURE_HEADERS)
+
+
+@router.post("/live/pick", responses=responses(400, 503))
+def pick(shared: Shared, pixel: Annotated[Pixel, Body(examples=[{"x": 320, "y": 200}])]) -> Pick:
+    """Say what a pixel of the newest composite shows: where to put an object, or which one was clicked on."""
+    return Pick.model_validate(shared.link.command("pick", {"x": pixel.x, "y": pixel.y}, PICK_TIMEOUT_S))
+
+
+async def first_of(*streams: Coroutine[Any, Any, None]) -> None:
+    """Run coroutines until one of them ends, then end the others."""
+    tasks = {asyncio.ensure_future(each) for each in streams}
+    try:
+        await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def _send_frames(socket: WebSocket, hub: LiveHub, credits: asyncio.Semaphore) -> None:
+    with hub.viewer() as viewer:
+        while True:
+            await credits.acquire()
+            frame = await viewer.next()
+            if frame is None:
+                await socket.close(GOING_AWAY)
+                return
+            await socket.send_bytes(frame.packed(viewer.skipped))
+
+
+async def _take_acknowledgements(socket: WebSocket, credits: asyncio.BoundedSemaphore) -> None:
+    try:
+        while True:
+            await socket.receive_text()
+            credits.release()
+    except WebSocketDisconnect:
+        return
+    except (ValueError, KeyError):  # it acknowledged what it never got, or sent bytes
+        await socket.close(POLICY_VIOLATION, "acknowledge each frame once")
+
+
+async def _mjpeg(hub: LiveHub) -> AsyncIterator[bytes]:
+    with hub.viewer() as viewer:
+        while (frame := await viewer.next()) is not None:
+            yield _part(frame)
+
+
+def _part(frame: LiveFrame) -> bytes:
+    head = f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(frame.jpeg)}\r\n\r\n"
+    return head.encode() + frame.jpeg + b"\r\n"

@@ -1,0 +1,357 @@
+"""A typed client of the REST API: scenes, assets, live pictures, snapshots, recordings (docs/python-client.md).
+
+with Client("http://127.0.0.1:8000") as client:
+    scene = client.active_scene()
+    scene.move("knot", translation_m=(0.3, -0.1, 0.0))
+"""
+
+import json
+import struct
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self, cast
+
+import httpx
+import numpy as np
+from jaxtyping import UInt8
+
+from protocol.codecs import decode_color
+from protocol.errors import DeltalightError
+from protocol.scene import SceneDocument
+
+if TYPE_CHECKING:
+    from websockets.sync.client import ClientConnection
+
+Json = dict[str, Any]
+Place = tuple[float, float, float]
+Rotation = tuple[float, float, float, float]
+_HEADER_LENGTH = struct.Struct("<I")
+
+
+class ApiError(DeltalightError):
+    """A request that the service refused: `kind` ends the problem's type, such as `stale-revision`."""
+
+    def __init__(self, sentence: str, status: int, kind: str, revision: int | None = None) -> None:
+        super().__init__(sentence)
+        self.status = status
+        self.kind = kind
+        self.revision = revision
+
+
+@dataclass(frozen=True)
+class Asset:
+    """An uploaded file; `reference` is how scene documents name it, `facts` say size and bounds."""
+
+    reference: str
+    names: tuple[str, ...]
+    kind: str
+    size_bytes: int
+    facts: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, answer: Json) -> Self:
+        """Read an answer of the service."""
+        names = tuple(answer["names"])
+        return cls(answer["asset"], names, answer["kind"], answer["size_bytes"], answer["facts"])
+
+
+@dataclass(frozen=True)
+class LiveFrame:
+    """A composite as it arrives; `header` holds the pass times, lights, camera and pose that it was made with."""
+
+    frame_id: int
+    age_ms: float
+    scene_id: str | None
+    scene_revision: int | None
+    header: Mapping[str, Any]
+    jpeg: bytes
+
+    @classmethod
+    def unpacked(cls, message: bytes) -> Self:
+        """Read a message of the live stream."""
+        (length,) = _HEADER_LENGTH.unpack_from(message)
+        start = _HEADER_LENGTH.size
+        header = json.loads(message[start : start + length])
+        scene = header["scene"] or {"id": None, "revision": None}
+        jpeg = message[start + length :]
+        return cls(header["frame_id"], header["age_ms"], scene["id"], scene["revision"], header, jpeg)
+
+    def picture(self) -> UInt8[np.ndarray, "h w 3"]:
+        """Decode the picture: RGB, camera-coded."""
+        camera = self.header["camera"]
+        return decode_color(memoryview(self.jpeg), "jpeg", (camera["height"], camera["width"], 3))
+
+
+class Scene:
+    """A scene at the revision that was seen last. Each change is one request, and one revision.
+
+    A change applies to the newest revision, whoever made it; inside `exclusively()` one that somebody else made in
+    between is refused with an `ApiError` of kind `stale-revision`.
+    """
+
+    def __init__(self, client: "Client", answer: Json) -> None:
+        self._client = client
+        self._answer = answer
+        self._guarded = False
+
+    @property
+    def id(self) -> str:
+        """Name in addresses."""
+        return str(self._answer["id"])
+
+    @property
+    def revision(self) -> int:
+        """The revision of `document`."""
+        return int(self._answer["revision"])
+
+    @property
+    def document(self) -> SceneDocument:
+        """The scene document as it was seen last."""
+        return SceneDocument.model_validate(self._answer["document"])
+
+    @property
+    def picture(self) -> tuple[str, str] | None:
+        """What the render server made of it: `shown`, `pending` or `refused`, and why; None unless it is active."""
+        picture = self._answer["picture"]
+        return None if picture is None else (picture["state"], picture["detail"])
+
+    def refresh(self) -> None:
+        """See the newest revision."""
+        self._take(self._client.request("GET", self._path()))
+
+    @contextmanager
+    def exclusively(self) -> Iterator[None]:
+        """Refuse changes to a revision that is not the newest any more."""
+        self._guarded = True
+        try:
+            yield
+        finally:
+            self._guarded = False
+
+    def replace(self, document: SceneDocument) -> None:
+        """Put another document in place of this one."""
+        body = document.model_dump(mode="json", exclude={"revision"})
+        self._change("PUT", "", body)
+
+    def add_object(self, asset: Asset | str, **keys: Any) -> str:  # noqa: ANN401 - keys of the scene document
+        """Add an object with keys of the scene document (`pose`, `material`, ...); returns its id."""
+        reference = asset.reference if isinstance(asset, Asset) else asset
+        before = {item["id"] for item in self._answer["document"]["objects"]}
+        self._change("POST", "/objects", {"asset": reference, **keys})
+        ids = [str(item["id"]) for item in self._answer["document"]["objects"]]
+        return next((each for each in reversed(ids) if each not in before), ids[-1])
+
+    def change_object(self, object_id: str, **keys: Any) -> None:  # noqa: ANN401 - keys of the scene document
+        """Change keys of an object; those that are not named stay."""
+        self._change("PATCH", f"/objects/{object_id}", keys)
+
+    def move(
+        self, object_id: str, *, translation_m: Place | None = None, rotation_wxyz: Rotation | None = None
+    ) -> None:
+        """Change where an object stands, metres, and how it is turned."""
+        pose = {"translation_m": translation_m, "rotation_wxyz": rotation_wxyz}
+        self.change_object(object_id, pose={key: value for key, value in pose.items() if value is not None})
+
+    def remove_object(self, object_id: str) -> None:
+        """Take an object out."""
+        self._change("DELETE", f"/objects/{object_id}", None)
+
+    def set_lights(self, **keys: Any) -> None:  # noqa: ANN401 - keys of the scene document
+        """Change keys of the lights (`mode`, `manual`, `environment`, ...)."""
+        self._change("PATCH", "/lights", keys)
+
+    def set_method(self, name: str, **settings: Any) -> None:  # noqa: ANN401 - settings of the method
+        """Relight with another method, with these settings and the defaults of the others."""
+        self._change("PUT", "/method", {"name": name, **settings})
+
+    def set_output(self, **keys: Any) -> None:  # noqa: ANN401 - keys of the scene document
+        """Change keys of the output (`view`, `antialiasing`, ...)."""
+        self._change("PATCH", "/output", keys)
+
+    def undo(self) -> None:
+        """Take the last change back."""
+        self._change("POST", "/undo", None)
+
+    def redo(self) -> None:
+        """Make the change again that was taken back."""
+        self._change("POST", "/redo", None)
+
+    def activate(self) -> None:
+        """Show this scene."""
+        self._change("POST", "/activate", None)
+
+    def delete(self) -> None:
+        """Delete the scene; not the active one."""
+        self._client.request("DELETE", self._path())
+
+    def _path(self, rest: str = "") -> str:
+        return f"/scenes/{self.id}{rest}"
+
+    def _change(self, method: str, rest: str, body: Json | None) -> None:
+        headers = {"If-Match": f'"{self.revision}"'} if self._guarded else {}
+        self._take(self._client.request(method, self._path(rest), json=body, headers=headers))
+
+    def _take(self, answer: Any) -> None:  # noqa: ANN401 - JSON
+        self._answer = answer
+
+
+class Client:
+    """Speaks with one service. Errors are `ApiError`; a service that does not answer is a `DeltalightError`."""
+
+    def __init__(self, address: str, token: str | None = None, *, timeout_s: float = 60.0) -> None:
+        self._address = address.rstrip("/")
+        self._headers = {} if token is None else {"Authorization": f"Bearer {token}"}
+        self._http = httpx.Client(
+            base_url=self._address + "/api/v1", headers=self._headers, timeout=timeout_s
+        )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, fault: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the connections."""
+        self._http.close()
+
+    def scenes(self) -> list[Json]:
+        """Id, name, revision and times of all scenes."""
+        return cast(list[Json], self.request("GET", "/scenes"))
+
+    def scene(self, scene_id: str) -> Scene:
+        """The scene with this id."""
+        return Scene(self, self.request("GET", f"/scenes/{scene_id}"))
+
+    def active_scene(self) -> Scene:
+        """The scene that is rendered."""
+        return Scene(self, self.request("GET", "/active-scene"))
+
+    def create_scene(self, document: SceneDocument | Mapping[str, Any]) -> Scene:
+        """Make a scene; it is shown once it is activated."""
+        body = document.model_dump(mode="json") if isinstance(document, SceneDocument) else dict(document)
+        return Scene(self, self.request("POST", "/scenes", json=body))
+
+    def assets(self) -> list[Asset]:
+        """All uploaded files, the newest first."""
+        return [Asset.of(answer) for answer in self.request("GET", "/assets")]
+
+    def upload(self, path: Path) -> Asset:
+        """Upload a mesh or an environment map."""
+        try:
+            with path.open("rb") as file:
+                answer = self.request(
+                    "POST",
+                    "/assets",
+                    params={"name": path.name},
+                    content=file,
+                    headers={"Content-Type": "application/octet-stream"},
+                )
+        except OSError as fault:
+            raise DeltalightError(f"{path} cannot be read ({fault.strerror}); correct the path.") from fault
+        return Asset.of(answer)
+
+    def state(self) -> Json:
+        """Rates, drops and delays of the processes."""
+        return cast(Json, self.request("GET", "/state"))
+
+    def snapshot(
+        self, folder: Path, pictures: Sequence[Mapping[str, Any]] | None = None, *, exr: bool = False
+    ) -> list[Path]:
+        """Render one frame in several ways, `{name, view, method?}` each, and save the pictures in `folder`."""
+        body = {"exr": exr, **({} if pictures is None else {"pictures": [dict(each) for each in pictures]})}
+        made = self.request("POST", "/snapshots", json=body)
+        folder.mkdir(parents=True, exist_ok=True)
+        files = []
+        for name in made["files"]:
+            files.append(folder / name)
+            files[-1].write_bytes(self._bytes(f"/snapshots/{made['id']}/{name}"))
+        return files
+
+    def start_recording(self, name: str | None = None, duration_s: float | None = None) -> Json:
+        """Record what the node sees, until it is stopped or for so long."""
+        body = {"name": name, "duration_s": duration_s}
+        body = {key: value for key, value in body.items() if value is not None}
+        return cast(Json, self.request("POST", "/recordings", json=body))
+
+    def stop_recording(self, recording_id: str) -> Json:
+        """End a recording; its facts."""
+        return cast(Json, self.request("POST", f"/recordings/{recording_id}/stop"))
+
+    def download_recording(self, recording_id: str, path: Path) -> None:
+        """Save a recording as an .mcap file."""
+        with self._http.stream("GET", f"/recordings/{recording_id}/content") as response:
+            if response.is_error:
+                response.read()
+                raise _refusal(response)
+            with path.open("wb") as file:
+                for chunk in response.iter_bytes():
+                    file.write(chunk)
+
+    def frames(self) -> Iterator[LiveFrame]:
+        """Composites as they come, the newest always; what the caller is too slow for is left out."""
+        with self._socket("/live") as socket:
+            for message in socket:
+                if isinstance(message, bytes):
+                    yield LiveFrame.unpacked(message)
+                    socket.send("ack")
+
+    def events(self) -> Iterator[Json]:
+        """Events as they come: `{type, ...}`; the first says `hello`."""
+        with self._socket("/events") as socket:
+            for message in socket:
+                yield json.loads(message)
+
+    def request(self, method: str, path: str, **options: Any) -> Any:  # noqa: ANN401 - JSON
+        """The answer to one request, as JSON; for routes that have no method here.
+
+        Raises:
+            ApiError: the service refused it.
+            DeltalightError: the service does not answer.
+        """
+        try:
+            response = self._http.request(method, path, **options)
+        except httpx.TransportError as fault:
+            raise DeltalightError(
+                f"No service answers at {self._address} ({fault}); start it, or correct the address."
+            ) from fault
+        if response.is_error:
+            raise _refusal(response)
+        return response.json() if response.content else None
+
+    def _bytes(self, path: str) -> bytes:
+        response = self._http.get(path)
+        if response.is_error:
+            raise _refusal(response)
+        return response.content
+
+    @contextmanager
+    def _socket(self, path: str) -> Iterator["ClientConnection"]:
+        """Open a WebSocket, with a ticket where the service wants tokens."""
+        from websockets.exceptions import ConnectionClosedError, InvalidHandshake
+        from websockets.sync.client import connect
+
+        query = f"?ticket={self.request('POST', '/tickets')['ticket']}" if self._headers else ""
+        address = f"ws{self._address.removeprefix('http')}/api/v1{path}{query}"
+        try:
+            with connect(address, max_size=None, compression=None) as socket:
+                yield socket
+        except (OSError, InvalidHandshake, ConnectionClosedError) as fault:
+            raise DeltalightError(
+                f"The stream {path} of {self._address} ended ({fault}); see whether the service runs."
+            ) from fault
+
+
+def _refusal(response: httpx.Response) -> ApiError:
+    try:
+        problem = response.json()
+        kind = str(problem["type"]).rsplit(":", 1)[-1]
+        return ApiError(problem["detail"], response.status_code, kind, problem.get("revision"))
+    except (ValueError, KeyError, TypeError):
+        sentence = f"The service answered {response.status_code} without a reason; see its log."
+        return ApiError(sentence, response.status_code, "unknown")

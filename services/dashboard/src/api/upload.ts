@@ -1,0 +1,24 @@
+// Uploads with progress, which fetch does not tell.
+import { API, ProblemError, authorization, refusal } from "./http";
+import type { AssetAnswer } from "./types";
+
+const UPLOAD_TYPE = "application/octet-stream";
+
+/** Send a file; `onProgress` gets 0..1, and stays at 1 while the service checks the file. */
+export function uploadAsset(file: File, onProgress: (share: number) => void): Promise<AssetAnswer> {
+  return new Promise((resolve, reject) => {
+    const sending = new XMLHttpRequest();
+    sending.open("POST", `${API}/assets?name=${encodeURIComponent(file.name)}`);
+    authorization().forEach((value, name) => sending.setRequestHeader(name, value));
+    sending.setRequestHeader("Content-Type", UPLOAD_TYPE);
+    sending.upload.onprogress = (event) => {
+      if (event.lengthComputable) onProgress(event.loaded / event.total);
+    };
+    sending.onerror = () => reject(new ProblemError(0, "unreachable", `${file.name} was not sent; try again.`));
+    sending.onload = () => {
+      if (sending.status < 300) resolve(JSON.parse(sending.responseText) as AssetAnswer);
+      else reject(refusal(sending.status, sending.responseText));
+    };
+    sending.send(file);
+  });
+}

@@ -1,0 +1,81 @@
+import type uPlot from "uplot";
+import { frame } from "../../live/picture";
+import { leadingPasses, samples, stacked, timeOf, type Sample } from "../../live/telemetry";
+import { milliseconds } from "../../math/units";
+import { Empty } from "../ui/Empty";
+import { Plot, type Series } from "./Plot";
+
+// Hues at even steps and of one lightness, so that none looks more important; warm first, as the sign's.
+const COLORS = ["#f0a03c", "#5b9df0", "#67b86a", "#d673c4", "#e0705c", "#46b8b0", "#a78bf0", "#8d9096"];
+const MOST_PASSES = COLORS.length - 1;
+
+/** Times of the passes, delay and rate of the last minute. */
+export function PerformancePanel() {
+  const all = samples.value;
+  const last = all.at(-1);
+  if (!last) {
+    return (
+      <Empty icon="chart" title="No frames yet">
+        <p>Plots of the last minute appear with the live picture.</p>
+      </Empty>
+    );
+  }
+  const names = leadingPasses(all, MOST_PASSES);
+  const times = all.map((sample) => sample.at - last.at);
+  return (
+    <div class="performance">
+      <figure class="plot-box wide">
+        <figcaption>Passes of the renderer, ms</figcaption>
+        <Plot label="Time of each pass, stacked, milliseconds" series={areas(names)} data={stackData(times, all, names)} />
+      </figure>
+      <PassLegend sample={last} names={names} />
+      <figure class="plot-box">
+        <figcaption>
+          Capture to page, ms <b>{last.age === null ? "–" : milliseconds(last.age)}</b>
+        </figcaption>
+        <Plot label="Delay, milliseconds" series={line("delay", "#f0a03c")} data={[times, all.map((each) => each.age)]} />
+      </figure>
+      <figure class="plot-box">
+        <figcaption>
+          Frames a second <b>{last.rate === null ? "–" : last.rate.toFixed(1)}</b>
+        </figcaption>
+        <Plot label="Frames a second" series={line("rate", "#5b9df0")} data={[times, all.map((each) => each.rate)]} />
+      </figure>
+    </div>
+  );
+}
+
+/** The highest area is drawn first, so that the lower ones lie over it. */
+function stackData(times: number[], all: readonly Sample[], names: readonly string[]): uPlot.AlignedData {
+  return [times, ...stacked(all, names).reverse()];
+}
+
+function areas(names: readonly string[]): Series[] {
+  return names.map((label, index) => ({ label, color: COLORS[index] ?? COLORS[MOST_PASSES]!, isFilled: true })).reverse();
+}
+
+function line(label: string, color: string): Series[] {
+  return [{ label, color, isFilled: false }];
+}
+
+function PassLegend({ sample, names }: { readonly sample: Sample; readonly names: readonly string[] }) {
+  const total = Object.values(sample.passes).reduce((sum, time) => sum + time, 0);
+  return (
+    <table class="legend">
+      <caption>
+        {frame.value?.renderer} <b>{milliseconds(total)}</b>
+      </caption>
+      <tbody>
+        {names.map((name, index) => (
+          <tr key={name}>
+            <th scope="row">
+              <i style={{ background: COLORS[index] }} />
+              <span class="cut">{name.replaceAll("_", " ")}</span>
+            </th>
+            <td>{timeOf(sample, name, names).toFixed(1)}</td>
+          </tr>
+        ))}
+      </tbody>
+    </table>
+  );
+}

@@ -1,0 +1,52 @@
+import { API } from "../../api/http";
+import { role } from "../../api/session";
+import type { Recording } from "../../api/types";
+import { bytes, clock } from "../../math/units";
+import { deleteRecording, isGrowing, replay, showRecording, stopRecording } from "../../state/takes";
+import { Button } from "../ui/Button";
+import { download } from "../ui/download";
+import { Icon } from "../ui/Icon";
+import { Menu, type MenuEntry } from "../ui/Menu";
+import { SecureImage } from "../ui/SecureImage";
+
+export function RecordingCard({ recording }: { readonly recording: Recording }) {
+  const mayChange = role.value === "control";
+  const path = `${API}/recordings/${recording.id}`;
+  const isRunning = isGrowing(recording);
+  const isShown = replay.value?.recording === recording.id;
+  const entries: MenuEntry[] = [
+    { label: "Download .mcap", icon: "download", onClick: () => download(`${path}/content`, `${recording.id}.mcap`) },
+    { label: "Delete", icon: "trash", disabled: !mayChange || isShown, onClick: () => deleteRecording(recording.id) },
+  ];
+  return (
+    <article class={`card take ${isShown ? "current" : ""}`} aria-label={recording.id}>
+      {isRunning ? <div class="poster running">{recording.state === "waiting" ? "Waiting for a frame" : "Recording"}</div> : <SecureImage className="poster" path={`${path}/poster.jpg`} alt="" />}
+      <div class="take-text">
+        <h3 class="cut">{recording.id}</h3>
+        <p class="quiet small">{recording.detail || factsText(recording)}</p>
+        <div class="row">
+          {isRunning ? (
+            <Button icon="stop" disabled={!mayChange} onClick={() => stopRecording(recording.id)}>
+              Stop
+            </Button>
+          ) : (
+            <Button icon="play" disabled={!mayChange || recording.state !== "finished"} onClick={() => showRecording(recording.id)}>
+              Replay
+            </Button>
+          )}
+          {!isRunning && (
+            <Menu label={`Actions for ${recording.id}`} entries={entries} kind="icon-only plain">
+              <Icon name="more" />
+            </Menu>
+          )}
+        </div>
+      </div>
+    </article>
+  );
+}
+
+function factsText({ duration_s, frames, size_bytes, changed }: Recording): string {
+  const day = new Date(changed).toLocaleString([], { dateStyle: "medium", timeStyle: "short" });
+  const facts = [duration_s === null ? "" : clock(duration_s), frames === null ? "" : `${frames} frames`, bytes(size_bytes), day];
+  return facts.filter(Boolean).join(", ");
+}

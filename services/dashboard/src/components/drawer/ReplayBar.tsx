@@ -1,0 +1,76 @@
+import { useEffect } from "preact/hooks";
+import { role } from "../../api/session";
+import type { Replay } from "../../api/types";
+import { clock } from "../../math/units";
+import { backToLive, changeReplay, readReplay, replay, showRecording } from "../../state/takes";
+import { Button } from "../ui/Button";
+import { IconButton } from "../ui/IconButton";
+import { Select } from "../ui/Select";
+
+const RATES = ["0.25", "0.5", "1", "2", "4"].map((value) => ({ value, label: `${value}×` }));
+const POLL_MS = 1000;
+
+/** Timeline of the recording that is shown in place of the camera. */
+export function ReplayBar() {
+  const shown = replay.value;
+  const isShown = shown?.recording != null;
+  useEffect(() => {
+    if (!isShown) return;
+    const timer = setInterval(() => void readReplay(), POLL_MS);
+    return () => clearInterval(timer);
+  }, [isShown]);
+  if (!shown || !isShown) return null;
+  const disabled = role.value !== "control";
+  const loop = async (): Promise<void> => {
+    await readReplay();
+    if (shown.recording) await showRecording(shown.recording, { ...replay.value, loop: !shown.loop });
+  };
+  return (
+    <div class="replay" role="group" aria-label="Replay">
+      <IconButton
+        icon={shown.playing ? "pause" : "play"}
+        label={shown.playing ? "Pause" : "Play"}
+        disabled={disabled}
+        onClick={() => changeReplay({ playing: !shown.playing })}
+      />
+      <span class="cut replay-name">{shown.recording}</span>
+      <Timeline shown={shown} disabled={disabled} />
+      <IconButton icon="loop" label="Loop" pressed={shown.loop === true} disabled={disabled} onClick={loop} />
+      <Select
+        label="Rate"
+        value={String(shown.rate ?? 1)}
+        choices={RATES}
+        onChange={(rate) => changeReplay({ rate: Number(rate) })}
+        disabled={disabled}
+      />
+      <Button kind="primary" disabled={disabled} onClick={backToLive}>
+        Back to live
+      </Button>
+    </div>
+  );
+}
+
+function Timeline({ shown, disabled }: { readonly shown: Replay; readonly disabled: boolean }) {
+  const position = shown.position_s ?? 0;
+  const duration = shown.duration_s ?? 0;
+  const share = duration > 0 ? position / duration : 0;
+  return (
+    <>
+      <span class="quiet">{clock(position)}</span>
+      <input
+        type="range"
+        class="grow"
+        aria-label="Position"
+        aria-valuetext={`${clock(position)} of ${clock(duration)}`}
+        min={0}
+        max={duration}
+        step={0.05}
+        value={position}
+        disabled={disabled}
+        ref={(element) => element?.style.setProperty("--filled", `${100 * share}%`)}
+        onChange={(event) => changeReplay({ position_s: event.currentTarget.valueAsNumber })}
+      />
+      <span class="quiet">{clock(duration)}</span>
+    </>
+  );
+}

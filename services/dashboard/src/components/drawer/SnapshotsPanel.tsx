@@ -1,0 +1,31 @@
+import { useSignal } from "@preact/signals";
+import { role } from "../../api/session";
+import { isTakingSnapshot, snapshots, takeSnapshot } from "../../state/takes";
+import { Button } from "../ui/Button";
+import { Empty } from "../ui/Empty";
+import { Switch } from "../ui/Switch";
+import { SnapshotCard } from "./SnapshotCard";
+
+export function SnapshotsPanel() {
+  const withExr = useSignal(false);
+  const isBusy = isTakingSnapshot.value;
+  return (
+    <div class="cards">
+      <div class="card action-card">
+        <Button icon="camera" kind="primary" disabled={role.value !== "control" || isBusy} onClick={() => takeSnapshot(null, withExr.value)}>
+          {isBusy ? "Rendering…" : "Take a snapshot"}
+        </Button>
+        <Switch label="Linear EXR too" checked={withExr.value} onChange={(on) => (withExr.value = on)} />
+        <p class="quiet small">One frame in every view, as PNG.</p>
+      </div>
+      {snapshots.value.length === 0 && (
+        <Empty icon="camera" title="No snapshots yet">
+          <p>They are kept on the service until they are deleted.</p>
+        </Empty>
+      )}
+      {snapshots.value.map((each) => (
+        <SnapshotCard key={each.id} snapshot={each} />
+      ))}
+    </div>
+  );
+}

@@ -1,0 +1,60 @@
+import type { SceneObject } from "../../api/types";
+import { edit } from "../../state/gesture";
+import { objectTarget } from "../../state/targets";
+import { Field } from "../ui/Field";
+import { NumberInput } from "../ui/NumberInput";
+import { Select } from "../ui/Select";
+import { Section } from "./Section";
+
+interface FrameSectionProps {
+  readonly item: SceneObject;
+  readonly disabled: boolean;
+}
+
+/** What the object's pose is relative to, and which way its file is up. */
+export function FrameSection({ item, disabled }: FrameSectionProps) {
+  const target = objectTarget(item.id);
+  const marker = item.frame.startsWith("marker:") ? Number(item.frame.slice("marker:".length)) : null;
+  return (
+    <Section title="Placement">
+      <Field label="Stands on" help="The board stays; an object on a marker moves with it, and is placed by numbers only." inline>
+        <Select
+          label="Stands on"
+          value={marker === null ? "world" : "marker"}
+          choices={[
+            { value: "world", label: "the board" },
+            { value: "marker", label: "a marker" },
+          ]}
+          onChange={(frame) => edit(target, { frame: frame === "world" ? "world" : "marker:0" })}
+          disabled={disabled}
+        />
+      </Field>
+      {marker !== null && (
+        <Field label="Marker" inline>
+          <NumberInput
+            label="Marker"
+            value={marker}
+            onChange={(id) => void edit(target, { frame: `marker:${id ?? 0}` })}
+            min={0}
+            step={1}
+            integer
+            disabled={disabled}
+          />
+        </Field>
+      )}
+      <Field label="Up in its file" help="glTF files are y up; others are taken as z up." inline>
+        <Select
+          label="Up in its file"
+          value={item.up_axis ?? "auto"}
+          choices={[
+            { value: "auto", label: "as usual for its format" },
+            { value: "y", label: "y" },
+            { value: "z", label: "z" },
+          ]}
+          onChange={(axis) => edit(target, { up_axis: axis === "auto" ? null : axis })}
+          disabled={disabled}
+        />
+      </Field>
+    </Section>
+  );
+}

@@ -1,0 +1,43 @@
+import { isGuideDismissed, openDrawer } from "../../state/preferences";
+import { objects } from "../../state/scene";
+import { inspectorTab, selectedObjectId, selectObject } from "../../state/selection";
+import { IconButton } from "../ui/IconButton";
+
+/** What to try first; goes for good when it is closed. */
+export function Guide() {
+  if (isGuideDismissed.value) return null;
+  const first = objects.value[0];
+  const isShort = inspectorTab.value !== "object" || selectedObjectId.value !== null;
+  return (
+    <section class={`guide ${isShort ? "short" : ""}`} aria-label="Try this">
+      <header class="spread">
+        <h2>Try this</h2>
+        <IconButton icon="close" label="Close Try this" onClick={() => (isGuideDismissed.value = true)} />
+      </header>
+      <ol>
+        <li>
+          <button type="button" disabled={!first} onClick={() => first && selectObject(first.id)}>
+            Drag the object
+          </button>
+          <span>Click it, then drag it or its arrows. Shadow and colour follow.</span>
+        </li>
+        <li>
+          <b>Drop a .glb on the picture</b>
+          <span>It stands where you let go.</span>
+        </li>
+        <li>
+          <button type="button" onClick={() => (inspectorTab.value = "lights")}>
+            Change the light
+          </button>
+          <span>Colour, strength and place of each lamp.</span>
+        </li>
+        <li>
+          <button type="button" onClick={() => openDrawer("compare")}>
+            Compare methods
+          </button>
+          <span>One frame, two pictures, a split to slide.</span>
+        </li>
+      </ol>
+    </section>
+  );
+}

@@ -1,0 +1,64 @@
+import { role } from "../../api/session";
+import type { Lights } from "../../api/types";
+import { edit } from "../../state/gesture";
+import { lights } from "../../state/scene";
+import { partTarget } from "../../state/targets";
+import { toast } from "../../state/toasts";
+import { assets } from "../../state/assets";
+import { Segments, type Segment } from "../ui/Segments";
+import { EnvironmentSection } from "./EnvironmentSection";
+import { FisheyeSection } from "./FisheyeSection";
+import { LightSection } from "./LightSection";
+import { ManualList } from "./ManualList";
+import { RegistrationSection } from "./RegistrationSection";
+import { Section } from "./Section";
+import { TrackedSection } from "./TrackedSection";
+
+type Mode = Lights["mode"];
+
+const MODES: readonly Segment<Mode>[] = [
+  { value: "manual", label: "Manual" },
+  { value: "fisheye", label: "Fish-eye" },
+  { value: "tracked", label: "Tracked" },
+  { value: "environment", label: "Map" },
+];
+const HELP: Readonly<Record<Mode, string>> = {
+  manual: "Lamps that you set by hand.",
+  fisheye: "What a fish-eye camera beside the objects sees, live.",
+  tracked: "Lamps that carry a marker and may be moved about.",
+  environment: "A given panorama of the surroundings (HDR or EXR).",
+};
+
+export function LightsPanel() {
+  const found = lights.value;
+  if (!found) return null;
+  const disabled = role.value !== "control";
+  return (
+    <>
+      <Section title="Light comes from">
+        <Segments label="Light mode" segments={MODES} value={found.mode} onChange={(mode) => !disabled && void setMode(found, mode)} />
+        <p class="quiet small">{HELP[found.mode]}</p>
+      </Section>
+      {found.mode === "manual" && <ManualList lights={found} disabled={disabled} />}
+      {found.mode === "manual" && <LightSection lights={found} disabled={disabled} />}
+      {found.mode === "tracked" && <TrackedSection lights={found} disabled={disabled} />}
+      {found.mode === "environment" && <EnvironmentSection lights={found} disabled={disabled} />}
+      {(found.mode === "fisheye" || found.mode === "environment") && <FisheyeSection lights={found} disabled={disabled} />}
+      <RegistrationSection lights={found} disabled={disabled} />
+    </>
+  );
+}
+
+/** Some modes need something to begin with. */
+async function setMode(current: Lights, mode: Mode): Promise<void> {
+  const target = partTarget("lights");
+  if (mode === "environment" && current.environment.map == null) {
+    const map = assets.value.find((each) => each.kind === "map");
+    if (!map) { toast("Upload an environment map first: drop an .hdr or .exr file on the assets."); return; }
+    await edit(target, { mode, environment: { map: map.asset } });
+  } else if (mode === "tracked" && current.tracked.length === 0) {
+    await edit(target, { mode, tracked: [{ marker: 0 }] });
+  } else {
+    await edit(target, { mode });
+  }
+}

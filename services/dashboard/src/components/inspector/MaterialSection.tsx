@@ -1,0 +1,80 @@
+import type { Material, SceneObject } from "../../api/types";
+import { schemas } from "../../forms/schemas";
+import { edit } from "../../state/gesture";
+import { objectTarget } from "../../state/targets";
+import { ColorField } from "../ui/ColorField";
+import { SliderField } from "../ui/SliderField";
+import { Switch } from "../ui/Switch";
+import { useGesture } from "../ui/useGesture";
+import { Section } from "./Section";
+
+interface MaterialSectionProps {
+  readonly item: SceneObject;
+  readonly disabled: boolean;
+}
+
+const INITIAL = { base_color: [0.8, 0.8, 0.8], metallic: 0, roughness: 0.5, specular: 0.5 } as const;
+
+/** The object's own material, or the file's. */
+export function MaterialSection({ item, disabled }: MaterialSectionProps) {
+  const material = item.material ?? null;
+  const target = objectTarget(item.id);
+  const isOwn = material !== null && !("precomputed" in material);
+  return (
+    <Section title="Material">
+      <Switch
+        label="Own material instead of the file's"
+        checked={isOwn}
+        disabled={disabled}
+        onChange={(own) => edit(target, { material: own ? INITIAL : null })}
+      />
+      {isOwn && <MaterialFields item={item} material={material} disabled={disabled} />}
+    </Section>
+  );
+}
+
+interface MaterialFieldsProps extends MaterialSectionProps {
+  readonly material: Material;
+}
+
+function MaterialFields({ item, material, disabled }: MaterialFieldsProps) {
+  const gesture = useGesture(objectTarget(item.id));
+  const push = (change: Partial<Material>): void => gesture.push({ material: change });
+  const help = (key: keyof Material): string => schemas.value.Material?.properties?.[key]?.description ?? "";
+  const shares = ["roughness", "metallic", "specular"] as const;
+  return (
+    <>
+      <ColorField
+        label="Base colour"
+        value={material.base_color}
+        onChange={(base_color) => push({ base_color })}
+        onEnd={gesture.end}
+        max={1}
+        help={help("base_color")}
+        disabled={disabled}
+      />
+      {shares.map((key) => (
+        <SliderField
+          key={key}
+          label={key.charAt(0).toUpperCase() + key.slice(1)}
+          value={material[key]}
+          onChange={(value) => push({ [key]: value })}
+          onEnd={gesture.end}
+          min={0}
+          max={1}
+          help={help(key)}
+          disabled={disabled}
+        />
+      ))}
+      <ColorField
+        label="Emission"
+        value={material.emission}
+        onChange={(emission) => push({ emission })}
+        onEnd={gesture.end}
+        max={1000}
+        help={help("emission")}
+        disabled={disabled}
+      />
+    </>
+  );
+}

@@ -1,0 +1,72 @@
+import type { Pose, SceneObject } from "../../api/types";
+import { anglesFromQuaternion, quaternionFromAngles } from "../../math/rotation";
+import { objectTarget } from "../../state/targets";
+import { draft } from "../../state/tools";
+import { Button } from "../ui/Button";
+import { Field } from "../ui/Field";
+import { NumberInput } from "../ui/NumberInput";
+import { useGesture } from "../ui/useGesture";
+import { VectorInput } from "../ui/VectorInput";
+import { Section } from "./Section";
+
+interface PoseSectionProps {
+  readonly item: SceneObject;
+  readonly disabled: boolean;
+}
+
+/** Position in metres, turn in degrees, scale: every action of the gizmo, by numbers. */
+export function PoseSection({ item, disabled }: PoseSectionProps) {
+  const gesture = useGesture(objectTarget(item.id));
+  const dragged = draft.value?.id === item.id ? draft.value.pose : null;
+  const pose = dragged ?? item.pose;
+  const push = (change: Partial<Pose>): void => gesture.push({ pose: change });
+  const upright = (): void => {
+    const [, , yaw] = anglesFromQuaternion(pose.rotation_wxyz);
+    push({ rotation_wxyz: quaternionFromAngles([0, 0, yaw]) });
+    gesture.end();
+  };
+  return (
+    <Section
+      title="Pose"
+      action={
+        <Button kind="plain" disabled={disabled} onClick={upright}>
+          Stand upright
+        </Button>
+      }
+    >
+      <VectorInput
+        label="Position"
+        unit="m"
+        help="Of the object's origin, in the frame of the marker board: x right, y up the sheet, z out of the paper."
+        value={pose.translation_m}
+        onChange={(translation_m) => push({ translation_m })}
+        onEnd={gesture.end}
+        disabled={disabled}
+      />
+      <VectorInput
+        label="Rotation"
+        unit="°"
+        help="First about x, then y, then z; z is up."
+        value={anglesFromQuaternion(pose.rotation_wxyz)}
+        onChange={(angles) => push({ rotation_wxyz: quaternionFromAngles(angles) })}
+        onEnd={gesture.end}
+        step={1}
+        decimals={1}
+        disabled={disabled}
+      />
+      <Field label="Scale" inline>
+        <NumberInput
+          label="Scale"
+          value={pose.scale}
+          onChange={(scale) => scale !== null && push({ scale })}
+          onEnd={gesture.end}
+          min={0.0001}
+          max={10000}
+          step={0.05}
+          unit="×"
+          disabled={disabled}
+        />
+      </Field>
+    </Section>
+  );
+}

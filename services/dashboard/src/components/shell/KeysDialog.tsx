@@ -1,0 +1,83 @@
+import { signal } from "@preact/signals";
+import { version } from "../../api/session";
+import { isGuideDismissed } from "../../state/preferences";
+import { Button } from "../ui/Button";
+import { Dialog } from "../ui/Dialog";
+
+export const areKeysShown = signal(false);
+
+const GROUPS: readonly { readonly title: string; readonly keys: readonly (readonly [string, string])[] }[] = [
+  {
+    title: "Tools",
+    keys: [
+      ["Q", "select"],
+      ["G or W", "move"],
+      ["R or E", "rotate"],
+      ["S", "scale"],
+      ["P", "place on a surface: click where"],
+      ["Shift", "snap to 1 cm, 15°, 0.1 while dragging"],
+      ["Esc", "cancel the drag; else select nothing"],
+    ],
+  },
+  {
+    title: "With the picture focused",
+    keys: [
+      ["Arrows", "move the selection 1 cm"],
+      ["Page Up / Down", "higher, lower"],
+      ["Shift / Alt", "with arrows: ten times, a tenth"],
+      ["[ and ]", "turn by 15°"],
+      ["Tab", "next object or light"],
+    ],
+  },
+  {
+    title: "Scene",
+    keys: [
+      ["Ctrl Z", "undo"],
+      ["Ctrl Shift Z", "redo"],
+      ["Ctrl D", "duplicate the object"],
+      ["Del", "remove the selection"],
+      ["H", "hide or show outlines"],
+    ],
+  },
+  {
+    title: "Views",
+    keys: [
+      ["1", "picture"],
+      ["2 … 6", "effects, change of light, volume, light's view, lights"],
+      ["?", "this list"],
+    ],
+  },
+];
+
+export function KeysDialog() {
+  if (!areKeysShown.value) return null;
+  const showGuide = (): void => {
+    isGuideDismissed.value = false;
+    areKeysShown.value = false;
+  };
+  return (
+    <Dialog title="Keys" onClose={() => (areKeysShown.value = false)}>
+      <div class="keys">
+        {GROUPS.map((group) => (
+          <section key={group.title}>
+            <h3>{group.title}</h3>
+            <dl>
+              {group.keys.map(([key, text]) => (
+                <>
+                  <dt>
+                    <kbd>{key}</kbd>
+                  </dt>
+                  <dd>{text}</dd>
+                </>
+              ))}
+            </dl>
+          </section>
+        ))}
+      </div>
+      <div class="spread dialog-end">
+        <Button onClick={showGuide}>Show “Try this” again</Button>
+        <span class="quiet small">Deltalight {version.value}</span>
+      </div>
+    </Dialog>
+  );
+}

@@ -1,0 +1,68 @@
+import { useRef } from "preact/hooks";
+import { API, request } from "../../api/http";
+import { role } from "../../api/session";
+import type { SceneAnswer } from "../../api/types";
+import { activateScene, deleteScene, duplicateScene, newScene } from "../../state/actions";
+import { scene, sceneDocument, scenes } from "../../state/scene";
+import { attempt } from "../../state/toasts";
+import { download } from "../ui/download";
+import { Icon } from "../ui/Icon";
+import { Menu, type MenuEntry } from "../ui/Menu";
+
+/** The scene that is shown; a menu to choose another, make, copy, import and export. */
+export function SceneMenu() {
+  const file = useRef<HTMLInputElement>(null);
+  const current = scene.value;
+  const name = sceneDocument.value?.name ?? "";
+  const mayChange = role.value === "control";
+  const others = scenes.value.map((each): MenuEntry => ({
+    label: each.name || "untitled",
+    ...(each.id === current?.id ? { icon: "check" as const } : {}),
+    end: `r${each.revision}`,
+    disabled: !mayChange,
+    onClick: () => activateScene(each.id),
+  }));
+  const entries: MenuEntry[] = [
+    ...others,
+    { label: "New scene", icon: "add", begins: true, disabled: !mayChange, onClick: () => newScene("untitled") },
+    { label: "Duplicate this scene", icon: "copy", disabled: !mayChange || !current, onClick: () => current && duplicateScene(current.id) },
+    { label: "Import a document", icon: "upload", disabled: !mayChange, onClick: () => file.current?.click() },
+    { label: "Export as JSON", icon: "download", disabled: !current, onClick: () => current && exportScene(current.id, name) },
+    ...deletions(current?.id, mayChange),
+  ];
+  return (
+    <>
+      <Menu label="Scenes" entries={entries}>
+        <span class="cut scene-name">{current ? name || "untitled" : "No scene"}</span>
+        <Icon name="down" />
+      </Menu>
+      <input ref={file} type="file" accept=".json,.yaml,.yml" hidden onChange={(event) => void importScene(event.currentTarget)} />
+    </>
+  );
+}
+
+function deletions(currentId: string | undefined, mayChange: boolean): MenuEntry[] {
+  return scenes.value
+    .filter((each) => each.id !== currentId)
+    .map((each, index): MenuEntry => ({
+      label: `Delete ${each.name || "untitled"}`,
+      icon: "trash",
+      begins: index === 0,
+      disabled: !mayChange,
+      onClick: () => deleteScene(each.id),
+    }));
+}
+
+async function exportScene(id: string, name: string): Promise<void> {
+  await download(`${API}/scenes/${id}/document`, `${name || "scene"}.json`);
+}
+
+async function importScene(input: HTMLInputElement): Promise<void> {
+  const file = input.files?.[0];
+  input.value = "";
+  if (!file) return;
+  const type = file.name.endsWith(".json") ? "application/json" : "application/yaml";
+  const body = await file.text();
+  const made = await attempt(() => request<SceneAnswer>("POST", `${API}/scenes`, { body, type }));
+  if (made) await activateScene(made.id);
+}

@@ -1,0 +1,43 @@
+import { useSignal } from "@preact/signals";
+import { signInProblem } from "../../api/session";
+import { signIn } from "../../state/begin";
+import { Button } from "../ui/Button";
+import { Mark } from "../ui/Mark";
+
+/** Shown where the service needs a token. */
+export function SignIn() {
+  const given = useSignal("");
+  const onSubmit = (event: SubmitEvent): void => {
+    event.preventDefault();
+    if (given.value.trim()) void signIn(given.value);
+  };
+  return (
+    <main class="sign-in">
+      <form onSubmit={onSubmit}>
+        <Mark />
+        <div>
+          <h1>Deltalight</h1>
+          <p class="quiet">This service is open to other hosts, so it asks for a token.</p>
+        </div>
+        {signInProblem.value && <p role="alert">{signInProblem.value}</p>}
+        <label class="field">
+          <span class="field-label">Token</span>
+          <input
+            class="input"
+            type="password"
+            autocomplete="current-password"
+            autofocus
+            value={given.value}
+            onInput={(event) => (given.value = event.currentTarget.value)}
+          />
+        </label>
+        <Button type="submit" kind="primary" disabled={!given.value.trim()}>
+          Sign in
+        </Button>
+        <p class="quiet small">
+          Make one with <code>deltalight api token NAME --role control</code>. It is kept until this tab is closed.
+        </p>
+      </form>
+    </main>
+  );
+}

@@ -1,0 +1,94 @@
+import { useSignal } from "@preact/signals";
+import { useEffect, useRef } from "preact/hooks";
+import { role } from "../../api/session";
+import { liveState, showPictureOn } from "../../live/picture";
+import { ASSET_DRAG, droppedAsset } from "../../state/drag";
+import { addObject } from "../../state/actions";
+import { upload } from "../../state/assets";
+import { nudge } from "../../state/nudge";
+import { selectedObjectId } from "../../state/selection";
+import { tool } from "../../state/tools";
+import { CompareSlider } from "./CompareSlider";
+import { usePictureBox } from "./fit";
+import { Outlines } from "./Outlines";
+import { PicturePointer } from "./pointer";
+import { PictureNotice } from "./PictureNotice";
+import { stepSelection } from "./stepSelection";
+import { useGizmo } from "./useGizmo";
+
+/** The live picture with everything that lies over it. */
+export function Picture() {
+  const area = useRef<HTMLDivElement>(null);
+  const surface = useRef<HTMLDivElement>(null);
+  const picture = useRef<HTMLCanvasElement>(null);
+  const handles = useRef<HTMLCanvasElement>(null);
+  const pointer = useRef<PicturePointer | null>(null);
+  const isDropping = useSignal(false);
+  const box = usePictureBox(area);
+  const gizmo = useGizmo(handles, surface, box);
+
+  useEffect(() => {
+    showPictureOn(picture.current);
+    if (surface.current) pointer.current = new PicturePointer(surface.current, () => gizmo.current?.isTouched === true);
+    return () => showPictureOn(null);
+  }, []);
+
+  const onKeyDown = (event: KeyboardEvent): void => {
+    if (event.ctrlKey || event.metaKey) return;
+    const done = event.key === "Escape" ? cancel() : stepSelection(event) || (role.value === "control" && nudge(event));
+    if (done) event.preventDefault();
+  };
+  const cancel = (): boolean => gizmo.current?.cancel() === true || pointer.current?.cancel() === true;
+  const onDrop = (event: DragEvent): void => {
+    event.preventDefault();
+    isDropping.value = false;
+    const pixel = pointer.current?.pixelOf(event);
+    if (pixel && role.value === "control") void dropAt(event, pixel);
+  };
+  const { left, top, width, height } = box.value;
+  const style = { left: `${left}px`, top: `${top}px`, width: `${width}px`, height: `${height}px` };
+  return (
+    <div class="picture-area" ref={area}>
+      <div
+        class={`picture ${isDropping.value ? "dropping" : ""} ${liveState.value === "live" ? "" : "not-live"}`}
+        style={style}
+        onDragOver={(event) => {
+          event.preventDefault();
+          isDropping.value = true;
+        }}
+        onDragLeave={() => (isDropping.value = false)}
+        onDrop={onDrop}
+      >
+        <canvas class="layer" ref={picture} role="img" aria-label="Live picture" />
+        <Outlines box={box} />
+        <canvas class="layer" ref={handles} aria-hidden="true" />
+        <div
+          class={`layer surface ${tool.value === "place" && selectedObjectId.value !== null ? "placing" : ""}`}
+          ref={surface}
+          id="stage"
+          role="application"
+          aria-label="Picture: click selects; arrow keys move the selection"
+          tabIndex={0}
+          onPointerDown={(event) => pointer.current?.down(event)}
+          onPointerMove={(event) => pointer.current?.move(event)}
+          onPointerUp={(event) => pointer.current?.up(event)}
+          onPointerCancel={() => pointer.current?.cancel()}
+          onPointerLeave={() => pointer.current?.leave()}
+          onKeyDown={onKeyDown}
+        />
+        <CompareSlider />
+        <PictureNotice />
+        {isDropping.value && <p class="drop-hint">Let go where the object is to stand</p>}
+      </div>
+    </div>
+  );
+}
+
+async function dropAt(event: DragEvent, pixel: readonly [number, number]): Promise<void> {
+  const dragged = droppedAsset(event.dataTransfer?.getData(ASSET_DRAG));
+  if (dragged) return addObject(dragged, pixel);
+  for (const file of event.dataTransfer?.files ?? []) {
+    const asset = await upload(file);
+    if (asset?.kind === "mesh") await addObject(asset, pixel, file.name);
+  }
+}

@@ -1,0 +1,68 @@
+import { isSceneRead, scene } from "../../state/scene";
+import { liveState, retryPicture } from "../../live/picture";
+import { isTakingSnapshot } from "../../state/takes";
+import { Button } from "../ui/Button";
+import { Icon } from "../ui/Icon";
+
+/** Says why there is no picture, or why it stands still, and what to do. */
+export function PictureNotice() {
+  switch (liveState.value) {
+    case "connecting":
+      return <Full title="Connecting to the live picture" text="The service is asked for the newest frame." />;
+    case "waiting":
+      return (
+        <Full
+          title="No picture yet"
+          text="Neither a camera nor a recording sends frames. Start one with `deltalight up --source CAMERA`, or replay a recording below."
+        />
+      );
+    case "reconnecting":
+      return (
+        <p class="picture-banner">
+          <Icon name="alert" /> The connection is lost; this is the last picture.
+          <Button kind="plain" onClick={retryPicture}>
+            Try now
+          </Button>
+        </p>
+      );
+    case "stale":
+      return (
+        <Banner
+          text={
+            isTakingSnapshot.value
+              ? "The renderer takes the snapshot; the live picture goes on after it."
+              : "No new picture comes. See Nodes below for what stands still."
+          }
+        />
+      );
+    case "no-board":
+      return <Banner text="The marker board is not in view, so objects cannot be placed. Point the camera at it." />;
+    case "live":
+      return isSceneRead.value && scene.value === null ? <Banner text="No scene is shown; add an object, or choose one under Scenes." /> : <Pending />;
+  }
+}
+
+function Pending() {
+  const state = scene.value?.picture;
+  if (state?.state === "pending") return <Banner text="The render server does not answer; it gets this scene as soon as it does." />;
+  if (state?.state === "refused") return <Banner text={state.detail} />;
+  return null;
+}
+
+function Banner({ text }: { readonly text: string }) {
+  return (
+    <p class="picture-banner">
+      <Icon name="alert" /> {text}
+    </p>
+  );
+}
+
+function Full({ title, text }: { readonly title: string; readonly text: string }) {
+  return (
+    <div class="picture-full">
+      <Icon name="film" />
+      <h2>{title}</h2>
+      <p>{text}</p>
+    </div>
+  );
+}

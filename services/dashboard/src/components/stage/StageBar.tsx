@@ -1,0 +1,54 @@
+import { role } from "../../api/session";
+import type { MethodName, View } from "../../api/types";
+import { METHODS } from "../../forms/methods";
+import { VIEWS } from "../../forms/views";
+import { setMethod, setView } from "../../state/actions";
+import { sceneDocument } from "../../state/scene";
+import { areOutlinesShown, isSnapping, tool, type Tool } from "../../state/tools";
+import { IconButton } from "../ui/IconButton";
+import { Segments, type Segment } from "../ui/Segments";
+import { Select } from "../ui/Select";
+import { AddObjectButton } from "./AddObjectButton";
+
+const TOOLS: readonly Segment<Tool>[] = [
+  { value: "select", label: "Select", icon: "cursor", hint: "Q" },
+  { value: "move", label: "Move", icon: "move", hint: "G" },
+  { value: "rotate", label: "Rotate", icon: "rotate", hint: "R" },
+  { value: "scale", label: "Scale", icon: "scale", hint: "S" },
+  { value: "place", label: "Place on a surface", icon: "place", hint: "P" },
+];
+
+/** Tools over the picture, and what it shows. */
+export function StageBar() {
+  const document = sceneDocument.value;
+  const isDisabled = role.value !== "control" || document === null;
+  return (
+    <div class="stage-bar" role="toolbar" aria-label="Tools">
+      <Segments label="Tool" segments={TOOLS} value={tool.value} onChange={(next) => (tool.value = next)} compact />
+      <IconButton
+        icon="magnet"
+        label="Snap to steps"
+        hint="or hold Shift"
+        pressed={isSnapping.value}
+        onClick={() => (isSnapping.value = !isSnapping.value)}
+      />
+      <IconButton
+        icon="frame"
+        label="Outlines and lamps"
+        hint="H"
+        pressed={areOutlinesShown.value}
+        onClick={() => (areOutlinesShown.value = !areOutlinesShown.value)}
+      />
+      <AddObjectButton />
+      <span class="grow" />
+      <Select<MethodName>
+        label="Method"
+        value={document?.method.name ?? "dvct"}
+        choices={METHODS.map(({ name, title }) => ({ value: name, label: title }))}
+        onChange={setMethod}
+        disabled={isDisabled}
+      />
+      <Select<View> label="View" value={document?.output.view ?? "composite"} choices={VIEWS} onChange={setView} disabled={isDisabled} />
+    </div>
+  );
+}

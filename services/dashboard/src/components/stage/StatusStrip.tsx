@@ -1,0 +1,49 @@
+import { frame, view } from "../../live/picture";
+import { droppedFrames } from "../../live/message";
+import { lensDeviation } from "../../math/camera";
+import { milliseconds } from "../../math/units";
+import { uploads } from "../../state/assets";
+
+// Beyond this share of the picture's width lines that should be straight are visibly bent.
+const STRONG = 0.02;
+
+/** Figures of the frame that is shown, and of uploads. */
+export function StatusStrip() {
+  const header = frame.value;
+  const deviation = view.value ? lensDeviation(view.value.lens) : 0;
+  return (
+    <footer class="status-strip">
+      {header && (
+        <dl>
+          <Figure name="Frame" value={String(header.frame_id)} />
+          <Figure name="Delay" value={header.age_ms === null ? "–" : milliseconds(header.age_ms)} />
+          <Figure name="Rate" value={header.frames_per_s === null ? "–" : `${header.frames_per_s.toFixed(1)} fps`} />
+          <Figure name="Dropped" value={String(droppedFrames(header.drops))} tip={dropText(header.drops)} />
+          <Figure name="Skipped" value={String(header.skipped)} tip="Frames that this browser was too slow for" />
+        </dl>
+      )}
+      {deviation > STRONG && <span class="quiet">Wide lens: handles are exact at their centre</span>}
+      <span class="grow" />
+      {uploads.value.map((each) => (
+        <label class="upload" key={each.id}>
+          <span class="cut">{each.share < 1 ? each.name : `Checking ${each.name}`}</span>
+          <progress value={each.share < 1 ? each.share : undefined} />
+        </label>
+      ))}
+    </footer>
+  );
+}
+
+function Figure({ name, value, tip }: { readonly name: string; readonly value: string; readonly tip?: string }) {
+  return (
+    <div title={tip}>
+      <dt>{name}</dt>
+      <dd>{value}</dd>
+    </div>
+  );
+}
+
+function dropText(drops: Readonly<Record<string, number>>): string {
+  const lines = Object.entries(drops).filter(([, count]) => count > 0);
+  return lines.map(([cause, count]) => `${cause}: ${count}`).join("\n") || "Nothing was lost";
+}

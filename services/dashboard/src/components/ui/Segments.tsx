@@ -1,0 +1,40 @@
+import { useId } from "preact/hooks";
+import { Icon, type IconName } from "./Icon";
+
+export interface Segment<T extends string> {
+  readonly value: T;
+  readonly label: string;
+  readonly icon?: IconName;
+  readonly hint?: string;
+}
+
+interface SegmentsProps<T extends string> {
+  readonly label: string;
+  readonly value: T;
+  readonly segments: readonly Segment<T>[];
+  readonly onChange: (value: T) => unknown;
+  /** Icons alone; the labels stay for screen readers and tips. */
+  readonly compact?: boolean;
+}
+
+/** One of a few, side by side; real radio buttons, so that keys work as everywhere. */
+export function Segments<T extends string>({ label, value, segments, onChange, compact = false }: SegmentsProps<T>) {
+  const name = useId();
+  return (
+    <div class="segments" role="radiogroup" aria-label={label}>
+      {segments.map((segment) => (
+        <label key={segment.value} title={segment.hint ? `${segment.label} (${segment.hint})` : segment.label}>
+          <input
+            type="radio"
+            name={name}
+            aria-label={segment.label}
+            checked={segment.value === value}
+            onChange={() => onChange(segment.value)}
+          />
+          {segment.icon && <Icon name={segment.icon} />}
+          {!compact && <span class="cut">{segment.label}</span>}
+        </label>
+      ))}
+    </div>
+  );
+}

@@ -1,0 +1,23 @@
+import { announcement, dismiss, toasts } from "../../state/toasts";
+import { Icon } from "./Icon";
+import { IconButton } from "./IconButton";
+
+/** Sentences over the page, and the line that only screen readers get. */
+export function Toasts() {
+  return (
+    <>
+      <div class="toasts" role="region" aria-label="Messages">
+        {toasts.value.map((each) => (
+          <div key={each.id} class={`toast ${each.kind}`} role={each.kind === "error" ? "alert" : "status"}>
+            <Icon name={each.kind === "error" ? "alert" : "info"} />
+            <p>{each.text}</p>
+            <IconButton icon="close" label="Dismiss" onClick={() => dismiss(each.id)} />
+          </div>
+        ))}
+      </div>
+      <div class="visually-hidden" aria-live="polite">
+        {announcement.value}
+      </div>
+    </>
+  );
+}

@@ -1,0 +1,47 @@
+// What the plots show: times, delay and rate of the last frames.
+import { signal } from "@preact/signals";
+import type { FrameHeader } from "./message";
+
+export interface Sample {
+  /** Seconds since the page was opened. */
+  readonly at: number;
+  readonly age: number | null;
+  readonly rate: number | null;
+  readonly passes: Readonly<Record<string, number>>;
+}
+
+const KEPT_S = 60;
+export const OTHERS = "others";
+
+export const samples = signal<readonly Sample[]>([]);
+
+export function note(header: FrameHeader, nowMs: number): void {
+  const at = nowMs / 1000;
+  const sample: Sample = { at, age: header.age_ms, rate: header.frames_per_s, passes: header.pass_times_ms };
+  const kept = samples.value.filter((each) => each.at > at - KEPT_S);
+  samples.value = [...kept, sample];
+}
+
+/** The passes that took most time over the samples, the costliest first, then `OTHERS` where there are more. */
+export function leadingPasses(of: readonly Sample[], most: number): string[] {
+  const sums = new Map<string, number>();
+  for (const sample of of) {
+    for (const [name, time] of Object.entries(sample.passes)) sums.set(name, (sums.get(name) ?? 0) + time);
+  }
+  const names = [...sums].sort((a, b) => b[1] - a[1]).map(([name]) => name);
+  return names.length > most ? [...names.slice(0, most), OTHERS] : names;
+}
+
+/** Time of one entry of `leadingPasses` in a sample. */
+export function timeOf(sample: Sample, name: string, named: readonly string[]): number {
+  if (name !== OTHERS) return sample.passes[name] ?? 0;
+  return Object.entries(sample.passes)
+    .filter(([pass]) => !named.includes(pass))
+    .reduce((sum, [, time]) => sum + time, 0);
+}
+
+/** Sums from the first series on, for areas that lie on each other: series x samples. */
+export function stacked(of: readonly Sample[], names: readonly string[]): number[][] {
+  const sums = of.map(() => 0);
+  return names.map((name) => of.map((sample, index) => (sums[index] = (sums[index] ?? 0) + timeOf(sample, name, names))));
+}

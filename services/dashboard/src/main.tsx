@@ -1,0 +1,22 @@
+import { render } from "preact";
+import "uplot/dist/uPlot.min.css";
+import "./styles/tokens.css";
+import "./styles/base.css";
+import "./styles/controls.css";
+import "./styles/overlays.css";
+import "./styles/layout.css";
+import "./styles/panels.css";
+import "./styles/stage.css";
+import "./styles/drawer.css";
+import { App } from "./components/shell/App";
+import { followScene } from "./state/selection";
+import { begin } from "./state/begin";
+import { followFrames } from "./state/tools";
+import { applyTheme } from "./state/theme";
+
+applyTheme();
+followScene();
+followFrames();
+void begin();
+const root = document.getElementById("app");
+if (root) render(<App />, root);

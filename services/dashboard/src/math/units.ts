@@ -1,0 +1,54 @@
+// Numbers as people read them.
+const UNITS: readonly (readonly [suffix: string, unit: string])[] = [
+  ["_m", "m"],
+  ["_deg", "°"],
+  ["_s", "s"],
+  ["_ms", "ms"],
+  ["_mb", "MB"],
+  ["_px", "px"],
+];
+const BYTE_UNITS = ["B", "kB", "MB", "GB"];
+
+/** The unit that a key's ending names; empty without. */
+export function unitOf(key: string): string {
+  return UNITS.find(([suffix]) => key.endsWith(suffix))?.[1] ?? "";
+}
+
+/** A key in words: `volume_edge_m` is "Volume edge". */
+export function labelOf(key: string): string {
+  const suffix = UNITS.find(([ending]) => key.endsWith(ending))?.[0] ?? "";
+  const words = key.slice(0, key.length - suffix.length).replaceAll("_", " ");
+  return words.charAt(0).toUpperCase() + words.slice(1);
+}
+
+/** At most `decimals` digits behind the point, without trailing zeros. */
+export function trimmed(value: number, decimals = 4): string {
+  const text = value.toFixed(decimals);
+  const short = text.includes(".") ? text.replace(/\.?0+$/, "") : text;
+  return short === "-0" ? "0" : short;
+}
+
+export function bytes(count: number): string {
+  let value = count;
+  let index = 0;
+  while (value >= 1000 && index < BYTE_UNITS.length - 1) {
+    value /= 1000;
+    index += 1;
+  }
+  return `${trimmed(value, value < 10 && index > 0 ? 1 : 0)} ${BYTE_UNITS[index] ?? ""}`;
+}
+
+/** Minutes and seconds: 75.4 is "1:15". */
+export function clock(seconds: number): string {
+  const whole = Math.max(0, Math.floor(seconds));
+  return `${Math.floor(whole / 60)}:${String(whole % 60).padStart(2, "0")}`;
+}
+
+export function milliseconds(value: number): string {
+  return value >= 1000 ? `${trimmed(value / 1000, 2)} s` : `${trimmed(value, value < 10 ? 1 : 0)} ms`;
+}
+
+export function size(metres: number): string {
+  if (metres < 0.1) return `${trimmed(metres * 1000, metres < 0.01 ? 1 : 0)} mm`;
+  return metres < 1 ? `${trimmed(metres * 100, 1)} cm` : `${trimmed(metres, 2)} m`;
+}

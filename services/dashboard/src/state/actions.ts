@@ -1,0 +1,148 @@
+// What people do to the scene, in one step each.
+import { API, request } from "../api/http";
+import type { AssetAnswer, LightType, ManualLight, Method, MethodName, PickAnswer, Pose, SceneAnswer, View } from "../api/types";
+import { boundsOf, longestEdge, sensibleScale, standOn } from "../math/bounds";
+import { meetPlane, type Pixel } from "../math/camera";
+import { UP } from "../math/vector";
+import { size, trimmed } from "../math/units";
+import { pictureSize, view } from "../live/picture";
+import { assetName, boundsByObject } from "./assets";
+import { edit } from "./gesture";
+import { change, lights, objects, readScene, readScenes, sceneDocument, takeScene } from "./scene";
+import { selectLight, selectObject } from "./selection";
+import { objectTarget, partTarget } from "./targets";
+import { announce, attempt, toast } from "./toasts";
+
+const UPRIGHT: Pose = { translation_m: [0, 0, 0], rotation_wxyz: [1, 0, 0, 0], scale: 1 };
+
+export async function pick(pixel: Pixel): Promise<PickAnswer | undefined> {
+  const body = { x: Math.max(0, pixel[0]), y: Math.max(0, pixel[1]) };
+  return attempt(() => request<PickAnswer>("POST", `${API}/live/pick`, { body }));
+}
+
+/** Where something new is put: on what the picture shows at a pixel, else on the board's plane there. */
+async function placeAt(pixel: Pixel): Promise<Pick<PickAnswer, "point_m" | "normal">> {
+  const found = await pick(pixel);
+  if (found?.point_m) return found;
+  const point_m = view.value ? meetPlane(view.value, pixel, [0, 0, 0], UP) : null;
+  if (point_m) toast("No surface was seen there; the object stands on the board's plane.");
+  return { point_m: point_m ?? [0, 0, 0], normal: UP };
+}
+
+/** Add an object of an asset at a pixel, named as a file; it stands on the surface there. */
+export async function addObject(asset: AssetAnswer, pixel: Pixel = centre(), name = assetName(asset)): Promise<void> {
+  if (!(await ensureScene())) return;
+  const { point_m, normal } = await placeAt(pixel);
+  const bounds = boundsOf(asset, null);
+  const scale = bounds ? sensibleScale(bounds) : 1;
+  const pose = standOn({ ...UPRIGHT, scale }, bounds, point_m ?? [0, 0, 0], normal ?? UP);
+  const id = freeId(name);
+  if (!(await change("POST", "/objects", { id, asset: asset.asset, pose }))) return;
+  selectObject(id);
+  announce(`${id} was added.`);
+  if (bounds && scale !== 1) {
+    const edge = longestEdge(bounds);
+    toast(`${id} is ${size(edge)} long in its file; it was added at scale ${trimmed(scale, 9)}. Change it under Scale.`);
+  }
+}
+
+function centre(): Pixel {
+  const { width, height } = pictureSize.value ?? { width: 0, height: 0 };
+  return [(width - 1) / 2, (height - 1) / 2];
+}
+
+/** A name for a new object: the file's, with a number where it is taken. */
+function freeId(fileName: string): string {
+  const stem = fileName.replace(/\.[^.]*$/, "").slice(0, 100) || "object";
+  const taken = new Set(objects.value.map((item) => item.id));
+  let id = stem;
+  for (let number = 2; taken.has(id); number++) id = `${stem} ${number}`;
+  return id;
+}
+
+async function ensureScene(): Promise<boolean> {
+  return sceneDocument.value !== null || (await newScene("my scene")) !== undefined;
+}
+
+export async function newScene(name: string): Promise<SceneAnswer | undefined> {
+  const made = await attempt(() => request<SceneAnswer>("POST", `${API}/scenes`, { body: { name } }));
+  return made && activateScene(made.id);
+}
+
+export async function activateScene(id: string): Promise<SceneAnswer | undefined> {
+  const answer = await attempt(() => request<SceneAnswer>("POST", `${API}/scenes/${id}/activate`));
+  if (!answer) return undefined;
+  selectObject(null);
+  await readScene();
+  takeScene(answer);
+  await readScenes();
+  return answer;
+}
+
+export async function duplicateScene(id: string): Promise<void> {
+  const made = await attempt(() => request<SceneAnswer>("POST", `${API}/scenes/${id}/duplicate`));
+  if (made) await activateScene(made.id);
+}
+
+export async function deleteScene(id: string): Promise<void> {
+  await attempt(() => request("DELETE", `${API}/scenes/${id}`));
+  await readScenes();
+}
+
+export async function removeObject(id: string): Promise<void> {
+  const removed = await change("DELETE", `/objects/${encodeURIComponent(id)}`);
+  if (removed) announce(`${id} was removed; undo brings it back.`);
+}
+
+export async function duplicateObject(id: string): Promise<void> {
+  const item = objects.value.find((each) => each.id === id);
+  if (!item) return;
+  const [x, y, z] = item.pose.translation_m;
+  const copy = { ...item, id: freeId(id), pose: { ...item.pose, translation_m: [x + 0.05, y, z] } };
+  if (await change("POST", "/objects", copy)) selectObject(copy.id);
+}
+
+export function setVisible(id: string, visible: boolean): Promise<number | null> {
+  return edit(objectTarget(id), { visible });
+}
+
+/** Stand an object on what the picture shows at a pixel. */
+export async function placeObject(id: string, pixel: Pixel): Promise<void> {
+  const item = objects.value.find((each) => each.id === id);
+  const found = await pick(pixel);
+  if (!item || !found) return;
+  if (!found.point_m || found.object === id) {
+    toast(found.object === id ? "Click beside the object, where it is to stand." : "No surface was seen there; click elsewhere.");
+    return;
+  }
+  await edit(objectTarget(id), { pose: standOn(item.pose, boundsByObject.value.get(id) ?? null, found.point_m, found.normal ?? UP) });
+}
+
+export async function addLight(type: LightType): Promise<void> {
+  const index = lights.value?.manual.length ?? 0;
+  if (await change("POST", "/lights/manual", { type })) selectLight(index);
+}
+
+export async function replaceLight(index: number, light: Partial<ManualLight>): Promise<void> {
+  await change("PUT", `/lights/manual/${index}`, light, { strict: true });
+}
+
+export async function removeLight(index: number): Promise<void> {
+  if (await change("DELETE", `/lights/manual/${index}`, undefined, { strict: true })) {
+    selectLight(null);
+    announce("The light was removed; undo brings it back.");
+  }
+}
+
+export function setMethod(name: MethodName): Promise<number | null> {
+  return edit(partTarget("method"), { name });
+}
+
+export function setView(name: View): Promise<number | null> {
+  return edit(partTarget("output"), { view: name });
+}
+
+export function methodOf(name: MethodName): Method | { name: MethodName } {
+  const current = sceneDocument.value?.method;
+  return current?.name === name ? current : { name };
+}

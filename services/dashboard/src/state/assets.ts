@@ -1,0 +1,58 @@
+// Uploaded files, and those on their way.
+import { computed, signal } from "@preact/signals";
+import { API, request } from "../api/http";
+import type { AssetAnswer } from "../api/types";
+import { uploadAsset } from "../api/upload";
+import { boundsOfObject, type Bounds } from "../math/bounds";
+import { objects } from "./scene";
+import { announce, attempt } from "./toasts";
+
+export interface Upload {
+  readonly id: number;
+  readonly name: string;
+  /** 0..1; 1 = the service checks the file. */
+  readonly share: number;
+}
+
+export const assets = signal<readonly AssetAnswer[]>([]);
+export const uploads = signal<readonly Upload[]>([]);
+let count = 0;
+
+export const boundsByObject = computed<ReadonlyMap<string, Bounds>>(() => {
+  const found = new Map<string, Bounds>();
+  for (const item of objects.value) {
+    const bounds = boundsOfObject(item, assets.value);
+    if (bounds) found.set(item.id, bounds);
+  }
+  return found;
+});
+
+export async function readAssets(): Promise<void> {
+  const found = await attempt(() => request<readonly AssetAnswer[]>("GET", `${API}/assets`));
+  if (found) assets.value = found;
+}
+
+/** Send a file; a refusal is told. */
+export async function upload(file: File): Promise<AssetAnswer | undefined> {
+  const id = ++count;
+  uploads.value = [...uploads.value, { id, name: file.name, share: 0 }];
+  const progress = (share: number): void => {
+    uploads.value = uploads.value.map((each) => (each.id === id ? { ...each, share } : each));
+  };
+  const asset = await attempt(() => uploadAsset(file, progress));
+  uploads.value = uploads.value.filter((each) => each.id !== id);
+  if (asset) {
+    announce(`${file.name} is uploaded.`);
+    await readAssets();
+  }
+  return asset;
+}
+
+export async function removeAsset(asset: AssetAnswer): Promise<void> {
+  await attempt(() => request("DELETE", `${API}/assets/${asset.asset}`));
+  await readAssets();
+}
+
+export function assetName(asset: AssetAnswer): string {
+  return asset.names[0] ?? asset.asset;
+}

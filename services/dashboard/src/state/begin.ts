@@ -1,0 +1,46 @@
+// Beginning and end of a session with the service.
+import { signal } from "@preact/signals";
+import { API, ProblemError, request } from "../api/http";
+import { keepToken, phase, signInProblem, token } from "../api/session";
+import type { Settings } from "../api/types";
+import { startPicture, stopPicture } from "../live/picture";
+import { startEvents, stopEvents } from "./events";
+import { readSchemas } from "../forms/schemas";
+
+const RETRY_MS = 3000;
+
+export const needsToken = signal(false);
+export const uploadLimitBytes = signal(Infinity);
+
+/** Ask the service what it needs; the sign-in page comes up where that is a token. */
+export async function begin(): Promise<void> {
+  try {
+    const settings = await request<Settings>("GET", `${API}/settings`);
+    needsToken.value = settings.needs_token;
+    uploadLimitBytes.value = settings.upload_limit_bytes;
+    await readSchemas();
+    phase.value = "ready";
+    startEvents();
+    startPicture();
+  } catch (fault) {
+    if (fault instanceof ProblemError && fault.status === 401) return;
+    phase.value = "unreachable";
+    setTimeout(() => void begin(), RETRY_MS);
+  }
+}
+
+export async function signIn(given: string): Promise<void> {
+  signInProblem.value = "";
+  keepToken(given.trim());
+  await begin();
+}
+
+export function signOut(): void {
+  stopEvents();
+  stopPicture();
+  keepToken(null);
+  signInProblem.value = "";
+  phase.value = "sign-in";
+}
+
+export const isSignedIn = (): boolean => token.value !== null;

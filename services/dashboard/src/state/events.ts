@@ -1,0 +1,102 @@
+// Events of the service, which keep every browser in step.
+import { API } from "../api/http";
+import { role, version } from "../api/session";
+import type { ProcessAnswer, Recording, Replay } from "../api/types";
+import { ReconnectingSocket } from "../live/socket";
+import { readAssets } from "./assets";
+import { readRevisions } from "./history";
+import { readState, takeReport } from "./processes";
+import { readScene, readScenes, scene } from "./scene";
+import { readRecordings, readReplay, readSnapshots, replay } from "./takes";
+import { toast } from "./toasts";
+
+interface Event {
+  readonly type: string;
+  readonly [key: string]: unknown;
+}
+
+const socket = new ReconnectingSocket(`${API}/events`, (message) => {
+  if (typeof message.data === "string") void take(JSON.parse(message.data) as Event);
+});
+
+export function startEvents(): void {
+  socket.start();
+}
+
+export function stopEvents(): void {
+  socket.stop();
+}
+
+/** Read everything: at the start, and after events were missed. */
+export async function readAll(): Promise<void> {
+  await Promise.all([readScene(), readScenes(), readAssets(), readState(), readRecordings(), readReplay(), readSnapshots()]);
+  await readRevisions();
+}
+
+async function take(event: Event): Promise<void> {
+  switch (event.type) {
+    case "hello":
+      return takeHello(event as unknown as Hello);
+    case "lost":
+      return readAll();
+    case "scene":
+      return takeSceneEvent(event as unknown as SceneEvent);
+    case "asset":
+      return readAssets();
+    case "process":
+      { takeReport(event as unknown as ProcessAnswer); return; }
+    case "recording":
+      return takeRecording(event as unknown as Partial<Recording>);
+    case "replay":
+      replay.value = event as unknown as Replay;
+      return;
+    case "snapshot":
+      return readSnapshots();
+    case "picture":
+      { takePicture(event as unknown as PictureEvent); return; }
+    case "notice":
+      { toast(String(event.text)); return; }
+  }
+}
+
+interface Hello {
+  readonly version: string;
+  readonly role: "view" | "control";
+}
+
+interface SceneEvent {
+  readonly id: string;
+  readonly revision: number;
+  readonly active: boolean;
+}
+
+interface PictureEvent {
+  readonly scene_id: string;
+  readonly revision: number;
+  readonly state: "shown" | "pending" | "refused";
+  readonly detail: string;
+}
+
+/** The first event of each connection: what happened before it is not known. */
+async function takeHello(hello: Hello): Promise<void> {
+  role.value = hello.role;
+  version.value = hello.version;
+  await readAll();
+}
+
+async function takeSceneEvent(event: SceneEvent): Promise<void> {
+  const current = scene.value;
+  const isNews = event.active ? current?.id !== event.id || event.revision > current.revision : current?.id === event.id;
+  await readScenes();
+  if (isNews) await readScene();
+  await readRevisions();
+}
+
+function takePicture(event: PictureEvent): void {
+  if (event.state === "refused" && event.scene_id === scene.value?.id) toast(event.detail, "error");
+}
+
+async function takeRecording(event: Partial<Recording>): Promise<void> {
+  if (event.detail) toast(event.detail, "error");
+  await readRecordings();
+}

@@ -1,0 +1,82 @@
+// Recordings, replay and snapshots.
+import { computed, signal } from "@preact/signals";
+import { API, request } from "../api/http";
+import type { Recording, Replay, ReplayChange, Snapshot, WantedPicture } from "../api/types";
+import { attempt } from "./toasts";
+
+export const recordings = signal<readonly Recording[]>([]);
+export const replay = signal<Replay | null>(null);
+export const snapshots = signal<readonly Snapshot[]>([]);
+export const isTakingSnapshot = signal(false);
+
+export const running = computed(() => recordings.value.find(isGrowing) ?? null);
+
+export function isGrowing(recording: Recording): boolean {
+  return recording.state === "waiting" || recording.state === "recording";
+}
+
+export async function readRecordings(): Promise<void> {
+  const found = await attempt(() => request<readonly Recording[]>("GET", `${API}/recordings`));
+  if (found) recordings.value = found;
+}
+
+export async function readReplay(): Promise<void> {
+  const found = await attempt(() => request<Replay>("GET", `${API}/replay`));
+  if (found) replay.value = found;
+}
+
+export async function readSnapshots(): Promise<void> {
+  const found = await attempt(() => request<readonly Snapshot[]>("GET", `${API}/snapshots`));
+  if (found) snapshots.value = found;
+}
+
+export async function startRecording(): Promise<void> {
+  await attempt(() => request("POST", `${API}/recordings`, { body: {} }));
+  await readRecordings();
+}
+
+export async function stopRecording(id: string): Promise<void> {
+  await attempt(() => request("POST", `${API}/recordings/${id}/stop`));
+  await readRecordings();
+}
+
+export async function deleteRecording(id: string): Promise<void> {
+  await attempt(() => request("DELETE", `${API}/recordings/${id}`));
+  await readRecordings();
+}
+
+/** Show a recording in place of the camera; `settings` are those of the replay so far. */
+export async function showRecording(id: string, settings: Partial<Replay> = {}): Promise<void> {
+  const { position_s = 0, playing = true, rate = 1, loop = true } = settings;
+  const body = { recording: id, position_s, playing, rate, loop };
+  const shown = await attempt(() => request<Replay>("PUT", `${API}/replay`, { body }));
+  if (shown) replay.value = shown;
+}
+
+export async function changeReplay(body: ReplayChange): Promise<void> {
+  const shown = await attempt(() => request<Replay>("PATCH", `${API}/replay`, { body }));
+  if (shown) replay.value = shown;
+}
+
+export async function backToLive(): Promise<void> {
+  await attempt(() => request("DELETE", `${API}/replay`));
+  await readReplay();
+}
+
+/** Take pictures of one frame; without `pictures`, of every view. */
+export async function takeSnapshot(
+  pictures: readonly WantedPicture[] | null,
+  exr: boolean,
+): Promise<Snapshot | undefined> {
+  isTakingSnapshot.value = true;
+  const body = { ...(pictures ? { pictures } : {}), exr };
+  const taken = await attempt(() => request<Snapshot>("POST", `${API}/snapshots`, { body }));
+  isTakingSnapshot.value = false;
+  if (taken) await readSnapshots();
+  return taken;
+}
+
+export async function deleteSnapshot(id: string): Promise<void> {
+  await attempt(() => request("DELETE", `${API}/snapshots/${id}`));
+  await readSnapshots();
+}

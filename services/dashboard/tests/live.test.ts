@@ -1,0 +1,55 @@
+import { describe, expect, it } from "vitest";
+import { droppedFrames, parseLiveMessage } from "../src/live/message";
+import { backoff } from "../src/live/socket";
+import { leadingPasses, OTHERS, stacked, timeOf, type Sample } from "../src/live/telemetry";
+
+function message(header: object, jpeg: readonly number[]): ArrayBuffer {
+  const text = new TextEncoder().encode(JSON.stringify(header));
+  const bytes = new Uint8Array(4 + text.length + jpeg.length);
+  new DataView(bytes.buffer).setUint32(0, text.length, true);
+  bytes.set(text, 4);
+  bytes.set(jpeg, 4 + text.length);
+  return bytes.buffer;
+}
+
+function sample(at: number, passes: Record<string, number>): Sample {
+  return { at, age: 10, rate: 30, passes };
+}
+
+describe("a message of the live picture", () => {
+  it("comes apart into header and picture", () => {
+    const { header, jpeg } = parseLiveMessage(message({ frame_id: 7, renderer: "é" }, [255, 216, 255]));
+    expect(header.frame_id).toBe(7);
+    expect(header.renderer).toBe("é");
+    expect([...jpeg]).toEqual([255, 216, 255]);
+  });
+
+  it("is refused where it is cut short", () => {
+    expect(() => parseLiveMessage(message({ frame_id: 7 }, []).slice(0, 8))).toThrow();
+    expect(() => parseLiveMessage(new ArrayBuffer(2))).toThrow();
+  });
+
+  it("counts a lost frame once, though depth and pose went with it", () => {
+    expect(droppedFrames({ "color.camera": 3, "clean_depth.camera": 3, "pose.camera": 2 })).toBe(3);
+  });
+});
+
+describe("the connection", () => {
+  it("waits longer after each failure, up to ten seconds", () => {
+    expect([0, 1, 2, 3, 10].map(backoff)).toEqual([500, 1000, 2000, 4000, 10_000]);
+  });
+});
+
+describe("the plots", () => {
+  const all = [sample(0, { a: 1, b: 5, c: 2, d: 1 }), sample(1, { a: 1, b: 4, c: 3 })];
+
+  it("name the costliest passes and gather the rest", () => {
+    expect(leadingPasses(all, 2)).toEqual(["b", "c", OTHERS]);
+    expect(leadingPasses(all, 4)).toEqual(["b", "c", "a", "d"]);
+    expect(timeOf(all[0]!, OTHERS, ["b", "c", OTHERS])).toBe(2);
+  });
+
+  it("stack to the sum of all passes", () => {
+    expect(stacked(all, ["b", "c", OTHERS])).toEqual([[5, 4], [7, 7], [9, 8]]);
+  });
+});

@@ -1,0 +1,4 @@
+// The parts of a browser that modules touch when they are loaded.
+import { vi } from "vitest";
+
+vi.stubGlobal("sessionStorage", { getItem: () => null, setItem: () => undefined, removeItem: () => undefined });

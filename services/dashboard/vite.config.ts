@@ -1,0 +1,21 @@
+import { defineConfig } from "vitest/config";
+
+// The service that `npm run dev` hands requests to.
+const SERVICE = "http://127.0.0.1:8000";
+
+export default defineConfig({
+  base: "./",
+  build: {
+    target: "es2022",
+    assetsInlineLimit: 0, // the page's policy allows no data: addresses
+    modulePreload: { polyfill: false },
+    chunkSizeWarningLimit: 600,
+  },
+  server: {
+    proxy: {
+      "/api": { target: SERVICE, ws: true },
+      "/openapi.json": { target: SERVICE },
+    },
+  },
+  test: { include: ["tests/**/*.test.ts"], setupFiles: ["tests/setup.ts"] },
+});

@@ -1,0 +1,65 @@
+"""Whether a process answers: a render server on its control socket, a publisher by its reports, an API over HTTP."""
+
+import urllib.error
+import urllib.request
+import uuid
+
+from protocol.envelope import decode
+from protocol.errors import DeltalightError
+from protocol.keys import Keys, KeySettings
+from protocol.messages import ControlRequest, StatsMessage
+from protocol.transport import Receiver, RequestClient
+
+HEALTH_PATH = "/api/v1/health"
+
+
+def check_health(address: str, *, streams: bool, timeout_s: float) -> str | None:
+    """Return what is wrong as a sentence, or None.
+
+    Raises:
+        DeltalightError: the address is not understood, or needs keys that are not there.
+    """
+    if address.startswith(("http://", "https://")):
+        return _ask_api(address.rstrip("/"), timeout_s)
+    keys = _keys(address)
+    return _await_report(address, keys, timeout_s) if streams else _ask_control(address, keys, timeout_s)
+
+
+def _keys(endpoint: str) -> Keys | None:
+    from services.settings import load_configuration
+
+    return load_configuration().section("keys", KeySettings).load([endpoint])
+
+
+def _ask_api(address: str, timeout_s: float) -> str | None:
+    try:
+        with urllib.request.urlopen(address + HEALTH_PATH, timeout=timeout_s):
+            return None
+    except urllib.error.HTTPError as fault:
+        return f"{address} answers with status {fault.code}; its log says why."
+    except (OSError, ValueError) as fault:
+        return f"No API answers at {address} ({fault}); start it, or correct the address."
+
+
+def _ask_control(endpoint: str, keys: Keys | None, timeout_s: float) -> str | None:
+    client = RequestClient(endpoint, keys=keys)
+    try:
+        reply = client.request(ControlRequest(node="ping", id=uuid.uuid4().hex, op="ping"), timeout_s)
+    except DeltalightError as fault:
+        return str(fault)
+    finally:
+        client.close()
+    return reply.error
+
+
+def _await_report(endpoint: str, keys: Keys | None, timeout_s: float) -> str | None:
+    receiver = Receiver([endpoint], ["stats"], keys=keys)
+    try:
+        reports = receiver.latest(timeout_s) or {}
+    finally:
+        receiver.close()
+    for multipart in reports.values():
+        message, _ = decode(multipart)
+        if isinstance(message, StatsMessage):
+            return None
+    return f"No report came from {endpoint} within {timeout_s:g} s; start its process, or look into its log."

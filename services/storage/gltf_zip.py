@@ -1,0 +1,155 @@
+"""A .zip with one glTF and its files, made one .glb (glTF 2.0, sections 3.6.1.2 and 4.4)."""
+
+import base64
+import binascii
+import json
+import posixpath
+import stat
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+from protocol.errors import DeltalightError
+from services.storage.asset_child import Facts
+
+MAX_ENTRIES = 1000
+_JSON_CHUNK, _BIN_CHUNK = 0x4E4F534A, 0x004E4942
+_IMAGE_TYPES = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg", ".webp": "image/webp"}
+_ENCRYPTED = 1  # general purpose flag, bit 0 (APPNOTE 4.4.4)
+
+
+def repack(path: Path, out: str, limit: str) -> Facts:
+    """Write the glTF of an archive as one .glb file (in the child); `limit` is its greatest size unpacked, bytes.
+
+    The same archive gives the same file to the bit.
+
+    Raises:
+        DeltalightError: what is wrong with the archive.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            glb = _repacked(_Archive(archive, path, int(limit)))
+    except (zipfile.BadZipFile, NotImplementedError, zlib.error, EOFError, OSError) as error:
+        raise DeltalightError(f"{path} is a damaged or unusual .zip ({error}); pack it again.") from error
+    Path(out).write_bytes(glb)
+    return {"size_bytes": len(glb)}
+
+
+class _Archive:
+    """The files of an archive by their paths; looked through before anything is unpacked."""
+
+    def __init__(self, archive: zipfile.ZipFile, path: Path, limit_bytes: int) -> None:
+        self.path = path
+        self._archive = archive
+        listed = [each for each in archive.infolist() if not each.is_dir()]
+        if len(listed) > MAX_ENTRIES:
+            raise DeltalightError(f"{path} holds more than {MAX_ENTRIES} files; pack one glTF and its files.")
+        for entry in listed:
+            self._check(entry)
+        if sum(entry.file_size for entry in listed) > limit_bytes:
+            raise DeltalightError(f"{path} holds more than {limit_bytes >> 20} MB unpacked; simplify it.")
+        self.entries = {entry.filename: entry for entry in listed if not _is_litter(entry.filename)}
+        if len(self.entries) < len([entry for entry in listed if not _is_litter(entry.filename)]):
+            raise DeltalightError(f"{path} holds two files of the same name; pack it again.")
+
+    def read(self, name: str) -> bytes:
+        if name not in self.entries:
+            raise DeltalightError(
+                f"{self.path} does not hold {name!r:.200}, which its glTF names; pack it too."
+            )
+        return self._archive.read(self.entries[name])  # never more than the size that was checked
+
+    def _check(self, entry: zipfile.ZipInfo) -> None:
+        name = entry.filename
+        steps = name.split("/")
+        if name.startswith("/") or "\\" in name or ":" in steps[0] or ".." in steps:
+            raise DeltalightError(
+                f"{self.path} holds the name {name!r:.200}, outside its own folder; pack it again."
+            )
+        if stat.S_ISLNK(entry.external_attr >> 16):
+            raise DeltalightError(f"{self.path} holds the link {name!r:.200}; pack the file itself.")
+        if entry.flag_bits & _ENCRYPTED:
+            raise DeltalightError(f"{self.path} is encrypted; pack it without a password.")
+
+
+def _is_litter(name: str) -> bool:
+    """What file managers add: it may even end in .gltf."""
+    return name.startswith("__MACOSX/") or posixpath.basename(name).startswith(".")
+
+
+def _repacked(archive: _Archive) -> bytes:
+    models = [name for name in archive.entries if name.lower().endswith((".gltf", ".glb"))]
+    if len(models) != 1:
+        found = "two or more glTF files" if models else "no glTF file"
+        raise DeltalightError(f"{archive.path} holds {found}; pack one .gltf with the files that it names.")
+    data = archive.read(models[0])
+    if models[0].lower().endswith(".glb"):
+        return data
+    try:
+        document = json.loads(data.decode("utf-8-sig"))
+        joined, binary = _joined(document, archive, posixpath.dirname(models[0]))
+        return _glb(json.dumps(joined, separators=(",", ":")).encode(), binary)
+    except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
+        raise DeltalightError(
+            f"{archive.path} holds no valid glTF 2 file ({error!r:.100}); export it again."
+        ) from error
+
+
+def _joined(document: dict[str, Any], archive: _Archive, folder: str) -> tuple[dict[str, Any], bytes]:
+    """Put all buffers, then all pictures, into one; buffer views move along."""
+    binary, starts = bytearray(), []
+    for buffer in document.get("buffers", []):
+        starts.append(_append(binary, _content(buffer["uri"], archive, folder)[: int(buffer["byteLength"])]))
+    views = [
+        {**view, "buffer": 0, "byteOffset": view.get("byteOffset", 0) + starts[view["buffer"]]}
+        for view in document.get("bufferViews", [])
+    ]
+    images = []
+    for image in document.get("images", []):
+        if "uri" not in image:
+            images.append(image)
+            continue
+        content = _content(image["uri"], archive, folder)
+        views.append({"buffer": 0, "byteOffset": _append(binary, content), "byteLength": len(content)})
+        rest = {key: value for key, value in image.items() if key != "uri"}
+        images.append({**rest, "bufferView": len(views) - 1, "mimeType": _image_type(image)})
+    made = {"buffers": [{"byteLength": len(binary)}], "bufferViews": views, "images": images}
+    return {**document, **{key: value for key, value in made.items() if value and binary}}, bytes(binary)
+
+
+def _append(binary: bytearray, content: bytes) -> int:
+    """Add a piece and return where it begins; every accessor type is aligned to four bytes."""
+    start = len(binary)
+    binary += content + bytes(-len(content) % 4)
+    return start
+
+
+def _content(uri: str, archive: _Archive, folder: str) -> bytes:
+    if uri.startswith("data:"):
+        try:
+            return base64.b64decode(uri.partition("base64,")[2], validate=True)
+        except binascii.Error as error:
+            raise DeltalightError(
+                f"{archive.path} holds a glTF with damaged data in it; export it again."
+            ) from error
+    return archive.read(posixpath.normpath(posixpath.join(folder, unquote(uri))))
+
+
+def _image_type(image: dict[str, Any]) -> str:
+    uri = str(image["uri"])
+    if uri.startswith("data:"):
+        return uri[5:].partition(";")[0]
+    return str(image.get("mimeType") or _IMAGE_TYPES.get(posixpath.splitext(uri.lower())[1], "image/png"))
+
+
+def _glb(text: bytes, binary: bytes) -> bytes:
+    chunks = _chunk(_JSON_CHUNK, text + b" " * (-len(text) % 4))
+    if binary:
+        chunks += _chunk(_BIN_CHUNK, binary)
+    return b"glTF" + (2).to_bytes(4, "little") + (12 + len(chunks)).to_bytes(4, "little") + chunks
+
+
+def _chunk(kind: int, data: bytes) -> bytes:
+    return len(data).to_bytes(4, "little") + kind.to_bytes(4, "little") + data

@@ -1,0 +1,157 @@
+"""Small pictures of meshes and environment maps, drawn on the processor (in the limited child process)."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from embreex.mesh_construction import TriangleMesh as EmbreeMesh
+from embreex.rtcore_scene import EmbreeScene
+from jaxtyping import Float32, Int
+
+from protocol.radiance_files import read_linear
+from render_server.scene.asset_check import check_mesh_file
+from render_server.scene.environment import LUMINANCE
+from render_server.scene.mesh import TriangleMesh, load_mesh
+from services.storage.asset_child import Facts
+
+SIZE = 256
+SAMPLES = 2  # rays along each edge of a pixel
+MARGIN = 1.06
+# Three-quarter view: from the front right and above, so far (in radii of the object) that lines hardly converge.
+AZIMUTH_DEG, ELEVATION_DEG, DISTANCE = -55.0, 25.0, 4.0
+# In camera axes (right, up, towards the camera): a key light from the upper left, a weaker one from the right,
+# and light from everywhere. White turned to the key light is just not clipped.
+KEY, FILL = np.array([-0.5, 0.7, 0.5], np.float32), np.array([0.9, 0.1, 0.4], np.float32)
+KEY_SHARE, FILL_SHARE, AMBIENT_SHARE = 0.65, 0.2, 0.15
+TEXTURE_EDGE = 2 * SIZE  # a texture seen whole is not finer than the rays
+MIDDLE_GREY = 0.18  # where the mean logarithm of a map's luminance lands (Reinhard et al. 2002)
+
+Pixels = Float32[np.ndarray, "h w 4"]
+
+
+def draw_mesh(path: Path, out: str) -> Facts:
+    """Write a three-quarter view of a mesh as PNG on a transparent ground.
+
+    Raises:
+        DeltalightError: the mesh cannot be loaded.
+    """
+    is_y_up = check_mesh_file(path) == ".glb"
+    meshes = load_mesh(path)
+    _write(out, _reduced(_Shot(meshes, is_y_up=is_y_up).rays(SIZE * SAMPLES)))
+    return {}
+
+
+def draw_map(path: Path, out: str) -> Facts:
+    """Write a latitude-longitude map as PNG, tone-mapped (Reinhard et al. 2002), in the middle of the picture.
+
+    Raises:
+        DeltalightError: the map cannot be loaded.
+    """
+    small = cv2.resize(read_linear(path), (SIZE, SIZE // 2), interpolation=cv2.INTER_AREA)
+    luminance = small @ LUMINANCE
+    mean = np.exp(np.log(luminance + 1e-4 * luminance.max() + 1e-9).mean())
+    scaled = MIDDLE_GREY / mean * luminance
+    shown = small * (MIDDLE_GREY / mean / (1 + scaled))[..., None]
+    picture = np.zeros((SIZE, SIZE, 4), np.float32)
+    picture[SIZE // 4 : SIZE // 4 + SIZE // 2] = np.dstack([shown, np.ones_like(luminance)])
+    _write(out, picture)
+    return {}
+
+
+class _Shot:
+    """Meshes before a camera, ready to be hit by rays; lengths are in radii of the whole."""
+
+    def __init__(self, meshes: list[TriangleMesh], *, is_y_up: bool) -> None:
+        self._meshes = meshes
+        self._camera_from_file = _camera_axes() @ (_Z_FROM_Y if is_y_up else np.eye(3, dtype=np.float32))
+        bounds = np.stack([mesh.bounds() for mesh in meshes])
+        low, high = bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)
+        radius = max(float(np.linalg.norm(high - low)) / 2, 1e-9)
+        self._scene, self._places = EmbreeScene(), []
+        for mesh in meshes:
+            centred = (mesh.positions - (low + high) / 2) / radius @ self._camera_from_file.T
+            placed = np.ascontiguousarray(centred - [0, 0, DISTANCE], np.float32)
+            EmbreeMesh(self._scene, placed, mesh.triangles)
+            self._places.append(placed[mesh.triangles.ravel()])
+
+    def rays(self, size: int) -> Pixels:
+        """Cast size x size rays about what is seen; gives premultiplied linear colour and coverage."""
+        used = np.concatenate(self._places)
+        seen = used[:, :2] / -used[:, 2:]
+        middle = (seen.min(axis=0) + seen.max(axis=0)) / 2
+        reach = MARGIN * float(np.ptp(seen, axis=0).max()) / 2
+        steps = (2 * (np.arange(size) + 0.5) / size - 1) * reach
+        right, up = np.meshgrid(middle[0] + steps, middle[1] - steps)
+        directions = np.dstack([right, up, -np.ones_like(right)]).reshape(-1, 3).astype(np.float32)
+        hits = self._scene.run(np.zeros_like(directions), directions, output=1)
+        pixels = np.zeros((size * size, 4), np.float32)
+        for index, mesh in enumerate(self._meshes):
+            rays = np.flatnonzero(hits["geomID"] == index)
+            corners = mesh.triangles[hits["primID"][rays]]
+            u, v = hits["u"][rays], hits["v"][rays]
+            weights = np.stack([1 - u - v, u, v], axis=1)
+            pixels[rays, :3] = self._shaded(mesh, corners, weights, directions[rays])
+            pixels[rays, 3] = 1
+        return pixels.reshape(size, size, 4)
+
+    def _shaded(
+        self,
+        mesh: TriangleMesh,
+        corners: Int[np.ndarray, "n 3"],
+        weights: Float32[np.ndarray, "n 3"],
+        directions: Float32[np.ndarray, "n 3"],
+    ) -> Float32[np.ndarray, "n 3"]:
+        """Radiance of Lambertian surfaces towards the camera; both sides of a triangle are lit."""
+        normals = _mixed(mesh.normals, corners, weights) @ self._camera_from_file.T
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
+        normals *= np.where((normals * directions).sum(axis=1, keepdims=True) > 0, -1, 1)
+        light = np.full((len(normals), 1), AMBIENT_SHARE, np.float32)
+        for share, place in ((KEY_SHARE, KEY), (FILL_SHARE, FILL)):
+            light += share * np.maximum(normals @ (place / np.linalg.norm(place)), 0)[:, None]
+        color = np.broadcast_to(mesh.material.base_color, normals.shape)
+        if mesh.colors is not None:
+            color = color * _mixed(mesh.colors, corners, weights)
+        if mesh.uv is not None and mesh.material.base_color_texture is not None:
+            color = color * _texels(mesh.material.base_color_texture, _mixed(mesh.uv, corners, weights))
+        return np.asarray(color * light + mesh.material.emission, np.float32)
+
+
+_Z_FROM_Y = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], np.float32)
+
+
+def _camera_axes() -> Float32[np.ndarray, "3 3"]:
+    """Rotation from z-up axes to those of the camera: right, up, towards it."""
+    azimuth, elevation = np.radians([AZIMUTH_DEG, ELEVATION_DEG])
+    back = np.array(
+        [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
+    )
+    right = np.array([-np.sin(azimuth), np.cos(azimuth), 0])
+    return np.stack([right, np.cross(back, right), back]).astype(np.float32)
+
+
+def _mixed(
+    values: Float32[np.ndarray, "k c"], corners: Int[np.ndarray, "n 3"], weights: Float32[np.ndarray, "n 3"]
+) -> Float32[np.ndarray, "n c"]:
+    return np.asarray(np.einsum("nkc,nk->nc", values[corners], weights), np.float32)
+
+
+def _texels(texture: np.ndarray, uv: Float32[np.ndarray, "n 2"]) -> Float32[np.ndarray, "n 3"]:
+    """Nearest texels of a repeated texture, made coarser first where it is finer than the picture."""
+    rows, columns = (min(edge, TEXTURE_EDGE) for edge in texture.shape[:2])
+    coarse = cv2.resize(texture.astype(np.float32), (columns, rows), interpolation=cv2.INTER_AREA)
+    column, row = (np.floor(uv * [columns, rows]).astype(np.int64) % [columns, rows]).T
+    return np.asarray(coarse[row, column])
+
+
+def _reduced(pixels: Pixels) -> Pixels:
+    """Average the rays of each pixel; colour is that of the covered part."""
+    mean = cv2.resize(pixels, (SIZE, SIZE), interpolation=cv2.INTER_AREA)
+    mean[..., :3] /= np.maximum(mean[..., 3:], 1e-6)
+    return np.asarray(mean)
+
+
+def _write(out: str, picture: Pixels) -> None:
+    linear = np.clip(picture[..., :3], 0, 1)
+    coded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    codes = np.rint(255 * np.dstack([coded[..., ::-1], picture[..., 3]])).astype(np.uint8)
+    Path(out).write_bytes(cv2.imencode(".png", codes)[1].tobytes())

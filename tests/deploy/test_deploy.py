@@ -1,0 +1,157 @@
+"""What `deploy/` promises: files that their own tools accept, and commands that run as they stand there."""
+
+import re
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+import yaml
+from prometheus_client.parser import text_string_to_metric_families
+
+from services import ports
+
+ROOT = Path(__file__).parents[2]
+DEPLOY = ROOT / "deploy"
+COMPOSE = ROOT / "docker-compose.yml"
+NVIDIA = DEPLOY / "docker-compose.nvidia.yml"
+TOKEN = "a-token-of-at-least-thirty-two-characters"
+VARIABLE = re.compile(r"\$\{[A-Z_]+:-([^}]*)\}")
+METRIC = re.compile(r"\bdeltalight_\w+")
+
+
+def compose_tool() -> list[str]:
+    """`docker compose` where the plugin is there, else `docker-compose`."""
+    plugin = ["docker", "compose"]
+    if shutil.which("docker") and subprocess.run([*plugin, "version"], capture_output=True).returncode == 0:
+        return plugin
+    if shutil.which("docker-compose") is None:
+        pytest.skip("neither `docker compose` nor docker-compose is installed")
+    return ["docker-compose"]
+
+
+def compose() -> dict[str, Any]:
+    """docker-compose.yml with the defaults of its variables."""
+    document: dict[str, Any] = yaml.safe_load(VARIABLE.sub(r"\1", COMPOSE.read_text()))
+    return document
+
+
+@pytest.mark.parametrize("files", [[COMPOSE], [COMPOSE, NVIDIA]], ids=["mesa", "nvidia"])
+def test_compose_accepts_the_files(files: list[Path]) -> None:
+    options = [part for file in files for part in ("--file", str(file))]
+    for profile in ([], ["--profile", "monitoring"]):
+        done = subprocess.run(
+            [*compose_tool(), *options, *profile, "config"], cwd=ROOT, capture_output=True, text=True
+        )
+        assert done.returncode == 0, done.stderr
+    assert "graphics" in done.stdout or NVIDIA not in files
+
+
+def test_the_dockerfile_passes_its_linter() -> None:
+    done = subprocess.run(
+        [Path(sys.executable).with_name("hadolint"), DEPLOY / "Dockerfile"], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_every_target_and_mounted_file_of_compose_is_there() -> None:
+    targets = set(re.findall(r"^FROM \S+ AS (\S+)$", (DEPLOY / "Dockerfile").read_text(), re.MULTILINE))
+    overrides = yaml.safe_load(NVIDIA.read_text())["services"]
+    for service in (*compose()["services"].values(), *overrides.values()):
+        assert service.get("build", {}).get("target", "node") in targets
+        for mount in service.get("volumes", []):
+            source = mount.split(":")[0]
+            assert not source.startswith(".") or (ROOT / source).exists()
+
+
+def test_the_nvidia_command_is_the_other_one_without_software() -> None:
+    override = yaml.safe_load(NVIDIA.read_text())["services"]["server"]["command"]
+    ours = [word for word in compose()["services"]["server"]["command"] if word != "--allow-software"]
+    assert override == ours
+
+
+@contextmanager
+def running(words: list[str]) -> Iterator[None]:
+    child = subprocess.Popen([sys.executable, "-m", "services.cli", *words], cwd=ROOT)
+    try:
+        yield
+    finally:
+        child.terminate()
+        try:
+            child.wait(15)
+        except subprocess.TimeoutExpired:
+            child.kill()
+            child.wait()
+
+
+def healthy(words: list[str]) -> bool:
+    return subprocess.run([sys.executable, "-m", "services.cli", *words], cwd=ROOT).returncode == 0
+
+
+def test_the_commands_of_compose_run_and_their_health_checks_pass(tmp_path: Path) -> None:
+    """With the same sockets, secret and checks; only the places of files and the port are others."""
+    (port,) = ports.private_ports(1)
+    for folder in ("run", "data"):
+        (tmp_path / folder).mkdir()
+    secret = tmp_path / "control_token"
+    secret.write_text(TOKEN + "\n")
+    places = {
+        "/run/deltalight": str(tmp_path / "run"),
+        "/var/lib/deltalight": str(tmp_path / "data"),
+        "/recordings": str(ROOT / "services" / "demo_assets"),
+        "/run/secrets/control_token": str(secret),
+        "127.0.0.1:8000": f"127.0.0.1:{port}",
+    }
+
+    def here(words: list[str]) -> list[str]:
+        for inside, outside in places.items():
+            words = [word.replace(inside, outside) for word in words]
+        return words
+
+    services = {name: compose()["services"][name] for name in ("node", "server", "api")}
+    with ExitStack() as stack:
+        for name, service in services.items():
+            own = ["--port", str(port)] if name == "api" else []
+            stack.enter_context(running([*here(service["command"]), *own]))
+        for name, service in services.items():
+            check = here(service["healthcheck"]["test"])
+            assert check[:2] == ["CMD", "deltalight"]
+            deadline = time.monotonic() + 120
+            while not healthy(check[2:]):
+                assert time.monotonic() < deadline, f"{name} did not become healthy"
+        client = httpx.Client(base_url=f"http://127.0.0.1:{port}/api/v1", timeout=30)
+        assert client.get("/state").status_code == 401
+        client.headers["Authorization"] = f"Bearer {TOKEN}"
+        assert client.get("/state").json()["render_server"] == "answers"
+        scenes = client.get("/scenes").json()
+        assert [scene["active"] for scene in scenes] == [True], "the first start shows a scene"
+        check_metrics(client.get("/metrics").text)
+
+
+def check_metrics(text: str) -> None:
+    """Boards and alerts ask for names that the service gives."""
+    given = {sample.name for family in text_string_to_metric_families(text) for sample in family.samples}
+    families = {family.name for family in text_string_to_metric_families(text)}
+    asked = set(METRIC.findall((DEPLOY / "prometheus" / "alerts.yml").read_text()))
+    asked |= set(METRIC.findall((DEPLOY / "grafana" / "boards" / "deltalight.json").read_text()))
+    missing = {name for name in asked if name not in given and name.removesuffix("_total") not in families}
+    assert not missing
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not installed")
+def test_systemd_understands_the_unit(tmp_path: Path) -> None:
+    text = (DEPLOY / "systemd" / "deltalight-node.service").read_text()
+    program = tmp_path / "deltalight"
+    program.write_text("#!/bin/sh\n")
+    program.chmod(0o755)
+    unit = tmp_path / "deltalight-node.service"
+    unit.write_text(text.replace("/opt/deltalight/.venv/bin/deltalight", str(program)))
+    done = subprocess.run(["systemd-analyze", "verify", "--man=no", unit], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert str(unit.name) not in done.stderr, done.stderr

@@ -1,0 +1,149 @@
+"""A stand-in for node and render server that publishes composites, reports and fish-eye light; clients for them."""
+
+import itertools
+import json
+import struct
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+from websockets.sync.client import ClientConnection, connect
+
+from protocol.codecs import encode_color
+from protocol.envelope import encode
+from protocol.messages import CompositeMessage, StatsMessage
+from protocol.transport import Publisher
+from services import ports
+from tests.services.api_samples import RenderServer, RunningApi, running_api
+from tests.services.conftest import HEIGHT, IDENTITY, WIDTH, camera
+
+PERIOD_S = 0.02
+LIGHT = {"type": "sphere", "position_m": [0.0, 0.0, 2.0], "intensity": [2.0, 1.0, 1.0], "radius_m": 0.1}
+AROUND = {"type": "environment", "mean_radiance": [0.1, 0.1, 0.1]}
+
+
+class StandInStream:
+    """Publishes a composite every 20 ms, each tenth time a report too; `revision` is the scene's at the server."""
+
+    def __init__(self, port: int) -> None:
+        self.sent = 0
+        self.revision: int | None = None
+        self._stop = threading.Event()
+        self.publisher = Publisher(ports.endpoint(port))
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        self._stop.set()
+        self._thread.join()
+        self.publisher.close()
+
+    def _run(self) -> None:
+        jpeg = encode_color(np.random.default_rng(1).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8))
+        for number in itertools.count(1):
+            if self._stop.wait(PERIOD_S):
+                return
+            self.publisher.send(encode(composite(number, self.revision), [jpeg]))
+            if number % 10 == 0:
+                self.publisher.send(encode(report("render-server", "stand-in renderer")))
+            self.sent = number
+
+
+def composite(number: int, revision: int | None = None) -> CompositeMessage:
+    now_ns = time.time_ns()
+    return CompositeMessage(
+        node="render-server",
+        frame_id=number,
+        capture_ns=now_ns - 5_000_000,
+        encoding="jpeg",
+        shape=(HEIGHT, WIDTH, 3),
+        status="ok",
+        scene_revision=revision,
+        camera=camera().to_dict(),
+        world_from_camera=IDENTITY,
+        received_ns=now_ns - 2_000_000,
+        rendered_ns=now_ns,
+        pass_times_ms={"trace cones": 12.5, "compose": 1.0},
+        drops={"color.cam": 3},
+        lights=(LIGHT, AROUND),
+    )
+
+
+def report(node: str, detail: str = "", **more: object) -> StatsMessage:
+    return StatsMessage(node=node, capture_ns=time.time_ns(), state="running", detail=detail, **more)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class LiveApi:
+    """An API whose composites come from `stream`; `address` is host:port."""
+
+    api: RunningApi
+    stream: StandInStream
+    server: RenderServer
+    control_port: int
+    address: str
+
+    @property
+    def client(self) -> httpx.Client:
+        return self.api.client
+
+
+@contextmanager
+def live_api(folder: Path, **settings: object) -> Iterator[LiveApi]:
+    control_port, stream_port = ports.private_ports(2)
+    endpoints = {"control": ports.endpoint(control_port), "subscribe": [ports.endpoint(stream_port)]}
+    stream, server = StandInStream(stream_port), RenderServer(control_port)
+    try:
+        with running_api(folder, **endpoints, **settings) as api:
+            address = f"{ports.LOOPBACK}:{api.client.base_url.port}"
+            wait_for_frames(address)
+            yield LiveApi(api, stream, server, control_port, address)
+    finally:
+        stream.close()
+        server.close()
+
+
+def wait_for_frames(address: str, patience_s: float = 30) -> None:
+    deadline_s = time.monotonic() + patience_s
+    while time.monotonic() < deadline_s:
+        with suppress(httpx.TransportError, KeyError):
+            if httpx.get(f"http://{address}/api/v1/health").json()["stream"]["status"] == "ok":
+                return
+        time.sleep(0.05)
+    pytest.fail("no frame ever came")
+
+
+def live_socket(address: str, query: str = "", **options: object) -> ClientConnection:
+    return connect(f"ws://{address}/api/v1/live{query}", compression=None, **options)  # type: ignore[arg-type]
+
+
+def event_socket(address: str, query: str = "", **options: object) -> ClientConnection:
+    return connect(f"ws://{address}/api/v1/events{query}", **options)  # type: ignore[arg-type]
+
+
+def read_frame(socket: ClientConnection, timeout_s: float = 10) -> dict[str, Any]:
+    """The header of the next frame, whose picture is checked to be a JPEG."""
+    message = socket.recv(timeout=timeout_s)
+    assert isinstance(message, bytes)
+    (length,) = struct.unpack_from("<I", message)
+    assert message[4 + length :][:2] == b"\xff\xd8"
+    header = json.loads(message[4 : 4 + length])
+    assert isinstance(header, dict)
+    return header
+
+
+def next_event(socket: ClientConnection, *types: str, timeout_s: float = 10) -> dict[str, Any]:
+    """The next event of one of these types."""
+    deadline_s = time.monotonic() + timeout_s
+    while True:
+        event = json.loads(socket.recv(timeout=max(deadline_s - time.monotonic(), 0)))
+        if event["type"] in types:
+            assert isinstance(event, dict)
+            return event

@@ -1,0 +1,196 @@
+"""Recordings over REST: real recorders at a real node's streams, downloads, killed recorders, wrong requests."""
+
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import cv2
+import httpx
+import numpy as np
+import psutil
+import pytest
+
+from protocol.scene import SceneDocument
+from protocol.source import open_source
+from services import ports
+from tests.services.api_samples import RunningApi, running_api, sentence
+from tests.services.record_samples import HEIGHT, WIDTH, Feed, feeding, frames, write
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    for _ in range(600):
+        if condition():
+            return
+        time.sleep(0.05)
+    pytest.fail("it never came")
+
+
+@contextmanager
+def fed_api(folder: Path) -> Iterator[tuple[RunningApi, Feed]]:
+    with feeding() as (endpoint, feed), running_api(folder, subscribe=[endpoint]) as api:
+        yield api, feed
+
+
+@pytest.fixture(scope="module")
+def api(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningApi]:
+    """With a node that sends thirty frames a second."""
+    with fed_api(tmp_path_factory.mktemp("data")) as (running, _):
+        yield running
+
+
+@pytest.fixture
+def client(api: RunningApi) -> httpx.Client:
+    return api.client
+
+
+def grows(client: httpx.Client, name: str) -> Callable[[], bool]:
+    return lambda: bool((client.get(f"/recordings/{name}").json().get("frames") or 0) > 3)
+
+
+def recorders() -> list[psutil.Process]:
+    return [child for child in psutil.Process().children() if "record" in child.cmdline()]
+
+
+def test_a_take_is_recorded_listed_downloaded_and_deleted(api: RunningApi, client: httpx.Client) -> None:
+    scene = client.post("/scenes", json={"name": "two lamps"}).json()
+    client.post(f"/scenes/{scene['id']}/activate").raise_for_status()
+    begun = client.post("/recordings", json={"name": "take-1", "node": "cam"})
+    assert begun.status_code == 201, begun.text
+    address = begun.headers["location"].removeprefix("/api/v1")
+    assert begun.json()["state"] == "waiting"
+    wait_for(grows(client, "take-1"))
+    assert client.get(address).json()["state"] == "recording"
+    for name in ("take-1", "take-2"):
+        answer = client.post("/recordings", json={"name": name, "node": "cam"})
+        assert "is being recorded already, as take-1" in sentence(answer, 409)
+    for action in ("content", "poster.jpg"):
+        assert "still being recorded" in sentence(client.get(f"{address}/{action}"), 409)
+    assert "still being recorded" in sentence(client.delete(address), 409)
+    stopped = client.post(f"{address}/stop")
+    assert stopped.status_code == 200, stopped.text
+    take = stopped.json()
+    assert (take["state"], take["scene"], take["detail"]) == ("finished", "two lamps", "")
+    assert take["frames"] > 3
+    assert take["streams"]["/color/image"]["messages"] == take["frames"]
+    assert take["duration_s"] == pytest.approx((take["frames"] - 1) / 30, rel=1)
+    assert client.get("/recordings").json()[0] == take == client.get(address).json()
+    assert not recorders()
+
+    whole = client.get(f"{address}/content")
+    assert whole.headers["content-disposition"].endswith('filename="take-1.mcap"')
+    assert len(whole.content) == take["size_bytes"]
+    part = client.get(f"{address}/content", headers={"Range": "bytes=0-7"})
+    assert (part.status_code, part.content) == (206, whole.content[:8])
+    kept = open_source(api.store.folder / "recordings" / "take-1.mcap")
+    assert len(kept) == take["frames"]
+    assert isinstance(kept.scene, SceneDocument)
+    poster = client.get(f"{address}/poster.jpg")
+    assert poster.headers["content-type"] == "image/jpeg"
+    picture = cv2.imdecode(np.frombuffer(poster.content, np.uint8), cv2.IMREAD_COLOR)
+    assert picture is not None
+    assert picture.shape == (HEIGHT, WIDTH, 3)
+    assert np.abs(picture[..., ::-1].astype(int) - kept[0].color).mean() < 6
+    assert client.delete(address).status_code == 204
+    assert "no recording" in sentence(client.get(address), 404)
+    assert not list((api.store.folder / "recordings").glob("**/take-1*"))
+
+
+def test_it_ends_by_itself_after_its_time(client: httpx.Client) -> None:
+    name = client.post("/recordings", json={"duration_s": 0.3}).json()["id"]
+    assert name.startswith("take-")
+    wait_for(lambda: client.get(f"/recordings/{name}").json().get("state") == "finished")
+    assert "no recording" in sentence(client.post(f"/recordings/{name}/stop"), 404)
+    taken = client.post("/recordings", json={"name": name})
+    assert "choose another name" in sentence(taken, 409)
+
+
+@pytest.mark.parametrize(
+    ("body", "expected"),
+    [
+        ({"name": "../take"}, "no name for a recording"),
+        ({"name": "a.mcap"}, "no name for a recording"),
+        ({"name": ""}, "no name for a recording"),
+        ({"name": "/etc/take"}, "no name for a recording"),
+        ({"duration_s": 0}, "duration_s"),
+        ({"duration": 3}, "the nearest known key is `duration_s`"),
+        ({"node": "a b"}, "node"),
+        ([], "dictionary"),
+    ],
+)
+def test_wrong_wishes_are_one_sentence(client: httpx.Client, body: object, expected: str) -> None:
+    assert expected in sentence(client.post("/recordings", json=body), 422)
+    assert not recorders()
+
+
+def test_without_frames_it_says_why_and_leaves_nothing(tmp_path: Path) -> None:
+    (nobody,) = ports.private_ports(1)
+    with running_api(tmp_path, subscribe=[ports.endpoint(nobody)]) as api:
+        client = api.client
+        client.post("/recordings", json={"name": "empty"}).raise_for_status()
+        wait_for(lambda: "No frame came from" in client.get("/recordings/empty").json()["detail"])
+        assert client.get("/recordings").json()[0]["state"] == "waiting"
+        answer = client.post("/recordings/empty/stop")
+        assert "start a node there or name its endpoint" in sentence(answer, 409)
+        assert client.get("/recordings").json() == []
+
+
+def test_a_killed_recorder_leaves_a_recording_that_is_mended(api: RunningApi, client: httpx.Client) -> None:
+    client.post("/recordings", json={"name": "torn"}).raise_for_status()
+    wait_for(grows(client, "torn"))
+    (recorder,) = recorders()
+    recorder.kill()
+    wait_for(lambda: bool(client.get("/recordings/torn").json()["state"] == "interrupted"))
+    listed: dict[str, Any] = next(each for each in client.get("/recordings").json() if each["id"] == "torn")
+    assert listed["frames"] > 0
+    assert "interrupted; recover it" in sentence(client.get("/recordings/torn/content"), 409)
+    assert client.get("/recordings/torn/poster.jpg").status_code == 200
+    mended = client.post("/recordings/torn/recover")
+    assert mended.status_code == 200, mended.text
+    assert (mended.json()["state"], mended.json()["frames"]) == ("finished", listed["frames"])
+    assert not list((api.store.folder / "recordings").glob("torn*.active"))
+    assert "nothing to mend" in sentence(client.post("/recordings/torn/recover"), 409)
+
+
+def test_a_service_that_ends_finishes_what_grows(tmp_path: Path) -> None:
+    with fed_api(tmp_path) as (api, _):
+        api.client.post("/recordings", json={"name": "last"}).raise_for_status()
+        wait_for(grows(api.client, "last"))
+    assert len(open_source(tmp_path / "recordings" / "last.mcap")) > 3
+    assert not recorders()
+
+
+def test_a_recorder_that_stops_answering_does_not_hold_the_service(tmp_path: Path) -> None:
+    with fed_api(tmp_path) as (api, feed):
+        api.client.post("/recordings", json={"name": "slow"}).raise_for_status()
+        wait_for(grows(api.client, "slow"))
+        feed.paused.set()
+        (recorder,) = recorders()
+        os.kill(recorder.pid, signal.SIGSTOP)
+        assert api.client.get("/recordings/slow").json()["state"] == "recording"
+        os.kill(recorder.pid, signal.SIGCONT)
+        assert api.client.post("/recordings/slow/stop").json()["state"] == "finished"
+
+
+def test_what_lies_in_the_folder_is_listed_as_it_is(tmp_path: Path) -> None:
+    folder = tmp_path / "recordings"
+    folder.mkdir()
+    write(folder / "good.mcap", frames(3))
+    (folder / "bad.mcap").write_bytes(b"no recording")
+    (folder / "notes.txt").touch()
+    (folder / "..mcap").touch()
+    with running_api(tmp_path) as api:
+        found = {each["id"]: each for each in api.client.get("/recordings").json()}
+        assert sorted(found) == ["bad", "good"]
+        assert found["good"]["frames"] == 3
+        assert (found["bad"]["frames"], found["bad"]["state"]) == (None, "finished")
+        assert "not an MCAP recording" in found["bad"]["detail"]
+        assert str(tmp_path) not in str(found)
+        assert str(tmp_path) not in api.client.get("/recordings/bad/poster.jpg").text
+        for name in ("notes", "..", "%2e%2e", "good.mcap"):
+            assert api.client.get(f"/recordings/{name}").status_code in (404, 422)
+        api.client.delete("/recordings/bad").raise_for_status()
+        assert sorted(each["id"] for each in api.client.get("/recordings").json()) == ["good"]

@@ -1,0 +1,166 @@
+"""Replay over REST: a real replay child, what the render server is told, and the way back to live."""
+
+import time
+from collections.abc import Callable, Iterator
+from threading import Event
+
+import httpx
+import psutil
+import pytest
+
+from protocol.messages import ControlRequest
+from protocol.transport import RequestClient
+from services import ports
+from services.recorder import Recorder as StreamRecorder
+from services.recorder import RecordJob
+from tests.services.api_samples import RunningApi, running_api, sentence
+from tests.services.record_samples import PERIOD_NS, frames, write
+from tests.services.render_server_samples import Recorder
+
+COUNT = 30
+LENGTH_S = (COUNT - 1) * PERIOD_NS / 1e9
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    for _ in range(600):
+        if condition():
+            return
+        time.sleep(0.05)
+    pytest.fail("it never came")
+
+
+@pytest.fixture(scope="module")
+def api(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningApi]:
+    folder = tmp_path_factory.mktemp("data")
+    (folder / "recordings").mkdir()
+    write(folder / "recordings" / "take.mcap", frames(COUNT))
+    (folder / "recordings" / "bad.mcap").write_bytes(b"no recording")
+    with running_api(folder) as running:
+        yield running
+
+
+@pytest.fixture
+def server(api: RunningApi) -> Iterator[Recorder]:
+    server = Recorder(api.control_port)
+    wait_for(lambda: bool(server.payloads("ping")))
+    yield server
+    api.client.delete("/replay").raise_for_status()
+    server.close()
+
+
+@pytest.fixture
+def client(api: RunningApi) -> httpx.Client:
+    return api.client
+
+
+def children() -> list[psutil.Process]:
+    return [child for child in psutil.Process().children() if "replay" in child.cmdline()]
+
+
+def source(server: Recorder) -> object:
+    """Where the render server was told to read from last."""
+    return server.payloads("set_source")[-1]["endpoints"]
+
+
+def test_a_recording_is_shown_moved_through_and_left(
+    client: httpx.Client, server: Recorder, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    wait_for(lambda: bool(server.payloads("set_source")))
+    assert source(server) is None, "what a killed service left is put right"
+    assert client.get("/replay").json()["recording"] is None
+    shown = client.put("/replay", json={"recording": "take", "position_s": 0.5, "playing": False})
+    assert shown.status_code == 200, shown.text
+    state = shown.json()
+    assert (state["recording"], state["playing"], state["rate"], state["loop"]) == ("take", False, 1.0, True)
+    assert state["position_s"] == pytest.approx(0.5, abs=1 / 30)
+    assert state["duration_s"] == pytest.approx(LENGTH_S)
+    (endpoint,) = source(server)  # type: ignore[misc]
+    assert str(endpoint).startswith("tcp://127.0.0.1:")
+    out = tmp_path_factory.mktemp("out") / "b.mcap"
+    status = StreamRecorder(RecordJob(out, (str(endpoint),), frames=2), print).run(Event())
+    assert status.frames == 2, "while paused the frame is sent again and again"
+
+    moved = client.patch("/replay", json={"position_s": 0.2, "rate": 0.05, "playing": True}).json()
+    assert (moved["playing"], moved["rate"]) == (True, 0.05)
+    assert 0.1 < moved["position_s"] < 0.5
+    assert client.patch("/replay", json={"playing": False}).json()["playing"] is False
+    held = client.get("/replay").json()["position_s"]
+    assert client.get("/replay").json()["position_s"] == held
+    assert "is being replayed" in sentence(client.delete("/recordings/take"), 409)
+    assert client.delete("/replay").status_code == 204
+    assert source(server) is None
+    assert client.get("/replay").json()["recording"] is None
+    assert not children()
+    assert "no recording is replayed" in sentence(client.patch("/replay", json={"playing": True}), 409)
+
+
+def test_one_replay_takes_the_place_of_another(client: httpx.Client, server: Recorder) -> None:
+    first = client.put("/replay", json={"recording": "take"})
+    assert first.status_code == 200, first.text
+    before = source(server)
+    assert client.put("/replay", json={"recording": "take", "loop": False}).json()["loop"] is False
+    assert source(server) != before
+    assert len(children()) == 1
+
+
+def test_a_dead_replay_gives_live_back(client: httpx.Client, server: Recorder) -> None:
+    client.put("/replay", json={"recording": "take"}).raise_for_status()
+    (child,) = children()
+    child.kill()
+    wait_for(lambda: client.get("/replay").json()["recording"] is None)
+    wait_for(lambda: source(server) is None)
+    assert client.put("/replay", json={"recording": "take"}).status_code == 200, "and it can be tried again"
+
+
+def test_a_render_server_that_comes_back_is_told_again(api: RunningApi, client: httpx.Client) -> None:
+    first = Recorder(api.control_port)
+    wait_for(lambda: client.get("/state").json()["render_server"] == "answers")
+    client.put("/replay", json={"recording": "take"}).raise_for_status()
+    shown = source(first)
+    first.close()
+    wait_for(lambda: client.get("/state").json()["render_server"] == "silent")
+    second = Recorder(api.control_port)
+    wait_for(lambda: bool(second.payloads("set_source")))
+    assert source(second) == shown
+    client.delete("/replay").raise_for_status()
+    assert source(second) is None
+    second.close()
+
+
+@pytest.mark.parametrize(
+    ("body", "status", "expected"),
+    [
+        ({"recording": "none"}, 404, "no recording 'none'"),
+        ({"recording": "bad"}, 422, "bad is not an MCAP"),
+        ({"recording": "../take"}, 422, "recording"),
+        ({"recording": "take", "rate": 0}, 422, "rate"),
+        ({"recording": "take", "position_s": -1}, 422, "position_s"),
+        ({}, 422, "the key `recording` is missing"),
+    ],
+)
+@pytest.mark.usefixtures("server")
+def test_wrong_wishes_are_one_sentence(
+    client: httpx.Client, body: dict[str, object], status: int, expected: str
+) -> None:
+    answer = client.put("/replay", json=body)
+    assert expected in sentence(answer, status)
+    assert not children()
+
+
+def test_the_control_endpoint_refuses_what_it_does_not_know(client: httpx.Client, server: Recorder) -> None:
+    client.put("/replay", json={"recording": "take"}).raise_for_status()
+    (child,) = children()
+    words = child.cmdline()
+    control = RequestClient(words[words.index("--control") + 1])
+
+    def error(op: str, **payload: object) -> str:
+        request = ControlRequest(node="test", id=f"{time.time_ns()}", op=op, payload=dict(payload))
+        return str(control.request(request, 10).error)
+
+    assert "did you mean seek?" in error("sek")
+    assert "number as `position_s`" in error("seek")
+    assert "number as `rate`" in error("rate", rate=True)
+    assert "rate of 0.05 to 20" in error("rate", rate=100.0)
+    control.close()
+    assert source(server) == [words[words.index("--publish") + 1]]
+    assert ports.LOOPBACK in words[words.index("--control") + 1]

@@ -1,0 +1,197 @@
+"""The render server behind real sockets, with a renderer that the test gives: changes, sources, long scenes."""
+
+import itertools
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from protocol.envelope import decode
+from protocol.messages import CompositeMessage, ControlReply, ControlRequest
+from protocol.scene import SceneDocument
+from protocol.transport import Publisher, Receiver, RequestClient
+from render_server.server import ServerSettings, serve
+from services import ports
+from tests.services.api_samples import UPLOAD, running_api
+from tests.services.conftest import color, depth, pose
+from tests.services.storage_samples import TETRAHEDRON
+from tests.services.test_session import InvertingRenderer
+
+FRAMES_PER_S = 100
+PATIENCE_S = 20.0
+
+
+class Node:
+    """Publishes numbered frames until it is closed; `newest` is the last number sent."""
+
+    def __init__(self, endpoint: str, first: int = 0) -> None:
+        self.newest = first
+        self._publisher = Publisher(endpoint)
+        self._closed = threading.Event()
+        self._thread = threading.Thread(target=self._run, args=(first,), daemon=True)
+        self._thread.start()
+
+    def _run(self, first: int) -> None:
+        for number in itertools.count(first):
+            if self._closed.wait(1 / FRAMES_PER_S):
+                return
+            self.newest = number
+            for message in (color(number, number), depth(number, number), pose(number, number)):
+                self._publisher.send(message)
+
+    def close(self) -> None:
+        self._closed.set()
+        self._thread.join()
+        self._publisher.close()
+
+
+class Server:
+    """A render server in a thread, its control client, and a receiver of what it publishes."""
+
+    def __init__(self, renderer: InvertingRenderer, node_port: int, **settings: object) -> None:
+        self.control, publish = map(ports.endpoint, ports.private_ports(2))
+        scene = SceneDocument(revision=7)
+        self._settings = ServerSettings.model_validate(
+            {
+                "subscribe": [ports.endpoint(node_port)],
+                "publish": publish,
+                "control": self.control,
+                **settings,
+            }
+        )
+        self._thread = threading.Thread(
+            target=serve,
+            args=(self._settings, renderer, scene),
+            kwargs={"renderer_name": "abacus"},
+            daemon=True,
+        )
+        self._thread.start()
+        self.client = RequestClient(self.control)
+        self.receiver = Receiver([publish], ["composite"])
+
+    def ask(self, op: str, **payload: object) -> ControlReply:
+        request = ControlRequest(node="test", id=f"r{time.time_ns()}", op=op, payload=payload)
+        return self.client.request(request, PATIENCE_S)
+
+    def composites(self) -> Iterator[CompositeMessage]:
+        """What comes, newest first where several wait."""
+        deadline_s = time.monotonic() + PATIENCE_S
+        while time.monotonic() < deadline_s:
+            for multipart in (self.receiver.latest(1.0) or {}).values():
+                message, _ = decode(multipart)
+                assert isinstance(message, CompositeMessage)
+                yield message
+        pytest.fail("no such composite came")
+
+    def first(self, wanted: Callable[[CompositeMessage], bool]) -> CompositeMessage:
+        return next(message for message in self.composites() if wanted(message))
+
+    def close(self) -> None:
+        assert self.ask("shutdown").ok
+        self._thread.join(PATIENCE_S)
+        assert not self._thread.is_alive()
+        self.client.close()
+        self.receiver.close()
+
+
+@contextmanager
+def serving(*, immediate: bool = True, **settings: object) -> Iterator[tuple[Server, InvertingRenderer, int]]:
+    renderer = InvertingRenderer()
+    renderer.immediate = immediate
+    (node_port,) = ports.private_ports(1)
+    server = Server(renderer, node_port, **settings)
+    try:
+        yield server, renderer, node_port
+    finally:
+        server.close()
+
+
+@pytest.mark.parametrize("immediate", [True, False], ids=["software", "gpu"])
+def test_a_rest_change_is_in_the_first_picture_that_is_begun_after_its_answer(
+    tmp_path: Path, immediate: bool
+) -> None:
+    with serving(immediate=immediate) as (server, renderer, node_port):
+        node = Node(ports.endpoint(node_port))
+        with running_api(tmp_path, control=server.control) as api:
+            api.client.post("/assets?name=t.obj", content=TETRAHEDRON, headers=UPLOAD).raise_for_status()
+            made = api.client.post("/scenes", json={"objects": [{"asset": "t.obj", "id": "cup"}]}).json()
+            api.client.post(f"/scenes/{made['id']}/activate").raise_for_status()
+            server.first(lambda message: message.status == "ok")
+            for height in range(10):
+                changed = api.client.patch(
+                    f"/scenes/{made['id']}/objects/cup", json={"pose": {"translation_m": [0, 0, height]}}
+                )
+                begun = node.newest  # a frame sent from now on cannot have been begun before the answer
+                assert changed.json()["picture"]["state"] == "shown"
+                revision = server.ask("ping").payload["revision"]
+                assert renderer.scenes[-1].objects[0].pose.translation_m[2] == height
+                later = server.first(lambda message, begun=begun: message.frame_id > begun)
+                assert later.scene_revision == revision
+        node.close()
+
+
+def test_a_scene_of_a_thousand_objects_passes_both_ways(tmp_path: Path) -> None:
+    objects = [{"asset": "t.obj", "id": f"object {number}"} for number in range(1000)]
+    with (
+        serving(session=tmp_path / "session.json") as (server, renderer, _),
+        running_api(tmp_path, control=server.control) as api,
+    ):
+        api.client.post("/assets?name=t.obj", content=TETRAHEDRON, headers=UPLOAD).raise_for_status()
+        made = api.client.post("/scenes", json={"objects": objects}).json()
+        shown = api.client.post(f"/scenes/{made['id']}/activate")
+        assert shown.json()["picture"]["state"] == "shown"
+        assert len(renderer.scenes[-1].objects) == 1000
+        scene = server.ask("get_scene").payload["scene"]
+        assert isinstance(scene, dict)
+        assert [item["id"] for item in scene["objects"]] == [item["id"] for item in objects]
+
+
+def test_another_source_is_read_at_once_and_the_old_one_never_shows_again() -> None:
+    (other_port,) = ports.private_ports(1)
+    with serving(immediate=False) as (server, renderer, node_port):
+        here, there = Node(ports.endpoint(node_port)), Node(ports.endpoint(other_port), first=10**6)
+        server.first(lambda message: message.frame_id > 5)
+        drops = server.first(lambda _: True).drops
+        lost = sum(count for name, count in drops.items() if name.endswith(".cam"))
+        assert server.ask("set_source", endpoints=[ports.endpoint(other_port)]).payload == {
+            "endpoints": [ports.endpoint(other_port)]
+        }
+        server.first(lambda message: message.frame_id >= 10**6)  # what was on its way came before
+        seen = list(itertools.islice(server.composites(), 20))
+        assert all(message.frame_id >= 10**6 for message in seen)
+        assert seen[-1].drops.get("earlier_sources", 0) >= lost
+        assert seen[-1].drops.get("superseded", 0) >= drops.get("superseded", 0)
+        assert renderer.sources_begun == 1
+        assert server.ask("set_source", endpoints=[ports.endpoint(other_port)]).ok
+        assert renderer.sources_begun == 1  # the same again changes nothing
+        for wrong in ("tcp://192.0.2.1:5", "http://127.0.0.1:5", "nonsense"):
+            refused = server.ask("set_source", endpoints=[wrong])
+            assert wrong in str(refused.error)
+        assert server.first(lambda _: True).frame_id >= 10**6  # refusals change nothing
+        back = server.ask("set_source", endpoints=None)
+        assert back.payload == {"endpoints": [ports.endpoint(node_port)]}
+        server.first(lambda message: message.frame_id < 10**6)
+        assert all(message.frame_id < 10**6 for message in itertools.islice(server.composites(), 20))
+        here.close()
+        there.close()
+
+
+def test_frames_go_on_after_a_snapshot_and_commands_wait_for_it(tmp_path: Path) -> None:
+    with serving(immediate=False) as (server, _, node_port):
+        node = Node(ports.endpoint(node_port))
+        server.first(lambda message: message.status == "ok")
+        pictures = [{"name": f"p{number}", "view": "delta"} for number in range(5)]
+        answers = [
+            server.ask("snapshot", folder=str(tmp_path), pictures=pictures, exr=True) for _ in range(3)
+        ]
+        for answer in answers:
+            assert answer.error is None
+            assert len(answer.payload["files"]) == 6  # type: ignore[arg-type]
+            assert answer.payload["errors"] == {}
+        after = server.first(lambda message: message.frame_id > node.newest - 2)
+        assert after.scene_revision == 7
+        assert len(list(tmp_path.iterdir())) == 6
+        node.close()

@@ -1,0 +1,125 @@
+"""Small pictures of assets: drawn once, with the asset's own colours, the right way up."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from protocol.radiance_files import write_exr
+from services.storage.asset_child import run_limited
+from services.storage.faults import RejectedAssetError
+from services.storage.store import Store
+from services.storage.thumbnails import SIZE
+from tests.services.api_samples import UPLOAD, running_api, sentence
+from tests.services.storage_samples import TETRAHEDRON, glb
+from tests.services.test_gltf_zip import FILES, packed
+
+PLY_HEAD = b"""ply
+format ascii 1.0
+element vertex 8
+property float x
+property float y
+property float z
+property uchar red
+property uchar green
+property uchar blue
+element face 4
+property list uchar int vertex_indices
+end_header
+"""
+
+
+def wall() -> bytes:
+    """Two upright squares one above the other, which face the thumbnail's camera: green above blue."""
+    rows = []
+    for low, color in ((0, "0 0 255"), (1, "0 255 0")):
+        for height in (low, low + 1):
+            rows += [f"-0.8 -0.5 {height} {color}", f"0.8 0.5 {height} {color}"]
+    faces = ["3 0 1 3", "3 0 3 2", "3 4 5 7", "3 4 7 6"]
+    return PLY_HEAD + "\n".join([*rows, *faces, ""]).encode()
+
+
+def drawn(folder: Path, name: str, content: bytes) -> np.ndarray:
+    path, out = folder / name, folder / "out.png"
+    path.write_bytes(content)
+    kind = "map" if path.suffix in (".hdr", ".exr") else "mesh"
+    run_limited(f"{kind}-thumbnail", path, name, str(out), output_bytes=1 << 20)  # type: ignore[arg-type]
+    picture = cv2.imread(str(out), cv2.IMREAD_UNCHANGED)
+    assert picture is not None
+    assert picture.shape == (SIZE, SIZE, 4)
+    return np.asarray(picture)
+
+
+def test_a_mesh_is_upright_centred_and_has_its_own_colours(tmp_path: Path) -> None:
+    picture = drawn(tmp_path, "wall.ply", wall())
+    covered = picture[..., 3] > 0
+    rows, columns = np.nonzero(covered)
+    for first, last in ((rows.min(), rows.max()), (columns.min(), columns.max())):
+        assert abs(first + last - (SIZE - 1)) <= 2, "in the middle"
+    assert max(np.ptp(rows), np.ptp(columns)) > 0.9 * SIZE, "as large as fits"
+    blue, green, red = (picture[..., channel] for channel in range(3))
+    is_green = covered & (green > 2 * blue.astype(int))
+    is_blue = covered & (blue > 2 * green.astype(int))
+    assert is_green.sum() > 0.3 * covered.sum()
+    assert np.nonzero(is_green)[0].mean() < np.nonzero(is_blue)[0].mean(), "z is up"
+    assert red[covered].max() < 30
+    assert 0 < ((picture[..., 3] > 0) & (picture[..., 3] < 255)).sum() < 0.1 * covered.sum(), (
+        "smooth edges only"
+    )
+
+
+def test_gltf_is_y_up_and_textured(tmp_path: Path) -> None:
+    with Store(tmp_path / "data") as store, store.assets.receiving(1 << 20) as incoming:
+        incoming.write(packed(FILES))
+        asset, _ = store.assets.keep(incoming, "quad.zip")
+        place = store.assets.thumbnail(asset.digest)
+        drawn_ns = place.stat().st_mtime_ns
+        assert store.assets.thumbnail(asset.digest).stat().st_mtime_ns == drawn_ns, "once"
+    picture = cv2.imread(str(place), cv2.IMREAD_UNCHANGED)
+    assert picture is not None
+    solid = picture[picture[..., 3] == 255]
+    assert len(solid) > 0.3 * SIZE * SIZE, "the square stands upright and is seen from the front"
+    assert solid[:, 2].min() > 100
+    assert solid[:, :2].max() < 30
+
+
+@pytest.mark.parametrize("suffix", [".hdr", ".exr"])
+def test_a_map_is_shown_whole_whatever_its_brightness(tmp_path: Path, suffix: str) -> None:
+    rng = np.random.default_rng(1)
+    radiance = rng.uniform(0.5, 1.5, (64, 128, 3)).astype(np.float32)
+    radiance[:32, :, 2] *= 3  # the sky is blue
+    shown = []
+    for factor in (1e-3, 1e3):
+        path = tmp_path / f"source{suffix}"
+        if suffix == ".hdr":
+            cv2.imwrite(str(path), radiance[..., ::-1] * factor)
+        else:
+            write_exr(path, radiance * np.float32(factor))
+        shown.append(drawn(tmp_path, f"map{suffix}", path.read_bytes()))
+    dark, bright = (picture[SIZE // 4 : 3 * SIZE // 4].astype(int) for picture in shown)
+    assert (shown[0][: SIZE // 4, :, 3] == 0).all()
+    assert (dark[..., 3] == 255).all()
+    assert np.abs(dark - bright).max() <= 2
+    assert dark[:32, :, 0].mean() > dark[-32:, :, 0].mean() + 20
+
+
+def test_a_mesh_that_lies_or_is_none_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(RejectedAssetError, match=r"flat\.obj has no triangle with an area"):
+        drawn(tmp_path, "flat.obj", b"v 0 0 0\nv 1 0 0\nf 1 1 2\n")
+    with pytest.raises(RejectedAssetError, match=r"bad\.glb"):
+        drawn(tmp_path, "bad.glb", glb({"asset": {"version": "2.0"}}))
+
+
+def test_rest_gives_it_to_browsers(tmp_path: Path) -> None:
+    with running_api(tmp_path) as api:
+        asset = api.client.post("/assets?name=t.obj", content=TETRAHEDRON, headers=UPLOAD).json()["asset"]
+        answer = api.client.get(f"/assets/{asset}/thumbnail.png")
+        assert (answer.status_code, answer.headers["content-type"]) == (200, "image/png")
+        assert "immutable" in answer.headers["cache-control"]
+        picture = cv2.imdecode(np.frombuffer(answer.content, np.uint8), cv2.IMREAD_UNCHANGED)
+        assert picture is not None
+        assert picture.shape == (SIZE, SIZE, 4)
+        assert "no asset" in sentence(api.client.get(f"/assets/{'0' * 64}/thumbnail.png"), 404)
+        api.client.delete(f"/assets/{asset}").raise_for_status()
+        assert sorted(path.name for path in (tmp_path / "assets").iterdir()) == [".incoming"]
