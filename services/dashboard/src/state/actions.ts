@@ -8,10 +8,12 @@ import { size, trimmed } from "../math/units";
 import { pictureSize, view } from "../live/picture";
 import { assetName, boundsByObject } from "./assets";
 import { edit } from "./gesture";
+import { rounded } from "./handle";
 import { change, lights, objects, readScene, readScenes, sceneDocument, takeScene } from "./scene";
 import { selectLight, selectObject } from "./selection";
 import { objectTarget, partTarget } from "./targets";
 import { announce, attempt, toast } from "./toasts";
+import { tool } from "./tools";
 
 const UPRIGHT: Pose = { translation_m: [0, 0, 0], rotation_wxyz: [1, 0, 0, 0], scale: 1 };
 
@@ -37,7 +39,7 @@ export async function addObject(asset: AssetAnswer, pixel: Pixel = centre(), nam
   const scale = bounds ? sensibleScale(bounds) : 1;
   const pose = standOn({ ...UPRIGHT, scale }, bounds, point_m ?? [0, 0, 0], normal ?? UP);
   const id = freeId(name);
-  if (!(await change("POST", "/objects", { id, asset: asset.asset, pose }))) return;
+  if (!(await change("POST", "/objects", { id, asset: asset.asset, pose: rounded(pose) }))) return;
   selectObject(id);
   announce(`${id} was added.`);
   if (bounds && scale !== 1) {
@@ -115,7 +117,9 @@ export async function placeObject(id: string, pixel: Pixel): Promise<void> {
     toast(found.object === id ? "Click beside the object, where it is to stand." : "No surface was seen there; click elsewhere.");
     return;
   }
-  await edit(objectTarget(id), { pose: standOn(item.pose, boundsByObject.value.get(id) ?? null, found.point_m, found.normal ?? UP) });
+  const pose = standOn(item.pose, boundsByObject.value.get(id) ?? null, found.point_m, found.normal ?? UP);
+  tool.value = "move";
+  await edit(objectTarget(id), { pose: rounded(pose) });
 }
 
 export async function addLight(type: LightType): Promise<void> {
