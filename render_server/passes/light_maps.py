@@ -263,7 +263,7 @@ def pack_light(
     own: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0),
     tail: Sequence[float] = NOT_MIRRORED,
 ) -> bytes:
-    """std430 Light: place, colour, shape, two axes and an image's own as floats, the ranges of its views as integers."""
+    """std430 Light: place, colour, shape, two axes and an image's own as floats, ranges of its views as integers."""
     axis_u = axis_v = np.zeros(3)
     shape = (0.0, 1.0, 0.0)
     if isinstance(light, DirectionalLight):

@@ -152,7 +152,7 @@ def create_app(settings: ApiSettings, store: Store, keys: Keys | None = None) ->
     app.state.context = context
     context.problems.install(app)
     for resource in RESOURCES:
-        app.include_router(resource.router, prefix=PREFIX, responses=responses(401, 403, 422, 429))
+        app.include_router(resource.router, prefix=PREFIX, responses=responses(400, 401, 403, 413, 422, 429))
     app.router.default = Page(app.router.not_found)
     return app
 

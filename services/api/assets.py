@@ -25,7 +25,14 @@ UNCHANGING = {
 PNG: dict[int | str, dict[str, Any]] = {
     200: {"content": {"image/png": {"schema": {"type": "string", "format": "binary"}}}}
 }
+_UPLOAD_ANSWERS = responses(400, 413, 415, 422) | {
+    200: {"model": AssetAnswer, "description": "The same content was there already."}
+}
 _KNOWN = ", ".join(each.name.upper() for each in FORMATS)
+_UPLOAD_ANSWERS: dict[int | str, dict[str, Any]] = {
+    200: {"model": AssetAnswer, "description": "The same content was there already."},
+    **responses(400, 413, 415, 422),
+}
 _UPLOAD_BODY = {
     "requestBody": {
         "required": True,
@@ -41,7 +48,7 @@ def list_assets(shared: Shared) -> list[AssetAnswer]:
     return [AssetAnswer.of(asset) for asset in shared.store.assets.all()]
 
 
-@router.post("", status_code=201, responses=responses(400, 413, 415, 422), openapi_extra=_UPLOAD_BODY)
+@router.post("", status_code=201, responses=_UPLOAD_ANSWERS, openapi_extra=_UPLOAD_BODY)
 async def upload_asset(
     shared: Shared,
     request: Request,

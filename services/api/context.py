@@ -28,7 +28,7 @@ from services.storage.scenes import StoredScene
 from services.storage.store import Store
 
 _GESTURE = re.compile(r"[A-Za-z0-9_-]{1,64}")
-_ENTITY_TAG = re.compile(r'(?:W/)?"(\d{1,18})"|(\d{1,18})')
+_ENTITY_TAG = re.compile(r'(?:W/)?"([0-9]{1,18})"|([0-9]{1,18})')
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,8 @@ def _if_match(
     if_match: Annotated[
         str | None,
         Header(
-            description='Revision that the change is made to, such as "7"; another one is refused with 409.'
+            description='Revision that the change is made to, such as "7"; another one is refused with 409.',
+            json_schema_extra={"pattern": rf"^({_ENTITY_TAG.pattern}|\*)$"},
         ),
     ] = None,
 ) -> int | None:
@@ -111,6 +112,7 @@ def _terms(
             alias="Deltalight-Gesture",
             description="Any id; changes in a row with the same one are undone together.",
             examples=["drag-17"],
+            json_schema_extra={"pattern": f"^{_GESTURE.pattern}$"},
         ),
     ] = None,
 ) -> Terms:

@@ -97,6 +97,8 @@ class Problems:
 
     def of_http(self, fault: HTTPException) -> JSONResponse:
         """The response to a refusal of the framework or of a gate."""
+        if fault.status_code == 400 and not isinstance(fault, ProblemError):  # the body's text cannot be read
+            return self._not_json()
         kind = fault.kind if isinstance(fault, ProblemError) else _slug(fault.status_code)
         return self.response(fault.status_code, kind, str(fault.detail), headers=fault.headers)
 
@@ -132,10 +134,13 @@ class Problems:
             sentence = f"The service failed ({type(fault).__name__}); see its log and report it."
             return self.response(500, "internal", sentence)
 
+    def _not_json(self) -> JSONResponse:
+        return self.response(400, "not-json", "The body is not valid JSON; correct it.")
+
     def _of_request(self, fault: RequestValidationError) -> JSONResponse:
         first = fault.errors()[0]
         if first["type"] == "json_invalid":
-            return self.response(400, "not-json", "The body is not valid JSON; correct it.")
+            return self._not_json()
         return self.response(422, "invalid", f"`{_place(first['loc'])}` is wrong: {_lower(first['msg'])}.")
 
 

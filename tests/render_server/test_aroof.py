@@ -122,7 +122,9 @@ def _reflected(point: Float64[np.ndarray, "3"], toward: Float64[np.ndarray, "3"]
 
 def test_products_are_integrals_of_light_cosine_and_harmonics(gpu: GpuContext, stage: Stage) -> None:
     """P_k(n) of uneven light against sums over all directions; the cosine's five bands leave out 2 % at most."""
-    document = aroof(stage.document([stage.virtual(ball(RADIUS))], [ambient(0.0)], floor()), near_light="none")
+    document = aroof(
+        stage.document([stage.virtual(ball(RADIUS))], [ambient(0.0)], floor()), near_light="none"
+    )
     renderer = SceneRenderer(gpu, document)
     renderer.render(frame())
     method = renderer._relighting._method
@@ -150,7 +152,9 @@ def test_products_are_integrals_of_light_cosine_and_harmonics(gpu: GpuContext, s
 def test_turning_everything_changes_nothing(gpu: GpuContext, stage: Stage) -> None:
     """Object, camera and lamp turned together about the vertical, and the object's file turned against its pose."""
     shape = cube(0.1)
-    plain_document = stage.document([stage.virtual(shape)], [directional((0, 0.4, -1.0)), ambient(0.3)], floor())
+    plain_document = stage.document(
+        [stage.virtual(shape)], [directional((0, 0.4, -1.0)), ambient(0.3)], floor()
+    )
     turn = trimesh.transformations.rotation_matrix(np.radians(37), (0, 0, 1))
     turned = shape.copy()
     turned.apply_transform(np.linalg.inv(turn))
@@ -169,7 +173,9 @@ def test_the_shadow_is_darkest_at_contact(gpu: GpuContext, stage: Stage) -> None
     fields = solve(gpu, aroof(document, near_light="none"), frame(pose=look_at(*CLOSE)))
     shown, away = on_floor(fields)
     share = (fields.cones_rho[..., 0] / np.maximum(fields.cones_mu[..., 0], 1e-9))[shown]
-    steps = [share[np.abs(away[shown] / RADIUS - at) < 0.1].mean() for at in (0.6, 0.8, 1.0, 1.5, 2.0, 3.0, 4.0)]
+    steps = [
+        share[np.abs(away[shown] / RADIUS - at) < 0.1].mean() for at in (0.6, 0.8, 1.0, 1.5, 2.0, 3.0, 4.0)
+    ]
     assert (np.diff(steps) > 0).all()
     assert steps[0] < 0.55
     assert steps[-1] > 0.97
@@ -242,7 +248,7 @@ def test_objects_that_change_their_shape_are_refused(
     gpu: GpuContext, stage: Stage, change: dict[str, object]
 ) -> None:
     document = aroof(stage.document([stage.virtual(cube(), id="dancer", **change)], [ambient(1.0)], floor()))
-    with pytest.raises(DeltalightError, match="`dancer`.*use dvct or dlpv"):
+    with pytest.raises(DeltalightError, match=r"`dancer`.*use dvct or dlpv"):
         SceneRenderer(gpu, document)
 
 
@@ -286,13 +292,17 @@ def test_the_picture_tilts_with_the_board_and_light_stays(gpu: GpuContext, stage
         document = aroof(stage.document([item], [ambient(1.0)], ground), near_light="none")
         fields = solve(gpu, document, frame(pose=BoardPose(matrix @ look_at(*CLOSE).world_from_camera)))
         known = (fields.position[..., 3] > 0) & (fields.matte == 0)
-        shares.append(np.where(known, fields.cones_rho[..., 0] / np.maximum(fields.cones_mu[..., 0], 1e-9), 1.0))
+        shares.append(
+            np.where(known, fields.cones_rho[..., 0] / np.maximum(fields.cones_mu[..., 0], 1e-9), 1.0)
+        )
     assert np.abs(shares[0] - shares[1]).max() < 0.03
 
 
 def test_without_near_light_the_environment_alone_surrounds_an_object(gpu: GpuContext, stage: Stage) -> None:
     """Even radiance from all directions, none of them measured by the camera."""
-    document = aroof(stage.document([stage.virtual(ball(RADIUS))], [ambient(0.25)], floor()), near_light="none")
+    document = aroof(
+        stage.document([stage.virtual(ball(RADIUS))], [ambient(0.25)], floor()), near_light="none"
+    )
     renderer = SceneRenderer(gpu, document)
     renderer.render(frame())
     method = renderer._relighting._method

@@ -84,7 +84,7 @@ def test_what_a_ball_hides_is_its_cone(ball_field: OcclusionField) -> None:
             assert got == pytest.approx(cap @ basis, abs=0.02 + 0.02 * solid_angle)
 
 
-def test_coefficients_are_those_of_brute_force_rays(ball: TriangleMesh) -> None:
+def test_coefficients_are_those_of_brute_force_rays() -> None:
     """A box with a hole, seen from beside it: trimesh's own intersections say the same."""
     shape = trimesh.util.concatenate(
         [trimesh.creation.box((0.2, 1.0, 1.0)), trimesh.creation.icosphere(2, 0.3)]
@@ -168,7 +168,12 @@ def test_a_field_is_read_as_it_was_written_and_damage_is_noticed(
     assert again.radius == ball_field.radius
     assert load_field(path.parent, "none", SETTINGS) is None
     whole = path.read_bytes()
-    for damaged in (whole[: len(whole) // 2], b"", b"PK\x03\x04nonsense", whole[:3000] + b"\xff" * 4000 + whole[7000:]):
+    for damaged in (
+        whole[: len(whole) // 2],
+        b"",
+        b"PK\x03\x04nonsense",
+        whole[:3000] + b"\xff" * 4000 + whole[7000:],
+    ):
         path.write_bytes(damaged)
         assert load_field(path.parent, "ab", SETTINGS) is None
 
@@ -178,7 +183,7 @@ def placed(mesh: TriangleMesh) -> PlacedObject:
 
 
 def test_fields_are_computed_once_and_again_where_the_file_is_damaged(
-    tmp_path: Path, ball: TriangleMesh, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, ball: TriangleMesh
 ) -> None:
     said: list[str] = []
     first = OcclusionFields(said.append, tmp_path).find(placed(ball), SETTINGS)
@@ -197,7 +202,9 @@ def test_fields_are_computed_once_and_again_where_the_file_is_damaged(
     assert said == []
 
 
-def test_beside_rendering_a_field_arrives_later_and_the_user_is_told(tmp_path: Path, ball: TriangleMesh) -> None:
+def test_beside_rendering_a_field_arrives_later_and_the_user_is_told(
+    tmp_path: Path, ball: TriangleMesh
+) -> None:
     said: list[str] = []
     fields = OcclusionFields(said.append, tmp_path)
     fields.waits = False

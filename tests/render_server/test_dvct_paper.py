@@ -16,7 +16,7 @@ from protocol.scene import SceneDocument, parse_scene
 from render_server.gpu.context import GpuContext, create_context
 from render_server.passes.trace_paper import TracePaperPass
 from render_server.passes.volume import Pyramid
-from render_server.relight.defaults import resolve_dvct
+from render_server.relight.defaults import resolve_voxel_cones
 from render_server.relight.dvct_paper import DvctPaper
 from render_server.relighting import Relighting, RelitFrame
 from render_server.renderer import SceneRenderer
@@ -117,7 +117,7 @@ def run(gpu: GpuContext, document: SceneDocument, view_frame: ViewFrame) -> Run:
     relit = relighting.relight(view_frame, view)
     assert relit is not None
     settings: Any = document.method
-    operator = DvctPaper(gpu, settings, resolve_dvct(settings, software=True), view.size)
+    operator = DvctPaper(gpu, settings, resolve_voxel_cones(settings, software=True), view.size)
     layers = operator.relight(relit.input)
     return Run(RelitFrame(relit.input, layers, relit.uniforms), operator, relighting)
 

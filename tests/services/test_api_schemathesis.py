@@ -5,9 +5,9 @@ from collections.abc import Iterator
 import pytest
 import schemathesis
 from schemathesis import Case, Config
-from schemathesis.specs.openapi.schemas import OpenApiSchema
 from schemathesis.checks import not_a_server_error
 from schemathesis.specs.openapi import checks
+from schemathesis.specs.openapi.schemas import OpenApiSchema
 
 from services import ports
 from tests.services.api_samples import RunningApi, running_api
@@ -22,14 +22,18 @@ CHECKS = [
     checks.response_schema_conformance,
     checks.negative_data_rejection,
 ]
-CONFIG = Config.from_dict({"generation": {"max-examples": 10, "deterministic": True, "database": "none"}, "seed": 1})
+CONFIG = Config.from_dict(
+    {"generation": {"max-examples": 10, "deterministic": True, "database": "none"}, "seed": 1}
+)
 
 
 @pytest.fixture(scope="module")
 def api(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningApi]:
     (control_port,) = ports.private_ports(1)
     server = Recorder(control_port)
-    with running_api(tmp_path_factory.mktemp("data"), control=ports.endpoint(control_port), requests_per_s=10_000) as running:
+    with running_api(
+        tmp_path_factory.mktemp("data"), control=ports.endpoint(control_port), requests_per_s=10_000
+    ) as running:
         upload(running.store, TETRAHEDRON, "t.obj")
         yield running
     server.close()

@@ -3,10 +3,10 @@
 #include "passes/common/surfaces.glsl"
 #include "passes/common/ray_mesh.glsl"
 #include "passes/common/lobe.glsl"
+#include "passes/common/camera_pinhole.glsl"
 
 uniform mat4 world_from_camera;
 uniform vec3 camera_position;
-uniform vec4 camera_pinhole;   // fx, fy, cx, cy (pixel centres at integers)
 
 struct Mirror { bool present; vec3 point; vec3 normal; float depth; float alpha; };
 
