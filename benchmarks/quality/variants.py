@@ -97,6 +97,9 @@ BARE_EXACT: dict[str, Any] = {
     "far_volume": False,
     "bounces": 0,
     "reflections": "cones",
+    "mirrored_lights": False,
+    "caustics": False,
+    "screen_space": False,
 }
 """Two sets of voxels marched, everything else as in the paper as far as it can be."""
 
@@ -118,6 +121,9 @@ ABLATION_STEPS: tuple[tuple[str, str, dict[str, Any]], ...] = (
     ("+ surroundings", "light of what is out of sight", {"lights.surroundings": "auto"}),
     ("+ bounce", "light gathered once more from voxel to voxel", {"bounces": 1}),
     ("+ rays", "objects in smooth real surfaces by rays", {"reflections": "rays"}),
+    ("+ mirrored lights", "smooth declared planes throw the lights back", {"mirrored_lights": True}),
+    ("+ caustics", "smooth objects throw the lights on as beams", {"caustics": True}),
+    ("+ screen space", "smooth objects reflect the picture", {"screen_space": True}),
     ("+ antialiasing", "coverage of pixels at the objects' edges", {"output.antialiasing": True}),
     ("+ every pixel", "cones traced at every pixel", {"cone_scale": 1}),
     ("+ finer voxels", "128 voxels an edge", {"volume_size": 128}),

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Body, Request, Response, WebSocket, WebSocketDisconnect
 from fastapi.responses import StreamingResponse
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, ConfigDict, Field
 
 from protocol.messages import MAX_EDGE_PX
 from services.api.context import Shared
@@ -45,6 +45,8 @@ class Pick(BaseModel):
 
 class Pixel(BaseModel):
     """A place in the composite."""
+
+    model_config = ConfigDict(strict=True)
 
     x: float = Field(ge=-0.5, le=MAX_EDGE_PX, description="To the right; the first pixel's centre is 0.")
     y: float = Field(ge=-0.5, le=MAX_EDGE_PX, description="Down; the first pixel's centre is 0.")

@@ -5,7 +5,7 @@ from typing import Annotated, Any, get_args
 
 from fastapi import APIRouter, Body, Path, Response
 from fastapi.responses import FileResponse
-from pydantic import Field, model_validator
+from pydantic import Field, StrictBool, model_validator
 
 from protocol.documents import StrictModel
 from protocol.messages import Name
@@ -59,7 +59,7 @@ class NewSnapshot(StrictModel):
         max_length=MAX_PICTURES,
         description="All of one and the same frame.",
     )
-    exr: bool = Field(default=False, description=f"Add {EXR}: the composite's linear radiance.")
+    exr: StrictBool = Field(default=False, description=f"Add {EXR}: the composite's linear radiance.")
 
     @model_validator(mode="after")
     def _check(self) -> "NewSnapshot":
