@@ -1,12 +1,12 @@
 // Events of the service, which keep every browser in step.
 import { API } from "../api/http";
 import { role, version } from "../api/session";
-import type { ProcessAnswer, Recording, Replay } from "../api/types";
+import type { PictureState, ProcessAnswer, Recording, Replay } from "../api/types";
 import { ReconnectingSocket } from "../live/socket";
 import { readAssets } from "./assets";
 import { readRevisions } from "./history";
 import { readState, takeReport } from "./processes";
-import { readScene, readScenes, scene } from "./scene";
+import { readScene, readScenes, scene, takePicture } from "./scene";
 import { readRecordings, readReplay, readSnapshots, replay } from "./takes";
 import { toast } from "./toasts";
 
@@ -53,7 +53,7 @@ async function take(event: Event): Promise<void> {
     case "snapshot":
       return readSnapshots();
     case "picture":
-      { takePicture(event as unknown as PictureEvent); return; }
+      { takePictureEvent(event as unknown as PictureEvent); return; }
     case "notice":
       { toast(String(event.text)); return; }
   }
@@ -70,12 +70,7 @@ interface SceneEvent {
   readonly active: boolean;
 }
 
-interface PictureEvent {
-  readonly scene_id: string;
-  readonly revision: number;
-  readonly state: "shown" | "pending" | "refused";
-  readonly detail: string;
-}
+type PictureEvent = PictureState & { readonly scene_id: string };
 
 /** The first event of each connection: what happened before it is not known. */
 async function takeHello(hello: Hello): Promise<void> {
@@ -92,8 +87,8 @@ async function takeSceneEvent(event: SceneEvent): Promise<void> {
   await readRevisions();
 }
 
-function takePicture(event: PictureEvent): void {
-  if (event.state === "refused" && event.scene_id === scene.value?.id) toast(event.detail, "error");
+function takePictureEvent({ scene_id, state, revision, detail }: PictureEvent): void {
+  takePicture(scene_id, { state, revision, detail });
 }
 
 async function takeRecording(event: Partial<Recording>): Promise<void> {

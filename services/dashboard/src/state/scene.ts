@@ -1,7 +1,7 @@
 // The scene that is rendered: as the service has it, with this browser's changes on their way laid over it.
 import { computed, signal } from "@preact/signals";
 import { API, ProblemError, request } from "../api/http";
-import type { SceneAnswer, SceneDocument, SceneSummary } from "../api/types";
+import type { PictureState, SceneAnswer, SceneDocument, SceneSummary } from "../api/types";
 import { settled } from "./pending";
 import { attempt, tell, toast } from "./toasts";
 
@@ -36,6 +36,14 @@ export function takeScene(answer: SceneAnswer): void {
   const current = served.value;
   if (current?.id === answer.id && current.revision > answer.revision) return;
   served.value = answer;
+}
+
+/** Take what the render server made of the scene. */
+export function takePicture(sceneId: string, picture: PictureState): void {
+  const current = served.value;
+  if (current?.id !== sceneId) return;
+  if (picture.state === "refused" && current.picture?.detail !== picture.detail) toast(picture.detail, "error");
+  served.value = { ...current, picture };
 }
 
 export async function readScene(): Promise<void> {

@@ -26,15 +26,7 @@ export function PictureNotice() {
         </p>
       );
     case "stale":
-      return (
-        <Banner
-          text={
-            isTakingSnapshot.value
-              ? "The renderer takes the snapshot; the live picture goes on after it."
-              : "No new picture comes. See Nodes below for what stands still."
-          }
-        />
-      );
+      return <Banner text={staleText()} />;
     case "no-board":
       return <Banner text="The marker board is not in view, so objects cannot be placed. Point the camera at it." />;
     case "live":
@@ -42,9 +34,17 @@ export function PictureNotice() {
   }
 }
 
+const PENDING = "The render server does not answer; it gets this scene as soon as it does.";
+
+function staleText(): string {
+  if (isTakingSnapshot.value) return "The renderer takes the snapshot; the live picture goes on after it.";
+  if (scene.value?.picture?.state === "pending") return PENDING;
+  return "No new picture comes. See Nodes below for what stands still.";
+}
+
 function Pending() {
   const state = scene.value?.picture;
-  if (state?.state === "pending") return <Banner text="The render server does not answer; it gets this scene as soon as it does." />;
+  if (state?.state === "pending") return <Banner text={PENDING} />;
   if (state?.state === "refused") return <Banner text={state.detail} />;
   return null;
 }
