@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import cv2
@@ -32,7 +32,8 @@ def replacing(path: Path) -> Iterator[Path]:
             f"'{path}' cannot be written ({fault.strerror}); free some space or choose another folder."
         ) from fault
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):  # the fault above says what is wrong
+            temporary.unlink()
 
 
 def write_bytes(path: Path, content: bytes) -> None:

@@ -25,9 +25,6 @@ UNCHANGING = {
 PNG: dict[int | str, dict[str, Any]] = {
     200: {"content": {"image/png": {"schema": {"type": "string", "format": "binary"}}}}
 }
-_UPLOAD_ANSWERS = responses(400, 413, 415, 422) | {
-    200: {"model": AssetAnswer, "description": "The same content was there already."}
-}
 _KNOWN = ", ".join(each.name.upper() for each in FORMATS)
 _UPLOAD_ANSWERS: dict[int | str, dict[str, Any]] = {
     200: {"model": AssetAnswer, "description": "The same content was there already."},
