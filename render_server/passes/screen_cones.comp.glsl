@@ -47,15 +47,16 @@ vec4 look(vec3 from, vec3 d, float spread) {
 }
 
 // How position and normal change from a pixel to the next along an axis; the lesser change of both sides, so that
-// no edge counts.
+// no edge counts. Where no object shows, the raster may hold what another frame left.
 struct Change { vec3 position; vec3 normal; };
 
-Change change_along(ivec2 raster, ivec2 axis, vec4 position, vec4 normal) {
+Change change_along(ivec2 pixel, ivec2 axis, vec4 position, vec4 normal) {
     Change least = Change(vec3(0.0), vec3(1e3));
     for (int side = -1; side <= 1; side += 2) {
-        vec4 p = texelFetch(virtual_raster_position, raster + side * axis, 0);
-        vec4 n = texelFetch(virtual_raster_normal, raster + side * axis, 0);
-        bool next = p.w > 0.0 && n.w == normal.w && distance(n, normal) < length(least.normal);
+        ivec2 beside = clamp(pixel + side * axis, ivec2(0), textureSize(matte, 0) - 1), raster = raster_texel(beside);
+        vec4 p = texelFetch(virtual_raster_position, raster, 0), n = texelFetch(virtual_raster_normal, raster, 0);
+        bool shown = p.w > 0.0 && texelFetch(matte, beside, 0).r > 0.0;
+        bool next = shown && n.w == normal.w && distance(n, normal) < length(least.normal);
         if (next) least = Change(float(side) * (p - position).xyz, float(side) * (n - normal).xyz);
     }
     return length(least.normal) < 1.0 ? least : Change(vec3(0.0), vec3(0.0));
@@ -79,8 +80,8 @@ vec4 reflection(ivec2 pixel) {
     bool shines = m.dielectric.rgb != vec3(0.0) || m.base_color.a > 0.0;
     if (!shines || m.dielectric.a >= ROUGHEST) return vec4(0.0);
     float alpha = max(m.dielectric.a * m.dielectric.a, LEAST_ALPHA);
-    Change x = change_along(raster, ivec2(1, 0), position, normal);
-    Change y = change_along(raster, ivec2(0, 1), position, normal);
+    Change x = change_along(pixel, ivec2(1, 0), position, normal);
+    Change y = change_along(pixel, ivec2(0, 1), position, normal);
     float spread = spread_of(alpha, x, y);
     vec4 sum = vec4(0.0);
     float count = 0.0;
