@@ -20,6 +20,7 @@ from jaxtyping import UInt8
 
 from protocol.codecs import decode_color
 from protocol.errors import DeltalightError
+from protocol.files import replacing, write_bytes
 from protocol.scene import SceneDocument
 
 if TYPE_CHECKING:
@@ -199,14 +200,21 @@ class Scene:
 
 
 class Client:
-    """Speaks with one service. Errors are `ApiError`; a service that does not answer is a `DeltalightError`."""
+    """Speaks with one service. Errors are `ApiError`; a service that does not answer is a `DeltalightError`.
+
+    Raises:
+        DeltalightError: the address is none.
+    """
 
     def __init__(self, address: str, token: str | None = None, *, timeout_s: float = 60.0) -> None:
         self._address = address.rstrip("/")
         self._headers = {} if token is None else {"Authorization": f"Bearer {token}"}
-        self._http = httpx.Client(
-            base_url=self._address + "/api/v1", headers=self._headers, timeout=timeout_s
-        )
+        try:
+            self._http = httpx.Client(
+                base_url=self._address + "/api/v1", headers=self._headers, timeout=timeout_s
+            )
+        except httpx.InvalidURL as fault:
+            raise DeltalightError(f"{address!r} is no address ({fault}); use http://HOST:PORT.") from fault
 
     def __enter__(self) -> Self:
         return self
@@ -263,14 +271,19 @@ class Client:
     def snapshot(
         self, folder: Path, pictures: Sequence[Mapping[str, Any]] | None = None, *, exr: bool = False
     ) -> list[Path]:
-        """Render one frame in several ways, `{name, view, method?}` each, and save the pictures in `folder`."""
+        """Render one frame in several ways, `{name, view, method?}` each, and save the pictures in `folder`.
+
+        Raises:
+            ApiError: no picture could be rendered.
+            DeltalightError: a picture cannot be written, or the service does not answer.
+        """
         body = {"exr": exr, **({} if pictures is None else {"pictures": [dict(each) for each in pictures]})}
         made = self.request("POST", "/snapshots", json=body)
         folder.mkdir(parents=True, exist_ok=True)
         files = []
         for name in made["files"]:
             files.append(folder / name)
-            files[-1].write_bytes(self._bytes(f"/snapshots/{made['id']}/{name}"))
+            write_bytes(files[-1], self._sent("GET", f"/snapshots/{made['id']}/{name}").content)
         return files
 
     def start_recording(self, name: str | None = None, duration_s: float | None = None) -> Json:
@@ -284,12 +297,18 @@ class Client:
         return cast(Json, self.request("POST", f"/recordings/{recording_id}/stop"))
 
     def download_recording(self, recording_id: str, path: Path) -> None:
-        """Save a recording as an .mcap file."""
-        with self._http.stream("GET", f"/recordings/{recording_id}/content") as response:
+        """Save a recording as an .mcap file, whole or not at all.
+
+        Raises:
+            ApiError: there is none, or it still grows.
+            DeltalightError: the file cannot be written, or the service does not answer.
+        """
+        address = f"/recordings/{recording_id}/content"
+        with replacing(path) as temporary, self._reaching(), self._http.stream("GET", address) as response:
             if response.is_error:
                 response.read()
                 raise _refusal(response)
-            with path.open("wb") as file:
+            with temporary.open("wb") as file:
                 for chunk in response.iter_bytes():
                     file.write(chunk)
 
@@ -314,26 +333,34 @@ class Client:
             ApiError: the service refused it.
             DeltalightError: the service does not answer.
         """
+        response = self._sent(method, path, **options)
         try:
+            return response.json() if response.content else None
+        except ValueError as fault:
+            raise DeltalightError(
+                f"What answers at {self._address} is no Deltalight; correct the address."
+            ) from fault
+
+    def _sent(self, method: str, path: str, **options: Any) -> httpx.Response:  # noqa: ANN401 - as httpx takes them
+        with self._reaching():
             response = self._http.request(method, path, **options)
-        except httpx.TransportError as fault:
+        if response.is_error:
+            raise _refusal(response)
+        return response
+
+    @contextmanager
+    def _reaching(self) -> Iterator[None]:
+        try:
+            yield
+        except httpx.RequestError as fault:
             raise DeltalightError(
                 f"No service answers at {self._address} ({fault}); start it, or correct the address."
             ) from fault
-        if response.is_error:
-            raise _refusal(response)
-        return response.json() if response.content else None
-
-    def _bytes(self, path: str) -> bytes:
-        response = self._http.get(path)
-        if response.is_error:
-            raise _refusal(response)
-        return response.content
 
     @contextmanager
     def _socket(self, path: str) -> Iterator["ClientConnection"]:
         """Open a WebSocket, with a ticket where the service wants tokens."""
-        from websockets.exceptions import ConnectionClosedError, InvalidHandshake
+        from websockets.exceptions import WebSocketException
         from websockets.sync.client import connect
 
         query = f"?ticket={self.request('POST', '/tickets')['ticket']}" if self._headers else ""
@@ -341,7 +368,7 @@ class Client:
         try:
             with connect(address, max_size=None, compression=None) as socket:
                 yield socket
-        except (OSError, InvalidHandshake, ConnectionClosedError) as fault:
+        except (OSError, WebSocketException) as fault:
             raise DeltalightError(
                 f"The stream {path} of {self._address} ended ({fault}); see whether the service runs."
             ) from fault

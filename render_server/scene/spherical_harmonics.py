@@ -6,8 +6,6 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 MAX_ORDER = 5
-# Of a clamped cosine, by band: what a convolution with it leaves (Ramamoorthi & Hanrahan 2001, eq. 8).
-COSINE_BANDS = (math.pi, 2 * math.pi / 3, math.pi / 4, 0.0, -math.pi / 24)
 
 
 def _constant(numerator: float, denominator: float) -> float:
@@ -37,11 +35,6 @@ def harmonics(directions: Float[np.ndarray, "n 3"], order: int) -> Float64[np.nd
         _constant(315, 256) * (x2 * (x2 - 3 * y2) - y2 * (3 * x2 - y2)),
     ]
     return np.stack(functions[: order**2], axis=1)
-
-
-def cosine_factors(order: int) -> Float64[np.ndarray, " k"]:
-    """Return for each coefficient the factor by which a clamped cosine about the same normal weighs it."""
-    return np.repeat(COSINE_BANDS[:order], [2 * band + 1 for band in range(order)])
 
 
 def even_directions(count: int) -> Float64[np.ndarray, "count 3"]:

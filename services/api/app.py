@@ -64,6 +64,7 @@ RESOURCES = (
     state,
     event_socket,
 )
+ANYWHERE = (400, 401, 403, 413, 422, 429, 503)  # what the gate, a body or the disk may be refused with
 DESCRIPTION = """Scenes, assets and the state of a Deltalight installation.
 
 Every change of a scene is a revision; `If-Match` with the revision that a change is made to refuses it (409) where
@@ -152,7 +153,7 @@ def create_app(settings: ApiSettings, store: Store, keys: Keys | None = None) ->
     app.state.context = context
     context.problems.install(app)
     for resource in RESOURCES:
-        app.include_router(resource.router, prefix=PREFIX, responses=responses(400, 401, 403, 413, 422, 429))
+        app.include_router(resource.router, prefix=PREFIX, responses=responses(*ANYWHERE))
     app.router.default = Page(app.router.not_found)
     return app
 
@@ -172,6 +173,7 @@ def _context(settings: ApiSettings, store: Store, keys: Keys | None) -> Context:
         settings.control,
         publish=lambda position: events.publish("replay", replay.replay_answer(position).model_dump()),
         notice=lambda text: events.publish("notice", {"text": text}),
+        keys=keys,
     )
     return Context(
         store=store,

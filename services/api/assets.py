@@ -4,10 +4,10 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
-from fastapi.responses import FileResponse
 
 from protocol.scene import DIGEST_PREFIX
 from services.api.context import Shared
+from services.api.kept_files import KeptFile
 from services.api.models import AssetAnswer
 from services.api.problems import ProblemError, responses
 from services.storage.asset_kinds import FORMATS
@@ -76,19 +76,19 @@ def get_asset(shared: Shared, digest: Digest) -> AssetAnswer:
     return AssetAnswer.of(shared.store.assets.get(digest.removeprefix(DIGEST_PREFIX)))
 
 
-@router.get("/{digest}/content", response_class=FileResponse, responses=responses(404))
-def download_asset(shared: Shared, digest: Digest) -> FileResponse:
+@router.get("/{digest}/content", response_class=KeptFile, responses=responses(404, 416))
+def download_asset(shared: Shared, digest: Digest) -> KeptFile:
     """Download the file."""
     asset = shared.store.assets.get(digest.removeprefix(DIGEST_PREFIX))
     path = shared.store.assets.path(asset)
-    return FileResponse(path, media_type=asset.format.media_type, filename=asset.names[0], headers=UNCHANGING)
+    return KeptFile(path, media_type=asset.format.media_type, filename=asset.names[0], headers=UNCHANGING)
 
 
-@router.get("/{digest}/thumbnail.png", response_class=FileResponse, responses=responses(404, 422) | PNG)
-def thumbnail(shared: Shared, digest: Digest) -> FileResponse:
+@router.get("/{digest}/thumbnail.png", response_class=KeptFile, responses=responses(404, 422) | PNG)
+def thumbnail(shared: Shared, digest: Digest) -> KeptFile:
     """Return a picture of a mesh or map, 256 x 256 pixels on a transparent ground."""
     path = shared.store.assets.thumbnail(digest.removeprefix(DIGEST_PREFIX))
-    return FileResponse(path, media_type="image/png", headers=UNCHANGING)
+    return KeptFile(path, media_type="image/png", headers=UNCHANGING)
 
 
 @router.delete("/{digest}", status_code=204, responses=responses(404, 409))

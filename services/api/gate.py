@@ -8,6 +8,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import Headers, QueryParams
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from protocol.errors import DeltalightError
 from services.api.passes import Pass, give_pass, pass_of
 from services.api.places import StreamPlaces, run_while
 from services.api.problems import ProblemError, Problems
@@ -80,6 +81,9 @@ class Gate:
             limit.check_announced(Headers(scope=scope))
         except ProblemError as refusal:
             await self._problems.of_http(refusal)(scope, receive, send)
+            return
+        except DeltalightError as fault:  # the tokens cannot be read now
+            await self._problems.of_fault(fault)(scope, receive, send)
             return
         await self._app(scope, limit.receive, send)
 

@@ -11,16 +11,18 @@ from pathlib import Path
 import structlog
 
 from protocol.errors import DeltalightError
+from protocol.keys import Keys
 from protocol.messages import ControlRequest
 from protocol.transport import RequestClient
-from services import ports
 from services.api.owned_child import OwnedChild
 from services.api.render_link import RenderLink, UnansweredError
+from services.api.replay_places import ReplayPlaces
 from services.storage.faults import ConflictError
 
 # A child's imports and its first frame take two seconds on a slow machine, five with two busy cores.
 START_TIMEOUT_S = 20.0
 ASK_TIMEOUT_S, LOOK_PERIOD_S = 2.0, 0.5
+START_ASK_TIMEOUT_S = 0.5  # so soon it is seen that a child ended instead of answering
 END_TIMEOUT_S = 3.0
 NODE = "replay"
 
@@ -54,17 +56,20 @@ class ReplayOrder:
 class Playback:
     """At most one replay, watched by a thread; when it ends for any reason the live nodes are shown again.
 
-    `publish` is told the position twice a second while it moves, and None when live is back; `notice` sentences.
+    `server` is the endpoint of the render server's commands. `publish` is told the position twice a second while it
+    moves, and None when live is back; `notice` sentences.
     """
 
     def __init__(
         self,
         link: RenderLink,
-        clock: str,
+        server: str,
         publish: Callable[[Position | None], None],
         notice: Callable[[str], None],
+        keys: Keys | None = None,
     ) -> None:
-        self._link, self._clock, self._publish, self._notice = link, clock, publish, notice
+        self._link, self._server, self._keys = link, server, keys
+        self._publish, self._notice = publish, notice
         self._changing = threading.Lock()
         self._shown: _Shown | None = None
 
@@ -87,18 +92,17 @@ class Playback:
         """Show a recording.
 
         Raises:
+            ConflictError: the render server is on another host.
             DeltalightError: it cannot be replayed.
         """
         with self._changing:
+            places = ReplayPlaces.beside(self._server)
             self._end()
-            node_port, control_port = ports.private_ports(2)
-            shown = _Shown(
-                order, ports.endpoint(node_port), ports.endpoint(control_port), self._clock, self._ended
-            )
+            shown = _Shown(order, places, self._server, self._keys, self._ended)
             try:
                 position = shown.first_position()
                 self._shown = shown
-                self._use((shown.endpoint,))
+                self._use((places.streams,))
             except BaseException:
                 if self._shown is shown:  # a server that refused may have read from there before it did
                     with suppress(DeltalightError):
@@ -149,8 +153,10 @@ class Playback:
         shown, self._shown = self._shown, None
         if shown is None:
             return False
-        self._use(None)
-        shown.close()
+        try:
+            self._use(None)
+        finally:
+            shown.close()
         return True
 
     def _use(self, endpoints: tuple[str, ...] | None) -> None:
@@ -187,21 +193,23 @@ class _Shown:
     def __init__(
         self,
         order: ReplayOrder,
-        endpoint: str,
-        control: str,
-        clock: str,
+        places: ReplayPlaces,
+        server: str,
+        keys: Keys | None,
         ended: Callable[["_Shown", str], None],
     ) -> None:
-        self.order, self.endpoint = order, endpoint
+        self.order = order
         self.last: Position | None = None
-        self._client = RequestClient(control)
-        words = ["replay", str(order.path), "--publish", endpoint, "--control", control, "--name", NODE]
-        words += ["--clock", clock, "--rate", str(order.rate), "--start", str(order.position_s)]
+        self._places = places
+        self._client = RequestClient(places.control, keys=keys)
+        words = ["replay", str(order.path), "--publish", places.streams, "--control", places.control]
+        words += ["--name", NODE, "--clock", server]
+        words += ["--rate", str(order.rate), "--start", str(order.position_s)]
         words += (["--loop"] if order.loop else []) + ([] if order.playing else ["--paused"])
-        self._is_closing = False
+        self._is_closing = self._has_answered = False
 
         def end(child: OwnedChild, _code: int) -> None:
-            if not self._is_closing:
+            if self._has_answered and not self._is_closing:
                 ended(self, child.last_sentence or "it said nothing.")
 
         self._child = OwnedChild(*words, on_end=end)
@@ -214,14 +222,18 @@ class _Shown:
         """
         deadline_s = time.monotonic() + START_TIMEOUT_S
         while time.monotonic() < deadline_s and self._child.is_running:
-            try:
-                return self.ask("position")
-            except UnansweredError:
-                continue
+            with suppress(UnansweredError):
+                position = self.ask("position", timeout_s=START_ASK_TIMEOUT_S)
+                self._has_answered = True
+                if self._child.is_running:  # else nobody would hear of its end
+                    return position
+        self._child.wait(START_ASK_TIMEOUT_S)  # for its last words
         sentence = self._child.last_sentence.replace(str(self.order.path), self.order.recording)
         raise DeltalightError(sentence or f"The replay of {self.order.recording} does not start; try again.")
 
-    def ask(self, op: str, payload: dict[str, object] | None = None) -> Position:
+    def ask(
+        self, op: str, payload: dict[str, object] | None = None, timeout_s: float = ASK_TIMEOUT_S
+    ) -> Position:
         """Carry out a command; gives the position after it.
 
         Raises:
@@ -232,7 +244,7 @@ class _Shown:
             node="api", capture_ns=time.time_ns(), id=uuid.uuid4().hex, op=op, payload=payload or {}
         )
         try:
-            reply = self._client.request(request, ASK_TIMEOUT_S)
+            reply = self._client.request(request, timeout_s)
         except DeltalightError as fault:
             raise UnansweredError(f"The replay does not answer ({fault}).") from fault
         if reply.error is not None:
@@ -245,3 +257,4 @@ class _Shown:
         self._is_closing = True
         self._child.end(END_TIMEOUT_S)
         self._client.close()
+        self._places.clear()

@@ -129,6 +129,12 @@ class Problems:
                 400, "incomplete", "The connection ended before the body did; send it again."
             )
 
+        @app.exception_handler(OSError)
+        async def _disk(_request: Request, fault: OSError) -> JSONResponse:
+            log.error("the data folder cannot be used", fault=str(fault))
+            sentence = f"The data folder cannot be used ({fault.strerror}); free some space, or see to its rights."
+            return self.response(503, "storage-fault", sentence)
+
         @app.exception_handler(Exception)
         async def _internal(_request: Request, fault: Exception) -> JSONResponse:
             sentence = f"The service failed ({type(fault).__name__}); see its log and report it."

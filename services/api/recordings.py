@@ -4,7 +4,6 @@ from datetime import UTC, datetime
 from typing import Annotated, Any, Literal, Self
 
 from fastapi import APIRouter, Body, Path, Response
-from fastapi.responses import FileResponse
 from pydantic import Field
 
 from protocol.documents import StrictModel
@@ -12,6 +11,7 @@ from protocol.errors import DeltalightError
 from protocol.messages import Name
 from services.api.bodies import AS_SENT, checked
 from services.api.context import Context, Shared
+from services.api.kept_files import KeptFile
 from services.api.problems import responses
 from services.api.take_recorder import RunningTake
 from services.api.take_shelf import NAME, Take, TakeShelf
@@ -161,26 +161,26 @@ def recover_recording(shared: Shared, recording_id: RecordingId) -> RecordingAns
 
 
 @router.get(
-    "/{recording_id}/content", response_class=FileResponse, responses=responses(404, 409) | DOWNLOAD_ANSWER
+    "/{recording_id}/content", response_class=KeptFile, responses=responses(404, 409, 416) | DOWNLOAD_ANSWER
 )
-def download_recording(shared: Shared, recording_id: RecordingId) -> FileResponse:
+def download_recording(shared: Shared, recording_id: RecordingId) -> KeptFile:
     """Download the .mcap file; ranges of it too."""
     _require_at_rest(shared, recording_id)
     take = shared.takes.get(recording_id)
     if take.state == "interrupted":
         raise ConflictError(f"{take.id} was interrupted; recover it, then download it.")
-    return FileResponse(take.path, media_type="application/octet-stream", filename=take.path.name)
+    return KeptFile(take.path, media_type="application/octet-stream", filename=take.path.name)
 
 
 @router.get(
     "/{recording_id}/poster.jpg",
-    response_class=FileResponse,
+    response_class=KeptFile,
     responses=responses(404, 409, 422) | POSTER_ANSWER,
 )
-def recording_poster(shared: Shared, recording_id: RecordingId) -> FileResponse:
+def recording_poster(shared: Shared, recording_id: RecordingId) -> KeptFile:
     """Return the first colour picture, at most 640 pixels wide or high."""
     _require_at_rest(shared, recording_id)
-    return FileResponse(shared.takes.poster(recording_id), media_type="image/jpeg")
+    return KeptFile(shared.takes.poster(recording_id), media_type="image/jpeg")
 
 
 @router.delete("/{recording_id}", status_code=204, responses=responses(404, 409))

@@ -57,7 +57,7 @@ class RenderLink:
         self._on_picture = on_picture
         self._client = RequestClient(control, keys=keys)
         self._sending = threading.Lock()
-        self._is_reachable = True
+        self._answers: bool | None = None  # not asked yet
         self._server_revision: int | None = None
         self._picture: Picture | None = None
         self._source: list[str] | None = None
@@ -82,8 +82,8 @@ class RenderLink:
 
     @property
     def is_reachable(self) -> bool:
-        """Whether the server answered when it was last asked."""
-        return self._is_reachable
+        """Whether the server answered when it was last asked; not before it was asked."""
+        return self._answers is True
 
     @property
     def picture(self) -> Picture | None:
@@ -99,7 +99,7 @@ class RenderLink:
             active = self._store.scenes.active()
             if active is None or self._is_settled(active):
                 return self._picture
-            picture = self._send(active) if self._is_reachable else _pending(active)
+            picture = _pending(active) if self._answers is False else self._send(active)
             if picture != self._picture:
                 self._picture = picture
                 self._on_picture(picture)
@@ -118,9 +118,10 @@ class RenderLink:
             UnansweredError: it does not answer.
             DeltalightError: it refused the command.
         """
-        if not self._is_reachable:
-            raise UnansweredError("The render server does not answer; see that it runs, then try again.")
+        self._refuse_where_silent()
         with self._sending:
+            self._refuse_where_silent()  # the first look may just have found nobody
+            self._require_alive()
             return self._ask(op, timeout_s, payload)
 
     def use_source(self, endpoints: Sequence[str] | None) -> None:
@@ -135,6 +136,18 @@ class RenderLink:
         self._source = None if endpoints is None else list(endpoints)
         self.on_source(self._source)
         self.command("set_source", {"endpoints": self._source})
+
+    def _refuse_where_silent(self) -> None:
+        if self._answers is False:
+            raise UnansweredError("The render server does not answer; see that it runs, then try again.")
+
+    def _require_alive(self) -> None:
+        """Find out within a second that a server has died; how long its commands take, only the renderer knows."""
+        try:
+            self._ask(CLOCK_OP, ALIVE_TIMEOUT_S)
+        except UnansweredError:
+            self._note_reachable(False)
+            self._refuse_where_silent()
 
     def _is_settled(self, active: StoredScene) -> bool:
         picture = self._picture
@@ -190,12 +203,13 @@ class RenderLink:
         return int(revision)
 
     def _look(self) -> None:
-        """Once a second: a server that came (back) gets the scene."""
-        while not self._stop.wait(LOOK_INTERVAL_S):
+        """At once and then once a second: a server that came (back) gets the scene."""
+        while not self._stop.is_set():
             try:
                 self._look_once()
             except DeltalightError as fault:
                 log.warning("the render server cannot be kept up to date", fault=str(fault))
+            self._stop.wait(LOOK_INTERVAL_S)
 
     def _look_once(self) -> None:
         with self._sending:
@@ -205,7 +219,7 @@ class RenderLink:
             except UnansweredError:
                 self._note_reachable(False)
                 return
-            if self._server_revision is None or not self._is_reachable:
+            if self._server_revision is None or not self._answers:
                 self._restore_source()
             self._note_reachable(True)
             if self._server_revision is None or seen < self._server_revision:  # it was started (again)
@@ -224,9 +238,9 @@ class RenderLink:
             log.warning("the render server keeps its source", fault=str(fault))
 
     def _note_reachable(self, reachable: bool) -> None:
-        if reachable != self._is_reachable:
+        if reachable != self._answers:
             log.info("render server answers" if reachable else "render server does not answer")
-        self._is_reachable = reachable
+        self._answers = reachable
 
     def _ask(
         self,

@@ -75,7 +75,7 @@ class SnapshotShelf:
         """
         facts = _facts(self._folder / name) if ID.fullmatch(name) else None
         if facts is None:
-            raise NotFoundError(f"there is no snapshot {name!r:.60}; list the snapshots for their names.")
+            raise _absent(name)
         return facts
 
     def file(self, name: str, file: str) -> Path:
@@ -96,7 +96,10 @@ class SnapshotShelf:
         """
         self.get(name)
         hidden = self._folder / f".{name}.part"
-        (self._folder / name).rename(hidden)
+        try:
+            (self._folder / name).rename(hidden)
+        except FileNotFoundError as fault:  # somebody else was faster
+            raise _absent(name) from fault
         shutil.rmtree(hidden, ignore_errors=True)
 
     def add(self, take: Callable[[str, Path], SnapshotFacts]) -> SnapshotFacts:
@@ -130,6 +133,10 @@ def files_of(answer: dict[str, Any], folder: Path) -> tuple[list[str], dict[str,
     written = [str(each) for each in answer.get("files", []) if FILE.fullmatch(str(each))]
     faults = {str(name): str(fault) for name, fault in answer.get("errors", {}).items()}
     return [each for each in written if (folder / each).is_file()], faults
+
+
+def _absent(name: str) -> NotFoundError:
+    return NotFoundError(f"there is no snapshot {name!r:.60}; list the snapshots for their names.")
 
 
 def now() -> datetime:

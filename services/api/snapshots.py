@@ -4,7 +4,6 @@ from pathlib import Path as FilePath
 from typing import Annotated, Any, get_args
 
 from fastapi import APIRouter, Body, Path, Response
-from fastapi.responses import FileResponse
 from pydantic import Field, StrictBool, model_validator
 
 from protocol.documents import StrictModel
@@ -13,6 +12,7 @@ from protocol.scene_method import Method, Output
 from services.api.assets import UNCHANGING
 from services.api.bodies import AS_SENT, checked
 from services.api.context import Context, Shared
+from services.api.kept_files import KeptFile
 from services.api.problems import ProblemError, responses
 from services.api.snapshot_shelf import ID, SnapshotFacts, SnapshotPicture, files_of, now
 
@@ -99,16 +99,16 @@ def get_snapshot(shared: Shared, snapshot_id: SnapshotId) -> SnapshotFacts:
     return shared.snapshots.get(snapshot_id)
 
 
-@router.get("/{snapshot_id}/{file}", response_class=FileResponse, responses=responses(404) | FILE_ANSWER)
+@router.get("/{snapshot_id}/{file}", response_class=KeptFile, responses=responses(404) | FILE_ANSWER)
 def snapshot_file(
     shared: Shared,
     snapshot_id: SnapshotId,
     file: Annotated[str, Path(max_length=80, description="One of its files.", examples=["composite.png"])],
-) -> FileResponse:
+) -> KeptFile:
     """Return a picture of a snapshot."""
     path = shared.snapshots.file(snapshot_id, file)
     media_type = "image/x-exr" if path.suffix == ".exr" else "image/png"
-    return FileResponse(path, media_type=media_type, headers=UNCHANGING)
+    return KeptFile(path, media_type=media_type, headers=UNCHANGING)
 
 
 @router.delete("/{snapshot_id}", status_code=204, responses=responses(404))

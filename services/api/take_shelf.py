@@ -3,8 +3,9 @@
 import json
 import os
 import re
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
@@ -24,6 +25,7 @@ from services.storage.faults import ConflictError, NotFoundError
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")  # no dots: nothing that ends like a suffix
 POSTER_EDGE = 640
 POSTER_QUALITY = 85
+LEFT_OVER_AFTER_S = 3600.0  # mending writes all the time: what is older, a killed process left
 
 Facts = dict[str, Any]
 
@@ -55,11 +57,16 @@ class TakeShelf:
         self.folder = make_output_folder(folder)
         self._cache = make_output_folder(folder / ".cache")
         self._reading = Lock()  # one recording is read at a time: it takes the disk
+        for path in folder.glob(f".*.tmp{SUFFIX}*"):
+            if path.stat().st_mtime < time.time() - LEFT_OVER_AFTER_S:
+                path.unlink(missing_ok=True)
 
     def all(self) -> list[Take]:
         """Return all recordings, the newest first."""
-        paths = {path.name.split(".")[0]: path for path in self._paths()}
-        takes = [self._take(path) for path in paths.values()]
+        takes = []
+        for name in {path.name.split(".")[0] for path in self._paths()}:
+            with suppress(NotFoundError):  # deleted meanwhile
+                takes.append(self.get(name))
         return sorted(takes, key=lambda take: (-take.changed_ns, take.id))
 
     def get(self, name: str) -> Take:
@@ -96,7 +103,7 @@ class TakeShelf:
         path = self._path(name)
         place = self._cache / f"{name}.jpg"
         with self._reading, _naming(path):
-            if not place.is_file() or place.stat().st_mtime_ns < path.stat().st_mtime_ns:
+            if not place.is_file() or place.stat().st_mtime_ns < _status(path).st_mtime_ns:
                 write_bytes(place, _first_picture(path))
         return place
 
@@ -124,11 +131,12 @@ class TakeShelf:
             NotFoundError: there is none of this name.
         """
         path = self._path(name)
-        for each in (path, self._cache / f"{name}.jpg", self._cache / f"{name}.json"):
+        torn = path.with_name(name + SUFFIX + ACTIVE_SUFFIX)  # also beside one that was just mended from it
+        for each in (path, torn, self._cache / f"{name}.jpg", self._cache / f"{name}.json"):
             each.unlink(missing_ok=True)
 
     def _paths(self) -> Iterator[Path]:
-        """Unfinished recordings first, so that a finished one of the same name counts."""
+        """All recordings, unfinished ones too."""
         for suffix in (SUFFIX + ACTIVE_SUFFIX, SUFFIX):
             for path in self.folder.glob(f"*{suffix}"):
                 if NAME.fullmatch(path.name.removesuffix(suffix)):
@@ -139,10 +147,10 @@ class TakeShelf:
             path = self.folder / (name + suffix)
             if NAME.fullmatch(name) and path.is_file():
                 return path
-        raise NotFoundError(f"there is no recording {name!r:.80}; list the recordings for their names.")
+        raise _absent(name)
 
     def _take(self, path: Path) -> Take:
-        status, name = path.stat(), path.name.split(".")[0]
+        status, name = _status(path), path.name.split(".")[0]
         facts, detail = self._facts(path, [status.st_size, status.st_mtime_ns])
         state: Literal["finished", "interrupted"] = "finished" if path.suffix == SUFFIX else "interrupted"
         return Take(name, path, state, status.st_size, status.st_mtime_ns, facts, detail)
@@ -150,16 +158,33 @@ class TakeShelf:
     def _facts(self, path: Path, key: list[int]) -> tuple[Facts | None, str]:
         """What a recording holds, or why it cannot be read; kept, because it takes reading the whole file."""
         place = self._cache / f"{path.name.split('.')[0]}.json"
+        known = _kept_facts(place, key)
+        if known is not None:
+            return known
         with self._reading:
-            try:
-                kept = json.loads(place.read_text())
-                if kept["key"] == key:
-                    return kept["facts"], kept["detail"]
-            except (OSError, ValueError, KeyError, TypeError):
-                pass  # there is none yet, or one that a full disk cut short
             facts, detail = _described(path)
             write_bytes(place, json.dumps({"key": key, "facts": facts, "detail": detail}).encode())
             return facts, detail
+
+
+def _absent(name: str) -> NotFoundError:
+    return NotFoundError(f"there is no recording {name!r:.80}; list the recordings for their names.")
+
+
+def _status(path: Path) -> os.stat_result:
+    """Size and time of a recording, which somebody may delete, or finish, after it was found."""
+    try:
+        return path.stat()
+    except FileNotFoundError as fault:
+        raise _absent(path.name.split(".")[0]) from fault
+
+
+def _kept_facts(place: Path, key: list[int]) -> tuple[Facts | None, str] | None:
+    try:
+        kept = json.loads(place.read_text())
+        return (kept["facts"], kept["detail"]) if kept["key"] == key else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None  # there is none yet, or one that a full disk cut short
 
 
 def _described(path: Path) -> tuple[Facts | None, str]:

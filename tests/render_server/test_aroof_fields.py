@@ -21,7 +21,7 @@ from render_server.scene.occlusion_field_cache import (
 )
 from render_server.scene.occlusion_rays import ObjectRays
 from render_server.scene.occlusion_transfer import object_surface
-from render_server.scene.spherical_harmonics import cosine_factors, even_directions, harmonics
+from render_server.scene.spherical_harmonics import even_directions, harmonics
 
 SETTINGS = FieldSettings(order=4, shells=3, resolution=12, reach=4.0, rays=256, indirect=True)
 RADIUS = 0.5
@@ -57,7 +57,9 @@ def test_harmonics_are_orthonormal_and_turn_a_cosine_into_itself() -> None:
     basis = harmonics(directions, 5)
     assert basis.T @ basis * 4 * np.pi / 20000 == pytest.approx(np.eye(25), abs=1e-4)
     normal = np.array([[0.6, 0.0, 0.8]])
-    transfer = harmonics(normal, 5)[0] * cosine_factors(5)
+    # What a clamped cosine leaves of each band (Ramamoorthi & Hanrahan 2001, eq. 8).
+    bands = [np.pi, 2 * np.pi / 3, np.pi / 4, 0.0, -np.pi / 24]
+    transfer = harmonics(normal, 5)[0] * np.repeat(bands, [1, 3, 5, 7, 9])
     cosine = np.maximum(directions @ normal[0], 0)
     assert transfer == pytest.approx(cosine @ basis * 4 * np.pi / 20000, abs=1e-3)
 
@@ -200,6 +202,31 @@ def test_fields_are_computed_once_and_again_where_the_file_is_damaged(
     assert (third.occlusion == first.occlusion).all()
     assert file.stat().st_size > 1000
     assert said == []
+
+
+def test_a_second_start_computes_nothing(
+    tmp_path: Path, ball: TriangleMesh, ball_field: OcclusionField, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store_field(tmp_path, field_digest(object_surface([ball], plain=True), SETTINGS), ball_field)
+    monkeypatch.setattr("render_server.occlusion_fields.compute_field", lambda *_: pytest.fail("computed"))
+    found = OcclusionFields(pytest.fail, tmp_path).find(placed(ball), SETTINGS)
+    assert found is not None
+    assert (found.occlusion == ball_field.occlusion).all()
+
+
+def test_a_terminal_shows_how_far_the_field_is(
+    tmp_path: Path,
+    ball: TriangleMesh,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setenv("TERM", "xterm")
+    OcclusionFields(pytest.fail, tmp_path).find(placed(ball), SETTINGS)
+    shown = capsys.readouterr()
+    assert "occlusion field of `ball`" in shown.err
+    assert "100%" in shown.err
+    assert shown.out == ""
 
 
 def test_beside_rendering_a_field_arrives_later_and_the_user_is_told(

@@ -1,100 +1,156 @@
-"""Requests made from the OpenAPI description itself: whatever comes, there is no 5xx and answers keep to it."""
+"""schemathesis over the whole OpenAPI description: no 5xx, and every answer keeps to what is described.
 
+Not covered, because no description holds them: the WebSockets and the endless `live.mjpg`. Render server, node
+and the children that record and replay are stand-ins, so that no request waits for a frame.
+"""
+
+import copy
+import json
+import subprocess
+import sys
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
-from hypothesis.strategies import SearchStrategy
 
-from tests.services.api_samples import UPLOAD, RunningApi, running_api
-from tests.services.storage_samples import TETRAHEDRON
+from protocol.messages import ControlRequest
+from services import ports
+from services.api import playback, take_recorder
+from tests.services.api_samples import RunningApi, running_api
+from tests.services.live_samples import StandInStream, wait_for_frames
+from tests.services.record_samples import frames, write
+from tests.services.render_server_samples import Recorder
+from tests.services.storage_samples import TETRAHEDRON, upload
 
-EXAMPLES = 250
 PROBLEM = "application/problem+json"
-JSON = st.recursive(
-    st.none()
-    | st.booleans()
-    | st.integers()
-    | st.floats(allow_nan=False, allow_infinity=False)
-    | st.text(max_size=8),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3),
-    max_leaves=6,
+CHECKS = (
+    "not_a_server_error",
+    "status_code_conformance",
+    "content_type_conformance",
+    "response_headers_conformance",
+    "response_schema_conformance",
+    "missing_required_header",
+    "unsupported_method",
 )
+# Left out, because they ask for what the service does not want:
+# negative_data_rejection: documents are read as leniently as YAML and the environment write them, `"2"` counts as 2
+#   and 1 as true; what is refused, test_api_scenes.py and test_api_bad_input.py say.
+# positive_data_acceptance: documents name assets and revisions, of which the description cannot say which exist.
+# use_after_free, ensure_resource_availability: ids come from dictionaries, so that requests share the resources.
+# ignored_auth: on loopback no token is needed; test_api_security.py covers the rest.
+OF_EACH = 20  # what there is of each resource; requests delete some
+NOWHERE = {"kind": "nothing", "object": None, "point_m": None, "normal": None, "distance_m": None}
+SCENE = {
+    "objects": [{"id": "knot", "asset": "t0.obj"}],
+    "lights": {"mode": "manual", "manual": [{"type": "sphere", "position_m": [1, 0, 1], "intensity": 5}]},
+}
+
+
+class Server(Recorder):
+    """Answers picks too."""
+
+    def _carry_out(self, request: ControlRequest) -> dict[str, object]:
+        return {"frame_id": 1, **NOWHERE} if request.op == "pick" else super()._carry_out(request)
+
+
+class NoChild:
+    """In place of a process that records or replays; it has ended, and nothing was recorded."""
+
+    is_running = False
+    last_sentence = ""
+
+    def __init__(self, *_arguments: str, **_callbacks: object) -> None: ...
+
+    def interrupt(self) -> None: ...
+
+    def end(self, _timeout_s: float) -> None: ...
+
+    def wait(self, _timeout_s: float) -> bool:
+        return True
+
+
+@pytest.fixture
+def full_api(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[RunningApi]:
+    """With pictures that come, and a render server that answers."""
+    for module in (playback, take_recorder):
+        monkeypatch.setattr(module, "OwnedChild", NoChild)
+    control_port, stream_port = ports.private_ports(2)
+    endpoints = {"control": ports.endpoint(control_port), "subscribe": [ports.endpoint(stream_port)]}
+    server, stream = Server(control_port), StandInStream(stream_port)
+    with running_api(tmp_path / "data", requests_per_s=10_000, **endpoints) as running:
+        wait_for_frames(f"{ports.LOOPBACK}:{running.client.base_url.port}")
+        yield running
+    stream.close()
+    server.close()
 
 
 @pytest.fixture(scope="module")
 def api(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningApi]:
-    with running_api(tmp_path_factory.mktemp("data"), requests_per_s=10_000) as running:
-        running.client.post("/assets?name=t.obj", content=TETRAHEDRON, headers=UPLOAD).raise_for_status()
+    with running_api(tmp_path_factory.mktemp("data")) as running:
+        upload(running.store, TETRAHEDRON, "t.obj")
         yield running
 
 
-class Values:
-    """Strategies for the schemas of an OpenAPI document: fitting values, and now and then one that does not fit."""
+def fill(api: RunningApi) -> dict[str, list[str]]:
+    """Put things of every kind into the store; gives their ids by the parameter that takes them."""
+    assets = [upload(api.store, TETRAHEDRON + b"#%d" % n, f"t{n}.obj") for n in range(OF_EACH)]
+    scenes = [api.store.scenes.create(SCENE).head.id for _ in range(OF_EACH)]
+    api.client.post(f"/scenes/{scenes[0]}/activate").raise_for_status()
+    one = {"pictures": [{"name": "a"}]}
+    snapshots = [api.client.post("/snapshots", json=one).json()["id"] for _ in range(OF_EACH)]
+    recorded = frames(2)
+    takes = [write(api.store.folder / "recordings" / f"take{n}.mcap", recorded) for n in range(OF_EACH)]
+    return {
+        "digest": [asset.reference for asset in assets],
+        "scene_id": scenes,
+        "object_id": ["knot"],
+        "index": ["0"],
+        "revision": ["1"],
+        "snapshot_id": snapshots,
+        "file": ["a.png"],
+        "recording_id": [take.stem for take in takes],
+    }
 
-    def __init__(self, description: dict[str, Any]) -> None:
-        self._schemas = description["components"]["schemas"]
 
-    def of(self, schema: dict[str, Any]) -> SearchStrategy[Any]:
-        if "$ref" in schema:
-            return self.of(self._schemas[schema["$ref"].rsplit("/", 1)[1]])
-        for key in ("oneOf", "anyOf"):
-            if key in schema:
-                return st.one_of([self.of(each) for each in schema[key]])
-        if "const" in schema or "enum" in schema:
-            return st.sampled_from(schema.get("enum") or [schema["const"]])
-        return getattr(self, f"_{schema.get('type', 'any')}")(schema)
+def with_plain_tuples(schema: Any) -> Any:  # noqa: ANN401 - JSON
+    """The description with `items` for tuples of one type, whose `prefixItems` schemathesis takes for a fault."""
+    if isinstance(schema, list):
+        return [with_plain_tuples(each) for each in schema]
+    if not isinstance(schema, dict):
+        return schema
+    plain = {key: with_plain_tuples(value) for key, value in schema.items()}
+    first, *others = plain.get("prefixItems", [None])
+    if first is not None and all(each == first for each in others):
+        plain["items"] = plain.pop("prefixItems")[0]
+    return plain
 
-    def sometimes_wrong(self, schema: dict[str, Any]) -> SearchStrategy[Any]:
-        return st.integers(0, 9).flatmap(lambda die: JSON if die == 0 else self.of(schema))
 
-    def _any(self, _schema: dict[str, Any]) -> SearchStrategy[Any]:
-        return JSON
+def configuration(known: dict[str, list[str]]) -> str:
+    """schemathesis.toml: ids that exist in most requests, others in the rest."""
+    lines = [f"[dictionaries.{name}]\nvalues = {json.dumps(ids)}" for name, ids in known.items()]
+    lines.append("[parameters]")
+    lines += [f'"path.{name}" = {{ dictionary = "{name}", probability = 0.8 }}' for name in known]
+    return "\n".join(lines)
 
-    def _null(self, _schema: dict[str, Any]) -> SearchStrategy[None]:
-        return st.none()
 
-    def _boolean(self, _schema: dict[str, Any]) -> SearchStrategy[bool]:
-        return st.booleans()
-
-    def _string(self, schema: dict[str, Any]) -> SearchStrategy[str]:
-        if "pattern" in schema:
-            return st.from_regex(schema["pattern"], fullmatch=True)
-        return st.sampled_from(["t.obj", "a", "world"]) | st.text(
-            min_size=schema.get("minLength", 0), max_size=20
-        )
-
-    def _integer(self, schema: dict[str, Any]) -> SearchStrategy[int]:
-        low, high = schema.get("minimum"), schema.get("maximum")
-        step = schema.get("multipleOf", 1)
-        return st.integers(None if low is None else low // step, None if high is None else high // step).map(
-            lambda value: value * step
-        )
-
-    def _number(self, schema: dict[str, Any]) -> SearchStrategy[float]:
-        return st.floats(
-            schema.get("minimum", schema.get("exclusiveMinimum", -1e6)),
-            schema.get("maximum", schema.get("exclusiveMaximum", 1e6)),
-        )
-
-    def _array(self, schema: dict[str, Any]) -> SearchStrategy[list[Any]]:
-        if "prefixItems" in schema:
-            return st.tuples(*map(self.of, schema["prefixItems"])).map(list)
-        return st.lists(self.sometimes_wrong(schema.get("items", {})), max_size=3)
-
-    def _object(self, schema: dict[str, Any]) -> SearchStrategy[dict[str, Any]]:
-        properties = schema.get("properties", {})
-        required = set(schema.get("required", []))
-        given = {key: self.of(properties[key]) for key in required & set(properties)}
-        rest = {key: self.sometimes_wrong(properties[key]) for key in set(properties) - required}
-        return (
-            st.fixed_dictionaries(given, optional=rest)
-            if properties
-            else JSON.filter(lambda v: isinstance(v, dict))
-        )
+def test_answers_keep_to_the_description(full_api: RunningApi, tmp_path: Path) -> None:
+    description = copy.deepcopy(full_api.app.openapi())  # type: ignore[attr-defined]
+    (tmp_path / "openapi.json").write_text(json.dumps(with_plain_tuples(description)))
+    (tmp_path / "schemathesis.toml").write_text(configuration(fill(full_api)))
+    options = ("--checks", ",".join(CHECKS), "--max-examples", "8", "--generation-deterministic")
+    options += ("--phases", "examples,fuzzing,stateful", "--continue-on-failure", "--no-shrink")
+    address = str(full_api.client.base_url).removesuffix("/api/v1/")
+    done = subprocess.run(
+        [Path(sys.executable).parent / "schemathesis", "run", "openapi.json", "--url", address, *options],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=280,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "internal" not in full_api.client.get("/state").json()["refused"]
 
 
 def operations(description: dict[str, Any]) -> list[tuple[str, str, dict[str, Any]]]:
@@ -103,58 +159,6 @@ def operations(description: dict[str, Any]) -> list[tuple[str, str, dict[str, An
         for path, methods in description["paths"].items()
         for method, operation in methods.items()
     ]
-
-
-def fuzzed(description: dict[str, Any]) -> list[tuple[str, str, dict[str, Any]]]:
-    """All but uploads, which have tests of their own, and what waits for a render server or starts a recorder."""
-    return [
-        (path, method, operation)
-        for path, method, operation in operations(description)
-        if "octet-stream" not in str(operation.get("requestBody"))
-        and not path.endswith("/activate")
-        and (method, path) != ("post", "/api/v1/recordings")
-    ]
-
-
-def request_for(
-    data: st.DataObject, values: Values, path: str, operation: dict[str, Any], known: dict[str, str]
-) -> dict[str, Any]:
-    """Arguments of a request that the description of an operation allows, or nearly so."""
-    query, headers, address = {}, {}, path.removeprefix("/api/v1")
-    for parameter in operation.get("parameters", []):
-        name = parameter["name"]
-        if parameter["in"] == "path":
-            value = data.draw(st.sampled_from([known.get(name, "x")] * 4 + ["none", "ä/..", "0"]))
-            address = address.replace(f"{{{name}}}", quote(value, safe=""))
-        elif parameter["in"] == "query" and data.draw(st.booleans()):
-            query[name] = data.draw(values.sometimes_wrong(parameter["schema"]))
-        elif data.draw(st.booleans()):
-            headers[name] = data.draw(st.sampled_from(['"1"', '"2"', "*", "x", ""]))
-    body = None
-    if "requestBody" in operation:
-        schema = operation["requestBody"]["content"]["application/json"]["schema"]
-        body = data.draw(values.sometimes_wrong(schema))
-    return {"url": address, "params": query, "headers": headers, "json": body}
-
-
-@settings(max_examples=EXAMPLES, deadline=None, suppress_health_check=list(HealthCheck))
-@given(data=st.data())
-@pytest.mark.skip(reason="failed once on a loaded machine with the new routes; to be looked into")
-def test_no_request_is_answered_by_5xx(api: RunningApi, data: st.DataObject) -> None:
-    description = api.app.openapi()  # type: ignore[attr-defined]
-    path, method, operation = data.draw(st.sampled_from(fuzzed(description)))
-    scene = api.store.scenes.create({"objects": [{"asset": "t.obj", "id": "a"}]})
-    known = {"scene_id": scene.head.id, "object_id": "a", "revision": "1"}
-    request = request_for(data, Values(description), path, operation, known)
-    answer = api.client.request(method, **request)
-    # No render server runs here: what needs one says so, where its description says that it may.
-    assert answer.status_code < 500 or answer.status_code == 503, answer.text
-    assert str(answer.status_code) in {*operation["responses"], "405"}, answer.text
-    described = operation["responses"].get(str(answer.status_code), {"content": {PROBLEM: {}}})
-    if "content" in described:
-        assert answer.headers["content-type"].partition(";")[0] in described["content"]
-    for head in api.store.scenes.all():  # lists stay short
-        api.store.scenes.delete(head.id)
 
 
 def test_the_description_tells_what_clients_need(api: RunningApi) -> None:

@@ -182,6 +182,11 @@ def test_what_lies_in_the_folder_is_listed_as_it_is(tmp_path: Path) -> None:
     (folder / "bad.mcap").write_bytes(b"no recording")
     (folder / "notes.txt").touch()
     (folder / "..mcap").touch()
+    (folder / "good.mcap.active").write_bytes(b"what it was mended from")
+    old, new = folder / ".torn.17.tmp.mcap.active", folder / ".torn.18.tmp.mcap"
+    for each in (old, new):
+        each.touch()
+    os.utime(old, (0, 0))
     with running_api(tmp_path) as api:
         found = {each["id"]: each for each in api.client.get("/recordings").json()}
         assert sorted(found) == ["bad", "good"]
@@ -194,3 +199,7 @@ def test_what_lies_in_the_folder_is_listed_as_it_is(tmp_path: Path) -> None:
             assert api.client.get(f"/recordings/{name}").status_code in (404, 422)
         api.client.delete("/recordings/bad").raise_for_status()
         assert sorted(each["id"] for each in api.client.get("/recordings").json()) == ["good"]
+        api.client.delete("/recordings/good").raise_for_status()
+        assert api.client.get("/recordings").json() == []
+        assert not old.exists()
+        assert new.exists(), "it may still grow"

@@ -11,8 +11,10 @@ import pytest
 from protocol.messages import ControlRequest
 from protocol.transport import RequestClient
 from services import ports
+from services.api.replay_places import ReplayPlaces
 from services.recorder import Recorder as StreamRecorder
 from services.recorder import RecordJob
+from services.storage.faults import ConflictError
 from tests.services.api_samples import RunningApi, running_api, sentence
 from tests.services.record_samples import PERIOD_NS, frames, write
 from tests.services.render_server_samples import Recorder
@@ -145,6 +147,16 @@ def test_wrong_wishes_are_one_sentence(
     answer = client.put("/replay", json=body)
     assert expected in sentence(answer, status)
     assert not children()
+
+
+def test_sockets_lie_beside_the_servers_and_other_hosts_are_refused() -> None:
+    places = ReplayPlaces.beside("ipc:///run/deltalight/control")
+    assert {places.streams, places.control} == {
+        "ipc:///run/deltalight/control-replay",
+        "ipc:///run/deltalight/control-replay-control",
+    }
+    with pytest.raises(ConflictError, match="on another host"):
+        ReplayPlaces.beside("tcp://gpu@192.0.2.7:5603")
 
 
 def test_the_control_endpoint_refuses_what_it_does_not_know(client: httpx.Client, server: Recorder) -> None:

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import httpx
 import pytest
@@ -31,7 +32,7 @@ def make(client: httpx.Client, **document: object) -> dict[str, object]:
 
 
 def wait_for(condition: Callable[[], bool]) -> None:
-    for _ in range(400):
+    for _ in range(1500):
         if condition():
             return
         time.sleep(0.02)
@@ -264,6 +265,14 @@ def test_wrong_if_match_is_refused(client: httpx.Client) -> None:
     address = f"/scenes/{make(client)['id']}"
     assert "in quotes" in sentence(client.patch(address, json={}, headers={"If-Match": "new"}), 400)
     assert client.patch(address, json={"name": "x"}, headers={"If-Match": "*"}).json()["revision"] == 2
+
+
+def test_a_server_that_never_answered_is_silent_from_the_first_request_on(tmp_path: Path) -> None:
+    with running_api(tmp_path) as api:
+        assert api.client.get("/health").json()["render_server"] == "silent"
+        scene = make(api.client)
+        answer = api.client.post(f"/scenes/{scene['id']}/activate").json()
+        assert answer["picture"]["state"] == "pending"
 
 
 def test_a_change_reaches_the_render_server_before_its_answer(api: RunningApi) -> None:

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
+import httpx
 import numpy as np
 import pytest
 
@@ -18,6 +19,7 @@ from services.storage.asset_probe import probe
 from services.storage.assets import Asset
 from services.storage.faults import RejectedAssetError, TooLargeError
 from services.storage.store import Store
+from tests.services.api_samples import UPLOAD, running_api, sentence
 
 POSITIONS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], "<f4")
 UV = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], "<f4")
@@ -95,6 +97,23 @@ def test_a_gltf_with_its_files_is_kept_as_one_glb(store: Store) -> None:
     assert np.allclose(texture[0, 0], [1, 0, 0], atol=1e-3)
     assert keep(store, packed(FILES), "other.zip").digest == asset.digest, "the same to the bit"
     assert not list((store.folder / "assets" / ".incoming").iterdir())
+
+
+def test_by_rest_it_comes_back_as_glb_and_a_wrong_one_is_a_sentence(tmp_path: Path) -> None:
+    with running_api(tmp_path, probe=probe) as api:
+
+        def sent(content: bytes) -> httpx.Response:
+            return api.client.post("/assets?name=quad.zip", content=content, headers=UPLOAD)
+
+        made = sent(packed(FILES))
+        assert made.status_code == 201, made.text
+        address = made.headers["location"].removeprefix("/api/v1")
+        got = api.client.get(f"{address}/content")
+        assert got.headers["content-type"] == "model/gltf-binary"
+        assert got.content[:4] == b"glTF"
+        assert api.client.get(f"{address}/thumbnail.png").content[:4] == b"\x89PNG"
+        assert "pack it too" in sentence(sent(packed({"quad.gltf": gltf()})), 422)
+        assert len(api.client.get("/assets").json()) == 1
 
 
 def test_data_within_the_gltf_is_taken_too(store: Store) -> None:

@@ -1,12 +1,34 @@
 import { describe, expect, it } from "vitest";
-import { lensDeviation, lensOf, meetPlane, pixelOf, project, projectionMatrix, unproject, type View } from "../src/math/camera";
+import {
+  lensDeviation,
+  lensOf,
+  meetPlane,
+  pixelOf,
+  project,
+  projectionMatrix,
+  unproject,
+  type View,
+} from "../src/math/camera";
 
-const BASE = { width: 640, height: 480, matrix: [600, 0, 320, 0, 590, 235, 0, 0, 1], distortion_model: "plumb_bob" as const };
+const BASE = {
+  width: 640,
+  height: 480,
+  matrix: [600, 0, 320, 0, 590, 235, 0, 0, 1],
+  distortion_model: "plumb_bob" as const,
+};
 const PINHOLE = lensOf({ ...BASE, distortion: [] });
 const BENT = lensOf({ ...BASE, distortion: [-0.28, 0.09, 0.001, -0.0007, 0.01] });
 const FISHEYE = lensOf({ ...BASE, distortion_model: "equidistant", distortion: [-0.02, 0.004, 0, 0] });
 // 1 m above the board's origin, looking straight down: optical x = world x, optical y = world -y.
-const ABOVE: View = { lens: PINHOLE, worldFromCamera: [[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 1], [0, 0, 0, 1]] };
+const ABOVE: View = {
+  lens: PINHOLE,
+  worldFromCamera: [
+    [1, 0, 0, 0],
+    [0, -1, 0, 0],
+    [0, 0, -1, 1],
+    [0, 0, 0, 1],
+  ],
+};
 
 describe("projection", () => {
   it("shows the point below the camera at the principal point, and y up on the board as up in the picture", () => {
@@ -32,7 +54,13 @@ describe("projection", () => {
   });
 
   it.each([PINHOLE, BENT, FISHEYE])("is undone by unproject all over the picture", (lens) => {
-    for (const pixel of [[0, 0], [639, 0], [12, 470], [639, 479], [320, 235]] as const) {
+    for (const pixel of [
+      [0, 0],
+      [639, 0],
+      [12, 470],
+      [639, 479],
+      [320, 235],
+    ] as const) {
       const [x, y] = unproject(lens, pixel);
       const [u, v] = pixelOf(lens, x, y);
       expect(Math.hypot(u - pixel[0], v - pixel[1])).toBeLessThan(1e-3);

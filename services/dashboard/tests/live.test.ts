@@ -50,6 +50,10 @@ describe("the plots", () => {
   });
 
   it("stack to the sum of all passes", () => {
-    expect(stacked(all, ["b", "c", OTHERS])).toEqual([[5, 4], [7, 7], [9, 8]]);
+    expect(stacked(all, ["b", "c", OTHERS])).toEqual([
+      [5, 4],
+      [7, 7],
+      [9, 8],
+    ]);
   });
 });

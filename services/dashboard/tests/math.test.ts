@@ -11,12 +11,27 @@ import { bytes, clock, labelOf, milliseconds, size, trimmed, unitOf } from "../s
 const UPRIGHT: Pose = { translation_m: [0, 0, 0], rotation_wxyz: [1, 0, 0, 0], scale: 1 };
 
 function mesh(format: string, minimum: Vector, maximum: Vector): AssetAnswer {
-  return { asset: "sha256:0", names: ["a"], kind: "mesh", format, size_bytes: 1, uploaded: "", facts: { minimum, maximum } };
+  return {
+    asset: "sha256:0",
+    names: ["a"],
+    kind: "mesh",
+    format,
+    size_bytes: 1,
+    uploaded: "",
+    facts: { minimum, maximum },
+  };
 }
 
 describe("rotations", () => {
-  it.each([[10, 20, 30], [-170, 45, 120], [0, 0, -90], [5, -89, 3]] as Vector[])("come back from angles %#", (...angles) => {
-    anglesFromQuaternion(quaternionFromAngles(angles)).forEach((each, axis) => expect(each).toBeCloseTo(angles[axis]!, 6));
+  it.each([
+    [10, 20, 30],
+    [-170, 45, 120],
+    [0, 0, -90],
+    [5, -89, 3],
+  ] as Vector[])("come back from angles %#", (...angles) => {
+    anglesFromQuaternion(quaternionFromAngles(angles)).forEach((each, axis) =>
+      expect(each).toBeCloseTo(angles[axis]!, 6),
+    );
   });
 
   it("turn about z by the yaw", () => {
@@ -27,11 +42,18 @@ describe("rotations", () => {
   it("keep the rotation where a pitch of 90 degrees makes two angles one", () => {
     const q = quaternionFromAngles([20, 90, 50]);
     const again = quaternionFromAngles(anglesFromQuaternion(q));
-    rotate(q, [0.3, 0.5, 0.7]).forEach((each, axis) => expect(rotate(again, [0.3, 0.5, 0.7])[axis]).toBeCloseTo(each, 6));
+    rotate(q, [0.3, 0.5, 0.7]).forEach((each, axis) =>
+      expect(rotate(again, [0.3, 0.5, 0.7])[axis]).toBeCloseTo(each, 6),
+    );
   });
 
   it("go between any two directions, opposite ones too", () => {
-    for (const to of [[0, 0, -1], [1, 0, 0], [0, 0, 1], [0.6, 0, 0.8]] as Vector[]) {
+    for (const to of [
+      [0, 0, -1],
+      [1, 0, 0],
+      [0, 0, 1],
+      [0.6, 0, 0.8],
+    ] as Vector[]) {
       rotate(turnBetween([0, 0, 1], to), [0, 0, 1]).forEach((each, axis) => expect(each).toBeCloseTo(to[axis]!, 9));
     }
   });
@@ -85,7 +107,13 @@ describe("small things", () => {
   it("writes numbers as people read them", () => {
     expect([trimmed(0.3000001), trimmed(-0.00001), trimmed(120)]).toEqual(["0.3", "0", "120"]);
     expect([bytes(999), bytes(1_234_000)]).toEqual(["999 B", "1.2 MB"]);
-    expect([clock(75.4), milliseconds(1234), milliseconds(4.25), size(0.0042), size(0.145)]).toEqual(["1:15", "1.23 s", "4.3 ms", "4.2 mm", "14.5 cm"]);
+    expect([clock(75.4), milliseconds(1234), milliseconds(4.25), size(0.0042), size(0.145)]).toEqual([
+      "1:15",
+      "1.23 s",
+      "4.3 ms",
+      "4.2 mm",
+      "14.5 cm",
+    ]);
   });
 
   it("keeps colours through the picker, brighter ones in their own strength", () => {
@@ -100,7 +128,14 @@ describe("small things", () => {
   });
 
   it("tells inside from outside of an outline", () => {
-    const hull = convexHull([[0, 0], [4, 0], [4, 4], [0, 4], [2, 2], [1, 3]]);
+    const hull = convexHull([
+      [0, 0],
+      [4, 0],
+      [4, 4],
+      [0, 4],
+      [2, 2],
+      [1, 3],
+    ]);
     expect(hull).toHaveLength(4);
     expect(isInside(hull, [1, 1])).toBe(true);
     expect(isInside(hull, [5, 1])).toBe(false);

@@ -12,9 +12,26 @@ function answer(id: string, revision: number): SceneAnswer {
   const document = {
     name: id,
     objects: [{ id: "knot", asset: "sha256:0", pose: POSE, visible: true }],
-    lights: { mode: "manual", manual: [{ type: "sphere", intensity: 1 }, { type: "ambient", radiance: 0.1 }] },
+    lights: {
+      mode: "manual",
+      manual: [
+        { type: "sphere", intensity: 1 },
+        { type: "ambient", radiance: 0.1 },
+      ],
+    },
   } as unknown as SceneDocument;
-  return { id, revision, document, active: true, what: "", can_undo: true, can_redo: false, picture: null, created: "", changed: "" };
+  return {
+    id,
+    revision,
+    document,
+    active: true,
+    what: "",
+    can_undo: true,
+    can_redo: false,
+    picture: null,
+    created: "",
+    changed: "",
+  };
 }
 
 describe("the scene", () => {
@@ -39,7 +56,10 @@ describe("changes", () => {
     const moved = objectTarget("knot").apply(document, { pose: { scale: 2 } });
     expect(moved.objects[0]?.pose).toEqual({ ...POSE, scale: 2 });
     const lit = lightTarget(1).apply(document, { radiance: 0.5 });
-    expect(lit.lights.manual).toEqual([{ type: "sphere", intensity: 1 }, { type: "ambient", radiance: 0.5 }]);
+    expect(lit.lights.manual).toEqual([
+      { type: "sphere", intensity: 1 },
+      { type: "ambient", radiance: 0.5 },
+    ]);
   });
 
   it("address ids with slashes and blanks", () => {
@@ -79,18 +99,40 @@ describe("a gesture", () => {
 });
 
 describe("the history", () => {
-  const entry = (revision: number, gesture: string | null): RevisionEntry => ({ revision, gesture, at: "", what: "", name: "" });
+  const entry = (revision: number, gesture: string | null): RevisionEntry => ({
+    revision,
+    gesture,
+    at: "",
+    what: "",
+    name: "",
+  });
 
   it("shows each gesture as one step", () => {
     const steps = stepsOf([entry(5, "b"), entry(4, "a"), entry(3, "a"), entry(2, null), entry(1, null)]);
-    expect(steps.map((step) => [step.entry.revision, step.count])).toEqual([[5, 1], [4, 2], [2, 1], [1, 1]]);
+    expect(steps.map((step) => [step.entry.revision, step.count])).toEqual([
+      [5, 1],
+      [4, 2],
+      [2, 1],
+      [1, 1],
+    ]);
   });
 });
 
 describe("forms", () => {
   it("read numbers with their ranges, and null as a value of its own", () => {
-    const field = fieldOf("volume_edge_m", { anyOf: [{ type: "number", minimum: 0.01, maximum: 20 }, { type: "null" }], description: "Edge." });
-    expect(field).toMatchObject({ kind: "number", label: "Volume edge", unit: "m", min: 0.01, max: 20, isNullable: true, help: "Edge." });
+    const field = fieldOf("volume_edge_m", {
+      anyOf: [{ type: "number", minimum: 0.01, maximum: 20 }, { type: "null" }],
+      description: "Edge.",
+    });
+    expect(field).toMatchObject({
+      kind: "number",
+      label: "Volume edge",
+      unit: "m",
+      min: 0.01,
+      max: 20,
+      isNullable: true,
+      help: "Edge.",
+    });
   });
 
   it("leave out what has a form of its own", () => {
@@ -103,7 +145,11 @@ describe("forms", () => {
         steps: { type: "integer", multipleOf: 8 },
       },
     });
-    expect(fields.map(({ key, kind }) => [key, kind])).toEqual([["operator", "choice"], ["far", "switch"], ["steps", "number"]]);
+    expect(fields.map(({ key, kind }) => [key, kind])).toEqual([
+      ["operator", "choice"],
+      ["far", "switch"],
+      ["steps", "number"],
+    ]);
     expect(fields[2]).toMatchObject({ step: 8, isInteger: true });
   });
 });

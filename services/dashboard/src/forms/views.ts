@@ -9,7 +9,11 @@ interface ViewText {
 export const VIEWS: readonly ViewText[] = [
   { value: "composite", label: "Picture", help: "The finished picture." },
   { value: "effects", label: "Effects", help: "Objects and the change of light on mid grey." },
-  { value: "delta", label: "Change of light", help: "Light gained in its colour, light lost in red, four times enlarged." },
+  {
+    value: "delta",
+    label: "Change of light",
+    help: "Light gained in its colour, light lost in red, four times enlarged.",
+  },
   { value: "volume", label: "Volume", help: "The lit voxels or cells." },
   { value: "rsm", label: "Light's view", help: "What the first lamp sees: the real scene left, objects right." },
   { value: "lights", label: "Lights", help: "The lights that were found, over the fish-eye picture." },

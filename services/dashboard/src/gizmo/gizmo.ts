@@ -31,7 +31,11 @@ export class Gizmo {
   private isShown = false;
 
   /** `surface` gets the pointer's events and has the picture's outline. Throws where there is no WebGL. */
-  constructor(canvas: HTMLCanvasElement, surface: HTMLElement, private readonly events: GizmoEvents) {
+  constructor(
+    canvas: HTMLCanvasElement,
+    surface: HTMLElement,
+    private readonly events: GizmoEvents,
+  ) {
     this.renderer = new WebGLRenderer({ canvas, alpha: true, antialias: true });
     this.renderer.setPixelRatio(devicePixelRatio);
     this.camera.matrixAutoUpdate = false;
@@ -123,9 +127,9 @@ export class Gizmo {
 
   /** Any of the three handles scales all: objects have one factor. */
   private scaleEvenly(scale: Vector3): void {
-    const changed = scale.toArray().reduce((far, each) =>
-      Math.abs(each - this.start.scale) > Math.abs(far - this.start.scale) ? each : far,
-    );
+    const changed = scale
+      .toArray()
+      .reduce((far, each) => (Math.abs(each - this.start.scale) > Math.abs(far - this.start.scale) ? each : far));
     scale.setScalar(Math.max(1e-4, Math.abs(changed)));
   }
 

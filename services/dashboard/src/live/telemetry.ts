@@ -43,5 +43,7 @@ export function timeOf(sample: Sample, name: string, named: readonly string[]): 
 /** Sums from the first series on, for areas that lie on each other: series x samples. */
 export function stacked(of: readonly Sample[], names: readonly string[]): number[][] {
   const sums = of.map(() => 0);
-  return names.map((name) => of.map((sample, index) => (sums[index] = (sums[index] ?? 0) + timeOf(sample, name, names))));
+  return names.map((name) =>
+    of.map((sample, index) => (sums[index] = (sums[index] ?? 0) + timeOf(sample, name, names))),
+  );
 }

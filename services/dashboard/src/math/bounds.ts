@@ -11,7 +11,18 @@ export interface Bounds {
 
 /** Edges of a box as pairs of corners; bit 0, 1, 2 of a corner's number = at the maximum of x, y, z. */
 export const EDGES: readonly (readonly [number, number])[] = [
-  [0, 1], [2, 3], [4, 5], [6, 7], [0, 2], [1, 3], [4, 6], [5, 7], [0, 4], [1, 5], [2, 6], [3, 7],
+  [0, 1],
+  [2, 3],
+  [4, 5],
+  [6, 7],
+  [0, 2],
+  [1, 3],
+  [4, 6],
+  [5, 7],
+  [0, 4],
+  [1, 5],
+  [2, 6],
+  [3, 7],
 ];
 
 // Normals of measured depth are off by a few degrees: what leans less than this is meant to be level.

@@ -157,17 +157,34 @@ export function projectionMatrix(lens: Lens, near: number, far: number, shift: P
   const cx = lens.cx + shift[0] + 0.5;
   const cy = lens.cy + shift[1] + 0.5;
   return [
-    (2 * fx) / width, 0, 0, 0,
-    0, (2 * fy) / height, 0, 0,
-    1 - (2 * cx) / width, (2 * cy) / height - 1, -(far + near) / (far - near), -1,
-    0, 0, (-2 * far * near) / (far - near), 0,
+    (2 * fx) / width,
+    0,
+    0,
+    0,
+    0,
+    (2 * fy) / height,
+    0,
+    0,
+    1 - (2 * cx) / width,
+    (2 * cy) / height - 1,
+    -(far + near) / (far - near),
+    -1,
+    0,
+    0,
+    (-2 * far * near) / (far - near),
+    0,
   ];
 }
 
 /** Greatest distance between what the lens and a pinhole show, at the picture's corners, as a share of its width. */
 export function lensDeviation(lens: Lens): number {
   if (!isDistorted(lens)) return 0;
-  const corners: Pixel[] = [[0, 0], [lens.width - 1, 0], [0, lens.height - 1], [lens.width - 1, lens.height - 1]];
+  const corners: Pixel[] = [
+    [0, 0],
+    [lens.width - 1, 0],
+    [0, lens.height - 1],
+    [lens.width - 1, lens.height - 1],
+  ];
   const deviations = corners.map(([u, v]) => {
     const [x, y] = unproject(lens, [u, v]);
     return Math.hypot(lens.fx * x + lens.cx - u, lens.fy * y + lens.cy - v);

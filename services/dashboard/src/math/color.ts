@@ -17,7 +17,9 @@ export function hexFromLinear(linear: Vector): string {
 }
 
 function byte(value: number): string {
-  return Math.round(255 * value).toString(16).padStart(2, "0");
+  return Math.round(255 * value)
+    .toString(16)
+    .padStart(2, "0");
 }
 
 /** Linear values of a picked colour, to four digits, as strong as `previous` where that is brighter than 1. */

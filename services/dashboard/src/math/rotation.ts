@@ -26,7 +26,7 @@ function half(degrees: number): [number, number] {
 /** The inverse; at a pitch of 90 degrees roll and yaw are one turn, and the roll is 0. */
 export function anglesFromQuaternion([w, x, y, z]: Quaternion): Vector {
   const sine = Math.max(-1, Math.min(1, 2 * (w * y - z * x)));
-  if (Math.abs(sine) > 0.9999995) return [0, (Math.sign(sine) * 90), (-2 * Math.sign(sine) * Math.atan2(x, w)) / DEGREE];
+  if (Math.abs(sine) > 0.9999995) return [0, Math.sign(sine) * 90, (-2 * Math.sign(sine) * Math.atan2(x, w)) / DEGREE];
   return [
     Math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)) / DEGREE,
     Math.asin(sine) / DEGREE,

@@ -1,6 +1,16 @@
 // What people do to the scene, in one step each.
 import { API, request } from "../api/http";
-import type { AssetAnswer, LightType, ManualLight, Method, MethodName, PickAnswer, Pose, SceneAnswer, View } from "../api/types";
+import type {
+  AssetAnswer,
+  LightType,
+  ManualLight,
+  Method,
+  MethodName,
+  PickAnswer,
+  Pose,
+  SceneAnswer,
+  View,
+} from "../api/types";
 import { boundsOf, longestEdge, sensibleScale, standOn } from "../math/bounds";
 import { meetPlane, type Pixel } from "../math/camera";
 import { UP } from "../math/vector";
@@ -44,7 +54,9 @@ export async function addObject(asset: AssetAnswer, pixel: Pixel = centre(), nam
   announce(`${id} was added.`);
   if (bounds && scale !== 1) {
     const edge = longestEdge(bounds);
-    toast(`${id} is ${size(edge)} long in its file; it was added at scale ${trimmed(scale, 9)}. Change it under Scale.`);
+    toast(
+      `${id} is ${size(edge)} long in its file; it was added at scale ${trimmed(scale, 9)}. Change it under Scale.`,
+    );
   }
 }
 
@@ -114,7 +126,11 @@ export async function placeObject(id: string, pixel: Pixel): Promise<void> {
   const found = await pick(pixel);
   if (!item || !found) return;
   if (!found.point_m || found.object === id) {
-    toast(found.object === id ? "Click beside the object, where it is to stand." : "No surface was seen there; click elsewhere.");
+    toast(
+      found.object === id
+        ? "Click beside the object, where it is to stand."
+        : "No surface was seen there; click elsewhere.",
+    );
     return;
   }
   const pose = standOn(item.pose, boundsByObject.value.get(id) ?? null, found.point_m, found.normal ?? UP);

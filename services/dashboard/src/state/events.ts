@@ -29,7 +29,15 @@ export function stopEvents(): void {
 
 /** Read everything: at the start, and after events were missed. */
 export async function readAll(): Promise<void> {
-  await Promise.all([readScene(), readScenes(), readAssets(), readState(), readRecordings(), readReplay(), readSnapshots()]);
+  await Promise.all([
+    readScene(),
+    readScenes(),
+    readAssets(),
+    readState(),
+    readRecordings(),
+    readReplay(),
+    readSnapshots(),
+  ]);
   await readRevisions();
 }
 
@@ -43,8 +51,10 @@ async function take(event: Event): Promise<void> {
       return takeSceneEvent(event as unknown as SceneEvent);
     case "asset":
       return readAssets();
-    case "process":
-      { takeReport(event as unknown as ProcessAnswer); return; }
+    case "process": {
+      takeReport(event as unknown as ProcessAnswer);
+      return;
+    }
     case "recording":
       return takeRecording(event as unknown as Partial<Recording>);
     case "replay":
@@ -52,10 +62,14 @@ async function take(event: Event): Promise<void> {
       return;
     case "snapshot":
       return readSnapshots();
-    case "picture":
-      { takePictureEvent(event as unknown as PictureEvent); return; }
-    case "notice":
-      { toast(String(event.text)); return; }
+    case "picture": {
+      takePictureEvent(event as unknown as PictureEvent);
+      return;
+    }
+    case "notice": {
+      toast(String(event.text));
+      return;
+    }
   }
 }
 
@@ -81,7 +95,9 @@ async function takeHello(hello: Hello): Promise<void> {
 
 async function takeSceneEvent(event: SceneEvent): Promise<void> {
   const current = scene.value;
-  const isNews = event.active ? current?.id !== event.id || event.revision > current.revision : current?.id === event.id;
+  const isNews = event.active
+    ? current?.id !== event.id || event.revision > current.revision
+    : current?.id === event.id;
   await readScenes();
   if (isNews) await readScene();
   await readRevisions();

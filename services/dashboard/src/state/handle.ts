@@ -43,7 +43,11 @@ function lightHandle(): Handle | null {
   const direction = "direction" in light ? light.direction : null;
   return {
     key: `light ${index} ${light.type}`,
-    pose: { translation_m: light.position_m, rotation_wxyz: direction ? turnBetween(SHINES, direction) : [1, 0, 0, 0], scale: 1 },
+    pose: {
+      translation_m: light.position_m,
+      rotation_wxyz: direction ? turnBetween(SHINES, direction) : [1, 0, 0, 0],
+      scale: 1,
+    },
     tools: direction ? ["move", "rotate"] : ["move"],
     target: lightTarget(index),
     patch: (pose) => lightPatch(light, pose),

@@ -88,7 +88,10 @@ export async function change(
 }
 
 async function tellChange(fault: unknown): Promise<void> {
-  if (!(fault instanceof ProblemError && fault.isStale)) { tell(fault); return; }
+  if (!(fault instanceof ProblemError && fault.isStale)) {
+    tell(fault);
+    return;
+  }
   await readScene();
   const what = served.value ? ` (${served.value.what}, revision ${served.value.revision})` : "";
   toast(`Somebody else was faster${what}. The scene was read again; look, and repeat your change.`, "error");

@@ -22,7 +22,12 @@ export function FisheyePicture() {
         <svg viewBox={`0 0 ${seen.width} ${seen.height}`} role="img" aria-label={`${seen.lights.length} lights`}>
           {seen.lights.map((light, index) => (
             <g key={index}>
-              <circle cx={light.x} cy={light.y} r={Math.max(light.radius_px, seen.width / 60)} stroke={hexFromLinear(light.color_linear)} />
+              <circle
+                cx={light.x}
+                cy={light.y}
+                r={Math.max(light.radius_px, seen.width / 60)}
+                stroke={hexFromLinear(light.color_linear)}
+              />
               <text x={light.x + light.radius_px + seen.width / 50} y={light.y}>
                 {index + 1}
               </text>

@@ -29,7 +29,12 @@ export function HistoryPanel() {
       </div>
       <ol aria-label="Revisions, the newest first">
         {steps.value.slice(0, MOST).map((each) => (
-          <Entry key={each.entry.revision} step={each} isCurrent={each.entry.revision === current.revision} mayChange={mayChange} />
+          <Entry
+            key={each.entry.revision}
+            step={each}
+            isCurrent={each.entry.revision === current.revision}
+            mayChange={mayChange}
+          />
         ))}
       </ol>
     </div>

@@ -26,14 +26,22 @@ export function PerformancePanel() {
     <div class="performance">
       <figure class="plot-box wide">
         <figcaption>Passes of the renderer, ms</figcaption>
-        <Plot label="Time of each pass, stacked, milliseconds" series={areas(names)} data={stackData(times, all, names)} />
+        <Plot
+          label="Time of each pass, stacked, milliseconds"
+          series={areas(names)}
+          data={stackData(times, all, names)}
+        />
       </figure>
       <PassLegend sample={last} names={names} />
       <figure class="plot-box">
         <figcaption>
           Capture to page, ms <b>{last.age === null ? "–" : milliseconds(last.age)}</b>
         </figcaption>
-        <Plot label="Delay, milliseconds" series={line("delay", "#f0a03c")} data={[times, all.map((each) => each.age)]} />
+        <Plot
+          label="Delay, milliseconds"
+          series={line("delay", "#f0a03c")}
+          data={[times, all.map((each) => each.age)]}
+        />
       </figure>
       <figure class="plot-box">
         <figcaption>
@@ -51,7 +59,9 @@ function stackData(times: number[], all: readonly Sample[], names: readonly stri
 }
 
 function areas(names: readonly string[]): Series[] {
-  return names.map((label, index) => ({ label, color: COLORS[index] ?? COLORS[MOST_PASSES]!, isFilled: true })).reverse();
+  return names
+    .map((label, index) => ({ label, color: COLORS[index] ?? COLORS[MOST_PASSES]!, isFilled: true }))
+    .reverse();
 }
 
 function line(label: string, color: string): Series[] {

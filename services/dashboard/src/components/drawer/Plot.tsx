@@ -27,7 +27,9 @@ export function Plot({ label, series, data }: PlotProps) {
     if (!element) return;
     const made = new uPlot(options(series, element), data, element);
     plot.current = made;
-    const observer = new ResizeObserver(() => made.setSize({ width: element.clientWidth, height: element.clientHeight }));
+    const observer = new ResizeObserver(() =>
+      made.setSize({ width: element.clientWidth, height: element.clientHeight }),
+    );
     observer.observe(element);
     return () => {
       observer.disconnect();
@@ -42,7 +44,12 @@ function options(series: readonly Series[], element: HTMLElement): uPlot.Options
   const style = getComputedStyle(element);
   const line = style.getPropertyValue("--line").trim();
   const text = style.getPropertyValue("--text-3").trim();
-  const axis: uPlot.Axis = { stroke: text, font: `11px ${style.fontFamily}`, grid: { stroke: line, width: 1 }, ticks: { show: false } };
+  const axis: uPlot.Axis = {
+    stroke: text,
+    font: `11px ${style.fontFamily}`,
+    grid: { stroke: line, width: 1 },
+    ticks: { show: false },
+  };
   return {
     width: element.clientWidth,
     height: element.clientHeight,
@@ -59,5 +66,11 @@ function options(series: readonly Series[], element: HTMLElement): uPlot.Options
 }
 
 function seriesOptions({ label, color, isFilled }: Series): uPlot.Series {
-  return { label, stroke: color, width: isFilled ? 0.5 : 1.75, points: { show: false }, ...(isFilled ? { fill: color } : {}) };
+  return {
+    label,
+    stroke: color,
+    width: isFilled ? 0.5 : 1.75,
+    points: { show: false },
+    ...(isFilled ? { fill: color } : {}),
+  };
 }

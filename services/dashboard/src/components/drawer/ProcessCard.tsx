@@ -23,7 +23,10 @@ export function ProcessCard({ seen }: { readonly seen: Seen }) {
         {drops.map(([name, count]) => (
           <Row key={name} name={`lost: ${name}`} value={String(count)} />
         ))}
-        <Row name="clock within" value={report.clock_bound_ms == null ? "not compared" : `${trimmed(report.clock_bound_ms, 2)} ms`} />
+        <Row
+          name="clock within"
+          value={report.clock_bound_ms == null ? "not compared" : `${trimmed(report.clock_bound_ms, 2)} ms`}
+        />
       </dl>
     </article>
   );

@@ -20,7 +20,11 @@ export function RecordingCard({ recording }: { readonly recording: Recording }) 
   ];
   return (
     <article class={`card take ${isShown ? "current" : ""}`} aria-label={recording.id}>
-      {isRunning ? <div class="poster running">{recording.state === "waiting" ? "Waiting for a frame" : "Recording"}</div> : <SecureImage className="poster" path={`${path}/poster.jpg`} alt="" />}
+      {isRunning ? (
+        <div class="poster running">{recording.state === "waiting" ? "Waiting for a frame" : "Recording"}</div>
+      ) : (
+        <SecureImage className="poster" path={`${path}/poster.jpg`} alt="" />
+      )}
       <div class="take-text">
         <h3 class="cut">{recording.id}</h3>
         <p class="quiet small">{recording.detail || factsText(recording)}</p>
@@ -30,7 +34,11 @@ export function RecordingCard({ recording }: { readonly recording: Recording }) 
               Stop
             </Button>
           ) : (
-            <Button icon="play" disabled={!mayChange || recording.state !== "finished"} onClick={() => showRecording(recording.id)}>
+            <Button
+              icon="play"
+              disabled={!mayChange || recording.state !== "finished"}
+              onClick={() => showRecording(recording.id)}
+            >
               Replay
             </Button>
           )}
@@ -47,6 +55,11 @@ export function RecordingCard({ recording }: { readonly recording: Recording }) 
 
 function factsText({ duration_s, frames, size_bytes, changed }: Recording): string {
   const day = new Date(changed).toLocaleString([], { dateStyle: "medium", timeStyle: "short" });
-  const facts = [duration_s === null ? "" : clock(duration_s), frames === null ? "" : `${frames} frames`, bytes(size_bytes), day];
+  const facts = [
+    duration_s === null ? "" : clock(duration_s),
+    frames === null ? "" : `${frames} frames`,
+    bytes(size_bytes),
+    day,
+  ];
   return facts.filter(Boolean).join(", ");
 }

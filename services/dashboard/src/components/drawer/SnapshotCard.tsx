@@ -9,14 +9,22 @@ import { SecureImage } from "../ui/SecureImage";
 
 export function SnapshotCard({ snapshot }: { readonly snapshot: Snapshot }) {
   const path = `${API}/snapshots/${snapshot.id}`;
-  const poster = snapshot.files.includes("composite.png") ? "composite.png" : snapshot.files.find((file) => file.endsWith(".png"));
+  const poster = snapshot.files.includes("composite.png")
+    ? "composite.png"
+    : snapshot.files.find((file) => file.endsWith(".png"));
   const entries: MenuEntry[] = [
     ...snapshot.files.map((file): MenuEntry => ({
       label: file,
       icon: "download",
       onClick: () => download(`${path}/${file}`, `frame-${snapshot.frame_id}-${file}`),
     })),
-    { label: "Delete", icon: "trash", begins: true, disabled: role.value !== "control", onClick: () => deleteSnapshot(snapshot.id) },
+    {
+      label: "Delete",
+      icon: "trash",
+      begins: true,
+      disabled: role.value !== "control",
+      onClick: () => deleteSnapshot(snapshot.id),
+    },
   ];
   const taken = new Date(snapshot.taken).toLocaleString([], { dateStyle: "medium", timeStyle: "medium" });
   return (

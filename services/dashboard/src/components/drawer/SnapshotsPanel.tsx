@@ -12,7 +12,12 @@ export function SnapshotsPanel() {
   return (
     <div class="cards">
       <div class="card action-card">
-        <Button icon="camera" kind="primary" disabled={role.value !== "control" || isBusy} onClick={() => takeSnapshot(null, withExr.value)}>
+        <Button
+          icon="camera"
+          kind="primary"
+          disabled={role.value !== "control" || isBusy}
+          onClick={() => takeSnapshot(null, withExr.value)}
+        >
           {isBusy ? "Rendering…" : "Take a snapshot"}
         </Button>
         <Switch label="Linear EXR too" checked={withExr.value} onChange={(on) => (withExr.value = on)} />

@@ -32,7 +32,10 @@ export function AnimationSection({ item, disabled }: AnimationSectionProps) {
   const push = (change: Partial<Animation>): void => gesture.push({ animation: change });
   const help = (key: keyof Animation): string | undefined => schemas.value.Animation?.properties?.[key]?.description;
   const choose = (value: string) =>
-    edit(objectTarget(item.id), value === AT_REST ? { animation: null, rigid: true } : { animation: { clip: Number(value) }, rigid: false });
+    edit(
+      objectTarget(item.id),
+      value === AT_REST ? { animation: null, rigid: true } : { animation: { clip: Number(value) }, rigid: false },
+    );
   return (
     <Section title="Animation">
       <Field label="Clip" inline>
@@ -41,7 +44,10 @@ export function AnimationSection({ item, disabled }: AnimationSectionProps) {
           value={animation ? String(indexOf(animation, clips)) : AT_REST}
           choices={[
             { value: AT_REST, label: "at rest" },
-            ...clips.map((clip, index) => ({ value: String(index), label: `${clip.name || index} (${trimmed(clip.duration_s, 1)} s)` })),
+            ...clips.map((clip, index) => ({
+              value: String(index),
+              label: `${clip.name || index} (${trimmed(clip.duration_s, 1)} s)`,
+            })),
           ]}
           onChange={choose}
           disabled={disabled}
@@ -74,5 +80,8 @@ function clipsOf(item: SceneObject): readonly Clip[] {
 
 function indexOf({ clip }: Animation, clips: readonly Clip[]): number {
   if (typeof clip === "number") return clip;
-  return Math.max(0, clips.findIndex((each) => each.name === clip));
+  return Math.max(
+    0,
+    clips.findIndex((each) => each.name === clip),
+  );
 }

@@ -28,8 +28,28 @@ export function EnvironmentSection({ lights, disabled }: EnvironmentSectionProps
           disabled={disabled}
         />
       </Field>
-      <SliderField label="Rotation" unit="°" value={rotation_deg} onChange={(value) => push({ rotation_deg: value })} onEnd={gesture.end} min={-180} max={180} step={1} disabled={disabled} />
-      <SliderField label="Intensity" value={intensity} onChange={(value) => push({ intensity: value })} onEnd={gesture.end} min={0} max={5} numberMax={1e9} step={0.05} disabled={disabled} />
+      <SliderField
+        label="Rotation"
+        unit="°"
+        value={rotation_deg}
+        onChange={(value) => push({ rotation_deg: value })}
+        onEnd={gesture.end}
+        min={-180}
+        max={180}
+        step={1}
+        disabled={disabled}
+      />
+      <SliderField
+        label="Intensity"
+        value={intensity}
+        onChange={(value) => push({ intensity: value })}
+        onEnd={gesture.end}
+        min={0}
+        max={5}
+        numberMax={1e9}
+        step={0.05}
+        disabled={disabled}
+      />
     </Section>
   );
 }

@@ -46,7 +46,16 @@ export function FisheyeSection({ lights, disabled }: FisheyeSectionProps) {
       )}
       {lights.mode === "fisheye" && isMetres && (
         <Field label="" inline>
-          <NumberInput label="Distance in metres" unit="m" value={distance} onChange={(value) => push("distance_m", value)} min={0.01} max={1000} step={0.1} disabled={disabled} />
+          <NumberInput
+            label="Distance in metres"
+            unit="m"
+            value={distance}
+            onChange={(value) => push("distance_m", value)}
+            min={0.01}
+            max={1000}
+            step={0.1}
+            disabled={disabled}
+          />
         </Field>
       )}
     </Section>

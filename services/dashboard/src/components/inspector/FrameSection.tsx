@@ -17,7 +17,11 @@ export function FrameSection({ item, disabled }: FrameSectionProps) {
   const marker = item.frame.startsWith("marker:") ? Number(item.frame.slice("marker:".length)) : null;
   return (
     <Section title="Placement">
-      <Field label="Stands on" help="The board stays; an object on a marker moves with it, and is placed by numbers only." inline>
+      <Field
+        label="Stands on"
+        help="The board stays; an object on a marker moves with it, and is placed by numbers only."
+        inline
+      >
         <Select
           label="Stands on"
           value={marker === null ? "world" : "marker"}

@@ -20,7 +20,13 @@ export function Inspector() {
   const tab = inspectorTab.value;
   return (
     <aside class="side right" aria-label="Inspector">
-      <Tabs label="Inspector" tabs={TABS} value={tab} onChange={(next) => (inspectorTab.value = next)} panelId={PANEL_ID} />
+      <Tabs
+        label="Inspector"
+        tabs={TABS}
+        value={tab}
+        onChange={(next) => (inspectorTab.value = next)}
+        panelId={PANEL_ID}
+      />
       <div class="scroll" role="tabpanel" id={PANEL_ID} aria-labelledby={`${PANEL_ID}-${tab}`}>
         <Panel tab={tab} />
       </div>

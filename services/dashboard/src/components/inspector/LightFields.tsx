@@ -22,9 +22,21 @@ interface Strength {
 }
 
 const STRENGTHS: readonly Strength[] = [
-  { key: "intensity", label: "Intensity", unit: "m²", max: 20, help: "Camera units times square metres: a surface at distance d gets intensity / d²." },
+  {
+    key: "intensity",
+    label: "Intensity",
+    unit: "m²",
+    max: 20,
+    help: "Camera units times square metres: a surface at distance d gets intensity / d².",
+  },
   { key: "irradiance", label: "Irradiance", unit: "", max: 10, help: "Camera units, across the beam." },
-  { key: "radiance", label: "Radiance", unit: "", max: 10, help: "Camera units: 1 is sensor white at the reference exposure." },
+  {
+    key: "radiance",
+    label: "Radiance",
+    unit: "",
+    max: 10,
+    help: "Camera units: 1 is sensor white at the reference exposure.",
+  },
 ];
 
 /** Strength, place, direction and size, as far as the kind of light has them. */
@@ -47,12 +59,24 @@ export function LightFields({ light, onChange, onEnd, disabled }: LightFieldsPro
         {...common}
       />
       {"position_m" in light && (
-        <VectorInput label="Position" unit="m" value={light.position_m} onChange={(position_m) => onChange({ position_m })} {...common} />
+        <VectorInput
+          label="Position"
+          unit="m"
+          value={light.position_m}
+          onChange={(position_m) => onChange({ position_m })}
+          {...common}
+        />
       )}
       {"direction" in light && <DirectionFields light={light} onChange={onChange} {...common} />}
       {"axis_u_m" in light && (
         <>
-          <VectorInput label="First edge" unit="m" value={light.axis_u_m} onChange={(axis_u_m) => onChange({ axis_u_m })} {...common} />
+          <VectorInput
+            label="First edge"
+            unit="m"
+            value={light.axis_u_m}
+            onChange={(axis_u_m) => onChange({ axis_u_m })}
+            {...common}
+          />
           <VectorInput
             label="Second edge"
             unit="m"
@@ -65,13 +89,37 @@ export function LightFields({ light, onChange, onEnd, disabled }: LightFieldsPro
       )}
       {"radius_m" in light && (
         <Field label="Radius" help="A larger lamp throws softer shadows." inline>
-          <NumberInput label="Radius" unit="m" value={light.radius_m} onChange={(radius_m) => onChange({ radius_m })} min={0} max={100} {...common} />
+          <NumberInput
+            label="Radius"
+            unit="m"
+            value={light.radius_m}
+            onChange={(radius_m) => onChange({ radius_m })}
+            min={0}
+            max={100}
+            {...common}
+          />
         </Field>
       )}
       {"angle_deg" in light && (
         <>
-          <SliderField label="Opening" unit="°" value={light.angle_deg} onChange={(angle_deg) => onChange({ angle_deg })} min={1} max={179} step={1} {...common} />
-          <SliderField label="Soft edge" value={light.blend} onChange={(blend) => onChange({ blend })} min={0} max={1} {...common} />
+          <SliderField
+            label="Opening"
+            unit="°"
+            value={light.angle_deg}
+            onChange={(angle_deg) => onChange({ angle_deg })}
+            min={1}
+            max={179}
+            step={1}
+            {...common}
+          />
+          <SliderField
+            label="Soft edge"
+            value={light.blend}
+            onChange={(blend) => onChange({ blend })}
+            min={0}
+            max={1}
+            {...common}
+          />
         </>
       )}
       {"angular_radius_deg" in light && (
@@ -95,7 +143,12 @@ export function LightFields({ light, onChange, onEnd, disabled }: LightFieldsPro
 type Directed = Extract<ManualLight, { direction: unknown }>;
 
 /** Where the light comes from: a bearing and a height over the board's plane. */
-function DirectionFields({ light, onChange, onEnd, disabled }: Omit<LightFieldsProps, "light"> & { readonly light: Directed }) {
+function DirectionFields({
+  light,
+  onChange,
+  onEnd,
+  disabled,
+}: Omit<LightFieldsProps, "light"> & { readonly light: Directed }) {
   const [bearing, height] = anglesFromDirection(light.direction);
   return (
     <>

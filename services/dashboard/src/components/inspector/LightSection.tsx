@@ -18,7 +18,10 @@ interface LightSectionProps {
   readonly disabled: boolean;
 }
 
-const TYPES = (Object.keys(LIGHT_TYPES) as LightType[]).map((type) => ({ value: type, label: LIGHT_TYPES[type].label }));
+const TYPES = (Object.keys(LIGHT_TYPES) as LightType[]).map((type) => ({
+  value: type,
+  label: LIGHT_TYPES[type].label,
+}));
 
 /** The selected lamp. */
 export function LightSection({ lights, disabled }: LightSectionProps) {
@@ -40,10 +43,24 @@ function LightEditor({ index, light, disabled }: LightEditorProps) {
   return (
     <Section
       title={`${label} ${index + 1}`}
-      action={<IconButton icon="trash" label="Remove light" hint="Del" disabled={disabled} onClick={() => removeLight(index)} />}
+      action={
+        <IconButton
+          icon="trash"
+          label="Remove light"
+          hint="Del"
+          disabled={disabled}
+          onClick={() => removeLight(index)}
+        />
+      }
     >
       <Field label="Kind" help={help} inline>
-        <Select label="Kind" value={light.type} choices={TYPES} onChange={(type) => changeType(index, light, type)} disabled={disabled} />
+        <Select
+          label="Kind"
+          value={light.type}
+          choices={TYPES}
+          onChange={(type) => changeType(index, light, type)}
+          disabled={disabled}
+        />
       </Field>
       {isOutOfSight(light) && <p class="quiet small">It hangs outside the picture; its fields move it.</p>}
       <LightFields light={light} onChange={gesture.push} onEnd={gesture.end} disabled={disabled} />

@@ -36,14 +36,21 @@ export function LightsPanel() {
   return (
     <>
       <Section title="Light comes from">
-        <Segments label="Light mode" segments={MODES} value={found.mode} onChange={(mode) => !disabled && void setMode(found, mode)} />
+        <Segments
+          label="Light mode"
+          segments={MODES}
+          value={found.mode}
+          onChange={(mode) => !disabled && void setMode(found, mode)}
+        />
         <p class="quiet small">{HELP[found.mode]}</p>
       </Section>
       {found.mode === "manual" && <ManualList lights={found} disabled={disabled} />}
       {found.mode === "manual" && <LightSection lights={found} disabled={disabled} />}
       {found.mode === "tracked" && <TrackedSection lights={found} disabled={disabled} />}
       {found.mode === "environment" && <EnvironmentSection lights={found} disabled={disabled} />}
-      {(found.mode === "fisheye" || found.mode === "environment") && <FisheyeSection lights={found} disabled={disabled} />}
+      {(found.mode === "fisheye" || found.mode === "environment") && (
+        <FisheyeSection lights={found} disabled={disabled} />
+      )}
       <RegistrationSection lights={found} disabled={disabled} />
     </>
   );
@@ -54,7 +61,10 @@ async function setMode(current: Lights, mode: Mode): Promise<void> {
   const target = partTarget("lights");
   if (mode === "environment" && current.environment.map == null) {
     const map = assets.value.find((each) => each.kind === "map");
-    if (!map) { toast("Upload an environment map first: drop an .hdr or .exr file on the assets."); return; }
+    if (!map) {
+      toast("Upload an environment map first: drop an .hdr or .exr file on the assets.");
+      return;
+    }
     await edit(target, { mode, environment: { map: map.asset } });
   } else if (mode === "tracked" && current.tracked.length === 0) {
     await edit(target, { mode, tracked: [{ marker: 0 }] });

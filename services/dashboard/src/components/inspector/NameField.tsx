@@ -10,7 +10,8 @@ export function NameField({ id, disabled }: { readonly id: string; readonly disa
       return;
     }
     const item = objects.value.find((each) => each.id === id);
-    if (await change("PUT", `/objects/${encodeURIComponent(id)}`, { ...item, id: name }, { strict: true })) selectObject(name);
+    if (await change("PUT", `/objects/${encodeURIComponent(id)}`, { ...item, id: name }, { strict: true }))
+      selectObject(name);
     else input.value = id;
   };
   return (

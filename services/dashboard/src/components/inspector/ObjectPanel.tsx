@@ -39,7 +39,11 @@ export function ObjectPanel() {
 function ObjectHead({ item, mayChange }: { readonly item: SceneObject; readonly mayChange: boolean }) {
   const asset = assets.value.find((each) => each.asset === item.asset);
   const bounds = boundsByObject.value.get(item.id);
-  const measures = bounds ? size(bounds).map((edge) => lengthText(edge * item.pose.scale)).join(" × ") : "";
+  const measures = bounds
+    ? size(bounds)
+        .map((edge) => lengthText(edge * item.pose.scale))
+        .join(" × ")
+    : "";
   return (
     <section class="section head" aria-label="Object">
       <div class="row">
@@ -52,8 +56,20 @@ function ObjectHead({ item, mayChange }: { readonly item: SceneObject; readonly 
           disabled={!mayChange}
           onClick={() => setVisible(item.id, !item.visible)}
         />
-        <IconButton icon="copy" label="Duplicate" hint="Ctrl+D" disabled={!mayChange} onClick={() => duplicateObject(item.id)} />
-        <IconButton icon="trash" label="Remove" hint="Del" disabled={!mayChange} onClick={() => removeObject(item.id)} />
+        <IconButton
+          icon="copy"
+          label="Duplicate"
+          hint="Ctrl+D"
+          disabled={!mayChange}
+          onClick={() => duplicateObject(item.id)}
+        />
+        <IconButton
+          icon="trash"
+          label="Remove"
+          hint="Del"
+          disabled={!mayChange}
+          onClick={() => removeObject(item.id)}
+        />
       </div>
       <p class="quiet small">
         {asset ? assetName(asset) : "The asset is gone"}

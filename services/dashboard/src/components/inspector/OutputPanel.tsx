@@ -39,7 +39,13 @@ export function OutputPanel() {
         </div>
       </Section>
       <Section title="Picture">
-        <SchemaForm fields={fields} values={output} onChange={(key, value) => gesture.push({ [key]: value })} onEnd={gesture.end} disabled={disabled} />
+        <SchemaForm
+          fields={fields}
+          values={output}
+          onChange={(key, value) => gesture.push({ [key]: value })}
+          onEnd={gesture.end}
+          disabled={disabled}
+        />
       </Section>
     </>
   );

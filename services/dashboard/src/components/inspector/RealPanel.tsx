@@ -27,7 +27,11 @@ export function RealPanel() {
     <>
       <Section title="Shape of the real scene">
         <GeometryField geometry={real.geometry} disabled={disabled} />
-        <Field label="Unseen albedo" help="Of surfaces that the camera does not see now; automatic remembers what it saw." inline>
+        <Field
+          label="Unseen albedo"
+          help="Of surfaces that the camera does not see now; automatic remembers what it saw."
+          inline
+        >
           <NumberInput
             label="Unseen albedo"
             value={real.unseen_albedo ?? null}
@@ -40,10 +44,18 @@ export function RealPanel() {
         </Field>
       </Section>
       {surfaces.map((surface, index) => (
-        <SurfaceSection key={index} index={index} surface={surface} onChange={(next) => change(index, next)} disabled={disabled} />
+        <SurfaceSection
+          key={index}
+          index={index}
+          surface={surface}
+          onChange={(next) => change(index, next)}
+          disabled={disabled}
+        />
       ))}
       <div class="section">
-        <p class="quiet small">Real surfaces are taken as matte. Declare those that are not, such as a polished table.</p>
+        <p class="quiet small">
+          Real surfaces are taken as matte. Declare those that are not, such as a polished table.
+        </p>
         <Button icon="add" onClick={add} disabled={disabled || surfaces.length >= MOST_SURFACES}>
           Declare a surface
         </Button>
@@ -64,7 +76,13 @@ function GeometryField({ geometry, disabled }: { readonly geometry: unknown; rea
     edit(partTarget("real"), { geometry: value === "depth" || value === "fused" ? value : { model: value } });
   return (
     <Field label="Geometry" help="Each frame's own depth, depth gathered over all frames, or a given model." inline>
-      <Select label="Geometry" value={model ?? String(geometry)} choices={choices} onChange={choose} disabled={disabled} />
+      <Select
+        label="Geometry"
+        value={model ?? String(geometry)}
+        choices={choices}
+        onChange={choose}
+        disabled={disabled}
+      />
     </Field>
   );
 }

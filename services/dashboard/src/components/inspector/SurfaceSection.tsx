@@ -24,12 +24,30 @@ export function SurfaceSection({ index, surface, onChange, disabled }: SurfaceSe
   return (
     <Section
       title={`Surface ${index + 1}`}
-      action={<IconButton icon="trash" label={`Remove surface ${index + 1}`} disabled={disabled} onClick={() => onChange(null)} />}
+      action={
+        <IconButton
+          icon="trash"
+          label={`Remove surface ${index + 1}`}
+          disabled={disabled}
+          onClick={() => onChange(null)}
+        />
+      }
     >
       {plane && (
         <>
-          <VectorInput label="Plane through" unit="m" value={plane.point_m} onChange={(point_m) => setPlane({ point_m })} disabled={disabled} />
-          <VectorInput label="Normal" value={plane.normal} onChange={(normal) => setPlane({ normal })} disabled={disabled} />
+          <VectorInput
+            label="Plane through"
+            unit="m"
+            value={plane.point_m}
+            onChange={(point_m) => setPlane({ point_m })}
+            disabled={disabled}
+          />
+          <VectorInput
+            label="Normal"
+            value={plane.normal}
+            onChange={(normal) => setPlane({ normal })}
+            disabled={disabled}
+          />
           <Field label="Thickness" help="Points closer to the plane than this belong to it." inline>
             <NumberInput
               label="Thickness"
@@ -45,8 +63,20 @@ export function SurfaceSection({ index, surface, onChange, disabled }: SurfaceSe
       )}
       {box && (
         <>
-          <VectorInput label="Lower corner" unit="m" value={box.min_m} onChange={(min_m) => set({ region: { box: { ...box, min_m } } })} disabled={disabled} />
-          <VectorInput label="Upper corner" unit="m" value={box.max_m} onChange={(max_m) => set({ region: { box: { ...box, max_m } } })} disabled={disabled} />
+          <VectorInput
+            label="Lower corner"
+            unit="m"
+            value={box.min_m}
+            onChange={(min_m) => set({ region: { box: { ...box, min_m } } })}
+            disabled={disabled}
+          />
+          <VectorInput
+            label="Upper corner"
+            unit="m"
+            value={box.max_m}
+            onChange={(max_m) => set({ region: { box: { ...box, max_m } } })}
+            disabled={disabled}
+          />
         </>
       )}
       {material && <p class="quiet small">Material “{material}” of the given model</p>}

@@ -34,10 +34,20 @@ export function TrackedSection({ lights, disabled }: TrackedSectionProps) {
           key={index}
           title={`Lamp on marker ${lamp.marker}`}
           action={
-            <IconButton icon="trash" label={`Remove lamp ${index + 1}`} disabled={disabled || lamps.length === 1} onClick={() => remove(index)} />
+            <IconButton
+              icon="trash"
+              label={`Remove lamp ${index + 1}`}
+              disabled={disabled || lamps.length === 1}
+              onClick={() => remove(index)}
+            />
           }
         >
-          <LampFields lamp={lamp} onChange={(values) => change(index, values)} onEnd={gesture.end} disabled={disabled} />
+          <LampFields
+            lamp={lamp}
+            onChange={(values) => change(index, values)}
+            onEnd={gesture.end}
+            disabled={disabled}
+          />
         </Section>
       ))}
       <div class="section">
@@ -61,7 +71,15 @@ function LampFields({ lamp, onChange, onEnd, disabled }: LampFieldsProps) {
   return (
     <>
       <Field label="Marker" help="One of the lamp markers of board.yaml." inline>
-        <NumberInput label="Marker" value={lamp.marker} onChange={(marker) => marker !== null && onChange({ marker })} min={0} step={1} integer {...common} />
+        <NumberInput
+          label="Marker"
+          value={lamp.marker}
+          onChange={(marker) => marker !== null && onChange({ marker })}
+          min={0}
+          step={1}
+          integer
+          {...common}
+        />
       </Field>
       <VectorInput
         label="Bulb"
@@ -71,11 +89,35 @@ function LampFields({ lamp, onChange, onEnd, disabled }: LampFieldsProps) {
         onChange={(offset_m) => onChange({ offset_m })}
         {...common}
       />
-      <SliderField label="Intensity" unit="m²" value={lamp.intensity} onChange={(intensity) => onChange({ intensity })} min={0} max={20} numberMax={1e9} step={0.05} {...common} />
+      <SliderField
+        label="Intensity"
+        unit="m²"
+        value={lamp.intensity}
+        onChange={(intensity) => onChange({ intensity })}
+        min={0}
+        max={20}
+        numberMax={1e9}
+        step={0.05}
+        {...common}
+      />
       <Field label="Radius" inline>
-        <NumberInput label="Radius" unit="m" value={lamp.radius_m} onChange={(radius_m) => radius_m !== null && onChange({ radius_m })} min={0} max={100} {...common} />
+        <NumberInput
+          label="Radius"
+          unit="m"
+          value={lamp.radius_m}
+          onChange={(radius_m) => radius_m !== null && onChange({ radius_m })}
+          min={0}
+          max={100}
+          {...common}
+        />
       </Field>
-      <ColorField label="Colour" value={lamp.color_linear} onChange={(color_linear) => onChange({ color_linear })} max={1000} {...common} />
+      <ColorField
+        label="Colour"
+        value={lamp.color_linear}
+        onChange={(color_linear) => onChange({ color_linear })}
+        max={1000}
+        {...common}
+      />
     </>
   );
 }

@@ -25,9 +25,19 @@ export function SceneMenu() {
   const entries: MenuEntry[] = [
     ...others,
     { label: "New scene", icon: "add", begins: true, disabled: !mayChange, onClick: () => newScene("untitled") },
-    { label: "Duplicate this scene", icon: "copy", disabled: !mayChange || !current, onClick: () => current && duplicateScene(current.id) },
+    {
+      label: "Duplicate this scene",
+      icon: "copy",
+      disabled: !mayChange || !current,
+      onClick: () => current && duplicateScene(current.id),
+    },
     { label: "Import a document", icon: "upload", disabled: !mayChange, onClick: () => file.current?.click() },
-    { label: "Export as JSON", icon: "download", disabled: !current, onClick: () => current && exportScene(current.id, name) },
+    {
+      label: "Export as JSON",
+      icon: "download",
+      disabled: !current,
+      onClick: () => current && exportScene(current.id, name),
+    },
     ...deletions(current?.id, mayChange),
   ];
   return (
@@ -36,7 +46,13 @@ export function SceneMenu() {
         <span class="cut scene-name">{current ? name || "untitled" : "No scene"}</span>
         <Icon name="down" />
       </Menu>
-      <input ref={file} type="file" accept=".json,.yaml,.yml" hidden onChange={(event) => void importScene(event.currentTarget)} />
+      <input
+        ref={file}
+        type="file"
+        accept=".json,.yaml,.yml"
+        hidden
+        onChange={(event) => void importScene(event.currentTarget)}
+      />
     </>
   );
 }

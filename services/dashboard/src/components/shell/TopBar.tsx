@@ -29,7 +29,13 @@ export function TopBar() {
       </h1>
       <SceneMenu />
       <span class="rule" />
-      <IconButton icon="undo" label="Undo" hint="Ctrl+Z" disabled={!mayChange || scene.value?.can_undo !== true} onClick={undo} />
+      <IconButton
+        icon="undo"
+        label="Undo"
+        hint="Ctrl+Z"
+        disabled={!mayChange || scene.value?.can_undo !== true}
+        onClick={undo}
+      />
       <IconButton
         icon="redo"
         label="Redo"
@@ -44,7 +50,11 @@ export function TopBar() {
       <RecordButton />
       <span class="rule" />
       <IconButton icon="keyboard" label="Keys and help" hint="?" onClick={() => (areKeysShown.value = true)} />
-      <IconButton icon={isDark ? "sun" : "moon"} label={isDark ? "Light appearance" : "Dark appearance"} onClick={toggleTheme} />
+      <IconButton
+        icon={isDark ? "sun" : "moon"}
+        label={isDark ? "Light appearance" : "Dark appearance"}
+        onClick={toggleTheme}
+      />
       <IconButton
         icon="layers"
         label="Inspector"

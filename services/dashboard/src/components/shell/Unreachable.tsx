@@ -9,7 +9,8 @@ export function Unreachable() {
         <div role="status">
           <h1>The service does not answer</h1>
           <p class="quiet">
-            See whether <code>deltalight up</code> or <code>deltalight api</code> still runs. This page tries again every three seconds.
+            See whether <code>deltalight up</code> or <code>deltalight api</code> still runs. This page tries again
+            every three seconds.
           </p>
         </div>
       </form>

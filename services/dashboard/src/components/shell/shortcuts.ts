@@ -32,7 +32,10 @@ function onKeyDown(event: KeyboardEvent): void {
 
 function isTyping(target: EventTarget | null): boolean {
   if (!(target instanceof HTMLElement)) return false;
-  return target.matches("input:not([type=radio], [type=checkbox], [type=range]), textarea, select") || target.isContentEditable;
+  return (
+    target.matches("input:not([type=radio], [type=checkbox], [type=range]), textarea, select") ||
+    target.isContentEditable
+  );
 }
 
 function onControlKey(key: string, shift: boolean): boolean {

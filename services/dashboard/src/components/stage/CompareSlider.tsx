@@ -12,7 +12,8 @@ export function CompareSlider() {
   if (!shown) return null;
   const follow = (event: PointerEvent): void => {
     const outline = root.current?.getBoundingClientRect();
-    if (outline && event.buttons === 1) split.value = Math.max(0, Math.min(100, (100 * (event.clientX - outline.left)) / outline.width));
+    if (outline && event.buttons === 1)
+      split.value = Math.max(0, Math.min(100, (100 * (event.clientX - outline.left)) / outline.width));
   };
   return (
     <div

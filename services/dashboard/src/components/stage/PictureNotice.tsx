@@ -30,7 +30,11 @@ export function PictureNotice() {
     case "no-board":
       return <Banner text="The marker board is not in view, so objects cannot be placed. Point the camera at it." />;
     case "live":
-      return isSceneRead.value && scene.value === null ? <Banner text="No scene is shown; add an object, or choose one under Scenes." /> : <Pending />;
+      return isSceneRead.value && scene.value === null ? (
+        <Banner text="No scene is shown; add an object, or choose one under Scenes." />
+      ) : (
+        <Pending />
+      );
   }
 }
 

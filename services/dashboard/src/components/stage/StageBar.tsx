@@ -48,7 +48,13 @@ export function StageBar() {
         onChange={setMethod}
         disabled={isDisabled}
       />
-      <Select<View> label="View" value={document?.output.view ?? "composite"} choices={VIEWS} onChange={setView} disabled={isDisabled} />
+      <Select<View>
+        label="View"
+        value={document?.output.view ?? "composite"}
+        choices={VIEWS}
+        onChange={setView}
+        disabled={isDisabled}
+      />
     </div>
   );
 }

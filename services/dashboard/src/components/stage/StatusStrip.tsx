@@ -16,6 +16,11 @@ export function StatusStrip() {
       {header && (
         <dl>
           <Figure name="Frame" value={String(header.frame_id)} />
+          <Figure
+            name="Revision"
+            value={String(header.scene?.revision ?? "–")}
+            tip="Of the scene that this frame shows"
+          />
           <Figure name="Delay" value={header.age_ms === null ? "–" : milliseconds(header.age_ms)} />
           <Figure name="Rate" value={header.frames_per_s === null ? "–" : `${header.frames_per_s.toFixed(1)} fps`} />
           <Figure name="Dropped" value={String(droppedFrames(header.drops))} tip={dropText(header.drops)} />

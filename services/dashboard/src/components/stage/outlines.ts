@@ -38,7 +38,10 @@ export function drawBox(sheet: Sheet, pose: Pose, bounds: Bounds, style: BoxStyl
   const { context } = sheet;
   const points = corners(pose, bounds);
   context.setLineDash(style.isDashed ? [5, 4] : []);
-  for (const [width, color] of [[3, "rgb(0 0 0 / 45%)"], [1.5, style.color]] as const) {
+  for (const [width, color] of [
+    [3, "rgb(0 0 0 / 45%)"],
+    [1.5, style.color],
+  ] as const) {
     context.lineWidth = width;
     context.strokeStyle = color;
     context.beginPath();
@@ -61,7 +64,10 @@ function strokeEdge({ context, view, factor }: Sheet, from: Vector, to: Vector):
 }
 
 /** Where the marks of lamps lie; those beyond the picture's edge are kept at it. */
-export function lampMarks(sheet: Pick<Sheet, "view" | "factor" | "width" | "height">, lamps: readonly ManualLight[]): LampMark[] {
+export function lampMarks(
+  sheet: Pick<Sheet, "view" | "factor" | "width" | "height">,
+  lamps: readonly ManualLight[],
+): LampMark[] {
   return lamps.flatMap((light, index) => {
     const at = "position_m" in light ? onSheet(sheet.view, sheet.factor, light.position_m) : null;
     if (!at) return [];

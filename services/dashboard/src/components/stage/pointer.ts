@@ -29,7 +29,11 @@ class Slide {
   private readonly drag: HandleDrag;
   private readonly from: Vector;
 
-  constructor(private readonly pose: Pose, from: Vector, drag: HandleDrag) {
+  constructor(
+    private readonly pose: Pose,
+    from: Vector,
+    drag: HandleDrag,
+  ) {
     this.from = from;
     this.drag = drag;
   }

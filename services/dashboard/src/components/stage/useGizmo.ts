@@ -58,7 +58,9 @@ async function load(canvas: HTMLCanvasElement | null, surface: HTMLElement | nul
       },
     });
   } catch {
-    toast("This browser has no WebGL, so there are no handles on the picture; drag objects themselves, use arrow keys or the fields.");
+    toast(
+      "This browser has no WebGL, so there are no handles on the picture; drag objects themselves, use arrow keys or the fields.",
+    );
     return null;
   }
 }

@@ -23,7 +23,12 @@ export function AssetCard({ asset, mayChange }: AssetCardProps) {
   const path = `${API}/assets/${asset.asset}`;
   const use = asset.kind === "mesh" ? () => addObject(asset) : () => lightWith(asset);
   const entries: MenuEntry[] = [
-    { label: asset.kind === "mesh" ? "Add to the scene" : "Light with it", icon: "add", disabled: !mayChange, onClick: use },
+    {
+      label: asset.kind === "mesh" ? "Add to the scene" : "Light with it",
+      icon: "add",
+      disabled: !mayChange,
+      onClick: use,
+    },
     { label: "Download", icon: "download", onClick: () => download(`${path}/content`, name) },
     { label: "Delete", icon: "trash", disabled: !mayChange, onClick: () => removeAsset(asset) },
   ];

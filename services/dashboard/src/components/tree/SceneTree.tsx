@@ -3,7 +3,14 @@ import type { Surface } from "../../api/types";
 import { LIGHT_TYPES } from "../../forms/lights";
 import { removeLight, removeObject, setVisible } from "../../state/actions";
 import { lights, objects, sceneDocument } from "../../state/scene";
-import { inspectorTab, selectedLight, selectedObjectId, selectLight, selectObject, selectReal } from "../../state/selection";
+import {
+  inspectorTab,
+  selectedLight,
+  selectedObjectId,
+  selectLight,
+  selectObject,
+  selectReal,
+} from "../../state/selection";
 import { IconButton } from "../ui/IconButton";
 import { TreeGroup } from "./TreeGroup";
 import { TreeItem } from "./TreeItem";

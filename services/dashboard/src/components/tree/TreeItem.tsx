@@ -19,7 +19,9 @@ interface TreeItemProps {
 export function TreeItem(props: TreeItemProps) {
   const { icon, label, isSelected, isDimmed = false, color, onSelect } = props;
   const onKeyDown = (event: KeyboardEvent): void => {
-    const act = { Enter: onSelect, " ": props.onToggle ?? onSelect, Delete: props.onRemove, Backspace: props.onRemove }[event.key];
+    const act = { Enter: onSelect, " ": props.onToggle ?? onSelect, Delete: props.onRemove, Backspace: props.onRemove }[
+      event.key
+    ];
     if (!act || event.target !== event.currentTarget) return;
     event.preventDefault();
     event.stopPropagation();

@@ -85,7 +85,14 @@ function MenuRow({ entry, onChoose }: { readonly entry: MenuEntry; readonly onCh
   return (
     <>
       {entry.begins && <hr />}
-      <button type="button" class="menu-item" role="menuitem" tabIndex={-1} disabled={entry.disabled} onClick={onChoose}>
+      <button
+        type="button"
+        class="menu-item"
+        role="menuitem"
+        tabIndex={-1}
+        disabled={entry.disabled}
+        onClick={onChoose}
+      >
         {entry.icon && <Icon name={entry.icon} />}
         <span class="cut">{entry.label}</span>
         {entry.end && <span class="end">{entry.end}</span>}

@@ -1,0 +1,215 @@
+"""The dashboard for tests: node, render server and web process of the demo, and a real browser that looks at them."""
+
+import base64
+import os
+import shutil
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import httpx
+import numpy as np
+import pytest
+from jaxtyping import UInt8
+from numpy.typing import ArrayLike
+from playwright.sync_api import BrowserContext, ConsoleMessage, Locator, Page
+
+from protocol.camera_model import CameraModel
+from protocol.scene import SceneDocument
+from services import ports
+from services.demo import NAME, demo_plan, demo_scene
+from services.host_store import activate_document, session_file
+from services.storage.store import Store
+from services.supervisor import Supervisor
+from tests.services.live_samples import live_socket, read_frame, wait_for_frames
+
+PATIENCE_S = 90.0
+# Where this names a folder, the tests leave pictures of what they see there, made with the demo's own settings.
+SCREENSHOTS = os.environ.get("DELTALIGHT_SCREENSHOTS")
+SIZE = {"width": 1280, "height": 800}
+JPEG_QUALITY = 82  # keeps each below 200 kB
+
+
+def find_chromium() -> str | None:
+    names = ("chromium", "chromium-browser", "google-chrome")
+    return next((path for path in map(shutil.which, names) if path), None)
+
+
+@dataclass(frozen=True)
+class Stack:
+    """A running demo: `address` is host:port, `client` speaks with /api/v1, `path` is the active scene's."""
+
+    address: str
+    client: httpx.Client
+    path: str
+
+    def scene(self) -> dict[str, Any]:
+        """The active scene, as its route answers."""
+        answer = self.client.get(self.path)
+        assert answer.status_code == 200, answer.text
+        found: dict[str, Any] = answer.json()
+        return found
+
+    def document(self) -> dict[str, Any]:
+        found: dict[str, Any] = self.scene()["document"]
+        return found
+
+    def object(self, name: str) -> dict[str, Any]:
+        """One object of the scene's document."""
+        found: dict[str, Any] = next(each for each in self.document()["objects"] if each["id"] == name)
+        return found
+
+    def get(self, path: str) -> Any:
+        answer = self.client.get(path)
+        assert answer.status_code == 200, answer.text
+        return answer.json()
+
+    def header(self) -> dict[str, Any]:
+        """What the newest picture says of itself."""
+        with live_socket(self.address) as socket:
+            return read_frame(socket, PATIENCE_S)
+
+
+@contextmanager
+def demo_stack(data: Path) -> Iterator[Stack]:
+    """The demo with small pictures, so that a software renderer makes several a second."""
+    (port,) = ports.private_ports(1)
+    with Store(data) as store:
+        shown = activate_document(store, _scene())
+    with session_file(shown) as session:
+        plan = replace(demo_plan(session), data=data, page_port=port)
+        with Supervisor(plan.specs()) as supervisor, _kept_alive(supervisor):
+            address = f"{ports.LOOPBACK}:{port}"
+            wait_for_frames(address, PATIENCE_S)
+            with httpx.Client(base_url=f"http://{address}/api/v1", timeout=PATIENCE_S) as client:
+                yield Stack(address, client, f"/scenes/{client.get('/active-scene').json()['id']}")
+
+
+def _scene() -> SceneDocument:
+    scene = demo_scene("dvct").replaced(name=NAME)
+    if SCREENSHOTS:
+        return scene
+    method = {"name": "dvct", "volume_size": 32, "rsm_size": 256, "cone_count": 6, "triangle_budget": 8000}
+    return scene.replaced(method=method, output={"width": 320, "height": 240})
+
+
+@contextmanager
+def _kept_alive(supervisor: Supervisor) -> Iterator[None]:
+    ended = threading.Event()
+    thread = threading.Thread(target=supervisor.run, args=(ended.is_set,))
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
+class Desk:
+    """A page of the dashboard as a person uses it, beside the REST API of the same stack."""
+
+    def __init__(self, stack: Stack, page: Page) -> None:
+        self.stack = stack
+        self.page = page
+        self.complaints: list[str] = []
+        page.on("console", self._hear)
+        page.on("pageerror", lambda fault: self.complaints.append(str(fault)))
+        page.set_default_timeout(PATIENCE_S * 1000)
+
+    def _hear(self, message: ConsoleMessage) -> None:
+        if message.type == "error":
+            self.complaints.append(message.text)
+
+    def open(self) -> None:
+        """Load the page and wait until it shows a picture of the newest revision."""
+        self.page.goto(f"http://{self.stack.address}/")
+        self.shows_newest()
+
+    def named(self, role: Any, name: str) -> Locator:
+        return self.page.get_by_role(role, name=name, exact=True)
+
+    def until(self, condition: Callable[[], object], what: str) -> None:
+        """Wait for something; `what` says for what if it never comes."""
+        deadline_s = time.monotonic() + PATIENCE_S
+        while not condition():
+            if time.monotonic() > deadline_s:
+                pytest.fail(f"it never came: {what}")
+            self.page.wait_for_timeout(50)
+
+    def shows_newest(self) -> None:
+        """Wait until the page shows a picture of the scene as REST has it now."""
+        revision = self.stack.scene()["revision"]
+        shown = self.page.locator(f".picture[data-revision='{revision}']")
+        shown.wait_for()
+
+    def pixels(self) -> UInt8[np.ndarray, "h w 3"]:
+        """The picture as the page shows it, BGR."""
+        url = self.named("img", "Live picture").evaluate("canvas => canvas.toDataURL()")
+        png = np.frombuffer(base64.b64decode(url.partition(",")[2]), np.uint8)
+        picture = cv2.imdecode(png, cv2.IMREAD_COLOR)
+        assert picture is not None
+        return picture
+
+    def place_of(self, point_m: ArrayLike) -> tuple[float, float]:
+        """Where on the screen the newest picture shows a point of the world, CSS pixels."""
+        header = self.stack.header()
+        camera = CameraModel.from_dict(header["camera"])
+        seen_m = np.linalg.inv(header["world_from_camera"]) @ [*np.asarray(point_m, float), 1.0]
+        column, row = camera.project(seen_m[None, :3])[0]
+        box = self.page.locator("#stage").bounding_box()
+        assert box is not None
+        factor = box["width"] / camera.width
+        return box["x"] + (column + 0.5) * factor, box["y"] + (row + 0.5) * factor
+
+    def pixel_at(self, place: tuple[float, float]) -> dict[str, float]:
+        """The picture's pixel at a place on the screen, as `POST /live/pick` wants it."""
+        box = self.page.locator("#stage").bounding_box()
+        assert box is not None
+        factor = self.stack.header()["camera"]["width"] / box["width"]
+        return {"x": (place[0] - box["x"]) * factor - 0.5, "y": (place[1] - box["y"]) * factor - 0.5}
+
+    def drag(self, start: tuple[float, float], end: tuple[float, float]) -> None:
+        self.page.mouse.move(*start)
+        self.page.mouse.down()
+        self.page.mouse.move((start[0] + end[0]) / 2, (start[1] + end[1]) / 2, steps=4)
+        self.page.mouse.move(*end, steps=4)
+        self.page.mouse.up()
+
+    def drop(self, name: str, content: bytes, place: tuple[float, float]) -> None:
+        """Drop a file on the picture."""
+        sent = {"name": name, "content": base64.b64encode(content).decode()}
+        transfer = self.page.evaluate_handle(
+            """({ name, content }) => {
+                const bytes = Uint8Array.from(atob(content), (letter) => letter.charCodeAt(0));
+                const transfer = new DataTransfer();
+                transfer.items.add(new File([bytes], name));
+                return transfer;
+            }""",
+            sent,
+        )
+        event = {"dataTransfer": transfer, "clientX": place[0], "clientY": place[1]}
+        for kind in ("dragover", "drop"):
+            self.page.dispatch_event("#stage", kind, event)
+
+    def photograph(self, name: str) -> None:
+        """Keep a picture of the page where pictures are wanted."""
+        if SCREENSHOTS:
+            path = Path(SCREENSHOTS) / f"dashboard_{name}.jpg"
+            self.page.screenshot(path=path, type="jpeg", quality=JPEG_QUALITY)
+
+
+@contextmanager
+def desk(stack: Stack, context: BrowserContext) -> Iterator[Desk]:
+    """A new page; what the browser complained of fails the test at its end."""
+    seat = Desk(stack, context.new_page())
+    try:
+        seat.open()
+        yield seat
+        assert seat.complaints == []
+    finally:
+        seat.page.close()
