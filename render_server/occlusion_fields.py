@@ -48,8 +48,8 @@ class OcclusionFields:
     (embree and matrix products leave the interpreter to others), and until it is there None is the answer.
     """
 
-    def __init__(self, say: Callable[[str], None], folder: Path | None = None) -> None:
-        self.waits = True
+    def __init__(self, say: Callable[[str], None], folder: Path | None = None, *, waits: bool = True) -> None:
+        self.waits = waits
         self._say = say
         self._folder = folder or default_folder()
         self._entries: dict[tuple[object, ...], _Entry] = {}

@@ -52,7 +52,9 @@ class _Plan:
 class Relighting:
     """Holds everything that lives longer than a frame."""
 
-    def __init__(self, gpu: GpuContext, scene: SceneDocument, notices: list[str]) -> None:
+    def __init__(
+        self, gpu: GpuContext, scene: SceneDocument, notices: list[str], *, waits: bool = True
+    ) -> None:
         self._gpu = gpu
         self._notices = notices
         self._timers = PassTimers(gpu)
@@ -62,7 +64,7 @@ class Relighting:
         self._resources: PictureResources | None = None
         self._albedo = AlbedoWatch(gpu)
         self._method: RelightBase | None = None
-        self._fields = OcclusionFields(self._say)
+        self._fields = OcclusionFields(self._say, waits=waits)
         self._lights_versions = count(VERSION_STEP, VERSION_STEP)
         self._relit: ViewFrame | None = None  # the last frame, as far as what it shows was taken over
         self._plan = self._planned(scene)

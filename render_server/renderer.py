@@ -55,13 +55,16 @@ class SceneRenderer:
     """Renders frames of one scene on one GPU context.
 
     `with_linear`: composites carry the linear picture too (for files). `notices` collects sentences that a user
-    should read (registration, memory), each once.
+    should read (registration, memory), each once. `waits`: the first picture waits for what a method precomputes of
+    objects; pictures after `set_scene` never do.
     """
 
-    def __init__(self, gpu: GpuContext, scene: SceneDocument, *, with_linear: bool = False) -> None:
+    def __init__(
+        self, gpu: GpuContext, scene: SceneDocument, *, with_linear: bool = False, waits: bool = True
+    ) -> None:
         self._gpu = gpu
         self.notices: list[str] = []
-        self._relighting = Relighting(gpu, scene, self.notices)
+        self._relighting = Relighting(gpu, scene, self.notices, waits=waits)
         self._composer = Composer(gpu)
         self._with_linear = with_linear
         self._sized: tuple[ViewFrame, ViewFrame] | None = None

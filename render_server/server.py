@@ -180,7 +180,7 @@ def run_server(settings: ServerSettings, keys: Keys | None = None) -> None:
         stack.callback(gpu.release)
         if gpu.is_software:
             log.warning("no GPU found, rendering slowly in software", renderer=gpu.renderer_name)
-        renderer = SceneRenderer(gpu, scene)
+        renderer = SceneRenderer(gpu, scene, waits=False)  # commands are answered meanwhile
         stack.callback(renderer.release)
         serve(settings, renderer, scene, renderer_name=gpu.renderer_name, keys=keys)
 

@@ -42,6 +42,13 @@ _KINDS: tuple[tuple[type[DeltalightError], int, str], ...] = (
 )
 
 
+# What the framework says in two words, by those.
+_ADVICE = {
+    "Not Found": ": nothing is at this address; /openapi.json lists what there is.",
+    "Method Not Allowed": ": this address does not take that method; /openapi.json lists those that it takes.",
+}
+
+
 class Problem(BaseModel):
     """What is wrong and what to do."""
 
@@ -99,8 +106,11 @@ class Problems:
         """The response to a refusal of the framework or of a gate."""
         if fault.status_code == 400 and not isinstance(fault, ProblemError):  # the body's text cannot be read
             return self._not_json()
-        kind = fault.kind if isinstance(fault, ProblemError) else _slug(fault.status_code)
-        return self.response(fault.status_code, kind, str(fault.detail), headers=fault.headers)
+        status = fault.status_code
+        kind = fault.kind if isinstance(fault, ProblemError) else _slug(status)
+        return self.response(
+            status, kind, f"{fault.detail}{_ADVICE.get(fault.detail, '')}", headers=fault.headers
+        )
 
     def of_fault(self, fault: DeltalightError) -> JSONResponse:
         """The response to a refusal of the storage or of a document."""
@@ -132,7 +142,9 @@ class Problems:
         @app.exception_handler(OSError)
         async def _disk(_request: Request, fault: OSError) -> JSONResponse:
             log.error("the data folder cannot be used", fault=str(fault))
-            sentence = f"The data folder cannot be used ({fault.strerror}); free some space, or see to its rights."
+            sentence = (
+                f"The data folder cannot be used ({fault.strerror}); free some space, or see to its rights."
+            )
             return self.response(503, "storage-fault", sentence)
 
         @app.exception_handler(Exception)

@@ -116,7 +116,7 @@ def list_recordings(shared: Shared) -> list[RecordingAnswer]:
     """List all recordings, those that grow first, then the newest first."""
     growing = shared.recorder.running()
     names = {take.id for take in growing}
-    kept = [RecordingAnswer.kept(take) for take in shared.takes.all() if take.id not in names]
+    kept = [RecordingAnswer.kept(take) for take in shared.takes.all(growing=names)]
     return [RecordingAnswer.growing(take) for take in growing] + kept
 
 

@@ -4,7 +4,7 @@ import json
 import os
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -61,10 +61,10 @@ class TakeShelf:
             if path.stat().st_mtime < time.time() - LEFT_OVER_AFTER_S:
                 path.unlink(missing_ok=True)
 
-    def all(self) -> list[Take]:
-        """Return all recordings, the newest first."""
+    def all(self, growing: Collection[str] = ()) -> list[Take]:
+        """Return all recordings except those that grow, which would be read whole each time; the newest first."""
         takes = []
-        for name in {path.name.split(".")[0] for path in self._paths()}:
+        for name in {path.name.split(".")[0] for path in self._paths()}.difference(growing):
             with suppress(NotFoundError):  # deleted meanwhile
                 takes.append(self.get(name))
         return sorted(takes, key=lambda take: (-take.changed_ns, take.id))

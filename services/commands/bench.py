@@ -95,6 +95,35 @@ def quality(
     run_quality(chosen, compared, size_px, spp, volume_size=volume, device=device, out=out, as_json=as_json)
 
 
+@bench.command()
+def rest(
+    *,
+    seconds: Annotated[float, typer.Option(min=0.2, max=3600, help="Length of each measurement.")] = 20.0,
+    size: Annotated[
+        str | None, typer.Option(metavar="WxH", help="Size of the pictures; default the demo's.")
+    ] = None,
+    device: Annotated[
+        int | None, typer.Option(min=0, help="EGL device; `deltalight doctor` lists them.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="File for the report as JSON.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
+) -> None:
+    """Time the REST API with and without rendering, what 20 live viewers cost, and the dashboard's size."""
+    from services.arguments import parse_size
+    from services.files import write_bytes
+
+    size_px = None if size is None else parse_size(size)
+    from benchmarks.rest import measure_rest, print_report  # needs the api extra, wrong options do not
+
+    report = measure_rest(seconds, size=size_px, device=device)
+    if out is not None:
+        write_bytes(out, json.dumps(report, indent=2).encode())
+    if as_json:
+        typer.echo(json.dumps(report, indent=2))
+    else:
+        print_report(report)
+
+
 def _methods(text: str) -> list[str]:
     names = [name.strip() for name in text.split(",")]
     known = [method.value for method in Method]

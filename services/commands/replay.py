@@ -1,14 +1,11 @@
 """`deltalight replay`: a recording or dataset folder, published as a sensor node does."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from services.commands.options import ConfigFile
-
-if TYPE_CHECKING:
-    pass
 
 
 def replay(

@@ -233,8 +233,7 @@ def test_beside_rendering_a_field_arrives_later_and_the_user_is_told(
     tmp_path: Path, ball: TriangleMesh
 ) -> None:
     said: list[str] = []
-    fields = OcclusionFields(said.append, tmp_path)
-    fields.waits = False
+    fields = OcclusionFields(said.append, tmp_path, waits=False)
     assert fields.find(placed(ball), SETTINGS) is None
     assert "`ball`" in said[0]
     fields.waits = True

@@ -30,7 +30,10 @@ from tests.render_server.scenes import (
 
 pytestmark = pytest.mark.usefixtures("clean_gl")
 FACE_Y = 0.1  # of the mirror, which looks along -y
-METHODS = {"dvct": {"caustics": False}, "dlpv": {"query_scale": 1, "caustics": False}}
+METHODS: dict[str, dict[str, object]] = {
+    "dvct": {"volume_size": 32, "cone_scale": 1, "caustics": False},
+    "dlpv": {"query_scale": 1, "caustics": False},
+}
 
 
 @pytest.fixture
@@ -38,17 +41,16 @@ def stage(tmp_path: Path) -> Stage:
     return Stage(tmp_path)
 
 
-def standing_mirror(stage: Stage, roughness: float = 0.0, **more: object) -> SceneDocument:
+def standing_mirror(
+    stage: Stage, name: str = "dvct", roughness: float = 0.0, *, screen_space: bool = True
+) -> SceneDocument:
     """A silver plate on the checkered floor. The sun from straight above is so strong that the plate, which takes
     nothing of it from what it shows, changes the floor's light by less than a percent."""
     plate = shifted(trimesh.creation.box((0.5, 0.01, 0.3)), 0, FACE_Y + 0.005, 0.15)
     material = {"metallic": 1.0, "roughness": roughness}
     mirror = stage.virtual(plate, (1.0, 1.0, 1.0), material)
     document = stage.document([mirror], [directional(irradiance=100.0)], floor())
-    name = str(more.pop("name", "dvct"))
-    settings = {"name": name, "rsm_size": 256, **METHODS[name], **more}
-    if name == "dvct":
-        settings |= {"volume_size": 32, "cone_scale": 1}
+    settings = {"name": name, "rsm_size": 256, "screen_space": screen_space, **METHODS[name]}
     return document.replaced(method=settings)
 
 
@@ -83,7 +85,7 @@ def mirrored_pixels() -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("name", METHODS)
 def test_a_flat_mirror_shows_the_patterns_radiance(gpu: GpuContext, stage: Stage, name: str) -> None:
-    """Within 2 % in the mean wherever the pattern is even around the point that optics names; nothing where it names none."""
+    """Within 2 % in the mean, where the pattern is even around what the mirror shows; else nothing."""
     document = standing_mirror(stage, name=name)
     found, shown, linear = reflected(gpu, document)
     pixels, meets = mirrored_pixels()

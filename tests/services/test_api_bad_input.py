@@ -23,6 +23,7 @@ from protocol.radiance_files import write_exr
 from services import ports
 from services.api.problems import TYPE_PREFIX
 from services.storage.asset_probe import probe
+from services.storage.faults import StorageFaultError
 from tests.services.api_samples import UPLOAD, RenderServer, RunningApi, running_api, sentence
 from tests.services.record_samples import frames, write
 from tests.services.storage_samples import TETRAHEDRON, glb
@@ -331,6 +332,26 @@ def test_a_disk_that_refuses_is_a_sentence(tmp_path: Path) -> None:
         assert "cannot be kept" in text
         incoming.mkdir()
         assert upload(api.client, TETRAHEDRON, "t.obj").status_code == 201
+        (api.store.folder / "snapshots").rmdir()
+        text = refused(api, lambda: api.client.get("/snapshots"), 503, "storage-fault")
+        assert "data folder cannot be used" in text
+
+
+def test_tokens_that_cannot_be_read_let_nobody_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with running_api(tmp_path / "data", host="0.0.0.0") as api:
+
+        def fail(_token: str) -> None:
+            raise StorageFaultError("The database cannot be used now; free some space.")
+
+        monkeypatch.setattr(api.store.tokens, "verify", fail)
+        answer = api.client.get("/scenes", headers={"Authorization": "Bearer right"})
+        assert "cannot be used now" in sentence(answer, 503)
+
+
+def test_addresses_and_methods_that_there_are_not(api: RunningApi) -> None:
+    assert "nothing is at" in refused(api, lambda: api.client.get("/nothing"), 404, "not-found")
+    text = refused(api, lambda: api.client.delete("/state"), 405, "method-not-allowed")
+    assert "does not take that method" in text
 
 
 def test_a_render_server_that_dies_holds_nobody_up(tmp_path: Path) -> None:

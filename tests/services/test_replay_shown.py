@@ -1,7 +1,5 @@
 """A replay seen at the render server's end: real processes, with sockets in a folder as in docker-compose.yml."""
 
-import os
-import signal
 import subprocess
 import sys
 import time
@@ -174,34 +172,37 @@ def test_it_goes_on_at_its_rate_and_around_or_stays_at_its_end(api: Api) -> None
     assert api.client.get("/replay").json()["playing"]
 
 
-def end_amid_work(host: Host, name: str, sent: int) -> None:
-    """Let an API that shows a recording and makes another, called `name`, end by a signal."""
-    with serving(host) as api:
-        api.client.put("/replay", json={"recording": "take"}).raise_for_status()
-        api.client.post("/recordings", json={"name": name}).raise_for_status()
-        wait_for(lambda: (api.client.get(f"/recordings/{name}").json()["frames"] or 0) > 3)
-        children = api.children("replay") + api.children("record")
-        assert len(children) == 2
-        os.kill(api.process.pid, sent)
-        assert len(psutil.wait_procs(children, 30)[0]) == 2
+def set_to_work(api: Api, name: str) -> list[psutil.Process]:
+    """Let it show a recording and make another, called `name`; the processes that do so."""
+    shown = api.client.put("/replay", json={"recording": "take"})
+    assert shown.status_code == 200, shown.text
+    api.client.post("/recordings", json={"name": name}).raise_for_status()
+    wait_for(lambda: (api.client.get(f"/recordings/{name}").json()["frames"] or 0) > 3)
+    children = api.children("replay") + api.children("record")
+    assert len(children) == 2
+    return children
+
+
+def require_whole(host: Host, name: str) -> None:
     folder = host.data / "recordings"
     assert len(open_source(folder / f"{name}.mcap")) > 3
     left = {path.name for path in folder.iterdir()} - {".cache"}
     assert not [each for each in left if each.endswith(".active") or each.startswith(".")]
 
 
-def test_recorder_and_replay_end_with_the_api(host: Host) -> None:
-    end_amid_work(host, "told-to-end", signal.SIGTERM)
-    assert not list(host.sockets.glob("*replay*"))
-
-
-def test_after_kill_9_the_take_is_whole_and_the_next_api_begins_live(host: Host) -> None:
-    end_amid_work(host, "killed", signal.SIGKILL)
+def test_recorder_and_replay_end_with_the_api_and_the_next_one_begins_live(host: Host) -> None:
+    with serving(host) as api:
+        children = set_to_work(api, "killed")
+        api.process.kill()
+        assert len(psutil.wait_procs(children, 30)[0]) == 2
+    require_whole(host, "killed")
     with serving(host) as api:
         found: dict[str, Any] = {each["id"]: each for each in api.client.get("/recordings").json()}
         assert (found["killed"]["state"], found["killed"]["detail"]) == ("finished", "")
         assert api.client.get("/replay").json()["recording"] is None
         live = recorded(host)[:4]
         wait_for(lambda: any(api.shows(each) for each in live))
-        again = api.client.put("/replay", json={"recording": "take"})
-        assert again.status_code == 200, f"a socket that was left is in the way: {again.text}"
+        children = set_to_work(api, "told-to-end")  # over the sockets that the killed one left
+    assert not any(child.is_running() for child in children), "they are ended before the API is"
+    require_whole(host, "told-to-end")
+    assert not list(host.sockets.glob("*replay*"))

@@ -62,7 +62,7 @@ function Control({ field, value, onChange, onEnd, disabled }: ControlProps) {
     );
   }
   if (field.kind === "switch" && !field.isNullable) {
-    return <Switch label="" checked={value === true} onChange={onChange} disabled={disabled} />;
+    return <Switch label="" name={field.label} checked={value === true} onChange={onChange} disabled={disabled} />;
   }
   return <ChoiceControl field={field} value={value} onChange={onChange} disabled={disabled} />;
 }

@@ -1,0 +1,219 @@
+"""How fast the web process answers, with and without pictures to make beside it; what its viewers cost."""
+
+import asyncio
+import gzip
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import httpx
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks.rest_load import Call, send_paced, watch
+from protocol.errors import DeltalightError
+from services import ports
+from services.api.page import DASHBOARD
+from services.demo import demo_plan, demo_scene
+from services.host import HostPlan
+from services.host_store import activate_document, session_file
+from services.offline import with_output
+from services.storage.store import Store
+from services.supervisor import Supervisor
+
+REQUESTS_PER_S = 50.0
+VIEWERS, VIEWER_FRAMES_PER_S = 20, 10.0
+ROUNDS = 3  # of viewers after none: what else the machine does falls on both
+START_TIMEOUT_S = 120.0  # a cold shader cache on a slow machine takes a while
+STEP_M = 0.001  # of the object that the requests move
+TEXT_SUFFIXES = (".js", ".css", ".html", ".svg")  # fonts are compressed already
+_COUNTER = "deltalight_live_frames_received_total"
+
+
+def measure_rest(seconds: float, *, size: tuple[int, int] | None, device: int | None) -> dict[str, Any]:
+    """Measure requests, viewers and the page's size; each measurement takes `seconds`.
+
+    Raises:
+        DeltalightError: no OpenGL, missing demo files, or a process that died for good.
+    """
+    report: dict[str, Any] = {
+        "cpus": os.cpu_count(),
+        "load_before": os.getloadavg()[0],
+        "seconds": seconds,
+        "requests_per_s": REQUESTS_PER_S,
+    }
+    with _running(size, device, with_rendering=False) as (address, _):
+        report["without_rendering"] = _requests(address, seconds)
+    with _running(size, device, with_rendering=True) as (address, supervisor):
+        _wait_for_pictures(address, supervisor)
+        rendered = _rendered(address)
+        began_s = time.perf_counter()
+        report["with_rendering"] = _requests(address, seconds)
+        report["with_rendering"]["frames_per_s"] = (_rendered(address) - rendered) / (
+            time.perf_counter() - began_s
+        )
+        report["viewers"] = _viewers(address, seconds)
+        report |= _picture(address)
+    report["dashboard"] = dashboard_sizes(DASHBOARD)
+    return report
+
+
+@contextmanager
+def _running(
+    size: tuple[int, int] | None, device: int | None, *, with_rendering: bool
+) -> Iterator[tuple[str, Supervisor]]:
+    """The demo's processes, or of them the web process alone, with a data folder of their own."""
+    scene = with_output(demo_scene("dvct"), size, None)
+    with TemporaryDirectory(prefix="deltalight-bench-") as folder:
+        data = Path(folder)
+        with Store(data) as store:
+            shown = activate_document(store, scene)
+        with session_file(shown) as session:
+            (port,) = ports.private_ports(1)
+            plan: HostPlan = replace(demo_plan(session), data=data, page_port=port, device=device)
+            with Supervisor(plan.specs() if with_rendering else plan.specs()[-1:]) as supervisor:
+                supervisor.run(until=lambda: ports.answers(port))
+                yield f"http://{ports.LOOPBACK}:{port}/api/v1", supervisor
+
+
+def _wait_for_pictures(address: str, supervisor: Supervisor) -> None:
+    deadline_s = time.monotonic() + START_TIMEOUT_S
+
+    def comes() -> bool:
+        if time.monotonic() > deadline_s:
+            raise DeltalightError("No picture came from the render server; see the lines above.")
+        return _rendered(address) >= 2
+
+    supervisor.run(until=comes)
+
+
+def _requests(address: str, seconds: float) -> dict[str, Any]:
+    """Four times reading, once moving the shown scene's object, over and over."""
+    scene = httpx.get(f"{address}/active-scene").raise_for_status().json()
+    path, thing = f"/scenes/{scene['id']}", scene["document"]["objects"][0]
+    x, y, z = thing["pose"]["translation_m"]
+    moves = [{"pose": {"translation_m": [x + STEP_M * step, y, z]}} for step in (1, 2, 1, 0)]
+    calls = [
+        Call("GET", path),
+        Call("GET", "/state"),
+        Call("GET", f"{path}/revisions"),
+        Call("GET", "/scenes"),
+        Call("PATCH", f"{path}/objects/{thing['id']}", moves),
+    ]
+    return asyncio.run(send_paced(address, calls, REQUESTS_PER_S, seconds)).figures()
+
+
+def _viewers(address: str, seconds: float) -> dict[str, Any]:
+    """Frames rendered a second with nobody looking and with many, in turn."""
+    alone, watched = 0.0, 0.0
+    got: list[int] = []
+
+    def look() -> None:
+        got.extend(asyncio.run(watch(address, VIEWERS, VIEWER_FRAMES_PER_S, seconds)))
+
+    for _ in range(ROUNDS):
+        alone += _frames_while(address, lambda: time.sleep(seconds))
+        watched += _frames_while(address, look)
+    return {
+        "viewers": VIEWERS,
+        "frames_per_s_each_at_most": VIEWER_FRAMES_PER_S,
+        "frames_per_s_each": sum(got) / (len(got) * seconds),
+        "rendered_per_s_without": alone / ROUNDS,
+        "rendered_per_s_with": watched / ROUNDS,
+        "ratio": watched / alone if alone else None,
+    }
+
+
+def _frames_while(address: str, work: Callable[[], object]) -> float:
+    before, began_s = _rendered(address), time.perf_counter()
+    work()
+    return (_rendered(address) - before) / (time.perf_counter() - began_s)
+
+
+def _rendered(address: str) -> float:
+    """Pictures that came from the render server since the web process was started."""
+    lines = httpx.get(f"{address}/metrics").raise_for_status().text.splitlines()
+    return next(float(line.split()[1]) for line in lines if line.startswith(f"{_COUNTER} "))
+
+
+def _picture(address: str) -> dict[str, Any]:
+    """The renderer's name and the size of its pictures."""
+    import cv2
+    import numpy as np
+
+    jpeg = httpx.get(f"{address}/live.jpg").raise_for_status().content
+    picture = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+    assert picture is not None
+    processes = httpx.get(f"{address}/nodes").raise_for_status().json()
+    renderer = next((each["detail"] for each in processes if each["kind"] == "render_server"), "")
+    return {"renderer": renderer, "size": [picture.shape[1], picture.shape[0]]}
+
+
+def dashboard_sizes(folder: Path) -> dict[str, Any] | None:
+    """Bytes of the built dashboard's files, as they are and gzipped; None = it is not built."""
+    if not (folder / "index.html").is_file():
+        return None
+    files = {}
+    for path in sorted(each for each in folder.rglob("*") if each.is_file()):
+        content = path.read_bytes()
+        sent = len(gzip.compress(content)) if path.suffix in TEXT_SUFFIXES else len(content)
+        files[path.relative_to(folder).as_posix()] = {"bytes": len(content), "gzipped_bytes": sent}
+    total = sum(each["gzipped_bytes"] for each in files.values())
+    return {"gzipped_bytes": total, "files": files}
+
+
+def print_report(report: dict[str, Any]) -> None:
+    """Print the report as tables."""
+    console = Console()
+    width, height = report["size"]
+    console.print(
+        f"{report['renderer']}, {report['cpus']} CPUs, {width}x{height}, {report['seconds']:g} s each"
+    )
+    console.print(f"load of the machine before: {report['load_before']:.1f}")
+    console.print(_request_table(report))
+    _print_viewers(console, report)
+    _print_dashboard(console, report["dashboard"])
+
+
+def _request_table(report: dict[str, Any]) -> Table:
+    title = f"{report['requests_per_s']:g} requests/s"
+    table = Table("", "Request", "p50 ms", "p99 ms", title=title, title_justify="left")
+    for column in table.columns[2:]:
+        column.justify = "right"
+    for key, meaning in (
+        ("without_rendering", "web process alone"),
+        ("with_rendering", "beside the renderer"),
+    ):
+        figures = report[key]
+        for method in ("GET", "PATCH"):
+            if method in figures:
+                one = figures[method]
+                table.add_row(meaning, method, f"{one['p50_ms']:.1f}", f"{one['p99_ms']:.1f}")
+        if figures["failed"]:
+            table.add_row(meaning, "failed", str(figures["failed"]), "")
+    return table
+
+
+def _print_viewers(console: Console, report: dict[str, Any]) -> None:
+    figures = report["viewers"]
+    console.print(f"rendered beside these requests: {report['with_rendering']['frames_per_s']:.2f} frames/s")
+    ratio = "-" if figures["ratio"] is None else f"{figures['ratio']:.2f}"
+    console.print(
+        f"rendered with nobody looking {figures['rendered_per_s_without']:.2f} frames/s, with {figures['viewers']} "
+        f"viewers {figures['rendered_per_s_with']:.2f} frames/s (ratio {ratio}); each got "
+        f"{figures['frames_per_s_each']:.2f} frames/s of at most {figures['frames_per_s_each_at_most']:g}"
+    )
+
+
+def _print_dashboard(console: Console, sizes: dict[str, Any] | None) -> None:
+    if sizes is None:
+        console.print("the dashboard is not built; `./run api` builds it")
+        return
+    console.print(f"dashboard: {sizes['gzipped_bytes'] / 1e3:.0f} kB gzipped")
+    for name, one in sizes["files"].items():
+        console.print(f"  {name}: {one['bytes'] / 1e3:.0f} kB, gzipped {one['gzipped_bytes'] / 1e3:.0f} kB")

@@ -1,0 +1,96 @@
+"""Load for a web process: requests at a steady rate, and viewers of the live video."""
+
+import asyncio
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import httpx
+import numpy as np
+
+REQUEST_TIMEOUT_S = 30.0
+
+
+@dataclass(frozen=True)
+class Call:
+    """A request that is sent again and again; `bodies` in turn."""
+
+    method: str
+    path: str
+    bodies: Sequence[object] = (None,)
+
+
+@dataclass
+class Times:
+    """From when a request was due to the end of its answer, seconds, of each method; and those that failed."""
+
+    seconds: dict[str, list[float]] = field(default_factory=dict)
+    failed: int = 0
+
+    def figures(self) -> dict[str, Any]:
+        """Median and 99th percentile by method, milliseconds."""
+        found: dict[str, Any] = {}
+        for method, values in sorted(self.seconds.items()):
+            p50_s, p99_s = np.percentile(values, (50, 99))
+            found[method] = {
+                "requests": len(values),
+                "p50_ms": 1e3 * float(p50_s),
+                "p99_ms": 1e3 * float(p99_s),
+            }
+        return {**found, "failed": self.failed}
+
+
+async def send_paced(address: str, calls: Sequence[Call], per_s: float, seconds: float) -> Times:
+    """Send `calls` in turn, `per_s` a second, whether the earlier ones were answered or not.
+
+    Times count from when a request was due, so that one that had to wait for its turn is not taken for a fast one.
+    """
+    times, began_s = Times(), time.perf_counter()
+    limits = httpx.Limits(max_connections=100)
+    async with httpx.AsyncClient(base_url=address, timeout=REQUEST_TIMEOUT_S, limits=limits) as client:
+        under_way = []
+        for number in range(max(1, round(per_s * seconds))):
+            due_s = began_s + number / per_s
+            await asyncio.sleep(max(0.0, due_s - time.perf_counter()))
+            call, turn = calls[number % len(calls)], number // len(calls)
+            under_way.append(asyncio.create_task(_send(client, call, turn, due_s, times)))
+        await asyncio.gather(*under_way)
+    return times
+
+
+async def _send(client: httpx.AsyncClient, call: Call, turn: int, due_s: float, times: Times) -> None:
+    body = call.bodies[turn % len(call.bodies)]
+    try:
+        answer = await client.request(call.method, call.path, json=body)
+    except httpx.TransportError:
+        times.failed += 1
+        return
+    if answer.is_error:
+        times.failed += 1
+        return
+    times.seconds.setdefault(call.method, []).append(time.perf_counter() - due_s)
+
+
+async def watch(address: str, viewers: int, frames_per_s: float, seconds: float) -> list[int]:
+    """Look with many viewers, each at most at this rate; gives how many frames each got."""
+    ends_s = time.perf_counter() + seconds
+    return list(await asyncio.gather(*(_view(address, 1 / frames_per_s, ends_s) for _ in range(viewers))))
+
+
+async def _view(address: str, period_s: float, ends_s: float) -> int:
+    """One viewer: it acknowledges a frame when the next is due, which is what a slow browser does."""
+    from websockets.asyncio.client import connect
+
+    frames = 0
+    async with connect(f"ws{address.removeprefix('http')}/live", max_size=None, compression=None) as socket:
+        while (left_s := ends_s - time.perf_counter()) > 0:
+            came_s = time.perf_counter()
+            try:
+                await asyncio.wait_for(socket.recv(), left_s)
+            except TimeoutError:
+                break
+            frames += 1
+            await asyncio.sleep(max(0.0, came_s + period_s - time.perf_counter()))
+            await socket.send("ack")
+    return frames

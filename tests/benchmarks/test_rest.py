@@ -1,0 +1,48 @@
+"""`deltalight bench rest` at tiny durations: it runs, and its figures hang together."""
+
+import gzip
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from benchmarks.rest import VIEWERS, dashboard_sizes, measure_rest, print_report
+from services.demo import RECORDING, SCENE
+
+
+def test_the_page_counts_as_it_is_sent(tmp_path: Path) -> None:
+    assert dashboard_sizes(tmp_path) is None
+    text, font = b"<p>text</p>" * 1000, bytes(range(256)) * 10
+    (tmp_path / "assets").mkdir()
+    (tmp_path / "index.html").write_bytes(text)
+    (tmp_path / "assets" / "a.woff2").write_bytes(font)
+    sizes = dashboard_sizes(tmp_path)
+    assert sizes is not None
+    assert sizes["files"]["index.html"] == {"bytes": len(text), "gzipped_bytes": len(gzip.compress(text))}
+    assert sizes["files"]["assets/a.woff2"]["gzipped_bytes"] == len(font)
+    assert sizes["gzipped_bytes"] == len(gzip.compress(text)) + len(font)
+
+
+@pytest.mark.skipif(
+    not (RECORDING.is_file() and SCENE.is_file()), reason="the demo's recording is not in this checkout"
+)
+def test_it_runs_and_reports(capsys: pytest.CaptureFixture[str]) -> None:
+    report = measure_rest(0.4, size=(96, 72), device=None)
+    for key in ("without_rendering", "with_rendering"):
+        figures = report[key]
+        assert figures["failed"] == 0
+        assert (figures["GET"]["requests"], figures["PATCH"]["requests"]) == (16, 4)
+        assert all(0 < figures[method]["p50_ms"] <= figures[method]["p99_ms"] for method in ("GET", "PATCH"))
+    assert report["size"] == [96, 72]
+    assert report["viewers"]["viewers"] == VIEWERS
+    print_report(json.loads(json.dumps(report)))
+    assert "50 requests/s" in capsys.readouterr().out
+
+
+def test_wrong_options_are_sentences() -> None:
+    command = [sys.executable, "-m", "services.cli", "bench", "rest", "--size", "big"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 2
+    assert "Traceback" not in done.stderr

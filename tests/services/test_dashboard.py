@@ -1,0 +1,291 @@
+"""The dashboard in a real browser, beside REST: what is done in the page is in the scene, and in the picture."""
+
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+from playwright.sync_api import Browser, sync_playwright
+
+from protocol.camera_model import CameraModel
+from services.api.page import DASHBOARD
+from services.demo import RECORDING, SCENE
+from tests.services.dashboard_samples import SIZE, Desk, Stack, demo_stack, desk, find_chromium
+
+CHROMIUM = find_chromium()
+pytestmark = [
+    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed (Debian: apt-get install chromium)"),
+    pytest.mark.skipif(
+        not (RECORDING.is_file() and SCENE.is_file()), reason="the demo's recording is not in this checkout"
+    ),
+    pytest.mark.skipif(
+        not (DASHBOARD / "index.html").is_file(), reason="the dashboard is not built; `./run test` builds it"
+    ),
+]
+FREE_TABLE_M = (0.05, 0.25, 0.0)  # between the board and the boxes, where nothing stands
+GRIP_AT = 0.4  # where the gizmo's arrow is taken, in its own lengths
+GIZMO_SIZE = 1.35  # as the page sets it
+
+
+@pytest.fixture(scope="module")
+def stack(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stack]:
+    with demo_stack(tmp_path_factory.mktemp("data")) as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def first_document(stack: Stack) -> dict[str, object]:
+    return {key: value for key, value in stack.document().items() if key != "revision"}
+
+
+@pytest.fixture
+def page(stack: Stack, browser: Browser, first_document: dict[str, object]) -> Iterator[Desk]:
+    """The page of somebody who comes for the first time, and the demo's scene as it begins."""
+    stack.client.put(stack.path, json=first_document).raise_for_status()
+    with browser.new_context(viewport=SIZE, color_scheme="dark", accept_downloads=True) as context:  # type: ignore[arg-type]
+        with desk(stack, context) as seat:
+            yield seat
+
+
+def knot_m(stack: Stack) -> np.ndarray:
+    return np.array(stack.object("knot")["pose"]["translation_m"])
+
+
+def green_centre(picture: np.ndarray) -> np.ndarray:
+    """Mean column and row of the knot's blue-green, which nothing else in the room has."""
+    hue, saturation, _ = cv2.split(cv2.cvtColor(picture, cv2.COLOR_BGR2HSV))
+    is_knot = (hue > 75) & (hue < 95) & (saturation > 110)
+    assert is_knot.sum() > 100
+    rows, columns = np.nonzero(is_knot)
+    return np.array([columns.mean(), rows.mean()])
+
+
+def test_the_first_start_shows_a_working_scene_and_what_to_try(stack: Stack, page: Desk) -> None:
+    picture = page.pixels()
+    assert picture.std() > 20, "the picture is not empty"
+    assert page.page.get_by_role("status").filter(has_text="Live").count() == 1
+    assert page.named("treeitem", "knot").count() == 1
+    guide = page.named("region", "Try this")
+    guide.get_by_role("button", name="Drag the object").click()
+    assert page.named("treeitem", "knot").get_attribute("aria-selected") == "true"
+    page.photograph("first_start")
+    page.named("button", "Close Try this").click()
+    page.page.reload()
+    page.shows_newest()
+    assert guide.count() == 0, "what was dismissed stays away"
+
+
+def box_glb() -> bytes:
+    """A magenta box of 12 cm, a colour that the room does not have."""
+    box = trimesh.creation.box((0.12, 0.12, 0.12))
+    material = trimesh.visual.material.PBRMaterial(baseColorFactor=[255, 0, 200, 255], metallicFactor=0.0)
+    box.visual = trimesh.visual.TextureVisuals(material=material)
+    content: bytes = box.export(file_type="glb")
+    return content
+
+
+def magenta(picture: np.ndarray) -> int:
+    blue, green, red = (channel.astype(int) for channel in cv2.split(picture))
+    return int(((red > 1.6 * green) & (blue > 1.4 * green)).sum())
+
+
+def test_a_glb_that_is_dropped_stands_where_it_was_let_go(stack: Stack, page: Desk) -> None:
+    assert magenta(page.pixels()) < 20
+    place = page.place_of(FREE_TABLE_M)
+    seen = stack.client.post("/live/pick", json=page.pixel_at(place)).json()
+    assert seen["kind"] == "real"
+    page.drop("crate.glb", box_glb(), place)
+    page.named("treeitem", "crate").wait_for()
+    page.until(lambda: page.named("treeitem", "crate").get_attribute("aria-selected") == "true", "its selection")
+    crate = stack.object("crate")
+    stands_m = np.array(crate["pose"]["translation_m"]) - [0, 0, 0.06]
+    assert np.linalg.norm(stands_m[:2] - FREE_TABLE_M[:2]) < 0.03, "the point under the pointer"
+    assert abs(stands_m[2]) < 0.02, "it stands on the table"
+    assert any(crate["asset"] == each["asset"] for each in stack.get("/assets"))
+    page.shows_newest()
+    page.until(lambda: magenta(page.pixels()) > 100, "the box in the picture")
+    page.photograph("drop")
+
+
+def arrow_place(page: Desk, from_m: np.ndarray) -> tuple[tuple[float, float], float]:
+    """Where the gizmo's x arrow is on the screen, and how far from its origin that is in metres.
+
+    three's TransformControls keep their size on the screen: see `factor` in its source.
+    """
+    header = page.stack.header()
+    eye_m = np.array(header["world_from_camera"])[:3, 3]
+    camera = CameraModel.from_dict(header["camera"])
+    half_angle_tangent = camera.height / 2 / camera.matrix[1, 1]
+    length_m = np.linalg.norm(from_m - eye_m) * 1.9 * half_angle_tangent * GIZMO_SIZE / 4
+    reach_m = float(GRIP_AT * length_m)
+    return page.place_of(from_m + [reach_m, 0, 0]), reach_m
+
+
+def test_the_gizmo_moves_an_object_along_its_axis(stack: Stack, page: Desk) -> None:
+    page.named("treeitem", "knot").click()
+    before_m, centre = knot_m(stack), green_centre(page.pixels())
+    start, reach_m = arrow_place(page, before_m)
+    end = page.place_of(before_m + [reach_m - 0.12, 0, 0])
+    page.drag(start, end)
+    page.until(lambda: knot_m(stack)[0] < before_m[0] - 0.05, "the knot at another place")
+    page.shows_newest()
+    after_m = knot_m(stack)
+    assert after_m[0] == pytest.approx(before_m[0] - 0.12, abs=0.03)
+    assert list(after_m[1:]) == pytest.approx(list(before_m[1:]), abs=1e-4), "the arrow holds the other axes"
+    assert page.named("spinbutton", "Position x").input_value() == f"{after_m[0]:.4f}".rstrip("0")
+    moved_px = green_centre(page.pixels()) - centre
+    assert np.linalg.norm(moved_px) > 0.03 * page.pixels().shape[1], "the picture follows"
+    page.photograph("gizmo")
+    page.page.keyboard.press("Control+z")
+    page.until(lambda: np.array_equal(knot_m(stack), before_m), "one undo takes the whole drag back")
+
+
+def test_a_lamp_changes_the_light_on_the_object(stack: Stack, page: Desk) -> None:
+    page.named("treeitem", "Lamp 1").click()
+    bright = page.pixels().astype(float)
+    column, row = green_centre(page.pixels()).astype(int)
+    body = np.s_[row - 10 : row + 10, column - 10 : column + 10]
+    intensity = page.named("spinbutton", "Intensity")
+    assert float(intensity.input_value()) == stack.document()["lights"]["manual"][0]["intensity"]
+    page.photograph("light")
+    intensity.fill("0.5")
+    intensity.press("Enter")
+    page.until(lambda: stack.document()["lights"]["manual"][0]["intensity"] == 0.5, "the light's new strength")
+    page.shows_newest()
+    assert page.pixels()[body].mean() < 0.8 * bright[body].mean()
+    assert page.named("slider", "Intensity, slider").input_value() == "0.5"
+
+
+def test_another_method_renders_the_next_picture(stack: Stack, page: Desk) -> None:
+    page.named("tab", "Performance").click()
+    passes = page.page.locator(".legend tbody th")
+    passes.first.wait_for()
+    before = passes.all_inner_texts()
+    page.photograph("performance")
+    page.page.get_by_role("toolbar").get_by_label("Method").select_option("none")
+    page.until(lambda: stack.document()["method"]["name"] == "none", "the method")
+    page.shows_newest()
+    assert "cones" in "".join(before)
+    page.until(lambda: not any("cones" in name for name in stack.header()["pass_times_ms"]), "other passes")
+    row = page.page.locator(".legend tbody tr", has_text="cones real").locator("td")
+    page.until(lambda: row.count() == 0 or row.inner_text() == "0.0", "the same in the page")
+
+
+def test_two_methods_are_compared_on_one_frame(stack: Stack, page: Desk) -> None:
+    page.named("tab", "Compare").click()
+    page.named("combobox", "Right (B)").select_option("dvct")
+    page.named("button", "Compare this frame").click()
+    split = page.page.get_by_role("slider", name="Split between")
+    split.wait_for(state="attached")
+    sides = page.page.locator(".compare img")
+    page.until(lambda: all(side.evaluate("img => img.complete && img.naturalWidth > 0") for side in sides.all()), "both")
+    (taken, *_) = stack.get("/snapshots")
+    assert [each["name"] for each in taken["pictures"]] == ["a", "b"]
+    assert page.page.get_by_text(f"Frame {taken['frame_id']}").count() >= 1
+    split.focus()
+    split.press("ArrowRight")
+    assert float(split.input_value()) > 50
+    page.photograph("compare")
+    page.named("button", "Back to the live picture").click()
+    assert sides.count() == 0
+
+
+def test_undo_and_redo_by_keys_and_buttons(stack: Stack, page: Desk) -> None:
+    page.named("treeitem", "knot").click()
+    before_m = knot_m(stack)
+    page.page.locator("#stage").focus()
+    for _ in range(3):
+        page.page.keyboard.press("PageUp")
+    page.until(lambda: knot_m(stack)[2] > before_m[2] + 0.029, "three steps up")
+    raised_m = knot_m(stack)
+    page.named("button", "Undo").click()
+    page.until(lambda: np.array_equal(knot_m(stack), before_m), "steps in a row undone as one")
+    page.page.keyboard.press("Control+Shift+z")
+    page.until(lambda: np.array_equal(knot_m(stack), raised_m), "the change made again")
+    page.named("tab", "History").click()
+    page.page.get_by_role("listitem").filter(has_text="shown").wait_for()
+    page.photograph("history")
+    page.page.keyboard.press("Delete")
+    page.named("treeitem", "knot").wait_for(state="detached")
+    assert stack.document()["objects"] == []
+    page.page.keyboard.press("Control+z")
+    page.named("treeitem", "knot").wait_for()
+    assert list(knot_m(stack)) == list(raised_m)
+
+
+def test_three_seconds_are_recorded_and_replayed(stack: Stack, page: Desk) -> None:
+    page.named("button", "Record").click()
+    page.until(lambda: recorded_s(stack) >= 3, "three seconds")
+    page.photograph("record")
+    page.named("button", "Stop recording").click()
+    card = page.page.locator("article.take")
+    card.get_by_role("button", name="Replay").click()
+    page.named("group", "Replay").wait_for()
+    (take,) = stack.get("/recordings")
+    assert take["state"] == "finished"
+    assert take["duration_s"] >= 2.5
+    assert stack.get("/replay")["recording"] == take["id"]
+    page.page.get_by_role("status").filter(has_text="Replay").wait_for()
+    page.named("button", "Pause").click()
+    page.named("button", "Play").wait_for()
+    page.named("slider", "Position").fill("1")
+    page.until(lambda: stack.get("/replay")["position_s"] == pytest.approx(1, abs=0.3), "the place in the recording")
+    page.shows_newest()
+    page.photograph("replay")
+    page.named("button", "Back to live").click()
+    page.named("group", "Replay").wait_for(state="detached")
+    page.until(lambda: stack.get("/replay")["recording"] is None, "live again")
+
+
+def recorded_s(stack: Stack) -> float:
+    return max((each["duration_s"] or 0 for each in stack.get("/recordings")), default=0)
+
+
+def test_a_reload_finds_everything_as_it_was(stack: Stack, page: Desk) -> None:
+    page.named("treeitem", "knot").click()
+    scale = page.named("spinbutton", "Scale")
+    scale.fill("0.5")
+    scale.press("Enter")
+    page.until(lambda: stack.object("knot")["pose"]["scale"] == 0.5, "the scale")
+    page.named("button", "Light appearance").click()
+    page.named("tab", "Nodes").click()
+    page.page.reload()
+    page.shows_newest()
+    assert page.page.locator("html").get_attribute("data-theme") == "light"
+    assert page.named("tab", "Nodes").get_attribute("aria-selected") == "true"
+    page.page.get_by_role("article", name="render-server").wait_for()
+    page.named("treeitem", "knot").click()
+    assert page.named("spinbutton", "Scale").input_value() == "0.5"
+    page.photograph("light_appearance")
+    page.named("button", "Undo").click()
+    page.until(lambda: stack.object("knot")["pose"]["scale"] == 1, "a change from before the reload taken back")
+
+
+@pytest.mark.parametrize(("width", "height"), [(1280, 800), (1024, 768), (768, 1024)])
+def test_everything_fits_and_has_a_name(page: Desk, width: int, height: int) -> None:
+    page.page.set_viewport_size({"width": width, "height": height})
+    page.named("tab", "Method").click()
+    page.photograph(f"{width}x{height}")
+    assert page.page.evaluate("document.documentElement.scrollWidth") <= width
+    outside = page.page.evaluate(
+        """() => [...document.querySelectorAll(".top button, .stage-bar button, .stage-bar label, .stage-bar select")]
+            .filter((each) => { const { left, right } = each.getBoundingClientRect();
+                return right > innerWidth || left < 0; })
+            .map((each) => each.ariaLabel ?? each.title)"""
+    )
+    assert outside == []
+    nameless = page.page.evaluate(
+        """() => [...document.querySelectorAll("button, a, input:not([hidden]), select, [role=img], [role=slider]")]
+            .filter((each) => !each.ariaLabel && !(each.closest("label") ?? each).textContent.trim())
+            .map((each) => each.outerHTML)"""
+    )
+    assert nameless == []
