@@ -10,6 +10,7 @@ import httpx
 import numpy as np
 
 REQUEST_TIMEOUT_S = 30.0
+WARM_UP_ROUNDS = 5  # a process that has just begun imports and caches at its first answers
 
 
 @dataclass(frozen=True)
@@ -46,10 +47,12 @@ async def send_paced(address: str, calls: Sequence[Call], per_s: float, seconds:
 
     Times count from when a request was due, so that one that had to wait for its turn is not taken for a fast one.
     """
-    times, began_s = Times(), time.perf_counter()
+    times = Times()
     limits = httpx.Limits(max_connections=100)
     async with httpx.AsyncClient(base_url=address, timeout=REQUEST_TIMEOUT_S, limits=limits) as client:
-        under_way = []
+        for call in WARM_UP_ROUNDS * list(calls):
+            await _send(client, call, 0, 0.0, Times())
+        began_s, under_way = time.perf_counter(), []
         for number in range(max(1, round(per_s * seconds))):
             due_s = began_s + number / per_s
             await asyncio.sleep(max(0.0, due_s - time.perf_counter()))

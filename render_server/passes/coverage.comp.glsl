@@ -14,7 +14,6 @@ layout(binding = 5, rgba32f) uniform image2D other;      // samples of another s
 uniform vec4 camera_pinhole;   // fx, fy, cx, cy
 uniform vec2 offset;           // pixels
 uniform float weight;          // of a sample
-uniform bool first;            // of the pixel's samples: what the buffers hold is of another frame
 uniform ivec4 rectangle;       // first pixel and size of the part of the picture that may show an object
 uniform ivec4 raster_rectangle;  // the same of the raster: beyond it nothing was drawn
 
@@ -52,8 +51,7 @@ void main() {
     ivec2 raster = sampled_texel(pixel), in_raster = raster - raster_rectangle.xy;
     bool drawn = all(greaterThanEqual(in_raster, ivec2(0))) && all(lessThan(in_raster, raster_rectangle.zw));
     vec4 position = drawn ? texelFetch(virtual_raster_position, raster, 0) : vec4(0.0);
-    if (first) imageStore(other, pixel, vec4(0.0));
-    vec4 sum = first ? vec4(0.0) : imageLoad(coverage, pixel);
+    vec4 sum = imageLoad(coverage, pixel);
     if (position.w > 0.0) {
         bool seen = in_front(pixel, position.w) > 0.0;
         // samples come in the order of their distance from the centre; one that shows stands before one that is hidden

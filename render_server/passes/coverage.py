@@ -5,7 +5,7 @@ from typing import Any
 
 from render_server.gpu.context import GpuContext
 from render_server.gpu.program import ComputeProgram
-from render_server.gpu.textures import bind_images, bind_samplers, texture_2d
+from render_server.gpu.textures import bind_images, bind_samplers, release_target, texture_2d
 from render_server.passes.geometry_buffer import GeometryBuffer, GeometryPass
 from render_server.passes.mesh_buffers import MeshBuffers
 from render_server.passes.picture import Picture
@@ -22,8 +22,8 @@ class CoveragePass:
     """Draws the objects once for each sample and gathers what the pixels of the picture see through the lens.
 
     One raster after another goes through the same buffer, so memory does not grow with the number of samples, and
-    vertex work does. `surface` is the geometry buffer on the picture's grid; it holds something only where `texture`
-    (RGBA16F: share in front of the real surface, share behind it, that share times its mean depth) is not zero.
+    vertex work does. `surface` is the geometry buffer on the picture's grid, `texture` (RGBA16F) the share in front of
+    the real surface, the share behind it, and that share times its mean depth.
     `other` (RGBA32F): place and share of samples that show another surface than `surface` does.
     """
 
@@ -31,6 +31,7 @@ class CoveragePass:
         self.surface = GeometryBuffer(gpu, size)
         self.texture = texture_2d(gpu, size, 4, "f2")
         self.other = texture_2d(gpu, size, 4, "f4")
+        self._sums = gpu.ctx.framebuffer([self.texture, self.other])
         self._program = ComputeProgram(gpu, Path(__file__).with_name("coverage.comp.glsl"))
 
     def run(
@@ -53,15 +54,18 @@ class CoveragePass:
             "raster_rectangle": in_raster,
             "weight": 1.0 / len(PATTERN),
         }
+        self.surface.begin()
+        self._sums.clear()
         bind_samplers({6: raster.position, 7: raster.normal, 8: raster.uv, 9: raster.tint, 15: picture.rays})
-        for number, (x, y) in enumerate(PATTERN):
+        for x, y in PATTERN:
             offset = (x / STEPS, y / STEPS)
             geometry.run(raster, mesh, view, offset, in_raster)
             surface = self.surface
             bind_images(surface.position, surface.normal, surface.uv, surface.tint, self.texture, self.other)
-            self._program.run(in_picture[2:], offset=offset, first=number == 0, **uniforms)
+            self._program.run(in_picture[2:], offset=offset, **uniforms)
 
     def release(self) -> None:
         """Free the GL objects."""
+        release_target(self._sums)
         for item in (self.surface, self.texture, self.other, self._program):
             item.release()

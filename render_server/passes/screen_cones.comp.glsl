@@ -47,7 +47,7 @@ vec4 look(vec3 from, vec3 d, float spread) {
 }
 
 // How position and normal change from a pixel to the next along an axis; the lesser change of both sides, so that
-// no edge counts. Where no object shows, the raster may hold what another frame left.
+// no edge counts.
 struct Change { vec3 position; vec3 normal; };
 
 Change change_along(ivec2 pixel, ivec2 axis, vec4 position, vec4 normal) {

@@ -68,7 +68,6 @@ class OcclusionField:
 
     grid: ShellGrid
     radius: float
-    half: Float64[np.ndarray, "3"]
     occlusion: Float16[np.ndarray, "shells n n n k"]
     transfer: Float16[np.ndarray, "shells h h h 9 9 3"] | None
 

@@ -62,7 +62,7 @@ def compute_field(
         transfer = compute_transfer(
             pieces, grid, settings, lambda share: step(OCCLUSION_SHARE + later * share)
         )
-    return OcclusionField(grid, rays.radius, rays.half, occlusion, transfer)
+    return OcclusionField(grid, rays.radius, occlusion, transfer)
 
 
 def store_field(folder: Path, digest: str, field: OcclusionField) -> None:
@@ -71,7 +71,7 @@ def store_field(folder: Path, digest: str, field: OcclusionField) -> None:
     Raises:
         DeltalightError: the folder cannot be written.
     """
-    arrays = {"centre": field.grid.centre, "halves": field.grid.halves, "half": field.half}
+    arrays = {"centre": field.grid.centre, "halves": field.grid.halves}
     arrays |= {"radius": np.array(field.radius), "occlusion": field.occlusion}
     if field.transfer is not None:
         arrays["transfer"] = field.transfer
@@ -91,16 +91,16 @@ def load_field(folder: Path, digest: str, settings: FieldSettings) -> OcclusionF
         return None
     grid = ShellGrid(arrays["centre"], arrays["halves"])
     radius = float(arrays["radius"])
-    return OcclusionField(grid, radius, arrays["half"], arrays["occlusion"], arrays.get("transfer"))
+    return OcclusionField(grid, radius, arrays["occlusion"], arrays.get("transfer"))
 
 
 def _is_whole(arrays: dict[str, np.ndarray], settings: FieldSettings) -> bool:
     """Whether everything is there in the shape that the settings say, and finite."""
     shells, n = settings.shells, settings.resolution
-    shapes: dict[str, tuple[int, ...]] = {"centre": (3,), "halves": (shells, 3), "half": (3,), "radius": ()}
+    shapes: dict[str, tuple[int, ...]] = {"centre": (3,), "halves": (shells, 3), "radius": ()}
     shapes["occlusion"] = (shells, n, n, n, settings.order**2)
     if settings.indirect:
         shapes["transfer"] = (shells, *[n // 2] * 3, LENGTH, LENGTH, 3)
-    if {name: array.shape for name, array in arrays.items()} != shapes:
+    if {name: arrays[name].shape for name in shapes if name in arrays} != shapes:
         return False
     return all(array.dtype.kind == "f" and np.isfinite(array).all() for array in arrays.values())

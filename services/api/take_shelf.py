@@ -191,6 +191,8 @@ def _described(path: Path) -> tuple[Facts | None, str]:
     try:
         with _naming(path):
             return describe_recording(path), ""
+    except NotFoundError:
+        raise
     except DeltalightError as fault:
         return None, str(fault)
 
@@ -200,6 +202,10 @@ def _naming(path: Path) -> Iterator[None]:
     """Tell faults of a recording by its name: clients know no paths."""
     try:
         yield
+    except NotFoundError:
+        raise
+    except FileNotFoundError as fault:  # deleted while it was read
+        raise _absent(path.name.split(".")[0]) from fault
     except DeltalightError as fault:
         raise DeltalightError(str(fault).replace(f"{path.parent}{os.sep}", "")) from fault
 

@@ -120,6 +120,18 @@ def test_a_camera_that_steps_aside_and_back(
     assert differing_pixels(back, fresh(gpu, document, seen(HERE))) == 0
 
 
+@pytest.mark.parametrize("by", [(-0.06, 0.0, 0.0), (-0.07, 0.0, 0.0), (0.15, -0.1, 0.0)])
+def test_an_object_that_moves_leaves_nothing(gpu: GpuContext, stage: Stage, by: Vector) -> None:
+    start = room(stage, has_model=False, operator="exact", volume_edge_m=0.5)
+    end = moved(start, by)
+    renderer = SceneRenderer(gpu, start, with_linear=True)
+    renderer.render(seen(HERE))
+    renderer.set_scene(end)
+    found = renderer.render(seen(HERE))
+    renderer.release()
+    assert differing_pixels(found, fresh(gpu, end, seen(HERE))) == 0
+
+
 @pytest.mark.parametrize("operator", ["exact", "paper"])
 def test_an_object_that_moves_less_than_a_voxel(gpu: GpuContext, stage: Stage, operator: str) -> None:
     """The volume stays where it is, but not what may receive the objects' shadows, nor the light maps around it."""

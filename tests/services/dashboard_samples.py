@@ -29,7 +29,7 @@ from services.supervisor import Supervisor
 from tests.services.live_samples import live_socket, read_frame, wait_for_frames
 
 PATIENCE_S = 90.0
-# Where this names a folder, the tests leave pictures of what they see there, made with the demo's own settings.
+# Where this names a folder, the tests leave pictures of what they see there, in the camera's size.
 SCREENSHOTS = os.environ.get("DELTALIGHT_SCREENSHOTS")
 SIZE = {"width": 1280, "height": 800}
 JPEG_QUALITY = 82  # keeps each below 200 kB
@@ -64,7 +64,7 @@ class Stack:
         found: dict[str, Any] = next(each for each in self.document()["objects"] if each["id"] == name)
         return found
 
-    def get(self, path: str) -> Any:
+    def get(self, path: str) -> Any:  # noqa: ANN401 - JSON
         answer = self.client.get(path)
         assert answer.status_code == 200, answer.text
         return answer.json()
@@ -91,12 +91,10 @@ def demo_stack(data: Path) -> Iterator[Stack]:
 
 
 def _scene() -> SceneDocument:
-    scene = demo_scene("dvct").replaced(name=NAME)
-    if SCREENSHOTS:
-        return scene
     small = {"volume_size": 32, "rsm_size": 256, "cone_count": 6, "triangle_budget": 8000, "bounces": 0}
     plain = {"caustics": False, "screen_space": False, "mirrored_lights": False, "far_volume": False}
-    return scene.replaced(method={"name": "dvct", **small, **plain}, output={"width": 320, "height": 240})
+    output = {"antialiasing": True} if SCREENSHOTS else {"width": 320, "height": 240}
+    return demo_scene("dvct").replaced(name=NAME, method={"name": "dvct", **small, **plain}, output=output)
 
 
 @contextmanager
@@ -132,8 +130,8 @@ class Desk:
         self.page.goto(f"http://{self.stack.address}/")
         self.shows_newest()
 
-    def named(self, role: Any, name: str) -> Locator:
-        return self.page.get_by_role(role, name=name, exact=True)
+    def named(self, role: str, name: str) -> Locator:
+        return self.page.get_by_role(role, name=name, exact=True)  # type: ignore[arg-type]
 
     def until(self, condition: Callable[[], object], what: str) -> None:
         """Wait for something; `what` says for what if it never comes."""
@@ -147,7 +145,9 @@ class Desk:
         """Wait until the page shows a picture of the scene as REST has it now."""
         revision = self.stack.scene()["revision"]
         shown = self.page.locator(".status-strip dl div", has_text="Revision").locator("dd")
-        self.until(lambda: shown.count() and shown.inner_text() == str(revision), f"a picture of revision {revision}")
+        self.until(
+            lambda: shown.count() and shown.inner_text() == str(revision), f"a picture of revision {revision}"
+        )
 
     def pixels(self) -> UInt8[np.ndarray, "h w 3"]:
         """The picture as the page shows it, BGR."""
@@ -155,7 +155,7 @@ class Desk:
         png = np.frombuffer(base64.b64decode(url.partition(",")[2]), np.uint8)
         picture = cv2.imdecode(png, cv2.IMREAD_COLOR)
         assert picture is not None
-        return picture
+        return np.asarray(picture, np.uint8)
 
     def place_of(self, point_m: ArrayLike) -> tuple[float, float]:
         """Where on the screen the newest picture shows a point of the world, CSS pixels."""
