@@ -12,7 +12,9 @@ HIGH_WATER_MARK = 2  # frames; the default of 1000 showed a slow consumer frames
 RECONNECT_MS = 100
 RECONNECT_MAX_MS = 1000
 HEARTBEAT_MS = 1000
-HEARTBEAT_TIMEOUT_MS = 3000
+# A receiver whose queue is full answers no heartbeat. Cut off for that, it may abort when it comes back (libzmq's
+# issue 3937); no healthy receiver stands still for so long.
+HEARTBEAT_TIMEOUT_MS = 30_000
 
 
 def check_endpoint(endpoint: str, keys: Keys | None = None) -> Endpoint:

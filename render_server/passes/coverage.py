@@ -22,8 +22,8 @@ class CoveragePass:
     """Draws the objects once for each sample and gathers what the pixels of the picture see through the lens.
 
     One raster after another goes through the same buffer, so memory does not grow with the number of samples, and
-    vertex work does. `surface` is the geometry buffer on the picture's grid, `texture` (RGBA16F) the share in front of
-    the real surface, the share behind it, and that share times its mean depth.
+    vertex work does. `surface` is the geometry buffer on the picture's grid; `texture` (RGBA16F): the share in front
+    of the real surface, the share behind it, and that share times its mean depth.
     `other` (RGBA32F): place and share of samples that show another surface than `surface` does.
     """
 

@@ -11,13 +11,11 @@ from protocol.errors import DeltalightError
 from protocol.frames import FisheyePictures, SensorFrame
 from protocol.source import Source
 from sensor_node.cameras.base import Camera, EndOfStream
-from sensor_node.cameras.replay import CLOCK_STEP_NS, DEFAULT_PERIOD_NS
+from sensor_node.cameras.replay import CLOCK_STEP_NS, DEFAULT_PERIOD_NS, LATE_NS
 
 MIN_RATE, MAX_RATE = 0.05, 20.0
 # While nothing moves the frame is published again so often: a change of the scene shows, and nothing looks lost.
 REPEAT_NS = 500_000_000
-# A replay that is further behind leaves frames out; a shorter delay it makes good.
-LATE_NS = 500_000_000
 # What lies on both sides of a jump is so far apart in the frames' times: longer than any filter reaches.
 JUMP_NS = 1_000_000_000
 

@@ -18,6 +18,8 @@ from sensor_node.cameras.base import Camera, EndOfStream, StaleFrameError
 DEFAULT_PERIOD_NS = 33_333_333
 # A clock that is only steered drifts by less within an hour; then the stamps follow it in such steps.
 CLOCK_STEP_NS = 10_000_000
+# A replay that is further behind leaves frames out; a shorter delay it makes good.
+LATE_NS = 500_000_000
 
 
 class PacedCamera(Camera):
@@ -25,7 +27,8 @@ class PacedCamera(Camera):
 
     In real time the first frame is due at `open`, the others as much later as their timestamps are; a frame
     that is asked for late comes at once, with the capture time it would have had. Without real time each
-    frame is captured when it is asked for. In a loop, frame ids and timestamps go on rising.
+    frame is captured when it is asked for. In a loop, frame ids and timestamps go on rising, and whoever falls
+    behind by more than half a second misses frames, as before a camera, else the delay would grow for ever.
     """
 
     def __init__(self, timestamps_ns: Sequence[int], *, realtime: bool, loop: bool) -> None:
@@ -69,6 +72,8 @@ class PacedCamera(Camera):
         """Wait until the next frame is due and return it."""
         if self._interrupted.is_set() or (not self._loop and self._next >= len(self._times)):
             raise EndOfStream
+        if self._realtime and self._loop and self._elapsed_ns() - self._due_ns(self._next) > LATE_NS:
+            self._next = self._newest(self._elapsed_ns())
         wait_ns = self._due_ns(self._next) - self._elapsed_ns() if self._realtime else 0
         if wait_ns > 0 and self._interrupted.wait(wait_ns / 1e9):
             raise EndOfStream

@@ -53,6 +53,19 @@ def test_a_loop_goes_on_with_rising_ids_and_times(source: DatasetReader) -> None
     assert offsets == [0] * 5
 
 
+@pytest.mark.parametrize(("loop", "least"), [(True, 20), (False, 1)])
+def test_a_looped_replay_that_falls_behind_leaves_frames_out(
+    source: DatasetReader, loop: bool, least: int
+) -> None:
+    """It stands in for a camera; one that ends gives every frame."""
+    with ReplayCamera(source, realtime=True, loop=loop) as camera:
+        camera.read()
+        time.sleep(0.7)
+        found = camera.read().frame_id
+    assert found >= least
+    assert loop or found == least
+
+
 def test_fish_eye_pictures_of_a_later_round_have_its_time(tmp_path: Path) -> None:
     synthetic = SyntheticCamera()
     with DatasetWriter(tmp_path / "take", board=synthetic.board) as writer:
