@@ -224,6 +224,8 @@ class RelightBase(ABC):
         with frame.timers.measure("change of light"):
             self._change.run(self._grid, self._direct, self._cones, self._reflection)
         screen = self._look_across(frame, uniforms) if uniforms["hidden_too"] else None
+        if self._caustics is not None:
+            self._caustics.bind()  # reflections may have put something else in its place
         with frame.timers.measure("virtual surface"):
             self._surface.run(
                 frame.matte, frame.virtual_raster, self._cones, self._grid, uniforms, screen=screen
