@@ -44,6 +44,7 @@ COMMANDS = {
     "schema",
     "bench speed",
     "bench quality",
+    "bench rest",
 }
 
 
