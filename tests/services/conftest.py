@@ -1,6 +1,5 @@
 """What the tests of services share: messages of a small camera, a command-line runner."""
 
-import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -31,16 +30,16 @@ def fresh_logs() -> Iterator[None]:
 
 
 @pytest.fixture
-def cli(tmp_path_factory: pytest.TempPathFactory) -> RunCli:
-    """Runs `deltalight` in a process of its own, with a data folder of its own."""
-    environment = {**os.environ, "XDG_DATA_HOME": str(tmp_path_factory.mktemp("data-home"))}
+def cli(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> RunCli:
+    """Runs `deltalight` in a process of its own, with homes of its own unless a test names others."""
+    for name in ("XDG_DATA_HOME", "XDG_CONFIG_HOME"):
+        monkeypatch.setenv(name, str(tmp_path_factory.mktemp(name)))
 
     def run(*arguments: object, timeout_s: float = 60) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, "-m", "services.cli", *(str(argument) for argument in arguments)]
         return subprocess.run(
             command,
             cwd=ROOT,
-            env=environment,
             capture_output=True,
             text=True,
             timeout=timeout_s,
