@@ -202,8 +202,7 @@ class RequestClient:
             raise DeltalightError(f"{self.endpoint} is still busy with another request: try again")
         try:
             socket = self._connected()
-            socket.send_multipart(multipart)
-            if not socket.poll(max(0, round((deadline - time.monotonic()) * 1000)), zmq.POLLIN):
+            if not _exchange(socket, multipart, deadline):
                 trust = "" if self._keys is None else f" and trusts {self._keys.name}.key"
                 raise DeltalightError(
                     f"no answer from {self.endpoint} within {timeout_s:g} s: see whether the server runs{trust}"
@@ -233,6 +232,21 @@ class RequestClient:
         if self._socket is not None:
             self._socket.close(0)
             self._socket = None
+
+
+def _exchange(socket: "zmq.Socket[bytes]", multipart: list[bytes], deadline: float) -> bool:
+    """Send a request; whether an answer waits before `deadline` (`time.monotonic`)."""
+    # Where the other end refused the connection there is no pipe left, and a plain send would wait for ever.
+    socket.sndtimeo = _left_ms(deadline)
+    try:
+        socket.send_multipart(multipart)
+    except zmq.Again:
+        return False
+    return bool(socket.poll(_left_ms(deadline), zmq.POLLIN))
+
+
+def _left_ms(deadline: float) -> int:
+    return max(0, round((deadline - time.monotonic()) * 1000))
 
 
 def _matched(control: ControlRequest, multipart: list[bytes]) -> ControlReply:

@@ -1,7 +1,10 @@
 """Encrypted sockets on loopback, with keys forced on: who gets in, who gets nothing, what is counted."""
 
+import socket
+import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +21,8 @@ ANY = "tcp://127.0.0.1:0"
 SETTLE_S = 5.0
 # What a refused receiver is given to get something by mistake: many reconnects and handshakes.
 PATIENCE_S = 0.8
+# Several attempts of libzmq to connect.
+REFUSED_S = 0.5
 
 
 @dataclass(frozen=True)
@@ -163,6 +168,35 @@ def test_control_needs_a_trusted_key(hosts: Hosts, opened: Callable[[Any], Any])
             client.request(question, PATIENCE_S)
     wait_until(lambda: server.refused > 0)
     assert trusted.request(question.model_copy(update={"id": "2"}), SETTLE_S).ok
+
+
+# How a peer that wants keys begins (ZMTP 3.1, section 3.1): signature, version, mechanism, as server, filler.
+CURVE_GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x01" + b"CURVE".ljust(20, b"\0") + b"\x01" + bytes(31)
+
+
+def greet(listener: socket.socket) -> None:
+    kept = []  # a closed connection would be a fault of the line, not a refusal
+    with suppress(OSError):
+        while True:
+            connection, _ = listener.accept()
+            kept.append(connection)
+            connection.sendall(CURVE_GREETING)
+    for connection in kept:
+        connection.close()
+
+
+def test_a_request_ends_in_time_where_the_refusal_left_nobody_to_send_to(
+    opened: Callable[[Any], Any],
+) -> None:
+    """libzmq takes the pipe of a refused connection away in about every third case, so there are many clients."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        threading.Thread(target=greet, args=(listener,), daemon=True).start()
+        clients = [opened(RequestClient(f"tcp://127.0.0.1:{listener.getsockname()[1]}")) for _ in range(12)]
+        time.sleep(REFUSED_S)
+        for client in clients:
+            with pytest.raises(DeltalightError, match="no answer"):
+                client.request(ControlRequest(node="a", id="1", op="status"), 0.1)
+        listener.shutdown(socket.SHUT_RDWR)
 
 
 def test_a_host_whose_key_is_unknown_is_refused_before_connecting(hosts: Hosts) -> None:
