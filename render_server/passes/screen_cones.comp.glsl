@@ -1,17 +1,22 @@
 // What smooth virtual surfaces reflect of the real scene that the camera sees, by cones across the picture ([D] 4.4.2):
-// the picture's radiance there, times how the objects change its light. A share of each lobe may remain for others.
+// the picture's radiance there, times how the objects change its light. What a cone does not find in the picture it meets
+// among the voxels (VOXELS), or that share of the lobe remains for others.
 #include "passes/common/screen_march.glsl"
 #include "passes/common/brdf.glsl"
 #include "passes/common/ray_mesh.glsl"
 #include "passes/common/lobe.glsl"
 #include "passes/common/upsample.glsl"
 #include "passes/common/texel_list.glsl"
+#ifdef VOXELS
+#include "passes/common/march.glsl"
+#include "passes/common/environment.glsl"
+#endif
 
 layout(local_size_x = 64) in;
 layout(binding = 0, rgba16f) writeonly uniform image2D reflected;   // rgb radiance times share; a: share of the lobe
 layout(binding = 1) uniform sampler2D matte;
-layout(binding = 2) uniform sampler2D direct_mu;
-layout(binding = 3) uniform sampler2D direct_rho;
+layout(binding = 13) uniform sampler2D direct_mu;
+layout(binding = 17) uniform sampler2D direct_rho;
 layout(binding = 10) uniform sampler2D cone_mu;
 layout(binding = 11) uniform sampler2D cone_rho;
 uniform vec3 camera_position;
@@ -39,11 +44,25 @@ vec3 change_of_light(vec2 at) {
     return (max(rho, vec3(0.0)) + LEAST_IRRADIANCE) / (mu + LEAST_IRRADIANCE);
 }
 
-// Radiance times share of one cone.
-vec4 look(vec3 from, vec3 d, float spread) {
+// Radiance times share of one cone, across the picture.
+vec4 look_across(vec3 from, vec3 d, float spread) {
     ScreenHit hit = screen_hit(from, d, spread);
     if (hit.share <= 0.0 || closest_hit(Ray(from, d)).distance < hit.distance) return vec4(0.0);
     return hit.share * vec4(screen_radiance(hit, spread) * change_of_light(hit.pixel), 1.0);
+}
+
+// The same through all that the cone may meet.
+vec4 look(vec3 from, vec3 d, float spread) {
+    vec4 seen = look_across(from, d, spread);
+#ifdef VOXELS
+    if (seen.a < 1.0) {
+        bool differs;
+        Crossed met = march_one(pyramid_rho, volume_coordinate(from), d, spread, differs);
+        vec3 behind = (1.0 - blocked_share(met.coverage)) * environment(d, atan(0.5 * spread));
+        seen += (1.0 - seen.a) * vec4(met.c + behind, 1.0);
+    }
+#endif
+    return seen;
 }
 
 // How position and normal change from a pixel to the next along an axis; the lesser change of both sides, so that

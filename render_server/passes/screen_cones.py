@@ -23,13 +23,19 @@ MEDIAN_DISC = 2.0 * 2.0**0.5 / CONE_COUNT**0.5
 
 
 class ScreenConesPass:
-    """`reflected` (RGBA16F): radiance times share of the specular lobe, and that share, on the picture's grid."""
+    """`reflected` (RGBA16F): radiance times share of the specular lobe, and that share, on the picture's grid.
 
-    def __init__(self, gpu: GpuContext, grid: SamplingGrid) -> None:
+    `march`: the defines of march.glsl where what the picture does not show is looked for among voxels, bound by the
+    caller, and in the environment; the share is 1 then. None: that share of the lobe remains for others.
+    """
+
+    def __init__(self, gpu: GpuContext, grid: SamplingGrid, march: dict[str, int] | None) -> None:
         self._grid = grid
         self._threads = list_threads(gpu, grid.picture_size[0] * grid.picture_size[1])
         self.reflected = texture_2d(gpu, grid.picture_size, 4, "f2")
         defines = {"ROUGHEST": ROUGHEST, "CONE_COUNT": CONE_COUNT, "MEDIAN_DISC": MEDIAN_DISC}
+        if march is not None:
+            defines |= {"VOXELS": 1, **march}
         self._program = ComputeProgram(gpu, Path(__file__).with_name("screen_cones.comp.glsl"), defines)
 
     def run(
@@ -43,7 +49,7 @@ class ScreenConesPass:
         """Trace; geometry, materials and the picture with its levels (`bind_picture`) must be bound."""
         objects.bind()
         bind_samplers(
-            {0: self._grid.pixels, 1: matte, 2: direct.mu, 3: direct.rho, 10: cones.mu, 11: cones.rho}
+            {0: self._grid.pixels, 1: matte, 13: direct.mu, 17: direct.rho, 10: cones.mu, 11: cones.rho}
         )
         bind_images(self.reflected)
         self._grid.virtual_texels.bind_to_storage_buffer(6)

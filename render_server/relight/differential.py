@@ -36,7 +36,13 @@ class Differential(RelightBase):
     ) -> None:
         self._pair = DirectLightPairPass(gpu, size)
         super().__init__(
-            gpu, resolved, size, settings.shadow_samples, self._pair, screen_space=settings.screen_space
+            gpu,
+            resolved,
+            size,
+            settings.shadow_samples,
+            self._pair,
+            screen_space=settings.screen_space,
+            march=march_defines(settings),
         )
         self._settings = settings
         self._mu_table = LightTable(gpu, resolved.rsm_size, settings.shadow_samples)
@@ -112,6 +118,7 @@ class Differential(RelightBase):
         """Bind what march.glsl reads beside one solution's voxels; return the uniforms of passes that march."""
         self._voxels.bind_support(everywhere=False)
         self._voxels.far.pyramid.texture.use(location=16)
+        bind_pyramids(self._voxels.mu, self._voxels.rho)
         return {**uniforms, **self._voxels.far.uniforms(), "cone_count": self._settings.cone_count}
 
     def _joint(self) -> Pyramid:

@@ -55,6 +55,7 @@ class DvctExact(DvctBase):
         """Bind what march.glsl reads beside mu and rho; return the uniforms of passes that march."""
         self._voxels.bind_support()
         self._voxels.far.pyramid.texture.use(location=16)
+        bind_pyramids(self._voxels.mu, self._voxels.rho)
         return {**uniforms, **self._voxels.far.uniforms(), "cone_count": self._settings.cone_count}
 
     def _joint(self) -> Pyramid:

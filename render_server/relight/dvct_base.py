@@ -4,7 +4,7 @@ from protocol.scene_method import DvctMethod
 from render_server.gpu.context import GpuContext
 from render_server.passes.direct_light import DirectLightPass
 from render_server.passes.volume import VolumePlacement, place_volume
-from render_server.relight.defaults import ResolvedSettings
+from render_server.relight.defaults import ResolvedSettings, march_defines
 from render_server.relight.frame import RelightInput
 from render_server.relight.relight_base import RelightBase
 
@@ -29,6 +29,7 @@ class DvctBase(RelightBase):
             caustics=settings.caustics and exact,
             mirrors_lights=exact and settings.mirrored_lights,
             screen_space=settings.screen_space and exact,
+            march=march_defines(settings) if exact else None,
         )
         self._settings = settings
 

@@ -46,6 +46,7 @@ class RelightBase(ABC):
         caustics: bool = False,
         mirrors_lights: bool = False,
         screen_space: bool = False,
+        march: dict[str, int] | None = None,
     ) -> None:
         self._resolved = resolved
         self._objects = ObjectTree(gpu)
@@ -59,7 +60,7 @@ class RelightBase(ABC):
         self._mirror_shares = MirrorSharesPass(gpu) if mirrors_lights else None
         self._reflection: moderngl.Texture | None = None
         self._caustics = CausticsPass(gpu, self._grid, self._objects) if caustics else None
-        self._screen = ScreenConesPass(gpu, self._grid) if screen_space else None
+        self._screen = ScreenConesPass(gpu, self._grid, march) if screen_space else None
         self._placed_key: object = None
         self._real_key: object = None
         self._object_key: object = None
@@ -92,6 +93,10 @@ class RelightBase(ABC):
     def _reflect(self, frame: RelightInput, uniforms: dict[str, Any]) -> moderngl.Texture | None:  # noqa: ARG002
         """Objects in smooth real surfaces (passes/mirror_objects.py); None leaves these to the cones."""
         return None
+
+    def _bind_march(self, uniforms: dict[str, Any]) -> dict[str, Any]:
+        """Bind what cones through voxels read; return the uniforms of passes that march, here none of their own."""
+        return uniforms
 
     def relight(self, frame: RelightInput) -> RelitLayers:
         """Compute everything that composition needs."""
@@ -237,7 +242,8 @@ class RelightBase(ABC):
         with frame.timers.measure("screen cones"):
             frame.picture.build_levels()
             bind_picture(frame.picture.linear, frame.real_surface.position)
-            self._screen.run(frame.matte, self._direct, self._cones, self._objects, uniforms)
+            own = self._bind_march(uniforms)
+            self._screen.run(frame.matte, self._direct, self._cones, self._objects, own)
         self.table.bind()
         return self._screen.reflected
 
