@@ -16,6 +16,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.rest_load import Call, send_paced, watch
+from benchmarks.rest_usage import CLIENTS, WEB, Sample, Usage, next_picture, sample
 from protocol.errors import DeltalightError
 from services import ports
 from services.api.page import DASHBOARD
@@ -32,7 +33,6 @@ ROUNDS = 3  # of viewers after none: what else the machine does falls on both
 START_TIMEOUT_S = 120.0  # a cold shader cache on a slow machine takes a while
 STEP_M = 0.001  # of the object that the requests move
 TEXT_SUFFIXES = (".js", ".css", ".html", ".svg")  # fonts are compressed already
-_COUNTER = "deltalight_live_frames_received_total"
 
 
 def measure_rest(seconds: float, *, size: tuple[int, int] | None, device: int | None) -> dict[str, Any]:
@@ -48,15 +48,10 @@ def measure_rest(seconds: float, *, size: tuple[int, int] | None, device: int | 
         "requests_per_s": REQUESTS_PER_S,
     }
     with _running(size, device, with_rendering=False) as (address, _):
-        report["without_rendering"] = _requests(address, seconds)
+        report["without_rendering"] = _requests(address, seconds, sample)
     with _running(size, device, with_rendering=True) as (address, supervisor):
         _wait_for_pictures(address, supervisor)
-        rendered = _rendered(address)
-        began_s = time.perf_counter()
-        report["with_rendering"] = _requests(address, seconds)
-        report["with_rendering"]["frames_per_s"] = (_rendered(address) - rendered) / (
-            time.perf_counter() - began_s
-        )
+        report["with_rendering"] = _requests(address, seconds, next_picture)
         report["viewers"] = _viewers(address, seconds)
         report |= _picture(address)
     report["dashboard"] = dashboard_sizes(DASHBOARD)
@@ -87,13 +82,13 @@ def _wait_for_pictures(address: str, supervisor: Supervisor) -> None:
     def comes() -> bool:
         if time.monotonic() > deadline_s:
             raise DeltalightError("No picture came from the render server; see the lines above.")
-        return _rendered(address) >= 2
+        return sample(address).frames >= 2
 
     supervisor.run(until=comes)
 
 
-def _requests(address: str, seconds: float) -> dict[str, Any]:
-    """Four times reading, once moving the shown scene's object, over and over."""
+def _requests(address: str, seconds: float, mark: Callable[[str], Sample]) -> dict[str, Any]:
+    """Four times reading, once moving the shown scene's object, over and over; pictures count between two marks."""
     scene = httpx.get(f"{address}/active-scene").raise_for_status().json()
     path, thing = f"/scenes/{scene['id']}", scene["document"]["objects"][0]
     x, y, z = thing["pose"]["translation_m"]
@@ -105,40 +100,35 @@ def _requests(address: str, seconds: float) -> dict[str, Any]:
         Call("GET", "/scenes"),
         Call("PATCH", f"{path}/objects/{thing['id']}", moves),
     ]
-    return asyncio.run(send_paced(address, calls, REQUESTS_PER_S, seconds)).figures()
+    usage, begun = Usage(), mark(address)
+    times = asyncio.run(send_paced(address, calls, REQUESTS_PER_S, seconds))
+    usage.add(begun, sample(address), mark(address))
+    return {**times.figures(), "frames_per_s": usage.frames_per_s, "cores": usage.cores}
 
 
 def _viewers(address: str, seconds: float) -> dict[str, Any]:
-    """Frames rendered a second with nobody looking and with many, in turn."""
-    alone, watched = 0.0, 0.0
-    got: list[int] = []
-
-    def look() -> None:
-        got.extend(asyncio.run(watch(address, VIEWERS, VIEWER_FRAMES_PER_S, seconds)))
-
+    """What many viewers take, against nobody looking, in turn: pictures rendered a second, and processor time."""
+    alone, watched, got = Usage(), Usage(), list[int]()
     for _ in range(ROUNDS):
-        alone += _frames_while(address, lambda: time.sleep(seconds))
-        watched += _frames_while(address, look)
+        begun = next_picture(address)
+        time.sleep(seconds)
+        alone.add(begun, sample(address), next_picture(address))
+        begun = next_picture(address)
+        got.extend(asyncio.run(watch(address, VIEWERS, VIEWER_FRAMES_PER_S, seconds)))
+        watched.add(begun, sample(address), next_picture(address))
+    more = {name: watched.cores[name] - alone.cores[name] for name in (WEB, CLIENTS)}
     return {
         "viewers": VIEWERS,
         "frames_per_s_each_at_most": VIEWER_FRAMES_PER_S,
         "frames_per_s_each": sum(got) / (len(got) * seconds),
-        "rendered_per_s_without": alone / ROUNDS,
-        "rendered_per_s_with": watched / ROUNDS,
-        "ratio": watched / alone if alone else None,
+        "rendered_per_s_without": alone.frames_per_s,
+        "rendered_per_s_with": watched.frames_per_s,
+        "ratio": watched.frames_per_s / alone.frames_per_s,
+        "cores_without": alone.cores,
+        "cores_with": watched.cores,
+        "share_of_processors": {name: cores / (os.cpu_count() or 1) for name, cores in more.items()},
+        "web_ms_per_frame_and_viewer": 1e3 * more[WEB] * watched.wall_s / max(1, sum(got)),
     }
-
-
-def _frames_while(address: str, work: Callable[[], object]) -> float:
-    before, began_s = _rendered(address), time.perf_counter()
-    work()
-    return (_rendered(address) - before) / (time.perf_counter() - began_s)
-
-
-def _rendered(address: str) -> float:
-    """Pictures that came from the render server since the web process was started."""
-    lines = httpx.get(f"{address}/metrics").raise_for_status().text.splitlines()
-    return next(float(line.split()[1]) for line in lines if line.startswith(f"{_COUNTER} "))
 
 
 def _picture(address: str) -> dict[str, Any]:
@@ -200,13 +190,17 @@ def _request_table(report: dict[str, Any]) -> Table:
 
 
 def _print_viewers(console: Console, report: dict[str, Any]) -> None:
-    figures = report["viewers"]
+    figures, shares = report["viewers"], report["viewers"]["share_of_processors"]
     console.print(f"rendered beside these requests: {report['with_rendering']['frames_per_s']:.2f} frames/s")
-    ratio = "-" if figures["ratio"] is None else f"{figures['ratio']:.2f}"
     console.print(
         f"rendered with nobody looking {figures['rendered_per_s_without']:.2f} frames/s, with {figures['viewers']} "
-        f"viewers {figures['rendered_per_s_with']:.2f} frames/s (ratio {ratio}); each got "
+        f"viewers {figures['rendered_per_s_with']:.2f} frames/s (ratio {figures['ratio']:.2f}); each got "
         f"{figures['frames_per_s_each']:.2f} frames/s of at most {figures['frames_per_s_each_at_most']:g}"
+    )
+    console.print(
+        f"for the viewers the web process took {100 * shares[WEB]:.1f} % of the processors "
+        f"({figures['web_ms_per_frame_and_viewer']:.2f} ms a frame and viewer), the viewers themselves "
+        f"{100 * shares[CLIENTS]:.1f} %"
     )
 
 

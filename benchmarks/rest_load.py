@@ -2,6 +2,7 @@
 
 import asyncio
 import time
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -24,10 +25,14 @@ class Call:
 
 @dataclass
 class Times:
-    """From when a request was due to the end of its answer, seconds, of each method; and those that failed."""
+    """From when a request was due to the end of its answer, seconds, of each method; and those that failed.
+
+    `pictures` counts what became of the changes, as their answers say.
+    """
 
     seconds: dict[str, list[float]] = field(default_factory=dict)
     failed: int = 0
+    pictures: Counter[str] = field(default_factory=Counter)
 
     def figures(self) -> dict[str, Any]:
         """Median and 99th percentile by method, milliseconds."""
@@ -39,7 +44,7 @@ class Times:
                 "p50_ms": 1e3 * float(p50_s),
                 "p99_ms": 1e3 * float(p99_s),
             }
-        return {**found, "failed": self.failed}
+        return {**found, "failed": self.failed, "pictures": dict(self.pictures)}
 
 
 async def send_paced(address: str, calls: Sequence[Call], per_s: float, seconds: float) -> Times:
@@ -73,6 +78,8 @@ async def _send(client: httpx.AsyncClient, call: Call, turn: int, due_s: float, 
         times.failed += 1
         return
     times.seconds.setdefault(call.method, []).append(time.perf_counter() - due_s)
+    if call.method == "PATCH":
+        times.pictures[answer.json()["picture"]["state"]] += 1
 
 
 async def watch(address: str, viewers: int, frames_per_s: float, seconds: float) -> list[int]:

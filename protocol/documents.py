@@ -2,6 +2,7 @@
 
 import difflib
 import json
+import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Self, TypeVar
@@ -71,7 +72,7 @@ def parse_mapping(text: str, name: str, *, is_json: bool) -> dict[str, Any]:
     """
     kind = "JSON" if is_json else "YAML"
     try:
-        data = json.loads(text) if is_json else yaml.safe_load(text)
+        data = json.loads(text) if is_json else yaml.load(text, _Loader)
     except (ValueError, yaml.YAMLError, RecursionError) as error:
         detail = " ".join(str(error).split())[:160]
         raise DeltalightError(f"{name} is not valid {kind} ({detail}); correct it there.") from error
@@ -82,16 +83,57 @@ def parse_mapping(text: str, name: str, *, is_json: bool) -> dict[str, Any]:
     return data
 
 
-def validate(model: type[Model], data: Mapping[str, Any], name: str) -> Model:
+def yaml_text(data: Mapping[str, Any]) -> str:
+    """The YAML of a document, keys in their order, which `parse_mapping` reads again."""
+    return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
+
+
+class _Loader(yaml.SafeLoader):
+    """Reads `1e-3` as the number that it is in YAML 1.2; in YAML 1.1 it is a text."""
+
+
+class _Dumper(yaml.SafeDumper):
+    """Quotes texts that `_Loader` would take for numbers."""
+
+
+for _kind in (_Loader, _Dumper):
+    _kind.add_implicit_resolver(
+        "tag:yaml.org,2002:float", re.compile(r"[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+$"), list("-+0123456789")
+    )
+
+
+def validate(model: type[Model], data: Mapping[str, Any], name: str, *, strict: bool = False) -> Model:
     """Validate a document called `name` against a model.
+
+    `strict`: a number is no text and no truth value, as in the model's JSON schema; else `"2"` and `true` are read as
+    numbers too, which is how they come from the environment.
 
     Raises:
         DeltalightError: the first fault, as one sentence with the place in the document.
     """
     try:
-        return model.model_validate(data)
+        return model.model_validate(_plain(data, {}), strict=True) if strict else model.model_validate(data)
     except ValidationError as error:
         raise DeltalightError(f"{name}: {_sentence(error.errors(include_url=False)[0], data)}") from error
+    except RecursionError as error:
+        raise DeltalightError(f"{name} is nested too deeply; send the keys that it has.") from error
+
+
+def _plain(value: Any, known: dict[int, Any]) -> Any:  # noqa: ANN401 - JSON
+    """JSON as strict models take it: arrays are tuples, and 2.0 is the integer 2, as JSON has one kind of number.
+
+    What is at several places is made once: YAML can name a part often, which must not become as many copies.
+    """
+    if isinstance(value, float) and value.is_integer():
+        return int(value)
+    if not isinstance(value, (Mapping, list, tuple)):
+        return value
+    if id(value) not in known:
+        if isinstance(value, Mapping):
+            known[id(value)] = {key: _plain(each, known) for key, each in value.items()}
+        else:
+            known[id(value)] = tuple(_plain(each, known) for each in value)
+    return known[id(value)]
 
 
 def _sentence(fault: ErrorDetails, document: Mapping[str, Any]) -> str:

@@ -38,10 +38,10 @@ class SceneDocument(StrictModel):
     def _name_objects(cls, value: Any) -> Any:  # noqa: ANN401 - whatever the document holds
         if not isinstance(value, (list, tuple)):
             return value
-        return [
+        return tuple(
             {"id": f"object{index}", **item} if isinstance(item, Mapping) else item
             for index, item in enumerate(value)
-        ]
+        )
 
     @model_validator(mode="after")
     def _check(self) -> Self:

@@ -29,7 +29,7 @@ def checked(model: type[Model], sent: object, name: str) -> Model:
     Raises:
         DeltalightError: the first fault, with its place and the nearest key.
     """
-    return validate(model, cast(Mapping[str, Any], sent), name)
+    return validate(model, cast(Mapping[str, Any], sent), name, strict=True)
 
 
 AS_SENT = WrapValidator(_as_sent)

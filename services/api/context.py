@@ -69,10 +69,8 @@ class Context:
         """Describe a scene, with its revision as entity tag; after a change everybody hears of it first."""
         if changed:
             self._tell(scene)
-        if changed and scene.head.is_active:
-            self.link.refresh()
+        picture = self.link.show(scene) if changed and scene.head.is_active else self.link.picture
         response.headers["ETag"] = f'"{scene.document.revision}"'
-        picture = self.link.picture
         return SceneAnswer.of(scene, picture if picture and picture.scene_id == scene.head.id else None)
 
     def _tell(self, scene: StoredScene) -> None:

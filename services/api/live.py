@@ -50,6 +50,11 @@ class Pixel(BaseModel):
 
     x: float = Field(ge=-0.5, le=MAX_EDGE_PX, description="To the right; the first pixel's centre is 0.")
     y: float = Field(ge=-0.5, le=MAX_EDGE_PX, description="Down; the first pixel's centre is 0.")
+    ignore: str | None = Field(
+        None,
+        max_length=200,
+        description="Id of an object to look through, at the real scene behind it: one that is being dragged.",
+    )
 
 
 @router.post("/tickets", status_code=201)
@@ -85,7 +90,8 @@ async def live_picture(shared: Shared) -> Response:
 @router.post("/live/pick", responses=responses(400, 503))
 def pick(shared: Shared, pixel: Annotated[Pixel, Body(examples=[{"x": 320, "y": 200}])]) -> Pick:
     """Say what a pixel of the newest composite shows: where to put an object, or which one was clicked on."""
-    return Pick.model_validate(shared.link.command("pick", {"x": pixel.x, "y": pixel.y}, PICK_TIMEOUT_S))
+    payload = pixel.model_dump(exclude_none=True)
+    return Pick.model_validate(shared.link.command("pick", payload, PICK_TIMEOUT_S))
 
 
 async def first_of(*streams: Coroutine[Any, Any, None]) -> None:

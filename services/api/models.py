@@ -6,8 +6,8 @@ from typing import Any, Literal, Self
 from pydantic import BaseModel, Field
 
 from protocol.scene import SceneDocument
+from services.api.outcomes import Picture
 from services.api.process_watch import Report
-from services.api.render_link import Picture
 from services.storage.asset_kinds import AssetKind
 from services.storage.assets import Asset
 from services.storage.scenes import Revision, SceneHead, StoredScene
@@ -37,13 +37,14 @@ class SceneSummary(BaseModel):
 
 
 class PictureState(BaseModel):
-    """What the render server made of the active scene."""
+    """What the render server made of a revision of the active scene."""
 
-    state: Literal["shown", "pending", "refused"] = Field(
-        description="`shown` = from the next frame on; `pending` = the render server does not answer; `refused` = "
-        "it cannot render this and shows what it had."
+    state: Literal["shown", "pending", "refused", "superseded"] = Field(
+        description="`shown` = from the next frame on; `pending` = the render server has not taken it yet, and the "
+        "event `picture` tells when it has; `refused` = it cannot render this and shows what it had; `superseded` = "
+        "a newer change was made before the server had taken this one, and is shown in its place."
     )
-    revision: int = Field(description="The revision that was sent.")
+    revision: int = Field(description="The revision that this is said of.")
     detail: str = Field(description="Why it is not shown; else empty.")
 
     @classmethod

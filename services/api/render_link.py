@@ -5,8 +5,7 @@ import time
 import uuid
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import structlog
 
@@ -17,32 +16,26 @@ from protocol.keys import Keys
 from protocol.messages import ControlRequest
 from protocol.transport import RequestClient
 from services.api.live_hub import ShownScene
+from services.api.outcomes import SILENT, Change, Outcomes, Picture, pending
+from services.api.turns import Turns
 from services.storage.scenes import StoredScene
 from services.storage.store import Store
 
 LOOK_INTERVAL_S = 1.0
 ALIVE_TIMEOUT_S = 1.0  # the server's own thread answers this, whatever the renderer does
 COMMAND_TIMEOUT_S = 25.0  # the server gives up after 20 s itself
+MAX_COMMANDS = 8  # at once: each holds one of the 40 threads that answer requests
 REMEMBERED_REVISIONS = 1024  # half a minute of a gesture's changes; pictures are a few frames behind
 
 log = structlog.get_logger()
 
 
-@dataclass(frozen=True)
-class Picture:
-    """What became of the newest revision: `shown` = from the next frame on, `pending` = the server does not answer,
-    `refused` = it cannot render it and shows what it had before."""
-
-    state: Literal["shown", "pending", "refused"]
-    scene_id: str
-    revision: int
-    detail: str = ""
-
-
 class RenderLink:
     """Sends the active scene to the render server, at once after a change and again after its restart.
 
-    The server counts revisions of its own, across scenes: each sending is its newest plus one.
+    One thread sends, always the newest revision: changes that come faster than the server takes them are left out.
+    Commands have their turn between, each after the changes that were made before it. The server counts revisions
+    of its own, across scenes: each sending is its newest plus one.
     """
 
     def __init__(
@@ -56,15 +49,18 @@ class RenderLink:
         self._store = store
         self._on_picture = on_picture
         self._client = RequestClient(control, keys=keys)
-        self._sending = threading.Lock()
+        self._turns = Turns()  # to ask the server; what is below is changed in one's turn
+        self._commands = threading.BoundedSemaphore(MAX_COMMANDS)
+        self._changed = threading.Event()
+        self._outcomes = Outcomes()
+        self._look_due_s = 0.0
         self._answers: bool | None = None  # not asked yet
         self._server_revision: int | None = None
-        self._picture: Picture | None = None
         self._source: list[str] | None = None
         self.on_source: Callable[[Sequence[str] | None], None] = lambda _endpoints: None
         self._sent: OrderedDict[int, ShownScene] = OrderedDict()  # by the server's revision
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._look, name="render-link", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="render-link", daemon=True)
 
     def start(self) -> None:
         """Begin to watch the server."""
@@ -73,11 +69,11 @@ class RenderLink:
     def close(self) -> None:
         """Stop watching."""
         self._stop.set()
+        self._changed.set()
         if self._thread.is_alive():
             self._thread.join(timeout=ALIVE_TIMEOUT_S)
-        if (
-            not self._thread.is_alive()
-        ):  # else it waits for a renderer that hangs: the process ends without it
+        # Else it waits for a renderer that hangs: the process ends without it.
+        if not self._thread.is_alive():
             self._client.close()
 
     @property
@@ -88,22 +84,19 @@ class RenderLink:
     @property
     def picture(self) -> Picture | None:
         """What the last sending came to."""
-        return self._picture
+        return self._outcomes.newest
 
-    def refresh(self) -> Picture | None:
-        """Send the newest revision of the active scene unless the server has it; None without an active scene.
+    def show(self, scene: StoredScene) -> Picture:
+        """Have a revision of the active scene sent, which is stored; what became of it, as far as soon known.
 
         While a server that did not answer is being looked for, this does not wait for it.
         """
-        with self._sending:
-            active = self._store.scenes.active()
-            if active is None or self._is_settled(active):
-                return self._picture
-            picture = _pending(active) if self._answers is False else self._send(active)
-            if picture != self._picture:
-                self._picture = picture
-                self._on_picture(picture)
-            return picture
+        change = _change(scene)
+        outcome = self._outcomes.expect(change)
+        self._changed.set()
+        if self._answers is False:
+            return pending(change, SILENT)
+        return self._outcomes.wait(change, outcome)
 
     def shown(self, server_revision: int | None) -> ShownScene | None:
         """Which scene a picture shows, made with a revision of the server's; None where that came from elsewhere."""
@@ -115,14 +108,18 @@ class RenderLink:
         """Carry out a command at the render server, after those that wait; gives the payload of the reply.
 
         Raises:
-            UnansweredError: it does not answer.
+            UnansweredError: it does not answer, or too many commands wait.
             DeltalightError: it refused the command.
         """
         self._refuse_where_silent()
-        with self._sending:
-            self._refuse_where_silent()  # the first look may just have found nobody
-            self._require_alive()
-            return self._ask(op, timeout_s, payload)
+        if not self._commands.acquire(blocking=False):
+            raise UnansweredError(
+                f"The render server is busy with {MAX_COMMANDS} other commands; try again soon."
+            )
+        try:
+            return self._carry_out(op, payload, timeout_s)
+        finally:
+            self._commands.release()
 
     def use_source(self, endpoints: Sequence[str] | None) -> None:
         """Let the server read frames from there, None = from its own nodes; a server that was restarted too.
@@ -135,7 +132,16 @@ class RenderLink:
         """
         self._source = None if endpoints is None else list(endpoints)
         self.on_source(self._source)
-        self.command("set_source", {"endpoints": self._source})
+        self._refuse_where_silent()
+        self._carry_out("set_source", {"endpoints": self._source}, COMMAND_TIMEOUT_S)
+
+    def _carry_out(self, op: str, payload: dict[str, object] | None, timeout_s: float) -> dict[str, object]:
+        with self._turns:
+            if self._changed.is_set():
+                self._send_newest()
+            self._refuse_where_silent()  # the first look may just have found nobody
+            self._require_alive()
+            return self._ask(op, timeout_s, payload)
 
     def _refuse_where_silent(self) -> None:
         if self._answers is False:
@@ -149,13 +155,23 @@ class RenderLink:
             self._note_reachable(False)
             self._refuse_where_silent()
 
-    def _is_settled(self, active: StoredScene) -> bool:
-        picture = self._picture
-        return (
-            picture is not None
-            and picture.state != "pending"
-            and (picture.scene_id, picture.revision) == (active.head.id, active.document.revision)
-        )
+    def _send_newest(self) -> None:
+        """Send the newest revision of the active scene unless the server has it (in one's turn)."""
+        self._changed.clear()
+        awaited = self._outcomes.awaited
+        active = self._store.scenes.active()
+        if active is None:
+            return
+        change, before = _change(active), self._outcomes.newest
+        if before is not None and before.change == change and before.state != "pending":
+            picture = before
+        elif self._answers is False:
+            picture = pending(change, SILENT)
+        else:
+            picture = self._send(active)
+        self._outcomes.note(picture, awaited)
+        if picture != before:
+            self._on_picture(picture)
 
     def _send(self, active: StoredScene) -> Picture:
         revision = active.document.revision
@@ -164,7 +180,7 @@ class RenderLink:
             self._set_scene(active)
         except UnansweredError:
             self._note_reachable(False)
-            return _pending(active)
+            return pending(_change(active), SILENT)
         except DeltalightError as refusal:
             detail = self._store.assets.without_paths(str(refusal))
             return Picture("refused", active.head.id, revision, detail)
@@ -197,36 +213,47 @@ class RenderLink:
             del self._sent[number]
             raise
         self._server_revision = number
+        self._look_due_s = time.monotonic() + LOOK_INTERVAL_S
 
     def _seen_revision(self) -> int:
         revision: Any = self._ask("ping", COMMAND_TIMEOUT_S)["revision"]
         return int(revision)
 
-    def _look(self) -> None:
-        """At once and then once a second: a server that came (back) gets the scene."""
+    def _run(self) -> None:
+        """Send what is changed; look at once, and whenever the server was not heard of for a second."""
         while not self._stop.is_set():
             try:
-                self._look_once()
-            except DeltalightError as fault:
+                with self._turns:
+                    self._look_where_due()
+                    self._send_newest()
+            except (DeltalightError, OSError) as fault:
                 log.warning("the render server cannot be kept up to date", fault=str(fault))
-            self._stop.wait(LOOK_INTERVAL_S)
+            self._changed.wait(max(0.0, self._look_due_s - time.monotonic()))
 
-    def _look_once(self) -> None:
-        with self._sending:
-            try:
-                self._ask(CLOCK_OP, ALIVE_TIMEOUT_S)
-                seen = self._seen_revision()
-            except UnansweredError:
-                self._note_reachable(False)
-                return
-            if self._server_revision is None or not self._answers:
+    def _look_where_due(self) -> None:
+        if time.monotonic() < self._look_due_s:
+            return
+        try:
+            self._look()
+        finally:
+            self._look_due_s = time.monotonic() + LOOK_INTERVAL_S
+
+    def _look(self) -> None:
+        """A server that came (back) is to get source and scene."""
+        try:
+            self._ask(CLOCK_OP, ALIVE_TIMEOUT_S)
+            seen = self._seen_revision()
+            is_new = self._server_revision is None or seen < self._server_revision  # it was started (again)
+            if is_new or not self._answers:
                 self._restore_source()
-            self._note_reachable(True)
-            if self._server_revision is None or seen < self._server_revision:  # it was started (again)
-                self._picture = None
-                self._sent.clear()
-            self._server_revision = seen
-        self.refresh()
+        except UnansweredError:
+            self._note_reachable(False)
+            return
+        self._note_reachable(True)
+        if is_new:
+            self._outcomes.forget()
+            self._sent.clear()
+        self._server_revision = seen
 
     def _restore_source(self) -> None:
         """Tell a server that came (back) where to read from; one that is left from a killed service too."""
@@ -272,6 +299,5 @@ class UnansweredError(DeltalightError):
     """The render server did not answer in time."""
 
 
-def _pending(active: StoredScene) -> Picture:
-    detail = "The render server does not answer; the scene is shown as soon as it does."
-    return Picture("pending", active.head.id, active.document.revision, detail)
+def _change(scene: StoredScene) -> Change:
+    return Change(scene.head.id, scene.document.revision)

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 import yaml
 from fastapi import Depends, Request, Response
 
-from protocol.documents import parse_mapping
+from protocol.documents import parse_mapping, yaml_text
 from protocol.scene import SceneDocument
 from services.api.bodies import SCENE_EXAMPLE
 from services.api.problems import ProblemError
@@ -62,7 +62,7 @@ SentDocument = Annotated[Any, Depends(_sent)]
 def document_file(document: SceneDocument, name: str, *, as_yaml: bool) -> Response:
     """The answer that a browser keeps as a file NAME.json or NAME.yaml."""
     if as_yaml:
-        content = yaml.safe_dump(document.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
+        content = yaml_text(document.model_dump(mode="json"))
         media_type, suffix = YAML_TYPE, "yaml"
     else:
         content, media_type, suffix = document.model_dump_json(), JSON_TYPE, "json"

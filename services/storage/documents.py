@@ -177,9 +177,9 @@ def checked_document(document: object, revision: int) -> SceneDocument:
     Raises:
         DeltalightError: the first fault, with its place.
     """
-    numbered = {**document, "revision": revision} if isinstance(document, Mapping) else document
     try:
-        return validate(SceneDocument, numbered, "the scene")  # type: ignore[arg-type]
+        checked = validate(SceneDocument, document, "the scene", strict=True)  # type: ignore[arg-type]
+        return checked.model_copy(update={"revision": revision})
     except UnicodeEncodeError as error:
         raise DeltalightError("the scene holds text that is not valid Unicode; correct it.") from error
 

@@ -35,9 +35,14 @@ def test_it_runs_and_reports(capsys: pytest.CaptureFixture[str]) -> None:
         answered = figures["GET"]["requests"] + figures["PATCH"]["requests"]
         assert answered + figures["failed"] == 20
         assert answered >= 15
+        assert sum(figures["pictures"].values()) == figures["PATCH"]["requests"]
+        assert figures["cores"]["web process"] > 0
         assert all(0 < figures[method]["p50_ms"] <= figures[method]["p99_ms"] for method in ("GET", "PATCH"))
     assert report["size"] == [96, 72]
-    assert report["viewers"]["viewers"] == VIEWERS
+    viewers = report["viewers"]
+    assert viewers["viewers"] == VIEWERS
+    taken = viewers["cores_with"]["web process"] - viewers["cores_without"]["web process"]
+    assert viewers["share_of_processors"]["web process"] == taken / report["cpus"]
     print_report(json.loads(json.dumps(report)))
     assert "50 requests/s" in capsys.readouterr().out
 

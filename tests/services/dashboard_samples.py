@@ -22,7 +22,8 @@ from playwright.sync_api import BrowserContext, ConsoleMessage, Locator, Page
 from protocol.camera_model import CameraModel
 from protocol.scene import SceneDocument
 from services import ports
-from services.demo import NAME, demo_plan, demo_scene
+from services.api.page import DASHBOARD
+from services.demo import NAME, RECORDING, demo_plan, demo_scene
 from services.host_store import activate_document, session_file
 from services.storage.store import Store
 from services.supervisor import Supervisor
@@ -32,6 +33,7 @@ PATIENCE_S = 90.0
 # Where this names a folder, the tests leave pictures of what they see there, in the camera's size.
 SCREENSHOTS = os.environ.get("DELTALIGHT_SCREENSHOTS")
 SIZE = {"width": 1280, "height": 800}
+AXE = DASHBOARD.parent / "node_modules" / "axe-core" / "axe.min.js"  # comes with the dashboard's tools
 JPEG_QUALITY = 82  # keeps each below 200 kB
 
 
@@ -78,11 +80,18 @@ class Stack:
 @contextmanager
 def demo_stack(data: Path) -> Iterator[Stack]:
     """The demo with small pictures, so that a software renderer makes several a second."""
+    with running_stack(data, _scene(), RECORDING) as stack:
+        yield stack
+
+
+@contextmanager
+def running_stack(data: Path, scene: SceneDocument, source: Path) -> Iterator[Stack]:
+    """Node, render server and web process over a recording or a data set."""
     (port,) = ports.private_ports(1)
     with Store(data) as store:
-        shown = activate_document(store, _scene())
+        shown = activate_document(store, scene)
     with session_file(shown) as session:
-        plan = replace(demo_plan(session), data=data, page_port=port)
+        plan = replace(demo_plan(session), source=str(source), data=data, page_port=port)
         with Supervisor(plan.specs()) as supervisor, _kept_alive(supervisor):
             address = f"{ports.LOOPBACK}:{port}"
             wait_for_frames(address, PATIENCE_S)
@@ -142,11 +151,11 @@ class Desk:
             self.page.wait_for_timeout(50)
 
     def shows_newest(self) -> None:
-        """Wait until the page shows a picture of the scene as REST has it now."""
-        revision = self.stack.scene()["revision"]
+        """Wait until the page shows a picture of the scene as REST has it; changes may be on their way there."""
         shown = self.page.locator(".status-strip dl div", has_text="Revision").locator("dd")
         self.until(
-            lambda: shown.count() and shown.inner_text() == str(revision), f"a picture of revision {revision}"
+            lambda: shown.count() and shown.inner_text() == str(self.stack.scene()["revision"]),
+            "a picture of the newest revision",
         )
 
     def pixels(self) -> UInt8[np.ndarray, "h w 3"]:
@@ -182,6 +191,37 @@ class Desk:
         self.page.mouse.move(*end, steps=4)
         self.page.mouse.up()
 
+    def swipe(self, start: tuple[float, float], end: tuple[float, float], steps: int = 5) -> None:
+        """Drag with a finger."""
+        places = np.linspace(start, end, steps + 1)
+        devtools = self.page.context.new_cdp_session(self.page)
+        for kind, (x, y) in zip(["touchStart", *["touchMove"] * steps], places, strict=True):
+            devtools.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": [{"x": x, "y": y}]})
+        devtools.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+        devtools.detach()
+
+    def faults_for_screen_readers(self) -> list[str]:
+        """What axe finds in the page as it is: rule, elements, and why."""
+        self.page.evaluate(AXE.read_text())
+        found = self.page.evaluate("async () => (await axe.run({ resultTypes: ['violations'] })).violations")
+        return [
+            f"{rule['id']}: {node['target']} {node['failureSummary']}"
+            for rule in found
+            for node in rule["nodes"]
+        ]
+
+    def beyond_the_edge(self) -> list[str]:
+        """Controls of the bars that the window cuts off, and the page itself where it scrolls sideways."""
+        outside: list[str] = self.page.evaluate(
+            """() => [...document.querySelectorAll(":is(.top, .stage-bar, .drawer-bar) :is(button, label, select)")]
+                .filter((each) => { const { left, right } = each.getBoundingClientRect();
+                    return right > innerWidth || left < 0; })
+                .map((each) => each.ariaLabel ?? each.title)"""
+        )
+        if self.page.evaluate("document.documentElement.scrollWidth > innerWidth"):
+            outside.append("the page")
+        return outside
+
     def drop(self, name: str, content: bytes, place: tuple[float, float]) -> None:
         """Drop a file on the picture."""
         sent = {"name": name, "content": base64.b64encode(content).decode()}
@@ -200,9 +240,14 @@ class Desk:
 
     def photograph(self, name: str) -> None:
         """Keep a picture of the page where pictures are wanted."""
-        if SCREENSHOTS:
-            path = Path(SCREENSHOTS) / f"dashboard_{name}.jpg"
-            self.page.screenshot(path=path, type="jpeg", quality=JPEG_QUALITY)
+        photograph(self.page, name)
+
+
+def photograph(page: Page, name: str) -> None:
+    """Keep a picture of a page where pictures are wanted."""
+    if SCREENSHOTS:
+        path = Path(SCREENSHOTS) / f"dashboard_{name}.jpg"
+        page.screenshot(path=path, type="jpeg", quality=JPEG_QUALITY)
 
 
 @contextmanager

@@ -1,5 +1,6 @@
 """A stand-in for the render server's control socket: notes what is asked, writes what snapshots want."""
 
+import threading
 from pathlib import Path
 
 import cv2
@@ -10,16 +11,27 @@ from protocol.messages import ControlRequest
 from protocol.transport import ReplyServer
 from services import ports
 
+NOWHERE = {"kind": "nothing", "object": None, "point_m": None, "normal": None, "distance_m": None}
+
 
 class Recorder:
-    """Answers as the render server does; `asked` holds (op, payload) in their order."""
+    """Answers as the render server does; `asked` holds (op, payload) in their order.
+
+    Where `gate` is closed, what changes or shows the picture waits, as for a slow renderer; `is_busy` tells that it
+    does.
+    """
 
     def __init__(self, control_port: int) -> None:
         self.asked: list[tuple[str, dict[str, object]]] = []
         self.fault: str | None = None
+        self.revision = 1
+        self.gate = threading.Event()
+        self.gate.set()
+        self.is_busy = threading.Event()
         self._server = ReplyServer(ports.endpoint(control_port), self._carry_out)
 
     def close(self) -> None:
+        self.gate.set()
         self._server.close()
 
     def payloads(self, op: str) -> list[dict[str, object]]:
@@ -29,10 +41,21 @@ class Recorder:
         self.asked.append((request.op, dict(request.payload)))
         match request.op:
             case "ping":
-                return {"revision": 1}
+                return {"revision": self.revision}
+            case "set_scene":
+                self._wait_at_gate()
+                self.revision = request.revision or self.revision + 1
+            case "pick":
+                self._wait_at_gate()
+                return {"frame_id": 1, **NOWHERE}
             case "snapshot":
                 return self._snapshot(request.payload)
         return {}
+
+    def _wait_at_gate(self) -> None:
+        self.is_busy.set()
+        self.gate.wait()
+        self.is_busy.clear()
 
     def _snapshot(self, order: dict[str, object]) -> dict[str, object]:
         if self.fault is not None:

@@ -187,15 +187,19 @@ def test_mjpeg_streams_pictures_and_live_jpg_is_the_newest(live: LiveApi) -> Non
 def test_a_pick_is_the_render_servers_answer(live: LiveApi, monkeypatch: pytest.MonkeyPatch) -> None:
     seen = {"frame_id": 5, "kind": "object", "object": "knot", "point_m": [0.1, 0.2, 0.3]}
     seen |= {"normal": [0, 0, 1], "distance_m": 0.9}
+    asked: list[dict[str, object]] = []
 
     def carry_out(request: ControlRequest) -> dict[str, object]:
         assert request.op == "pick"
+        asked.append(dict(request.payload))
         if request.payload["x"] == 1.0:
             raise DeltalightError("No frame was rendered yet.")
         return seen
 
     monkeypatch.setattr(live.server.session, "carry_out", carry_out)
     assert live.client.post("/live/pick", json={"x": 3, "y": 4.5}).json() == seen
+    live.client.post("/live/pick", json={"x": 3, "y": 4, "ignore": "knot"}).raise_for_status()
+    assert asked == [{"x": 3.0, "y": 4.5}, {"x": 3.0, "y": 4.0, "ignore": "knot"}]
     assert "No frame" in sentence(live.client.post("/live/pick", json={"x": 1, "y": 1}), 422)
     assert "`body.x`" in sentence(live.client.post("/live/pick", json={"x": -1, "y": 1}), 422)
 

@@ -116,6 +116,39 @@ def test_wrong_documents_are_refused(
     assert text in sentence(answer, status)
 
 
+@pytest.mark.parametrize(
+    ("path", "patch", "place"),
+    [
+        ("", {"output": {"width": "640", "height": 480}}, "output.width"),
+        ("", {"output": {"antialiasing": 1}}, "output.antialiasing"),
+        ("", {"objects": [{"asset": "t.obj", "pose": {"translation_m": [0, True, 0]}}]}, "translation_m[1]"),
+        ("/lights/manual/0", {"radiance": "0.5"}, "lights.manual[0].radiance"),
+        ("/method", {"bounces": 1.5}, "method.bounces"),
+        ("", {"name": 7}, "name"),
+        ("", {"revision": -1.0}, "revision"),
+    ],
+)
+def test_json_keeps_its_types(client: httpx.Client, path: str, patch: object, place: str) -> None:
+    scene = make(client, lights={"manual": [{"type": "ambient", "radiance": 0.2}]})
+    assert place in sentence(client.patch(f"/scenes/{scene['id']}{path}", json=patch), 422)
+
+
+def test_numbers_are_of_one_kind_whatever_they_look_like(client: httpx.Client) -> None:
+    address = f"/scenes/{make(client)['id']}"
+    lights = {"manual": [{"type": "ambient", "radiance": 2}]}
+    whole = client.patch(address, json={"output": {"width": 640.0, "height": 480}, "lights": lights})
+    assert whole.status_code == 200, whole.text
+    document = whole.json()["document"]
+    assert (document["output"]["width"], document["lights"]["manual"][0]["radiance"]) == (640, 2.0)
+    yaml_type = {"Content-Type": "application/yaml"}
+    text = "{name: '12e3', lights: {manual: [{type: ambient, radiance: 1e-3}]}}"
+    made = client.post("/scenes", content=text, headers=yaml_type).json()
+    assert (made["document"]["name"], made["document"]["lights"]["manual"][0]["radiance"]) == ("12e3", 0.001)
+    exported = client.get(f"/scenes/{made['id']}/document", params={"format": "yaml"}).content
+    assert client.post("/scenes", content=exported, headers=yaml_type).json()["document"] == made["document"]
+    assert "name" in sentence(client.post("/scenes", content="name: 12e3", headers=yaml_type), 422)
+
+
 def test_manual_lights_one_by_one(client: httpx.Client) -> None:
     scene = make(client, lights={"manual": [{"type": "ambient", "radiance": 0.2}]})
     address = f"/scenes/{scene['id']}/lights/manual"

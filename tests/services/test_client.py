@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 
 from protocol.errors import DeltalightError
-from protocol.messages import ControlRequest
 from protocol.scene import SceneDocument
 from protocol.source import open_source
 from services import ports
@@ -28,17 +27,6 @@ PRINTED_ADDRESS = "http://127.0.0.1:8000"
 LIGHT = {"type": "sphere", "position_m": [1, 0, 1], "intensity": 5}
 
 
-class Server(Recorder):
-    """Knows which revision it was sent last, as the render server does."""
-
-    revision = 1
-
-    def _carry_out(self, request: ControlRequest) -> dict[str, object]:
-        answer = super()._carry_out(request)
-        self.revision = request.revision or self.revision
-        return {**answer, "revision": self.revision} if request.op == "ping" else answer
-
-
 @dataclass(frozen=True)
 class Service:
     """A service with pictures, and its address."""
@@ -53,7 +41,7 @@ def serving(folder: Path, **settings: object) -> Iterator[Service]:
     """A service whose render server and node are stand-ins; a scene with an object is shown."""
     control_port, stream_port = ports.private_ports(2)
     endpoints = {"control": ports.endpoint(control_port), "subscribe": [ports.endpoint(stream_port)]}
-    server, stream = Server(control_port), StandInStream(stream_port)
+    server, stream = Recorder(control_port), StandInStream(stream_port)
     try:
         with running_api(folder, **endpoints, **settings) as api:
             upload(api.store, TETRAHEDRON, "knot.obj")
