@@ -67,8 +67,10 @@ class ShownFrame:
         """The pose that the picture was made with."""
         return None if self.view is None else self.view.world_from_camera
 
-    def pick(self, x: float, y: float) -> Pick:
+    def pick(self, x: float, y: float, ignore: str | None = None) -> Pick:
         """What the pixel around (x, y) shows; pixel centres are at integers.
+
+        Where the object `ignore` (an id) is in front, what counts is the real scene behind it.
 
         Raises:
             DeltalightError: it lies outside of the picture, or the picture has no pose.
@@ -85,7 +87,7 @@ class ShownFrame:
                 "The newest picture has no place in the world (no marker board in view, or a view that is not the "
                 "camera's); show the board, or another view."
             )
-        owner, found = self._look(self.view, pixel)
+        owner, found = self._look(self.view, pixel, ignore)
         if found is None:
             return Pick(self.frame.frame_id, "nothing")
         point, normal = found
@@ -93,11 +95,13 @@ class ShownFrame:
         kind: Literal["real", "object"] = "real" if owner is None else "object"
         return Pick(self.frame.frame_id, kind, owner, point, normal / np.linalg.norm(normal), distance_m)
 
-    def _look(self, view: CameraView, pixel: Pixel) -> tuple[str | None, Surface | None]:
-        """Id of the object in front, if there is one, and the surface there."""
+    def _look(self, view: CameraView, pixel: Pixel, ignore: str | None) -> tuple[str | None, Surface | None]:
+        """Id of the object in front, if there is one that counts, and the surface there."""
         if self.buffers is None:
             return None, self._in_frame(view, pixel)
         owner = _object_in_front(self.buffers, pixel)
+        if owner == ignore:
+            owner = None
         return owner, _surface_in_buffers(self.buffers, pixel, of_object=owner is not None)
 
     def _in_frame(self, view: CameraView, pixel: Pixel) -> Surface | None:

@@ -124,15 +124,15 @@ class SceneRenderer:
         self._sized = frame, resized_frame(frame, *size)
         return self._sized[1]
 
-    def pick(self, x: float, y: float) -> Pick:
-        """What the newest picture shows at a pixel.
+    def pick(self, x: float, y: float, ignore: str | None = None) -> Pick:
+        """What the newest picture shows at a pixel, seen through the object `ignore`.
 
         Raises:
             DeltalightError: there is no picture yet, it has no pose, or the pixel lies outside.
         """
         if self._shown is None:
             raise DeltalightError("Nothing was rendered yet; ask again when there is a picture.")
-        return self._shown.pick(x, y)
+        return self._shown.pick(x, y, ignore)
 
     def _composed(
         self, shown: ShownFrame, relit: RelitFrame, lights: list[dict[str, Any]], *, with_linear: bool

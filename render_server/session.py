@@ -97,8 +97,8 @@ class Renderer(Protocol):
     def sized(self, frame: ViewFrame) -> ViewFrame:
         """The frame at the composite's size."""
 
-    def pick(self, x: float, y: float) -> Pick:
-        """What the newest picture shows at a pixel."""
+    def pick(self, x: float, y: float, ignore: str | None = None) -> Pick:
+        """What the newest picture shows at a pixel, seen through the object `ignore`."""
 
     def begin_source(self) -> None:
         """Forget what earlier frames showed."""
@@ -133,12 +133,13 @@ class SourceInUse:
 
 
 class PickOrder(StrictModel):
-    """A pixel of the composite; centres are at integers."""
+    """A pixel of the composite (centres are at integers), and an object to look through."""
 
     model_config = ConfigDict(strict=True)
 
     x: float
     y: float
+    ignore: str | None = None
 
 
 def _only_configured(_endpoints: Sequence[str] | None) -> SourceInUse:
@@ -272,8 +273,8 @@ class RenderSession:
         return {}
 
     def _pick(self, request: ControlRequest) -> dict[str, object]:
-        pixel = validate(PickOrder, request.payload, "the command pick")
-        return self._renderer.pick(pixel.x, pixel.y).as_dict()
+        order = validate(PickOrder, request.payload, "the command pick")
+        return self._renderer.pick(order.x, order.y, order.ignore).as_dict()
 
     def _snapshot(self, request: ControlRequest) -> dict[str, object]:
         order = validate(SnapshotOrder, request.payload, "the command snapshot")

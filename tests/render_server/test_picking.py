@@ -102,6 +102,18 @@ def test_an_object_behind_a_real_thing_is_not_picked(gpu: GpuContext, stage: Sta
     assert (inverse[:3, :3] @ hidden.point_m + inverse[:3, 3])[2] == pytest.approx(0.5, abs=1e-3)
 
 
+def test_an_object_that_is_dragged_is_looked_through(gpu: GpuContext, stage: Stage) -> None:
+    view = frame()
+    renderer = SceneRenderer(gpu, everyday(stage))
+    renderer.render(view)
+    at = pixel_of(view, BALL_AT)
+    behind, other = renderer.pick(*at, ignore="ball"), renderer.pick(*at, ignore="box")
+    renderer.release()
+    assert (behind.kind, behind.object_id) == ("real", None)
+    assert abs(behind.point_m[2]) < 0.008, "the floor behind it"
+    assert (other.kind, other.object_id) == ("object", "ball")
+
+
 def two_materials(folder: Path) -> str:
     """A GLB of two meshes: a red cube left and a blue cube right of the middle."""
     scene = trimesh.Scene()

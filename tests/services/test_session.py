@@ -56,6 +56,7 @@ class InvertingRenderer:
         self.scenes: list[SceneDocument] = []
         self.sources_begun = 0
         self.newest: ViewFrame | None = None
+        self.ignored: str | None = None
         self.unfinished: list[int] = []
 
     def start(self, frame: ViewFrame, *, with_linear: bool = False) -> Started:
@@ -77,9 +78,10 @@ class InvertingRenderer:
     def sized(self, frame: ViewFrame) -> ViewFrame:
         return frame
 
-    def pick(self, x: float, y: float) -> Picked:
+    def pick(self, x: float, y: float, ignore: str | None = None) -> Picked:
         if self.newest is None:
             raise DeltalightError("Nothing was rendered yet; ask again when there is a picture.")
+        self.ignored = ignore
         return Picked(self.newest.frame_id, (x, y))
 
     def begin_source(self) -> None:
@@ -270,13 +272,16 @@ def test_on_a_gpu_a_frame_is_read_back_after_the_next_was_started(
     assert not session.is_waiting_for_gpu
 
 
-def test_pick_asks_the_renderer(session: RenderSession) -> None:
+def test_pick_asks_the_renderer(session: RenderSession, renderer: InvertingRenderer) -> None:
     with pytest.raises(DeltalightError, match="Nothing was rendered yet"):
         session.carry_out(request("pick", x=3, y=4))
     feed(session, 5)
     session.step()
     picked = session.carry_out(request("pick", x=3, y=4.5))
     assert picked == {"frame_id": 5, "kind": "nothing", "pixel": [3.0, 4.5]}
+    assert renderer.ignored is None
+    session.carry_out(request("pick", x=3, y=4.5, ignore="knot"))
+    assert renderer.ignored == "knot"
     for wrong in ({"x": 3}, {"x": 3, "y": "4"}, {"x": True, "y": 1}, {"x": 1, "y": 2, "z": 3}):
         with pytest.raises(DeltalightError, match="the command pick"):
             session.carry_out(request("pick", **wrong))

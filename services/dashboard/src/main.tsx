@@ -10,13 +10,14 @@ import "./styles/stage.css";
 import "./styles/drawer.css";
 import { App } from "./components/shell/App";
 import { followScene } from "./state/selection";
-import { begin } from "./state/begin";
+import { begin, followSession } from "./state/begin";
 import { followFrames } from "./state/tools";
 import { applyTheme } from "./state/theme";
 
 applyTheme();
 followScene();
 followFrames();
+followSession();
 void begin();
 const root = document.getElementById("app");
 if (root) render(<App />, root);

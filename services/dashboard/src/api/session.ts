@@ -20,7 +20,7 @@ export function keepToken(value: string | null): void {
 
 /** A request was refused for want of a right token. */
 export function tokenRefused(sentence: string): void {
-  signInProblem.value = token.value === null ? "" : sentence;
+  if (token.value !== null) signInProblem.value = sentence; // several requests may be refused, only one has a reason
   keepToken(null);
   phase.value = "sign-in";
 }

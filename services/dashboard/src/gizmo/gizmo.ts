@@ -7,6 +7,8 @@ import { SNAP_DEG, SNAP_M, SNAP_SCALE } from "../math/snap";
 import { length, subtract } from "../math/vector";
 
 export type GizmoMode = "translate" | "rotate" | "scale";
+/** What a handle does: `free` moves over the picture or the ground, `bound` along an axis, or it turns or scales. */
+export type Grip = "free" | "bound";
 
 interface GizmoEvents {
   readonly onStart: () => void;
@@ -15,6 +17,7 @@ interface GizmoEvents {
 }
 
 const SIZE = 1.35;
+const FREE_HANDLES = ["XYZ", "XY"];
 const NEAR_M = 0.01;
 // OpenCV's camera looks along +z with y down, three's along -z with y up.
 const FLIP = [1, -1, -1] as const;
@@ -33,7 +36,7 @@ export class Gizmo {
   /** `surface` gets the pointer's events and has the picture's outline. Throws where there is no WebGL. */
   constructor(
     canvas: HTMLCanvasElement,
-    surface: HTMLElement,
+    private readonly surface: HTMLElement,
     private readonly events: GizmoEvents,
   ) {
     this.renderer = new WebGLRenderer({ canvas, alpha: true, antialias: true });
@@ -56,6 +59,22 @@ export class Gizmo {
   /** Whether the pointer is on one of the handles. */
   get isTouched(): boolean {
     return this.isShown && this.controls.axis !== null;
+  }
+
+  /** The handle at a pointer; a finger hovers nowhere before it is there, so it is looked for anew. */
+  gripAt(event: PointerEvent): Grip | null {
+    if (!this.isShown) return null;
+    const { left, top, width, height } = this.surface.getBoundingClientRect();
+    const x = ((event.clientX - left) / width) * 2 - 1;
+    const y = 1 - ((event.clientY - top) / height) * 2;
+    this.controls.pointerHover({ x, y, button: event.button } as unknown as PointerEvent);
+    if (this.controls.axis === null) return null;
+    return this.controls.mode === "translate" && FREE_HANDLES.includes(this.controls.axis) ? "free" : "bound";
+  }
+
+  /** Leave the pointer to others; the handle that it is on stays lit. */
+  pause(isPaused: boolean): void {
+    this.controls.enabled = !isPaused;
   }
 
   dispose(): void {

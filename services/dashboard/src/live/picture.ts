@@ -35,9 +35,15 @@ export function showPictureOn(target: HTMLCanvasElement | null): void {
   canvas = target;
 }
 
+let watch: ReturnType<typeof setInterval> | undefined;
+
 export function startPicture(): void {
   socket.start();
-  setInterval(() => (isStale.value = performance.now() - lastArrival > staleAfterMs(frame.value?.frames_per_s)), 500);
+  clearInterval(watch);
+  watch = setInterval(
+    () => (isStale.value = performance.now() - lastArrival > staleAfterMs(frame.value?.frames_per_s)),
+    500,
+  );
 }
 
 function staleAfterMs(framesPerS: number | null | undefined): number {

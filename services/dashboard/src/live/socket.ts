@@ -47,7 +47,7 @@ export class ReconnectingSocket {
       if (this.isStopped()) return;
       this.open(new WebSocket(address));
     } catch {
-      this.wait(); // no ticket: the service is away, or the sign-in page is up
+      if (!this.isStopped()) this.wait(); // no ticket: the service is away
     }
   }
 

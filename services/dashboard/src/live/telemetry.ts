@@ -7,8 +7,14 @@ export interface Sample {
   readonly at: number;
   readonly age: number | null;
   readonly rate: number | null;
-  readonly passes: Readonly<Record<string, number>>;
+  readonly passes: Passes;
+  /** Names of the passes whose results this frame used again: their times are those of when they ran. */
+  readonly kept: ReadonlySet<string>;
+  /** The scene and its revision; null where another program's is shown. */
+  readonly shows: string | null;
 }
+
+type Passes = Readonly<Record<string, number>>;
 
 const KEPT_S = 60;
 export const OTHERS = "others";
@@ -17,18 +23,36 @@ export const samples = signal<readonly Sample[]>([]);
 
 export function note(header: FrameHeader, nowMs: number): void {
   const at = nowMs / 1000;
-  const sample: Sample = { at, age: header.age_ms, rate: header.frames_per_s, passes: header.pass_times_ms };
+  const shows = header.scene && `${header.scene.id} ${header.scene.revision}`;
+  const passes = withKept(samples.value.at(-1), header.pass_times_ms, shows);
+  const sample: Sample = { at, age: header.age_ms, rate: header.frames_per_s, shows, ...passes };
   const kept = samples.value.filter((each) => each.at > at - KEPT_S);
   samples.value = [...kept, sample];
 }
 
-/** The passes that took most time over the samples, the costliest first, then `OTHERS` where there are more. */
+/**
+ * While neither camera nor scene move, the renderer runs only what shows the next camera picture. The passes that it
+ * leaves out keep their times, so that what a change costs stays readable; the next revision begins anew.
+ */
+export function withKept(
+  before: Sample | undefined,
+  ran: Passes,
+  shows: string | null,
+): { passes: Passes; kept: ReadonlySet<string> } {
+  const earlier = before && shows !== null && before.shows === shows ? before.passes : {};
+  const kept = new Set(Object.keys(earlier).filter((name) => !(name in ran)));
+  return { passes: { ...earlier, ...ran }, kept };
+}
+
+/** Passes of the newest sample, then those before it, the costliest first, then `OTHERS` where there are more. */
 export function leadingPasses(of: readonly Sample[], most: number): string[] {
   const sums = new Map<string, number>();
   for (const sample of of) {
     for (const [name, time] of Object.entries(sample.passes)) sums.set(name, (sums.get(name) ?? 0) + time);
   }
-  const names = [...sums].sort((a, b) => b[1] - a[1]).map(([name]) => name);
+  const isCurrent = (name: string): number => Number(name in (of.at(-1)?.passes ?? {}));
+  const ranked = [...sums].sort(([a, time], [b, other]) => isCurrent(b) - isCurrent(a) || other - time);
+  const names = ranked.map(([name]) => name);
   return names.length > most ? [...names.slice(0, most), OTHERS] : names;
 }
 

@@ -81,18 +81,37 @@ export function corners(pose: Pose, bounds: Bounds): Vector[] {
   });
 }
 
-function levelled(normal: Vector): Vector {
+export function levelled(normal: Vector): Vector {
   return dot(normal, UP) > LEVEL_COSINE ? UP : normal;
 }
 
-/** The pose that stands the middle of an object's underside on a point, its up along the normal. */
+/** Whether two surfaces are turned alike, as far as measured normals tell. */
+export function isTurnedAlike(normal: Vector, other: Vector): boolean {
+  return dot(normal, other) > LEVEL_COSINE;
+}
+
+/** Whether a surface is steeper than 45 degrees, as walls and the undersides of things are. */
+export function isSteep(normal: Vector): boolean {
+  return normal[2] < Math.SQRT1_2;
+}
+
+/** Where an object touches a surface that it rests on: below the middle of its box, against the normal. */
+export function footOf(pose: Pose, bounds: Bounds | null, normal: Vector): Vector {
+  if (!bounds) return pose.translation_m;
+  const middle = transform(pose, scaled(add(bounds.minimum, bounds.maximum), 0.5));
+  const depth = Math.min(...corners(pose, bounds).map((corner) => dot(subtract(corner, middle), normal)));
+  return add(middle, scaled(normal, depth));
+}
+
+/** The pose that rests an object on a point of a surface, turned as it is. */
+export function restOn(pose: Pose, bounds: Bounds | null, point: Vector, normal: Vector): Pose {
+  const way = subtract(point, footOf(pose, bounds, normal));
+  return { ...pose, translation_m: add(pose.translation_m, way) };
+}
+
+/** The pose that rests an object on a point of a surface, its up along the normal. */
 export function standOn(pose: Pose, bounds: Bounds | null, point: Vector, normal: Vector): Pose {
-  const up = rotate(pose.rotation_wxyz, UP);
-  const turn = turnBetween(up, levelled(normal));
-  const rotation_wxyz = multiply(turn, pose.rotation_wxyz);
-  const foot: Vector = bounds
-    ? [(bounds.minimum[0] + bounds.maximum[0]) / 2, (bounds.minimum[1] + bounds.maximum[1]) / 2, bounds.minimum[2]]
-    : [0, 0, 0];
-  const offset = rotate(rotation_wxyz, scaled(foot, pose.scale));
-  return { ...pose, rotation_wxyz, translation_m: subtract(point, offset) };
+  const up = levelled(normal);
+  const turn = turnBetween(rotate(pose.rotation_wxyz, UP), up);
+  return restOn({ ...pose, rotation_wxyz: multiply(turn, pose.rotation_wxyz) }, bounds, point, up);
 }

@@ -1,5 +1,6 @@
 // What people do to the scene, in one step each.
 import { API, request } from "../api/http";
+import { lookAt } from "../live/pick";
 import type {
   AssetAnswer,
   LightType,
@@ -28,8 +29,7 @@ import { tool } from "./tools";
 const UPRIGHT: Pose = { translation_m: [0, 0, 0], rotation_wxyz: [1, 0, 0, 0], scale: 1 };
 
 export async function pick(pixel: Pixel): Promise<PickAnswer | undefined> {
-  const body = { x: Math.max(0, pixel[0]), y: Math.max(0, pixel[1]) };
-  return attempt(() => request<PickAnswer>("POST", `${API}/live/pick`, { body }));
+  return attempt(() => lookAt(pixel));
 }
 
 /** Where something new is put: on what the picture shows at a pixel, else on the board's plane there. */

@@ -1,5 +1,5 @@
 // Beginning and end of a session with the service.
-import { signal } from "@preact/signals";
+import { effect, signal } from "@preact/signals";
 import { API, ProblemError, request } from "../api/http";
 import { keepToken, phase, signInProblem, token } from "../api/session";
 import type { Settings } from "../api/types";
@@ -35,9 +35,16 @@ export async function signIn(given: string): Promise<void> {
   await begin();
 }
 
+/** Without a token nothing is asked for, until somebody signs in. */
+export function followSession(): void {
+  effect(() => {
+    if (phase.value !== "sign-in") return;
+    stopEvents();
+    stopPicture();
+  });
+}
+
 export function signOut(): void {
-  stopEvents();
-  stopPicture();
   keepToken(null);
   signInProblem.value = "";
   phase.value = "sign-in";

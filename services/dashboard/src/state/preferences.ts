@@ -26,6 +26,11 @@ export const isDrawerOpen = kept("drawer", false);
 export const drawerTab = kept<DrawerTab>("drawer-tab", "performance");
 export const isGuideDismissed = kept("guide-dismissed", false);
 
+/** An object that is dragged stands on what the camera sees under it; without, it keeps its height. */
+export const standsOnSurfaces = kept("stands-on-surfaces", true);
+/** It leans with a slope that it is dragged onto; without, it stays turned as it is. */
+export const leansWithSurfaces = kept("leans-with-surfaces", false);
+
 export function openDrawer(tab: DrawerTab): void {
   drawerTab.value = tab;
   isDrawerOpen.value = true;

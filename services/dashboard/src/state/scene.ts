@@ -41,7 +41,7 @@ export function takeScene(answer: SceneAnswer): void {
 /** Take what the render server made of the scene. */
 export function takePicture(sceneId: string, picture: PictureState): void {
   const current = served.value;
-  if (current?.id !== sceneId) return;
+  if (current?.id !== sceneId || (current.picture && current.picture.revision > picture.revision)) return;
   if (picture.state === "refused" && current.picture?.detail !== picture.detail) toast(picture.detail, "error");
   served.value = { ...current, picture };
 }

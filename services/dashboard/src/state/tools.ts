@@ -1,6 +1,6 @@
 // The tool in hand, and what is drawn over the picture.
 import { effect, signal } from "@preact/signals";
-import type { Pose } from "../api/types";
+import type { Pose, Vector } from "../api/types";
 import { frame } from "../live/picture";
 
 export type Tool = "select" | "move" | "rotate" | "scale" | "place";
@@ -19,6 +19,14 @@ export interface Draft {
 }
 
 export const draft = signal<Draft | null>(null);
+
+/** Where on a surface an object stands while it is dragged. */
+export interface Footing {
+  readonly point: Vector;
+  readonly normal: Vector;
+}
+
+export const footing = signal<Footing | null>(null);
 
 /** A draft ends with the first frame that shows its revision. */
 export function followFrames(): void {

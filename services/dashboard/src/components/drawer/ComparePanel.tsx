@@ -51,7 +51,13 @@ export function ComparePanel() {
 function SideChoice({ label, choice }: { readonly label: string; readonly choice: Signal<Choice> }) {
   return (
     <Field label={label}>
-      <Select label={label} value={choice.value} choices={CHOICES} onChange={(next) => (choice.value = next)} />
+      <Select
+        label={label}
+        value={choice.value}
+        choices={CHOICES}
+        onChange={(next) => (choice.value = next)}
+        disabled={role.value !== "control"}
+      />
     </Field>
   );
 }

@@ -39,7 +39,7 @@ export function Drawer() {
         />
       </div>
       {isOpen && (
-        <div class="drawer-body" role="tabpanel" id={PANEL_ID} aria-labelledby={`${PANEL_ID}-${tab}`}>
+        <div class="drawer-body" role="tabpanel" tabIndex={0} id={PANEL_ID} aria-labelledby={`${PANEL_ID}-${tab}`}>
           <Panel tab={tab} />
         </div>
       )}

@@ -1,8 +1,13 @@
 import { API } from "../../api/http";
+import type { Fisheye } from "../../api/types";
 import { hexFromLinear } from "../../math/color";
+import { trimmed } from "../../math/units";
 import { fisheye } from "../../state/processes";
 import { Icon } from "../ui/Icon";
 import { SecureImage } from "../ui/SecureImage";
+
+// Less of a picture that is too bright to be measured changes no light.
+const SOME = 0.0005;
 
 /** The fish-eye picture with the lights that were found in it. */
 export function FisheyePicture() {
@@ -15,31 +20,46 @@ export function FisheyePicture() {
       </article>
     );
   }
+  const found = seen.lights.length === 1 ? "1 light" : `${seen.lights.length} lights`;
   return (
     <article class="card fisheye" aria-label="Fish-eye camera">
       <div class="fisheye-picture" style={{ aspectRatio: `${seen.width} / ${seen.height}` }}>
         <SecureImage path={`${API}/fisheye.jpg?seen=${seen.seen_ns}`} alt="Fish-eye picture" />
-        <svg viewBox={`0 0 ${seen.width} ${seen.height}`} role="img" aria-label={`${seen.lights.length} lights`}>
+        <svg viewBox={`0 0 ${seen.width} ${seen.height}`} role="img" aria-label={found}>
           {seen.lights.map((light, index) => (
             <g key={index}>
               <circle
                 cx={light.x}
                 cy={light.y}
-                r={Math.max(light.radius_px, seen.width / 60)}
+                r={ringOf(light, seen.width)}
                 stroke={hexFromLinear(light.color_linear)}
               />
-              <text x={light.x + light.radius_px + seen.width / 50} y={light.y}>
+              <text font-size={seen.width / 10} x={light.x + ringOf(light, seen.width) + seen.width / 60} y={light.y}>
                 {index + 1}
               </text>
             </g>
           ))}
         </svg>
       </div>
-      <p class="small">
+      <div class="small">
         <b>Fish-eye camera</b>
-        <br />
-        <span class="quiet">{seen.lights.length === 1 ? "1 light found" : `${seen.lights.length} lights found`}</span>
-      </p>
+        <p class="quiet">{found} found</p>
+        <ol title="What each gives a surface that faces it; 1 = what the camera shows white">
+          {seen.lights.map((light, index) => (
+            <li key={index}>
+              {index + 1}
+              <i class="tree-color" style={{ background: hexFromLinear(light.color_linear) }} />
+              {trimmed(Math.max(...light.irradiance), 2)}
+            </li>
+          ))}
+        </ol>
+        {seen.clipped_share > SOME && <p class="quiet">{trimmed(100 * seen.clipped_share, 1)} % is too bright</p>}
+      </div>
     </article>
   );
+}
+
+/** Around the light, so that it stays visible inside. */
+function ringOf({ radius_px }: Fisheye["lights"][number], width: number): number {
+  return Math.max(1.6 * radius_px, width / 30);
 }

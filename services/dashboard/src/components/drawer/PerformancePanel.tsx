@@ -1,6 +1,6 @@
 import type uPlot from "uplot";
 import { frame } from "../../live/picture";
-import { leadingPasses, samples, stacked, timeOf, type Sample } from "../../live/telemetry";
+import { leadingPasses, OTHERS, samples, stacked, timeOf, type Sample } from "../../live/telemetry";
 import { milliseconds } from "../../math/units";
 import { Empty } from "../ui/Empty";
 import { Plot, type Series } from "./Plot";
@@ -77,15 +77,26 @@ function PassLegend({ sample, names }: { readonly sample: Sample; readonly names
       </caption>
       <tbody>
         {names.map((name, index) => (
-          <tr key={name}>
+          <tr key={name} class={sample.kept.has(name) ? "kept" : ""}>
             <th scope="row">
               <i style={{ background: COLORS[index] }} />
               <span class="cut">{name.replaceAll("_", " ")}</span>
             </th>
-            <td>{timeOf(sample, name, names).toFixed(1)}</td>
+            <td>{passText(sample, name, names)}</td>
           </tr>
         ))}
       </tbody>
+      {sample.kept.size > 0 && (
+        <tfoot>
+          <tr>
+            <td colSpan={2}>Nothing moves: pale ones are used again, with their last times.</td>
+          </tr>
+        </tfoot>
+      )}
     </table>
   );
+}
+
+function passText(sample: Sample, name: string, names: readonly string[]): string {
+  return name === OTHERS || name in sample.passes ? timeOf(sample, name, names).toFixed(1) : "–";
 }

@@ -20,7 +20,12 @@ export function SnapshotsPanel() {
         >
           {isBusy ? "Rendering…" : "Take a snapshot"}
         </Button>
-        <Switch label="Linear EXR too" checked={withExr.value} onChange={(on) => (withExr.value = on)} />
+        <Switch
+          label="Linear EXR too"
+          checked={withExr.value}
+          onChange={(on) => (withExr.value = on)}
+          disabled={role.value !== "control"}
+        />
         <p class="quiet small">One frame in every view, as PNG.</p>
       </div>
       {snapshots.value.length === 0 && (

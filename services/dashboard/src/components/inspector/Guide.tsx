@@ -1,3 +1,4 @@
+import { role } from "../../api/session";
 import { isGuideDismissed, openDrawer } from "../../state/preferences";
 import { objects } from "../../state/scene";
 import { inspectorTab, selectedObjectId, selectObject } from "../../state/selection";
@@ -5,7 +6,7 @@ import { IconButton } from "../ui/IconButton";
 
 /** What to try first; goes for good when it is closed. */
 export function Guide() {
-  if (isGuideDismissed.value) return null;
+  if (isGuideDismissed.value || role.value !== "control") return null;
   const first = objects.value[0];
   const isShort = inspectorTab.value !== "object" || selectedObjectId.value !== null;
   return (

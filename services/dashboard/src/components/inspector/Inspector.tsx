@@ -27,7 +27,7 @@ export function Inspector() {
         onChange={(next) => (inspectorTab.value = next)}
         panelId={PANEL_ID}
       />
-      <div class="scroll" role="tabpanel" id={PANEL_ID} aria-labelledby={`${PANEL_ID}-${tab}`}>
+      <div class="scroll" role="tabpanel" tabIndex={0} id={PANEL_ID} aria-labelledby={`${PANEL_ID}-${tab}`}>
         <Panel tab={tab} />
       </div>
       <Guide />

@@ -40,7 +40,8 @@ export function LightsPanel() {
           label="Light mode"
           segments={MODES}
           value={found.mode}
-          onChange={(mode) => !disabled && void setMode(found, mode)}
+          onChange={(mode) => setMode(found, mode)}
+          disabled={disabled}
         />
         <p class="quiet small">{HELP[found.mode]}</p>
       </Section>

@@ -1,10 +1,12 @@
 import type { Pose, SceneObject } from "../../api/types";
 import { anglesFromQuaternion, quaternionFromAngles } from "../../math/rotation";
 import { objectTarget } from "../../state/targets";
+import { leansWithSurfaces, standsOnSurfaces } from "../../state/preferences";
 import { draft } from "../../state/tools";
 import { Button } from "../ui/Button";
 import { Field } from "../ui/Field";
 import { NumberInput } from "../ui/NumberInput";
+import { Switch } from "../ui/Switch";
 import { useGesture } from "../ui/useGesture";
 import { VectorInput } from "../ui/VectorInput";
 import { Section } from "./Section";
@@ -54,6 +56,19 @@ export function PoseSection({ item, disabled }: PoseSectionProps) {
         decimals={1}
         disabled={disabled}
       />
+      <Field
+        label="Lean with surfaces"
+        help="While it is dragged over the picture, its up follows slopes and walls. Else it stays turned as it is, and stands on what is not too steep."
+        inline
+      >
+        <Switch
+          label=""
+          name="Lean with surfaces"
+          checked={leansWithSurfaces.value}
+          disabled={disabled || !standsOnSurfaces.value}
+          onChange={(leans) => (leansWithSurfaces.value = leans)}
+        />
+      </Field>
       <Field label="Scale" inline>
         <NumberInput
           label="Scale"

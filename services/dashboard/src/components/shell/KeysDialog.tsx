@@ -15,6 +15,7 @@ const GROUPS: readonly { readonly title: string; readonly keys: readonly (readon
       ["R or E", "rotate"],
       ["S", "scale"],
       ["P", "place on a surface: click where"],
+      ["F", "stand on surfaces while dragging, or keep the height"],
       ["Shift", "snap to 1 cm, 15°, 0.1 while dragging"],
       ["Esc", "cancel the drag; else select nothing"],
     ],

@@ -14,6 +14,7 @@ export function SceneMenu() {
   const file = useRef<HTMLInputElement>(null);
   const current = scene.value;
   const name = sceneDocument.value?.name ?? "";
+  const shown = current ? name || "untitled" : "No scene";
   const mayChange = role.value === "control";
   const others = scenes.value.map((each): MenuEntry => ({
     label: each.name || "untitled",
@@ -42,8 +43,8 @@ export function SceneMenu() {
   ];
   return (
     <>
-      <Menu label="Scenes" entries={entries}>
-        <span class="cut scene-name">{current ? name || "untitled" : "No scene"}</span>
+      <Menu label={`Scenes: ${shown}`} entries={entries}>
+        <span class="cut scene-name">{shown}</span>
         <Icon name="down" />
       </Menu>
       <input

@@ -1,12 +1,16 @@
 import { useSignal } from "@preact/signals";
+import { useEffect, useRef } from "preact/hooks";
 import { signInProblem } from "../../api/session";
 import { signIn } from "../../state/begin";
 import { Button } from "../ui/Button";
+import { Sentence } from "../ui/Sentence";
 import { Mark } from "../ui/Mark";
 
 /** Shown where the service needs a token. */
 export function SignIn() {
   const given = useSignal("");
+  const field = useRef<HTMLInputElement>(null);
+  useEffect(() => field.current?.focus(), []);
   const onSubmit = (event: SubmitEvent): void => {
     event.preventDefault();
     if (given.value.trim()) void signIn(given.value);
@@ -19,14 +23,18 @@ export function SignIn() {
           <h1>Deltalight</h1>
           <p class="quiet">This service is open to other hosts, so it asks for a token.</p>
         </div>
-        {signInProblem.value && <p role="alert">{signInProblem.value}</p>}
+        {signInProblem.value && (
+          <p role="alert">
+            <Sentence text={signInProblem.value} />
+          </p>
+        )}
         <label class="field">
           <span class="field-label">Token</span>
           <input
             class="input"
             type="password"
             autocomplete="current-password"
-            autofocus
+            ref={field}
             value={given.value}
             onInput={(event) => (given.value = event.currentTarget.value)}
           />

@@ -4,6 +4,7 @@ import { VIEWS } from "../../forms/views";
 import { duplicateObject, removeLight, removeObject, setView } from "../../state/actions";
 import { redo, undo } from "../../state/history";
 import { endNudge } from "../../state/nudge";
+import { standsOnSurfaces } from "../../state/preferences";
 import { selectLight, selectedLight, selectedObjectId, selectObject } from "../../state/selection";
 import { areOutlinesShown, tool, type Tool } from "../../state/tools";
 import { areKeysShown } from "./KeysDialog";
@@ -53,6 +54,7 @@ function onPlainKey(key: string): boolean {
   const nextView = VIEWS[Number(key) - 1];
   if (nextTool) tool.value = nextTool;
   else if (nextView && role.value === "control") void setView(nextView.value);
+  else if (key === "f" && role.value === "control") standsOnSurfaces.value = !standsOnSurfaces.value;
   else if (key === "h") areOutlinesShown.value = !areOutlinesShown.value;
   else if (key === "?") areKeysShown.value = true;
   else if (key === "escape") return leave();

@@ -4,8 +4,8 @@ import { pictureSize, view } from "../../live/picture";
 import { boundsByObject } from "../../state/assets";
 import { lights, objects } from "../../state/scene";
 import { selectedLight, selectedObjectId } from "../../state/selection";
-import { areOutlinesShown, draft } from "../../state/tools";
-import { drawBox, drawLamp, drawPlumbLine, lampMarks, type Sheet } from "./outlines";
+import { areOutlinesShown, draft, footing } from "../../state/tools";
+import { drawBox, drawLamp, drawPlumbLine, drawRing, lampMarks, type Sheet } from "./outlines";
 import type { Box } from "./fit";
 import { hovered } from "./pointer";
 
@@ -17,6 +17,7 @@ export function Outlines({ box }: { readonly box: ReadonlySignal<Box> }) {
     if (!sheet || !areOutlinesShown.value) return;
     const accent = getComputedStyle(document.documentElement).getPropertyValue("--on-picture").trim();
     drawObjects(sheet, accent);
+    if (footing.value) drawRing(sheet, footing.value, accent);
     if (lights.value?.mode === "manual") drawLamps(sheet, accent);
   });
   return <canvas class="layer" ref={canvas} aria-hidden="true" />;

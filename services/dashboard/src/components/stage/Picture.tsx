@@ -29,7 +29,7 @@ export function Picture() {
 
   useEffect(() => {
     showPictureOn(picture.current);
-    if (surface.current) pointer.current = new PicturePointer(surface.current, () => gizmo.current?.isTouched === true);
+    if (surface.current) pointer.current = new PicturePointer(surface.current, () => gizmo.current);
     return () => showPictureOn(null);
   }, []);
 
@@ -54,7 +54,7 @@ export function Picture() {
         style={style}
         onDragOver={(event) => {
           event.preventDefault();
-          isDropping.value = true;
+          isDropping.value = role.value === "control";
         }}
         onDragLeave={() => (isDropping.value = false)}
         onDrop={onDrop}

@@ -1,7 +1,10 @@
+import { useSignal } from "@preact/signals";
+import { useEffect } from "preact/hooks";
 import { isSceneRead, scene } from "../../state/scene";
-import { liveState, retryPicture } from "../../live/picture";
+import { frame, liveState, retryPicture } from "../../live/picture";
 import { isTakingSnapshot } from "../../state/takes";
 import { Button } from "../ui/Button";
+import { Sentence } from "../ui/Sentence";
 import { Icon } from "../ui/Icon";
 
 /** Says why there is no picture, or why it stands still, and what to do. */
@@ -38,6 +41,8 @@ export function PictureNotice() {
   }
 }
 
+// A slow renderer takes a change that late; while it takes others, nothing is wrong.
+const TAKEN_MS = 5000;
 const PENDING = "The render server does not answer; it gets this scene as soon as it does.";
 
 function staleText(): string {
@@ -48,7 +53,14 @@ function staleText(): string {
 
 function Pending() {
   const state = scene.value?.picture;
-  if (state?.state === "pending") return <Banner text={PENDING} />;
+  const isPending = state?.state === "pending";
+  const isLong = useSignal(false);
+  useEffect(() => {
+    isLong.value = false;
+    const timer = setTimeout(() => (isLong.value = true), TAKEN_MS);
+    return () => clearTimeout(timer);
+  }, [isPending, frame.value?.scene?.revision]);
+  if (isPending) return isLong.value ? <Banner text={PENDING} /> : null;
   if (state?.state === "refused") return <Banner text={state.detail} />;
   return null;
 }
@@ -56,7 +68,7 @@ function Pending() {
 function Banner({ text }: { readonly text: string }) {
   return (
     <p class="picture-banner">
-      <Icon name="alert" /> {text}
+      <Icon name="alert" /> <Sentence text={text} />
     </p>
   );
 }
@@ -66,7 +78,9 @@ function Full({ title, text }: { readonly title: string; readonly text: string }
     <div class="picture-full">
       <Icon name="film" />
       <h2>{title}</h2>
-      <p>{text}</p>
+      <p>
+        <Sentence text={text} />
+      </p>
     </div>
   );
 }

@@ -3,6 +3,7 @@ import type { MethodName, View } from "../../api/types";
 import { METHODS } from "../../forms/methods";
 import { VIEWS } from "../../forms/views";
 import { setMethod, setView } from "../../state/actions";
+import { standsOnSurfaces } from "../../state/preferences";
 import { sceneDocument } from "../../state/scene";
 import { areOutlinesShown, isSnapping, tool, type Tool } from "../../state/tools";
 import { IconButton } from "../ui/IconButton";
@@ -24,12 +25,28 @@ export function StageBar() {
   const isDisabled = role.value !== "control" || document === null;
   return (
     <div class="stage-bar" role="toolbar" aria-label="Tools">
-      <Segments label="Tool" segments={TOOLS} value={tool.value} onChange={(next) => (tool.value = next)} compact />
+      <Segments
+        label="Tool"
+        segments={TOOLS}
+        value={tool.value}
+        onChange={(next) => (tool.value = next)}
+        disabled={isDisabled}
+        compact
+      />
+      <IconButton
+        icon="stand"
+        label="Stand on surfaces"
+        hint="F: what is dragged stands on what the camera sees"
+        pressed={standsOnSurfaces.value}
+        disabled={isDisabled}
+        onClick={() => (standsOnSurfaces.value = !standsOnSurfaces.value)}
+      />
       <IconButton
         icon="magnet"
         label="Snap to steps"
         hint="or hold Shift"
         pressed={isSnapping.value}
+        disabled={isDisabled}
         onClick={() => (isSnapping.value = !isSnapping.value)}
       />
       <IconButton

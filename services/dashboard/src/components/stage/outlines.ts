@@ -3,6 +3,8 @@ import type { ManualLight, Pose, Vector } from "../../api/types";
 import { corners, EDGES, type Bounds } from "../../math/bounds";
 import { project, type Pixel, type View } from "../../math/camera";
 import { hexFromLinear } from "../../math/color";
+import { add, cross, normalized, scaled } from "../../math/vector";
+import type { Footing } from "../../state/tools";
 
 export interface Sheet {
   readonly context: CanvasRenderingContext2D;
@@ -26,6 +28,8 @@ export interface LampMark {
 
 const MARGIN_PX = 18;
 const LAMP_PX = 9;
+const RING_M = 0.025;
+const RING_STEPS = 24;
 const EDGE_STEPS = 6; // pieces of an edge, so that lenses bend it
 
 /** Place on the sheet of a point in the world, CSS pixels; null behind the camera. */
@@ -38,17 +42,38 @@ export function drawBox(sheet: Sheet, pose: Pose, bounds: Bounds, style: BoxStyl
   const { context } = sheet;
   const points = corners(pose, bounds);
   context.setLineDash(style.isDashed ? [5, 4] : []);
-  for (const [width, color] of [
+  strokeTwice(sheet, style.color, () => {
+    for (const [from, to] of EDGES) strokeEdge(sheet, points[from]!, points[to]!);
+  });
+  context.setLineDash([]);
+}
+
+/** A ring on a surface: where an object stands on it. */
+export function drawRing(sheet: Sheet, { point, normal }: Footing, color: string): void {
+  const side = normalized(cross(normal, Math.abs(normal[0]) < 0.9 ? [1, 0, 0] : [0, 1, 0]));
+  const across = cross(normal, side);
+  const rim = Array.from({ length: RING_STEPS }, (_, index) => {
+    const angle = (2 * Math.PI * index) / RING_STEPS;
+    return add(point, add(scaled(side, RING_M * Math.cos(angle)), scaled(across, RING_M * Math.sin(angle))));
+  });
+  strokeTwice(sheet, color, () => {
+    for (const [index, from] of rim.entries()) strokeEdge(sheet, from, rim[(index + 1) % RING_STEPS]!);
+    strokeEdge(sheet, point, add(point, scaled(normal, RING_M)));
+  });
+}
+
+/** Dark below the colour, so that it is seen on any picture. */
+function strokeTwice({ context }: Sheet, color: string, draw: () => void): void {
+  for (const [width, style] of [
     [3, "rgb(0 0 0 / 45%)"],
-    [1.5, style.color],
+    [1.5, color],
   ] as const) {
     context.lineWidth = width;
-    context.strokeStyle = color;
+    context.strokeStyle = style;
     context.beginPath();
-    for (const [from, to] of EDGES) strokeEdge(sheet, points[from]!, points[to]!);
+    draw();
     context.stroke();
   }
-  context.setLineDash([]);
 }
 
 function strokeEdge({ context, view, factor }: Sheet, from: Vector, to: Vector): void {

@@ -1,18 +1,17 @@
-// The pointer on the picture: click selects, dragging the selected object or a lamp slides it over the ground.
+// The pointer on the picture: a click selects, dragging the selected object or lamp slides it.
 import { signal } from "@preact/signals";
 import { role } from "../../api/session";
-import type { Pose, Vector } from "../../api/types";
+import type { Gizmo } from "../../gizmo/gizmo";
 import { pictureSize, view } from "../../live/picture";
-import { meetPlane, type Pixel } from "../../math/camera";
-import { snap, SNAP_M } from "../../math/snap";
-import { add, subtract, UP } from "../../math/vector";
+import type { Pixel } from "../../math/camera";
 import { pick, placeObject } from "../../state/actions";
-import { handle, HandleDrag } from "../../state/handle";
+import { beginSlide, slidesOnSurfaces, type Slide } from "../../state/slide";
 import { selectedLight, selectedObjectId, selectLight, selectObject } from "../../state/selection";
 import { isSnapping, tool } from "../../state/tools";
 import { lampAt, objectsAt } from "./hits";
 
-const CLICK_PX = 4;
+// A press that moves less is a click; a finger rolls where a mouse stands still.
+const CLICK_PX = { mouse: 4, touch: 10 };
 
 /** The object under the pointer. */
 export const hovered = signal<string | null>(null);
@@ -21,44 +20,9 @@ interface Press {
   readonly x: number;
   readonly y: number;
   readonly slides: boolean;
+  /** On a handle of the gizmo, where a click means nothing. */
+  readonly isOnHandle: boolean;
   slide: Slide | null;
-}
-
-/** Sliding over the horizontal plane through what is held. */
-class Slide {
-  private readonly drag: HandleDrag;
-  private readonly from: Vector;
-
-  constructor(
-    private readonly pose: Pose,
-    from: Vector,
-    drag: HandleDrag,
-  ) {
-    this.from = from;
-    this.drag = drag;
-  }
-
-  static begin(pixel: Pixel): Slide | null {
-    const held = handle.value;
-    const from = held && view.value && meetPlane(view.value, pixel, held.pose.translation_m, UP);
-    return held && from ? new Slide(held.pose, from, new HandleDrag(held)) : null;
-  }
-
-  move(pixel: Pixel, snaps: boolean): void {
-    const to = view.value && meetPlane(view.value, pixel, this.pose.translation_m, UP);
-    if (!to) return;
-    const [x, y, z] = add(this.pose.translation_m, subtract(to, this.from));
-    this.drag.move({ ...this.pose, translation_m: snaps ? [snap(x, SNAP_M), snap(y, SNAP_M), z] : [x, y, z] });
-  }
-
-  cancel(): void {
-    this.drag.move(this.pose);
-    this.end();
-  }
-
-  end(): void {
-    void this.drag.end();
-  }
 }
 
 export class PicturePointer {
@@ -66,34 +30,42 @@ export class PicturePointer {
 
   constructor(
     private readonly surface: HTMLElement,
-    private readonly isOnGizmo: () => boolean,
+    private readonly gizmo: () => Gizmo | null,
   ) {}
 
   down(event: PointerEvent): void {
-    if (event.button !== 0 || this.isOnGizmo()) return;
+    if (event.button !== 0 || !event.isPrimary) return;
     const [x, y] = this.place(event);
-    this.press = { x, y, slides: this.grabs([x, y]), slide: null };
+    const grip = this.gizmo()?.gripAt(event) ?? null;
+    if (grip === null) this.press = { x, y, slides: this.grabs([x, y]), isOnHandle: false, slide: null };
+    else if (grip === "free" && slidesOnSurfaces()) {
+      this.gizmo()?.pause(true); // its own drag would leave the surfaces
+      this.press = { x, y, slides: true, isOnHandle: true, slide: null };
+    }
   }
 
   move(event: PointerEvent): void {
+    if (!event.isPrimary) return;
     const at = this.place(event);
     const press = this.press;
     if (!press) {
-      hovered.value = view.value && !this.isOnGizmo() ? (objectsAt(view.value, this.pixel(at))[0] ?? null) : null;
+      const isOnGizmo = this.gizmo()?.isTouched === true;
+      hovered.value = view.value && !isOnGizmo ? (objectsAt(view.value, this.pixel(at))[0] ?? null) : null;
       return;
     }
-    if (!press.slide && press.slides && Math.hypot(at[0] - press.x, at[1] - press.y) > CLICK_PX) {
-      press.slide = Slide.begin(this.pixel([press.x, press.y]));
+    if (!press.slide && press.slides && !isClick(press, at, event)) {
+      press.slide = beginSlide(this.pixel([press.x, press.y]));
       this.surface.setPointerCapture(event.pointerId);
     }
     press.slide?.move(this.pixel(at), event.shiftKey !== isSnapping.value);
   }
 
   up(event: PointerEvent): void {
-    const press = this.press;
-    this.press = null;
+    if (!event.isPrimary) return;
+    const press = this.release();
     if (press?.slide) press.slide.end();
-    else if (press && this.moved(press, event) <= CLICK_PX) void this.click([press.x, press.y]);
+    else if (press && !press.isOnHandle && isClick(press, this.place(event), event))
+      void this.click([press.x, press.y]);
   }
 
   leave(): void {
@@ -102,20 +74,21 @@ export class PicturePointer {
 
   /** Put back what slides; false where nothing does. */
   cancel(): boolean {
-    const slide = this.press?.slide ?? null;
-    this.press = null;
+    const slide = this.release()?.slide ?? null;
     slide?.cancel();
     return slide !== null;
+  }
+
+  private release(): Press | null {
+    const press = this.press;
+    this.press = null;
+    this.gizmo()?.pause(false);
+    return press;
   }
 
   /** A pixel of the picture at a place of a mouse or drop event. */
   pixelOf(event: MouseEvent): Pixel {
     return this.pixel(this.place(event));
-  }
-
-  private moved(press: Press, event: PointerEvent): number {
-    const [x, y] = this.place(event);
-    return Math.hypot(x - press.x, y - press.y);
   }
 
   /** Whether a press here holds the selection, so that moving the pointer slides it. */
@@ -157,4 +130,8 @@ export class PicturePointer {
     const factor = (pictureSize.value?.width ?? 1) / this.surface.getBoundingClientRect().width;
     return [x * factor - 0.5, y * factor - 0.5];
   }
+}
+
+function isClick(press: Press, [x, y]: Pixel, { pointerType }: PointerEvent): boolean {
+  return Math.hypot(x - press.x, y - press.y) <= (pointerType === "touch" ? CLICK_PX.touch : CLICK_PX.mouse);
 }

@@ -53,7 +53,9 @@ export function AssetList() {
           <AssetCard key={asset.asset} asset={asset} mayChange={mayChange} />
         ))}
       </ul>
-      {assets.value.length === 0 && <p class="tree-empty">Drop GLB, OBJ, PLY, STL, HDR or EXR files here.</p>}
+      {assets.value.length === 0 && (
+        <p class="tree-empty">{mayChange ? "Drop GLB, OBJ, PLY, STL, HDR or EXR files here." : "None yet."}</p>
+      )}
     </section>
   );
 }

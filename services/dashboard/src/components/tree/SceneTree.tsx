@@ -23,18 +23,21 @@ const MODES = {
   environment: "Environment map",
 } as const;
 
-/** Objects, lights and real surfaces; arrow keys walk through them. */
+/** Objects, lights and real surfaces; arrow keys walk through all of them. */
 export function SceneTree() {
   const document = sceneDocument.value;
   return (
-    <div class="scroll" role="tree" aria-label="Scene" onKeyDown={walk}>
-      <TreeGroup title="Objects">
-        {objects.value.length === 0 && <p class="tree-empty">None yet. Drop a .glb on the picture.</p>}
+    <div class="scroll" onKeyDown={walk}>
+      <TreeGroup title="Objects" empty={objects.value.length > 0 ? null : noObjects()}>
         {objects.value.map((item) => (
           <ObjectItem key={item.id} id={item.id} visible={item.visible} />
         ))}
       </TreeGroup>
-      <TreeGroup title="Lights" action={<AddLightButton />}>
+      <TreeGroup
+        title="Lights"
+        action={<AddLightButton />}
+        empty={hasLights() ? null : "No lamps: only the surroundings shine."}
+      >
         <LightItems />
       </TreeGroup>
       <TreeGroup title="Real scene">
@@ -56,6 +59,10 @@ export function SceneTree() {
       </TreeGroup>
     </div>
   );
+}
+
+function noObjects(): string {
+  return role.value === "control" ? "None yet. Drop a .glb on the picture." : "None yet.";
 }
 
 function ObjectItem({ id, visible }: { readonly id: string; readonly visible: boolean }) {
@@ -80,6 +87,10 @@ function ObjectItem({ id, visible }: { readonly id: string; readonly visible: bo
   );
 }
 
+function hasLights(): boolean {
+  return lights.value !== null && (lights.value.mode !== "manual" || lights.value.manual.length > 0);
+}
+
 function LightItems() {
   const found = lights.value;
   if (!found) return null;
@@ -93,7 +104,6 @@ function LightItems() {
       />
     );
   }
-  if (found.manual.length === 0) return <p class="tree-empty">No lamps: only the surroundings shine.</p>;
   return (
     <>
       {found.manual.map((light, index) => (

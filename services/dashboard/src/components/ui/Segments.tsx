@@ -15,10 +15,12 @@ interface SegmentsProps<T extends string> {
   readonly onChange: (value: T) => unknown;
   /** Icons alone; the labels stay for screen readers and tips. */
   readonly compact?: boolean;
+  readonly disabled?: boolean;
 }
 
 /** One of a few, side by side; real radio buttons, so that keys work as everywhere. */
-export function Segments<T extends string>({ label, value, segments, onChange, compact = false }: SegmentsProps<T>) {
+export function Segments<T extends string>(props: SegmentsProps<T>) {
+  const { label, value, segments, onChange, compact = false, disabled = false } = props;
   const name = useId();
   return (
     <div class="segments" role="radiogroup" aria-label={label}>
@@ -29,6 +31,7 @@ export function Segments<T extends string>({ label, value, segments, onChange, c
             name={name}
             aria-label={segment.label}
             checked={segment.value === value}
+            disabled={disabled}
             onChange={() => onChange(segment.value)}
           />
           {segment.icon && <Icon name={segment.icon} />}

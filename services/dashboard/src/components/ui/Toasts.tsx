@@ -1,6 +1,7 @@
 import { announcement, dismiss, toasts } from "../../state/toasts";
 import { Icon } from "./Icon";
 import { IconButton } from "./IconButton";
+import { Sentence } from "./Sentence";
 
 /** Sentences over the page, and the line that only screen readers get. */
 export function Toasts() {
@@ -10,7 +11,9 @@ export function Toasts() {
         {toasts.value.map((each) => (
           <div key={each.id} class={`toast ${each.kind}`} role={each.kind === "error" ? "alert" : "status"}>
             <Icon name={each.kind === "error" ? "alert" : "info"} />
-            <p>{each.text}</p>
+            <p>
+              <Sentence text={each.text} />
+            </p>
             <IconButton icon="close" label="Dismiss" onClick={() => dismiss(each.id)} />
           </div>
         ))}
