@@ -202,9 +202,10 @@ class Lights(StrictModel):
     )
     surroundings: Literal["auto", "none"] = Field(
         default="auto",
-        description="Modes manual and tracked: light of what neither the camera nor the lights show. Below the "
-        "horizon the mean of the ground; above, more towards what is seen there, as strong as the board's paper "
-        "tells where board.yaml gives its white_albedo. Or none.",
+        description="Modes manual and tracked: light of what neither the camera nor the lights show. Walls, table "
+        "and floor go on beyond the picture; elsewhere it is the mean of the ground below the horizon and above it "
+        "more towards what is seen there, as strong as the board's paper tells where board.yaml gives its "
+        "white_albedo. Or none.",
     )
 
     @model_validator(mode="after")

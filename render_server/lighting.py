@@ -9,18 +9,20 @@ from jaxtyping import Float32, UInt8
 from protocol import scene_lights as documents
 from protocol.frames import ViewFrame
 from render_server.growing_interval import GrowingInterval
-from render_server.light_registration import (
-    Relight,
-    find_surroundings,
-    ground_radiance,
-    register_lights,
-    surroundings_shape,
-)
+from render_server.light_registration import register_lights
+from render_server.light_samples import Relight, bounced_light
 from render_server.lights_view import lights_picture
 from render_server.relight.frame import RelightInput
+from render_server.scene.continued_planes import ContinuedPlanes
 from render_server.scene.light_sources import open_lights
 from render_server.scene.lights import LightSet
 from render_server.scene.registration import RegistrationAverage
+from render_server.surroundings import (
+    find_continued_planes,
+    find_surroundings,
+    ground_radiance,
+    surroundings_shape,
+)
 
 Rgb = Float32[np.ndarray, "3"]
 VERSION_STEP = 8
@@ -57,6 +59,7 @@ class Lighting:
         self._average, self._interval = RegistrationAverage(), GrowingInterval()
         self._factor: Rgb | None = None
         self._ground: Rgb | None = None
+        self._walls: ContinuedPlanes | None = None
         self._sky: tuple[Rgb, Float32[np.ndarray, "n n 1"]] | None = None
 
     def follow(self, frame: ViewFrame) -> bool:
@@ -77,6 +80,8 @@ class Lighting:
         lights = self._raw.registered(self._factor)
         if self._ground is not None:
             lights = lights.with_ground(self._ground)
+        if self._walls is not None:
+            lights = lights.with_surfaces(self._walls.radiance, self._walls.share)
         if self._sky is not None:
             lights = lights.with_sky(*self._sky)
         self.lights, self.version = lights, next(self._versions)
@@ -140,10 +145,15 @@ class Lighting:
 
     def _find_surroundings(self, frame: ViewFrame, scene: RelightInput, relight: Relight) -> None:
         """Find the light of what is out of sight, as this frame shows it."""
+        trial = self.version + VERSION_STEP // 2
         lights = scene.lights if self._ground is None else scene.lights.with_ground(self._ground)
-        scene = replace(scene, lights=lights, lights_version=self.version + VERSION_STEP // 2)
-        shape = surroundings_shape(frame, scene)
-        found = find_surroundings(frame, scene, shape, relight)
+        scene = replace(scene, lights=lights, lights_version=trial)
+        bounce = bounced_light(scene, relight)
+        walls = self._walls = find_continued_planes(frame, scene, bounce, relight)
+        shape = surroundings_shape(frame, scene) * (1 - walls.share)
+        lights = lights.with_surfaces(walls.radiance, walls.share)
+        scene = replace(scene, lights=lights, lights_version=trial + 2)
+        found = find_surroundings(frame, scene, shape, bounce, relight)
         if found is not None:
             self._sky = (found, shape)
             radiance = ", ".join(f"{value:.3g}" for value in found)

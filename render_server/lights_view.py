@@ -102,7 +102,7 @@ def _color(light: SeenLight, strongest: float) -> tuple[int, ...]:
 
 
 def _draw_disc(sheet: _Sheet, light: SeenLight, color: tuple[int, ...]) -> None:
-    circle = _circle(light.toward, max(light.angular_radius_rad, LEAST_RADIUS_RAD))
+    circle = _circle(light.toward, max(float(light.angular_radius_rad), LEAST_RADIUS_RAD))
     sheet.line(circle, (0, 0, 0), 4, closed=True)
     sheet.line(circle, color, 2, closed=True)
 

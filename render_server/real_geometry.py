@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float32, Float64, UInt8
 
 from protocol.errors import DeltalightError
 from protocol.frames import DepthImage, ViewFrame
@@ -19,6 +19,7 @@ from render_server.scene.depth_surface import DepthSurface, depth_surface, noise
 from render_server.scene.fused_scene import FusedScene
 from render_server.scene.mesh import TriangleMesh, load_mesh, merge_for_gpu
 from render_server.scene.scene_tracker import RealSceneTracker
+from render_server.scene.steep_surfaces import steep_surfaces
 from render_server.view import CameraView
 
 COARSE_SHARE = 8  # of the triangles, for the coarse volume: its voxels are several times as large
@@ -101,7 +102,7 @@ class RealGeometry:
             self._build(self.model, None)
         else:
             assert frame.depth is not None
-            self._build_from_depth(frame.depth, view)
+            self._build_from_depth(frame.depth, frame.color, view)
         return True
 
     @property
@@ -158,15 +159,19 @@ class RealGeometry:
             return
         self._build(fine, triangle_corners(merge_for_gpu(coarse)))
 
-    def _build_from_depth(self, depth: DepthImage, view: CameraView) -> None:
+    def _build_from_depth(
+        self, depth: DepthImage, color: UInt8[np.ndarray, "h w 3"], view: CameraView
+    ) -> None:
         """Mesh the depth image, and once more with few triangles for what lies far from the objects."""
         self.surface = depth_surface(depth, view.camera)
+        steep = steep_surfaces(depth, color, view.camera)
         place = view.world_from_camera
-        fine = depth_mesh(depth, view.camera, place, self.budget, self.surface)
+        fine = depth_mesh(depth, view.camera, place, self.budget, self.surface, steep=steep)
         if not len(fine.triangles):
             self.state = None
             return
-        coarse = depth_mesh(depth, view.camera, place, self.budget // COARSE_SHARE, self.surface)
+        budget = self.budget // COARSE_SHARE
+        coarse = depth_mesh(depth, view.camera, place, budget, self.surface, steep=steep)
         self._build([fine], triangle_corners(merge_for_gpu([coarse])))
 
     def _build(

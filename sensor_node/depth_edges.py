@@ -5,7 +5,8 @@ camera does not see all that the first one does. The colour picture still shows 
 rim belongs to. Each such pixel looks at known samples around it, parts them into a nearer and a farther
 surface, extends a plane of each to itself and takes the one whose colours match it clearly better. The vote
 is shared with neighbours of similar colour, so that the rim comes out smooth. Pixels that see one surface
-only, or match both or neither, stay unknown.
+only, or match both or neither, stay unknown. So do those that resemble other unknown pixels much more than
+either surface: they show a third one, too steep to be measured, as the top of a box seen along it.
 """
 
 from collections.abc import Iterator
@@ -40,6 +41,11 @@ CLEAR_LOG_ODDS = float(np.log(4.0))
 MOST_LOG_ODDS = 3 * CLEAR_LOG_ODDS
 # Match of a colour that no surface around has (ten times the contrast away): it speaks for neither.
 ALIEN_MATCH = 1e-4
+# Unknown pixels are the nearest to an unknown one, so they resemble it most in any case: a third surface takes twice
+# the evidence (logarithms add) that decides between two.
+OWN_ODDS = 4.0**2
+# Lines thinner than this are edges, where colours mix to one of their own.
+OWN_WIDTH_PX = 3
 VOTE_RADIUS_PX = 2
 # Pixels worked on at a time: what they need stays in the processor's cache.
 CHUNK = 2048
@@ -70,6 +76,8 @@ class _Surfaces(NamedTuple):
     far: PerPixel
     log_odds: PerPixel
     """For the nearer surface, by colour."""
+    own: Bool[np.ndarray, " n"]
+    """Whether the colour is that of unknown pixels around and of neither surface."""
 
 
 def assign_edges(
@@ -101,10 +109,20 @@ def assign_edges(
     parts = [_seen(picture, part, offsets, noise, sigmas) for part in _chunks(places)]
     if parts:
         seen = _Surfaces(*(np.concatenate(values) for values in zip(*parts, strict=True)))
-        _assign(picture, seen, reach_px)
+        _assign(picture, _without_own(picture, seen), reach_px)
     inside = slice(margin, -margin)
     result = picture.inverse_depth.reshape(-1, picture.stride)[inside, inside]
     return np.where(known, inverse_depth, result), known | (result > 0)
+
+
+def _without_own(picture: _Padded, seen: _Surfaces) -> _Surfaces:
+    """Drop the pixels of areas in a colour of their own; where such pixels make but a thin line, they stay."""
+    own = np.zeros(len(picture.inverse_depth), np.uint8)
+    own[seen.places] = seen.own
+    window = np.ones((OWN_WIDTH_PX,) * 2, np.uint8)
+    areas = cv2.morphologyEx(own.reshape(-1, picture.stride), cv2.MORPH_OPEN, window).ravel()
+    kept = areas[seen.places] == 0
+    return _Surfaces(*(values[kept] for values in seen))
 
 
 def _assign(picture: _Padded, seen: _Surfaces, reach_px: int) -> None:
@@ -178,7 +196,8 @@ def _seen(
     samples = picture.inverse_depth.take(places + shifts)
     split = _split(samples, offsets.weight)
     nearer = (samples > split).astype(np.float32)
-    farther = (samples > 0) - nearer
+    unknown = (samples == 0).astype(np.float32)
+    farther = 1 - unknown - nearer
     near, near_stray = _continued(samples - split, nearer, offsets)
     far, far_stray = _continued(samples - split, farther, offsets)
     step = near - far
@@ -186,9 +205,11 @@ def _seen(
     two &= np.minimum(nearer.sum(axis=0), farther.sum(axis=0)) >= LEAST_SAMPLES
     places = places[two]
     match = _match(picture.color, places + shifts, places)
-    near_match, far_match = (_mean(match, part[:, two], offsets.weight) for part in (nearer, farther))
-    odds = (near_match + ALIEN_MATCH) / (far_match + ALIEN_MATCH)
-    return _Surfaces(places, (near + split)[two], (far + split)[two], np.log(odds))
+    near_match, far_match, own_match = (
+        _mean(match, part[:, two], offsets.weight) + ALIEN_MATCH for part in (nearer, farther, unknown)
+    )
+    own = own_match > OWN_ODDS * np.maximum(near_match, far_match)
+    return _Surfaces(places, (near + split)[two], (far + split)[two], np.log(near_match / far_match), own)
 
 
 def _split(samples: Samples, weight: Float32[np.ndarray, " samples"]) -> PerPixel:

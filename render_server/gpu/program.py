@@ -11,6 +11,9 @@ from render_server.gpu.context import GpuContext
 from render_server.gpu.shader_source import shader_source
 
 SOFTWARE_WALKERS = 1024
+# Mesa's software renderer ends all loops of a thread after 65535 turns in sum, without a word; tracing the cones of one
+# texel takes up to about 5000 (16 cones through 256 voxels and the coarse scene).
+SOFTWARE_SHARE = 12
 LIST_WALKERS = 16384
 
 Uniform = float | int | bool | Sequence[float] | Sequence[int] | np.ndarray[Any, Any]
@@ -58,9 +61,11 @@ class ComputeProgram:
 
 def list_threads(gpu: GpuContext, longest: int = LIST_WALKERS) -> int:
     """Threads to walk a list whose length only the GPU knows: at most `longest`; few in software, where an idle one
-    costs as much as a busy one.
+    costs as much as a busy one, but never so few that a thread's loops are cut off.
     """
-    return min(longest, SOFTWARE_WALKERS) if gpu.is_software else longest
+    if not gpu.is_software:
+        return longest
+    return min(longest, max(SOFTWARE_WALKERS, -(-longest // SOFTWARE_SHARE)))
 
 
 def _local_size(path: Path) -> tuple[int, int, int]:

@@ -12,14 +12,17 @@ from render_server.passes.voxel_store import VoxelStore
 
 SHADER = Path(__file__).with_name("gather_voxels.comp.glsl")
 GATHER_CONES = 4  # as good as 16 in pictures: the cones that see gathered light average over many groups
-SOFTWARE_WALKERS = 256  # lists are short here: the last round of more walkers would mostly be idle
+# In software, by 64 voxels an edge: lists are short here, and the last round of more walkers would mostly be idle.
+# Groups lie on surfaces, so their number grows with the square of the edge; so few each keep a walker's loops short of
+# where Mesa cuts them off (SOFTWARE_SHARE in gpu/program.py).
+SOFTWARE_WALKERS = 256
 
 
 class GatherVoxelsPass:
     """A few cones a group; lights, the far pyramid and the support must be bound. `defines`: those of march.glsl."""
 
     def __init__(self, gpu: GpuContext, defines: dict[str, int]) -> None:
-        self._threads = SOFTWARE_WALKERS if gpu.is_software else list_threads(gpu)
+        self._gpu = gpu
         self._one = ComputeProgram(gpu, SHADER, defines)
         self._dual = ComputeProgram(gpu, SHADER, {"DUAL": 1, **defines})
 
@@ -52,7 +55,10 @@ class GatherVoxelsPass:
         store.bind()
         groups.bind()
         bind_samplers({2: pyramids[0].texture, 3: pyramids[1].texture})
-        program.run((self._threads,), cone_count=GATHER_CONES, **uniforms)
+        edge = int(uniforms["volume_size"]) / 64
+        few = max(SOFTWARE_WALKERS, round(SOFTWARE_WALKERS * edge * edge))
+        threads = few if self._gpu.is_software else list_threads(self._gpu)
+        program.run((threads,), cone_count=GATHER_CONES, **uniforms)
 
     def release(self) -> None:
         """Free the programs."""

@@ -10,11 +10,19 @@ from jaxtyping import Bool, Float32, Float64, Int32, Int64, UInt32
 from protocol.camera_model import CameraModel
 from protocol.errors import DeltalightError
 from protocol.frames import DepthImage
-from render_server.scene.depth_surface import DepthSurface, depth_surface, jump_threshold
+from render_server.scene.depth_surface import (
+    DepthSurface,
+    by_ray,
+    depth_surface,
+    jump_threshold,
+    surface_normals,
+)
 from render_server.scene.materials import Material
 from render_server.scene.mesh import TriangleMesh
 
 CELL_SAMPLES = 6
+# Two nodes stand for pixels of their cells that are at most this many cells apart: two each way.
+MOST_CELLS = 2 * float(np.sqrt(2))
 REAL_MATERIAL = Material(roughness=1.0, specular=0.0, name="real")
 
 
@@ -34,6 +42,8 @@ def depth_mesh(
     world_from_camera: Float64[np.ndarray, "4 4"],
     triangle_budget: int = 40_000,
     surface: DepthSurface | None = None,
+    *,
+    steep: Float32[np.ndarray, "h w"] | None = None,
 ) -> TriangleMesh:
     """Mesh a clean depth image that is registered to `camera`, in the world.
 
@@ -41,7 +51,8 @@ def depth_mesh(
     (moved to the centre along the fitted surface); the stride is the least that keeps to the budget. No
     triangle crosses a depth discontinuity; cells without depth or normal are holes. `uv` is the pixel
     coordinate (pixel centres at integers) of the vertex in the camera's picture. `surface` is
-    `depth_surface(depth, camera)` where it is already known. Without any valid depth the mesh is empty.
+    `depth_surface(depth, camera)` where it is already known. `steep` is the inverse depth of surfaces too steep to be
+    measured (`steep_surfaces`), which join what they lie between. Without any valid depth the mesh is empty.
 
     Raises:
         DeltalightError: the budget is below 2, or depth and camera differ in size.
@@ -53,9 +64,11 @@ def depth_mesh(
     known = depth_surface(depth, camera) if surface is None else surface
     stride = stride_for_budget(camera.width, camera.height, triangle_budget)
     nodes = _nodes(known, camera, stride)
-    triangles = _grid_triangles(
-        nodes.inverse_depth, jump_threshold(depth, camera, nodes.inverse_depth, stride)
-    )
+    limit = jump_threshold(depth, camera, nodes.inverse_depth, stride)
+    slack = np.zeros_like(limit)
+    if steep is not None and steep.any():
+        nodes, slack = _with_steep(nodes, steep, camera, stride)
+    triangles = _grid_triangles(nodes.inverse_depth, limit, slack)
     return _world_mesh(nodes, triangles, world_from_camera)
 
 
@@ -79,6 +92,34 @@ def _nodes(surface: DepthSurface, camera: CameraModel, stride: int) -> _Nodes:
     # A wild slope must not throw the node off the depths of its cell.
     at_centre = chosen + np.clip(shift, -0.1 * chosen, 0.1 * chosen)
     return _Nodes(pixels, rays, np.where(chosen > 0, at_centre, 0), surface.normals.reshape(-1, 3)[flat])
+
+
+def _with_steep(
+    nodes: _Nodes, steep: Float32[np.ndarray, "h w"], camera: CameraModel, stride: int
+) -> tuple[_Nodes, Float32[np.ndarray, "gh gw"]]:
+    """Add the nodes of steep surfaces in holes; the second value is the step (1/m) that their own slopes explain."""
+    flat = _median_pixels(steep, stride)
+    by_pixel = _slopes(steep)
+    normals = surface_normals(steep, by_ray(by_pixel, camera), camera).reshape(-1, 3)[flat]
+    added = (steep.ravel()[flat] > 0) & (nodes.inverse_depth == 0) & normals.any(axis=-1)
+    slope = np.hypot(*by_pixel.reshape(2, -1)[:, flat])
+    joined = _Nodes(
+        nodes.pixels,
+        nodes.rays,
+        np.where(added, steep.ravel()[flat], nodes.inverse_depth),
+        np.where(added[..., None], normals, nodes.normals),
+    )
+    return joined, np.where(added, np.float32(MOST_CELLS * stride) * slope, np.float32(0))
+
+
+def _slopes(inverse: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "2 h w"]:
+    """Change by pixel, to the right and down, of what is not 0, from differences within it; NaN where alone."""
+    known = np.where(inverse > 0, inverse, np.float32(np.nan))
+    slopes = np.empty((2, *inverse.shape), np.float32)
+    for slope, values in ((slopes[0], known), (slopes[1].T, known.T)):
+        before, after = np.diff(values, prepend=np.nan), np.diff(values, append=np.nan)
+        slope[:] = np.where(np.isnan(before), after, np.where(np.isnan(after), before, (before + after) / 2))
+    return slopes
 
 
 @lru_cache(maxsize=4)
@@ -139,24 +180,30 @@ def _sort_planes(planes: list[UInt32[np.ndarray, "a b"]]) -> None:
 
 
 def _grid_triangles(
-    inverse: Float32[np.ndarray, "gh gw"], threshold: Float32[np.ndarray, "gh gw"]
+    inverse: Float32[np.ndarray, "gh gw"],
+    threshold: Float32[np.ndarray, "gh gw"],
+    slack: Float32[np.ndarray, "gh gw"],
 ) -> Int32[np.ndarray, "m 3"]:
     """Join neighbouring nodes on one surface; quads are cut along the diagonal with the lesser step.
 
-    Seen from the camera, triangles are counter-clockwise.
+    Steps may exceed the threshold by the slack of either node. Seen from the camera, triangles are counter-clockwise.
     """
     valid = inverse > 0
     index = np.arange(inverse.size, dtype=np.int32).reshape(inverse.shape)
     quads = [np.s_[:-1, :-1], np.s_[:-1, 1:], np.s_[1:, :-1], np.s_[1:, 1:]]
     corners = [inverse[quad] for quad in quads]
+    slacks = [slack[quad] for quad in quads]
     limit = threshold[:-1, :-1]
     holes = [~valid[quad] for quad in quads]
-    top, bottom = _joined(0, 1, corners, limit), _joined(2, 3, corners, limit)
-    left, right = _joined(0, 2, corners, limit), _joined(1, 3, corners, limit)
+
+    def joined(one: int, other: int) -> Bool[np.ndarray, "a b"]:
+        return np.asarray(np.abs(corners[one] - corners[other]) <= limit + slacks[one] + slacks[other])
+
+    top, bottom, left, right = joined(0, 1), joined(2, 3), joined(0, 2), joined(1, 3)
     falling = np.abs(corners[0] - corners[3]) <= np.abs(corners[1] - corners[2])
     # A quad with one hole still holds a triangle, if it is cut between the hole's neighbours.
     falling = (falling | holes[1] | holes[2]) & ~(holes[0] | holes[3])
-    diagonal = np.where(falling, _joined(0, 3, corners, limit), _joined(1, 2, corners, limit))
+    diagonal = np.where(falling, joined(0, 3), joined(1, 2))
     usable = [~hole for hole in holes]
     kinds = [
         (falling & left & bottom, (0, 2, 3)),
@@ -169,12 +216,6 @@ def _grid_triangles(
         chosen = fits & diagonal & usable[names[0]] & usable[names[1]] & usable[names[2]]
         parts.append(np.stack([index[quads[name]][chosen] for name in names], axis=1))
     return np.concatenate(parts)
-
-
-def _joined(
-    one: int, other: int, corners: list[Float32[np.ndarray, "a b"]], limit: Float32[np.ndarray, "a b"]
-) -> Bool[np.ndarray, "a b"]:
-    return np.asarray(np.abs(corners[one] - corners[other]) <= limit)
 
 
 def _world_mesh(

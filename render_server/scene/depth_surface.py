@@ -60,15 +60,15 @@ def depth_surface(depth: DepthImage, camera: CameraModel) -> DepthSurface:
     radius = _window_radius(noise_sigma(depth) * float(camera.matrix[0, 0]), inverse, mask)
     by_pixel = _window_gradient(inverse, mask, radius)
     _move_windows(by_pixel, valid & _crosses_edge(jumps, valid, radius), radius)
-    gradient = _by_ray(by_pixel, camera)
-    return DepthSurface(inverse, gradient, _normals(inverse, gradient, camera))
+    gradient = by_ray(by_pixel, camera)
+    return DepthSurface(inverse, gradient, surface_normals(inverse, gradient, camera))
 
 
 def jump_threshold(
     depth: DepthImage,
     camera: CameraModel,
     inverse_depth: Float32[np.ndarray, "h w"],
-    step_px: float = 1.0,
+    step_px: float | Float32[np.ndarray, "h w"] = 1.0,
 ) -> Float32[np.ndarray, "h w"]:
     """Return the change of w over `step_px` pixels beyond which two points are not on one surface.
 
@@ -76,7 +76,7 @@ def jump_threshold(
     |dw| = w tan(slope) / f.
     """
     focal = float(np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1]))
-    slope = np.float32(step_px * np.tan(np.radians(MAX_SLOPE_DEG)) / focal)
+    slope = step_px * np.float32(np.tan(np.radians(MAX_SLOPE_DEG)) / focal)
     return inverse_depth * slope + np.float32(NOISE_SIGMAS * np.sqrt(2) * noise_sigma(depth))
 
 
@@ -188,7 +188,7 @@ def _move_windows(
     slopes[:, np.concatenate(targets)] = slopes[:, np.concatenate(sources)]
 
 
-def _by_ray(by_pixel: Float32[np.ndarray, "2 h w"], camera: CameraModel) -> Float32[np.ndarray, "2 h w"]:
+def by_ray(by_pixel: Float32[np.ndarray, "2 h w"], camera: CameraModel) -> Float32[np.ndarray, "2 h w"]:
     """Turn a change by pixel into a change by ray coordinate."""
     if not camera.has_distortion:
         return by_pixel * camera.matrix[[0, 1], [0, 1]].astype(np.float32)[:, None, None]
@@ -204,12 +204,16 @@ def _pixel_from_ray(camera: CameraModel) -> Float32[np.ndarray, "2 2 h w"]:
     return np.ascontiguousarray(np.linalg.inv(jacobian).transpose(2, 3, 0, 1), np.float32)
 
 
-def _normals(
+def surface_normals(
     inverse: Float32[np.ndarray, "h w"],
     gradient: Float32[np.ndarray, "2 h w"],
     camera: CameraModel,
 ) -> Float32[np.ndarray, "h w 3"]:
-    """A plane n.P = d has w = (n/d).(x/z, y/z, 1), so n is along (gradient, w - gradient.ray)."""
+    """Return unit normals of inverse depth and its change by ray; zero where unknown.
+
+    They are in the optical frame, towards the camera. A plane n.P = d has w = (n/d).(x/z, y/z, 1), so n is along
+    (gradient, w - gradient.ray).
+    """
     x, y = gradient
     ray_x, ray_y = _ray_planes(camera)
     z = inverse - x * ray_x - y * ray_y

@@ -115,6 +115,28 @@ def test_a_colour_that_neither_surface_has_stays_unknown() -> None:
     assert not result.added[np.hypot(COLUMNS - 115, ROWS - 60) < 1.5].any()
 
 
+LID = (100, 150, 110)  # of neither surface, but much more like the green one
+
+
+def test_a_strip_of_its_own_colour_stays_unknown_though_it_resembles_one_surface_more() -> None:
+    color, hole = picture(ORANGE, GREEN, texture=4), ring(2, 10)
+    lid = (FROM_RIM >= 0) & (FROM_RIM < 8) & (ROWS < 60)
+    color[lid] = LID
+    result = assigned(hole, color)
+    inside = (FROM_RIM > 1) & (FROM_RIM < 7)
+    assert result.added[inside & (ROWS < 50)].mean() < 0.02
+    assert result.added[inside & (ROWS > 70)].mean() > 0.9  # the plain green shadow below
+    assert not result.wrong[np.abs(FROM_RIM) > 1.5].any()
+
+
+def test_a_thin_line_of_mixed_colours_is_no_surface_of_its_own() -> None:
+    color, hole = picture(ORANGE, GREEN, texture=4), ring(4, 6)
+    line = (FROM_RIM >= 3) & (FROM_RIM < 4.5)
+    color[line] = LID
+    result = assigned(hole, color)
+    assert result.added[line].mean() > 0.9
+
+
 def test_background_in_the_colour_of_the_thing_is_hidden_no_farther_than_the_reach() -> None:
     color = picture(ORANGE, GREEN)
     color[(np.abs(ROWS - 60) < 6) & (COLUMNS > 105)] = ORANGE

@@ -1,0 +1,184 @@
+"""What lies beyond the picture where its border cuts a plane: walls, table and floor go on.
+
+How far is not known. A plane of which a length L is seen goes on for at least d beyond the border with probability
+L / (L + d), because the border cuts it at a place that has nothing to do with it (Gott 1993, Nature 363, for lengths
+in place of times). What it shines with there follows from the lights and from what it makes of them where it is seen.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64
+
+from render_server.scene.lights import Light
+from render_server.scene.octahedral import octahedral_grid
+from render_server.scene.seen_light import seen_from
+from render_server.scene.seen_planes import SeenPlane
+
+# Share of the samples that noise may put behind a wall.
+STRAY = 0.005
+LEAST_IRRADIANCE = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """What the camera has in view: rays (x/z, y/z) between `low` and `high`."""
+
+    camera_from_world: Float64[np.ndarray, "4 4"]
+    low: Float64[np.ndarray, "2"]
+    high: Float64[np.ndarray, "2"]
+
+    def inside(self, places: Float64[np.ndarray, "m 3"]) -> Float64[np.ndarray, "m 4"]:
+        """Return how far places (world) are inside each of the four planes that bound the view, by some measure."""
+        seen = places @ self.camera_from_world[:3, :3].T + self.camera_from_world[:3, 3]
+        x_y, z = seen[:, :2], seen[:, 2:]
+        return np.concatenate([x_y - self.low * z, self.high * z - x_y], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class RealSamples:
+    """Pixels that show real surfaces: place (world, m), linear radiance, and irradiance.
+
+    `lit` is the share of the lights' unshadowed light that arrives, `indirect` the irradiance from all else. A sample
+    may lie `tolerance_m` off its plane.
+    """
+
+    position: Float64[np.ndarray, "k 3"]
+    radiance: Float64[np.ndarray, "k 3"]
+    lit: Float64[np.ndarray, " k"]
+    indirect: Float64[np.ndarray, "k 3"]
+    tolerance_m: Float64[np.ndarray, " k"]
+
+    def only(self, chosen: Bool[np.ndarray, " k"]) -> "RealSamples":
+        """Return some of the samples."""
+        fields = (self.position, self.radiance, self.lit, self.indirect, self.tolerance_m)
+        return RealSamples(*(values[chosen] for values in fields))
+
+
+@dataclass(frozen=True, eq=False)
+class ContinuedPlanes:
+    """Octahedral maps (world axes): radiance of what goes on, and the probability that it does."""
+
+    radiance: Float32[np.ndarray, "n n 3"]
+    share: Float32[np.ndarray, "n n 1"]
+
+
+@dataclass(frozen=True, eq=False)
+class _Sheet:
+    """One plane in every direction: distance (m, infinite where it is not met), probability, radiance."""
+
+    distance: Float64[np.ndarray, " n"]
+    share: Float64[np.ndarray, " n"]
+    radiance: Float64[np.ndarray, "n 3"]
+
+
+def continue_planes(
+    planes: Sequence[SeenPlane],
+    samples: RealSamples,
+    lights: Sequence[Light],
+    sight: Sight,
+    *,
+    centre: Float64[np.ndarray, "3"],
+    size: int,
+) -> ContinuedPlanes:
+    """Return what goes on around `centre` (world, m) of the planes that the picture's border cuts.
+
+    `size` is the edge of the maps in texels. Nearer planes stand before farther ones.
+    """
+    directions = octahedral_grid(size).reshape(-1, 3)
+    sheets = [
+        _sheet(plane, samples.only(plane.on_it), lights, sight, centre=centre, directions=directions)
+        for plane in planes
+        if _bounds_room(plane, samples)
+    ]
+    radiance, beyond = np.zeros((len(directions), 3)), np.ones(len(directions))
+    for nth in _nearest_first(sheets):
+        share = beyond * nth.share
+        radiance += share[:, None] * nth.radiance
+        beyond -= share
+    met = 1 - beyond
+    mean = radiance / np.maximum(met, np.finfo(np.float32).tiny)[:, None]
+    return ContinuedPlanes(
+        mean.reshape(size, size, 3).astype(np.float32), met.reshape(size, size, 1).astype(np.float32)
+    )
+
+
+def _nearest_first(sheets: Sequence[_Sheet]) -> list[_Sheet]:
+    """Reorder sheets, in each direction by itself: the first of the result is the nearest one everywhere."""
+    if not sheets:
+        return []
+    distance, share, radiance = (
+        np.stack([getattr(sheet, name) for sheet in sheets]) for name in ("distance", "share", "radiance")
+    )
+    order = np.argsort(distance, axis=0)
+    every = np.arange(distance.shape[1])
+    return [_Sheet(distance[rank, every], share[rank, every], radiance[rank, every]) for rank in order]
+
+
+def _bounds_room(plane: SeenPlane, samples: RealSamples) -> bool:
+    """Whether nothing is seen behind a plane: a thing has the room behind it, and ends."""
+    behind = samples.position @ plane.normal < plane.offset - 3 * samples.tolerance_m
+    return bool(behind.mean() <= STRAY)
+
+
+def _sheet(
+    plane: SeenPlane,
+    seen: RealSamples,
+    lights: Sequence[Light],
+    sight: Sight,
+    *,
+    centre: Float64[np.ndarray, "3"],
+    directions: Float64[np.ndarray, "n 3"],
+) -> _Sheet:
+    falling = directions @ plane.normal
+    height = plane.normal @ centre - plane.offset
+    meets = (falling < 0) & (height > 0)
+    distance = np.full(len(directions), np.inf)
+    distance[meets] = -height / falling[meets]
+    share, radiance = np.zeros(len(directions)), np.zeros((len(directions), 3))
+    places = centre + distance[meets, None] * directions[meets]
+    share[meets] = _goes_on(places, seen, sight)
+    radiance[meets] = _shines(places, plane, seen, lights)
+    return _Sheet(distance, share, radiance)
+
+
+def _goes_on(
+    places: Float64[np.ndarray, "m 3"], seen: RealSamples, sight: Sight
+) -> Float64[np.ndarray, " m"]:
+    """Probability that a plane is at places on it.
+
+    The seen length is twice that from the middle of what is seen to where the straight way to the place leaves the
+    view.
+    """
+    start = sight.inside(seen.position.mean(axis=0)[None])
+    end = sight.inside(places)
+    in_view = np.divide(start, start - end, out=np.ones_like(end), where=end < 0).min(axis=1)
+    return np.asarray(2 * in_view / (1 + in_view))
+
+
+def _shines(
+    places: Float64[np.ndarray, "m 3"], plane: SeenPlane, seen: RealSamples, lights: Sequence[Light]
+) -> Float64[np.ndarray, "m 3"]:
+    """Radiance at places on a plane: the albedo that it has where it is seen, under the irradiance to be expected.
+
+    What an albedo of 1 does not explain where it is seen comes of lights that nobody knows, and is the same beyond.
+    """
+    direct = _irradiance(lights, seen.position, plane.normal) * seen.lit[:, None]
+    irradiance = direct + seen.indirect
+    ratio = np.median(seen.radiance / np.maximum(irradiance, LEAST_IRRADIANCE), axis=0)
+    reflected = np.minimum(ratio, 1 / np.pi)
+    unexplained = np.median(seen.radiance - reflected * irradiance, axis=0)
+    expected = seen.lit.mean() * _irradiance(lights, places, plane.normal) + seen.indirect.mean(axis=0)
+    return np.asarray(np.maximum(reflected * expected + unexplained, 0))
+
+
+def _irradiance(
+    lights: Sequence[Light], places: Float64[np.ndarray, "m 3"], normal: Float64[np.ndarray, "3"]
+) -> Float64[np.ndarray, "m 3"]:
+    """Unshadowed irradiance of all lights at places that face along `normal`."""
+    total = np.zeros(places.shape)
+    for light in lights:
+        seen = seen_from(light, places)
+        total += seen.irradiance * np.maximum(seen.toward @ normal, 0)[:, None]
+    return total
