@@ -11,8 +11,8 @@ from render_server.gpu.context import GpuContext
 from render_server.gpu.shader_source import shader_source
 
 SOFTWARE_WALKERS = 1024
-# Mesa's software renderer ends all loops of a thread after 65535 turns in sum, without a word; tracing the cones of one
-# texel takes up to about 5000 (16 cones through 256 voxels and the coarse scene).
+# Mesa's software renderer ends all loops of a thread after 65535 turns in sum, without a word; tracing the cones of
+# one texel takes up to about 5000 (16 cones through 256 voxels and the coarse scene).
 SOFTWARE_SHARE = 12
 LIST_WALKERS = 16384
 

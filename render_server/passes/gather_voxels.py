@@ -13,8 +13,8 @@ from render_server.passes.voxel_store import VoxelStore
 SHADER = Path(__file__).with_name("gather_voxels.comp.glsl")
 GATHER_CONES = 4  # as good as 16 in pictures: the cones that see gathered light average over many groups
 # In software, by 64 voxels an edge: lists are short here, and the last round of more walkers would mostly be idle.
-# Groups lie on surfaces, so their number grows with the square of the edge; so few each keep a walker's loops short of
-# where Mesa cuts them off (SOFTWARE_SHARE in gpu/program.py).
+# Groups lie on surfaces, so their number grows with the square of the edge; so few each keep a walker's loops short
+# of where Mesa cuts them off (SOFTWARE_SHARE in gpu/program.py).
 SOFTWARE_WALKERS = 256
 
 
