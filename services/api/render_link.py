@@ -240,16 +240,17 @@ class RenderLink:
 
     def _look(self) -> None:
         """A server that came (back) is to get source and scene."""
+        answered_before = self._answers
         try:
             self._ask(CLOCK_OP, ALIVE_TIMEOUT_S)
+            self._note_reachable(True)  # also while the renderer is busy, as with the shaders of its first picture
             seen = self._seen_revision()
             is_new = self._server_revision is None or seen < self._server_revision  # it was started (again)
-            if is_new or not self._answers:
+            if is_new or not answered_before:
                 self._restore_source()
         except UnansweredError:
             self._note_reachable(False)
             return
-        self._note_reachable(True)
         if is_new:
             self._outcomes.forget()
             self._sent.clear()

@@ -2,6 +2,7 @@ import { useSignal } from "@preact/signals";
 import { useEffect } from "preact/hooks";
 import { isSceneRead, scene } from "../../state/scene";
 import { frame, liveState, retryPicture } from "../../live/picture";
+import { processes } from "../../state/processes";
 import { isTakingSnapshot } from "../../state/takes";
 import { Button } from "../ui/Button";
 import { Sentence } from "../ui/Sentence";
@@ -13,12 +14,7 @@ export function PictureNotice() {
     case "connecting":
       return <Full title="Connecting to the live picture" text="The service is asked for the newest frame." />;
     case "waiting":
-      return (
-        <Full
-          title="No picture yet"
-          text="Neither a camera nor a recording sends frames. Start one with `deltalight up --source CAMERA`, or replay a recording below."
-        />
-      );
+      return <Full title="No picture yet" text={isSomethingRunning() ? PREPARING : NOTHING_SENDS} />;
     case "reconnecting":
       return (
         <p class="picture-banner">
@@ -39,6 +35,15 @@ export function PictureNotice() {
         <Pending />
       );
   }
+}
+
+const NOTHING_SENDS =
+  "Neither a camera nor a recording sends frames. Start one with `deltalight up --source CAMERA`, or replay a recording below.";
+const PREPARING =
+  "Frames arrive, and the renderer prepares its first picture. The first start on a machine can take a minute: its shaders are compiled.";
+
+function isSomethingRunning(): boolean {
+  return [...processes.value.values()].some((seen) => seen.report.state === "running");
 }
 
 // A slow renderer takes a change that late; while it takes others, nothing is wrong.
