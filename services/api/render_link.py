@@ -243,7 +243,8 @@ class RenderLink:
         answered_before = self._answers
         try:
             self._ask(CLOCK_OP, ALIVE_TIMEOUT_S)
-            self._note_reachable(True)  # also while the renderer is busy, as with the shaders of its first picture
+            # It does, also while the renderer is busy, as with the shaders of its first picture.
+            self._note_reachable(True)
             seen = self._seen_revision()
             is_new = self._server_revision is None or seen < self._server_revision  # it was started (again)
             if is_new or not answered_before:
