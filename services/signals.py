@@ -26,6 +26,10 @@ def _raise_terminated(_number: int, _frame: FrameType | None) -> None:
 def _deliver_again(lost: "sys.UnraisableHookArgs") -> None:
     """A signal that comes while an object is freed is lost with a traceback: send it once more instead."""
     if isinstance(lost.exc_value, Terminated):
-        threading.Timer(AGAIN_AFTER_S, os.kill, (os.getpid(), signal.SIGTERM)).start()
+        again = signal.SIGTERM
+    elif isinstance(lost.exc_value, KeyboardInterrupt):
+        again = signal.SIGINT
     else:
         sys.__unraisablehook__(lost)
+        return
+    threading.Timer(AGAIN_AFTER_S, os.kill, (os.getpid(), again)).start()

@@ -10,7 +10,7 @@ export function ProcessCard({ seen }: { readonly seen: Seen }) {
   const rates = Object.entries(report.rates);
   const drops = Object.entries(report.drops).filter(([, count]) => count > 0);
   return (
-    <article class="card process" aria-label={report.name}>
+    <article class="card process" aria-label={report.name} tabIndex={0}>
       <header class="spread">
         <h3>{report.name}</h3>
         <span class={`badge ${isSilent ? "bad" : report.state}`}>{isSilent ? "silent" : report.state}</span>

@@ -1,0 +1,32 @@
+"""A signal that comes while Python cannot raise is not lost."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PROGRAM = """
+import os, signal, time
+from services.signals import raise_on_sigterm
+
+class Freed:
+    def __del__(self):
+        os.kill(os.getpid(), signal.{name})
+        time.sleep(0.1)
+
+raise_on_sigterm()
+try:
+    Freed()  # what is raised while an object is freed goes nowhere
+    time.sleep(60)
+except BaseException as ending:
+    print(type(ending).__name__)
+"""
+
+
+@pytest.mark.parametrize(("name", "ending"), [("SIGTERM", "Terminated"), ("SIGINT", "KeyboardInterrupt")])
+def test_a_signal_while_an_object_is_freed_ends_the_program_all_the_same(name: str, ending: str) -> None:
+    program = [sys.executable, "-c", PROGRAM.format(name=name)]
+    ended = subprocess.run(program, cwd=ROOT, capture_output=True, text=True, timeout=30, check=False)
+    assert (ended.stdout.strip(), ended.stderr, ended.returncode) == (ending, "", 0)
