@@ -14,18 +14,24 @@ class Terminated(BaseException):
 
 
 def raise_on_sigterm() -> None:
-    """Make SIGTERM raise `Terminated` in the main thread (SIGINT raises `KeyboardInterrupt` already)."""
+    """Make SIGTERM raise `Terminated` in the main thread (SIGINT raises `KeyboardInterrupt` already), once.
+
+    Linux tells the death of a supervisor once for each of its threads that dies: the second signal would
+    break off what the first one made the program finish.
+    """
     signal.signal(signal.SIGTERM, _raise_terminated)
     sys.unraisablehook = _deliver_again
 
 
 def _raise_terminated(_number: int, _frame: FrameType | None) -> None:
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
     raise Terminated
 
 
 def _deliver_again(lost: "sys.UnraisableHookArgs") -> None:
     """A signal that comes while an object is freed is lost with a traceback: send it once more instead."""
     if isinstance(lost.exc_value, Terminated):
+        signal.signal(signal.SIGTERM, _raise_terminated)
         again = signal.SIGTERM
     elif isinstance(lost.exc_value, KeyboardInterrupt):
         again = signal.SIGINT

@@ -30,3 +30,24 @@ def test_a_signal_while_an_object_is_freed_ends_the_program_all_the_same(name: s
     program = [sys.executable, "-c", PROGRAM.format(name=name)]
     ended = subprocess.run(program, cwd=ROOT, capture_output=True, text=True, timeout=30, check=False)
     assert (ended.stdout.strip(), ended.stderr, ended.returncode) == (ending, "", 0)
+
+
+FINISHING = """
+import os, signal, time
+from services.signals import Terminated, raise_on_sigterm
+
+raise_on_sigterm()
+try:
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(60)
+except Terminated:
+    for _ in range(20):  # a supervisor of many threads was killed
+        os.kill(os.getpid(), signal.SIGTERM)
+    print("finished")
+"""
+
+
+def test_further_signals_do_not_break_off_what_the_first_one_ends() -> None:
+    program = [sys.executable, "-c", FINISHING]
+    ended = subprocess.run(program, cwd=ROOT, capture_output=True, text=True, timeout=30, check=False)
+    assert (ended.stdout.strip(), ended.stderr, ended.returncode) == ("finished", "", 0)
