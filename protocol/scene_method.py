@@ -155,6 +155,13 @@ class DlpvMethod(StrictModel):
     geometry_volume: bool | None = Field(
         default=None, description="Surfaces block light between cells; null = yes, no for paper."
     )
+    bounces: int | None = Field(
+        default=None,
+        ge=0,
+        le=4,
+        description="How often surfaces reflect light that the volume brought them, each time a propagation more; "
+        "null = 2, 0 for paper (which has no volume to take it from).",
+    )
     ambient: Literal["blocked", "open"] | None = Field(
         default=None,
         description="Surfaces in the volume keep off light from the surroundings, or none does; "
@@ -199,9 +206,13 @@ class DlpvMethod(StrictModel):
     )
 
     @model_validator(mode="after")
-    def _one_volume_for_lobes(self) -> "DlpvMethod":
+    def _fits_operator(self) -> "DlpvMethod":
         if self.shadow == "lobe" and self.operator != "paper":
             raise ValueError("shadow `lobe` is part of operator `paper`: use shadow map, or operator paper")
+        if self.bounces and self.operator == "paper":
+            raise ValueError(
+                "`bounces` need operator `difference`: leave them out, or use operator difference"
+            )
         return self
 
     def _choice(self, value: T | None, default: T, printed: T) -> T:
@@ -218,6 +229,11 @@ class DlpvMethod(StrictModel):
     def resolved_geometry_volume(self) -> bool:
         """Whether surfaces block light, as given or the operator's default."""
         return self._choice(self.geometry_volume, True, False)
+
+    @property
+    def resolved_bounces(self) -> int:
+        """Bounces as given, or the operator's default."""
+        return self._choice(self.bounces, 2, 0)
 
     @property
     def resolved_ambient(self) -> Literal["blocked", "open"]:

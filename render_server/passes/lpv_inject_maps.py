@@ -74,7 +74,7 @@ class LpvInjectMapsPass:
 
 
 def _bind(sums: moderngl.Buffer, table: LightTable, real_albedo: moderngl.Texture) -> None:
-    sums.bind_to_storage_buffer(8)
+    sums.bind_to_storage_buffer(10)
     atlas = table.virtual_atlas
     bind_samplers({8: real_albedo, 13: table.real_atlas.normal, 16: atlas.uv, 17: atlas.normal})
 

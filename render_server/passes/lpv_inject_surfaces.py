@@ -32,7 +32,7 @@ class LpvInjectSurfacesPass:
         self, program: ComputeProgram, sums: moderngl.Buffer, store: VoxelStore, uniforms: dict[str, Any]
     ) -> None:
         store.bind()
-        sums.bind_to_storage_buffer(8)
+        sums.bind_to_storage_buffer(10)
         program.run((self._threads,), **uniforms)
 
     def release(self) -> None:

@@ -4,10 +4,11 @@
 layout(local_size_x = 64) in;
 layout(std430, binding = 8) readonly buffer First { int first[]; };
 layout(std430, binding = 9) readonly buffer Second { int second[]; };
+layout(std430, binding = 12) readonly buffer Third { int third[]; };
 layout(std430, binding = 10) writeonly buffer State { vec4 state[]; };   // channel by channel
 layout(std430, binding = 11) writeonly buffer Total { vec4 total[]; };
 uniform int cells;
-uniform bool has_second;
+uniform int count_of_sums;
 
 void main() {
     uint count = uint(cells * cells * cells), i = gl_GlobalInvocationID.x;
@@ -16,7 +17,10 @@ void main() {
         vec4 light;
         for (uint k = 0u; k < 4u; ++k) {
             uint at = i * uint(INJECTED_SUMS) + 4u * channel + k;
-            light[k] = float(first[at] + (has_second ? second[at] : 0)) / INJECTED_STEPS;
+            int sum = first[at];
+            if (count_of_sums > 1) sum += second[at];
+            if (count_of_sums > 2) sum += third[at];
+            light[k] = float(sum) / INJECTED_STEPS;
         }
         state[channel * count + i] = light;
         total[channel * count + i] = light;

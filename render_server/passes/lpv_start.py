@@ -16,10 +16,11 @@ class LpvStartPass:
     def __init__(self, gpu: GpuContext) -> None:
         self._program = ComputeProgram(gpu, Path(__file__).with_name("lpv_start.comp.glsl"))
 
-    def run(self, volume: LightVolume, sums: moderngl.Buffer, added: moderngl.Buffer | None = None) -> None:
-        """Begin with `sums`, and those of `added` if given."""
-        bind_storage({8: sums, 9: sums if added is None else added, 10: volume.state, 11: volume.total})
-        self._program.run((volume.cells**3,), cells=volume.cells, has_second=added is not None)
+    def run(self, volume: LightVolume, *sums: moderngl.Buffer) -> None:
+        """Begin with the total of one to three sums."""
+        first, second, third = (*sums, sums[0], sums[0])[:3]
+        bind_storage({8: first, 9: second, 10: volume.state, 11: volume.total, 12: third})
+        self._program.run((volume.cells**3,), cells=volume.cells, count_of_sums=len(sums))
 
     def release(self) -> None:
         """Free the program."""

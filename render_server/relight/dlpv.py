@@ -52,18 +52,15 @@ class Dlpv(RelightBase):
 
     def _trace(self, frame: RelightInput, uniforms: dict[str, Any]) -> None:
         volumes = self.volumes
-        uniforms = {**uniforms, **self._query_uniforms()}
+        uniforms = {**uniforms, **volumes.query_uniforms}
         seen = volumes.rho if volumes.change is None else volumes.change
         with frame.timers.measure("query real"):
             self._query.read_real(self._cones, self._grid, volumes.mu, seen, uniforms)
         with frame.timers.measure("query virtual"):
             self._query.read_virtual(self._cones, self._grid, volumes.rho, uniforms)
 
-    def _query_uniforms(self) -> dict[str, Any]:
-        return {"has_geometry": self.volumes.has_geometry, "damping": self._settings.resolved_damping}
-
     def _reflect(self, frame: RelightInput, uniforms: dict[str, Any]) -> moderngl.Texture | None:
-        own = {**uniforms, **self._query_uniforms()}
+        own = {**uniforms, **self.volumes.query_uniforms}
         wanted = self._settings.resolved_reflections == "rays"
         return self._mirrored.run(frame, self._bind_light, own, wanted=wanted)
 

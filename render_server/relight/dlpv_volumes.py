@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import moderngl
 import numpy as np
 from jaxtyping import Float32
 
@@ -16,6 +17,7 @@ from render_server.passes.light_volume import (
     moment_weights,
     transmitted_shares,
 )
+from render_server.passes.lpv_bounce import LpvBouncePass
 from render_server.passes.lpv_cover_faces import LpvCoverFacesPass
 from render_server.passes.lpv_inject_maps import LpvInjectMapsPass
 from render_server.passes.lpv_inject_surfaces import LpvInjectSurfacesPass
@@ -35,7 +37,8 @@ class DlpvVolumes:
     """V_rho, and beside it V_mu (`mu`), or for the paper the change (`change`).
 
     Injected are two sums: the real scene's light without objects, and the change that objects make. V_mu starts with
-    the first, V_rho with both, the paper's V_delta with the second and the negative lobes of direct light.
+    the first, V_rho with both, the paper's V_delta with the second and the negative lobes of direct light. What V_rho
+    brings to surfaces they reflect: it is propagated anew with that, once a bounce.
     `shown`: what was injected of the change, for people who look.
     """
 
@@ -50,8 +53,8 @@ class DlpvVolumes:
         is_paper = settings.operator == "paper"
         self.mu = None if is_paper else LightVolume(gpu, cells)
         self.change = LightVolume(gpu, cells) if is_paper else None
-        self._real_light, self._change_light, self._shadow_light = (
-            injected_sums(gpu, cells) for _ in range(3)
+        self._real_light, self._change_light, self._bounced_light, self._shadow_light = (
+            injected_sums(gpu, cells) for _ in range(4)
         )
         self._real_covered, self._virtual_covered = (covered_sums(gpu, cells) for _ in range(2))
         self._through_real, self._through_joint = (transmitted_shares(gpu, cells) for _ in range(2))
@@ -64,6 +67,7 @@ class DlpvVolumes:
         self._transmit = LpvTransmitPass(gpu)
         self._start = LpvStartPass(gpu)
         self._propagate = LpvPropagatePass(gpu)
+        self._bounce = LpvBouncePass(gpu)
         self._show = LpvShowPass(gpu)
         self.shown = Pyramid(gpu, cells, 1)
         self._virtual_key: object = None
@@ -72,6 +76,11 @@ class DlpvVolumes:
     def has_geometry(self) -> bool:
         """Whether surfaces block light between cells."""
         return self._settings.resolved_geometry_volume
+
+    @property
+    def query_uniforms(self) -> dict[str, Any]:
+        """How light is read from the volumes (passes/common/lpv_light.glsl)."""
+        return {"has_geometry": self.has_geometry, "damping": self._settings.resolved_damping}
 
     @property
     def _blocks_surroundings(self) -> bool:
@@ -95,7 +104,7 @@ class DlpvVolumes:
     ) -> None:
         """Surfels, albedo and light of the real scene; V_mu."""
         self.placement = placement
-        if self.has_geometry or self._blocks_surroundings:
+        if self.has_geometry or self._blocks_surroundings or self._settings.resolved_bounces > 0:
             with frame.timers.measure("voxelize"):
                 self._surfels(self._real, frame.real.corners)
         lighting = self._lighting(frame, uniforms)
@@ -142,9 +151,29 @@ class DlpvVolumes:
         with frame.timers.measure("propagate rho"):
             self._start.run(self.rho, self._real_light, self._change_light)
             self._propagate.run(self.rho, self._weights, self._steps, through)
+        self._bounce_light(frame, table, lighting, through)
         if self.change is not None:
             self._rebuild_change(frame, table, lighting)
         self._show.run(self.shown, self.placement.size, self._change_light, self._shadow_light)
+
+    def _bounce_light(
+        self,
+        frame: RelightInput,
+        table: LightTable,
+        lighting: dict[str, Any],
+        through: moderngl.Buffer | None,
+    ) -> None:
+        """V_rho once more, with what surfaces reflect of the light that the last one brought them."""
+        if self.mu is None:
+            return
+        stores, light = (self._real, self._virtual), (self.mu, self.rho)
+        for _ in range(self._settings.resolved_bounces):
+            with frame.timers.measure("bounces"):
+                bind_lighting(frame, table)
+                self._bounced_light.clear()
+                self._bounce.run(self._bounced_light, stores, light, {**lighting, **self.query_uniforms})
+                self._start.run(self.rho, self._real_light, self._change_light, self._bounced_light)
+                self._propagate.run(self.rho, self._weights, self._steps, through)
 
     def _rebuild_change(self, frame: RelightInput, table: LightTable, lighting: dict[str, Any]) -> None:
         """V_delta of the paper: one volume of the texels that differ ([P2] 4.3)."""

@@ -1,7 +1,7 @@
 // Adding a surface's reflected flux to the cell half a cell before it ([P2] 4.3.1). Needs volume.glsl.
 #include "passes/common/light_cells.glsl"
 
-layout(std430, binding = 8) buffer Injected { int injected[]; };
+layout(std430, binding = 10) buffer Injected { int injected[]; };
 
 // I(w) = flux / pi <axis, w>+ of a point at p (world, m), shifted half a cell along `axis`.
 void inject(vec3 p, vec3 axis, vec3 flux) {

@@ -1,0 +1,115 @@
+"""Light that surfaces reflect once the volume brought it to them: its flux in closed form, and that it dies away."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from jaxtyping import Float64
+
+from protocol.errors import DeltalightError
+from protocol.frames import decode_lut
+from protocol.scene import SceneDocument, parse_scene
+from protocol.scene_method import DlpvMethod
+from render_server.gpu.context import GpuContext
+from render_server.passes.light_volume import CONSTANT, LOBE, LightVolume
+from render_server.relight.dlpv import Dlpv
+from render_server.relight.voxel_sets import bind_lighting
+from render_server.renderer import SceneRenderer
+from tests.render_server.scenes import GREY, Stage, ambient, cube, floor, frame, shifted, solve, sphere_light
+
+pytestmark = pytest.mark.usefixtures("clean_gl")
+CELLS, EDGE_M = 16, 0.6
+FIXED = 2**20  # steps a unit of injected light
+
+
+@pytest.fixture
+def stage(tmp_path: Path) -> Stage:
+    return Stage(tmp_path)
+
+
+def dlpv(document: SceneDocument, **settings: object) -> SceneDocument:
+    method = {"volume_size": CELLS, "volume_edge_m": EDGE_M, "query_scale": 1, "rsm_size": 256, **settings}
+    return document.replaced(method=DlpvMethod.model_validate({"name": "dlpv", **method}))
+
+
+def fill(volume: LightVolume | None, radiance: float) -> None:
+    """Make light of the volume the same everywhere and from everywhere: E = pi radiance on any surface."""
+    assert volume is not None
+    even = np.zeros((3, CELLS, CELLS, CELLS, 4), np.float32)
+    even[..., 0] = 1.5 * radiance / CONSTANT
+    volume.total.write(even.tobytes())
+
+
+def bounced_flux(
+    gpu: GpuContext, document: SceneDocument, radiance_mu: float, radiance_rho: float
+) -> tuple[Float64[np.ndarray, "z y x 3"], float]:
+    """Flux (W in the picture's units) that surfaces send into each cell under even light of both volumes, and the
+    height of the lowest cells' bottom (m)."""
+    renderer = SceneRenderer(gpu, document)
+    view = frame()
+    renderer.render(view)
+    relighting = renderer._relighting
+    method = relighting._method
+    assert isinstance(method, Dlpv)
+    volumes = method.volumes
+    fill(volumes.mu, radiance_mu)
+    fill(volumes.rho, radiance_rho)
+    relit = relighting.relight(view, relighting._real.view)  # type: ignore[union-attr, arg-type]
+    assert relit is not None
+    bind_lighting(relit.input, method.table)
+    lighting = volumes._lighting(relit.input, method._uniforms(relit.input, volumes.placement))
+    volumes._bounced_light.clear()
+    volumes._bounce.run(
+        volumes._bounced_light,
+        (volumes._real, volumes._virtual),
+        (volumes.mu, volumes.rho),  # type: ignore[arg-type]
+        {**lighting, **volumes.query_uniforms},
+    )
+    sums = np.frombuffer(volumes._bounced_light.read(), np.int32).reshape(CELLS, CELLS, CELLS, 3, 4)
+    bottom_m = volumes.placement.origin[2]
+    edge_m = volumes.placement.voxel_edge
+    renderer.release()
+    return sums[..., 0] / FIXED * np.pi / LOBE[0] * edge_m**2, bottom_m
+
+
+def test_a_box_reflects_its_albedo_of_all_light_that_the_volume_brings(gpu: GpuContext, stage: Stage) -> None:
+    color = (0.8, 0.4, 0.2)
+    far = shifted(floor(), 0, 0, -3.0)
+    document = stage.document([stage.virtual(cube(0.12), color)], [ambient(0.2)], far)
+    flux, _ = bounced_flux(gpu, dlpv(document), 0.1, 0.5)
+    expected = np.array(color) * np.pi * 0.5 * 6 * 0.12**2
+    assert flux.sum(axis=(0, 1, 2)) == pytest.approx(expected, rel=0.01)
+
+
+def test_a_floor_reflects_its_albedo_of_what_the_objects_changed(gpu: GpuContext, stage: Stage) -> None:
+    """Its albedo is what the picture shows over all the light that the surroundings and V_mu bring."""
+    surroundings = 0.4
+    document = stage.document([stage.virtual(cube(0.002), (0.0, 0.0, 0.0))], [ambient(surroundings)], floor())
+    flux, bottom_m = bounced_flux(gpu, dlpv(document), 0.2, 0.5)
+    albedo = decode_lut(None)[GREY] / (surroundings + 0.2)
+    edge_m = EDGE_M / CELLS
+    above = int((0.5 * edge_m - bottom_m) / edge_m)
+    seen = flux[above, 5:11, 5:11]
+    assert seen == pytest.approx(np.broadcast_to(albedo * np.pi * 0.3 * edge_m**2, seen.shape), rel=0.01)
+
+
+def test_each_bounce_changes_less_than_the_one_before(gpu: GpuContext, stage: Stage) -> None:
+    """A box of bright walls under a lamp: what the object takes, the walls take from each other again."""
+    walls = [shifted(trimesh.creation.box((0.02, 0.4, 0.3)), side * 0.2, 0.1, 0.15) for side in (-1, 1)]
+    back = shifted(trimesh.creation.box((0.4, 0.02, 0.3)), 0, 0.3, 0.15)
+    room = trimesh.util.concatenate([floor(0.5), back, *walls])
+    lights = [sphere_light((0.1, -0.7, 0.8), 1.5, 0.05), ambient(0.05)]
+    document = stage.document([stage.virtual(cube(0.12), (0.3, 0.3, 0.3))], lights, room)
+    solutions = [solve(gpu, dlpv(document, bounces=count)) for count in (0, 1, 2, 3)]
+    assert all(np.array_equal(solutions[0].cones_mu, one.cones_mu) for one in solutions[1:])
+    seen = (solutions[0].fade == 1) & (solutions[0].matte == 0)
+    means = [one.cones_rho[seen].mean() for one in solutions]
+    steps = np.abs(np.diff(means))
+    assert steps[0] > 1e-3 * means[0]
+    assert (steps[1:] < 0.8 * steps[:-1]).all()
+
+
+def test_the_papers_operator_refuses_bounces() -> None:
+    with pytest.raises(DeltalightError, match="operator difference"):
+        parse_scene({"method": {"name": "dlpv", "operator": "paper", "bounces": 1}})
