@@ -172,10 +172,14 @@ class RealGeometry:
             return
         budget = self.budget // COARSE_SHARE
         coarse = depth_mesh(depth, view.camera, place, budget, self.surface, steep=steep)
-        self._build([fine], triangle_corners(merge_for_gpu([coarse])))
+        self._build([fine], triangle_corners(merge_for_gpu([coarse])), is_open=True)
 
     def _build(
-        self, meshes: list[TriangleMesh], coarse_corners: Float32[np.ndarray, "k 3 10"] | None
+        self,
+        meshes: list[TriangleMesh],
+        coarse_corners: Float32[np.ndarray, "k 3 10"] | None,
+        *,
+        is_open: bool = False,
     ) -> None:
         """Merge and upload."""
         merged = merge_for_gpu(meshes)
@@ -189,6 +193,7 @@ class RealGeometry:
             _sample(merged.vertices[:, :3]),
             self._materials,
             coarse_corners,
+            is_open=is_open,
         )
 
     @property

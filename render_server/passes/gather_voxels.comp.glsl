@@ -34,7 +34,7 @@ void gather(int slot) {
     vec3 q = corner + sums_at(at + GROUP_PLACE) / area;
     float turn = 2.0 * PI * fract(dot(0.5 * corner, TURN_OF_BLOCK));
     vec3 e_mu, e_rho;
-    diffuse(q, n, WIDTH, turn, ONLY_RHO, e_mu, e_rho);
+    diffuse(q, n, ConeSet(1, 0, WIDTH, turn), ONLY_RHO, e_mu, e_rho);
     group_light[2 * slot] = vec4(e_mu, 0.0);
     group_light[2 * slot + 1] = vec4(e_rho, 0.0);
 }

@@ -131,7 +131,7 @@ vec3 outgoing(Surfel s, vec3 n, uint own) {
     if (surfel_lights[own].radiance.w > 0.5) return vec3(0.0);
 #else
     vec3 p = s.position_area.xyz;
-    if (camera_sees(p)) return unsummed(own, vec4(measured_radiance(p), 1.0));
+    if (camera_sees(p, n)) return unsummed(own, vec4(measured_radiance(p), 1.0));
 #endif
     vec3 mu, rho;
     irradiances(s, n, own, mu, rho);
@@ -152,7 +152,7 @@ vec3 change_of(vec3 back, vec3 mu, vec3 rho) {
 vec3 outgoing(Surfel s, vec3 n, uint own) {
     vec3 p = s.position_area.xyz, mu, rho;
     irradiances(s, n, own, mu, rho);
-    bool seen = camera_sees(p);
+    bool seen = camera_sees(p, n);
     vec3 back = unseen_albedo(p) / PI;
     vec3 radiance = seen ? measured_radiance(p) : back * mu;
 #ifdef REAL_RHO

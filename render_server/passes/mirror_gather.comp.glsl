@@ -14,7 +14,7 @@ layout(binding = 0) uniform isampler2D sample_pixels;
 layout(binding = 1) uniform sampler2D hit_position;
 layout(binding = 8) uniform sampler2D hit_normal;
 
-const float WHOLE = 1.0;   // cones as wide as their shares
+const ConeSet WHOLE = ConeSet(1, 0, 1.0, 0.0);   // cones as wide as their shares
 const float OWN = 1.5;     // voxels from a surface that may be its own
 
 // Share of the way between two points (voxels) that real surfaces leave open; both ends are left out.
@@ -38,7 +38,7 @@ void gather(ivec2 texel) {
     Mirror m = mirror_at(texelFetch(sample_pixels, texel, 0).xy);
     vec3 q = volume_coordinate(position);
     vec3 e_mu, e_rho;
-    diffuse(q, normal.xyz, WHOLE, 0.0, true, e_mu, e_rho);
+    diffuse(q, normal.xyz, WHOLE, true, e_mu, e_rho);
     vec3 d = reflect(normalize(position - m.point), normal.xyz);
     float half_angle = specular_half_angle(materials[int(normal.w)].dielectric.a);
     March seen = march(q, d, 2.0 * tan(half_angle), true);

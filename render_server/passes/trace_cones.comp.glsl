@@ -20,16 +20,18 @@ layout(binding = 2, rgba16f) writeonly uniform image2D specular_mu;      // rgb 
 layout(binding = 3, rgba16f) writeonly uniform image2D specular_rho;
 uniform vec3 camera_position;
 
-const float WHOLE = 1.0;         // cones as wide as their shares
+// Four texels next to each other divide four times as many directions between them, each cone half as wide as a whole
+// share; join_cones takes the mean.
+ConeSet cones_of(ivec2 texel) { return ConeSet(4, (texel.x & 1) + 2 * (texel.y & 1), 0.5, 0.0); }
 
 void trace(ivec2 texel) {
     SurfacePoint s = surface_point(texel);
     vec3 q = volume_coordinate(s.position);
     vec3 e_mu, e_rho, c_mu = vec3(0.0), c_rho = vec3(0.0);
 #ifdef REAL
-    diffuse(q, s.normal, WHOLE, 0.0, false, e_mu, e_rho);
+    diffuse(q, s.normal, cones_of(texel), false, e_mu, e_rho);
 #else
-    diffuse(q, s.normal, WHOLE, 0.0, true, e_mu, e_rho);
+    diffuse(q, s.normal, cones_of(texel), true, e_mu, e_rho);
 #endif
     if (s.roughness >= 0.0) {
         vec3 v = normalize(camera_position - s.position);

@@ -47,7 +47,7 @@ class Differential(RelightBase):
         self._settings = settings
         self._mu_table = LightTable(gpu, resolved.rsm_size, settings.shadow_samples)
         defines = march_defines(settings)
-        self._tracing = TraceConesPass(gpu, defines)
+        self._tracing = TraceConesPass(gpu, self._grid.size, defines)
         self._unused = ConeFields(gpu, self._grid.size)
         self._mirrored = MirroredObjects(gpu, self._grid, self._objects, "gather", defines)
         placement = VolumePlacement((0.0, 0.0, 0.0), 1.0, resolved.volume_size)

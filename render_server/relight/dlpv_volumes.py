@@ -106,7 +106,7 @@ class DlpvVolumes:
         self.placement = placement
         if self.has_geometry or self._blocks_surroundings or self._settings.resolved_bounces > 0:
             with frame.timers.measure("voxelize"):
-                self._surfels(self._real, frame.real.corners)
+                self._surfels(self._real, frame.real.solid_corners(placement.voxel_edge))
         lighting = self._lighting(frame, uniforms)
         with frame.timers.measure("real albedo"):
             frame.picture.build_levels()

@@ -26,7 +26,7 @@ class DvctExact(DvctBase):
     ) -> None:
         super().__init__(gpu, settings, resolved, size)
         defines = march_defines(settings)
-        self._tracing = TraceConesPass(gpu, defines)
+        self._tracing = TraceConesPass(gpu, self._grid.size, defines)
         self._mirrored = MirroredObjects(gpu, self._grid, self._objects, "gather", defines)
         placement = VolumePlacement((0.0, 0.0, 0.0), 1.0, resolved.volume_size)
         self._voxels = VoxelScene(gpu, placement, settings)

@@ -14,6 +14,7 @@ from render_server.passes.mesh_buffers import MeshBuffers
 from render_server.passes.picture import Picture
 from render_server.passes.real_surface import RealSurface
 from render_server.passes.unseen_albedo import UnseenAlbedo
+from render_server.scene.back_sheets import with_backs
 from render_server.scene.lights import LightSet
 from render_server.scene.materials import Material
 from render_server.scene.mesh import TriangleMesh
@@ -54,6 +55,11 @@ class GeometryState:
     )
     objects: tuple[PlacedObject, ...] = ()  # what the triangles of virtual geometry were made from
     swept_points: Float64[np.ndarray, "k 3"] | None = None  # None: nothing is animated
+    is_open: bool = False  # one camera's view of what is solid: backs are not in it
+
+    def solid_corners(self, voxel_edge: float) -> Float32[np.ndarray, "m 3 10"]:
+        """`corners` for voxels of that edge (m), with the backs of what one camera saw (scene/back_sheets.py)."""
+        return with_backs(self.corners, voxel_edge) if self.is_open else self.corners
 
     @property
     def bounds(self) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:

@@ -113,7 +113,9 @@ class VoxelScene(VoxelSets):
         """Voxelise, light and filter the real scene (the mu set)."""
         timers = frame.timers
         with timers.measure("voxelize"):
-            self._voxelize_real(frame.real.corners, placement, [self.mu, self.rho])
+            self._voxelize_real(
+                frame.real.solid_corners(placement.voxel_edge), placement, [self.mu, self.rho]
+            )
             self.far.voxelize(frame, self._voxelize, self._clear)
         with timers.measure("light voxels"):
             frame.picture.build_levels()

@@ -51,7 +51,9 @@ class VoxelSolutions(VoxelSets):
         """Voxelise both geometries, then light, filter and gather in step; `tables` are those of mu and rho."""
         timers = frame.timers
         with timers.measure("voxelize"):
-            self._voxelize_real(frame.real.corners, placement, [self.mu, self.rho])
+            self._voxelize_real(
+                frame.real.solid_corners(placement.voxel_edge), placement, [self.mu, self.rho]
+            )
             self.far.voxelize(frame, self._voxelize, self._clear)
             self._voxelize_virtual(frame.virtual, [self.rho])
             self._real_groups.start(self._real)

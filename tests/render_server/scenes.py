@@ -7,6 +7,7 @@ from typing import Any
 import moderngl
 import numpy as np
 import trimesh
+from scipy.ndimage import binary_erosion
 
 from protocol.camera_model import CameraModel
 from protocol.frames import BoardPose, DepthImage, ViewFrame
@@ -202,6 +203,11 @@ class Fields:
     position: np.ndarray  # real surface, world; w = depth
     normal: np.ndarray
     virtual_radiance: np.ndarray
+
+
+def with_neighbours(pixels: np.ndarray) -> np.ndarray:
+    """Those of the pixels (h, w; bool) whose eight neighbours are among them too: joined cones look there."""
+    return np.asarray(binary_erosion(pixels, np.ones((3, 3)), border_value=1))
 
 
 def fields_of(renderer: SceneRenderer) -> Fields:

@@ -36,7 +36,7 @@ SIZE, EDGE_M = 64, 0.8
 # they are. The form factor of the point below its middle is r^2 / (r^2 + h^2).
 RADIUS, HEIGHT = 0.18, 0.15
 FACTOR = RADIUS**2 / (RADIUS**2 + HEIGHT**2)
-MARCH_ERROR = 0.35  # of a single form factor seen from one height (test_furnace: 0.9 to 1.35)
+MARCH_ERROR = 0.35  # of a single form factor seen from one height (test_furnace, whole shares: 0.9 to 1.35)
 LEAST_CLOSED = 0.96  # what cones find of the light in a closed box: some leave past its edges
 
 

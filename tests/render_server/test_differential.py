@@ -35,6 +35,7 @@ from tests.render_server.scenes import (
     shifted,
     solve,
     sphere_light,
+    with_neighbours,
 )
 
 pytestmark = pytest.mark.usefixtures("clean_gl")
@@ -168,7 +169,7 @@ def test_mu_does_not_know_the_object(gpu: GpuContext, stage: Stage) -> None:
         solve(gpu, differential(stage.document([stage.virtual(mesh)], lights, room)))
         for mesh in (cube(0.12), corners)
     )
-    both = inside(a) & inside(b)
+    both = with_neighbours(inside(a) & inside(b))
     assert np.array_equal(a.cones_mu[both], b.cones_mu[both])
     assert np.array_equal(a.direct_mu[both], b.direct_mu[both])
     assert not np.array_equal(a.cones_rho[both], b.cones_rho[both])

@@ -25,6 +25,7 @@ from tests.render_server.scenes import (
     shifted,
     solve,
     sphere_light,
+    with_neighbours,
 )
 
 pytestmark = pytest.mark.usefixtures("clean_gl")
@@ -144,7 +145,7 @@ def test_mu_does_not_know_the_object(gpu: GpuContext, stage: Stage) -> None:
     room = floor() + shifted(cube(0.5), -0.5, 0, 0)
     corners = cube(0.03, (-0.045, -0.045, 0)) + cube(0.03, (0.045, 0.045, 0.09))
     a, b = (solve(gpu, stage.document([stage.virtual(mesh)], lights, room)) for mesh in (cube(0.12), corners))
-    both = seen(a) & seen(b)
+    both = with_neighbours(seen(a) & seen(b))
     assert np.array_equal(a.cones_mu[both], b.cones_mu[both])
     assert np.array_equal(a.direct_mu[both], b.direct_mu[both])
     assert not np.array_equal(a.cones_rho[both], b.cones_rho[both])

@@ -11,7 +11,8 @@ from tests.render_server.voxel_lab import VoxelLab, cosine_directions, direction
 
 pytestmark = pytest.mark.usefixtures("clean_gl")
 BOX = np.array((36.0, 33.0, 38.0))  # its faces lie anywhere between the cells of the coarse levels
-DIFFUSE = 1.5 * np.sqrt(2 / 16)  # cone diameter / distance of 16 diffuse cones
+SHARE = 1.5 * np.sqrt(2 / 16)  # cone diameter / distance of a sixteenth of the projected hemisphere
+DIFFUSE = SHARE / 2  # trace_cones: four texels divide each share
 COUNT = 4000
 TURNS = {
     "aligned": np.eye(4),
@@ -37,7 +38,7 @@ def room_at_edges(local: np.ndarray, directions: np.ndarray, ratio: float) -> np
     return np.asarray(room.min(axis=1) / np.maximum(ratio * distance, 1.0))
 
 
-@pytest.mark.parametrize("ratio", [0.05, 0.3, DIFFUSE])
+@pytest.mark.parametrize("ratio", [0.05, DIFFUSE, SHARE])
 @pytest.mark.parametrize("turn", TURNS)
 def test_furnace(lab: VoxelLab, turn: str, ratio: float) -> None:
     """Inside a closed box of radiance 1 in black surroundings cones return 1 on average within 2 %, whatever their
@@ -118,4 +119,4 @@ def test_ball_blocks_as_much_as_its_form_factor(lab: VoxelLab, radius: float, di
         voxels.release()
     factor = float(np.mean(shares)) / (radius / distance) ** 2
     print(f"ball of radius {radius} at {distance}: {factor:.3f} of its form factor")
-    assert 0.9 < factor < 1.35
+    assert 0.9 < factor < 1.2

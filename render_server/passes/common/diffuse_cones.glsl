@@ -2,17 +2,21 @@
 // Needs march.glsl, environment.glsl.
 uniform int cone_count;
 
+// Which cones are looked along: every `parts`-th of parts * cone_count directions, from the one numbered `part` on, each
+// `width` (0..1) of its share wide, all turned by `turn` (rad) about the normal.
+struct ConeSet { int parts; int part; float width; float turn; };
 
-// Direction k of `cone_count` about z (realtime-gi, appendix A).
-vec3 cone_direction(int k, float turn) {
-    float z = sqrt(1.0 - (float(k) + 0.5) / float(cone_count));
-    float phi = float(k) * GOLDEN_ANGLE + turn;
+// Direction k about z, of equal shares of the projected solid angle (realtime-gi, appendix A).
+vec3 cone_direction(int k, ConeSet set) {
+    float number = float(set.parts * k + set.part);
+    float z = sqrt(1.0 - (number + 0.5) / float(set.parts * cone_count));
+    float phi = number * GOLDEN_ANGLE + set.turn;
     return vec3(sqrt(1.0 - z * z) * vec2(cos(phi), sin(phi)), z);
 }
 
-// Without and with the objects, from `q` (voxels) on a surface about n: one-sided voxels do not meet their own surface; `only_rho` leaves mu out. Cones have equal shares of
-// the projected solid angle; each looks at the middle of its share, `width` (0..1) of it wide. `turn` (rad) is about n.
-void diffuse(vec3 q, vec3 n, float width, float turn, bool only_rho, out vec3 e_mu, out vec3 e_rho) {
+// Without and with the objects, from `q` (voxels) on a surface about n: one-sided voxels do not meet their own surface.
+// `only_rho` leaves mu out.
+void diffuse(vec3 q, vec3 n, ConeSet set, bool only_rho, out vec3 e_mu, out vec3 e_rho) {
     // share pi / K: diameter / distance = 2 tan(half-angle)
     float share = 1.5 * sqrt(2.0 / float(cone_count));
     float half_angle = atan(0.5 * share);
@@ -20,8 +24,8 @@ void diffuse(vec3 q, vec3 n, float width, float turn, bool only_rho, out vec3 e_
     e_mu = vec3(0.0);
     e_rho = vec3(0.0);
     for (int k = 0; k < cone_count; ++k) {
-        vec3 d = basis * cone_direction(k, turn);
-        March m = march(q, d, width * share, only_rho);
+        vec3 d = basis * cone_direction(k, set);
+        March m = march(q, d, set.width * share, only_rho);
         vec3 r = environment(d, half_angle);
         e_mu += m.c_mu + m.t_mu * r;
         e_rho += m.c_rho + m.t_rho * r;

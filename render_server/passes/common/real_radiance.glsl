@@ -14,6 +14,12 @@ bool camera_sees(vec3 p) {
     return seen > 0.0 && abs(seen - c.z) < depth_tolerance * c.z;
 }
 
+// The side about n of a surface at p.
+bool camera_sees(vec3 p, vec3 n) {
+    vec3 c = (camera_from_world * vec4(p, 1.0)).xyz;
+    return dot(mat3(camera_from_world) * n, c) < 0.0 && camera_sees(p);
+}
+
 vec3 measured_radiance(vec3 p) {
     vec3 c = (camera_from_world * vec4(p, 1.0)).xyz;
     return textureLod(linear_picture, picture_pixel(c) / picture_size, picture_lod).rgb;

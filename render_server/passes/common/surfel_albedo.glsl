@@ -9,7 +9,7 @@ uniform float bias_real;   // m
 // surroundings; or as remembered.
 vec3 albedo_at(Surfel s, vec3 n, vec3 indirect) {
     vec3 p = s.position_area.xyz, e = indirect;
-    if (!camera_sees(p)) return unseen_albedo(p);
+    if (!camera_sees(p, n)) return unseen_albedo(p);
     for (int i = 0; i < light_count; ++i) {
         vec3 to_light; float radius;
         vec3 across = light_at(lights[i], p, n, to_light, radius);

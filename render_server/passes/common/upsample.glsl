@@ -2,13 +2,7 @@
 // by nearness and by how well their surface continues this one's.
 layout(binding = 0) uniform isampler2D sample_pixels;
 uniform int scale;
-
-// How well the plane (p, n) holds the point (sp, sn); `size`: distance at which a deviation counts, m.
-float continuation(vec3 p, vec3 n, vec3 sp, vec3 sn, float size) {
-    float off = abs(dot(sp - p, n)) / size;
-    float turn = max(0.0, dot(n, sn));
-    return exp(-off * off) * turn * turn * turn * turn;
-}
+#include "passes/common/continuation.glsl"
 
 // Texel j of the 2 x 2 around `pixel` and its bilinear weight.
 ivec2 low_texel(ivec2 pixel, int j, out float weight) {

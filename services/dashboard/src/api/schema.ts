@@ -1426,6 +1426,11 @@ export interface components {
              */
             readonly ambient?: ("blocked" | "open") | null;
             /**
+             * Bounces
+             * @description How often surfaces reflect light that the volume brought them, each time a propagation more; null = 2, 0 for paper (which has no volume to take it from).
+             */
+            readonly bounces?: number | null;
+            /**
              * Caustics
              * @description What smooth objects reflect of the lights falls on other surfaces as beams, or is injected into the volume; null = beams, the volume for paper.
              */

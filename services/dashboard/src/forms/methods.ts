@@ -23,7 +23,7 @@ export const METHODS: readonly MethodText[] = [
     title: "Light propagation volumes",
     help: "Soft, steady light whose cost hardly depends on the size of the picture. Contact shadows are blurred, and there are no reflections.",
     schema: "DlpvMethod",
-    main: ["operator", "volume_size", "steps", "damping"],
+    main: ["operator", "volume_size", "bounces", "damping"],
   },
   {
     name: "aroof",
