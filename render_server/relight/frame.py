@@ -14,7 +14,7 @@ from render_server.passes.mesh_buffers import MeshBuffers
 from render_server.passes.picture import Picture
 from render_server.passes.real_surface import RealSurface
 from render_server.passes.unseen_albedo import UnseenAlbedo
-from render_server.scene.back_sheets import with_backs
+from render_server.scene.back_sheets import back_sheets
 from render_server.scene.lights import LightSet
 from render_server.scene.materials import Material
 from render_server.scene.mesh import TriangleMesh
@@ -57,9 +57,12 @@ class GeometryState:
     swept_points: Float64[np.ndarray, "k 3"] | None = None  # None: nothing is animated
     is_open: bool = False  # one camera's view of what is solid: backs are not in it
 
-    def solid_corners(self, voxel_edge: float) -> Float32[np.ndarray, "m 3 10"]:
-        """`corners` for voxels of that edge (m), with the backs of what one camera saw (scene/back_sheets.py)."""
-        return with_backs(self.corners, voxel_edge) if self.is_open else self.corners
+    def solid_corners(self, voxel_edge: float) -> Float32[np.ndarray, "k 3 10"]:
+        """`corners` for voxels of that edge (m), with coarse backs of what one camera saw (scene/back_sheets.py)."""
+        if not self.is_open:
+            return self.corners
+        fronts = self.corners if self.coarse_corners is None else self.coarse_corners
+        return np.concatenate([self.corners, back_sheets(fronts, voxel_edge)])
 
     @property
     def bounds(self) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:

@@ -7,8 +7,8 @@ OFFSET_VOXELS = 2.0
 """A ray that leaves a surface looks at the cells around its own, and must not meet the back of the surface there."""
 
 
-def with_backs(corners: Float32[np.ndarray, "m 3 10"], voxel_edge: float) -> Float32[np.ndarray, "k 3 10"]:
-    """Add to each triangle (three corners, position first) its back, turned round and some voxels behind it.
+def back_sheets(corners: Float32[np.ndarray, "m 3 10"], voxel_edge: float) -> Float32[np.ndarray, "m 3 10"]:
+    """The back of each triangle (three corners, position first), turned round and some voxels behind it.
 
     A depth camera sees the front of things. Light does not pass through them from behind either: the underside of a
     shelf keeps off the light from above it and reflects that from below. How thick things are is unknown, so a back
@@ -20,4 +20,4 @@ def with_backs(corners: Float32[np.ndarray, "m 3 10"], voxel_edge: float) -> Flo
     normals = across / np.maximum(length, np.finfo(np.float32).tiny)
     backs = corners[:, ::-1].copy()
     backs[..., :3] -= OFFSET_VOXELS * voxel_edge * normals[:, None]
-    return np.concatenate([corners, backs])
+    return backs
