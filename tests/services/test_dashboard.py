@@ -214,7 +214,7 @@ def test_a_lamp_changes_the_light_on_the_object(stack: Stack, page: Desk) -> Non
     )
     page.shows_newest()
     dim = page.pixels()
-    assert dim[shows_knot(dim)].mean() < 0.8 * bright[shows_knot(bright)].mean()
+    assert dim[shows_knot(dim)].mean() < 0.9 * bright[shows_knot(bright)].mean()
     assert page.named("slider", "Intensity, slider").input_value() == "0.5"
 
 
