@@ -78,6 +78,19 @@ def test_scaled_change_has_its_scale_as_energy(share: float) -> None:
     assert energy.brightening == pytest.approx(share, abs=1e-4)
 
 
+def test_noise_of_the_truth_is_not_light() -> None:
+    """An independent, unbiased estimate of a little added light has all of it, though both are noisy."""
+    rng = np.random.default_rng(6)
+    size = (240, 320, 3)
+    without = np.full(size, 0.4, np.float32)
+    with_objects, result = (without + rng.normal(0.002, 0.006, size).astype(np.float32) for _ in range(2))
+    everywhere = np.ones(size[:2], bool)
+    energy = energy_ratios(
+        result, without, without, with_objects, Regions(everywhere, everywhere, ~everywhere)
+    )
+    assert energy.brightening == pytest.approx(1, abs=0.05)  # by the truth's own sign: 0.32
+
+
 def test_virtual_radiance_is_compared_on_objects_only() -> None:
     truth = np.full((*SIZE, 3), 0.4, np.float32)
     result = truth.copy()
