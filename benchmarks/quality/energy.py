@@ -17,7 +17,8 @@ class Energy:
     """Ratios ours / truth, 1 is right, nan where truth has nothing of the kind.
 
     `darkening` and `brightening`: summed linear change of changed real pixels, over the channels that truth
-    darkens or brightens around them; 0 = no change, negative = the wrong way. `virtual`: mean radiance of the objects.
+    darkens or brightens around them; 0 = no change, negative = the wrong way. `virtual`: mean radiance of the
+    objects.
     """
 
     darkening: float
