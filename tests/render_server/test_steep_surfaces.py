@@ -113,7 +113,8 @@ def test_the_lid_throws_its_shadow(gpu: GpuContext, tmp_path: Path) -> None:
         gpu, stage, colored(shown, tuple(COLORS[BEHIND]))
     )  # the lid is unknown
     assert bright > 0.5 / np.pi
-    assert top_of_a_cube_under_the_lid(gpu, stage, colored(shown)) < 0.2 * bright
+    dark = top_of_a_cube_under_the_lid(gpu, stage, colored(shown))
+    assert dark < 0.25 * bright  # the lid's underside gives back some of the floor's light
 
 
 @pytest.mark.parametrize("seen_as", [BEHIND, EDGE])
