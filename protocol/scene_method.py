@@ -159,8 +159,7 @@ class DlpvMethod(StrictModel):
         default=None,
         ge=0,
         le=4,
-        description="How often surfaces reflect light that the volume brought them, each time a propagation more; "
-        "null = 2, 0 for paper (which has no volume to take it from).",
+        description="How often surfaces reflect what the volume brought them; null = 2, 0 for paper.",
     )
     ambient: Literal["blocked", "open"] | None = Field(
         default=None,

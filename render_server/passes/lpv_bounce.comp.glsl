@@ -16,26 +16,14 @@ vec3 brought(bool with_objects, Surfel s, vec3 n) {
 }
 
 #ifdef REAL
-vec3 reflected(Surfel s, vec3 n) {
+vec3 sent_out(Surfel s, vec3 n) {
     vec3 surroundings = environment_irradiance(n);
     vec3 e_mu = max(surroundings + brought(false, s, n), vec3(0.0));
     vec3 e_rho = max(surroundings + brought(true, s, n), vec3(0.0));
     return albedo_at(s, n, e_mu) * (e_rho - e_mu);
 }
 #else
-vec3 reflected(Surfel s, vec3 n) { return virtual_albedo(s) * brought(true, s, n); }
+vec3 sent_out(Surfel s, vec3 n) { return virtual_albedo(s) * brought(true, s, n); }
 #endif
 
-void inject_side(Surfel s, vec3 n) {
-    vec3 radiosity = reflected(s, n);
-    if (radiosity != vec3(0.0)) inject(s.position_area.xyz, n, radiosity * s.position_area.w);
-}
-
-void main() {
-    uint count = min(surfel_count, surfel_capacity);
-    for (uint i = gl_GlobalInvocationID.x; i < count; i += gl_NumWorkGroups.x * 64u) {
-        Surfel s = surfels[i];
-        inject_side(s, s.normal_material.xyz);
-        if (s.uv_voxel.w > 0.5) inject_side(s, -s.normal_material.xyz);
-    }
-}
+#include "passes/common/inject_surfels.glsl"

@@ -21,17 +21,10 @@ vec3 reflectance(Surfel s, vec3 n) { return virtual_albedo(s); }
 vec3 emission_of(Surfel s) { return materials[int(s.normal_material.w)].emission.rgb; }
 #endif
 
-void inject_side(Surfel s, vec3 n) {
+vec3 sent_out(Surfel s, vec3 n) {
     vec3 radiosity = PI * emission_of(s);
     if (blocks_surroundings) radiosity += reflectance(s, n) * environment_irradiance(n) - environment_irradiance(-n);
-    if (radiosity != vec3(0.0)) inject(s.position_area.xyz, n, radiosity * s.position_area.w);
+    return radiosity;
 }
 
-void main() {
-    uint count = min(surfel_count, surfel_capacity);
-    for (uint i = gl_GlobalInvocationID.x; i < count; i += gl_NumWorkGroups.x * 64u) {
-        Surfel s = surfels[i];
-        inject_side(s, s.normal_material.xyz);
-        if (s.uv_voxel.w > 0.5) inject_side(s, -s.normal_material.xyz);
-    }
-}
+#include "passes/common/inject_surfels.glsl"

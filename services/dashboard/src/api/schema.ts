@@ -1427,7 +1427,7 @@ export interface components {
             readonly ambient?: ("blocked" | "open") | null;
             /**
              * Bounces
-             * @description How often surfaces reflect light that the volume brought them, each time a propagation more; null = 2, 0 for paper (which has no volume to take it from).
+             * @description How often surfaces reflect what the volume brought them; null = 2, 0 for paper.
              */
             readonly bounces?: number | null;
             /**

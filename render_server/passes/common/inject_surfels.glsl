@@ -1,0 +1,16 @@
+// Every surfel of a store, on each of its sides, sends `sent_out(surfel, normal)` (radiosity) into the volume. Needs
+// voxel_store.glsl, inject_light.glsl and that function.
+
+void inject_side(Surfel s, vec3 n) {
+    vec3 radiosity = sent_out(s, n);
+    if (radiosity != vec3(0.0)) inject(s.position_area.xyz, n, radiosity * s.position_area.w);
+}
+
+void main() {
+    uint count = min(surfel_count, surfel_capacity);
+    for (uint i = gl_GlobalInvocationID.x; i < count; i += gl_NumWorkGroups.x * 64u) {
+        Surfel s = surfels[i];
+        inject_side(s, s.normal_material.xyz);
+        if (s.uv_voxel.w > 0.5) inject_side(s, -s.normal_material.xyz);
+    }
+}
