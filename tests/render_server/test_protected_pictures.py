@@ -1,0 +1,107 @@
+"""Every method's pictures, protected to the bit on the machine that recorded them and within 60 dB elsewhere.
+
+`DELTALIGHT_REGENERATE_GOLDENS=1 pytest tests/render_server/test_protected_pictures.py` records them anew: look at the
+sheets (goldens/protected_*.png; a column a kind of scene, a row a kind of geometry) and at what changed before they
+are committed.
+"""
+
+import hashlib
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from render_server.gpu.context import GpuContext
+from tests.render_server.protected_scenes import GEOMETRIES, KINDS, METHODS, PICTURE, Case, cases, pictures_of
+from tests.render_server.test_golden import psnr_db
+
+pytestmark = pytest.mark.usefixtures("clean_gl")
+FOLDER = Path(__file__).with_name("goldens")
+RECORD = FOLDER / "protected.json"
+REGENERATE = os.environ.get("DELTALIGHT_REGENERATE_GOLDENS") == "1"
+LEAST_PSNR_DB = 60.0
+TURNED = 1  # the frame that the sheets show
+CPU_FLAGS = ("avx", "avx2", "fma", "avx512f")  # that change the last bits of what llvmpipe and numpy compute
+
+
+def made_with(gpu: GpuContext) -> dict[str, Any]:
+    """What decides the last bits of a picture."""
+    info = Path("/proc/cpuinfo")
+    flags = set(info.read_text().split()) if info.exists() else set()
+    return {
+        "renderer": gpu.renderer_name,
+        "version": gpu.version,
+        "cpu": [flag for flag in CPU_FLAGS if flag in flags],
+    }
+
+
+def digest(picture: np.ndarray) -> str:
+    return hashlib.sha256(np.ascontiguousarray(picture).tobytes()).hexdigest()
+
+
+def sheet_path(method: str) -> Path:
+    return FOLDER / f"protected_{method}.png"
+
+
+def tile(case: Case) -> tuple[slice, slice]:
+    """Where a sheet shows the case."""
+    row, column = GEOMETRIES.index(case.geometry), list(KINDS).index(case.kind)
+    width, height = PICTURE["width"], PICTURE["height"]
+    return np.s_[row * height : (row + 1) * height, column * width : (column + 1) * width]
+
+
+class Recording:
+    """What was recorded, and what this run adds when it records anew."""
+
+    def __init__(self) -> None:
+        self.old: dict[str, Any] = json.loads(RECORD.read_text()) if RECORD.exists() else {}
+        self.new: dict[str, list[str]] = {}
+        self.sheets: dict[str, np.ndarray] = {}
+
+    def add(self, case: Case, pictures: list[np.ndarray]) -> None:
+        self.new[str(case)] = [digest(picture) for picture in pictures]
+        size = len(GEOMETRIES) * PICTURE["height"], len(KINDS) * PICTURE["width"], 3
+        sheet = self.sheets.setdefault(case.method, np.zeros(size, np.uint8))
+        sheet[tile(case)] = pictures[TURNED]
+
+    def store(self, gpu: GpuContext) -> None:
+        record = {"made_with": made_with(gpu), "pictures": {**self.old.get("pictures", {}), **self.new}}
+        RECORD.write_text(json.dumps(record, indent=1, sort_keys=True) + "\n")
+        for method, sheet in self.sheets.items():
+            Image.fromarray(sheet).save(sheet_path(method), optimize=True)
+
+
+@pytest.fixture(scope="module")
+def recording(gpu: GpuContext) -> Iterator[Recording]:
+    record = Recording()
+    yield record
+    if REGENERATE:
+        record.store(gpu)
+
+
+@pytest.mark.parametrize("case", [pytest.param(case, id=str(case)) for case in cases()])
+def test_pictures_are_the_recorded_ones(
+    gpu: GpuContext, recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, case: Case
+) -> None:
+    monkeypatch.setenv("DELTALIGHT_CACHE", str(tmp_path / "cache"))
+    pictures = pictures_of(gpu, case, tmp_path)
+    if REGENERATE:
+        recording.add(case, pictures)
+        return
+    if recording.old["made_with"] == made_with(gpu):
+        assert [digest(picture) for picture in pictures] == recording.old["pictures"][str(case)]
+        return
+    golden = np.asarray(Image.open(sheet_path(case.method)))[tile(case)]
+    assert psnr_db(pictures[TURNED], golden) >= LEAST_PSNR_DB, recording.old["made_with"]
+
+
+def test_the_record_is_small_and_complete() -> None:
+    record = json.loads(RECORD.read_text())
+    assert set(record["pictures"]) == {str(case) for case in cases()}
+    assert {path.name for path in FOLDER.glob("protected_*.png")} == {sheet_path(m).name for m in METHODS}
+    assert all(path.stat().st_size < 500_000 for path in FOLDER.glob("protected_*.png"))
