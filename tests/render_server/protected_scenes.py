@@ -111,7 +111,7 @@ def _animated(stage: Stage) -> Changes:
         "id": "bar",
         "asset": str(bent_bar(stage.folder, QUARTER_TURN)),
         "animation": {},
-        "pose": {"translation_m": [0.2, 0.1, 0], "scale": 0.08},
+        "pose": {"translation_m": [-0.2, -0.15, 0], "scale": 0.15},
         "material": {"base_color": (0.3, 0.7, 0.3), "roughness": 0.6},
     }
     return {"more_objects": [bar]}
@@ -139,7 +139,8 @@ def _lights(stage: Stage) -> Changes:  # noqa: ARG001
 
 def _estimated(stage: Stage) -> Changes:  # noqa: ARG001
     """What is out of sight is found on the board's paper, albedo from the pictures."""
-    return {"surroundings": "auto", "unseen_albedo": None, "board": BOARD}
+    lights = [directional((-0.6, 0.5, -0.8), 0.3, 2.0), ambient(0.05)]
+    return {"surroundings": "auto", "unseen_albedo": None, "board": BOARD, "lights": lights}
 
 
 def _registered(stage: Stage) -> Changes:  # noqa: ARG001
