@@ -14,9 +14,8 @@ import numpy as np
 import trimesh
 
 from benchmarks.glb_builder import GlbBuilder
-from render_server.passes.mesh_buffers import triangle_corners
-from render_server.passes.volume import place_volume
-from render_server.passes.voxelize import pieces_in_volume
+from render_server.passes.gbuffer import triangle_corners
+from render_server.passes.voxels import pieces_in_volume, place_volume
 from render_server.scene.gltf_asset import load_gltf
 from render_server.scene.mesh import merge_for_gpu
 

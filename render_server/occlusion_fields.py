@@ -11,7 +11,7 @@ from rich.progress import Progress
 
 from protocol.errors import DeltalightError
 from protocol.scene_objects import SceneObject
-from render_server.relight.frame import PlacedObject
+from render_server.gpu_scene import PlacedObject
 from render_server.scene.mesh import TriangleMesh
 from render_server.scene.occlusion_field import FieldSettings, OcclusionField, Step
 from render_server.scene.occlusion_field_cache import (

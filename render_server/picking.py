@@ -9,8 +9,9 @@ from jaxtyping import Float64
 
 from protocol.errors import DeltalightError
 from protocol.frames import ViewFrame
-from render_server.gpu.texel import read_texel
-from render_server.relight.frame import PlacedObject, RelightInput
+from render_server.frame_graph import ShownBuffers
+from render_server.gpu.textures import read_texel
+from render_server.gpu_scene import PlacedObject
 from render_server.scene.depth_surface import depth_surface
 from render_server.scene.mesh import TriangleMesh
 from render_server.scene.ray_mesh import first_hit
@@ -59,7 +60,7 @@ class ShownFrame:
 
     frame: ViewFrame
     view: CameraView | None
-    buffers: RelightInput | None
+    buffers: ShownBuffers | None
     model: Sequence[TriangleMesh] = ()
 
     @property
@@ -120,18 +121,18 @@ class ShownFrame:
         return point, rotation @ (fitted if fitted.any() else -ray)
 
 
-def _object_in_front(scene: RelightInput, pixel: Pixel) -> str | None:
+def _object_in_front(shown: ShownBuffers, pixel: Pixel) -> str | None:
     """Id of the virtual object that the pixel shows."""
-    if read_texel(scene.matte, pixel)[0] < SHOWN_SHARE:
+    if read_texel(shown.object_coverage, pixel)[0] < SHOWN_SHARE:
         return None
-    material = read_texel(scene.virtual_raster.normal, _raster_texel(scene.view, pixel))[3]
-    return _owner(scene.virtual.objects, round(float(material)))
+    material = read_texel(shown.object_buffer.normal, _raster_texel(shown.view, pixel))[3]
+    return _owner(shown.objects.objects, round(float(material)))
 
 
-def _surface_in_buffers(scene: RelightInput, pixel: Pixel, *, of_object: bool) -> Surface | None:
+def _surface_in_buffers(shown: ShownBuffers, pixel: Pixel, *, of_object: bool) -> Surface | None:
     """Place and normal in one of the geometry buffers; None where the real surface is unknown."""
-    texel = _raster_texel(scene.view, pixel) if of_object else pixel
-    buffer = scene.virtual_raster if of_object else scene.real_surface
+    texel = _raster_texel(shown.view, pixel) if of_object else pixel
+    buffer = shown.object_buffer if of_object else shown.real_surface
     place = read_texel(buffer.position, texel).astype(np.float64)
     if place[3] <= 0:
         return None
@@ -139,7 +140,7 @@ def _surface_in_buffers(scene: RelightInput, pixel: Pixel, *, of_object: bool) -
 
 
 def _raster_texel(view: CameraView, pixel: Pixel) -> Pixel:
-    """Texel of the objects' raster that a pixel sees (passes/common/geometry.glsl)."""
+    """Texel of the objects' raster that a pixel sees (passes/shaders/common/geometry.glsl)."""
     if view.antialiased or not view.camera.has_distortion:
         return pixel
     (fx, fy, cx, cy), _ = view.raster

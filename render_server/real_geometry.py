@@ -1,7 +1,5 @@
 """The real scene's triangles: a mesh of the frame's depth, the fused surface of all frames, or a given model."""
 
-from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +8,10 @@ from jaxtyping import Float32, Float64, UInt8
 from protocol.errors import DeltalightError
 from protocol.frames import DepthImage, ViewFrame
 from protocol.scene_objects import ModelGeometry, RealScene
+from render_server.frame import Scan
 from render_server.gpu.context import GpuContext
-from render_server.passes.materials import MaterialTable
-from render_server.passes.mesh_buffers import MeshBuffers, triangle_corners
-from render_server.relight.frame import GeometryState
+from render_server.gpu_scene import GeometryState
+from render_server.passes.gbuffer import MaterialTable, MeshBuffers, triangle_corners
 from render_server.scene.depth_mesh import depth_mesh
 from render_server.scene.depth_surface import DepthSurface, depth_surface, noise_sigma
 from render_server.scene.fused_scene import FusedScene
@@ -34,24 +32,22 @@ ROUNDED_VOXELS = 0.35
 class RealGeometry:
     """Keeps the real scene until it moves (RealSceneTracker), then rebuilds it.
 
-    `versions` numbers every state, also across scenes, so that no cache takes one for another.
+    `state` is another object whenever its triangles change, `scan` whenever something moved, the camera included.
     """
 
-    def __init__(
-        self, gpu: GpuContext, real: RealScene, triangle_budget: int, versions: Iterator[int]
-    ) -> None:
+    def __init__(self, gpu: GpuContext, real: RealScene, triangle_budget: int) -> None:
         self._gpu = gpu
         self.budget = triangle_budget
         self._tracker = RealSceneTracker()
         self._buffers = MeshBuffers(gpu)
         self._materials: MaterialTable | None = None
-        self._versions = versions
         self.state: GeometryState | None = None
         self.material_names: tuple[str, ...] = ()
         self.is_model = isinstance(real.geometry, ModelGeometry)
         self.frame: ViewFrame | None = None
         self.view: CameraView | None = None
         self.surface: DepthSurface | None = None
+        self._scan: Scan | None = None
         self._world_from_fused = np.eye(4)
         self._fused_meshes: tuple[list[TriangleMesh], list[TriangleMesh]] = [], []
         self._fused = FusedScene() if real.geometry == "fused" else None
@@ -71,16 +67,30 @@ class RealGeometry:
         return self.is_model or self._fused is not None
 
     @property
-    def noise_sigma(self) -> float:
-        """Depth noise at 1 m, m; a model has none. Three of it are at least what voxels round off."""
-        if self.is_model or self.frame is None or self.frame.depth is None:
-            return 0.0
-        sensor = noise_sigma(self.frame.depth)
+    def scan(self) -> Scan:
+        """What the camera measured when something last moved."""
+        if self._scan is None:
+            self._scan = self._scanned()
+        return self._scan
+
+    def _scanned(self) -> Scan:
+        """Depth, its noise, and what the fused surface may differ from it. A model has no noise.
+
+        Three standard deviations of the noise are at least what voxels round off.
+        """
+        depth = None if self.is_model or self.frame is None else self.frame.depth
+        if depth is None:
+            return Scan(None, None, 0.0, 1.0, None)
+        known = depth.depth_m[depth.valid]
+        typical_depth = float(np.median(known)) if known.size else 1.0
         rounded_m = 0.0 if self._fused is None else ROUNDED_VOXELS * self._fused.voxel_m
-        return max(sensor, rounded_m / (3 * self.typical_depth**2))
+        sigma = max(noise_sigma(depth), rounded_m / (3 * typical_depth**2))
+        # The fused surface agrees with depth up to half a voxel, and three standard deviations of the depth's noise.
+        tolerance = None if self._fused is None else (0.5 * self._fused.voxel_m, 3 * sigma)
+        return Scan(depth, self.surface, sigma, typical_depth, tolerance)
 
     def update(self, frame: ViewFrame, view: CameraView) -> bool:
-        """Take over the frame's geometry if it changed; returns whether it did.
+        """Takes the frame's geometry if something moved; returns whether it did.
 
         Raises:
             DeltalightError: the scene wants depth and the frame has none.
@@ -93,25 +103,16 @@ class RealGeometry:
         if moved:
             self.frame, self.view = frame, view
         if self._fused is not None:
-            return self._fuse(self._fused, frame, view, moved)
-        if not moved:
-            return False
-        if self.is_model and self.state is not None:
-            self.state = replace(self.state, version=next(self._versions))
-        elif self.is_model:
-            self._build(self.model, None)
+            changed = self._fuse(self._fused, frame, view, moved)
         else:
-            assert frame.depth is not None
-            self._build_from_depth(frame.depth, frame.color, view)
-        return True
-
-    @property
-    def fused_tolerance(self) -> tuple[float, float] | None:
-        """Up to what difference the fused surface agrees with a frame's depth: m, and m at 1 m; None: not fused.
-
-        Half a voxel, and three standard deviations of the depth's noise.
-        """
-        return None if self._fused is None else (0.5 * self._fused.voxel_m, 3 * self.noise_sigma)
+            changed = moved
+            if moved and self.is_model and self.state is None:
+                self._build(self.model, None)
+            elif moved and frame.depth is not None and not self.is_model:
+                self._build_from_depth(frame.depth, frame.color, view)
+        if changed:
+            self._scan = None
+        return changed
 
     def _fuse(self, fused: FusedScene, frame: ViewFrame, view: CameraView, moved: bool) -> bool:
         """Average a frame in, unless all stands still long enough; returns whether anything changed."""
@@ -135,8 +136,6 @@ class RealGeometry:
             self.surface = surface
         if renewed or displaced:
             self._build_from_fused()
-        elif moved and self.state is not None:
-            self.state = replace(self.state, version=next(self._versions))
         return moved or renewed
 
     def _follow_pose(self, fused: FusedScene, view: CameraView) -> bool:
@@ -187,7 +186,6 @@ class RealGeometry:
         if self._materials is None:
             self._materials = MaterialTable(self._gpu, merged)
         self.state = GeometryState(
-            next(self._versions),
             self._buffers,
             triangle_corners(merged),
             _sample(merged.vertices[:, :3]),
@@ -195,14 +193,6 @@ class RealGeometry:
             coarse_corners,
             is_open=is_open,
         )
-
-    @property
-    def typical_depth(self) -> float:
-        """Median known depth, m (1 for a model)."""
-        if self.is_model or self.frame is None or self.frame.depth is None:
-            return 1.0
-        known = self.frame.depth.depth_m[self.frame.depth.valid]
-        return float(np.median(known)) if known.size else 1.0
 
     def release(self) -> None:
         """Free the GL objects."""

@@ -13,10 +13,10 @@ from protocol.errors import DeltalightError
 from protocol.frames import DepthImage, ViewFrame
 from protocol.scene import SceneDocument
 from protocol.scene_method import Output
-from render_server.compose import Composer
 from render_server.gpu.context import GpuContext
+from render_server.gpu.readback import AsyncReadback
+from render_server.live_scene import LiveScene, RelitFrame
 from render_server.picking import Pick, ShownFrame
-from render_server.relighting import Relighting, RelitFrame
 from render_server.view import CameraView
 
 
@@ -64,8 +64,8 @@ class SceneRenderer:
     ) -> None:
         self._gpu = gpu
         self.notices: list[str] = []
-        self._relighting = Relighting(gpu, scene, self.notices, waits=waits)
-        self._composer = Composer(gpu)
+        self._live = LiveScene(gpu, scene, self.notices, waits=waits)
+        self._readback = AsyncReadback(gpu)
         self._with_linear = with_linear
         self._sized: tuple[ViewFrame, ViewFrame] | None = None
         self._shown: ShownFrame | None = None
@@ -77,13 +77,13 @@ class SceneRenderer:
         Raises:
             DeltalightError: the scene needs an asset that cannot be read, or more memory than its budget.
         """
-        self._relighting.set_scene(scene)
+        self._live.set_scene(scene)
         self.scene = scene
 
     def begin_source(self) -> None:
         """Forget all that earlier frames showed: the next ones come from elsewhere."""
         self._shown = self._sized = None
-        self._relighting.begin_source()
+        self._live.begin_source()
 
     def render(self, frame: ViewFrame, *, with_linear: bool = False) -> CompositeFrame:
         """The composite of one frame; without pose or visible object it is the camera's picture, byte for byte."""
@@ -96,18 +96,18 @@ class SceneRenderer:
             self._shown = ShownFrame(frame, None, None)
             return _at_once(self._shown, frame.color)
         view = CameraView(frame.camera, frame.pose.world_from_camera)
-        relit = self._relighting.relight(frame, view)
-        lights = self._relighting.describe_lights()
+        relit = self._live.relight(frame, view)
+        lights = self._live.describe_lights()
         name = self.scene.output.view
         shows_lights = name == "lights" and bool(lights)
         is_cameras = frame.radiance_map is None if shows_lights else relit is None or name != "rsm"
-        seen = view if relit is None else relit.input.view
-        buffers = None if relit is None else relit.input
-        shown = ShownFrame(frame, seen if is_cameras else None, buffers, self._relighting.model)
+        buffers = None if relit is None else relit.shown()
+        seen = view if buffers is None else buffers.view
+        shown = ShownFrame(frame, seen if is_cameras else None, buffers, self._live.model)
         self._shown = shown
         if shows_lights:
-            times = {} if relit is None else dict(relit.timers.end_frame())
-            return _at_once(shown, self._relighting.lighting.picture(frame), times, lights)
+            times = {} if relit is None else dict(self._live.timers.end_frame())
+            return _at_once(shown, self._live.lighting.picture(frame), times, lights)
         if relit is None:
             return _at_once(shown, frame.color)
         return self._composed(shown, relit, lights, with_linear=with_linear or self._with_linear)
@@ -137,11 +137,16 @@ class SceneRenderer:
     def _composed(
         self, shown: ShownFrame, relit: RelitFrame, lights: list[dict[str, Any]], *, with_linear: bool
     ) -> PendingComposite:
-        self._composer.start(relit, self.scene.output, with_linear=with_linear)
-        times, frame, pose = dict(relit.timers.end_frame()), shown.frame, shown.world_from_camera
+        composite, timers = relit.compose(with_linear=with_linear), self._live.timers
+        with timers.measure("readback"):
+            self._readback.push(composite.code, "u1")
+            if with_linear:
+                self._readback.push(composite.linear, "f2")
+        times, frame, pose = dict(timers.end_frame()), shown.frame, shown.world_from_camera
 
         def finish() -> CompositeFrame:
-            color, linear = self._composer.finish(with_linear=with_linear)
+            color = np.ascontiguousarray(self._readback.pop()[..., :3])
+            linear = self._readback.pop()[..., :3].astype(np.float32) if with_linear else None
             return CompositeFrame(
                 frame.frame_id, frame.timestamp_ns, color, linear, "ok", frame.camera, pose, times, lights
             )
@@ -150,8 +155,8 @@ class SceneRenderer:
 
     def release(self) -> None:
         """Free all GL objects."""
-        self._relighting.release()
-        self._composer.release()
+        self._live.release()
+        self._readback.release()
 
 
 def _at_once(

@@ -2,18 +2,31 @@
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
 
 from protocol.camera_model import CameraModel
+from render_server.gpu.uniform_block import Block, Bool, Mat4, Vec2, Vec3, Vec4
 
 NEAR_M = 0.02
 FAR_M = 100.0
 RECTANGLE_MARGIN_PX = 8  # a lens bends the edges between the corners of a box
 
 Rectangle = tuple[int, int, int, int]  # first column and row, width and height
+
+
+@dataclass(frozen=True, eq=False)
+class CameraBlock(Block):
+    """Uniform block `Camera` (passes/shaders/common/camera.glsl)."""
+
+    camera_from_world: Mat4
+    world_from_camera: Mat4
+    camera_pinhole: Vec4
+    raster_pinhole: Vec4
+    camera_position: Vec3
+    lens_distortion: Bool
+    picture_size: Vec2
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,8 +52,13 @@ class CameraView:
 
     @cached_property
     def with_antialiasing(self) -> "CameraView":
-        """The same view for passes that read an antialiased geometry buffer of the objects."""
+        """The same view for stages that read an antialiased geometry buffer of the objects."""
         return replace(self, antialiased=True)
+
+    @cached_property
+    def without_antialiasing(self) -> "CameraView":
+        """The same view for what rasters the objects or looks at such a raster through the lens."""
+        return replace(self, antialiased=False)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -124,19 +142,18 @@ class CameraView:
         seen = points @ matrix[:3, :3].T + matrix[:3, 3]
         return None if (seen[:, 2] <= NEAR_M).any() else seen
 
-    def uniforms(self) -> dict[str, Any]:
-        """Every uniform that shaders read of the camera."""
+    def block(self) -> CameraBlock:
+        """What shaders read of the camera."""
         matrix = self.camera.matrix
-        return {
-            "camera_from_world": self.camera_from_world,
-            "world_from_camera": self.world_from_camera,
-            "clip_from_camera": self.clip_from_camera,
-            "camera_position": tuple(float(v) for v in self.position),
-            "camera_pinhole": (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]),
-            "picture_size": tuple(float(v) for v in self.size),
-            "lens_distortion": self.camera.has_distortion and not self.antialiased,
-            "raster_pinhole": tuple(float(v) for v in self.raster[0]),
-        }
+        return CameraBlock(
+            camera_from_world=self.camera_from_world,
+            world_from_camera=self.world_from_camera,
+            camera_pinhole=(matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]),
+            raster_pinhole=tuple(self.raster[0]),
+            camera_position=tuple(self.position),
+            lens_distortion=self.camera.has_distortion and not self.antialiased,
+            picture_size=self.size,
+        )
 
 
 def _rectangle(places: Float64[np.ndarray, "n 2"] | None, size: tuple[int, int]) -> Rectangle:

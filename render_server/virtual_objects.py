@@ -12,10 +12,9 @@ from protocol.errors import DeltalightError
 from protocol.scene_objects import Material as MaterialDocument
 from protocol.scene_objects import SceneObject
 from render_server.gpu.context import GpuContext
+from render_server.gpu_scene import GeometryState, PlacedObject
 from render_server.moving_object import MovingObject, clip_of
-from render_server.passes.materials import MaterialTable
-from render_server.passes.mesh_buffers import MeshBuffers, triangle_corners
-from render_server.relight.frame import GeometryState, PlacedObject
+from render_server.passes.gbuffer import MaterialTable, MeshBuffers, triangle_corners
 from render_server.scene.materials import Material
 from render_server.scene.mesh import Asset, GpuMesh, TriangleMesh, load_asset, merge_for_gpu
 
@@ -35,7 +34,6 @@ class VirtualObjects:
         self._board: BoardSpec | None = None
         self._moving: dict[str, MovingObject] = {}
         self._standing: dict[str, list[TriangleMesh]] = {}
-        self._version = 0
         self.state: GeometryState | None = None
 
     def load(self, objects: Sequence[SceneObject]) -> None:
@@ -79,7 +77,6 @@ class VirtualObjects:
             self._given = {each: made for each, made in self._given.items() if each in _materials(shown)}
         moved = [moving.follow(capture_ns) for moving in self._moving.values()]
         if is_new or any(moved):
-            self._version += 1
             self.state = self._build() if shown else None
         return self.state
 
@@ -94,7 +91,6 @@ class VirtualObjects:
             return None
         self._buffers.write(merged)
         return GeometryState(
-            self._version,
             self._buffers,
             triangle_corners(merged),
             np.vstack(points),

@@ -1,6 +1,8 @@
 """The one OpenGL context of a process (EGL, headless)."""
 
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import moderngl
@@ -32,9 +34,35 @@ class GpuContext:
     renderer_name: str
     version: str
     is_software: bool
+    watchers: list[Callable[[Any], None]] = field(default_factory=list)
+    """Told of every run of a kernel (gpu/kernel.py)."""
+    compile_watchers: list[Callable[[str, Mapping[str, str]], None]] = field(default_factory=list)
+    """Told of every program that is compiled: its label and the text of each of its stages."""
+
+    def compiled(self, label: str, sources: Mapping[str, str]) -> None:
+        """Tells who watches that a program is being compiled."""
+        for watch in self.compile_watchers:
+            watch(label, sources)
+
+    @cached_property
+    def _empty_textures(self) -> dict[type, Any]:
+        return {
+            moderngl.Texture: self.ctx.texture((1, 1), 4, bytes(4)),
+            moderngl.Texture3D: self.ctx.texture3d((1, 1, 1), 4, bytes(4)),
+            moderngl.TextureArray: self.ctx.texture_array((1, 1, 1), 4, bytes(4)),
+        }
+
+    def empty_texture(self, kind: type) -> Any:  # noqa: ANN401 (as the kind says)
+        """A texture of zeros that stands where a kernel is given none."""
+        return self._empty_textures[kind]
+
+    @cached_property
+    def empty_buffer(self) -> moderngl.Buffer:
+        """A buffer of zeros that stands where a kernel is given none."""
+        return self.ctx.buffer(bytes(256))
 
     def release(self) -> None:
-        """Free the context; nothing made from it may be used afterwards."""
+        """Frees the context; nothing made from it may be used afterwards."""
         self.ctx.release()
 
 

@@ -1,16 +1,41 @@
-"""Shader text: recursive `#include`, once each, with `#line` marks and defines after `#version`."""
+"""Shader text: recursive `#include`, once each, with `#line` marks and defines after `#version`; what it declares."""
 
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[1]
+SHADERS = Path(__file__).resolve().parents[1] / "passes" / "shaders"
 INCLUDE = re.compile(r'^\s*#include\s+"([^"]+)"\s*$')
 VERSION = "#version 430 core"
 
+_COMMENT = re.compile(r"//[^\n]*|/\*.*?\*/", re.DOTALL)
+_VARIABLE = re.compile(
+    r"(?:layout\s*\(([^)]*)\)\s*)?((?:(?:readonly|writeonly|coherent|volatile|restrict)\s+)*)"
+    r"\buniform\s+(?:(?:highp|mediump|lowp)\s+)?(\w+)\s+([^;{]+);"
+)
+_BLOCK = re.compile(
+    r"((?:(?:readonly|writeonly|coherent|volatile|restrict)\s+)*)\b(buffer|uniform)\s+(\w+)\s*\{"
+)
+_LOCAL_SIZE = re.compile(r"\blocal_size_([xyz])\s*=\s*(\d+)")
+
+
+@dataclass(frozen=True)
+class Declarations:
+    """Names that a shader's text declares, whichever of them its defines leave in.
+
+    `formats` are the formats of images (layout qualifiers; none where it is written only and has no format),
+    `written` the images and storage blocks that are not `readonly`.
+    """
+
+    names: frozenset[str]
+    formats: Mapping[str, frozenset[str]]
+    written: frozenset[str]
+    local_size: tuple[int, int, int]
+
 
 def shader_source(path: Path, defines: Mapping[str, int | float | str] | None = None) -> str:
-    """Text of the shader at `path` with its includes (paths relative to `render_server/`) and defines."""
+    """Text of the shader at `path` with its includes (relative to the shaders' folder) and defines."""
     files: list[Path] = []
     body = _expand(path, files)
     head = [VERSION, *(f"#define {name} {value}" for name, value in (defines or {}).items())]
@@ -28,8 +53,31 @@ def _expand(path: Path, seen: list[Path]) -> str:
         if match is None:
             lines.append(line)
             continue
-        target = ROOT / match.group(1)
+        target = SHADERS / match.group(1)
         if target not in seen:
             lines.append(_expand(target, seen))
         lines.append(f"#line {index + 1} {number}")
     return "\n".join(lines)
+
+
+def declarations(source: str) -> Declarations:
+    """What the text of a shader declares for its caller."""
+    text = _COMMENT.sub(" ", source)
+    names: set[str] = set()
+    formats: dict[str, frozenset[str]] = {}
+    written: set[str] = set()
+    for layout, access, kind, declared in _VARIABLE.findall(text):
+        for name in (part.strip().split("[")[0].strip() for part in declared.split(",")):
+            names.add(name)
+            if "image" in kind:
+                format_ = {word.strip() for word in layout.split(",")} - {""}
+                formats[name] = formats.get(name, frozenset()) | format_
+                if "readonly" not in access:
+                    written.add(name)
+    for access, kind, name in _BLOCK.findall(text):
+        names.add(name)
+        if kind == "buffer" and "readonly" not in access:
+            written.add(name)
+    sizes = {axis: int(size) for axis, size in _LOCAL_SIZE.findall(text)}
+    local_size = (sizes.get("x", 1), sizes.get("y", 1), sizes.get("z", 1))
+    return Declarations(frozenset(names), formats, frozenset(written), local_size)

@@ -1,10 +1,19 @@
-"""Making textures with the sampling state that every pass here wants."""
+"""Textures with the sampling state that every pass wants; reading one texel; freeing GL objects."""
 
-from collections.abc import Mapping
+from typing import Protocol
 
 import moderngl
+import numpy as np
+from jaxtyping import Float32
 
 from render_server.gpu.context import GpuContext
+
+
+class Releasable(Protocol):
+    """A GL object, or an owner of some."""
+
+    def release(self) -> None:
+        """Frees it."""
 
 
 def texture_2d(
@@ -25,21 +34,24 @@ def texture_2d(
     return texture
 
 
-def bind_images(*textures: moderngl.Texture | moderngl.Texture3D, first: int = 0) -> None:
-    """Bind textures as read-write images of their own format, on units from `first` on."""
-    for unit, texture in enumerate(textures, start=first):
-        texture.bind_to_image(unit, read=True, write=True)
-
-
-def bind_samplers(
-    textures: Mapping[int, moderngl.Texture | moderngl.Texture3D | moderngl.TextureArray],
-) -> None:
-    """Bind textures to sampler units."""
-    for unit, texture in textures.items():
-        texture.use(location=unit)
+def read_texel(texture: moderngl.Texture, place: tuple[int, int]) -> Float32[np.ndarray, " c"]:
+    """Components of the texel at `place` (column, row); waits until the GPU has filled it."""
+    target = texture.ctx.framebuffer([texture])
+    try:
+        data = target.read(viewport=(*place, 1, 1), components=texture.components, dtype="f4", alignment=1)
+    finally:
+        release_target(target)
+    return np.frombuffer(data, np.float32)
 
 
 def release_target(target: moderngl.Framebuffer) -> None:
-    """Free a framebuffer; a bound one is unbound first, or the next one made would meet a GL error."""
+    """Frees a framebuffer; a bound one is unbound first, or the next one made would meet a GL error."""
     target.ctx.detect_framebuffer(0).use()
     target.release()
+
+
+def release_all(*items: Releasable | None) -> None:
+    """Frees all items that are there."""
+    for item in items:
+        if item is not None:
+            item.release()

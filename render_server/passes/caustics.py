@@ -1,17 +1,13 @@
-"""Light that smooth virtual surfaces throw on others: beams from the lights' maps of the objects, added to pixels."""
+"""Caustics: light that smooth virtual surfaces throw on others, as beams from the lights' maps of the objects."""
 
 import math
-from pathlib import Path
-from typing import Any
 
 from render_server.gpu.context import GpuContext
-from render_server.gpu.program import ComputeProgram, list_threads
-from render_server.gpu.textures import bind_samplers
-from render_server.passes.light_table import LightTable
-from render_server.passes.object_tree import ObjectTree
-from render_server.passes.sampling_grid import SamplingGrid
+from render_server.gpu.kernel import Binding, Bindings, Kernel, list_threads
+from render_server.passes.cones import LowResGrid
+from render_server.passes.lights import LightBuffers
+from render_server.passes.ray_tracing import ObjectBvh
 
-FOLDER = Path(__file__).parent
 # A light's map of the objects is cut into so many blocks an edge, each sends so many rays: they start a 128th of the
 # objects' extent apart, and after a convex object has spread them four- to eightfold they are as far apart as voxels.
 BLOCKS = 64
@@ -23,62 +19,73 @@ WIDE_ALPHA = 1 / 32
 GREATEST_ALPHA = 0.174
 BEAM_BYTES = 64
 HEADER_BYTES = 16
-PLACE_BYTES = 6 * 4
-GROUP = 64  # invocations of a workgroup, one a beam
+SUMS_BYTES = 6 * 4  # of a pixel: three channels on its real surface, three on its object
 
 
-class CausticsPass:
-    """`sums`: fixed-point irradiance on real surfaces and objects, a pixel each (passes/common/caustic_sums.glsl)."""
+class Caustics:
+    """Renders caustics: fixed-point irradiance on real surfaces and objects (shaders/common/caustic_sums.glsl)."""
 
-    def __init__(self, gpu: GpuContext, grid: SamplingGrid, objects: ObjectTree) -> None:
+    def __init__(self, gpu: GpuContext, grid: LowResGrid, objects: ObjectBvh) -> None:
         self._threads, self._grid, self._objects = list_threads(gpu), grid, objects
-        self.sums = gpu.ctx.buffer(
-            reserve=PLACE_BYTES * (math.prod(grid.picture_size) + math.prod(grid.size))
+        self._sums = gpu.ctx.buffer(
+            reserve=SUMS_BYTES * (math.prod(grid.picture_size) + math.prod(grid.size))
         )
         self._beams = gpu.ctx.buffer(reserve=HEADER_BYTES + BEAM_BYTES)
-        path = FOLDER / "caustic_beams.comp.glsl"
-        self._sharp, self._wide = (
-            ComputeProgram(gpu, path, {"RAY_COUNT": RAYS, "RAY_ROUGHNESS": 1.0, **kind})
-            for kind in ({}, {"WIDE": 1})
-        )
-        self._splat = ComputeProgram(gpu, FOLDER / "caustic_splat.comp.glsl")
+        self._mirror_beams = Kernel(gpu, "caustic_beams", RAY_COUNT=RAYS)
+        self._lobe_beams = Kernel(gpu, "caustic_beams", RAY_COUNT=RAYS, WIDE=1)
+        self._splat = Kernel(gpu, "caustic_splat")
 
-    def run(self, table: LightTable, uniforms: dict[str, Any]) -> None:
-        """Fill `sums`; lights, geometry and materials must be bound.
+    @property
+    def bindings(self) -> dict[str, Binding]:
+        """The sums, for the passes that shade."""
+        return {"CausticSums": self._sums}
 
-        Uniforms beside those of the view: `bias_real`, `normal_offset`, `reach` (m).
+    def run(self, lights: LightBuffers, scene: Bindings, *, bias_m: float, reach_m: float) -> None:
+        """Fills the sums.
+
+        `bias_m` moves what may be in real shadow towards the light; beams are followed up to `reach_m`.
         """
-        self.sums.clear()
-        self._start_beams(len(table.virtual_views))
-        self._objects.bind()
-        bind_samplers({16: table.virtual_atlas.uv, 17: table.virtual_atlas.normal})
-        for view in range(len(table.virtual_views)):
-            index = table.first_virtual_view + view
-            own = {"view_index": index, "block_edge": max(table.tile_size // BLOCKS, 1), **uniforms}
-            self._sharp.run((BLOCKS, BLOCKS, RAYS), least_alpha=0.0, greatest_alpha=WIDE_ALPHA, **own)
-            self._wide.run(
-                (BLOCKS, BLOCKS, RAYS), least_alpha=WIDE_ALPHA, greatest_alpha=GREATEST_ALPHA, **own
-            )
-        self.bind()
-        bind_samplers({0: self._grid.pixels})
+        self._sums.clear()
+        self._empty_beams(len(lights.virtual_views))
+        for view in range(len(lights.virtual_views)):
+            self._trace_beams(lights, lights.first_virtual_view + view, scene, bias_m, reach_m)
+        grid = self._grid
         self._splat.run(
-            (self._threads,), picture_pixels=self._grid.picture_size, scale=self._grid.scale, **uniforms
+            (self._threads,),
+            self.bindings,
+            scene,
+            Beams=self._beams,
+            sample_pixels=grid.pixels,
+            picture_pixels=grid.picture_size,
+            scale=grid.scale,
         )
 
-    def _start_beams(self, views: int) -> None:
-        most = views * BLOCKS**2 * RAYS
-        needed = HEADER_BYTES + BEAM_BYTES * max(most, 1)
+    def _empty_beams(self, views: int) -> None:
+        """Makes room for the beams of so many views."""
+        needed = HEADER_BYTES + BEAM_BYTES * max(views * BLOCKS**2 * RAYS, 1)
         if self._beams.size < needed:
             self._beams.orphan(needed)
         self._beams.write(bytes(HEADER_BYTES))
-        self._beams.bind_to_storage_buffer(7)
 
-    def bind(self) -> None:
-        """Bind the sums to the place that caustic_sums.glsl names."""
-        self.sums.bind_to_storage_buffer(8)
+    def _trace_beams(
+        self, lights: LightBuffers, view_index: int, scene: Bindings, bias_m: float, reach_m: float
+    ) -> None:
+        """Adds the beams of one view: those of mirrors, and those of wider lobes."""
+        shared: dict[str, Binding] = {
+            "view_index": view_index,
+            "block_edge": max(lights.tile_size // BLOCKS, 1),
+            "bias_real": bias_m,
+            "reach": reach_m,
+            "Beams": self._beams,
+            **self._objects.bindings,
+        }
+        for kernel, least, greatest in (
+            (self._mirror_beams, 0.0, WIDE_ALPHA),
+            (self._lobe_beams, WIDE_ALPHA, GREATEST_ALPHA),
+        ):
+            kernel.run((BLOCKS, BLOCKS, RAYS), shared, scene, least_alpha=least, greatest_alpha=greatest)
 
     def release(self) -> None:
-        """Free the GL objects."""
-        for item in vars(self).values():
-            if hasattr(item, "release") and item not in (self._grid, self._objects):
-                item.release()
+        """Frees the GL objects."""
+        for item in (self._sums, self._beams, self._mirror_beams, self._lobe_beams, self._splat):
+            item.release()

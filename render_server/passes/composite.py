@@ -1,81 +1,191 @@
-"""The relit picture: camera codes and linear radiance."""
+"""The relit picture: camera codes and linear radiance; debug views of what it was made from."""
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import moderngl
 
 from render_server.gpu.context import GpuContext
-from render_server.gpu.program import ComputeProgram, list_threads
-from render_server.gpu.textures import bind_images, bind_samplers, texture_2d
-from render_server.passes.change_ratio import FILL_RADIUS, ChangeRatioPass
-from render_server.passes.direct_light import DirectLightPass
-from render_server.passes.light_table import LightTable
-from render_server.passes.mirror_objects import RAY_ROUGHNESS
-from render_server.passes.picture import Picture
-from render_server.passes.rims import RIM_SIGHT
-from render_server.passes.sampling_grid import SamplingGrid
-from render_server.passes.trace_cones import ConeFields
-from render_server.passes.volume import Pyramid, VolumePlacement
+from render_server.gpu.kernel import Binding, Bindings, Kernel, list_threads
+from render_server.gpu.textures import release_all, texture_2d
+from render_server.passes.cones import ConeFields, LowResGrid
+from render_server.passes.coverage import RIM_SIGHT
+from render_server.passes.gbuffer import CameraImage
+from render_server.passes.lights import LightBuffers
+from render_server.passes.reflections import RAY_ROUGHNESS
+from render_server.passes.shading import DirectLight
+from render_server.passes.voxels import PlacedVolume, VoxelMipmap
+
+FILL_RADIUS = 3  # texels of the reduced grid over which the change continues into a hole
+
+
+class ChangeRatio:
+    """How light changed, on the reduced grid: for holes of the depth map, and to compose only what changed.
+
+    `ratio`: rgb E_rho / E_mu, a: 0 unknown, 1 unchanged, 2 changed; `texels`: work list of those near a change.
+    """
+
+    def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
+        self.ratio = texture_2d(gpu, size, 4, "f2")
+        self.texels = gpu.ctx.buffer(bytes(4 * (1 + size[0] * size[1])))
+        self._ratio = Kernel(gpu, "change_ratio", RATIO=1)
+        self._near = Kernel(gpu, "change_ratio", FILL_RADIUS=FILL_RADIUS)
+
+    def run(
+        self,
+        grid: LowResGrid,
+        direct: DirectLight,
+        cones: ConeFields,
+        reflection: moderngl.Texture | None,
+    ) -> None:
+        """Compares the fields of one frame; `reflection` as in RelitLayers."""
+        self._ratio.run(
+            grid.size,
+            sample_pixels=grid.pixels,
+            scale=grid.scale,
+            direct_mu=direct.mu,
+            direct_rho=direct.rho,
+            cone_mu=cones.mu,
+            cone_rho=cones.rho,
+            cone_specular_mu=cones.specular_mu,
+            cone_specular_rho=cones.specular_rho,
+            reflection=reflection,
+            has_reflection=reflection is not None,
+            change_ratio_out=self.ratio,
+            Texels=None,
+        )
+        self.texels.write(bytes(4))
+        self._near.run(grid.size, sample_pixels=grid.pixels, change_ratio=self.ratio, Texels=self.texels)
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        release_all(self.ratio, self.texels, self._ratio, self._near)
 
 
 @dataclass(frozen=True)
 class RelitLayers:
-    """What a relighting method hands to composition; `pyramid` and `table` are there to be looked at."""
+    """What a relighting method hands to composition; `voxels`, `volume` and `lights` are for debug views."""
 
-    matte: moderngl.Texture
+    object_coverage: Binding
     virtual_radiance: moderngl.Texture
-    direct: DirectLightPass
+    direct: DirectLight
     cones: ConeFields
-    grid: SamplingGrid
-    change: ChangeRatioPass
-    pyramid: Pyramid
-    placement: VolumePlacement
-    table: LightTable
+    grid: LowResGrid
+    change: ChangeRatio
+    voxels: VoxelMipmap
+    volume: PlacedVolume
+    lights: LightBuffers
     reflection: moderngl.Texture | None = None
-    """Objects in smooth real surfaces (passes/mirror_objects.py); None: such surfaces have the cones' reflection."""
+    """Objects in smooth real surfaces (`MirrorRays`); None: such surfaces have the cones' reflection."""
 
 
-class CompositePass:
+class Composite:
     """Writes `code` (RGBA8UI, the camera's response applied) and `linear` (RGBA16F, camera units)."""
 
     def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
-        self._size = size
         self._threads = list_threads(gpu, size[0] * size[1])
         self.code = texture_2d(gpu, size, 4, "u1")
         self.linear = texture_2d(gpu, size, 4, "f2")
-        defines = {"FILL_RADIUS": FILL_RADIUS, "RIM_SIGHT": RIM_SIGHT, "RAY_ROUGHNESS": RAY_ROUGHNESS}
-        self._program = ComputeProgram(gpu, Path(__file__).with_name("composite.comp.glsl"), defines)
-
-    def run(self, picture: Picture, layers: RelitLayers, uniforms: dict[str, Any]) -> None:
-        """Compose; geometry and surfaces must be bound."""
-        cones, direct = layers.cones, layers.direct
-        bind_samplers(
-            {
-                0: layers.grid.pixels,
-                1: picture.code,
-                2: picture.linear,
-                3: picture.inverse_response,
-                8: layers.matte,
-            }
-            | {9: layers.virtual_radiance, 10: direct.mu, 11: direct.rho, 12: cones.mu, 13: cones.rho}
-            | {14: cones.specular_mu, 16: cones.specular_rho, 17: direct.lobe_mu, 18: direct.lobe_rho}
-            | {19: layers.change.ratio, 21: picture.rims}
+        self._kernel = Kernel(
+            gpu, "composite", FILL_RADIUS=FILL_RADIUS, RIM_SIGHT=RIM_SIGHT, RAY_ROUGHNESS=RAY_ROUGHNESS
         )
-        self.code.write(picture.bytes, alignment=1)
-        layers.change.texels.bind_to_storage_buffer(6)
-        bind_images(self.code, self.linear)
-        if layers.reflection is not None:
-            layers.reflection.use(location=20)
-        own = {
-            "scale": layers.grid.scale,
-            "exposure_scale": picture.exposure_scale,
-            "has_reflection": layers.reflection is not None,
-        }
-        self._program.run((self._threads,), **own, **uniforms)
+
+    def run(self, image: CameraImage, layers: RelitLayers, scene: Bindings) -> None:
+        """Composes the picture.
+
+        `scene` brings, besides camera, geometry and declared surfaces, how: `additive`, `relights_real`, `filmic`,
+        `store_linear` (fills `linear`, too) and `whole` (composes every pixel, not only those near a change).
+        """
+        self.code.write(image.bytes, alignment=1)
+        cones, direct = layers.cones, layers.direct
+        self._kernel.run(
+            (self._threads,),
+            scene,
+            picture=image.code,
+            linear_picture=image.linear,
+            inverse_response=image.inverse_response,
+            edge_correction=image.edge_correction,
+            exposure_scale=image.exposure_scale,
+            object_coverage=layers.object_coverage,
+            virtual_radiance=layers.virtual_radiance,
+            sample_pixels=layers.grid.pixels,
+            scale=layers.grid.scale,
+            direct_mu=direct.mu,
+            direct_rho=direct.rho,
+            lobe_mu=direct.lobe_mu,
+            lobe_rho=direct.lobe_rho,
+            cone_mu=cones.mu,
+            cone_rho=cones.rho,
+            cone_specular_mu=cones.specular_mu,
+            cone_specular_rho=cones.specular_rho,
+            change_ratio=layers.change.ratio,
+            Texels=layers.change.texels,
+            reflection=layers.reflection,
+            has_reflection=layers.reflection is not None,
+            code_out=self.code,
+            linear_out=self.linear,
+        )
 
     def release(self) -> None:
-        """Free the GL objects."""
-        for item in (self.code, self.linear, self._program):
-            item.release()
+        """Frees the GL objects."""
+        release_all(self.code, self.linear, self._kernel)
+
+
+class DebugViews:
+    """Overwrites a composite's `code` (RGBA8UI): effects, delta, voxels, reflective shadow maps."""
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self._gpu = gpu
+        self._kernels: dict[tuple[object, ...], Kernel] = {}
+
+    def change(
+        self,
+        code: moderngl.Texture,
+        image: CameraImage,
+        relit: moderngl.Texture,
+        object_coverage: Binding,
+        *,
+        effects: bool,
+    ) -> None:
+        """Shows the signed change of light, or the effects on grey."""
+        kernel = self._kernel("delta_view", **({"EFFECTS": 1} if effects else {}))
+        kernel.run(
+            image.size,
+            linear_picture=image.linear,
+            relit=relit,
+            object_coverage=object_coverage,
+            code_out=code,
+        )
+
+    def volume(
+        self,
+        code: moderngl.Texture,
+        image: CameraImage,
+        voxels: VoxelMipmap,
+        volume: PlacedVolume,
+        scene: Bindings,
+    ) -> None:
+        """Shows voxels as cubes; `scene` brings the camera."""
+        kernel = self._kernel("volume_view", DIRECTIONS=voxels.directions)
+        kernel.run(
+            image.size,
+            volume.bindings,
+            scene,
+            picture=image.code,
+            picture_rays=image.rays,
+            voxels=voxels.texture,
+            code_out=code,
+        )
+
+    def shadow_maps(self, code: moderngl.Texture, lights: LightBuffers) -> None:
+        """Shows real maps left, virtual maps right."""
+        self._kernel("rsm_view").run(code.size, lights.bindings, code_out=code)
+
+    def _kernel(self, name: str, **defines: int) -> Kernel:
+        key = name, *defines.items()
+        if key not in self._kernels:
+            self._kernels[key] = Kernel(self._gpu, name, **defines)
+        return self._kernels[key]
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        release_all(*self._kernels.values())

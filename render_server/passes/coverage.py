@@ -1,14 +1,11 @@
-"""Several samples of each pixel of the objects: coverage, and the surface that stands for the pixel."""
+"""How much of each pixel the virtual objects cover, and the edges of what is seen of them."""
 
-from pathlib import Path
-from typing import Any
+import moderngl
 
 from render_server.gpu.context import GpuContext
-from render_server.gpu.program import ComputeProgram
-from render_server.gpu.textures import bind_images, bind_samplers, release_target, texture_2d
-from render_server.passes.geometry_buffer import GeometryBuffer, GeometryPass
-from render_server.passes.mesh_buffers import MeshBuffers
-from render_server.passes.picture import Picture
+from render_server.gpu.kernel import Bindings, Kernel, list_threads
+from render_server.gpu.textures import release_all, release_target, texture_2d
+from render_server.passes.gbuffer import CameraImage, GeometryBuffer, MeshBuffers, RasterGeometry
 from render_server.view import CameraView, Rectangle
 
 # Where a pixel is sampled, in 1/16 pixels from its centre, nearest first. Of all patterns of eight with one sample in
@@ -16,56 +13,163 @@ from render_server.view import CameraView, Rectangle
 # at any angle and place is least: 0.17 of a pixel, 0.06 r.m.s. It is its own mirror image in the centre.
 PATTERN = ((-3, 1), (3, -1), (1, 5), (-1, -5), (-5, -3), (5, 3), (-7, 7), (7, -7))
 STEPS = 16
+RIM_SIGHT = 6
+"""Pixels within which a pixel at an edge finds the real thing and the background alone: behind the two that may be
+mixed there are four more on either side."""
 
 
-class CoveragePass:
+class SampleCoverage:
     """Draws the objects once for each sample and gathers what the pixels of the picture see through the lens.
 
     One raster after another goes through the same buffer, so memory does not grow with the number of samples, and
-    vertex work does. `surface` is the geometry buffer on the picture's grid; `texture` (RGBA16F): the share in front
-    of the real surface, the share behind it, and that share times its mean depth.
-    `other` (RGBA32F): place and share of samples that show another surface than `surface` does.
+    vertex work does. `surface` is the geometry buffer on the picture's grid; `texture` (RGBA16F): the fraction in
+    front of the real surface, the fraction behind it, and that fraction times its mean depth.
+    `second_surface` (RGBA32F): place and fraction of samples that show another surface than `surface` does.
     """
 
     def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
         self.surface = GeometryBuffer(gpu, size)
         self.texture = texture_2d(gpu, size, 4, "f2")
-        self.other = texture_2d(gpu, size, 4, "f4")
-        self._sums = gpu.ctx.framebuffer([self.texture, self.other])
-        self._program = ComputeProgram(gpu, Path(__file__).with_name("coverage.comp.glsl"))
+        self.second_surface = texture_2d(gpu, size, 4, "f4")
+        self._sums = gpu.ctx.framebuffer([self.texture, self.second_surface])
+        self._kernel = Kernel(gpu, "sample_coverage")
 
     def run(
         self,
-        geometry: GeometryPass,
+        geometry: RasterGeometry,
         raster: GeometryBuffer,
         mesh: MeshBuffers,
         *,
-        picture: Picture,
         view: CameraView,
         rectangles: tuple[Rectangle, Rectangle],
-        noise_sigma: float,
+        scene: Bindings,
     ) -> None:
-        """Fill the textures in the first of the `rectangles` (picture, raster); the real surface is bound."""
+        """Fills the textures in the first of the `rectangles` (picture, raster).
+
+        `scene` brings the camera of `view`, which looks at `raster` through the lens: not `with_antialiasing`.
+        """
         in_picture, in_raster = rectangles
-        uniforms: dict[str, Any] = {
-            **view.uniforms(),
-            "noise_sigma": noise_sigma,
-            "rectangle": in_picture,
-            "raster_rectangle": in_raster,
-            "weight": 1.0 / len(PATTERN),
-        }
-        self.surface.begin()
+        self.surface.clear()
+        self._sums.use()
         self._sums.clear()
-        bind_samplers({6: raster.position, 7: raster.normal, 8: raster.uv, 9: raster.tint, 15: picture.rays})
         for x, y in PATTERN:
             offset = (x / STEPS, y / STEPS)
-            geometry.run(raster, mesh, view, offset, in_raster)
-            surface = self.surface
-            bind_images(surface.position, surface.normal, surface.uv, surface.tint, self.texture, self.other)
-            self._program.run(in_picture[2:], offset=offset, **uniforms)
+            geometry.run(raster, mesh, view, scene, offset=offset, rectangle=in_raster)
+            self._kernel.run(
+                in_picture[2:],
+                raster.bindings,
+                scene,
+                position_out=self.surface.position,
+                normal_out=self.surface.normal,
+                uv_out=self.surface.uv,
+                tint_out=self.surface.tint,
+                sample_coverage=self.texture,
+                second_surface=self.second_surface,
+                rectangle=in_picture,
+                raster_rectangle=in_raster,
+                offset=offset,
+                weight=1.0 / len(PATTERN),
+            )
 
     def release(self) -> None:
-        """Free the GL objects."""
+        """Frees the GL objects."""
         release_target(self._sums)
-        for item in (self.surface, self.texture, self.other, self._program):
-            item.release()
+        release_all(self.surface, self.texture, self.second_surface, self._kernel)
+
+
+class ObjectCoverage:
+    """Fraction of each pixel that shows an object (R16F), and a work list of the pixels at `edges` of real things."""
+
+    def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
+        self._size = size
+        self.texture = texture_2d(gpu, size, 1, "f2")
+        self.edges = gpu.ctx.buffer(bytes(4 * (1 + size[0] * size[1])))
+        self._kernel = Kernel(gpu, "object_coverage")
+
+    def run(
+        self, rectangle: Rectangle, scene: Bindings, sample_coverage: moderngl.Texture | None = None
+    ) -> None:
+        """Compares depths and softens along the picture's edges, in the `rectangle`.
+
+        `sample_coverage`: texture of `SampleCoverage`; None: the geometry buffer has one sample a pixel.
+        """
+        self.texture.write(bytes(2 * self._size[0] * self._size[1]), alignment=1)
+        self.edges.write(bytes(4))
+        x, y, width, height = rectangle
+        if width <= 0 or height <= 0:
+            return
+        self._kernel.run(
+            (width, height),
+            scene,
+            first_pixel=(x, y),
+            sample_coverage=sample_coverage,
+            antialiased=sample_coverage is not None,
+            object_coverage_out=self.texture,
+            Texels=self.edges,
+        )
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        release_all(self.texture, self.edges, self._kernel)
+
+
+class EdgeUnmixing:
+    """Unmixes pixels at the edge of a real thing before an object.
+
+    Corrects the objects' coverage by how much of the pixel the thing fills, and fills the image's `edge_correction`
+    with what leaves the thing's own colour.
+    """
+
+    def __init__(self, gpu: GpuContext, image: CameraImage) -> None:
+        self._image = image
+        self._threads = list_threads(gpu)
+        self._target = gpu.ctx.framebuffer(color_attachments=[image.edge_correction])
+        self._kernel = Kernel(gpu, "edge_unmixing", RIM_SIGHT=RIM_SIGHT)
+
+    def run(
+        self, coverage: ObjectCoverage, scene: Bindings, sample_coverage: moderngl.Texture | None = None
+    ) -> None:
+        """Unmixes the pixels that `coverage` listed; the other arguments as it had them."""
+        self._target.use()
+        self._target.clear()
+        self._kernel.run(
+            (self._threads,),
+            scene,
+            sample_coverage=sample_coverage,
+            antialiased=sample_coverage is not None,
+            object_coverage=coverage.texture,
+            edge_correction=self._image.edge_correction,
+            Texels=coverage.edges,
+        )
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        release_target(self._target)
+        self._kernel.release()
+
+
+class InteriorEdgeAA:
+    """Antialiases the edges of the objects before each other.
+
+    `radiance` (RGBA16F): the objects' light, mixed where a pixel's samples show two of their surfaces.
+    """
+
+    def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
+        self.radiance = texture_2d(gpu, size, 4, "f2")
+        self._kernel = Kernel(gpu, "interior_edge_aa")
+
+    def run(self, radiance: moderngl.Texture, coverage: SampleCoverage, rectangle: Rectangle) -> None:
+        """Mixes `radiance`, shaded at the samples that stand for their pixels."""
+        self._kernel.run(
+            rectangle[2:],
+            coverage.surface.bindings,
+            radiance=radiance,
+            sample_coverage=coverage.texture,
+            second_surface=coverage.second_surface,
+            radiance_out=self.radiance,
+            rectangle=rectangle,
+        )
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        release_all(self.radiance, self._kernel)

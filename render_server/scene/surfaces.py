@@ -33,6 +33,10 @@ class SurfaceTable:
     def __len__(self) -> int:
         return len(self.packed)
 
+    def equals(self, other: "SurfaceTable") -> bool:
+        """Whether it declares the same surfaces."""
+        return np.array_equal(self.packed, other.packed)
+
     @property
     def f0(self) -> Float32[np.ndarray, "n 3"]:
         """Reflectance at normal incidence."""

@@ -1,0 +1,44 @@
+"""Albedo of real surfaces, kept from what pictures show for when the camera looks elsewhere (docs/method.md 2)."""
+
+from render_server.estimation.samples import sample_light
+from render_server.frame_graph import FrameGraph
+from render_server.gpu.context import GpuContext
+from render_server.growing_interval import GrowingInterval
+from render_server.passes.voxel_light import AlbedoTexture
+from render_server.scene.albedo_memory import MEAN_ALBEDO, AlbedoMemory
+from render_server.scene.lights import LightSet
+
+
+class AlbedoEstimator:
+    """Estimates the albedo volume of one real scene; looks again when the camera or the room has moved.
+
+    With a given albedo there is nothing to estimate.
+    """
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self.texture = AlbedoTexture(gpu)
+        self._volume = AlbedoMemory()
+        self._schedule = GrowingInterval()
+        self._is_given = False
+
+    def observe(self, graph: FrameGraph, lights: LightSet) -> bool:
+        """Adds what this frame shows under registered `lights`, if it is time; returns whether it did."""
+        if self._is_given or not self._schedule.is_due(graph.inputs.frame.timestamp_ns):
+            return False
+        samples = sample_light(graph, lights, None)
+        lit = samples.usable & samples.unshadowed
+        self._volume.observe(
+            graph.inputs.real.bounds, samples.position[lit], samples.measured[lit], samples.light[lit]
+        )
+        self.texture.upload(self._volume)
+        return True
+
+    def reset(self, given: float | None) -> None:
+        """Resets the estimate: another real scene, whose albedo may be `given`."""
+        self._volume, self._schedule = AlbedoMemory(), GrowingInterval()
+        self._is_given = given is not None
+        self.texture.clear(MEAN_ALBEDO if given is None else given)
+
+    def release(self) -> None:
+        """Frees the texture."""
+        self.texture.release()

@@ -1,0 +1,138 @@
+"""The lights of one scene document from frame to frame: followed, then completed from what the picture shows."""
+
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from protocol import scene_lights as documents
+from protocol.frames import ViewFrame
+from render_server.estimation.registration import register_lights
+from render_server.estimation.samples import bounced_light
+from render_server.estimation.unseen_environment import (
+    find_continued_planes,
+    find_unseen_light,
+    ground_radiance,
+    unseen_light_shape,
+)
+from render_server.frame_graph import FrameGraph
+from render_server.growing_interval import GrowingInterval
+from render_server.lights_view import lights_picture
+from render_server.scene.continued_planes import ContinuedPlanes
+from render_server.scene.light_sources import open_lights
+from render_server.scene.lights import LightSet
+from render_server.scene.registration import RegistrationAverage
+
+Rgb = Float32[np.ndarray, "3"]
+
+
+class LightEstimator:
+    """Lights in camera units: `lights`, another object whenever something of them changes.
+
+    Factor, ground and unseen environment are found from the first frame that can tell, and hold for all lights that
+    the source brings from then on; the factor is the mean of what later frames tell, after growing intervals. `say`
+    takes sentences for the user.
+
+    Raises:
+        DeltalightError: an environment map that cannot be read.
+    """
+
+    def __init__(self, wished: documents.Lights, say: Callable[[str], None]) -> None:
+        self._source = open_lights(wished)
+        self._say = say
+        self._follows_lamps = wished.mode == "tracked"
+        self._wants_registration = wished.resolved_registration == "auto"
+        given = wished.mode in ("manual", "tracked") and not self._wants_registration
+        self._wants_unseen = given and wished.surroundings == "auto"
+        self._wants_ground = self._wants_unseen or wished.mode == "fisheye"
+        self._raw: LightSet | None = None
+        self._reset()
+        self.lights: LightSet | None = None
+
+    def _reset(self) -> None:
+        """Resets all estimates."""
+        self._is_complete = False
+        self._average, self._schedule = RegistrationAverage(), GrowingInterval()
+        self._factor: Rgb | None = None
+        self._ground: Rgb | None = None
+        self._walls: ContinuedPlanes | None = None
+        self._sky: tuple[Rgb, Float32[np.ndarray, "n n 1"]] | None = None
+
+    def update(self, frame: ViewFrame) -> bool:
+        """Takes a frame's lights; returns whether there are any lights yet."""
+        raw = self._source.follow(frame)
+        for sentence in self._source.remarks:
+            self._say(sentence)
+        if raw is not None:
+            if self._follows_lamps and self._raw is not None and raw.identities != self._raw.identities:
+                self._reset()  # another lamp explains more of what is seen
+            self._raw = raw
+            self._apply()
+        return self.lights is not None
+
+    def _apply(self) -> LightSet:
+        """Applies what was estimated to the source's lights."""
+        assert self._raw is not None
+        lights = self._raw.registered(self._factor)
+        if self._ground is not None:
+            lights = lights.with_ground(self._ground)
+        if self._walls is not None:
+            lights = lights.with_surfaces(self._walls.radiance, self._walls.share)
+        if self._sky is not None:
+            lights = lights.with_sky(*self._sky)
+        self.lights = lights
+        return lights
+
+    def estimate(self, graph: FrameGraph, *, moved: bool) -> LightSet:
+        """The lights in camera units, with all found that a picture can tell.
+
+        Evaluates the graph under trial lights. Frames are measured again only where the real scene or the camera has
+        `moved`, so that still pictures stay.
+        """
+        assert self._raw is not None
+        assert self.lights is not None
+        shines = bool(self._raw.lights) or bool(self._raw.environment.any())
+        if self._follows_lamps and not shines:
+            return self.lights
+        due = self._wants_registration and (moved or not self._is_complete)
+        if due and self._schedule.is_due(graph.inputs.frame.timestamp_ns):
+            self._register(graph, self._raw)
+        elif self._is_complete:
+            return self.lights
+        if not self._is_complete:
+            self._is_complete = True
+            if self._wants_ground:
+                self._ground = ground_radiance(graph)
+            if self._wants_unseen:
+                self._find_unseen(graph, self.lights)
+        return self._apply()
+
+    def picture(self, frame: ViewFrame) -> UInt8[np.ndarray, "h w 3"]:
+        """Draws the lights (view `lights`), once there are any."""
+        assert self.lights is not None
+        return lights_picture(frame, self.lights, self._source.split)
+
+    def _register(self, graph: FrameGraph, raw: LightSet) -> None:
+        """Finds the lights' factor from this frame and averages it with those before."""
+        found = register_lights(graph, raw)
+        if self._factor is None:
+            factor = ", ".join(f"{value:.3g}" for value in found.factor)
+            fit = "" if found.residual is None else f", residual {100 * found.residual:.1f} %"
+            self._say(f"lights registered by {found.source}: factor ({factor}){fit}")
+        if found.warning is not None:
+            self._say(found.warning)
+        self._factor = self._average.add(found)
+
+    def _find_unseen(self, graph: FrameGraph, lights: LightSet) -> None:
+        """Estimates the light of what is out of sight, as this frame shows it."""
+        if self._ground is not None:
+            lights = lights.with_ground(self._ground)
+        bounce = bounced_light(graph, lights)
+        walls = self._walls = find_continued_planes(graph, lights, bounce)
+        shape = unseen_light_shape(graph, len(lights.environment)) * (1 - walls.share)
+        lights = lights.with_surfaces(walls.radiance, walls.share)
+        found = find_unseen_light(graph, lights, shape, bounce)
+        if found is not None:
+            self._sky = (found, shape)
+            radiance = ", ".join(f"{value:.3g}" for value in found)
+            self._say(f"surroundings out of sight: radiance up to ({radiance}), found on the board's paper")

@@ -1,0 +1,84 @@
+"""What light falls on the real surfaces that a picture shows, next to what the camera measured there; when to look
+again.
+"""
+
+from dataclasses import dataclass, replace
+
+import moderngl
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int64
+
+from protocol.frames import decode_lut
+from render_server.frame_graph import FrameGraph
+from render_server.scene.known_surfaces import known_albedo
+from render_server.scene.lights import LightSet
+from render_server.scene.registration import unclipped
+
+UNSHADOWED = 0.95  # fraction of its direct light that a pixel gets, from which on it counts as unshadowed
+
+Bounce = Float64[np.ndarray, "h w 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class LightSamples:
+    """What is known at pixels that show real surfaces; positions in world metres, the rest linear RGB."""
+
+    position: Float64[np.ndarray, "k 3"]
+    measured: Float64[np.ndarray, "k 3"]
+    direct: Float64[np.ndarray, "k 3"]
+    light: Float64[np.ndarray, "k 3"]
+    bounce: Float64[np.ndarray, "k 3"]
+    usable: Bool[np.ndarray, " k"]
+    albedo: Float32[np.ndarray, " k"]  # where it is known, else 0
+    lit: Float64[np.ndarray, " k"]  # fraction of the unshadowed direct light
+    pixel: Int64[np.ndarray, "k 2"]  # column, row
+
+    @property
+    def unshadowed(self) -> Bool[np.ndarray, " k"]:
+        """Which samples get nearly all of their direct light."""
+        return np.asarray(self.lit >= UNSHADOWED)
+
+
+def bounced_light(graph: FrameGraph, lights: LightSet) -> Bounce:
+    """Irradiance that the cones gather from real surfaces alone: traced under a black environment."""
+    black = replace(lights, environment=np.zeros_like(lights.environment))
+    return read_texture(graph.evaluate(black).cones.mu)[..., :3]
+
+
+def sample_light(graph: FrameGraph, lights: LightSet, bounce: Bounce | None) -> LightSamples:
+    """Reads the fields back where the real scene is in view; cones are those of the pixel's texel of the grid.
+
+    Without `bounce` all light that the cones gather counts as the lights'.
+    """
+    fields, shown, frame = graph.evaluate(lights), graph.shown(), graph.inputs.frame
+    cones, direct = read_texture(fields.cones.mu), read_texture(fields.direct.mu)
+    rows, columns = (np.arange(n) // fields.grid.scale for n in direct.shape[:2])
+    position = read_texture(shown.real_surface.position)
+    known = position[..., 3] > 0
+    covered = read_texture(shown.object_coverage)[..., 0] > 0
+    y, x = np.nonzero(known & ~covered & (cones[np.ix_(rows, columns)][..., 3] > 0))
+    coded = decode_lut(frame.response)[frame.color, np.arange(3)]
+    own = direct[y, x]
+    lit = np.divide(own[:, :3].mean(axis=1), own[:, 3], out=np.ones(len(own)), where=own[:, 3] > 0)
+    reflected = np.zeros((len(y), 3)) if bounce is None else bounce[rows[y], columns[x]]
+    albedo = np.zeros(known.shape, np.float32)
+    if frame.board is not None and frame.pose is not None:
+        albedo = known_albedo(frame.board, frame.camera, frame.pose)
+    return LightSamples(
+        position[y, x, :3],
+        (coded / frame.exposure_scale)[y, x],
+        own[:, :3],
+        own[:, :3] + cones[rows[y], columns[x]][:, :3] - reflected,
+        reflected,
+        unclipped(frame.color, coded)[y, x],
+        albedo[y, x],
+        lit,
+        np.stack([x, y], axis=1),
+    )
+
+
+def read_texture(texture: moderngl.Texture) -> Float64[np.ndarray, "h w c"]:
+    """Contents of a half-float or float texture."""
+    width, height = texture.size
+    dtype = np.float16 if texture.dtype == "f2" else np.float32
+    return np.frombuffer(texture.read(), dtype).reshape(height, width, -1).astype(np.float64)

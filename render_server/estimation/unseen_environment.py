@@ -1,0 +1,104 @@
+"""Estimates of unobserved light: of the ground, of planes that go on beyond the picture, of all else around."""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float32
+
+from protocol.frames import decode_lut
+from render_server.estimation.samples import Bounce, read_texture, sample_light
+from render_server.frame_graph import FrameGraph
+from render_server.scene.continued_planes import ContinuedPlanes, RealSamples, Sight, continue_planes
+from render_server.scene.environment import LUMINANCE
+from render_server.scene.lights import LightSet
+from render_server.scene.octahedral import irradiance, octahedral_uv, resample_to_octahedral
+from render_server.scene.registration import surroundings_from_patch
+from render_server.scene.seen_planes import PointCloud, find_planes
+
+GROUND_SIZES = 2.0
+FACES_UP = 0.7  # cosine to the vertical
+
+PLANE_SAMPLES = 6000  # pixels that planes are looked for in: a plane of the least share still has a hundred
+FLATNESS = 0.01  # of the distance: walls, tables and lenses are that even
+
+
+def find_continued_planes(graph: FrameGraph, lights: LightSet, bounce: Bounce) -> ContinuedPlanes:
+    """Finds what lies beyond the picture where its border cuts table, walls or floor (continued_planes.py)."""
+    known = sample_light(graph, lights, bounce)
+    inputs = graph.inputs
+    usable = np.flatnonzero(known.usable)
+    chosen = usable[:: max(1, len(usable) // PLANE_SAMPLES)]
+    position, pixel = known.position[chosen], known.pixel[chosen]
+    normal = read_texture(graph.observation.surface.normal)[pixel[:, 1], pixel[:, 0], :3]
+    pose = inputs.view.world_from_camera
+    depth = (position - pose[:3, 3]) @ pose[:3, 2]
+    tolerance = np.maximum(3 * inputs.scan.noise_sigma * depth**2, FLATNESS * depth)
+    indirect = (known.light + known.bounce - known.direct)[chosen]
+    seen = RealSamples(position, known.measured[chosen], known.lit[chosen], indirect, tolerance)
+    rays = inputs.frame.camera.rays().reshape(-1, 2).astype(np.float64)
+    sight = Sight(np.linalg.inv(pose), rays.min(axis=0), rays.max(axis=0))
+    low, high = inputs.objects.bounds
+    planes = find_planes(PointCloud(position, normal, tolerance))
+    size = len(lights.environment)
+    return continue_planes(planes, seen, lights.lights, sight, centre=(low + high) / 2, size=size)
+
+
+def find_unseen_light(
+    graph: FrameGraph, lights: LightSet, shape: Float32[np.ndarray, "n n 1"], bounce: Bounce
+) -> Float32[np.ndarray, "3"] | None:
+    """Radiance, times `shape`, of what neither the camera nor the lights show; None if the paper cannot tell.
+
+    Walls beside and behind the camera reflect light too. On paper of known albedo the irradiance is known from the
+    picture; what the lights and the visible scene leave unexplained comes from there.
+    """
+    board = graph.inputs.frame.board
+    if board is None or (board.white_albedo is None and not board.grey_cards):
+        return None
+    black = replace(lights, environment=np.zeros_like(lights.environment))
+    known = sample_light(graph, lights, bounce)
+    even = sample_light(graph, black.with_sky(np.ones(3, np.float32), shape), bounce)
+    paper = known.usable & (known.albedo > 0)
+    total, per_radiance = known.light + known.bounce, even.light - known.direct
+    return surroundings_from_patch(
+        known.measured[paper], total[paper], per_radiance[paper], known.albedo[paper]
+    )
+
+
+def ground_radiance(graph: FrameGraph) -> Float32[np.ndarray, "3"] | None:
+    """Mean radiance of the ground around the objects: of what faces up within two object sizes (docs/method.md 2)."""
+    surface, frame = graph.observation.surface, graph.inputs.frame
+    position, normal = read_texture(surface.position), read_texture(surface.normal)
+    low, high = graph.inputs.objects.bounds
+    away = np.linalg.norm(position[..., :3] - (low + high) / 2, axis=-1)
+    near = (position[..., 3] > 0) & (away <= GROUND_SIZES * float(np.max(high - low)))
+    ground = near & (normal[..., 2] > FACES_UP)
+    if not ground.any():
+        return None
+    coded = decode_lut(frame.response)[frame.color[ground], np.arange(3)]
+    return np.asarray(coded.mean(axis=0) / frame.exposure_scale, np.float32)
+
+
+def unseen_light_shape(graph: FrameGraph, size: int) -> Float32[np.ndarray, "n n 1"]:
+    """How the light of what is out of sight is spread over an octahedral map: 1 in its strongest direction.
+
+    Unseen walls adjoin seen ones, so it is the light that the seen surfaces above the horizon, as the objects see
+    them, would send to a surface facing each direction: as smooth as irradiance. Even where none is seen.
+    """
+    frame = graph.inputs.frame
+    position = read_texture(graph.observation.surface.position)
+    low, high = graph.inputs.objects.bounds
+    direction = position[..., :3] - (low + high) / 2
+    seen = (position[..., 3] > 0) & (direction[..., 2] > 0)
+    luminance = decode_lut(frame.response)[frame.color[seen], np.arange(3)] @ LUMINANCE
+    texel = np.minimum((octahedral_uv(direction[seen]) * size).astype(int), size - 1)
+    flat = texel[:, 1] * size + texel[:, 0]
+    count = np.bincount(flat, minlength=size * size)
+    mean = np.bincount(flat, luminance, size * size) / np.maximum(count, 1)
+    seen_radiance = np.repeat(mean.reshape(size, size, 1), 3, axis=2).astype(np.float32)
+
+    def received(facing: Float32[np.ndarray, "n m 3"]) -> Float32[np.ndarray, "n m 1"]:
+        light = irradiance(seen_radiance, facing.reshape(-1, 3))[:, 0]
+        return np.asarray(light.reshape(*facing.shape[:2], 1), np.float32)
+
+    shape = resample_to_octahedral(received, size, supersampling=1)
+    return shape / shape.max() if shape.max() > 0 else np.ones_like(shape)

@@ -1,0 +1,248 @@
+"""What one frame is made of: the resources that every method's stages read, and the stages that make them."""
+
+from dataclasses import dataclass
+from operator import is_
+from typing import Any
+
+import moderngl
+import numpy as np
+
+from protocol.frames import DepthImage, ViewFrame
+from render_server.gpu.context import GpuContext
+from render_server.gpu.kernel import Binding, Bindings
+from render_server.gpu.textures import release_all
+from render_server.gpu.uniform_block import UniformBlock
+from render_server.gpu_scene import GeometryState
+from render_server.graph import Graph, Resource
+from render_server.passes.coverage import EdgeUnmixing, InteriorEdgeAA, ObjectCoverage, SampleCoverage
+from render_server.passes.gbuffer import CameraImage, GeometryBuffer, RasterGeometry, RealSurface
+from render_server.passes.voxel_light import AlbedoTexture
+from render_server.scene.depth_surface import DepthSurface
+from render_server.scene.lights import LightSet
+from render_server.scene.surfaces import DIFFUSE_BOX, MAX_SURFACES, SurfaceTable
+from render_server.view import CameraBlock, CameraView, Rectangle
+
+BIAS_SIGMAS = 3.0  # of depth noise: no real surface shadows itself
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """What the camera measured of the real scene when something last moved.
+
+    `depth` and `surface` are None where a model is given; `noise_sigma` is the depth's noise at 1 m (m, grows with
+    z^2), `typical_depth` its median (m). `tolerance`: up to what difference the fused surface agrees with the depth
+    (m, and m at 1 m); None where nothing is fused.
+    """
+
+    depth: DepthImage | None
+    surface: DepthSurface | None
+    noise_sigma: float
+    typical_depth: float
+    tolerance: tuple[float, float] | None
+
+    @property
+    def bias_m(self) -> float:
+        """What a real surface is lifted by against its own shadow, m."""
+        return BIAS_SIGMAS * self.noise_sigma * self.typical_depth**2
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """The camera's image and the real surfaces that it shows. `bindings`: everything that shaders read of both."""
+
+    image: CameraImage
+    surface: RealSurface
+    scan: Scan
+    bindings: dict[str, Binding]
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectSurface:
+    """The objects as the camera sees them: their geometry buffer, and how much of each pixel they cover.
+
+    With antialiasing, `samples` are what the geometry buffer was made from; `rectangle` encloses the objects.
+    """
+
+    buffer: GeometryBuffer
+    coverage: ObjectCoverage
+    samples: SampleCoverage | None
+    rectangle: Rectangle
+
+
+@dataclass(frozen=True, eq=False)
+class FrameResources:
+    """What stages read of frame and scene. Sources are set by the renderer; the rest is made by this module's stages.
+
+    `observation` changes only when something moved: a picture of a scene at rest lights nothing anew. `geometry` are
+    the bindings of both surfaces, `everywhere` asks for light at every pixel (for estimation).
+    """
+
+    image: Resource[CameraImage]
+    view: Resource[CameraView]
+    scan: Resource[Scan]
+    real: Resource[GeometryState]
+    objects: Resource[GeometryState]
+    surfaces: Resource[SurfaceTable]
+    lights: Resource[LightSet]
+    everywhere: Resource[bool]
+    albedo: Resource[AlbedoTexture]
+    observation: Resource[Observation]
+    object_surface: Resource[ObjectSurface]
+    geometry: Resource[dict[str, Binding]]
+
+
+class PictureBuffers:
+    """Textures and kernels of one picture size that every method shares."""
+
+    def __init__(self, gpu: GpuContext, view: CameraView) -> None:
+        size, raster_size = view.size, view.raster[1]
+        self.key = (size, raster_size)
+        self._gpu = gpu
+        self.image = CameraImage(gpu, size)
+        self.real_surface = RealSurface(gpu, size)
+        self.coverage = ObjectCoverage(gpu, size)
+        self._raster = GeometryBuffer(gpu, raster_size)
+        self._model_raster: GeometryBuffer | None = None
+        self._samples: SampleCoverage | None = None
+        self._interior_edges: InteriorEdgeAA | None = None
+        self._unmixing = EdgeUnmixing(gpu, self.image)
+        self._geometry = RasterGeometry(gpu)
+        self._raster_camera, self._camera = (UniformBlock[CameraBlock](gpu, view.block()) for _ in range(2))
+        self._surfaces = gpu.ctx.buffer(reserve=MAX_SURFACES * 80 + 80)
+
+    def declare_surfaces(self, table: SurfaceTable) -> dict[str, Binding]:
+        """Uploads the declared surfaces of the real scene; returns what shaders read of them."""
+        if len(table):
+            self._surfaces.write(np.ascontiguousarray(table.packed, np.float32).tobytes())
+        specular = bool((table.packed[:, 3, 3] < DIFFUSE_BOX).any())
+        return {"Surfaces": self._surfaces, "surface_count": len(table), "specular_surfaces": specular}
+
+    def set_camera(self, view: CameraView) -> CameraView:
+        """Writes the camera's blocks: for rasters through the lens, and for what reads the objects' geometry buffer."""
+        self._raster_camera.write(view.without_antialiasing.block())
+        self._camera.write(view.block())
+        return view
+
+    def observe(self, scan: Scan, real: GeometryState, view: CameraView, declared: Bindings) -> Observation:
+        """Fills the real geometry buffer from depth, from the given model, or from both for a fused surface."""
+        raster_scene = {"Camera": self._raster_camera, **self.image.bindings, **declared}
+        if scan.depth is not None and scan.surface is not None:
+            self.real_surface.from_depth(scan.depth, scan.surface.normals, raster_scene)
+        if scan.depth is None or scan.tolerance is not None:
+            if self._model_raster is None:
+                self._model_raster = GeometryBuffer(self._gpu, self._raster.size)
+            own = {**raster_scene, **real.materials.bindings}
+            self._geometry.run(self._model_raster, real.buffers, view.without_antialiasing, own)
+            self.real_surface.from_model(self._model_raster, raster_scene, tolerance=scan.tolerance)
+        bindings: dict[str, Binding] = {
+            "Camera": self._camera,
+            **self.image.bindings,
+            **self.real_surface.bindings,
+            **declared,
+            "noise_sigma": scan.noise_sigma,
+            "lens_bends": view.camera.has_distortion,
+        }
+        return Observation(self.image, self.real_surface, scan, bindings)
+
+    def draw_objects(self, objects: GeometryState, seen: Observation, view: CameraView) -> ObjectSurface:
+        """Rasters the objects and finds how much of each pixel they cover, edges of real things before them unmixed."""
+        rectangle = view.rectangle_around(objects.points)
+        if view.antialiased:
+            samples = self._draw_samples(objects, seen, view, rectangle)
+            surface = ObjectSurface(samples.surface, self.coverage, samples, rectangle)
+        else:
+            scene = {**seen.bindings, **objects.materials.bindings}
+            self._geometry.run(self._raster, objects.buffers, view, scene)
+            surface = ObjectSurface(self._raster, self.coverage, None, rectangle)
+        scene = {**seen.bindings, **surface.buffer.bindings}
+        covered = None if surface.samples is None else surface.samples.texture
+        self.coverage.run(rectangle, scene, covered)
+        self._unmixing.run(self.coverage, scene, covered)
+        return surface
+
+    def _draw_samples(
+        self, objects: GeometryState, seen: Observation, view: CameraView, rectangle: Rectangle
+    ) -> SampleCoverage:
+        """Several samples a pixel, made into one surface."""
+        if self._samples is None:
+            self._samples = SampleCoverage(self._gpu, view.size)
+        plain = view.without_antialiasing
+        self._samples.run(
+            self._geometry,
+            self._raster,
+            objects.buffers,
+            view=plain,
+            rectangles=(rectangle, plain.raster_rectangle_around(objects.points)),
+            scene={**seen.bindings, **objects.materials.bindings, "Camera": self._raster_camera},
+        )
+        return self._samples
+
+    def antialias_interior(self, radiance: moderngl.Texture, surface: ObjectSurface) -> moderngl.Texture:
+        """The objects' shaded radiance with the edges before each other antialiased, where samples were drawn."""
+        if surface.samples is None:
+            return radiance
+        if self._interior_edges is None:
+            self._interior_edges = InteriorEdgeAA(self._gpu, surface.buffer.size)
+        self._interior_edges.run(radiance, surface.samples, surface.rectangle)
+        return self._interior_edges.radiance
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        release_all(
+            self._unmixing,
+            self.image,
+            self.real_surface,
+            self.coverage,
+            self._raster,
+            self._model_raster,
+            self._samples,
+            self._interior_edges,
+            self._geometry,
+            self._raster_camera,
+            self._camera,
+            self._surfaces,
+        )
+
+
+def declare_frame(graph: Graph, buffers: PictureBuffers) -> FrameResources:
+    """Declares the sources of a frame and the stages that come before every method's own."""
+    image = graph.source("camera image", "view")
+    view = graph.source("view", "view")
+    scan = graph.source("scan", "view")
+    real = graph.source("real geometry", "world")
+    objects = graph.source("object geometry", "objects")
+    surfaces = graph.source("surface table", "scene")
+    lights = graph.source("light set", "lights")
+    everywhere = graph.source("everywhere", "lights")
+    albedo = graph.source("albedo", "world")
+    declared = graph.stage("declared surfaces", buffers.declare_surfaces, surfaces)
+    camera = graph.stage("camera", buffers.set_camera, view)
+    observation = graph.stage("real surface", buffers.observe, scan, real, camera, declared)
+    surface = graph.stage("object surface", buffers.draw_objects, objects, observation, camera)
+    geometry = graph.stage("geometry", _geometry_bindings, observation, surface, objects)
+    return FrameResources(
+        image, view, scan, real, objects, surfaces, lights, everywhere, albedo, observation, surface, geometry
+    )
+
+
+def _geometry_bindings(
+    seen: Observation, surface: ObjectSurface, objects: GeometryState
+) -> dict[str, Binding]:
+    """Everything that shaders read of both geometry buffers."""
+    return {
+        **seen.bindings,
+        **surface.buffer.bindings,
+        **objects.materials.bindings,
+        "object_coverage": surface.coverage.texture,
+    }
+
+
+def set_source(resource: Resource[Any], value: object) -> None:
+    """Sets a source; the same object again is no change."""
+    resource.write(value, is_)
+
+
+def upload_image(resource: Resource[CameraImage], image: CameraImage, frame: ViewFrame) -> None:
+    """Uploads a frame's picture: a change, whatever it shows."""
+    image.upload(frame)
+    resource.write(image)

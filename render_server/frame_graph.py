@@ -1,0 +1,244 @@
+"""The graph of one scene's frames: what every method shares, the method's own stages, composition."""
+
+from dataclasses import dataclass, replace
+from operator import eq, is_
+from typing import Any
+
+import moderngl
+
+from protocol.frames import ViewFrame
+from protocol.scene_method import Output
+from render_server.frame import FrameResources, Observation, PictureBuffers, Scan, declare_frame
+from render_server.gpu.context import GpuContext
+from render_server.gpu.kernel import Bindings
+from render_server.gpu.timers import PassTimers
+from render_server.gpu_scene import GeometryState
+from render_server.graph import Graph, Resource
+from render_server.methods.lighting import Layers
+from render_server.methods.registry import MethodChoice
+from render_server.occlusion_fields import OcclusionFields
+from render_server.passes.composite import Composite, DebugViews, RelitLayers
+from render_server.passes.cones import ConeFields, LowResGrid
+from render_server.passes.gbuffer import CameraImage, GeometryBuffer, RealSurface
+from render_server.passes.shading import DirectLight
+from render_server.passes.voxel_light import AlbedoTexture
+from render_server.scene.lights import LightSet
+from render_server.scene.surfaces import SurfaceTable
+from render_server.view import CameraView
+
+
+@dataclass(frozen=True)
+class CompositeOptions:
+    """How the picture is composed: of a scene document's `output` and `method`. `with_linear`: `linear` is wanted."""
+
+    output: Output
+    additive: bool
+    relights_real: bool
+    with_linear: bool
+
+    @property
+    def bindings(self) -> Bindings:
+        """What composite.comp.glsl reads of it."""
+        needs_linear = self.with_linear or self.output.view in ("effects", "delta")
+        is_filmic = self.output.tone == "aces"
+        return {
+            "additive": self.additive,
+            "relights_real": self.relights_real,
+            "filmic": is_filmic,
+            "store_linear": needs_linear,
+            "whole": needs_linear or is_filmic,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class FrameInputs:
+    """What one frame is rendered from. Values that are the same objects as before are no change."""
+
+    frame: ViewFrame
+    view: CameraView
+    scan: Scan
+    real: GeometryState
+    objects: GeometryState
+    surfaces: SurfaceTable
+    lights: LightSet
+    albedo: AlbedoTexture
+
+
+@dataclass(frozen=True, eq=False)
+class Fields:
+    """Light at the camera's pixels before composition."""
+
+    direct: DirectLight
+    cones: ConeFields
+    grid: LowResGrid
+
+
+@dataclass(frozen=True, eq=False)
+class ShownBuffers:
+    """What was drawn of the newest frame, for questions about its pixels."""
+
+    view: CameraView
+    object_coverage: moderngl.Texture
+    object_buffer: GeometryBuffer
+    real_surface: RealSurface
+    objects: GeometryState
+
+
+class Composition:
+    """Composes the picture, and overwrites it with a debug view where one is asked for."""
+
+    def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
+        self._composite = Composite(gpu, size)
+        self._views = DebugViews(gpu)
+
+    def compose(
+        self,
+        image: CameraImage,
+        scene: Bindings,
+        options: CompositeOptions,
+        *layers: Any,  # noqa: ANN401 (of RelitLayers, in their order)
+    ) -> Composite:
+        """The relit picture."""
+        relit = RelitLayers(scene["object_coverage"], *layers)
+        self._composite.run(image, relit, {**scene, **options.bindings})
+        view = options.output.view
+        if view == "volume":
+            self._views.volume(self._composite.code, image, relit.voxels, relit.volume, scene)
+        elif view == "rsm":
+            self._views.shadow_maps(self._composite.code, relit.lights)
+        elif view in ("effects", "delta"):
+            self._views.change(
+                self._composite.code,
+                image,
+                self._composite.linear,
+                relit.object_coverage,
+                effects=view == "effects",
+            )
+        return self._composite
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        self._composite.release()
+        self._views.release()
+
+
+class FrameGraph:
+    """Declared once for a method and a picture size; every frame sets its sources and runs it.
+
+    `timers` are given from outside, because they outlive a graph. `checks` is `Graph`'s.
+    """
+
+    def __init__(
+        self,
+        gpu: GpuContext,
+        view: CameraView,
+        method: MethodChoice,
+        fields: OcclusionFields,
+        timers: PassTimers,
+        *,
+        checks: bool = False,
+    ) -> None:
+        self.method = method
+        self.buffers = PictureBuffers(gpu, view)
+        self.graph = Graph(gpu, timers, checks=checks)
+        self.graph.own(self.buffers)
+        self.resources: FrameResources = declare_frame(self.graph, self.buffers)
+        self.layers: Layers = method.declare(self.graph, self.resources, method.setup(view.size, fields))
+        self._options: Resource[CompositeOptions] = self.graph.source("output", "scene")
+        self._composite = self._declare_composition(Composition(gpu, view.size))
+        self._inputs: FrameInputs | None = None
+
+    def _declare_composition(self, composition: Composition) -> Resource[Composite]:
+        g, s, layers = self.graph, self.resources, self.layers
+        radiance = g.stage(
+            "interior edges", self.buffers.antialias_interior, layers.radiance, s.object_surface
+        )
+        return g.stage(
+            "composite",
+            composition.compose,
+            s.image,
+            "shading scene",
+            self._options,
+            radiance,
+            layers.direct,
+            layers.cones,
+            layers.grid,
+            layers.change,
+            layers.voxels,
+            layers.volume,
+            layers.lights,
+            layers.reflection,
+        )
+
+    def upload(self, frame: ViewFrame) -> None:
+        """Uploads a frame's picture: a change, whatever it shows."""
+        self.buffers.image.upload(frame)
+        self.resources.image.write(self.buffers.image)
+
+    def set_inputs(self, inputs: FrameInputs) -> None:
+        """Sets all sources but picture and output."""
+        s = self.resources
+        s.view.write(inputs.view, eq)
+        s.scan.write(inputs.scan, is_)
+        s.real.write(inputs.real, is_)
+        s.objects.write(inputs.objects, is_)
+        s.surfaces.write(inputs.surfaces, is_)
+        s.lights.write(inputs.lights, is_)
+        s.everywhere.write(False, eq)
+        s.albedo.write(inputs.albedo, is_)
+        self._inputs = inputs
+
+    def set_lights(self, lights: LightSet) -> None:
+        """Shines other lights on the same frame."""
+        assert self._inputs is not None
+        self.set_inputs(replace(self._inputs, lights=lights))
+
+    def renew_albedo(self) -> None:
+        """Tells the stages that the albedo texture holds something else."""
+        self.resources.albedo.write(self.resources.albedo.value)
+
+    @property
+    def inputs(self) -> FrameInputs:
+        """What the frame is rendered from."""
+        assert self._inputs is not None
+        return self._inputs
+
+    @property
+    def observation(self) -> Observation:
+        """The real surfaces in view, brought up to date."""
+        self.graph.run(self.resources.observation)
+        return self.resources.observation.value
+
+    def shown(self) -> ShownBuffers:
+        """The geometry buffers, brought up to date."""
+        s = self.resources
+        self.graph.run(s.geometry)
+        surface = s.object_surface.value
+        return ShownBuffers(
+            s.view.value,
+            surface.coverage.texture,
+            surface.buffer,
+            s.observation.value.surface,
+            s.objects.value,
+        )
+
+    def evaluate(self, lights: LightSet) -> Fields:
+        """Light of the frame under other lights, at every pixel and not only where the objects reach.
+
+        The sources keep these lights until they are set again.
+        """
+        s, layers = self.resources, self.layers
+        s.lights.write(lights, is_)
+        s.everywhere.write(True, eq)
+        self.graph.run(layers.direct, layers.cones, layers.grid)
+        return Fields(layers.direct.value, layers.cones.value, layers.grid.value)
+
+    def render(self, options: CompositeOptions) -> Composite:
+        """Composes the frame."""
+        self._options.write(options, eq)
+        self.graph.run()
+        return self._composite.value
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        self.graph.release()

@@ -1,0 +1,370 @@
+"""Kernels: compute and raster programs whose textures, images, buffers and uniforms are bound by their GLSL names.
+
+Units and binding points are assigned when a program is linked, so no shader states any, and nothing has to be bound
+before a kernel runs: what it needs, it is given.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from difflib import get_close_matches
+from typing import Any, Final, Protocol
+
+import moderngl
+import numpy as np
+
+from render_server.gpu.context import GpuContext
+from render_server.gpu.shader_source import SHADERS, Declarations, declarations, shader_source
+from render_server.gpu.uniform_block import UniformBlock
+
+SOFTWARE_WALKERS = 1024
+# Mesa's software renderer ends all loops of a thread after 65535 turns in sum, without a word; tracing the cones of
+# one texel takes up to about 5000 (16 cones through 256 voxels and the coarse scene).
+SOFTWARE_SHARE = 12
+LIST_WALKERS = 16384
+BLOCK_ALIGNMENT = (
+    16  # bytes that std140 blocks are padded to; drivers may leave the padding out of their size
+)
+GL_INT = 0x1404
+CLIP_DISTANCE0 = 0x3000  # GL_CLIP_DISTANCE0, which moderngl does not name
+
+Texture = moderngl.Texture | moderngl.Texture3D | moderngl.TextureArray
+Value = float | int | bool | Sequence[float] | Sequence[Sequence[float]] | np.ndarray[Any, Any]
+Binding = Texture | moderngl.Buffer | UniformBlock[Any] | Value | None
+Bindings = Mapping[str, Binding]
+"""GLSL names and what is bound to them; None stands for nothing: a texture without texels, an empty buffer."""
+
+SAMPLERS: Final = {
+    0x8B5E: moderngl.Texture,  # sampler2D
+    0x8DCA: moderngl.Texture,  # isampler2D
+    0x8DD2: moderngl.Texture,  # usampler2D
+    0x8B5F: moderngl.Texture3D,  # sampler3D
+    0x8DC1: moderngl.TextureArray,  # sampler2DArray
+}
+IMAGES: Final = {
+    0x904D: moderngl.Texture,  # image2D
+    0x9058: moderngl.Texture,  # iimage2D
+    0x9063: moderngl.Texture,  # uimage2D
+    0x904E: moderngl.Texture3D,  # image3D
+    0x9053: moderngl.TextureArray,  # image2DArray
+}
+FORMATS: Final = {
+    "f1": {1: "r8", 2: "rg8", 4: "rgba8"},
+    "f2": {1: "r16f", 2: "rg16f", 4: "rgba16f"},
+    "f4": {1: "r32f", 2: "rg32f", 4: "rgba32f"},
+    "u1": {1: "r8ui", 2: "rg8ui", 4: "rgba8ui"},
+    "i2": {1: "r16i", 2: "rg16i", 4: "rgba16i"},
+    "u4": {1: "r32ui", 2: "rg32ui", 4: "rgba32ui"},
+}
+
+
+class BindingError(RuntimeError):
+    """A kernel was given a name that it does not declare, lacks one that it needs, or got the wrong kind of thing."""
+
+
+class Drawable(Protocol):
+    """Geometry that a raster kernel draws."""
+
+    @property
+    def triangle_count(self) -> int:
+        """How many triangles are drawn."""
+
+    def draw(self, program: moderngl.Program) -> None:
+        """Draws all of it with `program`."""
+
+
+@dataclass(frozen=True)
+class Dispatch:
+    """One run of a kernel: workgroups (x, y, z), or triangles drawn; `written` are textures and buffers by name."""
+
+    kernel: str
+    size: tuple[int, ...]
+    written: Mapping[str, object]
+
+
+@dataclass(eq=False)
+class _Slot:
+    """An active resource of a linked program and the unit or binding point that it was given."""
+
+    name: str
+    member: Any
+    kind: int = 0
+    place: int = 0
+
+
+class _Program:
+    """A linked program and its resources by name."""
+
+    def __init__(
+        self,
+        gpu: GpuContext,
+        label: str,
+        program: moderngl.Program | moderngl.ComputeShader,
+        declared: Declarations,
+    ) -> None:
+        self._gpu, self.label, self.program, self._declared = gpu, label, program, declared
+        self._samplers: list[_Slot] = []
+        self._images: list[_Slot] = []
+        self._storage: list[_Slot] = []
+        self._blocks: list[_Slot] = []
+        self._uniforms: list[_Slot] = []
+        self._last: dict[str, bytes | Value] = {}
+        self._formats: dict[int, str] = {}
+        for name in program:
+            self._adopt(name, program[name])
+        self._assign()
+
+    def _adopt(self, name: str, member: object) -> None:
+        slot = _Slot(name, member, getattr(member, "gl_type", 0))
+        if isinstance(member, moderngl.StorageBlock):
+            self._storage.append(slot)
+        elif isinstance(member, moderngl.UniformBlock):
+            self._blocks.append(slot)
+        elif isinstance(member, moderngl.Uniform):
+            is_texture = slot.kind in SAMPLERS or slot.kind in IMAGES
+            slots = self._samplers if slot.kind in SAMPLERS else self._images
+            (slots if is_texture else self._uniforms).append(slot)
+            if is_texture:
+                slot.member.gl_type = (
+                    GL_INT  # a unit is an integer; moderngl 5.13 leaves that of an image3D unset
+                )
+
+    def _assign(self) -> None:
+        """Numbers units and binding points, each kind from 0 on."""
+        for slots in (self._samplers, self._images):
+            for slot in slots:
+                slot.place = slots.index(slot)
+                slot.member.value = slot.place
+        for slots in (self._storage, self._blocks):
+            for slot in slots:
+                slot.place = slots.index(slot)
+                slot.member.binding = slot.place
+
+    def bind(self, shared: Sequence[Bindings], own: Bindings) -> dict[str, object]:
+        """Binds everything that the program reads and writes; returns what it may write.
+
+        Raises:
+            BindingError: as the class says.
+        """
+        for name in own:
+            if name not in self._declared.names:
+                raise BindingError(f"Kernel {self.label} declares no `{name}`{self._nearest(name)}.")
+        sources = (own, *shared)
+        written: dict[str, object] = {}
+        for slot in self._samplers:
+            self._bind_sampler(slot, self._find(slot.name, sources))
+        for slot in self._images:
+            written[slot.name] = self._bind_image(slot, self._find(slot.name, sources))
+        for slot in self._storage:
+            written[slot.name] = self._bind_storage(slot, self._find(slot.name, sources))
+        for slot in self._blocks:
+            self._bind_block(slot, self._find(slot.name, sources))
+        for slot in self._uniforms:
+            self._write(slot, self._find(slot.name, sources))
+        return {name: item for name, item in written.items() if name in self._declared.written}
+
+    def _find(self, name: str, sources: Sequence[Bindings]) -> Binding:
+        for source in sources:
+            if name in source:
+                return source[name]
+        raise BindingError(f"Kernel {self.label} needs `{name}`, which it was not given.")
+
+    def _nearest(self, name: str) -> str:
+        close = get_close_matches(name, self._declared.names, 1)
+        return f"; the nearest name is `{close[0]}`" if close else ""
+
+    def _wrong(self, slot: _Slot, value: object, wanted: str) -> BindingError:
+        return BindingError(f"Kernel {self.label}: `{slot.name}` is {wanted}, not a {type(value).__name__}.")
+
+    def _bind_sampler(self, slot: _Slot, value: Binding) -> None:
+        kind = SAMPLERS[slot.kind]
+        texture: Any = self._gpu.empty_texture(kind) if value is None else value
+        if not isinstance(texture, Texture) or not isinstance(texture, kind):
+            raise self._wrong(slot, value, f"a {kind.__name__} that is sampled")
+        texture.use(location=slot.place)
+
+    def _bind_image(self, slot: _Slot, value: Binding) -> Texture:
+        kind = IMAGES[slot.kind]
+        if not isinstance(value, Texture) or not isinstance(value, kind):
+            raise self._wrong(slot, value, f"a {kind.__name__} that is written or read texel by texel")
+        wanted = self._declared.formats[slot.name]
+        found = FORMATS.get(value.dtype, {}).get(value.components, "no image format")
+        if wanted and found not in wanted:
+            raise BindingError(
+                f"Kernel {self.label}: `{slot.name}` is declared {' or '.join(sorted(wanted))}, "
+                f"but the texture is {found}."
+            )
+        value.bind_to_image(slot.place, read=True, write=True)
+        return value
+
+    def _bind_storage(self, slot: _Slot, value: Binding) -> moderngl.Buffer:
+        buffer = self._gpu.empty_buffer if value is None else value
+        if not isinstance(buffer, moderngl.Buffer):
+            raise self._wrong(slot, value, "a storage buffer")
+        buffer.bind_to_storage_buffer(slot.place)
+        return buffer
+
+    def _bind_block(self, slot: _Slot, value: Binding) -> None:
+        if not isinstance(value, UniformBlock):
+            raise self._wrong(slot, value, "a uniform block")
+        if value.size != -(-slot.member.size // BLOCK_ALIGNMENT) * BLOCK_ALIGNMENT:
+            raise BindingError(
+                f"Kernel {self.label}: block `{slot.name}` takes {slot.member.size} bytes, "
+                f"{type(value.value).__name__} packs {value.size}."
+            )
+        value.bind(slot.place)
+
+    def _write(self, slot: _Slot, value: Binding) -> None:
+        """Writes a uniform unless it has this value already; 4x4 arrays are row-major here."""
+        data: bytes | Value
+        if isinstance(value, np.ndarray):
+            ordered = value.T if value.ndim == 2 and slot.member.matrix else value
+            data = np.ascontiguousarray(ordered, dtype="f4").tobytes()
+        elif isinstance(value, bool | int | float | tuple | list | np.number | np.bool_):
+            data = value
+        else:
+            raise self._wrong(slot, value, "a uniform")
+        if self._last.get(slot.name) == data and slot.name in self._last:
+            return
+        try:
+            if isinstance(data, bytes):
+                slot.member.write(data)
+            else:
+                slot.member.value = data
+        except Exception as error:  # struct and moderngl raise several kinds
+            raise BindingError(
+                f"Kernel {self.label}: `{slot.name}` cannot take {value!r} ({error})."
+            ) from error
+        self._last[slot.name] = data
+
+    def resources(self) -> dict[str, list[str]]:
+        """Names of the active samplers, images, storage blocks and uniform blocks."""
+        return {
+            "samplers": [slot.name for slot in self._samplers],
+            "images": [slot.name for slot in self._images],
+            "storage blocks": [slot.name for slot in self._storage],
+            "uniform blocks": [slot.name for slot in self._blocks],
+        }
+
+    def report(self, size: tuple[int, ...], written: Mapping[str, object]) -> None:
+        """Tells who watches that the program ran."""
+        for watch in self._gpu.watchers:
+            watch(Dispatch(self.label, size, written))
+
+
+class Kernel:
+    """A compute shader of the shaders' folder with its defines.
+
+    The one place where work is dispatched, so that the memory barrier is never forgotten: a missing barrier does not
+    show on a software renderer.
+    """
+
+    def __init__(self, gpu: GpuContext, name: str, **defines: float | str) -> None:
+        self._ctx = gpu.ctx
+        source = shader_source(SHADERS / f"{name}.comp.glsl", defines)
+        declared = declarations(source)
+        self.label = _label(name, defines)
+        gpu.compiled(self.label, {"comp": source})
+        self._program = _Program(gpu, self.label, gpu.ctx.compute_shader(source), declared)
+        self._local = declared.local_size
+
+    def run(self, threads: Sequence[int], *shared: Bindings, **own: Binding) -> None:
+        """Runs at least `threads` (x[, y[, z]]) invocations; their writes are visible to what comes after.
+
+        `own` must be names that the shader declares; of `shared` it takes what it needs. `own` comes first, then
+        `shared` in their order.
+
+        Raises:
+            BindingError: a name is unknown or missing, or what is bound to it is of another kind or format.
+        """
+        written = self._program.bind(shared, own)
+        counts = [*threads, 1, 1][:3]
+        groups = tuple(max(1, -(-count // size)) for count, size in zip(counts, self._local, strict=True))
+        program = self._program.program
+        assert isinstance(program, moderngl.ComputeShader)
+        program.run(*groups)
+        self._ctx.memory_barrier()
+        self._program.report(groups, written)
+
+    def resources(self) -> dict[str, list[str]]:
+        """Names of what the linked program binds, by kind."""
+        return self._program.resources()
+
+    def release(self) -> None:
+        """Frees the GL object."""
+        self._program.program.release()
+
+
+class RasterKernel:
+    """A vertex and a fragment shader of the same name; draws with depth test into a framebuffer."""
+
+    def __init__(self, gpu: GpuContext, name: str, **defines: float | str) -> None:
+        self._ctx = gpu.ctx
+        vertex, fragment = (
+            shader_source(SHADERS / f"{name}.{stage}.glsl", defines) for stage in ("vert", "frag")
+        )
+        self.label = _label(name, defines)
+        gpu.compiled(self.label, {"vert": vertex, "frag": fragment})
+        program = gpu.ctx.program(vertex_shader=vertex, fragment_shader=fragment)
+        self._program = _Program(gpu, self.label, program, declarations(vertex + "\n" + fragment))
+
+    def draw(
+        self,
+        target: moderngl.Framebuffer,
+        mesh: Drawable,
+        *shared: Bindings,
+        box: tuple[int, int, int, int] | None = None,
+        clips: bool = False,
+        **own: Binding,
+    ) -> None:
+        """Draws `mesh` into `target`, or into its `box` (x, y, width, height); `clips` heeds gl_ClipDistance[0].
+
+        Raises:
+            BindingError: as `Kernel.run`.
+        """
+        self._program.bind(shared, own)
+        target.use()
+        target.viewport = box or (0, 0, *target.size)
+        target.scissor = box  # type: ignore[assignment]  # None lifts it, which the stubs do not know
+        self._ctx.enable_only(moderngl.DEPTH_TEST)
+        if clips:
+            self._ctx.enable_direct(CLIP_DISTANCE0)
+        program = self._program.program
+        assert isinstance(program, moderngl.Program)
+        mesh.draw(program)
+        if clips:
+            self._ctx.disable_direct(CLIP_DISTANCE0)
+        target.scissor = None  # type: ignore[assignment]  # or it would cut what is cleared next
+        self._program.report((mesh.triangle_count,), {})
+
+    def resources(self) -> dict[str, list[str]]:
+        """Names of what the linked program binds, by kind."""
+        return self._program.resources()
+
+    def release(self) -> None:
+        """Frees the GL object."""
+        self._program.program.release()
+
+
+def _label(name: str, defines: Mapping[str, float | str]) -> str:
+    """The shader's name and what it was compiled with, e.g. `trace_cones REAL`."""
+    return " ".join([name, *(key if value == 1 else f"{key}={value}" for key, value in defines.items())])
+
+
+def list_threads(gpu: GpuContext, longest: int = LIST_WALKERS) -> int:
+    """Threads to walk a list whose length only the GPU knows: at most `longest`; few in software, where an idle one
+    costs as much as a busy one, but never so few that a thread's loops are cut off.
+    """
+    if not gpu.is_software:
+        return longest
+    return min(longest, max(SOFTWARE_WALKERS, -(-longest // SOFTWARE_SHARE)))
+
+
+@contextmanager
+def watched(gpu: GpuContext, watch: Callable[[Dispatch], None]) -> Iterator[None]:
+    """Tells `watch` of every run of a kernel of this context."""
+    gpu.watchers.append(watch)
+    try:
+        yield
+    finally:
+        gpu.watchers.remove(watch)

@@ -1,0 +1,43 @@
+"""What objects hold on the GPU: textures and buffers found in their attributes, and the bytes that these take."""
+
+import math
+from collections.abc import Iterator
+
+import moderngl
+import numpy as np
+
+GPU_KINDS = (moderngl.Texture, moderngl.Texture3D, moderngl.TextureArray, moderngl.Buffer)
+OWN_CODE = "render_server."
+DEEPEST = 4  # attributes of attributes; a pass holds fields, which hold textures
+
+
+def gpu_objects(value: object, depth: int = 0) -> Iterator[object]:
+    """Textures and buffers that `value` is or holds; one that is held twice comes twice."""
+    if isinstance(value, GPU_KINDS):
+        yield value
+    elif depth < DEEPEST:
+        for item in _parts(value):
+            yield from gpu_objects(item, depth + 1)
+
+
+def _parts(value: object) -> Iterator[object]:
+    if isinstance(value, tuple | list):
+        yield from value
+    elif isinstance(value, dict):
+        yield from value.values()
+    elif type(value).__module__.startswith(OWN_CODE) and hasattr(value, "__dict__"):
+        yield from vars(value).values()
+
+
+def size_bytes(value: object) -> int:
+    """Bytes of the GPU's memory that `value` takes, mip levels left out."""
+    held = {id(item): item for item in gpu_objects(value)}
+    return sum(_size(item) for item in held.values())
+
+
+def _size(item: object) -> int:
+    if isinstance(item, moderngl.Buffer):
+        return int(item.size)
+    assert isinstance(item, moderngl.Texture | moderngl.Texture3D | moderngl.TextureArray)
+    texels = math.prod(item.size)
+    return int(texels * item.components * np.dtype(item.dtype).itemsize)

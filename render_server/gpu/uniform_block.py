@@ -1,0 +1,90 @@
+"""Uniform blocks (std140): values that many programs share, declared once in GLSL and once as a dataclass."""
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Annotated, Any, Generic, TypeVar, get_type_hints
+
+import numpy as np
+
+from render_server.gpu.context import GpuContext
+
+Bool = Annotated[bool, "bool"]
+Int = Annotated[int, "int"]
+Float = Annotated[float, "float"]
+Vec2 = Annotated[Sequence[float], "vec2"]
+Vec3 = Annotated[Sequence[float], "vec3"]
+Vec4 = Annotated[Sequence[float], "vec4"]
+Mat4 = Annotated[np.ndarray[Any, Any], "mat4"]
+"""Row-major here, as everywhere in Python."""
+
+# GLSL type: alignment and size in bytes (OpenGL 4.6 core, 7.6.2.2), format of its elements.
+STD140 = {
+    "bool": (4, 4, "I"),
+    "int": (4, 4, "i"),
+    "float": (4, 4, "f"),
+    "vec2": (8, 8, "2f"),
+    "vec3": (16, 12, "3f"),
+    "vec4": (16, 16, "4f"),
+    "mat4": (16, 64, "16f"),
+}
+
+
+_MEMBERS: dict[type, tuple[tuple[str, str], ...]] = {}
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Base of a block's dataclass: its fields are the block's members in their order, annotated with their types."""
+
+    @classmethod
+    def members(cls) -> tuple[tuple[str, str], ...]:
+        """Name and GLSL type of each member."""
+        if cls not in _MEMBERS:
+            hints = get_type_hints(cls, include_extras=True)
+            _MEMBERS[cls] = tuple((item.name, hints[item.name].__metadata__[0]) for item in fields(cls))
+        return _MEMBERS[cls]
+
+    def packed(self) -> bytes:
+        """The bytes that a shader reads."""
+        data = bytearray()
+        for name, kind in self.members():
+            align, size, form = STD140[kind]
+            data.extend(bytes(-len(data) % align))
+            value = getattr(self, name)
+            if kind == "mat4":
+                value = np.asarray(value, np.float32).T.ravel()
+            data.extend(struct.pack("<" + form, *value) if size > 4 else struct.pack("<" + form, value))
+        return bytes(data) + bytes(-len(data) % 16)
+
+
+Kind = TypeVar("Kind", bound=Block)
+
+
+class UniformBlock(Generic[Kind]):
+    """One block's buffer on the GPU; rewritten when the value changes."""
+
+    def __init__(self, gpu: GpuContext, value: Kind) -> None:
+        self.value = value
+        self._data = value.packed()
+        self._buffer = gpu.ctx.buffer(self._data, dynamic=True)
+
+    @property
+    def size(self) -> int:
+        """Bytes."""
+        return len(self._data)
+
+    def write(self, value: Kind) -> None:
+        """Replaces the value."""
+        data = value.packed()
+        if data != self._data:
+            self._buffer.write(data)
+        self.value, self._data = value, data
+
+    def bind(self, place: int) -> None:
+        """Binds the buffer to a binding point."""
+        self._buffer.bind_to_uniform_block(place)
+
+    def release(self) -> None:
+        """Frees the buffer."""
+        self._buffer.release()

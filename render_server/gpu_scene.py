@@ -1,0 +1,68 @@
+"""Triangles on the GPU as stages get them: the real scene's, and the virtual objects'."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32, Float64
+
+from render_server.passes.gbuffer import MaterialTable, MeshBuffers
+from render_server.scene.back_sheets import back_sheets
+from render_server.scene.materials import Material
+from render_server.scene.mesh import TriangleMesh
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedObject:
+    """One virtual object: its asset as the file has it, and where that stands (turned, scaled evenly, moved; m).
+
+    `material`: what the scene document gives it in place of the asset's own, if it does. `moves`: whether it plays an
+    animation, so that `meshes` hold for this frame alone.
+    """
+
+    id: str
+    meshes: tuple[TriangleMesh, ...]
+    world_from_asset: Float64[np.ndarray, "4 4"]
+    material: Material | None
+    moves: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class GeometryState:
+    """One set of triangles in the world; another set is another object.
+
+    `corners` are for the voxeliser (`triangle_corners` in passes/gbuffer.py), `points` enclose the set. `swept_points` enclose it at
+    all times of the animations that it plays: what is fitted around them stands still while it moves.
+    """
+
+    buffers: MeshBuffers
+    corners: Float32[np.ndarray, "m 3 10"]
+    points: Float64[np.ndarray, "n 3"]
+    materials: MaterialTable
+    coarse_corners: Float32[np.ndarray, "k 3 10"] | None = (
+        None  # fewer triangles for what lies far; None: all
+    )
+    objects: tuple[PlacedObject, ...] = ()  # what the triangles of virtual geometry were made from
+    swept_points: Float64[np.ndarray, "k 3"] | None = None  # None: nothing is animated
+    is_open: bool = False  # one camera's view of what is solid: backs are not in it
+
+    def solid_corners(self, voxel_edge: float) -> Float32[np.ndarray, "k 3 10"]:
+        """`corners` for voxels of that edge (m), with coarse backs of what one camera saw (scene/back_sheets.py)."""
+        if not self.is_open:
+            return self.corners
+        fronts = self.corners if self.coarse_corners is None else self.coarse_corners
+        return np.concatenate([self.corners, back_sheets(fronts, voxel_edge)])
+
+    @property
+    def bounds(self) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
+        """Least and greatest coordinates, m."""
+        return self.points.min(axis=0), self.points.max(axis=0)
+
+    @property
+    def lasting_points(self) -> Float64[np.ndarray, "k 3"]:
+        """Points that enclose the set now and later."""
+        return self.points if self.swept_points is None else self.swept_points
+
+    @property
+    def lasting_bounds(self) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
+        """Least and greatest coordinates now and later, m: volumes and light views are placed by them."""
+        return self.lasting_points.min(axis=0), self.lasting_points.max(axis=0)

@@ -1,0 +1,221 @@
+"""One scene from frame to frame: geometry, lights and estimates that outlive a frame, and the graph that renders it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from protocol.frames import ViewFrame
+from protocol.scene import SceneDocument
+from protocol.scene_method import NoneMethod, Output
+from protocol.scene_objects import Material
+from render_server.estimation.albedo import AlbedoEstimator
+from render_server.estimation.lighting import LightEstimator
+from render_server.frame_graph import CompositeOptions, FrameGraph, FrameInputs, ShownBuffers
+from render_server.gpu.context import GpuContext
+from render_server.gpu.timers import PassTimers
+from render_server.methods.registry import MethodChoice, choose_method
+from render_server.occlusion_fields import OcclusionFields
+from render_server.passes.composite import Composite
+from render_server.real_geometry import RealGeometry
+from render_server.scene.mesh import TriangleMesh
+from render_server.scene.surfaces import SurfaceTable, build_surface_table
+from render_server.view import CameraView
+from render_server.virtual_objects import VirtualObjects
+
+
+@dataclass(frozen=True, eq=False)
+class RelitFrame:
+    """A frame that is ready to be composed by `graph`."""
+
+    graph: FrameGraph
+    options: CompositeOptions
+
+    def compose(self, *, with_linear: bool) -> Composite:
+        """Renders the picture; `with_linear`: its linear radiance too."""
+        options = self.options
+        return self.graph.render(
+            CompositeOptions(options.output, options.additive, options.relights_real, with_linear)
+        )
+
+    def shown(self) -> ShownBuffers:
+        """The geometry buffers."""
+        return self.graph.shown()
+
+
+@dataclass(frozen=True, eq=False)
+class _Plan:
+    """A scene whose files and memory were checked."""
+
+    scene: SceneDocument
+    method: MethodChoice
+    lighting: LightEstimator
+
+
+class LiveScene:
+    """Holds everything that lives longer than a frame."""
+
+    def __init__(
+        self, gpu: GpuContext, scene: SceneDocument, notices: list[str], *, waits: bool = True
+    ) -> None:
+        self._gpu = gpu
+        self._notices = notices
+        self.timers = PassTimers(gpu)
+        self._objects = VirtualObjects(gpu)
+        self._real: RealGeometry | None = None
+        self._surfaces: SurfaceTable | None = None
+        self._albedo = AlbedoEstimator(gpu)
+        self.graph: FrameGraph | None = None
+        self._fields = OcclusionFields(self._say, waits=waits)
+        self._accumulated: ViewFrame | None = None  # last frame already accumulated
+        self._plan = self._planned(scene)
+        self.lighting = self._plan.lighting
+        self._take(self._plan)
+
+    def _planned(self, scene: SceneDocument) -> _Plan:
+        """Checks everything that can fail before anything is replaced."""
+        method = choose_method(scene.method, software=self._gpu.is_software)
+        if method.remark is not None:
+            self._say(method.remark)
+        method.require(scene.objects)
+        self._objects.load(scene.objects)
+        for sentence in ignored_wishes(scene):
+            self._say(sentence)
+        return _Plan(scene, method, LightEstimator(scene.lights, self._say))
+
+    def _say(self, sentence: str) -> None:
+        if sentence not in self._notices:
+            self._notices.append(sentence)
+
+    def set_scene(self, scene: SceneDocument) -> None:
+        """Replaces the scene; nothing changes if it cannot be used. Pictures do not wait for what is precomputed."""
+        self._take(self._planned(scene))
+        self._fields.waits = False
+
+    def _take(self, plan: _Plan) -> None:
+        old = self._plan
+        budget = plan.method.resolved.triangle_budget
+        if self._real is not None and isinstance(plan.scene.method, NoneMethod):
+            budget = self._real.budget  # it asks for none
+        if self._real is None or plan.scene.real != old.scene.real or budget != self._real.budget:
+            real = RealGeometry(self._gpu, plan.scene.real, budget)
+            if self._real is not None:
+                self._real.release()
+            self._real = real
+            self._albedo.reset(plan.scene.real.unseen_albedo)
+            self._surfaces = self._accumulated = None
+        if plan.method != old.method:
+            self._drop_graph()
+        if plan.scene.lights != old.scene.lights:
+            self.lighting = plan.lighting
+            self._accumulated = None
+        self._plan = plan
+
+    def _drop_graph(self) -> None:
+        if self.graph is not None:
+            self.graph.release()
+        self.graph = None
+
+    def begin_source(self) -> None:
+        """Forgets all that was seen and found: another camera shows another room."""
+        plan = self._planned(self._plan.scene)
+        if self._real is not None:
+            self._real.release()
+        self._real = None
+        self._drop_graph()
+        self.lighting = plan.lighting
+        self._take(plan)
+
+    @property
+    def model(self) -> Sequence[TriangleMesh]:
+        """The real scene's meshes, if it is given."""
+        return () if self._real is None else self._real.model
+
+    def relight(self, frame: ViewFrame, view: CameraView) -> RelitFrame | None:
+        """Makes a frame ready to be composed; None if no object is visible, or no light yet.
+
+        The same frame again, in another view or by another method, adds nothing to what is averaged over frames.
+        """
+        again, self._accumulated = frame is self._accumulated, None
+        lit = again or self.lighting.update(frame)
+        objects = self._objects.update(self._plan.scene.objects, frame.board, frame.timestamp_ns)
+        if objects is None or self._real is None or not lit:
+            return None
+        graph = self._graph_for(view)
+        with self.timers.measure("upload"):
+            graph.upload(frame)
+        moved = not again and self._real.update(frame, view)
+        assert self._real.view is not None
+        view = self._real.view  # while nothing moves, the pose's own jitter must not shake the picture
+        if self._real.state is None:
+            self._say(
+                "Depth showed no surface in some frames; they are passed through as the camera saw them."
+            )
+            return None
+        output = self._plan.scene.output
+        assert self.lighting.lights is not None
+        graph.set_inputs(
+            FrameInputs(
+                frame,
+                view.with_antialiasing if output.antialiasing else view,
+                self._real.scan,
+                self._real.state,
+                objects,
+                self._surface_table(frame, moved=moved),
+                self.lighting.lights,
+                self._albedo.texture,
+            )
+        )
+        graph.set_lights(self.lighting.estimate(graph, moved=moved))
+        if moved and self._real.has_unseen and self._albedo.observe(graph, self.lighting.lights):
+            graph.renew_albedo()
+            graph.set_lights(self.lighting.lights)
+        self._accumulated = frame
+        return RelitFrame(graph, self._options(output))
+
+    def _options(self, output: Output) -> CompositeOptions:
+        is_none = isinstance(self._plan.scene.method, NoneMethod)
+        additive = self._plan.method.composition == "additive"
+        return CompositeOptions(output, additive, not is_none, with_linear=False)
+
+    def _surface_table(self, frame: ViewFrame, *, moved: bool) -> SurfaceTable:
+        """The declared surfaces, with the board's sheet among them; renewed when something moved."""
+        assert self._real is not None
+        if self._surfaces is None or moved:
+            declared = self._plan.scene.real.surfaces
+            board = frame.board if declared else None
+            found = build_surface_table(declared, board, self._real.material_names)
+            if self._surfaces is None or not found.equals(self._surfaces):
+                self._surfaces = found
+        return self._surfaces
+
+    def _graph_for(self, view: CameraView) -> FrameGraph:
+        """The graph of the picture's size; another one when the lens or size changes."""
+        key = (view.size, view.raster[1])
+        if self.graph is not None and self.graph.buffers.key != key:
+            self._drop_graph()
+        if self.graph is None:
+            self.graph = FrameGraph(self._gpu, view, self._plan.method, self._fields, self.timers)
+        return self.graph
+
+    def describe_lights(self) -> list[dict[str, Any]]:
+        """Plain values of the lights, registration included."""
+        return [] if self.lighting.lights is None else self.lighting.lights.describe()
+
+    def release(self) -> None:
+        """Frees all GL objects."""
+        for item in (self._objects, self._real, self.graph, self._albedo, self._fields):
+            if item is not None:
+                item.release()
+
+
+def ignored_wishes(scene: SceneDocument) -> list[str]:
+    """Sentences on what the document asks for and this release leaves out of the picture."""
+    materials = [item.material for item in scene.objects if isinstance(item.material, Material)]
+    wishes = {
+        "output.camera_artifacts": scene.output.camera_artifacts,
+        f"shading.name `{scene.shading.name}`": scene.shading.name not in ("auto", "volume"),
+        "a material's transmission": any(material.transmission > 0 for material in materials),
+    }
+    return [
+        f"{name} arrives with a later release and is left out." for name, asked in wishes.items() if asked
+    ]

@@ -1,0 +1,274 @@
+"""AR object occlusion fields: natural light by precomputed shells of what rigid objects hide ([D] 5.2,
+docs/method.md 6).
+"""
+
+from dataclasses import dataclass, field
+from operator import eq
+
+import moderngl
+import numpy as np
+
+from protocol.scene_method import AroofMethod
+from render_server.frame import FrameResources, Observation
+from render_server.gpu.context import GpuContext
+from render_server.gpu.kernel import Binding, Bindings
+from render_server.gpu.textures import release_all
+from render_server.gpu_scene import GeometryState, PlacedObject
+from render_server.graph import Graph, Resource
+from render_server.methods.lighting import Layers, Shading, ShadingOptions, light_stages, shading_stages
+from render_server.methods.settings import Setup
+from render_server.occlusion_fields import OcclusionFields
+from render_server.passes.cones import ConeFields, LowResGrid
+from render_server.passes.occlusion_fields import (
+    FieldTextures,
+    LightChange,
+    LightProbe,
+    LightProbeCapture,
+    NaturalFields,
+    ObjectBounceLight,
+    OcclusionShade,
+    OcclusionShow,
+    field_texture,
+    standing_uniforms,
+)
+from render_server.passes.shading import DirectLight
+from render_server.passes.voxels import PlacedVolume, VolumePlacement, VoxelMipmap, place_volume
+from render_server.scene.occlusion_field import FieldSettings, OcclusionField
+
+
+@dataclass(eq=False)
+class FieldObject:
+    """One object: samples of its field, light around it, where it stands (`place`).
+
+    Without `textures` its field is still being computed.
+    """
+
+    probe: LightProbe
+    textures: FieldTextures | None
+    bounce_light: moderngl.Texture3D | None
+    place: dict[str, Binding] = field(default_factory=dict)
+
+    def release(self) -> None:
+        """Frees the GL objects that are its own."""
+        release_all(self.probe, self.bounce_light)
+
+
+class FieldObjects:
+    """The scene's objects as occlusion fields have them; objects of one asset share its samples."""
+
+    def __init__(self, gpu: GpuContext, fields: OcclusionFields, settings: FieldSettings) -> None:
+        self._gpu = gpu
+        self._fields = fields
+        self._settings = settings
+        self._textures: dict[OcclusionField, FieldTextures] = {}
+        self._made_for: tuple[OcclusionField | None, ...] | None = None
+        self.items: list[FieldObject] = []
+
+    def find(self, objects: GeometryState) -> tuple[OcclusionField | None, ...]:
+        """The objects' fields as far as they are there.
+
+        Raises:
+            DeltalightError: a field cannot be computed.
+        """
+        return tuple(self._fields.find(item, self._settings) for item in objects.objects)
+
+    def place(self, objects: GeometryState, found: tuple[OcclusionField | None, ...]) -> list[FieldObject]:
+        """Uploads fields that are new, and puts the objects where they stand now."""
+        if found != self._made_for:
+            self._make(found)
+            self._made_for = found
+        for item, placed, own in zip(self.items, objects.objects, found, strict=True):
+            item.place = _standing(placed, own)
+        return self.items
+
+    def _make(self, needed: tuple[OcclusionField | None, ...]) -> None:
+        """Makes what lies on the GPU; samples that are there already stay."""
+        for one in set(self._textures) - set(needed):
+            if one is not None:
+                self._textures.pop(one).release()
+        release_all(*self.items)
+        self.items = [self._made(one) for one in needed]
+
+    def _made(self, found: OcclusionField | None) -> FieldObject:
+        if found is not None and found not in self._textures:
+            self._textures[found] = FieldTextures(self._gpu, found)
+        textures = None if found is None else self._textures[found]
+        bounce_light = None
+        if textures is not None and textures.transfer is not None:
+            bounce_light = field_texture(self._gpu, textures.bounce_shape)
+        return FieldObject(LightProbe(self._gpu, self._settings.order**2), textures, bounce_light)
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        release_all(*self.items, *self._textures.values())
+        self.items, self._textures, self._made_for = [], {}, None
+
+
+def _standing(item: PlacedObject, found: OcclusionField | None) -> dict[str, Binding]:
+    """Where the object stands, and what it reflects where the field's own colours are 1."""
+    bounds = np.array([mesh.bounds() for mesh in item.meshes])
+    around = np.stack([bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)])
+    given = item.material
+    diffuse = np.ones(3) if given is None else (1 - given.metallic) * given.base_color
+    reflectance = tuple(float(value) for value in diffuse)
+    return {**standing_uniforms(item.world_from_asset, found, around), "reflectance": reflectance}
+
+
+class FieldShading:
+    """Natural light at real surfaces and objects, through what the fields leave of it."""
+
+    def __init__(self, gpu: GpuContext, settings: AroofMethod, cells: int, fields: ConeFields) -> None:
+        size, length = fields.mu.size, settings.sh_order**2
+        self._settings, self._fields, self._cells = settings, fields, cells
+        self._volume = PlacedVolume(gpu, VolumePlacement((0.0, 0.0, 0.0), 1.0, cells))
+        self._shown = VoxelMipmap(gpu, cells, 1)
+        self._probes = LightProbeCapture(gpu, length)
+        self._occlusion = OcclusionShade(gpu, size, length)
+        self._change = LightChange(gpu, size)
+        self._bounce = ObjectBounceLight(gpu, size)
+        self._natural = NaturalFields(gpu)
+        self._show = OcclusionShow(gpu)
+
+    def place(self, items: list[FieldObject], objects: GeometryState) -> PlacedVolume:
+        """All that the fields reach: lamps must be known there, and view `volume` shows it."""
+        low, high = objects.bounds
+        reach = [float(item.place["object_radius"]) * float(item.place["object_scale"]) for item in items]  # type: ignore[arg-type]
+        edge = float(np.max(high - low)) + 2 * self._settings.reach * max(reach)
+        self._volume.place(place_volume(low, high, self._cells, edge))
+        return self._volume
+
+    def show(self, items: list[FieldObject], volume: PlacedVolume) -> VoxelMipmap:
+        """Cells of what the fields hide."""
+        for number, item in enumerate(items):
+            self._show.run(self._shown, item.textures, volume.bindings, item.place, first=number == 0)
+        return self._shown
+
+    def find_light(
+        self, items: list[FieldObject], scene: Bindings, grid: LowResGrid, seen: Observation
+    ) -> list[FieldObject]:
+        """Light around each object, without the objects."""
+        seen.image.build_levels()
+        self._capture(items, _with_hidden(scene), grid, None)
+        return items
+
+    def hide(self, items: list[FieldObject], scene: Bindings, grid: LowResGrid) -> OcclusionShade:
+        """What the objects leave of natural light at real surfaces."""
+        self._occlude(items, _with_hidden(scene), grid, real=True)
+        return self._occlusion
+
+    def find_changed_light(
+        self, items: list[FieldObject], scene: Bindings, grid: LowResGrid, shade: OcclusionShade
+    ) -> list[FieldObject]:
+        """Light around each object, with what the objects change nearby."""
+        if self._settings.near_light == "measured":
+            own = _with_hidden(scene)
+            self._change.run(grid, shade, own)
+            self._capture(items, own, grid, self._change.changes)
+        return items
+
+    def _capture(
+        self,
+        items: list[FieldObject],
+        scene: Bindings,
+        grid: LowResGrid,
+        changes: moderngl.Texture | None,
+    ) -> None:
+        for item in items:
+            self._probes.forget()
+            if self._settings.near_light == "measured":
+                self._probes.gather(grid, scene, item.place, changes)
+            self._probes.resolve(item.probe, scene, item.place)
+
+    def reflect(self, items: list[FieldObject], scene: Bindings) -> list[FieldObject]:
+        """What each object sends back of its light; returns those that do."""
+        reflecting = [item for item in items if item.bounce_light is not None]
+        own = {**_with_hidden(scene), **self._probes.bindings}
+        for item in reflecting:
+            assert item.textures is not None
+            assert item.bounce_light is not None
+            self._bounce.light(item.textures, item.probe, item.bounce_light, own, item.place)
+        return reflecting
+
+    def write_fields(
+        self,
+        items: list[FieldObject],
+        reflecting: list[FieldObject],
+        scene: Bindings,
+        grid: LowResGrid,
+        _hidden: OcclusionShade,
+    ) -> ConeFields:
+        """Fields of real surfaces, then those of the objects, which other objects hide from the light too."""
+        own = _with_hidden(scene)
+        self._finish(reflecting, own, grid, real=True)
+        self._occlude(items, own, grid, real=False)
+        self._finish(reflecting, own, grid, real=False)
+        return self._fields
+
+    def _occlude(self, items: list[FieldObject], scene: Bindings, grid: LowResGrid, *, real: bool) -> None:
+        for number, item in enumerate(items):
+            self._occlusion.run(
+                grid, item.probe, item.textures, scene, item.place, first=number == 0, real=real
+            )
+
+    def _finish(
+        self, reflecting: list[FieldObject], scene: Bindings, grid: LowResGrid, *, real: bool
+    ) -> None:
+        for number, item in enumerate(reflecting):
+            assert item.bounce_light is not None
+            self._bounce.shade(grid, item.bounce_light, scene, item.place, first=number == 0, real=real)
+        bounce = self._bounce if reflecting else None
+        self._natural.run(self._fields, grid, self._occlusion, bounce, scene, real=real)
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        release_all(
+            self._volume,
+            self._shown,
+            self._probes,
+            self._occlusion,
+            self._change,
+            self._bounce,
+            self._natural,
+            self._show,
+        )
+
+
+def _with_hidden(scene: Bindings) -> dict[str, Binding]:
+    """What objects hide in the picture shines on them."""
+    return {**scene, "hidden_too": True}
+
+
+def aroof(g: Graph, s: FrameResources, setup: Setup[AroofMethod]) -> Layers:
+    """Lamps by shadow maps, natural light by fields; there is no volume but the one that is looked at."""
+    settings, resolved, size = setup.settings, setup.resolved, setup.picture_size
+    lit = light_stages(g, s, resolved, settings.shadow_samples)
+    options = ShadingOptions(caustics=settings.caustics, screen_space=settings.screen_space)
+    shading = Shading(g.gpu, size, resolved, lit.buffers, DirectLight(g.gpu, size), options)
+    own = FieldShading(g.gpu, settings, resolved.volume_size, shading.cones)
+    objects = FieldObjects(g.gpu, setup.fields, field_settings(settings))
+    found = g.polled("found fields", "objects", lambda: objects.find(s.objects.value), eq)
+    items = g.stage("occlusion fields", objects.place, s.objects, found)
+    volume = g.stage("volume", own.place, items, s.objects)
+    shown = g.stage("shown cells", own.show, items, volume)
+
+    def trace(scene: Resource[Bindings], grid: Resource[LowResGrid]) -> Resource[ConeFields]:
+        around = g.stage("light around objects", own.find_light, items, scene, grid, s.observation)
+        hidden = g.stage("occlusion real", own.hide, around, scene, grid)
+        changed = g.stage("changed light around objects", own.find_changed_light, around, scene, grid, hidden)
+        reflecting = g.stage("object bounce light", own.reflect, changed, scene)
+        return g.stage("cones", own.write_fields, changed, reflecting, scene, grid, hidden)
+
+    nothing: Resource[dict[str, Binding]] = g.stage("marching", lambda _: {}, volume)
+    return shading_stages(g, s, shading, lit, volume, shown, nothing, trace)
+
+
+def field_settings(settings: AroofMethod) -> FieldSettings:
+    """What of the method's settings a field depends on."""
+    return FieldSettings(
+        settings.sh_order,
+        settings.shells,
+        settings.resolution,
+        settings.reach,
+        settings.rays,
+        settings.indirect,
+    )

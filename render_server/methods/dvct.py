@@ -1,0 +1,130 @@
+"""Delta voxel cone tracing: the exact operator, and the one printed in the paper (docs/method.md 3 and 4)."""
+
+from protocol.scene_method import DvctMethod
+from render_server.frame import FrameResources
+from render_server.gpu.context import GpuContext
+from render_server.gpu.kernel import Binding, Bindings
+from render_server.graph import Graph, Resource
+from render_server.methods.lighting import (
+    Layers,
+    Shading,
+    ShadingOptions,
+    light_stages,
+    shading_stages,
+    volume_placement,
+)
+from render_server.methods.settings import Setup, march_defines
+from render_server.methods.voxel_volumes import (
+    DeltaVoxels,
+    InjectedVoxels,
+    delta_voxel_stages,
+    injection_stages,
+)
+from render_server.passes.cones import ConeFields, LowResGrid, TraceCones, TraceConesPaper
+from render_server.passes.shading import DirectLight
+from render_server.passes.voxels import DIRECTIONS, PlacedVolume, VoxelMipmap
+
+
+class ExactCones:
+    """Marches each cone through mu and rho at once."""
+
+    def __init__(
+        self, gpu: GpuContext, settings: DvctMethod, voxels: DeltaVoxels, fields: ConeFields
+    ) -> None:
+        size = fields.mu.size
+        self._voxels, self._fields, self._cone_count = voxels, fields, settings.cone_count
+        self._tracing = TraceCones(gpu, size, march_defines(settings))
+
+    def marching(self, _mu: VoxelMipmap, _rho: VoxelMipmap) -> dict[str, Binding]:
+        """Bindings of what cones march through."""
+        return self._voxels.march_bindings(self._cone_count)
+
+    def trace_real(self, scene: Bindings, grid: LowResGrid, marching: Bindings) -> ConeFields:
+        """Cones at real surfaces: E_mu, E_rho, and the specular cones."""
+        voxels = self._voxels
+        self._tracing.trace_real(self._fields, grid, voxels.mu, voxels.rho, {**scene, **marching})
+        return self._fields
+
+    def trace_objects(
+        self, fields: ConeFields, scene: Bindings, grid: LowResGrid, marching: Bindings
+    ) -> ConeFields:
+        """Cones at the objects: E_rho and the specular cone."""
+        voxels = self._voxels
+        self._tracing.trace_virtual(fields, grid, voxels.mu, voxels.rho, {**scene, **marching})
+        return fields
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        self._tracing.release()
+
+
+def dvct_exact(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
+    """Dual march through one-sided directional voxels."""
+    settings, resolved, size = setup.settings, setup.resolved, setup.picture_size
+    lit = light_stages(g, s, resolved, settings.shadow_samples, mirrors=settings.mirrored_lights)
+    placement = volume_placement(g, s, resolved.volume_size, settings.volume_edge_m)
+    voxels = DeltaVoxels(g.gpu, settings, resolved.volume_size)
+    mu, rho = delta_voxel_stages(g, s, lit, voxels, placement)
+    shading = Shading(
+        g.gpu,
+        size,
+        resolved,
+        lit.buffers,
+        DirectLight(g.gpu, size, shadow_cones=DIRECTIONS if settings.resolved_shadow == "cone" else None),
+        ShadingOptions(
+            caustics=settings.caustics,
+            screen_space=settings.screen_space,
+            mirror_gather="gather" if settings.reflections == "rays" else None,
+            march=march_defines(settings),
+        ),
+    )
+    cones = ExactCones(g.gpu, settings, voxels, shading.cones)
+    marching = g.stage("marching", cones.marching, mu, rho)
+
+    def trace(scene: Resource[Bindings], grid: Resource[LowResGrid]) -> Resource[ConeFields]:
+        real = g.stage("cones real", cones.trace_real, scene, grid, marching)
+        return g.stage("cones", cones.trace_objects, real, scene, grid, marching)
+
+    volume = g.stage("volume", lambda voxels: voxels.volume, "voxelize real")
+    return shading_stages(g, s, shading, lit, volume, rho, marching, trace)
+
+
+class PaperCones:
+    """Marches nine diffuse cones and a specular one through V_delta, and through V_rho on objects."""
+
+    def __init__(self, gpu: GpuContext, fields: ConeFields) -> None:
+        self._fields = fields
+        self._tracing = TraceConesPaper(gpu)
+
+    def trace(self, scene: Bindings, grid: LowResGrid, voxels: InjectedVoxels) -> ConeFields:
+        """Cones at real surfaces and at the objects."""
+        self._tracing.trace_real(self._fields, grid, voxels.delta, scene)
+        self._tracing.trace_virtual(self._fields, grid, voxels.rho, scene)
+        return self._fields
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        self._tracing.release()
+
+
+def dvct_paper(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
+    """The operator as printed in [P1] 3, in radiometric units: V_delta and V_rho by split-inject, visibility from the
+    joint V_eta.
+    """
+    settings, resolved, size = setup.settings, setup.resolved, setup.picture_size
+    lit = light_stages(g, s, resolved, settings.shadow_samples)
+    placement = volume_placement(g, s, resolved.volume_size, settings.volume_edge_m)
+    voxels = InjectedVoxels(g.gpu, resolved.volume_size)
+    injected = injection_stages(g, s, lit, voxels, placement)
+    shadow_cones = voxels.directions if settings.resolved_shadow == "cone" else None
+    direct = DirectLight(g.gpu, size, shadow_cones=shadow_cones)
+    shading = Shading(g.gpu, size, resolved, lit.buffers, direct, ShadingOptions())
+    cones = PaperCones(g.gpu, shading.cones)
+
+    def trace(scene: Resource[Bindings], grid: Resource[LowResGrid]) -> Resource[ConeFields]:
+        return g.stage("cones", cones.trace, scene, grid, injected)
+
+    volume: Resource[PlacedVolume] = g.stage("volume", lambda voxels: voxels.real.volume, injected)
+    joint: Resource[VoxelMipmap] = g.stage("joint voxels", lambda voxels: voxels.rho, injected)
+    nothing: Resource[dict[str, Binding]] = g.stage("marching", lambda _: {}, injected)
+    return shading_stages(g, s, shading, lit, volume, joint, nothing, trace)

@@ -1,0 +1,409 @@
+"""Stages that methods share: the lights' depth maps, and the shading of what the camera sees (docs/method.md 3)."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from operator import eq
+
+import moderngl
+import numpy as np
+from jaxtyping import Float64
+
+from render_server.frame import FrameResources, Observation
+from render_server.gpu.context import GpuContext
+from render_server.gpu.kernel import Binding, Bindings
+from render_server.gpu_scene import GeometryState
+from render_server.graph import Graph, Resource
+from render_server.methods.settings import ResolvedSettings
+from render_server.passes.caustics import GREATEST_ALPHA, Caustics
+from render_server.passes.composite import ChangeRatio
+from render_server.passes.cones import ConeFields, LowResGrid
+from render_server.passes.lights import LightBuffers, MirrorVisibility
+from render_server.passes.ray_tracing import ObjectBvh
+from render_server.passes.reflections import ROUGHEST, MirrorRays, ScreenCones
+from render_server.passes.shading import DirectLight, VirtualSurface
+from render_server.passes.shadow_maps import ShadowMaps
+from render_server.passes.voxel_light import AlbedoTexture
+from render_server.passes.voxels import PlacedVolume, VolumePlacement, VoxelMipmap, place_volume
+from render_server.scene.lights import LightSet
+from render_server.scene.mirror_lights import mirror_lights
+from render_server.scene.surfaces import SurfaceTable
+from render_server.view import CameraView
+
+SHADOW_REACH = 4.0  # in longest edges of the objects' bounds: how far around them real shadows are resolved
+LARGE_TRIANGLE = 0.1  # of that reach: from here on a triangle's own extent matters, not only its corners
+SELF_SHADOW_TEXELS = 1.5  # a virtual receiver is lifted by so many texels of the depth map
+SURFEL_SHADOW_SAMPLES = 4  # of a light's area: a voxel averages many surfels
+DEPTH_TOLERANCE = 0.02  # a surfel this near (relative) to what the camera sees is what it sees
+SURFEL_PICTURE_LOD = 2.0  # of the linear picture: one sample covers a surfel's pixels
+
+Points = Float64[np.ndarray, "n 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class LitScene:
+    """The lights' buffers and the resources that follow them.
+
+    `real_maps` and `object_maps`: depth maps of the real scene and of the objects; `mirrored`: where smooth planes
+    mirror the lights. The value of each is `buffers`, which all of them fill a part of.
+    """
+
+    buffers: LightBuffers
+    environment: Resource[LightBuffers]
+    real_maps: Resource[LightBuffers]
+    object_maps: Resource[LightBuffers]
+    mirrored: Resource[LightBuffers]
+
+    @property
+    def all(self) -> tuple[Resource[LightBuffers], ...]:
+        """Everything that shading under these lights depends on."""
+        return self.environment, self.real_maps, self.object_maps, self.mirrored
+
+
+class LightStages:
+    """Fits the lights' views around what they have to show, and draws their depth maps."""
+
+    def __init__(
+        self, gpu: GpuContext, tile_size: int, shadow_samples: int, *, mirrors: bool = False
+    ) -> None:
+        self.buffers = LightBuffers(gpu, tile_size, shadow_samples)
+        self._mirrors = mirrors
+        self._maps = ShadowMaps(gpu)
+        self._visibility = MirrorVisibility(gpu)
+
+    def set_environment(self, lights: LightSet) -> LightBuffers:
+        """Uploads the residual environment."""
+        self.buffers.set_environment(lights.environment)
+        return self.buffers
+
+    def fit_views(
+        self, lights: LightSet, real: GeometryState, extent: Points, surfaces: SurfaceTable, everywhere: bool
+    ) -> LightBuffers:
+        """Fits the views: of real shadows around the objects (or `everywhere`), and closely around the objects."""
+        receivers = real.points if everywhere else shadow_receivers(real, extent)
+        shining = list(lights.lights)
+        mirrors = mirror_lights(shining, surfaces, np.mean(extent, axis=0)) if self._mirrors else []
+        self.buffers.place(shining, real.points, receivers, extent, mirrors)
+        return self.buffers
+
+    def draw_real(self, _views: bytes, real: GeometryState) -> LightBuffers:
+        """Draws the real scene as the lights see it."""
+        buffers = self.buffers
+        self._maps.run(buffers.real_atlas, [real.buffers], buffers.real_views, 0, buffers.bindings)
+        return buffers
+
+    def draw_objects(self, _views: bytes, objects: GeometryState) -> LightBuffers:
+        """Draws the objects as the lights see them."""
+        buffers = self.buffers
+        first = buffers.first_virtual_view
+        self._maps.run(
+            buffers.virtual_atlas, [objects.buffers], buffers.virtual_views, first, buffers.bindings
+        )
+        return buffers
+
+    def map_mirrors(
+        self, _real: LightBuffers, _objects: LightBuffers, _lights: LightSet, seen: Observation
+    ) -> LightBuffers:
+        """Maps where smooth planes show the lights."""
+        if self.buffers.mirrors:
+            self._visibility.run(self.buffers, seen.scan.bias_m, {**seen.bindings, **self.buffers.bindings})
+        return self.buffers
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        for item in (self.buffers, self._maps, self._visibility):
+            item.release()
+
+
+def light_stages(
+    g: Graph, s: FrameResources, resolved: ResolvedSettings, shadow_samples: int, *, mirrors: bool = False
+) -> LitScene:
+    """Environment, views, depth maps of both geometries, and what smooth planes mirror of the lights."""
+    stages = LightStages(g.gpu, resolved.rsm_size, shadow_samples, mirrors=mirrors)
+    extent = object_extent(g, s)
+    environment = g.stage("environment", stages.set_environment, s.lights)
+    views = g.stage("light views", stages.fit_views, s.lights, s.real, extent, s.surfaces, s.everywhere)
+    real_views = g.stage("light views real", lambda lights: lights.real_records, views, same=eq)
+    object_views = g.stage("light views objects", lambda lights: lights.virtual_records, views, same=eq)
+    real_maps = g.stage("shadow maps real", stages.draw_real, real_views, s.real)
+    object_maps = g.stage("shadow maps objects", stages.draw_objects, object_views, s.objects)
+    mirrored = environment
+    if mirrors:
+        mirrored = g.stage(
+            "mirror visibility", stages.map_mirrors, real_maps, object_maps, s.lights, s.observation
+        )
+    return LitScene(stages.buffers, environment, real_maps, object_maps, mirrored)
+
+
+def object_extent(g: Graph, s: FrameResources) -> Resource[Points]:
+    """Points that enclose the objects at all times of their animations: volumes and light views are fitted to them."""
+    if "object extent" in g:
+        return g.resource("object extent")
+    return g.stage("object extent", lambda objects: objects.lasting_points, s.objects, same=np.array_equal)
+
+
+def volume_placement(
+    g: Graph, s: FrameResources, size: int, edge_m: float | None
+) -> Resource[VolumePlacement]:
+    """The cube of voxels or cells around the objects."""
+
+    def place(extent: Points) -> VolumePlacement:
+        return place_volume(extent.min(axis=0), extent.max(axis=0), size, edge_m)
+
+    return g.stage("volume placement", place, object_extent(g, s), same=eq)
+
+
+def surfel_scene(
+    seen: Observation, lights: LightBuffers, albedo: AlbedoTexture, *, measured: bool = True
+) -> dict[str, Binding]:
+    """Bindings of what lights real surfels; without `measured`, no surface counts as seen by the camera."""
+    return {
+        **seen.bindings,
+        **lights.bindings,
+        **albedo.bindings,
+        "Materials": None,  # of objects: declared by what both kinds of surfels share, and not read
+        "base_color_textures": None,
+        "shadow_samples": SURFEL_SHADOW_SAMPLES,
+        "bias_real": seen.scan.bias_m,
+        "bias_virtual": seen.scan.bias_m,
+        "depth_tolerance": DEPTH_TOLERANCE if measured else -1.0,
+        "picture_lod": SURFEL_PICTURE_LOD,
+    }
+
+
+def reflects_screen(objects: GeometryState) -> bool:
+    """Whether some object is smooth enough to show the picture in it."""
+    return bool(objects.materials.smoothest < ROUGHEST)
+
+
+def casts_caustics(objects: GeometryState) -> bool:
+    """Whether some object is smooth enough to throw beams."""
+    return bool(objects.materials.smoothest**2 < GREATEST_ALPHA)
+
+
+@dataclass(frozen=True, eq=False)
+class ShadingOptions:
+    """What of the shared shading a method uses.
+
+    `mirror_gather`: kernel that lights reflected points (`mirror_...`), None: no rays in smooth real surfaces.
+    `march`: defines of march.glsl, where smooth objects look among voxels for what the picture does not show.
+    """
+
+    caustics: bool = False
+    screen_space: bool = False
+    mirror_gather: str | None = None
+    march: Mapping[str, int] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Layers:
+    """What a method hands to composition; `voxels`, `volume` and `lights` are there for debug views."""
+
+    direct: Resource[DirectLight]
+    cones: Resource[ConeFields]
+    grid: Resource[LowResGrid]
+    change: Resource[ChangeRatio]
+    radiance: Resource[moderngl.Texture]
+    reflection: Resource[moderngl.Texture | None]
+    voxels: Resource[VoxelMipmap]
+    volume: Resource[PlacedVolume]
+    lights: Resource[LightBuffers]
+
+
+class Shading:
+    """Shades what the camera sees: cones at reduced resolution, direct light and objects at full.
+
+    A method fills `cones` by stages of its own. `marching` gives the bindings of what its cones march through.
+    """
+
+    def __init__(
+        self,
+        gpu: GpuContext,
+        size: tuple[int, int],
+        resolved: ResolvedSettings,
+        lights: LightBuffers,
+        direct: DirectLight,
+        options: ShadingOptions,
+    ) -> None:
+        self._gpu, self._options, self._lights, self._direct = gpu, options, lights, direct
+        self._scale = resolved.cone_scale
+        self._bvh = ObjectBvh(gpu)
+        self.grid = LowResGrid(gpu, size, resolved.cone_scale)
+        self.cones = ConeFields(gpu, self.grid.size)
+        self._surface = VirtualSurface(gpu, size)
+        self._change = ChangeRatio(gpu, self.grid.size)
+        self._caustics = Caustics(gpu, self.grid, self._bvh) if options.caustics else None
+        self._screen = ScreenCones(gpu, self.grid, options.march) if options.screen_space else None
+        self._rays: MirrorRays | None = None
+        self.normal_offset: Callable[[Points], float] = lights.virtual_texel_m
+        self.is_everywhere = False  # nothing is skipped because objects seem not to reach it
+
+    def scene(
+        self,
+        geometry: Bindings,
+        objects: GeometryState,
+        view: CameraView,
+        volume: PlacedVolume,
+        everywhere: bool,
+        *_lights: LightBuffers,
+    ) -> dict[str, Binding]:
+        """Bindings of what stages at pixels read: geometry, lights, volume, and what follows from them."""
+        low, high = objects.bounds
+        bounds = volume.placement.voxel_bounds(np.stack([low, high])).astype(float)
+        return {
+            **geometry,
+            **self._lights.bindings,
+            **volume.bindings,
+            "normal_offset": SELF_SHADOW_TEXELS * self.normal_offset((low + high) / 2),
+            "sample_distance": 1.5 * self._scale / view.camera.matrix[0, 0],
+            "object_low": tuple(bounds[:3]),
+            "object_high": tuple(1.0 - bounds[3:]),
+            "everywhere": everywhere or self.is_everywhere,
+            "has_caustics": self._caustics is not None and casts_caustics(objects),
+            "hidden_too": self._screen is not None and reflects_screen(objects),
+        }
+
+    def set_objects(self, objects: GeometryState) -> ObjectBvh:
+        """Takes the objects' triangles; their hierarchy is built when rays are traced."""
+        self._bvh.set_triangles(objects.corners, objects.bounds, objects.buffers)
+        return self._bvh
+
+    def choose_pixels(self, scene: Bindings) -> LowResGrid:
+        """Chooses the pixels that stand for blocks of the picture."""
+        self.grid.run(scene)
+        return self.grid
+
+    def cast_caustics(
+        self, scene: Bindings, _grid: LowResGrid, _bvh: ObjectBvh, seen: Observation, volume: PlacedVolume
+    ) -> Caustics | None:
+        """Renders caustics, where an object is smooth enough."""
+        if self._caustics is None or not scene["has_caustics"]:
+            return None
+        reach = volume.placement.size * volume.placement.voxel_edge
+        self._caustics.run(self._lights, scene, bias_m=seen.scan.bias_m, reach_m=reach)
+        return self._caustics
+
+    def light_directly(
+        self, scene: Bindings, grid: LowResGrid, caustics: Caustics | None, voxels: VoxelMipmap
+    ) -> DirectLight:
+        """Lights the real surfaces by the lights themselves."""
+        self._direct.run(grid, scene, joint=voxels.texture, caustics=caustics)
+        return self._direct
+
+    def reflect_objects(
+        self, scene: Bindings, grid: LowResGrid, bvh: ObjectBvh, marching: Bindings
+    ) -> moderngl.Texture | None:
+        """Traces the objects in smooth real surfaces; None where none is declared: cones serve."""
+        wanted = self._options.mirror_gather
+        if wanted is None or not scene["specular_surfaces"]:
+            if self._rays is not None:
+                self._rays.release()
+            self._rays = None
+            return None
+        if self._rays is None:
+            self._rays = MirrorRays(self._gpu, grid, bvh, wanted, self._options.march or {})
+        self._rays.run({}, {**scene, **marching})
+        return self._rays.reflection
+
+    def compare(
+        self, grid: LowResGrid, direct: DirectLight, cones: ConeFields, reflection: moderngl.Texture | None
+    ) -> ChangeRatio:
+        """Finds where light changes, and by what ratio."""
+        self._change.run(grid, direct, cones, reflection)
+        return self._change
+
+    def trace_screen(
+        self,
+        scene: Bindings,
+        direct: DirectLight,
+        cones: ConeFields,
+        bvh: ObjectBvh,
+        seen: Observation,
+        marching: Bindings,
+    ) -> moderngl.Texture | None:
+        """Traces what smooth objects reflect of the picture."""
+        if self._screen is None or not scene["hidden_too"]:
+            return None
+        seen.image.build_levels()
+        self._screen.run(direct, cones, bvh, {**scene, **marching})
+        return self._screen.reflected
+
+    def shade_objects(
+        self,
+        scene: Bindings,
+        grid: LowResGrid,
+        cones: ConeFields,
+        caustics: Caustics | None,
+        screen: moderngl.Texture | None,
+    ) -> moderngl.Texture:
+        """Shades the objects."""
+        self._surface.run(cones, grid, scene, screen=screen, caustics=caustics)
+        return self._surface.radiance
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        held = (
+            self._bvh,
+            self.grid,
+            self.cones,
+            self._direct,
+            self._surface,
+            self._change,
+            self._caustics,
+            self._screen,
+            self._rays,
+        )
+        for item in held:
+            if item is not None:
+                item.release()
+
+
+def shading_stages(
+    g: Graph,
+    s: FrameResources,
+    shading: Shading,
+    lit: LitScene,
+    volume: Resource[PlacedVolume],
+    voxels: Resource[VoxelMipmap],
+    marching: Resource[dict[str, Binding]],
+    trace: Callable[[Resource[Bindings], Resource[LowResGrid]], Resource[ConeFields]],
+    light_directly: Callable[..., DirectLight] | None = None,
+) -> Layers:
+    """Grid, cones (declared by `trace`), caustics, direct light, reflections, change of light, objects."""
+    scene = g.stage(
+        "shading scene",
+        shading.scene,
+        s.geometry,
+        s.objects,
+        s.view,
+        volume,
+        s.everywhere,
+        *lit.all,
+        s.lights,
+    )
+    bvh = g.stage("object bvh", shading.set_objects, s.objects)
+    grid = g.stage("low res grid", shading.choose_pixels, scene)
+    cones = trace(scene, grid)
+    caustics = g.stage("caustics", shading.cast_caustics, scene, grid, bvh, s.observation, volume)
+    direct = g.stage("direct light", light_directly or shading.light_directly, scene, grid, caustics, voxels)
+    reflection = g.stage("reflections", shading.reflect_objects, scene, grid, bvh, marching)
+    change = g.stage("change of light", shading.compare, grid, direct, cones, reflection)
+    screen = g.stage("screen cones", shading.trace_screen, scene, direct, cones, bvh, s.observation, marching)
+    radiance = g.stage("virtual surface", shading.shade_objects, scene, grid, cones, caustics, screen)
+    return Layers(direct, cones, grid, change, radiance, reflection, voxels, volume, lit.real_maps)
+
+
+def shadow_receivers(real: GeometryState, extent: Points) -> Points:
+    """Real points around the objects; all of them where nothing is near.
+
+    Vertices within reach, and what triangles too large to have any there bring into the cube of that reach.
+    """
+    low, high = extent.min(axis=0), extent.max(axis=0)
+    centre, reach = (low + high) / 2, SHADOW_REACH * float(np.max(high - low))
+    points = real.points
+    near = points[np.linalg.norm(points - centre, axis=1) <= reach]
+    corners = real.corners[..., :3].astype(np.float64)
+    first, last = corners.min(axis=1), corners.max(axis=1)
+    meets = np.all((first <= centre + reach) & (last >= centre - reach), axis=1)
+    large = meets & (np.max(last - first, axis=1) > LARGE_TRIANGLE * reach)
+    clipped = np.clip(corners[large].reshape(-1, 3), centre - reach, centre + reach)
+    return np.concatenate([near, clipped]) if len(near) or len(clipped) else points

@@ -1,0 +1,333 @@
+"""Delta light propagation volumes ([P2], docs/method.md 5)."""
+
+import moderngl
+import numpy as np
+from jaxtyping import Float32
+
+from protocol.scene_method import DlpvMethod
+from render_server.frame import FrameResources, Observation
+from render_server.gpu.context import GpuContext
+from render_server.gpu.kernel import Binding, Bindings
+from render_server.gpu.textures import release_all
+from render_server.gpu_scene import GeometryState
+from render_server.graph import Graph, Resource
+from render_server.methods.lighting import (
+    SURFEL_SHADOW_SAMPLES,
+    Layers,
+    LitScene,
+    Shading,
+    ShadingOptions,
+    casts_caustics,
+    light_stages,
+    shading_stages,
+    surfel_scene,
+    volume_placement,
+)
+from render_server.methods.settings import Setup
+from render_server.passes.cones import ConeFields, LowResGrid
+from render_server.passes.lights import LightBuffers
+from render_server.passes.lpv import (
+    LightVolume,
+    LpvCoverFaces,
+    LpvPropagate,
+    LpvShow,
+    LpvStart,
+    LpvTransmit,
+    covered_sums,
+    injected_sums,
+    lobe_weights,
+    moment_weights,
+    transmitted_fractions,
+)
+from render_server.passes.lpv_lighting import (
+    LpvBounce,
+    LpvInjectMaps,
+    LpvInjectSurfaces,
+    LpvQuery,
+    light_volume_bindings,
+)
+from render_server.passes.shading import DirectLight
+from render_server.passes.split_injection import RealAlbedo
+from render_server.passes.voxel_light import AlbedoTexture
+from render_server.passes.voxels import PlacedVolume, VolumePlacement, Voxelize, VoxelMipmap, VoxelStore
+from render_server.scene.lights import LightSet
+
+
+class LpvVolumes:
+    """V_rho, and beside it V_mu (`mu`), or for the paper the change (`change`).
+
+    Injected are two sums: the real scene's light without objects, and the change that objects make. V_mu starts with
+    the first, V_rho with both, the paper's V_delta with the second and the negative lobes of direct light. What V_rho
+    brings to surfaces they reflect: it is propagated anew with that, once a bounce.
+    `shown`: what was injected of the change, for debug view `volume`.
+    """
+
+    def __init__(self, gpu: GpuContext, settings: DlpvMethod, cells: int) -> None:
+        self._settings, self._steps = settings, settings.steps or cells
+        is_paper = settings.operator == "paper"
+        has_moments = settings.resolved_propagation == "moments"
+        self._weights = moment_weights(cells) if has_moments else lobe_weights()
+        nowhere = VolumePlacement((0.0, 0.0, 0.0), 1.0, cells)
+        self.volume, self._half_cells = PlacedVolume(gpu, nowhere), PlacedVolume(gpu, nowhere)
+        self.rho = LightVolume(gpu, cells)
+        self.mu = None if is_paper else LightVolume(gpu, cells)
+        self.change = LightVolume(gpu, cells) if is_paper else None
+        self.shown = VoxelMipmap(gpu, cells, 1)
+        self._real_light, self._change_light, self._bounced_light, self._shadow_light = (
+            injected_sums(gpu, cells) for _ in range(4)
+        )
+        self._real_covered, self._virtual_covered = (covered_sums(gpu, cells) for _ in range(2))
+        self._through_real, self._through_joint = (transmitted_fractions(gpu, cells) for _ in range(2))
+        self.real, self.objects = (VoxelStore(gpu, 2 * cells) for _ in range(2))
+        self._voxelize = Voxelize(gpu)
+        self._albedo = RealAlbedo(gpu)
+        self._maps = LpvInjectMaps(gpu)
+        self._surfaces = LpvInjectSurfaces(gpu)
+        self._cover = LpvCoverFaces(gpu)
+        self._transmit = LpvTransmit(gpu)
+        self._start = LpvStart(gpu)
+        self._propagate = LpvPropagate(gpu)
+        self._bounce = LpvBounce(gpu)
+        self._show = LpvShow(gpu)
+
+    @property
+    def _has_geometry(self) -> bool:
+        """Whether surfaces block light between cells."""
+        return self._settings.resolved_geometry_volume
+
+    @property
+    def _blocks_environment(self) -> bool:
+        return self._settings.resolved_ambient == "blocked"
+
+    @property
+    def query_bindings(self) -> dict[str, Binding]:
+        """How light is read from the volumes (shaders/common/lpv_light.glsl)."""
+        return {"has_geometry": self._has_geometry, "damping": self._settings.resolved_damping}
+
+    def place(self, placement: VolumePlacement) -> PlacedVolume:
+        """Moves the cells, and the half cells that surfels are made in."""
+        self.volume.place(placement)
+        self._half_cells.place(
+            VolumePlacement(placement.origin, placement.voxel_edge / 2, 2 * placement.size)
+        )
+        return self.volume
+
+    def voxelize_real(self, real: GeometryState, volume: PlacedVolume) -> VoxelStore:
+        """Surfels of the real scene, where something reads them."""
+        if self._has_geometry or self._blocks_environment or self._settings.resolved_bounces > 0:
+            self._surfels(self.real, real.solid_corners(volume.placement.voxel_edge))
+        return self.real
+
+    def voxelize_objects(self, objects: GeometryState, _volume: PlacedVolume) -> VoxelStore:
+        """Surfels of the objects."""
+        self._surfels(self.objects, objects.corners)
+        return self.objects
+
+    def _surfels(self, store: VoxelStore, corners: Float32[np.ndarray, "m 3 10"]) -> None:
+        """Surfels of half cells; only these are used of the store."""
+        store.grid.clear()
+        self._voxelize.run(store, corners, self._half_cells)
+
+    def real_scene(
+        self,
+        seen: Observation,
+        albedo: AlbedoTexture,
+        volume: PlacedVolume,
+        _lights: LightSet,
+        _environment: LightBuffers,
+        lights: LightBuffers,
+    ) -> dict[str, Binding]:
+        """Bindings of what injects the real scene's light."""
+        seen.image.build_levels()
+        own = {"blocks_environment": self._blocks_environment}
+        return {**surfel_scene(seen, lights, albedo), **volume.bindings, **own}
+
+    def inject_real(self, real: VoxelStore, scene: Bindings, lights: LightBuffers) -> moderngl.Buffer:
+        """The real scene's light without objects."""
+        self._albedo.run(lights, scene)
+        self._real_light.clear()
+        self._maps.add_real(self._real_light, lights, self._albedo.atlas, scene)
+        if self._blocks_environment:
+            self._surfaces.add_real(self._real_light, real, scene)
+        return self._real_light
+
+    def cover_real(self, real: VoxelStore, volume: PlacedVolume) -> moderngl.Buffer | None:
+        """What gets through between cells of the real scene; None: everything."""
+        if not self._has_geometry:
+            return None
+        self._cover.run(self._real_covered, real, volume.placement)
+        self._transmit.run(self._through_real, volume.placement.size, self._real_covered)
+        return self._through_real
+
+    def propagate_mu(self, injected: moderngl.Buffer, through: moderngl.Buffer | None) -> LightVolume | None:
+        """V_mu; the paper has none."""
+        if self.mu is not None:
+            self._start.run(self.mu, injected)
+            self._propagate.run(self.mu, self._weights, self._steps, through)
+        return self.mu
+
+    def joint_scene(
+        self, scene: Bindings, objects: GeometryState, lights: LightBuffers
+    ) -> dict[str, Binding]:
+        """Bindings of what injects the change that objects make."""
+        return {
+            **scene,
+            **lights.bindings,
+            "shadow_samples": SURFEL_SHADOW_SAMPLES,
+            **objects.materials.bindings,
+            "has_caustics": self._settings.resolved_caustics and casts_caustics(objects),
+        }
+
+    def inject_change(
+        self, objects: VoxelStore, scene: Bindings, lights: LightBuffers, _real: moderngl.Buffer
+    ) -> moderngl.Buffer:
+        """The change that objects make."""
+        self._change_light.clear()
+        self._maps.add_change(self._change_light, lights, self._albedo.atlas, scene)
+        self._surfaces.add_virtual(self._change_light, objects, scene)
+        return self._change_light
+
+    def cover_joint(
+        self, objects: VoxelStore, volume: PlacedVolume, _real: moderngl.Buffer | None
+    ) -> moderngl.Buffer | None:
+        """What gets through between cells with the objects among them; None: everything."""
+        if not self._has_geometry:
+            return None
+        self._cover.run(self._virtual_covered, objects, volume.placement)
+        self._transmit.run(
+            self._through_joint, volume.placement.size, self._real_covered, self._virtual_covered
+        )
+        return self._through_joint
+
+    def propagate_rho(
+        self, real: moderngl.Buffer, change: moderngl.Buffer, through: moderngl.Buffer | None
+    ) -> LightVolume:
+        """V_rho."""
+        self._start.run(self.rho, real, change)
+        self._propagate.run(self.rho, self._weights, self._steps, through)
+        return self.rho
+
+    def bounce(
+        self,
+        rho: LightVolume,
+        mu: LightVolume | None,
+        scene: Bindings,
+        through: moderngl.Buffer | None,
+    ) -> LightVolume:
+        """V_rho once more, with what surfaces reflect of the light that the last one brought them."""
+        for _ in range(0 if mu is None else self._settings.resolved_bounces):
+            assert mu is not None
+            self._bounced_light.clear()
+            own = {**scene, **self.query_bindings}
+            self._bounce.run(self._bounced_light, (self.real, self.objects), (mu, rho), own)
+            self._start.run(rho, self._real_light, self._change_light, self._bounced_light)
+            self._propagate.run(rho, self._weights, self._steps, through)
+        return rho
+
+    def propagate_change(
+        self,
+        change: moderngl.Buffer,
+        scene: Bindings,
+        lights: LightBuffers,
+        through: moderngl.Buffer | None,
+    ) -> LightVolume | None:
+        """V_delta of the paper: one volume of the texels that differ ([P2] 4.3); None of the other operator."""
+        if self.change is not None:
+            self._shadow_light.clear()
+            if self._settings.resolved_shadow == "lobe":
+                self._maps.add_shadow(self._shadow_light, lights, self._albedo.atlas, scene)
+            self._start.run(self.change, change, self._shadow_light)
+            self._propagate.run(self.change, self._weights, self._steps, through)
+        return self.change
+
+    def show(self, change: moderngl.Buffer, _delta: LightVolume | None, volume: PlacedVolume) -> VoxelMipmap:
+        """Cells of what was injected of the change."""
+        self._show.run(self.shown, volume.placement.size, change, self._shadow_light)
+        return self.shown
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        release_all(*(item for item in vars(self).values() if hasattr(item, "release")))
+
+
+class LpvFields:
+    """Reads the fields that cones fill elsewhere from the volumes."""
+
+    def __init__(self, gpu: GpuContext, volumes: LpvVolumes, fields: ConeFields) -> None:
+        self._volumes, self._fields = volumes, fields
+        self._query = LpvQuery(gpu)
+
+    def marching(self, rho: LightVolume) -> dict[str, Binding]:
+        """Bindings of what reflected points are lit by."""
+        return {**light_volume_bindings(rho, rho), **self._volumes.query_bindings}
+
+    def read(
+        self,
+        scene: Bindings,
+        grid: LowResGrid,
+        mu: LightVolume | None,
+        rho: LightVolume,
+        change: LightVolume | None,
+    ) -> ConeFields:
+        """Irradiance at real surfaces and at the objects."""
+        own = {**scene, **self._volumes.query_bindings}
+        self._query.read_real(self._fields, grid, mu, rho if change is None else change, own)
+        self._query.read_virtual(self._fields, grid, rho, own)
+        return self._fields
+
+    def release(self) -> None:
+        """Frees the programs."""
+        self._query.release()
+
+
+def lpv_stages(
+    g: Graph, s: FrameResources, lit: LitScene, volumes: LpvVolumes, volume: Resource[PlacedVolume]
+) -> tuple[Resource[LightVolume | None], Resource[LightVolume], Resource[LightVolume | None]]:
+    """Inject, block, propagate: V_mu of the real scene, V_rho with the objects, the paper's V_delta."""
+    real = g.stage("voxelize real", volumes.voxelize_real, s.real, volume)
+    scene = g.stage(
+        "inject scene",
+        volumes.real_scene,
+        s.observation,
+        s.albedo,
+        volume,
+        s.lights,
+        lit.environment,
+        lit.real_maps,
+    )
+    real_light = g.stage("inject real", volumes.inject_real, real, scene, lit.real_maps)
+    through_real = g.stage("geometry volume real", volumes.cover_real, real, volume)
+    mu = g.stage("propagate mu", volumes.propagate_mu, real_light, through_real)
+    objects = g.stage("voxelize objects", volumes.voxelize_objects, s.objects, volume)
+    joint = g.stage("inject scene joint", volumes.joint_scene, scene, s.objects, lit.object_maps)
+    change = g.stage("inject change", volumes.inject_change, objects, joint, lit.object_maps, real_light)
+    through = g.stage("geometry volume", volumes.cover_joint, objects, volume, through_real)
+    first = g.stage("propagate rho", volumes.propagate_rho, real_light, change, through)
+    rho = g.stage("bounces", volumes.bounce, first, mu, joint, through)
+    delta = g.stage("propagate delta", volumes.propagate_change, change, joint, lit.object_maps, through)
+    return mu, rho, delta
+
+
+def dlpv(g: Graph, s: FrameResources, setup: Setup[DlpvMethod]) -> Layers:
+    """V_rho and V_mu subtracted, or the paper's one volume of the change."""
+    settings, resolved, size = setup.settings, setup.resolved, setup.picture_size
+    lit = light_stages(g, s, resolved, settings.shadow_samples)
+    placement = volume_placement(g, s, resolved.volume_size, settings.volume_edge_m)
+    volumes = LpvVolumes(g.gpu, settings, resolved.volume_size)
+    volume = g.stage("volume", volumes.place, placement)
+    mu, rho, delta = lpv_stages(g, s, lit, volumes, volume)
+    shown = g.stage("shown cells", volumes.show, "inject change", delta, volume)
+    options = ShadingOptions(
+        caustics=settings.resolved_caustics,
+        screen_space=settings.resolved_screen_space,
+        mirror_gather="gather_lpv" if settings.resolved_reflections == "rays" else None,
+    )
+    direct = DirectLight(g.gpu, size, objects_shadow=settings.resolved_shadow == "map")
+    shading = Shading(g.gpu, size, resolved, lit.buffers, direct, options)
+    fields = LpvFields(g.gpu, volumes, shading.cones)
+    marching = g.stage("marching", fields.marching, rho)
+
+    def read(scene: Resource[Bindings], grid: Resource[LowResGrid]) -> Resource[ConeFields]:
+        return g.stage("cones", fields.read, scene, grid, mu, rho, delta)
+
+    return shading_stages(g, s, shading, lit, volume, shown, marching, read)

@@ -1,0 +1,520 @@
+"""Lit voxels that cones march through: of the real scene (mu), and of real and virtual surfaces (rho)
+(docs/method.md 4).
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float32
+
+from protocol.scene_method import DvctMethod, VoxelConeSettings
+from render_server.frame import FrameResources, Observation
+from render_server.gpu.context import GpuContext
+from render_server.gpu.kernel import Binding, Bindings
+from render_server.gpu.textures import release_all
+from render_server.gpu.uniform_block import UniformBlock
+from render_server.gpu_scene import GeometryState
+from render_server.graph import Graph, Resource
+from render_server.methods.lighting import SURFEL_SHADOW_SAMPLES, LitScene, casts_caustics, surfel_scene
+from render_server.methods.settings import march_defines
+from render_server.passes.lights import LightBuffers
+from render_server.passes.split_injection import FilterIsotropic, RealAlbedo, ResolveInjection, SplitInjection
+from render_server.passes.voxel_light import (
+    AlbedoTexture,
+    GatherVoxels,
+    GroupSurfels,
+    LightVoxels,
+    SurfelGroups,
+)
+from render_server.passes.voxels import (
+    DIRECTIONS,
+    ClearVoxels,
+    FarVolumeBlock,
+    FilterVoxels,
+    PlacedVolume,
+    ResolveVoxels,
+    VolumePlacement,
+    Voxelize,
+    VoxelMipmap,
+    VoxelStore,
+    place_volume,
+)
+from render_server.scene.lights import LightSet
+
+FAR_SIZE = 32  # voxels an edge of the coarse volume beyond
+FAR_EDGE_M = 20.0  # its greatest edge: what lies farther lights little through a cone's solid angle
+FAR_MARGIN = 1.05
+
+
+class VoxelSet:
+    """The sparse voxels of one geometry: where the volume lay when they were filled, their surfels and groups.
+
+    `is_lit`: its sums hold light, which has to go before it is lit anew.
+    """
+
+    def __init__(self, gpu: GpuContext, size: int, directions: int) -> None:
+        self.store = VoxelStore(gpu, size)
+        self.volume = PlacedVolume(gpu, VolumePlacement((0.0, 0.0, 0.0), 1.0, size))
+        self.groups = SurfelGroups(gpu, size)
+        self.is_lit = False
+        self._voxelize = Voxelize(gpu)
+        self._clear = ClearVoxels(gpu, directions)
+
+    def fill(
+        self,
+        corners: Float32[np.ndarray, "m 3 10"],
+        placement: VolumePlacement,
+        mipmaps: Sequence[VoxelMipmap],
+    ) -> None:
+        """Replaces the voxels by those of triangles; the mipmaps lose the texels of the old ones."""
+        self._clear.run(self.store, mipmaps, self.volume)
+        self.volume.place(placement)
+        self._voxelize.run(self.store, corners, self.volume)
+        self.is_lit = False
+
+    def forget_light(self) -> None:
+        """Empties the sums, unless they are."""
+        if self.is_lit:
+            self.store.sums.clear()
+        self.is_lit = True
+
+    def counts(self) -> tuple[int, int]:
+        """Touched voxels and surfels; waits for the GPU."""
+        return self.store.counts()
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        release_all(self.store, self.volume, self.groups, self._voxelize, self._clear)
+
+
+class FarScene:
+    """The real scene beyond the volume: a coarse mu mipmap around everything that the camera sees.
+
+    What leaves the volume meets the radiance that the camera measured there, not the environment; unless the
+    volume is not `is_used`.
+    """
+
+    def __init__(self, gpu: GpuContext, light: LightVoxels, *, is_used: bool) -> None:
+        self._is_used = is_used
+        self.mipmap = VoxelMipmap(gpu, FAR_SIZE, DIRECTIONS)
+        self._set = VoxelSet(gpu, FAR_SIZE, DIRECTIONS)
+        self._light = light
+        self._resolve = ResolveVoxels(gpu)
+        self._filter = FilterVoxels(gpu)
+        self._block = UniformBlock[FarVolumeBlock](gpu, self._set.volume.placement.far_block(is_used=is_used))
+
+    def voxelize(self, real: GeometryState) -> VoxelSet:
+        """Voxelises the whole real scene."""
+        if self._is_used:
+            low, high = real.bounds
+            edge = min(float(np.max(high - low)), FAR_EDGE_M) * FAR_MARGIN
+            corners = real.corners if real.coarse_corners is None else real.coarse_corners
+            self._set.fill(corners, place_volume(low, high, FAR_SIZE, edge), [self.mipmap])
+            self._block.write(self._set.volume.placement.far_block(is_used=True))
+        return self._set
+
+    def light(self, voxels: VoxelSet, scene: Bindings) -> VoxelMipmap:
+        """Gives the voxels the radiance that the camera measured, and filters them."""
+        if self._is_used:
+            voxels.forget_light()
+            self._light.light_real(voxels.store, {**scene, **voxels.volume.bindings})
+            self._resolve.resolve_mu(self.mipmap, voxels.store, voxels.volume)
+            self._filter.run(self.mipmap, voxels.volume)
+        return self.mipmap
+
+    @property
+    def bindings(self) -> dict[str, Binding]:
+        """Everything that march.glsl reads of it."""
+        return {"pyramid_far": self.mipmap.texture, "FarVolume": self._block}
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        release_all(self.mipmap, self._set, self._resolve, self._filter, self._block)
+
+
+class DirectionalVoxels:
+    """What the voxels of both marches hold: two anisotropic mipmaps, two sets, the far scene."""
+
+    def __init__(self, gpu: GpuContext, settings: VoxelConeSettings, size: int) -> None:
+        self._bounces = settings.bounces
+        self._measured = settings.radiance == "measured"
+        self.mu, self.rho = (VoxelMipmap(gpu, size, DIRECTIONS) for _ in range(2))
+        self.real, self.objects = (VoxelSet(gpu, size, DIRECTIONS) for _ in range(2))
+        self._light = LightVoxels(gpu)
+        self.far = FarScene(gpu, self._light, is_used=settings.far_volume)
+        self._group = GroupSurfels(gpu)
+        self._gather = GatherVoxels(gpu, march_defines(settings))
+        self._resolve = ResolveVoxels(gpu)
+        self._filter = FilterVoxels(gpu)
+
+    def voxelize_real(self, real: GeometryState, placement: VolumePlacement) -> VoxelSet:
+        """Voxelises the real scene, with backs of what one camera saw."""
+        self.real.fill(real.solid_corners(placement.voxel_edge), placement, [self.mu, self.rho])
+        return self.real
+
+    def voxelize_objects(self, objects: GeometryState, placement: VolumePlacement) -> VoxelSet:
+        """Voxelises the objects."""
+        self.objects.fill(objects.corners, placement, [self.rho])
+        self.objects.groups.start(self.objects.store)
+        if self._bounces > 0:
+            self._group.run(
+                self.objects.store, self.objects.groups, self.objects.volume.bindings, has_seen=False
+            )
+        return self.objects
+
+    def _filter_mu(self) -> None:
+        self._resolve.resolve_mu(self.mu, self.real.store, self.real.volume)
+        self._filter.run(self.mu, self.real.volume)
+
+    def _filter_rho(self) -> None:
+        self._resolve.resolve_rho(self.rho, self.real.store, self.objects.store, self.real.volume)
+        self._filter.run(self.rho, self.real.volume)
+
+    def march_bindings(self, cone_count: int) -> dict[str, Binding]:
+        """Everything that march.glsl reads."""
+        return {
+            **self._light.bindings,
+            **self.far.bindings,
+            "pyramid_mu": self.mu.texture,
+            "pyramid_rho": self.rho.texture,
+            "cone_count": cone_count,
+        }
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        release_all(
+            self.mu,
+            self.rho,
+            self.real,
+            self.objects,
+            self.far,
+            self._light,
+            self._group,
+            self._gather,
+            self._resolve,
+            self._filter,
+        )
+
+
+class DeltaVoxels(DirectionalVoxels):
+    """Voxels of the exact operator: rho is mu, where objects leave it as it is.
+
+    Light is gathered `settings.bounces` times from voxel to voxel, beyond direct and unoccluded ambient light.
+    """
+
+    def __init__(self, gpu: GpuContext, settings: DvctMethod, size: int) -> None:
+        super().__init__(gpu, settings, size)
+        self._caustics = settings.caustics
+
+    def real_scene(
+        self,
+        seen: Observation,
+        albedo: AlbedoTexture,
+        _lights: LightSet,
+        lights: LightBuffers,
+        _maps: LightBuffers,
+        _mirrored: LightBuffers,
+    ) -> dict[str, Binding]:
+        """Bindings of what lights real voxels."""
+        seen.image.build_levels()
+        return surfel_scene(seen, lights, albedo, measured=self._measured)
+
+    def light_real(self, voxels: VoxelSet, scene: Bindings) -> VoxelSet:
+        """Gives real surfels the radiance that the camera measured, or the lights' where it does not look."""
+        voxels.forget_light()
+        voxels.groups.start(voxels.store)
+        self._light.light_real(voxels.store, {**scene, **voxels.volume.bindings}, voxels.groups)
+        return voxels
+
+    def filter_real(self, _lit: VoxelSet) -> VoxelMipmap:
+        """Makes mu of the lit voxels."""
+        self._filter_mu()
+        return self.mu
+
+    def bounce_real(self, _mu: VoxelMipmap, _far: VoxelMipmap, scene: Bindings) -> VoxelMipmap:
+        """Real surfaces that the camera does not see: what they gather from mu in place of all ambient light."""
+        if self._bounces == 0:
+            return self.mu
+        own, store, groups = {**scene, **self.real.volume.bindings}, self.real.store, self.real.groups
+        self._group.run(store, groups, own, has_seen=True)
+        _, unseen = groups.counts()
+        for _ in range(self._bounces if unseen else 0):
+            self._gather.gather_unseen(store, groups, self.mu, {**own, **self.march_bindings(1)})
+            self._light.light_real(store, own, groups, gathered=True)
+            self._filter_mu()
+        return self.mu
+
+    def joint_scene(
+        self, scene: Bindings, objects: GeometryState, lights: LightBuffers, voxels: VoxelSet
+    ) -> dict[str, Binding]:
+        """Bindings of what lights the objects' voxels and changes the light of real ones."""
+        return {
+            **scene,
+            **lights.bindings,
+            "shadow_samples": SURFEL_SHADOW_SAMPLES,
+            **objects.materials.bindings,
+            **voxels.volume.bindings,
+            "has_caustics": self._caustics and casts_caustics(objects),
+        }
+
+    def light_objects(
+        self, voxels: VoxelSet, objects: GeometryState, scene: Bindings, _mu: VoxelMipmap
+    ) -> VoxelSet:
+        """Lights the objects' surfels, and changes the light of real ones by the objects' shadows."""
+        voxels.forget_light()
+        self._light.start_support(voxels.volume.placement.voxel_bounds(np.stack(objects.bounds)))
+        self._light_rho(scene, gathered=False)
+        return voxels
+
+    def _light_rho(self, scene: Bindings, *, gathered: bool) -> None:
+        self._light.light_virtual(self.objects.store, scene, self.objects.groups, gathered=gathered)
+        self._light.light_real_delta(self.real.store, scene, self.real.groups, gathered=gathered)
+
+    def filter_joint(self, _lit: VoxelSet) -> VoxelMipmap:
+        """Makes rho of the lit voxels of both sets."""
+        self._filter_rho()
+        return self.rho
+
+    def bounce_joint(self, _rho: VoxelMipmap, scene: Bindings) -> VoxelMipmap:
+        """Gathers light from mu and rho, lights the objects and changes the real surfaces by it."""
+        for _ in range(self._bounces):
+            marching = {**scene, **self.march_bindings(1)}
+            self._gather.gather_real(self.real.store, self.real.groups, self.mu, self.rho, marching)
+            self._gather.gather_virtual(self.objects.store, self.objects.groups, self.rho, marching)
+            self._light_rho(scene, gathered=True)
+            self._filter_rho()
+        return self.rho
+
+
+def delta_voxel_stages(
+    g: Graph, s: FrameResources, lit: LitScene, voxels: DeltaVoxels, placement: Resource[VolumePlacement]
+) -> tuple[Resource[VoxelMipmap], Resource[VoxelMipmap]]:
+    """Voxelise, light, filter and bounce: mu of the real scene, then rho with the objects."""
+    real = g.stage("voxelize real", voxels.voxelize_real, s.real, placement)
+    beyond = g.stage("voxelize far", voxels.far.voxelize, s.real)
+    scene = g.stage(
+        "real voxel scene",
+        voxels.real_scene,
+        s.observation,
+        s.albedo,
+        s.lights,
+        lit.environment,
+        lit.real_maps,
+        lit.mirrored,
+    )
+    lit_real = g.stage("light real voxels", voxels.light_real, real, scene)
+    far = g.stage("light far voxels", voxels.far.light, beyond, scene)
+    filtered = g.stage("filter mu", voxels.filter_real, lit_real)
+    mu = g.stage("bounces real", voxels.bounce_real, filtered, far, scene)
+    objects = g.stage("voxelize objects", voxels.voxelize_objects, s.objects, placement)
+    joint = g.stage("joint voxel scene", voxels.joint_scene, scene, s.objects, lit.object_maps, objects)
+    lit_joint = g.stage("light joint voxels", voxels.light_objects, objects, s.objects, joint, mu)
+    filtered_joint = g.stage("filter rho", voxels.filter_joint, lit_joint)
+    rho = g.stage("bounces joint", voxels.bounce_joint, filtered_joint, joint)
+    return mu, rho
+
+
+class SolutionVoxels(DirectionalVoxels):
+    """Voxels of two full solutions: the real scene alone (mu), real and virtual together (rho) (docs/method.md 6).
+
+    Each sums all of its light and opacity, under its own maps, as often as light is gathered. Shared are the pieces of
+    the real triangles and what the camera measured there, which tells solution rho what a surface gives back of its
+    light; and the scene beyond the volume, which objects do not change.
+    """
+
+    def voxelize_both(self, real: VoxelSet, objects: VoxelSet) -> tuple[VoxelSet, VoxelSet]:
+        """Groups the surfels of both sets, once they are voxelised."""
+        real.groups.start(real.store)
+        if self._bounces > 0:
+            self._group.run(real.store, real.groups, real.volume.bindings, has_seen=False)
+        return real, objects
+
+    def scenes(
+        self,
+        seen: Observation,
+        albedo: AlbedoTexture,
+        objects: GeometryState,
+        _lights: LightSet,
+        mu: LightBuffers,
+        rho: LightBuffers,
+    ) -> tuple[dict[str, Binding], dict[str, Binding]]:
+        """Bindings of what lights voxels, of solution mu and of rho."""
+        seen.image.build_levels()
+        shared = {**self.real.volume.bindings, **objects.materials.bindings, "has_caustics": False}
+        first, second = (surfel_scene(seen, each, albedo, measured=self._measured) for each in (mu, rho))
+        return {**first, **shared}, {**second, **shared}
+
+    def light_far(self, voxels: VoxelSet, scenes: tuple[Bindings, Bindings]) -> VoxelMipmap:
+        """Lights the scene beyond the volume, as solution mu has it."""
+        return self.far.light(voxels, scenes[0])
+
+    def light(
+        self, _voxels: tuple[VoxelSet, VoxelSet], _far: VoxelMipmap, scenes: tuple[Bindings, Bindings]
+    ) -> "SolutionVoxels":
+        """Lights, resolves and filters mu, then rho."""
+        self._light_both(scenes, gathered=False)
+        return self
+
+    def bounce(self, _lit: "SolutionVoxels", scenes: tuple[Bindings, Bindings]) -> "SolutionVoxels":
+        """Gathers each solution's light from its own voxels, and lights them by it."""
+        for _ in range(self._bounces):
+            self.set_support(everywhere=True)
+            marching = {**scenes[0], **self.march_bindings(1)}
+            self._gather.gather_real(self.real.store, self.real.groups, self.mu, self.rho, marching)
+            self._gather.gather_virtual(self.objects.store, self.objects.groups, self.rho, marching)
+            self._light_both(scenes, gathered=True)
+        return self
+
+    def _light_both(self, scenes: tuple[Bindings, Bindings], *, gathered: bool) -> None:
+        real, objects = self.real, self.objects
+        if not gathered:
+            objects.forget_light()
+        mu, rho = scenes
+        light = self._light
+        light.light_solution(real.store, mu, real.groups, with_objects=False, gathered=gathered)
+        self._resolve.resolve_mu(self.mu, real.store, real.volume)
+        light.light_solution(real.store, rho, real.groups, with_objects=True, gathered=gathered)
+        light.light_virtual(objects.store, rho, objects.groups, gathered=gathered)
+        real.store.delta_sums.clear()
+        self._resolve.resolve_rho(self.rho, real.store, objects.store, real.volume)
+        self._filter.run(self.mu, real.volume)
+        self._filter.run(self.rho, real.volume)
+
+    def set_support(self, *, everywhere: bool) -> None:
+        """Sets the bounds inside which march.glsl takes mu and rho for different: the whole volume, or nowhere, where
+        both are the same.
+        """
+        size = self.real.volume.placement.size
+        low, high = (0, size - 1) if everywhere else (size, -1)
+        # Unlike those of a delta, they are known before anything is lit.
+        self._light.start_support(np.array([low, low, low, -high, -high, -high], np.int32))
+
+
+def solution_stages(
+    g: Graph,
+    s: FrameResources,
+    voxels: SolutionVoxels,
+    placement: Resource[VolumePlacement],
+    mu_maps: Resource[LightBuffers],
+    rho_maps: Resource[LightBuffers],
+) -> Resource[SolutionVoxels]:
+    """Voxelise both geometries, then light, filter and gather in step."""
+    real = g.stage("voxelize real", voxels.voxelize_real, s.real, placement)
+    beyond = g.stage("voxelize far", voxels.far.voxelize, s.real)
+    objects = g.stage("voxelize objects", voxels.voxelize_objects, s.objects, placement)
+    both = g.stage("group surfels", voxels.voxelize_both, real, objects)
+    scenes = g.stage(
+        "voxel scenes", voxels.scenes, s.observation, s.albedo, s.objects, s.lights, mu_maps, rho_maps
+    )
+    far = g.stage("light far voxels", voxels.light_far, beyond, scenes)
+    lit = g.stage("light voxels", voxels.light, both, far, scenes)
+    return g.stage("bounces", voxels.bounce, lit, scenes)
+
+
+class InjectedVoxels:
+    """V_delta and V_rho with the joint opacity of V_eta, as split-inject fills them ([P1] 3.2).
+
+    Two isotropic mipmaps: (V_delta, V_eta) with signed radiance, and (V_rho, V_eta).
+    """
+
+    directions = 1
+
+    def __init__(self, gpu: GpuContext, size: int) -> None:
+        self.delta, self.rho = (VoxelMipmap(gpu, size, self.directions) for _ in range(2))
+        self.real, self.objects = (VoxelSet(gpu, size, self.directions) for _ in range(2))
+        self._albedo = RealAlbedo(gpu)
+        self._inject = SplitInjection(gpu)
+        self._resolve = ResolveInjection(gpu)
+        self._filter = FilterIsotropic(gpu)
+
+    def voxelize_real(self, real: GeometryState, placement: VolumePlacement) -> VoxelSet:
+        """Voxelises the real scene."""
+        self.real.fill(real.corners, placement, [self.delta, self.rho])
+        return self.real
+
+    def voxelize_objects(self, objects: GeometryState, placement: VolumePlacement) -> VoxelSet:
+        """Voxelises the objects."""
+        self.objects.fill(objects.corners, placement, [self.delta, self.rho])
+        return self.objects
+
+    def find_albedo(
+        self,
+        placed: VoxelSet,
+        seen: Observation,
+        albedo: AlbedoTexture,
+        _lights: LightSet,
+        lights: LightBuffers,
+        _environment: LightBuffers,
+    ) -> RealAlbedo:
+        """Finds the real scene's albedo as the lights see it."""
+        seen.image.build_levels()
+        self._albedo.run(lights, {**surfel_scene(seen, lights, albedo), **placed.volume.bindings})
+        return self._albedo
+
+    def inject(
+        self,
+        real: VoxelSet,
+        objects: VoxelSet,
+        found: RealAlbedo,
+        geometry: GeometryState,
+        seen: Observation,
+        albedo: AlbedoTexture,
+        lights: LightBuffers,
+    ) -> VoxelSet:
+        """Injects the light of all maps."""
+        scene = {
+            **surfel_scene(seen, lights, albedo),
+            **geometry.materials.bindings,
+            **real.volume.bindings,
+        }
+        self._inject.run(real.store, objects.store, lights, found.atlas, scene)
+        return real
+
+    def filter(self, real: VoxelSet) -> "InjectedVoxels":
+        """Makes both mipmaps of the sums."""
+        self._resolve.run(self.delta, self.rho, real.store, self.objects.store, real.volume)
+        self._filter.run(self.delta, self.rho, real.volume)
+        return self
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        release_all(
+            self.delta,
+            self.rho,
+            self.real,
+            self.objects,
+            self._albedo,
+            self._inject,
+            self._resolve,
+            self._filter,
+        )
+
+
+def injection_stages(
+    g: Graph, s: FrameResources, lit: LitScene, voxels: InjectedVoxels, placement: Resource[VolumePlacement]
+) -> Resource[InjectedVoxels]:
+    """Voxelise both geometries, find the real albedo, inject, filter."""
+    real = g.stage("voxelize real", voxels.voxelize_real, s.real, placement)
+    albedo = g.stage(
+        "real albedo",
+        voxels.find_albedo,
+        real,
+        s.observation,
+        s.albedo,
+        s.lights,
+        lit.real_maps,
+        lit.environment,
+    )
+    objects = g.stage("voxelize objects", voxels.voxelize_objects, s.objects, placement)
+    injected = g.stage(
+        "split inject",
+        voxels.inject,
+        real,
+        objects,
+        albedo,
+        s.objects,
+        s.observation,
+        s.albedo,
+        lit.object_maps,
+    )
+    return g.stage("filter", voxels.filter, injected)

@@ -1,1 +1,0 @@
-uniform vec4 camera_pinhole;   // fx, fy, cx, cy of the picture (pixel centres at integers)

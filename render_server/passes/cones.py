@@ -1,0 +1,218 @@
+"""Cone tracing at reduced resolution: which pixel stands for each texel, and what cones bring there."""
+
+from collections.abc import Mapping
+
+import moderngl
+
+from render_server.gpu.context import GpuContext
+from render_server.gpu.kernel import Binding, Bindings, Kernel, list_threads
+from render_server.gpu.textures import texture_2d
+from render_server.passes.voxels import VoxelMipmap
+
+
+class LowResGrid:
+    """RGBA16I: pixel of a real surface (x, y) and of a virtual one (x, y), -1 where the block shows none.
+
+    Where objects hide the block's real surfaces, -2 - pixel stands for one of them.
+
+    `virtual_texels` lists the texels that show an object (count, then indices).
+    """
+
+    def __init__(self, gpu: GpuContext, picture_size: tuple[int, int], scale: int) -> None:
+        self.picture_size, self.scale = picture_size, scale
+        self.size = (-(-picture_size[0] // scale), -(-picture_size[1] // scale))
+        self.pixels = texture_2d(gpu, self.size, 4, "i2")
+        self.virtual_texels = gpu.ctx.buffer(bytes(4 * (1 + self.texel_count)))
+        self._kernel = Kernel(gpu, "low_res_grid")
+
+    @property
+    def texel_count(self) -> int:
+        """How many texels the grid has."""
+        return self.size[0] * self.size[1]
+
+    @property
+    def bindings(self) -> dict[str, Binding]:
+        """What low_res_grid.glsl and upsample.glsl read of it."""
+        return {"sample_pixels": self.pixels, "low_resolution_size": self.size, "scale": self.scale}
+
+    def run(self, scene: Bindings) -> None:
+        """Chooses the pixels."""
+        self.virtual_texels.write(bytes(4))
+        self._kernel.run(
+            self.size,
+            scene,
+            sample_pixels_out=self.pixels,
+            Texels=self.virtual_texels,
+            picture_pixels=self.picture_size,
+            scale=self.scale,
+        )
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        self.pixels.release()
+        self.virtual_texels.release()
+        self._kernel.release()
+
+
+class ConeFields:
+    """What cones bring, at 1/scale of the picture: irradiance (diffuse) and mean radiance (specular cone)."""
+
+    def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
+        self.mu = texture_2d(gpu, size, 4, "f2")
+        self.rho = texture_2d(gpu, size, 4, "f2")
+        self.specular_mu = texture_2d(gpu, size, 4, "f2")
+        self.specular_rho = texture_2d(gpu, size, 4, "f2")
+        self.virtual = texture_2d(gpu, size, 4, "f2")
+        self.virtual_specular = texture_2d(gpu, size, 4, "f2")
+
+    def release(self) -> None:
+        """Frees the textures."""
+        for texture in vars(self).values():
+            texture.release()
+
+
+class BilateralConeFilter:
+    """Averages neighbouring texels, each of which looked along other cones: a joint bilateral tent over 3 x 3."""
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self._real = Kernel(gpu, "bilateral_cone_filter", REAL=1)
+        self._virtual = Kernel(gpu, "bilateral_cone_filter")
+
+    def filter_real(
+        self,
+        traced: tuple[moderngl.Texture, moderngl.Texture],
+        filtered: tuple[moderngl.Texture, moderngl.Texture],
+        grid: LowResGrid,
+        scene: Bindings,
+    ) -> None:
+        """E_mu and E_rho of the real surfaces; where mu and rho are the same they stay the same, bit for bit."""
+        self._real.run(
+            grid.size,
+            grid.bindings,
+            scene,
+            traced_mu=traced[0],
+            traced_rho=traced[1],
+            irradiance_mu=filtered[0],
+            irradiance_rho=filtered[1],
+        )
+
+    def filter_virtual(
+        self, traced: moderngl.Texture, filtered: moderngl.Texture, grid: LowResGrid, scene: Bindings
+    ) -> None:
+        """E_rho of the virtual surfaces."""
+        self._virtual.run(grid.size, grid.bindings, scene, traced_rho=traced, irradiance_rho=filtered)
+
+    def release(self) -> None:
+        """Frees the programs."""
+        self._real.release()
+        self._virtual.release()
+
+
+class TraceCones:
+    """Traces cones of the exact operator: both marches on real surfaces, that of rho on virtual ones
+    (docs/method.md 3, 4.5).
+
+    `size` is that of the reduced grid, `defines` are those of march.glsl.
+    """
+
+    def __init__(self, gpu: GpuContext, size: tuple[int, int], defines: Mapping[str, int]) -> None:
+        self._gpu = gpu
+        self._mu, self._rho, self._irradiance = (texture_2d(gpu, size, 4, "f2") for _ in range(3))
+        self._filter = BilateralConeFilter(gpu)
+        self._real = Kernel(gpu, "trace_cones", REAL=1, **defines)
+        self._virtual = Kernel(gpu, "trace_cones", **defines)
+        self._select = Kernel(gpu, "select_cone_texels", REAL=1)
+        self._texels = gpu.ctx.buffer(reserve=4)
+
+    def trace_real(
+        self, fields: ConeFields, grid: LowResGrid, mu: VoxelMipmap, rho: VoxelMipmap, scene: Bindings
+    ) -> None:
+        """E_mu, E_rho and the specular cones of the real surfaces."""
+        self._empty_list(grid)
+        traced: Bindings = {
+            "irradiance_mu": self._mu,
+            "irradiance_rho": self._rho,
+            "specular_mu": fields.specular_mu,
+            "specular_rho": fields.specular_rho,
+            "Texels": self._texels,
+            **grid.bindings,
+        }
+        self._select.run(grid.size, traced, scene)
+        self._real.run(self._threads(grid), traced, scene, pyramid_mu=mu.texture, pyramid_rho=rho.texture)
+        self._filter.filter_real((self._mu, self._rho), (fields.mu, fields.rho), grid, scene)
+
+    def trace_virtual(
+        self, fields: ConeFields, grid: LowResGrid, mu: VoxelMipmap, rho: VoxelMipmap, scene: Bindings
+    ) -> None:
+        """E_rho and the specular cone of the virtual surfaces."""
+        self._irradiance.write(bytes(8 * grid.texel_count))
+        self._virtual.run(
+            self._threads(grid),
+            grid.bindings,
+            scene,
+            irradiance_rho=self._irradiance,
+            specular_rho=fields.virtual_specular,
+            Texels=grid.virtual_texels,
+            pyramid_mu=mu.texture,
+            pyramid_rho=rho.texture,
+        )
+        self._filter.filter_virtual(self._irradiance, fields.virtual, grid, scene)
+
+    def _empty_list(self, grid: LowResGrid) -> None:
+        """Empties the list of real texels, and makes room for all of the grid."""
+        needed = 4 * (1 + grid.texel_count)
+        if self._texels.size < needed:
+            self._texels.orphan(needed)
+        self._texels.write(bytes(4))
+
+    def _threads(self, grid: LowResGrid) -> tuple[int]:
+        return (list_threads(self._gpu, grid.texel_count),)
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        for texture in (self._mu, self._rho, self._irradiance):
+            texture.release()
+        for kernel in (self._real, self._virtual, self._select):
+            kernel.release()
+        self._filter.release()
+        self._texels.release()
+
+
+class TraceConesPaper:
+    """Traces cones of the paper's operator ([P1] eq. 6 and 8): nine diffuse ones and a specular one.
+
+    They march through V_delta on real surfaces, through V_rho on virtual ones.
+    """
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self._real = Kernel(gpu, "trace_cones_paper", DIRECTIONS=1, REAL=1)
+        self._virtual = Kernel(gpu, "trace_cones_paper", DIRECTIONS=1)
+
+    def trace_real(self, fields: ConeFields, grid: LowResGrid, delta: VoxelMipmap, scene: Bindings) -> None:
+        """Ambient irradiance without occlusion (mu), the same with C_delta (rho), and the specular cones."""
+        self._real.run(
+            grid.size,
+            grid.bindings,
+            scene,
+            pyramid=delta.texture,
+            irradiance_mu=fields.mu,
+            irradiance_rho=fields.rho,
+            specular_mu=fields.specular_mu,
+            specular_rho=fields.specular_rho,
+        )
+
+    def trace_virtual(self, fields: ConeFields, grid: LowResGrid, rho: VoxelMipmap, scene: Bindings) -> None:
+        """Irradiance and specular cone of the virtual surfaces."""
+        self._virtual.run(
+            grid.size,
+            grid.bindings,
+            scene,
+            pyramid=rho.texture,
+            irradiance_rho=fields.virtual,
+            specular_rho=fields.virtual_specular,
+        )
+
+    def release(self) -> None:
+        """Frees the programs."""
+        self._real.release()
+        self._virtual.release()

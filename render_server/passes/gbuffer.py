@@ -1,0 +1,314 @@
+"""What the camera sees: its image, the meshes, and the geometry buffers of the real and the virtual scene."""
+
+import cv2
+import moderngl
+import numpy as np
+from jaxtyping import Float16, Float32
+
+from protocol.frames import DepthImage, ViewFrame, decode_lut
+from render_server.gpu.context import GpuContext
+from render_server.gpu.kernel import Binding, Bindings, Kernel, RasterKernel
+from render_server.gpu.textures import release_all, release_target, texture_2d
+from render_server.scene.mesh import VERTEX_ATTRIBUTES, VERTEX_LAYOUT, GpuMesh
+from render_server.view import CameraView, Rectangle
+
+INVERSE_SIZE = 8192  # steps of the inverse response: a code is at least 16 of them wide
+TEXTURE_SIZE = 1024  # texels an edge of a base-colour texture
+UV, COLOR, MATERIAL = slice(6, 8), slice(8, 11), 11  # columns of a vertex
+METALLIC, REFLECTANCE, ROUGHNESS = (
+    3,
+    slice(4, 7),
+    7,
+)  # columns of the material table, as materials.glsl has them
+
+
+class CameraImage:
+    """Code (RGBA8UI), linear radiance in camera units with levels (RGBA16F), response (256 x 1), pixel rays.
+
+    `edge_correction` (RGBA16F, written by `EdgeUnmixing`): what takes the old background out of a pixel's radiance at
+    the edge of a real thing before an object, and which pixel shows that thing's surface.
+    """
+
+    def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
+        self.size = size
+        self.code = texture_2d(gpu, size, 4, "u1")
+        self.linear = texture_2d(gpu, size, 4, "f2", linear=True)
+        self.build_levels()
+        self.response = texture_2d(gpu, (256, 1), 4, "f4")
+        self.inverse_response = texture_2d(gpu, (INVERSE_SIZE, 1), 4, "f4")
+        self.rays = texture_2d(gpu, size, 2, "f4")
+        self.edge_correction = texture_2d(gpu, size, 4, "f2")
+        self.exposure_scale = 1.0
+        self.bytes = b""
+        self._linearize = Kernel(gpu, "linearize")
+        self._rays_of: object = None
+        self._response_of: object = None
+
+    @property
+    def bindings(self) -> dict[str, Binding]:
+        """Linear radiance and pixel rays by their GLSL names."""
+        return {"linear_picture": self.linear, "picture_rays": self.rays}
+
+    def upload(self, frame: ViewFrame) -> None:
+        """Uploads a frame's picture and linearises it."""
+        height, width, _ = frame.color.shape
+        rgba = np.empty((height, width, 4), np.uint8)
+        rgba[..., :3] = frame.color
+        rgba[..., 3] = 255
+        self.bytes = rgba.tobytes()
+        self.code.write(self.bytes, alignment=1)
+        self._write_response(decode_lut(frame.response))
+        if self._rays_of != frame.camera:
+            self.rays.write(np.ascontiguousarray(frame.camera.rays(), np.float32).tobytes(), alignment=1)
+            self._rays_of = frame.camera
+        self.exposure_scale = frame.exposure_scale
+        self._linearize.run(
+            self.size,
+            picture=self.code,
+            response=self.response,
+            linear_out=self.linear,
+            exposure_scale=frame.exposure_scale,
+        )
+
+    def _write_response(self, decode: Float32[np.ndarray, "256 3"]) -> None:
+        """Uploads the response and its inverse, unless they are the same as before."""
+        if decode is self._response_of:
+            return
+        self._response_of = decode
+        lut = np.ones((256, 4), np.float32)
+        lut[:, :3] = decode
+        self.response.write(lut.tobytes(), alignment=1)
+        self.inverse_response.write(inverse_response(decode).tobytes(), alignment=1)
+
+    def build_levels(self) -> None:
+        """Averages the linear picture over areas (for samples that cover several pixels)."""
+        self.linear.build_mipmaps()
+        self.linear.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        release_all(self.code, self.linear, self.response, self.inverse_response)
+        release_all(self.rays, self.edge_correction, self._linearize)
+
+
+def inverse_response(decode: Float32[np.ndarray, "256 3"]) -> Float32[np.ndarray, "n 4"]:
+    """Code whose linear value is nearest, for the squares of INVERSE_SIZE even steps from 0 to 1."""
+    values = np.linspace(0.0, 1.0, INVERSE_SIZE) ** 2
+    table = np.ones((INVERSE_SIZE, 4), np.float32)
+    for channel in range(3):
+        between = 0.5 * (decode[1:, channel] + decode[:-1, channel])
+        table[:, channel] = np.searchsorted(between, values)
+    return table
+
+
+class MeshBuffers:
+    """Vertex and index buffers that are rewritten when the mesh changes."""
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self._ctx = gpu.ctx
+        self._vertices = gpu.ctx.buffer(reserve=4)
+        self._indices = gpu.ctx.buffer(reserve=4)
+        self._arrays: dict[int, moderngl.VertexArray] = {}
+        self.triangle_count = 0
+
+    @property
+    def storage(self) -> dict[str, Binding]:
+        """Vertices (rows of `VERTEX_LAYOUT`) and each triangle's vertex indices, for shaders that trace rays."""
+        return {"Vertices": self._vertices, "Corners": self._indices}
+
+    def write(self, mesh: GpuMesh) -> None:
+        """Replaces the contents by those of `mesh`."""
+        vertices = np.ascontiguousarray(mesh.vertices, np.float32).tobytes()
+        indices = np.ascontiguousarray(mesh.triangles, np.int32).tobytes()
+        self.triangle_count = len(mesh.triangles)
+        if len(vertices) > self._vertices.size or len(indices) > self._indices.size:
+            self.release()
+            self._vertices = self._ctx.buffer(reserve=max(len(vertices), 4))
+            self._indices = self._ctx.buffer(reserve=max(len(indices), 4))
+        if self.triangle_count:
+            self._vertices.write(vertices)
+            self._indices.write(indices)
+
+    def draw(self, program: moderngl.Program) -> None:
+        """Draws all triangles with `program`."""
+        if not self.triangle_count:
+            return
+        if program.glo not in self._arrays:
+            layout = [(self._vertices, *_layout_of(program))]
+            self._arrays[program.glo] = self._ctx.vertex_array(program, layout, self._indices)
+        self._arrays[program.glo].render(moderngl.TRIANGLES, vertices=3 * self.triangle_count)
+
+    def release(self) -> None:
+        """Frees all buffers."""
+        release_all(*self._arrays.values(), self._vertices, self._indices)
+        self._arrays.clear()
+
+
+def _layout_of(program: moderngl.Program) -> tuple[str, ...]:
+    """Format and attributes of a vertex; attributes that the program's compiler removed become padding."""
+    parts = list(zip(VERTEX_LAYOUT.split(), VERTEX_ATTRIBUTES, strict=True))
+    active = {name for _, name in parts if program.get(name, None) is not None}
+    formats = (part if name in active else f"{int(part[0]) * 4}x" for part, name in parts)
+    return " ".join(formats), *(name for _, name in parts if name in active)
+
+
+def triangle_corners(mesh: GpuMesh) -> Float32[np.ndarray, "m 3 10"]:
+    """Each triangle's corners as the voxeliser reads them: position, uv, colour, material, double-sided."""
+    vertices = mesh.vertices
+    double_sided = np.array([material.double_sided for material in mesh.materials], np.float32)
+    flags = double_sided[vertices[:, MATERIAL].astype(int)][:, None]
+    columns = [vertices[:, :3], vertices[:, UV], vertices[:, COLOR], vertices[:, MATERIAL:], flags]
+    return np.asarray(np.concatenate(columns, axis=1)[mesh.triangles], np.float32)
+
+
+class MaterialTable:
+    """Materials in a storage buffer, their base-colour textures in one array (common/materials.glsl).
+
+    `smoothest`: least roughness of those that reflect at all, 1 if none does.
+    """
+
+    def __init__(self, gpu: GpuContext, mesh: GpuMesh) -> None:
+        self.smoothest = _smoothest(mesh)
+        self._buffer = gpu.ctx.buffer(np.ascontiguousarray(mesh.material_table, np.float32).tobytes())
+        size = TEXTURE_SIZE if mesh.textures else 1
+        self._textures = gpu.ctx.texture_array((size, size, max(len(mesh.textures), 1)), 4, dtype="f2")
+        for index, texture in enumerate(mesh.textures):
+            self._textures.write(_resampled(texture, size), viewport=(0, 0, index, size, size, 1))
+        self._textures.filter = (moderngl.LINEAR, moderngl.LINEAR)
+
+    @property
+    def bindings(self) -> dict[str, Binding]:
+        """Table and textures by their GLSL names."""
+        return {"Materials": self._buffer, "base_color_textures": self._textures}
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        release_all(self._buffer, self._textures)
+
+
+def _smoothest(mesh: GpuMesh) -> float:
+    table = mesh.material_table
+    reflects = (table[:, METALLIC] > 0) | (table[:, REFLECTANCE] > 0).any(axis=1)
+    return float(min(table[reflects, ROUGHNESS], default=1.0))
+
+
+def _resampled(texture: Float16[np.ndarray, "h w 3"], size: int) -> bytes:
+    """RGBA float16 bytes of a linear texture, area-averaged to size x size."""
+    resized = cv2.resize(texture.astype(np.float32), (size, size), interpolation=cv2.INTER_AREA)
+    rgba = np.dstack([resized, np.ones((size, size), np.float32)])
+    return rgba.astype(np.float16).tobytes()
+
+
+class GeometryBuffer:
+    """World position + depth (RGBA32F, w = 0: nothing), normal + material (RGBA16F), uv, vertex colour."""
+
+    def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
+        self.size = size
+        self.position = texture_2d(gpu, size, 4, "f4")
+        self.normal = texture_2d(gpu, size, 4, "f2")
+        self.uv = texture_2d(gpu, size, 2, "f4")
+        self.tint = texture_2d(gpu, size, 4, "f1")
+        self._depth = gpu.ctx.depth_renderbuffer(size)
+        self.framebuffer = gpu.ctx.framebuffer([self.position, self.normal, self.uv, self.tint], self._depth)
+
+    @property
+    def bindings(self) -> dict[str, Binding]:
+        """Its textures by their GLSL names."""
+        return {
+            "virtual_raster_position": self.position,
+            "virtual_raster_normal": self.normal,
+            "virtual_raster_uv": self.uv,
+            "virtual_raster_tint": self.tint,
+        }
+
+    def clear(self, rectangle: Rectangle | None = None) -> None:
+        """Empties it, or only the `rectangle`."""
+        self.framebuffer.use()  # a clear heeds the scissor of the framebuffer in use
+        self.framebuffer.clear(0.0, 0.0, 0.0, 0.0, depth=1.0, viewport=rectangle)
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        release_target(self.framebuffer)
+        release_all(self._depth, self.position, self.normal, self.uv, self.tint)
+
+
+class RasterGeometry:
+    """Rasters meshes into a geometry buffer."""
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self._kernel = RasterKernel(gpu, "geometry_buffer")
+
+    def run(
+        self,
+        target: GeometryBuffer,
+        mesh: MeshBuffers,
+        view: CameraView,
+        scene: Bindings,
+        *,
+        offset: tuple[float, float] = (0.0, 0.0),
+        rectangle: Rectangle | None = None,
+    ) -> None:
+        """Draws `mesh` as `view` sees it, `offset` pixels beside the texels' centres.
+
+        `scene` brings the view's camera and the mesh's own materials. `rectangle`: the texels that can show the mesh;
+        the others keep what they held.
+        """
+        target.clear(rectangle)
+        self._kernel.draw(target.framebuffer, mesh, scene, clip_from_camera=view.clip_from_camera_at(offset))
+
+    def release(self) -> None:
+        """Frees the program."""
+        self._kernel.release()
+
+
+class RealSurface:
+    """World position + depth (RGBA32F; w = 0 unknown) and normal + surface entry (RGBA16F) on the picture's grid."""
+
+    def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
+        self.size = size
+        self.position = texture_2d(gpu, size, 4, "f4")
+        self.normal = texture_2d(gpu, size, 4, "f2")
+        self._depth = texture_2d(gpu, size, 1, "f4")
+        self._fitted = texture_2d(gpu, size, 3, "f4")
+        self._from_depth = Kernel(gpu, "real_surface")
+        self._from_model = Kernel(gpu, "real_surface_model")
+
+    @property
+    def bindings(self) -> dict[str, Binding]:
+        """Its textures by their GLSL names."""
+        return {"real_surface_position": self.position, "real_surface_normal": self.normal}
+
+    def from_depth(self, depth: DepthImage, normals: Float32[np.ndarray, "h w 3"], scene: Bindings) -> None:
+        """Fills it from the clean, registered depth map and its normals (optical frame, zero where unknown)."""
+        known = np.where(depth.valid, depth.depth_m, 0.0).astype(np.float32)
+        self._depth.write(known.tobytes(), alignment=1)
+        self._fitted.write(np.ascontiguousarray(normals, np.float32).tobytes(), alignment=1)
+        self._from_depth.run(
+            self.size, scene, depth_map=self._depth, fitted_normals=self._fitted, **self._images()
+        )
+
+    def from_model(
+        self, raster: GeometryBuffer, scene: Bindings, *, tolerance: tuple[float, float] | None = None
+    ) -> None:
+        """Fills it from a raster of the given model or the fused surface, through the lens.
+
+        `tolerance` (m, and m at 1 m that grow with z^2): pixels that the frame's depth filled before keep it where
+        the surface differs by more (something moved), and get the surface, the mean of many frames, where it agrees.
+        None: every pixel gets the surface.
+        """
+        self._from_model.run(
+            self.size,
+            scene,
+            model_raster_position=raster.position,
+            model_raster_normal=raster.normal,
+            keeps_depth=tolerance is not None,
+            tolerance=tolerance or (0.0, 0.0),
+            **self._images(),
+        )
+
+    def _images(self) -> dict[str, Binding]:
+        return {"position_out": self.position, "normal_out": self.normal}
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        release_all(self.position, self.normal, self._depth, self._fitted, self._from_depth, self._from_model)

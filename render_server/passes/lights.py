@@ -1,0 +1,298 @@
+"""Lights, their shadow maps and the residual environment, as every pass that shades reads them."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import moderngl
+import numpy as np
+from jaxtyping import Float32, Float64
+
+from render_server.gpu.context import GpuContext
+from render_server.gpu.kernel import Binding, Bindings, Kernel
+from render_server.gpu.uniform_block import Block, Float, Int, UniformBlock
+from render_server.passes.shadow_maps import (
+    NEAREST_M,
+    LightView,
+    ShadowMapAtlas,
+    frame_along,
+    light_views,
+    mirror_views,
+    pack_view,
+    texel_size_m,
+    tile_columns,
+)
+from render_server.scene.lights import DirectionalLight, Light, RectangleLight, SpotLight
+from render_server.scene.mirror_lights import MirrorLight
+from render_server.scene.octahedral import octahedral_grid, prefilter, sample_octahedral
+
+LIGHT_BYTES = 160  # of a std430 Light (shaders/common/lights.glsl)
+EMPTY = b"\0" * 256
+MIRROR_MAP_TEXELS = 256  # an edge of the map of where a plane mirrors a light
+MIRROR_MAP_MARGIN = 1.1  # of the extent that the map has to cover
+NOT_MIRRORED = (0.0,) * 7 + (-1.0,) + (0.0,) * 8
+NARROWEST_BLEND_RAD = 1e-4  # what a spot without blend falls off over
+
+MapAxes = tuple[Float64[np.ndarray, "4"], Float64[np.ndarray, "4"]]
+
+
+@dataclass(frozen=True, eq=False)
+class LightingBlock(Block):
+    """How many lights there are, and how the residual environment is layered."""
+
+    light_count: Int = 0
+    environment_layers: Int = 0
+    environment_first_half_angle: Float = 0.0
+    """Radians, of layer 0; the last layer's is pi/2, cosine-weighted."""
+
+
+class LightBuffers:
+    """What the lights see of the real scene and of the virtual objects, and the records that tell shaders so."""
+
+    def __init__(self, gpu: GpuContext, tile_size: int, shadow_samples: int) -> None:
+        self._gpu = gpu
+        self.tile_size = tile_size
+        self.shadow_samples = shadow_samples
+        self.lights: list[Light] = []
+        self.mirrors: list[MirrorLight] = []  # the last of the lights
+        self.mirror_visibility = gpu.ctx.texture_array((1, 1, 1), 2, dtype="f2")
+        self.real_views: list[LightView] = []
+        self.virtual_views: list[LightView] = []
+        # Records of the views as shaders read them: they change when these do.
+        self.real_records = self.virtual_records = b""
+        self.real_atlas = ShadowMapAtlas(gpu, 1, tile_size)
+        self.virtual_atlas = ShadowMapAtlas(gpu, 1, tile_size)
+        self._light_buffer = gpu.ctx.buffer(EMPTY, dynamic=True)
+        self._view_buffer = gpu.ctx.buffer(EMPTY, dynamic=True)
+        self._environment: moderngl.TextureArray | None = None
+        self._environment_half_angle = 0.0
+        self._block = UniformBlock(gpu, LightingBlock())
+
+    @property
+    def bindings(self) -> dict[str, Binding]:
+        """Everything that shaders read of the lights, by its GLSL name."""
+        return {
+            "Lights": self._light_buffer,
+            "LightViews": self._view_buffer,
+            "Lighting": self._block,
+            "real_light_depth": self.real_atlas.depth,
+            "virtual_light_depth": self.virtual_atlas.depth,
+            "real_light_normal": self.real_atlas.normal,
+            "virtual_light_normal": self.virtual_atlas.normal,
+            "virtual_light_uv": self.virtual_atlas.uv,
+            "mirror_visibility": self.mirror_visibility,
+            "environment_map": self._environment,
+            "shadow_samples": self.shadow_samples,
+        }
+
+    def set_environment(self, radiance: Float32[np.ndarray, "n n 3"]) -> None:
+        """Uploads the residual environment R (octahedral), averaged over cones of doubling half-angle."""
+        prefiltered = prefilter(radiance)
+        size, count = len(radiance), len(prefiltered.levels)
+        directions = octahedral_grid(size)
+        layers = [radiance, *(sample_octahedral(level, directions) for level in prefiltered.levels[1:])]
+        rgba = np.ones((count, size, size, 4), np.float16)
+        rgba[..., :3] = np.stack(layers)
+        if self._environment is not None:
+            self._environment.release()
+        self._environment = self._gpu.ctx.texture_array((size, size, count), 4, rgba.tobytes(), dtype="f2")
+        self._environment.filter = (moderngl.LINEAR, moderngl.LINEAR)
+        self._environment.repeat_x = self._environment.repeat_y = False
+        self._environment_half_angle = float(prefiltered.half_angles[0])
+        self._write_block()
+
+    def place(
+        self,
+        lights: list[Light],
+        real_points: Float64[np.ndarray, "n 3"],
+        receivers: Float64[np.ndarray, "k 3"],
+        virtual_points: Float64[np.ndarray, "m 3"],
+        mirrors: Sequence[MirrorLight] = (),
+    ) -> None:
+        """Fits each light's views: around the real points that may receive the objects' shadow, and closely around
+        the virtual objects; those of mirror images before their planes.
+        """
+        self.mirrors = list(mirrors)
+        self._make_mirror_maps()
+        shown = np.concatenate([receivers, virtual_points])
+        axes = [mirror_map_axes(mirror, shown) for mirror in mirrors]
+        real = [light_views(light, receivers, real_points) if len(receivers) else [] for light in lights]
+        virtual = [
+            light_views(light, virtual_points, virtual_points) if len(virtual_points) else []
+            for light in lights
+        ]
+        for mirror in mirrors:
+            real.append(mirror_views(mirror, receivers, real_points, mirror.tolerance_m))
+            virtual.append(mirror_views(mirror, virtual_points, virtual_points))
+        self.lights = [*lights, *(mirror.light for mirror in mirrors)]
+        self.real_views = [view for views in real for view in views]
+        self.virtual_views = [view for views in virtual for view in views]
+        self.real_atlas = self._atlas_for(self.real_atlas, len(self.real_views))
+        self.virtual_atlas = self._atlas_for(self.virtual_atlas, len(self.virtual_views))
+        self._write_records(real, virtual, axes)
+        self._write_block()
+
+    def _make_mirror_maps(self) -> None:
+        old, count = self.mirror_visibility, len(self.mirrors)
+        if not count or (old.width, old.layers) == (MIRROR_MAP_TEXELS, count):
+            return
+        old.release()
+        size = (MIRROR_MAP_TEXELS, MIRROR_MAP_TEXELS, count)
+        self.mirror_visibility = self._gpu.ctx.texture_array(size, 2, dtype="f2")
+        self.mirror_visibility.build_mipmaps()
+        self.mirror_visibility.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
+        self.mirror_visibility.repeat_x = self.mirror_visibility.repeat_y = False
+
+    def _atlas_for(self, atlas: ShadowMapAtlas, tiles: int) -> ShadowMapAtlas:
+        if atlas.tiles == max(tiles, 1):
+            return atlas
+        atlas.release()
+        return ShadowMapAtlas(self._gpu, max(tiles, 1), self.tile_size)
+
+    def _write_records(
+        self, real: list[list[LightView]], virtual: list[list[LightView]], axes: Sequence[MapAxes]
+    ) -> None:
+        """Writes the records of all lights and views; the real views come first."""
+        records = b""
+        first_real, first_virtual = 0, len(self.real_views)
+        first_mirror = len(self.lights) - len(self.mirrors)
+        for index, (light, real_part, virtual_part) in enumerate(
+            zip(self.lights, real, virtual, strict=True), start=-first_mirror
+        ):
+            ranges = (first_real, len(real_part), first_virtual, len(virtual_part))
+            if index < 0:
+                records += _pack_light(light, ranges)
+            else:
+                records += _pack_mirror(self.mirrors[index], index, axes[index], ranges)
+            first_real += len(real_part)
+            first_virtual += len(virtual_part)
+        self.real_records = self._packed(self.real_views)
+        self.virtual_records = self._packed(self.virtual_views)
+        packed = self.real_records + self.virtual_records
+        self._light_buffer.orphan(max(len(records), 16))
+        self._view_buffer.orphan(max(len(packed), 16))
+        self._light_buffer.write(records or EMPTY[:16])
+        self._view_buffer.write(packed or EMPTY[:16])
+
+    def _packed(self, views: list[LightView]) -> bytes:
+        columns = tile_columns(len(views))
+        records = [pack_view(view, tile, columns, self.tile_size) for tile, view in enumerate(views)]
+        return np.array(records, np.float32).tobytes()
+
+    def _write_block(self) -> None:
+        layers = 0 if self._environment is None else self._environment.layers
+        self._block.write(LightingBlock(len(self.lights), layers, self._environment_half_angle))
+
+    @property
+    def first_virtual_view(self) -> int:
+        """Index of the first virtual view's record."""
+        return len(self.real_views)
+
+    def virtual_texel_m(self, point: Float64[np.ndarray, "3"]) -> float:
+        """Largest texel of the virtual depth maps at `point`, m."""
+        return self._texel_m(self.virtual_views, point)
+
+    def real_texel_m(self, point: Float64[np.ndarray, "3"]) -> float:
+        """Largest texel of the real depth maps at `point`, m."""
+        return self._texel_m(self.real_views, point)
+
+    def _texel_m(self, views: list[LightView], point: Float64[np.ndarray, "3"]) -> float:
+        sizes = []
+        for view in views:
+            depth = (view.view_from_world @ np.append(point, 1.0))[2]
+            sizes.append(texel_size_m(view, self.tile_size, float(depth)))
+        return max(sizes, default=0.0)
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        for item in (self.real_atlas, self.virtual_atlas, self.mirror_visibility, self._block):
+            item.release()
+        for buffer in (self._light_buffer, self._view_buffer):
+            buffer.release()
+        if self._environment is not None:
+            self._environment.release()
+
+
+class MirrorVisibility:
+    """Maps where smooth real planes mirror the lights, one map for each image of a light (scene/mirror_lights.py).
+
+    A map holds how much of the light each point of the plane shows, without and with the objects; its mipmaps average
+    that over larger and larger footprints.
+    """
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self._kernel = Kernel(gpu, "mirror_visibility")
+
+    def run(self, lights: LightBuffers, noise_m: float, scene: Bindings) -> None:
+        """Fills `lights.mirror_visibility`. `noise_m`: of depth, m."""
+        count = len(lights.mirrors)
+        self._kernel.run(
+            (MIRROR_MAP_TEXELS, MIRROR_MAP_TEXELS, count),
+            scene,
+            visibility_out=lights.mirror_visibility,
+            first_image=len(lights.lights) - count,
+            bias_real=noise_m,
+            noise_m=noise_m,
+        )
+        lights.mirror_visibility.build_mipmaps()
+
+    def release(self) -> None:
+        """Frees the program."""
+        self._kernel.release()
+
+
+def mirror_map_axes(mirror: MirrorLight, points: Float64[np.ndarray, "n 3"]) -> MapAxes:
+    """Rows that multiply (x, y, z, 1) and give a map's coordinates (0..1) on the plane.
+
+    The map covers where the plane shows the light to the `points`.
+    """
+    normal, plane = mirror.plane[:3], mirror.plane
+    heights = points @ normal + plane[3]
+    points, heights = points[heights > 0], heights[heights > 0, None]
+    if isinstance(mirror.light, DirectionalLight):
+        to_light = np.broadcast_to(-mirror.light.direction.astype(float), points.shape)
+    else:
+        to_light = mirror.light.position.astype(float) - points
+    on_plane = points + to_light * (heights / -(to_light @ normal)[:, None])
+    axes = frame_along(normal)[:2]
+    local = on_plane @ axes.T
+    if not len(local):
+        local = np.zeros((1, 2))
+    low, high = local.min(axis=0), local.max(axis=0)
+    extent = max(float((high - low).max()), NEAREST_M) * MIRROR_MAP_MARGIN
+    offset = 0.5 - (low + high) / 2 / extent
+    u, v = (np.append(axis / extent, shift) for axis, shift in zip(axes, offset, strict=True))
+    return u, v
+
+
+def _pack_mirror(mirror: MirrorLight, layer: int, axes: MapAxes, ranges: Sequence[int]) -> bytes:
+    """std430 Light of an image of a light."""
+    own = mirror.tolerance_m, mirror.roughness, float(mirror.surface), float(mirror.source)
+    tail = [*mirror.plane, *mirror.f0, float(layer), *axes[0], *axes[1]]
+    return _pack_light(mirror.light, ranges, own, tail)
+
+
+def _pack_light(
+    light: Light,
+    ranges: Sequence[int],
+    own: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0),
+    tail: Sequence[float] = NOT_MIRRORED,
+) -> bytes:
+    """std430 Light: place, colour, shape, two axes and an image's own as floats, ranges of its views as integers."""
+    axis_u = axis_v = np.zeros(3)
+    shape = (0.0, 1.0, 0.0)
+    if isinstance(light, DirectionalLight):
+        kind, place, color = 0, light.direction, light.irradiance
+        shape = (math.tan(light.angular_radius_rad), 1.0, 0.0)
+    elif isinstance(light, RectangleLight):
+        kind, place, color = 3, light.position, light.radiance
+        axis_u, axis_v = light.axis_u / 2, light.axis_v / 2
+    elif isinstance(light, SpotLight):
+        kind, place, color, axis_u = 2, light.position, light.intensity, light.direction
+        blend = max(light.half_angle_rad - light.full_angle_rad, NARROWEST_BLEND_RAD)
+        shape = (light.radius_m, light.half_angle_rad / blend, 1.0 / blend)
+    else:
+        kind, place, color = 1, light.position, light.intensity
+        shape = (light.radius_m, 1.0, 0.0)
+    floats = [*place, kind, *color, own[0], *shape, own[1], *axis_u, own[2], *axis_v, own[3], *tail]
+    return np.array(floats, np.float32).tobytes() + np.array(ranges, np.int32).tobytes()

@@ -1,0 +1,249 @@
+"""Light propagation volumes: their buffers, the weights of a step, and what fills and propagates them.
+
+docs/method.md 5; the cells' layout is in shaders/common/light_cells.glsl.
+"""
+
+import math
+from dataclasses import dataclass
+
+import moderngl
+import numpy as np
+from jaxtyping import Float64
+
+from render_server.gpu.context import GpuContext
+from render_server.gpu.kernel import Bindings, Kernel, list_threads
+from render_server.passes.voxels import VolumePlacement, VoxelMipmap, VoxelStore
+
+COEFFICIENT_BYTES = 16  # a cell and channel: 4 floats
+INJECTED_SUMS = 12  # a cell: 4 coefficients x 3 channels
+COVERED_SUMS = 6  # a cell: its low faces on three axes, surfaces that face - and +
+TRANSMITTED_BYTES = 8  # a cell: its six neighbours, a byte each, padded
+CONSTANT, LINEAR = 0.5 / math.sqrt(math.pi), math.sqrt(3 / (4 * math.pi))  # Y_0 and Y_1 along its axis
+LOBE = (math.sqrt(math.pi) / 2, math.sqrt(math.pi / 3))  # clamped cosine in them
+FAR_FACE_SR, SIDE_FACE_SR = 0.40067, 0.42343  # as seen from the centre of the neighbouring cell
+DIRECTION_LENGTH = 10 / 32  # of the volume's edge: over so much a step's filter lets directions fade
+FUSED_STEPS = 2  # a dispatch: the rim of two cells still fits 32 KB of shared memory
+
+
+@dataclass(frozen=True)
+class StepWeights:
+    """What of a cell's coefficients goes on to a neighbour, for both directions of an axis up to sign.
+
+    `transfer`: (constant from constant, constant from along, along from constant, along from along);
+    `sideways`: across from across, the same for both. The 4x4 matrix has no other non-zeros.
+    """
+
+    transfer: tuple[float, float, float, float]
+    sideways: float
+
+
+def lobe_weights() -> StepWeights:
+    """Flux through each far and side face of the cell, sent on as a cosine lobe about that face.
+
+    [P2], docs/method.md 5.
+    """
+    slant = 2 / math.sqrt(5)  # cosine from the axis to the centre of a side face
+    flux = (FAR_FACE_SR + 4 * SIDE_FACE_SR, FAR_FACE_SR + 4 * SIDE_FACE_SR * slant)
+    shape = (LOBE[0] / math.pi, LOBE[1] / math.pi)
+    transfer = (
+        shape[0] * CONSTANT * flux[0],
+        shape[0] * LINEAR * flux[1],
+        shape[1] * CONSTANT * FAR_FACE_SR,
+        shape[1] * LINEAR * FAR_FACE_SR,
+    )
+    sideways = shape[1] * LINEAR * SIDE_FACE_SR * 2 * math.sqrt(1 - slant**2)
+    return StepWeights(transfer, sideways)
+
+
+def moment_weights(cells: int) -> StepWeights:
+    """Light keeps its direction: the integral of y_i y_j over the directions that pass the shared face.
+
+    A sixth of the sphere each, so the six matrices sum to the identity. Then a small fraction of the linear part is
+    left out (a filter as for P_N transport, McClarren & Hauck 2010): without it, steps of the truncated series
+    overshoot. DIRECTION_LENGTH is such that a square emitter of a quarter of the volume's edge does not light itself;
+    it then lights a floor before it within 0.02 of the form factor. Cosine lobes light it with half of its own
+    radiosity.
+    """
+    kept = 1 - 1 / (DIRECTION_LENGTH * cells)
+    nodes, weights = np.polynomial.legendre.leggauss(32)
+    u, v = np.meshgrid(nodes, nodes)
+    distance2 = 1 + u**2 + v**2
+    solid_angle = np.outer(weights, weights) * distance2**-1.5
+    cosine, lateral = distance2**-0.5, u * distance2**-0.5
+
+    def moment(a: Float64[np.ndarray, "n n"], b: Float64[np.ndarray, "n n"]) -> float:
+        return float((a * b * solid_angle).sum())
+
+    one = np.full_like(u, CONSTANT)
+    along, aside = LINEAR * cosine, LINEAR * lateral
+    mixed = moment(one, along)
+    transfer = (moment(one, one), mixed, kept * mixed, kept * moment(along, along))
+    return StepWeights(transfer, kept * moment(aside, aside))
+
+
+class LightVolume:
+    """State between steps (two buffers in turn) and the total, 3 channels x cells x 4 coefficients each."""
+
+    def __init__(self, gpu: GpuContext, cells: int) -> None:
+        self.cells = cells
+        size = 3 * cells**3 * COEFFICIENT_BYTES
+        self.state, self.next_state, self.total = (gpu.ctx.buffer(reserve=size) for _ in range(3))
+
+    def swap(self) -> None:
+        """Makes what was written the state."""
+        self.state, self.next_state = self.next_state, self.state
+
+    def release(self) -> None:
+        """Frees the buffers."""
+        for buffer in (self.state, self.next_state, self.total):
+            buffer.release()
+
+
+def injected_sums(gpu: GpuContext, cells: int) -> moderngl.Buffer:
+    """Fixed-point sums of injected light, empty."""
+    return _zeros(gpu, cells**3 * INJECTED_SUMS * 4)
+
+
+def covered_sums(gpu: GpuContext, cells: int) -> moderngl.Buffer:
+    """Fixed-point sums of covered faces, empty."""
+    return _zeros(gpu, cells**3 * COVERED_SUMS * 4)
+
+
+def transmitted_fractions(gpu: GpuContext, cells: int) -> moderngl.Buffer:
+    """What gets into each cell from its neighbours, packed; nothing until `LpvTransmit` writes it."""
+    return _zeros(gpu, cells**3 * TRANSMITTED_BYTES)
+
+
+def _zeros(gpu: GpuContext, size: int) -> moderngl.Buffer:
+    buffer = gpu.ctx.buffer(reserve=size)
+    buffer.clear()
+    return buffer
+
+
+class LpvStart:
+    """Turns fixed-point sums of injected light into the state before the first step."""
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self._kernel = Kernel(gpu, "lpv_start")
+
+    def run(self, volume: LightVolume, *sums: moderngl.Buffer) -> None:
+        """Starts state and total of `volume` with one to three `sums`, added up."""
+        first, second, third = (*sums, None, None)[:3]
+        self._kernel.run(
+            (volume.cells**3,),
+            First=first,
+            Second=second,
+            Third=third,
+            State=volume.state,
+            Total=volume.total,
+            cells=volume.cells,
+            count_of_sums=len(sums),
+        )
+
+    def release(self) -> None:
+        """Frees the GL object."""
+        self._kernel.release()
+
+
+class LpvShow:
+    """Draws the injected change into cells for debug view `volume`."""
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self._kernel = Kernel(gpu, "lpv_show")
+
+    def run(self, shown: VoxelMipmap, cells: int, change: moderngl.Buffer, shadow: moderngl.Buffer) -> None:
+        """Writes the sum of both buffers into level 0 of `shown`, which has one direction."""
+        self._kernel.run(
+            (cells, cells, cells), shown=shown.texture, Change=change, Shadow=shadow, cells=cells
+        )
+
+    def release(self) -> None:
+        """Frees the GL object."""
+        self._kernel.release()
+
+
+class LpvCoverFaces:
+    """Builds the geometry volume: how much of each cell face surfaces cover (Kaplanyan & Dachsbacher 2010)."""
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self._threads = list_threads(gpu)
+        self._kernel = Kernel(gpu, "lpv_cover_faces")
+
+    def run(self, covered: moderngl.Buffer, store: VoxelStore, cells: VolumePlacement) -> None:
+        """Replaces the sums of `covered` by those of the surfels of `store`.
+
+        `cells` is the placement of the cells; `store` was voxelized at half a cell an edge.
+        """
+        covered.clear()
+        self._kernel.run(
+            (self._threads,), store.bindings, Covered=covered, cells=cells.size, cell_edge=cells.voxel_edge
+        )
+
+    def release(self) -> None:
+        """Frees the GL object."""
+        self._kernel.release()
+
+
+class LpvTransmit:
+    """Computes the fraction of light that gets into each cell from its neighbours past covered faces."""
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self._real = Kernel(gpu, "lpv_transmit")
+        self._joint = Kernel(gpu, "lpv_transmit", JOINT=1)
+
+    def run(
+        self, out: moderngl.Buffer, cells: int, real: moderngl.Buffer, virtual: moderngl.Buffer | None = None
+    ) -> None:
+        """Fills `out` from the covered faces of the real scene, and of the objects if given."""
+        kernel = self._real if virtual is None else self._joint
+        kernel.run((cells**3,), RealCovered=real, VirtualCovered=virtual, Transmitted=out, cells=cells)
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        self._real.release()
+        self._joint.release()
+
+
+class LpvPropagate:
+    """Propagates light from cell to cell (docs/method.md 5).
+
+    `tiled`: in shared memory, several steps a dispatch (default on a GPU), else one by one.
+    """
+
+    def __init__(self, gpu: GpuContext, *, tiled: bool | None = None) -> None:
+        self._tiled = not gpu.is_software if tiled is None else tiled
+        self._kernels = (
+            {count: Kernel(gpu, "lpv_propagate", FUSED=count) for count in (1, FUSED_STEPS)}
+            if self._tiled
+            else {1: Kernel(gpu, "lpv_propagate_plain")}
+        )
+
+    def run(
+        self, volume: LightVolume, weights: StepWeights, steps: int, transmitted: moderngl.Buffer | None
+    ) -> None:
+        """Makes `steps` steps; without `transmitted` nothing blocks."""
+        medium: Bindings = {
+            "Transmitted": transmitted,
+            "has_geometry": transmitted is not None,
+            "transfer": weights.transfer,
+            "sideways": weights.sideways,
+        }
+        channels = 3 if self._tiled else 1  # the plain step walks over them
+        threads = (volume.cells, volume.cells, channels * volume.cells)
+        while steps > 0:
+            count = max(count for count in self._kernels if count <= steps)
+            self._kernels[count].run(
+                threads,
+                medium,
+                State=volume.state,
+                Next=volume.next_state,
+                Total=volume.total,
+                cells=volume.cells,
+            )
+            volume.swap()
+            steps -= count
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        for kernel in self._kernels.values():
+            kernel.release()

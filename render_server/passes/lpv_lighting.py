@@ -1,0 +1,157 @@
+"""Light into and out of light propagation volumes: injection, bounces, irradiance of surfaces (docs/method.md 5)."""
+
+import moderngl
+
+from render_server.gpu.context import GpuContext
+from render_server.gpu.kernel import Binding, Bindings, Kernel, list_threads
+from render_server.passes.caustics import GREATEST_ALPHA
+from render_server.passes.cones import ConeFields, LowResGrid
+from render_server.passes.lights import LightBuffers
+from render_server.passes.lpv import LightVolume
+from render_server.passes.voxels import VoxelStore
+
+
+def light_volume_bindings(mu: LightVolume, rho: LightVolume) -> dict[str, Binding]:
+    """The light without and with objects, as shaders/common/lpv_light.glsl reads it."""
+    return {"WithoutObjects": mu.total, "WithObjects": rho.total}
+
+
+class LpvInjectMaps:
+    """Adds the light of reflective shadow maps to fixed-point sums ([P2] 4.3)."""
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self._real = Kernel(gpu, "lpv_inject_maps", REAL=1, GREATEST_ALPHA=GREATEST_ALPHA)
+        self._change = Kernel(gpu, "lpv_inject_maps", GREATEST_ALPHA=GREATEST_ALPHA)
+        self._direct = Kernel(gpu, "lpv_inject_maps", DIRECT=1, GREATEST_ALPHA=GREATEST_ALPHA)
+
+    def add_real(
+        self, sums: moderngl.Buffer, lights: LightBuffers, real_albedo: moderngl.Texture, scene: Bindings
+    ) -> None:
+        """Adds what the real scene reflects, as if no object stood in the way."""
+        views = range(len(lights.real_views))
+        _inject_views(self._real, views, lights, scene, Injected=sums, real_albedo=real_albedo)
+
+    def add_change(
+        self, sums: moderngl.Buffer, lights: LightBuffers, real_albedo: moderngl.Texture, scene: Bindings
+    ) -> None:
+        """Adds what the objects reflect, less what the real scene behind them reflected."""
+        views = _virtual_views(lights)
+        _inject_views(self._change, views, lights, scene, Injected=sums, real_albedo=real_albedo)
+
+    def add_shadow(
+        self, sums: moderngl.Buffer, lights: LightBuffers, real_albedo: moderngl.Texture, scene: Bindings
+    ) -> None:
+        """Subtracts the light itself where the objects keep it off the real scene."""
+        views = _virtual_views(lights)
+        _inject_views(self._direct, views, lights, scene, Injected=sums, real_albedo=real_albedo)
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        for kernel in (self._real, self._change, self._direct):
+            kernel.release()
+
+
+def _virtual_views(lights: LightBuffers) -> range:
+    first = lights.first_virtual_view
+    return range(first, first + len(lights.virtual_views))
+
+
+def _inject_views(
+    kernel: Kernel, views: range, lights: LightBuffers, scene: Bindings, **own: Binding
+) -> None:
+    for view in views:
+        kernel.run((lights.tile_size, lights.tile_size), scene, view_index=view, **own)
+
+
+class LpvInjectSurfaces:
+    """Adds what surfaces do to the light of the environment, and what they emit, to fixed-point sums."""
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self._threads = list_threads(gpu)
+        self._real = Kernel(gpu, "lpv_inject_surfaces", REAL=1)
+        self._virtual = Kernel(gpu, "lpv_inject_surfaces")
+
+    def add_real(self, sums: moderngl.Buffer, store: VoxelStore, scene: Bindings) -> None:
+        """Adds the real scene's surfels."""
+        self._real.run((self._threads,), store.bindings, scene, Injected=sums)
+
+    def add_virtual(self, sums: moderngl.Buffer, store: VoxelStore, scene: Bindings) -> None:
+        """Adds the objects' surfels."""
+        self._virtual.run((self._threads,), store.bindings, scene, Injected=sums)
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        self._real.release()
+        self._virtual.release()
+
+
+class LpvBounce:
+    """Adds what surfaces reflect of the light that propagation brought to them to fixed-point sums."""
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self._threads = list_threads(gpu)
+        self._real = Kernel(gpu, "lpv_bounce", REAL=1)
+        self._virtual = Kernel(gpu, "lpv_bounce")
+
+    def run(
+        self,
+        sums: moderngl.Buffer,
+        stores: tuple[VoxelStore, VoxelStore],
+        light: tuple[LightVolume, LightVolume],
+        scene: Bindings,
+    ) -> None:
+        """Adds real and virtual surfels under the light without and with objects."""
+        volumes = light_volume_bindings(*light)
+        for kernel, store in zip((self._real, self._virtual), stores, strict=True):
+            kernel.run((self._threads,), store.bindings, volumes, scene, Injected=sums)
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        self._real.release()
+        self._virtual.release()
+
+
+class LpvQuery:
+    """Reads irradiance from light volumes on the reduced grid, into the fields that cones fill elsewhere."""
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self._real = Kernel(gpu, "lpv_query", REAL=1)
+        self._change = Kernel(gpu, "lpv_query", REAL=1, CHANGE=1)
+        self._virtual = Kernel(gpu, "lpv_query")
+
+    def read_real(
+        self,
+        fields: ConeFields,
+        grid: LowResGrid,
+        mu: LightVolume | None,
+        rho: LightVolume,
+        scene: Bindings,
+    ) -> None:
+        """Writes E_mu and E_rho of real surfaces; without `mu`, `rho` is the change itself."""
+        kernel = self._change if mu is None else self._real
+        kernel.run(
+            grid.size,
+            grid.bindings,
+            light_volume_bindings(rho if mu is None else mu, rho),
+            scene,
+            irradiance_mu=fields.mu,
+            irradiance_rho=fields.rho,
+            specular_mu=fields.specular_mu,
+            specular_rho=fields.specular_rho,
+        )
+
+    def read_virtual(self, fields: ConeFields, grid: LowResGrid, rho: LightVolume, scene: Bindings) -> None:
+        """Writes the irradiance of virtual surfaces, and what a mirror there would show."""
+        self._virtual.run(
+            grid.size,
+            grid.bindings,
+            light_volume_bindings(rho, rho),
+            scene,
+            irradiance_rho=fields.virtual,
+            specular_rho=fields.virtual_specular,
+        )
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        for kernel in (self._real, self._change, self._virtual):
+            kernel.release()

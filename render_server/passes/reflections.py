@@ -1,0 +1,193 @@
+"""Reflections: virtual objects in smooth real surfaces, and the camera's picture in smooth virtual ones."""
+
+from collections.abc import Mapping
+
+import moderngl
+import numpy as np
+
+from render_server.gpu.context import GpuContext
+from render_server.gpu.kernel import Bindings, Kernel, list_threads
+from render_server.gpu.textures import texture_2d
+from render_server.passes.caustics import GREATEST_ALPHA
+from render_server.passes.cones import ConeFields, LowResGrid
+from render_server.passes.ray_tracing import ObjectBvh
+from render_server.passes.shading import DirectLight
+
+# Of equal energy each: up to RAY_ROUGHNESS they stand closer than voxels do. There the cone of the lobe is 48 degrees
+# wide and the rays some 12 apart: a fifth of an object's length away from it, six of 64 voxels.
+RAY_COUNT = 16
+# Of surfaces; from here on cones serve. They span many voxels there, and so few rays would show as grain.
+RAY_ROUGHNESS = 0.3
+GROUP = 64  # invocations of a workgroup, one a ray
+ROW = 256  # workgroups a row: OpenGL promises no more than 65535
+
+# A lobe that holds 85 % of its energy within 45 degrees and more is as good as diffuse: the wider cones serve.
+ROUGHEST = GREATEST_ALPHA**0.5
+CONE_COUNT = 4
+# A disc of even weight whose median is that of the GGX lobe has so many times alpha as its half-angle (rad): half of
+# the lobe lies within 2 alpha, half of a disc within 1 / sqrt(2) of its radius. The cones share the disc.
+MEDIAN_DISC = 2.0 * 2.0**0.5 / CONE_COUNT**0.5
+
+
+class MirrorRays:
+    """Traces the virtual objects in smooth real surfaces by rays, because cones through voxels would blur them.
+
+    `reflection` (RGBA16F): radiance of the objects times the fraction of the lobe that they fill, and that fraction.
+    `gather` completes the name of the kernel that finds the light of reflected points (`mirror_gather...`); `defines`
+    are those that it needs.
+    """
+
+    def __init__(
+        self,
+        gpu: GpuContext,
+        grid: LowResGrid,
+        objects: ObjectBvh,
+        gather: str,
+        defines: Mapping[str, float | str],
+    ) -> None:
+        self._grid, self._objects = grid, objects
+        self.reflection = texture_2d(gpu, grid.picture_size, 4, "f2")
+        self._traced = texture_2d(gpu, grid.picture_size, 4, "f2")
+        self._hit_distance = texture_2d(gpu, grid.picture_size, 1, "f2")
+        self._position = texture_2d(gpu, grid.size, 4, "f4")
+        self._normal = texture_2d(gpu, grid.size, 4, "f2")
+        self._irradiance = texture_2d(gpu, grid.size, 4, "f2")
+        self._specular = texture_2d(gpu, grid.size, 4, "f2")
+        self._pixels = gpu.ctx.buffer(reserve=4 + 4 * grid.picture_size[0] * grid.picture_size[1])
+        self._texels = gpu.ctx.buffer(reserve=4 + 4 * grid.size[0] * grid.size[1])
+        self._select, self._hits, self._gather, self._trace, self._smooth = (
+            Kernel(gpu, f"mirror_{name}", RAY_ROUGHNESS=RAY_ROUGHNESS, RAY_COUNT=RAY_COUNT, **defines)
+            for name in ("select", "hits", gather, "objects", "smooth")
+        )
+
+    def run(self, light: Bindings, scene: Bindings) -> None:
+        """Fills `reflection`; `light` is what the gathering kernel reads beside the scene.
+
+        Waits for the GPU to say how many pixels need rays: where none do, nothing is built or traced.
+        """
+        count = self._list_pixels(scene)
+        if not count:
+            return
+        self._gather_light(light, scene)
+        self._trace_rays(count, scene)
+        self._smooth.run(
+            (count,),
+            scene,
+            Texels=self._pixels,
+            reflection=self.reflection,
+            traced=self._traced,
+            hit_distance=self._hit_distance,
+        )
+
+    def _list_pixels(self, scene: Bindings) -> int:
+        """Lists the pixels that need rays and returns how many they are; the others reflect nothing."""
+        _clear_list(self._pixels)
+        self._select.run(
+            self._grid.picture_size,
+            scene,
+            Texels=self._pixels,
+            reflection=self.reflection,
+            traced=self._traced,
+            hit_distance=self._hit_distance,
+            bounds_centre=tuple(self._objects.centre),
+            bounds_radius=self._objects.radius,
+        )
+        return _list_length(self._pixels)
+
+    def _gather_light(self, light: Bindings, scene: Bindings) -> None:
+        """Finds the light at reflected points, at the resolution of the cones."""
+        grid = self._grid
+        _clear_list(self._texels)
+        self._hits.run(
+            grid.size,
+            self._objects.bindings,
+            scene,
+            Texels=self._texels,
+            position_out=self._position,
+            normal_out=self._normal,
+            sample_pixels=grid.pixels,
+            scale=grid.scale,
+        )
+        self._gather.run(
+            (_list_length(self._texels),),
+            light,
+            scene,
+            Texels=self._texels,
+            sample_pixels=grid.pixels,
+            hit_position=self._position,
+            hit_normal=self._normal,
+            irradiance_out=self._irradiance,
+            specular_out=self._specular,
+        )
+
+    def _trace_rays(self, count: int, scene: Bindings) -> None:
+        groups = -(-count * RAY_COUNT // GROUP)
+        self._trace.run(
+            (GROUP * min(groups, ROW), -(-groups // ROW)),
+            self._objects.bindings,
+            scene,
+            Texels=self._pixels,
+            traced=self._traced,
+            hit_distance=self._hit_distance,
+            sample_pixels=self._grid.pixels,
+            scale=self._grid.scale,
+            hit_position=self._position,
+            hit_normal=self._normal,
+            hit_irradiance=self._irradiance,
+            hit_specular=self._specular,
+        )
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        for item in vars(self).values():
+            if hasattr(item, "release") and item not in (self._grid, self._objects):
+                item.release()
+
+
+class ScreenCones:
+    """Traces what smooth virtual surfaces reflect of the real scene that the camera sees ([D] 4.4.2).
+
+    `reflected` (RGBA16F): radiance times fraction of the specular lobe, and that fraction, on the picture's grid.
+    `march`: the defines of march.glsl where what the picture does not show is looked for among voxels and in the
+    environment; the fraction is 1 then. None: that fraction of the lobe remains for others.
+    """
+
+    def __init__(self, gpu: GpuContext, grid: LowResGrid, march: Mapping[str, float | str] | None) -> None:
+        self._grid = grid
+        self._threads = list_threads(gpu, grid.picture_size[0] * grid.picture_size[1])
+        self.reflected = texture_2d(gpu, grid.picture_size, 4, "f2")
+        voxels = {} if march is None else {"VOXELS": 1, **march}
+        self._kernel = Kernel(
+            gpu, "screen_cones", ROUGHEST=ROUGHEST, CONE_COUNT=CONE_COUNT, MEDIAN_DISC=MEDIAN_DISC, **voxels
+        )
+
+    def run(self, direct: DirectLight, cones: ConeFields, objects: ObjectBvh, scene: Bindings) -> None:
+        """Fills `reflected`; the picture needs its levels (`CameraImage.build_levels`)."""
+        self._kernel.run(
+            (self._threads,),
+            objects.bindings,
+            scene,
+            reflected=self.reflected,
+            Texels=self._grid.virtual_texels,
+            sample_pixels=self._grid.pixels,
+            scale=self._grid.scale,
+            direct_mu=direct.mu,
+            direct_rho=direct.rho,
+            cone_mu=cones.mu,
+            cone_rho=cones.rho,
+        )
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        self.reflected.release()
+        self._kernel.release()
+
+
+def _clear_list(texels: moderngl.Buffer) -> None:
+    """Empties a list of shaders/common/work_list.glsl."""
+    texels.write(bytes(4))
+
+
+def _list_length(texels: moderngl.Buffer) -> int:
+    """Waits for the GPU and returns how many texels a list holds."""
+    return int(np.frombuffer(texels.read(4), np.uint32)[0])

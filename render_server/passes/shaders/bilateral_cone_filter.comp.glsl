@@ -1,0 +1,59 @@
+// Four neighbouring texels looked along a quarter of the cones each (trace_cones): their mean looked along all of them.
+// A tent over 3 x 3 texels gives the four quarters the same weight; texels whose surface does not continue this one's
+// are left out.
+#include "common/low_res_grid.glsl"
+#include "common/continuation.glsl"
+
+layout(local_size_x = 8, local_size_y = 8) in;
+uniform sampler2D traced_rho;
+layout(rgba16f) writeonly uniform image2D irradiance_rho;
+#ifdef REAL
+uniform sampler2D traced_mu;                        // a: 1 where traced
+layout(rgba16f) writeonly uniform image2D irradiance_mu;
+#endif
+#include "common/camera.glsl"
+uniform float sample_distance;
+
+float tent(ivec2 o) { return float((2 - abs(o.x)) * (2 - abs(o.y))); }
+
+bool traced(ivec2 texel) {
+    if (any(lessThan(texel, ivec2(0))) || any(greaterThanEqual(texel, low_resolution_size))) return false;
+#ifdef REAL
+    return texelFetch(traced_mu, texel, 0).a > 0.0;
+#else
+    return texelFetch(traced_rho, texel, 0).a > 0.0;
+#endif
+}
+
+void average(ivec2 texel, inout vec3 mu, inout vec3 rho) {
+    SurfacePoint s = surface_point(texel);
+    float near = sample_distance * distance(s.position, camera_position), total = 0.0;
+    mu = rho = vec3(0.0);
+    for (int i = 0; i < 9; ++i) {
+        ivec2 o = ivec2(i % 3, i / 3) - 1, at = texel + o;
+        if (!traced(at)) continue;
+        SurfacePoint other = surface_point(at);
+        float w = tent(o) * continuation(s.position, s.normal, other.position, other.normal, near);
+        total += w;
+        rho += w * texelFetch(traced_rho, at, 0).rgb;
+#ifdef REAL
+        mu += w * texelFetch(traced_mu, at, 0).rgb;
+#endif
+    }
+    mu /= total;   // its own weight is 4
+    rho /= total;
+}
+
+void main() {
+    ivec2 texel = ivec2(gl_GlobalInvocationID.xy);
+    if (any(greaterThanEqual(texel, low_resolution_size))) return;
+    vec4 rho = texelFetch(traced_rho, texel, 0), mu = vec4(0.0);
+#ifdef REAL
+    mu = texelFetch(traced_mu, texel, 0);
+#endif
+    if (traced(texel)) average(texel, mu.rgb, rho.rgb);
+    imageStore(irradiance_rho, texel, rho);
+#ifdef REAL
+    imageStore(irradiance_mu, texel, mu);
+#endif
+}

@@ -1,0 +1,174 @@
+// Beams of light that smooth virtual surfaces reflect: the flux of each block of a light's map of the objects is split
+// over a few rays, each followed to the first surface that it meets. WIDE: they sample the GGX lobe; otherwise all go in the
+// mirror direction.
+#include "common/light_rays.glsl"
+#include "common/brdf.glsl"
+#include "common/geometry.glsl"
+#include "common/ray_mesh.glsl"
+#include "common/ray_pattern.glsl"
+#include "common/lobe.glsl"
+#include "common/packing.glsl"
+#include "common/beams.glsl"
+
+layout(local_size_x = 8, local_size_y = 8) in;
+uniform sampler2D virtual_light_uv;
+uniform sampler2D virtual_light_normal;
+uniform int view_index;
+uniform int block_edge;        // texels
+uniform float least_alpha;     // materials of lobes from this width on,
+uniform float greatest_alpha;  // below that one
+uniform float bias_real;       // m
+uniform float normal_offset;   // m: away from the object's own triangles
+uniform float reach;           // m: how far beams are followed
+#include "common/camera.glsl"
+
+#ifdef WIDE
+const float LOBE_FRACTION = 0.5;    // a ray stands for part of its lobe: that wide, so that all together are little wider
+#else
+const float LOBE_FRACTION = 1.0;    // all go in the mirror direction, and are as wide as the lobe
+#endif
+const float RAYS_APART = inversesqrt(float(RAY_COUNT));   // of a block's edge
+const float OVERLAP = 0.6;          // deviation, of the way to the next beam: their sum is even within a few percent
+// Deviation of the normal distribution that is as high as a GGX lobe cut off at 85 % of its energy; half-vectors turn
+// half as far as what they reflect.
+const float LOBE_DEVIATION = 2.0 * 0.65;
+const float ALIKE = 0.5;            // cosine between normals of neighbours on one smooth surface
+const float MARCH_PIXELS = 2.0;     // a step of the march over the depth image
+const int MARCH_STEPS = 512;
+
+struct Spot { bool present; vec3 point; vec3 normal; vec3 seen_from; int material; };   // seen_from: direction of the light
+
+Spot spot_at(LightView view, ivec2 texel) {
+    Spot spot = Spot(false, vec3(0.0), vec3(0.0), vec3(0.0), -1);
+    vec2 inside = vec2(texel) - view.tile.xy;
+    if (any(lessThan(inside, vec2(0.0))) || any(greaterThanEqual(inside, view.tile.zz))) return spot;
+    float depth = first_depth(virtual_light_depth, view, texel);
+    if (depth == NOTHING) return spot;
+    vec4 normal = texelFetch(virtual_light_normal, texel, 0);
+    vec2 s = texel_lateral(view, texel);
+    spot.point = ray_point(view, s, depth);
+    spot.seen_from = normalize(ray_point(view, s, 2.0) - ray_point(view, s, 1.0));
+    spot.normal = dot(normal.xyz, spot.seen_from) > 0.0 && materials[int(normal.w)].flags.x > 0.5 ? -normal.xyz : normal.xyz;
+    // Smooth normals lean beyond the horizon at silhouettes: there the surface is seen edge on.
+    float facing = dot(spot.normal, -spot.seen_from);
+    spot.normal = normalize(spot.normal - max(1e-2 - facing, 0.0) * spot.seen_from);
+    spot.material = int(normal.w);
+    spot.present = true;
+    return spot;
+}
+
+bool is_wanted(int material) {
+    vec4 dielectric = materials[material].dielectric;
+    float alpha = dielectric.a * dielectric.a;
+    bool smooth_enough = alpha >= least_alpha && alpha < greatest_alpha;
+    return smooth_enough && (materials[material].base_color.a > 0.0 || has_interface(dielectric.rgb));
+}
+
+// How a mirror's ray moves from this texel to the next block along `axis`, at a distance t.
+struct Drift { vec3 start; vec3 turn; };
+
+Drift drift_along(LightView view, ivec2 texel, ivec2 axis, Spot here, float side) {
+    int apart = max(block_edge / 2, 1);
+    vec3 own = reflect(here.seen_from, here.normal);
+    for (int sign = 1; sign >= -1; sign -= 2) {
+        Spot other = spot_at(view, texel + sign * apart * axis);
+        if (!other.present || other.material != here.material || dot(other.normal, here.normal) < ALIKE) continue;
+        float blocks = float(sign * block_edge) / float(apart) * RAYS_APART;
+        return Drift(blocks * (other.point - here.point), blocks * (reflect(other.seen_from, other.normal) - own));
+    }
+    vec3 across = transpose(mat3(view.view_from_world)) * vec3(vec2(axis), 0.0) * side * float(block_edge) * RAYS_APART;
+    return Drift(across, vec3(0.0));   // alone on its block: as if it were flat
+}
+
+// Distance at which a ray meets what the camera sees of the real scene, 1e30 if it does not.
+float meets_real(vec3 from, vec3 direction, float limit) {
+    float t = 0.0;
+    for (int i = 0; i < MARCH_STEPS && t < limit; ++i) {
+        vec3 p = from + t * direction;
+        vec3 c = (camera_from_world * vec4(p, 1.0)).xyz;
+        vec2 pixel = camera_pinhole.xy * c.xy / c.z + camera_pinhole.zw + 0.5;
+        if (c.z <= 0.0 || any(lessThan(pixel, vec2(0.0))) || any(greaterThanEqual(pixel, picture_size))) break;
+        float stride = MARCH_PIXELS * c.z / camera_pinhole.x;
+        vec4 seen = texelFetch(real_surface_position, ivec2(pixel), 0);
+        vec3 n = texelFetch(real_surface_normal, ivec2(pixel), 0).xyz;
+        float before = dot(p - seen.xyz, n), slope = dot(direction, n);
+        if (seen.w > 0.0 && before <= 0.0 && slope < 0.0 && distance(p, seen.xyz) < 4.0 * stride)
+            return max(t - before / slope, 0.0);
+        t += stride;
+    }
+    return 1e30;
+}
+
+// Fraction of a lobe's ray that is not lost between microfacets (Heitz 2014), for visible normals.
+float unmasked(float n_dot_v, float n_dot_l, float alpha) {
+    vec2 c = vec2(n_dot_v, n_dot_l);
+    vec2 lambda = 0.5 * (sqrt(1.0 + alpha * alpha * (1.0 / (c * c) - 1.0)) - 1.0);
+    return (1.0 + lambda.x) / (1.0 + lambda.x + lambda.y);
+}
+
+// The footprint's variance has a part of the way to the next beams along both axes, and `round`, the deviation in all
+// directions that each beam has of its own.
+void set_footprint(inout Beam beam, Drift x, Drift y, float round) {
+    mat3 basis = basis_around(beam.direction.xyz);
+    vec2 a = OVERLAP * ((x.start + beam.from.w * x.turn) * basis).xy;
+    vec2 b = OVERLAP * ((y.start + beam.from.w * y.turn) * basis).xy;
+    float xx = a.x * a.x + b.x * b.x + round * round, xy = a.x * a.y + b.x * b.y;
+    float yy = a.y * a.y + b.y * b.y + round * round;
+    float det = max(xx * yy - xy * xy, 1e-20);
+    beam.across = vec4(vec3(yy, -xy, xx) / det, 1.0 / (2.0 * PI * sqrt(det) * FOOTPRINT_FRACTION));
+    float half_sum = 0.5 * (xx + yy);
+    beam.direction.w = FOOTPRINT_CUT * sqrt(half_sum + sqrt(max(half_sum * half_sum - det, 0.0)));
+}
+
+void send(Spot spot, vec3 direction, vec3 flux, float spread, Drift x, Drift y) {
+    Beam beam;
+    beam.from = vec4(spot.point + normal_offset * spot.normal, 0.0);
+    MeshHit hit = closest_hit(Ray(beam.from.xyz, direction));
+    float object = hit.triangle < 0 ? 1e30 : hit.distance;
+    float real = meets_real(beam.from.xyz, direction, min(object, reach));
+    beam.from.w = min(object, real);
+    if (beam.from.w > reach) return;
+    beam.direction = vec4(direction, 0.0);
+    beam.flux = vec4(flux, real < object ? 0.0 : 1.0);
+    set_footprint(beam, x, y, spread * beam.from.w);
+    uint at = atomicAdd(beam_count, 1u);
+    if (at < uint(beams.length())) beams[at] = beam;
+}
+
+// Ray j of a block: its texel is one of RAY_COUNT spread evenly over the block, which divide the block's flux.
+void reflect_ray(Light light, LightView view, ivec2 block, int j) {
+    vec4 numbers = ray_numbers(block, j);
+    ivec2 texel = ivec2(view.tile.xy) + ivec2((vec2(block) + numbers.zw) * float(block_edge));
+    Spot spot = spot_at(view, texel);
+    if (!spot.present || !is_wanted(spot.material)) return;
+    vec3 to_light; float radius;
+    light_at(light, spot.point, spot.normal, to_light, radius);
+    float fraction = float(block_edge * block_edge) / float(RAY_COUNT);
+    vec3 flux = fraction * texel_light(light, view, texel_lateral(view, texel));
+    if (flux == vec3(0.0)) return;
+    flux *= real_visibility(light, spot.point, spot.normal, bias_real);
+    vec4 uv = texelFetch(virtual_light_uv, texel, 0);
+    Material m = material_of(spot.material, uv.xy, unpack_color(uv.z));
+    float alpha = max(m.roughness * m.roughness, LEAST_ALPHA);
+    vec3 v = -spot.seen_from, h = spot.normal;
+#ifdef WIDE
+    mat3 basis = basis_around(spot.normal);
+    h = basis * visible_normal(numbers.xy, v * basis, alpha);
+#endif
+    vec3 direction = reflect(-v, h);
+    float n_dot_l = dot(spot.normal, direction);
+    if (n_dot_l <= 0.0) return;
+    flux *= fresnel_schlick(m.f0, dot(v, h)) * unmasked(dot(spot.normal, v), n_dot_l, alpha);
+    float spread = length(vec2(LOBE_DEVIATION * alpha * LOBE_FRACTION, 0.5 * radius));   // a disc's deviation is half its radius
+    float side = texel_side(view, (view.view_from_world * vec4(spot.point, 1.0)).z);
+    Drift x = drift_along(view, texel, ivec2(1, 0), spot, side), y = drift_along(view, texel, ivec2(0, 1), spot, side);
+    send(spot, direction, flux, spread, x, y);
+}
+
+void main() {
+    LightView view = light_views[view_index];
+    ivec3 at = ivec3(gl_GlobalInvocationID);
+    Light light = lights[light_of_view(view_index)];
+    if (any(greaterThanEqual(at.xy * block_edge, ivec2(view.tile.zz))) || is_image(light)) return;
+    reflect_ray(light, view, at.xy, at.z);
+}

@@ -1,0 +1,67 @@
+// How light changed on the reduced grid. RATIO: E_rho / E_mu at each texel's pixel, and whether anything changed in
+// its block of pixels. Otherwise: list the texels that are within FILL_RADIUS of a change or show an object; only
+// their pixels are composed.
+#include "common/work_list.glsl"
+
+layout(local_size_x = 8, local_size_y = 8) in;
+uniform isampler2D sample_pixels;
+#ifdef RATIO
+layout(rgba16f) writeonly uniform image2D change_ratio_out;
+uniform sampler2D direct_mu;
+uniform sampler2D direct_rho;
+uniform sampler2D cone_mu;
+uniform sampler2D cone_rho;
+uniform sampler2D cone_specular_mu;
+uniform sampler2D cone_specular_rho;
+uniform sampler2D reflection;   // a: fraction of a smooth surface's lobe that objects fill
+uniform bool has_reflection;
+uniform int scale;
+
+const float LEAST_IRRADIANCE = 1e-4;
+
+bool block_changed(ivec2 texel) {
+    bool changed = false;
+    ivec2 last = textureSize(direct_mu, 0) - 1;
+    for (int i = 0; i < scale * scale; ++i) {
+        ivec2 pixel = min(pixel_in_block(texel, i, scale), last);
+        changed = changed || texelFetch(direct_mu, pixel, 0).rgb != texelFetch(direct_rho, pixel, 0).rgb
+            || (has_reflection && texelFetch(reflection, pixel, 0).a > 0.0);
+    }
+    return changed;
+}
+
+// rgb: ratio; a: 0 no real surface, 1 unchanged, 2 changed.
+vec4 value(ivec2 texel) {
+    ivec2 at = texelFetch(sample_pixels, texel, 0).xy;
+    if (at.x < 0) return vec4(1.0, 1.0, 1.0, 0.0);
+    vec4 rho = texelFetch(cone_rho, texel, 0), mu = texelFetch(cone_mu, texel, 0);
+    vec3 e_mu = texelFetch(direct_mu, at, 0).rgb + mu.rgb;
+    vec3 e_rho = texelFetch(direct_rho, at, 0).rgb + mu.rgb + rho.a * (rho.rgb - mu.rgb);
+    bool changed = e_mu != e_rho || texelFetch(cone_specular_mu, texel, 0) != texelFetch(cone_specular_rho, texel, 0)
+        || block_changed(texel);
+    return vec4((e_rho + LEAST_IRRADIANCE) / (e_mu + LEAST_IRRADIANCE), changed ? 2.0 : 1.0);
+}
+#else
+uniform sampler2D change_ratio;
+
+bool near_change(ivec2 texel) {
+    ivec2 last = textureSize(change_ratio, 0) - 1;
+    float near = 0.0;
+    for (int j = -FILL_RADIUS; j <= FILL_RADIUS; ++j)
+        for (int i = -FILL_RADIUS; i <= FILL_RADIUS; ++i)
+            near = max(near, texelFetch(change_ratio, clamp(texel + ivec2(i, j), ivec2(0), last), 0).a);
+    return near > 1.5;
+}
+#endif
+
+void main() {
+    ivec2 texel = ivec2(gl_GlobalInvocationID.xy);
+    ivec2 size = textureSize(sample_pixels, 0);
+    if (any(greaterThanEqual(texel, size))) return;
+#ifdef RATIO
+    imageStore(change_ratio_out, texel, value(texel));
+#else
+    if (texelFetch(sample_pixels, texel, 0).z >= 0 || near_change(texel))
+        append_texel(texel, size.x);
+#endif
+}

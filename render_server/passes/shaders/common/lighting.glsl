@@ -1,0 +1,6 @@
+// How many lights there are, and how the residual environment is layered (render_server/passes/lights.py).
+layout(std140) uniform Lighting {
+    int light_count;
+    int environment_layers;
+    float environment_first_half_angle;   // rad, of layer 0; the last is pi/2, cosine-weighted
+};

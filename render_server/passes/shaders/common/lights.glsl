@@ -1,0 +1,384 @@
+// Lights, their depth maps, and soft visibility with and without the virtual objects (docs/method.md 3, direct).
+#include "common/basis.glsl"
+#include "common/brdf.glsl"
+
+struct Light {
+    vec4 place;    // xyz: direction of travel (directional) or position in m; w: kind
+    vec4 color;    // rgb: E_perp (directional), intensity I (sphere, spot) or radiance L (rectangle), camera units
+    vec4 shape;    // x: tan(angular radius) (directional), radius in m (sphere, spot); y - z angle: fraction of I (spot)
+    vec4 axis_u;   // xyz: half an edge in m (rectangle) or direction of travel on the axis (spot)
+    vec4 axis_v;   // xyz: half the other edge in m (rectangle)
+    vec4 plane;    // of a mirror image: the plane (world) before which it shines
+    vec4 mirror;   // of a mirror image: F0 rgb, layer of its map of fractions; layer -1: no image. color.w: m, how far from
+                   // the plane points still belong to it; shape.w: roughness; axis_u.w: entry of the surface table;
+                   // axis_v.w: the light that it is an image of
+    vec4 map_u;    // of a mirror image: its map's coordinates of a world point are dot(xyz, p) + w
+    vec4 map_v;
+    ivec4 views;   // first view and count in the real atlas, first and count in the virtual atlas
+};
+const float DIRECTIONAL = 0.0, SPHERE = 1.0, SPOT = 2.0, RECTANGLE = 3.0;   // kinds
+
+struct LightView {
+    mat4 view_from_world;   // light at the origin (unless directional), looking along +z
+    vec4 tile;              // x, y, size in texels; half extent (m for directional, else tangent)
+    vec4 range;             // near, far in m; 1 if orthographic; 0
+    vec4 front;             // plane (world) before which the light shines
+};
+
+layout(std430) readonly buffer Lights { Light lights[]; };
+layout(std430) readonly buffer LightViews { LightView light_views[]; };
+uniform sampler2D real_light_depth;
+uniform sampler2D virtual_light_depth;
+uniform sampler2DArray mirror_visibility;   // r, g: fraction of an image that a plane shows without and with objects
+#include "common/lighting.glsl"
+uniform int shadow_samples;
+
+// Fraction of its intensity that a spot sends along d (unit, of travel); 1 for a sphere.
+float spot_fraction(Light light, vec3 d) {
+    float angle = 2.0 * asin(min(0.5 * distance(light.axis_u.xyz, d), 1.0));   // exact for small angles too
+    return clamp(light.shape.y - light.shape.z * angle, 0.0, 1.0);
+}
+
+// Half the angle between a and b (as seen from the receiver) along the normal of their plane.
+vec3 edge_term(vec3 a, vec3 b) {
+    vec3 across = cross(a, b);
+    float sine = length(across);
+    return sine < 1e-12 ? vec3(0.0) : across * (0.5 * atan(sine, dot(a, b)) / sine);
+}
+
+vec2 corner(int i) { return vec2(((i + 1) & 2) == 0 ? -1.0 : 1.0, (i & 2) == 0 ? -1.0 : 1.0); }
+
+// Vector irradiance of a rectangle of radiance 1 at p above the horizon of n: dot(result, n) is the irradiance (Lambert
+// 1760, photometry of polygons; exact). `edges` is 5, the last along the horizon, or 0 for another kind of light: on
+// llvmpipe a loop ends early and a branch does not.
+vec3 rectangle_vector(Light light, int edges, vec3 p, vec3 n) {
+    mat2x3 axes = mat2x3(light.axis_u.xyz, light.axis_v.xyz);
+    vec3 centre = light.place.xyz - p, sum = vec3(0.0), leaves = vec3(0.0), enters = vec3(0.0);
+    vec3 a = centre + axes * corner(0);
+    for (int i = 1; i <= edges; ++i) {
+        vec3 b = centre + axes * corner(i);
+        float above_a = dot(n, a), above_b = dot(n, b);
+        vec3 crossing = mix(a, b, above_a / (above_a == above_b ? 1.0 : above_a - above_b));
+        bool leaving = above_a >= 0.0 && above_b < 0.0, entering = above_a < 0.0 && above_b >= 0.0;
+        vec3 from = entering ? crossing : a, to = leaving ? crossing : b;
+        if (i == 5) { from = leaves; to = enters; }
+        else if (leaving) leaves = crossing;
+        else if (entering) enters = crossing;
+        if (i == 5 || above_a >= 0.0 || above_b >= 0.0) sum += edge_term(from, to);
+        a = b;
+    }
+    bool before = dot(cross(axes[0], axes[1]), centre) < 0.0;
+    return before ? -sum : vec3(0.0);   // seen from before, the corners run clockwise
+}
+
+// Irradiance across the beam at p of a surface with normal n, and the direction towards the light: the irradiance is
+// across * dot(n, to_light). A rectangle is one beam along its vector irradiance; its angular radius is that of the
+// disc with the same. Without a normal (0) no horizon cuts it.
+vec3 unmirrored_light_at(Light light, vec3 p, vec3 n, out vec3 to_light, out float angular_radius) {
+    vec3 d = light.place.xyz - p;
+    float distance2 = max(dot(d, d), 1e-8);
+    vec3 vector = rectangle_vector(light, light.place.w == RECTANGLE ? 5 : 0, p, n);
+    if (light.place.w == RECTANGLE) {
+        float across = length(vector);
+        to_light = across > 1e-12 ? vector / across : d * inversesqrt(distance2);
+        angular_radius = asin(min(sqrt(across / PI), 1.0));
+        return light.color.rgb * across;
+    }
+    if (light.place.w == DIRECTIONAL) {
+        to_light = -light.place.xyz;
+        angular_radius = atan(light.shape.x);
+        return light.color.rgb;
+    }
+    to_light = d * inversesqrt(distance2);
+    angular_radius = asin(min(light.shape.x * inversesqrt(distance2), 1.0));
+    return light.color.rgb / distance2 * spot_fraction(light, -to_light);
+}
+
+bool is_image(Light light) { return light.mirror.w >= 0.0; }
+
+vec3 light_at(Light light, vec3 p, vec3 n, out vec3 to_light, out float angular_radius) {
+    vec3 across = unmirrored_light_at(light, p, n, to_light, angular_radius);
+    if (!is_image(light)) return across;
+    bool before = dot(light.plane.xyz, p) + light.plane.w > 0.0;
+    float cosine = max(-dot(light.plane.xyz, to_light), 1e-3);
+    return before ? across * specular_reflectance(light.mirror.rgb, light.shape.w, cosine) : vec3(0.0);
+}
+
+// Fractions of a mirror image that its plane shows to p without and with the objects; 1 for other lights.
+vec2 mirror_fraction(Light light, vec3 p) {
+    if (!is_image(light)) return vec2(1.0);
+    vec3 n = light.plane.xyz;
+    bool distant = light.place.w == DIRECTIONAL;
+    vec3 direction = distant ? -light.place.xyz : light.place.xyz - p;
+    float part = max(dot(n, p) + light.plane.w, 0.0) / max(-dot(n, direction), 1e-6);   // of the way, up to the plane
+    vec3 q = p + part * direction;
+    float radius = light.place.w == RECTANGLE ? sqrt(length(light.axis_u.xyz) * length(light.axis_v.xyz)) : light.shape.x;
+    float texels = 2.0 * radius * part * length(light.map_u.xyz) * float(textureSize(mirror_visibility, 0).x);
+    vec2 uv = vec2(dot(light.map_u.xyz, q) + light.map_u.w, dot(light.map_v.xyz, q) + light.map_v.w);
+    return textureLod(mirror_visibility, vec3(uv, light.mirror.w), log2(max(texels, 1.0))).rg;
+}
+
+vec3 light_at(Light light, vec3 p, out vec3 to_light, out float angular_radius) {
+    return light_at(light, p, vec3(0.0), to_light, angular_radius);
+}
+
+vec2 lateral(LightView view, vec3 v) { return view.range.z > 0.5 ? v.xy : v.xy / max(v.z, 1e-6); }
+
+float linear_depth(LightView view, float d) {
+    float near = view.range.x, far = view.range.y;
+    return view.range.z > 0.5 ? mix(near, far, d) : near * far / (far - d * (far - near));
+}
+
+// Texel coordinate (pixel centres at .5) of a lateral position; outside its tile: negative.
+vec2 tile_texel(LightView view, vec2 s) {
+    vec2 uv = 0.5 + 0.5 * s / view.tile.w;
+    if (any(lessThan(uv, vec2(0.0))) || any(greaterThanEqual(uv, vec2(1.0)))) return vec2(-1.0);
+    return view.tile.xy + uv * view.tile.z;
+}
+
+const float NOTHING = 1e30;
+const float WIDE_TEXELS = 6.0;   // penumbrae wider than this get more samples
+
+float first_depth(sampler2D map, LightView view, ivec2 texel) {
+    float d = texelFetch(map, texel, 0).r;
+    return d >= 1.0 ? NOTHING : linear_depth(view, d);
+}
+
+// A receiver in a light's view: its plane, so that a tilted surface does not block its own surroundings.
+struct Receiver { vec2 s; float depth; vec3 normal; float plane; float bias; };
+
+const float DEPTH_ROUNDING = 1e-4;   // relative: no surface blocks itself by the rounding of its own depth
+
+Receiver receiver_at(LightView view, vec3 p, vec3 n, float bias) {
+    vec3 v = (view.view_from_world * vec4(p, 1.0)).xyz;
+    vec3 normal = mat3(view.view_from_world) * n;
+    normal.z = min(normal.z, -0.1);   // grazing: a slope of at most 10
+    return Receiver(lateral(view, v), v.z, normal, dot(normal, v), bias + DEPTH_ROUNDING * abs(v.z));
+}
+
+// Depth of the receiver's plane at another lateral position.
+float plane_depth(LightView view, Receiver r, vec2 s) {
+    float z = view.range.z > 0.5 ? (r.plane - dot(r.normal.xy, s)) / r.normal.z
+                                 : r.plane / min(dot(r.normal.xy, s) + r.normal.z, -1e-3);
+    return z > 0.0 ? z : r.depth;
+}
+
+// Bilinear comparison: fraction of the 2x2 texels around s that lie no nearer to the light than `depth`.
+float lit_fraction(sampler2D map, LightView view, vec2 s, float depth) {
+    vec2 t = tile_texel(view, s);
+    if (t.x < 0.0) return 1.0;
+    t = clamp(t, view.tile.xy + 0.5, view.tile.xy + view.tile.z - 0.5);
+    vec4 d = textureGather(map, t / vec2(textureSize(map, 0)), 0);   // (0,1) (1,1) (1,0) (0,0)
+    float near = view.range.x, far = view.range.y;
+    float limit = view.range.z > 0.5 ? (depth - near) / (far - near) : far * (depth - near) / (depth * (far - near));
+    vec4 lit = vec4(greaterThanEqual(d, vec4(min(depth <= near ? 0.0 : limit, 1.0))));
+    vec2 f = fract(t - 0.5);
+    return mix(mix(lit.w, lit.z, f.x), mix(lit.x, lit.y, f.x), f.y);
+}
+
+// A light's area as a receiver finds it on the map. At a blocker's depth the ray from the sample at offset o (on the
+// unit disc, or in the square -1..1 of a rectangle) is shifted laterally by gap (u o.x + v o.y) / (1 - dot(lean, o)).
+struct Spread { vec2 u; vec2 v; vec2 lean; float widest; bool square; };
+
+const float STEEPEST_LEAN = 0.9;   // samples as deep in the view as the receiver are taken as this deep
+
+Spread spread_of(Light light, LightView view, vec2 s, float depth) {
+    float size = light.shape.x;
+    Spread k = Spread(vec2(size, 0.0), vec2(0.0, size), vec2(0.0), size, light.place.w == RECTANGLE);
+    if (k.square) {
+        vec3 u = mat3(view.view_from_world) * light.axis_u.xyz, v = mat3(view.view_from_world) * light.axis_v.xyz;
+        k.u = u.xy - s * u.z;
+        k.v = v.xy - s * v.z;
+        k.lean = vec2(u.z, v.z) / depth;
+        float most = abs(k.lean.x) + abs(k.lean.y);
+        k.lean *= min(1.0, STEEPEST_LEAN / max(most, 1e-6));
+        vec2 extent = abs(k.u) + abs(k.v);
+        k.widest = max(extent.x, extent.y) / (1.0 - min(most, STEEPEST_LEAN));
+    }
+    return k;
+}
+
+// How far a ray drifts laterally between a blocker and the receiver, per unit of the light's area.
+float drift(LightView view, float receiver, float blocker) {
+    return view.range.z > 0.5 ? max(receiver - blocker, 0.0) : max(1.0 / blocker - 1.0 / receiver, 0.0);
+}
+
+vec2 shift_to(Spread k, float gap, vec2 o) {
+    return k.square ? gap * (k.u * o.x + k.v * o.y) / (1.0 - dot(k.lean, o)) : gap * k.widest * o;
+}
+
+float norm_of(Spread k, vec2 o) { return k.square ? max(abs(o.x), abs(o.y)) : length(o); }
+
+float cross2(vec2 a, vec2 b) { return a.x * b.y - a.y * b.x; }
+
+// Whether a shift, `margin` less, lies within the light's area (shift_to solved for o by Cramer's rule, undivided).
+bool within(Spread k, float gap, vec2 shift, float margin) {
+    if (!k.square) return length(shift) <= gap * k.widest + margin;
+    shift *= max(1.0 - margin / max(length(shift), 1e-12), 0.0);
+    vec2 q = vec2(cross2(shift, k.v), cross2(k.u, shift));
+    return norm_of(k, q) <= abs(gap * cross2(k.u, k.v) + dot(k.lean, q));
+}
+
+// Sample j of the light's area: a spiral on the unit disc, a Fibonacci lattice on the square.
+vec2 light_sample(Spread k, int j, int count) {
+    float along = (float(j) + 0.5) / float(count);
+    float phi = float(j) * GOLDEN_ANGLE;
+    return k.square ? 2.0 * vec2(along, fract(phi / (2.0 * PI))) - 1.0 : sqrt(along) * vec2(cos(phi), sin(phi));
+}
+
+int view_containing(int first, int count, vec3 p) {
+    for (int i = first; i < first + count - 1; ++i) {
+        LightView view = light_views[i];
+        vec3 v = (view.view_from_world * vec4(p, 1.0)).xyz;
+        if (v.z > 0.0 && all(lessThanEqual(abs(lateral(view, v)), vec2(view.tile.w)))) return i;
+    }
+    return first + count - 1;
+}
+
+// Whatever walks over a light's samples does so twice, once for discs and once for squares with no round for the other:
+// llvmpipe leaves a loop early, but takes both sides of a branch.
+
+struct Blocking { float sum; float hits; float deepest; };   // depths
+
+void add_blockers(bool square, sampler2D map, Spread k, LightView view, Receiver r, int count, inout Blocking found) {
+    k.square = square;
+    float gap = drift(view, r.depth, view.range.x);
+    float margin = view.tile.w / view.tile.z;   // half a texel
+    for (int j = 0; j < count; ++j) {
+        vec2 unit = light_sample(k, j, count);
+        vec2 offset = count == 1 ? vec2(0.0) : shift_to(k, gap, norm_of(k, unit) * unit);
+        vec2 t = tile_texel(view, r.s + offset);
+        if (t.x < 0.0) continue;
+        float d = first_depth(map, view, ivec2(t));
+        if (d >= r.depth - r.bias || !within(k, drift(view, r.depth, d), offset, margin)) continue;
+        found = Blocking(found.sum + d, found.hits + 1.0, max(found.deepest, d));
+    }
+}
+
+// Mean and greatest depth of what blocks the light's area in one map; NOTHING if nothing does. Only what lies inside
+// the cone from the receiver to that area counts, so that a tilted or noisy surface does not block itself. Samples
+// crowd towards the axis, because what is near the receiver matters only there.
+vec2 blockers(sampler2D map, Spread k, LightView view, Receiver r) {
+    float widest = k.widest * drift(view, r.depth, view.range.x);
+    float texel = 2.0 * view.tile.w / view.tile.z;
+    int count = widest < 0.5 * texel ? 1   // below half a texel: one look
+        : widest > WIDE_TEXELS * texel ? 2 * shadow_samples : shadow_samples;
+    Blocking found = Blocking(0.0, 0.0, 0.0);
+    add_blockers(false, map, k, view, r, k.square ? 0 : count, found);
+    add_blockers(true, map, k, view, r, k.square ? count : 0, found);
+    if (found.hits == 0.0) return vec2(lit_fraction(map, view, r.s, r.depth - r.bias) < 1.0 ? r.depth : NOTHING);
+    return vec2(found.sum / found.hits, found.deepest);
+}
+
+const float STEEPEST = 3.0;   // slope up to which a texel's rise is allowed for
+
+// `blocker`: mean and greatest depth; `gap`: the drift from there.
+struct Occluder { bool present; LightView view; Receiver receiver; Spread spread; vec2 blocker; vec2 gap; };
+
+Occluder occluder(sampler2D map, Light light, int first, int count, vec3 p, vec3 n, float bias) {
+    Occluder o;
+    o.present = false;
+    if (count == 0) return o;
+    o.view = light_views[view_containing(first, count, p)];
+    o.receiver = receiver_at(o.view, p, n, bias);
+    // What a tilted surface rises within a texel of the map must not block it either.
+    float texel = 2.0 * o.view.tile.w / o.view.tile.z * (o.view.range.z > 0.5 ? 1.0 : o.receiver.depth);
+    float slope = (abs(o.receiver.normal.x) + abs(o.receiver.normal.y)) / -o.receiver.normal.z;   // of texels askew too
+    o.receiver.bias += texel * min(slope, STEEPEST);
+    if (o.receiver.depth - o.receiver.bias <= o.view.range.x) return o;
+    o.spread = spread_of(light, o.view, o.receiver.s, o.receiver.depth);
+    float reach = o.spread.widest * drift(o.view, o.receiver.depth, o.view.range.x);
+    if (any(greaterThan(abs(o.receiver.s), vec2(o.view.tile.w + reach)))) return o;
+    o.blocker = blockers(map, o.spread, o.view, o.receiver);
+    o.present = o.blocker.x < NOTHING;
+    for (int i = 0; i < 2; ++i) o.gap[i] = o.present ? drift(o.view, o.receiver.depth, o.blocker[i]) : 0.0;
+    return o;
+}
+
+// Whether the ray to one sample of the light gets through, bilinearly: at the mean blocker's depth, and for a rectangle
+// at the deepest one's too: near a large light what blocks is seldom flat. The receiver's plane may rise towards
+// the light there, but what stands a quarter of the way to the blockers above it does block.
+float passes(sampler2D map, Occluder o, vec2 offset) {
+    float lit = 1.0;
+    for (int i = 0; i < (o.spread.square ? 2 : 1); ++i) {
+        vec2 s = o.receiver.s + shift_to(o.spread, o.gap[i], offset);
+        float highest = mix(o.receiver.depth, o.blocker[i], 0.75);
+        float depth = clamp(plane_depth(o.view, o.receiver, s), highest, o.receiver.depth);
+        lit = min(lit, lit_fraction(map, o.view, s, depth - o.receiver.bias));
+    }
+    return lit;
+}
+
+// Whether a virtual object can stand between p and any part of any light.
+bool object_may_shadow(vec3 p, float bias) {
+    for (int i = 0; i < light_count; ++i) {
+        Light light = lights[i];
+        vec2 shown = mirror_fraction(light, p);
+        if (shown.x != shown.y) return true;
+        for (int j = light.views.z; j < light.views.z + light.views.w; ++j) {
+            LightView view = light_views[j];
+            vec3 v = (view.view_from_world * vec4(p, 1.0)).xyz;
+            float depth = v.z - bias;
+            if (depth <= view.range.x) continue;
+            vec2 s = lateral(view, v);
+            float reach = spread_of(light, view, s, depth).widest * drift(view, depth, view.range.x);
+            if (all(lessThanEqual(abs(s), vec2(view.tile.w + reach)))) return true;
+        }
+    }
+    return false;
+}
+
+// Where the penumbra is many texels wide, few samples would show as steps.
+int samples_for(Occluder o) {
+    if (!o.present) return 1;
+    float texels = o.spread.widest * o.gap.x * o.view.tile.z / (2.0 * o.view.tile.w);
+    return texels > WIDE_TEXELS ? 4 * shadow_samples : shadow_samples;
+}
+
+// What sample o of a rectangle adds to the irradiance, up to a factor; 1 for other lights, whose samples add the same.
+float sample_weight(Light light, Spread k, vec3 p, vec3 n, vec2 o) {
+    vec3 d = light.place.xyz + mat2x3(light.axis_u.xyz, light.axis_v.xyz) * o - p;
+    float cosines = max(dot(d, n), 0.0) * max(-dot(d, cross(light.axis_u.xyz, light.axis_v.xyz)), 0.0);
+    return k.square ? cosines / max(dot(d, d) * dot(d, d), 1e-12) : 1.0;
+}
+
+// Adds (v_mu, v_rho, 1) times its weight for each sample of the light's area.
+void add_samples(
+    bool square, Light light, Spread k, Occluder real, Occluder object, vec3 p, vec3 n, int count, inout vec3 sum
+) {
+    k.square = real.spread.square = object.spread.square = square;
+    for (int j = 0; j < count; ++j) {
+        vec2 offset = light_sample(k, j, count);
+        float w = sample_weight(light, k, p, n, offset);
+        float v = real.present ? passes(real_light_depth, real, offset) : 1.0;
+        sum.xz += w * vec2(v, 1.0);
+        if (object.present && v > 0.0) v *= passes(virtual_light_depth, object, offset);
+        sum.y += w * v;
+    }
+}
+
+vec2 visible_fraction(Light light, Occluder real, Occluder object, vec3 p, vec3 n) {
+    if (!real.present && !object.present) return vec2(1.0);
+    int count = max(samples_for(real), samples_for(object));
+    Spread k = real.present ? real.spread : object.spread;
+    vec3 sum = vec3(0.0);
+    add_samples(false, light, k, real, object, p, n, k.square ? 0 : count, sum);
+    add_samples(true, light, k, real, object, p, n, k.square ? count : 0, sum);
+    return sum.z > 0.0 ? sum.xy / sum.z : vec2(1.0);
+}
+
+// V_mu alone.
+float real_visibility(Light light, vec3 p, vec3 n, float bias) {
+    Occluder none;
+    none.present = false;
+    Occluder real = occluder(real_light_depth, light, light.views.x, light.views.y, p, n, bias);
+    return mirror_fraction(light, p).x * visible_fraction(light, real, none, p, n).x;
+}
+
+// (V_mu, V_rho) at p with normal n: averages over the same samples of the light; v_rho = v_mu v_obj (docs/method.md 3).
+// `bias_real`, `bias_virtual` (m) move the receiver towards the light.
+vec2 visibility(Light light, vec3 p, vec3 n, float bias_real, float bias_virtual) {
+    Occluder real = occluder(real_light_depth, light, light.views.x, light.views.y, p, n, bias_real);
+    Occluder object = occluder(virtual_light_depth, light, light.views.z, light.views.w, p, n, bias_virtual);
+    return mirror_fraction(light, p) * visible_fraction(light, real, object, p, n);
+}

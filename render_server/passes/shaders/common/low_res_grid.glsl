@@ -1,0 +1,32 @@
+// Which picture pixel stands for each texel of the reduced resolution.
+#include "common/geometry.glsl"
+
+uniform isampler2D sample_pixels;   // real x, y; virtual x, y; -1: none; below: hidden by objects
+uniform ivec2 low_resolution_size;
+
+struct SurfacePoint { bool present; vec3 position; vec3 normal; float roughness; };
+
+#ifdef REAL
+#include "common/surfaces.glsl"
+uniform bool hidden_too;   // virtual surfaces reflect what they hide
+
+SurfacePoint surface_point(ivec2 texel) {
+    ivec2 pixel = texelFetch(sample_pixels, texel, 0).xy;
+    if (hidden_too && pixel.x < -1) pixel = -2 - pixel;
+    if (pixel.x < 0) return SurfacePoint(false, vec3(0.0), vec3(0.0, 0.0, 1.0), -1.0);
+    vec4 normal = texelFetch(real_surface_normal, pixel, 0);
+    float roughness = normal.w < 0.0 ? -1.0 : surfaces[int(normal.w)].surface.x;
+    return SurfacePoint(true, texelFetch(real_surface_position, pixel, 0).xyz, normal.xyz, roughness);
+}
+#else
+#include "common/materials.glsl"
+
+SurfacePoint surface_point(ivec2 texel) {
+    ivec2 pixel = texelFetch(sample_pixels, texel, 0).zw;
+    if (pixel.x < 0) return SurfacePoint(false, vec3(0.0), vec3(0.0, 0.0, 1.0), -1.0);
+    pixel = raster_texel(pixel);
+    vec4 normal = texelFetch(virtual_raster_normal, pixel, 0);
+    vec3 position = texelFetch(virtual_raster_position, pixel, 0).xyz;
+    return SurfacePoint(true, position, normal.xyz, materials[int(normal.w)].dielectric.a);
+}
+#endif

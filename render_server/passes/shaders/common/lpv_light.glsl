@@ -1,0 +1,57 @@
+// Irradiance of a surface from the light volumes (docs/method.md 5): E(n) = 2/3 <SH, lobe(-n)> (light is kept per cell
+// edge squared), trilinear about the point half a cell above the surface. Needs volume.glsl.
+#include "common/light_cells.glsl"
+
+layout(std430) readonly buffer WithoutObjects { vec4 light_mu[]; };   // channel by channel
+layout(std430) readonly buffer WithObjects { vec4 light_rho[]; };     // or the change itself
+uniform bool has_geometry;   // cells behind the surface are dark and must not be read
+uniform float damping;
+
+const float PER_FACE = 2.0 / 3.0;   // of 1 / edge^2: a uniform field's intensity in radiance
+
+struct Light12 { vec4 r; vec4 g; vec4 b; };
+
+uint cell_count() { return uint(volume_size * volume_size * volume_size); }
+
+// Intensity at q, from the cells whose centres lie before the plane (p, n) if `front_only`.
+Light12 intensity(bool with_objects, vec3 q, vec3 p, vec3 n, bool front_only) {
+    ivec3 base = ivec3(floor(q - 0.5));
+    vec3 f = q - 0.5 - vec3(base);
+    Light12 sum = Light12(vec4(0.0), vec4(0.0), vec4(0.0));
+    float total = 0.0;
+    for (int i = 0; i < 8; ++i) {
+        ivec3 o = ivec3(i & 1, (i >> 1) & 1, i >> 2), cell = base + o;
+        vec3 fraction = mix(1.0 - f, f, vec3(o));
+        float w = fraction.x * fraction.y * fraction.z * (front_only ? max(dot(vec3(cell) + 0.5 - p, n), 0.0) : 1.0);
+        if (w <= 0.0 || !in_grid(cell, volume_size)) continue;
+        uint at = cell_index(cell, volume_size), channel = cell_count();
+        if (with_objects) {
+            sum.r += w * light_rho[at]; sum.g += w * light_rho[at + channel]; sum.b += w * light_rho[at + 2u * channel];
+        } else {
+            sum.r += w * light_mu[at]; sum.g += w * light_mu[at + channel]; sum.b += w * light_mu[at + 2u * channel];
+        }
+        total += w;
+    }
+    float scale = total > 0.0 ? 1.0 / total : 0.0;
+    return Light12(scale * sum.r, scale * sum.g, scale * sum.b);
+}
+
+vec3 against(Light12 light, vec4 shape) { return vec3(dot(light.r, shape), dot(light.g, shape), dot(light.b, shape)); }
+
+// Where the light grows towards the back of the surface it leaked through it ([P2] 4.4): it is scaled down by how fast
+// it does so along the normal, relative to itself.
+vec3 damped(bool with_objects, vec3 q, vec3 n, vec3 e) {
+    vec3 behind = vec3(0.0), before = vec3(0.0);
+    for (int i = 0; i < (damping > 0.0 ? 1 : 0); ++i) {
+        behind = PER_FACE * against(intensity(with_objects, q, q, n, false), lobe(-n));
+        before = PER_FACE * against(intensity(with_objects, q + n, q, n, false), lobe(-n));
+    }
+    vec3 opposing = max((behind - before) * sign(e), vec3(0.0));
+    return e / (1.0 + damping * opposing / max(abs(e), vec3(1e-6)));
+}
+
+// Irradiance from the volume at a surface point q (cells) with normal n.
+vec3 from_volume(bool with_objects, vec3 q, vec3 n) {
+    vec3 e = PER_FACE * against(intensity(with_objects, q + 0.5 * n, q, n, has_geometry), lobe(-n));
+    return damped(with_objects, q, n, e);
+}

@@ -1,0 +1,180 @@
+// Cone marching through the rho and the mu set (docs/method.md 3, exact operator): where a path does not lead through
+// the support of the delta, both are the same and one march serves.
+//
+// A ray walks across the slices of cells along its main axis and looks where they touch, half into each, so that every
+// cell is met once, and none is missed where the level changes. The coverage that it meets is summed and a cone is
+// blocked when the sum is that of a wall. (Front-to-back products of a one-voxel shell let e^-2 of the light through at
+// any step: no furnace test could hold.)
+#include "common/volume.glsl"
+
+uniform sampler3D pyramid_mu;
+uniform sampler3D pyramid_rho;
+uniform sampler3D pyramid_far;   // real scene beyond the volume, coarse, the same in mu and rho
+layout(std140) uniform FarVolume {
+    vec3 far_origin;   // world position of its low corner, m
+    float far_edge;    // of a voxel, m
+    int far_size;      // voxels an edge, 0: it is not used
+    int far_levels;
+};
+layout(std430) readonly buffer Support { int support[6]; };   // voxels where mu and rho differ: min, -max
+
+// A wall's summed coverage scatters about 1 with its slant and place on the grid (2/3..4/3 at 45 degrees) and with
+// changes of level and other walls (down to 1/2). Below, the sum is the fraction of the cone that is covered.
+#ifdef MULTIPLIED_COVERAGE
+const float PARTLY = 1.0;
+const float WALL = 0.97;   // what is left could not be seen in an 8-bit picture
+#else
+const float PARTLY = 0.4;
+const float WALL = 0.5;
+#endif
+
+struct March { vec3 c_mu; float t_mu; vec3 c_rho; float t_rho; };
+
+struct Crossed { vec3 c; float coverage; };   // radiance gathered, coverage met so far
+
+float blocked_fraction(float coverage) {
+    return coverage < PARTLY ? coverage : min(PARTLY + (coverage - PARTLY) * (1.0 - PARTLY) / (WALL - PARTLY), 1.0);
+}
+
+void cross_cell(vec4 cell, inout Crossed sum) {
+    if (cell.a <= 0.0) return;
+#ifdef MULTIPLIED_COVERAGE
+    cell *= min(1.0, 1.0 / cell.a) * (1.0 - sum.coverage);   // front to back, as usual
+#endif
+    float taken = blocked_fraction(sum.coverage + cell.a) - blocked_fraction(sum.coverage);
+    sum.c += cell.rgb * (taken / cell.a);
+    sum.coverage += cell.a;
+}
+
+// A ray through a grid; its coordinate on the main axis is mirrored so that it grows.
+struct Walk {
+    vec3 from;       // cells of level 0
+    float first;     // main coordinate of `from`
+    vec3 slope;      // direction, 1 on the main axis
+    float stretch;   // distance a cell of the main axis
+    ivec3 facing;    // slabs that the ray sees from the front
+    vec3 ahead;      // from the next look's face to its sample: half a cell at the start, where nothing behind counts
+    int plane;       // main coordinate of the face
+    int level;
+};
+
+Walk walk_from(vec3 q, vec3 d) {
+    vec3 a = abs(d);
+    int axis = a.x >= a.y && a.x >= a.z ? 0 : (a.y >= a.z ? 1 : 2);
+    float side = d[axis] >= 0.0 ? 1.0 : -1.0;
+    vec3 ahead = vec3(0.0);
+    ahead[axis] = 0.5 * side;
+    ivec3 facing = ivec3(d.x >= 0.0 ? 0 : 1, d.y >= 0.0 ? 2 : 3, d.z >= 0.0 ? 4 : 5);
+    return Walk(q, side * q[axis], d / a[axis], 1.0 / a[axis], facing, ahead, int(ceil(side * q[axis] - 0.5)), 0);
+}
+
+float travelled(Walk w) { return max(float(w.plane) - w.first, 0.0) * w.stretch; }
+
+vec3 sample_point(Walk w) { return w.from + (float(w.plane) - w.first) * w.slope + w.ahead; }
+
+float slice_fraction(Walk w) { return w.ahead == vec3(0.0) ? 1.0 : 0.5; }
+
+// Cells grow, at most twofold a slice, to half..all of the cone's diameter, where a slice begins that is whole on the
+// coarser level too. `before`: what the cone had travelled ahead of this walk, cells of level 0.
+void choose_level(inout Walk w, float ratio, float before, int levels) {
+    int wide = 2 << w.level;
+    bool whole = w.level + 1 < levels && (w.plane & (wide - 1)) == 0;
+    if (whole && ratio * (before + travelled(w)) >= float(wide)) ++w.level;
+}
+
+void advance(inout Walk w, float ratio, float before, int levels) {
+    w.plane += 1 << w.level;
+    w.ahead = vec3(0.0);
+    choose_level(w, ratio, before, levels);
+}
+
+#ifdef ISOTROPIC_VOXELS
+// One radiance and one opacity for all directions: what all six hold together, as opaque as from where it is most.
+vec4 directional_sample(sampler3D pyramid, int n, vec3 q, Walk w) {
+    vec4 sum = vec4(0.0);
+    float most = 0.0;
+    for (int k = 0; k < 6; ++k) {
+        vec4 cell = volume_sample(pyramid, n, q, w.level, k);
+        sum += cell;
+        most = max(most, cell.a);
+    }
+    return sum.a > 0.0 ? sum * (most / sum.a) : vec4(0.0);
+}
+#else
+// Coverage and radiance that the ray meets in one slice. Of all surfaces in a cell, f and b are known: their area
+// towards and away from the ray along each axis. The net area n.d is exact; what a closed lump adds to it on the
+// side that the ray sees is at most half of `round` (exact for a sphere) and of the pairs min(f, b) (exact, 0, for a
+// plane: no surface hides itself).
+vec4 directional_sample(sampler3D pyramid, int n, vec3 q, Walk w) {
+    vec4 x = volume_sample(pyramid, n, q, w.level, w.facing.x);
+    vec4 y = volume_sample(pyramid, n, q, w.level, w.facing.y);
+    vec4 z = volume_sample(pyramid, n, q, w.level, w.facing.z);
+    vec3 weights = abs(w.slope);
+    vec4 most = weights.x * x + weights.y * y + weights.z * z;
+    if (most.a <= 0.0) return vec4(0.0);
+    vec3 f = vec3(x.a, y.a, z.a);
+    vec3 b = vec3(
+        volume_sample(pyramid, n, q, w.level, w.facing.x ^ 1).a,
+        volume_sample(pyramid, n, q, w.level, w.facing.y ^ 1).a,
+        volume_sample(pyramid, n, q, w.level, w.facing.z ^ 1).a);
+    float net = dot(weights, f - b);
+    float round = 0.5 * (net + max(abs(net), length(weights * (f + b))));
+    float paired = max(net, 0.0) + length(weights * min(f, b));
+    return most * min(min(round, paired) / most.a, 1.0);
+}
+#endif
+
+// Through the volume around the objects, from q (voxels), until a wall or the volume's end at distance t (voxels).
+// `differs`: the path led through cells where mu and rho are not the same.
+Crossed march_near(sampler3D pyramid, vec3 q, vec3 d, float ratio, out float t, out bool differs) {
+    Crossed sum = Crossed(vec3(0.0), 0.0);
+    Walk w = walk_from(q, d);
+    vec3 low = vec3(support[0], support[1], support[2]);
+    vec3 high = vec3(-support[3], -support[4], -support[5]) + 1.0;
+    differs = false;
+    for (int i = 0; i < 1024; ++i) {
+        vec3 at = sample_point(w);
+        if (!inside_volume(at) || sum.coverage >= WALL) break;
+        vec3 reach = vec3(1.5 * float(1 << w.level));
+        differs = differs || (all(greaterThan(at, low - reach)) && all(lessThan(at, high + reach)));
+        cross_cell(slice_fraction(w) * directional_sample(pyramid, volume_size, at, w), sum);
+        advance(w, ratio, 0.0, volume_levels);
+    }
+    t = travelled(w);
+    return sum;
+}
+
+// On through the coarse real scene, from q after a distance `before` (both in its voxels).
+void march_far(vec3 q, vec3 d, float before, float ratio, inout Crossed sum) {
+    Walk w = walk_from(q, d);
+    for (int i = 1; i < far_levels; ++i) choose_level(w, ratio, before, far_levels);
+    w.ahead *= float(1 << w.level);
+    for (int i = 0; i < 256; ++i) {
+        vec3 at = sample_point(w);
+        if (!inside_cube(at, far_size) || sum.coverage >= WALL) break;
+        cross_cell(slice_fraction(w) * directional_sample(pyramid_far, far_size, at, w), sum);
+        advance(w, ratio, before, far_levels);
+    }
+}
+
+// One march from q (voxels) along d, on into the coarse scene.
+Crossed march_one(sampler3D pyramid, vec3 q, vec3 d, float ratio, out bool differs) {
+    float t;
+    Crossed sum = march_near(pyramid, q, d, ratio, t, differs);
+    if (far_size > 0 && sum.coverage < WALL) {
+        vec3 leave = (volume_origin + (q + t * d) * voxel_edge - far_origin) / far_edge;
+        // A surface that starts the march outside of the volume must not meet its own coarse voxels.
+        float skip = t > 0.0 ? 0.0 : 1.5;
+        march_far(leave + skip * d, d, t * voxel_edge / far_edge + skip, ratio, sum);
+    }
+    return sum;
+}
+
+// Both marches from q (voxels) along d; `ratio` = cone diameter / distance. With `only_rho`, mu is that of rho.
+March march(vec3 q, vec3 d, float ratio, bool only_rho) {
+    bool differs;
+    Crossed rho = march_one(pyramid_rho, q, d, ratio, differs);
+    Crossed mu = rho;
+    if (differs && !only_rho) mu = march_one(pyramid_mu, q, d, ratio, differs);
+    return March(mu.c, 1.0 - blocked_fraction(mu.coverage), rho.c, 1.0 - blocked_fraction(rho.coverage));
+}

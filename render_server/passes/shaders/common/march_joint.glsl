@@ -1,0 +1,52 @@
+// Cone marching of [P1] 3.2: front-to-back through one pyramid whose opacity is the joint one (V_eta),
+//   c += (1 - a) c_v,  a += (1 - a) a_v        (c_v premultiplied; the factor a_0 before c_0 in eq. 5 is a slip).
+// A step is the edge of the cell sampled, as printed there, so that opacity needs no correction for it
+// (docs/method.md 4.5).
+#include "common/volume.glsl"
+
+const float OPAQUE = 0.99;   // opacity that ends a march
+
+// Premultiplied (c, a) as a cone along d meets it. One-sided pyramids are asked for both sides: a cone that starts
+// inside an object is blocked by its far wall.
+vec4 cone_sample(sampler3D pyramid, vec3 q, int level, vec3 d) {
+#if DIRECTIONS == 1
+    return volume_sample(pyramid, volume_size, q, level, 0);
+#else
+    vec4 sum = vec4(0.0);
+    for (int k = 0; k < DIRECTIONS; ++k) sum += abs(d[k >> 1]) * volume_sample(pyramid, volume_size, q, level, k);
+    return sum;
+#endif
+}
+
+// Where the ray q + t d, t >= 0, is inside a box: (first t, last t); none where first >= last.
+vec2 box_interval(vec3 q, vec3 d, vec3 low, vec3 high) {
+    vec3 inverse = 1.0 / (d + vec3(equal(d, vec3(0.0))) * 1e-9);
+    vec3 t0 = (low - q) * inverse, t1 = (high - q) * inverse;
+    vec3 near = min(t0, t1), far = max(t0, t1);
+    return vec2(max(max(near.x, near.y), max(near.z, 0.0)), min(far.x, min(far.y, far.z)));
+}
+
+// One step further. Directional cells hold the fraction of their face that is covered, which adds up to 1 across a
+// surface however it lies between the samples (march.glsl); the marker of isotropic ones is composited as printed.
+vec4 accumulated(vec4 sum, vec4 v) {
+    float room = 1.0 - sum.a;
+#if DIRECTIONS == 1
+    return sum + room * v;
+#else
+    return sum + v * (v.a > room ? room / v.a : 1.0);
+#endif
+}
+
+// (c, a) of the cone from q (voxels) along d within `interval`; `ratio` = diameter / distance.
+vec4 march(sampler3D pyramid, vec3 q, vec3 d, float ratio, vec2 interval) {
+    vec4 sum = vec4(0.0);
+    float t = interval.x;
+    for (int i = 0; i < 1024 && t < interval.y && sum.a < OPAQUE; ++i) {
+        float diameter = max(1.0, ratio * t);
+        int level = min(int(floor(log2(diameter) + 0.5)), volume_levels - 1);
+        float edge = exp2(float(level));
+        sum = accumulated(sum, cone_sample(pyramid, q + (t + 0.5 * edge) * d, level, d));
+        t += edge;
+    }
+    return sum;
+}

@@ -1,0 +1,29 @@
+// Radiance that the surface of a virtual object sends towards v (docs/method.md 4.7). Needs lights.glsl and brdf.glsl.
+#include "common/materials.glsl"
+
+uniform float noise_sigma;      // m at 1 m
+uniform float normal_offset;    // m: against self-shadowing by the virtual depth map
+
+struct Indirect { vec3 irradiance; vec3 specular; };
+
+vec3 direct_radiance(vec3 p, float depth, vec3 n, vec3 v, Material m) {
+    vec3 sum = vec3(0.0);
+    for (int i = 0; i < light_count; ++i) {
+        vec3 l; float radius;
+        vec3 across = light_at(lights[i], p, n, l, radius);
+        float cosine = dot(n, l);
+        if (cosine <= 0.0) continue;
+        float seen = visibility(lights[i], p + normal_offset * n, n, 3.0 * noise_sigma * depth * depth, 0.0).y;
+        float rough = has_interface(m.f0) ? burley(cosine, max(dot(n, v), 0.0), dot(l, v), m.roughness) : 1.0;
+        vec3 response = m.diffuse / PI * rough * cosine + specular_times_cosine(n, v, l, m.f0, m.roughness, radius);
+        sum += across * seen * response;
+    }
+    return sum;
+}
+
+vec3 object_radiance(vec3 p, float depth, vec3 n, vec3 v, Material m, Indirect indirect) {
+    float n_dot_v = max(dot(n, v), 1e-3);
+    float rough = has_interface(m.f0) ? burley_mean(n_dot_v, m.roughness) : 1.0;
+    return m.emission + direct_radiance(p, depth, n, v, m) + m.diffuse / PI * rough * indirect.irradiance
+        + specular_reflectance(m.f0, m.roughness, n_dot_v) * indirect.specular;
+}

@@ -1,0 +1,81 @@
+// Closest hit of a ray with the objects' triangles, and what their surface is like there. The hierarchy
+// (render_server/scene/bvh.py) lies in depth-first order with skips, so that no stack is needed.
+#include "common/materials.glsl"
+
+struct Node { vec3 low; int leaf; vec3 high; int skip; };   // leaf: first triangle << 3 | count, or -1
+layout(std430) readonly buffer Nodes { Node nodes[]; };
+layout(std430) readonly buffer Faces { vec4 faces[]; };           // 3 a triangle: corner and index, 2 edges
+layout(std430) readonly buffer Vertices { float vertices[]; };    // VERTEX_FLOATS each (scene/mesh.py)
+layout(std430) readonly buffer Corners { int vertex_of[]; };      // 3 a triangle
+
+const int VERTEX_FLOATS = 12;
+const float EDGE = 1e-5;   // barycentric: neighbours overlap by so much, so that no ray slips between them
+
+struct Ray { vec3 from; vec3 direction; };   // direction: unit length
+
+struct MeshHit { float distance; int triangle; vec2 place; };   // triangle: -1 for none; place: barycentric of corners 1, 2
+
+// Distance at which the ray enters a box before `limit`; negative if it does not.
+bool meets_box(vec3 low, vec3 high, vec3 from, vec3 inverse, float limit) {
+    vec3 a = (low - from) * inverse, b = (high - from) * inverse;
+    vec3 near = min(a, b), far = max(a, b);
+    float enter = max(max(near.x, near.y), max(near.z, 0.0));
+    return enter <= min(min(far.x, far.y), min(far.z, limit));
+}
+
+// Moeller and Trumbore 1997, both sides.
+void meet_triangle(int at, Ray ray, inout MeshHit hit) {
+    vec4 corner = faces[3 * at];
+    vec3 e1 = faces[3 * at + 1].xyz, e2 = faces[3 * at + 2].xyz;
+    vec3 p = cross(ray.direction, e2);
+    float det = dot(e1, p);
+    if (det == 0.0) return;
+    vec3 s = ray.from - corner.xyz;
+    float u = dot(s, p) / det;
+    vec3 q = cross(s, e1);
+    float v = dot(ray.direction, q) / det;
+    float t = dot(e2, q) / det;
+    if (u < -EDGE || v < -EDGE || u + v > 1.0 + EDGE || t <= 0.0 || t >= hit.distance) return;
+    hit = MeshHit(t, floatBitsToInt(corner.w), vec2(u, v));
+}
+
+MeshHit closest_hit(Ray ray) {
+    vec3 safe = mix(ray.direction, vec3(1e-12), lessThan(abs(ray.direction), vec3(1e-12)));
+    vec3 inverse = 1.0 / safe;
+    MeshHit hit = MeshHit(1e30, -1, vec2(0.0));
+    int count = nodes[0].skip;
+    for (int i = 0; i < count;) {
+        Node node = nodes[i];
+        bool met = meets_box(node.low, node.high, ray.from, inverse, hit.distance);
+        int last = met && node.leaf >= 0 ? (node.leaf >> 3) + (node.leaf & 7) : 0;
+        for (int j = node.leaf >> 3; j < last; ++j) meet_triangle(j, ray, hit);
+        i = met ? i + 1 : node.skip;
+    }
+    return hit;
+}
+
+struct MeshSurface { vec3 position; vec3 normal; vec2 uv; vec3 tint; int material; };
+
+vec3 vertex_vector(ivec3 rows, int column, vec3 weights) {
+    vec3 sum = vec3(0.0);
+    for (int k = 0; k < 3; ++k) {
+        int at = rows[k] * VERTEX_FLOATS + column;
+        sum += weights[k] * vec3(vertices[at], vertices[at + 1], vertices[at + 2]);
+    }
+    return sum;
+}
+
+// The surface at a hit, its normal turned towards the ray's origin as the raster turns it to the camera.
+MeshSurface surface_of(MeshHit hit, Ray ray) {
+    ivec3 rows = ivec3(vertex_of[3 * hit.triangle], vertex_of[3 * hit.triangle + 1], vertex_of[3 * hit.triangle + 2]);
+    vec3 weights = vec3(1.0 - hit.place.x - hit.place.y, hit.place);
+    int material = int(vertices[rows.x * VERTEX_FLOATS + 11]);
+    vec3 corner = vertex_vector(rows, 0, vec3(1.0, 0.0, 0.0));
+    vec3 face = cross(vertex_vector(rows, 0, vec3(0.0, 1.0, 0.0)) - corner, vertex_vector(rows, 0, vec3(0.0, 0.0, 1.0)) - corner);
+    vec3 normal = normalize(vertex_vector(rows, 3, weights));
+    if (dot(face, ray.direction) > 0.0) face = -face;
+    bool double_sided = materials[material].flags.x > 0.5;
+    if (dot(normal, ray.direction) > 0.0) normal = double_sided ? -normal : normalize(face);
+    vec2 uv = vertex_vector(rows, 6, weights).xy;
+    return MeshSurface(ray.from + hit.distance * ray.direction, normal, uv, vertex_vector(rows, 8, weights), material);
+}

@@ -1,0 +1,85 @@
+// A ray followed across the camera's picture, pixel by pixel, until it meets a real surface that the camera sees
+// ([D] 4.4.2). What lies behind something in the picture is not known: the ray is lost there.
+#include "common/geometry.glsl"
+#include "common/camera_image.glsl"
+
+uniform bool lens_bends;      // picture_pixel is a pinhole's
+uniform float noise_sigma;    // m at 1 m
+
+const float NEAREST = 0.02;     // m before the camera
+const float FARTHEST = 20.0;    // m along the ray
+const int MOST_STEPS = 4096;    // longer than any picture's diagonal
+const float FADE_PIXELS = 4.0;  // at the picture's border, so that no seam shows
+// Sine of the angle below which a surface is met too flatly to be trusted: a pixel of it spans ten across.
+const float FLATTEST = 0.1;
+
+// `point` on a real surface whose middle `pixel` shows; `fraction`: how far it can be trusted, 0 where the ray was lost.
+struct ScreenHit { float distance; vec2 pixel; float depth; float fraction; };
+
+// Pixel (centres at .5) that shows a point before the camera: a pinhole's, moved by what the lens bends there.
+vec2 seen_pixel(vec3 c) {
+    vec2 pixel = picture_pixel(c), last = picture_size - 1.0;
+    for (int i = 0; i < (lens_bends ? 2 : 0); ++i) {
+        vec2 ray = texelFetch(picture_rays, ivec2(clamp(pixel, vec2(0.0), last)), 0).xy;
+        vec2 centre = floor(clamp(pixel, vec2(0.0), last)) + 0.5;
+        pixel = centre + camera_pinhole.xy * (c.xy / c.z - ray);
+    }
+    return pixel;
+}
+
+bool in_picture(vec2 pixel) { return all(greaterThanEqual(pixel, vec2(0.0))) && all(lessThan(pixel, picture_size)); }
+
+// Fraction of the way from p to p + way (pixels) that lies in the picture; p does.
+float way_in_picture(vec2 p, vec2 way) {
+    vec2 safe = mix(way, vec2(1e-6), lessThan(abs(way), vec2(1e-6)));
+    vec2 border = mix(vec2(0.0), picture_size, greaterThan(safe, vec2(0.0)));
+    vec2 leave = (border - p) / safe;
+    return clamp(min(leave.x, leave.y), 0.0, 1.0);
+}
+
+// From `from` (world) along d until something is met; `spread`: diameter of the cone at distance 1.
+ScreenHit screen_hit(vec3 from, vec3 d, float spread) {
+    ScreenHit hit = ScreenHit(FARTHEST, vec2(0.0), 1.0, 0.0);
+    vec3 a = (camera_from_world * vec4(from, 1.0)).xyz, v = mat3(camera_from_world) * d;
+    if (a.z <= NEAREST) return hit;
+    float reach = v.z < 0.0 ? min(FARTHEST, (NEAREST - a.z) / v.z) : FARTHEST;
+    float near_a = 1.0 / a.z, near_b = 1.0 / (a.z + reach * v.z);
+    vec2 first = picture_pixel(a), way = picture_pixel(a + reach * v) - first;
+    if (!in_picture(first)) return hit;
+    float last = way_in_picture(first, way);
+    int steps = min(int(ceil(max(abs(way.x), abs(way.y)) * last)), MOST_STEPS);
+    float before = 0.0;
+    for (int i = 1; i <= steps; ++i) {
+        float s = last * float(i) / float(steps);
+        float t = reach * s * near_b / mix(near_a, near_b, s);   // even in the picture is not even in the world
+        vec3 c = a + t * v;
+        vec2 pixel = seen_pixel(c);
+        if (!in_picture(pixel)) break;
+        vec4 seen = texelFetch(real_surface_position, ivec2(pixel), 0);
+        if (seen.w > 0.0 && c.z > seen.w) {
+            vec3 n = texelFetch(real_surface_normal, ivec2(pixel), 0).xyz;
+            float tolerance = 3.0 * noise_sigma * seen.w * seen.w, towards = -dot(n, d);
+            float at = dot(n, from - seen.xyz) / max(towards, 1e-6);
+            if (towards > 0.0 && at > before - (t - before) - tolerance / max(towards, FLATTEST)) {
+                hit = ScreenHit(max(at, 0.0), pixel, c.z, smoothstep(0.0, FLATTEST, towards));
+                break;
+            }
+            if (c.z > seen.w + tolerance) break;
+        }
+        before = t;
+    }
+    if (hit.fraction > 0.0) {   // where on the surface: at most a pixel off
+        vec3 c = a + hit.distance * v;
+        if (c.z > NEAREST) { hit.pixel = seen_pixel(c); hit.depth = c.z; }
+        vec2 rim = min(hit.pixel, picture_size - hit.pixel);
+        float wide = 0.5 * spread * hit.distance * camera_pinhole.x / hit.depth;
+        hit.fraction *= clamp(min(rim.x, rim.y) / max(wide, FADE_PIXELS), 0.0, 1.0);
+    }
+    return hit;
+}
+
+// The picture over the cone's width there.
+vec3 screen_radiance(ScreenHit hit, float spread) {
+    float wide = spread * hit.distance * camera_pinhole.x / hit.depth;
+    return textureLod(linear_picture, hit.pixel / picture_size, log2(max(wide, 1.0))).rgb;
+}

@@ -1,0 +1,46 @@
+// Shadow cones ([P1] eq. 4): C_s is the opacity that a cone as wide as the light meets on its way there.
+// It is marched where the objects are: only they take light away that the picture still has, and what the real scene
+// blocks is in V_mu. So T_delta = -C_s E V_mu cos, and a real shadow is not cast twice (docs/method.md 3, direct).
+#include "common/march_joint.glsl"
+#include "common/lights.glsl"
+
+uniform sampler3D joint_pyramid;
+uniform vec3 object_low;     // voxels that hold the objects
+uniform vec3 object_high;
+
+const float SHADOW_START = 2.0;   // voxels along the normal, out of the receiver's own voxels
+
+struct ShadowCone { vec3 start; vec3 d; float ratio; vec2 interval; };
+
+ShadowCone shadow_cone(Light light, vec3 p, vec3 n) {
+    vec3 to_light; float radius;
+    light_at(light, p, n, to_light, radius);
+    ShadowCone cone;
+    cone.start = volume_coordinate(p) + SHADOW_START * n;
+    cone.d = to_light;
+    cone.ratio = 2.0 * tan(radius);
+    float away = distance(cone.start, 0.5 * (object_low + object_high));
+    vec3 margin = vec3(0.5 + 0.5 * max(1.0, cone.ratio * away));
+    cone.interval = box_interval(cone.start, to_light, object_low - margin, object_high + margin);
+    if (light.place.w > 0.5)
+        cone.interval.y = min(cone.interval.y, distance(volume_coordinate(light.place.xyz), cone.start));
+    return cone;
+}
+
+// Whether any shadow cone from p meets the objects.
+bool object_meets_cone(vec3 p, vec3 n) {
+    for (int i = 0; i < light_count; ++i) {
+        vec2 interval = shadow_cone(lights[i], p, n).interval;
+        if (interval.x < interval.y) return true;
+    }
+    return false;
+}
+
+// (V_mu, V_rho)
+vec2 cone_visibility(Light light, vec3 p, vec3 n, float bias) {
+    float v_mu = real_visibility(light, p, n, bias);
+    ShadowCone cone = shadow_cone(light, p, n);
+    if (v_mu == 0.0 || cone.interval.x >= cone.interval.y) return vec2(v_mu);
+    float blocked = march(joint_pyramid, cone.start, cone.d, cone.ratio, cone.interval).a;
+    return v_mu * vec2(1.0, 1.0 - blocked);
+}

@@ -1,0 +1,26 @@
+// Albedo of surfels. Needs voxel_store.glsl, lights.glsl, materials.glsl.
+const vec2 ALBEDO_RANGE = vec2(0.02, 0.95);
+
+#ifdef REAL
+#include "common/real_radiance.glsl"
+uniform float bias_real;   // m
+
+// As the picture shows it under the light that gets there ([P2] eq. 1), `indirect` of it by other surfaces and the
+// surroundings; or as remembered.
+vec3 albedo_at(Surfel s, vec3 n, vec3 indirect) {
+    vec3 p = s.position_area.xyz, e = indirect;
+    if (!camera_sees(p, n)) return unseen_albedo(p);
+    for (int i = 0; i < light_count; ++i) {
+        vec3 to_light; float radius;
+        vec3 across = light_at(lights[i], p, n, to_light, radius);
+        float cosine = dot(n, to_light);
+        if (cosine > 0.0) e += across * cosine * real_visibility(lights[i], p, n, bias_real);
+    }
+    return clamp(PI * measured_radiance(p) / max(e, vec3(1e-6)), ALBEDO_RANGE.x, ALBEDO_RANGE.y);
+}
+#else
+vec3 virtual_albedo(Surfel s) {
+    Material m = material_of(int(s.normal_material.w), s.uv_voxel.xy, s.tint.rgb);
+    return min(m.diffuse + m.f0, vec3(ALBEDO_RANGE.y));
+}
+#endif

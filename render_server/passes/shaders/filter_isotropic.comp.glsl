@@ -1,0 +1,22 @@
+// One level of the isotropic pyramids of V_delta and V_rho: plain means of eight cells ([P1] 3.2).
+#include "common/volume.glsl"
+
+layout(local_size_x = 4, local_size_y = 4, local_size_z = 4) in;
+layout(rgba16f) uniform image3D delta;
+layout(rgba16f) uniform image3D rho;
+uniform int level;   // that is written; >= 1
+
+void main() {
+    ivec3 cell = ivec3(gl_GlobalInvocationID);
+    if (any(greaterThanEqual(cell, ivec3(volume_size >> level)))) return;
+    ivec3 finer = level_base(level - 1, 0) + 2 * cell;
+    vec4 sum_delta = vec4(0.0), sum_rho = vec4(0.0);
+    for (int j = 0; j < 8; ++j) {
+        ivec3 at = finer + ivec3(j & 1, (j >> 1) & 1, j >> 2);
+        sum_delta += imageLoad(delta, at);
+        sum_rho += imageLoad(rho, at);
+    }
+    ivec3 to = level_base(level, 0) + cell;
+    imageStore(delta, to, 0.125 * sum_delta);
+    imageStore(rho, to, 0.125 * sum_rho);
+}

@@ -1,0 +1,34 @@
+// One level of the six one-sided pyramids (docs/method.md 4.4): two cells along k front to back, mean of the four
+// across.
+// Coverage of the two cells adds up to at most 1 (see trace_cones: pieces of one surface do not hide each other).
+#include "common/volume.glsl"
+
+layout(local_size_x = 4, local_size_y = 4, local_size_z = 4) in;
+layout(rgba16f) uniform image3D pyramid;
+uniform int level;          // that is written; >= 1
+
+vec4 fetch(ivec3 cell, int k) { return imageLoad(pyramid, level_base(level - 1, k) + cell); }
+
+vec4 front_to_back(vec4 front, vec4 back) {
+    float room = 1.0 - front.a;
+    return front + back * (back.a > room ? room / back.a : 1.0);
+}
+
+void main() {
+    int cells = volume_size >> level;
+    ivec3 id = ivec3(gl_GlobalInvocationID);
+    int k = id.z / cells;
+    if (id.x >= cells || id.y >= cells || k >= DIRECTIONS) return;
+    ivec3 cell = ivec3(id.xy, id.z - k * cells);
+    int along = k >> 1, u = (along + 1) % 3, v = (along + 2) % 3;
+    ivec3 step_along = ivec3(0), step_u = ivec3(0), step_v = ivec3(0);
+    step_along[along] = 1; step_u[u] = 1; step_v[v] = 1;
+    ivec3 front = 2 * cell + ((k & 1) == 0 ? ivec3(0) : step_along);
+    ivec3 back = 2 * cell + ((k & 1) == 0 ? step_along : ivec3(0));
+    vec4 sum = vec4(0.0);
+    for (int j = 0; j < 4; ++j) {
+        ivec3 across = (j & 1) * step_u + (j >> 1) * step_v;
+        sum += front_to_back(fetch(front + across, k), fetch(back + across, k));
+    }
+    imageStore(pyramid, level_base(level, k) + cell, 0.25 * sum);
+}

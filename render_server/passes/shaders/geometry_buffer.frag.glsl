@@ -1,0 +1,27 @@
+// World position + depth along the optical axis, normal + material, texture coordinate.
+#include "common/materials.glsl"
+#include "common/camera.glsl"
+in vec3 world;
+in vec3 normal;
+in vec2 uv;
+in vec3 tint;
+in float depth;
+flat in float material;
+layout(location = 0) out vec4 out_position;
+layout(location = 1) out vec4 out_normal;
+layout(location = 2) out vec2 out_uv;
+layout(location = 3) out vec4 out_tint;
+
+void main() {
+    vec3 n = normalize(normal);
+    vec3 view = camera_position - world;
+    // An interpolated normal may lean away at a silhouette: the triangle's own then serves.
+    vec3 flat_normal = normalize(cross(dFdx(world), dFdy(world)));
+    if (dot(flat_normal, view) < 0.0) flat_normal = -flat_normal;
+    bool double_sided = materials[int(material)].flags.x > 0.5;
+    if (dot(n, view) < 0.0) n = double_sided ? -n : flat_normal;
+    out_position = vec4(world, depth);
+    out_normal = vec4(n, material);
+    out_uv = uv;
+    out_tint = vec4(tint, 1.0);
+}

@@ -1,0 +1,25 @@
+// Meshes as the camera sees them, through the raster pinhole.
+#include "common/camera.glsl"
+uniform mat4 clip_from_camera;
+in vec3 in_position;
+in vec3 in_normal;
+in vec2 in_uv;
+in vec3 in_color;
+in float in_material;
+out vec3 world;
+out vec3 normal;
+out vec2 uv;
+out vec3 tint;
+out float depth;
+flat out float material;
+
+void main() {
+    vec4 camera = camera_from_world * vec4(in_position, 1.0);
+    world = in_position;
+    normal = in_normal;
+    uv = in_uv;
+    tint = in_color;
+    depth = camera.z;
+    material = in_material;
+    gl_Position = clip_from_camera * camera;
+}

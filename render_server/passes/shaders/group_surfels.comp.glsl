@@ -1,0 +1,46 @@
+// Find the groups of surfels. Without SUM: give each a slot. SUM: add its area, mean normal and place.
+#include "common/volume.glsl"
+#include "common/voxel_store.glsl"
+#include "common/surfel_groups.glsl"
+#include "common/surfel_light.glsl"
+
+layout(local_size_x = 64) in;
+
+#ifdef SUM
+uniform bool has_seen;    // SurfelLights tells which of them the camera looks at
+
+void add_to_group(Surfel s, uint surfel, int side, vec3 n) {
+    uint entry = group_entry(floatBitsToUint(s.uv_voxel.z), n);
+    int slot = group_slot(entry);
+    if (slot < 0) return;
+    float weight = s.position_area.w / (voxel_edge * voxel_edge);
+    vec3 place = volume_coordinate(s.position_area.xyz) - block_corner(entry);
+    int at = slot * GROUP_SUMS;
+    atomicAdd(group_sums[at + GROUP_AREA], fixed_point(weight));
+    for (int j = 0; j < 3; ++j) {
+        atomicAdd(group_sums[at + GROUP_NORMAL + j], fixed_point(weight * n[j]));
+        atomicAdd(group_sums[at + GROUP_PLACE + j], fixed_point(weight * place[j]));
+    }
+    if (!has_seen || surfel_lights[2u * surfel + uint(side)].radiance.w > 0.5) return;
+    if (atomicAdd(group_sums[at + GROUP_UNSEEN], 1) == 0) atomicAdd(unseen_count, 1u);
+}
+#else
+void add_to_group(Surfel s, uint surfel, int side, vec3 n) {
+    uint entry = group_entry(floatBitsToUint(s.uv_voxel.z), n);
+    if (atomicCompSwap(group_grid[entry], 0u, 0xffffffffu) != 0u) return;
+    uint slot = atomicAdd(group_count, 1u);
+    if (slot >= uint(group_entries.length())) return;
+    group_entries[slot] = entry;
+    group_grid[entry] = slot + 1u;
+    for (int i = 0; i < GROUP_SUMS; ++i) group_sums[int(slot) * GROUP_SUMS + i] = 0;
+}
+#endif
+
+void main() {
+    uint count = min(surfel_count, surfel_capacity);
+    for (uint i = gl_GlobalInvocationID.x; i < count; i += gl_NumWorkGroups.x * 64u) {
+        Surfel s = surfels[i];
+        add_to_group(s, i, 0, s.normal_material.xyz);
+        if (s.uv_voxel.w > 0.5) add_to_group(s, i, 1, -s.normal_material.xyz);
+    }
+}

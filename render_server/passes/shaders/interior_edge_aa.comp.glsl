@@ -1,0 +1,42 @@
+// Where samples of a pixel show another surface of the objects than the one that was shaded, the light of that surface
+// is taken from the neighbour that shows it, by their fraction.
+layout(local_size_x = 8, local_size_y = 8) in;
+layout(rgba16f) writeonly uniform image2D radiance_out;
+uniform sampler2D radiance;
+uniform sampler2D sample_coverage;
+uniform sampler2D second_surface;
+uniform sampler2D virtual_raster_position;
+uniform sampler2D virtual_raster_normal;
+uniform ivec4 rectangle;       // first pixel and size of the part of the picture that may show an object
+
+const float NEARNESS = 0.1;    // how much distance counts beside the distance from a neighbour's plane: it decides ties
+
+// How far a place is from the surface of a neighbour, m; far where that shows no object.
+float away(ivec2 at, vec3 place) {
+    if (texelFetch(sample_coverage, at, 0).r == 0.0) return 1e9;
+    vec3 apart = place - texelFetch(virtual_raster_position, at, 0).xyz;
+    return abs(dot(apart, texelFetch(virtual_raster_normal, at, 0).xyz)) + NEARNESS * length(apart);
+}
+
+vec3 radiance_of_other(ivec2 pixel, vec3 place) {
+    ivec2 last = textureSize(radiance, 0) - 1, best = pixel;
+    float least = away(pixel, place);
+    for (int i = 0; i < 9; ++i) {
+        ivec2 at = clamp(pixel + ivec2(i % 3, i / 3) - 1, ivec2(0), last);
+        float d = away(at, place);
+        if (d < least) { least = d; best = at; }
+    }
+    return texelFetch(radiance, best, 0).rgb;
+}
+
+void main() {
+    ivec2 inside = ivec2(gl_GlobalInvocationID.xy);
+    if (any(greaterThanEqual(inside, rectangle.zw))) return;
+    ivec2 pixel = rectangle.xy + inside;
+    float covered = texelFetch(sample_coverage, pixel, 0).r;
+    if (covered == 0.0 && texelFetch(sample_coverage, pixel, 0).g == 0.0) return;
+    vec4 second = texelFetch(second_surface, pixel, 0);
+    vec3 own = texelFetch(radiance, pixel, 0).rgb;
+    if (second.w > 0.0) own = mix(own, radiance_of_other(pixel, second.xyz), second.w / covered);
+    imageStore(radiance_out, pixel, vec4(own, 1.0));
+}

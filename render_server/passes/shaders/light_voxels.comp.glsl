@@ -1,0 +1,202 @@
+// Sum each surfel's opacity and outgoing radiance into its voxel, per direction k (docs/method.md 4.3):
+//   a_k += A max(0, -n.k) / h^2,   c_k += L A max(0, -n.k) / h^2.
+// REAL: L_mu is what the camera measured (all bounces), or albedo / pi E_mu where it does not look;
+//       REAL_DELTA sums L_rho - L_mu = L_mu (E_rho / E_mu - 1).
+// VIRTUAL: L_rho = albedo / pi E_rho + emission.
+// E is direct + ambient light at first; GATHERED: the direct light found then + what the surfel's group gathered;
+// REAL and VIRTUAL then add by how much L grows.
+// REAL_MU and REAL_RHO sum all of L, each under the maps of its own solution: L_mu as REAL,
+// L_rho = L_mu E_rho / E_mu where the camera measured L_mu, albedo / pi E_rho where it does not look.
+#include "common/volume.glsl"
+#include "common/voxel_store.glsl"
+#include "common/surfel_light.glsl"
+#include "common/lights.glsl"
+#include "common/environment.glsl"
+#include "common/materials.glsl"
+
+layout(local_size_x = 64) in;
+uniform float bias_real;      // m
+uniform float bias_virtual;   // m
+uniform bool keep_light;      // in SurfelLights, for what is summed later
+uniform bool has_caustics;    // beams carry what smooth virtual surfaces reflect of the lights
+const float WHITEST = 0.95;   // albedo of the brightest diffuse surfaces: no surface gives back more than it gets
+#if defined(REAL_MU) || defined(REAL_RHO)
+#define SOLUTION
+#endif
+#if defined(REAL) || defined(SOLUTION)
+#include "common/real_radiance.glsl"
+#endif
+#ifdef REAL_DELTA
+layout(std430) buffer DeltaSums { int delta_sums[]; };   // 18 a slot
+layout(std430) buffer Support { int support[6]; };        // bounds of changed voxels: min xyz, -max xyz
+#endif
+
+#ifdef GATHERED
+#include "common/surfel_groups.glsl"
+
+void irradiances(Surfel s, vec3 n, uint own, out vec3 mu, out vec3 rho) {
+    int slot = group_slot(group_entry(floatBitsToUint(s.uv_voxel.z), n));
+    vec3 ambient = environment_irradiance(n);
+    mu = surfel_lights[own].direct_mu.rgb + (slot < 0 ? ambient : group_light[2 * slot].rgb);
+    rho = surfel_lights[own].direct_rho.rgb + (slot < 0 ? ambient : group_light[2 * slot + 1].rgb);
+}
+#else
+#ifdef VIRTUAL
+const float LIFT = 0.1;       // voxels, so that a curved surface does not shadow its own surfels
+#else
+const float LIFT = 0.0;
+#endif
+
+#if defined(REAL) || defined(SOLUTION)
+// Without the objects, whose maps may be those of an earlier frame; a solution's own maps hold all of its geometry.
+vec2 light_fraction(Light light, vec3 p, vec3 n) { return vec2(real_visibility(light, p, n, bias_real)); }
+#else
+vec2 light_fraction(Light light, vec3 p, vec3 n) { return visibility(light, p, n, bias_real, bias_virtual); }
+#endif
+
+void irradiances(Surfel s, vec3 n, uint own, out vec3 mu, out vec3 rho) {
+    vec3 p = s.position_area.xyz + n * voxel_edge * LIFT;
+    mu = rho = vec3(0.0);
+    for (int i = 0; i < light_count; ++i) {
+        vec3 to_light; float radius;
+        vec3 across = light_at(lights[i], p, n, to_light, radius);
+        float cosine = dot(n, to_light);
+        if (cosine <= 0.0) continue;
+        vec2 v = light_fraction(lights[i], p, n);
+        mu += across * cosine * v.x;
+        rho += across * cosine * v.y;
+    }
+    if (keep_light) {
+#ifndef REAL_RHO
+        surfel_lights[own].direct_mu = vec4(mu, 0.0);
+#endif
+        surfel_lights[own].direct_rho = vec4(rho, 0.0);
+    }
+#ifdef REAL_RHO
+    mu = surfel_lights[own].direct_mu.rgb;
+#endif
+    vec3 ambient = environment_irradiance(n);
+    mu += ambient;
+    rho += ambient;
+}
+#endif
+
+void add(uint voxel, vec3 n, float area, vec3 radiance) {
+    int slot = int(grid[voxel]) - 1;
+    float scale = area / (voxel_edge * voxel_edge);
+    for (int k = 0; k < 6; ++k) {
+        float facing = max(0.0, -dot(n, axis_direction(k))) * scale;
+        if (facing <= 0.0) continue;
+#ifdef REAL_DELTA
+        int at = slot * 18 + k * 3;
+        for (int j = 0; j < 3; ++j) atomicAdd(delta_sums[at + j], fixed_point(radiance[j] * facing));
+#else
+        int at = slot * SUMS_PER_SLOT;
+#if !defined(GATHERED) || defined(SOLUTION)
+        atomicAdd(sums[at + COVERAGE + k], fixed_point(facing));
+#endif
+        for (int j = 0; j < 3; ++j) atomicAdd(sums[at + RADIANCE + k * 3 + j], fixed_point(radiance[j] * facing));
+#endif
+    }
+}
+
+#if !defined(REAL_DELTA) && !defined(SOLUTION)
+// What the sums lack: all of it at first, what it gained when light was gathered. w: 1 where the camera measured it.
+vec3 unsummed(uint own, vec4 radiance) {
+#ifdef GATHERED
+    vec3 summed = surfel_lights[own].radiance.rgb;
+#else
+    vec3 summed = vec3(0.0);
+#endif
+    if (keep_light) surfel_lights[own].radiance = radiance;
+    return radiance.rgb - summed;
+}
+#endif
+
+#ifdef VIRTUAL
+vec3 outgoing(Surfel s, vec3 n, uint own) {
+    vec3 mu, rho;
+    irradiances(s, n, own, mu, rho);
+    Material m = material_of(int(s.normal_material.w), s.uv_voxel.xy, s.tint.rgb);
+    vec3 albedo = min(m.diffuse + m.f0, vec3(WHITEST));
+    bool in_beams = has_caustics && keep_light && m.roughness * m.roughness < GREATEST_ALPHA;
+    vec3 carried = in_beams ? (albedo - min(m.diffuse, albedo)) * surfel_lights[own].direct_rho.rgb : vec3(0.0);
+    return unsummed(own, vec4((albedo * rho - carried) / PI + m.emission, 0.0));
+}
+#endif
+
+#ifdef REAL
+vec3 outgoing(Surfel s, vec3 n, uint own) {
+#ifdef GATHERED
+    if (surfel_lights[own].radiance.w > 0.5) return vec3(0.0);
+#else
+    vec3 p = s.position_area.xyz;
+    if (camera_sees(p, n)) return unsummed(own, vec4(measured_radiance(p), 1.0));
+#endif
+    vec3 mu, rho;
+    irradiances(s, n, own, mu, rho);
+    return unsummed(own, vec4(unseen_albedo(s.position_area.xyz) / PI * mu, 0.0));
+}
+#endif
+
+#if defined(REAL_DELTA) || defined(REAL_RHO)
+// What a surface that gives back `back` of its irradiance sends out more under rho. A ratio is right whatever the
+// light's scale; gained light comes back by at most the greatest albedo.
+vec3 change_of(vec3 back, vec3 mu, vec3 rho) {
+    vec3 change = rho - mu;
+    return change * mix(back, min(back, vec3(WHITEST / PI)), greaterThan(change, vec3(0.0)));
+}
+#endif
+
+#ifdef SOLUTION
+vec3 outgoing(Surfel s, vec3 n, uint own) {
+    vec3 p = s.position_area.xyz, mu, rho;
+    irradiances(s, n, own, mu, rho);
+    bool seen = camera_sees(p, n);
+    vec3 back = unseen_albedo(p) / PI;
+    vec3 radiance = seen ? measured_radiance(p) : back * mu;
+#ifdef REAL_RHO
+    if (seen) back = radiance / (mu + 1e-6);
+    radiance += change_of(back, mu, rho);
+#endif
+    return radiance;
+}
+#endif
+
+#ifdef REAL_DELTA
+// Changes of gathered light below this fraction of it would not show in 8-bit pictures; mu and rho are then taken as
+// the same there, and need no two marches.
+const float LEAST_CHANGE = 1.0 / 512.0;
+
+// L_rho - L_mu.
+vec3 outgoing(Surfel s, vec3 n, uint own) {
+    vec3 mu, rho;
+    irradiances(s, n, own, mu, rho);
+#ifdef GATHERED
+    if (all(lessThanEqual(abs(rho - mu), LEAST_CHANGE * max(mu, rho)))) return vec3(0.0);
+#endif
+    return change_of(surfel_lights[own].radiance.rgb / (mu + 1e-6), mu, rho);
+}
+#endif
+
+void light(Surfel s, uint own, vec3 n) {
+    uint voxel = floatBitsToUint(s.uv_voxel.z);
+    vec3 radiance = outgoing(s, n, own);
+#if defined(REAL_DELTA) || defined(GATHERED)
+    if (radiance == vec3(0.0)) return;
+#endif
+#ifdef REAL_DELTA
+    ivec3 v = voxel_of_index(voxel, volume_size);
+    for (int j = 0; j < 3; ++j) { atomicMin(support[j], v[j]); atomicMin(support[3 + j], -v[j]); }
+#endif
+    add(voxel, n, s.position_area.w, radiance);
+}
+
+void main() {
+    uint count = min(surfel_count, surfel_capacity);
+    for (uint i = gl_GlobalInvocationID.x; i < count; i += gl_NumWorkGroups.x * 64u) {
+        Surfel s = surfels[i];
+        light(s, 2u * i, s.normal_material.xyz);
+        if (s.uv_voxel.w > 0.5) light(s, 2u * i + 1u, -s.normal_material.xyz);
+    }
+}

@@ -1,0 +1,34 @@
+// For each texel of the reduced resolution, the picture pixel nearest to its centre that shows a real surface with
+// depth, and the one that shows a virtual object. Where objects hide all real surfaces, one of these as -2 - pixel.
+#include "common/geometry.glsl"
+#include "common/work_list.glsl"
+
+layout(local_size_x = 8, local_size_y = 8) in;
+layout(rgba16i) writeonly uniform iimage2D sample_pixels_out;
+uniform sampler2D object_coverage;
+uniform ivec2 picture_pixels;
+uniform int scale;
+
+void main() {
+    ivec2 texel = ivec2(gl_GlobalInvocationID.xy);
+    ivec2 low = (picture_pixels + scale - 1) / scale;
+    if (any(greaterThanEqual(texel, low))) return;
+    ivec4 best = ivec4(-1);
+    ivec2 hidden = ivec2(-1);
+    vec3 nearest = vec3(1e9);
+    for (int j = 0; j < scale; ++j)
+        for (int i = 0; i < scale; ++i) {
+            ivec2 pixel = texel * scale + ivec2(i, j);
+            if (any(greaterThanEqual(pixel, picture_pixels))) continue;
+            vec2 d = vec2(i, j) - 0.5 * float(scale - 1);
+            float away = dot(d, d);
+            float shown = texelFetch(object_coverage, pixel, 0).r;
+            bool known = texelFetch(real_surface_position, pixel, 0).w > 0.0;
+            if (away < nearest.x && shown < 1.0 && known) { nearest.x = away; best.xy = pixel; }
+            if (away < nearest.z && shown == 1.0 && known) { nearest.z = away; hidden = -2 - pixel; }
+            if (away < nearest.y && shown > 0.0) { nearest.y = away; best.zw = pixel; }
+        }
+    if (best.x < 0) best.xy = hidden;
+    imageStore(sample_pixels_out, texel, best);
+    if (best.z >= 0) append_texel(texel, low.x);
+}

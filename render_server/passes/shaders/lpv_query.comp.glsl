@@ -1,0 +1,75 @@
+// Irradiance of the light volumes at 1/scale of the picture (docs/method.md 5), on top of the environment R.
+// REAL: E_mu and E_rho of real surfaces; CHANGE: E_rho = E_mu + the one volume of the change. VIRTUAL otherwise: the light
+// on the objects, and what a mirror on them would see.
+#include "common/environment.glsl"
+#include "common/brdf.glsl"
+#include "common/volume.glsl"
+#include "common/lpv_light.glsl"
+#include "common/low_res_grid.glsl"
+
+layout(local_size_x = 8, local_size_y = 8) in;
+#ifdef REAL
+layout(rgba16f) writeonly uniform image2D irradiance_mu;    // rgb E_mu, a: 1 where known
+layout(rgba16f) writeonly uniform image2D irradiance_rho;   // rgb E_rho, a: volume fade
+layout(rgba16f) writeonly uniform image2D specular_mu;
+#else
+layout(rgba16f) writeonly uniform image2D irradiance_rho;   // rgb E_rho, a: 1 where known
+#endif
+layout(rgba16f) writeonly uniform image2D specular_rho;
+#include "common/camera.glsl"
+
+const float RIM = 2.0;   // cells over which the change fades at the border
+
+float border_fade(vec3 q) {
+    vec3 rim = min(q, float(volume_size) - q);
+    return smoothstep(0.0, RIM, min(rim.x, min(rim.y, rim.z)));
+}
+
+// What a mirror at the point would show of the environment, were nothing in the volume.
+vec3 mirrored(SurfacePoint s) {
+    if (s.roughness < 0.0) return vec3(0.0);
+    return environment(reflect(normalize(s.position - camera_position), s.normal), specular_half_angle(s.roughness));
+}
+
+#ifdef REAL
+void shade(ivec2 texel, SurfacePoint s) {
+    vec3 q = volume_coordinate(s.position);
+    vec3 e_mu = vec3(0.0), e_rho = vec3(0.0), c = vec3(0.0);
+    float fade = s.present ? border_fade(q) : 0.0;
+    if (s.present) {
+        c = mirrored(s);
+        e_mu = environment_irradiance(s.normal);
+        e_rho = e_mu;
+    }
+    if (fade > 0.0) {
+#ifdef CHANGE
+        e_rho += from_volume(true, q, s.normal);
+#else
+        vec3 mu = from_volume(false, q, s.normal), rho = from_volume(true, q, s.normal);
+        e_rho = max(e_mu + fade * mu + (rho - mu), vec3(0.0));   // composition lets the change fade
+        e_mu = max(e_mu + fade * mu, vec3(0.0));
+#endif
+    }
+    imageStore(irradiance_mu, texel, vec4(e_mu, s.present ? 1.0 : 0.0));
+    imageStore(irradiance_rho, texel, vec4(e_rho, fade));
+    imageStore(specular_mu, texel, vec4(c, 1.0));
+    imageStore(specular_rho, texel, vec4(c, 1.0));
+}
+#else
+void shade(ivec2 texel, SurfacePoint s) {
+    vec3 e = vec3(0.0), c = vec3(0.0);
+    if (s.present) {
+        vec3 q = volume_coordinate(s.position);
+        e = max(environment_irradiance(s.normal) + from_volume(true, q, s.normal), vec3(0.0));
+        c = mirrored(s);
+    }
+    imageStore(irradiance_rho, texel, vec4(e, s.present ? 1.0 : 0.0));
+    imageStore(specular_rho, texel, vec4(c, 1.0));
+}
+#endif
+
+void main() {
+    ivec2 texel = ivec2(gl_GlobalInvocationID.xy);
+    if (any(greaterThanEqual(texel, low_resolution_size))) return;
+    shade(texel, surface_point(texel));
+}

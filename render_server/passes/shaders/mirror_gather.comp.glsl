@@ -1,0 +1,53 @@
+// Ambient and bounced light at the reflected points that mirror_hits listed, and how far real things hide them from the
+// surface that reflects them.
+#include "common/march.glsl"
+#include "common/environment.glsl"
+#include "common/diffuse_cones.glsl"
+#include "common/brdf.glsl"
+#include "common/mirror.glsl"
+#include "common/materials.glsl"
+#include "common/work_list.glsl"
+
+layout(local_size_x = 64) in;
+layout(rgba16f) writeonly uniform image2D irradiance_out;   // rgb; a: fraction that no real thing hides
+layout(rgba16f) writeonly uniform image2D specular_out;     // rgb mean radiance of the specular cone
+uniform isampler2D sample_pixels;
+uniform sampler2D hit_position;
+uniform sampler2D hit_normal;
+
+const ConeSet WHOLE = ConeSet(1, 0, 1.0, 0.0);   // cones as wide as their fractions
+const float OWN = 1.5;     // voxels from a surface that may be its own
+
+// Fraction of the way between two points (voxels) that real surfaces leave open; both ends are left out.
+float open_fraction(vec3 from, vec3 to) {
+    vec3 d = normalize(to - from);
+    Walk w = walk_from(from + OWN * d, d);
+    float end = length(to - from) - 2.0 * OWN, coverage = 0.0;
+    for (int i = 0; i < 1024; ++i) {
+        vec3 at = sample_point(w);
+        if (travelled(w) > end || coverage >= WALL) break;
+        if (inside_volume(at)) coverage += slice_fraction(w) * directional_sample(pyramid_mu, volume_size, at, w).a;
+        w.plane += 1;
+        w.ahead = vec3(0.0);
+    }
+    return 1.0 - blocked_fraction(coverage);
+}
+
+void gather(ivec2 texel) {
+    vec3 position = texelFetch(hit_position, texel, 0).xyz;
+    vec4 normal = texelFetch(hit_normal, texel, 0);
+    Mirror m = mirror_at(texelFetch(sample_pixels, texel, 0).xy);
+    vec3 q = volume_coordinate(position);
+    vec3 e_mu, e_rho;
+    diffuse(q, normal.xyz, WHOLE, true, e_mu, e_rho);
+    vec3 d = reflect(normalize(position - m.point), normal.xyz);
+    float half_angle = specular_half_angle(materials[int(normal.w)].dielectric.a);
+    March seen = march(q, d, 2.0 * tan(half_angle), true);
+    imageStore(irradiance_out, texel, vec4(e_rho, open_fraction(volume_coordinate(m.point) + OWN * m.normal, q)));
+    imageStore(specular_out, texel, vec4(seen.c_rho + seen.t_rho * environment(d, half_angle), 1.0));
+}
+
+void main() {
+    uint i = gl_GlobalInvocationID.x;
+    if (i < listed_count()) gather(texel_of_index(texels[i], textureSize(sample_pixels, 0).x));
+}

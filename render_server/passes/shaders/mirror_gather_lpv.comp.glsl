@@ -1,0 +1,41 @@
+// Ambient and bounced light at the reflected points that mirror_hits listed, from the light volume, and whether real
+// things in the picture hide them from the surface that reflects them.
+#include "common/volume.glsl"
+#include "common/environment.glsl"
+#include "common/lpv_light.glsl"
+#include "common/brdf.glsl"
+#include "common/mirror.glsl"
+#include "common/materials.glsl"
+#include "common/screen_march.glsl"
+#include "common/work_list.glsl"
+
+layout(local_size_x = 64) in;
+layout(rgba16f) writeonly uniform image2D irradiance_out;   // rgb; a: fraction that no real thing hides
+layout(rgba16f) writeonly uniform image2D specular_out;     // rgb mean radiance of the specular cone
+uniform isampler2D sample_pixels;
+uniform sampler2D hit_position;
+uniform sampler2D hit_normal;
+
+const float CLEAR = 1e-3;   // of the depth: how far off its own surface a ray starts, and how near its end it stops
+
+float open_fraction(Mirror m, vec3 to) {
+    vec3 from = m.point + (CLEAR * m.depth + 3.0 * noise_sigma * m.depth * m.depth) * m.normal;
+    ScreenHit hit = screen_hit(from, normalize(to - from), 0.0);
+    return hit.fraction > 0.0 && hit.distance < distance(to, from) - CLEAR * m.depth ? 1.0 - hit.fraction : 1.0;
+}
+
+void gather(ivec2 texel) {
+    vec3 position = texelFetch(hit_position, texel, 0).xyz;
+    vec4 normal = texelFetch(hit_normal, texel, 0);
+    Mirror m = mirror_at(texelFetch(sample_pixels, texel, 0).xy);
+    vec3 q = volume_coordinate(position), d = reflect(normalize(position - m.point), normal.xyz);
+    vec3 e = max(environment_irradiance(normal.xyz) + from_volume(true, q, normal.xyz), vec3(0.0));
+    vec3 seen = environment(d, specular_half_angle(materials[int(normal.w)].dielectric.a));
+    imageStore(irradiance_out, texel, vec4(e, open_fraction(m, position)));
+    imageStore(specular_out, texel, vec4(seen, 1.0));
+}
+
+void main() {
+    uint i = gl_GlobalInvocationID.x;
+    if (i < listed_count()) gather(texel_of_index(texels[i], textureSize(sample_pixels, 0).x));
+}

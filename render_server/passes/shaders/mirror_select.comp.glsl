@@ -1,0 +1,36 @@
+// List the pixels of smooth real surfaces whose lobe can reach the virtual objects; the others reflect none.
+#include "common/mirror.glsl"
+#include "common/work_list.glsl"
+
+layout(local_size_x = 8, local_size_y = 8) in;
+layout(rgba16f) writeonly uniform image2D reflection;
+layout(rgba16f) writeonly uniform image2D traced;
+layout(r16f) writeonly uniform image2D hit_distance;
+uniform sampler2D object_coverage;
+uniform vec3 bounds_centre;
+uniform float bounds_radius;
+
+const float LOBE_FRACTION = 0.99;   // of its energy: how far out the lobe is followed
+
+bool reaches_objects(Mirror m) {
+    vec3 mirrored = reflect(normalize(m.point - camera_position), m.normal);
+    vec3 to = bounds_centre - m.point;
+    float distance = length(to);
+    if (distance <= bounds_radius) return true;
+    float lobe = 2.0 * atan(m.alpha * sqrt(LOBE_FRACTION / (1.0 - LOBE_FRACTION)));   // as specular_half_angle has it
+    return acos(clamp(dot(to, mirrored) / distance, -1.0, 1.0)) < asin(bounds_radius / distance) + lobe;
+}
+
+void main() {
+    ivec2 pixel = ivec2(gl_GlobalInvocationID.xy);
+    ivec2 size = textureSize(object_coverage, 0);
+    if (any(greaterThanEqual(pixel, size))) return;
+    Mirror m = mirror_at(pixel);
+    if (m.present && texelFetch(object_coverage, pixel, 0).r < 1.0 && reaches_objects(m)) {
+        append_texel(pixel, size.x);
+        return;
+    }
+    imageStore(reflection, pixel, vec4(0.0));
+    imageStore(traced, pixel, vec4(0.0));
+    imageStore(hit_distance, pixel, vec4(0.0));
+}

@@ -1,0 +1,34 @@
+// Rays of 3 x 3 pixels for each where the lobe is wider than that on the picture anyway: their pattern is made to be
+// even over 3 x 3, and does not show as grain.
+#include "common/mirror.glsl"
+#include "common/work_list.glsl"
+
+layout(local_size_x = 64) in;
+layout(rgba16f) writeonly uniform image2D reflection;
+uniform sampler2D object_coverage;
+uniform sampler2D traced;
+uniform sampler2D hit_distance;   // m from the surface to the objects, 0 none
+
+// Radius on the picture of half of the lobe's energy, pixels; `d`: m to what it meets.
+float lobe_pixels(Mirror m, float d) { return 2.0 * m.alpha * d / (m.depth + d) * camera_pinhole.x; }
+
+void smooth_pixel(ivec2 pixel) {
+    Mirror m = mirror_at(pixel);
+    float entry = texelFetch(real_surface_normal, pixel, 0).w, farthest = 0.0, count = 0.0;
+    vec4 own = texelFetch(traced, pixel, 0), around = vec4(0.0);
+    ivec2 last = textureSize(traced, 0) - 1;
+    for (int k = 0; k < 9; ++k) {
+        ivec2 at = clamp(pixel + ivec2(k % 3, k / 3) - 1, ivec2(0), last);
+        if (texelFetch(real_surface_normal, at, 0).w != entry || texelFetch(object_coverage, at, 0).r >= 1.0) continue;
+        around += texelFetch(traced, at, 0);
+        farthest = max(farthest, texelFetch(hit_distance, at, 0).r);
+        count += 1.0;
+    }
+    float smoothing = clamp(lobe_pixels(m, farthest) - 1.0, 0.0, 1.0);
+    imageStore(reflection, pixel, mix(own, around / count, smoothing));
+}
+
+void main() {
+    uint i = gl_GlobalInvocationID.x;
+    if (i < listed_count()) smooth_pixel(texel_of_index(texels[i], textureSize(traced, 0).x));
+}

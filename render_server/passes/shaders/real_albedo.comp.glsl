@@ -1,0 +1,56 @@
+// Albedo of the real surface at each texel of a light's map that has points in the volume, from the picture where the
+// camera looks at it: albedo = pi B_lin / E_mu ([P2] eq. 1, with visibility and ambient light).
+#include "common/light_rays.glsl"
+#include "common/environment.glsl"
+#include "common/volume.glsl"
+#include "common/real_radiance.glsl"
+
+layout(local_size_x = 8, local_size_y = 8) in;
+layout(rgba16f) writeonly uniform image2D albedo_out;
+uniform sampler2D real_light_normal;
+uniform int view_index;
+uniform float bias_real;   // m
+
+const vec2 ALBEDO_RANGE = vec2(0.02, 0.95);
+
+// Real direct and ambient light. The light whose map this is reaches its texels by what the map is.
+vec3 irradiance(vec3 p, vec3 n) {
+    vec3 e = environment_irradiance(n);
+    for (int i = 0; i < light_count; ++i) {
+        bool own = i == light_of_view(view_index);
+        vec3 to_light; float radius;
+        vec3 across = light_at(lights[i], p, n, to_light, radius);
+        float cosine = dot(n, to_light);
+        if (cosine <= 0.0) continue;
+        e += across * cosine * (own ? 1.0 : real_visibility(lights[i], p, n, bias_real));
+    }
+    return e;
+}
+
+const float SNAP_REACH = 0.5;   // voxels: split_inject looks for a touched voxel so near (SNAP along each axis)
+
+// Whether light that meets a surface within `around` (m) of p may go into a voxel of the volume.
+bool reaches_volume(vec3 p, float around) {
+    vec3 q = volume_coordinate(p);
+    return distance(q, clamp(q, vec3(0.0), vec3(float(volume_size)))) <= around / voxel_edge + SNAP_REACH;
+}
+
+void main() {
+    LightView view = light_views[view_index];
+    if (any(greaterThanEqual(vec2(gl_GlobalInvocationID.xy), view.tile.zz))) return;
+    ivec2 texel = ivec2(gl_GlobalInvocationID.xy) + ivec2(view.tile.xy);
+    float depth = first_depth(real_light_depth, view, texel);
+    if (depth == NOTHING) return;
+    vec2 s = texel_lateral(view, texel);
+    vec3 p = ray_point(view, s, depth);
+    if (!reaches_volume(p, hit_spread(view, s, depth))) return;
+    vec3 albedo = unseen_albedo(p);
+    if (camera_sees(p)) {
+        vec3 n = normalize(texelFetch(real_light_normal, texel, 0).xyz);
+        vec3 to_light; float radius;
+        light_at(lights[light_of_view(view_index)], p, to_light, radius);
+        if (dot(n, to_light) < 0.0) n = -n;   // what the light sees faces it
+        albedo = clamp(PI * measured_radiance(p) / max(irradiance(p, n), vec3(1e-6)), ALBEDO_RANGE.x, ALBEDO_RANGE.y);
+    }
+    imageStore(albedo_out, texel, vec4(albedo, 1.0));
+}

@@ -1,0 +1,28 @@
+// Real geometry buffer from a given model or the fused surface: its raster, looked up through the lens model.
+#include "common/geometry.glsl"
+#include "common/surfaces.glsl"
+
+layout(local_size_x = 8, local_size_y = 8) in;
+uniform sampler2D model_raster_position;   // as the objects' raster (common/geometry.glsl)
+uniform sampler2D model_raster_normal;
+layout(rgba32f) uniform image2D position_out;
+layout(rgba16f) writeonly uniform image2D normal_out;
+uniform bool keeps_depth;     // the frame's own depth is there already, and stays where it says something else
+uniform vec2 tolerance;       // up to which both say the same: m, and m at 1 m
+
+void main() {
+    ivec2 pixel = ivec2(gl_GlobalInvocationID.xy);
+    if (any(greaterThanEqual(pixel, imageSize(position_out)))) return;
+    ivec2 raster = raster_texel(pixel);
+    vec4 position = vec4(0.0);
+    vec4 normal = vec4(0.0, 0.0, 1.0, -1.0);
+    if (all(greaterThanEqual(raster, ivec2(0))) && all(lessThan(raster, textureSize(model_raster_position, 0)))) {
+        position = texelFetch(model_raster_position, raster, 0);
+        vec4 seen = texelFetch(model_raster_normal, raster, 0);
+        normal = vec4(seen.xyz, float(surface_entry(position.xyz, seen.w)));
+    }
+    float own = keeps_depth ? imageLoad(position_out, pixel).w : 0.0;
+    if (own > 0.0 && abs(position.w - own) > tolerance.x + tolerance.y * own * own) return;
+    imageStore(position_out, pixel, position);
+    imageStore(normal_out, pixel, normal);
+}

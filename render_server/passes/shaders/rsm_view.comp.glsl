@@ -1,0 +1,29 @@
+// The reflective shadow maps: what the lights see of the real scene (left) and of the objects (right), as normals.
+layout(local_size_x = 8, local_size_y = 8) in;
+layout(rgba8ui) writeonly uniform uimage2D code_out;
+uniform sampler2D real_light_normal;
+uniform sampler2D virtual_light_normal;
+uniform sampler2D real_light_depth;
+uniform sampler2D virtual_light_depth;
+
+// Nearest texel of a map fitted into a box of `size` pixels.
+uvec4 shown(sampler2D normal, sampler2D depth, vec2 at, vec2 size) {
+    vec2 extent = vec2(textureSize(normal, 0));
+    float zoom = max(extent.x / size.x, extent.y / size.y);
+    vec2 texel = (at - 0.5 * size) * zoom + 0.5 * extent;
+    if (any(lessThan(texel, vec2(0.0))) || any(greaterThanEqual(texel, extent))) return uvec4(16u, 16u, 16u, 255u);
+    if (texelFetch(depth, ivec2(texel), 0).r >= 1.0) return uvec4(0u, 0u, 0u, 255u);
+    return uvec4(round(255.0 * (0.5 + 0.5 * texelFetch(normal, ivec2(texel), 0).xyz)), 255u);
+}
+
+void main() {
+    ivec2 pixel = ivec2(gl_GlobalInvocationID.xy);
+    ivec2 size = imageSize(code_out);
+    if (any(greaterThanEqual(pixel, size))) return;
+    vec2 half_size = vec2(0.5 * float(size.x), float(size.y));
+    vec2 at = vec2(pixel) + 0.5;
+    bool left = at.x < half_size.x;
+    uvec4 code = left ? shown(real_light_normal, real_light_depth, at, half_size)
+                      : shown(virtual_light_normal, virtual_light_depth, at - vec2(half_size.x, 0.0), half_size);
+    imageStore(code_out, pixel, code);
+}

@@ -1,0 +1,133 @@
+// What smooth virtual surfaces reflect of the real scene that the camera sees, by cones across the picture ([D] 4.4.2):
+// the picture's radiance there, times how the objects change its light. What a cone does not find in the picture it meets
+// among the voxels (VOXELS), or that fraction of the lobe remains for others.
+#include "common/screen_march.glsl"
+#include "common/brdf.glsl"
+#include "common/ray_mesh.glsl"
+#include "common/lobe.glsl"
+#include "common/upsample.glsl"
+#include "common/work_list.glsl"
+#ifdef VOXELS
+#include "common/march.glsl"
+#include "common/environment.glsl"
+#endif
+
+layout(local_size_x = 64) in;
+layout(rgba16f) writeonly uniform image2D reflected;   // rgb radiance times fraction; a: fraction of the lobe
+uniform sampler2D object_coverage;
+uniform sampler2D direct_mu;
+uniform sampler2D direct_rho;
+uniform sampler2D cone_mu;
+uniform sampler2D cone_rho;
+#include "common/camera.glsl"
+
+const float LEAST_IRRADIANCE = 1e-4;
+const float CLEAR = 1e-3;   // of the depth: how far off its own surface a ray starts
+
+// E_rho / E_mu where a pixel sees a real surface, also behind objects.
+vec3 change_of_light(vec2 at) {
+    ivec2 pixel = clamp(ivec2(at), ivec2(0), textureSize(direct_mu, 0) - 1);
+    vec3 mu = vec3(0.0), rho = vec3(0.0);
+    float total = 0.0;
+    for (int j = 0; j < 4; ++j) {
+        float w;
+        ivec2 texel = low_texel(pixel, j, w);
+        if (texelFetch(sample_pixels, texel, 0).x == -1) continue;
+        vec4 e_mu = texelFetch(cone_mu, texel, 0), e_rho = texelFetch(cone_rho, texel, 0);
+        mu += w * e_mu.rgb;
+        rho += w * mix(e_mu.rgb, e_rho.rgb, e_rho.a);
+        total += w;
+    }
+    if (total == 0.0) return vec3(1.0);
+    mu = mu / total + texelFetch(direct_mu, pixel, 0).rgb;
+    rho = rho / total + texelFetch(direct_rho, pixel, 0).rgb;
+    return (max(rho, vec3(0.0)) + LEAST_IRRADIANCE) / (mu + LEAST_IRRADIANCE);
+}
+
+// Radiance times fraction of one cone, across the picture.
+vec4 look_across(vec3 from, vec3 d, float spread) {
+    ScreenHit hit = screen_hit(from, d, spread);
+    if (hit.fraction <= 0.0 || closest_hit(Ray(from, d)).distance < hit.distance) return vec4(0.0);
+    return hit.fraction * vec4(screen_radiance(hit, spread) * change_of_light(hit.pixel), 1.0);
+}
+
+// The same through all that the cone may meet.
+vec4 look(vec3 from, vec3 d, float spread) {
+    vec4 seen = look_across(from, d, spread);
+#ifdef VOXELS
+    if (seen.a < 1.0) {
+        bool differs;
+        Crossed met = march_one(pyramid_rho, volume_coordinate(from), d, spread, differs);
+        vec3 behind = (1.0 - blocked_fraction(met.coverage)) * environment(d, atan(0.5 * spread));
+        seen += (1.0 - seen.a) * vec4(met.c + behind, 1.0);
+    }
+#endif
+    return seen;
+}
+
+// How position and normal change from a pixel to the next along an axis; the lesser change of both sides, so that
+// no edge counts.
+struct Change { vec3 position; vec3 normal; };
+
+Change change_along(ivec2 pixel, ivec2 axis, vec4 position, vec4 normal) {
+    Change least = Change(vec3(0.0), vec3(1e3));
+    for (int side = -1; side <= 1; side += 2) {
+        ivec2 beside = clamp(pixel + side * axis, ivec2(0), textureSize(object_coverage, 0) - 1), raster = raster_texel(beside);
+        vec4 p = texelFetch(virtual_raster_position, raster, 0), n = texelFetch(virtual_raster_normal, raster, 0);
+        bool shown = p.w > 0.0 && texelFetch(object_coverage, beside, 0).r > 0.0;
+        bool next = shown && n.w == normal.w && distance(n, normal) < length(least.normal);
+        if (next) least = Change(float(side) * (p - position).xyz, float(side) * (n - normal).xyz);
+    }
+    return length(least.normal) < 1.0 ? least : Change(vec3(0.0), vec3(0.0));
+}
+
+// Diameter at distance 1 of what one cone stands for: its part of the lobe, and of how far a curved surface turns the
+// reflection from one border of the pixel to the other.
+float spread_of(float alpha, Change x, Change y) {
+    vec2 turned = 2.0 * vec2(length(x.normal), length(y.normal));
+    float fraction = 1.0 / float(CONE_COUNT);
+    float curved = max(sqrt(turned.x * turned.y * fraction), max(turned.x, turned.y) * fraction);
+    return length(vec2(2.0 * MEDIAN_DISC * alpha, curved));
+}
+
+// Cones spread evenly over the lobe and over the pixel.
+vec4 reflection(ivec2 pixel) {
+    ivec2 raster = raster_texel(pixel);
+    vec4 position = texelFetch(virtual_raster_position, raster, 0);
+    vec4 normal = texelFetch(virtual_raster_normal, raster, 0);
+    MaterialEntry m = materials[int(normal.w)];
+    bool shines = m.dielectric.rgb != vec3(0.0) || m.base_color.a > 0.0;
+    if (!shines || m.dielectric.a >= ROUGHEST) return vec4(0.0);
+    float alpha = max(m.dielectric.a * m.dielectric.a, LEAST_ALPHA);
+    Change x = change_along(pixel, ivec2(1, 0), position, normal);
+    Change y = change_along(pixel, ivec2(0, 1), position, normal);
+    float spread = spread_of(alpha, x, y);
+    vec4 sum = vec4(0.0);
+    float count = 0.0;
+    for (int j = 0; j < CONE_COUNT; ++j) {
+        vec3 even = fract(float(j) * vec3(0.6180339887, 0.7548776662, 0.5698402910) + vec3(0.0, 0.5, 0.5));
+        vec2 within = even.yz - 0.5;
+        vec3 n = normalize(normal.xyz + within.x * x.normal + within.y * y.normal);
+        vec3 p = position.xyz + within.x * x.position + within.y * y.position;
+        vec3 v = normalize(camera_position - p);
+        mat3 basis = basis_around(n);
+        vec3 h = basis * visible_normal(vec2(even.x, (float(j) + 0.5) / float(CONE_COUNT)), v * basis, alpha);
+        vec3 d = normalize(2.0 * dot(v, h) * h - v);
+        if (dot(d, normal.xyz) <= 0.0) continue;
+        sum += look(p + CLEAR * position.w * normal.xyz, d, spread);
+        count += 1.0;
+    }
+    return sum / max(count, 1.0);
+}
+
+// The pixels of the texels that show an object.
+void main() {
+    ivec2 size = textureSize(object_coverage, 0);
+    int grid_width = textureSize(sample_pixels, 0).x;
+    uint block = uint(scale * scale);
+    for (uint i = gl_GlobalInvocationID.x; i < listed_count() * block; i += gl_NumWorkGroups.x * 64u) {
+        ivec2 pixel = pixel_in_block(texel_of_index(texels[i / block], grid_width), int(i % block), scale);
+        if (any(greaterThanEqual(pixel, size)) || texelFetch(object_coverage, pixel, 0).r <= 0.0) continue;
+        imageStore(reflected, pixel, reflection(pixel));
+    }
+}

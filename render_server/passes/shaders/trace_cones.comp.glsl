@@ -1,0 +1,59 @@
+// Diffuse and specular cones of the exact operator at 1/scale of the picture (docs/method.md 3, 4.5).
+// REAL: E_mu and E_rho of ambient + bounced light on real surfaces. VIRTUAL: E_rho and the specular cone of the object.
+#include "common/march.glsl"
+#include "common/environment.glsl"
+#include "common/diffuse_cones.glsl"
+#include "common/brdf.glsl"
+#include "common/low_res_grid.glsl"
+#include "common/work_list.glsl"
+
+layout(local_size_x = 64) in;
+#ifdef REAL
+layout(rgba16f) writeonly uniform image2D irradiance_mu;    // rgb E_mu, a: 1 where traced
+layout(rgba16f) writeonly uniform image2D irradiance_rho;   // rgb E_rho, a: volume fade
+#else
+layout(rgba16f) writeonly uniform image2D irradiance_rho;   // rgb E_rho, a: 1 where traced
+#endif
+#ifdef REAL
+layout(rgba16f) writeonly uniform image2D specular_mu;      // rgb mean radiance of the specular cone
+#endif
+layout(rgba16f) writeonly uniform image2D specular_rho;
+#include "common/camera.glsl"
+
+// Four texels next to each other divide four times as many directions between them, each cone half as wide as its
+// own solid angle; bilateral_cone_filter takes the mean.
+ConeSet cones_of(ivec2 texel) { return ConeSet(4, (texel.x & 1) + 2 * (texel.y & 1), 0.5, 0.0); }
+
+void trace(ivec2 texel) {
+    SurfacePoint s = surface_point(texel);
+    vec3 q = volume_coordinate(s.position);
+    vec3 e_mu, e_rho, c_mu = vec3(0.0), c_rho = vec3(0.0);
+#ifdef REAL
+    diffuse(q, s.normal, cones_of(texel), false, e_mu, e_rho);
+#else
+    diffuse(q, s.normal, cones_of(texel), true, e_mu, e_rho);
+#endif
+    if (s.roughness >= 0.0) {
+        vec3 v = normalize(camera_position - s.position);
+        vec3 d = reflect(-v, s.normal);
+        float half_angle = specular_half_angle(s.roughness);
+        March m = march(q, d, 2.0 * tan(half_angle), false);
+        vec3 r = environment(d, half_angle);
+        c_mu = m.c_mu + m.t_mu * r;
+        c_rho = m.c_rho + m.t_rho * r;
+    }
+#ifdef REAL
+    imageStore(irradiance_mu, texel, vec4(e_mu, 1.0));
+    imageStore(irradiance_rho, texel, vec4(e_rho, volume_fade(q)));
+    imageStore(specular_mu, texel, vec4(c_mu, 1.0));
+#else
+    imageStore(irradiance_rho, texel, vec4(e_rho, 1.0));
+#endif
+    imageStore(specular_rho, texel, vec4(c_rho, 1.0));
+}
+
+// The texels that select_cone_texels or low_res_grid listed.
+void main() {
+    for (uint i = gl_GlobalInvocationID.x; i < listed_count(); i += gl_NumWorkGroups.x * 64u)
+        trace(texel_of_index(texels[i], low_resolution_size.x));
+}

@@ -1,0 +1,116 @@
+// Diffuse and specular cones of the paper's operator at 1/scale of the picture ([P1] eq. 6 and 8).
+// REAL: C_delta, the change of light on real surfaces. VIRTUAL: C_rho, the light of the volume on the objects, and the
+// environment where it is left of a cone.
+#include "common/march_joint.glsl"
+#include "common/environment.glsl"
+#include "common/brdf.glsl"
+#include "common/low_res_grid.glsl"
+
+layout(local_size_x = 8, local_size_y = 8) in;
+#ifdef REAL
+layout(rgba16f) writeonly uniform image2D irradiance_mu;    // rgb ambient E_mu, a: 1 where known
+layout(rgba16f) writeonly uniform image2D irradiance_rho;   // rgb E_mu + E of C_delta, a: volume fade
+layout(rgba16f) writeonly uniform image2D specular_mu;      // rgb mirrored radiance that objects hide
+layout(rgba16f) writeonly uniform image2D specular_rho;     // rgb C_delta of the specular cone
+uniform sampler2D linear_picture;
+uniform vec3 object_low;    // voxels that hold the objects
+uniform vec3 object_high;
+#else
+layout(rgba16f) writeonly uniform image2D irradiance_rho;   // rgb E_rho, a: 1 where traced
+layout(rgba16f) writeonly uniform image2D specular_rho;     // rgb mean radiance of the specular cone
+#endif
+uniform sampler3D pyramid;   // V_delta for REAL, V_rho otherwise; a: V_eta
+#include "common/camera.glsl"
+
+const float START = 2.0;    // voxels along the normal, out of the surface's own voxels
+// Nine cones: the normal, four at 45 degrees, four on the diagonals between ((1,1,1) about the normal).
+const int CONES = 9;
+const float HALF_ANGLE = 0.4759;     // rad: a ninth of the hemisphere's solid angle each, cos = 8/9
+const float RATIO = 1.0308;          // diameter / distance, 2 tan(HALF_ANGLE)
+const float DIAGONAL = 0.57735026919;
+const float RIGHT = 0.70710678119;
+const float COSINE_SUM = 1.0 + 4.0 * RIGHT + 4.0 * DIAGONAL;
+
+// Direction k about z; its z is the cosine that weighs it.
+vec3 cone_direction(int k) {
+    if (k == 0) return vec3(0.0, 0.0, 1.0);
+    float phi = float(k - 1) * PI / 4.0;
+    float z = (k & 1) == 1 ? RIGHT : DIAGONAL;
+    return vec3(sqrt(1.0 - z * z) * vec2(cos(phi), sin(phi)), z);
+}
+
+vec2 in_volume(vec3 q, vec3 d) { return box_interval(q, d, vec3(0.0), vec3(float(volume_size))); }
+
+// E of the nine cones; light that comes unhindered from all around would give pi L.
+vec3 diffuse(vec3 q, vec3 n, bool with_environment) {
+    mat3 basis = basis_around(n);
+    vec3 e = vec3(0.0);
+    for (int k = 0; k < CONES; ++k) {
+        vec3 local = cone_direction(k);
+        vec3 d = basis * local;
+        vec4 c = march(pyramid, q, d, RATIO, in_volume(q, d));
+        if (with_environment) c.rgb += (1.0 - c.a) * environment(d, HALF_ANGLE);
+        e += local.z * c.rgb;
+    }
+    return e * PI / COSINE_SUM;
+}
+
+void store_specular(ivec2 texel, vec3 mu, vec3 rho) {
+#ifdef REAL
+    imageStore(specular_mu, texel, vec4(mu, 1.0));
+#endif
+    imageStore(specular_rho, texel, vec4(rho, 1.0));
+}
+
+#ifdef REAL
+// What the real mirror shows at the texel's pixel: the picture, on a metal; what it shows of the environment otherwise.
+vec3 mirrored(ivec2 texel, SurfacePoint s, vec3 v, vec3 d, float half_angle) {
+    ivec2 pixel = texelFetch(sample_pixels, texel, 0).xy;
+    SurfaceEntry e = surfaces[int(texelFetch(real_surface_normal, pixel, 0).w)];
+    if (e.f0.w < 0.5) return environment(d, half_angle);
+    vec3 reflectance = specular_reflectance(e.f0.rgb, s.roughness, max(dot(s.normal, v), 1e-3));
+    return texelFetch(linear_picture, pixel, 0).rgb / max(reflectance, vec3(1e-3));
+}
+
+// C_delta adds what the object's voxels send; their opacity takes away what was mirrored from there ([P1] 3.2).
+void specular(ivec2 texel, SurfacePoint s, vec3 q) {
+    vec3 v = normalize(camera_position - s.position);
+    vec3 d = reflect(-v, s.normal);
+    float half_angle = specular_half_angle(s.roughness);
+    float ratio = 2.0 * tan(half_angle);
+    vec3 added = march(pyramid, q, d, ratio, in_volume(q, d)).rgb;
+    float hidden = march(pyramid, q, d, ratio, box_interval(q, d, object_low - 0.5, object_high + 0.5)).a;
+    store_specular(texel, hidden * mirrored(texel, s, v, d, half_angle), added);
+}
+
+void shade(ivec2 texel, SurfacePoint s) {
+    vec3 q = volume_coordinate(s.position);
+    float fade = s.present ? volume_fade(q) : 0.0;
+    vec3 e = s.present ? environment_irradiance(s.normal) : vec3(0.0);
+    imageStore(irradiance_mu, texel, vec4(e, s.present ? 1.0 : 0.0));
+    if (fade > 0.0) e += diffuse(q + START * s.normal, s.normal, false);
+    imageStore(irradiance_rho, texel, vec4(e, fade));
+    if (fade > 0.0 && s.roughness >= 0.0) specular(texel, s, q + START * s.normal);
+    else store_specular(texel, vec3(0.0), vec3(0.0));
+}
+#else
+void shade(ivec2 texel, SurfacePoint s) {
+    vec3 e = vec3(0.0), c = vec3(0.0);
+    if (s.present) {
+        vec3 q = volume_coordinate(s.position) + START * s.normal;
+        e = diffuse(q, s.normal, true);
+        vec3 d = reflect(normalize(s.position - camera_position), s.normal);
+        float half_angle = specular_half_angle(s.roughness);
+        vec4 met = march(pyramid, q, d, 2.0 * tan(half_angle), in_volume(q, d));
+        c = met.rgb + (1.0 - met.a) * environment(d, half_angle);
+    }
+    imageStore(irradiance_rho, texel, vec4(e, s.present ? 1.0 : 0.0));
+    store_specular(texel, vec3(0.0), c);
+}
+#endif
+
+void main() {
+    ivec2 texel = ivec2(gl_GlobalInvocationID.xy);
+    if (any(greaterThanEqual(texel, low_resolution_size))) return;
+    shade(texel, surface_point(texel));
+}

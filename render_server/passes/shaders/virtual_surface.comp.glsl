@@ -1,0 +1,67 @@
+// Radiance of the virtual surfaces (docs/method.md 4.7): direct light shadowed by real and virtual geometry, GGX lobes,
+// diffuse cones and the specular cone of the rho set.
+#include "common/lights.glsl"
+#include "common/brdf.glsl"
+#include "common/geometry.glsl"
+#include "common/object_light.glsl"
+#include "common/work_list.glsl"
+#include "common/caustics.glsl"
+
+layout(local_size_x = 64) in;
+layout(rgba16f) writeonly uniform image2D radiance_out;
+uniform sampler2D object_coverage;
+uniform sampler2D cone_irradiance;
+uniform sampler2D cone_specular;
+uniform sampler2D virtual_raster_uv;
+uniform sampler2D virtual_raster_tint;
+uniform sampler2D screen_reflection;   // rgb radiance times fraction; a: fraction of the specular lobe
+uniform bool has_screen_reflection;
+#include "common/camera.glsl"
+
+Indirect indirect_at(ivec2 pixel, vec4 position, vec3 normal) {
+    Indirect sum = Indirect(vec3(0.0), vec3(0.0));
+    float total = 0.0;
+    for (int j = 0; j < 4; ++j) {
+        float w;
+        ivec2 texel = low_texel(pixel, j, w);
+        vec4 e = texelFetch(cone_irradiance, texel, 0);
+        if (e.a == 0.0) continue;
+        ivec2 raster = raster_texel(texelFetch(sample_pixels, texel, 0).zw);
+        vec3 sp = texelFetch(virtual_raster_position, raster, 0).xyz;
+        vec3 sn = texelFetch(virtual_raster_normal, raster, 0).xyz;
+        w *= continuation(position.xyz, normal, sp, sn, sample_distance * position.w) + 1e-4;
+        sum.irradiance += w * e.rgb;
+        sum.specular += w * texelFetch(cone_specular, texel, 0).rgb;
+        total += w;
+    }
+    if (total > 0.0) { sum.irradiance /= total; sum.specular /= total; }
+    return sum;
+}
+
+void shade(ivec2 pixel) {
+    ivec2 raster = raster_texel(pixel);
+    vec4 position = texelFetch(virtual_raster_position, raster, 0);
+    vec4 normal = texelFetch(virtual_raster_normal, raster, 0);
+    Material m = material_of(
+        int(normal.w), texelFetch(virtual_raster_uv, raster, 0).xy, texelFetch(virtual_raster_tint, raster, 0).rgb);
+    vec3 v = normalize(camera_position - position.xyz);
+    Indirect indirect = indirect_at(pixel, position, normal.xyz);
+    if (has_screen_reflection) {
+        vec4 seen = texelFetch(screen_reflection, pixel, 0);
+        indirect.specular = seen.rgb + (1.0 - seen.a) * indirect.specular;
+    }
+    indirect.irradiance += caustic_irradiance(pixel, textureSize(object_coverage, 0), OBJECT_LAYER, position.xyz, normal.xyz, position.w);
+    vec3 radiance = object_radiance(position.xyz, position.w, normal.xyz, v, m, indirect);
+    imageStore(radiance_out, pixel, vec4(radiance, 1.0));
+}
+
+// The pixels of the texels that show an object.
+void main() {
+    ivec2 size = textureSize(object_coverage, 0);
+    int grid_width = textureSize(sample_pixels, 0).x;
+    uint block = uint(scale * scale);
+    for (uint i = gl_GlobalInvocationID.x; i < listed_count() * block; i += gl_NumWorkGroups.x * 64u) {
+        ivec2 pixel = pixel_in_block(texel_of_index(texels[i / block], grid_width), int(i % block), scale);
+        if (all(lessThan(pixel, size)) && texelFetch(object_coverage, pixel, 0).r > 0.0) shade(pixel);
+    }
+}

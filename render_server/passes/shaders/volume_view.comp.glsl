@@ -1,0 +1,51 @@
+// The lit voxels as cubes, walked cell by cell along each pixel's ray (Amanatides & Woo 1987); beyond the volume the
+// picture at a quarter of its brightness.
+#include "common/volume.glsl"
+#include "common/srgb.glsl"
+
+layout(local_size_x = 8, local_size_y = 8) in;
+layout(rgba8ui) writeonly uniform uimage2D code_out;
+uniform usampler2D picture;
+uniform sampler2D picture_rays;
+uniform sampler3D voxels;
+#include "common/camera.glsl"
+
+const float VISIBLE_COVERAGE = 0.05;
+
+// Premultiplied texel of a voxel as seen along d: the mean of what its facing directions hold.
+vec4 facing_texel(ivec3 cell, vec3 d) {
+    vec4 sum = vec4(0.0);
+    for (int axis = 0; axis < (DIRECTIONS == 1 ? 1 : 3); ++axis) {
+        int k = DIRECTIONS == 1 ? 0 : 2 * axis + (d[axis] >= 0.0 ? 0 : 1);
+        sum += texelFetch(voxels, level_base(0, k) + cell, 0) * (DIRECTIONS == 1 ? 1.0 : abs(d[axis]));
+    }
+    return sum;
+}
+
+void main() {
+    ivec2 pixel = ivec2(gl_GlobalInvocationID.xy);
+    if (any(greaterThanEqual(pixel, textureSize(picture, 0)))) return;
+    imageStore(code_out, pixel, uvec4(texelFetch(picture, pixel, 0).rgb / 4u, 255u));
+    vec3 d = normalize(mat3(world_from_camera) * vec3(texelFetch(picture_rays, pixel, 0).xy, 1.0));
+    vec3 q = volume_coordinate(camera_position);
+    vec3 inverse = 1.0 / (d + vec3(equal(d, vec3(0.0))) * 1e-9);
+    vec3 t0 = -q * inverse, t1 = (float(volume_size) - q) * inverse;
+    float enter = max(max(min(t0.x, t1.x), min(t0.y, t1.y)), max(min(t0.z, t1.z), 0.0));
+    float leave = min(max(t0.x, t1.x), min(max(t0.y, t1.y), max(t0.z, t1.z)));
+    if (enter >= leave) return;
+    vec3 at = q + (enter + 1e-3) * d;
+    ivec3 cell = ivec3(floor(at)), stride = ivec3(sign(d));
+    vec3 next = (vec3(cell) + max(vec3(stride), 0.0) - q) * inverse;
+    int axis = 2;
+    for (int i = 0; i < 3 * volume_size; ++i) {
+        if (any(lessThan(cell, ivec3(0))) || any(greaterThanEqual(cell, ivec3(volume_size)))) return;
+        vec4 c = facing_texel(cell, d);
+        if (c.a > VISIBLE_COVERAGE) {
+            imageStore(code_out, pixel, srgb(c.rgb / c.a * (1.0 - 0.12 * float(axis))));
+            return;
+        }
+        axis = next.x < next.y ? (next.x < next.z ? 0 : 2) : (next.y < next.z ? 1 : 2);
+        cell[axis] += stride[axis];
+        next[axis] += abs(inverse[axis]);
+    }
+}

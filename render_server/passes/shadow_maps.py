@@ -1,0 +1,301 @@
+"""Reflective shadow maps: what each light sees first of a geometry, and the views that its maps need."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import moderngl
+import numpy as np
+from jaxtyping import Float64
+
+from render_server.gpu.context import GpuContext
+from render_server.gpu.kernel import Bindings, RasterKernel
+from render_server.gpu.textures import release_target, texture_2d
+from render_server.passes.gbuffer import MeshBuffers
+from render_server.scene.lights import DirectionalLight, Light, RectangleLight, SpotLight
+from render_server.scene.mirror_lights import MirrorLight
+
+NEAR_MARGIN = 0.98  # near and far planes lie a little outside of what they enclose
+FAR_MARGIN = 1.02
+WIDEST_SINGLE_TANGENT = math.tan(math.radians(65))  # wider needs the six faces of a cube
+NEAREST_M = 1e-3
+EVERYWHERE = (0.0, 0.0, 0.0, 1.0)  # the plane before which everything lies
+
+
+@dataclass(frozen=True, eq=False)
+class LightView:
+    """One tile of a light's depth map: the frame (light at the origin, looking along +z) and what it encloses.
+
+    `half_extent` is in metres for a directional light, the tangent of the half angle for all others.
+    `front` is the plane a, b, c, d (world) before which ax + by + cz + d >= 0 the light shines, if only there.
+    """
+
+    view_from_world: Float64[np.ndarray, "4 4"]
+    half_extent: float
+    near: float
+    far: float
+    orthographic: bool
+    front: Float64[np.ndarray, "4"] | None = None
+
+    @property
+    def texel_span(self) -> float:
+        """Extent of the tile; divided by its texels: m (directional) or tangent a texel."""
+        return 2.0 * self.half_extent
+
+
+class ShadowMapAtlas:
+    """One depth texture and its reflective layers, a tile for every light view of one geometry set.
+
+    `normal` (RGBA16F) holds the normal and the material, `uv` (RGBA32F) the texture coordinate and the vertex colour.
+    """
+
+    def __init__(self, gpu: GpuContext, tiles: int, tile_size: int) -> None:
+        columns = tile_columns(tiles)
+        rows = max(1, -(-tiles // columns))
+        size = (columns * tile_size, rows * tile_size)
+        self.tiles, self.tile_size, self.columns, self.size = tiles, tile_size, columns, size
+        self.normal = texture_2d(gpu, size, 4, "f2")
+        self.uv = texture_2d(gpu, size, 4, "f4")
+        self.depth = gpu.ctx.depth_texture(size)
+        self.depth.compare_func = ""
+        self.depth.filter = (moderngl.NEAREST, moderngl.NEAREST)
+        self.target = gpu.ctx.framebuffer([self.normal, self.uv], self.depth)
+        self.clear()
+
+    def clear(self) -> None:
+        """Empties all tiles."""
+        self.target.use()
+        self.target.viewport = (0, 0, *self.size)
+        self.target.clear(0.0, 0.0, 0.0, 0.0, depth=1.0)
+
+    def box(self, tile: int) -> tuple[int, int, int, int]:
+        """Where a tile lies: x, y, width, height in texels."""
+        x, y = tile % self.columns, tile // self.columns
+        return x * self.tile_size, y * self.tile_size, self.tile_size, self.tile_size
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        release_target(self.target)
+        for item in (self.depth, self.normal, self.uv):
+            item.release()
+
+
+class ShadowMaps:
+    """Draws meshes into the tiles of an atlas."""
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self._kernel = RasterKernel(gpu, "reflective_shadow_map")
+
+    def run(
+        self,
+        atlas: ShadowMapAtlas,
+        meshes: Sequence[MeshBuffers],
+        views: Sequence[LightView],
+        first_view: int,
+        scene: Bindings,
+    ) -> None:
+        """Draws all `meshes` for each view; the views' records begin at `first_view` of `LightViews`."""
+        atlas.clear()
+        for tile, view in enumerate(views):
+            for mesh in meshes:
+                self._kernel.draw(
+                    atlas.target,
+                    mesh,
+                    scene,
+                    box=atlas.box(tile),
+                    clips=view.front is not None,
+                    view_index=first_view + tile,
+                )
+
+    def release(self) -> None:
+        """Frees the program."""
+        self._kernel.release()
+
+
+def light_views(
+    light: Light, receivers: Float64[np.ndarray, "n 3"], occluders: Float64[np.ndarray, "m 3"]
+) -> list[LightView]:
+    """Views that enclose the receivers (world points) as far as the light shines: one, or faces of a cube.
+
+    The occluders set where a view begins: what stands between the light and the receivers is in it. A
+    rectangle looks from its centre.
+    """
+    if isinstance(light, DirectionalLight):
+        return [_orthographic_view(np.asarray(light.direction, float), receivers, occluders)]
+    position = np.asarray(light.position, float)
+    if isinstance(light, RectangleLight):
+        return _rectangle_views(light, position, receivers, occluders)
+    if isinstance(light, SpotLight):
+        return _spot_views(light, position, receivers, occluders)
+    return _views_around(position, receivers, occluders)
+
+
+def mirror_views(
+    mirror: MirrorLight,
+    receivers: Float64[np.ndarray, "n 3"],
+    occluders: Float64[np.ndarray, "m 3"],
+    above_m: float = 0.0,
+) -> list[LightView]:
+    """Views of an image of a light, of what stands before its plane by more than `above_m`."""
+    front = mirror.plane - np.array([0.0, 0.0, 0.0, above_m])
+    receivers, occluders = (points[points @ front[:3] + front[3] > 0] for points in (receivers, occluders))
+    if not len(receivers):
+        return []
+    return [replace(view, front=front) for view in light_views(mirror.light, receivers, occluders)]
+
+
+def _views_around(
+    position: Float64[np.ndarray, "3"],
+    receivers: Float64[np.ndarray, "n 3"],
+    occluders: Float64[np.ndarray, "m 3"],
+) -> list[LightView]:
+    view = _perspective_view(position, receivers.mean(axis=0) - position, receivers, occluders)
+    if view is not None:
+        return [view]
+    axes = np.vstack([np.eye(3), -np.eye(3)])
+    return [
+        _wide_view(position, axis, 1.0, receivers, occluders)
+        for axis in axes
+        if (_tangents((receivers - position) @ frame_along(axis).T) <= 1.0).any()
+    ]
+
+
+def _spot_views(
+    light: SpotLight,
+    position: Float64[np.ndarray, "3"],
+    receivers: Float64[np.ndarray, "n 3"],
+    occluders: Float64[np.ndarray, "m 3"],
+) -> list[LightView]:
+    """The cone, unless a view of the receivers alone is narrower."""
+    half = math.tan(light.half_angle_rad) * 1.01
+    around = _views_around(position, receivers, occluders)
+    if half > WIDEST_SINGLE_TANGENT or (len(around) == 1 and around[0].half_extent <= half):
+        return around
+    axis = np.asarray(light.direction, float)
+    if not ((receivers - position) @ axis > NEAREST_M).any():
+        return []
+    return [_wide_view(position, axis, half, receivers, occluders)]
+
+
+def _rectangle_views(
+    light: RectangleLight,
+    position: Float64[np.ndarray, "3"],
+    receivers: Float64[np.ndarray, "n 3"],
+    occluders: Float64[np.ndarray, "m 3"],
+) -> list[LightView]:
+    """Views of what lies before the rectangle; the lamp's own housing and the wall behind it are left out."""
+    normal = light.normal
+    front = np.append(normal, -normal @ position - NEAREST_M)
+    receivers, occluders = (points[points @ front[:3] + front[3] > 0] for points in (receivers, occluders))
+    if not len(receivers):
+        return []
+    return [replace(view, front=front) for view in _views_around(position, receivers, occluders)]
+
+
+def frame_along(axis: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
+    """Rotation whose rows are right, down, and the unit axis."""
+    z = axis / np.linalg.norm(axis)
+    helper = np.eye(3)[np.argmin(np.abs(z))]
+    x = np.cross(helper, z)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z])
+
+
+def _matrix(
+    rotation: Float64[np.ndarray, "3 3"], origin: Float64[np.ndarray, "3"]
+) -> Float64[np.ndarray, "4 4"]:
+    """view_from_world of a frame with its origin in the world."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation
+    matrix[:3, 3] = -rotation @ origin
+    return matrix
+
+
+def _orthographic_view(
+    direction: Float64[np.ndarray, "3"],
+    receivers: Float64[np.ndarray, "n 3"],
+    occluders: Float64[np.ndarray, "m 3"],
+) -> LightView:
+    rotation = frame_along(direction)
+    local = receivers @ rotation.T
+    low, high = local.min(axis=0), local.max(axis=0)
+    first = min(float((occluders @ rotation[2]).min()), float(low[2]))
+    centre = (low + high) / 2
+    margin = 0.01 * float((high - low).max()) + NEAREST_M
+    half = float((high - low)[:2].max()) / 2 + margin
+    origin = rotation.T @ np.array([centre[0], centre[1], first - 2 * margin])
+    return LightView(_matrix(rotation, origin), half, margin, float(high[2]) - first + 3 * margin, True)
+
+
+def _tangents(local: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:
+    """Greater tangent of each point's direction against +z, per axis; infinite behind the light."""
+    tangents = np.abs(local[:, :2]).max(axis=1) / np.maximum(local[:, 2], NEAREST_M)
+    return np.where(local[:, 2] > NEAREST_M, tangents, np.inf)
+
+
+def _depth_range(
+    local: Float64[np.ndarray, "n 3"], blocking: Float64[np.ndarray, "m 3"], half: float
+) -> tuple[float, float]:
+    """Near plane before all that can block within the view, far plane behind the receivers."""
+    within = blocking[_tangents(blocking) <= half]
+    depths = np.concatenate([within[:, 2], local[_tangents(local) <= half][:, 2]])
+    near = max(float(depths.min(initial=local[:, 2].max())) * NEAR_MARGIN, NEAREST_M)
+    return near, max(float(local[:, 2].max()) * FAR_MARGIN, near + NEAREST_M)
+
+
+def _perspective_view(
+    position: Float64[np.ndarray, "3"],
+    axis: Float64[np.ndarray, "3"],
+    receivers: Float64[np.ndarray, "n 3"],
+    occluders: Float64[np.ndarray, "m 3"],
+) -> LightView | None:
+    """View along `axis` around all receivers; None if that is too wide for one view."""
+    if np.linalg.norm(axis) < NEAREST_M:
+        return None
+    rotation = frame_along(axis)
+    local = (receivers - position) @ rotation.T
+    half = float(_tangents(local).max()) * 1.01 + 1e-4
+    if half > WIDEST_SINGLE_TANGENT:
+        return None
+    near, far = _depth_range(local, (occluders - position) @ rotation.T, half)
+    return LightView(_matrix(rotation, position), half, near, far, False)
+
+
+def _wide_view(
+    position: Float64[np.ndarray, "3"],
+    axis: Float64[np.ndarray, "3"],
+    half: float,
+    receivers: Float64[np.ndarray, "n 3"],
+    occluders: Float64[np.ndarray, "m 3"],
+) -> LightView:
+    """View along `axis` up to the tangent `half`, whatever of the receivers lies in it."""
+    rotation = frame_along(axis)
+    local = (receivers - position) @ rotation.T
+    near, far = _depth_range(local, (occluders - position) @ rotation.T, half)
+    # Triangles whose vertices lie beside this view reach nearer than any vertex in it.
+    reach = float(np.linalg.norm(local, axis=1).max()) * FAR_MARGIN
+    return LightView(_matrix(rotation, position), half, max(0.1 * near, NEAREST_M), max(far, reach), False)
+
+
+def texel_size_m(view: LightView, tile_size: int, distance_m: float) -> float:
+    """What a texel spans at a distance from the light, m."""
+    span = view.texel_span / tile_size
+    return span if view.orthographic else span * float(np.abs(distance_m))
+
+
+def tile_columns(count: int) -> int:
+    """Tiles a row of an atlas of `count` tiles."""
+    return max(1, math.ceil(math.sqrt(count)))
+
+
+def pack_view(view: LightView, tile: int, columns: int, tile_size: int) -> Float64[np.ndarray, "28"]:
+    """std430 LightView: matrix by columns, tile, range, front."""
+    x, y = (tile % columns) * tile_size, (tile // columns) * tile_size
+    return np.concatenate(
+        [
+            view.view_from_world.T.ravel(),
+            [x, y, tile_size, view.half_extent],
+            [view.near, view.far, float(view.orthographic), 0.0],
+            EVERYWHERE if view.front is None else view.front,
+        ]
+    )

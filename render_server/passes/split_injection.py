@@ -1,0 +1,128 @@
+"""Split injection: light of reflective shadow maps goes into the voxels of V_delta and V_rho ([P1] 3.2)."""
+
+import moderngl
+
+from render_server.gpu.context import GpuContext
+from render_server.gpu.kernel import Bindings, Kernel, list_threads
+from render_server.gpu.textures import texture_2d
+from render_server.passes.lights import LightBuffers
+from render_server.passes.voxels import PlacedVolume, VoxelMipmap, VoxelStore
+
+LIGHT_SUMS = 6  # a slot: V_delta and V_rho, three channels each
+
+
+class RealAlbedo:
+    """Albedo of the real scene as the lights see it ([P2] eq. 1): an RGBA16F atlas beside the real depth maps.
+
+    Only the texels of which a part may lie inside the volume are filled.
+    """
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self._gpu = gpu
+        self.atlas = texture_2d(gpu, (1, 1), 4, "f2")
+        self._kernel = Kernel(gpu, "real_albedo")
+
+    def run(self, lights: LightBuffers, scene: Bindings) -> None:
+        """Fills the atlas."""
+        if self.atlas.size != lights.real_atlas.size:
+            self.atlas.release()
+            self.atlas = texture_2d(self._gpu, lights.real_atlas.size, 4, "f2")
+        threads = (lights.tile_size, lights.tile_size)
+        for view in range(len(lights.real_views)):
+            self._kernel.run(threads, scene, albedo_out=self.atlas, view_index=view)
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        self.atlas.release()
+        self._kernel.release()
+
+
+class SplitInjection:
+    """Sums into `delta_sums` of both stores (fixed point, so that the order of threads does not matter)."""
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self._real = Kernel(gpu, "split_inject")
+        self._virtual = Kernel(gpu, "split_inject", VIRTUAL=1)
+
+    def run(
+        self,
+        real: VoxelStore,
+        virtual: VoxelStore,
+        lights: LightBuffers,
+        real_albedo: moderngl.Texture,
+        scene: Bindings,
+    ) -> None:
+        """Injects all lights; `scene` brings the objects' materials."""
+        for store in (real, virtual):
+            store.delta_sums.clear(size=store.slot_capacity * LIGHT_SUMS * 4)
+        sums: Bindings = {
+            **real.bindings,
+            "RealLight": real.delta_sums,
+            "VirtualGrid": virtual.grid,
+            "VirtualLight": virtual.delta_sums,
+            "real_albedo": real_albedo,
+        }
+        threads = (lights.tile_size, lights.tile_size)
+        for view in range(len(lights.real_views)):
+            self._real.run(threads, sums, scene, view_index=view)
+        for view in range(len(lights.virtual_views)):
+            self._virtual.run(threads, sums, scene, view_index=lights.first_virtual_view + view)
+
+    def release(self) -> None:
+        """Frees the programs."""
+        self._real.release()
+        self._virtual.release()
+
+
+class ResolveInjection:
+    """Writes the sums to level 0 of V_delta and V_rho, with the marker of V_eta.
+
+    It walks the real set, then what only the virtual set touched.
+    """
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self._threads = list_threads(gpu)
+        self._kernel = Kernel(gpu, "resolve_light")
+
+    def run(
+        self,
+        delta: VoxelMipmap,
+        rho: VoxelMipmap,
+        real: VoxelStore,
+        virtual: VoxelStore,
+        volume: PlacedVolume,
+    ) -> None:
+        """Writes the texels of all touched voxels."""
+        for own, other, skip_shared in ((real, virtual, False), (virtual, real, True)):
+            self._kernel.run(
+                (self._threads,),
+                own.bindings,
+                volume.bindings,
+                delta=delta.texture,
+                rho=rho.texture,
+                Light=own.delta_sums,
+                OtherGrid=other.grid,
+                OtherLight=other.delta_sums,
+                skip_shared=skip_shared,
+            )
+
+    def release(self) -> None:
+        """Frees the program."""
+        self._kernel.release()
+
+
+class FilterIsotropic:
+    """Filters the levels of V_delta and V_rho above level 0, one dispatch a level for both."""
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self._kernel = Kernel(gpu, "filter_isotropic", DIRECTIONS=1)
+
+    def run(self, delta: VoxelMipmap, rho: VoxelMipmap, volume: PlacedVolume) -> None:
+        """Rebuilds all levels from level 0."""
+        for level in range(1, volume.placement.levels):
+            cells = volume.placement.size >> level
+            self._kernel.run((cells,) * 3, volume.bindings, delta=delta.texture, rho=rho.texture, level=level)
+
+    def release(self) -> None:
+        """Frees the program."""
+        self._kernel.release()

@@ -1,0 +1,296 @@
+"""Light of voxels: direct and measured, and what surfels gather from voxels around them (docs/method.md 4.3)."""
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+import moderngl
+import numpy as np
+from jaxtyping import Float32
+
+from render_server.gpu.context import GpuContext
+from render_server.gpu.kernel import Binding, Bindings, Kernel, list_threads
+from render_server.passes.caustics import GREATEST_ALPHA
+from render_server.passes.voxels import VoxelMipmap, VoxelStore
+from render_server.scene.albedo_memory import MEAN_ALBEDO, AlbedoMemory
+
+SUPPORT_BYTES = 24
+
+SURFEL_LIGHT_BYTES = 2 * 48  # front and back
+GROUP_SUMS_BYTES = 32
+GROUP_LIGHT_BYTES = 32
+HEADER_BYTES = 8
+NO_GROUPS: Final[Bindings] = {"SurfelLights": None}
+
+GATHER_CONES = 4  # as good as 16 in pictures: the cones that see gathered light average over many groups
+# In software, by 64 voxels an edge: lists are short here, and the last round of more walkers would mostly be idle.
+# Groups lie on surfaces, so their number grows with the square of the edge; so few each keep a walker's loops short
+# of where Mesa cuts them off (SOFTWARE_SHARE in gpu/kernel.py).
+SOFTWARE_WALKERS = 256
+
+
+class SurfelGroups:
+    """Groups of surfels for which light is gathered together, and each surfel's own light, beside one voxel store.
+
+    There is room for a group a surfel; blocks of 2^3 voxels mostly hold many surfels of one main axis.
+    """
+
+    def __init__(self, gpu: GpuContext, volume_size: int) -> None:
+        self._ctx = gpu.ctx
+        self._grid = gpu.ctx.buffer(reserve=6 * (volume_size // 2) ** 3 * 4)
+        self._allocate(0)
+
+    @property
+    def bindings(self) -> dict[str, Binding]:
+        """The blocks of surfel_groups.glsl and surfel_light.glsl."""
+        return {
+            "GroupGrid": self._grid,
+            "GroupEntries": self._entries,
+            "GroupSums": self._sums,
+            "GroupLight": self._light,
+            "SurfelLights": self.lights,
+        }
+
+    def start(self, store: VoxelStore) -> None:
+        """Forgets all groups and makes room for those of `store`."""
+        if store.surfel_capacity != self._room:
+            self._release_growing()
+            self._allocate(store.surfel_capacity)
+        self._grid.clear()
+        self._entries.write(bytes(HEADER_BYTES))
+
+    def _allocate(self, surfels: int) -> None:
+        """Makes the buffers that grow, with room for `surfels` surfels."""
+        self._room = surfels
+        self.lights = self._ctx.buffer(reserve=max(surfels, 1) * SURFEL_LIGHT_BYTES)
+        self._entries = self._ctx.buffer(reserve=HEADER_BYTES + surfels * 4)
+        self._sums = self._ctx.buffer(reserve=max(surfels, 1) * GROUP_SUMS_BYTES)
+        self._light = self._ctx.buffer(reserve=max(surfels, 1) * GROUP_LIGHT_BYTES)
+
+    def _release_growing(self) -> None:
+        for buffer in (self.lights, self._entries, self._sums, self._light):
+            buffer.release()
+
+    def counts(self) -> tuple[int, int]:
+        """Groups, and those among them with surfels that the camera does not see; waits for the GPU."""
+        groups, unseen = np.frombuffer(self._entries.read(HEADER_BYTES), np.uint32)
+        return int(groups), int(unseen)
+
+    def release(self) -> None:
+        """Frees all buffers."""
+        self._release_growing()
+        self._grid.release()
+
+
+class LightVoxels:
+    """Sums the radiance and opacity of each surfel per direction: real without objects, real's change, virtual; real
+    of a full solution.
+
+    With `gathered`, what the surfels' groups gathered takes the place of the unoccluded ambient light, and the sums
+    change by that; direct light is that of the last walk without.
+    """
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self._gpu = gpu
+        self._threads = list_threads(gpu)
+        self._kernels: dict[tuple[str, bool], Kernel] = {}
+        self.support = gpu.ctx.buffer(reserve=SUPPORT_BYTES, dynamic=True)
+
+    @property
+    def bindings(self) -> dict[str, Binding]:
+        """Bounds of the voxels where mu and rho differ, as march.glsl reads them."""
+        return {"Support": self.support}
+
+    def light_real(
+        self,
+        store: VoxelStore,
+        scene: Bindings,
+        groups: SurfelGroups | None = None,
+        *,
+        gathered: bool = False,
+    ) -> None:
+        """Sums c_mu and a_real; `groups` keep each surfel's light."""
+        self._run("REAL", store, groups, scene, gathered=gathered)
+
+    def light_real_delta(
+        self, store: VoxelStore, scene: Bindings, groups: SurfelGroups, *, gathered: bool = False
+    ) -> None:
+        """Sums c_rho - c_mu of real surfaces, of which `groups` keep L_mu; the support grows."""
+        store.delta_sums.clear()
+        self._run("REAL_DELTA", store, groups, scene, gathered=gathered)
+
+    def light_virtual(
+        self,
+        store: VoxelStore,
+        scene: Bindings,
+        groups: SurfelGroups | None = None,
+        *,
+        gathered: bool = False,
+    ) -> None:
+        """Sums c and a of the virtual surfaces; `groups` keep each surfel's light."""
+        self._run("VIRTUAL", store, groups, scene, gathered=gathered)
+
+    def light_solution(
+        self,
+        store: VoxelStore,
+        scene: Bindings,
+        groups: SurfelGroups,
+        *,
+        with_objects: bool,
+        gathered: bool = False,
+    ) -> None:
+        """Sums anew all light and opacity of real surfaces under the maps of `scene`; without objects first, as
+        `groups` keep E_mu for the other.
+        """
+        store.sums.clear()
+        self._run("REAL_RHO" if with_objects else "REAL_MU", store, groups, scene, gathered=gathered)
+
+    def _run(
+        self, kind: str, store: VoxelStore, groups: SurfelGroups | None, scene: Bindings, *, gathered: bool
+    ) -> None:
+        self._kernel(kind, gathered=gathered).run(
+            (self._threads,),
+            store.bindings,
+            NO_GROUPS if groups is None else groups.bindings,
+            scene,
+            keep_light=groups is not None,
+            DeltaSums=store.delta_sums,
+            Support=self.support,
+        )
+
+    def _kernel(self, kind: str, *, gathered: bool) -> Kernel:
+        """Compiled when it is first needed."""
+        if (kind, gathered) not in self._kernels:
+            defines = {kind: 1, "GREATEST_ALPHA": GREATEST_ALPHA, **({"GATHERED": 1} if gathered else {})}
+            self._kernels[kind, gathered] = Kernel(self._gpu, "light_voxels", **defines)
+        return self._kernels[kind, gathered]
+
+    def start_support(self, bounds: np.ndarray[Any, np.dtype[np.int32]]) -> None:
+        """Resets the support of the delta to the voxels of the objects (min x, y, z, -max x, y, z)."""
+        self.support.write(bounds.tobytes())
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        for kernel in self._kernels.values():
+            kernel.release()
+        self.support.release()
+
+
+class GroupSurfels:
+    """Walks the surfels twice: finds the groups, then adds up each one's area, normal and place."""
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self._threads = list_threads(gpu)
+        self._find = Kernel(gpu, "group_surfels")
+        self._sum = Kernel(gpu, "group_surfels", SUM=1)
+
+    def run(self, store: VoxelStore, groups: SurfelGroups, scene: Bindings, *, has_seen: bool) -> None:
+        """Fills `groups` (started before); `has_seen`: its surfel lights tell what the camera sees."""
+        self._find.run((self._threads,), store.bindings, groups.bindings, scene)
+        self._sum.run((self._threads,), store.bindings, groups.bindings, scene, has_seen=has_seen)
+
+    def release(self) -> None:
+        """Frees the programs."""
+        self._find.release()
+        self._sum.release()
+
+
+class GatherVoxels:
+    """Gathers the light of a few cones for each group. `defines`: those of march.glsl."""
+
+    def __init__(self, gpu: GpuContext, defines: Mapping[str, int]) -> None:
+        self._gpu = gpu
+        self._one = Kernel(gpu, "gather_voxels", **defines)
+        self._dual = Kernel(gpu, "gather_voxels", DUAL=1, **defines)
+
+    def gather_unseen(
+        self, store: VoxelStore, groups: SurfelGroups, mu: VoxelMipmap, scene: Bindings
+    ) -> None:
+        """E_mu of the groups that hold surfels which the camera does not see."""
+        self._run(self._one, store, groups, (mu, mu), scene, only_unseen=True)
+
+    def gather_real(
+        self, store: VoxelStore, groups: SurfelGroups, mu: VoxelMipmap, rho: VoxelMipmap, scene: Bindings
+    ) -> None:
+        """E_mu and E_rho of every group."""
+        self._run(self._dual, store, groups, (mu, rho), scene, only_unseen=False)
+
+    def gather_virtual(
+        self, store: VoxelStore, groups: SurfelGroups, rho: VoxelMipmap, scene: Bindings
+    ) -> None:
+        """E_rho of every group."""
+        self._run(self._one, store, groups, (rho, rho), scene, only_unseen=False)
+
+    def _run(
+        self,
+        kernel: Kernel,
+        store: VoxelStore,
+        groups: SurfelGroups,
+        mipmaps: tuple[VoxelMipmap, VoxelMipmap],
+        scene: Bindings,
+        *,
+        only_unseen: bool,
+    ) -> None:
+        kernel.run(
+            (self._threads(store),),
+            store.bindings,
+            groups.bindings,
+            scene,
+            pyramid_mu=mipmaps[0].texture,
+            pyramid_rho=mipmaps[1].texture,
+            cone_count=GATHER_CONES,
+            only_unseen=only_unseen,
+        )
+
+    def _threads(self, store: VoxelStore) -> int:
+        if not self._gpu.is_software:
+            return list_threads(self._gpu)
+        edge = store.volume_size / 64
+        return max(SOFTWARE_WALKERS, round(SOFTWARE_WALKERS * edge * edge))
+
+    def release(self) -> None:
+        """Frees the programs."""
+        self._one.release()
+        self._dual.release()
+
+
+class AlbedoTexture:
+    """A 3-D texture of albedo over a cube in world axes, for real surfaces that the camera does not look at.
+
+    It holds the mean of rooms until something was observed.
+    """
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self._gpu = gpu
+        self._texture: moderngl.Texture3D | None = None
+        self.clear(MEAN_ALBEDO)
+
+    @property
+    def bindings(self) -> dict[str, Binding]:
+        """What real_radiance.glsl reads of it."""
+        return {"albedo_volume": self._texture, "albedo_cube": self._cube}
+
+    def clear(self, albedo: float) -> None:
+        """Takes the same albedo everywhere."""
+        self._replace(np.full((1, 1, 1, 3), albedo, np.float32))
+        self._cube = (0.0, 0.0, 0.0, 1.0)
+
+    def upload(self, memory: AlbedoMemory) -> None:
+        """Takes over everything that was observed."""
+        self._replace(memory.filled())
+        x, y, z = (float(v) for v in memory.origin)
+        self._cube = (x, y, z, 1 / memory.edge)
+
+    def _replace(self, albedo: Float32[np.ndarray, "z y x 3"]) -> None:
+        self.release()
+        texels = np.concatenate([albedo, np.ones_like(albedo[..., :1])], axis=-1).astype(np.float16)
+        depth, height, width = albedo.shape[:3]
+        texture = self._gpu.ctx.texture3d(
+            (width, height, depth), 4, texels.tobytes(), dtype="f2", alignment=1
+        )
+        texture.repeat_x = texture.repeat_y = texture.repeat_z = False
+        self._texture = texture
+
+    def release(self) -> None:
+        """Frees the texture."""
+        if self._texture is not None:
+            self._texture.release()

@@ -1,0 +1,366 @@
+"""The voxel volume: its placement and mipmaps; sparse voxel sets from triangles to filtered texels."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import moderngl
+import numpy as np
+from jaxtyping import Float32, Float64
+
+from protocol.errors import DeltalightError
+from render_server.gpu.context import GpuContext
+from render_server.gpu.kernel import Binding, Kernel, list_threads
+from render_server.gpu.uniform_block import Block, Float, Int, UniformBlock, Vec3
+from render_server.scene.mesh import split_triangles
+
+MEGABYTE = 1_000_000
+DIRECTIONS = 6  # of an anisotropic volume; isotropic ones have 1
+
+SURFEL_BYTES = 64
+SUMS_PER_SLOT = 24
+DELTA_SUMS_PER_SLOT = 18
+COUNTER_BYTES = 16
+LEAST_SURFELS = 1024
+
+LONGEST_EDGE_VOXELS = 8.0  # longer ones are split before: balances the threads, bounds each one's loops
+
+
+@dataclass(frozen=True, eq=False)
+class VolumeBlock(Block):
+    """`Volume` of shaders/common/volume.glsl."""
+
+    volume_origin: Vec3
+    voxel_edge: Float
+    volume_size: Int
+    volume_levels: Int
+
+
+@dataclass(frozen=True, eq=False)
+class FarVolumeBlock(Block):
+    """`FarVolume` of shaders/common/march.glsl: the coarse volume beyond; size 0 where none is used."""
+
+    far_origin: Vec3
+    far_edge: Float
+    far_size: Int
+    far_levels: Int
+
+
+@dataclass(frozen=True)
+class VolumePlacement:
+    """A cube of `size`^3 voxels of edge `voxel_edge` m; its low corner `origin` (world, m) is snapped to voxels."""
+
+    origin: tuple[float, float, float]
+    voxel_edge: float
+    size: int
+
+    @property
+    def levels(self) -> int:
+        """Mipmap levels: halvings that leave whole cells, down to 2 or 3 cells an edge."""
+        levels, cells = 1, self.size
+        while cells % 2 == 0 and cells > 2:
+            cells //= 2
+            levels += 1
+        return levels
+
+    def block(self) -> VolumeBlock:
+        """The placement as shaders read it."""
+        return VolumeBlock(self.origin, self.voxel_edge, self.size, self.levels)
+
+    def far_block(self, *, is_used: bool) -> FarVolumeBlock:
+        """The placement as that of the coarse volume beyond; cones end before it unless it `is_used`."""
+        return FarVolumeBlock(self.origin, self.voxel_edge, self.size if is_used else 0, self.levels)
+
+    def voxel_bounds(self, points: Float64[np.ndarray, "n 3"]) -> np.ndarray[Any, np.dtype[np.int32]]:
+        """(min x, y, z, -max x, y, z) of the voxels that hold the world points, clipped to the volume."""
+        voxels = np.floor((points - np.array(self.origin)) / self.voxel_edge)
+        voxels = np.clip(voxels, 0, self.size - 1)
+        return np.concatenate([voxels.min(axis=0), -voxels.max(axis=0)]).astype(np.int32)
+
+
+def place_volume(
+    low: Float64[np.ndarray, "3"], high: Float64[np.ndarray, "3"], size: int, edge_m: float | None
+) -> VolumePlacement:
+    """Cube around the objects' bounds: twice their longest edge ([P1]) unless `edge_m` is given, snapped to voxels.
+
+    Snapping keeps the grid still in the world while the objects move.
+    """
+    edge = edge_m if edge_m is not None else 2.0 * float(np.max(high - low))
+    voxel = edge / size
+    origin = np.floor(((low + high) / 2 - edge / 2) / voxel) * voxel
+    return VolumePlacement((float(origin[0]), float(origin[1]), float(origin[2])), voxel, size)
+
+
+class PlacedVolume:
+    """A volume's current placement, and the uniform block that tells shaders of it."""
+
+    def __init__(self, gpu: GpuContext, placement: VolumePlacement) -> None:
+        self._placement = placement
+        self._block = UniformBlock(gpu, placement.block())
+
+    @property
+    def placement(self) -> VolumePlacement:
+        """Where the volume lies now."""
+        return self._placement
+
+    @property
+    def bindings(self) -> dict[str, Binding]:
+        """The uniform block of the current placement."""
+        return {"Volume": self._block}
+
+    def place(self, placement: VolumePlacement) -> None:
+        """Moves the volume."""
+        self._placement = placement
+        self._block.write(placement.block())
+
+    def release(self) -> None:
+        """Frees the block."""
+        self._block.release()
+
+
+def mipmap_shape(size: int, directions: int) -> tuple[int, int, int]:
+    """Texels (x, y, z) of the texture that holds all levels of all directions (shaders/common/volume.glsl)."""
+    return size, size, directions * size + math.ceil(directions / 2) * size // 2
+
+
+def volume_memory_bytes(size: int, directions: int) -> int:
+    """Bytes of a volume set: two RGBA16F mipmaps and two slot grids."""
+    return 2 * math.prod(mipmap_shape(size, directions)) * 8 + 2 * size**3 * 4
+
+
+def memory_statement(size: int, directions: int, budget_mb: int) -> str:
+    """One sentence that states the memory of the volume set.
+
+    Raises:
+        DeltalightError: it is beyond the budget.
+    """
+    needed = math.ceil(volume_memory_bytes(size, directions) / MEGABYTE)
+    if needed > budget_mb:
+        raise DeltalightError(
+            f"A volume set of {size}^3 voxels takes {needed} MB, beyond the budget of {budget_mb} MB: "
+            "lower method.volume_size or raise method.memory_budget_mb."
+        )
+    return f"volume set {size}^3: {needed} MB of a budget of {budget_mb} MB"
+
+
+class VoxelMipmap:
+    """One RGBA16F volume with its levels: premultiplied radiance and coverage, a direction a slab."""
+
+    def __init__(self, gpu: GpuContext, size: int, directions: int) -> None:
+        shape = mipmap_shape(size, directions)
+        limit = gpu.ctx.info["GL_MAX_3D_TEXTURE_SIZE"]
+        if max(shape) > limit:
+            raise DeltalightError(
+                f"This GPU's 3-D textures end at {limit} texels, {size}^3 voxels need {max(shape)}: "
+                "lower method.volume_size."
+            )
+        self.directions = directions
+        self.texture = gpu.ctx.texture3d(shape, 4, dtype="f2")
+        self.texture.filter = (moderngl.LINEAR, moderngl.LINEAR)
+        self.texture.repeat_x = self.texture.repeat_y = self.texture.repeat_z = False
+        self.texture.write(bytes(math.prod(shape) * 8))
+
+    def release(self) -> None:
+        """Frees the texture."""
+        self.texture.release()
+
+
+class VoxelStore:
+    """Slots, surfels and fixed-point sums of the real or of the virtual geometry (shaders/common/voxel_store.glsl).
+
+    Buffers grow with the number of surfels that a mesh can make; the grid is as large as the volume.
+    """
+
+    def __init__(self, gpu: GpuContext, volume_size: int) -> None:
+        self._ctx = gpu.ctx
+        self.volume_size = volume_size
+        self.grid = gpu.ctx.buffer(reserve=volume_size**3 * 4)
+        self.grid.clear()
+        self.counters = gpu.ctx.buffer(bytes(COUNTER_BYTES))
+        self._allocate(LEAST_SURFELS)
+
+    @property
+    def slot_capacity(self) -> int:
+        """Greatest number of touched voxels."""
+        return min(self.surfel_capacity, self.volume_size**3)
+
+    @property
+    def bindings(self) -> dict[str, Binding]:
+        """The blocks of voxel_store.glsl."""
+        return {
+            "Grid": self.grid,
+            "Touched": self.touched,
+            "Surfels": self.surfels,
+            "Counters": self.counters,
+            "Sums": self.sums,
+        }
+
+    def _allocate(self, surfels: int) -> None:
+        """Makes the buffers that grow, with room for `surfels` surfels."""
+        self.surfel_capacity = surfels
+        self.surfels = self._ctx.buffer(reserve=surfels * SURFEL_BYTES)
+        self.touched = self._ctx.buffer(reserve=self.slot_capacity * 4)
+        self.sums = self._ctx.buffer(reserve=self.slot_capacity * SUMS_PER_SLOT * 4)
+        self.delta_sums = self._ctx.buffer(reserve=self.slot_capacity * DELTA_SUMS_PER_SLOT * 4)
+
+    def _release_growing(self) -> None:
+        for buffer in (self.surfels, self.touched, self.sums, self.delta_sums):
+            buffer.release()
+
+    def start(self, surfel_bound: int) -> None:
+        """Begins a new voxelisation of at most `surfel_bound` surfels; the old voxels have been cleared."""
+        if surfel_bound > self.surfel_capacity:
+            self._release_growing()
+            self._allocate(int(surfel_bound * 1.25) + LEAST_SURFELS)
+        self.counters.write(np.array([0, 0, self.surfel_capacity, 0], np.uint32).tobytes())
+
+    def counts(self) -> tuple[int, int]:
+        """Touched voxels and surfels; waits for the GPU (tests and reports only)."""
+        slots, surfels = np.frombuffer(self.counters.read(8), np.uint32)
+        return int(slots), int(surfels)
+
+    def release(self) -> None:
+        """Frees all buffers."""
+        self._release_growing()
+        self.grid.release()
+        self.counters.release()
+
+
+class Voxelize:
+    """Clips triangles against the voxels they touch: surfels and touched voxels (docs/method.md 4.2)."""
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self._kernel = Kernel(gpu, "voxelize")
+        self._triangles = gpu.ctx.buffer(reserve=64)
+
+    def run(self, store: VoxelStore, corners: Float32[np.ndarray, "m 3 10"], volume: PlacedVolume) -> None:
+        """Fills `store` (empty before) with the surfels of the triangles inside the volume."""
+        pieces, bound = pieces_in_volume(corners, volume.placement)
+        store.start(bound)
+        if not len(pieces):
+            return
+        self._triangles.orphan(pieces.nbytes)
+        self._triangles.write(pieces.tobytes())
+        self._kernel.run(
+            (len(pieces),),
+            store.bindings,
+            volume.bindings,
+            Triangles=self._triangles,
+            triangle_count=len(pieces),
+        )
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        self._kernel.release()
+        self._triangles.release()
+
+
+def pieces_in_volume(
+    corners: Float32[np.ndarray, "m 3 10"], placement: VolumePlacement
+) -> tuple[Float32[np.ndarray, "k 3 10"], int]:
+    """Triangles that meet the volume, long ones split, and the greatest number of surfels that they can make."""
+    low, high = _voxel_extents(corners, placement)
+    met = np.all((high >= 0) & (low < placement.size), axis=1)
+    short = np.all(high - low < LONGEST_EDGE_VOXELS / 2, axis=1)
+    kept = met & short
+    split = split_triangles(corners[met & ~short], LONGEST_EDGE_VOXELS * placement.voxel_edge)
+    bound = _voxels_in(low[kept], high[kept], placement) + _voxels_in(
+        *_voxel_extents(split, placement), placement
+    )
+    return np.concatenate([corners[kept], split]), bound
+
+
+def _voxel_extents(
+    corners: Float32[np.ndarray, "m 3 10"], placement: VolumePlacement
+) -> tuple[Float64[np.ndarray, "m 3"], Float64[np.ndarray, "m 3"]]:
+    """Lowest and highest voxel coordinates of each triangle."""
+    a, b, c = (np.floor((corners[:, i, :3] - placement.origin) / placement.voxel_edge) for i in range(3))
+    return np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
+
+
+def _voxels_in(
+    low: Float64[np.ndarray, "m 3"], high: Float64[np.ndarray, "m 3"], placement: VolumePlacement
+) -> int:
+    """Number of voxels in the boxes, as far as they are in the volume."""
+    first, last = (np.clip(v, 0, placement.size - 1) for v in (low, high))
+    return int(np.prod(last - first + 1, axis=1).sum())
+
+
+class ClearVoxels:
+    """Empties the voxels that a set had touched, instead of whole volumes: its slots, its texels of level 0."""
+
+    def __init__(self, gpu: GpuContext, directions: int) -> None:
+        self._threads = list_threads(gpu)
+        self._kernel = Kernel(gpu, "clear_voxels", DIRECTIONS=directions)
+
+    def run(self, store: VoxelStore, mipmaps: Sequence[VoxelMipmap], volume: PlacedVolume) -> None:
+        """Empties `store`, and its voxels' texels in each of the mipmaps (at least one)."""
+        for index, mipmap in enumerate(mipmaps):
+            self._kernel.run(
+                (self._threads,),
+                store.bindings,
+                volume.bindings,
+                pyramid=mipmap.texture,
+                free_slots=index == len(mipmaps) - 1,
+            )
+        store.start(0)
+
+    def release(self) -> None:
+        """Frees the program."""
+        self._kernel.release()
+
+
+class ResolveVoxels:
+    """Writes sums to level 0: of mu (real alone) and of rho (real with its changed light, and virtual)."""
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self._threads = list_threads(gpu)
+        self._mu = Kernel(gpu, "resolve_voxels")
+        self._rho_real = Kernel(gpu, "resolve_voxels", RHO_REAL=1)
+        self._rho_virtual = Kernel(gpu, "resolve_voxels", RHO_VIRTUAL=1)
+
+    def resolve_mu(self, mu: VoxelMipmap, real: VoxelStore, volume: PlacedVolume) -> None:
+        """(c_mu, a_real)."""
+        self._mu.run((self._threads,), real.bindings, volume.bindings, pyramid=mu.texture)
+
+    def resolve_rho(
+        self, rho: VoxelMipmap, real: VoxelStore, virtual: VoxelStore, volume: PlacedVolume
+    ) -> None:
+        """(c_rho, a_real + a_virtual)."""
+        self._rho_real.run(
+            (self._threads,),
+            real.bindings,
+            volume.bindings,
+            pyramid=rho.texture,
+            DeltaSums=real.delta_sums,
+            OtherGrid=virtual.grid,
+            OtherSums=virtual.sums,
+        )
+        self._rho_virtual.run(
+            (self._threads,), virtual.bindings, volume.bindings, pyramid=rho.texture, OtherGrid=real.grid
+        )
+
+    def release(self) -> None:
+        """Frees the programs."""
+        for kernel in (self._mu, self._rho_real, self._rho_virtual):
+            kernel.release()
+
+
+class FilterVoxels:
+    """Filters the levels of an anisotropic mipmap, one dispatch a level (docs/method.md 4.4)."""
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self._kernel = Kernel(gpu, "filter_voxels")
+
+    def run(self, mipmap: VoxelMipmap, volume: PlacedVolume) -> None:
+        """Rebuilds all levels from level 0."""
+        for level in range(1, volume.placement.levels):
+            cells = volume.placement.size >> level
+            self._kernel.run(
+                (cells, cells, cells * DIRECTIONS), volume.bindings, pyramid=mipmap.texture, level=level
+            )
+
+    def release(self) -> None:
+        """Frees the program."""
+        self._kernel.release()
