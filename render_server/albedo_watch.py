@@ -1,13 +1,13 @@
 """Keeps what pictures show of the real scene's albedo for when the camera looks elsewhere (METHOD 2)."""
 
 from protocol.frames import ViewFrame
+from render_server.estimation.backoff_schedule import GrowingInterval
 from render_server.gpu.context import GpuContext
-from render_server.growing_interval import GrowingInterval
 from render_server.light_registration import observe_albedo
 from render_server.light_samples import Relight
 from render_server.passes.unseen_albedo import UnseenAlbedo
 from render_server.relight.frame import RelightInput
-from render_server.scene.albedo_memory import MEAN_ALBEDO, AlbedoMemory
+from render_server.scene.albedo_volume import MEAN_ALBEDO, AlbedoMemory
 
 
 class AlbedoWatch:

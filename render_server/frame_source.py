@@ -7,7 +7,7 @@ from pydantic import Field
 from protocol.documents import StrictModel
 from protocol.keys import Keys
 from protocol.transport import ReceivedMultipart, Receiver
-from render_server.frame_assembly import TOPICS
+from render_server.server.frames import TOPICS
 
 MAX_ENDPOINTS = 16
 EARLIER_SOURCES = "earlier_sources"

@@ -1,14 +1,14 @@
 """What has to be found from the picture: the factor of the lights (METHOD 1) and the albedo of real surfaces."""
 
 from protocol.frames import ViewFrame
-from render_server.light_samples import Relight, bounced_light, sample_light
-from render_server.relight.frame import RelightInput
-from render_server.scene.albedo_memory import AlbedoMemory
-from render_server.scene.registration import (
+from render_server.estimation.registration_fit import (
     Registration,
     registration_from_albedo_percentile,
     registration_from_patch,
 )
+from render_server.light_samples import Relight, bounced_light, sample_light
+from render_server.relight.frame import RelightInput
+from render_server.scene.albedo_volume import AlbedoMemory
 
 
 def register_lights(frame: ViewFrame, scene: RelightInput, relight: Relight) -> Registration:

@@ -8,15 +8,15 @@ from jaxtyping import Float32, UInt8
 
 from protocol import scene_lights as documents
 from protocol.frames import ViewFrame
-from render_server.growing_interval import GrowingInterval
+from render_server.debug_view import lights_picture
+from render_server.estimation.backoff_schedule import GrowingInterval
+from render_server.estimation.plane_extrapolation import ContinuedPlanes
+from render_server.estimation.registration_fit import RegistrationAverage
 from render_server.light_registration import register_lights
 from render_server.light_samples import Relight, bounced_light
-from render_server.lights_view import lights_picture
+from render_server.lights.lights import LightSet
+from render_server.lights.sources import open_lights
 from render_server.relight.frame import RelightInput
-from render_server.scene.continued_planes import ContinuedPlanes
-from render_server.scene.light_sources import open_lights
-from render_server.scene.lights import LightSet
-from render_server.scene.registration import RegistrationAverage
 from render_server.surroundings import (
     find_continued_planes,
     find_surroundings,

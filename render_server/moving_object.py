@@ -7,8 +7,8 @@ from jaxtyping import Float64
 
 from protocol.errors import DeltalightError
 from protocol.scene_objects import Animation, SceneObject
+from render_server.scene.gltf_animation import Clip
 from render_server.scene.gltf_asset import GltfAsset, Pose
-from render_server.scene.gltf_clips import Clip
 from render_server.scene.triangle_mesh import TriangleMesh
 
 

@@ -12,15 +12,15 @@ from rich.progress import Progress
 from protocol.errors import DeltalightError
 from protocol.scene_objects import SceneObject
 from render_server.relight.frame import PlacedObject
-from render_server.scene.mesh import TriangleMesh
-from render_server.scene.occlusion_field import FieldSettings, OcclusionField, Step
-from render_server.scene.occlusion_field_cache import (
+from render_server.scene.mesh_loading import TriangleMesh
+from render_server.scene.occlusion_cache import (
     compute_field,
     default_folder,
     field_digest,
     load_field,
     store_field,
 )
+from render_server.scene.occlusion_field import FieldSettings, OcclusionField, Step
 from render_server.scene.occlusion_transfer import object_surface
 
 log = structlog.get_logger()

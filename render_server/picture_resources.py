@@ -15,7 +15,7 @@ from render_server.passes.real_surface import RealSurface
 from render_server.passes.rims import RimsPass
 from render_server.real_geometry import RealGeometry
 from render_server.relight.frame import GeometryState
-from render_server.scene.surfaces import DIFFUSE_BOX, MAX_SURFACES, SurfaceTable
+from render_server.scene.declared_surfaces import DIFFUSE_BOX, MAX_SURFACES, SurfaceTable
 from render_server.view import CameraView, Rectangle
 
 

@@ -17,8 +17,8 @@ from render_server.relight.frame import GeometryState
 from render_server.scene.depth_mesh import depth_mesh
 from render_server.scene.depth_surface import DepthSurface, depth_surface, noise_sigma
 from render_server.scene.fused_scene import FusedScene
-from render_server.scene.mesh import TriangleMesh, load_mesh, merge_for_gpu
-from render_server.scene.scene_tracker import RealSceneTracker
+from render_server.scene.mesh_loading import TriangleMesh, load_mesh, merge_for_gpu
+from render_server.scene.motion_detection import RealSceneTracker
 from render_server.scene.steep_surfaces import steep_surfaces
 from render_server.view import CameraView
 

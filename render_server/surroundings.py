@@ -6,13 +6,13 @@ import numpy as np
 from jaxtyping import Float32
 
 from protocol.frames import ViewFrame, decode_lut
+from render_server.estimation.plane_detection import PointCloud, find_planes
+from render_server.estimation.plane_extrapolation import ContinuedPlanes, RealSamples, Sight, continue_planes
+from render_server.estimation.registration_fit import surroundings_from_patch
 from render_server.light_samples import Bounce, Relight, read_texture, sample_light
+from render_server.lights.environment import LUMINANCE
+from render_server.lights.octahedral import irradiance, octahedral_uv, resample_to_octahedral
 from render_server.relight.frame import RelightInput
-from render_server.scene.continued_planes import ContinuedPlanes, RealSamples, Sight, continue_planes
-from render_server.scene.environment import LUMINANCE
-from render_server.scene.octahedral import irradiance, octahedral_uv, resample_to_octahedral
-from render_server.scene.registration import surroundings_from_patch
-from render_server.scene.seen_planes import PointCloud, find_planes
 
 GROUND_SIZES = 2.0
 FACES_UP = 0.7  # cosine to the vertical

@@ -17,7 +17,7 @@ from render_server.passes.materials import MaterialTable
 from render_server.passes.mesh_buffers import MeshBuffers, triangle_corners
 from render_server.relight.frame import GeometryState, PlacedObject
 from render_server.scene.materials import Material
-from render_server.scene.mesh import Asset, GpuMesh, TriangleMesh, load_asset, merge_for_gpu
+from render_server.scene.mesh_loading import Asset, GpuMesh, TriangleMesh, load_asset, merge_for_gpu
 
 MARKER_FRAME = "marker:"
 

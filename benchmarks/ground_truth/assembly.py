@@ -9,7 +9,7 @@ from jaxtyping import Float, Float32
 
 from benchmarks.ground_truth.benchmark_scene import BenchmarkScene, Finish
 from benchmarks.ground_truth.parts import MeshFolder, diffuse, rgb, shape, two_sided
-from render_server.scene.environment import read_radiance
+from render_server.lights.environment import read_radiance
 
 ENVIRONMENT_FILE = "environment.hdr"
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from render_server.scene.lights import DirectionalLight, Light, RectangleLight, SpotLight
-from render_server.scene.mirror_lights import MirrorLight
+from render_server.lights.lights import DirectionalLight, Light, RectangleLight, SpotLight
+from render_server.lights.mirror_lights import MirrorLight
 
 NEAR_MARGIN = 0.98  # near and far planes lie a little outside of what they enclose
 FAR_MARGIN = 1.02

@@ -8,6 +8,9 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from render_server.gpu.context import GpuContext
+from render_server.lights.lights import Light
+from render_server.lights.mirror_lights import MirrorLight
+from render_server.lights.octahedral import octahedral_grid, prefilter, sample_octahedral
 from render_server.passes.light_maps import (
     SHARE_TEXELS,
     LightView,
@@ -20,9 +23,6 @@ from render_server.passes.light_maps import (
     tile_columns,
 )
 from render_server.passes.reflective_shadow_map import ShadowMapAtlas, texel_size_m
-from render_server.scene.lights import Light
-from render_server.scene.mirror_lights import MirrorLight
-from render_server.scene.octahedral import octahedral_grid, prefilter, sample_octahedral
 
 LIGHT_BYTES = 160  # of a std430 Light (passes/common/lights.glsl)
 EMPTY = b"\0" * 256

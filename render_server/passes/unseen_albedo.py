@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from render_server.gpu.context import GpuContext
-from render_server.scene.albedo_memory import MEAN_ALBEDO, AlbedoMemory
+from render_server.scene.albedo_volume import MEAN_ALBEDO, AlbedoMemory
 
 
 class UnseenAlbedo:

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from render_server.gpu.timers import PassTimers
+from render_server.lights.lights import LightSet
 from render_server.passes.geometry_buffer import GeometryBuffer
 from render_server.passes.materials import MaterialTable
 from render_server.passes.mesh_buffers import MeshBuffers
@@ -15,10 +16,9 @@ from render_server.passes.picture import Picture
 from render_server.passes.real_surface import RealSurface
 from render_server.passes.unseen_albedo import UnseenAlbedo
 from render_server.scene.back_sheets import back_sheets
-from render_server.scene.lights import LightSet
+from render_server.scene.declared_surfaces import SurfaceTable
 from render_server.scene.materials import Material
-from render_server.scene.mesh import TriangleMesh
-from render_server.scene.surfaces import SurfaceTable
+from render_server.scene.mesh_loading import TriangleMesh
 from render_server.view import CameraView
 
 

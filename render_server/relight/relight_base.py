@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from render_server.gpu.context import GpuContext
+from render_server.lights.mirror_lights import MirrorLight, mirror_lights
 from render_server.passes.caustics import GREATEST_ALPHA, CausticsPass
 from render_server.passes.change_ratio import ChangeRatioPass
 from render_server.passes.composite import RelitLayers
@@ -24,7 +25,6 @@ from render_server.passes.virtual_surface import VirtualSurfacePass
 from render_server.passes.volume import Pyramid, VolumePlacement
 from render_server.relight.defaults import ResolvedSettings
 from render_server.relight.frame import RelightInput
-from render_server.scene.mirror_lights import MirrorLight, mirror_lights
 
 SHADOW_REACH = 4.0  # in longest edges of the objects' bounds: how far around them real shadows are resolved
 LARGE_TRIANGLE = 0.1  # of that reach: from here on a triangle's own extent matters, not only its corners

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from protocol.errors import DeltalightError
-from render_server.scene.gltf_file import (
+from render_server.scene.gltf_document import (
     COMPONENT_TYPES,
     COMPONENTS,
     GltfFaultError,

@@ -18,7 +18,7 @@ from render_server.scene.depth_surface import (
     surface_normals,
 )
 from render_server.scene.materials import Material
-from render_server.scene.mesh import TriangleMesh
+from render_server.scene.mesh_loading import TriangleMesh
 
 CELL_SAMPLES = 6
 # Two nodes stand for pixels of their cells that are at most this many cells apart: two each way.

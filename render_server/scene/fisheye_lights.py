@@ -7,13 +7,13 @@ from jaxtyping import Float64
 
 from protocol import scene_lights as documents
 from protocol.frames import RadianceMap, ViewFrame
+from render_server.lights.fisheye import FollowedLight, LightTracker
+from render_server.lights.lights import DirectionalLight, Light, LightSet, SphereLight, complete_set
+from render_server.lights.median_cut import Split, split_map
+from render_server.lights.octahedral import above_horizon, irradiance
 from render_server.scene.hemisphere_map import HemisphereMap, WorldSky, to_world
 from render_server.scene.light_distance import fit_distance, paper_light
-from render_server.scene.light_tracking import FollowedLight, LightTracker
-from render_server.scene.lights import DirectionalLight, Light, LightSet, SphereLight, complete_set
 from render_server.scene.line_of_sight import is_hidden
-from render_server.scene.median_cut import Split, split_map
-from render_server.scene.octahedral import above_horizon, irradiance
 
 # Texels of 1.6 degrees, finer than what glossy surfaces tell apart; lights are not in it. Filtering it takes a
 # third of the time that a map of mode `environment` takes, which changes never.

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from render_server.scene.depth_surface import DepthSurface
-from render_server.scene.fused_volume import BLOCK, FusedVolume
+from render_server.scene.tsdf_volume import BLOCK, FusedVolume
 from render_server.view import CameraView
 
 SAMPLES = 4000

@@ -8,9 +8,9 @@ from jaxtyping import Bool, Float32, Float64
 
 from render_server.scene.depth_surface import DepthSurface
 from render_server.scene.fused_align import aligned_view
-from render_server.scene.fused_mesh import decimated, fused_mesh
-from render_server.scene.fused_volume import BLOCK, GRID, FusedPlacement, FusedVolume, PixelPlanes
-from render_server.scene.mesh import TriangleMesh
+from render_server.scene.mesh_loading import TriangleMesh
+from render_server.scene.tsdf_mesh import decimated, fused_mesh
+from render_server.scene.tsdf_volume import BLOCK, GRID, FusedPlacement, FusedVolume, PixelPlanes
 from render_server.view import CameraView
 
 # What lies farther than so many median distances goes to a second, coarser volume: a far wall would else spend the

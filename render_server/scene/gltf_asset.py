@@ -10,10 +10,10 @@ from jaxtyping import Float32, Float64
 
 from protocol.errors import DeltalightError
 from render_server.scene.asset_check import read_gltf
-from render_server.scene.gltf_clips import Clip, read_clips
-from render_server.scene.gltf_file import faults_named
+from render_server.scene.gltf_animation import Clip, read_clips
+from render_server.scene.gltf_document import faults_named
+from render_server.scene.gltf_meshes import GltfPart, PartReader, Skin
 from render_server.scene.gltf_nodes import NodeTree, read_nodes
-from render_server.scene.gltf_parts import GltfPart, PartReader, Skin
 from render_server.scene.normals import unit_or
 from render_server.scene.triangle_mesh import MAX_COORDINATE_M, TriangleMesh, joined, joined_triangles
 

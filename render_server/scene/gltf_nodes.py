@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from render_server.scene.gltf_file import GltfFaultError, GltfFile
+from render_server.scene.gltf_document import GltfFaultError, GltfFile
 
 
 @dataclass(frozen=True, eq=False)

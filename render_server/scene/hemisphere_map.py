@@ -10,12 +10,8 @@ from jaxtyping import Bool, Float32, Float64
 
 from protocol.frames import RadianceMap
 from protocol.hemisphere import hemisphere_uv, texel_directions, texel_solid_angles
-from render_server.scene.octahedral import (
-    octahedral_grid,
-    sample_octahedral,
-    texel_weights,
-)
-from render_server.scene.octahedral import texel_solid_angles as octahedral_solid_angles
+from render_server.lights.octahedral import octahedral_grid, sample_octahedral, texel_weights
+from render_server.lights.octahedral import texel_solid_angles as octahedral_solid_angles
 from render_server.scene.sky_grid import SkyGrid
 
 COARSE_SIZE = 32

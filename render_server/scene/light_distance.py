@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from protocol.frames import ViewFrame, decode_lut
-from render_server.scene.known_surfaces import LEAST_PIXELS, known_albedo
-from render_server.scene.median_cut import RegionLight
-from render_server.scene.registration import unclipped
+from render_server.estimation.registration_fit import unclipped
+from render_server.lights.median_cut import RegionLight
+from render_server.scene.board_albedo import LEAST_PIXELS, known_albedo
 
 # Inverse distances tried, 1/m: from far away to 20 cm, finer than what the paper can tell.
 INVERSE_DISTANCES = np.linspace(0.0, 5.0, 101)

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float16, Float32, Int64
 from scipy.spatial import cKDTree
 
-from render_server.scene.mesh import TriangleMesh, split_triangles
+from render_server.scene.mesh_loading import TriangleMesh, split_triangles
 from render_server.scene.occlusion_field import FieldSettings, ShellGrid, Step, fill_inside
 from render_server.scene.occlusion_rays import CHUNK, ObjectRays, RayHits, direction_set
 from render_server.scene.spherical_harmonics import harmonics

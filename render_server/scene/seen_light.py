@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from render_server.scene.lights import DirectionalLight, Light, RectangleLight, SphereLight, SpotLight
+from render_server.lights.lights import DirectionalLight, Light, RectangleLight, SphereLight, SpotLight
 
 NEAREST_M = 1e-6
 

@@ -5,10 +5,10 @@ from jaxtyping import Float64
 
 from protocol import scene_lights as documents
 from protocol.frames import ViewFrame
+from render_server.lights.lights import AMBIENT_SIZE, LightSet, SphereLight, complete_set
+from render_server.lights.median_cut import Split
+from render_server.lights.octahedral import above_horizon
 from render_server.scene.hemisphere_map import HemisphereMap
-from render_server.scene.lights import AMBIENT_SIZE, LightSet, SphereLight, complete_set
-from render_server.scene.median_cut import Split
-from render_server.scene.octahedral import above_horizon
 
 # Of a lamp's radius: it stays where it is until it has moved so far. Its shadows' soft edges then lie off by a
 # twentieth of their width, while the noise of the marker's pose would make them tremble and cost a rebuild a frame.

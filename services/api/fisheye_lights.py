@@ -11,7 +11,7 @@ from protocol.fisheye_parts import calibration_of
 from protocol.messages import RadianceMessage
 
 if TYPE_CHECKING:
-    from render_server.scene.lights import Light
+    from render_server.lights.lights import Light
     from render_server.scene.seen_light import SeenLight
 
 OUTLINE_POINTS = 16
@@ -90,7 +90,7 @@ def _outline(seen: "SeenLight") -> Float64[np.ndarray, "n 3"]:
 
 def _light(described: Mapping[str, Any]) -> "Light":
     """The light that a composite's message describes."""
-    from render_server.scene.lights import DirectionalLight, RectangleLight, SphereLight, SpotLight
+    from render_server.lights.lights import DirectionalLight, RectangleLight, SphereLight, SpotLight
 
     def vector(key: str) -> np.ndarray:
         return np.asarray(described[key], np.float32)

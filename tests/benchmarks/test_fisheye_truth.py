@@ -15,10 +15,10 @@ from protocol.frames import ViewFrame
 from protocol.scene_lights import Lights
 from protocol.scene_lights import SphereLight as GivenSphere
 from render_server.gpu.context import create_context
+from render_server.lights.environment import LUMINANCE
+from render_server.lights.lights import LightSet, SphereLight
 from render_server.renderer import SceneRenderer
-from render_server.scene.environment import LUMINANCE
 from render_server.scene.fisheye_lights import FisheyeSource
-from render_server.scene.lights import LightSet, SphereLight
 from render_server.scene.seen_light import SeenLight, seen_from
 
 if importlib.util.find_spec("mitsuba") is None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from render_server.scene.albedo_memory import CELLS, MEAN_ALBEDO, AlbedoMemory
+from render_server.scene.albedo_volume import CELLS, MEAN_ALBEDO, AlbedoMemory
 
 BOUNDS = (np.zeros(3), np.ones(3))
 

@@ -11,9 +11,9 @@ from scipy.optimize import curve_fit
 
 from protocol.scene import SceneDocument, parse_scene
 from render_server.gpu.context import GpuContext
+from render_server.lights.lights import RectangleLight, SpotLight, build_lights
 from render_server.passes.light_maps import light_views
 from render_server.renderer import SceneRenderer
-from render_server.scene.lights import RectangleLight, SpotLight, build_lights
 from tests.render_server.scenes import (
     Fields,
     Stage,

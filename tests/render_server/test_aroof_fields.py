@@ -11,14 +11,9 @@ from jaxtyping import Float64
 from render_server.occlusion_fields import OcclusionFields
 from render_server.relight.frame import PlacedObject
 from render_server.scene.materials import Material
-from render_server.scene.mesh import TriangleMesh
+from render_server.scene.mesh_loading import TriangleMesh
+from render_server.scene.occlusion_cache import compute_field, field_digest, load_field, store_field
 from render_server.scene.occlusion_field import FieldSettings, OcclusionField, place_shells
-from render_server.scene.occlusion_field_cache import (
-    compute_field,
-    field_digest,
-    load_field,
-    store_field,
-)
 from render_server.scene.occlusion_rays import ObjectRays
 from render_server.scene.occlusion_transfer import object_surface
 from render_server.scene.spherical_harmonics import even_directions, harmonics

@@ -9,12 +9,12 @@ from jaxtyping import Float32, Float64
 
 from protocol.frames import decode_lut
 from protocol.scene import SceneDocument
+from render_server.estimation.plane_detection import PointCloud, SeenPlane, find_planes
+from render_server.estimation.plane_extrapolation import ContinuedPlanes, RealSamples, Sight, continue_planes
 from render_server.gpu.context import GpuContext
+from render_server.lights.lights import Light, SphereLight
+from render_server.lights.octahedral import octahedral_grid, sample_octahedral
 from render_server.renderer import SceneRenderer
-from render_server.scene.continued_planes import ContinuedPlanes, RealSamples, Sight, continue_planes
-from render_server.scene.lights import Light, SphereLight
-from render_server.scene.octahedral import octahedral_grid, sample_octahedral
-from render_server.scene.seen_planes import PointCloud, SeenPlane, find_planes
 from tests.render_server.scenes import Stage, ambient, cube, floor, frame, look_at, plain, shifted
 
 SIZE = 32

@@ -15,11 +15,11 @@ from protocol.frames import DepthImage, LampPose, RadianceMap, ViewFrame, decode
 from protocol.hemisphere import texel_directions
 from protocol.scene import SceneDocument
 from render_server.gpu.context import GpuContext
+from render_server.lights.lights import DirectionalLight, LightSet, SphereLight
+from render_server.lights.octahedral import octahedral_grid, sample_octahedral
 from render_server.renderer import SceneRenderer
 from render_server.scene.fisheye_lights import FisheyeSource
-from render_server.scene.lights import DirectionalLight, LightSet, SphereLight
 from render_server.scene.line_of_sight import is_hidden
-from render_server.scene.octahedral import octahedral_grid, sample_octahedral
 from render_server.scene.tracked_lamps import TrackedSource
 from tests.render_server.scenes import (
     Stage,

@@ -10,9 +10,9 @@ from protocol.camera_model import CameraModel
 from protocol.frames import DepthImage
 from render_server.scene.depth_surface import DepthSurface, depth_surface
 from render_server.scene.fused_align import aligned_view, look_up
-from render_server.scene.fused_mesh import decimated, fused_mesh
 from render_server.scene.fused_scene import FusedScene
-from render_server.scene.mesh import TriangleMesh
+from render_server.scene.mesh_loading import TriangleMesh
+from render_server.scene.tsdf_mesh import decimated, fused_mesh
 from render_server.view import CameraView
 
 MATRIX = np.array([[150.0, 0, 79.5], [0, 150.0, 59.5], [0, 0, 1]])

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from render_server.scene.light_tracking import LightTracker
-from render_server.scene.median_cut import Region, RegionLight
-from render_server.scene.octahedral import texel_solid_angles
+from render_server.lights.fisheye import LightTracker
+from render_server.lights.median_cut import Region, RegionLight
+from render_server.lights.octahedral import texel_solid_angles
 
 SECOND = 1_000_000_000
 NOWHERE = Region(0, 1, 0, 1)

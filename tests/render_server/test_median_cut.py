@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from protocol.hemisphere import texel_directions, texel_solid_angles
-from render_server.scene.environment import LUMINANCE, WORK_SIZE, EnvironmentMap, read_radiance
+from render_server.lights.environment import LUMINANCE, WORK_SIZE, EnvironmentMap, read_radiance
+from render_server.lights.median_cut import RegionLight, Split, split_environment, split_map
+from render_server.lights.octahedral import octahedral_grid, sample_octahedral
+from render_server.lights.octahedral import texel_solid_angles as sphere
 from render_server.scene.hemisphere_map import HemisphereMap, to_world
-from render_server.scene.median_cut import RegionLight, Split, split_environment, split_map
-from render_server.scene.octahedral import octahedral_grid, sample_octahedral
-from render_server.scene.octahedral import texel_solid_angles as sphere
 
 SIZE = 128
 TILTED = np.array([[0.8, 0.0, 0.6], [0.0, 1.0, 0.0], [-0.6, 0.0, 0.8]])

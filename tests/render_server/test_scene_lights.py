@@ -8,7 +8,7 @@ import pytest
 from protocol import scene_lights as documents
 from protocol.errors import DeltalightError
 from protocol.radiance_files import write_exr
-from render_server.scene.environment import (
+from render_server.lights.environment import (
     LUMINANCE,
     EnvironmentMap,
     load_environment,
@@ -16,9 +16,9 @@ from render_server.scene.environment import (
     orientation,
     pixel_solid_angles,
 )
-from render_server.scene.lights import DirectionalLight, SphereLight, build_lights
-from render_server.scene.median_cut import split_environment
-from render_server.scene.octahedral import (
+from render_server.lights.lights import DirectionalLight, SphereLight, build_lights
+from render_server.lights.median_cut import split_environment
+from render_server.lights.octahedral import (
     irradiance,
     octahedral_direction,
     octahedral_uv,

@@ -3,7 +3,7 @@ import pytest
 
 from protocol.camera_model import CameraModel
 from protocol.frames import BoardPose, DepthImage, ViewFrame
-from render_server.scene.scene_tracker import RealSceneTracker
+from render_server.scene.motion_detection import RealSceneTracker
 
 CAMERA = CameraModel(160, 120, np.array([[150.0, 0, 79.5], [0, 150.0, 59.5], [0, 0, 1]]))
 SIGMA = 0.002

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from render_server.scene.lights import DirectionalLight, Light, RectangleLight, SphereLight, SpotLight
+from render_server.lights.lights import DirectionalLight, Light, RectangleLight, SphereLight, SpotLight
 from render_server.scene.seen_light import seen_from
 
 WHITE = np.ones(3, np.float32)

@@ -8,9 +8,9 @@ import pytest
 from protocol.board import BoardSpec
 from protocol.frames import ViewFrame, decode_lut
 from protocol.scene import SceneDocument
+from render_server.estimation.registration_fit import surroundings_from_patch
 from render_server.gpu.context import GpuContext
 from render_server.renderer import SceneRenderer
-from render_server.scene.registration import surroundings_from_patch
 from tests.render_server.scenes import Stage, ambient, cube, directional, floor, frame, plain
 
 ALBEDO = 0.7

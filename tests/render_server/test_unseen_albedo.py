@@ -8,8 +8,8 @@ import trimesh
 
 from protocol.frames import BoardPose, ViewFrame
 from protocol.scene import SceneDocument
+from render_server.estimation.backoff_schedule import GrowingInterval
 from render_server.gpu.context import GpuContext
-from render_server.growing_interval import GrowingInterval
 from render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (
     HEIGHT,

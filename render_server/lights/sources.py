@@ -4,10 +4,10 @@ from typing import Protocol
 
 from protocol import scene_lights as documents
 from protocol.frames import ViewFrame
+from render_server.lights.lights import LightSet, build_lights
+from render_server.lights.median_cut import Split
 from render_server.scene.fisheye_lights import FisheyeSource
 from render_server.scene.hemisphere_map import HemisphereMap
-from render_server.scene.lights import LightSet, build_lights
-from render_server.scene.median_cut import Split
 from render_server.scene.tracked_lamps import TrackedSource
 
 

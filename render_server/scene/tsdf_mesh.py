@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
 from render_server.scene.depth_mesh import REAL_MATERIAL
-from render_server.scene.fused_volume import BLOCK, GRID, FusedVolume
-from render_server.scene.mesh import TriangleMesh
+from render_server.scene.mesh_loading import TriangleMesh
+from render_server.scene.tsdf_volume import BLOCK, GRID, FusedVolume
 
 CORNERS = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)])
 EDGES = tuple((a, b) for a in range(8) for b in range(a + 1, 8) if np.abs(CORNERS[a] - CORNERS[b]).sum() == 1)

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
-from render_server.scene.lights import Light
-from render_server.scene.octahedral import octahedral_grid
+from render_server.estimation.plane_detection import SeenPlane
+from render_server.lights.lights import Light
+from render_server.lights.octahedral import octahedral_grid
 from render_server.scene.seen_light import seen_from
-from render_server.scene.seen_planes import SeenPlane
 
 # Share of the samples that noise may put behind a wall.
 STRAY = 0.005

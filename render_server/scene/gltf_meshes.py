@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 from scipy.sparse import csr_array
 
-from render_server.scene.gltf_file import GltfFaultError, GltfFile
+from render_server.scene.gltf_document import GltfFaultError, GltfFile
 from render_server.scene.gltf_nodes import NodeTree
 from render_server.scene.materials import Material
 from render_server.scene.normals import Smoothing

@@ -9,11 +9,11 @@ from jaxtyping import Float64, Int32, UInt8
 
 from protocol.frames import RadianceMap, ViewFrame
 from protocol.hemisphere import hemisphere_direction
-from render_server.scene.environment import LUMINANCE
+from render_server.lights.environment import LUMINANCE
+from render_server.lights.lights import LightSet
+from render_server.lights.median_cut import Region, Split
+from render_server.lights.octahedral import solid_angle_mean
 from render_server.scene.hemisphere_map import HemisphereMap
-from render_server.scene.lights import LightSet
-from render_server.scene.median_cut import Region, Split
-from render_server.scene.octahedral import solid_angle_mean
 from render_server.scene.seen_light import SeenLight, seen_from
 
 OUTLINE_POINTS = 24  # of each edge of a region, because a lens bends straight lines

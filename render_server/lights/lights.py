@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from protocol import scene_lights as documents
-from render_server.scene.environment import load_environment
-from render_server.scene.median_cut import split_environment
-from render_server.scene.octahedral import above_horizon, resample_to_octahedral, solid_angle_mean
+from render_server.lights.environment import load_environment
+from render_server.lights.median_cut import split_environment
+from render_server.lights.octahedral import above_horizon, resample_to_octahedral, solid_angle_mean
 
 ENVIRONMENT_SIZE = 256
 AMBIENT_SIZE = 64  # texels of 1.5 to 5 degrees: what a metal of roughness 0.3 still shows of a wall's edge

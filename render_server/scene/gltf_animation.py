@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from render_server.scene.gltf_file import GltfFaultError, GltfFile
+from render_server.scene.gltf_document import GltfFaultError, GltfFile
 from render_server.scene.gltf_nodes import NodeMotion, NodeTree
 
 MovedProperty = Literal["translation", "rotation", "scale", "weights"]

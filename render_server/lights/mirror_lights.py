@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from render_server.scene.lights import DirectionalLight, Light, RectangleLight, SphereLight, SpotLight
-from render_server.scene.surfaces import PLANE, SurfaceTable
+from render_server.lights.lights import DirectionalLight, Light, RectangleLight, SphereLight, SpotLight
+from render_server.scene.declared_surfaces import PLANE, SurfaceTable
 
 # Of planes; from here on a lobe spreads a light's image so far that it is no light any more, and cones serve.
 MIRROR_ROUGHNESS = 0.3

@@ -6,8 +6,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, UInt8
 
-from render_server.scene.environment import LUMINANCE
-from render_server.scene.known_surfaces import LEAST_PIXELS
+from render_server.lights.environment import LUMINANCE
+from render_server.scene.board_albedo import LEAST_PIXELS
 
 CLIPPED_LINEAR = 0.98
 CLIPPED_CODE = 255

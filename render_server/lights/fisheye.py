@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from scipy.optimize import linear_sum_assignment
 
-from render_server.scene.environment import LUMINANCE
-from render_server.scene.median_cut import RegionLight
+from render_server.lights.environment import LUMINANCE
+from render_server.lights.median_cut import RegionLight
 
 # Two lights of successive pictures may be one if they are no further apart. A lamp held in the hand at 1 m moves
 # as far within a time constant of half a second; neighbours of a split with four lights are mostly further apart.
