@@ -17,8 +17,8 @@ from benchmarks.glb_builder import GlbBuilder
 from render_server.passes.mesh_buffers import triangle_corners
 from render_server.passes.volume import place_volume
 from render_server.passes.voxelize import pieces_in_volume
-from render_server.scene.gltf_asset import load_gltf
-from render_server.scene.mesh_loading import merge_for_gpu
+from render_server.scene.gltf_meshes import load_gltf
+from render_server.scene.gpu_mesh import merge_for_gpu
 
 JOINTS = 40
 REPEATS = 9

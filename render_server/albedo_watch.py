@@ -1,13 +1,13 @@
 """Keeps what pictures show of the real scene's albedo for when the camera looks elsewhere (METHOD 2)."""
 
 from protocol.frames import ViewFrame
-from render_server.estimation.backoff_schedule import GrowingInterval
+from render_server.estimation.backoff_schedule import BackoffSchedule
 from render_server.gpu.context import GpuContext
 from render_server.light_registration import observe_albedo
 from render_server.light_samples import Relight
 from render_server.passes.unseen_albedo import UnseenAlbedo
 from render_server.relight.frame import RelightInput
-from render_server.scene.albedo_volume import MEAN_ALBEDO, AlbedoMemory
+from render_server.scene.albedo_volume import MEAN_ALBEDO, AlbedoVolume
 
 
 class AlbedoWatch:
@@ -18,8 +18,8 @@ class AlbedoWatch:
 
     def __init__(self, gpu: GpuContext) -> None:
         self.texture = UnseenAlbedo(gpu)
-        self._memory = AlbedoMemory()
-        self._interval = GrowingInterval()
+        self._memory = AlbedoVolume()
+        self._interval = BackoffSchedule()
         self._is_given = False
 
     def look(self, frame: ViewFrame, scene: RelightInput, relight: Relight) -> bool:
@@ -32,7 +32,7 @@ class AlbedoWatch:
 
     def begin(self, given: float | None) -> None:
         """Begin anew: another real scene."""
-        self._memory, self._interval = AlbedoMemory(), GrowingInterval()
+        self._memory, self._interval = AlbedoVolume(), BackoffSchedule()
         self._is_given = given is not None
         self.texture.clear(MEAN_ALBEDO if given is None else given)
 

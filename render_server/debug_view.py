@@ -10,15 +10,14 @@ from jaxtyping import Float64, Int32, UInt8
 from protocol.frames import RadianceMap, ViewFrame
 from protocol.hemisphere import hemisphere_direction
 from render_server.lights.environment import LUMINANCE
-from render_server.lights.lights import LightSet
+from render_server.lights.fisheye import HemisphereMap
+from render_server.lights.lights import IncidentLight, LightSet, incident_light
 from render_server.lights.median_cut import Region, Split
 from render_server.lights.octahedral import solid_angle_mean
-from render_server.scene.hemisphere_map import HemisphereMap
-from render_server.scene.seen_light import SeenLight, seen_from
 
 OUTLINE_POINTS = 24  # of each edge of a region, because a lens bends straight lines
-LEAST_RADIUS_RAD = float(np.radians(1.0))  # smaller lights are drawn larger, to be seen at all
-FAINTEST = 0.35  # of full colour: the weakest light is still visible
+MIN_RADIUS_RAD = float(np.radians(1.0))  # smaller lights are drawn larger, to be seen at all
+MIN_STRENGTH = 0.35  # of full colour: the weakest light is still visible
 REGION_COLOR = (255, 210, 60)
 TEXT_COLOR = (255, 255, 255)
 SHIFT = 4  # bits of a pixel's fraction in cv2's drawing calls
@@ -28,7 +27,7 @@ Project = Callable[[Float64[np.ndarray, "n 3"]], Float64[np.ndarray, "n 2"]]
 
 
 @dataclass(frozen=True, eq=False)
-class _Sheet:
+class _Canvas:
     """A picture to draw on; `project` gives its pixels for directions (world) from `viewpoint`, NaN if unseen."""
 
     picture: UInt8[np.ndarray, "h w 3"]
@@ -63,7 +62,7 @@ class _Sheet:
             )
 
 
-def lights_picture(
+def draw_lights(
     frame: ViewFrame, lights: LightSet, split: Split[HemisphereMap] | None
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Draw lights as discs of their size and colour, with number and irradiance, in the size of the frame.
@@ -71,56 +70,58 @@ def lights_picture(
     On the fish-eye picture of the frame if it has one, letterboxed, with the outlines of the regions of `split`.
     """
     fisheye = frame.radiance_map
-    sheet = _camera_sheet(frame) if fisheye is None else _fisheye_sheet(frame, fisheye)
-    seen = [seen_from(light, sheet.viewpoint) for light in lights.lights]
+    canvas = _camera_canvas(frame) if fisheye is None else _fisheye_canvas(frame, fisheye)
+    seen = [incident_light(light, canvas.viewpoint) for light in lights.lights]
     strongest = max((float(light.irradiance.max()) for light in seen), default=1.0)
     colors = [_color(light, strongest) for light in seen]
     for light, color in zip(seen, colors, strict=True):
-        _draw_disc(sheet, light, color)
+        _draw_disc(canvas, light, color)
     if split is not None:
         for cut in split.lights:
-            sheet.line(_outline(cut.region, split.residual), REGION_COLOR, 1, closed=True)
+            canvas.line(_outline(cut.region, split.residual), REGION_COLOR, 1, closed=True)
     names = lights.identities or tuple(range(1, len(seen) + 1))
     for row, (light, name, color) in enumerate(zip(seen, names, colors, strict=True), start=1):
-        where = "" if _draw_middle(sheet, light, f"{name}", color) else ", out of view"
+        where = "" if _draw_middle(canvas, light, f"{name}", color) else ", out of view"
         words = f"{name}: irradiance {float(light.irradiance @ LUMINANCE):.2f}{where}"
-        sheet.text(words, (round(8 * sheet.unit), round(18 * row * sheet.unit)), color)
+        canvas.text(words, (round(8 * canvas.unit), round(18 * row * canvas.unit)), color)
     words = f"elsewhere: mean radiance {float(solid_angle_mean(lights.environment) @ LUMINANCE):.2g}"
     if fisheye is not None and fisheye.clipped_share > 0:
         words += f"; {100 * fisheye.clipped_share:.1f} % clipped"
-    sheet.text(words, (round(8 * sheet.unit), sheet.picture.shape[0] - round(8 * sheet.unit)))
-    return sheet.picture
+    canvas.text(words, (round(8 * canvas.unit), canvas.picture.shape[0] - round(8 * canvas.unit)))
+    return canvas.picture
 
 
-def _color(light: SeenLight, strongest: float) -> tuple[int, ...]:
+def _color(light: IncidentLight, strongest: float) -> tuple[int, ...]:
     """The light's own colour, darker for weaker lights."""
     peak = max(float(light.irradiance.max()), 1e-12)
-    strength = FAINTEST + (1 - FAINTEST) * min(peak / max(strongest, 1e-12), 1.0)
+    strength = MIN_STRENGTH + (1 - MIN_STRENGTH) * min(peak / max(strongest, 1e-12), 1.0)
     return tuple(
         int(v) for v in np.rint(255 * strength * np.clip(light.irradiance / peak, 0, 1) ** (1 / 2.2))
     )
 
 
-def _draw_disc(sheet: _Sheet, light: SeenLight, color: tuple[int, ...]) -> None:
-    circle = _circle(light.toward, max(float(light.angular_radius_rad), LEAST_RADIUS_RAD))
-    sheet.line(circle, (0, 0, 0), 4, closed=True)
-    sheet.line(circle, color, 2, closed=True)
+def _draw_disc(canvas: _Canvas, light: IncidentLight, color: tuple[int, ...]) -> None:
+    circle = _circle(light.to_light, max(float(light.angular_radius_rad), MIN_RADIUS_RAD))
+    canvas.line(circle, (0, 0, 0), 4, closed=True)
+    canvas.line(circle, color, 2, closed=True)
 
 
-def _draw_middle(sheet: _Sheet, light: SeenLight, name: str, color: tuple[int, ...]) -> bool:
+def _draw_middle(canvas: _Canvas, light: IncidentLight, name: str, color: tuple[int, ...]) -> bool:
     """Mark where a light is; returns whether that is in the picture."""
-    middle = sheet.project(light.toward[None])[0]
-    height, width = sheet.picture.shape[:2]
+    middle = canvas.project(light.to_light[None])[0]
+    height, width = canvas.picture.shape[:2]
     if not (np.isfinite(middle).all() and (middle >= 0).all() and (middle < (width, height)).all()):
         return False
-    arm, (x, y) = round(7 * sheet.unit), (round(float(v)) for v in middle)
+    arm, (x, y) = round(7 * canvas.unit), (round(float(v)) for v in middle)
     for ink, thickness in ((0, 0, 0), 3), (color, 1):
-        cv2.drawMarker(sheet.picture, (x, y), ink, cv2.MARKER_CROSS, arm, round(thickness * sheet.unit) or 1)
-    sheet.text(name, (x + arm // 2, y - arm // 2), TEXT_COLOR)
+        cv2.drawMarker(
+            canvas.picture, (x, y), ink, cv2.MARKER_CROSS, arm, round(thickness * canvas.unit) or 1
+        )
+    canvas.text(name, (x + arm // 2, y - arm // 2), TEXT_COLOR)
     return True
 
 
-def _fisheye_sheet(frame: ViewFrame, seen: RadianceMap) -> _Sheet:
+def _fisheye_canvas(frame: ViewFrame, seen: RadianceMap) -> _Canvas:
     """The fish-eye picture as large as it fits into the frame's size, on black."""
     width, height = frame.camera.width, frame.camera.height
     rows, columns = seen.picture.shape[:2]
@@ -137,13 +138,13 @@ def _fisheye_sheet(frame: ViewFrame, seen: RadianceMap) -> _Sheet:
     def project(directions: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 2"]:
         return np.asarray((lens.project(directions @ rotation) + 0.5) * stretch - 0.5 + (left, top))
 
-    return _Sheet(picture, np.asarray(seen.world_from_fisheye[:3, 3]), project)
+    return _Canvas(picture, np.asarray(seen.world_from_fisheye[:3, 3]), project)
 
 
-def _camera_sheet(frame: ViewFrame) -> _Sheet:
+def _camera_canvas(frame: ViewFrame) -> _Canvas:
     assert frame.pose is not None  # the renderer passes frames without a pose through
     matrix = frame.pose.world_from_camera
-    return _Sheet(
+    return _Canvas(
         frame.color.copy(),
         np.asarray(matrix[:3, 3]),
         lambda directions: frame.camera.project(directions @ matrix[:3, :3]),
@@ -163,13 +164,13 @@ def _outline(region: Region, residual: HemisphereMap) -> Float64[np.ndarray, "n 
     return np.asarray(hemisphere_direction(np.concatenate(edges)) @ residual.world_from_map.T)
 
 
-def _circle(toward: Float64[np.ndarray, "3"], radius_rad: float) -> Float64[np.ndarray, "n 3"]:
+def _circle(to_light: Float64[np.ndarray, "3"], radius_rad: float) -> Float64[np.ndarray, "n 3"]:
     """Directions at an angle from one."""
-    side = np.cross(toward, (0.0, 0.0, 1.0) if abs(toward[2]) < 0.9 else (1.0, 0.0, 0.0))
+    side = np.cross(to_light, (0.0, 0.0, 1.0) if abs(to_light[2]) < 0.9 else (1.0, 0.0, 0.0))
     side /= np.linalg.norm(side)
     turn = np.linspace(0, 2 * np.pi, 4 * OUTLINE_POINTS, endpoint=False)[:, None]
-    around = np.cos(turn) * side + np.sin(turn) * np.cross(toward, side)
-    return np.asarray(np.cos(radius_rad) * toward + np.sin(radius_rad) * around)
+    around = np.cos(turn) * side + np.sin(turn) * np.cross(to_light, side)
+    return np.asarray(np.cos(radius_rad) * to_light + np.sin(radius_rad) * around)
 
 
 def _fixed(pixels: Float64[np.ndarray, "n 2"]) -> Int32[np.ndarray, "n 2"]:

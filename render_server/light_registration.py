@@ -8,7 +8,7 @@ from render_server.estimation.registration_fit import (
 )
 from render_server.light_samples import Relight, bounced_light, sample_light
 from render_server.relight.frame import RelightInput
-from render_server.scene.albedo_volume import AlbedoMemory
+from render_server.scene.albedo_volume import AlbedoVolume
 
 
 def register_lights(frame: ViewFrame, scene: RelightInput, relight: Relight) -> Registration:
@@ -28,7 +28,7 @@ def register_lights(frame: ViewFrame, scene: RelightInput, relight: Relight) -> 
     return registration_from_albedo_percentile(samples.measured[lit], samples.light[lit], samples.bounce[lit])
 
 
-def observe_albedo(frame: ViewFrame, scene: RelightInput, memory: AlbedoMemory, relight: Relight) -> None:
+def observe_albedo(frame: ViewFrame, scene: RelightInput, memory: AlbedoVolume, relight: Relight) -> None:
     """Add what this frame shows of the real surfaces' albedo; `scene.lights` are registered."""
     samples = sample_light(frame, scene, None, relight)
     lit = samples.usable & samples.unshadowed

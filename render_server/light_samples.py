@@ -8,10 +8,9 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 
 from protocol.frames import ViewFrame, decode_lut
-from render_server.estimation.registration_fit import unclipped
 from render_server.passes.composite import RelitLayers
 from render_server.relight.frame import RelightInput
-from render_server.scene.board_albedo import known_albedo
+from render_server.scene.board_albedo import known_albedo, unclipped
 
 UNSHADOWED = 0.95  # share of its direct light that a pixel gets, from which on it counts as unshadowed
 

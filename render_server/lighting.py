@@ -8,14 +8,14 @@ from jaxtyping import Float32, UInt8
 
 from protocol import scene_lights as documents
 from protocol.frames import ViewFrame
-from render_server.debug_view import lights_picture
-from render_server.estimation.backoff_schedule import GrowingInterval
-from render_server.estimation.plane_extrapolation import ContinuedPlanes
+from render_server.debug_view import draw_lights
+from render_server.estimation.backoff_schedule import BackoffSchedule
+from render_server.estimation.plane_extrapolation import ExtrapolatedPlanes
 from render_server.estimation.registration_fit import RegistrationAverage
 from render_server.light_registration import register_lights
 from render_server.light_samples import Relight, bounced_light
 from render_server.lights.lights import LightSet
-from render_server.lights.sources import open_lights
+from render_server.lights.sources import open_light_source
 from render_server.relight.frame import RelightInput
 from render_server.surroundings import (
     find_continued_planes,
@@ -41,7 +41,7 @@ class Lighting:
     """
 
     def __init__(self, wished: documents.Lights, versions: Iterator[int], say: Callable[[str], None]) -> None:
-        self._source = open_lights(wished)
+        self._source = open_light_source(wished)
         self._versions, self._say = versions, say
         self._follows_lamps = wished.mode == "tracked"
         self._wants_registration = wished.resolved_registration == "auto"
@@ -56,15 +56,15 @@ class Lighting:
     def _forget(self) -> None:
         """Find everything anew."""
         self._is_complete = False
-        self._average, self._interval = RegistrationAverage(), GrowingInterval()
+        self._average, self._interval = RegistrationAverage(), BackoffSchedule()
         self._factor: Rgb | None = None
         self._ground: Rgb | None = None
-        self._walls: ContinuedPlanes | None = None
+        self._walls: ExtrapolatedPlanes | None = None
         self._sky: tuple[Rgb, Float32[np.ndarray, "n n 1"]] | None = None
 
     def follow(self, frame: ViewFrame) -> bool:
         """Take over a frame's lights; returns whether there are any lights yet."""
-        raw = self._source.follow(frame)
+        raw = self._source.update(frame)
         for sentence in self._source.remarks:
             self._say(sentence)
         if raw is not None:
@@ -81,7 +81,7 @@ class Lighting:
         if self._ground is not None:
             lights = lights.with_ground(self._ground)
         if self._walls is not None:
-            lights = lights.with_surfaces(self._walls.radiance, self._walls.share)
+            lights = lights.with_surfaces(self._walls.radiance, self._walls.probability)
         if self._sky is not None:
             lights = lights.with_sky(*self._sky)
         self.lights, self.version = lights, next(self._versions)
@@ -130,7 +130,7 @@ class Lighting:
     def picture(self, frame: ViewFrame) -> UInt8[np.ndarray, "h w 3"]:
         """Draw the lights (view `lights`), once there are any."""
         assert self.lights is not None
-        return lights_picture(frame, self.lights, self._source.split)
+        return draw_lights(frame, self.lights, self._source.split)
 
     def _register(self, frame: ViewFrame, scene: RelightInput, relight: Relight) -> None:
         """Find the lights' factor from this frame and average it with those before."""
@@ -150,8 +150,8 @@ class Lighting:
         scene = replace(scene, lights=lights, lights_version=trial)
         bounce = bounced_light(scene, relight)
         walls = self._walls = find_continued_planes(frame, scene, bounce, relight)
-        shape = surroundings_shape(frame, scene) * (1 - walls.share)
-        lights = lights.with_surfaces(walls.radiance, walls.share)
+        shape = surroundings_shape(frame, scene) * (1 - walls.probability)
+        lights = lights.with_surfaces(walls.radiance, walls.probability)
         scene = replace(scene, lights=lights, lights_version=trial + 2)
         found = find_surroundings(frame, scene, shape, bounce, relight)
         if found is not None:

@@ -11,9 +11,9 @@ from protocol.errors import DeltalightError
 from protocol.frames import ViewFrame
 from render_server.gpu.texel import read_texel
 from render_server.relight.frame import PlacedObject, RelightInput
+from render_server.scene.bvh import first_hit
 from render_server.scene.depth_surface import depth_surface
-from render_server.scene.mesh_loading import TriangleMesh
-from render_server.scene.ray_mesh import first_hit
+from render_server.scene.triangle_mesh import TriangleMesh
 from render_server.view import CameraView
 
 SHOWN_SHARE = 0.5  # of a pixel that an object must cover to be what the pixel shows

@@ -21,7 +21,7 @@ from render_server.relight.frame import RelightInput
 from render_server.relight.methods import MethodChoice, choose_method
 from render_server.relight.relight_base import RelightBase
 from render_server.scene.declared_surfaces import build_surface_table
-from render_server.scene.mesh_loading import TriangleMesh
+from render_server.scene.triangle_mesh import TriangleMesh
 from render_server.view import CameraView
 from render_server.virtual_objects import VirtualObjects
 

@@ -6,9 +6,14 @@ import numpy as np
 from jaxtyping import Float32
 
 from protocol.frames import ViewFrame, decode_lut
-from render_server.estimation.plane_detection import PointCloud, find_planes
-from render_server.estimation.plane_extrapolation import ContinuedPlanes, RealSamples, Sight, continue_planes
-from render_server.estimation.registration_fit import surroundings_from_patch
+from render_server.estimation.plane_detection import PointCloud, detect_planes
+from render_server.estimation.plane_extrapolation import (
+    ExtrapolatedPlanes,
+    RealSamples,
+    ViewFrustum,
+    extrapolate_planes,
+)
+from render_server.estimation.registration_fit import unseen_radiance_from_patch
 from render_server.light_samples import Bounce, Relight, read_texture, sample_light
 from render_server.lights.environment import LUMINANCE
 from render_server.lights.octahedral import irradiance, octahedral_uv, resample_to_octahedral
@@ -23,8 +28,8 @@ FLATNESS = 0.01  # of the distance: walls, tables and lenses are that even
 
 def find_continued_planes(
     frame: ViewFrame, scene: RelightInput, bounce: Bounce, relight: Relight
-) -> ContinuedPlanes:
-    """Find what lies beyond the picture where its border cuts table, walls or floor (continued_planes.py)."""
+) -> ExtrapolatedPlanes:
+    """Find what lies beyond the picture where its border cuts table, walls or floor (plane_extrapolation.py)."""
     known = sample_light(frame, scene, bounce, relight)
     usable = np.flatnonzero(known.usable)
     chosen = usable[:: max(1, len(usable) // PLANE_SAMPLES)]
@@ -36,11 +41,11 @@ def find_continued_planes(
     indirect = (known.light + known.bounce - known.direct)[chosen]
     seen = RealSamples(position, known.measured[chosen], known.lit[chosen], indirect, tolerance)
     rays = frame.camera.rays().reshape(-1, 2).astype(np.float64)
-    sight = Sight(np.linalg.inv(pose), rays.min(axis=0), rays.max(axis=0))
+    sight = ViewFrustum(np.linalg.inv(pose), rays.min(axis=0), rays.max(axis=0))
     low, high = scene.virtual.bounds
-    planes = find_planes(PointCloud(position, normal, tolerance))
+    planes = detect_planes(PointCloud(position, normal, tolerance))
     size = len(scene.lights.environment)
-    return continue_planes(planes, seen, scene.lights.lights, sight, centre=(low + high) / 2, size=size)
+    return extrapolate_planes(planes, seen, scene.lights.lights, sight, centre=(low + high) / 2, size=size)
 
 
 def find_surroundings(
@@ -65,7 +70,7 @@ def find_surroundings(
     even = sample_light(frame, only_sky, bounce, relight)
     paper = known.usable & (known.albedo > 0)
     total, per_radiance = known.light + known.bounce, even.light - known.direct
-    return surroundings_from_patch(
+    return unseen_radiance_from_patch(
         known.measured[paper], total[paper], per_radiance[paper], known.albedo[paper]
     )
 

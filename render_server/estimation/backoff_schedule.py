@@ -1,10 +1,10 @@
 """When to look again at what is averaged over time."""
 
 FIRST_WAIT_S = 1.0
-LONGEST_WAIT_S = 30.0
+MAX_WAIT_S = 30.0
 
 
-class GrowingInterval:
+class BackoffSchedule:
     """At once, then after waits that double from 1 to 30 s of the frames' own time: soon good, then nearly free."""
 
     def __init__(self) -> None:
@@ -19,5 +19,5 @@ class GrowingInterval:
         self._last_ns = min(self._last_ns, timestamp_ns)
         if timestamp_ns - self._last_ns < self._wait_s * 1e9:
             return False
-        self._last_ns, self._wait_s = timestamp_ns, min(2 * self._wait_s, LONGEST_WAIT_S)
+        self._last_ns, self._wait_s = timestamp_ns, min(2 * self._wait_s, MAX_WAIT_S)
         return True

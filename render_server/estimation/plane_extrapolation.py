@@ -11,18 +11,17 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
-from render_server.estimation.plane_detection import SeenPlane
-from render_server.lights.lights import Light
+from render_server.estimation.plane_detection import DetectedPlane
+from render_server.lights.lights import Light, incident_light
 from render_server.lights.octahedral import octahedral_grid
-from render_server.scene.seen_light import seen_from
 
 # Share of the samples that noise may put behind a wall.
-STRAY = 0.005
-LEAST_IRRADIANCE = 1e-6
+MAX_STRAY_FRACTION = 0.005
+MIN_IRRADIANCE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class ViewFrustum:
     """What the camera has in view: rays (x/z, y/z) between `low` and `high`."""
 
     camera_from_world: Float64[np.ndarray, "4 4"]
@@ -57,108 +56,113 @@ class RealSamples:
 
 
 @dataclass(frozen=True, eq=False)
-class ContinuedPlanes:
+class ExtrapolatedPlanes:
     """Octahedral maps (world axes): radiance of what goes on, and the probability that it does."""
 
     radiance: Float32[np.ndarray, "n n 3"]
-    share: Float32[np.ndarray, "n n 1"]
+    probability: Float32[np.ndarray, "n n 1"]
 
 
 @dataclass(frozen=True, eq=False)
-class _Sheet:
+class _PlaneLayer:
     """One plane in every direction: distance (m, infinite where it is not met), probability, radiance."""
 
     distance: Float64[np.ndarray, " n"]
-    share: Float64[np.ndarray, " n"]
+    probability: Float64[np.ndarray, " n"]
     radiance: Float64[np.ndarray, "n 3"]
 
 
-def continue_planes(
-    planes: Sequence[SeenPlane],
+def extrapolate_planes(
+    planes: Sequence[DetectedPlane],
     samples: RealSamples,
     lights: Sequence[Light],
-    sight: Sight,
+    frustum: ViewFrustum,
     *,
     centre: Float64[np.ndarray, "3"],
     size: int,
-) -> ContinuedPlanes:
+) -> ExtrapolatedPlanes:
     """Return what goes on around `centre` (world, m) of the planes that the picture's border cuts.
 
     `size` is the edge of the maps in texels. Nearer planes stand before farther ones.
     """
     directions = octahedral_grid(size).reshape(-1, 3)
-    sheets = [
-        _sheet(plane, samples.only(plane.on_it), lights, sight, centre=centre, directions=directions)
+    layers = [
+        _plane_layer(
+            plane, samples.only(plane.inliers), lights, frustum, centre=centre, directions=directions
+        )
         for plane in planes
         if _bounds_room(plane, samples)
     ]
     radiance, beyond = np.zeros((len(directions), 3)), np.ones(len(directions))
-    for nth in _nearest_first(sheets):
-        share = beyond * nth.share
-        radiance += share[:, None] * nth.radiance
-        beyond -= share
+    for nth in _nearest_first(layers):
+        probability = beyond * nth.probability
+        radiance += probability[:, None] * nth.radiance
+        beyond -= probability
     met = 1 - beyond
     mean = radiance / np.maximum(met, np.finfo(np.float32).tiny)[:, None]
-    return ContinuedPlanes(
+    return ExtrapolatedPlanes(
         mean.reshape(size, size, 3).astype(np.float32), met.reshape(size, size, 1).astype(np.float32)
     )
 
 
-def _nearest_first(sheets: Sequence[_Sheet]) -> list[_Sheet]:
+def _nearest_first(layers: Sequence[_PlaneLayer]) -> list[_PlaneLayer]:
     """Reorder sheets, in each direction by itself: the first of the result is the nearest one everywhere."""
-    if not sheets:
+    if not layers:
         return []
-    distance, share, radiance = (
-        np.stack([getattr(sheet, name) for sheet in sheets]) for name in ("distance", "share", "radiance")
+    distance, probability, radiance = (
+        np.stack([getattr(layer, name) for layer in layers])
+        for name in ("distance", "probability", "radiance")
     )
     order = np.argsort(distance, axis=0)
     every = np.arange(distance.shape[1])
-    return [_Sheet(distance[rank, every], share[rank, every], radiance[rank, every]) for rank in order]
+    return [
+        _PlaneLayer(distance[rank, every], probability[rank, every], radiance[rank, every]) for rank in order
+    ]
 
 
-def _bounds_room(plane: SeenPlane, samples: RealSamples) -> bool:
+def _bounds_room(plane: DetectedPlane, samples: RealSamples) -> bool:
     """Whether nothing is seen behind a plane: a thing has the room behind it, and ends."""
     behind = samples.position @ plane.normal < plane.offset - 3 * samples.tolerance_m
-    return bool(behind.mean() <= STRAY)
+    return bool(behind.mean() <= MAX_STRAY_FRACTION)
 
 
-def _sheet(
-    plane: SeenPlane,
+def _plane_layer(
+    plane: DetectedPlane,
     seen: RealSamples,
     lights: Sequence[Light],
-    sight: Sight,
+    frustum: ViewFrustum,
     *,
     centre: Float64[np.ndarray, "3"],
     directions: Float64[np.ndarray, "n 3"],
-) -> _Sheet:
+) -> _PlaneLayer:
     falling = directions @ plane.normal
     height = plane.normal @ centre - plane.offset
     meets = (falling < 0) & (height > 0)
     distance = np.full(len(directions), np.inf)
     distance[meets] = -height / falling[meets]
-    share, radiance = np.zeros(len(directions)), np.zeros((len(directions), 3))
+    probability, radiance = np.zeros(len(directions)), np.zeros((len(directions), 3))
     places = centre + distance[meets, None] * directions[meets]
-    share[meets] = _goes_on(places, seen, sight)
-    radiance[meets] = _shines(places, plane, seen, lights)
-    return _Sheet(distance, share, radiance)
+    probability[meets] = _continuation_probability(places, seen, frustum)
+    radiance[meets] = _expected_radiance(places, plane, seen, lights)
+    return _PlaneLayer(distance, probability, radiance)
 
 
-def _goes_on(
-    places: Float64[np.ndarray, "m 3"], seen: RealSamples, sight: Sight
+def _continuation_probability(
+    places: Float64[np.ndarray, "m 3"], seen: RealSamples, frustum: ViewFrustum
 ) -> Float64[np.ndarray, " m"]:
     """Probability that a plane is at places on it.
 
     The seen length is twice that from the middle of what is seen to where the straight way to the place leaves the
     view.
     """
-    start = sight.inside(seen.position.mean(axis=0)[None])
-    end = sight.inside(places)
+    start = frustum.inside(seen.position.mean(axis=0)[None])
+    end = frustum.inside(places)
     in_view = np.divide(start, start - end, out=np.ones_like(end), where=end < 0).min(axis=1)
     return np.asarray(2 * in_view / (1 + in_view))
 
 
-def _shines(
-    places: Float64[np.ndarray, "m 3"], plane: SeenPlane, seen: RealSamples, lights: Sequence[Light]
+def _expected_radiance(
+    places: Float64[np.ndarray, "m 3"], plane: DetectedPlane, seen: RealSamples, lights: Sequence[Light]
 ) -> Float64[np.ndarray, "m 3"]:
     """Radiance at places on a plane: the albedo that it has where it is seen, under the irradiance to be expected.
 
@@ -166,7 +170,7 @@ def _shines(
     """
     direct = _irradiance(lights, seen.position, plane.normal) * seen.lit[:, None]
     irradiance = direct + seen.indirect
-    ratio = np.median(seen.radiance / np.maximum(irradiance, LEAST_IRRADIANCE), axis=0)
+    ratio = np.median(seen.radiance / np.maximum(irradiance, MIN_IRRADIANCE), axis=0)
     reflected = np.minimum(ratio, 1 / np.pi)
     unexplained = np.median(seen.radiance - reflected * irradiance, axis=0)
     expected = seen.lit.mean() * _irradiance(lights, places, plane.normal) + seen.indirect.mean(axis=0)
@@ -179,6 +183,6 @@ def _irradiance(
     """Unshadowed irradiance of all lights at places that face along `normal`."""
     total = np.zeros(places.shape)
     for light in lights:
-        seen = seen_from(light, places)
-        total += seen.irradiance * np.maximum(seen.toward @ normal, 0)[:, None]
+        seen = incident_light(light, places)
+        total += seen.irradiance * np.maximum(seen.to_light @ normal, 0)[:, None]
     return total

@@ -4,14 +4,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Float64, UInt8
+from jaxtyping import Bool, Float, Float32, Float64
 
 from render_server.lights.environment import LUMINANCE
 from render_server.scene.board_albedo import LEAST_PIXELS
 
-CLIPPED_LINEAR = 0.98
-CLIPPED_CODE = 255
-DARK_LINEAR = 0.005
 OUTLIER_DEVIATIONS = 3.0
 LEAST_IRRADIANCE = 1e-4
 LEAST_OPENING = 0.05  # share of the hemisphere that must be open: below, noise of the paper decides
@@ -78,7 +75,7 @@ def _paper_irradiance(
     return np.pi * np.asarray(measured, np.float64) / np.asarray(albedo, np.float64).reshape(-1, 1)
 
 
-def surroundings_from_patch(
+def unseen_radiance_from_patch(
     measured: Float[np.ndarray, "k 3"],
     irradiance: Float[np.ndarray, "k 3"],
     per_radiance: Float[np.ndarray, "k 3"],
@@ -140,17 +137,6 @@ _NOTHING_SEEN = (
     "No lit real surface was usable to scale the lights, so they are used as given: "
     "set lights.registration or the exposure."
 )
-
-
-def unclipped(
-    color: UInt8[np.ndarray, "h w 3"], linear: Float[np.ndarray, "h w 3"]
-) -> Bool[np.ndarray, "h w"]:
-    """Whether a pixel carries its true radiance: no channel at the top of the scale, not all but black.
-
-    `linear` is the picture decoded by the response alone, before division by the exposure.
-    """
-    bright = (linear >= CLIPPED_LINEAR) | (color == CLIPPED_CODE)
-    return np.asarray(~bright.any(axis=-1) & (linear @ LUMINANCE >= DARK_LINEAR))
 
 
 class RegistrationAverage:

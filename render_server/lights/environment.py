@@ -1,7 +1,7 @@
 """Environment maps in latitude-longitude form: loading, orientation, area averaging."""
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Self
 
@@ -14,12 +14,25 @@ from protocol.frames import decode_lut
 from protocol.pictures import decode_rgb, read_bytes
 from protocol.radiance_files import LINEAR_SUFFIXES, read_linear
 from protocol.scene_lights import EnvironmentLights
-from render_server.scene.sky_grid import SkyGrid
 
 WORK_SIZE = (512, 256)
 MAX_EDGE = 16384
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 _CODED_SUFFIXES = (".png", ".jpg", ".jpeg")
+
+
+@dataclass(frozen=True, eq=False)
+class SkyGrid:
+    """Unit direction (map axes) and solid angle (sr) of every pixel of a map."""
+
+    directions: Float32[np.ndarray, "h w 3"]
+    solid_angles: Float32[np.ndarray, "h w"]
+
+    @cached_property
+    def moments(self) -> Float32[np.ndarray, "h w 4"]:
+        """Solid angle, and solid angle times direction."""
+        parts = [np.ones_like(self.solid_angles)[..., None], self.directions]
+        return np.asarray(np.concatenate(parts, axis=-1) * self.solid_angles[..., None])
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,6 +13,7 @@ from render_server.lights.octahedral import above_horizon, resample_to_octahedra
 
 ENVIRONMENT_SIZE = 256
 AMBIENT_SIZE = 64  # texels of 1.5 to 5 degrees: what a metal of roughness 0.3 still shows of a wall's edge
+MIN_DISTANCE_M = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,14 +137,14 @@ class LightSet:
     """Everything that shines, in camera units once multiplied by the registration.
 
     `environment` is the residual radiance map R, octahedral, world axes; the lights are not in it. Of it,
-    `ground_share` (0..1) is the share of each texel where the real ground's radiance belongs, because nothing else
+    `ground_fraction` (0..1) is the share of each texel where the real ground's radiance belongs, because nothing else
     is known to be there. `registration` is the factor R G B that `lights` and `environment` still lack, ones where
     it is to be found from the picture first. `identities` number the lights where they are followed over time.
     """
 
     lights: tuple[Light, ...]
     environment: Float32[np.ndarray, "n n 3"]
-    ground_share: Float32[np.ndarray, "n n 1"]
+    ground_fraction: Float32[np.ndarray, "n n 1"]
     registration: Float32[np.ndarray, "3"]
     identities: tuple[int, ...] = ()
 
@@ -160,13 +161,13 @@ class LightSet:
     def with_ground(self, radiance: Float32[np.ndarray, "3"]) -> "LightSet":
         """Return the set with ground of this radiance below the horizon, where nothing else is known to be."""
         ground = np.broadcast_to(radiance, self.environment.shape)
-        return self.with_surfaces(ground, self.ground_share)
+        return self.with_surfaces(ground, self.ground_fraction)
 
     def with_surfaces(
-        self, radiance: Float32[np.ndarray, "n n 3"], share: Float32[np.ndarray, "n n 1"]
+        self, radiance: Float32[np.ndarray, "n n 3"], fraction: Float32[np.ndarray, "n n 1"]
     ) -> "LightSet":
         """Return the set with surfaces (maps of the environment's size) before a share of each direction."""
-        return replace(self, environment=(1 - share) * self.environment + share * radiance)
+        return replace(self, environment=(1 - fraction) * self.environment + fraction * radiance)
 
     def with_sky(self, radiance: Float32[np.ndarray, "3"], shape: Float32[np.ndarray, "n n 1"]) -> "LightSet":
         """Return the set with more radiance above the horizon: `shape` (of the environment's size) times this."""
@@ -196,20 +197,20 @@ def build_lights(lights: documents.Lights) -> LightSet:
     shining, environment = (
         _from_environment(lights) if lights.mode == "environment" else _manual(lights.manual)
     )
-    return complete_set(lights, shining, environment, 1 - above_horizon(len(environment)))
+    return light_set(lights, shining, environment, 1 - above_horizon(len(environment)))
 
 
-def complete_set(
+def light_set(
     lights: documents.Lights,
     shining: tuple[Light, ...],
     environment: Float32[np.ndarray, "n n 3"],
-    ground_share: Float32[np.ndarray, "n n 1"],
+    ground_fraction: Float32[np.ndarray, "n n 1"],
     identities: tuple[int, ...] = (),
 ) -> LightSet:
     """Add the registration that a scene document wishes."""
     given = lights.resolved_registration
     factor = np.ones(3, np.float32) if given == "auto" else np.array(given, np.float32)
-    return LightSet(shining, environment, ground_share, factor, identities)
+    return LightSet(shining, environment, ground_fraction, factor, identities)
 
 
 def _manual(
@@ -254,8 +255,52 @@ def _from_environment(
     )
     shining = tuple(
         DirectionalLight(
-            (-light.toward).astype(np.float32), light.irradiance.astype(np.float32), light.angular_radius_rad
+            (-light.to_light).astype(np.float32),
+            light.irradiance.astype(np.float32),
+            light.angular_radius_rad,
         )
         for light in split.lights
     )
     return shining, resample_to_octahedral(split.residual.sample, ENVIRONMENT_SIZE)
+
+
+@dataclass(frozen=True, eq=False)
+class IncidentLight:
+    """`toward` is the unit direction to the light (world), `irradiance` falls on a surface that faces it."""
+
+    to_light: Float64[np.ndarray, "*n 3"]
+    irradiance: Float64[np.ndarray, "*n 3"]
+    angular_radius_rad: Float64[np.ndarray, "*n"]
+
+
+def incident_light(light: Light, position: Float64[np.ndarray, "*n 3"]) -> IncidentLight:
+    """Return what a light looks like from places (world, m), without anything in between."""
+    if isinstance(light, DirectionalLight):
+        to_light = np.broadcast_to(-light.direction.astype(np.float64), position.shape)
+        irradiance = np.broadcast_to(light.irradiance.astype(np.float64), position.shape)
+        return IncidentLight(to_light, irradiance, np.full(position.shape[:-1], light.angular_radius_rad))
+    offset = light.position.astype(np.float64) - position
+    distance = np.maximum(np.linalg.norm(offset, axis=-1), MIN_DISTANCE_M)
+    to_light = offset / distance[..., None]
+    if isinstance(light, RectangleLight):
+        edges = np.cross(light.axis_u.astype(np.float64), light.axis_v.astype(np.float64))
+        shown = np.maximum(-to_light @ edges, 0.0)  # area across the line of sight, m^2
+        irradiance = light.radiance.astype(np.float64) * (shown / distance**2)[..., None]
+        return IncidentLight(to_light, irradiance, np.arctan(np.sqrt(shown / np.pi) / distance))
+    irradiance = light.intensity.astype(np.float64) / distance[..., None] ** 2
+    if isinstance(light, SpotLight):
+        irradiance = irradiance * _within_cone(light, to_light)[..., None]
+    return IncidentLight(to_light, irradiance, _angular_radius(light, distance))
+
+
+def _within_cone(light: SpotLight, to_light: Float64[np.ndarray, "*n 3"]) -> Float64[np.ndarray, "*n"]:
+    """Share of a spot's intensity in the direction of whoever looks toward it."""
+    angle = np.arccos(np.clip(-to_light @ light.direction, -1, 1))
+    soft = max(light.half_angle_rad - light.full_angle_rad, 1e-9)
+    return np.asarray(np.clip((light.half_angle_rad - angle) / soft, 0, 1))
+
+
+def _angular_radius(
+    light: SphereLight | SpotLight, distance: Float64[np.ndarray, "*n"]
+) -> Float64[np.ndarray, "*n"]:
+    return np.asarray(np.arcsin(np.minimum(light.radius_m / distance, 1.0)))

@@ -8,14 +8,13 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Float64
 
-from render_server.lights.environment import LUMINANCE, WORK_SIZE, EnvironmentMap
-from render_server.scene.sky_grid import SkyGrid
+from render_server.lights.environment import LUMINANCE, WORK_SIZE, EnvironmentMap, SkyGrid
 
 PEAK_THRESHOLD = 4.0
-LEAST_SHARE = 0.01
+MIN_FRACTION = 0.01
 # Lights of this angular radius are not cut again: sampling a light's disc does the rest.
 LEAST_RADIUS_RAD = float(np.radians(5.0))
-IsHidden = Callable[[Float64[np.ndarray, "3"]], bool]
+OcclusionTest = Callable[[Float64[np.ndarray, "3"]], bool]
 
 
 class SkyMap(Protocol):
@@ -71,7 +70,7 @@ class RegionLight:
     `region` holds in the grid of the split's residual.
     """
 
-    toward: Float64[np.ndarray, "3"]
+    to_light: Float64[np.ndarray, "3"]
     irradiance: Float64[np.ndarray, "3"]
     angular_radius_rad: float
     region: Region
@@ -107,7 +106,7 @@ def split_map(
     *,
     threshold: float = PEAK_THRESHOLD,
     whole_map: bool = False,
-    is_hidden: IsHidden | None = None,
+    is_occluded: OcclusionTest | None = None,
 ) -> Split[MapT]:
     """Split a map into at most `count` lights and a residual (METHOD 2).
 
@@ -119,16 +118,16 @@ def split_map(
     luminance = _luminance(sky.radiance)
     energy = float(np.vdot(luminance, sky.grid.solid_angles))
     limit = 0.0 if whole_map else threshold * energy / max(sky.known_solid_angle, 1e-9)
-    least = 0.0 if whole_map else LEAST_SHARE * energy
+    least = 0.0 if whole_map else MIN_FRACTION * energy
     frame = _bounding(luminance, limit, Region(0, luminance.shape[0], 0, luminance.shape[1]))
     residual = sky.radiance.copy()
     lights = []
     above = np.maximum(luminance[frame.window] - np.float32(limit), 0)
     for part in variance_cut(above[..., None] * sky.grid.moments[frame.window], count):
         region = _bounding(luminance, limit, _moved(part, frame))
-        peaks = sky.radiance[region.window] * _share(luminance[region.window], limit)
+        peaks = sky.radiance[region.window] * _fraction_above(luminance[region.window], limit)
         light = _region_light(sky, region, peaks)
-        hidden = is_hidden is not None and is_hidden(light.toward)
+        hidden = is_occluded is not None and is_occluded(light.to_light)
         if not hidden and light.irradiance @ LUMINANCE >= least:
             lights.append(light)
             residual[region.window] -= peaks
@@ -139,7 +138,7 @@ def _luminance(radiance: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h
     return np.asarray(cv2.transform(radiance, LUMINANCE[None]), np.float32)
 
 
-def _share(luminance: Float32[np.ndarray, "h w"], limit: float) -> Float32[np.ndarray, "h w 1"]:
+def _fraction_above(luminance: Float32[np.ndarray, "h w"], limit: float) -> Float32[np.ndarray, "h w 1"]:
     """Return which part of each pixel's light is above the limit, 0..1."""
     above = np.maximum(luminance - np.float32(limit), 0)
     return np.asarray(above / np.maximum(luminance, np.float32(1e-30)))[..., None]
@@ -166,13 +165,13 @@ def _region_light(sky: SkyMap, region: Region, peaks: Float32[np.ndarray, "h w 3
     pull = (weight @ directions.reshape(-1, 3)).astype(np.float64)
     length = float(np.linalg.norm(pull))
     brightest = directions.reshape(-1, 3)[int(np.argmax(weight))].astype(np.float64)
-    toward = pull / length if length > 1e-6 * energy else brightest
-    cosine = cv2.transform(directions, toward.astype(np.float32)[None]).ravel()
+    to_light = pull / length if length > 1e-6 * energy else brightest
+    cosine = cv2.transform(directions, to_light.astype(np.float32)[None]).ravel()
     angle = np.arccos(np.clip(cosine, -1, 1))
     radius = np.sqrt(2 * np.vdot(weight, angle**2) / energy)
     irradiance = solid_angles.ravel() @ peaks.reshape(-1, 3)
     return RegionLight(
-        sky.world_from_map @ toward,
+        sky.world_from_map @ to_light,
         irradiance.astype(np.float64),
         float(min(radius, np.pi / 2)),
         region,

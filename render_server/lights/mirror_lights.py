@@ -75,10 +75,10 @@ def _image(
         return replace(light, direction=_single(turn @ light.direction), angular_radius_rad=radius)
     height = float(normal @ light.position + plane[3])
     position = light.position.astype(float) - 2 * height * normal
-    way = objects - position
-    if height <= 0 or normal @ way < LEAST_COSINE * np.linalg.norm(way):
+    to_objects = objects - position
+    if height <= 0 or normal @ to_objects < LEAST_COSINE * np.linalg.norm(to_objects):
         return None
-    wider = 2 * alpha * height * float(np.linalg.norm(way)) / float(normal @ way)
+    wider = 2 * alpha * height * float(np.linalg.norm(to_objects)) / float(normal @ to_objects)
     if isinstance(light, RectangleLight):
         return _rectangle_image(light, position, turn, wider)
     moved = replace(light, position=_single(position), radius_m=float(np.hypot(light.radius_m, wider)))

@@ -1,20 +1,220 @@
-"""Where a scene document's lights come from, frame after frame."""
+"""Where a scene document's lights come from, frame after frame: fixed, lamps with markers, or a fish-eye camera."""
 
+from functools import partial
 from typing import Protocol
 
+import numpy as np
+from jaxtyping import Float64
+
 from protocol import scene_lights as documents
-from protocol.frames import ViewFrame
-from render_server.lights.lights import LightSet, build_lights
-from render_server.lights.median_cut import Split
-from render_server.scene.fisheye_lights import FisheyeSource
-from render_server.scene.hemisphere_map import HemisphereMap
-from render_server.scene.tracked_lamps import TrackedSource
+from protocol.frames import RadianceMap, ViewFrame
+from render_server.lights.fisheye import (
+    HemisphereMap,
+    LightTracker,
+    TrackedLight,
+    WorldSky,
+    fit_distance,
+    is_occluded,
+    paper_light,
+    to_world,
+)
+from render_server.lights.lights import (
+    AMBIENT_SIZE,
+    DirectionalLight,
+    Light,
+    LightSet,
+    SphereLight,
+    build_lights,
+    light_set,
+)
+from render_server.lights.median_cut import Split, split_map
+from render_server.lights.octahedral import above_horizon, irradiance
+
+# Of a lamp's radius: it stays where it is until it has moved so far. Its shadows' soft edges then lie off by a
+# twentieth of their width, while the noise of the marker's pose would make them tremble and cost a rebuild a frame.
+STILL_FRACTION = 0.1
+# Texels of 1.6 degrees, finer than what glossy surfaces tell apart; lights are not in it. Filtering it takes a
+# third of the time that a map of mode `environment` takes, which changes never.
+RESIDUAL_SIZE = 128
+UP = np.array([[0.0, 0.0, 1.0]])
+
+
+class TrackedSource:
+    """Turns the poses of lamps into light sets; a lamp out of sight stays where it was seen last."""
+
+    def __init__(self, lights: documents.Lights) -> None:
+        self._wished = lights
+        self._positions: dict[int, Float64[np.ndarray, " 3"]] = {}
+        self._in_sight: set[int] = set()
+        self._begun = False
+        self.split: Split[HemisphereMap] | None = None  # no picture is split
+
+    def update(self, frame: ViewFrame) -> LightSet | None:
+        """Return the lights of a frame, not registered yet; None where they are those of the frame before."""
+        poses = {lamp.marker: lamp.world_from_marker for lamp in frame.lamps}
+        self._in_sight = set(poses)
+        changed = not self._begun
+        self._begun = True
+        for lamp in self._wished.tracked:
+            if lamp.marker in poses:
+                position = (poses[lamp.marker] @ (*lamp.offset_m, 1.0))[:3]
+                changed |= self._move(lamp, position)
+        return self._lights() if changed else None
+
+    def _move(self, lamp: documents.TrackedLamp, position: Float64[np.ndarray, "3"]) -> bool:
+        last = self._positions.get(lamp.marker)
+        if last is not None and np.linalg.norm(position - last) <= STILL_FRACTION * lamp.radius_m:
+            return False
+        self._positions[lamp.marker] = position
+        return True
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Sentences for the user on lamps that are not in sight."""
+        unseen = [lamp.marker for lamp in self._wished.tracked if lamp.marker not in self._positions]
+        lost = [marker for marker in self._positions if marker not in self._in_sight]
+        sentences = []
+        if unseen:
+            sentences.append(
+                f"No picture has shown the marker of {_lamps(unseen)} yet, so no light comes from there: turn it to "
+                "the camera, and see that board.yaml has it in lamp_markers."
+            )
+        if lost:
+            sentences.append(
+                f"The marker of {_lamps(lost)} is out of sight in some frames; there the light stays where it was."
+            )
+        return tuple(sentences)
+
+    def _lights(self) -> LightSet:
+        shown = [lamp for lamp in self._wished.tracked if lamp.marker in self._positions]
+        return light_set(
+            self._wished,
+            tuple(_lamp_light(lamp, self._positions[lamp.marker]) for lamp in shown),
+            np.zeros((AMBIENT_SIZE, AMBIENT_SIZE, 3), np.float32),
+            1 - above_horizon(AMBIENT_SIZE),
+            tuple(lamp.marker for lamp in shown),
+        )
+
+
+def _lamp_light(lamp: documents.TrackedLamp, position: Float64[np.ndarray, "3"]) -> SphereLight:
+    color = np.array(lamp.color_linear, np.float32)
+    return SphereLight(position.astype(np.float32), lamp.intensity * color, lamp.radius_m)
+
+
+def _lamps(markers: list[int]) -> str:
+    return f"lamp {markers[0]}" if len(markers) == 1 else f"lamps {', '.join(map(str, markers))}"
+
+
+class FisheyeSource:
+    """Turns the radiance maps of frames into light sets."""
+
+    def __init__(self, lights: documents.Lights) -> None:
+        self._wished = lights
+        self._tracker = LightTracker(lights.fisheye.smoothing_s)
+        self._map: RadianceMap | None = None
+        self._sky: WorldSky | None = None
+        self._distance_m: float | None = None
+        self._wants_distance = lights.fisheye.distance_m == "auto"
+        if isinstance(lights.fisheye.distance_m, float):
+            self._distance_m = lights.fisheye.distance_m
+        self.split: Split[HemisphereMap] | None = None
+
+    def update(self, frame: ViewFrame) -> LightSet | None:
+        """Return the lights of a frame, not registered yet; None where they are those of the frame before.
+
+        Until a frame brings the first map there are none.
+        """
+        if frame.radiance_map is not None and frame.radiance_map is not self._map:
+            self._map = frame.radiance_map
+            self._see(frame, frame.radiance_map)
+        elif self._map is None or not (
+            self._tracker.advance(frame.timestamp_ns) | self._find_distance(frame, self._map)
+        ):
+            return None
+        return self._lights()
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Sentences for the user."""
+        if self._map is None:
+            return (_NO_PICTURE,)
+        if self._distance_m is None or self._wished.fisheye.distance_m != "auto":
+            return ()
+        return (f"lights of the fish-eye picture: {self._distance_m:.2g} m away, as the board's paper tells",)
+
+    def _see(self, frame: ViewFrame, seen: RadianceMap) -> None:
+        settings = self._wished.fisheye
+        hidden = None
+        if frame.depth is not None and frame.pose is not None:
+            place = seen.world_from_fisheye[:3, 3]
+            hidden = partial(is_occluded, frame.depth, frame.pose.world_from_camera, place)
+        self.split = split_map(
+            HemisphereMap.of(seen),
+            settings.count,
+            threshold=settings.threshold,
+            whole_map=settings.split == "all",
+            is_occluded=hidden,
+        )
+        self._sky = to_world(self.split.residual, RESIDUAL_SIZE)
+        self._tracker.set_target(frame.timestamp_ns, self.split.lights, self._sky.filled())
+        self._find_distance(frame, seen)
+
+    def _find_distance(self, frame: ViewFrame, seen: RadianceMap) -> bool:
+        """Find how far the lights are from the first frame that shows enough paper; returns whether it did."""
+        assert self.split is not None
+        assert self._tracker.residual is not None
+        paper = paper_light(frame) if self._wants_distance and self.split.lights else None
+        if paper is None:
+            return False
+        self._wants_distance = False
+        ambient = irradiance(self._tracker.residual, UP)[0]
+        place = seen.world_from_fisheye[:3, 3]
+        self._distance_m = fit_distance(paper, place, self.split.lights, ambient)
+        return self._distance_m is not None
+
+    def _lights(self) -> LightSet:
+        assert self._map is not None
+        assert self._sky is not None
+        assert self._tracker.residual is not None
+        place, distance_m = self._map.world_from_fisheye[:3, 3], self._distance_m
+        tracked = self._tracker.lights
+        return light_set(
+            self._wished,
+            tuple(
+                _distant(light) if distance_m is None else _near(light, place, distance_m)
+                for light in tracked
+            ),
+            self._tracker.residual,
+            (1 - self._sky.seen) * (1 - above_horizon(RESIDUAL_SIZE)),
+            tuple(light.identity for light in tracked),
+        )
+
+
+def _distant(light: TrackedLight) -> Light:
+    return DirectionalLight(
+        (-light.to_light).astype(np.float32), light.irradiance.astype(np.float32), light.angular_radius_rad
+    )
+
+
+def _near(light: TrackedLight, place: Float64[np.ndarray, "3"], distance_m: float) -> Light:
+    """A sphere that lights `place` as the distant light does: E = I / d^2, and looks as large from there."""
+    return SphereLight(
+        (place + distance_m * light.to_light).astype(np.float32),
+        (light.irradiance * distance_m**2).astype(np.float32),
+        float(distance_m * np.sin(light.angular_radius_rad)),
+    )
+
+
+_NO_PICTURE = (
+    "No fish-eye picture has come yet, so frames are passed through as the camera saw them: give the source one, "
+    "or set lights.mode to manual."
+)
 
 
 class LightSource(Protocol):
     """Lights that may change from frame to frame."""
 
-    def follow(self, frame: ViewFrame) -> LightSet | None:
+    def update(self, frame: ViewFrame) -> LightSet | None:
         """Return the lights of a frame, not registered yet; None where they are those of the frame before."""
         ...
 
@@ -29,7 +229,7 @@ class LightSource(Protocol):
         ...
 
 
-class GivenLights:
+class FixedLights:
     """Lights of modes `manual` and `environment`: always the same."""
 
     split: Split[HemisphereMap] | None = None
@@ -38,13 +238,13 @@ class GivenLights:
     def __init__(self, lights: documents.Lights) -> None:
         self._lights: LightSet | None = build_lights(lights)
 
-    def follow(self, frame: ViewFrame) -> LightSet | None:  # noqa: ARG002
+    def update(self, frame: ViewFrame) -> LightSet | None:  # noqa: ARG002
         """Return the lights once."""
         lights, self._lights = self._lights, None
         return lights
 
 
-def open_lights(lights: documents.Lights) -> LightSource:
+def open_light_source(lights: documents.Lights) -> LightSource:
     """Return the source of a scene document's lights.
 
     Raises:
@@ -56,4 +256,4 @@ def open_lights(lights: documents.Lights) -> LightSource:
         case "tracked":
             return TrackedSource(lights)
         case _:
-            return GivenLights(lights)
+            return FixedLights(lights)

@@ -9,12 +9,11 @@ import numpy as np
 from render_server.gpu.context import GpuContext
 from render_server.gpu.program import ComputeProgram
 from render_server.gpu.textures import bind_images, bind_samplers, texture_2d
-from render_server.lights.octahedral import octahedral_grid, texel_solid_angles
+from render_server.lights.octahedral import MAX_ORDER, harmonics, octahedral_grid, texel_solid_angles
 from render_server.passes.object_field import field_texture
 from render_server.passes.picture import Picture
 from render_server.passes.sampling_grid import SamplingGrid
 from render_server.passes.voxel_store import bind_storage
-from render_server.scene.spherical_harmonics import MAX_ORDER, harmonics
 
 FOLDER = Path(__file__).parent
 PROBE_SIZE = 32

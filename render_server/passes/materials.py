@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float16
 
 from render_server.gpu.context import GpuContext
-from render_server.scene.mesh_loading import GpuMesh
+from render_server.scene.gpu_mesh import GpuMesh
 
 TEXTURE_SIZE = 1024  # texels an edge of a base-colour texture
 METALLIC, REFLECTANCE, ROUGHNESS = 3, slice(4, 7), 7  # columns of the table, as materials.glsl has them

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from render_server.gpu.context import GpuContext
-from render_server.scene.mesh_loading import VERTEX_ATTRIBUTES, VERTEX_LAYOUT, GpuMesh
+from render_server.scene.gpu_mesh import VERTEX_ATTRIBUTES, VERTEX_LAYOUT, GpuMesh
 
 UV, COLOR, MATERIAL = slice(6, 8), slice(8, 11), 11  # columns of a vertex
 

@@ -1,4 +1,4 @@
-"""Where smooth real planes mirror a light: a map of the plane for each image of a light (scene/mirror_lights.py)."""
+"""Where smooth real planes mirror a light: a map of the plane for each image of a light (lights/mirror_lights.py)."""
 
 from pathlib import Path
 from typing import Any

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from render_server.gpu.context import GpuContext
-from render_server.scene.albedo_volume import MEAN_ALBEDO, AlbedoMemory
+from render_server.scene.albedo_volume import MEAN_ALBEDO, AlbedoVolume
 
 
 class UnseenAlbedo:
@@ -23,7 +23,7 @@ class UnseenAlbedo:
         self._replace(np.full((1, 1, 1, 3), albedo, np.float32))
         self._cube = (0.0, 0.0, 0.0, 1.0)
 
-    def upload(self, memory: AlbedoMemory) -> None:
+    def upload(self, memory: AlbedoVolume) -> None:
         """Take over everything that was observed."""
         self._replace(memory.filled())
         x, y, z = (float(v) for v in memory.origin)

@@ -9,7 +9,7 @@ from render_server.gpu.context import GpuContext
 from render_server.gpu.program import ComputeProgram
 from render_server.passes.volume import VolumePlacement
 from render_server.passes.voxel_store import VoxelStore
-from render_server.scene.mesh_loading import split_triangles
+from render_server.scene.gpu_mesh import split_triangles
 
 LONGEST_EDGE_VOXELS = 8.0  # longer ones are split before: balances the threads, bounds each one's loops
 

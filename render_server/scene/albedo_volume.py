@@ -10,7 +10,7 @@ ALBEDO_RANGE = (0.02, 0.95)
 MEAN_ALBEDO = 0.5  # of rooms of which nothing was seen yet
 
 
-class AlbedoMemory:
+class AlbedoVolume:
     """Sums of measured radiance and of irradiance in the cells of a cube: albedo = pi sum B / sum E.
 
     `version` rises with every change. `origin` is the cube's lowest corner and `edge` its edge, world metres.

@@ -10,8 +10,8 @@ from protocol.errors import DeltalightError
 from render_server.scene.gltf_document import (
     COMPONENT_TYPES,
     COMPONENTS,
+    GltfDocument,
     GltfFaultError,
-    GltfFile,
     faults_named,
     file_inside,
     uri_bytes,
@@ -56,7 +56,7 @@ def _check_ply_counts(path: Path) -> None:
         raise DeltalightError(f"{path} announces more elements than it can hold; export the mesh again.")
 
 
-def read_gltf(path: Path) -> GltfFile:
+def read_gltf(path: Path) -> GltfDocument:
     """Read a .gltf or .glb file and check every count in it against the bytes that are there.
 
     Loaders allocate by accessor counts; a few hundred bytes can otherwise ask for gigabytes.
@@ -96,7 +96,7 @@ def _uint32(data: bytes, offset: int) -> int:
     return int.from_bytes(data[offset : offset + 4], "little")
 
 
-def _checked(path: Path, document: dict[str, Any], binary: bytes | None) -> GltfFile:
+def _checked(path: Path, document: dict[str, Any], binary: bytes | None) -> GltfDocument:
     version = str(document["asset"]["version"])
     if not version.startswith("2."):
         raise GltfFaultError(f"glTF {version} is not supported, only 2.x")
@@ -110,7 +110,7 @@ def _checked(path: Path, document: dict[str, Any], binary: bytes | None) -> Gltf
     _check_accessors(document.get("accessors", []), _Views(views, sizes))
     _check_nodes(document.get("nodes", []))
     _check_triangles(document)
-    return GltfFile(path, document, tuple(buffers))
+    return GltfDocument(path, document, tuple(buffers))
 
 
 def _count(value: object) -> int:

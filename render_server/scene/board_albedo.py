@@ -4,11 +4,12 @@ from collections.abc import Iterable
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, UInt8
+from jaxtyping import Bool, Float, Float32, Float64, UInt8
 
 from protocol.board import BoardSpec
 from protocol.camera_model import CameraModel
 from protocol.frames import BoardPose
+from render_server.lights.environment import LUMINANCE
 
 LEAST_PIXELS = 30
 ENOUGH_PIXELS = 10 * LEAST_PIXELS
@@ -16,6 +17,10 @@ FARTHEST_PX = 1e5  # beyond, fixed-point outlines overflow
 # From a patch's edges, where lens and sampling mix it with what is beside it; the second if little is left.
 INSETS_PX = (2, 1)
 EDGE_POINTS = 8
+# Linear values and codes beyond which a pixel does not carry its true radiance.
+CLIPPED_LINEAR = 0.98
+CLIPPED_CODE = 255
+DARK_LINEAR = 0.005
 
 
 def known_albedo(board: BoardSpec, camera: CameraModel, pose: BoardPose) -> Float32[np.ndarray, "h w"]:
@@ -48,6 +53,17 @@ def card_pixels(
 ) -> Bool[np.ndarray, "h w"]:
     """Return which pixels show a card, well inside its edges."""
     return _inside(_masks([outline], camera, pose), camera)
+
+
+def unclipped(
+    color: UInt8[np.ndarray, "h w 3"], linear: Float[np.ndarray, "h w 3"]
+) -> Bool[np.ndarray, "h w"]:
+    """Whether a pixel carries its true radiance: no channel at the top of the scale, not all but black.
+
+    `linear` is the picture decoded by the response alone, before division by the exposure.
+    """
+    bright = (linear >= CLIPPED_LINEAR) | (color == CLIPPED_CODE)
+    return np.asarray(~bright.any(axis=-1) & (linear @ LUMINANCE >= DARK_LINEAR))
 
 
 def _inside(masks: list[UInt8[np.ndarray, "h w"]], camera: CameraModel) -> Bool[np.ndarray, "h w"]:
@@ -88,8 +104,8 @@ def _mask(
 
 def _dense_outline(patch: Float64[np.ndarray, "4 3"]) -> Float64[np.ndarray, "n 3"]:
     """Return points along a quad's edges, because a lens bends straight lines."""
-    share = np.linspace(0, 1, EDGE_POINTS, endpoint=False)[:, None]
+    fraction = np.linspace(0, 1, EDGE_POINTS, endpoint=False)[:, None]
     following = np.roll(patch, -1, axis=0)
     return np.concatenate(
-        [start + share * (end - start) for start, end in zip(patch, following, strict=True)]
+        [start + fraction * (end - start) for start, end in zip(patch, following, strict=True)]
     )

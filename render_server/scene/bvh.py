@@ -3,13 +3,14 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int32, Int64
+from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
 LEAF_SIZE = 4  # triangles at most: boxes around fewer cost as many tests as they save
 BINS = 16  # places an axis where a node may be split (Wald 2007)
 # Of the greatest coordinate: boxes grow by it, so that float32 rays do not miss what touches them.
 ROUNDING = 1e-6
 COUNT_BITS = 3  # of a leaf: its number of triangles stands below the place of the first
+PARALLEL = 1e-12  # determinant (m^2), from which on a ray counts as going along the triangle's plane
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,3 +213,31 @@ def _assembled(
         (place + size)[back].astype(np.int32),
         order.astype(np.int32),
     )
+
+
+def first_hit(
+    corners: Float32[np.ndarray, "m 3 3"],
+    origin: Float64[np.ndarray, "3"],
+    direction: Float64[np.ndarray, "3"],
+) -> tuple[float, Float64[np.ndarray, "3"]] | None:
+    """Distance along `toward` (in its lengths) to the nearest triangle before the origin, and its unit normal.
+
+    The normal faces the origin. None: the ray meets none.
+    """
+    first, second, third = np.moveaxis(corners.astype(np.float64), 1, 0)
+    u_edge, v_edge = second - first, third - first
+    across = np.cross(direction, v_edge)
+    determinant = (u_edge * across).sum(axis=1)
+    crossed = np.abs(determinant) > PARALLEL
+    scale = np.divide(1.0, determinant, out=np.zeros_like(determinant), where=crossed)
+    start = origin - first
+    u = (start * across).sum(axis=1) * scale
+    turned = np.cross(start, u_edge)
+    v, distance = (turned @ direction) * scale, (turned * v_edge).sum(axis=1) * scale
+    hit = crossed & (u >= 0) & (v >= 0) & (u + v <= 1) & (distance > 0)
+    if not hit.any():
+        return None
+    nearest = int(np.flatnonzero(hit)[distance[hit].argmin()])
+    normal = np.cross(u_edge[nearest], v_edge[nearest])
+    normal /= np.linalg.norm(normal)
+    return float(distance[nearest]), -normal if normal @ direction > 0 else normal

@@ -9,7 +9,7 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Bool, Float32, Int32, Int64, UInt8
 
 from protocol.camera_model import CameraModel
 from protocol.frames import DepthImage
@@ -22,6 +22,24 @@ MAX_RADIUS = 5
 SHIFTS = ((0, -1), (0, 1), (-1, 0), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1))
 # Least spread of a window's valid pixels, relative to a full window (determinant of their covariance).
 LEAST_SUPPORT = 0.01
+# A thinner strip is an edge, where colours mix.
+MIN_STRIP_WIDTH_PX = 3
+# Smaller ones are crumbs of edges: depth comes with holes up to this size filled.
+MIN_STRIP_AREA_PX = 64
+# As far beside a strip its surfaces are looked at, in windows of as much to each side.
+BORDER_RADIUS_PX = 4
+# Colours of a strip and of what is beside it mix so far out: lenses and demosaicing blur edges over a pixel or two.
+MIXED_BORDER_PX = 2
+# Spread of colour, 0..1, that light and noise cause where a window shows none.
+MIN_COLOR_SPREAD = 0.05
+COLOR_SIGMAS = 3.0
+# Share of a strip that must look like a steep surface for all of it to count as one: all but a mixed pixel at either
+# side of strips 8 pixels wide. Blurred edges of near things before far ones have a third or more of such pixels.
+MIN_GRAZING_FRACTION = 0.75
+
+Map = Float32[np.ndarray, "h w"]
+Mask = Bool[np.ndarray, "h w"]
+Colors = Float32[np.ndarray, "h w 3"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,3 +246,123 @@ def surface_normals(
 @lru_cache(maxsize=4)
 def _ray_planes(camera: CameraModel) -> Float32[np.ndarray, "2 h w"]:
     return np.ascontiguousarray(camera.rays().transpose(2, 0, 1))
+
+
+@dataclass(frozen=True, eq=False)
+class _Side:
+    """The nearer or the farther surface beside a strip, as each pixel has it nearest."""
+
+    surface: Mask
+    distance_px: Map
+    nearest_pixel: Int64[np.ndarray, "h w"]
+    """Flat index of that nearest pixel."""
+
+
+def grazing_depth_fill(depth: DepthImage, color: UInt8[np.ndarray, "h w 3"], camera: CameraModel) -> Map:
+    """Return the inverse depth (1/m) of steep surfaces where `depth` knows none; 0 elsewhere.
+
+    `depth` is clean and registered to `color` (RGB) and `camera`. In inverse depth a plane is an affine function of
+    the pixel (depth_surface.py), so strips are filled linearly from their near to their far side.
+    """
+    valid = depth.valid & (depth.depth_m > 0)
+    inverse = np.divide(1, depth.depth_m, out=np.zeros_like(depth.depth_m), where=valid)
+    result = np.zeros_like(inverse)
+    unknown = (~valid).view(np.uint8)
+    to_known = cv2.distanceTransform(unknown, cv2.DIST_L2, cv2.DIST_MASK_5)
+    thick = cv2.morphologyEx(unknown, cv2.MORPH_OPEN, np.ones((MIN_STRIP_WIDTH_PX,) * 2, np.uint8))
+    count, labels, boxes, _ = cv2.connectedComponentsWithStats(thick, connectivity=4)
+    for label in range(1, count):
+        if boxes[label, cv2.CC_STAT_AREA] < MIN_STRIP_AREA_PX:
+            continue
+        part = _strip_window(boxes[label])
+        strip = labels[part] == label
+        around = inverse[part] * _dilated(strip, BORDER_RADIUS_PX)
+        if _may_be_grazing(strip, around, to_known[part], depth, camera):
+            grazing, bridged = _bridge(strip, around, color[part], depth, camera)
+            result[part][grazing] = bridged[grazing]
+    return np.asarray(result)
+
+
+def _strip_window(box: Int32[np.ndarray, "5"]) -> tuple[slice, slice]:
+    """Rows and columns of a strip (OpenCV's statistics: left, top, width, height) and the surfaces beside it."""
+    margin = 2 * BORDER_RADIUS_PX
+    left, top, width, height = (int(value) for value in box[:4])
+    return (
+        slice(max(top - margin, 0), top + height + margin),
+        slice(max(left - margin, 0), left + width + margin),
+    )
+
+
+def _may_be_grazing(strip: Mask, around: Map, to_known: Map, depth: DepthImage, camera: CameraModel) -> bool:
+    """Rule most strips out at little cost: no step beside them could make most of their pixels steep.
+
+    `around` is the inverse depth beside the strip, 0 elsewhere, `to_known` how far pixels are from known ones: there,
+    a strip is at least twice as wide.
+    """
+    known = around[around > 0]
+    if not known.size:
+        return False
+    least = np.full(int(strip.sum()), known.min())
+    bearable = jump_threshold(depth, camera, least, 2 * to_known[strip])
+    return bool((known.max() - known.min() > bearable).mean() > MIN_GRAZING_FRACTION)
+
+
+def _bridge(
+    strip: Mask, around: Map, color: UInt8[np.ndarray, "h w 3"], depth: DepthImage, camera: CameraModel
+) -> tuple[Mask, Map]:
+    """Which pixels of a strip are a steep surface, and inverse depth there; `around` has it on either side."""
+    split = (around[around > 0].min() + around.max()) / 2
+    near, far = _side(around > split), _side((around > 0) & (around <= split))
+    before, behind = around.ravel()[near.nearest_pixel], around.ravel()[far.nearest_pixel]
+    width = near.distance_px + far.distance_px
+    bridged = (before * far.distance_px + behind * near.distance_px) / width
+    grazing = strip & (before - behind > jump_threshold(depth, camera, bridged, width))
+    pure = ~_dilated(strip, MIXED_BORDER_PX)
+    least, own = MIN_GRAZING_FRACTION * strip.sum(), np.flatnonzero(grazing)
+    for side in (near, far):
+        if len(own) > least:
+            own = own[_differs_in_color(side, np.float32(1 / 255) * color, pure, own)]
+    return grazing & (len(own) > least), np.asarray(bridged)
+
+
+def _dilated(mask: Mask, radius_px: int) -> Mask:
+    return np.asarray(cv2.dilate(mask.view(np.uint8), np.ones((2 * radius_px + 1,) * 2)).view(bool))
+
+
+def _side(surface: Mask) -> _Side:
+    """Look from every pixel at the nearest pixel of a surface."""
+    distance, labels = cv2.distanceTransformWithLabels(
+        (~surface).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    places = np.flatnonzero(surface)
+    nearest = np.zeros(labels.max() + 1, np.int64)
+    nearest[labels.ravel()[places]] = places
+    return _Side(surface, distance, nearest[labels])
+
+
+def _differs_in_color(
+    side: _Side, color: Colors, pure: Mask, pixels: Int64[np.ndarray, " n"]
+) -> Bool[np.ndarray, " n"]:
+    """Whether pixels (flat indices) differ in colour from the surface, where it is pure, nearest to them."""
+    mean, variance = _color_statistics(color, side.surface & pure)
+    nearest_pixel = side.nearest_pixel.ravel()[pixels]
+    difference = color.reshape(-1, 3)[pixels] - mean.reshape(-1, 3)[nearest_pixel]
+    squared = np.einsum("nc,nc->n", difference, difference)
+    return np.asarray(squared > COLOR_SIGMAS**2 * (variance.ravel()[nearest_pixel] + MIN_COLOR_SPREAD**2))
+
+
+def _color_statistics(color: Colors, mask: Mask) -> tuple[Colors, Map]:
+    """Mean and variance (over all channels; infinite of none) of a mask's colours in the window around each pixel."""
+    weight = mask.astype(np.float32)
+
+    def summed(values: np.ndarray) -> np.ndarray:
+        size = (2 * BORDER_RADIUS_PX + 1,) * 2
+        border = cv2.BORDER_CONSTANT
+        return np.asarray(cv2.boxFilter(values, cv2.CV_32F, size, normalize=False, borderType=border))
+
+    count = summed(weight)
+    fraction = 1 / np.maximum(count, 1)
+    mean = summed(color * weight[..., None]) * fraction[..., None]
+    square = summed(np.einsum("hwc,hwc->hw", color, color) * weight) * fraction
+    variance = np.maximum(square - np.einsum("hwc,hwc->hw", mean, mean), 0)
+    return mean, np.where(count > 0, variance, np.float32(np.inf))

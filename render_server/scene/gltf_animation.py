@@ -9,8 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from render_server.scene.gltf_document import GltfFaultError, GltfFile
-from render_server.scene.gltf_nodes import NodeMotion, NodeTree
+from render_server.scene.gltf_document import GltfDocument, GltfFaultError, NodeMotion, NodeTree
 
 MovedProperty = Literal["translation", "rotation", "scale", "weights"]
 Interpolation = Literal["STEP", "LINEAR", "CUBICSPLINE"]
@@ -43,15 +42,15 @@ class Track:
 
     def _between(self, index: int, time_s: float) -> Float64[np.ndarray, "c w"]:
         span = self.times[index + 1] - self.times[index]
-        share = float((time_s - self.times[index]) / span)
+        fraction = float((time_s - self.times[index]) / span)
         before, after = self.keys[index], self.keys[index + 1]
         if self.interpolation == "STEP":
             return np.asarray(before[0])
         if self.interpolation == "CUBICSPLINE":
-            return _hermite(before, after, float(span), share)
+            return _hermite(before, after, float(span), fraction)
         if self.path == "rotation":
-            return slerp(before[0], after[0], share)
-        return np.asarray(before[0] + share * (after[0] - before[0]))
+            return slerp(before[0], after[0], fraction)
+        return np.asarray(before[0] + fraction * (after[0] - before[0]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +90,7 @@ def unit(quaternions: Float64[np.ndarray, "c 4"]) -> Float64[np.ndarray, "c 4"]:
 
 
 def slerp(
-    first: Float64[np.ndarray, "c 4"], second: Float64[np.ndarray, "c 4"], share: float
+    first: Float64[np.ndarray, "c 4"], second: Float64[np.ndarray, "c 4"], fraction: float
 ) -> Float64[np.ndarray, "c 4"]:
     """Along the shorter arc between unit quaternions (Shoemake 1985)."""
     cosine = np.einsum("cw,cw->c", first, second)[:, None]
@@ -100,25 +99,25 @@ def slerp(
     sine = np.sin(angle)
     along = np.maximum(sine, LEAST_SINE)
     is_near = sine < LEAST_SINE
-    one = np.where(is_near, 1 - share, np.sin((1 - share) * angle) / along)
-    other = np.where(is_near, share, np.sin(share * angle) / along)
+    one = np.where(is_near, 1 - fraction, np.sin((1 - fraction) * angle) / along)
+    other = np.where(is_near, fraction, np.sin(fraction * angle) / along)
     return np.asarray(one * first + other * second)
 
 
 def _hermite(
-    before: Float64[np.ndarray, "3 c w"], after: Float64[np.ndarray, "3 c w"], span_s: float, share: float
+    before: Float64[np.ndarray, "3 c w"], after: Float64[np.ndarray, "3 c w"], span_s: float, fraction: float
 ) -> Float64[np.ndarray, "c w"]:
     """Cubic Hermite spline (appendix C.5): tangents are per second."""
-    square, cube = share**2, share**3
+    square, cube = fraction**2, fraction**3
     return np.asarray(
         (2 * cube - 3 * square + 1) * before[1]
-        + span_s * (cube - 2 * square + share) * before[2]
+        + span_s * (cube - 2 * square + fraction) * before[2]
         + (3 * square - 2 * cube) * after[1]
         + span_s * (cube - square) * after[0]
     )
 
 
-def read_clips(file: GltfFile, nodes: NodeTree) -> tuple[Clip, ...]:
+def read_clips(gltf: GltfDocument, nodes: NodeTree) -> tuple[Clip, ...]:
     """Take over all clips that move nodes of the document.
 
     Raises:
@@ -126,18 +125,18 @@ def read_clips(file: GltfFile, nodes: NodeTree) -> tuple[Clip, ...]:
             not exist or whose place is a matrix.
     """
     clips: dict[str, Clip] = {}
-    for index, animation in enumerate(file.entries("animations")):
+    for index, animation in enumerate(gltf.entries("animations")):
         name = str(animation.get("name") or f"clip {index}")
         if name in clips:
             name = f"{name} ({index})"
         try:
-            clips[name] = Clip(name, _tracks(file, nodes, animation))
+            clips[name] = Clip(name, _tracks(gltf, nodes, animation))
         except GltfFaultError as fault:
             raise GltfFaultError(f"in its animation `{name}`, {fault}") from fault
     return tuple(clips.values())
 
 
-def _tracks(file: GltfFile, nodes: NodeTree, animation: dict[str, Any]) -> tuple[Track, ...]:
+def _tracks(gltf: GltfDocument, nodes: NodeTree, animation: dict[str, Any]) -> tuple[Track, ...]:
     """Channels, those of the same times, kind and width together: they are sampled at once."""
     together: dict[tuple[Any, ...], list[tuple[int, np.ndarray]]] = defaultdict(list)
     for number, channel in enumerate(animation.get("channels", [])):
@@ -147,13 +146,13 @@ def _tracks(file: GltfFile, nodes: NodeTree, animation: dict[str, Any]) -> tuple
         sampler = _sampler(animation, number, channel)
         _check_target(nodes, node, path)
         width = WIDTHS.get(path, 0) or len(nodes.rest.weights[node])
-        times = _times(file, sampler)
-        keys = _keys(file, sampler, len(times), width)
+        times = _times(gltf, sampler)
+        keys = _keys(gltf, sampler, len(times), width)
         if path == "rotation" and keys.shape[1] == 1:
             keys = unit(keys[:, 0])[:, None]
         together[sampler["input"], sampler.get("interpolation", "LINEAR"), path, width].append((node, keys))
     return tuple(
-        Track(path, how, _times(file, {"input": times}), *_stacked(channels))
+        Track(path, how, _times(gltf, {"input": times}), *_stacked(channels))
         for (times, how, path, _), channels in together.items()
     )
 
@@ -183,16 +182,18 @@ def _check_target(nodes: NodeTree, node: int, path: str) -> None:
         raise GltfFaultError(f"a channel moves node {node}, whose place is given as a matrix")
 
 
-def _times(file: GltfFile, sampler: dict[str, Any]) -> Float64[np.ndarray, " k"]:
-    times = file.floats(sampler["input"], 1)[:, 0].astype(np.float64)
+def _times(gltf: GltfDocument, sampler: dict[str, Any]) -> Float64[np.ndarray, " k"]:
+    times = gltf.floats(sampler["input"], 1)[:, 0].astype(np.float64)
     if not len(times) or times[0] < 0 or (np.diff(times) <= 0).any():
         raise GltfFaultError("the times of a sampler's keys do not rise from 0 on")
     return times
 
 
-def _keys(file: GltfFile, sampler: dict[str, Any], count: int, width: int) -> Float64[np.ndarray, "k p w"]:
+def _keys(
+    gltf: GltfDocument, sampler: dict[str, Any], count: int, width: int
+) -> Float64[np.ndarray, "k p w"]:
     parts = 3 if sampler.get("interpolation") == "CUBICSPLINE" else 1
-    values = file.array(sampler["output"]).astype(np.float64)
+    values = gltf.array(sampler["output"]).astype(np.float64)
     if values.size != count * parts * width:
         raise GltfFaultError(f"a sampler has {values.size} numbers where {count * parts * width} belong")
     if not np.isfinite(values).all():

@@ -13,7 +13,7 @@ GRID_STEP_PX = 4
 
 
 @dataclass(frozen=True)
-class TrackerSettings:
+class MotionThresholds:
     """When a change counts.
 
     `image_motion_px`: motion of the picture by the change of pose alone, pixels (> 0).
@@ -24,10 +24,10 @@ class TrackerSettings:
 
     image_motion_px: float = 0.5
     depth_sigmas: float = 3.0
-    depth_share: float = 0.02
+    depth_fraction: float = 0.02
     color_noise: float = 0.02
     color_sigmas: float = 4.0
-    color_share: float = 0.005
+    color_fraction: float = 0.005
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,15 +39,15 @@ class _Reference:
     inverse_depth: Float32[np.ndarray, "gh gw"] | None
 
 
-class RealSceneTracker:
+class MotionDetector:
     """Compares each frame with the one that the real scene was last built from.
 
     Changes are measured against that frame, not the previous one, so that slow drift is found as well.
     The same frames in the same order always give the same answers.
     """
 
-    def __init__(self, settings: TrackerSettings | None = None) -> None:
-        self._settings = settings or TrackerSettings()
+    def __init__(self, thresholds: MotionThresholds | None = None) -> None:
+        self._thresholds = thresholds or MotionThresholds()
         self._reference: _Reference | None = None
 
     def update(self, frame: ViewFrame) -> bool:
@@ -63,12 +63,12 @@ class RealSceneTracker:
         return (
             before.camera != after.camera
             or (before.depth is None) != (after.depth is None)
-            or _image_motion(before, after, old.inverse_depth) > self._settings.image_motion_px
-            or self._moved_share(old, new) > self._settings.depth_share
-            or self._recolored_share(old, new) > self._settings.color_share
+            or _image_motion(before, after, old.inverse_depth) > self._thresholds.image_motion_px
+            or self._moved_fraction(old, new) > self._thresholds.depth_fraction
+            or self._recolored_fraction(old, new) > self._thresholds.color_fraction
         )
 
-    def _moved_share(self, old: _Reference, new: _Reference) -> float:
+    def _moved_fraction(self, old: _Reference, new: _Reference) -> float:
         """Share of the samples valid in both whose inverse depth differs by more than noise explains."""
         before, after, depth = old.inverse_depth, new.inverse_depth, new.frame.depth
         if before is None or after is None or depth is None:
@@ -76,17 +76,17 @@ class RealSceneTracker:
         if before.shape != after.shape:
             return 1.0
         both = (before > 0) & (after > 0)
-        limit = self._settings.depth_sigmas * np.sqrt(2) * noise_sigma(depth)
+        limit = self._thresholds.depth_sigmas * np.sqrt(2) * noise_sigma(depth)
         moved = both & (np.abs(after - before) > limit)
         return float(np.count_nonzero(moved)) / max(int(np.count_nonzero(both)), 1)
 
-    def _recolored_share(self, old: _Reference, new: _Reference) -> float:
+    def _recolored_fraction(self, old: _Reference, new: _Reference) -> float:
         """Share of the block means whose linear colour differs, in any channel, by more than noise explains.
 
         A block's mean has the noise of a pixel divided by the block's edge; codecs leave some more.
         """
-        sigma = self._settings.color_noise * np.sqrt(np.maximum(old.color, 0.01)) / 2
-        limit = self._settings.color_sigmas * np.sqrt(2) * sigma
+        sigma = self._thresholds.color_noise * np.sqrt(np.maximum(old.color, 0.01)) / 2
+        limit = self._thresholds.color_sigmas * np.sqrt(2) * sigma
         return float((np.abs(new.color - old.color) > limit).any(axis=-1).mean())
 
 

@@ -12,18 +12,18 @@ from jaxtyping import Float32
 from protocol.files import replacing
 from render_server.scene.occlusion_field import (
     FieldSettings,
+    ObjectRays,
     OcclusionField,
+    ProgressCallback,
     ShellGrid,
-    Step,
     compute_occlusion,
     place_shells,
 )
-from render_server.scene.occlusion_rays import ObjectRays
 from render_server.scene.occlusion_transfer import LENGTH, compute_transfer, surface_pieces
 
 FIELD_VERSION = 1  # of what is computed from the same input
 CACHE_VARIABLE = "DELTALIGHT_CACHE"
-OCCLUSION_SHARE = 0.8  # of the time
+OCCLUSION_FRACTION = 0.8  # of the time
 
 
 def default_folder() -> Path:
@@ -45,7 +45,7 @@ def field_digest(surface: Float32[np.ndarray, "m 3 6"], settings: FieldSettings)
 
 
 def compute_field(
-    surface: Float32[np.ndarray, "m 3 6"], settings: FieldSettings, step: Step
+    surface: Float32[np.ndarray, "m 3 6"], settings: FieldSettings, progress: ProgressCallback
 ) -> OcclusionField:
     """Compute the field of an object (`object_surface`, asset's frame); seconds.
 
@@ -54,13 +54,15 @@ def compute_field(
     """
     rays = ObjectRays(np.ascontiguousarray(surface[..., :3]))
     grid = place_shells(rays, settings)
-    occlusion = compute_occlusion(rays, grid, settings, lambda share: step(OCCLUSION_SHARE * share))
+    occlusion = compute_occlusion(
+        rays, grid, settings, lambda fraction: progress(OCCLUSION_FRACTION * fraction)
+    )
     transfer = None
     if settings.indirect:
         pieces = surface_pieces(surface, rays.radius)
-        later = 1 - OCCLUSION_SHARE
+        later = 1 - OCCLUSION_FRACTION
         transfer = compute_transfer(
-            pieces, grid, settings, lambda share: step(OCCLUSION_SHARE + later * share)
+            pieces, grid, settings, lambda fraction: progress(OCCLUSION_FRACTION + later * fraction)
         )
     return OcclusionField(grid, rays.radius, occlusion, transfer)
 

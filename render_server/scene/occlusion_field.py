@@ -5,20 +5,144 @@ within the next: the innermost fits the object, so that contact is resolved, the
 of its shadow.
 """
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
-from jaxtyping import Bool, Float16, Float32, Float64
+from jaxtyping import Bool, Float16, Float32, Float64, Int32, Int64
 from scipy.ndimage import distance_transform_edt
 
-from render_server.scene.occlusion_rays import ObjectRays
-from render_server.scene.spherical_harmonics import harmonics
+from protocol.errors import DeltalightError
+from render_server.lights.octahedral import even_directions, harmonics
 
+Vectors = Float32[np.ndarray, "m 3"]
+FINER = 4  # times as many directions in the next finer set
+FINEST = 2  # sets beyond the first: a ball seen from afar is met by few of all directions
+INSIDE = 0.75  # share of all directions that meet the object from behind: a point within it, or within a closed gap
+CHUNK = 400_000  # rays tested at once: some 5 ms, between which another thread may run
+AIM = 1.02  # times the enclosing radius: the rim of an object that fills its sphere is met too
 BLEND_CELLS = 2  # at its border a shell passes over to the next over so many cells; the object lies within
 
-Step = Callable[[float], None]
+ProgressCallback = Callable[[float], None]
 """Told how much of the whole has been done (0..1); may raise to end the work."""
+
+
+@dataclass(frozen=True, eq=False)
+class DirectionSet:
+    """Directions of equal solid angle over the whole sphere."""
+
+    directions: Float32[np.ndarray, "n 3"]
+
+    @property
+    def solid_angle(self) -> float:
+        """Of one direction, sr."""
+        return 4 * math.pi / len(self.directions)
+
+
+@cache
+def direction_set(count: int) -> DirectionSet:
+    """Return a set of `count` directions."""
+    return DirectionSet(even_directions(count).astype(np.float32))
+
+
+@dataclass(frozen=True, eq=False)
+class RayHits:
+    """What met the object: the point's number, the direction's number in its set, triangle, and seen from behind."""
+
+    point: Int64[np.ndarray, " h"]
+    direction: Int64[np.ndarray, " h"]
+    triangle: Int32[np.ndarray, " h"]
+    behind: Bool[np.ndarray, " h"]
+
+
+class ObjectRays:
+    """The triangles of one object, and the sphere around them.
+
+    Raises:
+        DeltalightError: the package embreex is not installed.
+    """
+
+    def __init__(self, corners: Float32[np.ndarray, "m 3 3"]) -> None:
+        try:
+            from embreex.mesh_construction import TriangleMesh
+            from embreex.rtcore_scene import EmbreeScene
+        except ImportError as error:
+            raise DeltalightError(
+                "Method aroof traces rays with the package embreex, which is not installed: pip install embreex."
+            ) from error
+        self._scene = EmbreeScene()
+        vertices = np.ascontiguousarray(corners.reshape(-1, 3))
+        faces = np.arange(len(vertices), dtype=np.int32).reshape(-1, 3)
+        self._mesh = TriangleMesh(self._scene, vertices, faces)
+        edges = corners[:, 1:] - corners[:, :1]
+        self._normals = np.cross(edges[:, 0], edges[:, 1])
+        low, high = vertices.min(axis=0), vertices.max(axis=0)
+        self.centre = (low.astype(np.float64) + high) / 2
+        self.half = (high.astype(np.float64) - low) / 2
+        self.radius = max(float(np.linalg.norm(vertices - self.centre, axis=1).max()), 1e-9)
+
+    def aimed(
+        self, points: Vectors, count: int
+    ) -> Iterator[tuple[Int64[np.ndarray, " p"], DirectionSet, RayHits]]:
+        """Trace rays from all points, some points at a time: their numbers, the directions they took, what was met.
+
+        Points within the enclosing sphere take `count` directions; from farther away the object fills less of the
+        sphere, and finer sets meet it about as often. Only directions that may meet it are traced.
+        """
+        finer = self._finer(points)
+        for level in range(FINEST + 1):
+            chosen = direction_set(count * FINER**level)
+            of_level = np.flatnonzero(finer == level)
+            parts = -(-len(of_level) * len(chosen.directions) // CHUNK)
+            for part in np.array_split(of_level, parts) if parts else []:
+                yield part, chosen, self._meet(points[part], chosen)
+
+    def inside(self, hits: RayHits, points: int, chosen: DirectionSet) -> Bool[np.ndarray, " points"]:
+        """Return which of the points that `aimed` gave lie within the object."""
+        behind = np.bincount(hits.point[hits.behind], minlength=points)
+        return np.asarray(behind > INSIDE * len(chosen.directions))
+
+    def _finer(self, points: Vectors) -> Int64[np.ndarray, " m"]:
+        """Which set each point takes."""
+        fraction = (1 - self._aim_cosine(points)) / 2
+        steps = np.ceil(np.log(1 / np.maximum(fraction, 1e-9)) / math.log(FINER) - 1e-9)
+        return np.clip(steps, 0, FINEST).astype(np.int64)
+
+    def _aim_cosine(self, points: Vectors) -> Float64[np.ndarray, " m"]:
+        """Cosine of the half-angle under which a point sees the enclosing sphere; -1 from inside."""
+        ratio = AIM * self.radius / np.maximum(np.linalg.norm(points - self.centre, axis=1), 1e-12)
+        return np.where(ratio < 1, np.sqrt(np.maximum(1 - ratio**2, 0)), -1.0)
+
+    def _meet(self, points: Vectors, chosen: DirectionSet) -> RayHits:
+        directions = (self.centre - points).astype(np.float32)
+        directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-12)
+        cosine = self._aim_cosine(points).astype(np.float32)[:, None]
+        point, direction = np.nonzero((cosine < 0) | (directions @ chosen.directions.T >= cosine))
+        return self._met(points[point], chosen.directions[direction], point, direction)
+
+    def meet_along(self, points: Vectors, normals: Vectors, chosen: DirectionSet) -> RayHits:
+        """Trace every direction of the set above each point's horizon."""
+        point, direction = np.nonzero(normals @ chosen.directions.T > 0)
+        return self._met(points[point], chosen.directions[direction], point, direction)
+
+    def _met(
+        self,
+        start: Vectors,
+        directions: Vectors,
+        point: Int64[np.ndarray, " m"],
+        direction: Int64[np.ndarray, " m"],
+    ) -> RayHits:
+        if not len(start):
+            return RayHits(point, direction, np.zeros(0, np.int32), np.zeros(0, bool))
+        triangle = self._scene.run(
+            np.ascontiguousarray(start), np.ascontiguousarray(directions), query="INTERSECT"
+        )
+        met = triangle >= 0
+        found = triangle[met]
+        behind = np.einsum("hk,hk->h", directions[met], self._normals[found]) > 0
+        return RayHits(point[met], direction[met], found, behind)
 
 
 @dataclass(frozen=True)
@@ -54,8 +178,8 @@ def place_shells(rays: ObjectRays, settings: FieldSettings) -> ShellGrid:
     cell = 2 * rays.radius / (settings.resolution - 1)
     first = np.maximum(rays.half / margin, rays.half + BLEND_CELLS * cell / 2)
     last = np.full(3, settings.reach * rays.radius)
-    share = np.linspace(0, 1, settings.shells)[:, None]
-    return ShellGrid(rays.centre, first ** (1 - share) * last**share)
+    fraction = np.linspace(0, 1, settings.shells)[:, None]
+    return ShellGrid(rays.centre, first ** (1 - fraction) * last**fraction)
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +197,7 @@ class OcclusionField:
 
 
 def compute_occlusion(
-    rays: ObjectRays, grid: ShellGrid, settings: FieldSettings, step: Step
+    rays: ObjectRays, grid: ShellGrid, settings: FieldSettings, progress: ProgressCallback
 ) -> Float16[np.ndarray, "shells n n n k"]:
     """Sample what the object hides on all shells."""
     n, count = settings.resolution, settings.order**2
@@ -81,8 +205,8 @@ def compute_occlusion(
     for shell in range(settings.shells):
         points = grid.points(shell, n)
 
-        def done(share: float, shell: int = shell) -> None:
-            step((shell + share) / settings.shells)
+        def done(fraction: float, shell: int = shell) -> None:
+            progress((shell + fraction) / settings.shells)
 
         values, inside = _hidden(rays, points, settings, done)
         cells = values.reshape(n, n, n, count)
@@ -92,7 +216,7 @@ def compute_occlusion(
 
 
 def _hidden(
-    rays: ObjectRays, points: Float32[np.ndarray, "n 3"], settings: FieldSettings, done: Step
+    rays: ObjectRays, points: Float32[np.ndarray, "n 3"], settings: FieldSettings, done: ProgressCallback
 ) -> tuple[Float32[np.ndarray, "n k"], Bool[np.ndarray, " n"]]:
     """Coefficients at points, and which of these lie within the object."""
     values = np.zeros((len(points), settings.order**2), np.float32)

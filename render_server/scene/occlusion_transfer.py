@@ -13,10 +13,19 @@ import numpy as np
 from jaxtyping import Bool, Float16, Float32, Int64
 from scipy.spatial import cKDTree
 
-from render_server.scene.mesh_loading import TriangleMesh, split_triangles
-from render_server.scene.occlusion_field import FieldSettings, ShellGrid, Step, fill_inside
-from render_server.scene.occlusion_rays import CHUNK, ObjectRays, RayHits, direction_set
-from render_server.scene.spherical_harmonics import harmonics
+from render_server.lights.octahedral import harmonics
+from render_server.scene.gpu_mesh import split_triangles
+from render_server.scene.occlusion_field import (
+    CHUNK,
+    FieldSettings,
+    ObjectRays,
+    ProgressCallback,
+    RayHits,
+    ShellGrid,
+    direction_set,
+    fill_inside,
+)
+from render_server.scene.triangle_mesh import TriangleMesh
 
 ORDER = 3  # of the light that falls on the object, and of what it sends back: both are diffuse
 LENGTH = ORDER**2
@@ -85,7 +94,7 @@ def _texels(texture: Float16[np.ndarray, "h w 3"], uv: Float32[np.ndarray, "m 3 
 
 
 def compute_transfer(
-    pieces: SurfacePieces, grid: ShellGrid, settings: FieldSettings, step: Step
+    pieces: SurfacePieces, grid: ShellGrid, settings: FieldSettings, progress: ProgressCallback
 ) -> Float16[np.ndarray, "shells h h h 9 9 3"]:
     """Sample on all shells, at half the resolution of the occlusion, the radiance that comes from the object."""
     n = settings.resolution // 2
@@ -96,7 +105,7 @@ def compute_transfer(
         values, inside = _received(rays, grid.points(shell, n), sent, settings.rays)
         cells = values.reshape(n, n, n, LENGTH, LENGTH, 3)
         found[shell] = fill_inside(cells, inside.reshape(n, n, n), 2 * grid.halves[shell][::-1] / (n - 1))
-        step((shell + 1) / settings.shells)
+        progress((shell + 1) / settings.shells)
     return found
 
 

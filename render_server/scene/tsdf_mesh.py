@@ -1,19 +1,46 @@
 """Triangles of a fused volume: surface nets (Gibson 1998), and fewer of them by clustering vertices."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
 from render_server.scene.depth_mesh import REAL_MATERIAL
-from render_server.scene.mesh_loading import TriangleMesh
-from render_server.scene.tsdf_volume import BLOCK, GRID, FusedVolume
+from render_server.scene.depth_surface import DepthSurface
+from render_server.scene.triangle_mesh import TriangleMesh
+from render_server.scene.tsdf_volume import (
+    BLOCK,
+    CORNERS,
+    GRID,
+    PixelPlanes,
+    TsdfPlacement,
+    TsdfVolume,
+    aligned_view,
+)
+from render_server.view import CameraView
 
-CORNERS = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)])
 EDGES = tuple((a, b) for a in range(8) for b in range(a + 1, 8) if np.abs(CORNERS[a] - CORNERS[b]).sum() == 1)
 VOXELS = GRID * BLOCK  # voxels an edge of the whole grid
 # Growth of the clusters where their triangles are still too many.
 CLUSTER_GROWTH = 1.15
+# What lies farther than so many median distances goes to a second, coarser volume: a far wall would else spend the
+# voxels that near things need.
+NEAR_MEDIANS = 2.0
+# Triangles of the near and the far volume at their own fineness, before they are thinned to a budget: averaging a
+# frame in and making triangles anew takes a core 30 ms each at 320x240.
+FINE_TRIANGLES = (80_000, 20_000)
+# A surface of area A crosses A (|nx| + |ny| + |nz|) / h^2 edges of the lattice, 1.5 A / h^2 in the mean over
+# directions; each gives two triangles.
+TRIANGLES_PER_CELL = 3.0
+# Memory for four times the blocks that the first frame fills (measured: a block for 54 triangles), 36 MB for the near
+# volume; what would go beyond is left out.
+TRIANGLES_PER_BLOCK = 54 / 4
+# Share of a box's edge that the first frame fills: the camera will look elsewhere.
+FIRST_FRACTION = 0.5
+# Triangles are made anew when this share of the voxels at surfaces moved by more than this share of a voxel: less
+# hardly changes how much of a voxel of the volume they cover.
+MOVED_FRACTION, MOVED_VOXELS = 0.02, 0.25
 
 
 class _Cells(NamedTuple):
@@ -23,7 +50,7 @@ class _Cells(NamedTuple):
     corners: Float32[np.ndarray, "n 8"]
 
 
-def fused_mesh(volume: FusedVolume) -> TriangleMesh:
+def extract_mesh(volume: TsdfVolume) -> TriangleMesh:
     """The surface where the field is zero, in the world; only where it was seen on all sides of a cell.
 
     Triangles are counter-clockwise seen from free space; normals are the field's gradient. Behind the rim of a thing
@@ -87,7 +114,7 @@ def _unit(vectors: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
     return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12))
 
 
-def _crossed_cells(volume: FusedVolume) -> _Cells:
+def _crossed_cells(volume: TsdfVolume) -> _Cells:
     """Cells with known distances of both signs at their corners."""
     # Distances at the corners of a cell that the surface passes through are below sqrt(3) voxels.
     near = np.abs(volume.distance) < 2 * volume.placement.voxel_m
@@ -105,7 +132,7 @@ def _crossed_cells(volume: FusedVolume) -> _Cells:
     return _Cells(voxel, np.stack([corner[block, cell] for corner in corners], axis=1))
 
 
-def _with_border(volume: FusedVolume, blocks: Int64[np.ndarray, " k"]) -> Float32[np.ndarray, "k 9 9 9"]:
+def _with_border(volume: TsdfVolume, blocks: Int64[np.ndarray, " k"]) -> Float32[np.ndarray, "k 9 9 9"]:
     """Distances of blocks and of the voxels after them, NaN where unknown."""
     known = volume.known_distance()
     result = np.full((len(blocks), *(BLOCK + 1,) * 3), np.nan, np.float32)
@@ -128,8 +155,8 @@ def _vertices(cells: _Cells) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.nda
     for a, b in EDGES:
         one, other = cells.corners[:, a], cells.corners[:, b]
         crossed = (one < 0) != (other < 0)
-        share = np.divide(one, one - other, out=np.zeros_like(one), where=crossed)[:, None]
-        total += np.where(crossed[:, None], CORNERS[a] + share * (CORNERS[b] - CORNERS[a]), 0)
+        fraction = np.divide(one, one - other, out=np.zeros_like(one), where=crossed)[:, None]
+        total += np.where(crossed[:, None], CORNERS[a] + fraction * (CORNERS[b] - CORNERS[a]), 0)
         count += crossed[:, None]
     gradient = cells.corners.astype(np.float64) @ (2 * CORNERS - 1)
     return total / np.maximum(count, 1), _unit(gradient)
@@ -186,3 +213,134 @@ def _only_used(
         None,
         REAL_MATERIAL,
     )
+
+
+class TsdfScene:
+    """Two volumes that are laid out for the first frame, and their triangles."""
+
+    def __init__(self) -> None:
+        self.volumes: list[TsdfVolume] = []
+        self._meshed: list[Float32[np.ndarray, "b 512"]] = []
+        self._meshes: list[TriangleMesh] = []
+        self.view: CameraView | None = None
+        """From where the last frame's depth fits the surface."""
+
+    @property
+    def voxel_m(self) -> float:
+        """Distance of the near volume's voxels, m; 0 before anything was seen."""
+        return self.volumes[0].placement.voxel_m if self.volumes else 0.0
+
+    def add(
+        self,
+        surface: DepthSurface,
+        view: CameraView,
+        noise_sigma: float,
+        *,
+        align: bool = False,
+        settle: bool = False,
+    ) -> bool:
+        """Average a frame into the volumes; returns whether the triangles are new.
+
+        Args:
+            surface: of the frame's depth; one without any known pixel changes nothing.
+            view: camera and pose of the frame.
+            noise_sigma: depth noise at 1 m, m.
+            align: the pose has an error that is worth correcting by the shape seen (a marker board's).
+            settle: make the triangles anew however little changed.
+        """
+        self.view = view
+        if not (surface.inverse_depth > 0).any():
+            return False
+        if not self.volumes:
+            self.volumes = [TsdfVolume(place) for place in place_volumes(surface, view, noise_sigma)]
+            self._meshed = [volume.known_distance() for volume in self.volumes]
+        if align:
+            self.view = aligned_view(self.volumes, surface, view, noise_sigma)
+        planes = PixelPlanes.of(surface, view.camera, noise_sigma)
+        for volume in self.volumes:
+            volume.integrate(planes, self.view)
+        if not settle and self._moved_fraction() <= MOVED_FRACTION:
+            return False
+        self._meshed = [volume.known_distance() for volume in self.volumes]
+        self._meshes = [extract_mesh(volume) for volume in self.volumes]
+        return True
+
+    def meshes(self, *triangle_budgets: int) -> list[list[TriangleMesh]]:
+        """Near and far surfaces in at most so many triangles, for each budget (falling); none before a frame."""
+        meshes, result = self._meshes, []
+        for budget in triangle_budgets:
+            fraction = min(1.0, budget / max(sum(len(mesh.triangles) for mesh in meshes), 1))
+            meshes = [decimated(mesh, int(fraction * len(mesh.triangles))) for mesh in meshes]
+            result.append(meshes)
+        return result
+
+    def _moved_fraction(self) -> float:
+        """Share of the voxels at surfaces whose distance differs from the one that triangles were made of."""
+        pairs = zip(self.volumes, self._meshed, strict=True)
+        counts = np.array([_count_moved(volume, meshed) for volume, meshed in pairs]).sum(axis=0)
+        return float(counts[0] / max(counts[1], 1))
+
+
+def _count_moved(volume: TsdfVolume, meshed: Float32[np.ndarray, "b 512"]) -> tuple[int, int]:
+    """Count voxels at surfaces that moved, and voxels at surfaces."""
+    now, voxel_m = volume.known_distance(), volume.placement.voxel_m
+    before = np.full_like(now, np.nan)
+    before[: len(meshed)] = meshed
+    at_surface: Bool[np.ndarray, "b 512"] = (np.abs(now) < voxel_m) | (np.abs(before) < voxel_m)
+    moved = at_surface & ~(np.abs(now - before) <= MOVED_VOXELS * voxel_m)
+    return int(np.count_nonzero(moved)), int(np.count_nonzero(at_surface))
+
+
+class _SeenPoints(NamedTuple):
+    """What each known pixel of a frame shows: place (world), distance along the axis, area (m, m^2)."""
+
+    points: Float64[np.ndarray, "n 3"]
+    z: Float64[np.ndarray, " n"]
+    area: Float64[np.ndarray, " n"]
+
+    def only(self, chosen: Bool[np.ndarray, " n"]) -> "_SeenPoints":
+        return _SeenPoints(*(values[chosen] for values in self))
+
+
+def place_volumes(
+    surface: DepthSurface, view: CameraView, noise_sigma: float
+) -> tuple[TsdfPlacement, TsdfPlacement]:
+    """A cube around what one frame shows near by, and a coarser one around all of it."""
+    shown = _seen_points(surface, view)
+    near = shown.z <= NEAR_MEDIANS * np.median(shown.z)
+    details_1m = noise_sigma, 1 / float(view.camera.matrix[0, 0])
+    inside = _placement(shown.only(near), shown.only(near), details_1m, FINE_TRIANGLES[0])
+    beyond = shown if near.all() else shown.only(~near)
+    around = _placement(shown, beyond, details_1m, FINE_TRIANGLES[1])
+    return inside, replace(around, hole=inside.box)
+
+
+def _placement(
+    held: _SeenPoints, counted: _SeenPoints, details_1m: tuple[float, float], triangles: int
+) -> TsdfPlacement:
+    """A cube around what is `held`, with voxels so small that what is `counted` gives so many triangles.
+
+    Voxels are no smaller than the noise of one frame or a pixel's footprint (`details_1m`: at 1 m) at the median
+    distance, which hold no more detail; and so large that the cube leaves room around what it holds.
+    """
+    low, high = np.percentile(held.points, [1, 99], axis=0)
+    edge_m = float((high - low).max()) / FIRST_FRACTION
+    noise, pixel = details_1m
+    distance = float(np.median(counted.z))
+    by_budget = float(np.sqrt(TRIANGLES_PER_CELL * counted.area.sum() / triangles))
+    voxel_m = max(by_budget, noise * distance**2, pixel * distance, edge_m / (GRID * BLOCK))
+    blocks = min(int(np.ceil(edge_m / (BLOCK * voxel_m))), GRID)
+    x, y, z = (float(v) for v in (low + high) / 2 - voxel_m * blocks * BLOCK / 2)
+    return TsdfPlacement((x, y, z), voxel_m, blocks, int(triangles / TRIANGLES_PER_BLOCK))
+
+
+def _seen_points(surface: DepthSurface, view: CameraView) -> _SeenPoints:
+    """A pixel shows z^2 / f^2 / cos(slant), at most 80 degrees aslant."""
+    known = surface.inverse_depth > 0
+    z = 1 / surface.inverse_depth[known].astype(np.float64)
+    rays = np.dstack([view.camera.rays(), np.ones(known.shape, np.float32)])[known].astype(np.float64)
+    cosine = np.abs(np.einsum("ni,ni->n", rays, surface.normals[known])) / np.linalg.norm(rays, axis=1)
+    cosine = np.where(cosine > 0, cosine, 1)  # no normal: as if it faced the camera
+    matrix, focal = view.world_from_camera, view.camera.matrix
+    area = z * z / (focal[0, 0] * focal[1, 1]) / np.maximum(cosine, np.cos(np.radians(80)))
+    return _SeenPoints(rays * z[:, None] @ matrix[:3, :3].T + matrix[:3, 3], z, area)

@@ -5,10 +5,11 @@ rounding to whole pixels then leave no error. Weights are inverse variances of d
 space is carved, so that things which moved away disappear.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Self
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
@@ -19,14 +20,25 @@ from render_server.view import NEAR_M, CameraView
 BLOCK = 8  # voxels an edge of a block
 GRID = 128  # blocks an edge of the largest box
 # What a frame adds counts at least this share, so that slow changes of the scene are followed.
-LONGEST_MEMORY_FRAMES = 32
+MAX_MEMORY_FRAMES = 32
 # Distances are kept so far from a surface: gradients lie within three voxels, depth noise within three sigma.
 REACH_VOXELS, REACH_SIGMAS = 3.0, 3.0
 CHUNK_BLOCKS = 128  # updated at once: their arrays fit a core's cache
+ALIGNMENT_SAMPLES = 4000
+# Neighbouring pixels err alike (filters, calibration): so many count as one.
+CORRELATED_PIXELS = 100
+# What is known of the pose beforehand, standard deviations: some millimetres at a metre. Shape corrects what it can
+# tell; along a bare wall, say, the board's pose stays.
+POSE_SIGMA_RAD, POSE_SIGMA_M = 0.005, 0.005
+ALIGNMENT_ITERATIONS = 8
+# Corrections below this share of a voxel end the search.
+CONVERGED_VOXELS = 0.01
+MIN_ALIGNMENT_SAMPLES = 50
+CORNERS = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)])
 
 
 @dataclass(frozen=True)
-class FusedPlacement:
+class TsdfPlacement:
     """A cube of voxels in world axes.
 
     `origin` is the first voxel's centre (m), `voxel_m` the distance of voxels, `blocks` the cube's edge in blocks of
@@ -64,23 +76,23 @@ class PixelPlanes:
     @classmethod
     def of(cls, surface: DepthSurface, camera: CameraModel, noise_sigma: float) -> Self:
         """From a frame's depth, registered to `camera`, with noise of `noise_sigma` m at 1 m."""
-        inverse, towards = surface.inverse_depth.ravel(), _towards(camera)
+        inverse, rays = surface.inverse_depth.ravel(), _pixel_rays(camera)
         z = np.divide(1, inverse, out=np.zeros_like(inverse), where=inverse > 0)
         normals = surface.normals.reshape(-1, 3)
-        facing = -towards / np.linalg.norm(towards, axis=1, keepdims=True)
+        facing = -rays / np.linalg.norm(rays, axis=1, keepdims=True)
         normals = np.where((normals == 0).all(axis=1, keepdims=True), facing, normals)
         rows = np.zeros((len(z) + 1, 6), np.float32)
         rows[:-1, :3] = normals
-        rows[:-1, 3] = np.einsum("ni,ni->n", normals, towards) * z
+        rows[:-1, 3] = np.einsum("ni,ni->n", normals, rays) * z
         rows[:-1, 4] = REACH_SIGMAS * noise_sigma * z * z
         rows[:-1, 5] = inverse**4  # the variance of depth is (sigma z^2)^2
         return cls(rows, inverse)
 
 
-class FusedVolume:
+class TsdfVolume:
     """Signed distances to the nearest surface, m: positive in front, cut off at the reach of what was measured."""
 
-    def __init__(self, placement: FusedPlacement) -> None:
+    def __init__(self, placement: TsdfPlacement) -> None:
         self.placement = placement
         self.slots = np.full((placement.blocks,) * 3, -1, np.int32)
         """Number of the block at each place of the cube (x, y, z), -1: none."""
@@ -104,7 +116,7 @@ class FusedVolume:
         half_block = self.placement.block_m / 2
         chosen = _spread_pixels(planes, view, half_block)
         matrix = view.world_from_camera.astype(np.float32)
-        points = _towards(view.camera)[chosen] / planes.inverse_depth[chosen, None]
+        points = _pixel_rays(view.camera)[chosen] / planes.inverse_depth[chosen, None]
         world = points @ matrix[:3, :3].T + matrix[:3, 3]
         held = _inside(world, self.placement.box)
         if self.placement.hole is not None:
@@ -147,7 +159,7 @@ class FusedVolume:
         return np.flatnonzero(near)
 
     def _update(self, blocks: Int64[np.ndarray, " k"], planes: PixelPlanes, view: CameraView) -> None:
-        points = _in_camera(self.places[blocks], self.placement, view)
+        points = _voxels_in_camera(self.places[blocks], self.placement, view)
         row = _pixel_rows(points, view)
         known = np.flatnonzero(planes.rows[row, 5] > 0)
         x, y, z = points[:, known]
@@ -176,14 +188,14 @@ class FusedVolume:
         before = np.where(np.abs(new - old) > reach, before / 2, before)
         total = before + weight
         distances[at] = (old * before + new * weight) / total
-        weights[at] = np.minimum(total, np.maximum(before, LONGEST_MEMORY_FRAMES * weight))
+        weights[at] = np.minimum(total, np.maximum(before, MAX_MEMORY_FRAMES * weight))
 
 
 def _inside(points: Float32[np.ndarray, "n 3"], box: Float64[np.ndarray, "2 3"]) -> Bool[np.ndarray, " n"]:
     return np.asarray(((points >= box[0]) & (points <= box[1])).all(axis=1))
 
 
-def _in_hole(places: Int32[np.ndarray, "n 3"], placement: FusedPlacement) -> Bool[np.ndarray, " n"]:
+def _in_hole(places: Int32[np.ndarray, "n 3"], placement: TsdfPlacement) -> Bool[np.ndarray, " n"]:
     """Whether blocks lie inside the hole entirely."""
     if placement.hole is None:
         return np.zeros(len(places), bool)
@@ -196,7 +208,7 @@ def _spread_pixels(planes: PixelPlanes, view: CameraView, distance_m: float) -> 
     """Pixels whose points lie at most `distance_m` apart on the surface: each 1st, 2nd, 4th... by its footprint."""
     camera, inverse = view.camera, planes.inverse_depth
     # A pixel is z / f wide, and longer by 1 / cos(slant) = z |towards| / |n.P|.
-    cosine = np.abs(planes.rows[:-1, 3]) * inverse / np.linalg.norm(_towards(camera), axis=1)
+    cosine = np.abs(planes.rows[:-1, 3]) * inverse / np.linalg.norm(_pixel_rays(camera), axis=1)
     affordable = distance_m * float(camera.matrix[0, 0]) * inverse * cosine
     stride = np.exp2(np.floor(np.log2(np.clip(affordable, 1, 64)))).astype(np.int32)
     row, column = np.divmod(np.arange(inverse.size, dtype=np.int32), camera.width)
@@ -204,25 +216,14 @@ def _spread_pixels(planes: PixelPlanes, view: CameraView, distance_m: float) -> 
 
 
 @lru_cache(maxsize=4)
-def _towards(camera: CameraModel) -> Float32[np.ndarray, "n 3"]:
+def _pixel_rays(camera: CameraModel) -> Float32[np.ndarray, "n 3"]:
     """(x/z, y/z, 1) of each pixel's ray."""
     rays = camera.rays().reshape(-1, 2)
     return np.column_stack([rays, np.ones(len(rays), np.float32)])
 
 
-def _columns(
-    rows: Float32[np.ndarray, "n 6"],
-) -> tuple[
-    Float32[np.ndarray, "n 3"],
-    Float32[np.ndarray, " n"],
-    Float32[np.ndarray, " n"],
-    Float32[np.ndarray, " n"],
-]:
-    return rows[:, :3], rows[:, 3], rows[:, 4], rows[:, 5]
-
-
-def _in_camera(
-    places: Int32[np.ndarray, "k 3"], placement: FusedPlacement, view: CameraView
+def _voxels_in_camera(
+    places: Int32[np.ndarray, "k 3"], placement: TsdfPlacement, view: CameraView
 ) -> Float32[np.ndarray, "3 n"]:
     """Voxels of blocks in the optical frame, m."""
     matrix = view.camera_from_world
@@ -262,3 +263,114 @@ def _pixel_table(camera: CameraModel) -> Int32[np.ndarray, " n"]:
     pixels = np.rint(np.nan_to_num(camera.project(rays), nan=-1.0)).clip(-1, 2**20).astype(np.int64)
     inside = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)
     return np.where(inside, pixels[:, 1] * camera.width + pixels[:, 0], none).astype(np.int32)
+
+
+def aligned_view(
+    volumes: list[TsdfVolume], surface: DepthSurface, view: CameraView, noise_sigma: float
+) -> CameraView:
+    """Return the view from which the depth image fits the volumes best; the view itself where too little fits.
+
+    Args:
+        volumes: what was fused so far.
+        surface: of the frame's depth.
+        view: camera and pose by the board.
+        noise_sigma: depth noise at 1 m, m.
+    """
+    points, sigma_m = _alignment_points(surface, view, noise_sigma)
+    total = np.zeros(6)
+    for _ in range(ALIGNMENT_ITERATIONS):
+        matrix = _displaced(total, view.world_from_camera)
+        step = _gauss_newton_step(
+            volumes, points @ matrix[:3, :3].T + matrix[:3, 3], sigma_m, total, matrix[:3, 3]
+        )
+        if step is None:
+            return view
+        total += step
+        if np.abs(step).max() < CONVERGED_VOXELS * volumes[0].placement.voxel_m:
+            break
+    return replace(view, world_from_camera=_displaced(total, view.world_from_camera))
+
+
+def _displaced(
+    motion: Float64[np.ndarray, "6"], pose: Float64[np.ndarray, "4 4"]
+) -> Float64[np.ndarray, "4 4"]:
+    """The pose turned about the camera's centre (first three, rad) and shifted (m), both in world axes."""
+    result = pose.copy()
+    result[:3, :3] = cv2.Rodrigues(motion[:3])[0] @ pose[:3, :3]
+    result[:3, 3] += motion[3:]
+    return result
+
+
+def _alignment_points(
+    surface: DepthSurface, view: CameraView, noise_sigma: float
+) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, " n"]]:
+    """Points spread over the picture (optical frame), and their standard deviations across the surface, m."""
+    stride = max(1, int(np.sqrt(surface.inverse_depth.size / ALIGNMENT_SAMPLES)))
+    grid = np.s_[stride // 2 :: stride, stride // 2 :: stride]
+    inverse = surface.inverse_depth[grid]
+    known = (inverse > 0) & (surface.normals[grid] != 0).any(axis=-1)
+    z = 1 / inverse[known].astype(np.float64)
+    rays = np.column_stack([view.camera.rays()[grid][known], np.ones(len(z))])
+    return rays * z[:, None], noise_sigma * z * z
+
+
+def _gauss_newton_step(
+    volumes: list[TsdfVolume],
+    world: Float64[np.ndarray, "n 3"],
+    sigma_m: Float64[np.ndarray, " n"],
+    total: Float64[np.ndarray, "6"],
+    centre: Float64[np.ndarray, "3"],
+) -> Float64[np.ndarray, "6"] | None:
+    """One Gauss-Newton step of the motion; None where too few samples meet a known surface."""
+    rows, residuals, information = [], [], []
+    for volume in volumes:
+        found, distance, gradient = interpolate(volume, world)
+        # A voxel's interpolation is no better than a tenth of it.
+        sigma = np.hypot(sigma_m[found], 0.1 * volume.placement.voxel_m)
+        # Cauchy's weight: what moved must not pull the camera along.
+        information.append(1 / (sigma**2 * (1 + (distance / (3 * sigma)) ** 2) * CORRELATED_PIXELS))
+        rows.append(np.hstack([np.cross(world[found] - centre, gradient), gradient]))
+        residuals.append(distance)
+    slopes, missed, weight = np.concatenate(rows), np.concatenate(residuals), np.concatenate(information)
+    if len(missed) < MIN_ALIGNMENT_SAMPLES:
+        return None
+    prior = 1 / np.repeat([POSE_SIGMA_RAD, POSE_SIGMA_M], 3) ** 2
+    normal = (slopes * weight[:, None]).T @ slopes + np.diag(prior)
+    return np.asarray(np.linalg.solve(normal, -(slopes * weight[:, None]).T @ missed - prior * total))
+
+
+def interpolate(
+    volume: TsdfVolume, world: Float64[np.ndarray, "n 3"]
+) -> tuple[Int64[np.ndarray, " m"], Float64[np.ndarray, " m"], Float64[np.ndarray, "m 3"]]:
+    """Points whose voxel cell is known, their distances (m) and the unit gradient there, trilinear."""
+    placement = volume.placement
+    at = (world - placement.origin) / placement.voxel_m
+    found = np.flatnonzero(((at >= 0) & (at < placement.blocks * BLOCK - 1)).all(axis=1))
+    cell = np.floor(at[found]).astype(np.int64)
+    fraction = at[found] - cell
+    corners = np.stack([_at_voxels(volume, cell + step) for step in CORNERS], axis=1)
+    known: Bool[np.ndarray, " m"] = np.isfinite(corners).all(axis=1)
+    found, fraction, corners = found[known], fraction[known], corners[known]
+    sides = np.where(CORNERS[None] == 1, fraction[:, None], 1 - fraction[:, None])
+    distance = (corners * sides.prod(axis=2)).sum(axis=1)
+    signs = 2.0 * CORNERS - 1
+    slopes = [
+        (corners * signs[:, axis] * np.delete(sides, axis, axis=2).prod(axis=2)).sum(axis=1)
+        for axis in range(3)
+    ]
+    gradient = np.stack(slopes, axis=1)
+    length = np.linalg.norm(gradient, axis=1)
+    # Where distances are cut off they do not change.
+    steep = length > 0.5 * placement.voxel_m
+    return found[steep], distance[steep], gradient[steep] / length[steep, None]
+
+
+def _at_voxels(volume: TsdfVolume, voxel: Int64[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:
+    """Distances at voxels inside the cube, NaN where unknown."""
+    block, inside = np.divmod(voxel, BLOCK)
+    slot = volume.slots[tuple(block.T)]
+    index = np.ravel_multi_index(tuple(inside.T), (BLOCK,) * 3)
+    if not len(volume.places):
+        return np.full(len(voxel), np.nan)
+    known = (slot >= 0) & (volume.weight[slot, index] > 0)
+    return np.where(known, volume.distance[slot, index], np.nan).astype(np.float64)

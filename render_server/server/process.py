@@ -26,10 +26,9 @@ from protocol.keys import Keys
 from protocol.messages import ControlRequest, StatsMessage
 from protocol.scene import SceneDocument, load_scene
 from protocol.transport import Publisher, ReplyServer
-from render_server.frame_source import FrameSource
 from render_server.gpu.context import create_context
 from render_server.renderer import SceneRenderer
-from render_server.server.frames import FrameAssembler, PairingSettings
+from render_server.server.frames import FrameAssembler, FrameSource, PairingSettings
 from render_server.server.session import RenderedFrame, Renderer, RenderSession, SourceInUse
 
 GPU_TIMEOUT_S = 0.002  # a started frame is read back after so long, should no other follow

@@ -22,8 +22,7 @@ from protocol.frames import ViewFrame
 from protocol.messages import CompositeMessage, ControlRequest, StatsMessage
 from protocol.scene import SceneDocument, parse_scene
 from protocol.transport import ReceivedMultipart
-from render_server.frame_source import SourceOrder
-from render_server.server.frames import AssembledFrame, FrameAssembler
+from render_server.server.frames import AssembledFrame, FrameAssembler, SourceOrder
 from render_server.server.snapshot import SnapshotOrder, take_snapshot
 
 RATE_WINDOW_S = 5.0

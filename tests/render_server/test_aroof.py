@@ -13,10 +13,9 @@ from protocol.frames import BoardPose
 from protocol.scene import SceneDocument, parse_scene
 from protocol.scene_method import AroofMethod
 from render_server.gpu.context import GpuContext
-from render_server.lights.octahedral import octahedral_grid
+from render_server.lights.octahedral import even_directions, harmonics, octahedral_grid
 from render_server.relight.aroof import Aroof
 from render_server.renderer import SceneRenderer
-from render_server.scene.spherical_harmonics import even_directions, harmonics
 from tests.render_server.scenes import (
     Fields,
     Stage,

@@ -9,9 +9,8 @@ from render_server.estimation.registration_fit import (
     RegistrationAverage,
     registration_from_albedo_percentile,
     registration_from_patch,
-    unclipped,
 )
-from render_server.scene.board_albedo import known_albedo, paper_pixels
+from render_server.scene.board_albedo import known_albedo, paper_pixels, unclipped
 
 FACTOR = np.array([2.0, 1.5, 0.75])
 BOARD = BoardSpec(

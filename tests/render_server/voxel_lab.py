@@ -19,9 +19,9 @@ from render_server.passes.resolve_voxels import ResolveVoxelsPass
 from render_server.passes.volume import Pyramid, VolumePlacement
 from render_server.passes.voxel_store import VoxelStore
 from render_server.passes.voxelize import VoxelizePass
+from render_server.scene.gpu_mesh import GpuMesh, merge_for_gpu
 from render_server.scene.materials import Material
-from render_server.scene.mesh_loading import GpuMesh, TriangleMesh, merge_for_gpu
-from render_server.scene.normals import smooth_normals
+from render_server.scene.triangle_mesh import TriangleMesh, smooth_normals
 
 DIRECTIONS = 6
 

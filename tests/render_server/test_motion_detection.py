@@ -3,7 +3,7 @@ import pytest
 
 from protocol.camera_model import CameraModel
 from protocol.frames import BoardPose, DepthImage, ViewFrame
-from render_server.scene.motion_detection import RealSceneTracker
+from render_server.scene.motion_detection import MotionDetector
 
 CAMERA = CameraModel(160, 120, np.array([[150.0, 0, 79.5], [0, 150.0, 59.5], [0, 0, 1]]))
 SIGMA = 0.002
@@ -28,7 +28,7 @@ def changed(**changes: object) -> ViewFrame:
 
 
 def test_noise_alone_is_no_change() -> None:
-    tracker = RealSceneTracker()
+    tracker = MotionDetector()
     assert tracker.update(frame(0))
     assert not any(tracker.update(frame(seed)) for seed in range(1, 20))
 
@@ -39,13 +39,13 @@ def test_noise_alone_is_no_change() -> None:
 def test_motion_of_the_camera_counts_from_half_a_pixel_on(
     shift_m: float, turn_rad: float, expected: bool
 ) -> None:
-    tracker = RealSceneTracker()
+    tracker = MotionDetector()
     tracker.update(frame(0))
     assert tracker.update(frame(1, shift_m, turn_rad)) is expected
 
 
 def test_slow_drift_adds_up() -> None:
-    tracker = RealSceneTracker()
+    tracker = MotionDetector()
     answers = [tracker.update(frame(step, shift_m=0.001 * step)) for step in range(9)]
     assert answers[0]
     assert not answers[1]
@@ -53,7 +53,7 @@ def test_slow_drift_adds_up() -> None:
 
 
 def test_depth_that_moves_counts() -> None:
-    tracker = RealSceneTracker()
+    tracker = MotionDetector()
     tracker.update(frame(0))
     moved = frame(1).depth
     assert moved is not None
@@ -63,12 +63,12 @@ def test_depth_that_moves_counts() -> None:
 
 
 def test_light_that_changes_counts_and_exposure_that_is_known_does_not() -> None:
-    tracker = RealSceneTracker()
+    tracker = MotionDetector()
     tracker.update(frame(0))
     lit = frame(1).color.copy()
     lit[40:70, 40:70] = np.minimum(lit[40:70, 40:70].astype(int) + 25, 255)
     assert tracker.update(changed(color=lit))
-    tracker = RealSceneTracker()
+    tracker = MotionDetector()
     bright = changed(color=np.full((120, 160, 3), 188, np.uint8))
     dark = changed(color=np.full((120, 160, 3), 137, np.uint8), exposure_scale=0.5)
     tracker.update(bright)
@@ -79,14 +79,14 @@ def test_light_that_changes_counts_and_exposure_that_is_known_does_not() -> None
 def test_losing_pose_or_depth_or_changing_the_camera_counts() -> None:
     other = CameraModel(160, 120, np.array([[151.0, 0, 79.5], [0, 150.0, 59.5], [0, 0, 1]]))
     for changes in ({"pose": None}, {"depth": None}, {"camera": other}):
-        tracker = RealSceneTracker()
+        tracker = MotionDetector()
         tracker.update(frame(0))
         assert tracker.update(changed(**changes))
         assert not tracker.update(changed(**changes))
 
 
 def test_without_depth_the_distance_to_the_board_serves() -> None:
-    tracker = RealSceneTracker()
+    tracker = MotionDetector()
     near, far = np.eye(4), np.eye(4)
     near[2, 3], far[2, 3] = -1.0, -1.0
     far[0, 3] = 0.006

@@ -9,10 +9,9 @@ import pytest
 from protocol.camera_model import CameraModel
 from protocol.frames import DepthImage
 from render_server.scene.depth_surface import DepthSurface, depth_surface
-from render_server.scene.fused_align import aligned_view, look_up
-from render_server.scene.fused_scene import FusedScene
-from render_server.scene.mesh_loading import TriangleMesh
-from render_server.scene.tsdf_mesh import decimated, fused_mesh
+from render_server.scene.triangle_mesh import TriangleMesh
+from render_server.scene.tsdf_mesh import TsdfScene, decimated, extract_mesh
+from render_server.scene.tsdf_volume import aligned_view, interpolate
 from render_server.view import CameraView
 
 MATRIX = np.array([[150.0, 0, 79.5], [0, 150.0, 59.5], [0, 0, 1]])
@@ -53,15 +52,15 @@ def seen(boxes: tuple[Box, ...], at: CameraView, noise: float = 0.0, seed: int =
     return depth_surface(image, at.camera)
 
 
-def fused(boxes: tuple[Box, ...], views: list[CameraView], noise: float = 0.0) -> FusedScene:
-    scene = FusedScene()
+def fused(boxes: tuple[Box, ...], views: list[CameraView], noise: float = 0.0) -> TsdfScene:
+    scene = TsdfScene()
     for number, at in enumerate(views):
         scene.add(seen(boxes, at, noise, number), at, max(noise, SIGMA), settle=True)
     return scene
 
 
-def near_mesh(scene: FusedScene) -> TriangleMesh:
-    return fused_mesh(scene.volumes[0])
+def near_mesh(scene: TsdfScene) -> TriangleMesh:
+    return extract_mesh(scene.volumes[0])
 
 
 def inside(mesh: TriangleMesh, box: Box, margin: float) -> np.ndarray:
@@ -168,7 +167,7 @@ def test_a_far_wall_goes_to_the_coarse_volume_and_joins_the_near_one() -> None:
 
 
 def test_a_still_scene_settles() -> None:
-    scene, at = FusedScene(), view()
+    scene, at = TsdfScene(), view()
     renewed = [scene.add(seen(ROOM, at), at, SIGMA) for _ in range(4)]
     assert renewed == [True, False, False, False]
 
@@ -195,10 +194,10 @@ def test_a_pose_that_errs_is_corrected_by_what_the_shape_tells(boxes: tuple[Box,
 
 def test_without_anything_known_a_pose_stays() -> None:
     at = view()
-    first = FusedScene()
+    first = TsdfScene()
     assert first.add(seen(ROOM, at), at, SIGMA, align=True)
     assert first.view is at
-    scene = FusedScene()
+    scene = TsdfScene()
     nothing = DepthSurface(
         np.zeros((120, 160), np.float32),
         np.zeros((2, 120, 160), np.float32),
@@ -214,7 +213,7 @@ def test_a_real_room_is_where_the_frame_left_out_sees_it(shared_data: Path) -> N
     folder = shared_data / "rgbd" / "open3d_redwood_livingroom" / "RGBD"
     lines = (folder / "trajectory.log").read_text().splitlines()
     camera = CameraModel(640, 480, np.array([[525.0, 0, 319.5], [0, 525.0, 239.5], [0, 0, 1]]))
-    scene, noise = FusedScene(), 0.0023
+    scene, noise = TsdfScene(), 0.0023
     for number in (0, 1, 3, 4, 2):
         pose = np.array([[float(v) for v in row.split()] for row in lines[5 * number + 1 : 5 * number + 5]])
         coded = cv2.imread(str(folder / "depth" / f"{number:05}.png"), cv2.IMREAD_UNCHANGED)
@@ -227,7 +226,7 @@ def test_a_real_room_is_where_the_frame_left_out_sees_it(shared_data: Path) -> N
             scene.add(surface, at, noise)
     rays = np.dstack([camera.rays(), np.ones((480, 640))])[::4, ::4].reshape(-1, 3)
     z = depth[::4, ::4].reshape(-1, 1)
-    found, distance, _ = look_up(scene.volumes[0], (rays * z @ pose[:3, :3].T + pose[:3, 3])[z[:, 0] > 0])
+    found, distance, _ = interpolate(scene.volumes[0], (rays * z @ pose[:3, :3].T + pose[:3, 3])[z[:, 0] > 0])
     assert len(found) > 0.9 * np.count_nonzero(z)
     assert np.abs(np.median(distance)) < 0.001
     assert (np.abs(distance) < 3 * noise * z[z[:, 0] > 0][found, 0] ** 2).mean() > 0.97

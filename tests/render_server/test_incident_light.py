@@ -3,8 +3,14 @@
 import numpy as np
 import pytest
 
-from render_server.lights.lights import DirectionalLight, Light, RectangleLight, SphereLight, SpotLight
-from render_server.scene.seen_light import seen_from
+from render_server.lights.lights import (
+    DirectionalLight,
+    Light,
+    RectangleLight,
+    SphereLight,
+    SpotLight,
+    incident_light,
+)
 
 WHITE = np.ones(3, np.float32)
 DOWN, HIGH = np.array([0, 0, -1], np.float32), np.array([0, 0, 2], np.float32)
@@ -22,12 +28,12 @@ BELOW = np.zeros(3)
 @pytest.mark.parametrize("kind", LIGHTS)
 def test_many_places_at_once_are_as_each_by_itself(kind: str) -> None:
     places = np.random.default_rng(1).uniform(-1.5, 1.5, (4, 5, 3))
-    many = seen_from(LIGHTS[kind], places)
-    assert many.toward.shape == many.irradiance.shape == (4, 5, 3)
+    many = incident_light(LIGHTS[kind], places)
+    assert many.to_light.shape == many.irradiance.shape == (4, 5, 3)
     assert many.angular_radius_rad.shape == (4, 5)
     for row, column in np.ndindex(4, 5):
-        one = seen_from(LIGHTS[kind], places[row, column])
-        assert one.toward == pytest.approx(many.toward[row, column])
+        one = incident_light(LIGHTS[kind], places[row, column])
+        assert one.to_light == pytest.approx(many.to_light[row, column])
         assert one.irradiance == pytest.approx(many.irradiance[row, column])
         assert float(one.angular_radius_rad) == pytest.approx(many.angular_radius_rad[row, column])
 
@@ -42,8 +48,8 @@ def test_many_places_at_once_are_as_each_by_itself(kind: str) -> None:
     ],
 )
 def test_lights_straight_above(kind: str, irradiance: float, radius: float) -> None:
-    seen = seen_from(LIGHTS[kind], BELOW)
-    assert seen.toward == pytest.approx([0, 0, 1])
+    seen = incident_light(LIGHTS[kind], BELOW)
+    assert seen.to_light == pytest.approx([0, 0, 1])
     assert seen.irradiance == pytest.approx(irradiance)
     assert float(seen.angular_radius_rad) == pytest.approx(radius)
 
@@ -52,7 +58,7 @@ def test_a_spot_fades_between_its_angles_and_a_rectangle_shines_to_one_side() ->
     def at(light: Light, degrees: float) -> float:
         """Irradiance one metre from the light, this far from its axis."""
         angle = np.radians(degrees)
-        return float(seen_from(light, HIGH + np.array([np.sin(angle), 0, -np.cos(angle)])).irradiance[0])
+        return float(incident_light(light, HIGH + np.array([np.sin(angle), 0, -np.cos(angle)])).irradiance[0])
 
     spot, rectangle = LIGHTS["spot"], LIGHTS["rectangle"]
     found = [at(spot, degrees) for degrees in (14, 22.5, 31)]
@@ -63,6 +69,6 @@ def test_a_spot_fades_between_its_angles_and_a_rectangle_shines_to_one_side() ->
 
 def test_at_the_middle_of_a_light_nothing_is_infinite() -> None:
     for light in (LIGHTS["sphere"], LIGHTS["spot"], LIGHTS["rectangle"]):
-        seen = seen_from(light, HIGH.astype(float))
+        seen = incident_light(light, HIGH.astype(float))
         assert np.isfinite(seen.irradiance).all()
-        assert np.isfinite(seen.toward).all()
+        assert np.isfinite(seen.to_light).all()

@@ -11,7 +11,7 @@ from protocol.frames import BoardPose, DepthImage
 from protocol.source import open_source
 from render_server.gpu.context import GpuContext
 from render_server.scene.depth_mesh import depth_mesh
-from render_server.scene.steep_surfaces import steep_surfaces
+from render_server.scene.depth_surface import grazing_depth_fill
 from sensor_node.view_frames import ViewFrameBuilder
 from tests.render_server.scenes import Stage, camera, cube, directional, frame, look_at, solve
 
@@ -65,7 +65,7 @@ def measured(depth: Float32[np.ndarray, "h w"], unknown: Bool[np.ndarray, "h w"]
 
 def test_a_lid_seen_along_it_is_the_plane_between_its_edges() -> None:
     depth, shown = shelf(ALONG)
-    found = steep_surfaces(measured(depth, shown == LID), colored(shown), CAMERA)
+    found = grazing_depth_fill(measured(depth, shown == LID), colored(shown), CAMERA)
     assert not found[shown != LID].any()
     assert (found > 0)[shown == LID].mean() > 0.95
     inner = (
@@ -80,8 +80,8 @@ def test_a_lid_seen_along_it_is_the_plane_between_its_edges() -> None:
 def test_the_mesh_closes_the_lid_with_triangles_that_face_up_and_join_nothing_else() -> None:
     depth, shown = shelf(ALONG)
     image, pose = measured(depth, shown == LID), ALONG.world_from_camera
-    steep = steep_surfaces(image, colored(shown), CAMERA)
-    open_, closed = (depth_mesh(image, CAMERA, pose, 80_000, steep=each) for each in (None, steep))
+    grazing = grazing_depth_fill(image, colored(shown), CAMERA)
+    open_, closed = (depth_mesh(image, CAMERA, pose, 80_000, grazing=each) for each in (None, grazing))
     inside = cv2.erode((shown == LID).astype(np.uint8), np.ones((5, 41))) > 0
     counts = []
     for mesh in (open_, closed):
@@ -121,13 +121,13 @@ def test_the_lid_throws_its_shadow(gpu: GpuContext, tmp_path: Path) -> None:
 def test_a_strip_in_the_colour_of_a_surface_beside_it_stays_unknown(seen_as: int) -> None:
     depth, shown = shelf(ALONG)
     color = colored(shown, tuple(COLORS[seen_as]))
-    assert not steep_surfaces(measured(depth, shown == LID), color, CAMERA).any()
+    assert not grazing_depth_fill(measured(depth, shown == LID), color, CAMERA).any()
 
 
 def test_what_a_measurable_slope_explains_has_lost_its_depth_for_another_reason() -> None:
     depth, shown = shelf(ABOVE)
     assert (shown == LID).sum() > 4000
-    assert not steep_surfaces(measured(depth, shown == LID), colored(shown), CAMERA).any()
+    assert not grazing_depth_fill(measured(depth, shown == LID), colored(shown), CAMERA).any()
 
 
 def test_edges_of_mixed_colours_and_holes_in_one_surface_are_none() -> None:
@@ -138,13 +138,13 @@ def test_edges_of_mixed_colours_and_holes_in_one_surface_are_none() -> None:
     color = colored(shown)
     color[rim | hole] = (250, 20, 250)
     unknown = rim | hole
-    assert not steep_surfaces(measured(depth, unknown), color, CAMERA).any()
+    assert not grazing_depth_fill(measured(depth, unknown), color, CAMERA).any()
 
 
 def test_nothing_known_and_all_known_give_nothing() -> None:
     depth, shown = shelf(ALONG)
     for unknown in (np.ones(shown.shape, bool), np.zeros(shown.shape, bool)):
-        assert not steep_surfaces(measured(depth, unknown), colored(shown), CAMERA).any()
+        assert not grazing_depth_fill(measured(depth, unknown), colored(shown), CAMERA).any()
 
 
 @pytest.mark.data
@@ -156,4 +156,4 @@ def test_a_real_desk_has_unknown_depth_everywhere_and_nothing_seen_along_it(
     view = ViewFrameBuilder(source)(source[number])
     assert view.depth is not None
     assert (~view.depth.valid).sum() > 10_000
-    assert not steep_surfaces(view.depth, view.color, view.camera).any()
+    assert not grazing_depth_fill(view.depth, view.color, view.camera).any()

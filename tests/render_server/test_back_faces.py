@@ -8,7 +8,7 @@ import pytest
 from protocol.frames import decode_lut
 from protocol.scene_method import DlpvMethod, DvctMethod
 from render_server.gpu.context import GpuContext
-from render_server.scene.back_sheets import OFFSET_VOXELS, back_sheets
+from render_server.scene.depth_mesh import BACK_OFFSET_VOXELS, back_faces
 from tests.render_server.scenes import (
     HEIGHT,
     WIDTH,
@@ -36,9 +36,9 @@ def test_a_back_lies_behind_its_triangle_and_faces_away() -> None:
     corners = np.zeros((1, 3, 10), np.float32)
     corners[0, :, :3] = [(0, 0, 1), (1, 0, 1), (0, 1, 1)]
     corners[0, :, 3:] = np.arange(21).reshape(3, 7)
-    (back,) = back_sheets(corners, 0.01)
+    (back,) = back_faces(corners, 0.01)
     assert back[:, :3] == pytest.approx(
-        np.array([(0, 1, 1), (1, 0, 1), (0, 0, 1)]) - (0, 0, OFFSET_VOXELS * 0.01)
+        np.array([(0, 1, 1), (1, 0, 1), (0, 0, 1)]) - (0, 0, BACK_OFFSET_VOXELS * 0.01)
     )
     assert np.array_equal(back[:, 3:], corners[0, ::-1, 3:])
 

@@ -9,8 +9,13 @@ from jaxtyping import Float32, Float64
 
 from protocol.frames import decode_lut
 from protocol.scene import SceneDocument
-from render_server.estimation.plane_detection import PointCloud, SeenPlane, find_planes
-from render_server.estimation.plane_extrapolation import ContinuedPlanes, RealSamples, Sight, continue_planes
+from render_server.estimation.plane_detection import DetectedPlane, PointCloud, detect_planes
+from render_server.estimation.plane_extrapolation import (
+    ExtrapolatedPlanes,
+    RealSamples,
+    ViewFrustum,
+    extrapolate_planes,
+)
 from render_server.gpu.context import GpuContext
 from render_server.lights.lights import Light, SphereLight
 from render_server.lights.octahedral import octahedral_grid, sample_octahedral
@@ -21,7 +26,7 @@ SIZE = 32
 DIRECTIONS = octahedral_grid(SIZE).reshape(-1, 3)
 EYE, CENTRE = np.array([0, -1.0, 0.5]), np.array([0, 0, 0.5])
 VIEW = np.array([0.5, 0.5])  # greatest x / z and y / z: at 2 m, 1 m to each side
-SIGHT = Sight(
+SIGHT = ViewFrustum(
     np.linalg.inv(look_at((0, -1.0, 0.5), (0, 1.0, 0.5)).world_from_camera.astype(np.float64)), -VIEW, VIEW
 )
 
@@ -45,12 +50,12 @@ def evenly(
 
 def shown(
     *parts: tuple[Float64[np.ndarray, "k 3"], Float64[np.ndarray, "3"], float],
-) -> tuple[list[SeenPlane], RealSamples]:
+) -> tuple[list[DetectedPlane], RealSamples]:
     """Planes (points, normal, radiance) as samples that no known light explains."""
     position = np.concatenate([points for points, _, _ in parts])
     number = np.repeat(np.arange(len(parts)), [len(points) for points, _, _ in parts])
     planes = [
-        SeenPlane(normal, float(points[0] @ normal), number == each)
+        DetectedPlane(normal, float(points[0] @ normal), number == each)
         for each, (points, normal, _) in enumerate(parts)
     ]
     radiance = np.array([radiance for _, _, radiance in parts])[number]
@@ -62,9 +67,9 @@ def shown(
 
 
 def continued(
-    planes: list[SeenPlane], samples: RealSamples, lights: tuple[Light, ...] = ()
-) -> ContinuedPlanes:
-    return continue_planes(planes, samples, lights, SIGHT, centre=CENTRE, size=SIZE)
+    planes: list[DetectedPlane], samples: RealSamples, lights: tuple[Light, ...] = ()
+) -> ExtrapolatedPlanes:
+    return extrapolate_planes(planes, samples, lights, SIGHT, centre=CENTRE, size=SIZE)
 
 
 AHEAD = wall(1, 1.0, -1.0, evenly((-1, -0.5), (1, 1.5)))  # fills the view, whose middle is its own
@@ -87,13 +92,13 @@ def test_the_planes_of_a_noisy_corner_are_found_the_largest_first_and_always_the
     position += rng.normal(0, 0.003, position.shape)
     order = rng.permutation(len(position))
     cloud = PointCloud(position[order], normal[order], np.full(len(order), 0.01))
-    found, again = find_planes(cloud), find_planes(cloud)
+    found, again = detect_planes(cloud), detect_planes(cloud)
     assert len(found) == 3
     for plane, (points, unit) in zip(found, parts, strict=True):
         assert plane.normal @ unit > np.cos(np.radians(0.5))
         assert plane.offset == pytest.approx(points[0] @ unit, abs=0.005)
-        assert plane.on_it.sum() == pytest.approx(len(points), rel=0.05)
-    assert (np.sum([plane.on_it for plane in found], axis=0) <= 1).all()
+        assert plane.inliers.sum() == pytest.approx(len(points), rel=0.05)
+    assert (np.sum([plane.inliers for plane in found], axis=0) <= 1).all()
     for one, other in zip(found, again, strict=True):
         assert np.array_equal(one.normal, other.normal)
         assert one.offset == other.offset
@@ -104,8 +109,8 @@ def test_where_no_plane_is_none_is_found(count: int) -> None:
     rng = np.random.default_rng(3)
     normal = rng.normal(size=(count, 3))
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
-    assert find_planes(PointCloud(rng.uniform(0, 1, (count, 3)), normal, np.full(count, 0.002))) == []
-    assert not continued([], shown((*AHEAD, 1.0))[1]).share.any()
+    assert detect_planes(PointCloud(rng.uniform(0, 1, (count, 3)), normal, np.full(count, 0.002))) == []
+    assert not continued([], shown((*AHEAD, 1.0))[1]).probability.any()
 
 
 def test_a_wall_goes_on_with_the_probability_that_its_seen_length_gives() -> None:
@@ -115,7 +120,7 @@ def test_a_wall_goes_on_with_the_probability_that_its_seen_length_gives() -> Non
     beyond = np.maximum(
         np.abs(place[:, [0, 2]] - CENTRE[[0, 2]]).max(axis=1), 1
     )  # in halves of the seen length
-    share = found.share.reshape(-1)
+    share = found.probability.reshape(-1)
     assert share[met] == pytest.approx(2 / (1 + beyond), rel=1e-5)
     assert (share[~met] == 0).all()
     assert found.radiance.reshape(-1, 3)[met] == pytest.approx(0.3, rel=1e-5)
@@ -146,9 +151,9 @@ def test_a_thing_that_has_the_room_behind_it_ends_where_it_ends() -> None:
     planes, samples = shown((*ground, 0.2), (*box, 0.7))
     found = continued(planes, samples)
     only_ground = continued(planes[:1], samples)
-    np.testing.assert_array_equal(found.share, only_ground.share)
-    assert (found.share.reshape(-1)[DIRECTIONS[:, 2] >= 0] == 0).all()
-    assert (found.share.reshape(-1)[DIRECTIONS[:, 2] < 0] > 0).all()
+    np.testing.assert_array_equal(found.probability, only_ground.probability)
+    assert (found.probability.reshape(-1)[DIRECTIONS[:, 2] >= 0] == 0).all()
+    assert (found.probability.reshape(-1)[DIRECTIONS[:, 2] < 0] > 0).all()
 
 
 def test_nearer_planes_stand_before_farther_ones() -> None:
@@ -159,15 +164,15 @@ def test_nearer_planes_stand_before_farther_ones() -> None:
     planes, samples = shown((*end, 0.3), (*side, 0.9))
     both = continued(planes, samples)
     ahead, aside = (continued([plane], samples) for plane in planes)
-    one, other = ahead.share, aside.share
-    assert both.share == pytest.approx(one + (1 - one) * other, abs=1e-6)
+    one, other = ahead.probability, aside.probability
+    assert both.probability == pytest.approx(one + (1 - one) * other, abs=1e-6)
     x, y = DIRECTIONS[:, 0].reshape(one.shape), DIRECTIONS[:, 1].reshape(one.shape)
     for nearer, first, second, radiance in (
         (0.6 * y > x, one, other, (0.3, 0.9)),
         (x > 0.6 * y, other, one, (0.9, 0.3)),
     ):
         mixed = first * radiance[0] + (1 - first) * second * radiance[1]
-        seen = both.share * both.radiance
+        seen = both.probability * both.radiance
         assert seen[nearer[..., 0]] == pytest.approx(np.repeat(mixed[nearer[..., 0]], 3, axis=1), abs=1e-5)
 
 
