@@ -1,4 +1,4 @@
-"""View `lights`: where light comes from, drawn on the fish-eye picture, or on the camera's where there is none."""
+"""Debug view `lights`: light sources drawn on the fish-eye picture, or on the camera's where there is none."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from render_server.lights.lights import IncidentLight, LightSet, incident_light
 from render_server.lights.median_cut import Region, Split
 from render_server.lights.octahedral import solid_angle_mean
 
-OUTLINE_POINTS = 24  # of each edge of a region, because a lens bends straight lines
+OUTLINE_POINTS = 24  # per edge of a region, because a lens bends straight lines
 MIN_RADIUS_RAD = float(np.radians(1.0))  # smaller lights are drawn larger, to be seen at all
 MIN_STRENGTH = 0.35  # of full colour: the weakest light is still visible
 REGION_COLOR = (255, 210, 60)
@@ -42,7 +42,7 @@ class _Canvas:
     def line(
         self, directions: Float64[np.ndarray, "n 3"], color: tuple[int, ...], width: float, *, closed: bool
     ) -> None:
-        """Draw through directions, in pieces where some are not in the picture."""
+        """Draw a line through directions, interrupted where they are outside the picture."""
         pixels = self.project(directions)
         if closed:
             pixels = np.concatenate([pixels, pixels[:1]])
@@ -53,7 +53,7 @@ class _Canvas:
         cv2.polylines(self.picture, lines, False, color, thickness, cv2.LINE_AA, SHIFT)
 
     def text(self, words: str, at: tuple[int, int], color: tuple[int, ...] = TEXT_COLOR) -> None:
-        """Write, lower left corner at a pixel, with a dark edge, so that it can be read on everything."""
+        """Write text with its lower left corner at a pixel, outlined in black to be readable on any background."""
         scale, thickness = 0.45 * self.unit, max(1, round(self.unit))
         places = [(at[0] + x, at[1] + y) for x in (-1, 1) for y in (-1, 1)]
         for place, ink in [*((place, (0, 0, 0)) for place in places), (at, color)]:
@@ -65,9 +65,9 @@ class _Canvas:
 def draw_lights(
     frame: ViewFrame, lights: LightSet, split: Split[HemisphereMap] | None
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Draw lights as discs of their size and colour, with number and irradiance, in the size of the frame.
+    """Draw lights as discs of their size and colour, with number and irradiance, at the frame's size.
 
-    On the fish-eye picture of the frame if it has one, letterboxed, with the outlines of the regions of `split`.
+    Draws on the frame's fish-eye picture if it has one, letterboxed, with the outlines of the regions of `split`.
     """
     fisheye = frame.radiance_map
     canvas = _camera_canvas(frame) if fisheye is None else _fisheye_canvas(frame, fisheye)
@@ -81,7 +81,7 @@ def draw_lights(
             canvas.line(_outline(cut.region, split.residual), REGION_COLOR, 1, closed=True)
     names = lights.identities or tuple(range(1, len(seen) + 1))
     for row, (light, name, color) in enumerate(zip(seen, names, colors, strict=True), start=1):
-        where = "" if _draw_middle(canvas, light, f"{name}", color) else ", out of view"
+        where = "" if _draw_centre(canvas, light, f"{name}", color) else ", out of view"
         words = f"{name}: irradiance {float(light.irradiance @ LUMINANCE):.2f}{where}"
         canvas.text(words, (round(8 * canvas.unit), round(18 * row * canvas.unit)), color)
     words = f"elsewhere: mean radiance {float(solid_angle_mean(lights.environment) @ LUMINANCE):.2g}"
@@ -92,7 +92,7 @@ def draw_lights(
 
 
 def _color(light: IncidentLight, strongest: float) -> tuple[int, ...]:
-    """The light's own colour, darker for weaker lights."""
+    """Return the light's own colour, darker for weaker lights."""
     peak = max(float(light.irradiance.max()), 1e-12)
     strength = MIN_STRENGTH + (1 - MIN_STRENGTH) * min(peak / max(strongest, 1e-12), 1.0)
     return tuple(
@@ -106,13 +106,13 @@ def _draw_disc(canvas: _Canvas, light: IncidentLight, color: tuple[int, ...]) ->
     canvas.line(circle, color, 2, closed=True)
 
 
-def _draw_middle(canvas: _Canvas, light: IncidentLight, name: str, color: tuple[int, ...]) -> bool:
-    """Mark where a light is; returns whether that is in the picture."""
-    middle = canvas.project(light.to_light[None])[0]
+def _draw_centre(canvas: _Canvas, light: IncidentLight, name: str, color: tuple[int, ...]) -> bool:
+    """Mark the centre of a light; returns whether it is in the picture."""
+    centre = canvas.project(light.to_light[None])[0]
     height, width = canvas.picture.shape[:2]
-    if not (np.isfinite(middle).all() and (middle >= 0).all() and (middle < (width, height)).all()):
+    if not (np.isfinite(centre).all() and (centre >= 0).all() and (centre < (width, height)).all()):
         return False
-    arm, (x, y) = round(7 * canvas.unit), (round(float(v)) for v in middle)
+    arm, (x, y) = round(7 * canvas.unit), (round(float(v)) for v in centre)
     for ink, thickness in ((0, 0, 0), 3), (color, 1):
         cv2.drawMarker(
             canvas.picture, (x, y), ink, cv2.MARKER_CROSS, arm, round(thickness * canvas.unit) or 1
@@ -122,7 +122,7 @@ def _draw_middle(canvas: _Canvas, light: IncidentLight, name: str, color: tuple[
 
 
 def _fisheye_canvas(frame: ViewFrame, seen: RadianceMap) -> _Canvas:
-    """The fish-eye picture as large as it fits into the frame's size, on black."""
+    """Fit the fish-eye picture into the frame's size, on black."""
     width, height = frame.camera.width, frame.camera.height
     rows, columns = seen.picture.shape[:2]
     scale = min(width / columns, height / rows)
@@ -152,7 +152,7 @@ def _camera_canvas(frame: ViewFrame) -> _Canvas:
 
 
 def _outline(region: Region, residual: HemisphereMap) -> Float64[np.ndarray, "n 3"]:
-    """Directions (world) along the edges of a region."""
+    """Return directions (world) along the edges of a region."""
     size = len(residual.radiance)
     low, high = np.array([region.left, region.top]) / size, np.array([region.right, region.bottom]) / size
     corners = np.array([low, (high[0], low[1]), high, (low[0], high[1])])
@@ -165,7 +165,7 @@ def _outline(region: Region, residual: HemisphereMap) -> Float64[np.ndarray, "n 
 
 
 def _circle(to_light: Float64[np.ndarray, "3"], radius_rad: float) -> Float64[np.ndarray, "n 3"]:
-    """Directions at an angle from one."""
+    """Return directions at an angle around the one to a light."""
     side = np.cross(to_light, (0.0, 0.0, 1.0) if abs(to_light[2]) < 0.9 else (1.0, 0.0, 0.0))
     side /= np.linalg.norm(side)
     turn = np.linspace(0, 2 * np.pi, 4 * OUTLINE_POINTS, endpoint=False)[:, None]

@@ -26,7 +26,7 @@ MARKER_FRAME = "marker:"
 
 
 class AnimatedObject:
-    """Follows one animation; `meshes` are those of the last pose, in the asset's frame."""
+    """An object that plays a clip; `meshes` are in the pose that it advanced to, in the asset's frame."""
 
     def __init__(self, asset: GltfAsset, clip: Clip, animation: Animation) -> None:
         self.asset, self.animation = asset, animation
@@ -36,16 +36,16 @@ class AnimatedObject:
 
     @property
     def is_still(self) -> bool:
-        """Whether it shows one and the same pose for ever."""
+        """Whether its pose never changes."""
         return self.animation.speed == 0 or self._clip.duration_s == 0
 
     @property
     def bounds(self) -> Float64[np.ndarray, "2 3"]:
-        """Least and greatest coordinates of all that the clip shows, in the asset's frame."""
+        """Least and greatest coordinates over the whole clip, in the asset's frame."""
         return self.asset.bounds(self._clip)
 
     def advance_to(self, capture_ns: int) -> bool:
-        """Take the pose of that time; returns whether it differs from the one before."""
+        """Pose the meshes for a capture time; returns whether they changed."""
         time_s = self.animation.time_s(capture_ns, self._clip.duration_s)
         pose = self.asset.pose(self._clip, time_s)
         if pose.equals(self._pose):
@@ -56,7 +56,7 @@ class AnimatedObject:
 
 
 def clip_of(item: SceneObject, asset: GltfAsset | None) -> Clip | None:
-    """The clip that an object plays; None if it keeps its shape.
+    """Return the clip that an object plays; None if it plays none.
 
     Raises:
         DeltalightError: it names a clip that its asset does not have.

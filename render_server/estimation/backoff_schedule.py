@@ -1,18 +1,21 @@
-"""When to look again at what is averaged over time."""
+"""Exponential back-off for re-measurement."""
 
 FIRST_WAIT_S = 1.0
 MAX_WAIT_S = 30.0
 
 
 class BackoffSchedule:
-    """At once, then after waits that double from 1 to 30 s of the frames' own time: soon good, then nearly free."""
+    """Due at once, then after intervals that double from 1 to 30 s of the frames' own time.
+
+    An average over time is soon good, and keeping it up to date then costs almost nothing.
+    """
 
     def __init__(self) -> None:
         self._last_ns: int | None = None
         self._wait_s = FIRST_WAIT_S
 
     def is_due(self, timestamp_ns: int) -> bool:
-        """Whether it is time; if so, the next wait begins. A clock that was set back begins the wait anew."""
+        """Whether a measurement is due; if so, the next interval begins. It restarts if the clock is set back."""
         if self._last_ns is None:
             self._last_ns = timestamp_ns
             return True

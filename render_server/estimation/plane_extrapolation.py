@@ -1,8 +1,8 @@
-"""What lies beyond the picture where its border cuts a plane: walls, table and floor go on.
+"""Extrapolates planes that the picture's border cuts: walls, table and floor go on beyond it.
 
-How far is not known. A plane of which a length L is seen goes on for at least d beyond the border with probability
-L / (L + d), because the border cuts it at a place that has nothing to do with it (Gott 1993, Nature 363, for lengths
-in place of times). What it shines with there follows from the lights and from what it makes of them where it is seen.
+How far is unknown. A plane seen over a length L continues for at least d beyond the border with probability
+L / (L + d), because the border cuts it at a place that is independent of it (Gott 1993, Nature 363, for lengths in
+place of times). Its radiance there follows from the lights and from its reflectance where it is seen.
 """
 
 from collections.abc import Sequence
@@ -15,21 +15,21 @@ from render_server.estimation.plane_detection import DetectedPlane
 from render_server.lights.lights import Light, incident_light
 from render_server.lights.octahedral import octahedral_grid
 
-# Share of the samples that noise may put behind a wall.
+# Fraction of the samples that noise may put behind a wall.
 MAX_STRAY_FRACTION = 0.005
 MIN_IRRADIANCE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class ViewFrustum:
-    """What the camera has in view: rays (x/z, y/z) between `low` and `high`."""
+    """The camera's view: rays (x/z, y/z) between `low` and `high`."""
 
     camera_from_world: Float64[np.ndarray, "4 4"]
     low: Float64[np.ndarray, "2"]
     high: Float64[np.ndarray, "2"]
 
     def inside(self, places: Float64[np.ndarray, "m 3"]) -> Float64[np.ndarray, "m 4"]:
-        """Return how far places (world) are inside each of the four planes that bound the view, by some measure."""
+        """Return signed, unnormalised distances of positions (world) to the four sides, positive inside."""
         seen = places @ self.camera_from_world[:3, :3].T + self.camera_from_world[:3, 3]
         x_y, z = seen[:, :2], seen[:, 2:]
         return np.concatenate([x_y - self.low * z, self.high * z - x_y], axis=1)
@@ -37,10 +37,10 @@ class ViewFrustum:
 
 @dataclass(frozen=True, eq=False)
 class RealSamples:
-    """Pixels that show real surfaces: place (world, m), linear radiance, and irradiance.
+    """Samples of real surfaces in view: position (world, m), linear radiance, and irradiance.
 
-    `lit` is the share of the lights' unshadowed light that arrives, `indirect` the irradiance from all else. A sample
-    may lie `tolerance_m` off its plane.
+    `lit` is the fraction of the lights' unshadowed light that arrives, `indirect` the irradiance from all else. A
+    sample may lie `tolerance_m` off its plane.
     """
 
     position: Float64[np.ndarray, "k 3"]
@@ -50,14 +50,14 @@ class RealSamples:
     tolerance_m: Float64[np.ndarray, " k"]
 
     def only(self, chosen: Bool[np.ndarray, " k"]) -> "RealSamples":
-        """Return some of the samples."""
+        """Return the chosen samples."""
         fields = (self.position, self.radiance, self.lit, self.indirect, self.tolerance_m)
         return RealSamples(*(values[chosen] for values in fields))
 
 
 @dataclass(frozen=True, eq=False)
 class ExtrapolatedPlanes:
-    """Octahedral maps (world axes): radiance of what goes on, and the probability that it does."""
+    """Octahedral maps (world axes): radiance of the extrapolated planes, and the probability that they exist."""
 
     radiance: Float32[np.ndarray, "n n 3"]
     probability: Float32[np.ndarray, "n n 1"]
@@ -65,7 +65,7 @@ class ExtrapolatedPlanes:
 
 @dataclass(frozen=True, eq=False)
 class _PlaneLayer:
-    """One plane in every direction: distance (m, infinite where it is not met), probability, radiance."""
+    """One plane in every direction: distance (m, infinite where rays miss it), probability, radiance."""
 
     distance: Float64[np.ndarray, " n"]
     probability: Float64[np.ndarray, " n"]
@@ -81,9 +81,9 @@ def extrapolate_planes(
     centre: Float64[np.ndarray, "3"],
     size: int,
 ) -> ExtrapolatedPlanes:
-    """Return what goes on around `centre` (world, m) of the planes that the picture's border cuts.
+    """Extrapolate planes that the picture's border cuts, as seen from `centre` (world, m).
 
-    `size` is the edge of the maps in texels. Nearer planes stand before farther ones.
+    `size` is the edge of the maps in texels. Nearer planes occlude farther ones.
     """
     directions = octahedral_grid(size).reshape(-1, 3)
     layers = [
@@ -106,7 +106,7 @@ def extrapolate_planes(
 
 
 def _nearest_first(layers: Sequence[_PlaneLayer]) -> list[_PlaneLayer]:
-    """Reorder sheets, in each direction by itself: the first of the result is the nearest one everywhere."""
+    """Sort layers by distance in each direction: the first of the result is the nearest everywhere."""
     if not layers:
         return []
     distance, probability, radiance = (
@@ -121,7 +121,7 @@ def _nearest_first(layers: Sequence[_PlaneLayer]) -> list[_PlaneLayer]:
 
 
 def _bounds_room(plane: DetectedPlane, samples: RealSamples) -> bool:
-    """Whether nothing is seen behind a plane: a thing has the room behind it, and ends."""
+    """Whether nothing is seen behind a plane; the faces of things have the room behind them, and end."""
     behind = samples.position @ plane.normal < plane.offset - 3 * samples.tolerance_m
     return bool(behind.mean() <= MAX_STRAY_FRACTION)
 
@@ -150,10 +150,9 @@ def _plane_layer(
 def _continuation_probability(
     places: Float64[np.ndarray, "m 3"], seen: RealSamples, frustum: ViewFrustum
 ) -> Float64[np.ndarray, " m"]:
-    """Probability that a plane is at places on it.
+    """Return the probability that a plane extends to places on it.
 
-    The seen length is twice that from the middle of what is seen to where the straight way to the place leaves the
-    view.
+    The seen length is twice that from the centre of the seen part to where the line to the place leaves the view.
     """
     start = frustum.inside(seen.position.mean(axis=0)[None])
     end = frustum.inside(places)
@@ -164,9 +163,9 @@ def _continuation_probability(
 def _expected_radiance(
     places: Float64[np.ndarray, "m 3"], plane: DetectedPlane, seen: RealSamples, lights: Sequence[Light]
 ) -> Float64[np.ndarray, "m 3"]:
-    """Radiance at places on a plane: the albedo that it has where it is seen, under the irradiance to be expected.
+    """Return the radiance at places on a plane: its seen albedo under the expected irradiance.
 
-    What an albedo of 1 does not explain where it is seen comes of lights that nobody knows, and is the same beyond.
+    Radiance that an albedo of 1 does not explain comes from unknown lights, and is the same beyond the border.
     """
     direct = _irradiance(lights, seen.position, plane.normal) * seen.lit[:, None]
     irradiance = direct + seen.indirect
@@ -180,7 +179,7 @@ def _expected_radiance(
 def _irradiance(
     lights: Sequence[Light], places: Float64[np.ndarray, "m 3"], normal: Float64[np.ndarray, "3"]
 ) -> Float64[np.ndarray, "m 3"]:
-    """Unshadowed irradiance of all lights at places that face along `normal`."""
+    """Return the unshadowed irradiance of all lights at places with this normal."""
     total = np.zeros(places.shape)
     for light in lights:
         seen = incident_light(light, places)

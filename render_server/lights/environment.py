@@ -30,14 +30,14 @@ class SkyGrid:
 
     @cached_property
     def moments(self) -> Float32[np.ndarray, "h w 4"]:
-        """Solid angle, and solid angle times direction."""
+        """Solid angle, and solid angle times direction, of every pixel."""
         parts = [np.ones_like(self.solid_angles)[..., None], self.directions]
         return np.asarray(np.concatenate(parts, axis=-1) * self.solid_angles[..., None])
 
 
 @dataclass(frozen=True, eq=False)
 class EnvironmentMap:
-    """Radiance from all directions, latitude-longitude, and how it stands in the world.
+    """Radiance from all directions, latitude-longitude, and its orientation in the world.
 
     In map axes (z up) the column coordinate u in [0, 1) has azimuth phi = pi (1 - 2 u) and the row
     coordinate v has elevation pi (0.5 - v): the direction is (cos phi cos e, sin phi cos e, sin e). So the
@@ -63,7 +63,7 @@ class EnvironmentMap:
         return replace(self, radiance=radiance)
 
     def rolled(self, columns: int) -> "EnvironmentMap":
-        """Return the same light on a grid that begins at another column: the map's axes turn along."""
+        """Return the same light on a grid that begins at another column; the map's axes rotate along."""
         turned = orientation((0.0, 0.0, 1.0), -360 * columns / self.radiance.shape[1])
         return EnvironmentMap(np.roll(self.radiance, -columns, axis=1), self.world_from_map @ turned)
 
@@ -122,9 +122,9 @@ def map_directions(rows: int, columns: int) -> Float32[np.ndarray, "h w 3"]:
 
 
 def orientation(up: tuple[float, float, float], rotation_deg: float) -> Float64[np.ndarray, "3 3"]:
-    """Return world_from_map for an up axis and a turn about it (counter-clockwise seen from above).
+    """Return world_from_map for an up axis and a rotation about it (counter-clockwise seen from above).
 
-    Without a turn the map's centre looks along world +x, projected at right angles to `up` (along world +y
+    Without rotation the map's centre looks along world +x, projected at right angles to `up` (along world +y
     where `up` is within 25 degrees of the x axis).
     """
     axis = np.asarray(up, np.float64) / np.linalg.norm(up)

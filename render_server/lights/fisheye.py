@@ -1,4 +1,8 @@
-"""Lights in a fish-eye picture: its radiance map, lights tracked over time, how far they are, what occludes them."""
+"""Lights in a fish-eye picture: its radiance map, lights tracked over time, their distance, occlusion tests.
+
+A fish-eye picture gives directions only, but shadows of a lamp one metre away diverge by ten degrees over a table.
+Paper of one albedo is a light meter with hundreds of cells: across it, light of a near lamp varies by I cos / d^2.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,37 +20,37 @@ from render_server.lights.environment import LUMINANCE, SkyGrid
 from render_server.lights.median_cut import RegionLight
 from render_server.lights.octahedral import octahedral_grid, sample_octahedral, texel_weights
 from render_server.lights.octahedral import texel_solid_angles as octahedral_solid_angles
-from render_server.scene.board_albedo import LEAST_PIXELS, known_albedo, unclipped
+from render_server.scene.board_albedo import MIN_PIXELS, known_albedo, unclipped
 
 COARSE_SIZE = 32
-# Power of the cosine by which what is seen counts for an unseen direction: half at 24 degrees, about as far as the
-# parts of a room (a wall, a window, the ceiling) are like themselves.
+# Power of the cosine that weights seen directions for an unseen one: half at 24 degrees, about the extent of parts of
+# a room (a wall, a window, the ceiling).
 LOBE_POWER = 8
-# What is seen anywhere, against what is seen close by: decides only where nothing is close.
+# Weight of all seen directions: decides only where none is close.
 MIN_LOBE_WEIGHT = 1e-4
-# Two lights of successive pictures may be one if they are no further apart. A lamp held in the hand at 1 m moves
-# as far within a time constant of half a second; neighbours of a split with four lights are mostly further apart.
+# Lights of successive pictures within this angle may be the same. A hand-held lamp at 1 m moves as far within a time
+# constant of half a second; neighbours of a split with four lights are mostly farther apart.
 GATE_RAD = float(np.radians(20.0))
-# While nothing new is seen, light moves on in so many steps a time constant, each of which costs a rebuild.
+# Between pictures, lights move in so many steps per time constant, each of which costs a rebuild.
 STEPS_PER_CONSTANT = 5
-SETTLED_CONSTANTS = 7.0  # after which what is left of a change is 0.1 %: taken as done
-FORGOTTEN_FRACTION = 1e-3  # of all lights' irradiance: a light on its way out is gone below
+SETTLED_CONSTANTS = 7.0  # after which 0.1 % of a change is left: taken as done
+FORGOTTEN_FRACTION = 1e-3  # of all lights' irradiance: fading lights are dropped below
 NS = 1e-9
-# Inverse distances tried, 1/m: from far away to 20 cm, finer than what the paper can tell.
+# Candidate inverse distances, 1/m: from far away to 20 cm, finer than the paper resolves.
 INVERSE_DISTANCES = np.linspace(0.0, 5.0, 101)
-# Near lights are believed if they explain this share of all smooth differences (a plane over the paper) between its
-# light and that of far lights: uneven ambient light and shadows do not go the way of the lamps by chance ...
+# Near lights are accepted if they explain this fraction of all smooth differences (a plane over the paper) from far
+# lights: uneven ambient light and shadows do not vary like near lamps by chance ...
 MIN_EXPLAINED = 0.75
-# ... and if that is more than noise would do once in a thousand times (F-test with 1 and many degrees of freedom),
-# where four neighbouring values of pixels and channels count as one, because lens and demosaicing mix them.
+# ... and if the improvement is significant at 0.1 % (F-test with 1 and many degrees of freedom), where four
+# neighbouring values of pixels and channels count as one, because lens and demosaicing mix them.
 MIN_F_RATIO = 11.0
 CORRELATED_VALUES = 4
 OUTLIER_DEVIATIONS = 3.0
-RAY_STEP_M = 0.01  # as fine as the things on a table that can hide a light
-MAX_RAY_M = 10.0  # beyond, depth cameras see nothing
+RAY_STEP_M = 0.01  # as fine as things on a table that can occlude a light
+MAX_RAY_M = 10.0  # range of depth cameras
 DEPTH_TOLERANCE = 0.02  # of depth: beyond the noise of any depth camera in its range
-# How deep below a surface the first point behind it may lie: more than a step goes in, also where the camera looks
-# along the surface, and less than the things on a table are apart.
+# Greatest depth of the first point behind a surface: more than a step, even where the camera looks along the surface,
+# and less than things on a table are apart.
 THICKNESS_M = 0.05
 
 
@@ -60,7 +64,7 @@ class HemisphereMap:
 
     @classmethod
     def of(cls, radiance_map: RadianceMap) -> Self:
-        """Take over what a fish-eye camera saw."""
+        """Build from a fish-eye camera's radiance map."""
         radiance = radiance_map.radiance * radiance_map.seen[..., None]
         return cls(radiance, radiance_map.seen, np.asarray(radiance_map.world_from_fisheye[:3, :3]))
 
@@ -86,13 +90,13 @@ def _grid(size: int) -> SkyGrid:
 
 @dataclass(frozen=True, eq=False)
 class WorldSky:
-    """A map on an octahedral grid in world axes: radiance times the share of each texel that is `seen`."""
+    """A map on an octahedral grid in world axes: radiance times the fraction of each texel that is `seen`."""
 
     radiance: Float32[np.ndarray, "m m 3"]
     seen: Float32[np.ndarray, "m m 1"]
 
     def filled(self) -> Float32[np.ndarray, "m m 3"]:
-        """Return radiance in all directions: where none was seen, the mean of what is seen about there."""
+        """Return radiance in all directions; unseen ones get the weighted mean of nearby seen ones."""
         return np.asarray(self.radiance + (1 - self.seen) * _nearby_mean(self.radiance, self.seen))
 
 
@@ -110,9 +114,9 @@ def to_world(sky: HemisphereMap, size: int) -> WorldSky:
 def _sampling(
     rotation: bytes, map_size: int, size: int
 ) -> tuple[Float32[np.ndarray, "k k 2"], Float32[np.ndarray, "k k"]]:
-    """Where to read a map for each sample of the octahedral grid, and what the sample counts (0 behind).
+    """Return where to read a map for each sample of the octahedral grid, and the sample's weight (0 behind).
 
-    Samples are half as far apart as the map's texels, or there are 2x2 a texel of the grid.
+    Samples are half as far apart as the map's texels, with at least 2x2 per texel of the grid.
     """
     fine = size * max(2, 2 * map_size // size)
     world_from_map = np.frombuffer(rotation).reshape(3, 3)
@@ -126,7 +130,7 @@ def _sampling(
 def _nearby_mean(
     radiance: Float32[np.ndarray, "m m 3"], seen: Float32[np.ndarray, "m m 1"]
 ) -> Float32[np.ndarray, "m m 3"]:
-    """Return the mean radiance of what is seen about each direction, weighted by a power of the cosine."""
+    """Return the mean seen radiance around each direction, weighted by a power of the cosine."""
     size = len(radiance)
     coarse = min(size, COARSE_SIZE)
     both = np.dstack([radiance, seen]) * texel_weights(coarse, size // coarse)[..., None]
@@ -145,7 +149,7 @@ def _lobe_weights(size: int) -> Float32[np.ndarray, "k k"]:
 
 @dataclass(frozen=True, eq=False)
 class TrackedLight:
-    """A distant light with a number: `toward` is the unit direction to it (world), `irradiance` across the beam."""
+    """A distant light with an identity: unit direction to it (world), irradiance across the beam."""
 
     identity: int
     to_light: Float64[np.ndarray, "3"]
@@ -154,11 +158,11 @@ class TrackedLight:
 
 
 class LightTracker:
-    """Follows lights and residual (octahedral, world axes) with a time constant, seconds; 0 = at once.
+    """Tracks lights and residual (octahedral, world axes) through a low-pass filter; time constant in s, 0 = none.
 
-    Lights and residual pass the same low-pass filter: what a light that fades in still lacks is still in the
-    residual, and their sum follows that of the maps. The first map is taken as it is. A new map changes nothing
-    by itself; time does. A clock that was set back stops the light until it goes on.
+    Lights and residual pass the same filter: what a fading light still lacks is still in the residual, so that their
+    sum follows that of the maps. The first map is taken as it is. A new map only sets the target; `advance` moves
+    towards it. If the clock is set back, lights stay until it goes on.
     """
 
     def __init__(self, smoothing_s: float) -> None:
@@ -174,7 +178,7 @@ class LightTracker:
     def set_target(
         self, timestamp_ns: int, lights: tuple[RegionLight, ...], residual: Float32[np.ndarray, "n n 3"]
     ) -> None:
-        """Take the split of a new map as what is to be approached from this time on."""
+        """Approach the split of a new map from this time on."""
         self.advance(timestamp_ns, at_once=True)
         self._clock_ns = timestamp_ns
         self._target = self._identified(lights)
@@ -187,7 +191,7 @@ class LightTracker:
             self._settle()
 
     def advance(self, timestamp_ns: int, *, at_once: bool = False) -> bool:
-        """Let time pass; returns whether light changed. Small steps are saved up unless wanted `at_once`."""
+        """Advance the filter; returns whether lights changed. Small steps are accumulated unless `at_once`."""
         self._clock_ns = min(self._clock_ns, timestamp_ns)
         passed_s = (timestamp_ns - self._clock_ns) * NS
         least_s = 0.0 if at_once else self._smoothing_s / STEPS_PER_CONSTANT
@@ -205,7 +209,7 @@ class LightTracker:
         self.lights, self.residual, self._to_settle_s = self._target, self._target_residual, 0.0
 
     def _approach(self, fraction: float) -> None:
-        """Go this share of the way to what is wanted; a light that is wanted no more goes towards darkness."""
+        """Move this fraction of the way to the target; lights without a target fade out."""
         target = {light.identity: light for light in self._target}
         assert self.residual is not None
         assert self._target_residual is not None
@@ -217,7 +221,7 @@ class LightTracker:
         self.residual = self.residual + np.float32(fraction) * (self._target_residual - self.residual)
 
     def _identified(self, lights: tuple[RegionLight, ...]) -> tuple[TrackedLight, ...]:
-        """Give each new light the number of the one that it continues, or a new number."""
+        """Give each new light the identity of the light that it continues, or a new one."""
         old = self._matched(lights)
         numbered = []
         for index, light in enumerate(lights):
@@ -230,8 +234,8 @@ class LightTracker:
         return tuple(numbered)
 
     def _matched(self, lights: tuple[RegionLight, ...]) -> dict[int, int]:
-        """Number by index of those new lights that continue an old one: pairs near each other and alike in energy."""
-        # Lights on their way out may come back; where two are as near, the one that shines is the likelier.
+        """Match new lights (by index) to identities of old ones: pairs close in direction and energy."""
+        # Fading lights may come back; of two at the same distance, the shining one is likelier.
         old = [
             *self._target,
             *(light for light in self.lights if light.identity not in self._target_identities),
@@ -260,7 +264,7 @@ def _strength(light: TrackedLight | RegionLight) -> float:
 
 
 def _blended(light: TrackedLight, target: TrackedLight | None, fraction: float) -> TrackedLight:
-    """The light a share of the way on."""
+    """Interpolate between a light and its target."""
     if target is None:
         return replace(light, irradiance=(1 - fraction) * light.irradiance)
     to_light = light.to_light + fraction * (target.to_light - light.to_light)
@@ -274,20 +278,20 @@ def _blended(light: TrackedLight, target: TrackedLight | None, fraction: float) 
 
 @dataclass(frozen=True, eq=False)
 class PaperLight:
-    """Irradiance (camera units) of points of the board's plane (world, m) where the albedo is known."""
+    """Irradiance (camera units) at points of the board (world, m) with known albedo."""
 
     points: Float64[np.ndarray, "k 3"]
     irradiance: Float64[np.ndarray, "k 3"]
 
 
 def paper_light(frame: ViewFrame) -> PaperLight | None:
-    """Read the light off paper and grey cards; None where fewer than 30 pixels show any unclipped."""
+    """Measure irradiance on paper and grey cards; None for fewer than 30 unclipped pixels."""
     if frame.board is None or frame.pose is None:
         return None
     albedo = known_albedo(frame.board, frame.camera, frame.pose)
     coded = decode_lut(frame.response)[frame.color, np.arange(3)]
     usable = (albedo > 0) & unclipped(frame.color, coded)
-    if np.count_nonzero(usable) < LEAST_PIXELS:
+    if np.count_nonzero(usable) < MIN_PIXELS:
         return None
     matrix = frame.pose.world_from_camera
     rays = np.insert(frame.camera.rays()[usable].astype(np.float64), 2, 1.0, axis=1) @ matrix[:3, :3].T
@@ -302,11 +306,11 @@ def fit_distance(
     lights: Sequence[RegionLight],
     ambient: Float64[np.ndarray, "3"],
 ) -> float | None:
-    """Find the distance of the lights from the fish-eye camera at `place`, m; None where they seem far away.
+    """Estimate the distance of the lights from the fish-eye camera at `position`, m; None where they seem far away.
 
-    The paper's irradiance is f (sum of E_i (D/d)^2 cos + ambient) with a factor f for each channel; the distance
-    D, one for all lights, is that of least squares if it is believed. `ambient` is the irradiance of all else on
-    paper, in the units of the lights.
+    The paper's irradiance is f (sum of E_i (D/d)^2 cos + ambient) with a factor f per channel; D, one distance for
+    all lights, is fitted by least squares and must be significant. `ambient` is the irradiance of all other light
+    on the paper, in the units of the lights.
     """
     far = _predicted(paper, position, lights, ambient, 0.0)
     misfits = [
@@ -328,19 +332,17 @@ def _predicted(
     ambient: Float64[np.ndarray, "3"],
     inverse: float,
 ) -> Float64[np.ndarray, "k 3"]:
-    """Irradiance of the paper under lights at an inverse distance."""
+    """Return the irradiance of the paper under lights at an inverse distance."""
     predicted = np.tile(ambient, (len(paper.points), 1))
     for light in lights:
-        to_lamp = light.to_light - inverse * (
-            paper.points - position
-        )  # to the lamp, as a share of its distance
+        to_lamp = light.to_light - inverse * (paper.points - position)  # in units of the lamp's distance
         attenuation = np.maximum(to_lamp[:, 2], 0) / np.linalg.norm(to_lamp, axis=1) ** 3
         predicted += attenuation[:, None] * light.irradiance
     return np.asarray(np.maximum(predicted, 1e-12))
 
 
 def _plane(paper: PaperLight, predicted: Float64[np.ndarray, "k 3"]) -> Float64[np.ndarray, "k 3"]:
-    """Measured over predicted irradiance as a linear function of the place, each channel, by least squares."""
+    """Fit measured over predicted irradiance by a linear function of position per channel."""
     places = np.column_stack([np.ones(len(paper.points)), paper.points[:, :2]])
     kept = _without_outliers(paper.irradiance / predicted)
     return np.stack(
@@ -353,7 +355,7 @@ def _plane(paper: PaperLight, predicted: Float64[np.ndarray, "k 3"]) -> Float64[
 
 
 def _misfit(paper: PaperLight, predicted: Float64[np.ndarray, "k 3"]) -> float:
-    """Mean squared difference of predicted and measured irradiance, relative; a factor a channel is fitted."""
+    """Return the relative mean squared difference to the measured irradiance, after fitting a factor per channel."""
     kept = _without_outliers(paper.irradiance / predicted)
     measured, predicted = paper.irradiance[kept], predicted[kept]
     factor = (measured * predicted).sum(axis=0) / (predicted**2).sum(axis=0)
@@ -372,10 +374,10 @@ def is_occluded(
     origin: Float64[np.ndarray, "3"],
     direction: Float64[np.ndarray, "3"],
 ) -> bool:
-    """Whether the ray from a place (world, m) in a unit direction goes through a surface of the depth image.
+    """Whether the ray from `origin` (world, m) in a unit direction passes through a surface of the depth image.
 
-    The ray is followed as long as the camera sees it: nothing is known to hide it beyond. Passing behind
-    something near the camera is no hit: the ray must come from before a surface and leave it close behind.
+    The ray is marched while the camera sees it; beyond, nothing is known to occlude it. Passing behind something near
+    the camera is no hit: the ray must enter a surface from the front and lie close behind it.
     """
     known = depth.valid & (depth.depth_m > 0)
     if not known.any():

@@ -1,4 +1,4 @@
-"""The lights of a scene as the renderer takes them: a list and a smooth environment around it."""
+"""Lights of a scene as the renderer uses them: light models and a smooth environment around them."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -12,13 +12,13 @@ from render_server.lights.median_cut import split_environment
 from render_server.lights.octahedral import above_horizon, resample_to_octahedral, solid_angle_mean
 
 ENVIRONMENT_SIZE = 256
-AMBIENT_SIZE = 64  # texels of 1.5 to 5 degrees: what a metal of roughness 0.3 still shows of a wall's edge
+AMBIENT_SIZE = 64  # texels of 1.5 to 5 degrees: a metal of roughness 0.3 still resolves the edge of a wall
 MIN_DISTANCE_M = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class DirectionalLight:
-    """A distant light: `direction` is the way it travels (unit, world), `irradiance` is across the beam."""
+    """A distant light: `direction` of travel (unit, world), `irradiance` across the beam."""
 
     direction: Float32[np.ndarray, "3"]
     irradiance: Float32[np.ndarray, "3"]
@@ -40,7 +40,7 @@ class DirectionalLight:
 
 @dataclass(frozen=True, eq=False)
 class SphereLight:
-    """A lamp that shines equally in all directions: E = I cos/d^2; position in metres, world."""
+    """An isotropic lamp: E = I cos/d^2; position in metres, world."""
 
     position: Float32[np.ndarray, "3"]
     intensity: Float32[np.ndarray, "3"]
@@ -136,10 +136,10 @@ Light = DirectionalLight | SphereLight | SpotLight | RectangleLight
 class LightSet:
     """Everything that shines, in camera units once multiplied by the registration.
 
-    `environment` is the residual radiance map R, octahedral, world axes; the lights are not in it. Of it,
-    `ground_fraction` (0..1) is the share of each texel where the real ground's radiance belongs, because nothing else
-    is known to be there. `registration` is the factor R G B that `lights` and `environment` still lack, ones where
-    it is to be found from the picture first. `identities` number the lights where they are followed over time.
+    `environment` is the residual radiance map R without the lights, octahedral, world axes. `ground_fraction` (0..1)
+    is the fraction of each of its texels that shows the real ground, because nothing else is known to be there.
+    `registration` is the factor R G B that `lights` and `environment` still lack, ones where it is to be estimated
+    from the picture. `identities` number the lights where they are tracked over time.
     """
 
     lights: tuple[Light, ...]
@@ -159,18 +159,18 @@ class LightSet:
         )
 
     def with_ground(self, radiance: Float32[np.ndarray, "3"]) -> "LightSet":
-        """Return the set with ground of this radiance below the horizon, where nothing else is known to be."""
+        """Return the set with ground of this radiance in `ground_fraction` of its environment."""
         ground = np.broadcast_to(radiance, self.environment.shape)
         return self.with_surfaces(ground, self.ground_fraction)
 
     def with_surfaces(
         self, radiance: Float32[np.ndarray, "n n 3"], fraction: Float32[np.ndarray, "n n 1"]
     ) -> "LightSet":
-        """Return the set with surfaces (maps of the environment's size) before a share of each direction."""
+        """Return the set with surfaces (maps of the environment's size) in front of a fraction of each texel."""
         return replace(self, environment=(1 - fraction) * self.environment + fraction * radiance)
 
     def with_sky(self, radiance: Float32[np.ndarray, "3"], shape: Float32[np.ndarray, "n n 1"]) -> "LightSet":
-        """Return the set with more radiance above the horizon: `shape` (of the environment's size) times this."""
+        """Return the set with radiance added above the horizon, times `shape` (of the environment's size)."""
         above = above_horizon(len(self.environment))
         return replace(self, environment=self.environment + above * shape * radiance)
 
@@ -186,10 +186,9 @@ class LightSet:
 
 
 def build_lights(lights: documents.Lights) -> LightSet:
-    """Make the light set of a scene document whose lights are given: modes `manual` and `environment`.
+    """Build the light set of a scene document in mode `manual` or `environment`.
 
-    An environment is split with the count, the threshold and the kind of split that `lights.fisheye` gives, as in
-    mode `fisheye`.
+    An environment is split by the settings of `lights.fisheye`, as in mode `fisheye`.
 
     Raises:
         DeltalightError: an environment map that cannot be read.
@@ -207,7 +206,7 @@ def light_set(
     ground_fraction: Float32[np.ndarray, "n n 1"],
     identities: tuple[int, ...] = (),
 ) -> LightSet:
-    """Add the registration that a scene document wishes."""
+    """Assemble a light set with the registration that a scene document requests."""
     given = lights.resolved_registration
     factor = np.ones(3, np.float32) if given == "auto" else np.array(given, np.float32)
     return LightSet(shining, environment, ground_fraction, factor, identities)
@@ -266,7 +265,7 @@ def _from_environment(
 
 @dataclass(frozen=True, eq=False)
 class IncidentLight:
-    """`toward` is the unit direction to the light (world), `irradiance` falls on a surface that faces it."""
+    """Light as it arrives at positions: unit direction to it (world), irradiance on a surface that faces it."""
 
     to_light: Float64[np.ndarray, "*n 3"]
     irradiance: Float64[np.ndarray, "*n 3"]
@@ -274,7 +273,7 @@ class IncidentLight:
 
 
 def incident_light(light: Light, position: Float64[np.ndarray, "*n 3"]) -> IncidentLight:
-    """Return what a light looks like from places (world, m), without anything in between."""
+    """Return the unoccluded light at positions (world, m)."""
     if isinstance(light, DirectionalLight):
         to_light = np.broadcast_to(-light.direction.astype(np.float64), position.shape)
         irradiance = np.broadcast_to(light.irradiance.astype(np.float64), position.shape)
@@ -294,7 +293,7 @@ def incident_light(light: Light, position: Float64[np.ndarray, "*n 3"]) -> Incid
 
 
 def _within_cone(light: SpotLight, to_light: Float64[np.ndarray, "*n 3"]) -> Float64[np.ndarray, "*n"]:
-    """Share of a spot's intensity in the direction of whoever looks toward it."""
+    """Return the fraction of a spot's intensity that it emits against `to_light`."""
     angle = np.arccos(np.clip(-to_light @ light.direction, -1, 1))
     soft = max(light.half_angle_rad - light.full_angle_rad, 1e-9)
     return np.asarray(np.clip((light.half_angle_rad - angle) / soft, 0, 1))

@@ -1,4 +1,4 @@
-"""Splitting a map of radiance into a few distant lights and a smooth residual (METHOD 2)."""
+"""Splitting a map of radiance into a few distant lights and a smooth residual (docs/method.md 2)."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,8 +12,8 @@ from render_server.lights.environment import LUMINANCE, WORK_SIZE, EnvironmentMa
 
 PEAK_THRESHOLD = 4.0
 MIN_FRACTION = 0.01
-# Lights of this angular radius are not cut again: sampling a light's disc does the rest.
-LEAST_RADIUS_RAD = float(np.radians(5.0))
+# Regions of this angular radius are not cut again: sampling the disc of a light resolves the rest.
+MIN_RADIUS_RAD = float(np.radians(5.0))
 OcclusionTest = Callable[[Float64[np.ndarray, "3"]], bool]
 
 
@@ -65,7 +65,7 @@ class Region:
 
 @dataclass(frozen=True, eq=False)
 class RegionLight:
-    """What a region sends: `toward` is the unit direction to it (world), `irradiance` across the beam.
+    """Light of a region: unit direction to it (world), irradiance across the beam.
 
     `region` holds in the grid of the split's residual.
     """
@@ -78,7 +78,7 @@ class RegionLight:
 
 @dataclass(frozen=True, eq=False)
 class Split(Generic[MapT]):
-    """Lights and the rest of a map; together they are the map."""
+    """Lights and residual of a map; together they are the map."""
 
     lights: tuple[RegionLight, ...]
     residual: MapT
@@ -108,12 +108,11 @@ def split_map(
     whole_map: bool = False,
     is_occluded: OcclusionTest | None = None,
 ) -> Split[MapT]:
-    """Split a map into at most `count` lights and a residual (METHOD 2).
+    """Split a map into at most `count` lights and a residual (docs/method.md 2).
 
     R = L min(1, c / lum L) with c = `threshold` times the solid-angle mean of what is known; P = L - R is cut into
-    regions, each of which becomes a light. Regions under 1 % of the map's energy go back to R, and those whose
-    direction (unit, world) `is_hidden`. With `whole_map` everything is cut and nothing but what is hidden is left
-    (the papers' way).
+    regions, each of which becomes a light. Regions under 1 % of the map's energy go back to R, and so do those whose
+    direction (unit, world) `is_occluded`. With `whole_map`, as in the papers, everything but occluded regions is cut.
     """
     luminance = _luminance(sky.radiance)
     energy = float(np.vdot(luminance, sky.grid.solid_angles))
@@ -127,8 +126,8 @@ def split_map(
         region = _bounding(luminance, limit, _moved(part, frame))
         peaks = sky.radiance[region.window] * _fraction_above(luminance[region.window], limit)
         light = _region_light(sky, region, peaks)
-        hidden = is_occluded is not None and is_occluded(light.to_light)
-        if not hidden and light.irradiance @ LUMINANCE >= least:
+        occluded = is_occluded is not None and is_occluded(light.to_light)
+        if not occluded and light.irradiance @ LUMINANCE >= least:
             lights.append(light)
             residual[region.window] -= peaks
     return Split(tuple(lights), sky.with_radiance(residual))
@@ -139,7 +138,7 @@ def _luminance(radiance: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h
 
 
 def _fraction_above(luminance: Float32[np.ndarray, "h w"], limit: float) -> Float32[np.ndarray, "h w 1"]:
-    """Return which part of each pixel's light is above the limit, 0..1."""
+    """Return the fraction of each pixel's light above the limit, 0..1."""
     above = np.maximum(luminance - np.float32(limit), 0)
     return np.asarray(above / np.maximum(luminance, np.float32(1e-30)))[..., None]
 
@@ -157,7 +156,7 @@ def _moved(region: Region, origin: Region) -> Region:
 
 
 def _region_light(sky: SkyMap, region: Region, peaks: Float32[np.ndarray, "h w 3"]) -> RegionLight:
-    """Sum a region up: E = sum P dw, centroid, radius = sqrt(2 mean squared angle) (a disc's own radius)."""
+    """Integrate a region: E = sum P dw, centroid, radius = sqrt(2 mean squared angle) (a disc's own radius)."""
     directions = sky.grid.directions[region.window]
     solid_angles = sky.grid.solid_angles[region.window]
     weight = (_luminance(peaks) * solid_angles).ravel()
@@ -179,7 +178,7 @@ def _region_light(sky: SkyMap, region: Region, peaks: Float32[np.ndarray, "h w 3
 
 
 def _darkest_column(columns: Float[np.ndarray, " w"]) -> int:
-    """Where to open the map so that the seam is least likely to cut a light in two."""
+    """Find where to open the map so that the seam is least likely to cut a light in two."""
     width = max(1, len(columns) // 64)
     around = np.convolve(np.concatenate([columns, columns[: width - 1]]), np.ones(width), "valid")
     return (int(np.argmin(around)) + width // 2) % len(columns)
@@ -219,14 +218,14 @@ class _Table:
         return np.asarray(lower[region.right] - lower[region.left] - upper[region.right] + upper[region.left])
 
     def spread(self, region: Region) -> float:
-        """Spread of a region that is worth a cut, else 0."""
+        """Return the spread of a region that is worth cutting, else 0."""
         sums = self.sums(region)
         spread = float(_spread(sums))
         # Radius as of a light: sqrt(2 mean squared angle).
-        return 0.0 if 2 * spread <= LEAST_RADIUS_RAD**2 * sums[0] else spread
+        return 0.0 if 2 * spread <= MIN_RADIUS_RAD**2 * sums[0] else spread
 
     def halves(self, region: Region) -> tuple[Region, Region] | None:
-        """Cut a region where the spreads of both sides add up to least; None if it is a single pixel."""
+        """Cut a region where the sum of both sides' spreads is least; None for a single pixel."""
         top, bottom, left, right = region.top, region.bottom, region.left, region.right
         row = _best_cut(self.values[top : bottom + 1, right] - self.values[top : bottom + 1, left])
         column = _best_cut(self.values[bottom, left : right + 1] - self.values[top, left : right + 1])
@@ -241,7 +240,7 @@ class _Table:
 
 
 def _best_cut(running: Float64[np.ndarray, "n 4"]) -> tuple[int, float] | None:
-    """Where to cut a row of running sums, and the spread that both sides then have; None if it cannot be cut."""
+    """Return where to cut a row of running sums, and the spread of both sides; None if it cannot be cut."""
     if len(running) < 3:
         return None
     before = running[1:-1] - running[0]
@@ -251,7 +250,7 @@ def _best_cut(running: Float64[np.ndarray, "n 4"]) -> tuple[int, float] | None:
 
 
 def _spread(moments: Float64[np.ndarray, "*n 4"]) -> Float64[np.ndarray, "*n"]:
-    """Weighted sum of squared distances of unit vectors to their centroid: W - |sum w d|^2 / W."""
+    """Return the weighted sum of squared distances of unit vectors to their centroid: W - |sum w d|^2 / W."""
     weight = moments[..., 0]
     pull = np.einsum("...i,...i", moments[..., 1:], moments[..., 1:])
     return np.asarray(np.maximum(weight - pull / np.maximum(weight, 1e-300), 0))

@@ -1,4 +1,4 @@
-"""Lights as smooth real planes mirror them: a polished table lights what stands on it from below."""
+"""Images of lights in smooth real planes: a polished table lights things on it from below."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -9,17 +9,17 @@ from jaxtyping import Float32, Float64
 from render_server.lights.lights import DirectionalLight, Light, RectangleLight, SphereLight, SpotLight
 from render_server.scene.declared_surfaces import PLANE, SurfaceTable
 
-# Of planes; from here on a lobe spreads a light's image so far that it is no light any more, and cones serve.
+# Of planes. From this roughness on, a lobe blurs a light's image so much that cones represent it.
 MIRROR_ROUGHNESS = 0.3
-LEAST_COSINE = 0.05  # a light that grazes the plane has no image of its own there
+MIN_COSINE = 0.05  # lights at grazing angles have no image of their own
 
 
 @dataclass(frozen=True, eq=False)
 class MirrorLight:
-    """The image of a light in a plane. It shines before the plane, as much as the plane reflects of it.
+    """The image of a light in a plane, which shines in front of it, attenuated by the plane's reflectance.
 
-    `plane` (a, b, c, d; unit normal towards the objects) has ax + by + cz + d > 0 before it; `surface` is its row in
-    the table of surfaces, `source` the light's number.
+    `plane` (a, b, c, d; unit normal towards the objects) has ax + by + cz + d > 0 in front of it; `surface` is its
+    row in the table of surfaces, `source` the index of the light.
     """
 
     light: Light
@@ -34,7 +34,7 @@ class MirrorLight:
 def mirror_lights(
     lights: Sequence[Light], surfaces: SurfaceTable, objects: Float64[np.ndarray, "3"]
 ) -> list[MirrorLight]:
-    """Images of the lights in the smooth declared planes that they and `objects` (a point, world, m) are before."""
+    """Return images of lights in smooth declared planes in front of which they and `objects` (a point, m) lie."""
     found = []
     for index, row in enumerate(surfaces.packed):
         roughness = float(surfaces.roughness[index])
@@ -62,42 +62,45 @@ def _plane_towards(
 def _image(
     light: Light, plane: Float64[np.ndarray, "4"], alpha: float, objects: Float64[np.ndarray, "3"]
 ) -> Light | None:
-    """The light behind the plane, as large as its image is seen from the objects; None if it is not before the plane.
+    """Mirror a light, enlarged by the blur that the objects see; None if it is not in front of the plane.
 
-    A GGX lobe of alpha spreads the way by 2 alpha; at the light's distance b from the plane that is 2 alpha b across.
+    A GGX lobe of alpha spreads directions by 2 alpha; at the light's distance b from the plane that is 2 alpha b.
     """
     normal = plane[:3]
-    turn = np.eye(3) - 2 * np.outer(normal, normal)
+    reflection = np.eye(3) - 2 * np.outer(normal, normal)
     if isinstance(light, DirectionalLight):
-        if -light.direction @ normal < LEAST_COSINE:
+        if -light.direction @ normal < MIN_COSINE:
             return None
         radius = float(np.arctan(np.hypot(np.tan(light.angular_radius_rad), 2 * alpha)))
-        return replace(light, direction=_single(turn @ light.direction), angular_radius_rad=radius)
+        return replace(light, direction=_single(reflection @ light.direction), angular_radius_rad=radius)
     height = float(normal @ light.position + plane[3])
     position = light.position.astype(float) - 2 * height * normal
     to_objects = objects - position
-    if height <= 0 or normal @ to_objects < LEAST_COSINE * np.linalg.norm(to_objects):
+    if height <= 0 or normal @ to_objects < MIN_COSINE * np.linalg.norm(to_objects):
         return None
-    wider = 2 * alpha * height * float(np.linalg.norm(to_objects)) / float(normal @ to_objects)
+    blur_m = 2 * alpha * height * float(np.linalg.norm(to_objects)) / float(normal @ to_objects)
     if isinstance(light, RectangleLight):
-        return _rectangle_image(light, position, turn, wider)
-    moved = replace(light, position=_single(position), radius_m=float(np.hypot(light.radius_m, wider)))
+        return _rectangle_image(light, position, reflection, blur_m)
+    moved = replace(light, position=_single(position), radius_m=float(np.hypot(light.radius_m, blur_m)))
     if isinstance(moved, SpotLight):
-        return replace(moved, direction=_single(turn @ moved.direction))
+        return replace(moved, direction=_single(reflection @ moved.direction))
     assert isinstance(moved, SphereLight)
     return moved
 
 
 def _rectangle_image(
-    light: RectangleLight, position: Float64[np.ndarray, "3"], turn: Float64[np.ndarray, "3 3"], wider: float
+    light: RectangleLight,
+    position: Float64[np.ndarray, "3"],
+    reflection: Float64[np.ndarray, "3 3"],
+    blur_m: float,
 ) -> RectangleLight:
-    """Its axes change places, as a mirror image turns about; wider at the same flux."""
+    """Mirror a rectangle: its axes change places to keep the orientation, and blur widens it at the same flux."""
     u, v = (float(np.linalg.norm(axis)) for axis in (light.axis_u, light.axis_v))
-    grown = [float(np.hypot(edge, 2 * wider) / edge) for edge in (u, v)]
+    grown = [float(np.hypot(edge, 2 * blur_m) / edge) for edge in (u, v)]
     return RectangleLight(
         _single(position),
-        _single(turn @ light.axis_v * grown[1]),
-        _single(turn @ light.axis_u * grown[0]),
+        _single(reflection @ light.axis_v * grown[1]),
+        _single(reflection @ light.axis_u * grown[0]),
         light.radiance / np.float32(grown[0] * grown[1]),
     )
 

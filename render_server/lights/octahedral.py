@@ -1,4 +1,4 @@
-"""Octahedral maps of the whole sphere: mapping, integrals, prefiltering by cones, irradiance.
+"""Octahedral maps of the whole sphere: mapping, integrals, prefiltering by cones, irradiance; spherical harmonics.
 
 Texel (row j, column i) of an n x n map has its centre at uv = ((i + 0.5)/n, (j + 0.5)/n). With
 p = 2 uv - 1 the direction is (px, py, 1 - |px| - |py|) where |px| + |py| <= 1 (upper half, +z in the centre);
@@ -18,7 +18,7 @@ MIN_LEVEL_SIZE = 32
 SUMMED_SIZE = 64
 SUMMED_FROM_RAD = 0.4
 CONE_SAMPLES = 64
-KEPT_LEVELS = 16
+CACHED_LEVELS = 16
 SampleMap = Callable[[Float32[np.ndarray, "n m 3"]], Float32[np.ndarray, "n m c"]]
 MAX_ORDER = 5
 
@@ -56,7 +56,7 @@ def octahedral_grid(size: int) -> Float64[np.ndarray, "n n 3"]:
 
 @cache
 def texel_weights(size: int, supersampling: int) -> Float32[np.ndarray, "k k"]:
-    """Return the solid angles of supersampling^2 samples a texel, as shares of the mean of their texel's."""
+    """Return the solid angles of supersampling^2 samples a texel, relative to the mean of their texel."""
     weight = np.linalg.norm(_folded_direction(_grid_uv(size * supersampling)), axis=-1) ** -3
     mean = weight.reshape(size, supersampling, size, supersampling).mean(axis=(1, 3))
     return np.asarray(weight / mean.repeat(supersampling, 0).repeat(supersampling, 1), np.float32)
@@ -99,22 +99,22 @@ def sample_octahedral(
     radiance: Float32[np.ndarray, "n n 3"], directions: Float[np.ndarray, "a b 3"]
 ) -> Float32[np.ndarray, "a b 3"]:
     """Read a map bilinearly; texels meet their true neighbours over the map's border."""
-    return _sampled(radiance, _place(directions, len(radiance)))
+    return _sampled(radiance, _texel_coordinates(directions, len(radiance)))
 
 
-def _place(directions: Float[np.ndarray, "a b 3"], size: int) -> Float32[np.ndarray, "a b 2"]:
-    """Where `_sampled` reads a map of this size for directions."""
+def _texel_coordinates(directions: Float[np.ndarray, "a b 3"], size: int) -> Float32[np.ndarray, "a b 2"]:
+    """Return where `_sampled` reads a map of this size for directions."""
     return (octahedral_uv(directions) * size + 0.5).astype(np.float32)
 
 
 def _sampled(
-    radiance: Float32[np.ndarray, "n n 3"], place: Float32[np.ndarray, "a b 2"]
+    radiance: Float32[np.ndarray, "n n 3"], coordinates: Float32[np.ndarray, "a b 2"]
 ) -> Float32[np.ndarray, "a b 3"]:
-    return np.asarray(cv2.remap(_bordered(radiance), place, None, cv2.INTER_LINEAR))
+    return np.asarray(cv2.remap(_bordered(radiance), coordinates, None, cv2.INTER_LINEAR))
 
 
 def _bordered(radiance: Float32[np.ndarray, "n n 3"]) -> Float32[np.ndarray, "m m 3"]:
-    """Add a border of one texel: over an edge of the map lies the same edge, mirrored about its middle."""
+    """Add a border of one texel: across an edge of the map lies the same edge, mirrored about its middle."""
     rows = np.concatenate([radiance[:1, ::-1], radiance, radiance[-1:, ::-1]])
     left, right = rows[::-1, :1].copy(), rows[::-1, -1:].copy()
     return np.ascontiguousarray(np.concatenate([left, rows, right], axis=1))
@@ -122,7 +122,7 @@ def _bordered(radiance: Float32[np.ndarray, "n n 3"]) -> Float32[np.ndarray, "m 
 
 @cache
 def above_horizon(size: int) -> Float32[np.ndarray, "n n 1"]:
-    """Return the share of each texel that looks up (+z); the horizon is as wide as a texel."""
+    """Return the fraction of each texel above the horizon (+z), blurred by one texel."""
     texel = np.pi / size
     return resample_to_octahedral(lambda d: np.clip(0.5 + d[..., 2:] / texel, 0, 1).astype(np.float32), size)
 
@@ -179,16 +179,16 @@ def _cone_average(
     spacing = 2 * half_angle / np.sqrt(CONE_SAMPLES)
     wanted = np.sqrt(4 * np.pi) / spacing
     source = min(halved, key=lambda level: abs(np.log2(len(level) / wanted)))
-    samples = _sampled(source, _cone_places(half_angle, size, len(source)))
+    samples = _sampled(source, _cone_coordinates(half_angle, size, len(source)))
     return np.asarray(samples.mean(axis=1).reshape(size, size, 3))
 
 
-# Maps of one size are filtered again and again while light is followed, so where to read them is kept.
-@lru_cache(maxsize=KEPT_LEVELS)
-def _cone_places(half_angle: float, size: int, source_size: int) -> Float32[np.ndarray, "n k 2"]:
+# Maps of one size are filtered again and again while lights are tracked, so sample coordinates are cached.
+@lru_cache(maxsize=CACHED_LEVELS)
+def _cone_coordinates(half_angle: float, size: int, source_size: int) -> Float32[np.ndarray, "n k 2"]:
     frames = _tangent_frames(octahedral_grid(size).reshape(-1, 3)).astype(np.float32)
     directions = _spiral(np.sin(half_angle)).astype(np.float32) @ np.swapaxes(frames, 1, 2)
-    return _place(directions, source_size)
+    return _texel_coordinates(directions, source_size)
 
 
 def _cone_sum(
@@ -199,7 +199,7 @@ def _cone_sum(
     return np.asarray(total.reshape(size, size, 3), np.float32)
 
 
-@lru_cache(maxsize=KEPT_LEVELS)
+@lru_cache(maxsize=CACHED_LEVELS)
 def _cone_weights(half_angle: float, size: int, source_size: int) -> Float32[np.ndarray, "n k"]:
     axis, source = octahedral_grid(size).reshape(-1, 3), octahedral_grid(source_size).reshape(-1, 3)
     cosine = (axis @ source.T).astype(np.float32)
@@ -228,7 +228,7 @@ def _tangent_frames(axis: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 
 def irradiance(
     radiance: Float32[np.ndarray, "n n 3"], normals: Float[np.ndarray, "k 3"]
 ) -> Float64[np.ndarray, "k 3"]:
-    """Integrate a map over the hemisphere of each unit normal (the plain sum; for reference)."""
+    """Integrate a map over the hemisphere of each unit normal, by plain summation."""
     weighted = radiance.reshape(-1, 3) * texel_solid_angles(len(radiance)).reshape(-1, 1)
     directions = octahedral_grid(len(radiance)).reshape(-1, 3)
     return np.asarray(np.maximum(normals @ directions.T, 0) @ weighted.astype(np.float64))
@@ -239,9 +239,10 @@ def _constant(numerator: float, denominator: float) -> float:
 
 
 def harmonics(directions: Float[np.ndarray, "n 3"], order: int) -> Float64[np.ndarray, "n k"]:
-    """Return the basis functions at unit directions: k = order^2, index l^2 + l + m, orthonormal over the sphere.
+    """Evaluate real spherical harmonics at unit directions as polynomials (Sloan 2008, appendix A2).
 
-    The same polynomials stand in passes/common/harmonics.glsl.
+    k = order^2 functions up to band 4, index l^2 + l + m, orthonormal over the sphere; the same polynomials are in
+    passes/shaders/common/harmonics.glsl.
     """
     x, y, z = np.asarray(directions, np.float64).T
     x2, y2, z2 = x * x, y * y, z * z
@@ -264,7 +265,7 @@ def harmonics(directions: Float[np.ndarray, "n 3"], order: int) -> Float64[np.nd
 
 
 def even_directions(count: int) -> Float64[np.ndarray, "count 3"]:
-    """Return unit directions of equal shares of the sphere (a spiral by the golden angle)."""
+    """Return unit directions of equal solid angle over the sphere (a spiral by the golden angle)."""
     k = np.arange(count)
     z = 1 - (2 * k + 1) / count
     turn = k * math.pi * (3 - math.sqrt(5))

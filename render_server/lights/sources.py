@@ -1,4 +1,4 @@
-"""Where a scene document's lights come from, frame after frame: fixed, lamps with markers, or a fish-eye camera."""
+"""Sources of a scene document's lights over time: fixed, lamps with markers, or a fish-eye (docs/method.md 2)."""
 
 from functools import partial
 from typing import Protocol
@@ -30,32 +30,65 @@ from render_server.lights.lights import (
 from render_server.lights.median_cut import Split, split_map
 from render_server.lights.octahedral import above_horizon, irradiance
 
-# Of a lamp's radius: it stays where it is until it has moved so far. Its shadows' soft edges then lie off by a
-# twentieth of their width, while the noise of the marker's pose would make them tremble and cost a rebuild a frame.
+# Fraction of a lamp's radius that it must move to count as moved. Soft edges of its shadows are then off by a
+# twentieth of their width, whereas noise of the marker's pose would make them tremble and cost a rebuild per frame.
 STILL_FRACTION = 0.1
-# Texels of 1.6 degrees, finer than what glossy surfaces tell apart; lights are not in it. Filtering it takes a
-# third of the time that a map of mode `environment` takes, which changes never.
+# Texels of 1.6 degrees, finer than glossy surfaces resolve; lights are not in it. Filtering it takes a third of the
+# time of a map of mode `environment`, which never changes.
 RESIDUAL_SIZE = 128
 UP = np.array([[0.0, 0.0, 1.0]])
 
 
-class TrackedSource:
-    """Turns the poses of lamps into light sets; a lamp out of sight stays where it was seen last."""
-
-    def __init__(self, lights: documents.Lights) -> None:
-        self._wished = lights
-        self._positions: dict[int, Float64[np.ndarray, " 3"]] = {}
-        self._in_sight: set[int] = set()
-        self._begun = False
-        self.split: Split[HemisphereMap] | None = None  # no picture is split
+class LightSource(Protocol):
+    """Lights that may change from frame to frame."""
 
     def update(self, frame: ViewFrame) -> LightSet | None:
-        """Return the lights of a frame, not registered yet; None where they are those of the frame before."""
+        """Return the unregistered lights of a frame; None where they did not change."""
+        ...
+
+    @property
+    def split(self) -> Split[HemisphereMap] | None:
+        """The latest split of a fish-eye picture, for the debug view."""
+        ...
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Sentences for the user on what is missing or was found."""
+        ...
+
+
+class FixedLights:
+    """Lights of modes `manual` and `environment`, which never change."""
+
+    split: Split[HemisphereMap] | None = None
+    remarks: tuple[str, ...] = ()
+
+    def __init__(self, lights: documents.Lights) -> None:
+        self._lights: LightSet | None = build_lights(lights)
+
+    def update(self, frame: ViewFrame) -> LightSet | None:  # noqa: ARG002
+        """Return the lights for the first frame."""
+        lights, self._lights = self._lights, None
+        return lights
+
+
+class TrackedSource:
+    """Lights of mode `tracked`: lamps with a marker; a lamp out of sight keeps its last position."""
+
+    def __init__(self, lights: documents.Lights) -> None:
+        self._document = lights
+        self._positions: dict[int, Float64[np.ndarray, " 3"]] = {}
+        self._visible: set[int] = set()
+        self._started = False
+        self.split: Split[HemisphereMap] | None = None
+
+    def update(self, frame: ViewFrame) -> LightSet | None:
+        """Return the unregistered lights of a frame; None where they did not change."""
         poses = {lamp.marker: lamp.world_from_marker for lamp in frame.lamps}
-        self._in_sight = set(poses)
-        changed = not self._begun
-        self._begun = True
-        for lamp in self._wished.tracked:
+        self._visible = set(poses)
+        changed = not self._started
+        self._started = True
+        for lamp in self._document.tracked:
             if lamp.marker in poses:
                 position = (poses[lamp.marker] @ (*lamp.offset_m, 1.0))[:3]
                 changed |= self._move(lamp, position)
@@ -70,14 +103,14 @@ class TrackedSource:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """Sentences for the user on lamps that are not in sight."""
-        unseen = [lamp.marker for lamp in self._wished.tracked if lamp.marker not in self._positions]
-        lost = [marker for marker in self._positions if marker not in self._in_sight]
+        """Sentences for the user on lamps that are out of sight."""
+        never_seen = [lamp.marker for lamp in self._document.tracked if lamp.marker not in self._positions]
+        lost = [marker for marker in self._positions if marker not in self._visible]
         sentences = []
-        if unseen:
+        if never_seen:
             sentences.append(
-                f"No picture has shown the marker of {_lamps(unseen)} yet, so no light comes from there: turn it to "
-                "the camera, and see that board.yaml has it in lamp_markers."
+                f"No picture has shown the marker of {_lamps(never_seen)} yet, so no light comes from there: turn it "
+                "to the camera, and see that board.yaml has it in lamp_markers."
             )
         if lost:
             sentences.append(
@@ -86,9 +119,9 @@ class TrackedSource:
         return tuple(sentences)
 
     def _lights(self) -> LightSet:
-        shown = [lamp for lamp in self._wished.tracked if lamp.marker in self._positions]
+        shown = [lamp for lamp in self._document.tracked if lamp.marker in self._positions]
         return light_set(
-            self._wished,
+            self._document,
             tuple(_lamp_light(lamp, self._positions[lamp.marker]) for lamp in shown),
             np.zeros((AMBIENT_SIZE, AMBIENT_SIZE, 3), np.float32),
             1 - above_horizon(AMBIENT_SIZE),
@@ -106,10 +139,10 @@ def _lamps(markers: list[int]) -> str:
 
 
 class FisheyeSource:
-    """Turns the radiance maps of frames into light sets."""
+    """Lights of mode `fisheye`: a camera's radiance maps, split into lights and tracked over time."""
 
     def __init__(self, lights: documents.Lights) -> None:
-        self._wished = lights
+        self._document = lights
         self._tracker = LightTracker(lights.fisheye.smoothing_s)
         self._map: RadianceMap | None = None
         self._sky: WorldSky | None = None
@@ -120,13 +153,13 @@ class FisheyeSource:
         self.split: Split[HemisphereMap] | None = None
 
     def update(self, frame: ViewFrame) -> LightSet | None:
-        """Return the lights of a frame, not registered yet; None where they are those of the frame before.
+        """Return the unregistered lights of a frame; None where they did not change.
 
-        Until a frame brings the first map there are none.
+        There are none until a frame brings the first map.
         """
         if frame.radiance_map is not None and frame.radiance_map is not self._map:
             self._map = frame.radiance_map
-            self._see(frame, frame.radiance_map)
+            self._split_map(frame, frame.radiance_map)
         elif self._map is None or not (
             self._tracker.advance(frame.timestamp_ns) | self._find_distance(frame, self._map)
         ):
@@ -138,29 +171,29 @@ class FisheyeSource:
         """Sentences for the user."""
         if self._map is None:
             return (_NO_PICTURE,)
-        if self._distance_m is None or self._wished.fisheye.distance_m != "auto":
+        if self._distance_m is None or self._document.fisheye.distance_m != "auto":
             return ()
         return (f"lights of the fish-eye picture: {self._distance_m:.2g} m away, as the board's paper tells",)
 
-    def _see(self, frame: ViewFrame, seen: RadianceMap) -> None:
-        settings = self._wished.fisheye
-        hidden = None
+    def _split_map(self, frame: ViewFrame, seen: RadianceMap) -> None:
+        settings = self._document.fisheye
+        occlusion_test = None
         if frame.depth is not None and frame.pose is not None:
-            place = seen.world_from_fisheye[:3, 3]
-            hidden = partial(is_occluded, frame.depth, frame.pose.world_from_camera, place)
+            position = seen.world_from_fisheye[:3, 3]
+            occlusion_test = partial(is_occluded, frame.depth, frame.pose.world_from_camera, position)
         self.split = split_map(
             HemisphereMap.of(seen),
             settings.count,
             threshold=settings.threshold,
             whole_map=settings.split == "all",
-            is_occluded=hidden,
+            is_occluded=occlusion_test,
         )
         self._sky = to_world(self.split.residual, RESIDUAL_SIZE)
         self._tracker.set_target(frame.timestamp_ns, self.split.lights, self._sky.filled())
         self._find_distance(frame, seen)
 
     def _find_distance(self, frame: ViewFrame, seen: RadianceMap) -> bool:
-        """Find how far the lights are from the first frame that shows enough paper; returns whether it did."""
+        """Estimate the lights' distance on the first frame with enough paper; returns whether that succeeded."""
         assert self.split is not None
         assert self._tracker.residual is not None
         paper = paper_light(frame) if self._wants_distance and self.split.lights else None
@@ -168,20 +201,20 @@ class FisheyeSource:
             return False
         self._wants_distance = False
         ambient = irradiance(self._tracker.residual, UP)[0]
-        place = seen.world_from_fisheye[:3, 3]
-        self._distance_m = fit_distance(paper, place, self.split.lights, ambient)
+        position = seen.world_from_fisheye[:3, 3]
+        self._distance_m = fit_distance(paper, position, self.split.lights, ambient)
         return self._distance_m is not None
 
     def _lights(self) -> LightSet:
         assert self._map is not None
         assert self._sky is not None
         assert self._tracker.residual is not None
-        place, distance_m = self._map.world_from_fisheye[:3, 3], self._distance_m
+        position, distance_m = self._map.world_from_fisheye[:3, 3], self._distance_m
         tracked = self._tracker.lights
         return light_set(
-            self._wished,
+            self._document,
             tuple(
-                _distant(light) if distance_m is None else _near(light, place, distance_m)
+                _distant(light) if distance_m is None else _near(light, position, distance_m)
                 for light in tracked
             ),
             self._tracker.residual,
@@ -196,10 +229,10 @@ def _distant(light: TrackedLight) -> Light:
     )
 
 
-def _near(light: TrackedLight, place: Float64[np.ndarray, "3"], distance_m: float) -> Light:
-    """A sphere that lights `place` as the distant light does: E = I / d^2, and looks as large from there."""
+def _near(light: TrackedLight, position: Float64[np.ndarray, "3"], distance_m: float) -> Light:
+    """Return a sphere with the same irradiance (E = I / d^2) and angular size at `position` as the distant light."""
     return SphereLight(
-        (place + distance_m * light.to_light).astype(np.float32),
+        (position + distance_m * light.to_light).astype(np.float32),
         (light.irradiance * distance_m**2).astype(np.float32),
         float(distance_m * np.sin(light.angular_radius_rad)),
     )
@@ -209,39 +242,6 @@ _NO_PICTURE = (
     "No fish-eye picture has come yet, so frames are passed through as the camera saw them: give the source one, "
     "or set lights.mode to manual."
 )
-
-
-class LightSource(Protocol):
-    """Lights that may change from frame to frame."""
-
-    def update(self, frame: ViewFrame) -> LightSet | None:
-        """Return the lights of a frame, not registered yet; None where they are those of the frame before."""
-        ...
-
-    @property
-    def split(self) -> Split[HemisphereMap] | None:
-        """The latest split of a fish-eye picture, for people who look."""
-        ...
-
-    @property
-    def remarks(self) -> tuple[str, ...]:
-        """Sentences for the user: what is missing, what was found."""
-        ...
-
-
-class FixedLights:
-    """Lights of modes `manual` and `environment`: always the same."""
-
-    split: Split[HemisphereMap] | None = None
-    remarks: tuple[str, ...] = ()
-
-    def __init__(self, lights: documents.Lights) -> None:
-        self._lights: LightSet | None = build_lights(lights)
-
-    def update(self, frame: ViewFrame) -> LightSet | None:  # noqa: ARG002
-        """Return the lights once."""
-        lights, self._lights = self._lights, None
-        return lights
 
 
 def open_light_source(lights: documents.Lights) -> LightSource:

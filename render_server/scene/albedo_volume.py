@@ -1,13 +1,13 @@
-"""Albedo of the real scene by place, averaged over time (METHOD 2): for surfaces that the camera does not see now."""
+"""Albedo of the real scene by position, averaged over time, for surfaces out of view (docs/method.md 2)."""
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int64
 
-CELLS = 64  # along an edge of the grid: 5 cm in a room of 3 m, finer than bounce light can tell
-MARGIN = 1.1  # of the grid over the scene's bounds when it is laid out
-GREATEST_WEIGHT = 200.0  # samples a cell keeps: what changes is forgotten after as many new ones
+CELLS = 64  # per edge of the cube: 5 cm in a room of 3 m, finer than bounce light resolves
+MARGIN = 1.1  # of the cube over the scene's bounds
+MAX_WEIGHT = 200.0  # samples a cell keeps: as many new ones replace an outdated albedo
 ALBEDO_RANGE = (0.02, 0.95)
-MEAN_ALBEDO = 0.5  # of rooms of which nothing was seen yet
+MEAN_ALBEDO = 0.5  # before any observation
 
 
 class AlbedoVolume:
@@ -29,25 +29,25 @@ class AlbedoVolume:
         measured: Float[np.ndarray, "k 3"],
         irradiance: Float[np.ndarray, "k 3"],
     ) -> None:
-        """Take what one picture shows: unshadowed, unclipped pixels of diffuse surfaces.
+        """Accumulate the unshadowed, unclipped pixels of diffuse surfaces in one picture.
 
         Args:
-            bounds: least and greatest coordinates of the real scene, world metres; where they have left the cube,
-                everything is forgotten and a new one is laid out.
+            bounds: least and greatest coordinates of the real scene, world metres; if they leave the cube, all
+                samples are dropped and a new cube is placed.
             position: world metres.
             measured: linear radiance B, camera units.
-            irradiance: all light E that falls there, camera units.
+            irradiance: total irradiance E there, camera units.
         """
-        self._lay_out(*bounds)
+        self._place_cube(*bounds)
         cell, inside = self._cells(position)
         known = inside & (irradiance > 0).all(axis=1) & np.isfinite(measured).all(axis=1)
         values = np.column_stack([measured, irradiance, np.ones(len(measured))])[known]
         new = np.stack([np.bincount(cell[known], column, CELLS**3) for column in values.T], axis=1)
-        kept = np.minimum(1, np.maximum(GREATEST_WEIGHT - new[:, 6], 0) / np.maximum(self._sums[:, 6], 1e-9))
+        kept = np.minimum(1, np.maximum(MAX_WEIGHT - new[:, 6], 0) / np.maximum(self._sums[:, 6], 1e-9))
         self._sums = self._sums * kept[:, None] + new
         self.version += 1
 
-    def _lay_out(self, low: Float64[np.ndarray, " 3"], high: Float64[np.ndarray, " 3"]) -> None:
+    def _place_cube(self, low: Float64[np.ndarray, " 3"], high: Float64[np.ndarray, " 3"]) -> None:
         if self.edge > 0 and (low >= self.origin).all() and (high <= self.origin + self.edge).all():
             return
         self.edge = MARGIN * float(np.max(high - low))
@@ -63,7 +63,7 @@ class AlbedoVolume:
         return (z * CELLS + y) * CELLS + x, inside
 
     def filled(self) -> Float32[np.ndarray, "z y x 3"]:
-        """Return the albedo of every cell; one without samples has that of the smallest surroundings with some."""
+        """Return the albedo of every cell; empty cells take it from the finest coarser level with samples."""
         levels = [self._sums.reshape((CELLS,) * 3 + (7,))]
         while len(levels[-1]) > 1:
             half = len(levels[-1]) // 2

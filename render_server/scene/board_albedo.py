@@ -1,4 +1,4 @@
-"""Where the picture shows surfaces of known albedo: the board's white paper and grey cards (METHOD 1)."""
+"""Pixels that serve as a light meter: unclipped, and on the board's white paper or grey cards (docs/method.md 1)."""
 
 from collections.abc import Iterable
 
@@ -11,13 +11,13 @@ from protocol.camera_model import CameraModel
 from protocol.frames import BoardPose
 from render_server.lights.environment import LUMINANCE
 
-LEAST_PIXELS = 30
-ENOUGH_PIXELS = 10 * LEAST_PIXELS
-FARTHEST_PX = 1e5  # beyond, fixed-point outlines overflow
-# From a patch's edges, where lens and sampling mix it with what is beside it; the second if little is left.
+MIN_PIXELS = 30
+SUFFICIENT_PIXELS = 10 * MIN_PIXELS
+MAX_COORDINATE_PX = 1e5  # beyond, fixed-point outlines overflow
+# Margin inside a patch's edges, where lens and sampling mix it with its neighbours; the second if few are left.
 INSETS_PX = (2, 1)
 EDGE_POINTS = 8
-# Linear values and codes beyond which a pixel does not carry its true radiance.
+# Limits of linear values and codes within which a pixel carries its true radiance.
 CLIPPED_LINEAR = 0.98
 CLIPPED_CODE = 255
 DARK_LINEAR = 0.005
@@ -26,8 +26,8 @@ DARK_LINEAR = 0.005
 def known_albedo(board: BoardSpec, camera: CameraModel, pose: BoardPose) -> Float32[np.ndarray, "h w"]:
     """Return the albedo of every pixel that shows a surface of known albedo; 0 elsewhere.
 
-    Grey cards have the albedo that board.yaml gives them. White paper counts where its albedo is given too, and
-    with the assumed one where no card is in view. What covers the board is not known here.
+    Grey cards have the albedo that board.yaml gives them. White paper counts where its albedo is given too, and with
+    the assumed one where no card is in view. Things that cover the board are not detected here.
     """
     albedo = np.zeros((camera.height, camera.width), np.float32)
     cards = [(card_pixels(card.outline(), camera, pose), card.albedo) for card in board.grey_cards]
@@ -58,7 +58,7 @@ def card_pixels(
 def unclipped(
     color: UInt8[np.ndarray, "h w 3"], linear: Float[np.ndarray, "h w 3"]
 ) -> Bool[np.ndarray, "h w"]:
-    """Whether a pixel carries its true radiance: no channel at the top of the scale, not all but black.
+    """Return which pixels carry their true radiance: no channel clipped, and not nearly black.
 
     `linear` is the picture decoded by the response alone, before division by the exposure.
     """
@@ -72,7 +72,7 @@ def _inside(masks: list[UInt8[np.ndarray, "h w"]], camera: CameraModel) -> Bool[
     for inset in INSETS_PX:
         for mask in masks:
             found |= cv2.erode(mask, _square(inset), borderValue=0)
-        if np.count_nonzero(found) >= ENOUGH_PIXELS:
+        if np.count_nonzero(found) >= SUFFICIENT_PIXELS:
             break
     return np.asarray(found.astype(bool))
 
@@ -95,7 +95,7 @@ def _mask(
     camera_from_world = np.linalg.inv(pose.world_from_camera)
     outline = _dense_outline(patch) @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
     pixels = camera.project(outline)
-    if not np.isfinite(pixels).all() or np.abs(pixels).max() > FARTHEST_PX:
+    if not np.isfinite(pixels).all() or np.abs(pixels).max() > MAX_COORDINATE_PX:
         return None
     mask = np.zeros((camera.height, camera.width), np.uint8)
     cv2.fillPoly(mask, [np.round(pixels * 16).astype(np.int32)], 1, shift=4)

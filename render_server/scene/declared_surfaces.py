@@ -13,7 +13,7 @@ from protocol.scene_objects import Region, Surface
 MAX_SURFACES = 16
 PLANE, BOX, MATERIAL, DIFFUSE_BOX = 0.0, 1.0, 2.0, 3.0
 SHEET_TOLERANCE_M = 0.005
-# Reflectance of a declared metal whose colour the document leaves open (that of silver and aluminium).
+# Reflectance of a declared metal without a colour in the document (that of silver and aluminium).
 ASSUMED_METAL_F0 = 0.9
 
 
@@ -21,9 +21,9 @@ ASSUMED_METAL_F0 = 0.9
 class SurfaceTable:
     """Declared surfaces in the order of the document; the first row whose region holds a point wins.
 
-    A row of `packed` is five vectors (SurfaceEntry of passes/common/surfaces.glsl): (F0 R G B, metallic);
+    A row of `packed` is five vectors (SurfaceEntry of passes/shaders/common/surfaces.glsl): (F0 R G B, metallic);
     (roughness, 0, 0, 0); (albedo R G B, 1 if declared); and the region, whose kind is the first vector's
-    last number. 0 plane: (point, kind), (unit normal, tolerance); 1 box: (lower corner, kind), (upper
+    last component. 0 plane: (point, kind), (unit normal, tolerance); 1 box: (lower corner, kind), (upper
     corner, 0); 2 material of the given model: (its index, 0, 0,
     kind), zeros; 3 box in which all is diffuse: the marker sheet, which comes first.
     """
@@ -46,7 +46,7 @@ class SurfaceTable:
     def lookup(
         self, points: Float[np.ndarray, "k 3"], materials: Int32[np.ndarray, " k"] | None = None
     ) -> Int32[np.ndarray, " k"]:
-        """Return for world points the row of their surface, -1 = diffuse (reference for the shaders).
+        """Return the row of each world point's surface, -1 for diffuse (reference for the shaders).
 
         `materials` are the material indices of points on a given model.
         """
@@ -119,7 +119,7 @@ def _region(region: Region, material_names: Sequence[str]) -> tuple[list[float],
 
 
 def _sheet_row(board: BoardSpec) -> list[list[float]]:
-    """Return the row of the printed sheet, 5 mm thick to either side."""
+    """Return the row of the board's printed sheet, 5 mm thick to either side."""
     outline = board.sheet_outline()
     thickness = np.array([0, 0, SHEET_TOLERANCE_M])
     low, high = outline.min(axis=0) - thickness, outline.max(axis=0) + thickness

@@ -1,4 +1,4 @@
-"""Triangle mesh of the real scene as one depth image shows it."""
+"""Triangle mesh of one depth image, and back faces for it."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -21,11 +21,11 @@ from render_server.scene.materials import Material
 from render_server.scene.triangle_mesh import TriangleMesh
 
 CELL_SAMPLES = 6
-# Two nodes stand for pixels of their cells that are at most this many cells apart: two each way.
-MOST_CELLS = 2 * float(np.sqrt(2))
+# Pixels of two neighbouring nodes are at most this many cells apart: two in each direction.
+MAX_CELL_DISTANCE = 2 * float(np.sqrt(2))
 REAL_MATERIAL = Material(roughness=1.0, specular=0.0, name="real")
+# A ray that leaves a surface samples the cells around its own, and must not meet the back face of the surface there.
 BACK_OFFSET_VOXELS = 2.0
-"""A ray that leaves a surface looks at the cells around its own, and must not meet the back of the surface there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,9 +52,9 @@ def depth_mesh(
     A node stands for each cell of stride x stride pixels, at the cell's centre, with the cell's median depth
     (moved to the centre along the fitted surface); the stride is the least that keeps to the budget. No
     triangle crosses a depth discontinuity; cells without depth or normal are holes. `uv` is the pixel
-    coordinate (pixel centres at integers) of the vertex in the camera's picture. `surface` is
-    `depth_surface(depth, camera)` where it is already known. `steep` is the inverse depth of surfaces too steep to be
-    measured (`steep_surfaces`), which join what they lie between. Without any valid depth the mesh is empty.
+    coordinate (pixel centres at integers) of the vertex in the camera's picture. `surface` is `depth_surface(depth,
+    camera)` where it is already known. `grazing` is the inverse depth of surfaces too oblique to measure
+    (`grazing_depth_fill`), which join their two sides. Without any valid depth the mesh is empty.
 
     Raises:
         DeltalightError: the budget is below 2, or depth and camera differ in size.
@@ -99,7 +99,7 @@ def _nodes(surface: DepthSurface, camera: CameraModel, stride: int) -> _Nodes:
 def _with_grazing(
     nodes: _Nodes, grazing: Float32[np.ndarray, "h w"], camera: CameraModel, stride: int
 ) -> tuple[_Nodes, Float32[np.ndarray, "gh gw"]]:
-    """Add the nodes of steep surfaces in holes; the second value is the step (1/m) that their own slopes explain."""
+    """Fill holes with nodes of grazing surfaces; the second value is the step (1/m) that their slopes explain."""
     flat = _median_pixels(grazing, stride)
     by_pixel = _slopes(grazing)
     normals = surface_normals(grazing, by_ray(by_pixel, camera), camera).reshape(-1, 3)[flat]
@@ -111,11 +111,11 @@ def _with_grazing(
         np.where(added, grazing.ravel()[flat], nodes.inverse_depth),
         np.where(added[..., None], normals, nodes.normals),
     )
-    return joined, np.where(added, np.float32(MOST_CELLS * stride) * slope, np.float32(0))
+    return joined, np.where(added, np.float32(MAX_CELL_DISTANCE * stride) * slope, np.float32(0))
 
 
 def _slopes(inverse: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "2 h w"]:
-    """Change by pixel, to the right and down, of what is not 0, from differences within it; NaN where alone."""
+    """Return differences per pixel, to the right and down, among non-zero pixels; NaN for isolated ones."""
     known = np.where(inverse > 0, inverse, np.float32(np.nan))
     slopes = np.empty((2, *inverse.shape), np.float32)
     for slope, values in ((slopes[0], known), (slopes[1].T, known.T)):
@@ -244,11 +244,11 @@ def _world_mesh(
 
 
 def back_faces(corners: Float32[np.ndarray, "m 3 10"], voxel_edge: float) -> Float32[np.ndarray, "m 3 10"]:
-    """The back of each triangle (three corners, position first), turned round and some voxels behind it.
+    """Return the back face of each triangle (three corners, position first), reversed and some voxels behind it.
 
-    A depth camera sees the front of things. Light does not pass through them from behind either: the underside of a
-    shelf keeps off the light from above it and reflects that from below. How thick things are is unknown, so a back
-    lies as near as voxels allow. `voxel_edge` in m.
+    A depth camera sees only the front of things, but they block light from behind too: the underside of a shelf
+    blocks the light from above it and reflects that from below. The thickness is unknown, so a back face lies as near
+    as voxels allow. `voxel_edge` in m.
     """
     positions = corners[..., :3]
     across = np.cross(positions[:, 1] - positions[:, 0], positions[:, 2] - positions[:, 0])

@@ -1,7 +1,13 @@
-"""Surface normals and discontinuities of a depth image, from inverse depth.
+"""Surface normals and discontinuities of a depth image, from inverse depth, and surfaces too oblique to measure.
 
 In inverse depth w = 1/z a plane is an affine function of the ray (x/z, y/z), and the noise of stereo and
 structured light, sigma z^2, is the same everywhere (sigma). Both make w the quantity to fit and to compare.
+
+Stereo gives no depth on the top of a box when the camera looks along it. Such a surface at a grazing angle shows as a
+strip without depth between something near and something far, in a colour that neither has. Without it, light would
+fall through it, so it is bridged from the near to the far side. A strip so wide that a measurable slope could explain
+it has lost its depth for another reason (black, shiny) and stays unknown; so does a strip in the colour of a surface
+beside it, the occlusion shadow of stereo.
 """
 
 from dataclasses import dataclass
@@ -17,24 +23,24 @@ from protocol.frames import DepthImage
 ASSUMED_NOISE_SIGMA_M = 0.002
 MAX_SLOPE_DEG = 80.0
 NOISE_SIGMAS = 3.0
-WANTED_TILT_RAD = 0.05
+MAX_TILT_ERROR_RAD = 0.05
 MAX_RADIUS = 5
 SHIFTS = ((0, -1), (0, 1), (-1, 0), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1))
-# Least spread of a window's valid pixels, relative to a full window (determinant of their covariance).
-LEAST_SUPPORT = 0.01
+# Least spread of a window's valid pixels relative to a full window (determinant of their covariance).
+MIN_SUPPORT = 0.01
 # A thinner strip is an edge, where colours mix.
 MIN_STRIP_WIDTH_PX = 3
-# Smaller ones are crumbs of edges: depth comes with holes up to this size filled.
+# Smaller strips are remains of edges: depth comes with holes up to this size filled.
 MIN_STRIP_AREA_PX = 64
-# As far beside a strip its surfaces are looked at, in windows of as much to each side.
+# Surfaces beside a strip are sampled up to this distance, in windows of this radius.
 BORDER_RADIUS_PX = 4
-# Colours of a strip and of what is beside it mix so far out: lenses and demosaicing blur edges over a pixel or two.
+# Colours mix this far across a strip's border: lenses and demosaicing blur edges over a pixel or two.
 MIXED_BORDER_PX = 2
-# Spread of colour, 0..1, that light and noise cause where a window shows none.
+# Least standard deviation of colour, 0..1, by light and noise.
 MIN_COLOR_SPREAD = 0.05
 COLOR_SIGMAS = 3.0
-# Share of a strip that must look like a steep surface for all of it to count as one: all but a mixed pixel at either
-# side of strips 8 pixels wide. Blurred edges of near things before far ones have a third or more of such pixels.
+# Fraction of a strip that must look like a grazing surface for all of it to count as one: all but a mixed pixel at
+# either side of strips 8 pixels wide. Of blurred edges of near things before far ones, a third or more is mixed.
 MIN_GRAZING_FRACTION = 0.75
 
 Map = Float32[np.ndarray, "h w"]
@@ -44,7 +50,7 @@ Colors = Float32[np.ndarray, "h w 3"]
 
 @dataclass(frozen=True, eq=False)
 class DepthSurface:
-    """What is known of the surface behind every pixel.
+    """The surface at every pixel.
 
     `inverse_depth` is as measured, 0 where invalid and where a pixel stands alone. `gradient` is its change
     by ray coordinate (x/z, y/z), fitted to the surroundings (NaN where unknown). `normals` are unit vectors
@@ -101,11 +107,11 @@ def jump_threshold(
 def _window_radius(
     sigma_px: float, inverse: Float32[np.ndarray, "h w"], mask: Float32[np.ndarray, "h w"]
 ) -> int:
-    """Return the least radius whose slope error, sigma f z / sqrt(sum of squared offsets), is bearable."""
+    """Return the least radius whose slope error, sigma f z / sqrt(sum of squared offsets), is acceptable."""
     mean = float(inverse.sum(dtype=np.float64) / max(float(mask.sum(dtype=np.float64)), 1.0))
     error = sigma_px / max(mean, 1e-6)
     for radius in range(1, MAX_RADIUS):
-        if error <= WANTED_TILT_RAD * np.sqrt((2 * radius + 1) ** 2 * radius * (radius + 1) / 3):
+        if error <= MAX_TILT_ERROR_RAD * np.sqrt((2 * radius + 1) ** 2 * radius * (radius + 1) / 3):
             return radius
     return MAX_RADIUS
 
@@ -134,7 +140,7 @@ def _window_gradient(
     wv -= w * mean_v
     determinant = uu * vv - uv * uv
     full = (2 * radius + 1) ** 2 * radius * (radius + 1) / 3
-    known = (determinant > LEAST_SUPPORT * full**2) & (mask > 0)
+    known = (determinant > MIN_SUPPORT * full**2) & (mask > 0)
     inverted = np.divide(1, determinant, out=np.full_like(determinant, np.nan), where=known)
     gradient = np.empty((2, *inverse.shape), np.float32)
     np.multiply(wu * vv - wv * uv, inverted, out=gradient[0])
@@ -161,7 +167,7 @@ def _jumps(
 
 
 def _lonely(jumps: tuple[UInt8[np.ndarray, "h w"], UInt8[np.ndarray, "h w"]]) -> Bool[np.ndarray, "h w"]:
-    """Whether a pixel jumps to three of its neighbours or more: a spike, or afloat between surfaces."""
+    """Whether a pixel jumps to at least three of its neighbours: a spike, or a flying pixel between surfaces."""
     down, right = jumps
     count = down + right
     count[1:] += down[:-1]
@@ -250,19 +256,18 @@ def _ray_planes(camera: CameraModel) -> Float32[np.ndarray, "2 h w"]:
 
 @dataclass(frozen=True, eq=False)
 class _Side:
-    """The nearer or the farther surface beside a strip, as each pixel has it nearest."""
+    """The nearer or the farther surface beside a strip: each pixel's distance to it, and its nearest pixel (flat)."""
 
     surface: Mask
     distance_px: Map
     nearest_pixel: Int64[np.ndarray, "h w"]
-    """Flat index of that nearest pixel."""
 
 
 def grazing_depth_fill(depth: DepthImage, color: UInt8[np.ndarray, "h w 3"], camera: CameraModel) -> Map:
-    """Return the inverse depth (1/m) of steep surfaces where `depth` knows none; 0 elsewhere.
+    """Return the inverse depth (1/m) of surfaces at grazing angles where `depth` has none; 0 elsewhere.
 
     `depth` is clean and registered to `color` (RGB) and `camera`. In inverse depth a plane is an affine function of
-    the pixel (depth_surface.py), so strips are filled linearly from their near to their far side.
+    the pixel, so strips are filled linearly from their near to their far side.
     """
     valid = depth.valid & (depth.depth_m > 0)
     inverse = np.divide(1, depth.depth_m, out=np.zeros_like(depth.depth_m), where=valid)
@@ -284,7 +289,7 @@ def grazing_depth_fill(depth: DepthImage, color: UInt8[np.ndarray, "h w 3"], cam
 
 
 def _strip_window(box: Int32[np.ndarray, "5"]) -> tuple[slice, slice]:
-    """Rows and columns of a strip (OpenCV's statistics: left, top, width, height) and the surfaces beside it."""
+    """Return rows and columns of a strip (box: left, top, width, height, area) and the surfaces beside it."""
     margin = 2 * BORDER_RADIUS_PX
     left, top, width, height = (int(value) for value in box[:4])
     return (
@@ -294,10 +299,10 @@ def _strip_window(box: Int32[np.ndarray, "5"]) -> tuple[slice, slice]:
 
 
 def _may_be_grazing(strip: Mask, around: Map, to_known: Map, depth: DepthImage, camera: CameraModel) -> bool:
-    """Rule most strips out at little cost: no step beside them could make most of their pixels steep.
+    """Rule out most strips cheaply: no depth step beside them could make most of their pixels grazing.
 
-    `around` is the inverse depth beside the strip, 0 elsewhere, `to_known` how far pixels are from known ones: there,
-    a strip is at least twice as wide.
+    `around` is the inverse depth beside the strip, 0 elsewhere, `to_known` the distance of pixels from known ones: a
+    strip is at least twice as wide there.
     """
     known = around[around > 0]
     if not known.size:
@@ -310,7 +315,7 @@ def _may_be_grazing(strip: Mask, around: Map, to_known: Map, depth: DepthImage, 
 def _bridge(
     strip: Mask, around: Map, color: UInt8[np.ndarray, "h w 3"], depth: DepthImage, camera: CameraModel
 ) -> tuple[Mask, Map]:
-    """Which pixels of a strip are a steep surface, and inverse depth there; `around` has it on either side."""
+    """Return which pixels of a strip are a grazing surface, and their inverse depth, bridged between its sides."""
     split = (around[around > 0].min() + around.max()) / 2
     near, far = _side(around > split), _side((around > 0) & (around <= split))
     before, behind = around.ravel()[near.nearest_pixel], around.ravel()[far.nearest_pixel]
@@ -330,7 +335,7 @@ def _dilated(mask: Mask, radius_px: int) -> Mask:
 
 
 def _side(surface: Mask) -> _Side:
-    """Look from every pixel at the nearest pixel of a surface."""
+    """Find the nearest pixel of a surface from every pixel."""
     distance, labels = cv2.distanceTransformWithLabels(
         (~surface).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE, labelType=cv2.DIST_LABEL_PIXEL
     )
@@ -343,7 +348,7 @@ def _side(surface: Mask) -> _Side:
 def _differs_in_color(
     side: _Side, color: Colors, pure: Mask, pixels: Int64[np.ndarray, " n"]
 ) -> Bool[np.ndarray, " n"]:
-    """Whether pixels (flat indices) differ in colour from the surface, where it is pure, nearest to them."""
+    """Whether pixels (flat indices) differ in colour from the nearest unmixed part of a surface."""
     mean, variance = _color_statistics(color, side.surface & pure)
     nearest_pixel = side.nearest_pixel.ravel()[pixels]
     difference = color.reshape(-1, 3)[pixels] - mean.reshape(-1, 3)[nearest_pixel]
@@ -352,7 +357,7 @@ def _differs_in_color(
 
 
 def _color_statistics(color: Colors, mask: Mask) -> tuple[Colors, Map]:
-    """Mean and variance (over all channels; infinite of none) of a mask's colours in the window around each pixel."""
+    """Return mean and total variance of a mask's colours in the window around each pixel; infinite without any."""
     weight = mask.astype(np.float32)
 
     def summed(values: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Animation clips of a glTF document and what they say at a time (glTF 2.0, section 3.11 and appendix C)."""
+"""Animation clips of a glTF document, sampled at a time (glTF 2.0, section 3.11 and appendix C)."""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -14,14 +14,15 @@ from render_server.scene.gltf_document import GltfDocument, GltfFaultError, Node
 MovedProperty = Literal["translation", "rotation", "scale", "weights"]
 Interpolation = Literal["STEP", "LINEAR", "CUBICSPLINE"]
 WIDTHS = {"translation": 3, "rotation": 4, "scale": 3}
-# Below this angle's sine the chord and the arc between two quaternions agree to float32, and the quotient would not.
-LEAST_SINE = 1e-4
+# Below this sine, chord and arc between two quaternions agree in float32, and the quotient of sines is inexact.
+MIN_SINE = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """Keys of one property of several nodes at the same times (k >= 1, s). Cubic ones have in-tangent, value,
-    out-tangent a key (p = 3), others the value alone (p = 1).
+    """Keyframes of one property of several nodes at the same times (k >= 1, s).
+
+    A key of a cubic track is in-tangent, value, out-tangent (p = 3), of another the value alone (p = 1).
     """
 
     path: MovedProperty
@@ -31,7 +32,7 @@ class Track:
     nodes: Int64[np.ndarray, " c"]
 
     def at(self, time_s: float) -> Float64[np.ndarray, "c w"]:
-        """The values at a time; before the first and after the last key those of that key."""
+        """Sample the values at a time, clamped to the first and the last key."""
         after = int(np.searchsorted(self.times, time_s, side="right"))
         value = self.keys.shape[1] // 2
         if after in (0, len(self.times)):
@@ -55,7 +56,7 @@ class Track:
 
 @dataclass(frozen=True, eq=False)
 class Clip:
-    """Tracks that play together; it lasts to the last key, s."""
+    """Tracks that play together, up to the last key."""
 
     name: str
     tracks: tuple[Track, ...]
@@ -67,11 +68,11 @@ class Clip:
 
     @cached_property
     def key_times(self) -> Float64[np.ndarray, " k"]:
-        """All times of keys, each once."""
+        """All distinct key times and 0, s."""
         return np.unique(np.concatenate([np.zeros(1), *(track.times for track in self.tracks)]))
 
     def motion(self, rest: NodeMotion, time_s: float) -> NodeMotion:
-        """How the nodes stand at a time; what no track moves stays at rest."""
+        """Return the nodes' transforms at a time; properties without a track keep the rest pose."""
         motion = rest.copy()
         for track in self.tracks:
             values = track.at(time_s)
@@ -84,7 +85,7 @@ class Clip:
 
 
 def unit(quaternions: Float64[np.ndarray, "c 4"]) -> Float64[np.ndarray, "c 4"]:
-    """Quaternions of length 1."""
+    """Normalize quaternions."""
     lengths = np.linalg.norm(quaternions, axis=1, keepdims=True)
     return np.asarray(quaternions / np.maximum(lengths, 1e-30))
 
@@ -92,13 +93,13 @@ def unit(quaternions: Float64[np.ndarray, "c 4"]) -> Float64[np.ndarray, "c 4"]:
 def slerp(
     first: Float64[np.ndarray, "c 4"], second: Float64[np.ndarray, "c 4"], fraction: float
 ) -> Float64[np.ndarray, "c 4"]:
-    """Along the shorter arc between unit quaternions (Shoemake 1985)."""
+    """Interpolate unit quaternions along the shorter arc (Shoemake 1985)."""
     cosine = np.einsum("cw,cw->c", first, second)[:, None]
     second = np.where(cosine < 0, -second, second)
     angle = np.arccos(np.clip(np.abs(cosine), 0, 1))
     sine = np.sin(angle)
-    along = np.maximum(sine, LEAST_SINE)
-    is_near = sine < LEAST_SINE
+    along = np.maximum(sine, MIN_SINE)
+    is_near = sine < MIN_SINE
     one = np.where(is_near, 1 - fraction, np.sin((1 - fraction) * angle) / along)
     other = np.where(is_near, fraction, np.sin(fraction * angle) / along)
     return np.asarray(one * first + other * second)
@@ -107,7 +108,7 @@ def slerp(
 def _hermite(
     before: Float64[np.ndarray, "3 c w"], after: Float64[np.ndarray, "3 c w"], span_s: float, fraction: float
 ) -> Float64[np.ndarray, "c w"]:
-    """Cubic Hermite spline (appendix C.5): tangents are per second."""
+    """Evaluate a cubic Hermite spline (appendix C.5); tangents are per second."""
     square, cube = fraction**2, fraction**3
     return np.asarray(
         (2 * cube - 3 * square + 1) * before[1]
@@ -118,7 +119,7 @@ def _hermite(
 
 
 def read_clips(gltf: GltfDocument, nodes: NodeTree) -> tuple[Clip, ...]:
-    """Take over all clips that move nodes of the document.
+    """Read all clips of a document.
 
     Raises:
         GltfFaultError: a channel without its sampler, keys that do not fit, times that do not rise, a node that does
@@ -137,7 +138,7 @@ def read_clips(gltf: GltfDocument, nodes: NodeTree) -> tuple[Clip, ...]:
 
 
 def _tracks(gltf: GltfDocument, nodes: NodeTree, animation: dict[str, Any]) -> tuple[Track, ...]:
-    """Channels, those of the same times, kind and width together: they are sampled at once."""
+    """Group channels of the same times, property and width into tracks, which are sampled at once."""
     together: dict[tuple[Any, ...], list[tuple[int, np.ndarray]]] = defaultdict(list)
     for number, channel in enumerate(animation.get("channels", [])):
         path, node = channel["target"].get("path"), channel["target"].get("node")

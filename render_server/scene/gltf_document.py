@@ -1,4 +1,4 @@
-"""A glTF 2 document with its bytes, and the arrays that it describes (glTF 2.0, section 3.6)."""
+"""A glTF 2 document: its arrays (glTF 2.0, section 3.6) and its tree of nodes (section 3.5)."""
 
 import base64
 import io
@@ -22,7 +22,7 @@ COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9
 
 
 class GltfFaultError(Exception):
-    """What is wrong inside a glTF document; becomes a sentence with the file's name."""
+    """A fault inside a glTF document; `faults_named` adds the file's name."""
 
 
 @contextmanager
@@ -38,18 +38,18 @@ def faults_named(path: Path) -> Iterator[None]:
 
 @dataclass(frozen=True, eq=False)
 class GltfDocument:
-    """A document whose sizes hold (asset_check.py)."""
+    """The JSON object `root` and its buffers; all sizes were checked (asset_check.py)."""
 
     path: Path
     root: dict[str, Any]
     buffers: tuple[bytes, ...]
 
     def entries(self, name: str) -> list[dict[str, Any]]:
-        """A top-level list of the document."""
+        """Return a top-level list of the document."""
         return list(self.root.get(name, []))
 
     def array(self, index: int) -> Shaped[np.ndarray, "n c"]:
-        """Rows of an accessor: as stored, or float32 if it is normalised (then -1..1 or 0..1)."""
+        """Return the rows of an accessor: as stored, or float32 in -1..1 or 0..1 if it is normalised."""
         accessor = self.root["accessors"][index]
         columns, kind = COMPONENTS[accessor["type"]], np.dtype(COMPONENT_TYPES[accessor["componentType"]])
         if "bufferView" in accessor:
@@ -61,7 +61,7 @@ class GltfDocument:
         return _normalized(rows) if accessor.get("normalized", False) else rows
 
     def floats(self, index: int, columns: int) -> Float32[np.ndarray, "n c"]:
-        """Rows of an accessor as float32.
+        """Return the rows of an accessor as float32.
 
         Raises:
             GltfFaultError: it has another number of columns or holds what is not finite.
@@ -94,7 +94,7 @@ class GltfDocument:
         return replaced
 
     def texture(self, index: int) -> "Image.Image | None":
-        """The picture of a texture, not yet decoded; None where it is of a kind that is not read.
+        """Open the image of a texture without decoding it; None for unsupported kinds.
 
         Raises:
             GltfFaultError: it is missing or no picture.
@@ -120,7 +120,7 @@ class GltfDocument:
 
 
 def uri_bytes(uri: str, folder: Path) -> bytes:
-    """What a URI of a document stands for: data of its own, or a file inside the document's folder."""
+    """Read what a URI refers to: embedded data, or a file inside the document's folder."""
     if uri.startswith("data:"):
         return base64.b64decode(uri.partition("base64,")[2])
     path = file_inside(uri, folder)
@@ -130,7 +130,7 @@ def uri_bytes(uri: str, folder: Path) -> bytes:
 
 
 def file_inside(uri: str, folder: Path) -> Path:
-    """The file that a URI names; it must lie inside `folder`."""
+    """Resolve the file that a URI names; it must lie inside `folder`."""
     path = (folder / unquote(uri)).resolve()
     if not path.is_relative_to(folder.resolve()):
         raise GltfFaultError(f"it refers to {uri}, outside its own folder")
@@ -138,11 +138,11 @@ def file_inside(uri: str, folder: Path) -> Path:
 
 
 def _normalized(rows: Shaped[np.ndarray, "n c"]) -> Float32[np.ndarray, "n c"]:
-    """Integers as shares of their greatest value (glTF 2.0, section 3.11)."""
+    """Convert integers to fractions of their greatest value (glTF 2.0, section 3.11)."""
     if rows.dtype.kind == "f":
         return rows.astype(np.float32)
-    weights = rows.astype(np.float32) / np.float32(np.iinfo(rows.dtype).max)
-    return np.asarray(np.maximum(weights, np.float32(-1)))
+    fractions = rows.astype(np.float32) / np.float32(np.iinfo(rows.dtype).max)
+    return np.asarray(np.maximum(fractions, np.float32(-1)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,16 +155,16 @@ class NodeMotion:
     weights: tuple[Float64[np.ndarray, " _"], ...]
 
     def copy(self) -> "NodeMotion":
-        """One that may be written to."""
+        """Return a deep copy."""
         weights = tuple(values.copy() for values in self.weights)
         return NodeMotion(self.translation.copy(), self.rotation.copy(), self.scale.copy(), weights)
 
 
 @dataclass(frozen=True, eq=False)
 class NodeTree:
-    """Nodes at rest. `levels` holds the nodes of each depth, roots first; `shown` those of the document's scene.
+    """Nodes in the rest pose. `levels` holds the nodes of each depth, roots first; `shown` those of the scene.
 
-    Nodes that `has_matrix` stand as `matrices` says, whatever their motion.
+    Nodes with `has_matrix` keep their matrix in `matrices`, whatever their motion.
     """
 
     parents: Int64[np.ndarray, " n"]
@@ -175,7 +175,7 @@ class NodeTree:
     has_matrix: Bool[np.ndarray, " n"]
 
     def asset_from_node(self, motion: NodeMotion) -> Float64[np.ndarray, "n 4 4"]:
-        """Where the nodes stand in the asset's frame."""
+        """Return the global transform of each node."""
         matrices = np.tile(np.eye(4), (len(self.parents), 1, 1))
         matrices[:, :3, :3] = _rotations(motion.rotation) * motion.scale[:, None, :]
         matrices[:, :3, 3] = motion.translation
@@ -186,7 +186,7 @@ class NodeTree:
 
 
 def read_nodes(gltf: GltfDocument) -> NodeTree:
-    """Take over the nodes of a document; they form trees (asset_check.py).
+    """Read the nodes of a document; they form trees (asset_check.py).
 
     Raises:
         GltfFaultError: numbers that are not finite, a rotation of length 0, or a wrong number of weights.
@@ -210,7 +210,7 @@ def read_nodes(gltf: GltfDocument) -> NodeTree:
 
 
 def target_count(mesh: dict[str, Any]) -> int:
-    """How many morph targets a mesh has."""
+    """Return the number of morph targets of a mesh."""
     return len(mesh["primitives"][0].get("targets", []))
 
 
@@ -223,7 +223,7 @@ def _vectors(nodes: list[dict[str, Any]], key: str, default: Any) -> Float64[np.
 
 
 def _rest_weights(gltf: GltfDocument, node: dict[str, Any]) -> Float64[np.ndarray, " t"]:
-    """The node's own weights, else the mesh's, else none."""
+    """Return the node's own morph weights, else the mesh's, else none."""
     if "mesh" not in node:
         return np.zeros(0)
     mesh = gltf.root["meshes"][node["mesh"]]
@@ -235,7 +235,7 @@ def _rest_weights(gltf: GltfDocument, node: dict[str, Any]) -> Float64[np.ndarra
 
 
 def _levels(nodes: list[dict[str, Any]]) -> tuple[Int64[np.ndarray, " n"], tuple[np.ndarray, ...]]:
-    """The parent of each node, -1 for roots, and the nodes of each depth."""
+    """Return the parent of each node, -1 for roots, and the nodes of each depth."""
     parents = np.full(len(nodes), -1)
     for index, node in enumerate(nodes):
         parents[node.get("children", [])] = index
@@ -247,7 +247,7 @@ def _levels(nodes: list[dict[str, Any]]) -> tuple[Int64[np.ndarray, " n"], tuple
 
 
 def _shown(gltf: GltfDocument, nodes: list[dict[str, Any]]) -> tuple[int, ...]:
-    """Nodes of the default scene in depth-first order; all of them where there is no scene."""
+    """Return the nodes of the default scene in depth-first order; all nodes where there is no scene."""
     scenes = gltf.entries("scenes")
     if not scenes:
         return tuple(range(len(nodes)))

@@ -1,4 +1,4 @@
-"""The meshes of a glTF document where its nodes show them, with their morph targets and skins."""
+"""Meshes of a glTF document in a pose of its nodes, morph targets and skins (glTF 2.0, sections 3.7 and 3.11)."""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -28,17 +28,17 @@ from render_server.scene.triangle_mesh import (
 )
 
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
-# Places in a clip where its bounds are looked up, beside its keys: a turn of 360 degrees is 6 degrees apart then, and
-# an arc rises 0.1 % of its radius over the chord.
+# Times at which the bounds of a clip are sampled beside its keys: a full turn then has steps of 6 degrees, and an arc
+# rises 0.1 % of its radius over the chord.
 SWEEP_STEPS = 64
 MAX_SWEEP_TIMES = 256
-MAX_SWEEP_VERTICES = 20_000  # of larger meshes so many are followed
-SWEEP_MARGIN = 0.02  # of the longest edge, for what lies between those times and vertices
+MAX_SWEEP_VERTICES = 20_000  # sampled of larger meshes
+SWEEP_MARGIN = 0.02  # of the longest edge, for what lies between the sampled times and vertices
 
 
 @dataclass(frozen=True, eq=False)
 class Morph:
-    """What each target adds to vertices and, if the file says so, to their normals, at weight 1."""
+    """Offsets of each morph target to positions and, where the file has them, to normals, at weight 1."""
 
     positions: tuple[Float32[np.ndarray, "n 3"], ...]
     normals: tuple[Float32[np.ndarray, "n 3"], ...] | None
@@ -46,8 +46,9 @@ class Morph:
 
 @dataclass(frozen=True, eq=False)
 class Skin:
-    """Joints that a mesh hangs on: their nodes, where the mesh's vertices are in each joint's frame, and the share of
-    each joint in each vertex (sparse, n x j, rows sum to 1).
+    """Joints of a mesh: their nodes, their inverse bind matrices, and the weight of each joint at each vertex.
+
+    `weights` is sparse (n x j); its rows sum to 1.
     """
 
     joints: Int64[np.ndarray, " j"]
@@ -57,9 +58,9 @@ class Skin:
 
 @dataclass(frozen=True, eq=False)
 class GltfPart:
-    """One primitive at one node: its mesh in the node's frame, without morphing and skin.
+    """One primitive at one node: its mesh in the node's frame, before morphing and skinning.
 
-    `smoothing` is there if the file gives no normals; then they follow the shape.
+    `smoothing` recomputes the normals of a posed mesh where the file has none.
     """
 
     node: int
@@ -69,7 +70,7 @@ class GltfPart:
     skin: Skin | None
 
     def of_vertices(self, rows: Int64[np.ndarray, " k"]) -> "GltfPart":
-        """Some of the vertices alone, to follow where they go."""
+        """Return the part with some of its vertices only, to track their positions."""
         morph, skin = self.morph, self.skin
         if morph is not None:
             morph = Morph(tuple(delta[rows] for delta in morph.positions), None)
@@ -80,7 +81,7 @@ class GltfPart:
 
 
 class PartReader:
-    """Reads each primitive and each material once, however many nodes show it."""
+    """Reads each primitive and each material once, however many nodes use it."""
 
     def __init__(self, gltf: GltfDocument, nodes: NodeTree) -> None:
         self._gltf = gltf
@@ -89,7 +90,7 @@ class PartReader:
         self._primitives: dict[tuple[int, int], ConvertedMesh | None] = {}
 
     def read(self) -> list[tuple[int | None, GltfPart]]:
-        """All that nodes show, with the index of its material.
+        """Read the parts of all shown nodes, with the index of their material.
 
         Raises:
             GltfFaultError: attributes that do not fit each other, or joints that do not exist.
@@ -157,7 +158,7 @@ def _material(gltf: GltfDocument, index: int | None) -> Material:
 
 
 def _geometry(gltf: GltfDocument, primitive: dict[str, Any]) -> FileGeometry | None:
-    """A primitive's own shape; None if it is made of points or lines."""
+    """Return the geometry of a primitive; None for points and lines."""
     mode = primitive.get("mode", _TRIANGLES)
     if mode not in (_TRIANGLES, _STRIP, _FAN):
         return None
@@ -194,7 +195,7 @@ def _triangles(
 def _attribute(
     gltf: GltfDocument, attributes: dict[str, int], name: str, count: int, columns: int
 ) -> Float32[np.ndarray, "n c"] | None:
-    """The first columns of an attribute (integers as shares of their greatest value), None where there is none."""
+    """Return the first columns of an attribute (integer colours as 0..1); None where the primitive lacks it."""
     if name not in attributes:
         return None
     rows = gltf.array(attributes[name])
@@ -210,7 +211,7 @@ def _uv(gltf: GltfDocument, attributes: dict[str, int], count: int) -> Float32[n
 
 
 def _morph(gltf: GltfDocument, primitive: dict[str, Any], made: ConvertedMesh, count: int) -> Morph:
-    """Targets of a primitive, for the vertices that were made of it."""
+    """Return the morph targets of a primitive, for the vertices of its converted mesh."""
     targets: Sequence[dict[str, int]] = primitive.get("targets", [])
     if len(targets) != count:
         raise GltfFaultError("the primitives of a mesh have different numbers of morph targets")
@@ -232,7 +233,7 @@ def _delta(
 
 
 def _joint_weights(gltf: GltfDocument, primitive: dict[str, Any], joint_count: int) -> csr_array:
-    """Share of each joint in each of the file's vertices."""
+    """Return the weight of each joint at each of the file's vertices."""
     attributes = primitive["attributes"]
     sets = [name.removeprefix("JOINTS_") for name in sorted(attributes) if name.startswith("JOINTS_")]
     joints = np.hstack([gltf.array(attributes[f"JOINTS_{name}"]) for name in sets]).astype(np.int64)
@@ -248,26 +249,24 @@ def _joint_weights(gltf: GltfDocument, primitive: dict[str, Any], joint_count: i
     if joints.max(initial=0) >= joint_count:
         raise GltfFaultError(f"a skinned mesh hangs on joint {joints.max()} of a skin of {joint_count}")
     sums = weights.sum(axis=1, keepdims=True)
-    weights[sums[:, 0] == 0, 0] = (
-        1.0  # as viewers do with vertices that hang on nothing: on their first joint
-    )
+    weights[sums[:, 0] == 0, 0] = 1.0  # as viewers do: vertices without weights follow their first joint
     weights /= np.where(sums == 0, 1, sums)
     rows = np.repeat(np.arange(len(joints)), joints.shape[1])
     # Duplicates are added up, and entries of a row sorted: the same file gives the same sums.
-    weights = csr_array((weights.ravel(), (rows, joints.ravel())), shape=(len(joints), joint_count))
-    weights.eliminate_zeros()
-    return weights
+    matrix = csr_array((weights.ravel(), (rows, joints.ravel())), shape=(len(joints), joint_count))
+    matrix.eliminate_zeros()
+    return matrix
 
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """Where all nodes stand in the asset's frame, and the morph weights of each."""
+    """Global transforms and morph weights of all nodes."""
 
     asset_from_node: Float64[np.ndarray, "n 4 4"]
     weights: tuple[Float64[np.ndarray, " _"], ...]
 
     def equals(self, other: "Pose | None") -> bool:
-        """Whether both are the same to the last bit."""
+        """Whether both poses are bit-identical."""
         return (
             other is not None
             and np.array_equal(self.asset_from_node, other.asset_from_node)
@@ -276,7 +275,7 @@ class Pose:
 
 
 class GltfAsset:
-    """Meshes of a document, one a material, in any pose of its clips. The file's axes and units."""
+    """Meshes of a document, one per material, in any pose of its clips, in the file's axes and units."""
 
     def __init__(
         self, path: Path, nodes: NodeTree, parts: list[list[GltfPart]], clips: tuple[Clip, ...]
@@ -289,24 +288,24 @@ class GltfAsset:
         self._bounds: dict[str, Float64[np.ndarray, "2 3"]] = {}
 
     def clip(self, wanted: int | str | None) -> Clip | None:
-        """The clip of this number or name, the first one for None; None if there is none such."""
+        """Return the clip of this number or name (None: the first); None if there is none."""
         if isinstance(wanted, str):
             return next((clip for clip in self.clips if clip.name == wanted), None)
         number = 0 if wanted is None else wanted
         return self.clips[number] if number < len(self.clips) else None
 
     def pose(self, clip: Clip | None, time_s: float) -> Pose:
-        """The pose of a clip at a time, or the pose at rest."""
+        """Return the pose of a clip at a time, or the rest pose."""
         rest = self._nodes.rest
         motion = rest if clip is None else clip.motion(rest, time_s)
         return Pose(self._nodes.asset_from_node(motion), motion.weights)
 
     def meshes(self, pose: Pose) -> list[TriangleMesh]:
-        """The meshes in a pose."""
+        """Return the meshes in a pose."""
         return [_posed(rest, same, pose) for rest, same in zip(self._rest, self._parts, strict=True)]
 
     def bounds(self, clip: Clip) -> Float64[np.ndarray, "2 3"]:
-        """Least and greatest coordinates of all poses of a clip, with a margin of 2 %; found once.
+        """Return least and greatest coordinates over a whole clip, with a margin of 2 %; computed once.
 
         Raises:
             DeltalightError: it moves vertices beyond 10 km.
@@ -354,13 +353,13 @@ def _sweep_times(clip: Clip) -> Float64[np.ndarray, " k"]:
 
 
 def _sampled_vertices(part: GltfPart, vertex_count: int) -> GltfPart:
-    """A part with the vertices that triangles use, or some of them where the asset has many."""
+    """Return a part with the vertices that triangles use, or a subset where the asset has many."""
     used = np.unique(part.mesh.triangles)
     return part.of_vertices(used[:: -(-vertex_count // MAX_SWEEP_VERTICES)])
 
 
 def _posed(rest: TriangleMesh, parts: Sequence[GltfPart], pose: Pose) -> TriangleMesh:
-    """The mesh of one material."""
+    """Return the mesh of one material in a pose."""
     shaped = [_shaped(part, pose) for part in parts]
     return replace(
         rest,
@@ -373,7 +372,7 @@ def _posed(rest: TriangleMesh, parts: Sequence[GltfPart], pose: Pose) -> Triangl
 
 
 def _shaped(part: GltfPart, pose: Pose) -> TriangleMesh:
-    """One part: morphed, then placed by its skin or its node. A mirroring node turns the winding round."""
+    """Morph a part, then place it by its skin or its node. A mirroring node reverses the winding."""
     matrices = _matrices(part, pose)
     positions = _placed(_morphed(part, pose), matrices)
     mirrored = part.skin is None and np.linalg.det(matrices[:3, :3]) < 0
@@ -386,14 +385,14 @@ def _shaped(part: GltfPart, pose: Pose) -> TriangleMesh:
 
 
 def _matrices(part: GltfPart, pose: Pose) -> Float64[np.ndarray, "*n 4 4"]:
-    """asset_from_mesh: one matrix, or with a skin one a vertex (n, 4, 4); a skin's node itself does not count."""
+    """Return asset_from_mesh: one matrix, or with a skin one per vertex. The node of a skinned mesh has no effect."""
     if part.skin is None:
         return np.asarray(pose.asset_from_node[part.node])
     return _blended(part.skin, pose)
 
 
 def _blended(skin: Skin, pose: Pose) -> Float64[np.ndarray, "n 4 4"]:
-    """Linear blend of the joints' matrices."""
+    """Blend the joints' matrices linearly."""
     asset_from_mesh = pose.asset_from_node[skin.joints] @ skin.joint_from_mesh
     return np.asarray((skin.weights @ asset_from_mesh.reshape(-1, 16)).reshape(-1, 4, 4))
 
@@ -401,7 +400,7 @@ def _blended(skin: Skin, pose: Pose) -> Float64[np.ndarray, "n 4 4"]:
 def _placed(
     positions: Float32[np.ndarray, "n 3"], matrices: Float64[np.ndarray, "*n 4 4"]
 ) -> Float32[np.ndarray, "n 3"]:
-    """Positions under one matrix, or one each."""
+    """Transform positions by one matrix, or one each."""
     turned = (matrices[..., :3, :3] @ positions[..., None].astype(np.float64))[..., 0]
     return np.asarray(turned + matrices[..., :3, 3], np.float32)
 
@@ -417,7 +416,7 @@ def _added(
     deltas: Sequence[Float32[np.ndarray, "n 3"]],
     weights: Float64[np.ndarray, " t"],
 ) -> Float32[np.ndarray, "n 3"]:
-    """Base plus weighted deltas."""
+    """Add weighted deltas."""
     total = base.copy()
     for delta, weight in zip(deltas, weights, strict=True):
         if weight != 0:
@@ -438,12 +437,12 @@ def _turned(
     *,
     mirrored: bool,
 ) -> Float32[np.ndarray, "n 3"]:
-    """Unit normals under one matrix, or one each.
+    """Transform normals by one matrix, or one each, to unit length.
 
-    They go by the cofactors, which are the inverse transpose but for a factor, and need no inverse: clips often hide
-    things by a scale of 0. What has no normal left keeps the one of `instead`.
+    Uses the cofactor matrix, which is the inverse transpose but for a factor and exists for singular matrices too:
+    clips often hide things by a scale of 0. A normal of length 0 is replaced by that of `instead`.
     """
-    # Elements first (numbers, or one a vertex): twice as fast as a small product each.
+    # Matrix elements first (scalars, or one per vertex): twice as fast as one small product per vertex.
     a = np.ascontiguousarray(np.moveaxis(matrices[..., :3, :3], (-2, -1), (0, 1)))
     x, y, z = normals.T.astype(np.float64)
     turned = np.empty((len(normals), 3))

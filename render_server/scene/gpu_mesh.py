@@ -20,7 +20,7 @@ class GpuMesh:
     """Several meshes in one vertex buffer.
 
     A row of `vertices` is position 3, normal 3, uv 2, colour 3, material index 1 (`VERTEX_LAYOUT`).
-    `material_table` is described where it is made; `textures` are the base-colour textures in the order of its
+    For `material_table` see `materials.material_table`; `textures` are the base-colour textures in the order of its
     texture indices.
     """
 
@@ -32,7 +32,7 @@ class GpuMesh:
 
 
 def merge_for_gpu(meshes: Sequence[TriangleMesh]) -> GpuMesh:
-    """Put meshes (each with its own material, in this order) into one interleaved buffer.
+    """Merge meshes (each with its own material, in this order) into one interleaved buffer.
 
     Raises:
         DeltalightError: there is no mesh.
@@ -82,9 +82,9 @@ def split_triangles(corners: Float32[np.ndarray, "m 3 c"], max_edge: float) -> F
 
 
 def _check_pieces(corners: Float32[np.ndarray, "m 3 c"], max_edge: float) -> None:
-    """Refuse before the memory is gone, by a bound from below on the number of pieces.
+    """Refuse by a lower bound on the number of pieces, before memory runs out.
 
-    An equilateral triangle is the largest that the limit allows; bisection ends a few times above that.
+    An equilateral triangle is the largest that the limit allows; bisection makes a few times as many.
     """
     edges = np.roll(corners[..., :3], -1, axis=1) - corners[..., :3]
     areas = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) / 2

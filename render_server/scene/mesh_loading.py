@@ -1,4 +1,4 @@
-"""Triangle meshes: loading from files, merging for the GPU, splitting for voxelisation."""
+"""Loading of mesh files: GLB, glTF, OBJ, PLY, STL."""
 
 from collections import defaultdict
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ from render_server.scene.triangle_mesh import (
 
 @dataclass(frozen=True, eq=False)
 class Asset:
-    """The meshes of a file as they rest, and what poses them if the file has clips."""
+    """The meshes of a file in their rest pose, and the glTF asset that animates them if the file has clips."""
 
     meshes: list[TriangleMesh]
     animated: GltfAsset | None
@@ -33,8 +33,8 @@ class Asset:
 def load_mesh(path: Path) -> list[TriangleMesh]:
     """Read a GLB, glTF, OBJ, PLY or STL file: one mesh a material, in the file's own axes and units.
 
-    The scene graph's transforms are applied (and the skins and morph targets of glTF, as they rest), degenerate
-    triangles dropped, missing normals computed (sharp at edges beyond 60 degrees). Vertex colours are sRGB bytes, in
+    Applies the scene graph's transforms (and skins and morph targets of glTF, in the rest pose), drops degenerate
+    triangles, and computes missing normals (sharp at edges beyond 60 degrees). Vertex colours are sRGB bytes, in
     glTF linear.
 
     Raises:
@@ -48,7 +48,7 @@ def load_asset(path: Path) -> Asset:
     """Read a mesh file as `load_mesh` does, and the clips of a glTF file.
 
     Raises:
-        DeltalightError: as `load_mesh`, or a clip that does not hold together.
+        DeltalightError: as `load_mesh`, or a malformed clip.
     """
     if check_mesh_file(path) in GLTF_SUFFIXES:
         gltf = load_gltf(path)
@@ -119,7 +119,7 @@ def _file_geometry(geometry: trimesh.Trimesh) -> FileGeometry:
 
 
 def _uv(geometry: trimesh.Trimesh, count: int) -> Float32[np.ndarray, "n 2"] | None:
-    """Return texture coordinates; the loader's have their origin at the bottom."""
+    """Return texture coordinates with the origin at the top; the loader has it at the bottom."""
     uv = getattr(geometry.visual, "uv", None)
     if uv is None or np.shape(uv) != (count, 2) or not np.isfinite(uv).all():
         return None

@@ -1,4 +1,4 @@
-"""Decides whether the real scene still is what the renderer last built its geometry and light from."""
+"""Detects when the real scene has changed since the renderer last built geometry and light from it."""
 
 from dataclasses import dataclass
 
@@ -14,12 +14,12 @@ GRID_STEP_PX = 4
 
 @dataclass(frozen=True)
 class MotionThresholds:
-    """When a change counts.
+    """Thresholds beyond which the scene has changed.
 
     `image_motion_px`: motion of the picture by the change of pose alone, pixels (> 0).
     `depth_sigmas`: a depth sample has moved beyond this many standard deviations of a difference;
-    `depth_share`: share of the samples that may (0..1). `color_noise`: standard deviation of linear colour
-    at 1.0, with shot noise's square root below (camera units); `color_sigmas`, `color_share` as for depth.
+    `depth_fraction`: fraction of the samples that may (0..1). `color_noise`: standard deviation of linear colour at
+    1.0, falling with its square root (shot noise; camera units); `color_sigmas`, `color_fraction` as for depth.
     """
 
     image_motion_px: float = 0.5
@@ -32,7 +32,7 @@ class MotionThresholds:
 
 @dataclass(frozen=True, eq=False)
 class _Reference:
-    """The frame that was last built from, thinned out."""
+    """The frame that the scene was last built from, subsampled."""
 
     frame: ViewFrame
     color: Float32[np.ndarray, "gh gw 3"]
@@ -43,7 +43,7 @@ class MotionDetector:
     """Compares each frame with the one that the real scene was last built from.
 
     Changes are measured against that frame, not the previous one, so that slow drift is found as well.
-    The same frames in the same order always give the same answers.
+    Deterministic: the same frames in the same order give the same answers.
     """
 
     def __init__(self, thresholds: MotionThresholds | None = None) -> None:
@@ -51,8 +51,8 @@ class MotionDetector:
         self._reference: _Reference | None = None
 
     def update(self, frame: ViewFrame) -> bool:
-        """Return whether the real scene must be built again; if so, `frame` is the new reference."""
-        current = _Reference(frame, _thin_color(frame), _thin_inverse_depth(frame.depth))
+        """Return whether the real scene must be rebuilt; if so, `frame` becomes the reference."""
+        current = _Reference(frame, _downsampled_color(frame), _subsampled_inverse_depth(frame.depth))
         if self._reference is not None and not self._changed(self._reference, current):
             return False
         self._reference = current
@@ -69,7 +69,7 @@ class MotionDetector:
         )
 
     def _moved_fraction(self, old: _Reference, new: _Reference) -> float:
-        """Share of the samples valid in both whose inverse depth differs by more than noise explains."""
+        """Return the fraction of common samples whose inverse depth differs by more than noise explains."""
         before, after, depth = old.inverse_depth, new.inverse_depth, new.frame.depth
         if before is None or after is None or depth is None:
             return 0.0
@@ -81,7 +81,7 @@ class MotionDetector:
         return float(np.count_nonzero(moved)) / max(int(np.count_nonzero(both)), 1)
 
     def _recolored_fraction(self, old: _Reference, new: _Reference) -> float:
-        """Share of the block means whose linear colour differs, in any channel, by more than noise explains.
+        """Return the fraction of block means whose linear colour differs in any channel by more than noise explains.
 
         A block's mean has the noise of a pixel divided by the block's edge; codecs leave some more.
         """
@@ -90,7 +90,7 @@ class MotionDetector:
         return float((np.abs(new.color - old.color) > limit).any(axis=-1).mean())
 
 
-def _thin_color(frame: ViewFrame) -> Float32[np.ndarray, "gh gw 3"]:
+def _downsampled_color(frame: ViewFrame) -> Float32[np.ndarray, "gh gw 3"]:
     """Return linear colour averaged over blocks of 4 x 4 pixels."""
     height, width = frame.color.shape[:2]
     size = (max(width // GRID_STEP_PX, 1), max(height // GRID_STEP_PX, 1))
@@ -99,7 +99,7 @@ def _thin_color(frame: ViewFrame) -> Float32[np.ndarray, "gh gw 3"]:
     return np.asarray(cv2.resize(linear, size, interpolation=cv2.INTER_AREA))
 
 
-def _thin_inverse_depth(depth: DepthImage | None) -> Float32[np.ndarray, "gh gw"] | None:
+def _subsampled_inverse_depth(depth: DepthImage | None) -> Float32[np.ndarray, "gh gw"] | None:
     """Return 1/z of every fourth pixel, 0 where unknown."""
     if depth is None:
         return None

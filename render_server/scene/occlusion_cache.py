@@ -1,4 +1,4 @@
-"""Occlusion fields on disk, named by their content: computed once an asset and settings, on one machine."""
+"""Occlusion fields on disk, addressed by content: computed once per asset and settings."""
 
 import hashlib
 import os
@@ -21,9 +21,9 @@ from render_server.scene.occlusion_field import (
 )
 from render_server.scene.occlusion_transfer import LENGTH, compute_transfer, surface_pieces
 
-FIELD_VERSION = 1  # of what is computed from the same input
+FIELD_VERSION = 1  # rises when the same input gives another field
 CACHE_VARIABLE = "DELTALIGHT_CACHE"
-OCCLUSION_FRACTION = 0.8  # of the time
+OCCLUSION_FRACTION = 0.8  # of the computing time
 
 
 def default_folder() -> Path:
@@ -36,7 +36,7 @@ def default_folder() -> Path:
 def field_digest(surface: Float32[np.ndarray, "m 3 6"], settings: FieldSettings) -> str:
     """Return 16 hexadecimal digits that change with the object's triangles, its colours, or the settings.
 
-    Without indirect light colours do not count.
+    Colours count only with indirect light.
     """
     hasher = hashlib.sha256(repr((FIELD_VERSION, astuple(settings))).encode())
     counting = surface if settings.indirect else surface[..., :3]
@@ -47,7 +47,7 @@ def field_digest(surface: Float32[np.ndarray, "m 3 6"], settings: FieldSettings)
 def compute_field(
     surface: Float32[np.ndarray, "m 3 6"], settings: FieldSettings, progress: ProgressCallback
 ) -> OcclusionField:
-    """Compute the field of an object (`object_surface`, asset's frame); seconds.
+    """Compute the field of an object (`object_surface`, asset's frame); takes seconds.
 
     Raises:
         DeltalightError: the package embreex is not installed.
@@ -83,7 +83,7 @@ def store_field(folder: Path, digest: str, field: OcclusionField) -> None:
 
 
 def load_field(folder: Path, digest: str, settings: FieldSettings) -> OcclusionField | None:
-    """Read a field; None where there is none, or where the file is damaged (then it is to be made again)."""
+    """Read a field; None where there is none, or where the file is damaged and must be replaced."""
     try:
         with np.load(folder / f"{digest}.npz", allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
@@ -97,7 +97,7 @@ def load_field(folder: Path, digest: str, settings: FieldSettings) -> OcclusionF
 
 
 def _is_whole(arrays: dict[str, np.ndarray], settings: FieldSettings) -> bool:
-    """Whether everything is there in the shape that the settings say, and finite."""
+    """Whether all arrays are there, in the shape that the settings require, and finite."""
     shells, n = settings.shells, settings.resolution
     shapes: dict[str, tuple[int, ...]] = {"centre": (3,), "halves": (shells, 3), "radius": ()}
     shapes["occlusion"] = (shells, n, n, n, settings.order**2)

@@ -1,4 +1,4 @@
-"""Triangles of one material: vertex normals, transforms, and what a file's geometry must be to become such."""
+"""Triangle meshes of one material: conversion and checks of a file's geometry, vertex normals, joining."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -15,18 +15,17 @@ from render_server.scene.materials import Material
 
 # Scanned meshes of 100k triangles are full of edges beyond 40 degrees that nobody means to be sharp.
 CREASE_ANGLE_DEG = 60.0
-# Twice the area relative to the longest edge squared, below which a triangle has no direction in float32.
+# Twice the area relative to the longest edge squared, below which a triangle has no normal in float32.
 DEGENERATE_RATIO = 1e-9
-UNIT_ROUNDING = (
-    2.5e-7  # three components of a unit vector are rounded by up to 6e-8 each, and once more by a length
-)
+# Components of a unit vector are rounded by up to 6e-8 each, and once more by a length.
+UNIT_ROUNDING = 2.5e-7
 MAX_COORDINATE_M = 1e4
 
 
 def face_normals(
     positions: Float32[np.ndarray, "n 3"], triangles: Int32[np.ndarray, "m 3"]
 ) -> tuple[Float64[np.ndarray, "m 3"], Bool[np.ndarray, " m"]]:
-    """Return unit normals by the right-hand rule, and which triangles have an area at all."""
+    """Return unit normals by the right-hand rule, and which triangles are not degenerate."""
     corners = positions.astype(np.float64)[triangles]
     edges = np.roll(corners, -1, axis=1) - corners
     normals = np.cross(edges[:, 0], edges[:, 1])
@@ -39,14 +38,14 @@ def face_normals(
 
 @dataclass(frozen=True, eq=False)
 class Smoothing:
-    """Which vertices share a normal: numbers of their groups. Edges stay sharp or smooth while a mesh bends."""
+    """Smoothing group of each vertex. Edges stay sharp or smooth while a mesh deforms."""
 
     group: Int32[np.ndarray, " n"]
 
     def normals(
         self, positions: Float32[np.ndarray, "n 3"], triangles: Int32[np.ndarray, "m 3"]
     ) -> Float32[np.ndarray, "n 3"]:
-        """Angle-weighted means of the triangles' normals (Thuermer & Wuethrich 1998) over each group."""
+        """Return angle-weighted mean normals (Thuermer & Wuethrich 1998) of each group."""
         normals, _ = face_normals(positions, triangles)
         weights = _corner_angles(positions.astype(np.float64)[triangles]).ravel()[:, None]
         weighted = weights * np.repeat(normals, 3, axis=0)
@@ -95,14 +94,14 @@ def smooth_normals(
 def unit_or(
     vectors: Float[np.ndarray, "n 3"], instead: Float[np.ndarray, "n 3"]
 ) -> Float32[np.ndarray, "n 3"]:
-    """Vectors at length 1, those of length 0 replaced. What float32 cannot bring nearer to 1 keeps its bits."""
+    """Normalize vectors; those of length 0 become `instead`. Unit vectors within float32 rounding keep their bits."""
     lengths = np.linalg.norm(vectors.astype(np.float64), axis=1, keepdims=True)
     lengths[np.abs(lengths - 1) < UNIT_ROUNDING] = 1
     return np.where(lengths > 0, vectors / np.maximum(lengths, 1e-300), instead).astype(np.float32)
 
 
 def weld(positions: Float32[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
-    """Return for every vertex the number of its position; equal positions share a number."""
+    """Return the index of each vertex's position; equal positions share an index."""
     order = np.lexsort(positions.T)
     ordered = positions[order]
     fresh = np.concatenate([[False], (ordered[1:] != ordered[:-1]).any(axis=1)])
@@ -114,7 +113,7 @@ def weld(positions: Float32[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
 def _smoothing_groups(
     welded: Int64[np.ndarray, "m 3"], normals: Float64[np.ndarray, "m 3"], cos_crease: float
 ) -> Int32[np.ndarray, " c"]:
-    """Number every corner (3 * triangle + k) by the group of corners it shares its normal with."""
+    """Return the smoothing group of every corner (3 * triangle + k)."""
     start, end = welded.ravel(), np.roll(welded, -1, axis=1).ravel()
     low, high = np.minimum(start, end), np.maximum(start, end)
     order = np.lexsort((low, high))
@@ -164,7 +163,7 @@ class TriangleMesh:
         return np.stack([used.min(axis=0), used.max(axis=0)])
 
     def transformed(self, matrix: Float64[np.ndarray, "4 4"]) -> "TriangleMesh":
-        """Return the mesh in another frame; a mirroring matrix turns the winding round."""
+        """Return the mesh in another frame; a mirroring matrix reverses the winding."""
         linear = matrix[:3, :3]
         positions = self.positions @ linear.T + matrix[:3, 3]
         normals = self.normals @ np.linalg.inv(linear)
@@ -180,7 +179,7 @@ class TriangleMesh:
 
 @dataclass(frozen=True, eq=False)
 class FileGeometry:
-    """What a file says of one mesh; None where it says nothing."""
+    """Geometry of one mesh as a file has it; None for attributes that it lacks."""
 
     positions: Float32[np.ndarray, "n 3"]
     triangles: Int64[np.ndarray, "m 3"]
@@ -191,7 +190,7 @@ class FileGeometry:
 
 @dataclass(frozen=True, eq=False)
 class ConvertedMesh:
-    """A mesh, which of the file's vertices each of its vertices is, and how its normals were computed, if so."""
+    """A converted mesh, the file's vertex behind each of its vertices, and its smoothing if normals were computed."""
 
     mesh: TriangleMesh
     source: Int64[np.ndarray, " n"]
@@ -201,9 +200,9 @@ class ConvertedMesh:
 def converted(
     given: FileGeometry, material: Material, path: Path, *, keeps_degenerate: bool = False
 ) -> ConvertedMesh | None:
-    """Take over a file's mesh; None if no triangle is left after degenerate ones are dropped.
+    """Convert a file's mesh; None if no triangle is left after dropping degenerate ones.
 
-    Missing normals are computed (sharp at edges beyond 60 degrees).
+    Computes missing normals (sharp at edges beyond 60 degrees).
 
     Raises:
         DeltalightError: vertices that do not exist, coordinates or normals that are not finite, or beyond 10 km.
@@ -249,7 +248,7 @@ def _check_geometry(
 def _unit_normals(
     normals: Float32[np.ndarray, "n 3"] | None, count: int, path: Path
 ) -> Float32[np.ndarray, "n 3"] | None:
-    """The file's own normals, normalised; None where it has none or some of length zero."""
+    """Return the file's own normals at unit length; None where it has none or some of length zero."""
     if normals is None or normals.shape != (count, 3):
         return None
     if not np.isfinite(normals).all():

@@ -1,4 +1,4 @@
-"""Triangles of a fused volume: surface nets (Gibson 1998), and fewer of them by clustering vertices."""
+"""Mesh of the real scene's TSDF: surface nets (Gibson 1998), decimated by clustering vertices."""
 
 from dataclasses import replace
 from typing import NamedTuple
@@ -22,39 +22,39 @@ from render_server.view import CameraView
 
 EDGES = tuple((a, b) for a in range(8) for b in range(a + 1, 8) if np.abs(CORNERS[a] - CORNERS[b]).sum() == 1)
 VOXELS = GRID * BLOCK  # voxels an edge of the whole grid
-# Growth of the clusters where their triangles are still too many.
+# Growth of the clusters while there are still too many triangles.
 CLUSTER_GROWTH = 1.15
-# What lies farther than so many median distances goes to a second, coarser volume: a far wall would else spend the
-# voxels that near things need.
+# Points beyond so many median distances go to a second, coarser volume: a far wall would otherwise use up the voxels
+# that near things need.
 NEAR_MEDIANS = 2.0
-# Triangles of the near and the far volume at their own fineness, before they are thinned to a budget: averaging a
-# frame in and making triangles anew takes a core 30 ms each at 320x240.
+# Triangles of the near and the far volume at full resolution, before decimation: integrating a frame and extracting
+# the meshes take a core 30 ms each at 320x240.
 FINE_TRIANGLES = (80_000, 20_000)
 # A surface of area A crosses A (|nx| + |ny| + |nz|) / h^2 edges of the lattice, 1.5 A / h^2 in the mean over
 # directions; each gives two triangles.
 TRIANGLES_PER_CELL = 3.0
-# Memory for four times the blocks that the first frame fills (measured: a block for 54 triangles), 36 MB for the near
-# volume; what would go beyond is left out.
+# Memory for four times the blocks that the first frame fills (measured: a block per 54 triangles), 36 MB for the near
+# volume; blocks beyond are left out.
 TRIANGLES_PER_BLOCK = 54 / 4
-# Share of a box's edge that the first frame fills: the camera will look elsewhere.
+# Fraction of a box's edge that the first frame fills: the camera will look elsewhere.
 FIRST_FRACTION = 0.5
-# Triangles are made anew when this share of the voxels at surfaces moved by more than this share of a voxel: less
-# hardly changes how much of a voxel of the volume they cover.
+# Meshes are extracted again when this fraction of the voxels at surfaces moved by more than this fraction of a voxel:
+# less hardly changes how much of the scene's voxels they cover.
 MOVED_FRACTION, MOVED_VOXELS = 0.02, 0.25
 
 
 class _Cells(NamedTuple):
-    """Cells through which the surface passes: voxel of their first corner, distances at their corners."""
+    """Cells that the surface crosses: voxel of their first corner, and distances at all corners."""
 
     voxel: Int64[np.ndarray, "n 3"]
     corners: Float32[np.ndarray, "n 8"]
 
 
 def extract_mesh(volume: TsdfVolume) -> TriangleMesh:
-    """The surface where the field is zero, in the world; only where it was seen on all sides of a cell.
+    """Extract the zero level set, in the world, from cells whose corners are all known.
 
     Triangles are counter-clockwise seen from free space; normals are the field's gradient. Behind the rim of a thing
-    that was seen from one side only, the surface goes on as far as distances reach, as if the thing were so thick.
+    that was seen from one side only, the surface continues up to the truncation distance.
     """
     cells = _crossed_cells(volume)
     places, normals = _vertices(cells)
@@ -68,14 +68,14 @@ def extract_mesh(volume: TsdfVolume) -> TriangleMesh:
 
 
 def decimated(mesh: TriangleMesh, triangle_budget: int) -> TriangleMesh:
-    """The mesh, or one of at most `triangle_budget` triangles: vertices within a cube become one (Rossignac 1993)."""
+    """Return a mesh of at most `triangle_budget` triangles: vertices within a cube become one (Rossignac 1993)."""
     if len(mesh.triangles) <= triangle_budget:
         return mesh
     corners = mesh.positions[mesh.triangles]
     double_area = np.linalg.norm(
         np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
     )
-    # A plane along the axes gives two triangles a cube's face; others give more.
+    # An axis-aligned plane gives two triangles per face of a cube; others give more.
     cell_m = float(np.sqrt(double_area.sum(dtype=np.float64) / max(triangle_budget, 1)))
     result = mesh
     while len(result.triangles) > triangle_budget:
@@ -99,7 +99,7 @@ def _clustered(mesh: TriangleMesh, cell_m: float) -> TriangleMesh:
 
 
 def _without_copies(triangles: Int64[np.ndarray, "m 3"]) -> Int64[np.ndarray, "k 3"]:
-    """One of the triangles that have the same corners."""
+    """Drop all but one of the triangles with the same corners."""
     low, middle, high = np.sort(triangles, axis=1).T
     count = int(triangles.max(initial=0)) + 1
     _, first = np.unique((low * count + middle) * count + high, return_index=True)
@@ -115,8 +115,8 @@ def _unit(vectors: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
 
 
 def _crossed_cells(volume: TsdfVolume) -> _Cells:
-    """Cells with known distances of both signs at their corners."""
-    # Distances at the corners of a cell that the surface passes through are below sqrt(3) voxels.
+    """Return the cells with known distances of both signs at their corners."""
+    # Distances at the corners of a crossed cell are below sqrt(3) voxels.
     near = np.abs(volume.distance) < 2 * volume.placement.voxel_m
     blocks = np.flatnonzero(near.any(axis=1))
     distance = _with_border(volume, blocks)
@@ -133,7 +133,7 @@ def _crossed_cells(volume: TsdfVolume) -> _Cells:
 
 
 def _with_border(volume: TsdfVolume, blocks: Int64[np.ndarray, " k"]) -> Float32[np.ndarray, "k 9 9 9"]:
-    """Distances of blocks and of the voxels after them, NaN where unknown."""
+    """Return the distances of blocks with the next voxels of their neighbours, NaN where unknown."""
     known = volume.known_distance()
     result = np.full((len(blocks), *(BLOCK + 1,) * 3), np.nan, np.float32)
     for step in CORNERS:
@@ -149,7 +149,7 @@ def _with_border(volume: TsdfVolume, blocks: Int64[np.ndarray, " k"]) -> Float32
 
 
 def _vertices(cells: _Cells) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
-    """Mean of the zeros on a cell's edges (voxels from its first corner), and the field's direction there."""
+    """Return the mean of the zero crossings on a cell's edges (voxels from its first corner), and normals."""
     total = np.zeros((len(cells.voxel), 3))
     count = np.zeros((len(cells.voxel), 1))
     for a, b in EDGES:
@@ -163,7 +163,7 @@ def _vertices(cells: _Cells) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.nda
 
 
 def _triangles(cells: _Cells) -> Int64[np.ndarray, "m 3"]:
-    """Two triangles for each edge of the voxels' lattice that the surface crosses between four cells."""
+    """Connect the four cells around each lattice edge that the surface crosses by two triangles."""
     keys = np.ravel_multi_index(tuple(cells.voxel.T), (VOXELS,) * 3)
     order = np.argsort(keys)
     inside = cells.corners < 0
@@ -189,7 +189,7 @@ def _triangles(cells: _Cells) -> Int64[np.ndarray, "m 3"]:
 def _find(
     keys: Int64[np.ndarray, " n"], order: Int64[np.ndarray, " n"], voxel: Int64[np.ndarray, "m 3"]
 ) -> Int64[np.ndarray, " m"]:
-    """Number of the cell at each voxel, -1 for none."""
+    """Return the index of the cell at each voxel, -1 for none."""
     if not len(keys):
         return np.full(len(voxel), -1)
     wanted = np.ravel_multi_index(tuple(np.maximum(voxel, 0).T), (VOXELS,) * 3)
@@ -216,18 +216,20 @@ def _only_used(
 
 
 class TsdfScene:
-    """Two volumes that are laid out for the first frame, and their triangles."""
+    """Near and far TSDF volume of the real scene, laid out for the first frame, and their meshes.
+
+    `view` is the view from which the last frame's depth fits the field.
+    """
 
     def __init__(self) -> None:
         self.volumes: list[TsdfVolume] = []
         self._meshed: list[Float32[np.ndarray, "b 512"]] = []
         self._meshes: list[TriangleMesh] = []
         self.view: CameraView | None = None
-        """From where the last frame's depth fits the surface."""
 
     @property
     def voxel_m(self) -> float:
-        """Distance of the near volume's voxels, m; 0 before anything was seen."""
+        """Voxel edge of the near volume, m; 0 before the first frame."""
         return self.volumes[0].placement.voxel_m if self.volumes else 0.0
 
     def add(
@@ -239,14 +241,14 @@ class TsdfScene:
         align: bool = False,
         settle: bool = False,
     ) -> bool:
-        """Average a frame into the volumes; returns whether the triangles are new.
+        """Integrate a frame; returns whether the meshes changed.
 
         Args:
-            surface: of the frame's depth; one without any known pixel changes nothing.
+            surface: the frame's depth; without any known pixel nothing changes.
             view: camera and pose of the frame.
             noise_sigma: depth noise at 1 m, m.
-            align: the pose has an error that is worth correcting by the shape seen (a marker board's).
-            settle: make the triangles anew however little changed.
+            align: refine the pose against the field (for poses by a marker board).
+            settle: extract the meshes however little changed.
         """
         self.view = view
         if not (surface.inverse_depth > 0).any():
@@ -266,7 +268,7 @@ class TsdfScene:
         return True
 
     def meshes(self, *triangle_budgets: int) -> list[list[TriangleMesh]]:
-        """Near and far surfaces in at most so many triangles, for each budget (falling); none before a frame."""
+        """Return near and far mesh within each triangle budget (in falling order); none before the first frame."""
         meshes, result = self._meshes, []
         for budget in triangle_budgets:
             fraction = min(1.0, budget / max(sum(len(mesh.triangles) for mesh in meshes), 1))
@@ -275,14 +277,14 @@ class TsdfScene:
         return result
 
     def _moved_fraction(self) -> float:
-        """Share of the voxels at surfaces whose distance differs from the one that triangles were made of."""
+        """Return the fraction of voxels at surfaces that moved since the meshes were extracted."""
         pairs = zip(self.volumes, self._meshed, strict=True)
         counts = np.array([_count_moved(volume, meshed) for volume, meshed in pairs]).sum(axis=0)
         return float(counts[0] / max(counts[1], 1))
 
 
 def _count_moved(volume: TsdfVolume, meshed: Float32[np.ndarray, "b 512"]) -> tuple[int, int]:
-    """Count voxels at surfaces that moved, and voxels at surfaces."""
+    """Count the voxels at surfaces that moved, and all voxels at surfaces."""
     now, voxel_m = volume.known_distance(), volume.placement.voxel_m
     before = np.full_like(now, np.nan)
     before[: len(meshed)] = meshed
@@ -292,7 +294,7 @@ def _count_moved(volume: TsdfVolume, meshed: Float32[np.ndarray, "b 512"]) -> tu
 
 
 class _SeenPoints(NamedTuple):
-    """What each known pixel of a frame shows: place (world), distance along the axis, area (m, m^2)."""
+    """Points of a frame's known pixels: position (world, m), depth (m), area (m^2)."""
 
     points: Float64[np.ndarray, "n 3"]
     z: Float64[np.ndarray, " n"]
@@ -305,7 +307,7 @@ class _SeenPoints(NamedTuple):
 def place_volumes(
     surface: DepthSurface, view: CameraView, noise_sigma: float
 ) -> tuple[TsdfPlacement, TsdfPlacement]:
-    """A cube around what one frame shows near by, and a coarser one around all of it."""
+    """Place a cube around the near points of a frame, and a coarser one around all of them."""
     shown = _seen_points(surface, view)
     near = shown.z <= NEAR_MEDIANS * np.median(shown.z)
     details_1m = noise_sigma, 1 / float(view.camera.matrix[0, 0])
@@ -318,10 +320,10 @@ def place_volumes(
 def _placement(
     held: _SeenPoints, counted: _SeenPoints, details_1m: tuple[float, float], triangles: int
 ) -> TsdfPlacement:
-    """A cube around what is `held`, with voxels so small that what is `counted` gives so many triangles.
+    """Place a cube around the points `held`, with voxels so small that the points `counted` give so many triangles.
 
-    Voxels are no smaller than the noise of one frame or a pixel's footprint (`details_1m`: at 1 m) at the median
-    distance, which hold no more detail; and so large that the cube leaves room around what it holds.
+    Voxels are no smaller than a frame's noise and a pixel's footprint (`details_1m`: at 1 m) at the median distance,
+    and so large that the cube leaves room around what it holds.
     """
     low, high = np.percentile(held.points, [1, 99], axis=0)
     edge_m = float((high - low).max()) / FIRST_FRACTION
@@ -335,7 +337,7 @@ def _placement(
 
 
 def _seen_points(surface: DepthSurface, view: CameraView) -> _SeenPoints:
-    """A pixel shows z^2 / f^2 / cos(slant), at most 80 degrees aslant."""
+    """Return the points of known pixels; a pixel's area is z^2 / f^2 / cos(slant), with a slant up to 80 degrees."""
     known = surface.inverse_depth > 0
     z = 1 / surface.inverse_depth[known].astype(np.float64)
     rays = np.dstack([view.camera.rays(), np.ones(known.shape, np.float32)])[known].astype(np.float64)

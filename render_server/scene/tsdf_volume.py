@@ -1,8 +1,12 @@
-"""Depth of many frames averaged into one signed distance field (Curless & Levoy 1996), in sparse blocks of voxels.
+"""Truncated signed distance field of many depth frames (Curless & Levoy 1996), in sparse blocks of voxels.
 
-Distances are taken to the plane that was fitted around each pixel, not along the ray: oblique surfaces and the
-rounding to whole pixels then leave no error. Weights are inverse variances of depth noise. What is seen to be free
-space is carved, so that things which moved away disappear.
+Distances are measured to the plane fitted around each pixel, not along the ray: oblique surfaces and rounding to
+whole pixels then cause no error. Weights are inverse variances of depth noise. Observed free space is carved, so that
+things which moved away disappear.
+
+The pose of a depth image is refined against the field (Bylow et al. 2013). The board gives the colour camera's pose
+with an error of millimetres at the distance of other things, and depth may be captured a little earlier or later than
+colour: averaging frames by the board's pose alone would blur the surface.
 """
 
 from dataclasses import dataclass, replace
@@ -19,19 +23,19 @@ from render_server.view import NEAR_M, CameraView
 
 BLOCK = 8  # voxels an edge of a block
 GRID = 128  # blocks an edge of the largest box
-# What a frame adds counts at least this share, so that slow changes of the scene are followed.
+# Weights saturate at so many frames, so that the field keeps up with slow changes of the scene.
 MAX_MEMORY_FRAMES = 32
-# Distances are kept so far from a surface: gradients lie within three voxels, depth noise within three sigma.
+# Truncation distance: gradients need three voxels, depth noise three sigma.
 REACH_VOXELS, REACH_SIGMAS = 3.0, 3.0
-CHUNK_BLOCKS = 128  # updated at once: their arrays fit a core's cache
+CHUNK_BLOCKS = 128  # blocks updated at once: their arrays fit a core's cache
 ALIGNMENT_SAMPLES = 4000
-# Neighbouring pixels err alike (filters, calibration): so many count as one.
+# Errors of neighbouring pixels are correlated (filters, calibration): so many count as one.
 CORRELATED_PIXELS = 100
-# What is known of the pose beforehand, standard deviations: some millimetres at a metre. Shape corrects what it can
-# tell; along a bare wall, say, the board's pose stays.
+# Prior of the pose, standard deviations: some millimetres at a metre. Where shape is ambiguous, along a bare wall,
+# say, the board's pose stays.
 POSE_SIGMA_RAD, POSE_SIGMA_M = 0.005, 0.005
 ALIGNMENT_ITERATIONS = 8
-# Corrections below this share of a voxel end the search.
+# Corrections below this fraction of a voxel end the search.
 CONVERGED_VOXELS = 0.01
 MIN_ALIGNMENT_SAMPLES = 50
 CORNERS = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)])
@@ -39,10 +43,10 @@ CORNERS = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)])
 
 @dataclass(frozen=True)
 class TsdfPlacement:
-    """A cube of voxels in world axes.
+    """A cube of voxels aligned with the world's axes.
 
-    `origin` is the first voxel's centre (m), `voxel_m` the distance of voxels, `blocks` the cube's edge in blocks of
-    8 voxels. `max_blocks` bounds memory. Blocks inside `hole` (least and greatest coordinates, m) stay empty.
+    `origin` is the centre of the first voxel (m), `voxel_m` the edge of a voxel, `blocks` the cube's edge in blocks
+    of 8 voxels. `max_blocks` bounds memory. Blocks inside `hole` (least and greatest coordinates, m) stay empty.
     """
 
     origin: tuple[float, float, float]
@@ -64,9 +68,9 @@ class TsdfPlacement:
 
 @dataclass(frozen=True, eq=False)
 class PixelPlanes:
-    """The plane seen at each pixel: rows of (nx, ny, nz, n.P, noise, weight), optical frame, and 1/z of the pixels.
+    """The plane at each pixel in the optical frame: rows of (nx, ny, nz, n.P, noise, weight), and 1/z of the pixels.
 
-    The last row is for no pixel at all. `noise` is how far from the plane noise reaches, m; weights are inverse
+    The last row stands for no pixel at all. `noise` is three standard deviations of depth, m; weights are inverse
     variances relative to the noise at 1 m.
     """
 
@@ -75,7 +79,7 @@ class PixelPlanes:
 
     @classmethod
     def of(cls, surface: DepthSurface, camera: CameraModel, noise_sigma: float) -> Self:
-        """From a frame's depth, registered to `camera`, with noise of `noise_sigma` m at 1 m."""
+        """Build from a frame's depth, registered to `camera`, with noise of `noise_sigma` m at 1 m."""
         inverse, rays = surface.inverse_depth.ravel(), _pixel_rays(camera)
         z = np.divide(1, inverse, out=np.zeros_like(inverse), where=inverse > 0)
         normals = surface.normals.reshape(-1, 3)
@@ -90,12 +94,12 @@ class PixelPlanes:
 
 
 class TsdfVolume:
-    """Signed distances to the nearest surface, m: positive in front, cut off at the reach of what was measured."""
+    """Signed distances to the nearest surface, m: positive in front, truncated."""
 
     def __init__(self, placement: TsdfPlacement) -> None:
         self.placement = placement
         self.slots = np.full((placement.blocks,) * 3, -1, np.int32)
-        """Number of the block at each place of the cube (x, y, z), -1: none."""
+        """Index of the block at each place of the cube (x, y, z), -1 for none."""
         self.places: Int32[np.ndarray, "b 3"] = np.zeros((0, 3), np.int32)
         self.distance: Float32[np.ndarray, "b 512"] = np.zeros((0, BLOCK**3), np.float32)
         self.weight: Float32[np.ndarray, "b 512"] = np.zeros((0, BLOCK**3), np.float32)
@@ -108,11 +112,11 @@ class TsdfVolume:
             self._update(blocks[start : start + CHUNK_BLOCKS], planes, view)
 
     def known_distance(self) -> Float32[np.ndarray, "b 512"]:
-        """Distances, NaN where nothing was measured."""
+        """Return the distances, NaN where nothing was measured."""
         return np.where(self.weight > 0, self.distance, np.float32(np.nan))
 
     def _allocate(self, planes: PixelPlanes, view: CameraView) -> None:
-        """Make blocks wherever the distances around this frame's surfaces reach."""
+        """Allocate blocks within the truncation distance of this frame's surfaces."""
         half_block = self.placement.block_m / 2
         chosen = _spread_pixels(planes, view, half_block)
         matrix = view.world_from_camera.astype(np.float32)
@@ -142,13 +146,13 @@ class TsdfVolume:
         self.weight = np.concatenate([self.weight, empty])
 
     def _blocks_in_view(self, view: CameraView) -> Int64[np.ndarray, " k"]:
-        """Blocks whose sphere touches the view's pyramid."""
+        """Return the blocks whose bounding sphere touches the view frustum."""
         edge = self.placement.block_m
         centre = (self.places + (0.5 - 0.5 / BLOCK)) * edge + self.placement.origin
         matrix = view.camera_from_world
         seen = centre @ matrix[:3, :3].T + matrix[:3, 3]
         (fx, fy, cx, cy), (width, height) = view.raster
-        # Inward normals of the pyramid's sides, not unit: (1, 0, slope) has length sqrt(1 + slope^2).
+        # Inward normals of the frustum's sides, not unit: (1, 0, slope) has length sqrt(1 + slope^2).
         slopes = np.array(
             [(cx + 0.5) / fx, (width - 0.5 - cx) / fx, (cy + 0.5) / fy, (height - 0.5 - cy) / fy]
         )
@@ -166,13 +170,13 @@ class TsdfVolume:
         nx, ny, nz, offset, noise, weight = planes.rows[row[known]].T
         reach = self._reach(noise)
         distance = nx * x + ny * y + nz * z - offset
-        kept = distance > -reach  # what lies behind is not seen
+        kept = distance > -reach  # voxels farther behind the surface are occluded
         known = known[kept]
         at = blocks[known // BLOCK**3] * BLOCK**3 + known % BLOCK**3
         self._average(at, np.minimum(distance, reach)[kept], reach[kept], weight[kept])
 
     def _reach(self, noise: Float32[np.ndarray, " n"]) -> Float32[np.ndarray, " n"]:
-        """How far from a surface distances are kept, m."""
+        """Return the truncation distance, m."""
         return np.asarray(np.maximum(noise, np.float32(REACH_VOXELS * self.placement.voxel_m)))
 
     def _average(
@@ -184,7 +188,7 @@ class TsdfVolume:
     ) -> None:
         distances, weights = self.distance.ravel(), self.weight.ravel()
         old, before = distances[at], weights[at]
-        # More than the reach apart is no noise: something moved. What was known then counts half.
+        # A difference beyond the truncation distance is no noise: something moved. Halve the old weight.
         before = np.where(np.abs(new - old) > reach, before / 2, before)
         total = before + weight
         distances[at] = (old * before + new * weight) / total
@@ -196,7 +200,7 @@ def _inside(points: Float32[np.ndarray, "n 3"], box: Float64[np.ndarray, "2 3"])
 
 
 def _in_hole(places: Int32[np.ndarray, "n 3"], placement: TsdfPlacement) -> Bool[np.ndarray, " n"]:
-    """Whether blocks lie inside the hole entirely."""
+    """Return which blocks lie entirely inside the hole."""
     if placement.hole is None:
         return np.zeros(len(places), bool)
     low = places * placement.block_m + placement.origin
@@ -205,9 +209,9 @@ def _in_hole(places: Int32[np.ndarray, "n 3"], placement: TsdfPlacement) -> Bool
 
 
 def _spread_pixels(planes: PixelPlanes, view: CameraView, distance_m: float) -> Int64[np.ndarray, " k"]:
-    """Pixels whose points lie at most `distance_m` apart on the surface: each 1st, 2nd, 4th... by its footprint."""
+    """Return pixels whose points lie at most `distance_m` apart: each 1st, 2nd, 4th... by its footprint."""
     camera, inverse = view.camera, planes.inverse_depth
-    # A pixel is z / f wide, and longer by 1 / cos(slant) = z |towards| / |n.P|.
+    # A pixel is z / f wide, and longer by 1 / cos(slant) = z |ray| / |n.P|.
     cosine = np.abs(planes.rows[:-1, 3]) * inverse / np.linalg.norm(_pixel_rays(camera), axis=1)
     affordable = distance_m * float(camera.matrix[0, 0]) * inverse * cosine
     stride = np.exp2(np.floor(np.log2(np.clip(affordable, 1, 64)))).astype(np.int32)
@@ -217,7 +221,7 @@ def _spread_pixels(planes: PixelPlanes, view: CameraView, distance_m: float) -> 
 
 @lru_cache(maxsize=4)
 def _pixel_rays(camera: CameraModel) -> Float32[np.ndarray, "n 3"]:
-    """(x/z, y/z, 1) of each pixel's ray."""
+    """Return (x/z, y/z, 1) of each pixel."""
     rays = camera.rays().reshape(-1, 2)
     return np.column_stack([rays, np.ones(len(rays), np.float32)])
 
@@ -225,7 +229,7 @@ def _pixel_rays(camera: CameraModel) -> Float32[np.ndarray, "n 3"]:
 def _voxels_in_camera(
     places: Int32[np.ndarray, "k 3"], placement: TsdfPlacement, view: CameraView
 ) -> Float32[np.ndarray, "3 n"]:
-    """Voxels of blocks in the optical frame, m."""
+    """Return the voxel centres of blocks in the optical frame, m."""
     matrix = view.camera_from_world
     first = places * placement.block_m + np.array(placement.origin)
     starts = (first @ matrix[:3, :3].T + matrix[:3, 3]).astype(np.float32)
@@ -239,7 +243,7 @@ def _lattice() -> Int64[np.ndarray, "512 3"]:
 
 
 def _pixel_rows(points: Float32[np.ndarray, "3 n"], view: CameraView) -> Int32[np.ndarray, " n"]:
-    """The pixel (row of `PixelPlanes`) that looks at each point of the optical frame; the last row for none."""
+    """Project points of the optical frame to pixels (rows of `PixelPlanes`); the last row where none sees it."""
     (fx, fy, cx, cy), (width, height) = view.raster
     table = _pixel_table(view.camera)
     x, y, z = points
@@ -253,7 +257,7 @@ def _pixel_rows(points: Float32[np.ndarray, "3 n"], view: CameraView) -> Int32[n
 
 @lru_cache(maxsize=4)
 def _pixel_table(camera: CameraModel) -> Int32[np.ndarray, " n"]:
-    """For each texel of the view's raster (a pinhole) the pixel that looks the same way, width * height for none."""
+    """Return for each texel of the view's pinhole raster the pixel with the same ray, width * height for none."""
     (fx, fy, cx, cy), (width, height) = CameraView(camera, np.eye(4)).raster
     none = camera.width * camera.height
     if not camera.has_distortion:
@@ -268,12 +272,12 @@ def _pixel_table(camera: CameraModel) -> Int32[np.ndarray, " n"]:
 def aligned_view(
     volumes: list[TsdfVolume], surface: DepthSurface, view: CameraView, noise_sigma: float
 ) -> CameraView:
-    """Return the view from which the depth image fits the volumes best; the view itself where too little fits.
+    """Return the view from which a depth image fits the volumes best; `view` itself where too few samples match.
 
     Args:
-        volumes: what was fused so far.
-        surface: of the frame's depth.
-        view: camera and pose by the board.
+        volumes: the field so far.
+        surface: the frame's depth.
+        view: camera, and its pose by the board.
         noise_sigma: depth noise at 1 m, m.
     """
     points, sigma_m = _alignment_points(surface, view, noise_sigma)
@@ -294,7 +298,7 @@ def aligned_view(
 def _displaced(
     motion: Float64[np.ndarray, "6"], pose: Float64[np.ndarray, "4 4"]
 ) -> Float64[np.ndarray, "4 4"]:
-    """The pose turned about the camera's centre (first three, rad) and shifted (m), both in world axes."""
+    """Return the pose rotated about the camera's centre (first three, rad) and translated (m), in world axes."""
     result = pose.copy()
     result[:3, :3] = cv2.Rodrigues(motion[:3])[0] @ pose[:3, :3]
     result[:3, 3] += motion[3:]
@@ -304,7 +308,7 @@ def _displaced(
 def _alignment_points(
     surface: DepthSurface, view: CameraView, noise_sigma: float
 ) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, " n"]]:
-    """Points spread over the picture (optical frame), and their standard deviations across the surface, m."""
+    """Return points spread over the picture (optical frame, m), and their standard deviations along the ray, m."""
     stride = max(1, int(np.sqrt(surface.inverse_depth.size / ALIGNMENT_SAMPLES)))
     grid = np.s_[stride // 2 :: stride, stride // 2 :: stride]
     inverse = surface.inverse_depth[grid]
@@ -321,13 +325,13 @@ def _gauss_newton_step(
     total: Float64[np.ndarray, "6"],
     centre: Float64[np.ndarray, "3"],
 ) -> Float64[np.ndarray, "6"] | None:
-    """One Gauss-Newton step of the motion; None where too few samples meet a known surface."""
+    """Return one Gauss-Newton step of the motion; None where too few samples meet a known surface."""
     rows, residuals, information = [], [], []
     for volume in volumes:
         found, distance, gradient = interpolate(volume, world)
-        # A voxel's interpolation is no better than a tenth of it.
+        # Interpolation is no better than a tenth of a voxel.
         sigma = np.hypot(sigma_m[found], 0.1 * volume.placement.voxel_m)
-        # Cauchy's weight: what moved must not pull the camera along.
+        # Cauchy weights: things that moved must not pull the camera along.
         information.append(1 / (sigma**2 * (1 + (distance / (3 * sigma)) ** 2) * CORRELATED_PIXELS))
         rows.append(np.hstack([np.cross(world[found] - centre, gradient), gradient]))
         residuals.append(distance)
@@ -342,7 +346,7 @@ def _gauss_newton_step(
 def interpolate(
     volume: TsdfVolume, world: Float64[np.ndarray, "n 3"]
 ) -> tuple[Int64[np.ndarray, " m"], Float64[np.ndarray, " m"], Float64[np.ndarray, "m 3"]]:
-    """Points whose voxel cell is known, their distances (m) and the unit gradient there, trilinear."""
+    """Interpolate trilinearly: indices of points in known cells, their distances (m) and unit gradients."""
     placement = volume.placement
     at = (world - placement.origin) / placement.voxel_m
     found = np.flatnonzero(((at >= 0) & (at < placement.blocks * BLOCK - 1)).all(axis=1))
@@ -360,13 +364,13 @@ def interpolate(
     ]
     gradient = np.stack(slopes, axis=1)
     length = np.linalg.norm(gradient, axis=1)
-    # Where distances are cut off they do not change.
+    # Truncated distances have no gradient.
     steep = length > 0.5 * placement.voxel_m
     return found[steep], distance[steep], gradient[steep] / length[steep, None]
 
 
 def _at_voxels(volume: TsdfVolume, voxel: Int64[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:
-    """Distances at voxels inside the cube, NaN where unknown."""
+    """Return the distances at voxels of the cube, NaN where unknown."""
     block, inside = np.divmod(voxel, BLOCK)
     slot = volume.slots[tuple(block.T)]
     index = np.ravel_multi_index(tuple(inside.T), (BLOCK,) * 3)

@@ -1,8 +1,7 @@
-"""Frames from sensor nodes: the endpoints that are read, and their streams paired to whole frames.
+"""Frames from sensor nodes: the endpoints that are read, and their streams paired to complete frames.
 
 A colour frame triggers; pose and lamps are those of the same frame, the depth the nearest in capture time within a
-tolerance, the radiance map the one that holds. What stays without a partner, or is overtaken by a newer frame, is
-counted.
+tolerance, the radiance map the latest. Frames without a partner, or overtaken by a newer frame, are counted.
 """
 
 from collections import Counter, deque
@@ -48,7 +47,7 @@ class SourceOrder(StrictModel):
 
 
 class FrameSource:
-    """Receives the streams of `configured` endpoints until others are named.
+    """Receives the streams of the `configured` endpoints until `use` names others.
 
     `keys` are needed where an endpoint leaves the host.
 
@@ -64,13 +63,13 @@ class FrameSource:
 
     @property
     def endpoints(self) -> tuple[str, ...]:
-        """What is read now."""
+        """Endpoints that are read now."""
         return self._endpoints
 
     def use(self, endpoints: Sequence[str] | None) -> bool:
-        """Read from these from now on, None = the configured ones; returns whether they are others than before.
+        """Switch to these endpoints, None = the configured ones; returns whether that is a change.
 
-        If so, what waits is thrown away.
+        If so, waiting messages are dropped.
 
         Raises:
             DeltalightError: as above; then all stays as it was.

@@ -88,7 +88,7 @@ def test_coefficients_are_those_of_brute_force_rays() -> None:
     corners = np.asarray(shape.triangles, np.float32)
     rays = ObjectRays(corners)
     point = np.array([[0.7, 0.1, 0.3]], np.float32)
-    for _, chosen, hits in rays.aimed(point, 256):
+    for _, chosen, hits in rays.trace(point, 256):
         met = np.zeros(len(chosen.directions), bool)
         met[hits.direction] = True
     start = np.repeat(point, len(met), axis=0)
