@@ -14,10 +14,10 @@ from rich.console import Console
 from rich.table import Table
 
 from protocol.hemisphere import texel_directions
-from render_server.scene.fisheye_lights import RESIDUAL_SIZE
-from render_server.scene.hemisphere_map import HemisphereMap, to_world
-from render_server.scene.median_cut import split_map
-from render_server.scene.octahedral import prefilter
+from render_server.lights.fisheye import HemisphereMap, to_world
+from render_server.lights.median_cut import split_map
+from render_server.lights.octahedral import prefilter
+from render_server.lights.sources import RESIDUAL_SIZE
 
 ROUNDS = 30
 SIZES = (256, 512)

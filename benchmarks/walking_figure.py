@@ -15,7 +15,7 @@ from jaxtyping import Float32, Float64, Int32
 
 from benchmarks.glb_builder import GlbBuilder
 from benchmarks.ground_truth import scene_demo
-from render_server.scene.normals import face_normals, smooth_normals
+from render_server.scene.triangle_mesh import face_normals, smooth_normals
 
 SIDES = 12
 BLEND_M = 0.008

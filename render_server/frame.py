@@ -14,12 +14,12 @@ from render_server.gpu.textures import release_all
 from render_server.gpu.uniform_block import UniformBlock
 from render_server.gpu_scene import GeometryState
 from render_server.graph import Graph, Resource
+from render_server.lights.lights import LightSet
 from render_server.passes.coverage import EdgeUnmixing, InteriorEdgeAA, ObjectCoverage, SampleCoverage
 from render_server.passes.gbuffer import CameraImage, GeometryBuffer, RasterGeometry, RealSurface
 from render_server.passes.voxel_light import AlbedoTexture
+from render_server.scene.declared_surfaces import DIFFUSE_BOX, MAX_SURFACES, SurfaceTable
 from render_server.scene.depth_surface import DepthSurface
-from render_server.scene.lights import LightSet
-from render_server.scene.surfaces import DIFFUSE_BOX, MAX_SURFACES, SurfaceTable
 from render_server.view import CameraBlock, CameraView, Rectangle
 
 BIAS_SIGMAS = 3.0  # of depth noise: no real surface shadows itself

@@ -14,6 +14,7 @@ from render_server.gpu.kernel import Bindings
 from render_server.gpu.timers import PassTimers
 from render_server.gpu_scene import GeometryState
 from render_server.graph import Graph, Resource
+from render_server.lights.lights import LightSet
 from render_server.methods.lighting import Layers
 from render_server.methods.registry import MethodChoice
 from render_server.occlusion_fields import OcclusionFields
@@ -22,8 +23,7 @@ from render_server.passes.cones import ConeFields, LowResGrid
 from render_server.passes.gbuffer import CameraImage, GeometryBuffer, RealSurface
 from render_server.passes.shading import DirectLight
 from render_server.passes.voxel_light import AlbedoTexture
-from render_server.scene.lights import LightSet
-from render_server.scene.surfaces import SurfaceTable
+from render_server.scene.declared_surfaces import SurfaceTable
 from render_server.view import CameraView
 
 

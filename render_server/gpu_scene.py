@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from render_server.passes.gbuffer import MaterialTable, MeshBuffers
-from render_server.scene.back_sheets import back_sheets
+from render_server.scene.depth_mesh import back_faces
 from render_server.scene.materials import Material
-from render_server.scene.mesh import TriangleMesh
+from render_server.scene.triangle_mesh import TriangleMesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,11 +46,11 @@ class GeometryState:
     is_open: bool = False  # one camera's view of what is solid: backs are not in it
 
     def solid_corners(self, voxel_edge: float) -> Float32[np.ndarray, "k 3 10"]:
-        """`corners` for voxels of that edge (m), with coarse backs of what one camera saw (scene/back_sheets.py)."""
+        """`corners` for voxels of that edge (m), with coarse backs of what one camera saw (scene/depth_mesh.py)."""
         if not self.is_open:
             return self.corners
         fronts = self.corners if self.coarse_corners is None else self.coarse_corners
-        return np.concatenate([self.corners, back_sheets(fronts, voxel_edge)])
+        return np.concatenate([self.corners, back_faces(fronts, voxel_edge)])
 
     @property
     def bounds(self) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:

@@ -17,8 +17,8 @@ from render_server.methods.registry import MethodChoice, choose_method
 from render_server.occlusion_fields import OcclusionFields
 from render_server.passes.composite import Composite
 from render_server.real_geometry import RealGeometry
-from render_server.scene.mesh import TriangleMesh
-from render_server.scene.surfaces import SurfaceTable, build_surface_table
+from render_server.scene.declared_surfaces import SurfaceTable, build_surface_table
+from render_server.scene.triangle_mesh import TriangleMesh
 from render_server.view import CameraView
 from render_server.virtual_objects import VirtualObjects
 

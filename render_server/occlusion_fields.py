@@ -12,16 +12,16 @@ from rich.progress import Progress
 from protocol.errors import DeltalightError
 from protocol.scene_objects import SceneObject
 from render_server.gpu_scene import PlacedObject
-from render_server.scene.mesh import TriangleMesh
-from render_server.scene.occlusion_field import FieldSettings, OcclusionField, Step
-from render_server.scene.occlusion_field_cache import (
+from render_server.scene.occlusion_cache import (
     compute_field,
     default_folder,
     field_digest,
     load_field,
     store_field,
 )
+from render_server.scene.occlusion_field import FieldSettings, OcclusionField, ProgressCallback
 from render_server.scene.occlusion_transfer import object_surface
+from render_server.scene.triangle_mesh import TriangleMesh
 
 log = structlog.get_logger()
 
@@ -81,7 +81,7 @@ class OcclusionFields:
         if entry.field is not None:
             return
 
-        def make(step: Step) -> None:
+        def make(step: ProgressCallback) -> None:
             made = compute_field(surface, settings, step)
             try:
                 store_field(self._folder, digest, made)
@@ -101,7 +101,7 @@ class OcclusionFields:
         entry.thread = threading.Thread(target=self._beside, args=(entry, make), daemon=True)
         entry.thread.start()
 
-    def _beside(self, entry: _Entry, make: Callable[[Step], None]) -> None:
+    def _beside(self, entry: _Entry, make: Callable[[ProgressCallback], None]) -> None:
         def step(_share: float) -> None:
             if self._ended.is_set():
                 raise _EndedError

@@ -12,9 +12,9 @@ from protocol.frames import ViewFrame
 from render_server.frame_graph import ShownBuffers
 from render_server.gpu.textures import read_texel
 from render_server.gpu_scene import PlacedObject
+from render_server.scene.bvh import first_hit
 from render_server.scene.depth_surface import depth_surface
-from render_server.scene.mesh import TriangleMesh
-from render_server.scene.ray_mesh import first_hit
+from render_server.scene.triangle_mesh import TriangleMesh
 from render_server.view import CameraView
 
 SHOWN_SHARE = 0.5  # of a pixel that an object must cover to be what the pixel shows

@@ -13,11 +13,12 @@ from render_server.gpu.context import GpuContext
 from render_server.gpu_scene import GeometryState
 from render_server.passes.gbuffer import MaterialTable, MeshBuffers, triangle_corners
 from render_server.scene.depth_mesh import depth_mesh
-from render_server.scene.depth_surface import DepthSurface, depth_surface, noise_sigma
-from render_server.scene.fused_scene import FusedScene
-from render_server.scene.mesh import TriangleMesh, load_mesh, merge_for_gpu
-from render_server.scene.scene_tracker import RealSceneTracker
-from render_server.scene.steep_surfaces import steep_surfaces
+from render_server.scene.depth_surface import DepthSurface, depth_surface, grazing_depth_fill, noise_sigma
+from render_server.scene.gpu_mesh import merge_for_gpu
+from render_server.scene.mesh_loading import load_mesh
+from render_server.scene.motion_detection import MotionDetector
+from render_server.scene.triangle_mesh import TriangleMesh
+from render_server.scene.tsdf_mesh import TsdfScene
 from render_server.view import CameraView
 
 COARSE_SHARE = 8  # of the triangles, for the coarse volume: its voxels are several times as large
@@ -30,7 +31,7 @@ ROUNDED_VOXELS = 0.35
 
 
 class RealGeometry:
-    """Keeps the real scene until it moves (RealSceneTracker), then rebuilds it.
+    """Keeps the real scene until it moves (MotionDetector), then rebuilds it.
 
     `state` is another object whenever its triangles change, `scan` whenever something moved, the camera included.
     """
@@ -38,7 +39,7 @@ class RealGeometry:
     def __init__(self, gpu: GpuContext, real: RealScene, triangle_budget: int) -> None:
         self._gpu = gpu
         self.budget = triangle_budget
-        self._tracker = RealSceneTracker()
+        self._tracker = MotionDetector()
         self._buffers = MeshBuffers(gpu)
         self._materials: MaterialTable | None = None
         self.state: GeometryState | None = None
@@ -50,7 +51,7 @@ class RealGeometry:
         self._scan: Scan | None = None
         self._world_from_fused = np.eye(4)
         self._fused_meshes: tuple[list[TriangleMesh], list[TriangleMesh]] = [], []
-        self._fused = FusedScene() if real.geometry == "fused" else None
+        self._fused = TsdfScene() if real.geometry == "fused" else None
         self._still_frames = 0
         self.model: list[TriangleMesh] = []
         if isinstance(real.geometry, ModelGeometry):
@@ -114,7 +115,7 @@ class RealGeometry:
             self._scan = None
         return changed
 
-    def _fuse(self, fused: FusedScene, frame: ViewFrame, view: CameraView, moved: bool) -> bool:
+    def _fuse(self, fused: TsdfScene, frame: ViewFrame, view: CameraView, moved: bool) -> bool:
         """Average a frame in, unless all stands still long enough; returns whether anything changed."""
         self._still_frames = 0 if moved else self._still_frames + 1
         if self._still_frames > STILL_FRAMES:
@@ -138,7 +139,7 @@ class RealGeometry:
             self._build_from_fused()
         return moved or renewed
 
-    def _follow_pose(self, fused: FusedScene, view: CameraView) -> bool:
+    def _follow_pose(self, fused: TsdfScene, view: CameraView) -> bool:
         """Whether the fused surface must be put elsewhere for this frame, because its pose is off.
 
         The picture goes by the frame's pose; what its depth shows must lie where that pose puts it.
@@ -163,14 +164,14 @@ class RealGeometry:
     ) -> None:
         """Mesh the depth image, and once more with few triangles for what lies far from the objects."""
         self.surface = depth_surface(depth, view.camera)
-        steep = steep_surfaces(depth, color, view.camera)
+        grazing = grazing_depth_fill(depth, color, view.camera)
         place = view.world_from_camera
-        fine = depth_mesh(depth, view.camera, place, self.budget, self.surface, steep=steep)
+        fine = depth_mesh(depth, view.camera, place, self.budget, self.surface, grazing=grazing)
         if not len(fine.triangles):
             self.state = None
             return
         budget = self.budget // COARSE_SHARE
-        coarse = depth_mesh(depth, view.camera, place, budget, self.surface, steep=steep)
+        coarse = depth_mesh(depth, view.camera, place, budget, self.surface, grazing=grazing)
         self._build([fine], triangle_corners(merge_for_gpu([coarse])), is_open=True)
 
     def _build(

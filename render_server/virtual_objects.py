@@ -1,4 +1,4 @@
-"""The scene document's objects as one set of triangles in the world."""
+"""The scene document's objects as one set of triangles in the world, animated ones at a frame's capture time."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -9,16 +9,69 @@ from jaxtyping import Float64
 
 from protocol.board import BoardSpec
 from protocol.errors import DeltalightError
+from protocol.scene_objects import Animation, SceneObject
 from protocol.scene_objects import Material as MaterialDocument
-from protocol.scene_objects import SceneObject
 from render_server.gpu.context import GpuContext
 from render_server.gpu_scene import GeometryState, PlacedObject
-from render_server.moving_object import MovingObject, clip_of
 from render_server.passes.gbuffer import MaterialTable, MeshBuffers, triangle_corners
+from render_server.scene.gltf_animation import Clip
+from render_server.scene.gltf_meshes import GltfAsset, Pose
+from render_server.scene.gpu_mesh import GpuMesh, merge_for_gpu
 from render_server.scene.materials import Material
-from render_server.scene.mesh import Asset, GpuMesh, TriangleMesh, load_asset, merge_for_gpu
+from render_server.scene.mesh_loading import Asset, load_asset
+from render_server.scene.triangle_mesh import TriangleMesh
 
 MARKER_FRAME = "marker:"
+
+
+class AnimatedObject:
+    """An object that plays a clip; `meshes` are in the pose that it advanced to, in the asset's frame."""
+
+    def __init__(self, asset: GltfAsset, clip: Clip, animation: Animation) -> None:
+        self.asset, self.animation = asset, animation
+        self._clip = clip
+        self._pose: Pose | None = None
+        self.meshes: Sequence[TriangleMesh] = ()
+
+    @property
+    def is_still(self) -> bool:
+        """Whether its pose never changes."""
+        return self.animation.speed == 0 or self._clip.duration_s == 0
+
+    @property
+    def bounds(self) -> Float64[np.ndarray, "2 3"]:
+        """Least and greatest coordinates over the whole clip, in the asset's frame."""
+        return self.asset.bounds(self._clip)
+
+    def advance_to(self, capture_ns: int) -> bool:
+        """Pose the meshes for a capture time; returns whether they changed."""
+        time_s = self.animation.time_s(capture_ns, self._clip.duration_s)
+        pose = self.asset.pose(self._clip, time_s)
+        if pose.equals(self._pose):
+            return False
+        self._pose = pose
+        self.meshes = self.asset.meshes(pose)
+        return True
+
+
+def clip_of(item: SceneObject, asset: GltfAsset | None) -> Clip | None:
+    """Return the clip that an object plays; None if it plays none.
+
+    Raises:
+        DeltalightError: it names a clip that its asset does not have.
+    """
+    playing = item.playing
+    if playing is None:
+        return None
+    clip = None if asset is None else asset.clip(playing.clip)
+    if clip is not None or item.animation is None:
+        return clip
+    if asset is None or not asset.clips:
+        raise DeltalightError(
+            f"object `{item.id}`: {item.asset} has no animation; leave out `animation`, or export it with its clips."
+        )
+    names = ", ".join(f"`{each.name}`" for each in asset.clips)
+    raise DeltalightError(f"object `{item.id}`: {item.asset} has no clip {playing.clip!r}; it has {names}.")
 
 
 class VirtualObjects:
@@ -32,7 +85,7 @@ class VirtualObjects:
         self._given: dict[MaterialDocument, Material] = {}
         self._shown: tuple[SceneObject, ...] = ()
         self._board: BoardSpec | None = None
-        self._moving: dict[str, MovingObject] = {}
+        self._moving: dict[str, AnimatedObject] = {}
         self._standing: dict[str, list[TriangleMesh]] = {}
         self.state: GeometryState | None = None
 
@@ -55,13 +108,13 @@ class VirtualObjects:
                     f"object `{item.id}`: precomputed materials arrive with a later release; give base_color instead."
                 )
 
-    def _animated(self, item: SceneObject) -> MovingObject | None:
+    def _animated(self, item: SceneObject) -> AnimatedObject | None:
         """The object as its clip moves it; None if it plays none."""
         asset = self._assets[item.asset].animated
         clip = clip_of(item, asset)
         if asset is None or clip is None or item.playing is None:
             return None
-        return MovingObject(asset, clip, item.playing)
+        return AnimatedObject(asset, clip, item.playing)
 
     def update(
         self, objects: Sequence[SceneObject], board: BoardSpec | None, capture_ns: int
@@ -75,7 +128,7 @@ class VirtualObjects:
             self._moving = {name: moving for name, moving in animated.items() if moving is not None}
             self._standing = {}
             self._given = {each: made for each, made in self._given.items() if each in _materials(shown)}
-        moved = [moving.follow(capture_ns) for moving in self._moving.values()]
+        moved = [moving.advance_to(capture_ns) for moving in self._moving.values()]
         if is_new or any(moved):
             self.state = self._build() if shown else None
         return self.state

@@ -9,7 +9,7 @@ from jaxtyping import Float, Float32
 
 from benchmarks.ground_truth.benchmark_scene import BenchmarkScene, Finish
 from benchmarks.ground_truth.parts import MeshFolder, diffuse, rgb, shape, two_sided
-from render_server.scene.environment import read_radiance
+from render_server.lights.environment import read_radiance
 
 ENVIRONMENT_FILE = "environment.hdr"
 
@@ -34,7 +34,7 @@ def material(finish: Finish) -> dict[str, Any]:
 
 
 def environment_light(radiance: Float32[np.ndarray, "h w 3"]) -> dict[str, Any]:
-    """Light from a map that is laid out as in render_server/scene/environment.py.
+    """Light from a map that is laid out as in render_server/lights/environment.py.
 
     Mitsuba puts the first and the last row on the poles, we put row j at (j + 0.5)/h of the way. A map of
     2 h + 1 rows with ours at the odd ones and their means between is the same function in its layout.

@@ -74,7 +74,7 @@ class BenchmarkScene:
     """A real room, virtual objects in it, and what the scene document says of both.
 
     `real` makes the Mitsuba shapes of the room without lights. `environment` is a latitude-longitude map (linear,
-    row 0 up = +z, centre column looks along +x, +y is to its left, as render_server/scene/environment.py reads it);
+    row 0 up = +z, centre column looks along +x, +y is to its left, as render_server/lights/environment.py reads it);
     lamps and a map exclude each other. `surfaces` is the document's `real.surfaces`.
     `world_from_camera` and every object's poses have one entry a frame.
     """

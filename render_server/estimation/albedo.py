@@ -1,12 +1,12 @@
 """Albedo of real surfaces, kept from what pictures show for when the camera looks elsewhere (docs/method.md 2)."""
 
+from render_server.estimation.backoff_schedule import BackoffSchedule
 from render_server.estimation.samples import sample_light
 from render_server.frame_graph import FrameGraph
 from render_server.gpu.context import GpuContext
-from render_server.growing_interval import GrowingInterval
+from render_server.lights.lights import LightSet
 from render_server.passes.voxel_light import AlbedoTexture
-from render_server.scene.albedo_memory import MEAN_ALBEDO, AlbedoMemory
-from render_server.scene.lights import LightSet
+from render_server.scene.albedo_volume import MEAN_ALBEDO, AlbedoVolume
 
 
 class AlbedoEstimator:
@@ -17,8 +17,8 @@ class AlbedoEstimator:
 
     def __init__(self, gpu: GpuContext) -> None:
         self.texture = AlbedoTexture(gpu)
-        self._volume = AlbedoMemory()
-        self._schedule = GrowingInterval()
+        self._volume = AlbedoVolume()
+        self._schedule = BackoffSchedule()
         self._is_given = False
 
     def observe(self, graph: FrameGraph, lights: LightSet) -> bool:
@@ -35,7 +35,7 @@ class AlbedoEstimator:
 
     def reset(self, given: float | None) -> None:
         """Resets the estimate: another real scene, whose albedo may be `given`."""
-        self._volume, self._schedule = AlbedoMemory(), GrowingInterval()
+        self._volume, self._schedule = AlbedoVolume(), BackoffSchedule()
         self._is_given = given is not None
         self.texture.clear(MEAN_ALBEDO if given is None else given)
 

@@ -7,7 +7,11 @@ from jaxtyping import Float32, UInt8
 
 from protocol import scene_lights as documents
 from protocol.frames import ViewFrame
+from render_server.debug_view import draw_lights
+from render_server.estimation.backoff_schedule import BackoffSchedule
+from render_server.estimation.plane_extrapolation import ExtrapolatedPlanes
 from render_server.estimation.registration import register_lights
+from render_server.estimation.registration_fit import RegistrationAverage
 from render_server.estimation.samples import bounced_light
 from render_server.estimation.unseen_environment import (
     find_continued_planes,
@@ -16,12 +20,8 @@ from render_server.estimation.unseen_environment import (
     unseen_light_shape,
 )
 from render_server.frame_graph import FrameGraph
-from render_server.growing_interval import GrowingInterval
-from render_server.lights_view import lights_picture
-from render_server.scene.continued_planes import ContinuedPlanes
-from render_server.scene.light_sources import open_lights
-from render_server.scene.lights import LightSet
-from render_server.scene.registration import RegistrationAverage
+from render_server.lights.lights import LightSet
+from render_server.lights.sources import open_light_source
 
 Rgb = Float32[np.ndarray, "3"]
 
@@ -38,7 +38,7 @@ class LightEstimator:
     """
 
     def __init__(self, wished: documents.Lights, say: Callable[[str], None]) -> None:
-        self._source = open_lights(wished)
+        self._source = open_light_source(wished)
         self._say = say
         self._follows_lamps = wished.mode == "tracked"
         self._wants_registration = wished.resolved_registration == "auto"
@@ -52,15 +52,15 @@ class LightEstimator:
     def _reset(self) -> None:
         """Resets all estimates."""
         self._is_complete = False
-        self._average, self._schedule = RegistrationAverage(), GrowingInterval()
+        self._average, self._schedule = RegistrationAverage(), BackoffSchedule()
         self._factor: Rgb | None = None
         self._ground: Rgb | None = None
-        self._walls: ContinuedPlanes | None = None
+        self._walls: ExtrapolatedPlanes | None = None
         self._sky: tuple[Rgb, Float32[np.ndarray, "n n 1"]] | None = None
 
     def update(self, frame: ViewFrame) -> bool:
         """Takes a frame's lights; returns whether there are any lights yet."""
-        raw = self._source.follow(frame)
+        raw = self._source.update(frame)
         for sentence in self._source.remarks:
             self._say(sentence)
         if raw is not None:
@@ -77,7 +77,7 @@ class LightEstimator:
         if self._ground is not None:
             lights = lights.with_ground(self._ground)
         if self._walls is not None:
-            lights = lights.with_surfaces(self._walls.radiance, self._walls.share)
+            lights = lights.with_surfaces(self._walls.radiance, self._walls.probability)
         if self._sky is not None:
             lights = lights.with_sky(*self._sky)
         self.lights = lights
@@ -110,7 +110,7 @@ class LightEstimator:
     def picture(self, frame: ViewFrame) -> UInt8[np.ndarray, "h w 3"]:
         """Draws the lights (view `lights`), once there are any."""
         assert self.lights is not None
-        return lights_picture(frame, self.lights, self._source.split)
+        return draw_lights(frame, self.lights, self._source.split)
 
     def _register(self, graph: FrameGraph, raw: LightSet) -> None:
         """Finds the lights' factor from this frame and averages it with those before."""
@@ -129,8 +129,8 @@ class LightEstimator:
             lights = lights.with_ground(self._ground)
         bounce = bounced_light(graph, lights)
         walls = self._walls = find_continued_planes(graph, lights, bounce)
-        shape = unseen_light_shape(graph, len(lights.environment)) * (1 - walls.share)
-        lights = lights.with_surfaces(walls.radiance, walls.share)
+        shape = unseen_light_shape(graph, len(lights.environment)) * (1 - walls.probability)
+        lights = lights.with_surfaces(walls.radiance, walls.probability)
         found = find_unseen_light(graph, lights, shape, bounce)
         if found is not None:
             self._sky = (found, shape)

@@ -1,13 +1,13 @@
 """The lights' common factor, found from the picture (docs/method.md 1)."""
 
-from render_server.estimation.samples import bounced_light, sample_light
-from render_server.frame_graph import FrameGraph
-from render_server.scene.lights import LightSet
-from render_server.scene.registration import (
+from render_server.estimation.registration_fit import (
     Registration,
     registration_from_albedo_percentile,
     registration_from_patch,
 )
+from render_server.estimation.samples import bounced_light, sample_light
+from render_server.frame_graph import FrameGraph
+from render_server.lights.lights import LightSet
 
 
 def register_lights(graph: FrameGraph, lights: LightSet) -> Registration:

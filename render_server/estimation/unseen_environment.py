@@ -6,14 +6,19 @@ import numpy as np
 from jaxtyping import Float32
 
 from protocol.frames import decode_lut
+from render_server.estimation.plane_detection import PointCloud, detect_planes
+from render_server.estimation.plane_extrapolation import (
+    ExtrapolatedPlanes,
+    RealSamples,
+    ViewFrustum,
+    extrapolate_planes,
+)
+from render_server.estimation.registration_fit import unseen_radiance_from_patch
 from render_server.estimation.samples import Bounce, read_texture, sample_light
 from render_server.frame_graph import FrameGraph
-from render_server.scene.continued_planes import ContinuedPlanes, RealSamples, Sight, continue_planes
-from render_server.scene.environment import LUMINANCE
-from render_server.scene.lights import LightSet
-from render_server.scene.octahedral import irradiance, octahedral_uv, resample_to_octahedral
-from render_server.scene.registration import surroundings_from_patch
-from render_server.scene.seen_planes import PointCloud, find_planes
+from render_server.lights.environment import LUMINANCE
+from render_server.lights.lights import LightSet
+from render_server.lights.octahedral import irradiance, octahedral_uv, resample_to_octahedral
 
 GROUND_SIZES = 2.0
 FACES_UP = 0.7  # cosine to the vertical
@@ -22,8 +27,8 @@ PLANE_SAMPLES = 6000  # pixels that planes are looked for in: a plane of the lea
 FLATNESS = 0.01  # of the distance: walls, tables and lenses are that even
 
 
-def find_continued_planes(graph: FrameGraph, lights: LightSet, bounce: Bounce) -> ContinuedPlanes:
-    """Finds what lies beyond the picture where its border cuts table, walls or floor (continued_planes.py)."""
+def find_continued_planes(graph: FrameGraph, lights: LightSet, bounce: Bounce) -> ExtrapolatedPlanes:
+    """Finds what lies beyond the picture where its border cuts table, walls or floor (plane_extrapolation.py)."""
     known = sample_light(graph, lights, bounce)
     inputs = graph.inputs
     usable = np.flatnonzero(known.usable)
@@ -36,11 +41,11 @@ def find_continued_planes(graph: FrameGraph, lights: LightSet, bounce: Bounce) -
     indirect = (known.light + known.bounce - known.direct)[chosen]
     seen = RealSamples(position, known.measured[chosen], known.lit[chosen], indirect, tolerance)
     rays = inputs.frame.camera.rays().reshape(-1, 2).astype(np.float64)
-    sight = Sight(np.linalg.inv(pose), rays.min(axis=0), rays.max(axis=0))
+    sight = ViewFrustum(np.linalg.inv(pose), rays.min(axis=0), rays.max(axis=0))
     low, high = inputs.objects.bounds
-    planes = find_planes(PointCloud(position, normal, tolerance))
+    planes = detect_planes(PointCloud(position, normal, tolerance))
     size = len(lights.environment)
-    return continue_planes(planes, seen, lights.lights, sight, centre=(low + high) / 2, size=size)
+    return extrapolate_planes(planes, seen, lights.lights, sight, centre=(low + high) / 2, size=size)
 
 
 def find_unseen_light(
@@ -59,7 +64,7 @@ def find_unseen_light(
     even = sample_light(graph, black.with_sky(np.ones(3, np.float32), shape), bounce)
     paper = known.usable & (known.albedo > 0)
     total, per_radiance = known.light + known.bounce, even.light - known.direct
-    return surroundings_from_patch(
+    return unseen_radiance_from_patch(
         known.measured[paper], total[paper], per_radiance[paper], known.albedo[paper]
     )
 

@@ -15,6 +15,7 @@ from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Binding, Bindings
 from render_server.gpu_scene import GeometryState
 from render_server.graph import Graph, Resource
+from render_server.lights.lights import LightSet
 from render_server.methods.lighting import (
     Layers,
     LitScene,
@@ -34,7 +35,6 @@ from render_server.passes.lights import LightBuffers
 from render_server.passes.shading import DirectLightPair
 from render_server.passes.shadow_maps import ShadowMaps
 from render_server.passes.voxels import VoxelMipmap
-from render_server.scene.lights import LightSet
 
 
 class TwoSolutions:

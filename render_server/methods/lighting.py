@@ -13,6 +13,8 @@ from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Binding, Bindings
 from render_server.gpu_scene import GeometryState
 from render_server.graph import Graph, Resource
+from render_server.lights.lights import LightSet
+from render_server.lights.mirror_lights import mirror_lights
 from render_server.methods.settings import ResolvedSettings
 from render_server.passes.caustics import GREATEST_ALPHA, Caustics
 from render_server.passes.composite import ChangeRatio
@@ -24,9 +26,7 @@ from render_server.passes.shading import DirectLight, VirtualSurface
 from render_server.passes.shadow_maps import ShadowMaps
 from render_server.passes.voxel_light import AlbedoTexture
 from render_server.passes.voxels import PlacedVolume, VolumePlacement, VoxelMipmap, place_volume
-from render_server.scene.lights import LightSet
-from render_server.scene.mirror_lights import mirror_lights
-from render_server.scene.surfaces import SurfaceTable
+from render_server.scene.declared_surfaces import SurfaceTable
 from render_server.view import CameraView
 
 SHADOW_REACH = 4.0  # in longest edges of the objects' bounds: how far around them real shadows are resolved

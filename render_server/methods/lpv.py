@@ -11,6 +11,7 @@ from render_server.gpu.kernel import Binding, Bindings
 from render_server.gpu.textures import release_all
 from render_server.gpu_scene import GeometryState
 from render_server.graph import Graph, Resource
+from render_server.lights.lights import LightSet
 from render_server.methods.lighting import (
     SURFEL_SHADOW_SAMPLES,
     Layers,
@@ -50,7 +51,6 @@ from render_server.passes.shading import DirectLight
 from render_server.passes.split_injection import RealAlbedo
 from render_server.passes.voxel_light import AlbedoTexture
 from render_server.passes.voxels import PlacedVolume, VolumePlacement, Voxelize, VoxelMipmap, VoxelStore
-from render_server.scene.lights import LightSet
 
 
 class LpvVolumes:

@@ -15,6 +15,7 @@ from render_server.gpu.textures import release_all
 from render_server.gpu.uniform_block import UniformBlock
 from render_server.gpu_scene import GeometryState
 from render_server.graph import Graph, Resource
+from render_server.lights.lights import LightSet
 from render_server.methods.lighting import SURFEL_SHADOW_SAMPLES, LitScene, casts_caustics, surfel_scene
 from render_server.methods.settings import march_defines
 from render_server.passes.lights import LightBuffers
@@ -39,7 +40,6 @@ from render_server.passes.voxels import (
     VoxelStore,
     place_volume,
 )
-from render_server.scene.lights import LightSet
 
 FAR_SIZE = 32  # voxels an edge of the coarse volume beyond
 FAR_EDGE_M = 20.0  # its greatest edge: what lies farther lights little through a cone's solid angle

@@ -11,6 +11,9 @@ from jaxtyping import Float32, Float64
 from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Binding, Bindings, Kernel
 from render_server.gpu.uniform_block import Block, Float, Int, UniformBlock
+from render_server.lights.lights import DirectionalLight, Light, RectangleLight, SpotLight
+from render_server.lights.mirror_lights import MirrorLight
+from render_server.lights.octahedral import octahedral_grid, prefilter, sample_octahedral
 from render_server.passes.shadow_maps import (
     NEAREST_M,
     LightView,
@@ -22,9 +25,6 @@ from render_server.passes.shadow_maps import (
     texel_size_m,
     tile_columns,
 )
-from render_server.scene.lights import DirectionalLight, Light, RectangleLight, SpotLight
-from render_server.scene.mirror_lights import MirrorLight
-from render_server.scene.octahedral import octahedral_grid, prefilter, sample_octahedral
 
 LIGHT_BYTES = 160  # of a std430 Light (shaders/common/lights.glsl)
 EMPTY = b"\0" * 256
@@ -214,7 +214,7 @@ class LightBuffers:
 
 
 class MirrorVisibility:
-    """Maps where smooth real planes mirror the lights, one map for each image of a light (scene/mirror_lights.py).
+    """Maps where smooth real planes mirror the lights, one map for each image of a light (lights/mirror_lights.py).
 
     A map holds how much of the light each point of the plane shows, without and with the objects; its mipmaps average
     that over larger and larger footprints.

@@ -10,12 +10,11 @@ from jaxtyping import Float16, Float32, Float64
 from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Binding, Bindings, Kernel
 from render_server.gpu.textures import texture_2d
+from render_server.lights.octahedral import MAX_ORDER, harmonics, octahedral_grid, texel_solid_angles
 from render_server.passes.cones import ConeFields, LowResGrid
 from render_server.passes.voxels import VoxelMipmap
 from render_server.scene.occlusion_field import OcclusionField
 from render_server.scene.occlusion_transfer import LENGTH
-from render_server.scene.octahedral import octahedral_grid, texel_solid_angles
-from render_server.scene.spherical_harmonics import MAX_ORDER, harmonics
 
 MOST_SHELLS = 6
 COEFFICIENTS_PER_TEXEL = 4

@@ -11,7 +11,7 @@ from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Binding, Bindings, Kernel, list_threads
 from render_server.passes.caustics import GREATEST_ALPHA
 from render_server.passes.voxels import VoxelMipmap, VoxelStore
-from render_server.scene.albedo_memory import MEAN_ALBEDO, AlbedoMemory
+from render_server.scene.albedo_volume import MEAN_ALBEDO, AlbedoVolume
 
 SUPPORT_BYTES = 24
 
@@ -274,7 +274,7 @@ class AlbedoTexture:
         self._replace(np.full((1, 1, 1, 3), albedo, np.float32))
         self._cube = (0.0, 0.0, 0.0, 1.0)
 
-    def upload(self, memory: AlbedoMemory) -> None:
+    def upload(self, memory: AlbedoVolume) -> None:
         """Takes over everything that was observed."""
         self._replace(memory.filled())
         x, y, z = (float(v) for v in memory.origin)

@@ -1,1 +1,1 @@
-"""The scene on the CPU: meshes, materials, the real scene, lights, registration. No OpenGL."""
+"""The scene on the CPU: meshes, materials, animation, and the real scene from depth or a model. No OpenGL."""

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from protocol.errors import DeltalightError
-from render_server.scene.gltf_file import (
+from render_server.scene.gltf_document import (
     COMPONENT_TYPES,
     COMPONENTS,
+    GltfDocument,
     GltfFaultError,
-    GltfFile,
     faults_named,
     file_inside,
     uri_bytes,
@@ -30,7 +30,7 @@ _HARMLESS_EXTENSIONS = re.compile(
 
 
 def check_mesh_file(path: Path) -> str:
-    """Return the suffix of a mesh file that exists, is of a known type and of a bearable size.
+    """Return the suffix of a mesh file that exists, is of a known type and not too large.
 
     Raises:
         DeltalightError: otherwise.
@@ -48,7 +48,7 @@ def check_mesh_file(path: Path) -> str:
 
 
 def _check_ply_counts(path: Path) -> None:
-    """Every element of a PLY file takes at least a byte, so that its counts cannot exceed the file's size."""
+    """Check the element counts of a PLY file: every element takes at least a byte."""
     with path.open("rb") as file:
         header = file.read(1 << 16).split(b"end_header")[0]
     counts = re.findall(rb"^\s*element\s+\S+\s+(\d{1,18})\s*$", header, re.MULTILINE)
@@ -56,7 +56,7 @@ def _check_ply_counts(path: Path) -> None:
         raise DeltalightError(f"{path} announces more elements than it can hold; export the mesh again.")
 
 
-def read_gltf(path: Path) -> GltfFile:
+def read_gltf(path: Path) -> GltfDocument:
     """Read a .gltf or .glb file and check every count in it against the bytes that are there.
 
     Loaders allocate by accessor counts; a few hundred bytes can otherwise ask for gigabytes.
@@ -96,7 +96,7 @@ def _uint32(data: bytes, offset: int) -> int:
     return int.from_bytes(data[offset : offset + 4], "little")
 
 
-def _checked(path: Path, document: dict[str, Any], binary: bytes | None) -> GltfFile:
+def _checked(path: Path, document: dict[str, Any], binary: bytes | None) -> GltfDocument:
     version = str(document["asset"]["version"])
     if not version.startswith("2."):
         raise GltfFaultError(f"glTF {version} is not supported, only 2.x")
@@ -110,7 +110,7 @@ def _checked(path: Path, document: dict[str, Any], binary: bytes | None) -> Gltf
     _check_accessors(document.get("accessors", []), _Views(views, sizes))
     _check_nodes(document.get("nodes", []))
     _check_triangles(document)
-    return GltfFile(path, document, tuple(buffers))
+    return GltfDocument(path, document, tuple(buffers))
 
 
 def _count(value: object) -> int:
@@ -160,7 +160,7 @@ class _Views:
     sizes: list[int]
 
     def check(self, index: int, place: dict[str, Any], count: int, element: int) -> None:
-        """Whether so many elements, each of `element` bytes, lie in the view that a part of an accessor names."""
+        """Check that `count` elements of `element` bytes lie within the view that part of an accessor names."""
         view = _count(place["bufferView"])
         stride = _count(self.views[view].get("byteStride", element))
         needed = _count(place.get("byteOffset", 0)) + max(count - 1, 0) * stride + element * (count > 0)
@@ -196,7 +196,7 @@ def _check_sparse(index: int, accessor: dict[str, Any], element: int, views: _Vi
 
 
 def _check_nodes(nodes: list[dict[str, Any]]) -> None:
-    """Nodes must form trees, or whoever follows them may never end."""
+    """Check that nodes form trees, so that traversals end."""
     children = [_count(child) for node in nodes for child in node.get("children", [])]
     if len(set(children)) != len(children) or any(child >= len(nodes) for child in children):
         raise GltfFaultError("its nodes do not form a tree")

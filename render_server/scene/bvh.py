@@ -1,20 +1,21 @@
-"""Bounding volume hierarchy over triangles, flattened for loops without a stack (passes/common/ray_mesh.glsl)."""
+"""Bounding volume hierarchy of triangles for stackless traversal (passes/shaders/common/ray_mesh.glsl)."""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int32, Int64
+from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
 LEAF_SIZE = 4  # triangles at most: boxes around fewer cost as many tests as they save
 BINS = 16  # places an axis where a node may be split (Wald 2007)
 # Of the greatest coordinate: boxes grow by it, so that float32 rays do not miss what touches them.
 ROUNDING = 1e-6
 COUNT_BITS = 3  # of a leaf: its number of triangles stands below the place of the first
+PARALLEL = 1e-12  # determinant (m^2), from which on a ray counts as going along the triangle's plane
 
 
 @dataclass(frozen=True, eq=False)
 class Bvh:
-    """Nodes in depth-first order: what follows a node is its first child, `skip` is what follows its last descendant.
+    """Nodes in depth-first order: after a node comes its first child; `skip` is the node after its last descendant.
 
     `leaf` is -1 for inner nodes, else the place of the first triangle in `order` << 3 | number of triangles.
     """
@@ -26,14 +27,14 @@ class Bvh:
     order: Int32[np.ndarray, " m"]
 
     def packed(self) -> bytes:
-        """Nodes as the shader's struct: low corner, leaf, high corner, skip (32 bytes)."""
+        """Pack nodes as the shader's struct: low corner, leaf, high corner, skip (32 bytes)."""
         rows = np.empty((len(self.leaf), 8), np.float32)
         rows[:, 0:3], rows[:, 4:7] = self.low, self.high
         rows.view(np.int32)[:, 3], rows.view(np.int32)[:, 7] = self.leaf, self.skip
         return rows.tobytes()
 
     def packed_triangles(self, corners: Float32[np.ndarray, "m 3 3"]) -> bytes:
-        """Triangles in `order`: (corner, index in the mesh), (edge to the second corner, 0), (to the third, 0)."""
+        """Pack triangles in `order`: (corner, index in the mesh), (edge to second corner, 0), (edge to third, 0)."""
         rows = np.zeros((len(self.order), 3, 4), np.float32)
         first = corners[self.order, 0]
         rows[:, 0, :3] = first
@@ -43,13 +44,13 @@ class Bvh:
 
     @property
     def cost(self) -> float:
-        """Boxes that a ray through the tree must be expected to open: their surfaces relative to the whole's."""
+        """Expected number of boxes that a ray opens: the sum of their surface areas relative to the root's."""
         extent = self.high.astype(np.float64) - self.low
         areas = (extent * np.roll(extent, 1, axis=1)).sum(axis=1)
         return float(areas.sum() / areas[0])
 
     def refitted(self, corners: Float32[np.ndarray, "m 3 3"]) -> "Bvh":
-        """The same tree around triangles that moved: correct always, good while neighbours stay neighbours."""
+        """Refit the tree to moved triangles: always correct, and good while neighbours stay neighbours."""
         held = self.leaf & ((1 << COUNT_BITS) - 1)
         firsts = np.concatenate([[0], np.cumsum(np.where(self.leaf < 0, 0, held))])
         # A node's triangles follow each other in `order`, up to the first of what comes after its last descendant.
@@ -64,13 +65,13 @@ class Bvh:
 def _over_spans(
     reduce: np.ufunc, rows: Float32[np.ndarray, "m 3"], spans: Int64[np.ndarray, " 2k"]
 ) -> Float32[np.ndarray, "k 3"]:
-    """Reduce rows from each span's start to its end; the last row stands twice, so that an end may lie behind all."""
+    """Reduce rows from each span's start to its end; the last row is repeated, because an end may lie behind all."""
     return np.asarray(reduce.reduceat(np.concatenate([rows, rows[-1:]]), spans)[::2])
 
 
 @dataclass(frozen=True, eq=False)
 class _Level:
-    """Nodes of one depth. The children of those that are `inner` follow each other in the next level, in pairs."""
+    """Nodes of one depth. The children of `inner` nodes are consecutive pairs in the next level."""
 
     low: Float32[np.ndarray, "s 3"]
     high: Float32[np.ndarray, "s 3"]
@@ -87,9 +88,9 @@ class _Boxes:
 
 
 def build_bvh(corners: Float32[np.ndarray, "m 3 3"]) -> Bvh:
-    """Split by the surface area heuristic in bins, all nodes of a depth at once; m >= 1.
+    """Build a tree by the binned surface area heuristic, all nodes of a depth at once; m >= 1.
 
-    The same triangles give the same tree.
+    Deterministic: the same triangles give the same tree.
     """
     low, high = corners.min(axis=1), corners.max(axis=1)
     boxes = _Boxes(low, high, (low + high) * np.float32(0.5))
@@ -109,7 +110,7 @@ def _split(
     leaf_of: Int64[np.ndarray, "m 2"],
     depth: int,
 ) -> tuple[_Level, Int64[np.ndarray, " b"], Int64[np.ndarray, " b"]]:
-    """One level from `triangles`, sorted by their `node` in it, and the triangles of the next level with theirs."""
+    """Return the level of `triangles`, sorted by their `node` in it, and triangles and nodes of the next level."""
     counts = np.bincount(node)
     starts = np.cumsum(counts) - counts
     low = np.minimum.reduceat(boxes.low[triangles], starts)
@@ -126,7 +127,7 @@ def _split(
 def _children(
     boxes: _Boxes, triangles: Int64[np.ndarray, " a"], node: Int64[np.ndarray, " a"]
 ) -> tuple[Int64[np.ndarray, " a"], Int64[np.ndarray, " a"]]:
-    """Sort each node's triangles along its longest axis and deal them to its two children."""
+    """Sort each node's triangles along its longest axis and divide them between its two children."""
     counts = np.bincount(node)
     starts = np.cumsum(counts) - counts
     centre = boxes.centre[triangles]
@@ -139,9 +140,9 @@ def _children(
     cell = node * BINS + np.minimum((along / width[node] * BINS).astype(np.int64), BINS - 1)
     sort = np.argsort(cell, kind="stable")
     triangles, node, cell = triangles[sort], node[sort], cell[sort]
-    first_share = _best_split(boxes, triangles, cell, counts)
+    first_count = _best_split(boxes, triangles, cell, counts)
     place = np.arange(len(triangles)) - starts[node]
-    return triangles, 2 * node + (place >= first_share[node])
+    return triangles, 2 * node + (place >= first_count[node])
 
 
 def _best_split(
@@ -150,7 +151,7 @@ def _best_split(
     cell: Int64[np.ndarray, " a"],
     counts: Int64[np.ndarray, " s"],
 ) -> Int64[np.ndarray, " s"]:
-    """How many triangles of each node, sorted by cell, the first child gets: half, where all lie in one bin."""
+    """Return how many triangles of each node, sorted by cell, the first child gets: half where all lie in one bin."""
     held = np.bincount(cell, minlength=len(counts) * BINS)
     used = np.flatnonzero(held)
     starts = np.cumsum(held[used]) - held[used]
@@ -172,14 +173,14 @@ def _best_split(
 def _areas(
     low: Float32[np.ndarray, "s b 3"], high: Float32[np.ndarray, "s b 3"]
 ) -> Float32[np.ndarray, "s b"]:
-    """Half the surface of the box around the first bins; 0 where they hold nothing."""
+    """Return half the surface area of the box around the first bins; 0 where they are empty."""
     extent = np.maximum.accumulate(high, axis=1) - np.minimum.accumulate(low, axis=1)
     extent = np.where(np.isfinite(extent), extent, 0)
     return np.asarray((extent * np.roll(extent, 1, axis=-1)).sum(axis=-1))
 
 
 def _flattened(levels: list[_Level], leaf_of: Int64[np.ndarray, "m 2"], margin: float) -> Bvh:
-    """Depth-first order: sizes of subtrees from below, places from above."""
+    """Order nodes depth first: subtree sizes bottom-up, then places top-down."""
     sizes = [np.ones(len(level.inner), np.int64) for level in levels]
     for depth in reversed(range(len(levels) - 1)):
         sizes[depth][levels[depth].inner] += sizes[depth + 1].reshape(-1, 2).sum(axis=1)
@@ -197,7 +198,7 @@ def _assembled(
     leaf_of: Int64[np.ndarray, "m 2"],
     margin: float,
 ) -> Bvh:
-    """Put the nodes of all levels to their places, and the triangles in the order of their leaves."""
+    """Put the nodes of all levels in their places, and the triangles in the order of their leaves."""
     place, size = np.concatenate(places), np.concatenate(sizes)
     back = np.argsort(place)
     starts = np.cumsum([0] + [len(level.inner) for level in levels])
@@ -212,3 +213,32 @@ def _assembled(
         (place + size)[back].astype(np.int32),
         order.astype(np.int32),
     )
+
+
+def first_hit(
+    corners: Float32[np.ndarray, "m 3 3"],
+    origin: Float64[np.ndarray, "3"],
+    direction: Float64[np.ndarray, "3"],
+) -> tuple[float, Float64[np.ndarray, "3"]] | None:
+    """Intersect a single ray with all triangles (Möller and Trumbore 1997); building a tree would not pay off.
+
+    Returns:
+        The distance to the nearest hit in lengths of `direction`, and its unit normal towards the origin; else None.
+    """
+    first, second, third = np.moveaxis(corners.astype(np.float64), 1, 0)
+    u_edge, v_edge = second - first, third - first
+    across = np.cross(direction, v_edge)
+    determinant = (u_edge * across).sum(axis=1)
+    crossed = np.abs(determinant) > PARALLEL
+    scale = np.divide(1.0, determinant, out=np.zeros_like(determinant), where=crossed)
+    start = origin - first
+    u = (start * across).sum(axis=1) * scale
+    turned = np.cross(start, u_edge)
+    v, distance = (turned @ direction) * scale, (turned * v_edge).sum(axis=1) * scale
+    hit = crossed & (u >= 0) & (v >= 0) & (u + v <= 1) & (distance > 0)
+    if not hit.any():
+        return None
+    nearest = int(np.flatnonzero(hit)[distance[hit].argmin()])
+    normal = np.cross(u_edge[nearest], v_edge[nearest])
+    normal /= np.linalg.norm(normal)
+    return float(distance[nearest]), -normal if normal @ direction > 0 else normal

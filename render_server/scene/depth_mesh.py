@@ -1,4 +1,4 @@
-"""Triangle mesh of the real scene as one depth image shows it."""
+"""Triangle mesh of one depth image, and back faces for it."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -18,12 +18,14 @@ from render_server.scene.depth_surface import (
     surface_normals,
 )
 from render_server.scene.materials import Material
-from render_server.scene.mesh import TriangleMesh
+from render_server.scene.triangle_mesh import TriangleMesh
 
 CELL_SAMPLES = 6
-# Two nodes stand for pixels of their cells that are at most this many cells apart: two each way.
-MOST_CELLS = 2 * float(np.sqrt(2))
+# Pixels of two neighbouring nodes are at most this many cells apart: two in each direction.
+MAX_CELL_DISTANCE = 2 * float(np.sqrt(2))
 REAL_MATERIAL = Material(roughness=1.0, specular=0.0, name="real")
+# A ray that leaves a surface samples the cells around its own, and must not meet the back face of the surface there.
+BACK_OFFSET_VOXELS = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,16 +45,16 @@ def depth_mesh(
     triangle_budget: int = 40_000,
     surface: DepthSurface | None = None,
     *,
-    steep: Float32[np.ndarray, "h w"] | None = None,
+    grazing: Float32[np.ndarray, "h w"] | None = None,
 ) -> TriangleMesh:
     """Mesh a clean depth image that is registered to `camera`, in the world.
 
     A node stands for each cell of stride x stride pixels, at the cell's centre, with the cell's median depth
     (moved to the centre along the fitted surface); the stride is the least that keeps to the budget. No
     triangle crosses a depth discontinuity; cells without depth or normal are holes. `uv` is the pixel
-    coordinate (pixel centres at integers) of the vertex in the camera's picture. `surface` is
-    `depth_surface(depth, camera)` where it is already known. `steep` is the inverse depth of surfaces too steep to be
-    measured (`steep_surfaces`), which join what they lie between. Without any valid depth the mesh is empty.
+    coordinate (pixel centres at integers) of the vertex in the camera's picture. `surface` is `depth_surface(depth,
+    camera)` where it is already known. `grazing` is the inverse depth of surfaces too oblique to measure
+    (`grazing_depth_fill`), which join their two sides. Without any valid depth the mesh is empty.
 
     Raises:
         DeltalightError: the budget is below 2, or depth and camera differ in size.
@@ -66,8 +68,8 @@ def depth_mesh(
     nodes = _nodes(known, camera, stride)
     limit = jump_threshold(depth, camera, nodes.inverse_depth, stride)
     slack = np.zeros_like(limit)
-    if steep is not None and steep.any():
-        nodes, slack = _with_steep(nodes, steep, camera, stride)
+    if grazing is not None and grazing.any():
+        nodes, slack = _with_grazing(nodes, grazing, camera, stride)
     triangles = _grid_triangles(nodes.inverse_depth, limit, slack)
     return _world_mesh(nodes, triangles, world_from_camera)
 
@@ -94,26 +96,26 @@ def _nodes(surface: DepthSurface, camera: CameraModel, stride: int) -> _Nodes:
     return _Nodes(pixels, rays, np.where(chosen > 0, at_centre, 0), surface.normals.reshape(-1, 3)[flat])
 
 
-def _with_steep(
-    nodes: _Nodes, steep: Float32[np.ndarray, "h w"], camera: CameraModel, stride: int
+def _with_grazing(
+    nodes: _Nodes, grazing: Float32[np.ndarray, "h w"], camera: CameraModel, stride: int
 ) -> tuple[_Nodes, Float32[np.ndarray, "gh gw"]]:
-    """Add the nodes of steep surfaces in holes; the second value is the step (1/m) that their own slopes explain."""
-    flat = _median_pixels(steep, stride)
-    by_pixel = _slopes(steep)
-    normals = surface_normals(steep, by_ray(by_pixel, camera), camera).reshape(-1, 3)[flat]
-    added = (steep.ravel()[flat] > 0) & (nodes.inverse_depth == 0) & normals.any(axis=-1)
+    """Fill holes with nodes of grazing surfaces; the second value is the step (1/m) that their slopes explain."""
+    flat = _median_pixels(grazing, stride)
+    by_pixel = _slopes(grazing)
+    normals = surface_normals(grazing, by_ray(by_pixel, camera), camera).reshape(-1, 3)[flat]
+    added = (grazing.ravel()[flat] > 0) & (nodes.inverse_depth == 0) & normals.any(axis=-1)
     slope = np.hypot(*by_pixel.reshape(2, -1)[:, flat])
     joined = _Nodes(
         nodes.pixels,
         nodes.rays,
-        np.where(added, steep.ravel()[flat], nodes.inverse_depth),
+        np.where(added, grazing.ravel()[flat], nodes.inverse_depth),
         np.where(added[..., None], normals, nodes.normals),
     )
-    return joined, np.where(added, np.float32(MOST_CELLS * stride) * slope, np.float32(0))
+    return joined, np.where(added, np.float32(MAX_CELL_DISTANCE * stride) * slope, np.float32(0))
 
 
 def _slopes(inverse: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "2 h w"]:
-    """Change by pixel, to the right and down, of what is not 0, from differences within it; NaN where alone."""
+    """Return differences per pixel, to the right and down, among non-zero pixels; NaN for isolated ones."""
     known = np.where(inverse > 0, inverse, np.float32(np.nan))
     slopes = np.empty((2, *inverse.shape), np.float32)
     for slope, values in ((slopes[0], known), (slopes[1].T, known.T)):
@@ -239,3 +241,19 @@ def _world_mesh(
         nodes.pixels.reshape(-1, 2)[used],
         REAL_MATERIAL,
     )
+
+
+def back_faces(corners: Float32[np.ndarray, "m 3 10"], voxel_edge: float) -> Float32[np.ndarray, "m 3 10"]:
+    """Return the back face of each triangle (three corners, position first), reversed and some voxels behind it.
+
+    A depth camera sees only the front of things, but they block light from behind too: the underside of a shelf
+    blocks the light from above it and reflects that from below. The thickness is unknown, so a back face lies as near
+    as voxels allow. `voxel_edge` in m.
+    """
+    positions = corners[..., :3]
+    across = np.cross(positions[:, 1] - positions[:, 0], positions[:, 2] - positions[:, 0])
+    length = np.linalg.norm(across, axis=-1, keepdims=True)
+    normals = across / np.maximum(length, np.finfo(np.float32).tiny)
+    backs = corners[:, ::-1].copy()
+    backs[..., :3] -= BACK_OFFSET_VOXELS * voxel_edge * normals[:, None]
+    return backs

@@ -1,7 +1,13 @@
-"""Surface normals and discontinuities of a depth image, from inverse depth.
+"""Surface normals and discontinuities of a depth image, from inverse depth, and surfaces too oblique to measure.
 
 In inverse depth w = 1/z a plane is an affine function of the ray (x/z, y/z), and the noise of stereo and
 structured light, sigma z^2, is the same everywhere (sigma). Both make w the quantity to fit and to compare.
+
+Stereo gives no depth on the top of a box when the camera looks along it. Such a surface at a grazing angle shows as a
+strip without depth between something near and something far, in a colour that neither has. Without it, light would
+fall through it, so it is bridged from the near to the far side. A strip so wide that a measurable slope could explain
+it has lost its depth for another reason (black, shiny) and stays unknown; so does a strip in the colour of a surface
+beside it, the occlusion shadow of stereo.
 """
 
 from dataclasses import dataclass
@@ -9,7 +15,7 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Bool, Float32, Int32, Int64, UInt8
 
 from protocol.camera_model import CameraModel
 from protocol.frames import DepthImage
@@ -17,16 +23,34 @@ from protocol.frames import DepthImage
 ASSUMED_NOISE_SIGMA_M = 0.002
 MAX_SLOPE_DEG = 80.0
 NOISE_SIGMAS = 3.0
-WANTED_TILT_RAD = 0.05
+MAX_TILT_ERROR_RAD = 0.05
 MAX_RADIUS = 5
 SHIFTS = ((0, -1), (0, 1), (-1, 0), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1))
-# Least spread of a window's valid pixels, relative to a full window (determinant of their covariance).
-LEAST_SUPPORT = 0.01
+# Least spread of a window's valid pixels relative to a full window (determinant of their covariance).
+MIN_SUPPORT = 0.01
+# A thinner strip is an edge, where colours mix.
+MIN_STRIP_WIDTH_PX = 3
+# Smaller strips are remains of edges: depth comes with holes up to this size filled.
+MIN_STRIP_AREA_PX = 64
+# Surfaces beside a strip are sampled up to this distance, in windows of this radius.
+BORDER_RADIUS_PX = 4
+# Colours mix this far across a strip's border: lenses and demosaicing blur edges over a pixel or two.
+MIXED_BORDER_PX = 2
+# Least standard deviation of colour, 0..1, by light and noise.
+MIN_COLOR_SPREAD = 0.05
+COLOR_SIGMAS = 3.0
+# Fraction of a strip that must look like a grazing surface for all of it to count as one: all but a mixed pixel at
+# either side of strips 8 pixels wide. Of blurred edges of near things before far ones, a third or more is mixed.
+MIN_GRAZING_FRACTION = 0.75
+
+Map = Float32[np.ndarray, "h w"]
+Mask = Bool[np.ndarray, "h w"]
+Colors = Float32[np.ndarray, "h w 3"]
 
 
 @dataclass(frozen=True, eq=False)
 class DepthSurface:
-    """What is known of the surface behind every pixel.
+    """The surface at every pixel.
 
     `inverse_depth` is as measured, 0 where invalid and where a pixel stands alone. `gradient` is its change
     by ray coordinate (x/z, y/z), fitted to the surroundings (NaN where unknown). `normals` are unit vectors
@@ -83,11 +107,11 @@ def jump_threshold(
 def _window_radius(
     sigma_px: float, inverse: Float32[np.ndarray, "h w"], mask: Float32[np.ndarray, "h w"]
 ) -> int:
-    """Return the least radius whose slope error, sigma f z / sqrt(sum of squared offsets), is bearable."""
+    """Return the least radius whose slope error, sigma f z / sqrt(sum of squared offsets), is acceptable."""
     mean = float(inverse.sum(dtype=np.float64) / max(float(mask.sum(dtype=np.float64)), 1.0))
     error = sigma_px / max(mean, 1e-6)
     for radius in range(1, MAX_RADIUS):
-        if error <= WANTED_TILT_RAD * np.sqrt((2 * radius + 1) ** 2 * radius * (radius + 1) / 3):
+        if error <= MAX_TILT_ERROR_RAD * np.sqrt((2 * radius + 1) ** 2 * radius * (radius + 1) / 3):
             return radius
     return MAX_RADIUS
 
@@ -116,7 +140,7 @@ def _window_gradient(
     wv -= w * mean_v
     determinant = uu * vv - uv * uv
     full = (2 * radius + 1) ** 2 * radius * (radius + 1) / 3
-    known = (determinant > LEAST_SUPPORT * full**2) & (mask > 0)
+    known = (determinant > MIN_SUPPORT * full**2) & (mask > 0)
     inverted = np.divide(1, determinant, out=np.full_like(determinant, np.nan), where=known)
     gradient = np.empty((2, *inverse.shape), np.float32)
     np.multiply(wu * vv - wv * uv, inverted, out=gradient[0])
@@ -143,7 +167,7 @@ def _jumps(
 
 
 def _lonely(jumps: tuple[UInt8[np.ndarray, "h w"], UInt8[np.ndarray, "h w"]]) -> Bool[np.ndarray, "h w"]:
-    """Whether a pixel jumps to three of its neighbours or more: a spike, or afloat between surfaces."""
+    """Whether a pixel jumps to at least three of its neighbours: a spike, or a flying pixel between surfaces."""
     down, right = jumps
     count = down + right
     count[1:] += down[:-1]
@@ -228,3 +252,122 @@ def surface_normals(
 @lru_cache(maxsize=4)
 def _ray_planes(camera: CameraModel) -> Float32[np.ndarray, "2 h w"]:
     return np.ascontiguousarray(camera.rays().transpose(2, 0, 1))
+
+
+@dataclass(frozen=True, eq=False)
+class _Side:
+    """The nearer or the farther surface beside a strip: each pixel's distance to it, and its nearest pixel (flat)."""
+
+    surface: Mask
+    distance_px: Map
+    nearest_pixel: Int64[np.ndarray, "h w"]
+
+
+def grazing_depth_fill(depth: DepthImage, color: UInt8[np.ndarray, "h w 3"], camera: CameraModel) -> Map:
+    """Return the inverse depth (1/m) of surfaces at grazing angles where `depth` has none; 0 elsewhere.
+
+    `depth` is clean and registered to `color` (RGB) and `camera`. In inverse depth a plane is an affine function of
+    the pixel, so strips are filled linearly from their near to their far side.
+    """
+    valid = depth.valid & (depth.depth_m > 0)
+    inverse = np.divide(1, depth.depth_m, out=np.zeros_like(depth.depth_m), where=valid)
+    result = np.zeros_like(inverse)
+    unknown = (~valid).view(np.uint8)
+    to_known = cv2.distanceTransform(unknown, cv2.DIST_L2, cv2.DIST_MASK_5)
+    thick = cv2.morphologyEx(unknown, cv2.MORPH_OPEN, np.ones((MIN_STRIP_WIDTH_PX,) * 2, np.uint8))
+    count, labels, boxes, _ = cv2.connectedComponentsWithStats(thick, connectivity=4)
+    for label in range(1, count):
+        if boxes[label, cv2.CC_STAT_AREA] < MIN_STRIP_AREA_PX:
+            continue
+        part = _strip_window(boxes[label])
+        strip = labels[part] == label
+        around = inverse[part] * _dilated(strip, BORDER_RADIUS_PX)
+        if _may_be_grazing(strip, around, to_known[part], depth, camera):
+            grazing, bridged = _bridge(strip, around, color[part], depth, camera)
+            result[part][grazing] = bridged[grazing]
+    return np.asarray(result)
+
+
+def _strip_window(box: Int32[np.ndarray, "5"]) -> tuple[slice, slice]:
+    """Return rows and columns of a strip (box: left, top, width, height, area) and the surfaces beside it."""
+    margin = 2 * BORDER_RADIUS_PX
+    left, top, width, height = (int(value) for value in box[:4])
+    return (
+        slice(max(top - margin, 0), top + height + margin),
+        slice(max(left - margin, 0), left + width + margin),
+    )
+
+
+def _may_be_grazing(strip: Mask, around: Map, to_known: Map, depth: DepthImage, camera: CameraModel) -> bool:
+    """Rule out most strips cheaply: no depth step beside them could make most of their pixels grazing.
+
+    `around` is the inverse depth beside the strip, 0 elsewhere, `to_known` the distance of pixels from known ones: a
+    strip is at least twice as wide there.
+    """
+    known = around[around > 0]
+    if not known.size:
+        return False
+    least = np.full(int(strip.sum()), known.min())
+    bearable = jump_threshold(depth, camera, least, 2 * to_known[strip])
+    return bool((known.max() - known.min() > bearable).mean() > MIN_GRAZING_FRACTION)
+
+
+def _bridge(
+    strip: Mask, around: Map, color: UInt8[np.ndarray, "h w 3"], depth: DepthImage, camera: CameraModel
+) -> tuple[Mask, Map]:
+    """Return which pixels of a strip are a grazing surface, and their inverse depth, bridged between its sides."""
+    split = (around[around > 0].min() + around.max()) / 2
+    near, far = _side(around > split), _side((around > 0) & (around <= split))
+    before, behind = around.ravel()[near.nearest_pixel], around.ravel()[far.nearest_pixel]
+    width = near.distance_px + far.distance_px
+    bridged = (before * far.distance_px + behind * near.distance_px) / width
+    grazing = strip & (before - behind > jump_threshold(depth, camera, bridged, width))
+    pure = ~_dilated(strip, MIXED_BORDER_PX)
+    least, own = MIN_GRAZING_FRACTION * strip.sum(), np.flatnonzero(grazing)
+    for side in (near, far):
+        if len(own) > least:
+            own = own[_differs_in_color(side, np.float32(1 / 255) * color, pure, own)]
+    return grazing & (len(own) > least), np.asarray(bridged)
+
+
+def _dilated(mask: Mask, radius_px: int) -> Mask:
+    return np.asarray(cv2.dilate(mask.view(np.uint8), np.ones((2 * radius_px + 1,) * 2)).view(bool))
+
+
+def _side(surface: Mask) -> _Side:
+    """Find the nearest pixel of a surface from every pixel."""
+    distance, labels = cv2.distanceTransformWithLabels(
+        (~surface).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    places = np.flatnonzero(surface)
+    nearest = np.zeros(labels.max() + 1, np.int64)
+    nearest[labels.ravel()[places]] = places
+    return _Side(surface, distance, nearest[labels])
+
+
+def _differs_in_color(
+    side: _Side, color: Colors, pure: Mask, pixels: Int64[np.ndarray, " n"]
+) -> Bool[np.ndarray, " n"]:
+    """Whether pixels (flat indices) differ in colour from the nearest unmixed part of a surface."""
+    mean, variance = _color_statistics(color, side.surface & pure)
+    nearest_pixel = side.nearest_pixel.ravel()[pixels]
+    difference = color.reshape(-1, 3)[pixels] - mean.reshape(-1, 3)[nearest_pixel]
+    squared = np.einsum("nc,nc->n", difference, difference)
+    return np.asarray(squared > COLOR_SIGMAS**2 * (variance.ravel()[nearest_pixel] + MIN_COLOR_SPREAD**2))
+
+
+def _color_statistics(color: Colors, mask: Mask) -> tuple[Colors, Map]:
+    """Return mean and total variance of a mask's colours in the window around each pixel; infinite without any."""
+    weight = mask.astype(np.float32)
+
+    def summed(values: np.ndarray) -> np.ndarray:
+        size = (2 * BORDER_RADIUS_PX + 1,) * 2
+        border = cv2.BORDER_CONSTANT
+        return np.asarray(cv2.boxFilter(values, cv2.CV_32F, size, normalize=False, borderType=border))
+
+    count = summed(weight)
+    fraction = 1 / np.maximum(count, 1)
+    mean = summed(color * weight[..., None]) * fraction[..., None]
+    square = summed(np.einsum("hwc,hwc->hw", color, color) * weight) * fraction
+    variance = np.maximum(square - np.einsum("hwc,hwc->hw", mean, mean), 0)
+    return mean, np.where(count > 0, variance, np.float32(np.inf))

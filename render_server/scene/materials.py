@@ -49,7 +49,7 @@ class Material:
 
     @classmethod
     def from_document(cls, document: MaterialDocument) -> Self:
-        """Make the material that a scene document gives an object in place of the asset's own."""
+        """Make a material from a scene document, which replaces the asset's own."""
         return cls(
             base_color=np.array(document.base_color, np.float32),
             metallic=document.metallic,
@@ -103,7 +103,7 @@ class Material:
         )
 
     def checked(self, place: str) -> Self:
-        """Return the material with its shares clipped to 0..1.
+        """Return the material with colour, metallic and roughness clipped to 1.
 
         Raises:
             DeltalightError: a value is not finite or negative; `place` names the file.

@@ -1,7 +1,7 @@
 """Light that a rigid object reflects onto what is around it (radiance transfer field, [D] 5.2.4).
 
-Each piece of its surface has a transfer vector, self-shadowing included: its irradiance under light of unit SH
-coefficients. A sample of the field adds up the pieces that it sees.
+Each piece of its surface has a transfer vector, including self-shadowing: its irradiance under light of unit SH
+coefficients. A sample of the field sums the pieces that it sees.
 """
 
 import math
@@ -13,33 +13,40 @@ import numpy as np
 from jaxtyping import Bool, Float16, Float32, Int64
 from scipy.spatial import cKDTree
 
-from render_server.scene.mesh import TriangleMesh, split_triangles
-from render_server.scene.occlusion_field import FieldSettings, ShellGrid, Step, fill_inside
-from render_server.scene.occlusion_rays import CHUNK, ObjectRays, RayHits, direction_set
-from render_server.scene.spherical_harmonics import harmonics
-
-ORDER = 3  # of the light that falls on the object, and of what it sends back: both are diffuse
-LENGTH = ORDER**2
-PIECE = (
-    1 / 6
-)  # of the enclosing radius: longest edge of a piece, about the change of direction that 3 bands tell apart
-MOST_PIECES = (
-    4096  # with a transfer vector of their own; the others take that of the nearest which faces the same way
+from render_server.lights.octahedral import harmonics
+from render_server.scene.gpu_mesh import split_triangles
+from render_server.scene.occlusion_field import (
+    CHUNK,
+    FieldSettings,
+    ObjectRays,
+    ProgressCallback,
+    RayHits,
+    ShellGrid,
+    direction_set,
+    fill_inside,
 )
-FACING = 0.5  # enclosing radii that opposite normals count as distance, halved: a thin sheet has two sides
-LIFT = 1e-4  # of the radius: a piece does not hide itself
+from render_server.scene.triangle_mesh import TriangleMesh
+
+ORDER = 3  # SH bands of incident and reflected light: both are diffuse
+LENGTH = ORDER**2
+# Longest edge of a piece in enclosing radii: about the change of direction that 3 bands resolve.
+PIECE_EDGE = 1 / 6
+# Pieces with a transfer vector of their own; the others take that of the nearest one with a similar normal.
+MAX_PIECES = 4096
+FACING = 0.5  # half the distance that opposite normals count as, enclosing radii: a thin sheet has two sides
+LIFT = 1e-4  # of the radius: offset of rays, so that a piece does not occlude itself
 
 
 @dataclass(frozen=True, eq=False)
 class SurfacePieces:
-    """Triangles with diffuse reflectance (linear RGB) that precomputation takes for even."""
+    """Triangles with uniform diffuse reflectance (linear RGB)."""
 
     corners: Float32[np.ndarray, "m 3 3"]
     reflectance: Float32[np.ndarray, "m 3"]
 
     @property
     def centres(self) -> Float32[np.ndarray, "m 3"]:
-        """Centre of each."""
+        """Centroids."""
         return np.asarray(self.corners.mean(axis=1))
 
     @property
@@ -52,14 +59,14 @@ class SurfacePieces:
 def object_surface(meshes: Sequence[TriangleMesh], *, plain: bool) -> Float32[np.ndarray, "m 3 6"]:
     """Return the corners of all triangles: position, diffuse reflectance (linear RGB).
 
-    `plain`: reflectance 1, because the scene document's material takes the asset's place.
+    `plain`: reflectance 1, because the scene document's material replaces the asset's.
     """
     return np.concatenate([_with_reflectance(mesh, plain=plain) for mesh in meshes])
 
 
 def surface_pieces(surface: Float32[np.ndarray, "m 3 6"], radius: float) -> SurfacePieces:
-    """Cut large triangles."""
-    pieces = split_triangles(surface, PIECE * radius)
+    """Split large triangles into pieces."""
+    pieces = split_triangles(surface, PIECE_EDGE * radius)
     return SurfacePieces(np.ascontiguousarray(pieces[..., :3]), pieces[..., 3:].mean(axis=1))
 
 
@@ -77,7 +84,7 @@ def _with_reflectance(mesh: TriangleMesh, *, plain: bool) -> Float32[np.ndarray,
 
 
 def _texels(texture: Float16[np.ndarray, "h w 3"], uv: Float32[np.ndarray, "m 3 2"]) -> np.ndarray:
-    """Nearest texels at corners; the texture repeats."""
+    """Return the nearest texels at corners; the texture repeats."""
     rows, columns = texture.shape[:2]
     x = np.minimum((uv[..., 0] % 1 * columns).astype(int), columns - 1)
     y = np.minimum((uv[..., 1] % 1 * rows).astype(int), rows - 1)
@@ -85,40 +92,42 @@ def _texels(texture: Float16[np.ndarray, "h w 3"], uv: Float32[np.ndarray, "m 3 
 
 
 def compute_transfer(
-    pieces: SurfacePieces, grid: ShellGrid, settings: FieldSettings, step: Step
+    pieces: SurfacePieces, grid: ShellGrid, settings: FieldSettings, progress: ProgressCallback
 ) -> Float16[np.ndarray, "shells h h h 9 9 3"]:
-    """Sample on all shells, at half the resolution of the occlusion, the radiance that comes from the object."""
+    """Sample the radiance reflected by the object on all shells, at half the resolution of the occlusion."""
     n = settings.resolution // 2
     rays = ObjectRays(pieces.corners)
-    sent = _sent_light(pieces, rays, settings.rays)
+    reflected = _reflected_light(pieces, rays, settings.rays)
     found = np.empty((settings.shells, n, n, n, LENGTH, LENGTH, 3), np.float16)
     for shell in range(settings.shells):
-        values, inside = _received(rays, grid.points(shell, n), sent, settings.rays)
+        values, inside = _received_light(rays, grid.points(shell, n), reflected, settings.rays)
         cells = values.reshape(n, n, n, LENGTH, LENGTH, 3)
         found[shell] = fill_inside(cells, inside.reshape(n, n, n), 2 * grid.halves[shell][::-1] / (n - 1))
-        step((shell + 1) / settings.shells)
+        progress((shell + 1) / settings.shells)
     return found
 
 
-def _sent_light(pieces: SurfacePieces, rays: ObjectRays, count: int) -> Float32[np.ndarray, "2m 9 3"]:
-    """Radiance of each piece's front for unit light coefficients, then that of each piece's back."""
-    chosen, keeper = _chosen_pieces(pieces, rays.radius)
+def _reflected_light(pieces: SurfacePieces, rays: ObjectRays, count: int) -> Float32[np.ndarray, "2m 9 3"]:
+    """Return the radiance of each piece's front for unit light coefficients, then that of each piece's back."""
+    chosen, representative = _representative_pieces(pieces, rays.radius)
     normals = pieces.normals[chosen]
     front, back = (_irradiance(pieces.centres[chosen], side * normals, rays, count) for side in (1, -1))
     colors = pieces.reflectance[:, None, :] / math.pi
-    return np.concatenate([side[keeper][:, :, None] * colors for side in (front, back)]).astype(np.float32)
+    return np.concatenate([side[representative][:, :, None] * colors for side in (front, back)]).astype(
+        np.float32
+    )
 
 
-def _chosen_pieces(
+def _representative_pieces(
     pieces: SurfacePieces, radius: float
 ) -> tuple[Int64[np.ndarray, " c"], Int64[np.ndarray, " m"]]:
-    """Pieces with a transfer vector of their own, evenly over the area, and which of these stands for each piece."""
+    """Choose pieces with a transfer vector of their own, evenly by area, and the one that represents each piece."""
     count = len(pieces.corners)
-    if count <= MOST_PIECES:
+    if count <= MAX_PIECES:
         return np.arange(count), np.arange(count)
     edges = pieces.corners[:, 1:] - pieces.corners[:, :1]
     area = np.cumsum(np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1))
-    chosen = np.unique(np.searchsorted(area, np.linspace(0, area[-1], MOST_PIECES + 1)[:-1], side="right"))
+    chosen = np.unique(np.searchsorted(area, np.linspace(0, area[-1], MAX_PIECES + 1)[:-1], side="right"))
     place = np.concatenate([pieces.centres / radius, FACING * pieces.normals], axis=1)
     return chosen, np.asarray(cKDTree(place[chosen]).query(place)[1], np.int64)
 
@@ -126,43 +135,43 @@ def _chosen_pieces(
 def _irradiance(
     points: Float32[np.ndarray, "c 3"], normals: Float32[np.ndarray, "c 3"], rays: ObjectRays, count: int
 ) -> Float32[np.ndarray, "c 9"]:
-    """Transfer vectors: integral of visibility, clamped cosine and each harmonic."""
+    """Return transfer vectors: the integral of visibility, clamped cosine and each harmonic."""
     directions = direction_set(count)
     basis = (harmonics(directions.directions, ORDER) * directions.solid_angle).astype(np.float32)
     start = (points + LIFT * rays.radius * normals).astype(np.float32)
     found = np.empty((len(points), LENGTH), np.float32)
     for part in np.array_split(np.arange(len(points)), -(-len(points) * count // CHUNK)):
         cosine = np.maximum(normals[part] @ directions.directions.T, 0)
-        hits = rays.meet_along(start[part], normals[part].astype(np.float32), directions)
+        hits = rays.trace_hemisphere(start[part], normals[part].astype(np.float32), directions)
         cosine[hits.point, hits.direction] = 0
         found[part] = cosine @ basis
     return found
 
 
-def _received(
-    rays: ObjectRays, points: Float32[np.ndarray, "n 3"], sent: Float32[np.ndarray, "m 9 3"], count: int
+def _received_light(
+    rays: ObjectRays, points: Float32[np.ndarray, "n 3"], reflected: Float32[np.ndarray, "m 9 3"], count: int
 ) -> tuple[Float32[np.ndarray, "n 9 27"], Bool[np.ndarray, " n"]]:
-    """Coefficients of the radiance that arrives at points, by light coefficient and colour; which lie inside."""
+    """Return coefficients of the radiance at points, by light coefficient and colour, and which points lie inside."""
     values = np.zeros((len(points), LENGTH, LENGTH * 3), np.float32)
     inside = np.zeros(len(points), bool)
-    flat = sent.reshape(len(sent), -1)
-    for part, chosen, hits in rays.aimed(points, count):
+    flat = reflected.reshape(len(reflected), -1)
+    for part, chosen, hits in rays.trace(points, count):
         basis = (harmonics(chosen.directions, ORDER) * chosen.solid_angle).astype(np.float32)
-        _add_up(values, part, hits, basis, flat)
+        _accumulate(values, part, hits, basis, flat)
         inside[part] = rays.inside(hits, len(part), chosen)
     return values, inside
 
 
-def _add_up(
+def _accumulate(
     values: Float32[np.ndarray, "n 9 27"],
     points: Int64[np.ndarray, " p"],
     hits: RayHits,
     basis: Float32[np.ndarray, "d 9"],
-    sent: Float32[np.ndarray, "m 27"],
+    reflected: Float32[np.ndarray, "m 27"],
 ) -> None:
-    """Sum over each point's rays; hits come ordered by point."""
-    pieces = len(sent) // 2
-    light = sent[hits.triangle + pieces * hits.behind]
+    """Sum over each point's rays; hits are ordered by point."""
+    pieces = len(reflected) // 2
+    light = reflected[hits.triangle + pieces * hits.behind]
     seen = basis[hits.direction]
     ends = np.searchsorted(hits.point, np.arange(len(points) + 1))
     for number, (start, end) in enumerate(pairwise(ends)):

@@ -1,18 +1,145 @@
-"""Triangles of one material, and what every file's geometry must be before it becomes such."""
+"""Triangle meshes of one material: conversion and checks of a file's geometry, vertex normals, joining."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int32, Int64
+from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from protocol.errors import DeltalightError
 from render_server.scene.asset_check import MAX_TRIANGLES
 from render_server.scene.materials import Material
-from render_server.scene.normals import Smoothing, face_normals, split_at_creases, unit_or
 
+# Scanned meshes of 100k triangles are full of edges beyond 40 degrees that nobody means to be sharp.
+CREASE_ANGLE_DEG = 60.0
+# Twice the area relative to the longest edge squared, below which a triangle has no normal in float32.
+DEGENERATE_RATIO = 1e-9
+# Components of a unit vector are rounded by up to 6e-8 each, and once more by a length.
+UNIT_ROUNDING = 2.5e-7
 MAX_COORDINATE_M = 1e4
+
+
+def face_normals(
+    positions: Float32[np.ndarray, "n 3"], triangles: Int32[np.ndarray, "m 3"]
+) -> tuple[Float64[np.ndarray, "m 3"], Bool[np.ndarray, " m"]]:
+    """Return unit normals by the right-hand rule, and which triangles are not degenerate."""
+    corners = positions.astype(np.float64)[triangles]
+    edges = np.roll(corners, -1, axis=1) - corners
+    normals = np.cross(edges[:, 0], edges[:, 1])
+    double_area = np.linalg.norm(normals, axis=1)
+    longest = np.einsum("mij,mij->mi", edges, edges).max(axis=1)
+    proper = double_area > DEGENERATE_RATIO * longest
+    normals[proper] /= double_area[proper, None]
+    return normals, proper
+
+
+@dataclass(frozen=True, eq=False)
+class Smoothing:
+    """Smoothing group of each vertex. Edges stay sharp or smooth while a mesh deforms."""
+
+    group: Int32[np.ndarray, " n"]
+
+    def normals(
+        self, positions: Float32[np.ndarray, "n 3"], triangles: Int32[np.ndarray, "m 3"]
+    ) -> Float32[np.ndarray, "n 3"]:
+        """Return angle-weighted mean normals (Thuermer & Wuethrich 1998) of each group."""
+        normals, _ = face_normals(positions, triangles)
+        weights = _corner_angles(positions.astype(np.float64)[triangles]).ravel()[:, None]
+        weighted = weights * np.repeat(normals, 3, axis=0)
+        groups = self.group[triangles.ravel()]
+        sums = np.stack([np.bincount(groups, weighted[:, axis]) for axis in range(3)], axis=1)
+        lengths = np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-30)
+        return np.asarray((sums / lengths)[self.group], np.float32)
+
+
+def split_at_creases(
+    positions: Float32[np.ndarray, "n 3"],
+    triangles: Int32[np.ndarray, "m 3"],
+    crease_deg: float = CREASE_ANGLE_DEG,
+) -> tuple[Int64[np.ndarray, " k"], Int32[np.ndarray, "m 3"], Smoothing]:
+    """Split vertices where normals must not be smoothed over a crease.
+
+    Vertices at one position count as one. Around each, triangles that hang together over edges with less
+    than `crease_deg` between their normals share a normal. Triangles must not be degenerate.
+
+    Returns:
+        (source, triangles, smoothing): vertex i of the result is vertex source[i] of the input.
+    """
+    normals, _ = face_normals(positions, triangles)
+    welded = weld(positions)[triangles]
+    groups = _smoothing_groups(welded, normals, np.cos(np.radians(crease_deg)))
+    keys = groups.astype(np.int64) * len(positions) + triangles.ravel()
+    _, first, index = np.unique(keys, return_index=True, return_inverse=True)
+    source = triangles.ravel()[first].astype(np.int64)
+    return source, index.reshape(-1, 3).astype(np.int32), Smoothing(groups[first])
+
+
+def smooth_normals(
+    positions: Float32[np.ndarray, "n 3"],
+    triangles: Int32[np.ndarray, "m 3"],
+    crease_deg: float = CREASE_ANGLE_DEG,
+) -> tuple[Int64[np.ndarray, " k"], Int32[np.ndarray, "m 3"], Float32[np.ndarray, "k 3"]]:
+    """Compute normals that do not smooth over creases.
+
+    Returns:
+        (source, triangles, normals): as of `split_at_creases`.
+    """
+    source, split, smoothing = split_at_creases(positions, triangles, crease_deg)
+    return source, split, smoothing.normals(positions[source], split)
+
+
+def unit_or(
+    vectors: Float[np.ndarray, "n 3"], instead: Float[np.ndarray, "n 3"]
+) -> Float32[np.ndarray, "n 3"]:
+    """Normalize vectors; those of length 0 become `instead`. Unit vectors within float32 rounding keep their bits."""
+    lengths = np.linalg.norm(vectors.astype(np.float64), axis=1, keepdims=True)
+    lengths[np.abs(lengths - 1) < UNIT_ROUNDING] = 1
+    return np.where(lengths > 0, vectors / np.maximum(lengths, 1e-300), instead).astype(np.float32)
+
+
+def weld(positions: Float32[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
+    """Return the index of each vertex's position; equal positions share an index."""
+    order = np.lexsort(positions.T)
+    ordered = positions[order]
+    fresh = np.concatenate([[False], (ordered[1:] != ordered[:-1]).any(axis=1)])
+    numbers = np.empty(len(positions), np.int64)
+    numbers[order] = np.cumsum(fresh)
+    return numbers
+
+
+def _smoothing_groups(
+    welded: Int64[np.ndarray, "m 3"], normals: Float64[np.ndarray, "m 3"], cos_crease: float
+) -> Int32[np.ndarray, " c"]:
+    """Return the smoothing group of every corner (3 * triangle + k)."""
+    start, end = welded.ravel(), np.roll(welded, -1, axis=1).ravel()
+    low, high = np.minimum(start, end), np.maximum(start, end)
+    order = np.lexsort((low, high))
+    same = (low[order[1:]] == low[order[:-1]]) & (high[order[1:]] == high[order[:-1]])
+    one, other = order[:-1][same], order[1:][same]
+    smooth = np.einsum("ei,ei->e", normals[one // 3], normals[other // 3]) >= cos_crease
+    one, other = one[smooth], other[smooth]
+    one_end, other_end = _next_corner(one), _next_corner(other)
+    # Neighbours wound alike run through their common edge in opposite directions.
+    alike = start[one] == start[other]
+    rows = np.concatenate([one, one_end])
+    columns = np.concatenate([np.where(alike, other, other_end), np.where(alike, other_end, other)])
+    count = welded.size
+    links = coo_array((np.ones(len(rows), np.int8), (rows, columns)), shape=(count, count))
+    return np.asarray(connected_components(links, directed=False)[1], np.int32)
+
+
+def _next_corner(corner: Int64[np.ndarray, " e"]) -> Int64[np.ndarray, " e"]:
+    return np.asarray(corner - corner % 3 + (corner + 1) % 3)
+
+
+def _corner_angles(corners: Float64[np.ndarray, "m 3 3"]) -> Float64[np.ndarray, "m 3"]:
+    forward = np.roll(corners, -1, axis=1) - corners
+    backward = np.roll(corners, 1, axis=1) - corners
+    sine = np.linalg.norm(np.cross(forward, backward), axis=2)
+    return np.asarray(np.arctan2(sine, np.einsum("mij,mij->mi", forward, backward)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +163,7 @@ class TriangleMesh:
         return np.stack([used.min(axis=0), used.max(axis=0)])
 
     def transformed(self, matrix: Float64[np.ndarray, "4 4"]) -> "TriangleMesh":
-        """Return the mesh in another frame; a mirroring matrix turns the winding round."""
+        """Return the mesh in another frame; a mirroring matrix reverses the winding."""
         linear = matrix[:3, :3]
         positions = self.positions @ linear.T + matrix[:3, 3]
         normals = self.normals @ np.linalg.inv(linear)
@@ -52,7 +179,7 @@ class TriangleMesh:
 
 @dataclass(frozen=True, eq=False)
 class FileGeometry:
-    """What a file says of one mesh; None where it says nothing."""
+    """Geometry of one mesh as a file has it; None for attributes that it lacks."""
 
     positions: Float32[np.ndarray, "n 3"]
     triangles: Int64[np.ndarray, "m 3"]
@@ -63,7 +190,7 @@ class FileGeometry:
 
 @dataclass(frozen=True, eq=False)
 class ConvertedMesh:
-    """A mesh, which of the file's vertices each of its vertices is, and how its normals were computed, if so."""
+    """A converted mesh, the file's vertex behind each of its vertices, and its smoothing if normals were computed."""
 
     mesh: TriangleMesh
     source: Int64[np.ndarray, " n"]
@@ -73,9 +200,9 @@ class ConvertedMesh:
 def converted(
     given: FileGeometry, material: Material, path: Path, *, keeps_degenerate: bool = False
 ) -> ConvertedMesh | None:
-    """Take over a file's mesh; None if no triangle is left after degenerate ones are dropped.
+    """Convert a file's mesh; None if no triangle is left after dropping degenerate ones.
 
-    Missing normals are computed (sharp at edges beyond 60 degrees).
+    Computes missing normals (sharp at edges beyond 60 degrees).
 
     Raises:
         DeltalightError: vertices that do not exist, coordinates or normals that are not finite, or beyond 10 km.
@@ -121,7 +248,7 @@ def _check_geometry(
 def _unit_normals(
     normals: Float32[np.ndarray, "n 3"] | None, count: int, path: Path
 ) -> Float32[np.ndarray, "n 3"] | None:
-    """The file's own normals, normalised; None where it has none or some of length zero."""
+    """Return the file's own normals at unit length; None where it has none or some of length zero."""
     if normals is None or normals.shape != (count, 3):
         return None
     if not np.isfinite(normals).all():

@@ -11,8 +11,7 @@ from protocol.fisheye_parts import calibration_of
 from protocol.messages import RadianceMessage
 
 if TYPE_CHECKING:
-    from render_server.scene.lights import Light
-    from render_server.scene.seen_light import SeenLight
+    from render_server.lights.lights import IncidentLight, Light
 
 OUTLINE_POINTS = 16
 ENVIRONMENT = "environment"  # the light that is nowhere in particular
@@ -36,22 +35,22 @@ def lights_in_picture(message: RadianceMessage, described: Sequence[Mapping[str,
     Raises:
         DeltalightError: the calibration is none.
     """
-    from render_server.scene.seen_light import seen_from
+    from render_server.lights.lights import incident_light
 
     viewpoint = np.array(message.world_from_fisheye)[:3, 3]
     found = []
     for each in described:
         if each.get("type") == ENVIRONMENT:
             continue
-        seen = seen_from(_light(each), viewpoint)
-        pixels = _pixels(message, np.vstack([seen.toward, _outline(seen)]))
+        seen = incident_light(_light(each), viewpoint)
+        pixels = _pixels(message, np.vstack([seen.to_light, _outline(seen)]))
         if np.isfinite(pixels[0]).all():
             found.append(_marked(each, seen, pixels))
     return found
 
 
 def _marked(
-    described: Mapping[str, Any], seen: "SeenLight", pixels: Float64[np.ndarray, "n 2"]
+    described: Mapping[str, Any], seen: "IncidentLight", pixels: Float64[np.ndarray, "n 2"]
 ) -> FisheyeLight:
     """`pixels` begin with the light's middle; those of its outline that the picture does not show are NaN."""
     distances = np.linalg.norm(pixels - pixels[0], axis=1)
@@ -77,9 +76,9 @@ def _pixels(message: RadianceMessage, directions: Float64[np.ndarray, "n 3"]) ->
     return np.asarray((lens.project(directions @ rotation) + 0.5) * stretch - 0.5)
 
 
-def _outline(seen: "SeenLight") -> Float64[np.ndarray, "n 3"]:
+def _outline(seen: "IncidentLight") -> Float64[np.ndarray, "n 3"]:
     """Directions around a light, at its angular radius."""
-    toward = seen.toward
+    toward = seen.to_light
     side = np.cross(toward, (0.0, 0.0, 1.0) if abs(toward[2]) < 0.9 else (1.0, 0.0, 0.0))
     side /= np.linalg.norm(side)
     turn = np.linspace(0, 2 * np.pi, OUTLINE_POINTS, endpoint=False)[:, None]
@@ -90,7 +89,7 @@ def _outline(seen: "SeenLight") -> Float64[np.ndarray, "n 3"]:
 
 def _light(described: Mapping[str, Any]) -> "Light":
     """The light that a composite's message describes."""
-    from render_server.scene.lights import DirectionalLight, RectangleLight, SphereLight, SpotLight
+    from render_server.lights.lights import DirectionalLight, RectangleLight, SphereLight, SpotLight
 
     def vector(key: str) -> np.ndarray:
         return np.asarray(described[key], np.float32)

@@ -40,7 +40,7 @@ def _models() -> "dict[str, type[BaseModel]]":
 
     models: dict[str, type[BaseModel]] = {"node": NodeConfig, "keys": KeySettings}
     try:
-        from render_server.server import ServerSettings
+        from render_server.server.process import ServerSettings
         from services.api.settings import ApiSettings
     except ModuleNotFoundError:  # a host that only captures
         return models

@@ -36,7 +36,7 @@ def _schema(document: Document) -> dict[str, Any]:
 
             return NodeConfig.model_json_schema()
         case Document.SERVER:
-            from render_server.server import ServerSettings
+            from render_server.server.process import ServerSettings
 
             return ServerSettings.model_json_schema()
         case Document.API:

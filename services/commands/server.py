@@ -41,7 +41,7 @@ def server(
 ) -> None:
     """Render what sensor nodes send and publish the composites, until Ctrl-C."""
     from protocol.keys import KeySettings
-    from render_server.server import ServerSettings, run_server
+    from render_server.server.process import ServerSettings, run_server
     from services.settings import load_configuration
 
     configuration = load_configuration(config_file)

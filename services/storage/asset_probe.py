@@ -32,7 +32,7 @@ def mesh_facts(path: Path) -> Facts:
         read_gltf(path)  # a file that lies is refused before the loader's second of imports
     import numpy as np
 
-    from render_server.scene.mesh import load_asset
+    from render_server.scene.mesh_loading import load_asset
 
     asset = load_asset(path)
     meshes, clips = asset.meshes, () if asset.animated is None else asset.animated.clips

@@ -15,11 +15,10 @@ from protocol.frames import ViewFrame
 from protocol.scene_lights import Lights
 from protocol.scene_lights import SphereLight as GivenSphere
 from render_server.gpu.context import create_context
+from render_server.lights.environment import LUMINANCE
+from render_server.lights.lights import IncidentLight, LightSet, SphereLight, incident_light
+from render_server.lights.sources import FisheyeSource
 from render_server.renderer import SceneRenderer
-from render_server.scene.environment import LUMINANCE
-from render_server.scene.fisheye_lights import FisheyeSource
-from render_server.scene.lights import LightSet, SphereLight
-from render_server.scene.seen_light import SeenLight, seen_from
 
 if importlib.util.find_spec("mitsuba") is None:
     pytest.skip("Mitsuba is not installed (dev extra)", allow_module_level=True)
@@ -48,7 +47,7 @@ def probe(view: ViewFrame) -> np.ndarray:
     return view.radiance_map.world_from_fisheye[:3, 3]
 
 
-def given(case: SceneCase) -> list[SeenLight]:
+def given(case: SceneCase) -> list[IncidentLight]:
     """The scene's lamps as seen from the fish-eye camera, the strongest first."""
     lamps = [lamp for lamp in case.truth.document(0).lights.manual if isinstance(lamp, GivenSphere)]
     spheres = [
@@ -59,17 +58,17 @@ def given(case: SceneCase) -> list[SeenLight]:
         )
         for lamp in lamps
     ]
-    return strongest_first([seen_from(sphere, probe(case.views[0])) for sphere in spheres])
+    return strongest_first([incident_light(sphere, probe(case.views[0])) for sphere in spheres])
 
 
-def strongest_first(lights: list[SeenLight]) -> list[SeenLight]:
+def strongest_first(lights: list[IncidentLight]) -> list[IncidentLight]:
     return sorted(lights, key=lambda light: -float(light.irradiance @ LUMINANCE))
 
 
 def found(view: ViewFrame, distance_m: float | str) -> LightSet:
     lights = FisheyeSource(
         Lights.model_validate({"mode": "fisheye", "fisheye": {"distance_m": distance_m}})
-    ).follow(view)
+    ).update(view)
     assert lights is not None
     return lights
 
@@ -77,10 +76,10 @@ def found(view: ViewFrame, distance_m: float | str) -> LightSet:
 def test_lamps_are_where_they_are_and_as_strong(case: SceneCase) -> None:
     """No factor is between them: both cameras have the same reference exposure."""
     view, lamps = case.views[0], given(case)
-    lights = strongest_first([seen_from(one, probe(view)) for one in found(view, "far").lights])
+    lights = strongest_first([incident_light(one, probe(view)) for one in found(view, "far").lights])
     assert len(lights) == len(lamps)
     for light, lamp in zip(lights, lamps, strict=True):
-        assert np.degrees(np.arccos(min(1.0, float(light.toward @ lamp.toward)))) < ANGLE_DEG
+        assert np.degrees(np.arccos(min(1.0, float(light.to_light @ lamp.to_light)))) < ANGLE_DEG
         assert light.irradiance @ LUMINANCE == pytest.approx(
             lamp.irradiance @ LUMINANCE, rel=IRRADIANCE_SHARE
         )

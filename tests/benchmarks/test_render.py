@@ -15,7 +15,7 @@ from benchmarks.ground_truth.parts import looking, placed, rectangle, rgb, shape
 from benchmarks.ground_truth.render import RoomRenderer, choose_variant, passes
 from protocol.camera_model import CameraModel
 from protocol.errors import DeltalightError
-from render_server.scene.environment import EnvironmentMap, map_directions
+from render_server.lights.environment import EnvironmentMap, map_directions
 
 if importlib.util.find_spec("mitsuba") is None:
     pytest.skip("Mitsuba is not installed (dev extra)", allow_module_level=True)

@@ -18,7 +18,7 @@ from benchmarks.ground_truth.scenes import SCENES, scene_named
 from protocol.camera_model import CameraModel
 from protocol.errors import DeltalightError
 from protocol.scene import parse_scene
-from render_server.scene.environment import map_directions, pixel_solid_angles
+from render_server.lights.environment import map_directions, pixel_solid_angles
 
 if importlib.util.find_spec("mitsuba") is None:
     pytest.skip("Mitsuba is not installed (dev extra)", allow_module_level=True)

@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks import walking_figure
 from protocol.scene import load_scene
-from render_server.scene.gltf_asset import GltfAsset, load_gltf
+from render_server.scene.gltf_meshes import GltfAsset, load_gltf
 
 ASSETS = Path(__file__).parents[2] / "services" / "demo_assets"
 MAX_BYTES = 200_000

@@ -9,7 +9,7 @@ import numpy as np
 import trimesh
 
 from benchmarks.glb_builder import GlbBuilder
-from render_server.scene.gltf_asset import load_gltf
+from render_server.scene.gltf_meshes import load_gltf
 from render_server.scene.triangle_mesh import TriangleMesh
 
 HALF = np.sqrt(0.5)

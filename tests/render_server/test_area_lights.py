@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import trimesh
 from numpy.typing import NDArray
+from render_server.passes.light_maps import light_views
 from scipy.optimize import curve_fit
 
 from protocol.scene import SceneDocument, parse_scene
 from render_server.gpu.context import GpuContext
-from render_server.passes.light_maps import light_views
+from render_server.lights.lights import RectangleLight, SpotLight, build_lights
 from render_server.renderer import SceneRenderer
-from render_server.scene.lights import RectangleLight, SpotLight, build_lights
 from tests.render_server.scenes import (
     Fields,
     Stage,

@@ -7,16 +7,15 @@ import numpy as np
 import pytest
 import trimesh
 from jaxtyping import Float64
+from render_server.relight.aroof import Aroof
 
 from protocol.errors import DeltalightError
 from protocol.frames import BoardPose
 from protocol.scene import SceneDocument, parse_scene
 from protocol.scene_method import AroofMethod
 from render_server.gpu.context import GpuContext
-from render_server.relight.aroof import Aroof
+from render_server.lights.octahedral import even_directions, harmonics, octahedral_grid
 from render_server.renderer import SceneRenderer
-from render_server.scene.octahedral import octahedral_grid
-from render_server.scene.spherical_harmonics import even_directions, harmonics
 from tests.render_server.scenes import (
     Fields,
     Stage,

@@ -7,21 +7,15 @@ import numpy as np
 import pytest
 import trimesh
 from jaxtyping import Float64
-
-from render_server.occlusion_fields import OcclusionFields
 from render_server.relight.frame import PlacedObject
+
+from render_server.lights.octahedral import even_directions, harmonics
+from render_server.occlusion_fields import OcclusionFields
 from render_server.scene.materials import Material
-from render_server.scene.mesh import TriangleMesh
-from render_server.scene.occlusion_field import FieldSettings, OcclusionField, place_shells
-from render_server.scene.occlusion_field_cache import (
-    compute_field,
-    field_digest,
-    load_field,
-    store_field,
-)
-from render_server.scene.occlusion_rays import ObjectRays
+from render_server.scene.occlusion_cache import compute_field, field_digest, load_field, store_field
+from render_server.scene.occlusion_field import FieldSettings, ObjectRays, OcclusionField, place_shells
 from render_server.scene.occlusion_transfer import object_surface
-from render_server.scene.spherical_harmonics import even_directions, harmonics
+from render_server.scene.triangle_mesh import TriangleMesh
 
 SETTINGS = FieldSettings(order=4, shells=3, resolution=12, reach=4.0, rays=256, indirect=True)
 RADIUS = 0.5
@@ -94,7 +88,7 @@ def test_coefficients_are_those_of_brute_force_rays() -> None:
     corners = np.asarray(shape.triangles, np.float32)
     rays = ObjectRays(corners)
     point = np.array([[0.7, 0.1, 0.3]], np.float32)
-    for _, chosen, hits in rays.aimed(point, 256):
+    for _, chosen, hits in rays.trace(point, 256):
         met = np.zeros(len(chosen.directions), bool)
         met[hits.direction] = True
     start = np.repeat(point, len(met), axis=0)

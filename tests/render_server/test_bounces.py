@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import trimesh
 from numpy.typing import NDArray
+from render_server.passes.volume import Pyramid
+from render_server.relight.dvct import DvctExact
 
 from protocol.frames import decode_lut
 from protocol.scene import SceneDocument
 from render_server.gpu.context import GpuContext
-from render_server.passes.volume import Pyramid
-from render_server.relight.dvct import DvctExact
 from render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (
     GREY,

@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-
-from render_server.gpu.context import GpuContext
 from render_server.gpu.program import ComputeProgram
 from render_server.passes.mesh_buffers import MeshBuffers
 from render_server.passes.object_tree import ObjectTree
+
+from render_server.gpu.context import GpuContext
 from render_server.scene.bvh import LEAF_SIZE, Bvh, build_bvh
 
 pytestmark = pytest.mark.usefixtures("clean_gl")

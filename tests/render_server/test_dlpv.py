@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 import trimesh
 from jaxtyping import Float64
+from render_server.albedo_watch import AlbedoWatch
+from render_server.passes.light_volume import CONSTANT, LOBE
+from render_server.relight.dlpv import Dlpv
+from render_server.relight.frame import RelightInput
 
 from protocol.errors import DeltalightError
 from protocol.frames import BoardPose, ViewFrame, decode_lut
 from protocol.scene import SceneDocument, parse_scene
 from protocol.scene_method import DlpvMethod
 from protocol.scene_objects import Pose
-from render_server.albedo_watch import AlbedoWatch
 from render_server.gpu.context import GpuContext
-from render_server.passes.light_volume import CONSTANT, LOBE
-from render_server.relight.dlpv import Dlpv
-from render_server.relight.frame import RelightInput
 from render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (
     GREY,

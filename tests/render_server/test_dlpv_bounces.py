@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 import trimesh
 from jaxtyping import Float64
+from render_server.passes.light_volume import CONSTANT, LOBE, LightVolume
+from render_server.relight.dlpv import Dlpv
+from render_server.relight.voxel_sets import bind_lighting
 
 from protocol.errors import DeltalightError
 from protocol.frames import decode_lut
 from protocol.scene import SceneDocument, parse_scene
 from protocol.scene_method import DlpvMethod
 from render_server.gpu.context import GpuContext
-from render_server.passes.light_volume import CONSTANT, LOBE, LightVolume
-from render_server.relight.dlpv import Dlpv
-from render_server.relight.voxel_sets import bind_lighting
 from render_server.renderer import SceneRenderer
 from tests.render_server.scenes import GREY, Stage, ambient, cube, floor, frame, shifted, solve, sphere_light
 

@@ -3,8 +3,6 @@
 import numpy as np
 import pytest
 from jaxtyping import Float32
-
-from render_server.gpu.context import GpuContext
 from render_server.passes.light_volume import (
     LOBE,
     LightVolume,
@@ -14,6 +12,8 @@ from render_server.passes.light_volume import (
     transmitted_shares,
 )
 from render_server.passes.lpv_propagate import LpvPropagatePass
+
+from render_server.gpu.context import GpuContext
 
 pytestmark = pytest.mark.usefixtures("clean_gl")
 CELLS = 16

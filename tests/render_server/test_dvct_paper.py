@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 import trimesh
 from jaxtyping import Bool, Float32, Float64
-
-from protocol.camera_model import CameraModel
-from protocol.frames import BoardPose, ViewFrame, decode_lut
-from protocol.scene import SceneDocument, parse_scene
-from render_server.gpu.context import GpuContext, create_context
 from render_server.passes.trace_paper import TracePaperPass
 from render_server.passes.volume import Pyramid
 from render_server.relight.defaults import resolve_voxel_cones
 from render_server.relight.dvct_paper import DvctPaper
 from render_server.relighting import Relighting, RelitFrame
+
+from protocol.camera_model import CameraModel
+from protocol.frames import BoardPose, ViewFrame, decode_lut
+from protocol.scene import SceneDocument, parse_scene
+from render_server.gpu.context import GpuContext, create_context
 from render_server.renderer import SceneRenderer
 from render_server.view import CameraView
 

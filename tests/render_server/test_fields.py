@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import trimesh
 from numpy.typing import NDArray
+from render_server.passes.volume import VolumePlacement
 from scipy.optimize import curve_fit
 
 from render_server.gpu.context import GpuContext
-from render_server.passes.volume import VolumePlacement
 from tests.render_server.scenes import (
     Fields,
     Stage,

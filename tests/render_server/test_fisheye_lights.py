@@ -15,12 +15,11 @@ from protocol.frames import DepthImage, LampPose, RadianceMap, ViewFrame, decode
 from protocol.hemisphere import texel_directions
 from protocol.scene import SceneDocument
 from render_server.gpu.context import GpuContext
+from render_server.lights.fisheye import is_occluded
+from render_server.lights.lights import DirectionalLight, LightSet, SphereLight
+from render_server.lights.octahedral import octahedral_grid, sample_octahedral
+from render_server.lights.sources import FisheyeSource, TrackedSource
 from render_server.renderer import SceneRenderer
-from render_server.scene.fisheye_lights import FisheyeSource
-from render_server.scene.lights import DirectionalLight, LightSet, SphereLight
-from render_server.scene.line_of_sight import is_hidden
-from render_server.scene.octahedral import octahedral_grid, sample_octahedral
-from render_server.scene.tracked_lamps import TrackedSource
 from tests.render_server.scenes import (
     Stage,
     camera,
@@ -82,7 +81,7 @@ def source(**settings: object) -> FisheyeSource:
 
 
 def followed(one: FisheyeSource | TrackedSource, view: ViewFrame) -> LightSet:
-    lights = one.follow(view)
+    lights = one.update(view)
     assert lights is not None
     return lights
 
@@ -96,8 +95,8 @@ def test_a_map_becomes_a_directional_light_and_an_environment() -> None:
     up = sample_octahedral(lights.environment, np.array([[[0.0, 0, 1]]]))[0, 0]
     assert up == pytest.approx([0.3] * 3, rel=1e-3)
     below = octahedral_grid(len(lights.environment))[..., 2] < -0.1
-    assert lights.ground_share[below].min() == 1
-    assert lights.ground_share[octahedral_grid(len(lights.environment))[..., 2] > 0.1].max() == 0
+    assert lights.ground_fraction[below].min() == 1
+    assert lights.ground_fraction[octahedral_grid(len(lights.environment))[..., 2] > 0.1].max() == 0
     grounded = lights.with_ground(np.array([0.9, 0.5, 0.1], np.float32))
     assert grounded.environment[below] == pytest.approx(np.tile([0.9, 0.5, 0.1], (below.sum(), 1)), rel=1e-4)
 
@@ -113,13 +112,13 @@ def test_a_turned_camera_gives_the_same_light_in_the_world() -> None:
 
 def test_nothing_new_costs_nothing() -> None:
     one, picture = source(), seen()
-    assert one.follow(frame()) is None
+    assert one.update(frame()) is None
     assert "No fish-eye picture has come yet" in one.remarks[0]
-    assert one.follow(frame(radiance_map=picture)) is not None
+    assert one.update(frame(radiance_map=picture)) is not None
     assert one.remarks == ()
     for step in range(5):
-        assert one.follow(frame(radiance_map=picture, timestamp_ns=step * SECOND)) is None
-    assert one.follow(frame(radiance_map=seen(), timestamp_ns=6 * SECOND)) is not None
+        assert one.update(frame(radiance_map=picture, timestamp_ns=step * SECOND)) is None
+    assert one.update(frame(radiance_map=seen(), timestamp_ns=6 * SECOND)) is not None
 
 
 def test_lights_keep_their_number_and_settle_after_a_jump() -> None:
@@ -128,7 +127,7 @@ def test_lights_keep_their_number_and_settle_after_a_jump() -> None:
     brighter = seen(value=200.0)
     lights = followed(one, frame(radiance_map=brighter, timestamp_ns=SECOND))
     for step in range(1, 16):
-        new = one.follow(frame(radiance_map=brighter, timestamp_ns=SECOND + step * SECOND // 10))
+        new = one.update(frame(radiance_map=brighter, timestamp_ns=SECOND + step * SECOND // 10))
         lights = new or lights
     assert lights.identities == first.identities == (1,)
     before, after = first.lights[0], lights.lights[0]
@@ -183,7 +182,7 @@ def test_paper_that_comes_into_view_later_still_tells() -> None:
     one, view = source(), paper_under_a_lamp(1.0)
     assert isinstance(followed(one, replace(view, board=None)).lights[0], DirectionalLight)
     assert isinstance(followed(one, view).lights[0], SphereLight)
-    assert one.follow(view) is None
+    assert one.update(view) is None
 
 
 def wall(distance: float = 1.0) -> tuple[DepthImage, np.ndarray]:
@@ -197,18 +196,18 @@ def wall(distance: float = 1.0) -> tuple[DepthImage, np.ndarray]:
 def test_walls_hide_what_is_behind_them() -> None:
     depth, pose = wall()
     place = np.array([-0.1, 0.5, 0])
-    assert is_hidden(depth, pose, place, np.array([0.0, 1, 0]))  # straight through the wall
-    assert not is_hidden(depth, pose, place, np.array([0.0, 0.2, 0.98]))  # out of the picture before
-    assert not is_hidden(depth, pose, place, np.array([0.0, -1, 0]))  # behind the camera
-    assert is_hidden(depth, pose, np.array([0.3, 1.5, 0]), np.array([0.0, 1, 0]))
+    assert is_occluded(depth, pose, place, np.array([0.0, 1, 0]))  # straight through the wall
+    assert not is_occluded(depth, pose, place, np.array([0.0, 0.2, 0.98]))  # out of the picture before
+    assert not is_occluded(depth, pose, place, np.array([0.0, -1, 0]))  # behind the camera
+    assert is_occluded(depth, pose, np.array([0.3, 1.5, 0]), np.array([0.0, 1, 0]))
     behind = np.array([0.2, 1.3, 0])  # passes behind the near half's edge, through free space
-    assert not is_hidden(depth, pose, behind, np.array([-1.0, 0.3, 0]) / np.hypot(1, 0.3))
+    assert not is_occluded(depth, pose, behind, np.array([-1.0, 0.3, 0]) / np.hypot(1, 0.3))
 
 
 def test_without_depth_nothing_hides() -> None:
     depth, pose = wall()
     unknown = replace(depth, valid=np.zeros_like(depth.valid))
-    assert not is_hidden(unknown, pose, np.array([-0.1, 0.5, 0]), np.array([0.0, 1, 0]))
+    assert not is_occluded(unknown, pose, np.array([-0.1, 0.5, 0]), np.array([0.0, 1, 0]))
 
 
 def test_a_bright_wall_is_no_light() -> None:
@@ -251,7 +250,7 @@ def test_a_lamp_stands_where_its_marker_says() -> None:
 def test_a_lamp_that_moves_is_followed_and_one_that_trembles_is_not() -> None:
     one = TrackedSource(tracked())
     followed(one, frame(lamps=(lamp_pose(0.5),)))
-    assert one.follow(frame(lamps=(lamp_pose(0.504),))) is None
+    assert one.update(frame(lamps=(lamp_pose(0.504),))) is None
     moved = followed(one, frame(lamps=(lamp_pose(0.52),)))
     assert moved.lights[0].describe()["position_m"][0] == pytest.approx(0.52)
 
@@ -262,7 +261,7 @@ def test_a_lamp_out_of_sight_stays_and_one_never_seen_is_said() -> None:
     assert "No picture has shown the marker of lamp 7 yet" in one.remarks[0]
     followed(one, frame(lamps=(lamp_pose(0.5), lamp_pose(1.0, marker=3))))
     assert one.remarks == ()
-    assert one.follow(frame()) is None
+    assert one.update(frame()) is None
     assert "lamp 7 is out of sight" in one.remarks[0]
 
 

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from benchmarks.glb_builder import GlbBuilder
 from protocol.scene_objects import Animation
-from render_server.scene.gltf_asset import load_gltf
-from render_server.scene.mesh import load_asset, load_mesh
+from render_server.scene.gltf_meshes import load_gltf
+from render_server.scene.mesh_loading import load_asset, load_mesh
 from tests.render_server.gltf_samples import (
     HALF,
     IDENTITY,

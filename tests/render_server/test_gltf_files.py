@@ -9,8 +9,8 @@ import pytest
 
 from benchmarks.glb_builder import GlbBuilder
 from protocol.errors import DeltalightError
-from render_server.scene.gltf_asset import GltfAsset, load_gltf
-from render_server.scene.mesh import load_asset, load_mesh
+from render_server.scene.gltf_meshes import GltfAsset, load_gltf
+from render_server.scene.mesh_loading import load_asset, load_mesh
 from tests.render_server.gltf_samples import (
     bent_bar,
     box,

@@ -11,14 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
-from protocol.errors import DeltalightError
-from render_server.gpu import shader_source as shader_text
-from render_server.gpu.context import GpuContext, explain_context_failure, is_software_renderer
 from render_server.gpu.program import ComputeProgram
-from render_server.gpu.readback import AsyncReadback
-from render_server.gpu.textures import texture_2d
-from render_server.gpu.timers import PassTimers
 from render_server.passes.volume import (
     Pyramid,
     VolumePlacement,
@@ -27,6 +20,13 @@ from render_server.passes.volume import (
     pyramid_shape,
     volume_memory_bytes,
 )
+
+from protocol.errors import DeltalightError
+from render_server.gpu import shader_source as shader_text
+from render_server.gpu.context import GpuContext, explain_context_failure, is_software_renderer
+from render_server.gpu.readback import AsyncReadback
+from render_server.gpu.textures import texture_2d
+from render_server.gpu.timers import PassTimers
 from render_server.renderer import SceneRenderer
 from tests.render_server.scenes import Stage, cube, directional, floor, frame
 

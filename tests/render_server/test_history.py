@@ -6,14 +6,14 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from render_server.passes.volume import VolumePlacement
+from render_server.relight.dvct import DvctExact
+from render_server.relight.dvct_paper import DvctPaper
 
 from protocol.frames import ViewFrame
 from protocol.scene import SceneDocument
 from protocol.scene_objects import Pose, Surface
 from render_server.gpu.context import GpuContext
-from render_server.passes.volume import VolumePlacement
-from render_server.relight.dvct import DvctExact
-from render_server.relight.dvct_paper import DvctPaper
 from render_server.renderer import CompositeFrame, SceneRenderer
 from tests.render_server.scenes import (
     Stage,

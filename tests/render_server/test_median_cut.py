@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from protocol.hemisphere import texel_directions, texel_solid_angles
-from render_server.scene.environment import LUMINANCE, WORK_SIZE, EnvironmentMap, read_radiance
-from render_server.scene.hemisphere_map import HemisphereMap, to_world
-from render_server.scene.median_cut import RegionLight, Split, split_environment, split_map
-from render_server.scene.octahedral import octahedral_grid, sample_octahedral
-from render_server.scene.octahedral import texel_solid_angles as sphere
+from render_server.lights.environment import LUMINANCE, WORK_SIZE, EnvironmentMap, read_radiance
+from render_server.lights.fisheye import HemisphereMap, to_world
+from render_server.lights.median_cut import RegionLight, Split, split_environment, split_map
+from render_server.lights.octahedral import octahedral_grid, sample_octahedral
+from render_server.lights.octahedral import texel_solid_angles as sphere
 
 SIZE = 128
 TILTED = np.array([[0.8, 0.0, 0.6], [0.0, 1.0, 0.0], [-0.6, 0.0, 0.8]])
@@ -58,9 +58,9 @@ def irradiance_of_lights(lights: tuple[RegionLight, ...]) -> np.ndarray:
     for light in lights:
         cosine = 1 - index / 400 * (1 - np.cos(light.angular_radius_rad))
         turn, sine = index * 2.399963, np.sqrt(1 - cosine**2)
-        side = unit(*np.cross(light.toward, (0.3, 0.5, 0.8)))
-        around = np.cos(turn)[:, None] * side + np.sin(turn)[:, None] * np.cross(light.toward, side)
-        disc = cosine[:, None] * light.toward + sine[:, None] * around
+        side = unit(*np.cross(light.to_light, (0.3, 0.5, 0.8)))
+        around = np.cos(turn)[:, None] * side + np.sin(turn)[:, None] * np.cross(light.to_light, side)
+        disc = cosine[:, None] * light.to_light + sine[:, None] * around
         total += np.maximum(normals() @ disc.T, 0).mean(axis=1)[:, None] * light.irradiance
     return total
 
@@ -84,8 +84,8 @@ def test_lamps_on_a_hemisphere_are_found(turned: np.ndarray | None) -> None:
     require_the_map(split, sky)
     for toward, radius_deg, value in lamps:
         in_world = toward if turned is None else turned @ toward
-        light = max(split.lights, key=lambda one: float(one.toward @ in_world))
-        assert np.degrees(np.arccos(min(1.0, light.toward @ in_world))) < 0.5
+        light = max(split.lights, key=lambda one: float(one.to_light @ in_world))
+        assert np.degrees(np.arccos(min(1.0, light.to_light @ in_world))) < 0.5
         assert np.degrees(light.angular_radius_rad) == pytest.approx(radius_deg, rel=0.06)
         whole = value * np.array([1, 0.8, 0.6]) * 2 * np.pi * (1 - np.cos(np.radians(radius_deg)))
         assert light.irradiance == pytest.approx(whole, rel=0.12)  # what is below the limit stays
@@ -131,9 +131,9 @@ def test_what_was_not_seen_does_not_count_as_dark() -> None:
 def test_hidden_lights_go_back() -> None:
     near, far = unit(1, 0, 0.5), unit(-1, 0, 1)
     sky = hemisphere((near, 4.0, 60.0), (far, 4.0, 60.0))
-    split = split_map(sky, 4, is_hidden=lambda toward: bool(toward @ near > 0.9))
+    split = split_map(sky, 4, is_occluded=lambda toward: bool(toward @ near > 0.9))
     (light,) = split.lights
-    assert light.toward @ far > 0.999
+    assert light.to_light @ far > 0.999
     require_the_map(split, sky)
 
 

@@ -7,12 +7,12 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
+from render_server.passes.mirror_objects import RAY_ROUGHNESS
 
 from protocol.frames import ViewFrame, decode_lut
 from protocol.scene import SceneDocument
 from protocol.scene_objects import Surface
 from render_server.gpu.context import GpuContext
-from render_server.passes.mirror_objects import RAY_ROUGHNESS
 from render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (
     HEIGHT,

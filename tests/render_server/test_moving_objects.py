@@ -13,7 +13,7 @@ from protocol.scene import SceneDocument
 from protocol.scene_method import DlpvMethod
 from render_server.gpu.context import GpuContext
 from render_server.renderer import SceneRenderer
-from render_server.scene.gltf_asset import load_gltf
+from render_server.scene.gltf_meshes import load_gltf
 from render_server.virtual_objects import VirtualObjects
 from tests.render_server.gltf_samples import (
     IDENTITY,

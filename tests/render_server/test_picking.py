@@ -13,7 +13,7 @@ from protocol.scene import SceneDocument
 from render_server.gpu.context import GpuContext
 from render_server.picking import Pick
 from render_server.renderer import SceneRenderer
-from render_server.scene.ray_mesh import first_hit
+from render_server.scene.bvh import first_hit
 from tests.render_server.scenes import (
     HEIGHT,
     WIDTH,

@@ -8,7 +8,7 @@ import pytest
 from protocol import scene_lights as documents
 from protocol.errors import DeltalightError
 from protocol.radiance_files import write_exr
-from render_server.scene.environment import (
+from render_server.lights.environment import (
     LUMINANCE,
     EnvironmentMap,
     load_environment,
@@ -16,9 +16,9 @@ from render_server.scene.environment import (
     orientation,
     pixel_solid_angles,
 )
-from render_server.scene.lights import DirectionalLight, SphereLight, build_lights
-from render_server.scene.median_cut import split_environment
-from render_server.scene.octahedral import (
+from render_server.lights.lights import DirectionalLight, SphereLight, build_lights
+from render_server.lights.median_cut import split_environment
+from render_server.lights.octahedral import (
     irradiance,
     octahedral_direction,
     octahedral_uv,
@@ -146,8 +146,8 @@ def test_lamps_are_found_with_place_energy_and_size() -> None:
     assert len(split.lights) == 3
     for toward, radius_deg, value in lamps:
         unit = np.array(toward) / np.linalg.norm(toward)
-        light = max(split.lights, key=lambda item: float(item.toward @ unit))
-        assert np.degrees(np.arccos(min(light.toward @ unit, 1))) < 0.3
+        light = max(split.lights, key=lambda item: float(item.to_light @ unit))
+        assert np.degrees(np.arccos(min(light.to_light @ unit, 1))) < 0.3
         solid_angle = 2 * np.pi * (1 - np.cos(np.radians(radius_deg)))
         mean = flux(environment) @ LUMINANCE / (4 * np.pi)
         radiance = value * np.array([1, 0.8, 0.6])
@@ -159,7 +159,7 @@ def test_lamps_are_found_with_place_energy_and_size() -> None:
 def test_a_lamp_behind_the_seam_is_not_cut_in_two() -> None:
     split = split_environment(discs(((-1, 0, 0.2), 5.0, 40.0)), 1)
     (light,) = split.lights
-    assert light.toward == pytest.approx(np.array([-1, 0, 0.2]) / np.hypot(1, 0.2), abs=0.01)
+    assert light.to_light == pytest.approx(np.array([-1, 0, 0.2]) / np.hypot(1, 0.2), abs=0.01)
     assert np.degrees(light.angular_radius_rad) == pytest.approx(5, rel=0.05)
 
 

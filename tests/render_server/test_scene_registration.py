@@ -4,14 +4,13 @@ import pytest
 from protocol.board import BoardSpec, GreyCard
 from protocol.camera_model import CameraModel
 from protocol.frames import BoardPose
-from render_server.scene.known_surfaces import known_albedo, paper_pixels
-from render_server.scene.registration import (
+from render_server.estimation.registration_fit import (
     Registration,
     RegistrationAverage,
     registration_from_albedo_percentile,
     registration_from_patch,
-    unclipped,
 )
+from render_server.scene.board_albedo import known_albedo, paper_pixels, unclipped
 
 FACTOR = np.array([2.0, 1.5, 0.75])
 BOARD = BoardSpec(

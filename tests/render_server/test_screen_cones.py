@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
+from render_server.passes.screen_cones import ROUGHEST
 
 from protocol.scene import SceneDocument
 from protocol.scene_lights import Lights
 from render_server.gpu.context import GpuContext
-from render_server.passes.screen_cones import ROUGHEST
 from render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (
     FOCAL,

@@ -14,7 +14,7 @@ from protocol.radiance_files import read_linear
 from protocol.scene import SceneDocument
 from render_server.gpu.context import GpuContext
 from render_server.renderer import SceneRenderer
-from render_server.snapshot import SnapshotOrder, take_snapshot
+from render_server.server.snapshot import SnapshotOrder, take_snapshot
 from tests.render_server.scenes import (
     Stage,
     ambient,

@@ -8,9 +8,9 @@ import pytest
 from protocol.board import BoardSpec
 from protocol.frames import ViewFrame, decode_lut
 from protocol.scene import SceneDocument
+from render_server.estimation.registration_fit import unseen_radiance_from_patch
 from render_server.gpu.context import GpuContext
 from render_server.renderer import SceneRenderer
-from render_server.scene.registration import surroundings_from_patch
 from tests.render_server.scenes import Stage, ambient, cube, directional, floor, frame, plain
 
 ALBEDO = 0.7
@@ -80,7 +80,7 @@ def test_shadows_and_stains_on_the_paper_do_not_count() -> None:
     wanted = np.array([0.3, 0.2, 0.1])
     measured = ALBEDO / np.pi * (irradiance + wanted * per_radiance)
     measured[:120] *= 0.2
-    found = surroundings_from_patch(measured, irradiance, per_radiance, ALBEDO)
+    found = unseen_radiance_from_patch(measured, irradiance, per_radiance, ALBEDO)
     assert found is not None
     assert found[0] == pytest.approx(wanted[0], abs=0.01)
-    assert surroundings_from_patch(measured[:20], irradiance[:20], per_radiance[:20], ALBEDO) is None
+    assert unseen_radiance_from_patch(measured[:20], irradiance[:20], per_radiance[:20], ALBEDO) is None

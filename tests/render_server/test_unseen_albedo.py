@@ -8,8 +8,8 @@ import trimesh
 
 from protocol.frames import BoardPose, ViewFrame
 from protocol.scene import SceneDocument
+from render_server.estimation.backoff_schedule import BackoffSchedule
 from render_server.gpu.context import GpuContext
-from render_server.growing_interval import GrowingInterval
 from render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (
     HEIGHT,
@@ -91,7 +91,7 @@ def test_another_room_begins_without_memory(gpu: GpuContext, tmp_path: Path) -> 
 
 
 def test_the_interval_grows_and_survives_a_clock_that_is_set_back() -> None:
-    interval = GrowingInterval()
+    interval = BackoffSchedule()
     due = [second for second in range(200) if interval.is_due(second * 10**9)]
     assert due == [0, 1, 3, 7, 15, 31, 61, 91, 121, 151, 181]
     assert not interval.is_due(5 * 10**9)

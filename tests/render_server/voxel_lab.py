@@ -6,10 +6,7 @@ from typing import Any
 
 import numpy as np
 import trimesh
-
-from render_server.gpu.context import GpuContext
 from render_server.gpu.program import ComputeProgram
-from render_server.gpu.textures import bind_samplers
 from render_server.passes.filter_voxels import FilterVoxelsPass
 from render_server.passes.light_table import LightTable
 from render_server.passes.light_voxels import LightVoxelsPass
@@ -19,9 +16,12 @@ from render_server.passes.resolve_voxels import ResolveVoxelsPass
 from render_server.passes.volume import Pyramid, VolumePlacement
 from render_server.passes.voxel_store import VoxelStore
 from render_server.passes.voxelize import VoxelizePass
+
+from render_server.gpu.context import GpuContext
+from render_server.gpu.textures import bind_samplers
+from render_server.scene.gpu_mesh import GpuMesh, merge_for_gpu
 from render_server.scene.materials import Material
-from render_server.scene.mesh import GpuMesh, TriangleMesh, merge_for_gpu
-from render_server.scene.normals import smooth_normals
+from render_server.scene.triangle_mesh import TriangleMesh, smooth_normals
 
 DIRECTIONS = 6
 

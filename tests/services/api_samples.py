@@ -11,7 +11,7 @@ import httpx
 
 from protocol.scene import SceneDocument
 from protocol.transport import ReplyServer
-from render_server.session import RenderSession
+from render_server.server.session import RenderSession
 from services import ports
 from services.api.app import create_app
 from services.api.serve import http_server, listening

@@ -5,7 +5,7 @@ import pytest
 
 from protocol.envelope import EnvelopeError, decode
 from protocol.transport import ReceivedMultipart
-from render_server.frame_assembly import FrameAssembler, PairingSettings
+from render_server.server.frames import FrameAssembler, PairingSettings
 from tests.services.conftest import color, depth, pose
 
 MS = 1_000_000

@@ -14,7 +14,7 @@ import httpx
 import numpy as np
 import pytest
 
-from render_server.scene.mesh import load_mesh
+from render_server.scene.mesh_loading import load_mesh
 from services.storage.asset_probe import probe
 from services.storage.assets import Asset
 from services.storage.faults import RejectedAssetError, TooLargeError

@@ -13,7 +13,7 @@ from protocol.envelope import decode
 from protocol.messages import CompositeMessage, ControlReply, ControlRequest
 from protocol.scene import SceneDocument
 from protocol.transport import Publisher, Receiver, RequestClient
-from render_server.server import ServerSettings, serve
+from render_server.server.process import ServerSettings, serve
 from services import ports
 from tests.services.api_samples import UPLOAD, running_api
 from tests.services.conftest import color, depth, pose

@@ -13,8 +13,8 @@ from protocol.errors import DeltalightError
 from protocol.frames import ViewFrame
 from protocol.messages import ControlRequest
 from protocol.scene import SceneDocument
-from render_server.frame_assembly import FrameAssembler
-from render_server.session import MAXIMUM_FAULTS_IN_A_ROW, RenderSession, SourceInUse
+from render_server.server.frames import FrameAssembler
+from render_server.server.session import MAXIMUM_FAULTS_IN_A_ROW, RenderSession, SourceInUse
 from tests.services.conftest import IDENTITY, camera, color, depth, pose, received
 
 START = 10**15

@@ -10,7 +10,7 @@ import pytest
 
 from protocol.errors import DeltalightError
 from protocol.keys import KeySettings
-from render_server.server import ServerSettings
+from render_server.server.process import ServerSettings
 from sensor_node.node import NodeConfig
 from services.settings import load_configuration
 from tests.services.conftest import ROOT

@@ -1,4 +1,4 @@
-// Real spherical harmonics of a unit direction, index l^2 + l + m (render_server/scene/spherical_harmonics.py).
+// Real spherical harmonics of a unit direction, index l^2 + l + m (render_server/lights/octahedral.py).
 #define HARMONICS 25
 
 void harmonics(vec3 d, out float b[HARMONICS]) {

@@ -3,7 +3,7 @@ struct SurfaceEntry {
     vec4 f0;        // rgb reflectance at normal incidence, w: metallic
     vec4 surface;   // roughness
     vec4 albedo;    // rgb, w: 1 if declared
-    vec4 region[2]; // render_server/scene/surfaces.py says what they hold; kind in region[0].w
+    vec4 region[2]; // render_server/scene/declared_surfaces.py says what they hold; kind in region[0].w
 };
 layout(std430) readonly buffer Surfaces { SurfaceEntry surfaces[]; };
 uniform int surface_count;

@@ -1,0 +1,187 @@
+"""Extrapolates planes that the picture's border cuts: walls, table and floor go on beyond it.
+
+How far is unknown. A plane seen over a length L continues for at least d beyond the border with probability
+L / (L + d), because the border cuts it at a place that is independent of it (Gott 1993, Nature 363, for lengths in
+place of times). Its radiance there follows from the lights and from its reflectance where it is seen.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64
+
+from render_server.estimation.plane_detection import DetectedPlane
+from render_server.lights.lights import Light, incident_light
+from render_server.lights.octahedral import octahedral_grid
+
+# Fraction of the samples that noise may put behind a wall.
+MAX_STRAY_FRACTION = 0.005
+MIN_IRRADIANCE = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class ViewFrustum:
+    """The camera's view: rays (x/z, y/z) between `low` and `high`."""
+
+    camera_from_world: Float64[np.ndarray, "4 4"]
+    low: Float64[np.ndarray, "2"]
+    high: Float64[np.ndarray, "2"]
+
+    def inside(self, places: Float64[np.ndarray, "m 3"]) -> Float64[np.ndarray, "m 4"]:
+        """Return signed, unnormalised distances of positions (world) to the four sides, positive inside."""
+        seen = places @ self.camera_from_world[:3, :3].T + self.camera_from_world[:3, 3]
+        x_y, z = seen[:, :2], seen[:, 2:]
+        return np.concatenate([x_y - self.low * z, self.high * z - x_y], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class RealSamples:
+    """Samples of real surfaces in view: position (world, m), linear radiance, and irradiance.
+
+    `lit` is the fraction of the lights' unshadowed light that arrives, `indirect` the irradiance from all else. A
+    sample may lie `tolerance_m` off its plane.
+    """
+
+    position: Float64[np.ndarray, "k 3"]
+    radiance: Float64[np.ndarray, "k 3"]
+    lit: Float64[np.ndarray, " k"]
+    indirect: Float64[np.ndarray, "k 3"]
+    tolerance_m: Float64[np.ndarray, " k"]
+
+    def only(self, chosen: Bool[np.ndarray, " k"]) -> "RealSamples":
+        """Return the chosen samples."""
+        fields = (self.position, self.radiance, self.lit, self.indirect, self.tolerance_m)
+        return RealSamples(*(values[chosen] for values in fields))
+
+
+@dataclass(frozen=True, eq=False)
+class ExtrapolatedPlanes:
+    """Octahedral maps (world axes): radiance of the extrapolated planes, and the probability that they exist."""
+
+    radiance: Float32[np.ndarray, "n n 3"]
+    probability: Float32[np.ndarray, "n n 1"]
+
+
+@dataclass(frozen=True, eq=False)
+class _PlaneLayer:
+    """One plane in every direction: distance (m, infinite where rays miss it), probability, radiance."""
+
+    distance: Float64[np.ndarray, " n"]
+    probability: Float64[np.ndarray, " n"]
+    radiance: Float64[np.ndarray, "n 3"]
+
+
+def extrapolate_planes(
+    planes: Sequence[DetectedPlane],
+    samples: RealSamples,
+    lights: Sequence[Light],
+    frustum: ViewFrustum,
+    *,
+    centre: Float64[np.ndarray, "3"],
+    size: int,
+) -> ExtrapolatedPlanes:
+    """Extrapolate planes that the picture's border cuts, as seen from `centre` (world, m).
+
+    `size` is the edge of the maps in texels. Nearer planes occlude farther ones.
+    """
+    directions = octahedral_grid(size).reshape(-1, 3)
+    layers = [
+        _plane_layer(
+            plane, samples.only(plane.inliers), lights, frustum, centre=centre, directions=directions
+        )
+        for plane in planes
+        if _bounds_room(plane, samples)
+    ]
+    radiance, beyond = np.zeros((len(directions), 3)), np.ones(len(directions))
+    for nth in _nearest_first(layers):
+        probability = beyond * nth.probability
+        radiance += probability[:, None] * nth.radiance
+        beyond -= probability
+    met = 1 - beyond
+    mean = radiance / np.maximum(met, np.finfo(np.float32).tiny)[:, None]
+    return ExtrapolatedPlanes(
+        mean.reshape(size, size, 3).astype(np.float32), met.reshape(size, size, 1).astype(np.float32)
+    )
+
+
+def _nearest_first(layers: Sequence[_PlaneLayer]) -> list[_PlaneLayer]:
+    """Sort layers by distance in each direction: the first of the result is the nearest everywhere."""
+    if not layers:
+        return []
+    distance, probability, radiance = (
+        np.stack([getattr(layer, name) for layer in layers])
+        for name in ("distance", "probability", "radiance")
+    )
+    order = np.argsort(distance, axis=0)
+    every = np.arange(distance.shape[1])
+    return [
+        _PlaneLayer(distance[rank, every], probability[rank, every], radiance[rank, every]) for rank in order
+    ]
+
+
+def _bounds_room(plane: DetectedPlane, samples: RealSamples) -> bool:
+    """Whether nothing is seen behind a plane; the faces of things have the room behind them, and end."""
+    behind = samples.position @ plane.normal < plane.offset - 3 * samples.tolerance_m
+    return bool(behind.mean() <= MAX_STRAY_FRACTION)
+
+
+def _plane_layer(
+    plane: DetectedPlane,
+    seen: RealSamples,
+    lights: Sequence[Light],
+    frustum: ViewFrustum,
+    *,
+    centre: Float64[np.ndarray, "3"],
+    directions: Float64[np.ndarray, "n 3"],
+) -> _PlaneLayer:
+    falling = directions @ plane.normal
+    height = plane.normal @ centre - plane.offset
+    meets = (falling < 0) & (height > 0)
+    distance = np.full(len(directions), np.inf)
+    distance[meets] = -height / falling[meets]
+    probability, radiance = np.zeros(len(directions)), np.zeros((len(directions), 3))
+    places = centre + distance[meets, None] * directions[meets]
+    probability[meets] = _continuation_probability(places, seen, frustum)
+    radiance[meets] = _expected_radiance(places, plane, seen, lights)
+    return _PlaneLayer(distance, probability, radiance)
+
+
+def _continuation_probability(
+    places: Float64[np.ndarray, "m 3"], seen: RealSamples, frustum: ViewFrustum
+) -> Float64[np.ndarray, " m"]:
+    """Return the probability that a plane extends to places on it.
+
+    The seen length is twice that from the centre of the seen part to where the line to the place leaves the view.
+    """
+    start = frustum.inside(seen.position.mean(axis=0)[None])
+    end = frustum.inside(places)
+    in_view = np.divide(start, start - end, out=np.ones_like(end), where=end < 0).min(axis=1)
+    return np.asarray(2 * in_view / (1 + in_view))
+
+
+def _expected_radiance(
+    places: Float64[np.ndarray, "m 3"], plane: DetectedPlane, seen: RealSamples, lights: Sequence[Light]
+) -> Float64[np.ndarray, "m 3"]:
+    """Return the radiance at places on a plane: its seen albedo under the expected irradiance.
+
+    Radiance that an albedo of 1 does not explain comes from unknown lights, and is the same beyond the border.
+    """
+    direct = _irradiance(lights, seen.position, plane.normal) * seen.lit[:, None]
+    irradiance = direct + seen.indirect
+    ratio = np.median(seen.radiance / np.maximum(irradiance, MIN_IRRADIANCE), axis=0)
+    reflected = np.minimum(ratio, 1 / np.pi)
+    unexplained = np.median(seen.radiance - reflected * irradiance, axis=0)
+    expected = seen.lit.mean() * _irradiance(lights, places, plane.normal) + seen.indirect.mean(axis=0)
+    return np.asarray(np.maximum(reflected * expected + unexplained, 0))
+
+
+def _irradiance(
+    lights: Sequence[Light], places: Float64[np.ndarray, "m 3"], normal: Float64[np.ndarray, "3"]
+) -> Float64[np.ndarray, "m 3"]:
+    """Return the unshadowed irradiance of all lights at places with this normal."""
+    total = np.zeros(places.shape)
+    for light in lights:
+        seen = incident_light(light, places)
+        total += seen.irradiance * np.maximum(seen.to_light @ normal, 0)[:, None]
+    return total

@@ -1,0 +1,1 @@
+"""Lights of a scene: what shines, where it comes from from frame to frame, and maps of all directions."""

@@ -1,0 +1,273 @@
+"""Octahedral maps of the whole sphere: mapping, integrals, prefiltering by cones, irradiance; spherical harmonics.
+
+Texel (row j, column i) of an n x n map has its centre at uv = ((i + 0.5)/n, (j + 0.5)/n). With
+p = 2 uv - 1 the direction is (px, py, 1 - |px| - |py|) where |px| + |py| <= 1 (upper half, +z in the centre);
+beyond, the corners are folded down (Engelhardt & Dachsbacher 2008). Axes are world axes.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache, lru_cache
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float32, Float64
+
+MIN_LEVEL_SIZE = 32
+SUMMED_SIZE = 64
+SUMMED_FROM_RAD = 0.4
+CONE_SAMPLES = 64
+CACHED_LEVELS = 16
+SampleMap = Callable[[Float32[np.ndarray, "n m 3"]], Float32[np.ndarray, "n m c"]]
+MAX_ORDER = 5
+
+
+def octahedral_direction(uv: Float[np.ndarray, "*shape 2"]) -> Float64[np.ndarray, "*shape 3"]:
+    """Return the unit direction of map coordinates in 0..1."""
+    folded = _folded_direction(uv)
+    return np.asarray(folded / np.linalg.norm(folded, axis=-1, keepdims=True))
+
+
+def _folded_direction(uv: Float[np.ndarray, "*shape 2"]) -> Float64[np.ndarray, "*shape 3"]:
+    """Return the point of the octahedron |x| + |y| + |z| = 1."""
+    p = 2 * np.asarray(uv, np.float64) - 1
+    z = 1 - np.abs(p).sum(axis=-1)
+    below = np.maximum(-z, 0)[..., None]
+    return np.concatenate([p - np.copysign(below, p), z[..., None]], axis=-1)
+
+
+def octahedral_uv(direction: Float[np.ndarray, "*shape 3"]) -> Float[np.ndarray, "*shape 2"]:
+    """Return the map coordinates in 0..1 of directions of any length."""
+    d = np.asarray(direction)
+    d = d / np.abs(d).sum(axis=-1, keepdims=True)
+    p = d[..., :2]
+    folded = np.copysign(1 - np.abs(p[..., ::-1]), p)
+    return np.asarray(np.where(d[..., 2:] < 0, folded, p) / 2 + 0.5)
+
+
+@cache
+def octahedral_grid(size: int) -> Float64[np.ndarray, "n n 3"]:
+    """Return the unit directions of the texel centres of a size x size map (read-only)."""
+    directions = octahedral_direction(_grid_uv(size))
+    directions.flags.writeable = False
+    return directions
+
+
+@cache
+def texel_weights(size: int, supersampling: int) -> Float32[np.ndarray, "k k"]:
+    """Return the solid angles of supersampling^2 samples a texel, relative to the mean of their texel."""
+    weight = np.linalg.norm(_folded_direction(_grid_uv(size * supersampling)), axis=-1) ** -3
+    mean = weight.reshape(size, supersampling, size, supersampling).mean(axis=(1, 3))
+    return np.asarray(weight / mean.repeat(supersampling, 0).repeat(supersampling, 1), np.float32)
+
+
+def _grid_uv(size: int) -> Float64[np.ndarray, "n n 2"]:
+    centres = (np.arange(size) + 0.5) / size
+    return np.stack(np.meshgrid(centres, centres), axis=-1)
+
+
+@cache
+def texel_solid_angles(size: int) -> Float32[np.ndarray, "n n"]:
+    """Return the solid angle of every texel, sr; they add up to 4 pi.
+
+    A patch dA of the octahedron seen from the centre at distance r has dA cos / r^2, proportional to r^-3.
+    """
+    fine = max(1, 256 // size)
+    weight = np.linalg.norm(_folded_direction(_grid_uv(size * fine)), axis=-1) ** -3
+    weight = weight.reshape(size, fine, size, fine).mean(axis=(1, 3))
+    weight = (weight * (4 * np.pi / weight.sum())).astype(np.float32)
+    weight.flags.writeable = False
+    return np.asarray(weight)
+
+
+def resample_to_octahedral(sample: SampleMap, size: int, supersampling: int = 2) -> np.ndarray:
+    """Average a radiance function over the texels of an octahedral map, weighted by solid angle.
+
+    `sample` maps directions (n, m, 3) to radiance (n, m, c); every texel takes supersampling^2 of them.
+    """
+    uv = _grid_uv(size * supersampling)
+    folded = _folded_direction(uv)
+    weight = (np.linalg.norm(folded, axis=-1, keepdims=True) ** -3).astype(np.float32)
+    weighted = sample(folded.astype(np.float32)) * weight
+    blocks = (size, supersampling, size, supersampling, -1)
+    total = weighted.reshape(blocks).sum(axis=(1, 3)) / weight.reshape(blocks).sum(axis=(1, 3))
+    return np.asarray(total, np.float32)
+
+
+def sample_octahedral(
+    radiance: Float32[np.ndarray, "n n 3"], directions: Float[np.ndarray, "a b 3"]
+) -> Float32[np.ndarray, "a b 3"]:
+    """Read a map bilinearly; texels meet their true neighbours over the map's border."""
+    return _sampled(radiance, _texel_coordinates(directions, len(radiance)))
+
+
+def _texel_coordinates(directions: Float[np.ndarray, "a b 3"], size: int) -> Float32[np.ndarray, "a b 2"]:
+    """Return where `_sampled` reads a map of this size for directions."""
+    return (octahedral_uv(directions) * size + 0.5).astype(np.float32)
+
+
+def _sampled(
+    radiance: Float32[np.ndarray, "n n 3"], coordinates: Float32[np.ndarray, "a b 2"]
+) -> Float32[np.ndarray, "a b 3"]:
+    return np.asarray(cv2.remap(_bordered(radiance), coordinates, None, cv2.INTER_LINEAR))
+
+
+def _bordered(radiance: Float32[np.ndarray, "n n 3"]) -> Float32[np.ndarray, "m m 3"]:
+    """Add a border of one texel: across an edge of the map lies the same edge, mirrored about its middle."""
+    rows = np.concatenate([radiance[:1, ::-1], radiance, radiance[-1:, ::-1]])
+    left, right = rows[::-1, :1].copy(), rows[::-1, -1:].copy()
+    return np.ascontiguousarray(np.concatenate([left, rows, right], axis=1))
+
+
+@cache
+def above_horizon(size: int) -> Float32[np.ndarray, "n n 1"]:
+    """Return the fraction of each texel above the horizon (+z), blurred by one texel."""
+    texel = np.pi / size
+    return resample_to_octahedral(lambda d: np.clip(0.5 + d[..., 2:] / texel, 0, 1).astype(np.float32), size)
+
+
+def solid_angle_mean(radiance: Float32[np.ndarray, "n n 3"]) -> Float64[np.ndarray, "3"]:
+    """Return the mean radiance over the sphere."""
+    weights = texel_solid_angles(len(radiance)).astype(np.float64)
+    return np.asarray(np.tensordot(weights, radiance, axes=2) / (4 * np.pi))
+
+
+@dataclass(frozen=True, eq=False)
+class PrefilteredMap:
+    """An octahedral map averaged over cones; level l holds cones of `half_angles[l]` radians.
+
+    Level 0 is the map itself. From level 1 on the half angle is 2^l texel widths of level 0, the last is
+    pi/2; its value is irradiance / pi. A cone of half angle a reads level log2(a / half_angles[0]).
+    """
+
+    levels: tuple[Float32[np.ndarray, "n n 3"], ...]
+    half_angles: tuple[float, ...]
+
+
+def prefilter(radiance: Float32[np.ndarray, "n n 3"]) -> PrefilteredMap:
+    """Average a map over cones, weighted by the cosine to the axis (so the widest gives irradiance / pi)."""
+    size = len(radiance)
+    halved = [radiance]
+    while len(halved[-1]) > SUMMED_SIZE // 4:
+        halved.append(_halved(halved[-1]))
+    summed = next((source for source in halved if len(source) <= SUMMED_SIZE), radiance)
+    levels, angles = [radiance], [float(np.sqrt(4 * np.pi)) / size]
+    while angles[-1] < np.pi / 2:
+        angles.append(min(2 * angles[-1], np.pi / 2))
+        level_size = max(size >> len(levels), min(size, MIN_LEVEL_SIZE))
+        if angles[-1] < SUMMED_FROM_RAD:
+            levels.append(_cone_average(halved, angles[-1], level_size))
+        else:
+            levels.append(_cone_sum(summed, angles[-1], level_size))
+    return PrefilteredMap(tuple(levels), tuple(angles))
+
+
+def _halved(radiance: Float32[np.ndarray, "n n 3"]) -> Float32[np.ndarray, "m m 3"]:
+    half = len(radiance) // 2
+    weighted = radiance * texel_weights(half, 2)[..., None]
+    return np.asarray(cv2.resize(weighted, (half, half), interpolation=cv2.INTER_AREA), np.float32)
+
+
+def _cone_average(
+    halved: list[Float32[np.ndarray, "n n 3"]], half_angle: float, size: int
+) -> Float32[np.ndarray, "m m 3"]:
+    """Average over a cone about every texel's direction with samples in a spiral over its projected disc.
+
+    Each sample reads the halved map whose texels are about as wide as the samples are apart.
+    """
+    spacing = 2 * half_angle / np.sqrt(CONE_SAMPLES)
+    wanted = np.sqrt(4 * np.pi) / spacing
+    source = min(halved, key=lambda level: abs(np.log2(len(level) / wanted)))
+    samples = _sampled(source, _cone_coordinates(half_angle, size, len(source)))
+    return np.asarray(samples.mean(axis=1).reshape(size, size, 3))
+
+
+# Maps of one size are filtered again and again while lights are tracked, so sample coordinates are cached.
+@lru_cache(maxsize=CACHED_LEVELS)
+def _cone_coordinates(half_angle: float, size: int, source_size: int) -> Float32[np.ndarray, "n k 2"]:
+    frames = _tangent_frames(octahedral_grid(size).reshape(-1, 3)).astype(np.float32)
+    directions = _spiral(np.sin(half_angle)).astype(np.float32) @ np.swapaxes(frames, 1, 2)
+    return _texel_coordinates(directions, source_size)
+
+
+def _cone_sum(
+    source: Float32[np.ndarray, "n n 3"], half_angle: float, size: int
+) -> Float32[np.ndarray, "m m 3"]:
+    """Average over wide cones by the plain sum over all texels of a source map."""
+    total = _cone_weights(half_angle, size, len(source)) @ source.reshape(-1, 3)
+    return np.asarray(total.reshape(size, size, 3), np.float32)
+
+
+@lru_cache(maxsize=CACHED_LEVELS)
+def _cone_weights(half_angle: float, size: int, source_size: int) -> Float32[np.ndarray, "n k"]:
+    axis, source = octahedral_grid(size).reshape(-1, 3), octahedral_grid(source_size).reshape(-1, 3)
+    cosine = (axis @ source.T).astype(np.float32)
+    weight = np.where(cosine > np.cos(half_angle), cosine, 0) * texel_solid_angles(source_size).ravel()
+    return np.asarray(weight / weight.sum(axis=1, keepdims=True))
+
+
+def _spiral(sin_half_angle: float) -> Float64[np.ndarray, "n 3"]:
+    """Return directions about +z that are uniform over the cone's projected disc (cosine-weighted)."""
+    index = np.arange(CONE_SAMPLES) + 0.5
+    radius = sin_half_angle * np.sqrt(index / CONE_SAMPLES)
+    angle = index * (np.pi * (3 - np.sqrt(5)))
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - radius**2)], axis=1)
+
+
+def _tangent_frames(axis: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3 3"]:
+    """Return rotations whose third column is the axis (Duff et al. 2017)."""
+    x, y, z = axis.T
+    sign = np.copysign(1.0, z)
+    a = -1 / (sign + z)
+    b = x * y * a
+    columns = [1 + sign * x * x * a, sign * b, -sign * x], [b, sign + y * y * a, -y], [x, y, z]
+    return np.stack([np.stack(column, axis=-1) for column in columns], axis=-1)
+
+
+def irradiance(
+    radiance: Float32[np.ndarray, "n n 3"], normals: Float[np.ndarray, "k 3"]
+) -> Float64[np.ndarray, "k 3"]:
+    """Integrate a map over the hemisphere of each unit normal, by plain summation."""
+    weighted = radiance.reshape(-1, 3) * texel_solid_angles(len(radiance)).reshape(-1, 1)
+    directions = octahedral_grid(len(radiance)).reshape(-1, 3)
+    return np.asarray(np.maximum(normals @ directions.T, 0) @ weighted.astype(np.float64))
+
+
+def _constant(numerator: float, denominator: float) -> float:
+    return math.sqrt(numerator / (denominator * math.pi))
+
+
+def harmonics(directions: Float[np.ndarray, "n 3"], order: int) -> Float64[np.ndarray, "n k"]:
+    """Evaluate real spherical harmonics at unit directions as polynomials (Sloan 2008, appendix A2).
+
+    k = order^2 functions up to band 4, index l^2 + l + m, orthonormal over the sphere; the same polynomials are in
+    passes/shaders/common/harmonics.glsl.
+    """
+    x, y, z = np.asarray(directions, np.float64).T
+    x2, y2, z2 = x * x, y * y, z * z
+    one = np.ones_like(x)
+    c1, c2, c3, c4 = _constant(3, 4), _constant(15, 4), _constant(35, 32), _constant(315, 16)
+    functions = [
+        _constant(1, 4) * one,
+        *(c1 * y, c1 * z, c1 * x),
+        *(c2 * x * y, c2 * y * z, _constant(5, 16) * (3 * z2 - 1), c2 * x * z, c2 / 2 * (x2 - y2)),
+        *(c3 * y * (3 * x2 - y2), _constant(105, 4) * x * y * z, _constant(21, 32) * y * (5 * z2 - 1)),
+        *(_constant(7, 16) * z * (5 * z2 - 3), _constant(21, 32) * x * (5 * z2 - 1)),
+        *(_constant(105, 16) * z * (x2 - y2), c3 * x * (x2 - 3 * y2)),
+        *(c4 * x * y * (x2 - y2), _constant(315, 32) * y * z * (3 * x2 - y2)),
+        *(_constant(45, 16) * x * y * (7 * z2 - 1), _constant(45, 32) * y * z * (7 * z2 - 3)),
+        *(_constant(9, 256) * (35 * z2 * z2 - 30 * z2 + 3), _constant(45, 32) * x * z * (7 * z2 - 3)),
+        *(_constant(45, 64) * (x2 - y2) * (7 * z2 - 1), _constant(315, 32) * x * z * (x2 - 3 * y2)),
+        _constant(315, 256) * (x2 * (x2 - 3 * y2) - y2 * (3 * x2 - y2)),
+    ]
+    return np.stack(functions[: order**2], axis=1)
+
+
+def even_directions(count: int) -> Float64[np.ndarray, "count 3"]:
+    """Return unit directions of equal solid angle over the sphere (a spiral by the golden angle)."""
+    k = np.arange(count)
+    z = 1 - (2 * k + 1) / count
+    turn = k * math.pi * (3 - math.sqrt(5))
+    level = np.sqrt(1 - z * z)
+    return np.stack([level * np.cos(turn), level * np.sin(turn), z], axis=1)

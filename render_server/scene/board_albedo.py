@@ -1,0 +1,111 @@
+"""Pixels that serve as a light meter: unclipped, and on the board's white paper or grey cards (docs/method.md 1)."""
+
+from collections.abc import Iterable
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Float64, UInt8
+
+from protocol.board import BoardSpec
+from protocol.camera_model import CameraModel
+from protocol.frames import BoardPose
+from render_server.lights.environment import LUMINANCE
+
+MIN_PIXELS = 30
+SUFFICIENT_PIXELS = 10 * MIN_PIXELS
+MAX_COORDINATE_PX = 1e5  # beyond, fixed-point outlines overflow
+# Margin inside a patch's edges, where lens and sampling mix it with its neighbours; the second if few are left.
+INSETS_PX = (2, 1)
+EDGE_POINTS = 8
+# Limits of linear values and codes within which a pixel carries its true radiance.
+CLIPPED_LINEAR = 0.98
+CLIPPED_CODE = 255
+DARK_LINEAR = 0.005
+
+
+def known_albedo(board: BoardSpec, camera: CameraModel, pose: BoardPose) -> Float32[np.ndarray, "h w"]:
+    """Return the albedo of every pixel that shows a surface of known albedo; 0 elsewhere.
+
+    Grey cards have the albedo that board.yaml gives them. White paper counts where its albedo is given too, and with
+    the assumed one where no card is in view. Things that cover the board are not detected here.
+    """
+    albedo = np.zeros((camera.height, camera.width), np.float32)
+    cards = [(card_pixels(card.outline(), camera, pose), card.albedo) for card in board.grey_cards]
+    if board.white_albedo is not None or not any(mask.any() for mask, _ in cards):
+        albedo[paper_pixels(board, camera, pose)] = board.paper_albedo
+    for mask, value in cards:
+        albedo[mask] = value
+    return albedo
+
+
+def paper_pixels(board: BoardSpec, camera: CameraModel, pose: BoardPose) -> Bool[np.ndarray, "h w"]:
+    """Return which pixels show white paper between the board's markers, well inside its edges."""
+    covered = [_mask(card.outline(), camera, pose) for card in board.grey_cards]
+    paper = _inside(_masks(board.paper_patches(), camera, pose), camera)
+    for mask in covered:
+        if mask is not None:
+            paper &= ~cv2.dilate(mask, _square(INSETS_PX[0])).astype(bool)
+    return paper
+
+
+def card_pixels(
+    outline: Float64[np.ndarray, "4 3"], camera: CameraModel, pose: BoardPose
+) -> Bool[np.ndarray, "h w"]:
+    """Return which pixels show a card, well inside its edges."""
+    return _inside(_masks([outline], camera, pose), camera)
+
+
+def unclipped(
+    color: UInt8[np.ndarray, "h w 3"], linear: Float[np.ndarray, "h w 3"]
+) -> Bool[np.ndarray, "h w"]:
+    """Return which pixels carry their true radiance: no channel clipped, and not nearly black.
+
+    `linear` is the picture decoded by the response alone, before division by the exposure.
+    """
+    bright = (linear >= CLIPPED_LINEAR) | (color == CLIPPED_CODE)
+    return np.asarray(~bright.any(axis=-1) & (linear @ LUMINANCE >= DARK_LINEAR))
+
+
+def _inside(masks: list[UInt8[np.ndarray, "h w"]], camera: CameraModel) -> Bool[np.ndarray, "h w"]:
+    """Return the patches without their edges: 2 pixels, or 1 where few pixels would be left."""
+    found = np.zeros((camera.height, camera.width), np.uint8)
+    for inset in INSETS_PX:
+        for mask in masks:
+            found |= cv2.erode(mask, _square(inset), borderValue=0)
+        if np.count_nonzero(found) >= SUFFICIENT_PIXELS:
+            break
+    return np.asarray(found.astype(bool))
+
+
+def _square(inset: int) -> UInt8[np.ndarray, "n n"]:
+    return np.ones((2 * inset + 1,) * 2, np.uint8)
+
+
+def _masks(
+    patches: Iterable[Float64[np.ndarray, "4 3"]], camera: CameraModel, pose: BoardPose
+) -> list[UInt8[np.ndarray, "h w"]]:
+    masks = (_mask(patch, camera, pose) for patch in patches)
+    return [mask for mask in masks if mask is not None]
+
+
+def _mask(
+    patch: Float64[np.ndarray, "4 3"], camera: CameraModel, pose: BoardPose
+) -> UInt8[np.ndarray, "h w"] | None:
+    """Return the pixels of a quad in world coordinates; None where it is not wholly in front of the camera."""
+    camera_from_world = np.linalg.inv(pose.world_from_camera)
+    outline = _dense_outline(patch) @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
+    pixels = camera.project(outline)
+    if not np.isfinite(pixels).all() or np.abs(pixels).max() > MAX_COORDINATE_PX:
+        return None
+    mask = np.zeros((camera.height, camera.width), np.uint8)
+    cv2.fillPoly(mask, [np.round(pixels * 16).astype(np.int32)], 1, shift=4)
+    return mask
+
+
+def _dense_outline(patch: Float64[np.ndarray, "4 3"]) -> Float64[np.ndarray, "n 3"]:
+    """Return points along a quad's edges, because a lens bends straight lines."""
+    fraction = np.linspace(0, 1, EDGE_POINTS, endpoint=False)[:, None]
+    following = np.roll(patch, -1, axis=0)
+    return np.concatenate(
+        [start + fraction * (end - start) for start, end in zip(patch, following, strict=True)]
+    )

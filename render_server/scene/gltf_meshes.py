@@ -1,0 +1,457 @@
+"""Meshes of a glTF document in a pose of its nodes, morph targets and skins (glTF 2.0, sections 3.7 and 3.11)."""
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int64
+from scipy.sparse import csr_array
+
+from protocol.errors import DeltalightError
+from render_server.scene.asset_check import read_gltf
+from render_server.scene.gltf_animation import Clip, read_clips
+from render_server.scene.gltf_document import GltfDocument, GltfFaultError, NodeTree, faults_named, read_nodes
+from render_server.scene.materials import Material
+from render_server.scene.triangle_mesh import (
+    MAX_COORDINATE_M,
+    ConvertedMesh,
+    FileGeometry,
+    Smoothing,
+    TriangleMesh,
+    converted,
+    joined,
+    joined_triangles,
+    unit_or,
+)
+
+_TRIANGLES, _STRIP, _FAN = 4, 5, 6
+# Times at which the bounds of a clip are sampled beside its keys: a full turn then has steps of 6 degrees, and an arc
+# rises 0.1 % of its radius over the chord.
+SWEEP_STEPS = 64
+MAX_SWEEP_TIMES = 256
+MAX_SWEEP_VERTICES = 20_000  # sampled of larger meshes
+SWEEP_MARGIN = 0.02  # of the longest edge, for what lies between the sampled times and vertices
+
+
+@dataclass(frozen=True, eq=False)
+class Morph:
+    """Offsets of each morph target to positions and, where the file has them, to normals, at weight 1."""
+
+    positions: tuple[Float32[np.ndarray, "n 3"], ...]
+    normals: tuple[Float32[np.ndarray, "n 3"], ...] | None
+
+
+@dataclass(frozen=True, eq=False)
+class Skin:
+    """Joints of a mesh: their nodes, their inverse bind matrices, and the weight of each joint at each vertex.
+
+    `weights` is sparse (n x j); its rows sum to 1.
+    """
+
+    joints: Int64[np.ndarray, " j"]
+    joint_from_mesh: Float64[np.ndarray, "j 4 4"]
+    weights: csr_array
+
+
+@dataclass(frozen=True, eq=False)
+class GltfPart:
+    """One primitive at one node: its mesh in the node's frame, before morphing and skinning.
+
+    `smoothing` recomputes the normals of a posed mesh where the file has none.
+    """
+
+    node: int
+    mesh: TriangleMesh
+    smoothing: Smoothing | None
+    morph: Morph | None
+    skin: Skin | None
+
+    def of_vertices(self, rows: Int64[np.ndarray, " k"]) -> "GltfPart":
+        """Return the part with some of its vertices only, to track their positions."""
+        morph, skin = self.morph, self.skin
+        if morph is not None:
+            morph = Morph(tuple(delta[rows] for delta in morph.positions), None)
+        if skin is not None:
+            skin = replace(skin, weights=skin.weights[rows])
+        mesh = replace(self.mesh, positions=self.mesh.positions[rows], normals=self.mesh.normals[rows])
+        return replace(self, mesh=mesh, morph=morph, skin=skin, smoothing=None)
+
+
+class PartReader:
+    """Reads each primitive and each material once, however many nodes use it."""
+
+    def __init__(self, gltf: GltfDocument, nodes: NodeTree) -> None:
+        self._gltf = gltf
+        self._nodes = nodes
+        self._materials: dict[int | None, Material] = {}
+        self._primitives: dict[tuple[int, int], ConvertedMesh | None] = {}
+
+    def read(self) -> list[tuple[int | None, GltfPart]]:
+        """Read the parts of all shown nodes, with the index of their material.
+
+        Raises:
+            GltfFaultError: attributes that do not fit each other, or joints that do not exist.
+            DeltalightError: geometry or materials that cannot be used.
+        """
+        parts = []
+        for node in self._nodes.shown:
+            description = self._gltf.root["nodes"][node]
+            if "mesh" not in description:
+                continue
+            mesh = self._gltf.root["meshes"][description["mesh"]]
+            for number, primitive in enumerate(mesh["primitives"]):
+                made = self._primitive(description["mesh"], number, primitive)
+                if made is not None:
+                    parts.append((primitive.get("material"), self._part(node, description, primitive, made)))
+        return parts
+
+    def _part(
+        self, node: int, description: dict[str, Any], primitive: dict[str, Any], made: ConvertedMesh
+    ) -> GltfPart:
+        count = len(self._nodes.rest.weights[node])
+        morph = _morph(self._gltf, primitive, made, count) if count else None
+        skin = None
+        if "skin" in description and "JOINTS_0" in primitive["attributes"]:
+            skin = self._skin(self._gltf.root["skins"][description["skin"]], primitive, made)
+        return GltfPart(node, made.mesh, made.smoothing, morph, skin)
+
+    def _primitive(self, mesh: int, number: int, primitive: dict[str, Any]) -> ConvertedMesh | None:
+        key = mesh, number
+        if key not in self._primitives:
+            material = self._material(primitive.get("material"))
+            given = _geometry(self._gltf, primitive)
+            # What has no area in the mesh itself may have one when it is morphed.
+            keeps = "targets" in primitive
+            self._primitives[key] = (
+                None if given is None else converted(given, material, self._gltf.path, keeps_degenerate=keeps)
+            )
+        return self._primitives[key]
+
+    def _material(self, index: int | None) -> Material:
+        if index not in self._materials:
+            self._materials[index] = _material(self._gltf, index).checked(str(self._gltf.path))
+        return self._materials[index]
+
+    def _skin(self, skin: dict[str, Any], primitive: dict[str, Any], made: ConvertedMesh) -> Skin:
+        joints = np.array(skin["joints"], np.int64)
+        if not len(joints) or joints.min() < 0 or joints.max() >= len(self._nodes.parents):
+            raise GltfFaultError("a skin names joints that do not exist")
+        joint_from_mesh = np.tile(np.eye(4), (len(joints), 1, 1))
+        if "inverseBindMatrices" in skin:
+            columns = self._gltf.floats(skin["inverseBindMatrices"], 16).astype(np.float64)
+            if len(columns) < len(joints):
+                raise GltfFaultError("a skin has fewer inverse bind matrices than joints")
+            joint_from_mesh = columns[: len(joints)].reshape(-1, 4, 4).transpose(0, 2, 1)
+        weights = _joint_weights(self._gltf, primitive, len(joints))[made.source]
+        return Skin(joints, joint_from_mesh, weights)
+
+
+def _material(gltf: GltfDocument, index: int | None) -> Material:
+    if index is None:
+        return Material(base_color=np.ones(3, np.float32), name="default")
+    description = gltf.root["materials"][index]
+    texture = description.get("pbrMetallicRoughness", {}).get("baseColorTexture")
+    return Material.from_gltf(description, None if texture is None else gltf.texture(texture["index"]))
+
+
+def _geometry(gltf: GltfDocument, primitive: dict[str, Any]) -> FileGeometry | None:
+    """Return the geometry of a primitive; None for points and lines."""
+    mode = primitive.get("mode", _TRIANGLES)
+    if mode not in (_TRIANGLES, _STRIP, _FAN):
+        return None
+    attributes = primitive["attributes"]
+    positions = gltf.array(attributes["POSITION"]).astype(np.float32)
+    count = len(positions)
+    return FileGeometry(
+        positions,
+        _triangles(gltf, primitive, mode, count),
+        _attribute(gltf, attributes, "NORMAL", count, 3),
+        _uv(gltf, attributes, count),
+        _attribute(gltf, attributes, "COLOR_0", count, 3),
+    )
+
+
+def _triangles(
+    gltf: GltfDocument, primitive: dict[str, Any], mode: int, count: int
+) -> Int64[np.ndarray, "m 3"]:
+    given = gltf.array(primitive["indices"])[:, 0].astype(np.int64) if "indices" in primitive else None
+    indices = np.arange(count) if given is None else given
+    if mode == _TRIANGLES:
+        if len(indices) % 3:
+            raise GltfFaultError(f"{len(indices)} indices are no whole number of triangles")
+        return indices.reshape(-1, 3)
+    if len(indices) < 3:
+        return np.zeros((0, 3), np.int64)
+    first, second, third = indices[:-2], indices[1:-1], indices[2:]
+    if mode == _FAN:
+        return np.stack([np.full(len(first), indices[0]), second, third], axis=1)
+    odd = (np.arange(len(first)) % 2).astype(bool)  # each second triangle of a strip is wound the other way
+    return np.stack([first, np.where(odd, third, second), np.where(odd, second, third)], axis=1)
+
+
+def _attribute(
+    gltf: GltfDocument, attributes: dict[str, int], name: str, count: int, columns: int
+) -> Float32[np.ndarray, "n c"] | None:
+    """Return the first columns of an attribute (integer colours as 0..1); None where the primitive lacks it."""
+    if name not in attributes:
+        return None
+    rows = gltf.array(attributes[name])
+    if len(rows) != count or rows.shape[1] < columns:
+        raise GltfFaultError(f"the attribute {name} does not fit the mesh's {count} vertices")
+    scale = np.iinfo(rows.dtype).max if name == "COLOR_0" and rows.dtype.kind == "u" else 1
+    return (rows[:, :columns] / np.float32(scale)).astype(np.float32)
+
+
+def _uv(gltf: GltfDocument, attributes: dict[str, int], count: int) -> Float32[np.ndarray, "n 2"] | None:
+    uv = _attribute(gltf, attributes, "TEXCOORD_0", count, 2)
+    return uv if uv is not None and np.isfinite(uv).all() else None
+
+
+def _morph(gltf: GltfDocument, primitive: dict[str, Any], made: ConvertedMesh, count: int) -> Morph:
+    """Return the morph targets of a primitive, for the vertices of its converted mesh."""
+    targets: Sequence[dict[str, int]] = primitive.get("targets", [])
+    if len(targets) != count:
+        raise GltfFaultError("the primitives of a mesh have different numbers of morph targets")
+    positions = tuple(_delta(gltf, target, "POSITION", made) for target in targets)
+    gives_normals = made.smoothing is None and any("NORMAL" in target for target in targets)
+    normals = tuple(_delta(gltf, target, "NORMAL", made) for target in targets) if gives_normals else None
+    return Morph(positions, normals)
+
+
+def _delta(
+    gltf: GltfDocument, target: dict[str, int], name: str, made: ConvertedMesh
+) -> Float32[np.ndarray, "n 3"]:
+    if name not in target:
+        return np.zeros_like(made.mesh.positions)
+    rows = gltf.floats(target[name], 3)
+    if made.source.max() >= len(rows):
+        raise GltfFaultError(f"a morph target has {len(rows)} vertices, fewer than its mesh")
+    return np.asarray(rows[made.source])
+
+
+def _joint_weights(gltf: GltfDocument, primitive: dict[str, Any], joint_count: int) -> csr_array:
+    """Return the weight of each joint at each of the file's vertices."""
+    attributes = primitive["attributes"]
+    sets = [name.removeprefix("JOINTS_") for name in sorted(attributes) if name.startswith("JOINTS_")]
+    joints = np.hstack([gltf.array(attributes[f"JOINTS_{name}"]) for name in sets]).astype(np.int64)
+    weights = np.hstack([gltf.floats(attributes[f"WEIGHTS_{name}"], 4) for name in sets])
+    if (
+        joints.shape != weights.shape
+        or len(joints) != gltf.root["accessors"][attributes["POSITION"]]["count"]
+    ):
+        raise GltfFaultError("the joints and weights of a skinned mesh do not fit its vertices")
+    if (weights < 0).any():
+        raise GltfFaultError("a skinned mesh has weights below 0")
+    joints[weights == 0] = 0
+    if joints.max(initial=0) >= joint_count:
+        raise GltfFaultError(f"a skinned mesh hangs on joint {joints.max()} of a skin of {joint_count}")
+    sums = weights.sum(axis=1, keepdims=True)
+    weights[sums[:, 0] == 0, 0] = 1.0  # as viewers do: vertices without weights follow their first joint
+    weights /= np.where(sums == 0, 1, sums)
+    rows = np.repeat(np.arange(len(joints)), joints.shape[1])
+    # Duplicates are added up, and entries of a row sorted: the same file gives the same sums.
+    matrix = csr_array((weights.ravel(), (rows, joints.ravel())), shape=(len(joints), joint_count))
+    matrix.eliminate_zeros()
+    return matrix
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """Global transforms and morph weights of all nodes."""
+
+    asset_from_node: Float64[np.ndarray, "n 4 4"]
+    weights: tuple[Float64[np.ndarray, " _"], ...]
+
+    def equals(self, other: "Pose | None") -> bool:
+        """Whether both poses are bit-identical."""
+        return (
+            other is not None
+            and np.array_equal(self.asset_from_node, other.asset_from_node)
+            and all(np.array_equal(a, b) for a, b in zip(self.weights, other.weights, strict=True))
+        )
+
+
+class GltfAsset:
+    """Meshes of a document, one per material, in any pose of its clips, in the file's axes and units."""
+
+    def __init__(
+        self, path: Path, nodes: NodeTree, parts: list[list[GltfPart]], clips: tuple[Clip, ...]
+    ) -> None:
+        self.clips = clips
+        self._path = path
+        self._nodes = nodes
+        self._parts = parts
+        self._rest = [joined([part.mesh for part in same]) for same in parts]
+        self._bounds: dict[str, Float64[np.ndarray, "2 3"]] = {}
+
+    def clip(self, wanted: int | str | None) -> Clip | None:
+        """Return the clip of this number or name (None: the first); None if there is none."""
+        if isinstance(wanted, str):
+            return next((clip for clip in self.clips if clip.name == wanted), None)
+        number = 0 if wanted is None else wanted
+        return self.clips[number] if number < len(self.clips) else None
+
+    def pose(self, clip: Clip | None, time_s: float) -> Pose:
+        """Return the pose of a clip at a time, or the rest pose."""
+        rest = self._nodes.rest
+        motion = rest if clip is None else clip.motion(rest, time_s)
+        return Pose(self._nodes.asset_from_node(motion), motion.weights)
+
+    def meshes(self, pose: Pose) -> list[TriangleMesh]:
+        """Return the meshes in a pose."""
+        return [_posed(rest, same, pose) for rest, same in zip(self._rest, self._parts, strict=True)]
+
+    def bounds(self, clip: Clip) -> Float64[np.ndarray, "2 3"]:
+        """Return least and greatest coordinates over a whole clip, with a margin of 2 %; computed once.
+
+        Raises:
+            DeltalightError: it moves vertices beyond 10 km.
+        """
+        if clip.name not in self._bounds:
+            self._bounds[clip.name] = self._swept(clip)
+        return self._bounds[clip.name]
+
+    def _swept(self, clip: Clip) -> Float64[np.ndarray, "2 3"]:
+        followed = [_sampled_vertices(part, self._vertex_count) for same in self._parts for part in same]
+        poses = [self.pose(clip, float(time_s)) for time_s in _sweep_times(clip)]
+        points = [_placed(_morphed(part, pose), _matrices(part, pose)) for pose in poses for part in followed]
+        low = np.min([part.min(axis=0) for part in points], axis=0).astype(np.float64)
+        high = np.max([part.max(axis=0) for part in points], axis=0).astype(np.float64)
+        if not np.abs([low, high]).max() <= MAX_COORDINATE_M:
+            raise DeltalightError(f"{self._path} moves vertices beyond 10 km; scale its animation to metres.")
+        margin = SWEEP_MARGIN * float(np.max(high - low))
+        return np.stack([low - margin, high + margin])
+
+    @property
+    def _vertex_count(self) -> int:
+        return sum(len(mesh.positions) for mesh in self._rest)
+
+
+def load_gltf(path: Path) -> GltfAsset:
+    """Read a .glb or .gltf file with its clips.
+
+    Raises:
+        DeltalightError: it is damaged, empty, or holds what cannot be shown.
+    """
+    gltf = read_gltf(path)
+    with faults_named(path):
+        nodes = read_nodes(gltf)
+        together: dict[int | None, list[GltfPart]] = defaultdict(list)
+        for material, part in PartReader(gltf, nodes).read():
+            together[material].append(part)
+        if not together:
+            raise DeltalightError(f"{path} has no triangle with an area; export a triangle mesh.")
+        return GltfAsset(path, nodes, list(together.values()), read_clips(gltf, nodes))
+
+
+def _sweep_times(clip: Clip) -> Float64[np.ndarray, " k"]:
+    times = np.union1d(clip.key_times, np.linspace(0, clip.duration_s, SWEEP_STEPS))
+    return times if len(times) <= MAX_SWEEP_TIMES else np.linspace(0, clip.duration_s, MAX_SWEEP_TIMES)
+
+
+def _sampled_vertices(part: GltfPart, vertex_count: int) -> GltfPart:
+    """Return a part with the vertices that triangles use, or a subset where the asset has many."""
+    used = np.unique(part.mesh.triangles)
+    return part.of_vertices(used[:: -(-vertex_count // MAX_SWEEP_VERTICES)])
+
+
+def _posed(rest: TriangleMesh, parts: Sequence[GltfPart], pose: Pose) -> TriangleMesh:
+    """Return the mesh of one material in a pose."""
+    shaped = [_shaped(part, pose) for part in parts]
+    return replace(
+        rest,
+        positions=np.concatenate([mesh.positions for mesh in shaped]),
+        normals=np.concatenate([mesh.normals for mesh in shaped]),
+        triangles=joined_triangles(
+            [mesh.triangles for mesh in shaped], [len(mesh.positions) for mesh in shaped]
+        ),
+    )
+
+
+def _shaped(part: GltfPart, pose: Pose) -> TriangleMesh:
+    """Morph a part, then place it by its skin or its node. A mirroring node reverses the winding."""
+    matrices = _matrices(part, pose)
+    positions = _placed(_morphed(part, pose), matrices)
+    mirrored = part.skin is None and np.linalg.det(matrices[:3, :3]) < 0
+    triangles = np.ascontiguousarray(part.mesh.triangles[:, ::-1]) if mirrored else part.mesh.triangles
+    if part.smoothing is not None:
+        normals = part.smoothing.normals(positions, triangles)
+    else:
+        normals = _turned(_morphed_normals(part, pose), matrices, part.mesh.normals, mirrored=mirrored)
+    return replace(part.mesh, positions=positions, normals=normals, triangles=triangles)
+
+
+def _matrices(part: GltfPart, pose: Pose) -> Float64[np.ndarray, "*n 4 4"]:
+    """Return asset_from_mesh: one matrix, or with a skin one per vertex. The node of a skinned mesh has no effect."""
+    if part.skin is None:
+        return np.asarray(pose.asset_from_node[part.node])
+    return _blended(part.skin, pose)
+
+
+def _blended(skin: Skin, pose: Pose) -> Float64[np.ndarray, "n 4 4"]:
+    """Blend the joints' matrices linearly."""
+    asset_from_mesh = pose.asset_from_node[skin.joints] @ skin.joint_from_mesh
+    return np.asarray((skin.weights @ asset_from_mesh.reshape(-1, 16)).reshape(-1, 4, 4))
+
+
+def _placed(
+    positions: Float32[np.ndarray, "n 3"], matrices: Float64[np.ndarray, "*n 4 4"]
+) -> Float32[np.ndarray, "n 3"]:
+    """Transform positions by one matrix, or one each."""
+    turned = (matrices[..., :3, :3] @ positions[..., None].astype(np.float64))[..., 0]
+    return np.asarray(turned + matrices[..., :3, 3], np.float32)
+
+
+def _morphed(part: GltfPart, pose: Pose) -> Float32[np.ndarray, "n 3"]:
+    if part.morph is None:
+        return part.mesh.positions
+    return _added(part.mesh.positions, part.morph.positions, pose.weights[part.node])
+
+
+def _added(
+    base: Float32[np.ndarray, "n 3"],
+    deltas: Sequence[Float32[np.ndarray, "n 3"]],
+    weights: Float64[np.ndarray, " t"],
+) -> Float32[np.ndarray, "n 3"]:
+    """Add weighted deltas."""
+    total = base.copy()
+    for delta, weight in zip(deltas, weights, strict=True):
+        if weight != 0:
+            total += np.float32(weight) * delta
+    return total
+
+
+def _morphed_normals(part: GltfPart, pose: Pose) -> Float32[np.ndarray, "n 3"]:
+    if part.morph is None or part.morph.normals is None:
+        return part.mesh.normals
+    return _added(part.mesh.normals, part.morph.normals, pose.weights[part.node])
+
+
+def _turned(
+    normals: Float32[np.ndarray, "n 3"],
+    matrices: Float64[np.ndarray, "*n 4 4"],
+    instead: Float32[np.ndarray, "n 3"],
+    *,
+    mirrored: bool,
+) -> Float32[np.ndarray, "n 3"]:
+    """Transform normals by one matrix, or one each, to unit length.
+
+    Uses the cofactor matrix, which is the inverse transpose but for a factor and exists for singular matrices too:
+    clips often hide things by a scale of 0. A normal of length 0 is replaced by that of `instead`.
+    """
+    # Matrix elements first (scalars, or one per vertex): twice as fast as one small product per vertex.
+    a = np.ascontiguousarray(np.moveaxis(matrices[..., :3, :3], (-2, -1), (0, 1)))
+    x, y, z = normals.T.astype(np.float64)
+    turned = np.empty((len(normals), 3))
+    for i in range(3):
+        p, q = a[(i + 1) % 3], a[(i + 2) % 3]
+        turned[:, i] = (
+            (p[1] * q[2] - p[2] * q[1]) * x
+            + (p[2] * q[0] - p[0] * q[2]) * y
+            + (p[0] * q[1] - p[1] * q[0]) * z
+        )
+    turned *= -1 if mirrored else 1
+    return unit_or(turned, instead)

@@ -1,0 +1,134 @@
+"""Loading of mesh files: GLB, glTF, OBJ, PLY, STL."""
+
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from jaxtyping import Float32
+
+from protocol.errors import DeltalightError
+from protocol.frames import decode_lut
+from protocol.scene_objects import GLTF_SUFFIXES
+from render_server.scene.asset_check import check_mesh_file
+from render_server.scene.gltf_meshes import GltfAsset, load_gltf
+from render_server.scene.materials import Material
+from render_server.scene.triangle_mesh import (
+    FileGeometry,
+    TriangleMesh,
+    converted,
+    joined,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Asset:
+    """The meshes of a file in their rest pose, and the glTF asset that animates them if the file has clips."""
+
+    meshes: list[TriangleMesh]
+    animated: GltfAsset | None
+
+
+def load_mesh(path: Path) -> list[TriangleMesh]:
+    """Read a GLB, glTF, OBJ, PLY or STL file: one mesh a material, in the file's own axes and units.
+
+    Applies the scene graph's transforms (and skins and morph targets of glTF, in the rest pose), drops degenerate
+    triangles, and computes missing normals (sharp at edges beyond 60 degrees). Vertex colours are sRGB bytes, in
+    glTF linear.
+
+    Raises:
+        DeltalightError: the file is missing, of an unknown type, damaged, empty, or has coordinates that
+            are not finite or beyond 10 km.
+    """
+    return load_asset(path).meshes
+
+
+def load_asset(path: Path) -> Asset:
+    """Read a mesh file as `load_mesh` does, and the clips of a glTF file.
+
+    Raises:
+        DeltalightError: as `load_mesh`, or a malformed clip.
+    """
+    if check_mesh_file(path) in GLTF_SUFFIXES:
+        gltf = load_gltf(path)
+        return Asset(gltf.meshes(gltf.pose(None, 0.0)), gltf if gltf.clips else None)
+    together: dict[int, list[TriangleMesh]] = defaultdict(list)
+    for key, part in _parts(_open_scene(path), path):
+        together[key].append(part)
+    if not together:
+        raise DeltalightError(f"{path} has no triangle with an area; export a triangle mesh.")
+    return Asset([joined(same) for same in together.values()], None)
+
+
+def _open_scene(path: Path) -> trimesh.Scene:
+    try:
+        return trimesh.load_scene(path, process=False, maintain_order=True)
+    except MemoryError:
+        raise
+    except Exception as error:  # a damaged file can make the loader fail in any way
+        raise DeltalightError(f"{path} cannot be read as a mesh ({error}); export it again.") from error
+
+
+def _parts(scene: trimesh.Scene, path: Path) -> list[tuple[int, TriangleMesh]]:
+    """Return (material key, mesh in the file's frame) of every node that shows triangles."""
+    materials: dict[int, Material] = {}
+    parts = []
+    for node in scene.graph.nodes_geometry:
+        matrix, name = scene.graph[node]
+        geometry = scene.geometry[name]
+        if not isinstance(geometry, trimesh.Trimesh) or len(geometry.faces) == 0:
+            continue
+        key = id(getattr(geometry.visual, "material", None))
+        if key not in materials:
+            materials[key] = _material(geometry, path)
+        made = converted(_file_geometry(geometry), materials[key], path)
+        if made is not None:
+            mesh = made.mesh
+            parts.append((key, mesh if np.array_equal(matrix, np.eye(4)) else mesh.transformed(matrix)))
+    return parts
+
+
+def _material(geometry: trimesh.Trimesh, path: Path) -> Material:
+    try:
+        return _described_material(geometry).checked(str(path))
+    except (TypeError, ValueError, AttributeError) as error:
+        raise DeltalightError(f"{path} has a malformed material ({error}); export it again.") from error
+
+
+def _described_material(geometry: trimesh.Trimesh) -> Material:
+    loaded = getattr(geometry.visual, "material", None)
+    if loaded is not None and isinstance(loaded, trimesh.visual.material.SimpleMaterial):
+        # An image that no file names is the loader's own placeholder.
+        image = loaded.image if loaded.image is not None and "file_path" in loaded.image.info else None
+        return Material.from_mtl(str(loaded.name or ""), loaded.kwargs or {}, image)
+    has_colors = geometry.visual.kind == "vertex"
+    return Material(base_color=np.ones(3, np.float32)) if has_colors else Material()
+
+
+def _file_geometry(geometry: trimesh.Trimesh) -> FileGeometry:
+    positions = np.asarray(geometry.vertices, np.float32)
+    has_normals = "vertex_normals" in geometry._cache
+    return FileGeometry(
+        positions,
+        np.asarray(geometry.faces, np.int64),
+        np.asarray(geometry._cache["vertex_normals"], np.float32) if has_normals else None,
+        _uv(geometry, len(positions)),
+        _colors(geometry),
+    )
+
+
+def _uv(geometry: trimesh.Trimesh, count: int) -> Float32[np.ndarray, "n 2"] | None:
+    """Return texture coordinates with the origin at the top; the loader has it at the bottom."""
+    uv = getattr(geometry.visual, "uv", None)
+    if uv is None or np.shape(uv) != (count, 2) or not np.isfinite(uv).all():
+        return None
+    return np.column_stack([uv[:, 0], 1 - uv[:, 1]]).astype(np.float32)
+
+
+def _colors(geometry: trimesh.Trimesh) -> Float32[np.ndarray, "n 3"] | None:
+    """Return linear vertex colours: sRGB bytes of PLY, STL and OBJ."""
+    if geometry.visual.kind != "vertex":
+        return None
+    codes = np.asarray(geometry.visual.vertex_colors, np.uint8)[:, :3]
+    return decode_lut(None)[:, 0][codes]

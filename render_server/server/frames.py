@@ -1,0 +1,304 @@
+"""Frames from sensor nodes: the endpoints that are read, and their streams paired to complete frames.
+
+A colour frame triggers; pose and lamps are those of the same frame, the depth the nearest in capture time within a
+tolerance, the radiance map the latest. Frames without a partner, or overtaken by a newer frame, are counted.
+"""
+
+from collections import Counter, deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+import numpy as np
+from pydantic import Field
+
+from protocol.board import BoardSpec
+from protocol.camera_model import CameraModel
+from protocol.codecs import decode_color, decode_depth, decode_response
+from protocol.documents import StrictModel, validate
+from protocol.errors import DeltalightError
+from protocol.frames import BoardPose, DepthImage, LampPose, RadianceMap, ViewFrame
+from protocol.keys import Keys
+from protocol.light_codecs import lamp_poses, radiance_map
+from protocol.messages import (
+    ColorMessage,
+    DepthMessage,
+    LampsMessage,
+    Message,
+    MessageBase,
+    PoseMessage,
+    RadianceMessage,
+)
+from protocol.transport import ReceivedMultipart, Receiver
+
+MAX_ENDPOINTS = 16
+EARLIER_SOURCES = "earlier_sources"
+TOPICS = ("color", "clean_depth", "pose", "radiance", "lamps")
+KEPT_MESSAGES = 8  # per stream; a renderer that is slower than this many frames drops them anyway
+
+Built = TypeVar("Built")
+Kind = TypeVar("Kind", bound=MessageBase)
+
+
+class SourceOrder(StrictModel):
+    """Endpoints to read frames from; null = those that were configured."""
+
+    endpoints: tuple[str, ...] | None = Field(min_length=1, max_length=MAX_ENDPOINTS)
+
+
+class FrameSource:
+    """Receives the streams of the `configured` endpoints until `use` names others.
+
+    `keys` are needed where an endpoint leaves the host.
+
+    Raises:
+        DeltalightError: an endpoint that leaves the host without keys, or is not understood.
+    """
+
+    def __init__(self, configured: Sequence[str], keys: Keys | None = None) -> None:
+        self._configured = self._endpoints = tuple(configured)
+        self._keys = keys
+        self._earlier_drops = 0
+        self._receiver = Receiver(self._configured, TOPICS, keys=keys)
+
+    @property
+    def endpoints(self) -> tuple[str, ...]:
+        """Endpoints that are read now."""
+        return self._endpoints
+
+    def use(self, endpoints: Sequence[str] | None) -> bool:
+        """Switch to these endpoints, None = the configured ones; returns whether that is a change.
+
+        If so, waiting messages are dropped.
+
+        Raises:
+            DeltalightError: as above; then all stays as it was.
+        """
+        wanted = self._configured if endpoints is None else tuple(endpoints)
+        if wanted == self._endpoints:
+            return False
+        receiver = Receiver(wanted, TOPICS, keys=self._keys)
+        before, self._receiver, self._endpoints = self._receiver, receiver, wanted
+        self._earlier_drops += sum(before.drops.values())
+        before.close()
+        return True
+
+    def latest(self, timeout_s: float) -> dict[str, ReceivedMultipart] | None:
+        """Newest message of every topic (`Receiver.latest`)."""
+        return self._receiver.latest(timeout_s)
+
+    @property
+    def drops(self) -> dict[str, int]:
+        """Messages of each topic that a newer one replaced before they were taken.
+
+        Those of earlier sources are one number, because there is no end to their names.
+        """
+        earlier = {EARLIER_SOURCES: self._earlier_drops} if self._earlier_drops else {}
+        return {**earlier, **self._receiver.drops}
+
+    def close(self) -> None:
+        """Stop receiving."""
+        self._receiver.close()
+
+
+class PairingSettings(StrictModel):
+    """How streams are paired."""
+
+    depth_tolerance_ms: float = Field(
+        default=20.0,
+        ge=0,
+        le=1000,
+        description="Greatest difference of capture time of colour and depth, ms.",
+    )
+    patience_ms: float = Field(
+        default=250.0, ge=0, le=5000, description="How long a colour frame waits for its pose and depth, ms."
+    )
+
+
+@dataclass(frozen=True)
+class AssembledFrame:
+    """The renderer's input, and the header of the colour frame that it is made from."""
+
+    view: ViewFrame
+    color: ColorMessage
+    received_ns: int
+
+
+@dataclass(frozen=True)
+class _Held(Generic[Kind]):
+    message: Kind
+    parts: Sequence[memoryview]
+    received_ns: int
+
+
+class FrameAssembler:
+    """Takes decoded messages in any order and gives the newest frame that is complete.
+
+    `needs_depth` says whether the scene's real geometry comes from depth. Payloads are decoded for the chosen
+    frame only. `counts` holds what happened to the others: `superseded` (overtaken by a newer frame),
+    `unpaired_pose` (passed through when the patience ran out), `unpaired_depth` (dropped: no depth near its time).
+    """
+
+    def __init__(self, settings: PairingSettings | None = None, *, needs_depth: bool = True) -> None:
+        self.needs_depth = needs_depth
+        self.counts: Counter[str] = Counter()
+        self._settings = settings or PairingSettings()
+        self._colors: deque[_Held[ColorMessage]] = deque()
+        self._depths: deque[_Held[DepthMessage]] = deque(maxlen=KEPT_MESSAGES)
+        self._poses: deque[_Held[PoseMessage]] = deque(maxlen=KEPT_MESSAGES)
+        self._lamps: deque[LampsMessage] = deque(maxlen=KEPT_MESSAGES)
+        self._radiance: deque[_Held[RadianceMessage]] = deque(maxlen=KEPT_MESSAGES)
+        self._map: tuple[_Held[RadianceMessage], RadianceMap] | None = None  # the one decoded last
+        self._reference_exposure_s: float | None = None  # of the first frame, as for recordings
+        self._camera = _Unchanged(CameraModel.from_dict)
+        self._depth_camera = _Unchanged(CameraModel.from_dict)
+        self._board = _Unchanged(_board_spec)
+
+    def begun_anew(self) -> "FrameAssembler":
+        """Return an assembler without any message, for another source; it goes on counting."""
+        fresh = FrameAssembler(self._settings, needs_depth=self.needs_depth)
+        fresh.counts = self.counts
+        return fresh
+
+    def add(self, message: Message, parts: Sequence[memoryview], received_ns: int) -> None:
+        """Keep a message until its partners come; other streams than `TOPICS` are ignored."""
+        match message:
+            case ColorMessage():
+                self._colors.append(_Held(message, parts, received_ns))
+                self._drop_colors(len(self._colors) - KEPT_MESSAGES)
+            case DepthMessage(stream="clean_depth"):
+                self._depths.append(_Held(message, parts, received_ns))
+            case PoseMessage():
+                self._poses.append(_Held(message, parts, received_ns))
+            case LampsMessage():
+                self._lamps.append(message)
+            case RadianceMessage():
+                # Maps are sent again for those who come late.
+                if all(_identity(held.message) != _identity(message) for held in self._radiance):
+                    self._radiance.append(_Held(message, parts, received_ns))
+
+    def take(self, now_ns: int) -> AssembledFrame | None:
+        """The newest complete frame, or the newest whose patience ran out; older ones are dropped.
+
+        Raises:
+            DeltalightError: the chosen frame's payload is broken; it is gone, the next call goes on.
+        """
+        expired_ns = now_ns - int(1e6 * self._settings.patience_ms)
+        for index in reversed(range(len(self._colors))):
+            color = self._colors[index]
+            pose, depth = self._pose_of(color.message), self._depth_of(color.message)
+            complete = pose is not None and (depth is not None or not self.needs_depth)
+            if color.received_ns <= expired_ns and depth is None and self.needs_depth and self._depths:
+                self._colors.remove(color)
+                self.counts["unpaired_depth"] += 1
+                return None
+            if complete or color.received_ns <= expired_ns:
+                self._drop_colors(index)
+                self._colors.popleft()
+                return self._build(color, pose, depth)
+        return None
+
+    def _drop_colors(self, count: int) -> None:
+        for _ in range(count):
+            self._colors.popleft()
+            self.counts["superseded"] += 1
+
+    def _pose_of(self, color: ColorMessage) -> _Held[PoseMessage] | None:
+        """The pose of this very frame; the capture time tells turns of a looped recording apart."""
+        poses = (held for held in self._poses if _identity(held.message) == _identity(color))
+        return next(poses, None)
+
+    def _depth_of(self, color: ColorMessage) -> _Held[DepthMessage] | None:
+        own = [held for held in self._depths if held.message.node == color.node]
+        nearest = min(own, key=lambda held: abs(held.message.capture_ns - color.capture_ns), default=None)
+        if nearest is None:
+            return None
+        apart_ms = abs(nearest.message.capture_ns - color.capture_ns) / 1e6
+        return nearest if apart_ms <= self._settings.depth_tolerance_ms else None
+
+    def _lamps_of(self, color: ColorMessage) -> tuple[LampPose, ...]:
+        own = (message for message in self._lamps if _identity(message) == _identity(color))
+        return next((lamp_poses(message) for message in own), ())
+
+    def _map_of(self, color: ColorMessage) -> RadianceMap | None:
+        """The newest map that is not later than the frame; before the first the first."""
+        own = [held for held in self._radiance if held.message.node == color.node]
+        if not own:
+            return None
+        begun = [held for held in own if held.message.capture_ns <= color.capture_ns]
+        newest = max(begun, key=_captured) if begun else min(own, key=_captured)
+        if self._map is None or self._map[0] is not newest:
+            self._map = newest, self._decode_map(newest)
+        return self._map[1]
+
+    def _decode_map(self, held: _Held[RadianceMessage]) -> RadianceMap:
+        try:
+            return radiance_map(held.message, held.parts)
+        except DeltalightError:
+            self._radiance.remove(held)  # so that it costs one frame and not all that it holds for
+            raise
+
+    def _build(
+        self, color: _Held[ColorMessage], pose: _Held[PoseMessage] | None, depth: _Held[DepthMessage] | None
+    ) -> AssembledFrame:
+        self.counts["unpaired_pose"] += pose is None
+        header = color.message
+        if self._reference_exposure_s is None:
+            self._reference_exposure_s = header.exposure_s
+        view = ViewFrame(
+            frame_id=header.frame_id,
+            timestamp_ns=header.capture_ns,
+            color=decode_color(color.parts[0], header.encoding, header.shape),
+            camera=self._camera(header.camera),
+            response=decode_response(color.parts[1]) if header.has_response else None,
+            exposure_scale=(header.exposure_s or 1.0) / (self._reference_exposure_s or 1.0),
+            pose=None if pose is None else _board_pose(pose.message),
+            depth=None if depth is None else self._depth_image(depth),
+            board=None if pose is None or pose.message.board is None else self._board(pose.message.board),
+            radiance_map=self._map_of(header),
+            lamps=self._lamps_of(header),
+        )
+        return AssembledFrame(view, header, color.received_ns)
+
+    def _depth_image(self, depth: _Held[DepthMessage]) -> DepthImage:
+        header = depth.message
+        depth_m, valid = decode_depth(depth.parts[0], header.encoding, header.shape, header.depth_scale_m)
+        return DepthImage(depth_m, valid, self._depth_camera(header.camera), header.noise_sigma_m)
+
+
+class _Unchanged(Generic[Built]):
+    """Builds an object from plain data and keeps it while the data stays equal.
+
+    A camera model caches its rays, and neither camera nor board change from frame to frame.
+    """
+
+    def __init__(self, build: Callable[[Mapping[str, object]], Built]) -> None:
+        self._build = build
+        self._last: tuple[Mapping[str, object], Built] | None = None
+
+    def __call__(self, data: Mapping[str, object]) -> Built:
+        if self._last is None or self._last[0] != data:
+            self._last = (data, self._build(data))
+        return self._last[1]
+
+
+def _captured(held: _Held[Kind]) -> int:
+    return held.message.capture_ns
+
+
+def _identity(message: MessageBase) -> tuple[str, int, int]:
+    return message.node, message.frame_id, message.capture_ns
+
+
+def _board_pose(message: PoseMessage) -> BoardPose | None:
+    if message.world_from_camera is None:
+        return None
+    return BoardPose(
+        np.array(message.world_from_camera),
+        message.reprojection_error_px,
+        None if message.alternative is None else np.array(message.alternative),
+    )
+
+
+def _board_spec(data: Mapping[str, object]) -> BoardSpec:
+    return validate(BoardSpec, data, "the board of the pose message")

@@ -1,0 +1,253 @@
+"""The render server's process: sockets around one `RenderSession`.
+
+Threads: the receiver's, the reply server's, the sender's (which encodes and publishes), and the main one,
+which owns the OpenGL context and does nothing but render and carry out commands.
+"""
+
+import queue
+import threading
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from concurrent.futures import TimeoutError as FutureTimeoutError
+from contextlib import ExitStack
+from pathlib import Path
+
+import structlog
+from pydantic import Field
+
+from protocol.clock import CLOCK_OP, clock_payload
+from protocol.codecs import encode_color
+from protocol.documents import StrictModel
+from protocol.envelope import encode
+from protocol.errors import DeltalightError
+from protocol.files import write_bytes
+from protocol.keys import Keys
+from protocol.messages import ControlRequest, StatsMessage
+from protocol.scene import SceneDocument, load_scene
+from protocol.transport import Publisher, ReplyServer
+from render_server.gpu.context import create_context
+from render_server.renderer import SceneRenderer
+from render_server.server.frames import FrameAssembler, FrameSource, PairingSettings
+from render_server.server.session import RenderedFrame, Renderer, RenderSession, SourceInUse
+
+GPU_TIMEOUT_S = 0.002  # a started frame is read back after so long, should no other follow
+RECEIVE_TIMEOUT_S = 0.05  # bounds how long a command waits while no frames come
+STATS_INTERVAL_S = 1.0
+ANSWER_TIMEOUT_S = 20.0
+SNAPSHOT_TIMEOUT_S = 120.0  # a frame in many views and by several methods, in software
+
+Payload = dict[str, object]
+
+log = structlog.get_logger()
+
+
+class ServerSettings(StrictModel):
+    """Settings of a render server."""
+
+    scene: Path | None = Field(default=None, description="Scene document to start with.")
+    session: Path | None = Field(
+        default=None, description="File that keeps the current scene, so that a restart goes on with it."
+    )
+    subscribe: tuple[str, ...] = Field(min_length=1, description="Endpoints of sensor nodes.")
+    publish: str = Field(description="Endpoint for composites and stats.")
+    control: str = Field(description="Endpoint for commands.")
+    name: str = Field(default="render-server", description="Name in topics and messages.")
+    device: int | None = Field(default=None, ge=0, description="EGL device; null = the driver's first.")
+    allow_software: bool = Field(default=False, description="Accept a renderer without a GPU.")
+    jpeg_quality: int = Field(default=90, ge=1, le=100, description="Quality of published composites.")
+    pairing: PairingSettings = Field(default_factory=PairingSettings)
+
+    def initial_scene(self) -> SceneDocument:
+        """The kept scene where there is one, else the scene document, else an empty scene.
+
+        Raises:
+            DeltalightError: the document is wrong.
+        """
+        if self.session is not None and self.session.is_file():
+            return load_scene(self.session)
+        return SceneDocument() if self.scene is None else load_scene(self.scene)
+
+
+class CommandDesk:
+    """Hands commands from the thread that receives them to the one that may use OpenGL."""
+
+    def __init__(self) -> None:
+        self._closed = False
+        self._pending: queue.SimpleQueue[tuple[ControlRequest, Future[Payload]]] = queue.SimpleQueue()
+
+    def ask(self, request: ControlRequest) -> Payload:
+        """Wait for the payload of the answer (the reply server's thread).
+
+        Raises:
+            DeltalightError: the command was refused, or the renderer did not answer in time.
+        """
+        answer: Future[Payload] = Future()
+        if request.op == CLOCK_OP:  # answered here, because waiting for a frame would blur the times
+            return clock_payload(time.time_ns())
+        self._pending.put((request, answer))
+        if self._closed:
+            self.serve(_refuse)
+        timeout_s = SNAPSHOT_TIMEOUT_S if request.op == "snapshot" else ANSWER_TIMEOUT_S
+        try:
+            return answer.result(timeout_s)
+        except FutureTimeoutError as fault:
+            raise DeltalightError(
+                f"The renderer did not answer within {timeout_s:.0f} s; try again or restart it."
+            ) from fault
+
+    def serve(self, carry_out: Callable[[ControlRequest], Payload]) -> None:
+        """Answer all that wait (the thread that renders)."""
+        while not self._pending.empty():
+            request, answer = self._pending.get()
+            try:
+                answer.set_result(carry_out(request))
+            except Exception as fault:  # it belongs to whoever asked, and the renderer goes on
+                answer.set_exception(fault)
+
+    def close(self) -> None:
+        """Refuse what waits and what comes, so that nobody waits for a renderer that is gone."""
+        self._closed = True
+        self.serve(_refuse)
+
+
+def _refuse(request: ControlRequest) -> Payload:
+    raise DeltalightError(f"The render server ends and cannot carry out '{request.op}'; start it again.")
+
+
+class Sender:
+    """Encodes and publishes in a thread of its own, so that the next frame is rendered meanwhile.
+
+    OpenCV encodes without the interpreter lock. Two messages may wait; the renderer never does.
+    """
+
+    def __init__(self, publisher: Publisher, jpeg_quality: int) -> None:
+        self.dropped = 0
+        self._publisher = publisher
+        self._quality = jpeg_quality
+        self._generation = 0  # pictures of an earlier one are not sent
+        self._waiting: queue.Queue[tuple[RenderedFrame | StatsMessage | None, int]] = queue.Queue(maxsize=2)
+        self._thread = threading.Thread(target=self._run, name="sender", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Send what waits, then end the thread."""
+        self._waiting.put((None, self._generation))
+        self._thread.join(timeout=1.0)
+
+    def offer(self, item: RenderedFrame | StatsMessage) -> None:
+        """Send it soon, or count it as dropped where sending is slower than rendering."""
+        try:
+            self._waiting.put_nowait((item, self._generation))
+        except queue.Full:
+            self.dropped += 1
+
+    def forget(self) -> None:
+        """Send no picture that was offered before."""
+        self._generation += 1
+
+    def _run(self) -> None:
+        while True:
+            item, generation = self._waiting.get()
+            if item is None:
+                return
+            try:
+                pieces = self._multipart(item)
+                if generation == self._generation or isinstance(item, StatsMessage):
+                    self._publisher.send(pieces)
+            except DeltalightError as fault:
+                log.warning("not sent", fault=str(fault))
+
+    def _multipart(self, item: RenderedFrame | StatsMessage) -> list[bytes]:
+        if isinstance(item, StatsMessage):
+            return encode(item)
+        jpeg = encode_color(item.pixels, "jpeg", self._quality)
+        return encode(item.message.model_copy(update={"encoding": "jpeg"}), [jpeg])
+
+
+def run_server(settings: ServerSettings, keys: Keys | None = None) -> None:
+    """Serve until a `shutdown` command or an exception (Ctrl-C, SIGTERM) ends it.
+
+    `keys` are needed where an endpoint leaves the host.
+
+    Raises:
+        DeltalightError: a wrong scene, no fit OpenGL device, or a port in use.
+    """
+    scene = settings.initial_scene()
+    with ExitStack() as stack:
+        gpu = create_context(settings.device, allow_software=settings.allow_software)
+        stack.callback(gpu.release)
+        if gpu.is_software:
+            log.warning("no GPU found, rendering slowly in software", renderer=gpu.renderer_name)
+        renderer = SceneRenderer(gpu, scene, waits=False)  # commands are answered meanwhile
+        stack.callback(renderer.release)
+        serve(settings, renderer, scene, renderer_name=gpu.renderer_name, keys=keys)
+
+
+def serve(
+    settings: ServerSettings,
+    renderer: Renderer,
+    scene: SceneDocument,
+    *,
+    renderer_name: str,
+    keys: Keys | None = None,
+) -> None:
+    """Open the sockets around a renderer that shows `scene`; serve until a `shutdown` command. This thread renders.
+
+    Raises:
+        DeltalightError: a port in use, or an endpoint that leaves the host without keys.
+    """
+    with ExitStack() as stack:
+        publisher = Publisher(settings.publish, keys=keys)
+        stack.callback(publisher.close)
+        sender = Sender(publisher, settings.jpeg_quality)
+        stack.callback(sender.close)
+        source = FrameSource(settings.subscribe, keys)
+        stack.callback(source.close)
+
+        def use_source(endpoints: Sequence[str] | None) -> SourceInUse:
+            is_another = source.use(endpoints)
+            if is_another:
+                sender.forget()
+            return SourceInUse(source.endpoints, is_another)
+
+        session = RenderSession(
+            renderer,
+            scene,
+            assembler=FrameAssembler(settings.pairing),
+            name=settings.name,
+            renderer_name=renderer_name,
+            keep_scene=lambda kept: _keep(settings.session, kept),
+            use_source=use_source,
+            mailbox_drops=lambda: {**source.drops, "send": sender.dropped},
+        )
+        desk = CommandDesk()
+        replies = ReplyServer(settings.control, desk.ask, node=settings.name, keys=keys)
+        stack.callback(replies.close)
+        stack.callback(desk.close)
+        log.info("render server runs", renderer=renderer_name, publish=settings.publish)
+        _loop(session, source, sender, desk)
+
+
+def _patience_s(session: RenderSession) -> float:
+    """How long to wait for a message."""
+    return GPU_TIMEOUT_S if session.is_waiting_for_gpu else RECEIVE_TIMEOUT_S
+
+
+def _loop(session: RenderSession, source: FrameSource, sender: Sender, desk: CommandDesk) -> None:
+    stats_due_s = time.monotonic()
+    while not session.stopping:
+        for multipart in (source.latest(_patience_s(session)) or {}).values():
+            session.receive(multipart)
+        rendered = session.step()
+        if rendered is not None:
+            sender.offer(rendered)
+        if time.monotonic() >= stats_due_s:
+            sender.offer(session.stats())
+            stats_due_s = time.monotonic() + STATS_INTERVAL_S
+        desk.serve(session.carry_out)
+
+
+def _keep(path: Path | None, scene: SceneDocument) -> None:
+    if path is not None:
+        write_bytes(path, scene.model_dump_json(indent=1).encode())

@@ -1,0 +1,390 @@
+"""One scene's render session: newest frame in, composite out, commands in between.
+
+No sockets, no threads: `server.py` feeds it and sends what comes out, tests give it messages and a renderer.
+"""
+
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import structlog
+from jaxtyping import Float32, Float64, UInt8
+from pydantic import ConfigDict
+
+from protocol.camera_model import CameraModel
+from protocol.documents import StrictModel, nearest, validate
+from protocol.envelope import decode
+from protocol.errors import DeltalightError
+from protocol.frames import ViewFrame
+from protocol.messages import CompositeMessage, ControlRequest, StatsMessage
+from protocol.scene import SceneDocument, parse_scene
+from protocol.transport import ReceivedMultipart
+from render_server.server.frames import AssembledFrame, FrameAssembler, SourceOrder
+from render_server.server.snapshot import SnapshotOrder, take_snapshot
+
+RATE_WINDOW_S = 5.0
+WAITING_AFTER_S = 2.0
+MAXIMUM_FAULTS_IN_A_ROW = 30
+
+log = structlog.get_logger()
+
+
+class Composite(Protocol):
+    """What a renderer gives back (`renderer.CompositeFrame`)."""
+
+    @property
+    def color(self) -> UInt8[np.ndarray, "h w 3"]:
+        """The finished picture, camera-coded RGB."""
+
+    @property
+    def status(self) -> str:
+        """`ok` or `no_pose`."""
+
+    @property
+    def camera(self) -> CameraModel:
+        """The camera at the picture's size."""
+
+    @property
+    def world_from_camera(self) -> Float64[np.ndarray, "4 4"] | None:
+        """Where it stood; None without a pose."""
+
+    @property
+    def pass_times_ms(self) -> dict[str, float]:
+        """Milliseconds of each pass."""
+
+    @property
+    def lights(self) -> Sequence[dict[str, Any]]:
+        """The lights that the picture was made with."""
+
+    @property
+    def linear(self) -> Float32[np.ndarray, "h w 3"] | None:
+        """The picture before the camera's response, where that was asked for."""
+
+
+class Pick(Protocol):
+    """What a pixel shows (`picking.Pick`)."""
+
+    def as_dict(self) -> dict[str, object]:
+        """The pick as plain data."""
+
+
+class Pending(Protocol):
+    """A started frame (`renderer.PendingComposite`)."""
+
+    @property
+    def immediate(self) -> bool:
+        """Whether nothing is gained by starting another frame first."""
+
+    @property
+    def finish(self) -> Callable[[], Composite]:
+        """Gives the composite; waits for the GPU if it must."""
+
+
+class Renderer(Protocol):
+    """What a session needs of `renderer.SceneRenderer`."""
+
+    @property
+    def notices(self) -> Sequence[str]:
+        """Sentences that a user should read; the list only grows."""
+
+    def start(self, frame: ViewFrame, *, with_linear: bool = False) -> Pending:
+        """Begin the composite of one frame; frames finish in the order in which they were started."""
+
+    def sized(self, frame: ViewFrame) -> ViewFrame:
+        """The frame at the composite's size."""
+
+    def pick(self, x: float, y: float, ignore: str | None = None) -> Pick:
+        """What the newest picture shows at a pixel, seen through the object `ignore`."""
+
+    def begin_source(self) -> None:
+        """Forget what earlier frames showed."""
+
+    def set_scene(self, scene: SceneDocument) -> None:
+        """Use another scene from the next frame on."""
+
+
+@dataclass(frozen=True)
+class RenderedFrame:
+    """A composite that is to be encoded and sent; `pixels` belong to `message` (stated as raw)."""
+
+    message: CompositeMessage
+    pixels: UInt8[np.ndarray, "h w 3"]
+
+
+@dataclass(frozen=True)
+class _Started:
+    """A frame at the GPU, and the revision of the scene that it was begun with."""
+
+    frame: AssembledFrame
+    pending: Pending
+    revision: int
+
+
+@dataclass(frozen=True)
+class SourceInUse:
+    """Endpoints that are read now, and whether they are others than before."""
+
+    endpoints: Sequence[str]
+    is_another: bool
+
+
+class PickOrder(StrictModel):
+    """A pixel of the composite (centres are at integers), and an object to look through."""
+
+    model_config = ConfigDict(strict=True)
+
+    x: float
+    y: float
+    ignore: str | None = None
+
+
+def _only_configured(_endpoints: Sequence[str] | None) -> SourceInUse:
+    raise DeltalightError("This render session cannot change its source; start it with other endpoints.")
+
+
+class RenderSession:
+    """Keeps one scene, its renderer and the frames that wait for it.
+
+    `keep_scene` is called with every scene that was accepted, so that a restart can go on with it;
+    `mailbox_drops` tells what the receiver dropped, by topic; `use_source` makes it read other endpoints (None: those
+    configured).
+    """
+
+    def __init__(
+        self,
+        renderer: Renderer,
+        scene: SceneDocument,
+        *,
+        assembler: FrameAssembler | None = None,
+        name: str = "render-server",
+        renderer_name: str = "",
+        keep_scene: Callable[[SceneDocument], None] = lambda _scene: None,
+        mailbox_drops: Callable[[], Mapping[str, int]] = dict,
+        use_source: Callable[[Sequence[str] | None], SourceInUse] = _only_configured,
+        clock_ns: Callable[[], int] = time.time_ns,
+    ) -> None:
+        self.scene = scene
+        self.counts: Counter[str] = Counter()
+        self.stopping = False
+        self._renderer = renderer
+        self._assembler = assembler or FrameAssembler()
+        self._assembler.needs_depth = _needs_depth(scene)
+        self._name = name
+        self._renderer_name = renderer_name
+        self._keep_scene = keep_scene
+        self._mailbox_drops = mailbox_drops
+        self._use_source = use_source
+        self._clock_ns = clock_ns
+        self._newest: AssembledFrame | None = None
+        self._finished: RenderedFrame | None = None
+        self._started: _Started | None = None
+        self._rendered_ns: deque[int] = deque()
+        self._last_fault = ""
+        self._faults_in_a_row = 0
+        self._logged_notices = 0
+
+    def receive(self, multipart: ReceivedMultipart) -> None:
+        """Take a message of the sensor node; a malformed one is counted and logged."""
+        try:
+            message, parts = decode(multipart)
+        except DeltalightError as fault:
+            self._count_fault("bad_messages", fault)
+            return
+        self._assembler.add(message, parts, multipart.received_ns)
+
+    @property
+    def is_waiting_for_gpu(self) -> bool:
+        """Whether a started frame is to be finished by the next step."""
+        return self._started is not None
+
+    def step(self) -> RenderedFrame | None:
+        """Start the newest frame, if one is ready, and give the one that was started before (in software: itself).
+
+        A picture that a command finished comes first.
+
+        A frame that cannot be rendered is counted and logged.
+
+        Raises:
+            Exception: nothing but unexpected faults `MAXIMUM_FAULTS_IN_A_ROW` times: the renderer is broken,
+                not the frames, and only a restart of the process helps.
+        """
+        if self._finished is not None:
+            finished, self._finished = self._finished, None
+            return finished
+        try:
+            frame = self._assembler.take(self._clock_ns())
+            return self._render(frame)
+        except DeltalightError as fault:
+            self._count_fault("bad_frames", fault)
+        except Exception as fault:  # whatever it is, the next frame must still be rendered
+            self._count_fault("bad_frames", fault)
+            self._faults_in_a_row += 1
+            if self._faults_in_a_row >= MAXIMUM_FAULTS_IN_A_ROW:
+                raise
+        return None
+
+    def drops(self) -> dict[str, int]:
+        """What was lost so far, and where."""
+        return {**self._mailbox_drops(), **self._assembler.counts, **self.counts}
+
+    def stats(self) -> StatsMessage:
+        """How the session is doing."""
+        now_ns = self._clock_ns()
+        while self._rendered_ns and self._rendered_ns[0] < now_ns - RATE_WINDOW_S * 1e9:
+            self._rendered_ns.popleft()
+        is_running = bool(self._rendered_ns) and self._rendered_ns[-1] > now_ns - WAITING_AFTER_S * 1e9
+        return StatsMessage(
+            node=self._name,
+            capture_ns=now_ns,
+            state="degraded" if self._last_fault else "running" if is_running else "waiting",
+            detail=f"{self._renderer_name}; {self._last_fault}" if self._last_fault else self._renderer_name,
+            rates={"frames_per_s": len(self._rendered_ns) / RATE_WINDOW_S},
+            drops=self.drops(),
+        )
+
+    def carry_out(self, request: ControlRequest) -> dict[str, object]:
+        """Carry out a command between two frames; gives the payload of the reply.
+
+        Raises:
+            DeltalightError: an unknown command, or one that is refused.
+        """
+        commands: dict[str, Callable[[ControlRequest], dict[str, object]]] = {
+            "ping": lambda _: {"revision": self.scene.revision},
+            "get_scene": lambda _: {"scene": self.scene.model_dump(mode="json")},
+            "set_scene": self._set_scene,
+            "set_view": lambda asked: self._use_scene(_with_view(self.scene, asked.payload.get("view"))),
+            "pick": self._pick,
+            "snapshot": self._snapshot,
+            "set_source": self._set_source,
+            "stats": lambda _: {"stats": self.stats().model_dump(mode="json")},
+            "shutdown": self._shut_down,
+        }
+        if request.op not in commands:
+            hint = nearest(request.op, commands) or ", ".join(commands)
+            raise DeltalightError(f"There is no command '{request.op}'; did you mean {hint}?")
+        return commands[request.op](request)
+
+    def _shut_down(self, _request: ControlRequest) -> dict[str, object]:
+        self.stopping = True
+        return {}
+
+    def _pick(self, request: ControlRequest) -> dict[str, object]:
+        order = validate(PickOrder, request.payload, "the command pick")
+        return self._renderer.pick(order.x, order.y, order.ignore).as_dict()
+
+    def _snapshot(self, request: ControlRequest) -> dict[str, object]:
+        order = validate(SnapshotOrder, request.payload, "the command snapshot")
+        frame = self._newest
+        if frame is None:
+            raise DeltalightError("No frame has come yet; take the snapshot when there is a picture.")
+        self._finish_started()
+        taken = take_snapshot(self._renderer, self.scene, frame.view, order)
+        return {
+            "frame_id": frame.color.frame_id,
+            "capture_ns": frame.color.capture_ns,
+            "files": taken.files,
+            "errors": taken.errors,
+        }
+
+    def _set_source(self, request: ControlRequest) -> dict[str, object]:
+        order = validate(SourceOrder, request.payload, "the command set_source")
+        self._finish_started()
+        source = self._use_source(order.endpoints)
+        if source.is_another:
+            self._finished = self._newest = None  # of the source before
+            self._assembler = self._assembler.begun_anew()
+            self._renderer.begin_source()
+        return {"endpoints": list(source.endpoints)}
+
+    def _finish_started(self) -> None:
+        """Wait for the frame at the GPU, so that a command may use it; its picture comes with the next step."""
+        before, self._started = self._started, None
+        if before is not None:
+            self._finished = self._finish(before)
+
+    def _render(self, frame: AssembledFrame | None) -> RenderedFrame | None:
+        before, self._started = self._started, None
+        if frame is not None:
+            self._newest = frame
+            self._started = _Started(frame, self._renderer.start(frame.view), self.scene.revision)
+        if before is None and self._started is not None and self._started.pending.immediate:
+            before, self._started = self._started, None
+        return None if before is None else self._finish(before)
+
+    def _finish(self, started: "_Started") -> RenderedFrame:
+        composite, frame = started.pending.finish(), started.frame
+        self._last_fault = ""
+        self._faults_in_a_row = 0
+        self._log_notices()
+        self._rendered_ns.append(self._clock_ns())
+        color = frame.color
+        message = CompositeMessage(
+            node=self._name,
+            frame_id=color.frame_id,
+            capture_ns=color.capture_ns,
+            clock_offset_ns=color.clock_offset_ns,
+            clock_bound_ns=color.clock_bound_ns,
+            encoding="raw",
+            shape=(*composite.color.shape[:2], 3),
+            status="ok" if composite.status == "ok" else "no_pose",
+            scene_revision=started.revision,
+            camera=composite.camera.to_dict(),
+            world_from_camera=_rows(composite.world_from_camera),
+            received_ns=frame.received_ns,
+            rendered_ns=self._rendered_ns[-1],
+            pass_times_ms=composite.pass_times_ms,
+            lights=tuple(composite.lights),
+            drops=self.drops(),
+        )
+        return RenderedFrame(message, composite.color)
+
+    def _set_scene(self, request: ControlRequest) -> dict[str, object]:
+        """Idempotent by revision: the current revision is confirmed and an older one refused."""
+        current = self.scene.revision
+        revision = current + 1 if request.revision is None else request.revision
+        document = request.payload.get("scene")
+        if not isinstance(document, dict):
+            raise DeltalightError("The command set_scene needs the scene document as `scene` in its payload.")
+        scene = parse_scene({**document, "revision": revision})
+        if revision < current or (revision == current and scene != self.scene):
+            raise DeltalightError(
+                f"The scene is already at revision {current}; get it, change it and send it as {current + 1}."
+            )
+        return {"revision": current} if revision == current else self._use_scene(scene)
+
+    def _use_scene(self, scene: SceneDocument) -> dict[str, object]:
+        self._renderer.set_scene(scene)
+        self._assembler.needs_depth = _needs_depth(scene)
+        self.scene = scene
+        self._keep_scene(scene)
+        return {"revision": scene.revision}
+
+    def _log_notices(self) -> None:
+        for notice in self._renderer.notices[self._logged_notices :]:
+            log.info(notice)
+        self._logged_notices = len(self._renderer.notices)
+
+    def _count_fault(self, kind: str, fault: Exception) -> None:
+        self.counts[kind] += 1
+        sentence = str(fault) if isinstance(fault, DeltalightError) else f"{type(fault).__name__}: {fault}"
+        if sentence != self._last_fault:  # a fault of every frame is one line, not thirty a second
+            log.warning(kind, fault=sentence)
+            log.debug("traceback", exc_info=fault)
+        self._last_fault = sentence
+
+
+def _rows(matrix: Float64[np.ndarray, "4 4"] | None) -> Any:  # noqa: ANN401 - pydantic makes tuples of four of it
+    return None if matrix is None else matrix.tolist()
+
+
+def _needs_depth(scene: SceneDocument) -> bool:
+    return scene.real.geometry in ("depth", "fused")
+
+
+def _with_view(scene: SceneDocument, view: object) -> SceneDocument:
+    document = scene.model_dump(mode="json")
+    document["output"]["view"] = view
+    return parse_scene({**document, "revision": scene.revision + 1})
