@@ -246,8 +246,8 @@ class RenderSession:
             drops=self.drops(),
         )
 
-    def carry_out(self, request: ControlRequest) -> dict[str, object]:
-        """Carry out a command between two frames; gives the payload of the reply.
+    def execute(self, request: ControlRequest) -> dict[str, object]:
+        """Execute a command between two frames and return the payload of the reply.
 
         Raises:
             DeltalightError: an unknown command, or one that is refused.

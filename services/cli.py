@@ -28,8 +28,8 @@ from services.commands.replay import replay
 from services.commands.schema import schema
 from services.commands.server import server
 from services.commands.up import up
-from services.lifeline import end_with_supervisor
 from services.logs import configure_logging
+from services.parent_death_signal import end_with_supervisor
 from services.signals import Terminated, raise_on_sigterm
 
 DEBUG_FLAG = "--debug"

@@ -12,7 +12,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from services.api.events import EventHub
 from services.api.live_hub import LiveHub
 from services.api.problems import Problems
-from services.api.process_watch import ProcessWatch
+from services.api.streams import ProcessWatch
 
 MEDIA_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 # From a read out of the cache to a mesh that takes the time limit of its check.
@@ -21,7 +21,7 @@ NO_OPERATION = "none"  # refused before a route was found
 
 
 class Reachable(Protocol):
-    """What says whether the render server answers."""
+    """Tells whether the render server answers."""
 
     @property
     def is_reachable(self) -> bool:

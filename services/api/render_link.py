@@ -3,7 +3,7 @@
 import threading
 import time
 import uuid
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -15,9 +15,8 @@ from protocol.errors import DeltalightError
 from protocol.keys import Keys
 from protocol.messages import ControlRequest
 from protocol.transport import RequestClient
+from services.api.delivery import SILENT, Change, Deliveries, DeliveryStatus, pending
 from services.api.live_hub import ShownScene
-from services.api.outcomes import SILENT, Change, Outcomes, Picture, pending
-from services.api.turns import Turns
 from services.storage.scenes import StoredScene
 from services.storage.store import Store
 
@@ -28,6 +27,37 @@ MAX_COMMANDS = 8  # at once: each holds one of the 40 threads that answer reques
 REMEMBERED_REVISIONS = 1024  # half a minute of a gesture's changes; pictures are a few frames behind
 
 log = structlog.get_logger()
+
+
+class FifoLock:
+    """FIFO lock: threads acquire it in their order of arrival.
+
+    `threading.Lock` may be acquired again by the thread that has just released it, ahead of those that wait.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._is_held = False
+        self._waiting: deque[threading.Lock] = deque()
+
+    def __enter__(self) -> None:
+        """Wait until all who came before have released the lock."""
+        with self._lock:
+            if not self._is_held:
+                self._is_held = True
+                return
+            turn = threading.Lock()
+            turn.acquire()
+            self._waiting.append(turn)
+        turn.acquire()
+
+    def __exit__(self, *_fault: object) -> None:
+        """Hand over to the thread that has waited longest."""
+        with self._lock:
+            if self._waiting:
+                self._waiting.popleft().release()
+            else:
+                self._is_held = False
 
 
 class RenderLink:
@@ -44,15 +74,15 @@ class RenderLink:
         control: str,
         keys: Keys | None = None,
         *,
-        on_picture: Callable[[Picture], None] = lambda _picture: None,
+        on_delivery: Callable[[DeliveryStatus], None] = lambda _status: None,
     ) -> None:
         self._store = store
-        self._on_picture = on_picture
+        self._on_delivery = on_delivery
         self._client = RequestClient(control, keys=keys)
-        self._turns = Turns()  # to ask the server; what is below is changed in one's turn
+        self._asking = FifoLock()  # to ask the server; what is below changes while it is held
         self._commands = threading.BoundedSemaphore(MAX_COMMANDS)
         self._changed = threading.Event()
-        self._outcomes = Outcomes()
+        self._deliveries = Deliveries()
         self._look_due_s = 0.0
         self._answers: bool | None = None  # not asked yet
         self._server_revision: int | None = None
@@ -82,21 +112,21 @@ class RenderLink:
         return self._answers is True
 
     @property
-    def picture(self) -> Picture | None:
-        """What the last sending came to."""
-        return self._outcomes.newest
+    def delivery(self) -> DeliveryStatus | None:
+        """The status of the last change that was sent."""
+        return self._deliveries.newest
 
-    def show(self, scene: StoredScene) -> Picture:
+    def show(self, scene: StoredScene) -> DeliveryStatus:
         """Have a revision of the active scene sent, which is stored; what became of it, as far as soon known.
 
         While a server that did not answer is being looked for, this does not wait for it.
         """
         change = _change(scene)
-        outcome = self._outcomes.expect(change)
+        outcome = self._deliveries.expect(change)
         self._changed.set()
         if self._answers is False:
             return pending(change, SILENT)
-        return self._outcomes.wait(change, outcome)
+        return self._deliveries.wait(change, outcome)
 
     def shown(self, server_revision: int | None) -> ShownScene | None:
         """Which scene a picture shows, made with a revision of the server's; None where that came from elsewhere."""
@@ -117,7 +147,7 @@ class RenderLink:
                 f"The render server is busy with {MAX_COMMANDS} other commands; try again soon."
             )
         try:
-            return self._carry_out(op, payload, timeout_s)
+            return self._execute(op, payload, timeout_s)
         finally:
             self._commands.release()
 
@@ -133,10 +163,10 @@ class RenderLink:
         self._source = None if endpoints is None else list(endpoints)
         self.on_source(self._source)
         self._refuse_where_silent()
-        self._carry_out("set_source", {"endpoints": self._source}, COMMAND_TIMEOUT_S)
+        self._execute("set_source", {"endpoints": self._source}, COMMAND_TIMEOUT_S)
 
-    def _carry_out(self, op: str, payload: dict[str, object] | None, timeout_s: float) -> dict[str, object]:
-        with self._turns:
+    def _execute(self, op: str, payload: dict[str, object] | None, timeout_s: float) -> dict[str, object]:
+        with self._asking:
             if self._changed.is_set():
                 self._send_newest()
             self._refuse_where_silent()  # the first look may just have found nobody
@@ -156,24 +186,24 @@ class RenderLink:
             self._refuse_where_silent()
 
     def _send_newest(self) -> None:
-        """Send the newest revision of the active scene unless the server has it (in one's turn)."""
+        """Send the newest revision of the active scene unless the server has it (while asking)."""
         self._changed.clear()
-        awaited = self._outcomes.awaited
+        awaited = self._deliveries.awaited
         active = self._store.scenes.active()
         if active is None:
             return
-        change, before = _change(active), self._outcomes.newest
+        change, before = _change(active), self._deliveries.newest
         if before is not None and before.change == change and before.state != "pending":
-            picture = before
+            status = before
         elif self._answers is False:
-            picture = pending(change, SILENT)
+            status = pending(change, SILENT)
         else:
-            picture = self._send(active)
-        self._outcomes.note(picture, awaited)
-        if picture != before:
-            self._on_picture(picture)
+            status = self._send(active)
+        self._deliveries.note(status, awaited)
+        if status != before:
+            self._on_delivery(status)
 
-    def _send(self, active: StoredScene) -> Picture:
+    def _send(self, active: StoredScene) -> DeliveryStatus:
         revision = active.document.revision
         try:
             self._ask(CLOCK_OP, ALIVE_TIMEOUT_S)
@@ -183,8 +213,8 @@ class RenderLink:
             return pending(_change(active), SILENT)
         except DeltalightError as refusal:
             detail = self._store.assets.without_paths(str(refusal))
-            return Picture("refused", active.head.id, revision, detail)
-        return Picture("shown", active.head.id, revision)
+            return DeliveryStatus("refused", active.head.id, revision, detail)
+        return DeliveryStatus("shown", active.head.id, revision)
 
     def _set_scene(self, active: StoredScene) -> None:
         scene = self._store.assets.localised(active.document).model_dump(mode="json")
@@ -223,7 +253,7 @@ class RenderLink:
         """Send what is changed; look at once, and whenever the server was not heard of for a second."""
         while not self._stop.is_set():
             try:
-                with self._turns:
+                with self._asking:
                     self._look_where_due()
                     self._send_newest()
             except (DeltalightError, OSError) as fault:
@@ -253,7 +283,7 @@ class RenderLink:
             self._note_reachable(False)
             return
         if is_new:
-            self._outcomes.forget()
+            self._deliveries.forget()
             self._sent.clear()
         self._server_revision = seen
 

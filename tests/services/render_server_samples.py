@@ -28,7 +28,7 @@ class Recorder:
         self.gate = threading.Event()
         self.gate.set()
         self.is_busy = threading.Event()
-        self._server = ReplyServer(ports.endpoint(control_port), self._carry_out)
+        self._server = ReplyServer(ports.endpoint(control_port), self._execute)
 
     def close(self) -> None:
         self.gate.set()
@@ -37,7 +37,7 @@ class Recorder:
     def payloads(self, op: str) -> list[dict[str, object]]:
         return [payload for asked, payload in self.asked if asked == op]
 
-    def _carry_out(self, request: ControlRequest) -> dict[str, object]:
+    def _execute(self, request: ControlRequest) -> dict[str, object]:
         self.asked.append((request.op, dict(request.payload)))
         match request.op:
             case "ping":

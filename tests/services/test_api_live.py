@@ -17,11 +17,10 @@ from websockets.sync.client import ClientConnection
 from protocol.errors import DeltalightError
 from protocol.messages import ControlRequest
 from services import ports
-from services.api.live import WINDOW
+from services.api.credentials import OPEN_TICKETS, TICKET_LIFE_S, Principal, Tickets
+from services.api.limits import STREAMS_PER_CLIENT
 from services.api.live_hub import LiveHub
-from services.api.passes import Pass
-from services.api.places import PLACES_PER_CLIENT
-from services.api.tickets import OPEN_TICKETS, TICKET_LIFE_S, TicketBox
+from services.api.routes.live import WINDOW
 from tests.services.api_samples import sentence
 from tests.services.conftest import HEIGHT, ROOT, WIDTH
 from tests.services.live_samples import (
@@ -189,14 +188,14 @@ def test_a_pick_is_the_render_servers_answer(live: LiveApi, monkeypatch: pytest.
     seen |= {"normal": [0, 0, 1], "distance_m": 0.9}
     asked: list[dict[str, object]] = []
 
-    def carry_out(request: ControlRequest) -> dict[str, object]:
+    def execute(request: ControlRequest) -> dict[str, object]:
         assert request.op == "pick"
         asked.append(dict(request.payload))
         if request.payload["x"] == 1.0:
             raise DeltalightError("No frame was rendered yet.")
         return seen
 
-    monkeypatch.setattr(live.server.session, "carry_out", carry_out)
+    monkeypatch.setattr(live.server.session, "execute", execute)
     assert live.client.post("/live/pick", json={"x": 3, "y": 4.5}).json() == seen
     live.client.post("/live/pick", json={"x": 3, "y": 4, "ignore": "knot"}).raise_for_status()
     assert asked == [{"x": 3.0, "y": 4.5}, {"x": 3.0, "y": 4.0, "ignore": "knot"}]
@@ -272,21 +271,21 @@ def test_both_roles_look_and_a_token_works_where_headers_can_be_sent(guarded: Li
 
 def test_tickets_end_and_the_oldest_are_forgotten() -> None:
     now_s = 0.0
-    box = TicketBox(lambda: now_s)
-    rights = Pass("view", "id", "wall")
-    late, early = box.give(rights), box.give(rights)
+    tickets = Tickets(lambda: now_s)
+    principal = Principal("view", "id", "wall")
+    late, early = tickets.issue(principal), tickets.issue(principal)
     now_s = TICKET_LIFE_S - 1
-    assert box.take(early) == rights
+    assert tickets.redeem(early) == principal
     now_s = TICKET_LIFE_S + 1
-    assert box.take(late) is None
-    oldest = box.give(rights)
+    assert tickets.redeem(late) is None
+    oldest = tickets.issue(principal)
     for _ in range(OPEN_TICKETS):
-        box.give(rights)
-    assert box.take(oldest) is None
+        tickets.issue(principal)
+    assert tickets.redeem(oldest) is None
 
 
 def test_a_revoked_token_ends_what_it_opened(guarded: LiveApi, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("services.api.places.CHECK_INTERVAL_S", 0.1)
+    monkeypatch.setattr("services.api.limits.CHECK_INTERVAL_S", 0.1)
     headers = bearer(guarded, "guest", "view")
     with live_socket(guarded.address, additional_headers=headers) as socket:
         read_frame(socket)
@@ -297,7 +296,7 @@ def test_a_revoked_token_ends_what_it_opened(guarded: LiveApi, monkeypatch: pyte
 
 def test_a_client_has_only_so_many_places(live: LiveApi) -> None:
     with ExitStack() as stack:
-        for _ in range(PLACES_PER_CLIENT):
+        for _ in range(STREAMS_PER_CLIENT):
             stack.enter_context(event_socket(live.address))
         with pytest.raises(websockets.InvalidStatus) as refused:
             event_socket(live.address)

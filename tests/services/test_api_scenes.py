@@ -345,7 +345,7 @@ def test_a_change_reaches_the_render_server_before_its_answer(api: RunningApi) -
     again = RenderServer(api.control_port)  # as started, knows nothing
     wait_for(lambda: again.session.scene.name == "while it was away")
     wait_for(lambda: client.get(address).json()["picture"]["state"] == "shown")
-    again.session.carry_out(_view_request())  # somebody else changes the scene at the server too
+    again.session.execute(_view_request())  # somebody else changes the scene at the server too
     assert client.patch(address, json={"name": "last"}).json()["picture"]["state"] == "shown"
     assert again.session.scene.name == "last"
     again.close()

@@ -168,7 +168,7 @@ def test_the_revision_is_that_of_the_frames_start(
         if rendered is not None:
             revisions.append((rendered.message.frame_id, rendered.message.scene_revision))
         if number == 1:  # frame 1 waits for the GPU
-            assert session.carry_out(request("set_view", view="delta")) == {"revision": 4}
+            assert session.execute(request("set_view", view="delta")) == {"revision": 4}
     last = session.step()
     assert last is not None
     revisions.append((last.message.frame_id, last.message.scene_revision))
@@ -211,41 +211,41 @@ def test_set_scene_is_idempotent_by_revision(
 ) -> None:
     document = SceneDocument(name="second").model_dump(mode="json")
     for _ in range(2):
-        assert session.carry_out(request("set_scene", 4, scene=document)) == {"revision": 4}
+        assert session.execute(request("set_scene", 4, scene=document)) == {"revision": 4}
     assert [scene.name for scene in renderer.scenes] == ["second"]
     assert [scene.revision for scene in kept] == [4]
     with pytest.raises(DeltalightError, match="already at revision 4"):
-        session.carry_out(request("set_scene", 3, scene=document))
+        session.execute(request("set_scene", 3, scene=document))
     with pytest.raises(DeltalightError, match="already at revision 4"):
-        session.carry_out(request("set_scene", 4, scene={**document, "name": "third"}))
+        session.execute(request("set_scene", 4, scene={**document, "name": "third"}))
 
 
 def test_wrong_or_refused_scene_changes_nothing(session: RenderSession, kept: list[SceneDocument]) -> None:
     with pytest.raises(DeltalightError, match="nearest known key is `lights`"):
-        session.carry_out(request("set_scene", 4, scene={"light": {}}))
+        session.execute(request("set_scene", 4, scene={"light": {}}))
     with pytest.raises(DeltalightError, match="cannot be shown"):
-        session.carry_out(request("set_scene", 4, scene={"name": "refused"}))
+        session.execute(request("set_scene", 4, scene={"name": "refused"}))
     assert session.scene.name == "first"
     assert kept == []
 
 
 def test_set_view_and_get_scene(session: RenderSession) -> None:
-    assert session.carry_out(request("set_view", view="delta")) == {"revision": 4}
-    scene = session.carry_out(request("get_scene"))["scene"]
+    assert session.execute(request("set_view", view="delta")) == {"revision": 4}
+    scene = session.execute(request("get_scene"))["scene"]
     assert isinstance(scene, dict)
     assert scene["output"]["view"] == "delta"
     with pytest.raises(DeltalightError, match="view"):
-        session.carry_out(request("set_view", view="upside-down"))
+        session.execute(request("set_view", view="upside-down"))
 
 
 def test_other_commands(session: RenderSession) -> None:
-    assert session.carry_out(request("ping")) == {"revision": 3}
-    stats = session.carry_out(request("stats"))["stats"]
+    assert session.execute(request("ping")) == {"revision": 3}
+    stats = session.execute(request("stats"))["stats"]
     assert isinstance(stats, dict)
     assert stats["detail"] == "abacus"
     with pytest.raises(DeltalightError, match="did you mean shutdown"):
-        session.carry_out(request("shutdwn"))
-    session.carry_out(request("shutdown"))
+        session.execute(request("shutdwn"))
+    session.execute(request("shutdown"))
     assert session.stopping
 
 
@@ -274,17 +274,17 @@ def test_on_a_gpu_a_frame_is_read_back_after_the_next_was_started(
 
 def test_pick_asks_the_renderer(session: RenderSession, renderer: InvertingRenderer) -> None:
     with pytest.raises(DeltalightError, match="Nothing was rendered yet"):
-        session.carry_out(request("pick", x=3, y=4))
+        session.execute(request("pick", x=3, y=4))
     feed(session, 5)
     session.step()
-    picked = session.carry_out(request("pick", x=3, y=4.5))
+    picked = session.execute(request("pick", x=3, y=4.5))
     assert picked == {"frame_id": 5, "kind": "nothing", "pixel": [3.0, 4.5]}
     assert renderer.ignored is None
-    session.carry_out(request("pick", x=3, y=4.5, ignore="knot"))
+    session.execute(request("pick", x=3, y=4.5, ignore="knot"))
     assert renderer.ignored == "knot"
     for wrong in ({"x": 3}, {"x": 3, "y": "4"}, {"x": True, "y": 1}, {"x": 1, "y": 2, "z": 3}):
         with pytest.raises(DeltalightError, match="the command pick"):
-            session.carry_out(request("pick", **wrong))
+            session.execute(request("pick", **wrong))
 
 
 def test_a_snapshot_loses_no_frame_and_no_scene(
@@ -297,10 +297,10 @@ def test_a_snapshot_loses_no_frame_and_no_scene(
         "exr": True,
     }
     with pytest.raises(DeltalightError, match="No frame has come yet"):
-        session.carry_out(request("snapshot", **order))
+        session.execute(request("snapshot", **order))
     feed(session, 7)
     assert session.step() is None  # it waits for the GPU
-    taken = session.carry_out(request("snapshot", **order))
+    taken = session.execute(request("snapshot", **order))
     assert taken == {
         "frame_id": 7,
         "capture_ns": START + 7,
@@ -328,7 +328,7 @@ def test_a_refused_snapshot_is_one_sentence(session: RenderSession, tmp_path: Pa
         ({"folder": str(tmp_path), "pictures": [{"name": "../a"}]}, "name"),
     ):
         with pytest.raises(DeltalightError, match=words):
-            session.carry_out(request("snapshot", **wrong))
+            session.execute(request("snapshot", **wrong))
 
 
 def test_another_source_begins_with_nothing_of_the_one_before(renderer: InvertingRenderer) -> None:
@@ -347,10 +347,10 @@ def test_another_source_begins_with_nothing_of_the_one_before(renderer: Invertin
     session.step()  # waits for the GPU
     session.receive(color(2, START + 2, START))  # waits for its pose and depth
     with pytest.raises(DeltalightError, match="bad is not an endpoint"):
-        session.carry_out(request("set_source", endpoints=["bad"]))
+        session.execute(request("set_source", endpoints=["bad"]))
     assert renderer.sources_begun == 0
     counted = dict(session.drops())
-    answer = session.carry_out(request("set_source", endpoints=None))
+    answer = session.execute(request("set_source", endpoints=None))
     assert (answer, used, renderer.sources_begun) == ({"endpoints": ["tcp://configured"]}, [None], 1)
     assert session.drops() == counted
     session.receive(depth(2, START + 2))
@@ -358,11 +358,11 @@ def test_another_source_begins_with_nothing_of_the_one_before(renderer: Invertin
     assert session.step() is None
     assert renderer.unfinished == []
     with pytest.raises(DeltalightError, match="Nothing was rendered"):
-        session.carry_out(request("pick", x=1, y=1))
+        session.execute(request("pick", x=1, y=1))
     for wrong in ({}, {"endpoints": []}, {"endpoints": "tcp://127.0.0.1:1"}, {"endpoints": ["a"] * 17}):
         with pytest.raises(DeltalightError, match="the command set_source"):
-            session.carry_out(request("set_source", **wrong))
+            session.execute(request("set_source", **wrong))
     for _ in range(2):  # the same again changes nothing
-        assert session.carry_out(request("set_source", endpoints=["x"]))
+        assert session.execute(request("set_source", endpoints=["x"]))
     assert used == [None, ("x",), ("x",)]
     assert renderer.sources_begun == 2

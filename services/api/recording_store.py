@@ -1,4 +1,4 @@
-"""The recordings in the data folder: what each holds, its poster, mending and removing."""
+"""The recordings in the data folder: their contents, posters, recovery and deletion."""
 
 import json
 import os
@@ -25,16 +25,16 @@ from services.storage.faults import ConflictError, NotFoundError
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")  # no dots: nothing that ends like a suffix
 POSTER_EDGE = 640
 POSTER_QUALITY = 85
-LEFT_OVER_AFTER_S = 3600.0  # mending writes all the time: what is older, a killed process left
+LEFT_OVER_AFTER_S = 3600.0  # recovery writes all the time: an older file was left by a killed process
 
 Facts = dict[str, Any]
 
 
 @dataclass(frozen=True)
-class Take:
-    """A recording on the disk; `facts` are of `recording_info`; None where it cannot be read, as `detail` says.
+class StoredRecording:
+    """A recording on the disk; `facts` are those of `recording_info`, None if it cannot be read, as `detail` says.
 
-    `finished` was ended; `interrupted` was not, because its recorder was killed, and can be mended.
+    An `interrupted` recording was never ended, because its recorder was killed; it can be recovered.
     """
 
     id: str
@@ -46,8 +46,8 @@ class Take:
     detail: str
 
 
-class TakeShelf:
-    """Recordings under their names, `FOLDER/NAME.mcap`; what was found in them is kept in `FOLDER/.cache`.
+class RecordingStore:
+    """Recordings by name, `FOLDER/NAME.mcap`; what was read from them is cached in `FOLDER/.cache`.
 
     Raises:
         DeltalightError: the folder cannot be written.
@@ -61,27 +61,27 @@ class TakeShelf:
             if path.stat().st_mtime < time.time() - LEFT_OVER_AFTER_S:
                 path.unlink(missing_ok=True)
 
-    def all(self, growing: Collection[str] = ()) -> list[Take]:
-        """Return all recordings except those that grow, which would be read whole each time; the newest first."""
-        takes = []
+    def all(self, growing: Collection[str] = ()) -> list[StoredRecording]:
+        """Return all recordings, the newest first, except growing ones, which would be read whole each time."""
+        found = []
         for name in {path.name.split(".")[0] for path in self._paths()}.difference(growing):
             with suppress(NotFoundError):  # deleted meanwhile
-                takes.append(self.get(name))
-        return sorted(takes, key=lambda take: (-take.changed_ns, take.id))
+                found.append(self.get(name))
+        return sorted(found, key=lambda each: (-each.changed_ns, each.id))
 
-    def get(self, name: str) -> Take:
+    def get(self, name: str) -> StoredRecording:
         """Return one recording.
 
         Raises:
             NotFoundError: there is none of this name.
         """
-        return self._take(self._path(name))
+        return self._described(self._path(name))
 
     def new_path(self, name: str) -> Path:
-        """Where a recording of this name is to grow.
+        """Return the path for a new recording of this name.
 
         Raises:
-            DeltalightError: it is no name for a recording.
+            DeltalightError: it is not a valid name.
             ConflictError: it is taken.
         """
         if not NAME.fullmatch(name):
@@ -94,25 +94,25 @@ class TakeShelf:
         return path
 
     def poster(self, name: str) -> Path:
-        """Return the JPEG file of a recording's first colour picture; it is made when it is first asked for.
+        """Return the JPEG file of a recording's first colour picture, made on first request.
 
         Raises:
             NotFoundError: there is no such recording.
             DeltalightError: it cannot be read.
         """
         path = self._path(name)
-        place = self._cache / f"{name}.jpg"
+        cached = self._cache / f"{name}.jpg"
         with self._reading, _naming(path):
-            if not place.is_file() or place.stat().st_mtime_ns < _status(path).st_mtime_ns:
-                write_bytes(place, _first_picture(path))
-        return place
+            if not cached.is_file() or cached.stat().st_mtime_ns < _status(path).st_mtime_ns:
+                write_bytes(cached, _first_picture(path))
+        return cached
 
-    def recover(self, name: str) -> Take:
-        """Mend an interrupted recording; it takes the place of what was left.
+    def recover(self, name: str) -> StoredRecording:
+        """Recover an interrupted recording; the result replaces what was left of it.
 
         Raises:
             NotFoundError: there is no such recording.
-            ConflictError: it is whole.
+            ConflictError: it is complete.
             DeltalightError: nothing in it can be read, or the disk refuses.
         """
         path = self._path(name)
@@ -122,7 +122,7 @@ class TakeShelf:
         with self._reading, _naming(path):
             recover_recording(path, out, lambda numbers: numbers)
             path.unlink()
-        return self._take(out)
+        return self._described(out)
 
     def remove(self, name: str) -> None:
         """Delete a recording.
@@ -131,8 +131,9 @@ class TakeShelf:
             NotFoundError: there is none of this name.
         """
         path = self._path(name)
-        torn = path.with_name(name + SUFFIX + ACTIVE_SUFFIX)  # also beside one that was just mended from it
-        for each in (path, torn, self._cache / f"{name}.jpg", self._cache / f"{name}.json"):
+        # An unfinished file may also lie beside the one that was just recovered from it.
+        unfinished = path.with_name(name + SUFFIX + ACTIVE_SUFFIX)
+        for each in (path, unfinished, self._cache / f"{name}.jpg", self._cache / f"{name}.json"):
             each.unlink(missing_ok=True)
 
     def _paths(self) -> Iterator[Path]:
@@ -149,21 +150,21 @@ class TakeShelf:
                 return path
         raise _absent(name)
 
-    def _take(self, path: Path) -> Take:
+    def _described(self, path: Path) -> StoredRecording:
         status, name = _status(path), path.name.split(".")[0]
         facts, detail = self._facts(path, [status.st_size, status.st_mtime_ns])
         state: Literal["finished", "interrupted"] = "finished" if path.suffix == SUFFIX else "interrupted"
-        return Take(name, path, state, status.st_size, status.st_mtime_ns, facts, detail)
+        return StoredRecording(name, path, state, status.st_size, status.st_mtime_ns, facts, detail)
 
     def _facts(self, path: Path, key: list[int]) -> tuple[Facts | None, str]:
-        """What a recording holds, or why it cannot be read; kept, because it takes reading the whole file."""
-        place = self._cache / f"{path.name.split('.')[0]}.json"
-        known = _kept_facts(place, key)
+        """Return what a recording holds, or why it cannot be read; cached, because the whole file is read."""
+        cached = self._cache / f"{path.name.split('.')[0]}.json"
+        known = _cached_facts(cached, key)
         if known is not None:
             return known
         with self._reading:
-            facts, detail = _described(path)
-            write_bytes(place, json.dumps({"key": key, "facts": facts, "detail": detail}).encode())
+            facts, detail = _read_facts(path)
+            write_bytes(cached, json.dumps({"key": key, "facts": facts, "detail": detail}).encode())
             return facts, detail
 
 
@@ -172,22 +173,22 @@ def _absent(name: str) -> NotFoundError:
 
 
 def _status(path: Path) -> os.stat_result:
-    """Size and time of a recording, which somebody may delete, or finish, after it was found."""
+    """Return size and time of a recording, which may be deleted or finished after it was found."""
     try:
         return path.stat()
     except FileNotFoundError as fault:
         raise _absent(path.name.split(".")[0]) from fault
 
 
-def _kept_facts(place: Path, key: list[int]) -> tuple[Facts | None, str] | None:
+def _cached_facts(path: Path, key: list[int]) -> tuple[Facts | None, str] | None:
     try:
-        kept = json.loads(place.read_text())
-        return (kept["facts"], kept["detail"]) if kept["key"] == key else None
+        cached = json.loads(path.read_text())
+        return (cached["facts"], cached["detail"]) if cached["key"] == key else None
     except (OSError, ValueError, KeyError, TypeError):
         return None  # there is none yet, or one that a full disk cut short
 
 
-def _described(path: Path) -> tuple[Facts | None, str]:
+def _read_facts(path: Path) -> tuple[Facts | None, str]:
     try:
         with _naming(path):
             return describe_recording(path), ""
@@ -199,7 +200,7 @@ def _described(path: Path) -> tuple[Facts | None, str]:
 
 @contextmanager
 def _naming(path: Path) -> Iterator[None]:
-    """Tell faults of a recording by its name: clients know no paths."""
+    """Name recordings instead of paths in errors: clients know no paths."""
     try:
         yield
     except NotFoundError:

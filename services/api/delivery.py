@@ -1,4 +1,4 @@
-"""What became of changes of the active scene at the render server, for those who wait to hear it."""
+"""Whether the render server has taken a change of the active scene, for the requests that wait to hear it."""
 
 import threading
 from collections.abc import Collection
@@ -25,7 +25,7 @@ class Change:
 
 
 @dataclass(frozen=True)
-class Picture:
+class DeliveryStatus:
     """What became of a revision.
 
     `shown` = from the next frame on, `pending` = the server has not taken it yet, `refused` = it cannot render it
@@ -39,32 +39,32 @@ class Picture:
 
     @property
     def change(self) -> Change:
-        """Whose outcome this is."""
+        """The change that this is the status of."""
         return Change(self.scene_id, self.revision)
 
 
-class Outcomes:
-    """Tells each change what became of it: the newest one when it was sent, older ones at once (any thread)."""
+class Deliveries:
+    """Resolves the delivery of each change: the newest one when it was sent, older ones at once (any thread)."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._newest: Picture | None = None
-        self._awaited: dict[Change, Future[Picture]] = {}
-        self._places = threading.BoundedSemaphore(WAITERS)
+        self._newest: DeliveryStatus | None = None
+        self._awaited: dict[Change, Future[DeliveryStatus]] = {}
+        self._waiters = threading.BoundedSemaphore(WAITERS)
 
     @property
-    def newest(self) -> Picture | None:
-        """What the last sending came to."""
+    def newest(self) -> DeliveryStatus | None:
+        """The status of the last change that was sent."""
         return self._newest
 
     @property
     def awaited(self) -> Collection[Change]:
-        """Changes that nobody knows the outcome of yet."""
+        """Changes whose status is not known yet."""
         with self._lock:
             return tuple(self._awaited)
 
-    def expect(self, change: Change) -> Future[Picture]:
-        """What will have become of a change that is stored; older ones of its scene hear that they are superseded."""
+    def expect(self, change: Change) -> Future[DeliveryStatus]:
+        """Return the future status of a stored change; older changes of its scene are superseded."""
         with self._lock:
             of_scene = [each for each in self._awaited if each.scene_id == change.scene_id]
             newer = max((each.revision for each in of_scene), default=0)
@@ -77,50 +77,50 @@ class Outcomes:
                     self._awaited.pop(older).set_result(_superseded(older))
             return self._awaited.setdefault(change, Future())
 
-    def wait(self, change: Change, outcome: Future[Picture]) -> Picture:
-        """The outcome of a change; `pending` where it is not known soon, or too many wait already."""
+    def wait(self, change: Change, outcome: Future[DeliveryStatus]) -> DeliveryStatus:
+        """Return the status of a change; `pending` if it is not known soon, or too many wait already."""
         if outcome.done():
             return outcome.result()
-        if not self._places.acquire(blocking=False):
+        if not self._waiters.acquire(blocking=False):
             return pending(change, BUSY)
         try:
             return outcome.result(WAIT_S)
         except FutureTimeoutError:
             return pending(change, BUSY)
         finally:
-            self._places.release()
+            self._waiters.release()
 
-    def note(self, picture: Picture, awaited: Collection[Change]) -> None:
-        """Tell what a sending came to; `awaited` were stored before it was looked what is the newest."""
+    def note(self, status: DeliveryStatus, awaited: Collection[Change]) -> None:
+        """Resolve the change that was sent; `awaited` were stored before the newest was read, and are superseded."""
         with self._lock:
-            self._newest = picture
-            self._tell(picture.change, picture)
+            self._newest = status
+            self._resolve(status.change, status)
             for change in awaited:
-                self._tell(change, _superseded(change))
+                self._resolve(change, _superseded(change))
 
     def forget(self) -> None:
-        """The server has lost what it was sent, and is to get it again."""
+        """Note that the server lost what it was sent; it is to be sent again."""
         with self._lock:
             if self._newest is not None:
                 self._newest = pending(self._newest.change, BUSY)
 
-    def _tell(self, change: Change, picture: Picture) -> None:
+    def _resolve(self, change: Change, status: DeliveryStatus) -> None:
         outcome = self._awaited.pop(change, None)
         if outcome is not None:
-            outcome.set_result(picture)
+            outcome.set_result(status)
 
 
-def pending(change: Change, detail: str) -> Picture:
-    """The server has not taken this change."""
-    return Picture("pending", change.scene_id, change.revision, detail)
+def pending(change: Change, detail: str) -> DeliveryStatus:
+    """Return the status of a change that the server has not taken."""
+    return DeliveryStatus("pending", change.scene_id, change.revision, detail)
 
 
-def _superseded(change: Change) -> Picture:
+def _superseded(change: Change) -> DeliveryStatus:
     detail = "A newer change was made before the render server had taken this one, and is shown in its place."
-    return Picture("superseded", change.scene_id, change.revision, detail)
+    return DeliveryStatus("superseded", change.scene_id, change.revision, detail)
 
 
-def _known(picture: Picture) -> Future[Picture]:
-    outcome: Future[Picture] = Future()
-    outcome.set_result(picture)
+def _known(status: DeliveryStatus) -> Future[DeliveryStatus]:
+    outcome: Future[DeliveryStatus] = Future()
+    outcome.set_result(status)
     return outcome

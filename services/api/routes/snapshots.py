@@ -9,14 +9,15 @@ from pydantic import Field, StrictBool, model_validator
 from protocol.documents import StrictModel
 from protocol.messages import Name
 from protocol.scene_method import Method, Output
-from services.api.assets import UNCHANGING
-from services.api.bodies import AS_SENT, checked
 from services.api.context import Context, Shared
-from services.api.kept_files import KeptFile
+from services.api.file_response import StoredFileResponse
 from services.api.problems import ProblemError, responses
-from services.api.snapshot_shelf import ID, SnapshotFacts, SnapshotPicture, files_of, now
+from services.api.request_bodies import AS_SENT, checked
+from services.api.routes.assets import UNCHANGING
+from services.api.snapshot_store import ID, SnapshotFacts, SnapshotPicture, files_of, now
 
 router = APIRouter(tags=["snapshots"], prefix="/snapshots")
+ROUTERS = (router,)
 VIEWS: tuple[str, ...] = ("camera", *get_args(Output.model_fields["view"].annotation))
 MAX_PICTURES = 16
 EXR = "composite.exr"
@@ -99,16 +100,18 @@ def get_snapshot(shared: Shared, snapshot_id: SnapshotId) -> SnapshotFacts:
     return shared.snapshots.get(snapshot_id)
 
 
-@router.get("/{snapshot_id}/{file}", response_class=KeptFile, responses=responses(404) | FILE_ANSWER)
+@router.get(
+    "/{snapshot_id}/{file}", response_class=StoredFileResponse, responses=responses(404) | FILE_ANSWER
+)
 def snapshot_file(
     shared: Shared,
     snapshot_id: SnapshotId,
     file: Annotated[str, Path(max_length=80, description="One of its files.", examples=["composite.png"])],
-) -> KeptFile:
+) -> StoredFileResponse:
     """Return a picture of a snapshot."""
     path = shared.snapshots.file(snapshot_id, file)
     media_type = "image/x-exr" if path.suffix == ".exr" else "image/png"
-    return KeptFile(path, media_type=media_type, headers=UNCHANGING)
+    return StoredFileResponse(path, media_type=media_type, headers=UNCHANGING)
 
 
 @router.delete("/{snapshot_id}", status_code=204, responses=responses(404))
@@ -134,7 +137,7 @@ def _taken(shared: Context, name: str, folder: FilePath, wanted: NewSnapshot) ->
         capture_ns=answer["capture_ns"],
         scene_id=None if active is None else active.head.id,
         scene_revision=None if active is None else active.document.revision,
-        recording=shared.playback.recording,
+        recording=shared.replay.recording,
         pictures=[_described(picture, files, faults) for picture in wanted.pictures],
         files=files,
     )

@@ -1,4 +1,4 @@
-"""A supervised child ends with its supervisor, even when that one was killed."""
+"""Ends a supervised child with its supervisor, even a killed one, by the kernel's parent-death signal."""
 
 import ctypes
 import os

@@ -21,14 +21,14 @@ def playback_control(camera: PlaybackCamera, endpoint: str, keys: Keys | None) -
     Raises:
         DeltalightError: the endpoint cannot be used.
     """
-    server = ReplyServer(endpoint, lambda request: _carry_out(camera, request), node="replay", keys=keys)
+    server = ReplyServer(endpoint, lambda request: _execute(camera, request), node="replay", keys=keys)
     try:
         yield
     finally:
         server.close()
 
 
-def _carry_out(camera: PlaybackCamera, request: ControlRequest) -> dict[str, object]:
+def _execute(camera: PlaybackCamera, request: ControlRequest) -> dict[str, object]:
     """Every op answers with the position after it."""
     match request.op:
         case "position":

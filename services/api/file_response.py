@@ -1,4 +1,4 @@
-"""Answers that are a file of the data folder, which somebody else may delete at any moment."""
+"""A response that sends a file of the data folder, which may be deleted at any moment."""
 
 from fastapi.responses import FileResponse
 from starlette.datastructures import Headers
@@ -8,11 +8,11 @@ from services.api.problems import ProblemError
 from services.storage.faults import NotFoundError
 
 
-class KeptFile(FileResponse):
-    """A file, or the range of it that is asked for; what keeps it from being sent is a problem as elsewhere."""
+class StoredFileResponse(FileResponse):
+    """A file, or the requested range of it; errors become problem details."""
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Send it.
+        """Send the file.
 
         Raises:
             NotFoundError: it was deleted meanwhile.
@@ -21,7 +21,7 @@ class KeptFile(FileResponse):
         head: Message | None = None
 
         async def after_reading(message: Message) -> None:
-            """Keep the head back until something was read: the file is opened after it is sent."""
+            """Hold the head back until the file was read: it is opened only after the head is sent."""
             nonlocal head
             if message["type"] == "http.response.start":
                 if message["status"] >= 400:
@@ -35,7 +35,7 @@ class KeptFile(FileResponse):
 
         try:
             await super().__call__(scope, receive, after_reading)
-        except (RuntimeError, FileNotFoundError) as fault:  # the former is the framework's word for it
+        except (RuntimeError, FileNotFoundError) as fault:  # the framework raises the former
             raise NotFoundError("the file was deleted meanwhile; list what there is.") from fault
 
 

@@ -1,4 +1,4 @@
-"""The snapshots in the data folder: pictures of one frame, with what is known of it."""
+"""The snapshots in the data folder: pictures of one frame and their description."""
 
 import os
 import re
@@ -21,7 +21,7 @@ from services.storage.faults import NotFoundError, StorageFaultError
 FACTS = "snapshot.json"
 ID = re.compile(r"\d{8}-\d{6}-[0-9a-f]{6}")
 FILE = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,70}\.(png|exr)")
-LEFT_OVER_AFTER_S = 3600.0  # no snapshot takes an hour: what is older, a killed process left
+LEFT_OVER_AFTER_S = 3600.0  # no snapshot takes an hour: an older folder was left by a killed process
 
 
 class SnapshotPicture(StrictModel):
@@ -48,8 +48,8 @@ class SnapshotFacts(StrictModel):
     files: list[str]
 
 
-class SnapshotShelf:
-    """Snapshots, each `FOLDER/ID/` with its pictures and snapshot.json; one that is not complete is hidden.
+class SnapshotStore:
+    """Snapshots, each a folder `FOLDER/ID/` with its pictures and snapshot.json; incomplete ones are hidden.
 
     Raises:
         DeltalightError: the folder cannot be written.
@@ -79,7 +79,7 @@ class SnapshotShelf:
         return facts
 
     def file(self, name: str, file: str) -> Path:
-        """Where a file of a snapshot lies.
+        """Return the path of a snapshot's file.
 
         Raises:
             NotFoundError: there is no such snapshot, or no such file in it.
@@ -103,7 +103,7 @@ class SnapshotShelf:
         shutil.rmtree(hidden, ignore_errors=True)
 
     def add(self, take: Callable[[str, Path], SnapshotFacts]) -> SnapshotFacts:
-        """Make a snapshot: `take(name, folder)` writes the pictures; it is listed when it is whole on the disk.
+        """Add a snapshot: `take(name, folder)` writes the pictures; it is listed once it is synced to the disk.
 
         Raises:
             StorageFaultError: the disk refuses.
@@ -129,7 +129,7 @@ class SnapshotShelf:
 
 
 def files_of(answer: dict[str, Any], folder: Path) -> tuple[list[str], dict[str, str]]:
-    """The files that a render server says it wrote, as far as they are there, and its faults by picture."""
+    """Return the files that a render server reports and that exist, and its errors by picture."""
     written = [str(each) for each in answer.get("files", []) if FILE.fullmatch(str(each))]
     faults = {str(name): str(fault) for name, fault in answer.get("errors", {}).items()}
     return [each for each in written if (folder / each).is_file()], faults
@@ -140,7 +140,7 @@ def _absent(name: str) -> NotFoundError:
 
 
 def now() -> datetime:
-    """The time of a snapshot."""
+    """Return the time that a snapshot taken now carries."""
     return datetime.now(UTC)
 
 

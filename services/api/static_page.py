@@ -1,4 +1,4 @@
-"""The dashboard: the files that were built of it, served at `/`."""
+"""Serves the built dashboard at `/`."""
 
 from html import escape
 from pathlib import Path
@@ -46,8 +46,8 @@ into <code>{escape("services/dashboard/dist")}</code> first. An installed packag
 """
 
 
-class Page:
-    """Serves what no route is for; `otherwise` gets addresses of the API that do not exist."""
+class StaticPage:
+    """Serves all addresses without a route; `otherwise` answers unknown addresses of the API."""
 
     def __init__(self, otherwise: ASGIApp, folder: Path | None = None) -> None:
         folder = folder or DASHBOARD

@@ -1,4 +1,7 @@
-"""What every request passes before the application: host, origin, rate, token, role, size of the body."""
+"""Middleware that checks every request before the application sees it.
+
+It checks host, origin, rate, token, role and the size of the body.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,22 +12,19 @@ from starlette.datastructures import Headers, QueryParams
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from protocol.errors import DeltalightError
-from services.api.passes import Pass, give_pass, pass_of
-from services.api.places import StreamPlaces, run_while
+from services.api.credentials import Principal, SecretToken, Tickets, principal_of, set_principal
+from services.api.limits import RateLimit, StreamLimits, run_while
 from services.api.problems import ProblemError, Problems
-from services.api.rate import RateLimit
-from services.api.secret_token import SecretToken
-from services.api.tickets import TicketBox
 from services.ports import LOOPBACK
 from services.storage.tokens import TokenStore
 
 BODY_LIMIT_BYTES = 2 << 20  # three times a document with the most objects that one may have
 UPLOAD_PATH = "/api/v1/assets"
-PROTECTED = "/api/"  # all else is the page's files and the API's description, which anybody may have
-OPEN_PATHS = frozenset({"/api/v1/health"})  # it tells nothing that needs a token
+PROTECTED = "/api/"  # the page's files and the API's description are public
+OPEN_PATHS = frozenset({"/api/v1/health"})  # it reveals nothing that needs a token
 STREAM_PATHS = frozenset({"/api/v1/live.mjpg"})  # these answers do not end by themselves; no WebSocket does
-# They change nothing, though they are posted.
-LOOKING_PATHS = frozenset({"/api/v1/tickets", "/api/v1/live/pick"})
+# POST requests that change nothing.
+READ_ONLY_PATHS = frozenset({"/api/v1/tickets", "/api/v1/live/pick"})
 WRONG_TOKENS_PER_S, WRONG_TOKENS_AT_ONCE = 1 / 6, 10
 LOOPBACK_NAMES = frozenset({LOOPBACK, "localhost", "::1"})
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
@@ -32,28 +32,28 @@ POLICY_VIOLATION = 1008  # WebSocket close code
 
 
 @dataclass(frozen=True)
-class GateRules:
-    """`needs_token` = other hosts can connect; without it the Host header must be loopback's."""
+class AuthRules:
+    """What the middleware requires; without `needs_token` the Host header must be that of loopback."""
 
     needs_token: bool
     requests_per_s: float
     upload_limit_bytes: int
 
 
-class Gate:
-    """Middleware that lets through what may pass.
+class AuthMiddleware:
+    """Authenticates and authorises requests, and answers those that it refuses.
 
-    There are no cookies, so a browser sends no rights by itself; that a page of another site may reach a service on
-    loopback which needs no token is stopped by Origin and Host.
+    There are no cookies, so a browser never sends credentials by itself. Checking Origin and Host keeps pages of
+    other sites from reaching a service on loopback that needs no token.
     """
 
     def __init__(
         self,
         app: ASGIApp,
         *,
-        rules: GateRules,
+        rules: AuthRules,
         tokens: TokenStore,
-        tickets: TicketBox,
+        tickets: Tickets,
         problems: Problems,
         secret: SecretToken | None = None,
     ) -> None:
@@ -65,7 +65,7 @@ class Gate:
         self._problems = problems
         self._rate = RateLimit(rules.requests_per_s, 2 * rules.requests_per_s)
         self._wrong_tokens = RateLimit(WRONG_TOKENS_PER_S, WRONG_TOKENS_AT_ONCE)
-        self._places = StreamPlaces()
+        self._streams = StreamLimits()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on, or answer it here."""
@@ -77,7 +77,7 @@ class Gate:
             if scope["type"] == "websocket" or scope["path"] in STREAM_PATHS:
                 await self._stream(scope, receive, send)
                 return
-            limit = _Limit(self._body_limit(scope), receive)
+            limit = _BodyLimit(self._body_limit(scope), receive)
             limit.check_announced(Headers(scope=scope))
         except ProblemError as refusal:
             await self._problems.of_http(refusal)(scope, receive, send)
@@ -91,21 +91,21 @@ class Gate:
         headers = Headers(scope=scope)
         self._check_names(headers)
         self._check_rate(scope)
-        rights = await self._rights(scope, headers)
-        if rights.role == "view" and not _only_looks(scope):
-            raise _may_only_look(rights)
-        give_pass(scope, rights)
+        principal = await self._authenticate(scope, headers)
+        if principal.role == "view" and not _is_read_only(scope):
+            raise _read_only_role(principal)
+        set_principal(scope, principal)
 
     async def _stream(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass on a connection that stays open: it takes a place, and ends when its token is revoked."""
-        token_id = pass_of(scope).token_id
+        """Pass on a connection that stays open; it counts as a stream, and ends when its token is revoked."""
+        token_id = principal_of(scope).token_id
 
         async def is_allowed() -> bool:
             return token_id is None or await run_in_threadpool(self._tokens.knows, token_id)
 
-        with self._places.taken(_client(scope)):
-            came_to_its_end = await run_while(self._app(scope, receive, send), is_allowed)
-        if not came_to_its_end and scope["type"] == "websocket":
+        with self._streams.slot(_client(scope)):
+            ended_by_itself = await run_while(self._app(scope, receive, send), is_allowed)
+        if not ended_by_itself and scope["type"] == "websocket":
             await send({"type": "websocket.close", "code": POLICY_VIOLATION, "reason": "token revoked"})
 
     def _check_names(self, headers: Headers) -> None:
@@ -129,39 +129,39 @@ class Gate:
             raise _too_many(wait_s, "rate", "Too many requests; send fewer a second.")
         self._rate.take(client)
 
-    async def _rights(self, scope: Scope, headers: Headers) -> Pass:
-        """A token or ticket that is sent must be right, even where none is needed."""
+    async def _authenticate(self, scope: Scope, headers: Headers) -> Principal:
+        """A token or ticket that is sent must be valid, even where none is needed."""
         scheme, _, token = headers.get("authorization", "").partition(" ")
         ticket = QueryParams(scope["query_string"]).get("ticket")
         if not scheme and (ticket is None or not _takes_tickets(scope)):
             if self._rules.needs_token and _is_protected(scope):
                 raise _unknown_token(False)
-            return Pass("control")
+            return Principal("control")
         client = _client(scope)
         wait_s = self._wrong_tokens.wait_s(client)
         if wait_s > 0:
             raise _too_many(wait_s, "wrong-tokens", "Too many wrong tokens came from this address; wait.")
-        rights = await self._verified(scheme, token) if scheme else self._tickets.take(ticket or "")
-        if rights is None:
+        principal = await self._verified(scheme, token) if scheme else self._tickets.redeem(ticket or "")
+        if principal is None:
             self._wrong_tokens.take(client)
             raise _unknown_token(True)
-        return rights
+        return principal
 
-    async def _verified(self, scheme: str, given: str) -> Pass | None:
+    async def _verified(self, scheme: str, given: str) -> Principal | None:
         if scheme.lower() != "bearer":
             return None
-        rights = None if self._secret is None else self._secret.verify(given.strip())
-        if rights is not None:
-            return rights
+        principal = None if self._secret is None else self._secret.verify(given.strip())
+        if principal is not None:
+            return principal
         token = await run_in_threadpool(self._tokens.verify, given.strip())
-        return None if token is None else Pass(token.role, token.id, token.name)
+        return None if token is None else Principal(token.role, token.id, token.name)
 
     def _body_limit(self, scope: Scope) -> int:
         is_upload = scope["path"] == UPLOAD_PATH and scope["method"] == "POST"
         return self._rules.upload_limit_bytes if is_upload else BODY_LIMIT_BYTES
 
 
-class _Limit:
+class _BodyLimit:
     """Counts the bytes of a body as they arrive."""
 
     def __init__(self, limit_bytes: int, receive: Receive) -> None:
@@ -190,8 +190,8 @@ def _takes_tickets(scope: Scope) -> bool:
     return scope["type"] == "websocket" or scope["method"] in SAFE_METHODS
 
 
-def _only_looks(scope: Scope) -> bool:
-    return _takes_tickets(scope) or scope["path"] in LOOKING_PATHS
+def _is_read_only(scope: Scope) -> bool:
+    return _takes_tickets(scope) or scope["path"] in READ_ONLY_PATHS
 
 
 def _is_protected(scope: Scope) -> bool:
@@ -206,9 +206,11 @@ def _is_embedded(headers: Headers) -> bool:
     )
 
 
-def _may_only_look(rights: Pass) -> ProblemError:
+def _read_only_role(principal: Principal) -> ProblemError:
     return ProblemError(
-        403, "role", f"The token `{rights.name}` may only look; use one of role control to change something."
+        403,
+        "role",
+        f"The token `{principal.name}` may only look; use one of role control to change something.",
     )
 
 

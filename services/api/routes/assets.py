@@ -7,12 +7,13 @@ from fastapi.concurrency import run_in_threadpool
 
 from protocol.scene import DIGEST_PREFIX
 from services.api.context import Shared
-from services.api.kept_files import KeptFile
+from services.api.file_response import StoredFileResponse
 from services.api.models import AssetAnswer
 from services.api.problems import ProblemError, responses
 from services.storage.asset_kinds import FORMATS
 
 router = APIRouter(tags=["assets"], prefix="/assets")
+ROUTERS = (router,)
 Digest = Annotated[
     str, Path(description="`sha256:<hex>` or the digits alone.", examples=["sha256:2c26b46b68ffc68f..."])
 ]
@@ -76,19 +77,21 @@ def get_asset(shared: Shared, digest: Digest) -> AssetAnswer:
     return AssetAnswer.of(shared.store.assets.get(digest.removeprefix(DIGEST_PREFIX)))
 
 
-@router.get("/{digest}/content", response_class=KeptFile, responses=responses(404, 416))
-def download_asset(shared: Shared, digest: Digest) -> KeptFile:
+@router.get("/{digest}/content", response_class=StoredFileResponse, responses=responses(404, 416))
+def download_asset(shared: Shared, digest: Digest) -> StoredFileResponse:
     """Download the file."""
     asset = shared.store.assets.get(digest.removeprefix(DIGEST_PREFIX))
     path = shared.store.assets.path(asset)
-    return KeptFile(path, media_type=asset.format.media_type, filename=asset.names[0], headers=UNCHANGING)
+    return StoredFileResponse(
+        path, media_type=asset.format.media_type, filename=asset.names[0], headers=UNCHANGING
+    )
 
 
-@router.get("/{digest}/thumbnail.png", response_class=KeptFile, responses=responses(404, 422) | PNG)
-def thumbnail(shared: Shared, digest: Digest) -> KeptFile:
+@router.get("/{digest}/thumbnail.png", response_class=StoredFileResponse, responses=responses(404, 422) | PNG)
+def thumbnail(shared: Shared, digest: Digest) -> StoredFileResponse:
     """Return a picture of a mesh or map, 256 x 256 pixels on a transparent ground."""
     path = shared.store.assets.thumbnail(digest.removeprefix(DIGEST_PREFIX))
-    return KeptFile(path, media_type="image/png", headers=UNCHANGING)
+    return StoredFileResponse(path, media_type="image/png", headers=UNCHANGING)
 
 
 @router.delete("/{digest}", status_code=204, responses=responses(404, 409))

@@ -1,4 +1,4 @@
-"""A command of this command line as a child of the service: it ends with the service, however that ends."""
+"""A `deltalight` command as a child process that ends with the service, however that ends."""
 
 import os
 import signal
@@ -9,17 +9,17 @@ from collections import deque
 from collections.abc import Callable
 
 from protocol.errors import DeltalightError
-from services.lifeline import SUPERVISOR_VARIABLE
+from services.parent_death_signal import SUPERVISOR_VARIABLE
 
 KEPT_LINES = 20
 START_TIMEOUT_S = 10.0
 
 
-class OwnedChild:
-    """Runs `deltalight ARGUMENTS` in a thread of its own.
+class ChildProcess:
+    """Runs `deltalight ARGUMENTS`, started and watched by its own thread.
 
-    The kernel ends a child of a killed parent when the thread dies that started it, so that this thread lives as long
-    as the child. `on_line` is told each line that it prints, `on_end` its exit code, both by that thread.
+    The kernel sends the parent-death signal when the *thread* that started the child ends, so that thread lives as
+    long as the child. It calls `on_line` with each line of output and `on_end` with the exit code.
 
     Raises:
         DeltalightError: the process cannot be started.
@@ -28,8 +28,8 @@ class OwnedChild:
     def __init__(
         self,
         *arguments: str,
-        on_end: "Callable[[OwnedChild, int], None]",
-        on_line: "Callable[[OwnedChild, str], None]" = lambda _child, _line: None,
+        on_end: "Callable[[ChildProcess, int], None]",
+        on_line: "Callable[[ChildProcess, str], None]" = lambda _child, _line: None,
     ) -> None:
         self._command = [sys.executable, "-m", "services.cli", "--log-level", "warning", *arguments]
         self._on_line, self._on_end = on_line, on_end
@@ -50,17 +50,17 @@ class OwnedChild:
 
     @property
     def last_sentence(self) -> str:
-        """What it wrote last to its standard error, without the command's name; empty where it wrote nothing."""
+        """The last line of its standard error without the command's name; empty if there is none."""
         line = next((line for line in reversed(self._errors) if line.strip()), "")
         return line.removeprefix("deltalight: ")
 
     def interrupt(self) -> None:
-        """Ask it to finish, as Ctrl-C does."""
+        """Interrupt it, as Ctrl-C does."""
         if self._process is not None and self.is_running:
             self._process.send_signal(signal.SIGINT)
 
     def end(self, timeout_s: float) -> None:
-        """Tell it to end, wait for its end and for what `on_end` does; kill it where it takes longer."""
+        """Terminate it and wait for its end and for `on_end`; kill it if that takes longer."""
         if self._process is None:
             return
         self._process.terminate()
@@ -69,7 +69,7 @@ class OwnedChild:
             self.wait(timeout_s)
 
     def wait(self, timeout_s: float) -> bool:
-        """Wait for its end and for what `on_end` does; whether it came in time."""
+        """Wait for its end and for `on_end`; return whether it ended in time."""
         if threading.current_thread() is not self._thread:
             self._thread.join(timeout_s)
         return not self._thread.is_alive()
