@@ -10,9 +10,9 @@ from typing import Annotated
 
 import typer
 
+from benchmarks.cli import bench
 from protocol.errors import DeltalightError
 from services.commands.api import api
-from services.commands.bench import bench
 from services.commands.board import board
 from services.commands.calibrate import calibrate
 from services.commands.config import config

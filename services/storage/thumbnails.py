@@ -1,4 +1,4 @@
-"""Small pictures of meshes and environment maps, drawn on the processor (in the limited child process)."""
+"""Small pictures of meshes and environment maps, drawn on the processor (in the worker)."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from protocol.radiance_files import read_linear
 from render_server.scene.asset_check import check_mesh_file
 from render_server.scene.environment import LUMINANCE
 from render_server.scene.mesh import TriangleMesh, load_mesh
-from services.storage.asset_child import Facts
+from services.storage.asset_kinds import Facts
 
 SIZE = 256
 SAMPLES = 2  # rays along each edge of a pixel

@@ -1,27 +1,16 @@
-"""Loading an untrusted file once, in a limited child process, before anything else may load it."""
+"""What is known of a mesh or a map once it is loaded (in the worker)."""
 
 from pathlib import Path
 
 from protocol.errors import DeltalightError
-from services.storage.asset_child import MEMORY_LIMIT_BYTES, Facts, run_limited
-from services.storage.asset_kinds import AssetKind
-
-
-def probe(path: Path, kind: AssetKind, name: str, *, memory_bytes: int = MEMORY_LIMIT_BYTES) -> Facts:
-    """Load a file in a child process and return what is known of it then.
-
-    A mesh has `triangles`, `vertices`, `minimum` and `maximum` (in the file's own units and axes, at rest), and the
-    `clips` (`name`, `duration_s`) that it can play; a map has `width` and `height` in pixels. `name` stands for the
-    file in sentences.
-
-    Raises:
-        RejectedAssetError: it cannot be loaded, or not within the limits.
-    """
-    return run_limited(kind, path, name, memory_bytes=memory_bytes)
+from services.storage.asset_kinds import Facts
 
 
 def mesh_facts(path: Path) -> Facts:
-    """Load a mesh (in the child).
+    """Load a mesh and return its facts.
+
+    They are `triangles`, `vertices`, `minimum` and `maximum` (in the file's own units and axes, at rest), and the
+    `clips` (`name`, `duration_s`) that it can play.
 
     Raises:
         DeltalightError: what is wrong with it.
@@ -47,7 +36,7 @@ def mesh_facts(path: Path) -> Facts:
 
 
 def map_facts(path: Path) -> Facts:
-    """Load an environment map (in the child).
+    """Load an environment map and return its `width` and `height` in pixels.
 
     Raises:
         DeltalightError: what is wrong with it.

@@ -1,4 +1,4 @@
-"""`deltalight bench`: measurements; they depend on the machine and are no tests."""
+"""`deltalight bench`: measurements of this machine, not tests. The only module here that `services` imports."""
 
 import json
 from pathlib import Path
@@ -9,8 +9,8 @@ import typer
 from protocol.errors import DeltalightError
 from services.commands.options import Method
 
+# What `bench quality` compares.
 DEFAULT_METHODS = "camera,none,paper,exact,path"
-"""What `bench quality` compares."""
 
 bench = typer.Typer(
     no_args_is_help=True, help="Measure speed on this machine, and agreement with ground truth."
