@@ -9,6 +9,7 @@ from typing import Any
 
 from fastapi import FastAPI
 from fastapi.concurrency import run_in_threadpool
+from pydantic.json_schema import models_json_schema
 from starlette.middleware import Middleware
 
 from protocol.keys import Keys
@@ -32,6 +33,7 @@ from services.api.settings import ApiSettings
 from services.api.snapshot_store import SnapshotStore
 from services.api.static_page import StaticPage
 from services.api.streams import ProcessWatch, Sink, Streams
+from services.live_message import LiveHeader
 from services.storage.store import Store
 
 PREFIX = "/api/v1"
@@ -73,16 +75,25 @@ TAGS = [
 
 
 class _App(FastAPI):
-    """FastAPI whose OpenAPI document states the media type of problems, and tokens."""
+    """FastAPI whose OpenAPI document also has the media type of problems, tokens, and the live header."""
 
     def openapi(self) -> dict[str, Any]:
         """Return the OpenAPI document."""
         if self.openapi_schema is None:
             schema = describe_problems(super().openapi())
+            schema["components"]["schemas"].update(_live_header_schemas())
             schema["components"]["securitySchemes"] = {"token": {"type": "http", "scheme": "bearer"}}
             schema["security"] = [{}, {"token": []}]
             self.openapi_schema = schema
         return self.openapi_schema
+
+
+def _live_header_schemas() -> dict[str, Any]:
+    """Return the schemas of a live picture's header, which no route of HTTP answers with."""
+    template = "#/components/schemas/{model}"
+    _, schema = models_json_schema([(LiveHeader, "serialization")], ref_template=template)
+    definitions: dict[str, Any] = schema["$defs"]
+    return definitions
 
 
 def create_app(settings: ApiSettings, store: Store, keys: Keys | None = None) -> FastAPI:

@@ -16,7 +16,7 @@ from protocol.keys import Keys
 from protocol.messages import ControlRequest
 from protocol.transport import RequestClient
 from services.api.delivery import SILENT, Change, Deliveries, DeliveryStatus, pending
-from services.api.live_hub import ShownScene
+from services.live_message import ShownScene
 from services.storage.scenes import StoredScene
 from services.storage.store import Store
 
@@ -218,7 +218,7 @@ class RenderLink:
 
     def _set_scene(self, active: StoredScene) -> None:
         scene = self._store.assets.localised(active.document).model_dump(mode="json")
-        shown = ShownScene(active.head.id, active.document.revision)
+        shown = ShownScene(id=active.head.id, revision=active.document.revision)
         sent = (self._seen_revision() if self._server_revision is None else self._server_revision) + 1
         try:
             self._set_revision(sent, scene, shown)

@@ -26,6 +26,7 @@ from tests.services.conftest import HEIGHT, ROOT, WIDTH
 from tests.services.live_samples import (
     LiveApi,
     StandInStream,
+    composite,
     event_socket,
     live_api,
     live_socket,
@@ -74,7 +75,16 @@ def test_a_frames_header_says_what_it_shows_and_where_time_went(live: LiveApi) -
     assert (header["camera"]["width"], header["camera"]["height"]) == (WIDTH, HEIGHT)
     assert header["world_from_camera"][3] == [0, 0, 0, 1]
     assert [light["type"] for light in header["lights"]] == ["sphere", "environment"]
+    description = httpx.get(f"http://{live.address}/openapi.json").json()
+    assert set(header) == set(description["components"]["schemas"]["LiveHeader"]["properties"])
     assert {"number", "frame_id", "capture_ns", "frames_per_s", "renderer"} <= set(header)
+
+
+def test_a_composite_without_a_camera_is_refused() -> None:
+    hub = LiveHub()
+    with pytest.raises(DeltalightError, match=r"`camera\.width`"):
+        hub.publish(composite(1).model_copy(update={"camera": {}}), b"", None, "")
+    assert hub.newest is None
 
 
 def test_a_frame_names_the_scene_and_revision_of_the_api(live: LiveApi) -> None:
