@@ -59,7 +59,6 @@ class PictureHeader(BaseModel):
         *,
         number: int,
         frames_per_s: float | None,
-        scene: ShownScene | None,
         renderer: str,
     ) -> Self:
         """Describe a composite.
@@ -67,7 +66,13 @@ class PictureHeader(BaseModel):
         Raises:
             DeltalightError: its camera is none.
         """
-        own = {"number": number, "frames_per_s": frames_per_s, "scene": scene, "renderer": renderer}
+        scene = {"id": message.scene_id, "revision": message.scene_revision}
+        own = {
+            "number": number,
+            "frames_per_s": frames_per_s,
+            "scene": None if message.scene_id is None else scene,
+            "renderer": renderer,
+        }
         return validate(cls, {**dict(message), **own}, "the composite")
 
 

@@ -196,8 +196,7 @@ def _sinks(context: Context) -> dict[str, Sink]:
 
 def _publish_composite(context: Context, message: Message, parts: Sequence[memoryview]) -> None:
     if isinstance(message, CompositeMessage) and message.encoding == "jpeg":
-        scene = context.link.shown(message.scene_revision)
-        context.live.publish(message, bytes(parts[0]), scene, context.watch.detail(message.node))
+        context.live.publish(message, bytes(parts[0]), context.watch.detail(message.node))
 
 
 def _publish_report(context: Context, message: Message) -> None:

@@ -11,7 +11,7 @@ from typing import Literal
 
 from protocol.messages import CompositeMessage
 from services.frame_age import age_ms
-from services.live_message import PictureHeader, ShownScene, ViewerHeader, pack
+from services.live_message import PictureHeader, ViewerHeader, pack
 
 RATE_WINDOW_S = 3.0
 STALE_AFTER_S = 2.0
@@ -73,9 +73,7 @@ class LiveHub:
         """Wake viewers in this event loop from now on."""
         self._loop = loop
 
-    def publish(
-        self, message: CompositeMessage, jpeg: bytes, scene: ShownScene | None, renderer: str
-    ) -> None:
+    def publish(self, message: CompositeMessage, jpeg: bytes, renderer: str) -> None:
         """Make this composite the newest and wake all viewers that wait (any thread).
 
         Raises:
@@ -85,9 +83,7 @@ class LiveHub:
         with self._lock:
             self._arrivals_s.append(now_s)
             number = 1 if self._newest is None else self._newest.number + 1
-            header = PictureHeader.of(
-                message, number=number, frames_per_s=self._rate(), scene=scene, renderer=renderer
-            )
+            header = PictureHeader.of(message, number=number, frames_per_s=self._rate(), renderer=renderer)
             encoded = header.model_dump_json().encode()
             self._newest = LiveFrame(number, message, jpeg, now_s, time.time_ns(), encoded)
         self._wake_soon()

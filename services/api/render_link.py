@@ -3,9 +3,8 @@
 import threading
 import time
 import uuid
-from collections import OrderedDict, deque
+from collections import deque
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import structlog
 
@@ -16,7 +15,6 @@ from protocol.keys import Keys
 from protocol.messages import ControlRequest
 from protocol.transport import RequestClient
 from services.api.delivery import SILENT, Change, Deliveries, DeliveryStatus, pending
-from services.live_message import ShownScene
 from services.storage.scenes import StoredScene
 from services.storage.store import Store
 
@@ -24,7 +22,6 @@ LOOK_INTERVAL_S = 1.0
 ALIVE_TIMEOUT_S = 1.0  # the server's own thread answers this, whatever the renderer does
 COMMAND_TIMEOUT_S = 25.0  # the server gives up after 20 s itself
 MAX_COMMANDS = 8  # at once: each holds one of the 40 threads that answer requests
-REMEMBERED_REVISIONS = 1024  # half a minute of a gesture's changes; pictures are a few frames behind
 
 log = structlog.get_logger()
 
@@ -61,11 +58,10 @@ class FifoLock:
 
 
 class RenderLink:
-    """Sends the active scene to the render server, at once after a change and again after its restart.
+    """Sends the active scene to the render server, immediately after a change and again after its restart.
 
-    One thread sends, always the newest revision: changes that come faster than the server takes them are left out.
-    Commands have their turn between, each after the changes that were made before it. The server counts revisions
-    of its own, across scenes: each sending is its newest plus one.
+    One thread sends, always the newest revision: changes that come faster than the server takes them are skipped.
+    Commands run in between, each after the changes that were made before it.
     """
 
     def __init__(
@@ -85,15 +81,15 @@ class RenderLink:
         self._deliveries = Deliveries()
         self._look_due_s = 0.0
         self._answers: bool | None = None  # not asked yet
-        self._server_revision: int | None = None
+        self._instance: str | None = None  # of the server; another one has lost what was sent before
+        self._has_scene = False  # whether this instance took a scene from here
         self._source: list[str] | None = None
         self.on_source: Callable[[Sequence[str] | None], None] = lambda _endpoints: None
-        self._sent: OrderedDict[int, ShownScene] = OrderedDict()  # by the server's revision
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="render-link", daemon=True)
 
     def start(self) -> None:
-        """Begin to watch the server."""
+        """Start watching the server."""
         self._thread.start()
 
     def close(self) -> None:
@@ -117,9 +113,9 @@ class RenderLink:
         return self._deliveries.newest
 
     def show(self, scene: StoredScene) -> DeliveryStatus:
-        """Have a revision of the active scene sent, which is stored; what became of it, as far as soon known.
+        """Send a stored revision of the active scene, and return its status as far as it is known soon.
 
-        While a server that did not answer is being looked for, this does not wait for it.
+        Does not wait for a server that did not answer last.
         """
         change = _change(scene)
         outcome = self._deliveries.expect(change)
@@ -128,14 +124,10 @@ class RenderLink:
             return pending(change, SILENT)
         return self._deliveries.wait(change, outcome)
 
-    def shown(self, server_revision: int | None) -> ShownScene | None:
-        """Which scene a picture shows, made with a revision of the server's; None where that came from elsewhere."""
-        return None if server_revision is None else self._sent.get(server_revision)
-
     def command(
         self, op: str, payload: dict[str, object] | None = None, timeout_s: float = COMMAND_TIMEOUT_S
     ) -> dict[str, object]:
-        """Carry out a command at the render server, after those that wait; gives the payload of the reply.
+        """Execute a command at the render server, after those that wait, and return the payload of its reply.
 
         Raises:
             UnansweredError: it does not answer, or too many commands wait.
@@ -152,9 +144,9 @@ class RenderLink:
             self._commands.release()
 
     def use_source(self, endpoints: Sequence[str] | None) -> None:
-        """Let the server read frames from there, None = from its own nodes; a server that was restarted too.
+        """Make the server read frames from there, also after its restart; None = from its own nodes.
 
-        `on_source` hears of it.
+        Calls `on_source` with the endpoints.
 
         Raises:
             UnansweredError: it does not answer, and is told as soon as it does.
@@ -178,7 +170,7 @@ class RenderLink:
             raise UnansweredError("The render server does not answer; see that it runs, then try again.")
 
     def _require_alive(self) -> None:
-        """Find out within a second that a server has died; how long its commands take, only the renderer knows."""
+        """Detect a dead server within a second; how long its commands take, only the renderer knows."""
         try:
             self._ask(CLOCK_OP, ALIVE_TIMEOUT_S)
         except UnansweredError:
@@ -217,40 +209,22 @@ class RenderLink:
         return DeliveryStatus("shown", active.head.id, revision)
 
     def _set_scene(self, active: StoredScene) -> None:
+        """The first scene goes without a revision: what an earlier service has sent must not refuse it."""
+        if self._instance is None:
+            self._instance = self._server_instance()
         scene = self._store.assets.localised(active.document).model_dump(mode="json")
-        shown = ShownScene(id=active.head.id, revision=active.document.revision)
-        sent = (self._seen_revision() if self._server_revision is None else self._server_revision) + 1
-        try:
-            self._set_revision(sent, scene, shown)
-        except UnansweredError:
-            raise
-        except DeltalightError:
-            newest = self._seen_revision()
-            if newest < sent:  # refused for what it is, not because somebody else changed the scene meanwhile
-                raise
-            self._set_revision(newest + 1, scene, shown)
-
-    def _set_revision(self, number: int, scene: object, shown: ShownScene) -> None:
-        """Noted before the server answers: a picture of it may come earlier than the answer."""
-        self._sent[number] = shown
-        while len(self._sent) > REMEMBERED_REVISIONS:
-            self._sent.popitem(last=False)
-        try:
-            self._ask("set_scene", COMMAND_TIMEOUT_S, {"scene": scene}, revision=number)
-        except UnansweredError:
-            raise
-        except DeltalightError:
-            del self._sent[number]
-            raise
-        self._server_revision = number
+        revision = active.document.revision if self._has_scene else None
+        self._ask(
+            "set_scene", COMMAND_TIMEOUT_S, {"scene": scene}, scene_id=active.head.id, revision=revision
+        )
+        self._has_scene = True
         self._look_due_s = time.monotonic() + LOOK_INTERVAL_S
 
-    def _seen_revision(self) -> int:
-        revision: Any = self._ask("ping", COMMAND_TIMEOUT_S)["revision"]
-        return int(revision)
+    def _server_instance(self) -> str:
+        return str(self._ask("ping", COMMAND_TIMEOUT_S)["instance"])
 
     def _run(self) -> None:
-        """Send what is changed; look at once, and whenever the server was not heard of for a second."""
+        """Send changes; look at the server at first, and whenever it was not heard of for a second."""
         while not self._stop.is_set():
             try:
                 with self._asking:
@@ -269,14 +243,14 @@ class RenderLink:
             self._look_due_s = time.monotonic() + LOOK_INTERVAL_S
 
     def _look(self) -> None:
-        """A server that came (back) is to get source and scene."""
+        """Find out whether the server answers; one that came (back) gets source and scene."""
         answered_before = self._answers
         try:
             self._ask(CLOCK_OP, ALIVE_TIMEOUT_S)
             # It does, also while the renderer is busy, as with the shaders of its first picture.
             self._note_reachable(True)
-            seen = self._seen_revision()
-            is_new = self._server_revision is None or seen < self._server_revision  # it was started (again)
+            instance = self._server_instance()
+            is_new = instance != self._instance  # it was started (again)
             if is_new or not answered_before:
                 self._restore_source()
         except UnansweredError:
@@ -284,11 +258,10 @@ class RenderLink:
             return
         if is_new:
             self._deliveries.forget()
-            self._sent.clear()
-        self._server_revision = seen
+            self._instance, self._has_scene = instance, False
 
     def _restore_source(self) -> None:
-        """Tell a server that came (back) where to read from; one that is left from a killed service too."""
+        """Tell a server that came (back) where to read from; it may be left from a killed service."""
         try:
             self._ask("set_source", COMMAND_TIMEOUT_S, {"endpoints": self._source})
         except UnansweredError:
@@ -306,6 +279,8 @@ class RenderLink:
         op: str,
         timeout_s: float,
         payload: dict[str, object] | None = None,
+        *,
+        scene_id: str | None = None,
         revision: int | None = None,
     ) -> dict[str, object]:
         request = ControlRequest(
@@ -314,6 +289,7 @@ class RenderLink:
             id=uuid.uuid4().hex,
             op=op,
             payload=payload or {},
+            scene_id=scene_id,
             revision=revision,
         )
         try:

@@ -24,6 +24,7 @@ class Recorder:
     def __init__(self, control_port: int) -> None:
         self.asked: list[tuple[str, dict[str, object]]] = []
         self.fault: str | None = None
+        self.scene_id: str | None = None
         self.revision = 1
         self.gate = threading.Event()
         self.gate.set()
@@ -41,10 +42,10 @@ class Recorder:
         self.asked.append((request.op, dict(request.payload)))
         match request.op:
             case "ping":
-                return {"revision": self.revision}
+                return {"scene_id": self.scene_id, "revision": self.revision, "instance": "stand-in"}
             case "set_scene":
                 self._wait_at_gate()
-                self.revision = request.revision or self.revision + 1
+                self.scene_id, self.revision = request.scene_id, request.revision or self.revision + 1
             case "pick":
                 self._wait_at_gate()
                 return {"frame_id": 1, **NOWHERE}

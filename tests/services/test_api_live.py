@@ -63,7 +63,7 @@ def bearer(live: LiveApi, name: str, role: str) -> dict[str, str]:
 
 
 def test_a_frames_header_says_what_it_shows_and_where_time_went(live: LiveApi) -> None:
-    live.stream.revision = None
+    live.stream.scene = (None, 7)
     with live_socket(live.address) as socket:
         header = read_frame(socket)
     assert header["pass_times_ms"] == {"trace cones": 12.5, "compose": 1.0}
@@ -83,7 +83,7 @@ def test_a_frames_header_says_what_it_shows_and_where_time_went(live: LiveApi) -
 def test_a_composite_without_a_camera_is_refused() -> None:
     hub = LiveHub()
     with pytest.raises(DeltalightError, match=r"`camera\.width`"):
-        hub.publish(composite(1).model_copy(update={"camera": {}}), b"", None, "")
+        hub.publish(composite(1).model_copy(update={"camera": {}}), b"", "")
     assert hub.newest is None
 
 
@@ -91,14 +91,24 @@ def test_a_frame_names_the_scene_and_revision_of_the_api(live: LiveApi) -> None:
     client = live.client
     scene_id = client.post("/scenes", json={"name": "shown"}).json()["id"]
     assert client.post(f"/scenes/{scene_id}/activate").json()["picture"]["state"] == "shown"
-    live.stream.revision = live.server.session.scene.revision
+    live.stream.scene = shown(live)
     assert client.patch(f"/scenes/{scene_id}", json={"name": "renamed"}).json()["revision"] == 2
     with live_socket(live.address) as socket:
         assert next_scene(socket, None) == {"id": scene_id, "revision": 1}
-        live.stream.revision = live.server.session.scene.revision
+        live.stream.scene = shown(live)
         assert next_scene(socket, {"id": scene_id, "revision": 1}) == {"id": scene_id, "revision": 2}
-        live.stream.revision = 10**6  # somebody else's
+        live.server.session.execute(
+            ControlRequest(node="other", id="r1", op="set_view", payload={"view": "delta"})
+        )
+        live.stream.scene = shown(live)
+        assert live.stream.scene == (None, 3)
         assert next_scene(socket, {"id": scene_id, "revision": 2}) is None
+
+
+def shown(live: LiveApi) -> tuple[str | None, int]:
+    """What a picture of the render session would say that it shows."""
+    session = live.server.session
+    return session.scene_id, session.scene.revision
 
 
 def next_scene(socket: ClientConnection, before: object) -> object:

@@ -94,8 +94,10 @@ class InvertingRenderer:
         self.scenes.append(scene)
 
 
-def request(op: str, revision: int | None = None, **payload: object) -> ControlRequest:
-    return ControlRequest(node="test", id="r1", op=op, revision=revision, payload=payload)
+def request(
+    op: str, revision: int | None = None, scene_id: str | None = None, **payload: object
+) -> ControlRequest:
+    return ControlRequest(node="test", id="r1", op=op, scene_id=scene_id, revision=revision, payload=payload)
 
 
 @pytest.fixture
@@ -146,7 +148,7 @@ def test_composite_says_with_which_camera_pose_and_scene_it_was_made(session: Re
     feed(session, 5)
     rendered = session.step()
     assert rendered is not None
-    assert rendered.message.scene_revision == 3
+    assert (rendered.message.scene_id, rendered.message.scene_revision) == (None, 3)
     assert rendered.message.camera == camera().to_dict()
     assert rendered.message.world_from_camera == IDENTITY
     session.receive(color(6, START + 6, START))
@@ -220,6 +222,41 @@ def test_set_scene_is_idempotent_by_revision(
         session.execute(request("set_scene", 4, scene={**document, "name": "third"}))
 
 
+def test_revisions_of_one_scene_say_nothing_of_another(session: RenderSession) -> None:
+    document = SceneDocument(name="second", revision=9).model_dump(mode="json")
+    shown = []
+
+    def show(scene_id: str | None, revision: int | None) -> None:
+        session.execute(request("set_scene", revision, scene_id, scene=document))
+        feed(session, len(shown))
+        rendered = session.step()
+        assert rendered is not None
+        shown.append((rendered.message.scene_id, rendered.message.scene_revision))
+
+    sent = [("a", 7), ("a", 7), ("a", 8), ("b", 1), ("a", 7), (None, 1)]
+    for scene_id, revision in sent:
+        show(scene_id, revision)
+    assert shown == sent
+    show("a", 7)
+    for wrong in (request("set_scene", 6, "a", scene=document), request("set_scene", 7, "a", scene={})):
+        with pytest.raises(DeltalightError, match="already at revision 7"):
+            session.execute(wrong)
+    show("a", None)  # whatever came before, by the document's own revision
+    show(None, None)  # counts on
+    session.execute(request("set_view", view="delta"))
+    assert shown[-3:] == [("a", 7), ("a", 9), (None, 10)]
+    assert (session.scene_id, session.scene.revision) == (None, 11)
+
+
+def test_a_changed_view_is_not_the_scene_of_its_sender(session: RenderSession) -> None:
+    document = SceneDocument(name="second").model_dump(mode="json")
+    session.execute(request("set_scene", 7, "a", scene=document))
+    session.execute(request("set_view", view="delta"))
+    assert (session.scene_id, session.scene.revision) == (None, 8)
+    session.execute(request("set_scene", 8, "a", scene=document))
+    assert (session.scene_id, session.scene.output.view) == ("a", "composite")
+
+
 def test_wrong_or_refused_scene_changes_nothing(session: RenderSession, kept: list[SceneDocument]) -> None:
     with pytest.raises(DeltalightError, match="nearest known key is `lights`"):
         session.execute(request("set_scene", 4, scene={"light": {}}))
@@ -239,7 +276,11 @@ def test_set_view_and_get_scene(session: RenderSession) -> None:
 
 
 def test_other_commands(session: RenderSession) -> None:
-    assert session.execute(request("ping")) == {"revision": 3}
+    assert session.execute(request("ping")) == {
+        "scene_id": None,
+        "revision": 3,
+        "instance": session.instance,
+    }
     stats = session.execute(request("stats"))["stats"]
     assert isinstance(stats, dict)
     assert stats["detail"] == "abacus"
