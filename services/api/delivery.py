@@ -1,4 +1,4 @@
-"""Whether the render server has taken a change of the active scene, for the requests that wait to hear it."""
+"""Tracks whether the render server has taken a change of the active scene, for the requests that wait for it."""
 
 import threading
 from collections.abc import Collection

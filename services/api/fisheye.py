@@ -83,7 +83,7 @@ def _marked(
 
 
 def _pixels(message: RadianceMessage, directions: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 2"]:
-    """Pixels of the picture, which is smaller than the lens's, for directions in the world; NaN if not in it."""
+    """Project directions in the world to pixels of the (scaled-down) picture; NaN outside it."""
     lens = calibration_of(message.camera, None).lens
     height, width = message.picture_shape[:2]
     stretch = np.array([width / lens.width, height / lens.height])
@@ -92,7 +92,7 @@ def _pixels(message: RadianceMessage, directions: Float64[np.ndarray, "n 3"]) ->
 
 
 def _outline(seen: "SeenLight") -> Float64[np.ndarray, "n 3"]:
-    """Directions around a light, at its angular radius."""
+    """Return directions around a light, at its angular radius."""
     toward = seen.toward
     side = np.cross(toward, (0.0, 0.0, 1.0) if abs(toward[2]) < 0.9 else (1.0, 0.0, 0.0))
     side /= np.linalg.norm(side)
@@ -103,7 +103,7 @@ def _outline(seen: "SeenLight") -> Float64[np.ndarray, "n 3"]:
 
 
 def _light(described: Mapping[str, Any]) -> "Light":
-    """The light that a composite's message describes."""
+    """Return the light that a composite's message describes."""
     from render_server.scene.lights import DirectionalLight, RectangleLight, SphereLight, SpotLight
 
     def vector(key: str) -> np.ndarray:

@@ -25,7 +25,7 @@ class Reachable(Protocol):
 
     @property
     def is_reachable(self) -> bool:
-        """Whether it does."""
+        """Whether it answered when it was last asked."""
 
 
 class Metrics:
@@ -57,12 +57,12 @@ class Metrics:
         self._seconds.labels(operation).observe(seconds)
 
     def text(self) -> bytes:
-        """All measurements as Prometheus reads them."""
+        """Return all measurements in the text format of Prometheus."""
         return generate_latest(self._registry)
 
 
 class Meter:
-    """Middleware that measures every request, refused ones too."""
+    """Middleware that measures every request, including refused ones."""
 
     def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
         self._app = app
@@ -88,7 +88,7 @@ class Meter:
 
 
 class _Reported(Collector):
-    """What others count, read when Prometheus asks."""
+    """Collects what other parts of the service count."""
 
     def __init__(self, problems: Problems, watch: ProcessWatch, link: Reachable) -> None:
         self._problems = problems
@@ -96,7 +96,7 @@ class _Reported(Collector):
         self._link = link
 
     def collect(self) -> Iterable[Metric]:
-        """Give all families."""
+        """Return all metric families."""
         refused = CounterMetricFamily(
             "deltalight_api_refused", "Requests refused, by kind of problem.", labels=["kind"]
         )
@@ -127,14 +127,14 @@ class _Reported(Collector):
 
 
 class _Streams(Collector):
-    """How many look and listen, and what they were sent."""
+    """Collects the number of viewers and listeners, and what they were sent."""
 
     def __init__(self, live: LiveHub, events: EventHub) -> None:
         self._live = live
         self._events = events
 
     def collect(self) -> Iterable[Metric]:
-        """Give all families."""
+        """Return all metric families."""
         live = self._live
         yield _gauge("deltalight_live_viewers", "Viewers of the live video.", live.viewers)
         yield _counter("deltalight_live_frames_received", "Composites that came.", live.received)

@@ -104,7 +104,7 @@ class RenderLink:
 
     @property
     def is_reachable(self) -> bool:
-        """Whether the server answered when it was last asked; not before it was asked."""
+        """Whether the server answered when it was last asked; False before that."""
         return self._answers is True
 
     @property
@@ -178,7 +178,7 @@ class RenderLink:
             self._refuse_where_silent()
 
     def _send_newest(self) -> None:
-        """Send the newest revision of the active scene unless the server has it (while asking)."""
+        """Send the newest revision of the active scene unless the server has it (holding the lock)."""
         self._changed.clear()
         awaited = self._deliveries.awaited
         active = self._store.scenes.active()
@@ -209,7 +209,7 @@ class RenderLink:
         return DeliveryStatus("shown", active.head.id, revision)
 
     def _set_scene(self, active: StoredScene) -> None:
-        """The first scene goes without a revision: what an earlier service has sent must not refuse it."""
+        """Send the scene; the first without a revision, so that the server does not compare it with older ones."""
         if self._instance is None:
             self._instance = self._server_instance()
         scene = self._store.assets.localised(active.document).model_dump(mode="json")

@@ -1,4 +1,4 @@
-"""What nodes and render servers publish: subscribed to in a thread, their newest reports kept."""
+"""Subscribes to what nodes and render servers publish, and keeps their newest reports."""
 
 import threading
 import time
