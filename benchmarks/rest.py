@@ -19,7 +19,7 @@ from benchmarks.rest_load import Call, send_paced, watch
 from benchmarks.rest_usage import CLIENTS, WEB, Sample, Usage, next_picture, sample
 from protocol.errors import DeltalightError
 from services import ports
-from services.api.page import DASHBOARD
+from services.api.static_page import DASHBOARD
 from services.demo import demo_plan, demo_scene
 from services.host import HostPlan
 from services.host_store import activate_document, session_file

@@ -12,7 +12,7 @@ from typing import Annotated, Final, Literal, Self, get_args
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints, model_validator
 
-SCHEMA_VERSION: Final = 3
+SCHEMA_VERSION: Final = 4
 MAX_HEADER_BYTES = 64 * 1024
 MAX_PART_BYTES = 64 * 1024 * 1024
 MAX_PAYLOAD_BYTES = 4 * 1024 * 1024
@@ -120,7 +120,7 @@ class MessageBase(BaseModel):
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
-    schema_version: Literal[3] = SCHEMA_VERSION
+    schema_version: Literal[4] = SCHEMA_VERSION
     node: Name
     stream: Stream
     frame_id: Count
@@ -288,8 +288,8 @@ class CompositeMessage(MessageBase):
     """The finished picture of the colour frame `frame_id` (sRGB, RGB order); one part.
 
     `capture_ns` and the clock fields are those of that frame; `received_ns` and `rendered_ns` are by the
-    server's clock. `scene_revision` is the server's, of the scene that the frame was begun with. `camera`
-    (`CameraModel.to_dict()` at the picture's size) and pose are those that it was made with.
+    server's clock. `scene_id` and `scene_revision` are those of the request that set the scene which the frame was
+    begun with. `camera` (`CameraModel.to_dict()` at the picture's size) and pose are those that it was made with.
     """
 
     stream: Literal["composite"] = "composite"
@@ -297,6 +297,7 @@ class CompositeMessage(MessageBase):
     shape: PictureShape
     dtype: Literal["uint8"] = "uint8"
     status: Literal["ok", "no_pose"]
+    scene_id: Name | None = None
     scene_revision: Count | None = None
     camera: PlainDict
     world_from_camera: RigidMatrix | None = None
@@ -309,6 +310,12 @@ class CompositeMessage(MessageBase):
     def part_rules(self) -> tuple[PartRule, ...]:
         """The picture."""
         return (PartRule("picture", self.shape, self.dtype, self.encoding == "jpeg"),)
+
+    @model_validator(mode="after")
+    def _scene_has_a_revision(self) -> Self:
+        if self.scene_id is not None and self.scene_revision is None:
+            raise ValueError("scene_revision must be given where scene_id is")
+        return self
 
 
 class StatsMessage(MessageBase):
@@ -345,11 +352,12 @@ class ControlMessage(MessageBase):
 class ControlRequest(ControlMessage):
     """A command: `op` with `payload`.
 
-    A repeated `id`, or a repeated `revision` of one op, is not carried out twice.
+    A repeated `id`, or a repeated `revision` of one op and scene, is not executed twice.
     """
 
     stream: Literal["request"] = "request"
     op: Name
+    scene_id: Name | None = None
     revision: Count | None = None
 
 

@@ -1,4 +1,4 @@
-"""Control by request and reply: a client that gives up in time, a server that carries nothing out twice."""
+"""Control by request and reply: a client that gives up in time, a server that executes nothing twice."""
 
 import threading
 import time
@@ -28,13 +28,14 @@ _log = structlog.get_logger(__name__)
 
 @dataclass(frozen=True)
 class _Applied:
+    scene_id: str | None
     revision: int
     payload: dict[str, object]
     reply: ControlReply
 
 
 class ReplyMemory:
-    """Makes control idempotent: by request id, and by revision for each op (SPEC.md, section 6)."""
+    """Makes control idempotent: by request id, and by revision of a scene for each op (SPEC.md, section 6)."""
 
     def __init__(self, size: int = REMEMBERED_REPLIES) -> None:
         self._size = size
@@ -43,7 +44,7 @@ class ReplyMemory:
         self._applied: dict[str, _Applied] = {}
 
     def find(self, request: ControlRequest) -> ControlReply | None:
-        """Reply of an earlier request that this one repeats.
+        """Return the reply to an earlier request that this one repeats.
 
         Raises:
             DeltalightError: its revision is older than the applied one, or is the same with other content.
@@ -51,7 +52,9 @@ class ReplyMemory:
         if request.id in self._by_id:
             return self._by_id[request.id][0]
         last = self._applied.get(request.op)
-        if last is None or request.revision is None or request.revision > last.revision:
+        if last is None or request.revision is None or request.scene_id != last.scene_id:
+            return None
+        if request.revision > last.revision:
             return None
         if request.revision < last.revision or request.payload != last.payload:
             raise DeltalightError(
@@ -66,8 +69,12 @@ class ReplyMemory:
         self._bytes += length
         while len(self._by_id) > self._size or self._bytes > REMEMBERED_BYTES:
             self._bytes -= self._by_id.popitem(last=False)[1][1]
-        if reply.ok and request.revision is not None:
-            self._applied[request.op] = _Applied(request.revision, request.payload, reply)
+        if not reply.ok:
+            return
+        self._applied.pop(request.op, None)
+        if request.revision is not None:
+            applied = _Applied(request.scene_id, request.revision, request.payload, reply)
+            self._applied[request.op] = applied
 
 
 LAST_REPLY_MS = 200  # what a closing server waits for its last reply to leave
@@ -174,7 +181,7 @@ class ReplyServer:
 class RequestClient:
     """Sends requests to one `ReplyServer`, one at a time; threads may share it.
 
-    A request that got no answer may be sent again as it is: its id keeps it from being carried out twice.
+    A request that got no answer may be sent again as it is: its id keeps it from being executed twice.
     `keys` are needed where the endpoint leaves the host.
     """
 

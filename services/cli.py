@@ -10,9 +10,9 @@ from typing import Annotated
 
 import typer
 
+from benchmarks.cli import bench
 from protocol.errors import DeltalightError
 from services.commands.api import api
-from services.commands.bench import bench
 from services.commands.board import board
 from services.commands.calibrate import calibrate
 from services.commands.config import config
@@ -28,8 +28,8 @@ from services.commands.replay import replay
 from services.commands.schema import schema
 from services.commands.server import server
 from services.commands.up import up
-from services.lifeline import end_with_supervisor
 from services.logs import configure_logging
+from services.parent_death_signal import end_with_supervisor
 from services.signals import Terminated, raise_on_sigterm
 
 DEBUG_FLAG = "--debug"

@@ -6,7 +6,6 @@ with Client("http://127.0.0.1:8000") as client:
 """
 
 import json
-import struct
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -22,6 +21,7 @@ from protocol.codecs import decode_color
 from protocol.errors import DeltalightError
 from protocol.files import replacing, write_bytes
 from protocol.scene import SceneDocument
+from services.live_message import LiveHeader, unpack
 
 if TYPE_CHECKING:
     from websockets.sync.client import ClientConnection
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 Json = dict[str, Any]
 Place = tuple[float, float, float]
 Rotation = tuple[float, float, float, float]
-_HEADER_LENGTH = struct.Struct("<I")
 
 
 class ApiError(DeltalightError):
@@ -63,27 +62,33 @@ class Asset:
 class LiveFrame:
     """A composite as it arrives; `header` holds the pass times, lights, camera and pose that it was made with."""
 
-    frame_id: int
-    age_ms: float
-    scene_id: str | None
-    scene_revision: int | None
-    header: Mapping[str, Any]
+    header: LiveHeader
     jpeg: bytes
 
-    @classmethod
-    def unpacked(cls, message: bytes) -> Self:
-        """Read a message of the live stream."""
-        (length,) = _HEADER_LENGTH.unpack_from(message)
-        start = _HEADER_LENGTH.size
-        header = json.loads(message[start : start + length])
-        scene = header["scene"] or {"id": None, "revision": None}
-        jpeg = message[start + length :]
-        return cls(header["frame_id"], header["age_ms"], scene["id"], scene["revision"], header, jpeg)
+    @property
+    def frame_id(self) -> int:
+        """The camera's frame."""
+        return self.header.frame_id
+
+    @property
+    def age_ms(self) -> float:
+        """Time from its capture to its sending."""
+        return self.header.age_ms
+
+    @property
+    def scene_id(self) -> str | None:
+        """The scene that it shows; None where another program set it."""
+        return None if self.header.scene is None else self.header.scene.id
+
+    @property
+    def scene_revision(self) -> int | None:
+        """The revision of that scene."""
+        return None if self.header.scene is None else self.header.scene.revision
 
     def picture(self) -> UInt8[np.ndarray, "h w 3"]:
         """Decode the picture: RGB, camera-coded."""
-        camera = self.header["camera"]
-        return decode_color(memoryview(self.jpeg), "jpeg", (camera["height"], camera["width"], 3))
+        camera = self.header.camera
+        return decode_color(memoryview(self.jpeg), "jpeg", (camera.height, camera.width, 3))
 
 
 class Scene:
@@ -317,7 +322,7 @@ class Client:
         with self._socket("/live") as socket:
             for message in socket:
                 if isinstance(message, bytes):
-                    yield LiveFrame.unpacked(message)
+                    yield LiveFrame(*unpack(message))
                     socket.send("ack")
 
     def events(self) -> Iterator[Json]:

@@ -9,7 +9,7 @@ from threading import Event
 from protocol.keys import KeySettings
 from sensor_node.cameras.playback import PlaybackCamera
 from sensor_node.node import NodeConfig, run_node
-from services.replay_control import playback_control
+from services.replay_endpoint import playback_control
 from services.settings import load_configuration
 
 

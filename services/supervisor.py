@@ -15,7 +15,7 @@ from types import TracebackType
 from typing import Self
 
 from protocol.errors import DeltalightError
-from services.lifeline import SUPERVISOR_VARIABLE
+from services.parent_death_signal import SUPERVISOR_VARIABLE
 
 POLL_INTERVAL_S = 0.1
 RESTART_DELAY_S = 0.2

@@ -135,6 +135,7 @@ def _picture_examples() -> Iterator[Example]:
             encoding="raw",
             shape=shape,
             status="ok",
+            scene_id="4f0c2a9be1d37785",
             scene_revision=4,
             camera=CAMERA,
             world_from_camera=POSE,
@@ -212,7 +213,13 @@ def _small_examples() -> Iterator[Example]:
     )
     yield "stats", stats, [], []
     request = ControlRequest(
-        node="api", capture_ns=CAPTURE_NS, id="a1", op="set_scene", revision=4, payload={"name": "table"}
+        node="api",
+        capture_ns=CAPTURE_NS,
+        id="a1",
+        op="set_scene",
+        scene_id="4f0c2a9be1d37785",
+        revision=4,
+        payload={"name": "table"},
     )
     yield "request", request, [], []
     text = b'{"scene": {"name": "table"}}'

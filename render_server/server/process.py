@@ -1,7 +1,7 @@
 """The render server's process: sockets around one `RenderSession`.
 
 Threads: the receiver's, the reply server's, the sender's (which encodes and publishes), and the main one,
-which owns the OpenGL context and does nothing but render and carry out commands.
+which owns the OpenGL context and does nothing but render and execute commands.
 """
 
 import queue
@@ -69,15 +69,15 @@ class ServerSettings(StrictModel):
         return SceneDocument() if self.scene is None else load_scene(self.scene)
 
 
-class CommandDesk:
-    """Hands commands from the thread that receives them to the one that may use OpenGL."""
+class CommandQueue:
+    """Passes commands from the thread that receives them to the one that may use OpenGL."""
 
     def __init__(self) -> None:
         self._closed = False
         self._pending: queue.SimpleQueue[tuple[ControlRequest, Future[Payload]]] = queue.SimpleQueue()
 
     def ask(self, request: ControlRequest) -> Payload:
-        """Wait for the payload of the answer (the reply server's thread).
+        """Queue a command and wait for the payload of its reply (the reply server's thread).
 
         Raises:
             DeltalightError: the command was refused, or the renderer did not answer in time.
@@ -96,17 +96,17 @@ class CommandDesk:
                 f"The renderer did not answer within {timeout_s:.0f} s; try again or restart it."
             ) from fault
 
-    def serve(self, carry_out: Callable[[ControlRequest], Payload]) -> None:
-        """Answer all that wait (the thread that renders)."""
+    def serve(self, execute: Callable[[ControlRequest], Payload]) -> None:
+        """Execute all queued commands (the thread that renders)."""
         while not self._pending.empty():
             request, answer = self._pending.get()
             try:
-                answer.set_result(carry_out(request))
+                answer.set_result(execute(request))
             except Exception as fault:  # it belongs to whoever asked, and the renderer goes on
                 answer.set_exception(fault)
 
     def close(self) -> None:
-        """Refuse what waits and what comes, so that nobody waits for a renderer that is gone."""
+        """Refuse queued and later commands, so that nobody waits for a renderer that is gone."""
         self._closed = True
         self.serve(_refuse)
 
@@ -221,12 +221,12 @@ def serve(
             use_source=use_source,
             mailbox_drops=lambda: {**source.drops, "send": sender.dropped},
         )
-        desk = CommandDesk()
-        replies = ReplyServer(settings.control, desk.ask, node=settings.name, keys=keys)
+        commands = CommandQueue()
+        replies = ReplyServer(settings.control, commands.ask, node=settings.name, keys=keys)
         stack.callback(replies.close)
-        stack.callback(desk.close)
+        stack.callback(commands.close)
         log.info("render server runs", renderer=renderer_name, publish=settings.publish)
-        _loop(session, source, sender, desk)
+        _loop(session, source, sender, commands)
 
 
 def _patience_s(session: RenderSession) -> float:
@@ -234,7 +234,7 @@ def _patience_s(session: RenderSession) -> float:
     return GPU_TIMEOUT_S if session.is_waiting_for_gpu else RECEIVE_TIMEOUT_S
 
 
-def _loop(session: RenderSession, source: FrameSource, sender: Sender, desk: CommandDesk) -> None:
+def _loop(session: RenderSession, source: FrameSource, sender: Sender, commands: CommandQueue) -> None:
     stats_due_s = time.monotonic()
     while not session.stopping:
         for multipart in (source.latest(_patience_s(session)) or {}).values():
@@ -245,7 +245,7 @@ def _loop(session: RenderSession, source: FrameSource, sender: Sender, desk: Com
         if time.monotonic() >= stats_due_s:
             sender.offer(session.stats())
             stats_due_s = time.monotonic() + STATS_INTERVAL_S
-        desk.serve(session.carry_out)
+        commands.serve(session.execute)
 
 
 def _keep(path: Path | None, scene: SceneDocument) -> None:

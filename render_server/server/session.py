@@ -4,6 +4,7 @@ No sockets, no threads: `server.py` feeds it and sends what comes out, tests giv
 """
 
 import time
+import uuid
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -116,11 +117,12 @@ class RenderedFrame:
 
 @dataclass(frozen=True)
 class _Started:
-    """A frame at the GPU, and the revision of the scene that it was begun with."""
+    """A frame at the GPU, and the id and revision of the scene that it was begun with."""
 
     frame: AssembledFrame
     pending: Pending
-    revision: int
+    scene_id: str | None
+    scene_revision: int
 
 
 @dataclass(frozen=True)
@@ -148,9 +150,9 @@ def _only_configured(_endpoints: Sequence[str] | None) -> SourceInUse:
 class RenderSession:
     """Keeps one scene, its renderer and the frames that wait for it.
 
-    `keep_scene` is called with every scene that was accepted, so that a restart can go on with it;
-    `mailbox_drops` tells what the receiver dropped, by topic; `use_source` makes it read other endpoints (None: those
-    configured).
+    `scene_id` is the sender's id of the scene, if they gave one; `instance` tells this session from those before a
+    restart. `keep_scene` is called with every accepted scene, so that a restart can resume with it; `mailbox_drops`
+    returns what the receiver dropped, by topic; `use_source` makes it read other endpoints (None: those configured).
     """
 
     def __init__(
@@ -167,6 +169,8 @@ class RenderSession:
         clock_ns: Callable[[], int] = time.time_ns,
     ) -> None:
         self.scene = scene
+        self.scene_id: str | None = None
+        self.instance = uuid.uuid4().hex
         self.counts: Counter[str] = Counter()
         self.stopping = False
         self._renderer = renderer
@@ -245,17 +249,17 @@ class RenderSession:
             drops=self.drops(),
         )
 
-    def carry_out(self, request: ControlRequest) -> dict[str, object]:
-        """Carry out a command between two frames; gives the payload of the reply.
+    def execute(self, request: ControlRequest) -> dict[str, object]:
+        """Execute a command between two frames and return the payload of the reply.
 
         Raises:
             DeltalightError: an unknown command, or one that is refused.
         """
         commands: dict[str, Callable[[ControlRequest], dict[str, object]]] = {
-            "ping": lambda _: {"revision": self.scene.revision},
+            "ping": self._ping,
             "get_scene": lambda _: {"scene": self.scene.model_dump(mode="json")},
             "set_scene": self._set_scene,
-            "set_view": lambda asked: self._use_scene(_with_view(self.scene, asked.payload.get("view"))),
+            "set_view": self._set_view,
             "pick": self._pick,
             "snapshot": self._snapshot,
             "set_source": self._set_source,
@@ -266,6 +270,13 @@ class RenderSession:
             hint = nearest(request.op, commands) or ", ".join(commands)
             raise DeltalightError(f"There is no command '{request.op}'; did you mean {hint}?")
         return commands[request.op](request)
+
+    def _ping(self, _request: ControlRequest) -> dict[str, object]:
+        return {"scene_id": self.scene_id, "revision": self.scene.revision, "instance": self.instance}
+
+    def _set_view(self, request: ControlRequest) -> dict[str, object]:
+        """The scene that results is none that the sender of the one before knows."""
+        return self._use_scene(_with_view(self.scene, request.payload.get("view")), scene_id=None)
 
     def _shut_down(self, _request: ControlRequest) -> dict[str, object]:
         self.stopping = True
@@ -309,7 +320,9 @@ class RenderSession:
         before, self._started = self._started, None
         if frame is not None:
             self._newest = frame
-            self._started = _Started(frame, self._renderer.start(frame.view), self.scene.revision)
+            self._started = _Started(
+                frame, self._renderer.start(frame.view), self.scene_id, self.scene.revision
+            )
         if before is None and self._started is not None and self._started.pending.immediate:
             before, self._started = self._started, None
         return None if before is None else self._finish(before)
@@ -330,7 +343,8 @@ class RenderSession:
             encoding="raw",
             shape=(*composite.color.shape[:2], 3),
             status="ok" if composite.status == "ok" else "no_pose",
-            scene_revision=started.revision,
+            scene_id=started.scene_id,
+            scene_revision=started.scene_revision,
             camera=composite.camera.to_dict(),
             world_from_camera=_rows(composite.world_from_camera),
             received_ns=frame.received_ns,
@@ -342,23 +356,32 @@ class RenderSession:
         return RenderedFrame(message, composite.color)
 
     def _set_scene(self, request: ControlRequest) -> dict[str, object]:
-        """Idempotent by revision: the current revision is confirmed and an older one refused."""
+        """Idempotent by scene id and revision: confirms the current revision and refuses an older one."""
+        scene = self._scene_of(request)
         current = self.scene.revision
-        revision = current + 1 if request.revision is None else request.revision
-        document = request.payload.get("scene")
-        if not isinstance(document, dict):
-            raise DeltalightError("The command set_scene needs the scene document as `scene` in its payload.")
-        scene = parse_scene({**document, "revision": revision})
-        if revision < current or (revision == current and scene != self.scene):
+        if request.revision is None or request.scene_id != self.scene_id or scene.revision > current:
+            return self._use_scene(scene, request.scene_id)
+        if scene.revision < current or scene != self.scene:
             raise DeltalightError(
                 f"The scene is already at revision {current}; get it, change it and send it as {current + 1}."
             )
-        return {"revision": current} if revision == current else self._use_scene(scene)
+        return {"revision": current}
 
-    def _use_scene(self, scene: SceneDocument) -> dict[str, object]:
+    def _scene_of(self, request: ControlRequest) -> SceneDocument:
+        """The document of a request; its revision is the request's, and counts on where the sender knows none."""
+        document = request.payload.get("scene")
+        if not isinstance(document, dict):
+            raise DeltalightError("The command set_scene needs the scene document as `scene` in its payload.")
+        if request.revision is not None:
+            document = {**document, "revision": request.revision}
+        elif request.scene_id is None:
+            document = {**document, "revision": self.scene.revision + 1}
+        return parse_scene(document)
+
+    def _use_scene(self, scene: SceneDocument, scene_id: str | None) -> dict[str, object]:
         self._renderer.set_scene(scene)
         self._assembler.needs_depth = _needs_depth(scene)
-        self.scene = scene
+        self.scene, self.scene_id = scene, scene_id
         self._keep_scene(scene)
         return {"revision": scene.revision}
 

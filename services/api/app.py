@@ -1,7 +1,7 @@
-"""The web application: routes, gate and problem details put together."""
+"""The web application: assembles routes, middleware and problem details."""
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import asdict
 from importlib.metadata import version
@@ -9,62 +9,43 @@ from typing import Any
 
 from fastapi import FastAPI
 from fastapi.concurrency import run_in_threadpool
+from pydantic.json_schema import models_json_schema
 from starlette.middleware import Middleware
 
 from protocol.keys import Keys
-from services.api import (
-    assets,
-    event_socket,
-    fisheye,
-    lights,
-    live,
-    nodes,
-    objects,
-    parts,
-    recordings,
-    replay,
-    scenes,
-    snapshots,
-    state,
-)
+from protocol.messages import CompositeMessage, Message, StatsMessage
+from services.api.auth import AuthMiddleware, AuthRules
 from services.api.camera_finder import CameraFinder
 from services.api.context import Context
+from services.api.credentials import SecretToken, Tickets
 from services.api.events import EventHub
-from services.api.fisheye_view import FisheyeView
-from services.api.gate import Gate, GateRules
+from services.api.fisheye import FisheyeView
 from services.api.live_hub import LiveHub
 from services.api.metrics import Meter, Metrics
-from services.api.page import Page
-from services.api.playback import Playback
+from services.api.models import ProcessAnswer
 from services.api.problems import Problems, describe_problems, responses
-from services.api.process_watch import ProcessWatch
+from services.api.recording_session import RecordingSession, RecordingSessions
+from services.api.recording_store import RecordingStore
 from services.api.render_link import RenderLink
-from services.api.secret_token import SecretToken
+from services.api.replay_control import ReplayControl
+from services.api.routes import assets, live, recordings, scenes, snapshots, state
 from services.api.settings import ApiSettings
-from services.api.snapshot_shelf import SnapshotShelf
-from services.api.streams import Streams, sinks
-from services.api.take_recorder import RunningTake, TakeRecorder
-from services.api.take_shelf import TakeShelf
-from services.api.tickets import TicketBox
+from services.api.snapshot_store import SnapshotStore
+from services.api.static_page import StaticPage
+from services.api.streams import ProcessWatch, Sink, Streams
+from services.live_message import LiveHeader
 from services.storage.store import Store
 
 PREFIX = "/api/v1"
-RESOURCES = (
-    scenes,
-    objects,
-    lights,
-    parts,
-    assets,
-    live,
-    fisheye,
-    nodes,
-    recordings,
-    replay,
-    snapshots,
-    state,
-    event_socket,
+ROUTERS = (
+    *scenes.ROUTERS,
+    *assets.ROUTERS,
+    *live.ROUTERS,
+    *recordings.ROUTERS,
+    *snapshots.ROUTERS,
+    *state.ROUTERS,
 )
-ANYWHERE = (400, 401, 403, 413, 422, 429, 503)  # what the gate, a body or the disk may be refused with
+ANYWHERE = (400, 401, 403, 413, 422, 429, 503)  # refusals of the middleware, of a body, or of the disk
 DESCRIPTION = """Scenes, assets and the state of a Deltalight installation.
 
 Every change of a scene is a revision; `If-Match` with the revision that a change is made to refuses it (409) where
@@ -94,23 +75,32 @@ TAGS = [
 
 
 class _App(FastAPI):
-    """FastAPI whose OpenAPI document names the media type of problems, and tokens."""
+    """FastAPI whose OpenAPI document also has the media type of problems, tokens, and the live header."""
 
     def openapi(self) -> dict[str, Any]:
         """Return the OpenAPI document."""
         if self.openapi_schema is None:
             schema = describe_problems(super().openapi())
+            schema["components"]["schemas"].update(_live_header_schemas())
             schema["components"]["securitySchemes"] = {"token": {"type": "http", "scheme": "bearer"}}
             schema["security"] = [{}, {"token": []}]
             self.openapi_schema = schema
         return self.openapi_schema
 
 
+def _live_header_schemas() -> dict[str, Any]:
+    """Return the schemas of a live picture's header, which no route of HTTP answers with."""
+    template = "#/components/schemas/{model}"
+    _, schema = models_json_schema([(LiveHeader, "serialization")], ref_template=template)
+    definitions: dict[str, Any] = schema["$defs"]
+    return definitions
+
+
 def create_app(settings: ApiSettings, store: Store, keys: Keys | None = None) -> FastAPI:
-    """The application; it speaks with the render server while it runs. The store stays the caller's."""
+    """Create the application, which talks to the render server while it runs. The caller closes the store."""
     context = _context(settings, store, keys)
-    streams = Streams(settings.subscribe, sinks(context), keys)
-    context.link.on_source = streams.follow
+    streams = Streams(settings.subscribe, _sinks(context), keys)
+    context.link.on_source = streams.use_source
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
@@ -118,12 +108,12 @@ def create_app(settings: ApiSettings, store: Store, keys: Keys | None = None) ->
         context.link.start()
         streams.start()
         yield
-        await run_in_threadpool(context.playback.close)
-        await run_in_threadpool(context.recorder.close)
+        await run_in_threadpool(context.replay.close)
+        await run_in_threadpool(context.recording_sessions.close)
         await run_in_threadpool(streams.close)
         await run_in_threadpool(context.link.close)
 
-    rules = GateRules(
+    rules = AuthRules(
         needs_token=settings.leaves_host,
         requests_per_s=settings.requests_per_s,
         upload_limit_bytes=settings.upload_limit_mb << 20,
@@ -141,7 +131,7 @@ def create_app(settings: ApiSettings, store: Store, keys: Keys | None = None) ->
         middleware=[
             Middleware(Meter, metrics=context.metrics),
             Middleware(
-                Gate,
+                AuthMiddleware,
                 rules=rules,
                 tokens=store.tokens,
                 tickets=context.tickets,
@@ -152,26 +142,27 @@ def create_app(settings: ApiSettings, store: Store, keys: Keys | None = None) ->
     )
     app.state.context = context
     context.problems.install(app)
-    for resource in RESOURCES:
-        app.include_router(resource.router, prefix=PREFIX, responses=responses(*ANYWHERE))
-    app.router.default = Page(app.router.not_found)
+    for router in ROUTERS:
+        app.include_router(router, prefix=PREFIX, responses=responses(*ANYWHERE))
+    app.router.default = StaticPage(app.router.not_found)
     return app
 
 
 def _context(settings: ApiSettings, store: Store, keys: Keys | None) -> Context:
     events, watch, live_hub, problems = EventHub(), ProcessWatch(), LiveHub(), Problems()
     link = RenderLink(
-        store, settings.control, keys, on_picture=lambda picture: events.publish("picture", asdict(picture))
+        store, settings.control, keys, on_delivery=lambda status: events.publish("picture", asdict(status))
     )
-    takes = TakeShelf(store.folder / "recordings")
+    recording_store = RecordingStore(store.folder / "recordings")
 
-    def tell_take(take: RunningTake, is_growing: bool) -> None:
-        events.publish("recording", recordings.recording_event(takes, take, is_growing=is_growing))
+    def publish_recording(session: RecordingSession, is_growing: bool) -> None:
+        body = recordings.recording_event(recording_store, session, is_growing=is_growing)
+        events.publish("recording", body)
 
-    playback = Playback(
+    replay = ReplayControl(
         link,
         settings.control,
-        publish=lambda position: events.publish("replay", replay.replay_answer(position).model_dump()),
+        publish=lambda position: events.publish("replay", recordings.replay_answer(position).model_dump()),
         notice=lambda text: events.publish("notice", {"text": text}),
         keys=keys,
     )
@@ -183,12 +174,32 @@ def _context(settings: ApiSettings, store: Store, keys: Keys | None) -> Context:
         fisheye=FisheyeView(),
         watch=watch,
         cameras=CameraFinder(),
-        tickets=TicketBox(),
-        takes=takes,
-        recorder=TakeRecorder(takes, settings.subscribe, tell_take),
-        playback=playback,
-        snapshots=SnapshotShelf(store.folder / "snapshots"),
+        tickets=Tickets(),
+        recordings=recording_store,
+        recording_sessions=RecordingSessions(recording_store, settings.subscribe, publish_recording),
+        replay=replay,
+        snapshots=SnapshotStore(store.folder / "snapshots"),
         settings=settings,
         problems=problems,
         metrics=Metrics(problems, watch, link, live_hub, events),
     )
+
+
+def _sinks(context: Context) -> dict[str, Sink]:
+    """Route composites to viewers, radiance to the fish-eye view, and reports to the watch and to event listeners."""
+    return {
+        "composite": lambda message, parts: _publish_composite(context, message, parts),
+        "radiance": context.fisheye.note,
+        "stats": lambda message, _parts: _publish_report(context, message),
+    }
+
+
+def _publish_composite(context: Context, message: Message, parts: Sequence[memoryview]) -> None:
+    if isinstance(message, CompositeMessage) and message.encoding == "jpeg":
+        context.live.publish(message, bytes(parts[0]), context.watch.detail(message.node))
+
+
+def _publish_report(context: Context, message: Message) -> None:
+    if isinstance(message, StatsMessage):
+        report = context.watch.note(message)
+        context.events.publish("process", ProcessAnswer.of(report).model_dump())

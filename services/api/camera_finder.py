@@ -1,4 +1,4 @@
-"""Which cameras this host has, as the API tells it."""
+"""Finds the cameras of this host, as the API reports them."""
 
 import threading
 from concurrent.futures import Future
@@ -37,14 +37,14 @@ class CamerasAnswer(BaseModel):
 
 
 class CameraFinder:
-    """Looks for cameras in a thread that may hang; who asks meanwhile waits for the same search."""
+    """Searches for cameras in a thread that may hang; concurrent callers wait for the same search."""
 
     def __init__(self) -> None:
         self._search: Future[CamerasAnswer] | None = None
         self._lock = threading.Lock()
 
     def find(self) -> CamerasAnswer:
-        """The cameras that there are now.
+        """Return the cameras that are attached now.
 
         Raises:
             ProblemError: the search takes too long.
@@ -53,7 +53,7 @@ class CameraFinder:
             search = self._search
             if search is None or search.done():
                 search = self._search = Future()
-                threading.Thread(target=_carry_out, args=(search,), name="cameras", daemon=True).start()
+                threading.Thread(target=_find, args=(search,), name="cameras", daemon=True).start()
         try:
             return search.result(TIMEOUT_S)
         except FutureTimeoutError:
@@ -63,7 +63,7 @@ class CameraFinder:
             raise ProblemError(503, "cameras", sentence) from None
 
 
-def _carry_out(search: "Future[CamerasAnswer]") -> None:
+def _find(search: "Future[CamerasAnswer]") -> None:
     from sensor_node.cameras.discovery import discover
 
     try:

@@ -1,4 +1,4 @@
-"""What the routes share: the store, the link to the render server, and how a request names a revision."""
+"""What the routes share: the service's parts, and how a request states the revision that it changes."""
 
 import re
 from collections.abc import Mapping
@@ -9,20 +9,20 @@ from fastapi import Depends, Header, Response
 from starlette.requests import HTTPConnection
 
 from services.api.camera_finder import CameraFinder
+from services.api.credentials import Tickets
 from services.api.events import EventHub
-from services.api.fisheye_view import FisheyeView
+from services.api.fisheye import FisheyeView
 from services.api.live_hub import LiveHub
 from services.api.metrics import Metrics
 from services.api.models import SceneAnswer
-from services.api.playback import Playback
 from services.api.problems import ProblemError, Problems
-from services.api.process_watch import ProcessWatch
+from services.api.recording_session import RecordingSessions
+from services.api.recording_store import RecordingStore
 from services.api.render_link import RenderLink
+from services.api.replay_control import ReplayControl
 from services.api.settings import ApiSettings
-from services.api.snapshot_shelf import SnapshotShelf
-from services.api.take_recorder import TakeRecorder
-from services.api.take_shelf import TakeShelf
-from services.api.tickets import TicketBox
+from services.api.snapshot_store import SnapshotStore
+from services.api.streams import ProcessWatch
 from services.storage.documents import Edit
 from services.storage.scenes import StoredScene
 from services.storage.store import Store
@@ -32,9 +32,11 @@ _ENTITY_TAG = re.compile(r'(?:W/)?"([0-9]{1,18})"|([0-9]{1,18})')
 
 
 @dataclass(frozen=True)
-class Terms:
-    """Under which a change is made: `expected` is the revision that it is made to (None = the newest), `gesture`
-    joins changes that one undo takes back."""
+class Precondition:
+    """What a change depends on: `expected` is the revision that it applies to (None = the newest).
+
+    Changes in a row with the same `gesture` are undone together.
+    """
 
     expected: int | None
     gesture: str | None
@@ -42,7 +44,7 @@ class Terms:
 
 @dataclass(frozen=True)
 class Context:
-    """The parts that routes use."""
+    """The parts of the service that routes use."""
 
     store: Store
     link: RenderLink
@@ -51,29 +53,32 @@ class Context:
     fisheye: FisheyeView
     watch: ProcessWatch
     cameras: CameraFinder
-    tickets: TicketBox
-    takes: TakeShelf
-    recorder: TakeRecorder
-    playback: Playback
-    snapshots: SnapshotShelf
+    tickets: Tickets
+    recordings: RecordingStore
+    recording_sessions: RecordingSessions
+    replay: ReplayControl
+    snapshots: SnapshotStore
     settings: ApiSettings
     problems: Problems
     metrics: Metrics
 
-    def change(self, scene_id: str, edit: Edit, what: str, terms: Terms, response: Response) -> SceneAnswer:
-        """Change a scene, show it where it is the active one, and describe it."""
-        scene = self.store.scenes.change(scene_id, edit, what, terms.expected, terms.gesture)
+    def change(
+        self, scene_id: str, edit: Edit, what: str, precondition: Precondition, response: Response
+    ) -> SceneAnswer:
+        """Change a scene, show it if it is the active one, and describe it."""
+        scene = self.store.scenes.change(scene_id, edit, what, precondition.expected, precondition.gesture)
         return self.answer(scene, response, changed=True)
 
     def answer(self, scene: StoredScene, response: Response, *, changed: bool = False) -> SceneAnswer:
-        """Describe a scene, with its revision as entity tag; after a change everybody hears of it first."""
+        """Describe a scene, with its revision as entity tag; a change is announced to all listeners first."""
         if changed:
-            self._tell(scene)
-        picture = self.link.show(scene) if changed and scene.head.is_active else self.link.picture
+            self._announce(scene)
+        delivery = self.link.show(scene) if changed and scene.head.is_active else self.link.delivery
         response.headers["ETag"] = f'"{scene.document.revision}"'
-        return SceneAnswer.of(scene, picture if picture and picture.scene_id == scene.head.id else None)
+        is_of_scene = delivery is not None and delivery.scene_id == scene.head.id
+        return SceneAnswer.of(scene, delivery if is_of_scene else None)
 
-    def _tell(self, scene: StoredScene) -> None:
+    def _announce(self, scene: StoredScene) -> None:
         head = scene.head
         body = {"id": head.id, "revision": head.revision, "name": head.name, "what": scene.what}
         self.events.publish("scene", {**body, "active": head.is_active})
@@ -102,7 +107,7 @@ def _if_match(
     return int(match.group(1) or match.group(2))
 
 
-def _terms(
+def _precondition(
     expected: Annotated[int | None, Depends(_if_match)],
     gesture: Annotated[
         str | None,
@@ -113,22 +118,22 @@ def _terms(
             json_schema_extra={"pattern": f"^{_GESTURE.pattern}$"},
         ),
     ] = None,
-) -> Terms:
+) -> Precondition:
     if gesture is not None and not _GESTURE.fullmatch(gesture):
         raise ProblemError(
             400, "gesture", "Deltalight-Gesture must be 1 to 64 letters, digits, dashes or underscores."
         )
-    return Terms(expected, gesture)
+    return Precondition(expected, gesture)
 
 
 Shared = Annotated[Context, Depends(_context)]
-Expected = Annotated[int | None, Depends(_if_match)]
-OnTerms = Annotated[Terms, Depends(_terms)]
+ExpectedRevision = Annotated[int | None, Depends(_if_match)]
+IfUnchanged = Annotated[Precondition, Depends(_precondition)]
 
 
-def with_revision_of(document: object, terms: Terms) -> Terms:
-    """The terms of a change; without If-Match the `revision` that the document itself carries is expected."""
+def with_revision_of(document: object, precondition: Precondition) -> Precondition:
+    """Return the precondition of a change; without If-Match it expects the `revision` in the document itself."""
     revision = document.get("revision") if isinstance(document, Mapping) else None
-    if terms.expected is not None or not isinstance(revision, int) or isinstance(revision, bool):
-        return terms
-    return replace(terms, expected=revision)
+    if precondition.expected is not None or not isinstance(revision, int) or isinstance(revision, bool):
+        return precondition
+    return replace(precondition, expected=revision)

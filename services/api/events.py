@@ -1,4 +1,4 @@
-"""What happens in the service, told to every client that listens on the events WebSocket."""
+"""Events of the service, published to every client of the events WebSocket."""
 
 import asyncio
 import threading
@@ -10,7 +10,7 @@ from typing import Literal
 
 from pydantic_core import to_json
 
-QUEUE_EVENTS = 256  # what a client may be behind: a minute of four processes' reports
+QUEUE_EVENTS = 256  # how far a client may fall behind: a minute of reports from four processes
 
 EventType = Literal[
     "hello", "scene", "asset", "picture", "process", "recording", "replay", "snapshot", "notice", "lost"
@@ -19,7 +19,7 @@ EventType = Literal[
 
 @dataclass(eq=False)
 class EventQueue:
-    """What one client was not sent yet; where it is full the oldest is lost, and counted."""
+    """Events that one client was not sent yet; a full queue drops the oldest and counts it."""
 
     loop: asyncio.AbstractEventLoop
     lost: int = 0
@@ -38,7 +38,7 @@ class EventQueue:
             self.loop.call_soon_threadsafe(self._arrived.set)
 
     async def next(self) -> str:
-        """The oldest event, as soon as there is one; how many were lost before it comes first."""
+        """Wait for the oldest event; the number of those lost before it comes first."""
         while True:
             with self._lock:
                 if self.lost:
@@ -51,14 +51,14 @@ class EventQueue:
 
 
 class EventHub:
-    """Passes each event to all who listen; it is encoded once, and nobody waits for a slow one."""
+    """Publishes each event to all listeners; it is encoded once, and slow listeners delay nobody."""
 
     def __init__(self) -> None:
         self._queues: set[EventQueue] = set()
         self._lock = threading.Lock()
 
     def publish(self, type: EventType, body: Mapping[str, object]) -> None:
-        """Tell all clients (any thread); `body` is what pydantic makes JSON of, models and times included."""
+        """Publish an event (any thread); `body` is anything that pydantic serialises, models and times included."""
         with self._lock:
             queues = tuple(self._queues)
         if queues:
@@ -68,12 +68,12 @@ class EventHub:
 
     @property
     def listeners(self) -> int:
-        """How many listen."""
+        """The number of listeners."""
         return len(self._queues)
 
     @contextmanager
     def listening(self) -> Iterator[EventQueue]:
-        """A queue of all events from now on; in the event loop that takes them."""
+        """Subscribe to all events for the duration of the block (in the event loop that takes them)."""
         queue = EventQueue(asyncio.get_running_loop())
         with self._lock:
             self._queues.add(queue)
@@ -85,5 +85,5 @@ class EventHub:
 
 
 def packed(type: EventType, body: Mapping[str, object]) -> str:
-    """An event as it is sent: a JSON object with its type."""
+    """Return an event as it is sent: a JSON object with its type."""
     return to_json({"type": type, **body}, inf_nan_mode="null").decode()

@@ -1,55 +1,129 @@
-"""Routes of what the fish-eye camera sees: its newest picture, and where in it the composite's lights are."""
+"""The newest fish-eye picture, and where in it the lights of a composite are."""
 
-from fastapi import APIRouter, Response
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float64
 from pydantic import BaseModel, Field
 
-from protocol.messages import RadianceMessage
-from services.api.context import Shared
-from services.api.fisheye_lights import FisheyeLight, lights_in_picture
-from services.api.live import JPEG_ANSWER, PICTURE_HEADERS
-from services.api.problems import responses
-from services.storage.faults import NotFoundError
+from protocol.fisheye_parts import calibration_of
+from protocol.messages import Message, RadianceMessage
 
-router = APIRouter(tags=["live"])
+if TYPE_CHECKING:
+    from render_server.lights.lights import Light
+    from render_server.lights.lights import IncidentLight
 
-
-class FisheyeAnswer(BaseModel):
-    """The fish-eye picture's size and the lights in it; a light that it does not show is left out."""
-
-    seen_ns: int = Field(description="When it was taken, ns since 1970 by the node's clock.")
-    node: str = Field(description="The node that sees it.")
-    width: int = Field(description="Of the picture, pixels.")
-    height: int
-    clipped_share: float = Field(description="Of what it sees, what was too bright to be measured.")
-    lights: list[FisheyeLight]
+PICTURE_PART = 2  # of a radiance message (SPEC.md, section 3)
+OUTLINE_POINTS = 16
+ENVIRONMENT = "environment"  # the light that is nowhere in particular
 
 
-@router.get("/fisheye", responses=responses(404))
-def fisheye(shared: Shared) -> FisheyeAnswer:
-    """Return what the fish-eye camera sees: the size of its picture, and the places of the lights in it."""
-    message, _ = _newest(shared)
-    frame = shared.live.newest
-    height, width = message.picture_shape[:2]
-    return FisheyeAnswer(
-        seen_ns=message.capture_ns,
-        node=message.node,
-        width=width,
-        height=height,
-        clipped_share=message.clipped_share,
-        lights=lights_in_picture(message, () if frame is None else frame.message.lights),
+@dataclass
+class FisheyeView:
+    """The newest radiance message and its picture for people (JPEG), if any arrived."""
+
+    newest: tuple[RadianceMessage, bytes] | None = None
+
+    def note(self, message: Message, parts: Sequence[memoryview]) -> None:
+        """Keep the picture of a message that has just arrived."""
+        assert isinstance(message, RadianceMessage)
+        self.newest = message, bytes(parts[PICTURE_PART])
+
+
+class FisheyeLight(BaseModel):
+    """A light of the newest composite, as the fish-eye camera sees it."""
+
+    x: float = Field(description="Of its middle, pixels of the picture.")
+    y: float
+    radius_px: float = Field(description="Greatest distance of its outline from its middle.")
+    color_linear: tuple[float, float, float] = Field(description="R G B, linear; the largest is 1.")
+    irradiance: tuple[float, float, float] = Field(description="On a surface that faces it, camera units.")
+    type: str = Field(description="As in the scene document.", examples=["sphere"])
+    id: int | None = Field(description="Of a light that is followed over time; else null.")
+
+
+def lights_in_picture(message: RadianceMessage, described: Sequence[Mapping[str, Any]]) -> list[FisheyeLight]:
+    """Return the lights that the picture of `message` shows; `described` are those of a composite.
+
+    Raises:
+        DeltalightError: the calibration is none.
+    """
+    from render_server.lights.lights import incident_light
+
+    viewpoint = np.array(message.world_from_fisheye)[:3, 3]
+    found = []
+    for each in described:
+        if each.get("type") == ENVIRONMENT:
+            continue
+        seen = incident_light(_light(each), viewpoint)
+        pixels = _pixels(message, np.vstack([seen.to_light, _outline(seen)]))
+        if np.isfinite(pixels[0]).all():
+            found.append(_marked(each, seen, pixels))
+    return found
+
+
+def _marked(
+    described: Mapping[str, Any], seen: "IncidentLight", pixels: Float64[np.ndarray, "n 2"]
+) -> FisheyeLight:
+    """`pixels` begin with the light's middle; those of its outline that the picture does not show are NaN."""
+    distances = np.linalg.norm(pixels - pixels[0], axis=1)
+    red, green, blue = (float(value) for value in seen.irradiance)
+    peak = max(red, green, blue, 1e-12)
+    return FisheyeLight(
+        x=float(pixels[0, 0]),
+        y=float(pixels[0, 1]),
+        radius_px=float(np.nanmax(distances)),
+        color_linear=(red / peak, green / peak, blue / peak),
+        irradiance=(red, green, blue),
+        type=str(described["type"]),
+        id=described.get("id"),
     )
 
 
-@router.get("/fisheye.jpg", response_class=Response, responses={**responses(404), **JPEG_ANSWER})
-def fisheye_picture(shared: Shared) -> Response:
-    """Return the newest fish-eye picture."""
-    return Response(_newest(shared)[1], media_type="image/jpeg", headers=PICTURE_HEADERS)
+def _pixels(message: RadianceMessage, directions: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 2"]:
+    """Project directions in the world to pixels of the (scaled-down) picture; NaN outside it."""
+    lens = calibration_of(message.camera, None).lens
+    height, width = message.picture_shape[:2]
+    stretch = np.array([width / lens.width, height / lens.height])
+    rotation = np.array(message.world_from_fisheye)[:3, :3]
+    return np.asarray((lens.project(directions @ rotation) + 0.5) * stretch - 0.5)
 
 
-def _newest(shared: Shared) -> tuple[RadianceMessage, bytes]:
-    newest = shared.fisheye.newest
-    if newest is None:
-        raise NotFoundError(
-            "no node has sent light of a fish-eye camera; docs/fisheye.md tells how to set one up."
-        )
-    return newest
+def _outline(seen: "IncidentLight") -> Float64[np.ndarray, "n 3"]:
+    """Return directions around a light, at its angular radius."""
+    toward = seen.to_light
+    side = np.cross(toward, (0.0, 0.0, 1.0) if abs(toward[2]) < 0.9 else (1.0, 0.0, 0.0))
+    side /= np.linalg.norm(side)
+    turn = np.linspace(0, 2 * np.pi, OUTLINE_POINTS, endpoint=False)[:, None]
+    around = np.cos(turn) * side + np.sin(turn) * np.cross(toward, side)
+    angle = seen.angular_radius_rad
+    return np.asarray(np.cos(angle) * toward + np.sin(angle) * around)
+
+
+def _light(described: Mapping[str, Any]) -> "Light":
+    """Return the light that a composite's message describes."""
+    from render_server.lights.lights import DirectionalLight, RectangleLight, SphereLight, SpotLight
+
+    def vector(key: str) -> np.ndarray:
+        return np.asarray(described[key], np.float32)
+
+    match described["type"]:
+        case "directional":
+            angle = float(np.radians(described["angular_radius_deg"]))
+            return DirectionalLight(vector("direction"), vector("irradiance"), angle)
+        case "rectangle":
+            axes = vector("axis_u_m"), vector("axis_v_m")
+            return RectangleLight(vector("position_m"), *axes, vector("radiance"))
+        case "spot":
+            return SpotLight(
+                vector("position_m"),
+                vector("direction"),
+                vector("intensity"),
+                float(described["radius_m"]),
+                float(np.radians(described["angle_deg"])) / 2,
+                float(described["blend"]),
+            )
+        case _:
+            return SphereLight(vector("position_m"), vector("intensity"), float(described["radius_m"]))

@@ -1,34 +1,25 @@
-"""The newest composite, shared by any number of viewers that each take it at their own pace."""
+"""The newest composite, shared by any number of viewers, each at its own pace."""
 
 import asyncio
-import json
-import struct
 import threading
 import time
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 from protocol.messages import CompositeMessage
 from services.frame_age import age_ms
+from services.live_message import PictureHeader, ViewerHeader, pack
 
 RATE_WINDOW_S = 3.0
 STALE_AFTER_S = 2.0
 
 
 @dataclass(frozen=True)
-class ShownScene:
-    """The scene that a picture shows, by the API's own id and revision."""
-
-    id: str
-    revision: int
-
-
-@dataclass(frozen=True)
 class LiveFrame:
-    """A composite as viewers get it; `number` counts the frames that arrived, `facts` are JSON without its brace.
+    """A composite as viewers get it; `number` counts the frames that arrived, `header` is a `PictureHeader` as JSON.
 
     It arrived at `arrived_s` of the monotonic clock and `arrived_ns` of this host's.
     """
@@ -38,20 +29,15 @@ class LiveFrame:
     jpeg: bytes
     arrived_s: float
     arrived_ns: int
-    facts: bytes
+    header: bytes
 
     def packed(self, skipped: int) -> bytes:
-        """One binary message: little-endian uint32 length of the JSON header, the header, the JPEG.
-
-        `skipped` and the age belong to one viewer and the moment of sending; the rest was encoded once for all.
-        """
-        own = json.dumps({"age_ms": age_ms(self.message), "skipped": skipped}).encode()
-        header = own[:-1] + b", " + self.facts
-        return struct.pack("<I", len(header)) + header + self.jpeg
+        """Return the message for a viewer that was not sent `skipped` frames."""
+        return pack(self.header, ViewerHeader(age_ms=age_ms(self.message), skipped=skipped), self.jpeg)
 
 
 class Viewer:
-    """One viewer's place in the stream; `skipped` counts the frames that it was not sent."""
+    """One viewer of the stream; `skipped` counts the frames that it was not sent."""
 
     def __init__(self, hub: "LiveHub") -> None:
         self.skipped = 0
@@ -59,7 +45,7 @@ class Viewer:
         self._number = 0
 
     async def next(self) -> LiveFrame | None:
-        """The newest frame, as soon as there is one that this viewer has not got; None = the stream has ended."""
+        """Wait for a frame newer than this viewer's last; None = the stream has ended."""
         frame = await self._hub.newer_than(self._number)
         if frame is not None:
             missed = frame.number - self._number - 1 if self._number else 0
@@ -70,7 +56,7 @@ class Viewer:
 
 
 class LiveHub:
-    """Holds the newest frame only; waiting for a newer one costs nobody else anything."""
+    """Holds only the newest frame; viewers that wait for a newer one do not delay each other."""
 
     def __init__(self) -> None:
         self.viewers = 0
@@ -87,16 +73,19 @@ class LiveHub:
         """Wake viewers in this event loop from now on."""
         self._loop = loop
 
-    def publish(
-        self, message: CompositeMessage, jpeg: bytes, scene: ShownScene | None, renderer: str
-    ) -> None:
-        """Make this composite the newest and wake all who wait (any thread)."""
+    def publish(self, message: CompositeMessage, jpeg: bytes, renderer: str) -> None:
+        """Make this composite the newest and wake all viewers that wait (any thread).
+
+        Raises:
+            DeltalightError: no header can be made of it.
+        """
         now_s = time.monotonic()
         with self._lock:
             self._arrivals_s.append(now_s)
             number = 1 if self._newest is None else self._newest.number + 1
-            facts = self._facts(number, message, scene, renderer)
-            self._newest = LiveFrame(number, message, jpeg, now_s, time.time_ns(), facts)
+            header = PictureHeader.of(message, number=number, frames_per_s=self._rate(), renderer=renderer)
+            encoded = header.model_dump_json().encode()
+            self._newest = LiveFrame(number, message, jpeg, now_s, time.time_ns(), encoded)
         self._wake_soon()
 
     def close(self) -> None:
@@ -106,7 +95,7 @@ class LiveHub:
 
     @contextmanager
     def viewer(self) -> Iterator[Viewer]:
-        """A place in the stream (in the event loop)."""
+        """Join the stream for the duration of the block (in the event loop)."""
         self.viewers += 1
         try:
             yield Viewer(self)
@@ -115,16 +104,16 @@ class LiveHub:
 
     @property
     def received(self) -> int:
-        """How many frames came."""
+        """The number of frames that arrived."""
         return 0 if self._newest is None else self._newest.number
 
     @property
     def newest(self) -> LiveFrame | None:
-        """The newest frame, if any came."""
+        """The newest frame, if any arrived."""
         return self._newest
 
     async def newer_than(self, number: int) -> LiveFrame | None:
-        """The newest frame, as soon as there is one after `number`; None = the stream has ended."""
+        """Wait for a frame after `number`; None = the stream has ended."""
         while not self._ended:
             arrived = self._arrived
             if self._newest is not None and self._newest.number > number:
@@ -138,14 +127,14 @@ class LiveHub:
         self.skipped += missed
 
     def state(self) -> tuple[Literal["waiting", "ok", "stale"], float | None]:
-        """Whether frames come, and the seconds since the newest did."""
+        """Return whether frames arrive, and the seconds since the newest did."""
         if self._newest is None:
             return "waiting", None
         since_s = time.monotonic() - self._newest.arrived_s
         return ("ok" if since_s < STALE_AFTER_S else "stale"), since_s
 
     def frames_per_s(self) -> float | None:
-        """Rate of arrival over the last seconds; None before the second frame."""
+        """Return the rate of arrival over the last seconds; None before the second frame."""
         with self._lock:
             return self._rate()
 
@@ -157,25 +146,6 @@ class LiveHub:
             return None
         span_s = self._arrivals_s[-1] - self._arrivals_s[0]
         return (len(self._arrivals_s) - 1) / span_s if span_s > 0 else None
-
-    def _facts(
-        self, number: int, message: CompositeMessage, scene: ShownScene | None, renderer: str
-    ) -> bytes:
-        facts: dict[str, Any] = {
-            "number": number,
-            "frame_id": message.frame_id,
-            "capture_ns": message.capture_ns,
-            "frames_per_s": self._rate(),
-            "status": message.status,
-            "drops": message.drops,
-            "pass_times_ms": message.pass_times_ms,
-            "lights": message.lights,
-            "camera": message.camera,
-            "world_from_camera": message.world_from_camera,
-            "scene": None if scene is None else {"id": scene.id, "revision": scene.revision},
-            "renderer": renderer,
-        }
-        return json.dumps(facts).encode()[1:]
 
     def _wake_soon(self) -> None:
         if self._loop is not None and not self._loop.is_closed():

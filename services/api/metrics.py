@@ -12,7 +12,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from services.api.events import EventHub
 from services.api.live_hub import LiveHub
 from services.api.problems import Problems
-from services.api.process_watch import ProcessWatch
+from services.api.streams import ProcessWatch
 
 MEDIA_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 # From a read out of the cache to a mesh that takes the time limit of its check.
@@ -21,11 +21,11 @@ NO_OPERATION = "none"  # refused before a route was found
 
 
 class Reachable(Protocol):
-    """What says whether the render server answers."""
+    """Tells whether the render server answers."""
 
     @property
     def is_reachable(self) -> bool:
-        """Whether it does."""
+        """Whether it answered when it was last asked."""
 
 
 class Metrics:
@@ -57,12 +57,12 @@ class Metrics:
         self._seconds.labels(operation).observe(seconds)
 
     def text(self) -> bytes:
-        """All measurements as Prometheus reads them."""
+        """Return all measurements in the text format of Prometheus."""
         return generate_latest(self._registry)
 
 
 class Meter:
-    """Middleware that measures every request, refused ones too."""
+    """Middleware that measures every request, including refused ones."""
 
     def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
         self._app = app
@@ -88,7 +88,7 @@ class Meter:
 
 
 class _Reported(Collector):
-    """What others count, read when Prometheus asks."""
+    """Collects what other parts of the service count."""
 
     def __init__(self, problems: Problems, watch: ProcessWatch, link: Reachable) -> None:
         self._problems = problems
@@ -96,7 +96,7 @@ class _Reported(Collector):
         self._link = link
 
     def collect(self) -> Iterable[Metric]:
-        """Give all families."""
+        """Return all metric families."""
         refused = CounterMetricFamily(
             "deltalight_api_refused", "Requests refused, by kind of problem.", labels=["kind"]
         )
@@ -127,14 +127,14 @@ class _Reported(Collector):
 
 
 class _Streams(Collector):
-    """How many look and listen, and what they were sent."""
+    """Collects the number of viewers and listeners, and what they were sent."""
 
     def __init__(self, live: LiveHub, events: EventHub) -> None:
         self._live = live
         self._events = events
 
     def collect(self) -> Iterable[Metric]:
-        """Give all families."""
+        """Return all metric families."""
         live = self._live
         yield _gauge("deltalight_live_viewers", "Viewers of the live video.", live.viewers)
         yield _counter("deltalight_live_frames_received", "Composites that came.", live.received)

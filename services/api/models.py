@@ -6,8 +6,8 @@ from typing import Any, Literal, Self
 from pydantic import BaseModel, Field
 
 from protocol.scene import SceneDocument
-from services.api.outcomes import Picture
-from services.api.process_watch import Report
+from services.api.delivery import DeliveryStatus
+from services.api.streams import Report
 from services.storage.asset_kinds import AssetKind
 from services.storage.assets import Asset
 from services.storage.scenes import Revision, SceneHead, StoredScene
@@ -48,9 +48,9 @@ class PictureState(BaseModel):
     detail: str = Field(description="Why it is not shown; else empty.")
 
     @classmethod
-    def of(cls, picture: Picture) -> Self:
-        """Describe what a sending came to."""
-        return cls(state=picture.state, revision=picture.revision, detail=picture.detail)
+    def of(cls, status: DeliveryStatus) -> Self:
+        """Describe the delivery of a revision."""
+        return cls(state=status.state, revision=status.revision, detail=status.detail)
 
 
 class SceneAnswer(BaseModel):
@@ -68,7 +68,7 @@ class SceneAnswer(BaseModel):
     document: SceneDocument
 
     @classmethod
-    def of(cls, scene: StoredScene, picture: Picture | None) -> Self:
+    def of(cls, scene: StoredScene, delivery: DeliveryStatus | None) -> Self:
         """Describe a scene at a revision."""
         return cls(
             id=scene.head.id,
@@ -79,7 +79,7 @@ class SceneAnswer(BaseModel):
             what=scene.what,
             can_undo=scene.can_undo,
             can_redo=scene.can_redo,
-            picture=None if picture is None else PictureState.of(picture),
+            picture=None if delivery is None else PictureState.of(delivery),
             document=scene.document,
         )
 

@@ -29,7 +29,7 @@ TYPE_PREFIX = "urn:deltalight:problem:"
 
 log = structlog.get_logger()
 
-# The first class that a fault is an instance of says its status and kind.
+# The first class that an error is an instance of determines its status and kind.
 _KINDS: tuple[tuple[type[DeltalightError], int, str], ...] = (
     (NotFoundError, 404, "not-found"),
     (StaleRevisionError, 409, "stale-revision"),
@@ -42,7 +42,7 @@ _KINDS: tuple[tuple[type[DeltalightError], int, str], ...] = (
 )
 
 
-# What the framework says in two words, by those.
+# Advice for the two-word sentences of the framework.
 _ADVICE = {
     "Not Found": ": nothing is at this address; /openapi.json lists what there is.",
     "Method Not Allowed": ": this address does not take that method; /openapi.json lists those that it takes.",
@@ -65,7 +65,7 @@ class Problem(BaseModel):
 
 
 class ProblemError(HTTPException):
-    """A refusal that is not the storage's: `kind` ends the problem's type."""
+    """A refusal by the service itself: `kind` ends the problem's type."""
 
     def __init__(
         self, status: int, kind: str, sentence: str, headers: Mapping[str, str] | None = None
@@ -75,7 +75,7 @@ class ProblemError(HTTPException):
 
 
 class Problems:
-    """Makes responses of faults and counts them by kind."""
+    """Turns errors into responses and counts them by kind."""
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
@@ -89,7 +89,7 @@ class Problems:
         headers: Mapping[str, str] | None = None,
         revision: int | None = None,
     ) -> JSONResponse:
-        """The response that says this; a lone surrogate in `sentence` becomes a question mark."""
+        """Return a problem as a response; a lone surrogate in `sentence` becomes a question mark."""
         self.counts[kind] += 1
         problem = Problem(
             type=TYPE_PREFIX + kind,
@@ -103,7 +103,7 @@ class Problems:
         )
 
     def of_http(self, fault: HTTPException) -> JSONResponse:
-        """The response to a refusal of the framework or of a gate."""
+        """Return the response to a refusal by the framework or the middleware."""
         if fault.status_code == 400 and not isinstance(fault, ProblemError):  # the body's text cannot be read
             return self._not_json()
         status = fault.status_code
@@ -113,13 +113,13 @@ class Problems:
         )
 
     def of_fault(self, fault: DeltalightError) -> JSONResponse:
-        """The response to a refusal of the storage or of a document."""
+        """Return the response to a refusal by the storage or a document."""
         status, kind = next((status, kind) for each, status, kind in _KINDS if isinstance(fault, each))
         revision = fault.current if isinstance(fault, StaleRevisionError) else None
         return self.response(status, kind, str(fault), revision=revision)
 
     def install(self, app: FastAPI) -> None:
-        """Answer every fault of the application so."""
+        """Register the handlers of all errors of the application."""
 
         @app.exception_handler(HTTPException)
         async def _http(_request: Request, fault: HTTPException) -> JSONResponse:
@@ -174,7 +174,7 @@ def describe_problems(schema: dict[str, Any]) -> dict[str, Any]:
 
 
 def responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """The errors of a route, for its OpenAPI description."""
+    """Return the errors of a route for its OpenAPI description."""
     return {status: {"model": Problem, "description": HTTPStatus(status).phrase} for status in statuses}
 
 

@@ -3,9 +3,8 @@
 import threading
 import time
 import uuid
-from collections import OrderedDict
+from collections import deque
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import structlog
 
@@ -15,9 +14,7 @@ from protocol.errors import DeltalightError
 from protocol.keys import Keys
 from protocol.messages import ControlRequest
 from protocol.transport import RequestClient
-from services.api.live_hub import ShownScene
-from services.api.outcomes import SILENT, Change, Outcomes, Picture, pending
-from services.api.turns import Turns
+from services.api.delivery import SILENT, Change, Deliveries, DeliveryStatus, pending
 from services.storage.scenes import StoredScene
 from services.storage.store import Store
 
@@ -25,17 +22,46 @@ LOOK_INTERVAL_S = 1.0
 ALIVE_TIMEOUT_S = 1.0  # the server's own thread answers this, whatever the renderer does
 COMMAND_TIMEOUT_S = 25.0  # the server gives up after 20 s itself
 MAX_COMMANDS = 8  # at once: each holds one of the 40 threads that answer requests
-REMEMBERED_REVISIONS = 1024  # half a minute of a gesture's changes; pictures are a few frames behind
 
 log = structlog.get_logger()
 
 
-class RenderLink:
-    """Sends the active scene to the render server, at once after a change and again after its restart.
+class FifoLock:
+    """FIFO lock: threads acquire it in their order of arrival.
 
-    One thread sends, always the newest revision: changes that come faster than the server takes them are left out.
-    Commands have their turn between, each after the changes that were made before it. The server counts revisions
-    of its own, across scenes: each sending is its newest plus one.
+    `threading.Lock` may be acquired again by the thread that has just released it, ahead of those that wait.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._is_held = False
+        self._waiting: deque[threading.Lock] = deque()
+
+    def __enter__(self) -> None:
+        """Wait until all who came before have released the lock."""
+        with self._lock:
+            if not self._is_held:
+                self._is_held = True
+                return
+            turn = threading.Lock()
+            turn.acquire()
+            self._waiting.append(turn)
+        turn.acquire()
+
+    def __exit__(self, *_fault: object) -> None:
+        """Hand over to the thread that has waited longest."""
+        with self._lock:
+            if self._waiting:
+                self._waiting.popleft().release()
+            else:
+                self._is_held = False
+
+
+class RenderLink:
+    """Sends the active scene to the render server, immediately after a change and again after its restart.
+
+    One thread sends, always the newest revision: changes that come faster than the server takes them are skipped.
+    Commands run in between, each after the changes that were made before it.
     """
 
     def __init__(
@@ -44,26 +70,26 @@ class RenderLink:
         control: str,
         keys: Keys | None = None,
         *,
-        on_picture: Callable[[Picture], None] = lambda _picture: None,
+        on_delivery: Callable[[DeliveryStatus], None] = lambda _status: None,
     ) -> None:
         self._store = store
-        self._on_picture = on_picture
+        self._on_delivery = on_delivery
         self._client = RequestClient(control, keys=keys)
-        self._turns = Turns()  # to ask the server; what is below is changed in one's turn
+        self._asking = FifoLock()  # to ask the server; what is below changes while it is held
         self._commands = threading.BoundedSemaphore(MAX_COMMANDS)
         self._changed = threading.Event()
-        self._outcomes = Outcomes()
+        self._deliveries = Deliveries()
         self._look_due_s = 0.0
         self._answers: bool | None = None  # not asked yet
-        self._server_revision: int | None = None
+        self._instance: str | None = None  # of the server; another one has lost what was sent before
+        self._has_scene = False  # whether this instance took a scene from here
         self._source: list[str] | None = None
         self.on_source: Callable[[Sequence[str] | None], None] = lambda _endpoints: None
-        self._sent: OrderedDict[int, ShownScene] = OrderedDict()  # by the server's revision
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="render-link", daemon=True)
 
     def start(self) -> None:
-        """Begin to watch the server."""
+        """Start watching the server."""
         self._thread.start()
 
     def close(self) -> None:
@@ -78,34 +104,30 @@ class RenderLink:
 
     @property
     def is_reachable(self) -> bool:
-        """Whether the server answered when it was last asked; not before it was asked."""
+        """Whether the server answered when it was last asked; False before that."""
         return self._answers is True
 
     @property
-    def picture(self) -> Picture | None:
-        """What the last sending came to."""
-        return self._outcomes.newest
+    def delivery(self) -> DeliveryStatus | None:
+        """The status of the last change that was sent."""
+        return self._deliveries.newest
 
-    def show(self, scene: StoredScene) -> Picture:
-        """Have a revision of the active scene sent, which is stored; what became of it, as far as soon known.
+    def show(self, scene: StoredScene) -> DeliveryStatus:
+        """Send a stored revision of the active scene, and return its status as far as it is known soon.
 
-        While a server that did not answer is being looked for, this does not wait for it.
+        Does not wait for a server that did not answer last.
         """
         change = _change(scene)
-        outcome = self._outcomes.expect(change)
+        outcome = self._deliveries.expect(change)
         self._changed.set()
         if self._answers is False:
             return pending(change, SILENT)
-        return self._outcomes.wait(change, outcome)
-
-    def shown(self, server_revision: int | None) -> ShownScene | None:
-        """Which scene a picture shows, made with a revision of the server's; None where that came from elsewhere."""
-        return None if server_revision is None else self._sent.get(server_revision)
+        return self._deliveries.wait(change, outcome)
 
     def command(
         self, op: str, payload: dict[str, object] | None = None, timeout_s: float = COMMAND_TIMEOUT_S
     ) -> dict[str, object]:
-        """Carry out a command at the render server, after those that wait; gives the payload of the reply.
+        """Execute a command at the render server, after those that wait, and return the payload of its reply.
 
         Raises:
             UnansweredError: it does not answer, or too many commands wait.
@@ -117,14 +139,14 @@ class RenderLink:
                 f"The render server is busy with {MAX_COMMANDS} other commands; try again soon."
             )
         try:
-            return self._carry_out(op, payload, timeout_s)
+            return self._execute(op, payload, timeout_s)
         finally:
             self._commands.release()
 
     def use_source(self, endpoints: Sequence[str] | None) -> None:
-        """Let the server read frames from there, None = from its own nodes; a server that was restarted too.
+        """Make the server read frames from there, also after its restart; None = from its own nodes.
 
-        `on_source` hears of it.
+        Calls `on_source` with the endpoints.
 
         Raises:
             UnansweredError: it does not answer, and is told as soon as it does.
@@ -133,10 +155,10 @@ class RenderLink:
         self._source = None if endpoints is None else list(endpoints)
         self.on_source(self._source)
         self._refuse_where_silent()
-        self._carry_out("set_source", {"endpoints": self._source}, COMMAND_TIMEOUT_S)
+        self._execute("set_source", {"endpoints": self._source}, COMMAND_TIMEOUT_S)
 
-    def _carry_out(self, op: str, payload: dict[str, object] | None, timeout_s: float) -> dict[str, object]:
-        with self._turns:
+    def _execute(self, op: str, payload: dict[str, object] | None, timeout_s: float) -> dict[str, object]:
+        with self._asking:
             if self._changed.is_set():
                 self._send_newest()
             self._refuse_where_silent()  # the first look may just have found nobody
@@ -148,7 +170,7 @@ class RenderLink:
             raise UnansweredError("The render server does not answer; see that it runs, then try again.")
 
     def _require_alive(self) -> None:
-        """Find out within a second that a server has died; how long its commands take, only the renderer knows."""
+        """Detect a dead server within a second; how long its commands take, only the renderer knows."""
         try:
             self._ask(CLOCK_OP, ALIVE_TIMEOUT_S)
         except UnansweredError:
@@ -156,24 +178,24 @@ class RenderLink:
             self._refuse_where_silent()
 
     def _send_newest(self) -> None:
-        """Send the newest revision of the active scene unless the server has it (in one's turn)."""
+        """Send the newest revision of the active scene unless the server has it (holding the lock)."""
         self._changed.clear()
-        awaited = self._outcomes.awaited
+        awaited = self._deliveries.awaited
         active = self._store.scenes.active()
         if active is None:
             return
-        change, before = _change(active), self._outcomes.newest
+        change, before = _change(active), self._deliveries.newest
         if before is not None and before.change == change and before.state != "pending":
-            picture = before
+            status = before
         elif self._answers is False:
-            picture = pending(change, SILENT)
+            status = pending(change, SILENT)
         else:
-            picture = self._send(active)
-        self._outcomes.note(picture, awaited)
-        if picture != before:
-            self._on_picture(picture)
+            status = self._send(active)
+        self._deliveries.note(status, awaited)
+        if status != before:
+            self._on_delivery(status)
 
-    def _send(self, active: StoredScene) -> Picture:
+    def _send(self, active: StoredScene) -> DeliveryStatus:
         revision = active.document.revision
         try:
             self._ask(CLOCK_OP, ALIVE_TIMEOUT_S)
@@ -183,47 +205,29 @@ class RenderLink:
             return pending(_change(active), SILENT)
         except DeltalightError as refusal:
             detail = self._store.assets.without_paths(str(refusal))
-            return Picture("refused", active.head.id, revision, detail)
-        return Picture("shown", active.head.id, revision)
+            return DeliveryStatus("refused", active.head.id, revision, detail)
+        return DeliveryStatus("shown", active.head.id, revision)
 
     def _set_scene(self, active: StoredScene) -> None:
+        """Send the scene; the first without a revision, so that the server does not compare it with older ones."""
+        if self._instance is None:
+            self._instance = self._server_instance()
         scene = self._store.assets.localised(active.document).model_dump(mode="json")
-        shown = ShownScene(active.head.id, active.document.revision)
-        sent = (self._seen_revision() if self._server_revision is None else self._server_revision) + 1
-        try:
-            self._set_revision(sent, scene, shown)
-        except UnansweredError:
-            raise
-        except DeltalightError:
-            newest = self._seen_revision()
-            if newest < sent:  # refused for what it is, not because somebody else changed the scene meanwhile
-                raise
-            self._set_revision(newest + 1, scene, shown)
-
-    def _set_revision(self, number: int, scene: object, shown: ShownScene) -> None:
-        """Noted before the server answers: a picture of it may come earlier than the answer."""
-        self._sent[number] = shown
-        while len(self._sent) > REMEMBERED_REVISIONS:
-            self._sent.popitem(last=False)
-        try:
-            self._ask("set_scene", COMMAND_TIMEOUT_S, {"scene": scene}, revision=number)
-        except UnansweredError:
-            raise
-        except DeltalightError:
-            del self._sent[number]
-            raise
-        self._server_revision = number
+        revision = active.document.revision if self._has_scene else None
+        self._ask(
+            "set_scene", COMMAND_TIMEOUT_S, {"scene": scene}, scene_id=active.head.id, revision=revision
+        )
+        self._has_scene = True
         self._look_due_s = time.monotonic() + LOOK_INTERVAL_S
 
-    def _seen_revision(self) -> int:
-        revision: Any = self._ask("ping", COMMAND_TIMEOUT_S)["revision"]
-        return int(revision)
+    def _server_instance(self) -> str:
+        return str(self._ask("ping", COMMAND_TIMEOUT_S)["instance"])
 
     def _run(self) -> None:
-        """Send what is changed; look at once, and whenever the server was not heard of for a second."""
+        """Send changes; look at the server at first, and whenever it was not heard of for a second."""
         while not self._stop.is_set():
             try:
-                with self._turns:
+                with self._asking:
                     self._look_where_due()
                     self._send_newest()
             except (DeltalightError, OSError) as fault:
@@ -239,26 +243,25 @@ class RenderLink:
             self._look_due_s = time.monotonic() + LOOK_INTERVAL_S
 
     def _look(self) -> None:
-        """A server that came (back) is to get source and scene."""
+        """Find out whether the server answers; one that came (back) gets source and scene."""
         answered_before = self._answers
         try:
             self._ask(CLOCK_OP, ALIVE_TIMEOUT_S)
             # It does, also while the renderer is busy, as with the shaders of its first picture.
             self._note_reachable(True)
-            seen = self._seen_revision()
-            is_new = self._server_revision is None or seen < self._server_revision  # it was started (again)
+            instance = self._server_instance()
+            is_new = instance != self._instance  # it was started (again)
             if is_new or not answered_before:
                 self._restore_source()
         except UnansweredError:
             self._note_reachable(False)
             return
         if is_new:
-            self._outcomes.forget()
-            self._sent.clear()
-        self._server_revision = seen
+            self._deliveries.forget()
+            self._instance, self._has_scene = instance, False
 
     def _restore_source(self) -> None:
-        """Tell a server that came (back) where to read from; one that is left from a killed service too."""
+        """Tell a server that came (back) where to read from; it may be left from a killed service."""
         try:
             self._ask("set_source", COMMAND_TIMEOUT_S, {"endpoints": self._source})
         except UnansweredError:
@@ -276,6 +279,8 @@ class RenderLink:
         op: str,
         timeout_s: float,
         payload: dict[str, object] | None = None,
+        *,
+        scene_id: str | None = None,
         revision: int | None = None,
     ) -> dict[str, object]:
         request = ControlRequest(
@@ -284,6 +289,7 @@ class RenderLink:
             id=uuid.uuid4().hex,
             op=op,
             payload=payload or {},
+            scene_id=scene_id,
             revision=revision,
         )
         try:

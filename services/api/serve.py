@@ -1,4 +1,4 @@
-"""The REST API's process."""
+"""The REST API's process: its socket, its web server, and the scene that it starts with."""
 
 import socket
 from pathlib import Path
@@ -9,24 +9,28 @@ from fastapi import FastAPI
 
 from protocol.errors import DeltalightError
 from protocol.keys import Keys
+from protocol.messages import ControlRequest
+from protocol.scene import SceneDocument, parse_scene
+from protocol.transport import RequestClient
 from services.api.app import create_app
-from services.api.first_scene import make_first_scene
 from services.api.settings import ApiSettings
+from services.host_store import FIRST_SCENE, activate_document
 from services.storage.scene_files import import_scene
 from services.storage.store import Store, default_folder
 
 FIRST_TOKEN = "first"
 MAX_CONNECTIONS = 256
+ANSWER_TIMEOUT_S = 1.0
 LARGEST_SOCKET_MESSAGE = 1024  # bytes: clients send acknowledgements only
 
 log = structlog.get_logger()
 
 
 def run_api(settings: ApiSettings, keys: Keys | None = None, scene: Path | None = None) -> None:
-    """Serve until SIGINT or SIGTERM; `scene` is imported and rendered first.
+    """Serve until SIGINT or SIGTERM; `scene` is imported and activated first.
 
-    Where there is none at all, the render server's is taken over, or an empty one made. Where the address leaves
-    the host and there is no token yet, one is made and printed.
+    Without any scene, it takes over that of the render server, or creates an empty one. If the address leaves the
+    host and there is no token yet, it creates one and prints it.
 
     Raises:
         DeltalightError: the port is in use, the data folder cannot be used, or the scene is wrong.
@@ -39,14 +43,14 @@ def run_api(settings: ApiSettings, keys: Keys | None = None, scene: Path | None 
             store.scenes.activate(import_scene(store, scene))
         make_first_scene(store, settings, keys)
         if settings.leaves_host:
-            _say_who_may_enter(settings, store)
+            _announce_access(settings, store)
         server = http_server(create_app(settings, store, keys))
         log.info("web process runs", address=f"http://{settings.host}:{settings.port}")
         server.run(sockets=[listener])
 
 
 class _Server(uvicorn.Server):
-    """Ends the live pictures before it waits for connections to end; those would not do so by themselves."""
+    """Ends the live streams before it waits for connections to close; they would not end by themselves."""
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Stop serving."""
@@ -56,7 +60,7 @@ class _Server(uvicorn.Server):
 
 
 def http_server(app: FastAPI) -> uvicorn.Server:
-    """The web server that runs the application."""
+    """Return the web server that runs the application."""
     config = uvicorn.Config(
         app,
         log_level="warning",
@@ -72,7 +76,7 @@ def http_server(app: FastAPI) -> uvicorn.Server:
 
 
 def listening(host: str, port: int) -> socket.socket:
-    """A socket that listens at an address.
+    """Return a socket that listens at an address.
 
     Raises:
         DeltalightError: it cannot.
@@ -91,7 +95,7 @@ def listening(host: str, port: int) -> socket.socket:
     return listener
 
 
-def _say_who_may_enter(settings: ApiSettings, store: Store) -> None:
+def _announce_access(settings: ApiSettings, store: Store) -> None:
     log.warning(
         "other hosts can connect; every request needs a token, and nothing is encrypted: put a TLS proxy in front "
         "or use an SSH tunnel",
@@ -100,3 +104,29 @@ def _say_who_may_enter(settings: ApiSettings, store: Store) -> None:
     if store.tokens.is_empty and settings.token_file is None:
         token = store.tokens.create(FIRST_TOKEN, "control")
         print(f"Token `{FIRST_TOKEN}` (role control), shown this once: {token}", flush=True)
+
+
+def make_first_scene(store: Store, settings: ApiSettings, keys: Keys | None) -> None:
+    """If no scene is active, take over that of the render server, or create an empty one."""
+    if store.scenes.active() is not None:
+        return
+    try:
+        shown = _shown_scene(settings.control, keys)
+        activate_document(store, shown.replaced(name=shown.name or FIRST_SCENE))
+    except (DeltalightError, OSError) as fault:  # it does not run yet, or its files are another host's
+        log.debug("nothing to take over from the render server", fault=str(fault))
+        activate_document(store, SceneDocument(name=FIRST_SCENE))
+
+
+def _shown_scene(control: str, keys: Keys | None) -> SceneDocument:
+    client = RequestClient(control, keys=keys)
+    try:
+        reply = client.request(ControlRequest(node="api", id="first-scene", op="get_scene"), ANSWER_TIMEOUT_S)
+    finally:
+        client.close()
+    if reply.error is not None:
+        raise DeltalightError(reply.error)
+    document = reply.payload.get("scene")
+    if not isinstance(document, dict):
+        raise DeltalightError("The render server's answer holds no scene.")
+    return parse_scene(document)

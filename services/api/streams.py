@@ -1,28 +1,70 @@
-"""What node and render server publish, as far as the service shows it."""
+"""Subscribes to what nodes and render servers publish, and keeps their newest reports."""
 
 import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
 import structlog
 
 from protocol.envelope import decode
 from protocol.errors import DeltalightError
 from protocol.keys import Keys
-from protocol.messages import CompositeMessage, Message, StatsMessage
+from protocol.messages import Message, StatsMessage
 from protocol.transport import ReceivedMultipart, Receiver
-from services.api.context import Context
-from services.api.models import ProcessAnswer
 
 RECEIVE_TIMEOUT_S = 0.2
-LIGHT = "radiance."  # topics of what nodes see of the light
+FORGOTTEN_AFTER_S = 3600.0
+RADIANCE = "radiance."  # prefix of the topics on which nodes publish measured light
 
 Sink = Callable[[Message, Sequence[memoryview]], None]
 
 log = structlog.get_logger()
 
 
+@dataclass(frozen=True)
+class Report:
+    """The newest report of a process, when it arrived (monotonic seconds) and how long it travelled."""
+
+    message: StatsMessage
+    received_s: float
+    delay_ms: float
+
+    @property
+    def age_s(self) -> float:
+        """Seconds since it arrived."""
+        return time.monotonic() - self.received_s
+
+
+class ProcessWatch:
+    """Keeps the newest report of every process (any thread)."""
+
+    def __init__(self) -> None:
+        self._reports: dict[str, Report] = {}
+        self._lock = threading.Lock()
+
+    def note(self, message: StatsMessage) -> Report:
+        """Keep a report that has just arrived."""
+        sent_ns = message.capture_ns + message.clock_offset_ns
+        report = Report(message, time.monotonic(), (time.time_ns() - sent_ns) / 1e6)
+        with self._lock:
+            self._reports[message.node] = report
+        return report
+
+    def reports(self) -> list[Report]:
+        """Return the newest report of each process, ordered by name."""
+        with self._lock:
+            self._reports = {k: v for k, v in self._reports.items() if v.age_s < FORGOTTEN_AFTER_S}
+            return [self._reports[name] for name in sorted(self._reports)]
+
+    def detail(self, name: str) -> str:
+        """Return the detail of a process's newest report; empty if there is none."""
+        report = self._reports.get(name)
+        return "" if report is None else report.message.detail
+
+
 class Streams:
-    """Hands the newest message of each topic to the sink of its stream, in a thread of its own."""
+    """Hands the newest message of each topic to the sink of its stream, in its own thread."""
 
     def __init__(self, endpoints: Sequence[str], sinks: Mapping[str, Sink], keys: Keys | None = None) -> None:
         self._receiver = Receiver(endpoints, list(sinks), keys=keys)
@@ -34,11 +76,14 @@ class Streams:
         self._thread = threading.Thread(target=self._run, name="streams", daemon=True)
 
     def start(self) -> None:
-        """Begin to listen."""
+        """Start listening."""
         self._thread.start()
 
-    def follow(self, endpoints: Sequence[str] | None) -> None:
-        """Hear also what the render server reads from now on, None = its own nodes; light comes from there only."""
+    def use_source(self, endpoints: Sequence[str] | None) -> None:
+        """Subscribe also to what the render server reads from now on; None = its own nodes.
+
+        While there is such a source, radiance comes from there only.
+        """
         with self._changing:
             before = self._source
             self._source = Receiver(endpoints, list(self._sinks), keys=self._keys) if endpoints else None
@@ -48,7 +93,7 @@ class Streams:
     def close(self) -> None:
         """Stop listening."""
         self._stop.set()
-        self.follow(None)
+        self.use_source(None)
         self._receiver.close()
         if self._thread.is_alive():
             self._thread.join()
@@ -58,7 +103,7 @@ class Streams:
             own = self._receiver.latest(RECEIVE_TIMEOUT_S) or {}
             source = self._source
             for topic, multipart in own.items():
-                if source is None or not topic.startswith(LIGHT):
+                if source is None or not topic.startswith(RADIANCE):
                     self._pass_on(multipart)
             for multipart in (source.latest(0) or {}).values() if source is not None else ():
                 self._pass_on(multipart)
@@ -69,24 +114,3 @@ class Streams:
             self._sinks[message.stream](message, parts)
         except DeltalightError as fault:
             log.warning("message not understood", fault=str(fault))
-
-
-def sinks(context: Context) -> dict[str, Sink]:
-    """Where what is received goes: pictures to viewers, reports to the watch and to those who hear events."""
-    return {
-        "composite": lambda message, parts: _show(context, message, parts),
-        "radiance": context.fisheye.note,
-        "stats": lambda message, _parts: _note_report(context, message),
-    }
-
-
-def _show(context: Context, message: Message, parts: Sequence[memoryview]) -> None:
-    if isinstance(message, CompositeMessage) and message.encoding == "jpeg":
-        scene = context.link.shown(message.scene_revision)
-        context.live.publish(message, bytes(parts[0]), scene, context.watch.detail(message.node))
-
-
-def _note_report(context: Context, message: Message) -> None:
-    if isinstance(message, StatsMessage):
-        report = context.watch.note(message)
-        context.events.publish("process", ProcessAnswer.of(report).model_dump())

@@ -5,11 +5,12 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from services.storage.faults import RejectedAssetError
 
 AssetKind = Literal["mesh", "map"]
+Facts = dict[str, Any]  # what is known of a file once it is loaded, as JSON
 HEAD_BYTES = 4096
 MAX_NAME_LENGTH = 200
 _STL_HEADER_BYTES, _STL_TRIANGLE_BYTES = 84, 50

@@ -21,17 +21,17 @@ from sqlalchemy.orm import Session
 
 from protocol.errors import DeltalightError
 from protocol.scene import DIGEST_PREFIX, SceneDocument
-from services.storage.asset_child import Facts, Task, run_limited
 from services.storage.asset_kinds import (
     BY_NAME,
     HEAD_BYTES,
     AssetFormat,
     AssetKind,
+    Facts,
     clean_name,
     is_archive,
     recognise,
 )
-from services.storage.asset_probe import probe
+from services.storage.asset_sandbox import Task, probe, run_limited
 from services.storage.database import Database
 from services.storage.faults import ConflictError, NotFoundError, StorageFaultError, TooLargeError
 from services.storage.tables import AssetNameRow, AssetRow, AssetUseRow, SceneRow
@@ -46,7 +46,7 @@ CHUNK_BYTES = 1 << 20
 
 @dataclass(frozen=True)
 class Asset:
-    """What is known of an uploaded file; `facts` are those of `asset_probe.probe`."""
+    """What is known of an uploaded file; `facts` are those of `asset_facts`."""
 
     digest: str
     names: tuple[str, ...]

@@ -12,7 +12,7 @@ from typing import Any
 from urllib.parse import unquote
 
 from protocol.errors import DeltalightError
-from services.storage.asset_child import Facts
+from services.storage.asset_kinds import Facts
 
 MAX_ENTRIES = 1000
 _JSON_CHUNK, _BIN_CHUNK = 0x4E4F534A, 0x004E4942
@@ -21,7 +21,7 @@ _ENCRYPTED = 1  # general purpose flag, bit 0 (APPNOTE 4.4.4)
 
 
 def repack(path: Path, out: str, limit: str) -> Facts:
-    """Write the glTF of an archive as one .glb file (in the child); `limit` is its greatest size unpacked, bytes.
+    """Write the glTF of an archive as one .glb file (in the worker); `limit` is its greatest size unpacked, bytes.
 
     The same archive gives the same file to the bit.
 

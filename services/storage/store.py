@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Self
 
 from protocol.errors import DeltalightError
-from services.storage.asset_probe import probe as probe_asset
+from services.storage.asset_sandbox import probe as probe_asset
 from services.storage.assets import AssetStore, Probe
 from services.storage.database import Database
 from services.storage.scenes import SceneStore

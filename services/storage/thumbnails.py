@@ -1,4 +1,4 @@
-"""Small pictures of meshes and environment maps, drawn on the processor (in the limited child process)."""
+"""Small pictures of meshes and environment maps, drawn on the processor (in the worker)."""
 
 from pathlib import Path
 
@@ -9,11 +9,11 @@ from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Float32, Int
 
 from protocol.radiance_files import read_linear
-from render_server.lights.environment import LUMINANCE
 from render_server.scene.asset_check import check_mesh_file
-from render_server.scene.mesh_loading import load_mesh
+from render_server.lights.environment import LUMINANCE
 from render_server.scene.triangle_mesh import TriangleMesh
-from services.storage.asset_child import Facts
+from render_server.scene.mesh_loading import load_mesh
+from services.storage.asset_kinds import Facts
 
 SIZE = 256
 SAMPLES = 2  # rays along each edge of a pixel

@@ -4,11 +4,11 @@ from itertools import pairwise
 
 import pytest
 
+from benchmarks.cli import DEFAULT_METHODS
 from benchmarks.quality.variants import ABLATION_STEPS, ablation_chain, parse_variants
 from protocol.errors import DeltalightError
 from protocol.scene import parse_scene
 from protocol.scene_method import DvctMethod, NoneMethod
-from services.commands.bench import DEFAULT_METHODS
 
 SCENE = parse_scene({"method": {"name": "dvct", "volume_edge_m": 0.7}})
 

@@ -91,9 +91,13 @@ def test_colour_comes_back(
     assert [bytes(part) for part in raw] == [part.tobytes() for part in parts]
 
 
-@given(base_fields, plain_dicts, st.none() | counts)
-def test_control_comes_back(base: dict[str, Any], payload: dict[str, Any], revision: int | None) -> None:
-    message = ControlRequest(**base, id="a-1", op="set_scene", revision=revision, payload=payload)
+@given(base_fields, plain_dicts, st.none() | st.just("4f0c"), st.none() | counts)
+def test_control_comes_back(
+    base: dict[str, Any], payload: dict[str, Any], scene_id: str | None, revision: int | None
+) -> None:
+    message = ControlRequest(
+        **base, id="a-1", op="set_scene", scene_id=scene_id, revision=revision, payload=payload
+    )
     assert decode(encode(message)) == (message, [])
 
 
@@ -111,7 +115,7 @@ def test_topic_is_stream_and_node() -> None:
     assert encode(color(), [np.zeros((2, 4, 3), np.uint8)])[0] == b"color.desk"
 
 
-@pytest.mark.parametrize("version", [0, 1, 4, 999, -1])
+@pytest.mark.parametrize("version", [0, 1, SCHEMA_VERSION - 1, SCHEMA_VERSION + 1, 999, -1])
 def test_another_version_is_refused_and_both_are_named(version: int) -> None:
     with pytest.raises(EnvelopeError, match=rf"version {version} .* version {SCHEMA_VERSION}"):
         unpack_header(header_of(color(), schema_version=version))

@@ -145,6 +145,27 @@ def test_repeats_are_not_carried_out_twice(opened: Callable[[Any], Any]) -> None
     assert done == [3, 4, 1]
 
 
+def test_revisions_hold_for_one_scene(opened: Callable[[Any], Any]) -> None:
+    done: list[tuple[str | None, int | None]] = []
+    server = opened(
+        ReplyServer(ANY, lambda control: {"n": done.append((control.scene_id, control.revision))})
+    )
+    client = opened(RequestClient(server.endpoint))
+    sent: list[tuple[str | None, int | None]] = [
+        ("a", 3),
+        ("b", 1),
+        ("a", 2),
+        (None, 1),
+        (None, None),
+        (None, 1),
+    ]
+    for number, (scene_id, revision) in enumerate(sent):
+        assert client.request(request(id=f"r{number}", scene_id=scene_id, revision=revision), 5).ok
+    assert client.request(request(id="again", revision=1), 5).ok
+    assert not client.request(request(id="older", revision=0), 5).ok
+    assert done == sent
+
+
 def test_memory_forgets_old_ids_and_a_refused_revision_may_come_again() -> None:
     memory = ReplyMemory(size=2)
     refused = request(id="a", revision=1)

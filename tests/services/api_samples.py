@@ -30,12 +30,12 @@ class RenderServer:
     def __init__(self, port: int) -> None:
         self.renderer = InvertingRenderer()
         self.session = RenderSession(self.renderer, SceneDocument(name="as started", revision=7))
-        self._replies = ReplyServer(ports.endpoint(port), self._carry_out)
+        self._replies = ReplyServer(ports.endpoint(port), self._execute)
 
-    def _carry_out(self, request: object) -> dict[str, object]:
+    def _execute(self, request: object) -> dict[str, object]:
         if getattr(request, "op", "") == "clock":
             return {}
-        return self.session.carry_out(request)  # type: ignore[arg-type]
+        return self.session.execute(request)  # type: ignore[arg-type]
 
     def close(self) -> None:
         self._replies.close()

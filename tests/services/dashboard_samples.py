@@ -22,7 +22,7 @@ from playwright.sync_api import BrowserContext, ConsoleMessage, Locator, Page
 from protocol.camera_model import CameraModel
 from protocol.scene import SceneDocument
 from services import ports
-from services.api.page import DASHBOARD
+from services.api.static_page import DASHBOARD
 from services.demo import NAME, RECORDING, demo_plan, demo_scene
 from services.host_store import activate_document, session_file
 from services.storage.store import Store

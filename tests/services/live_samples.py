@@ -30,11 +30,11 @@ AROUND = {"type": "environment", "mean_radiance": [0.1, 0.1, 0.1]}
 
 
 class StandInStream:
-    """Publishes a composite every 20 ms, each tenth time a report too; `revision` is the scene's at the server."""
+    """Publishes a composite every 20 ms, each tenth time a report too; `scene` = id and revision of what it shows."""
 
     def __init__(self, port: int) -> None:
         self.sent = 0
-        self.revision: int | None = None
+        self.scene: tuple[str | None, int | None] = (None, None)
         self._stop = threading.Event()
         self.publisher = Publisher(ports.endpoint(port))
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -50,13 +50,13 @@ class StandInStream:
         for number in itertools.count(1):
             if self._stop.wait(PERIOD_S):
                 return
-            self.publisher.send(encode(composite(number, self.revision), [jpeg]))
+            self.publisher.send(encode(composite(number, *self.scene), [jpeg]))
             if number % 10 == 0:
                 self.publisher.send(encode(report("render-server", "stand-in renderer")))
             self.sent = number
 
 
-def composite(number: int, revision: int | None = None) -> CompositeMessage:
+def composite(number: int, scene_id: str | None = None, revision: int | None = None) -> CompositeMessage:
     now_ns = time.time_ns()
     return CompositeMessage(
         node="render-server",
@@ -65,6 +65,7 @@ def composite(number: int, revision: int | None = None) -> CompositeMessage:
         encoding="jpeg",
         shape=(HEIGHT, WIDTH, 3),
         status="ok",
+        scene_id=scene_id,
         scene_revision=revision,
         camera=camera().to_dict(),
         world_from_camera=IDENTITY,

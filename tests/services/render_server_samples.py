@@ -24,11 +24,12 @@ class Recorder:
     def __init__(self, control_port: int) -> None:
         self.asked: list[tuple[str, dict[str, object]]] = []
         self.fault: str | None = None
+        self.scene_id: str | None = None
         self.revision = 1
         self.gate = threading.Event()
         self.gate.set()
         self.is_busy = threading.Event()
-        self._server = ReplyServer(ports.endpoint(control_port), self._carry_out)
+        self._server = ReplyServer(ports.endpoint(control_port), self._execute)
 
     def close(self) -> None:
         self.gate.set()
@@ -37,14 +38,14 @@ class Recorder:
     def payloads(self, op: str) -> list[dict[str, object]]:
         return [payload for asked, payload in self.asked if asked == op]
 
-    def _carry_out(self, request: ControlRequest) -> dict[str, object]:
+    def _execute(self, request: ControlRequest) -> dict[str, object]:
         self.asked.append((request.op, dict(request.payload)))
         match request.op:
             case "ping":
-                return {"revision": self.revision}
+                return {"scene_id": self.scene_id, "revision": self.revision, "instance": "stand-in"}
             case "set_scene":
                 self._wait_at_gate()
-                self.revision = request.revision or self.revision + 1
+                self.scene_id, self.revision = request.scene_id, request.revision or self.revision + 1
             case "pick":
                 self._wait_at_gate()
                 return {"frame_id": 1, **NOWHERE}

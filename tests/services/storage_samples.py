@@ -4,8 +4,7 @@ import json
 import struct
 from pathlib import Path
 
-from services.storage.asset_child import Facts
-from services.storage.asset_kinds import AssetKind
+from services.storage.asset_kinds import AssetKind, Facts
 from services.storage.assets import Asset
 from services.storage.store import Store
 

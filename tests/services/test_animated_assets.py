@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from services.storage.asset_probe import probe
+from services.storage.asset_sandbox import probe
 from services.storage.faults import RejectedAssetError
 
 ASSETS = Path(__file__).parents[2] / "services" / "demo_assets"

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from protocol.radiance_files import write_exr
-from services.storage.asset_probe import probe
+from services.storage.asset_sandbox import probe
 from services.storage.faults import RejectedAssetError
 from tests.services.api_samples import UPLOAD, RunningApi, running_api, sentence
 from tests.services.conftest import ROOT

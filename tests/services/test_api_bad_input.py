@@ -22,7 +22,7 @@ import pytest
 from protocol.radiance_files import write_exr
 from services import ports
 from services.api.problems import TYPE_PREFIX
-from services.storage.asset_probe import probe
+from services.storage.asset_sandbox import probe
 from services.storage.faults import StorageFaultError
 from tests.services.api_samples import UPLOAD, RenderServer, RunningApi, running_api, sentence
 from tests.services.record_samples import frames, write

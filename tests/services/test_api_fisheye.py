@@ -13,7 +13,7 @@ from protocol.transport import Publisher
 from sensor_node.cameras.discovery import Discovery, FoundCamera, MissingSupport
 from services import ports
 from services.api import camera_finder
-from services.api.fisheye_lights import lights_in_picture
+from services.api.fisheye import lights_in_picture
 from tests.services.api_samples import sentence
 from tests.services.conftest import IDENTITY
 from tests.services.live_samples import LiveApi, live_api

@@ -17,16 +17,16 @@ from websockets.sync.client import ClientConnection
 from protocol.errors import DeltalightError
 from protocol.messages import ControlRequest
 from services import ports
-from services.api.live import WINDOW
+from services.api.credentials import OPEN_TICKETS, TICKET_LIFE_S, Principal, Tickets
+from services.api.limits import STREAMS_PER_CLIENT
 from services.api.live_hub import LiveHub
-from services.api.passes import Pass
-from services.api.places import PLACES_PER_CLIENT
-from services.api.tickets import OPEN_TICKETS, TICKET_LIFE_S, TicketBox
+from services.api.routes.live import WINDOW
 from tests.services.api_samples import sentence
 from tests.services.conftest import HEIGHT, ROOT, WIDTH
 from tests.services.live_samples import (
     LiveApi,
     StandInStream,
+    composite,
     event_socket,
     live_api,
     live_socket,
@@ -63,7 +63,7 @@ def bearer(live: LiveApi, name: str, role: str) -> dict[str, str]:
 
 
 def test_a_frames_header_says_what_it_shows_and_where_time_went(live: LiveApi) -> None:
-    live.stream.revision = None
+    live.stream.scene = (None, 7)
     with live_socket(live.address) as socket:
         header = read_frame(socket)
     assert header["pass_times_ms"] == {"trace cones": 12.5, "compose": 1.0}
@@ -75,21 +75,40 @@ def test_a_frames_header_says_what_it_shows_and_where_time_went(live: LiveApi) -
     assert (header["camera"]["width"], header["camera"]["height"]) == (WIDTH, HEIGHT)
     assert header["world_from_camera"][3] == [0, 0, 0, 1]
     assert [light["type"] for light in header["lights"]] == ["sphere", "environment"]
+    description = httpx.get(f"http://{live.address}/openapi.json").json()
+    assert set(header) == set(description["components"]["schemas"]["LiveHeader"]["properties"])
     assert {"number", "frame_id", "capture_ns", "frames_per_s", "renderer"} <= set(header)
+
+
+def test_a_composite_without_a_camera_is_refused() -> None:
+    hub = LiveHub()
+    with pytest.raises(DeltalightError, match=r"`camera\.width`"):
+        hub.publish(composite(1).model_copy(update={"camera": {}}), b"", "")
+    assert hub.newest is None
 
 
 def test_a_frame_names_the_scene_and_revision_of_the_api(live: LiveApi) -> None:
     client = live.client
     scene_id = client.post("/scenes", json={"name": "shown"}).json()["id"]
     assert client.post(f"/scenes/{scene_id}/activate").json()["picture"]["state"] == "shown"
-    live.stream.revision = live.server.session.scene.revision
+    live.stream.scene = shown(live)
     assert client.patch(f"/scenes/{scene_id}", json={"name": "renamed"}).json()["revision"] == 2
     with live_socket(live.address) as socket:
         assert next_scene(socket, None) == {"id": scene_id, "revision": 1}
-        live.stream.revision = live.server.session.scene.revision
+        live.stream.scene = shown(live)
         assert next_scene(socket, {"id": scene_id, "revision": 1}) == {"id": scene_id, "revision": 2}
-        live.stream.revision = 10**6  # somebody else's
+        live.server.session.execute(
+            ControlRequest(node="other", id="r1", op="set_view", payload={"view": "delta"})
+        )
+        live.stream.scene = shown(live)
+        assert live.stream.scene == (None, 3)
         assert next_scene(socket, {"id": scene_id, "revision": 2}) is None
+
+
+def shown(live: LiveApi) -> tuple[str | None, int]:
+    """What a picture of the render session would say that it shows."""
+    session = live.server.session
+    return session.scene_id, session.scene.revision
 
 
 def next_scene(socket: ClientConnection, before: object) -> object:
@@ -189,14 +208,14 @@ def test_a_pick_is_the_render_servers_answer(live: LiveApi, monkeypatch: pytest.
     seen |= {"normal": [0, 0, 1], "distance_m": 0.9}
     asked: list[dict[str, object]] = []
 
-    def carry_out(request: ControlRequest) -> dict[str, object]:
+    def execute(request: ControlRequest) -> dict[str, object]:
         assert request.op == "pick"
         asked.append(dict(request.payload))
         if request.payload["x"] == 1.0:
             raise DeltalightError("No frame was rendered yet.")
         return seen
 
-    monkeypatch.setattr(live.server.session, "carry_out", carry_out)
+    monkeypatch.setattr(live.server.session, "execute", execute)
     assert live.client.post("/live/pick", json={"x": 3, "y": 4.5}).json() == seen
     live.client.post("/live/pick", json={"x": 3, "y": 4, "ignore": "knot"}).raise_for_status()
     assert asked == [{"x": 3.0, "y": 4.5}, {"x": 3.0, "y": 4.0, "ignore": "knot"}]
@@ -272,21 +291,21 @@ def test_both_roles_look_and_a_token_works_where_headers_can_be_sent(guarded: Li
 
 def test_tickets_end_and_the_oldest_are_forgotten() -> None:
     now_s = 0.0
-    box = TicketBox(lambda: now_s)
-    rights = Pass("view", "id", "wall")
-    late, early = box.give(rights), box.give(rights)
+    tickets = Tickets(lambda: now_s)
+    principal = Principal("view", "id", "wall")
+    late, early = tickets.issue(principal), tickets.issue(principal)
     now_s = TICKET_LIFE_S - 1
-    assert box.take(early) == rights
+    assert tickets.redeem(early) == principal
     now_s = TICKET_LIFE_S + 1
-    assert box.take(late) is None
-    oldest = box.give(rights)
+    assert tickets.redeem(late) is None
+    oldest = tickets.issue(principal)
     for _ in range(OPEN_TICKETS):
-        box.give(rights)
-    assert box.take(oldest) is None
+        tickets.issue(principal)
+    assert tickets.redeem(oldest) is None
 
 
 def test_a_revoked_token_ends_what_it_opened(guarded: LiveApi, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("services.api.places.CHECK_INTERVAL_S", 0.1)
+    monkeypatch.setattr("services.api.limits.CHECK_INTERVAL_S", 0.1)
     headers = bearer(guarded, "guest", "view")
     with live_socket(guarded.address, additional_headers=headers) as socket:
         read_frame(socket)
@@ -297,7 +316,7 @@ def test_a_revoked_token_ends_what_it_opened(guarded: LiveApi, monkeypatch: pyte
 
 def test_a_client_has_only_so_many_places(live: LiveApi) -> None:
     with ExitStack() as stack:
-        for _ in range(PLACES_PER_CLIENT):
+        for _ in range(STREAMS_PER_CLIENT):
             stack.enter_context(event_socket(live.address))
         with pytest.raises(websockets.InvalidStatus) as refused:
             event_socket(live.address)

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from services import ports
-from services.api import playback, take_recorder
+from services.api import recording_session, replay_control
 from tests.services.api_samples import RunningApi, running_api
 from tests.services.live_samples import StandInStream, wait_for_frames
 from tests.services.record_samples import frames, write
@@ -63,8 +63,8 @@ class NoChild:
 @pytest.fixture
 def full_api(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[RunningApi]:
     """With pictures that come, and a render server that answers."""
-    for module in (playback, take_recorder):
-        monkeypatch.setattr(module, "OwnedChild", NoChild)
+    for module in (recording_session, replay_control):
+        monkeypatch.setattr(module, "ChildProcess", NoChild)
     control_port, stream_port = ports.private_ports(2)
     endpoints = {"control": ports.endpoint(control_port), "subscribe": [ports.endpoint(stream_port)]}
     server, stream = Recorder(control_port), StandInStream(stream_port)

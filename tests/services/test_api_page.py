@@ -22,7 +22,7 @@ def folder(tmp_path: Path) -> Path:
 @pytest.fixture
 def page(tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[httpx.Client]:
     """A client of the root of a service that serves `folder`."""
-    monkeypatch.setattr("services.api.page.DASHBOARD", folder)
+    monkeypatch.setattr("services.api.static_page.DASHBOARD", folder)
     with (
         running_api(tmp_path / "data") as running,
         httpx.Client(base_url=f"http://127.0.0.1:{running.client.base_url.port}") as client,

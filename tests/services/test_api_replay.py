@@ -11,7 +11,7 @@ import pytest
 from protocol.messages import ControlRequest
 from protocol.transport import RequestClient
 from services import ports
-from services.api.replay_places import ReplayPlaces
+from services.api.replay_control import ReplayEndpoints
 from services.recorder import Recorder as StreamRecorder
 from services.recorder import RecordJob
 from services.storage.faults import ConflictError
@@ -150,13 +150,13 @@ def test_wrong_wishes_are_one_sentence(
 
 
 def test_sockets_lie_beside_the_servers_and_other_hosts_are_refused() -> None:
-    places = ReplayPlaces.beside("ipc:///run/deltalight/control")
+    places = ReplayEndpoints.beside("ipc:///run/deltalight/control")
     assert {places.streams, places.control} == {
         "ipc:///run/deltalight/control-replay",
         "ipc:///run/deltalight/control-replay-control",
     }
     with pytest.raises(ConflictError, match="on another host"):
-        ReplayPlaces.beside("tcp://gpu@192.0.2.7:5603")
+        ReplayEndpoints.beside("tcp://gpu@192.0.2.7:5603")
 
 
 def test_the_control_endpoint_refuses_what_it_does_not_know(client: httpx.Client, server: Recorder) -> None:

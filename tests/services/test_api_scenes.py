@@ -8,6 +8,8 @@ import httpx
 import pytest
 import yaml
 
+from protocol.messages import ControlRequest
+from services import ports
 from services.api.render_link import ALIVE_TIMEOUT_S
 from tests.services.api_samples import UPLOAD, RenderServer, RunningApi, running_api, sentence
 from tests.services.storage_samples import TETRAHEDRON
@@ -320,7 +322,7 @@ def test_a_change_reaches_the_render_server_before_its_answer(api: RunningApi) -
         "revision": 1,
         "detail": "",
     }
-    assert server.session.scene.revision > 7  # above what the server had of its own
+    assert (server.session.scene_id, server.session.scene.revision) == (scene["id"], 1)
     for revision in (2, 3):
         answer = client.patch(address, json={"name": f"change {revision}"}).json()
         assert answer["picture"] == {"state": "shown", "revision": revision, "detail": ""}
@@ -345,12 +347,29 @@ def test_a_change_reaches_the_render_server_before_its_answer(api: RunningApi) -
     again = RenderServer(api.control_port)  # as started, knows nothing
     wait_for(lambda: again.session.scene.name == "while it was away")
     wait_for(lambda: client.get(address).json()["picture"]["state"] == "shown")
-    again.session.carry_out(_view_request())  # somebody else changes the scene at the server too
+    again.session.execute(_view_request())  # somebody else changes the scene at the server too
     assert client.patch(address, json={"name": "last"}).json()["picture"]["state"] == "shown"
     assert again.session.scene.name == "last"
     again.close()
     wait_for(lambda: client.get("/health").json()["status"] == "degraded")
     assert ALIVE_TIMEOUT_S < 2
+
+
+def test_a_service_that_begins_shows_its_scene_whatever_the_server_had(tmp_path: Path) -> None:
+    (control_port,) = ports.private_ports(1)
+    server = RenderServer(control_port)
+    control = ports.endpoint(control_port)
+    with running_api(tmp_path, control=control) as api:
+        scene = make(api.client, name="restored")
+        wait_for(lambda: api.client.get("/state").json()["render_server"] == "answers")
+        api.client.post(f"/scenes/{scene['id']}/activate").raise_for_status()
+    server.session.execute(_ahead(scene["id"]))
+    with running_api(tmp_path, control=control) as api:
+        wait_for(lambda: server.session.scene.name == "restored")
+        answer = api.client.patch(f"/scenes/{scene['id']}", json={"name": "changed"}).json()
+        assert answer["picture"] == {"state": "shown", "revision": 2, "detail": ""}
+        assert (server.session.scene_id, server.session.scene.revision) == (scene["id"], 2)
+    server.close()
 
 
 def test_requests_and_refusals_are_measured(client: httpx.Client) -> None:
@@ -363,6 +382,13 @@ def test_requests_and_refusals_are_measured(client: httpx.Client) -> None:
     assert any(line.startswith('deltalight_api_refused_total{kind="invalid"}') for line in lines)
     assert any(line.startswith("deltalight_render_server_answers") for line in lines)
     assert not any(address in line for line in lines)  # each scene of its own would be endless labels
+
+
+def _ahead(scene_id: str) -> ControlRequest:
+    scene = {"name": "ahead"}
+    return ControlRequest(
+        node="test", id="ahead", op="set_scene", scene_id=scene_id, revision=99, payload={"scene": scene}
+    )
 
 
 def _view_request() -> object:

@@ -7,9 +7,9 @@ import httpx
 import pytest
 
 from protocol.errors import DeltalightError
-from services.api.gate import WRONG_TOKENS_AT_ONCE
-from services.api.rate import REMEMBERED_CLIENTS, RateLimit
-from services.api.secret_token import SecretToken
+from services.api.auth import WRONG_TOKENS_AT_ONCE
+from services.api.credentials import SecretToken
+from services.api.limits import REMEMBERED_CLIENTS, RateLimit
 from services.api.settings import ApiSettings
 from tests.services.api_samples import RunningApi, running_api, sentence
 

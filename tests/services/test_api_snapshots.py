@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from services.api.snapshot_shelf import SnapshotShelf
+from services.api.snapshot_store import SnapshotStore
 from tests.services.api_samples import RunningApi, running_api, sentence
 from tests.services.render_server_samples import Recorder
 from tests.services.test_api_scenes import wait_for
@@ -116,7 +116,7 @@ def test_what_is_not_whole_or_not_a_snapshot_is_not_listed(api: RunningApi, fold
     assert [each["id"] for each in api.client.get("/snapshots").json()] == sorted(ids[1:], reverse=True)
     for address in (ids[0], "none", "20261121-101500-3fa2c1", f"{ids[1]}/snapshot.json", f"{ids[1]}/rsm.png"):
         assert api.client.get(f"/snapshots/{address}").status_code in (404, 422)
-    SnapshotShelf(folder)
+    SnapshotStore(folder)
     assert (folder / ".20261121-101500-3fa2c1.part").is_dir(), "it may still grow"
 
 

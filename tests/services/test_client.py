@@ -15,6 +15,7 @@ from protocol.scene import SceneDocument
 from protocol.source import open_source
 from services import ports
 from services.client import ApiError, Client
+from services.live_message import unpack
 from tests.services.api_samples import RunningApi, running_api
 from tests.services.conftest import HEIGHT, ROOT, WIDTH
 from tests.services.live_samples import StandInStream, wait_for_frames
@@ -220,6 +221,12 @@ def test_with_a_token_everything_works_streams_too(tmp_path: Path) -> None:
                 assert (refused.value.status, refused.value.kind) == (401, "token")
         with Client(service.address) as client, pytest.raises(DeltalightError, match="401"):
             next(client.frames())
+
+
+@pytest.mark.parametrize("message", [b"", b"\x02\0\0\0{}\xff\xd8", b"\xff\xff\0\0{}"])
+def test_a_picture_without_a_valid_header_is_a_sentence(message: bytes) -> None:
+    with pytest.raises(DeltalightError, match="valid header"):
+        unpack(message)
 
 
 def test_faults_are_sentences(service: Service, client: Client, tmp_path: Path) -> None:

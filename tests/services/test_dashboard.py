@@ -9,7 +9,7 @@ import trimesh
 from playwright.sync_api import Browser, sync_playwright
 
 from protocol.camera_model import CameraModel
-from services.api.page import DASHBOARD
+from services.api.static_page import DASHBOARD
 from services.demo import RECORDING, SCENE
 from tests.services.dashboard_samples import AXE, SIZE, Desk, Stack, demo_stack, desk, find_chromium
 

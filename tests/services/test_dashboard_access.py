@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import pytest
 from playwright.sync_api import Locator, Page, expect, sync_playwright
 
-from services.api.page import DASHBOARD
+from services.api.static_page import DASHBOARD
 from tests.services.dashboard_samples import AXE, PATIENCE_S, SIZE, find_chromium, photograph
 from tests.services.live_samples import LiveApi, live_api
 

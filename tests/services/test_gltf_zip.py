@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from render_server.scene.mesh_loading import load_mesh
-from services.storage.asset_probe import probe
+from services.storage.asset_sandbox import probe
 from services.storage.assets import Asset
 from services.storage.faults import RejectedAssetError, TooLargeError
 from services.storage.store import Store

@@ -8,7 +8,7 @@ import pytest
 from protocol.errors import DeltalightError
 from protocol.scene import SceneDocument, load_scene
 from services import ports
-from services.api.first_scene import make_first_scene
+from services.api.serve import make_first_scene
 from services.api.settings import ApiSettings
 from services.host import HostPlan
 from services.host_store import FIRST_SCENE, scene_to_show, session_file

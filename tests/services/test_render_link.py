@@ -10,10 +10,10 @@ import httpx
 import pytest
 
 from services import ports
-from services.api import live, outcomes, render_link
-from services.api.outcomes import BUSY, WAITERS, Change, Outcomes, Picture
-from services.api.render_link import MAX_COMMANDS
-from services.api.turns import Turns
+from services.api import delivery, render_link
+from services.api.delivery import BUSY, WAITERS, Change, Deliveries, DeliveryStatus
+from services.api.render_link import MAX_COMMANDS, FifoLock
+from services.api.routes import live
 from tests.services.api_samples import RunningApi, running_api, sentence
 from tests.services.live_samples import event_socket, next_event
 from tests.services.render_server_samples import Recorder
@@ -67,7 +67,7 @@ class Shown:
 @pytest.fixture
 def wait_s(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
     """Sets how long an answer waits for the renderer."""
-    return lambda seconds: monkeypatch.setattr(outcomes, "WAIT_S", seconds)
+    return lambda seconds: monkeypatch.setattr(delivery, "WAIT_S", seconds)
 
 
 @pytest.fixture
@@ -186,13 +186,13 @@ def test_commands_that_wait_are_limited_and_requests_go_on(shown: Shown) -> None
 
 
 def test_older_changes_are_superseded_in_whatever_order_they_are_told() -> None:
-    known = Outcomes()
+    known = Deliveries()
     newer, older = Change("a", 6), Change("a", 5)
     outcome = known.expect(newer)
     assert known.expect(older).result(0).state == "superseded"
     other = known.expect(Change("b", 1))
     assert not other.done()
-    shown = Picture("shown", "a", 6)
+    shown = DeliveryStatus("shown", "a", 6)
     known.note(shown, known.awaited)
     assert outcome.result(0) == known.newest == shown
     assert other.result(0).state == "superseded", "the scene that is shown is another one"
@@ -200,21 +200,21 @@ def test_older_changes_are_superseded_in_whatever_order_they_are_told() -> None:
     assert not known.expect(newer).done(), "it is looked again whether the server still has it"
 
 
-def test_turns_are_taken_in_the_order_of_arrival() -> None:
-    turns, order = Turns(), list[int]()
+def test_the_lock_is_held_in_the_order_of_arrival() -> None:
+    lock, order = FifoLock(), list[int]()
 
     def take(number: int) -> None:
-        with turns:
+        with lock:
             order.append(number)
 
-    with turns:
+    with lock:
         threads = []
         for number in range(5):
             threads.append(threading.Thread(target=take, args=(number,)))
             threads[-1].start()
-            wait_for(lambda count=number + 1: len(turns._waiting) == count)
+            wait_for(lambda count=number + 1: len(lock._waiting) == count)
     for thread in threads:
         thread.join()
     assert order == list(range(5))
-    with turns:  # free again
+    with lock:  # free again
         pass

@@ -94,8 +94,10 @@ class InvertingRenderer:
         self.scenes.append(scene)
 
 
-def request(op: str, revision: int | None = None, **payload: object) -> ControlRequest:
-    return ControlRequest(node="test", id="r1", op=op, revision=revision, payload=payload)
+def request(
+    op: str, revision: int | None = None, scene_id: str | None = None, **payload: object
+) -> ControlRequest:
+    return ControlRequest(node="test", id="r1", op=op, scene_id=scene_id, revision=revision, payload=payload)
 
 
 @pytest.fixture
@@ -146,7 +148,7 @@ def test_composite_says_with_which_camera_pose_and_scene_it_was_made(session: Re
     feed(session, 5)
     rendered = session.step()
     assert rendered is not None
-    assert rendered.message.scene_revision == 3
+    assert (rendered.message.scene_id, rendered.message.scene_revision) == (None, 3)
     assert rendered.message.camera == camera().to_dict()
     assert rendered.message.world_from_camera == IDENTITY
     session.receive(color(6, START + 6, START))
@@ -168,7 +170,7 @@ def test_the_revision_is_that_of_the_frames_start(
         if rendered is not None:
             revisions.append((rendered.message.frame_id, rendered.message.scene_revision))
         if number == 1:  # frame 1 waits for the GPU
-            assert session.carry_out(request("set_view", view="delta")) == {"revision": 4}
+            assert session.execute(request("set_view", view="delta")) == {"revision": 4}
     last = session.step()
     assert last is not None
     revisions.append((last.message.frame_id, last.message.scene_revision))
@@ -211,41 +213,80 @@ def test_set_scene_is_idempotent_by_revision(
 ) -> None:
     document = SceneDocument(name="second").model_dump(mode="json")
     for _ in range(2):
-        assert session.carry_out(request("set_scene", 4, scene=document)) == {"revision": 4}
+        assert session.execute(request("set_scene", 4, scene=document)) == {"revision": 4}
     assert [scene.name for scene in renderer.scenes] == ["second"]
     assert [scene.revision for scene in kept] == [4]
     with pytest.raises(DeltalightError, match="already at revision 4"):
-        session.carry_out(request("set_scene", 3, scene=document))
+        session.execute(request("set_scene", 3, scene=document))
     with pytest.raises(DeltalightError, match="already at revision 4"):
-        session.carry_out(request("set_scene", 4, scene={**document, "name": "third"}))
+        session.execute(request("set_scene", 4, scene={**document, "name": "third"}))
+
+
+def test_revisions_of_one_scene_say_nothing_of_another(session: RenderSession) -> None:
+    document = SceneDocument(name="second", revision=9).model_dump(mode="json")
+    shown = []
+
+    def show(scene_id: str | None, revision: int | None) -> None:
+        session.execute(request("set_scene", revision, scene_id, scene=document))
+        feed(session, len(shown))
+        rendered = session.step()
+        assert rendered is not None
+        shown.append((rendered.message.scene_id, rendered.message.scene_revision))
+
+    sent = [("a", 7), ("a", 7), ("a", 8), ("b", 1), ("a", 7), (None, 1)]
+    for scene_id, revision in sent:
+        show(scene_id, revision)
+    assert shown == sent
+    show("a", 7)
+    for wrong in (request("set_scene", 6, "a", scene=document), request("set_scene", 7, "a", scene={})):
+        with pytest.raises(DeltalightError, match="already at revision 7"):
+            session.execute(wrong)
+    show("a", None)  # whatever came before, by the document's own revision
+    show(None, None)  # counts on
+    session.execute(request("set_view", view="delta"))
+    assert shown[-3:] == [("a", 7), ("a", 9), (None, 10)]
+    assert (session.scene_id, session.scene.revision) == (None, 11)
+
+
+def test_a_changed_view_is_not_the_scene_of_its_sender(session: RenderSession) -> None:
+    document = SceneDocument(name="second").model_dump(mode="json")
+    session.execute(request("set_scene", 7, "a", scene=document))
+    session.execute(request("set_view", view="delta"))
+    assert (session.scene_id, session.scene.revision) == (None, 8)
+    session.execute(request("set_scene", 8, "a", scene=document))
+    assert (session.scene_id, session.scene.output.view) == ("a", "composite")
 
 
 def test_wrong_or_refused_scene_changes_nothing(session: RenderSession, kept: list[SceneDocument]) -> None:
     with pytest.raises(DeltalightError, match="nearest known key is `lights`"):
-        session.carry_out(request("set_scene", 4, scene={"light": {}}))
+        session.execute(request("set_scene", 4, scene={"light": {}}))
     with pytest.raises(DeltalightError, match="cannot be shown"):
-        session.carry_out(request("set_scene", 4, scene={"name": "refused"}))
+        session.execute(request("set_scene", 4, scene={"name": "refused"}))
     assert session.scene.name == "first"
     assert kept == []
 
 
 def test_set_view_and_get_scene(session: RenderSession) -> None:
-    assert session.carry_out(request("set_view", view="delta")) == {"revision": 4}
-    scene = session.carry_out(request("get_scene"))["scene"]
+    assert session.execute(request("set_view", view="delta")) == {"revision": 4}
+    scene = session.execute(request("get_scene"))["scene"]
     assert isinstance(scene, dict)
     assert scene["output"]["view"] == "delta"
     with pytest.raises(DeltalightError, match="view"):
-        session.carry_out(request("set_view", view="upside-down"))
+        session.execute(request("set_view", view="upside-down"))
 
 
 def test_other_commands(session: RenderSession) -> None:
-    assert session.carry_out(request("ping")) == {"revision": 3}
-    stats = session.carry_out(request("stats"))["stats"]
+    assert session.execute(request("ping")) == {
+        "scene_id": None,
+        "revision": 3,
+        "instance": session.instance,
+    }
+    stats = session.execute(request("stats"))["stats"]
     assert isinstance(stats, dict)
     assert stats["detail"] == "abacus"
     with pytest.raises(DeltalightError, match="did you mean shutdown"):
-        session.carry_out(request("shutdwn"))
-    session.carry_out(request("shutdown"))
+        session.execute(request("shutdwn"))
+    session.execute(request("shutdown"))
     assert session.stopping
 
 
@@ -274,17 +315,17 @@ def test_on_a_gpu_a_frame_is_read_back_after_the_next_was_started(
 
 def test_pick_asks_the_renderer(session: RenderSession, renderer: InvertingRenderer) -> None:
     with pytest.raises(DeltalightError, match="Nothing was rendered yet"):
-        session.carry_out(request("pick", x=3, y=4))
+        session.execute(request("pick", x=3, y=4))
     feed(session, 5)
     session.step()
-    picked = session.carry_out(request("pick", x=3, y=4.5))
+    picked = session.execute(request("pick", x=3, y=4.5))
     assert picked == {"frame_id": 5, "kind": "nothing", "pixel": [3.0, 4.5]}
     assert renderer.ignored is None
-    session.carry_out(request("pick", x=3, y=4.5, ignore="knot"))
+    session.execute(request("pick", x=3, y=4.5, ignore="knot"))
     assert renderer.ignored == "knot"
     for wrong in ({"x": 3}, {"x": 3, "y": "4"}, {"x": True, "y": 1}, {"x": 1, "y": 2, "z": 3}):
         with pytest.raises(DeltalightError, match="the command pick"):
-            session.carry_out(request("pick", **wrong))
+            session.execute(request("pick", **wrong))
 
 
 def test_a_snapshot_loses_no_frame_and_no_scene(
@@ -297,10 +338,10 @@ def test_a_snapshot_loses_no_frame_and_no_scene(
         "exr": True,
     }
     with pytest.raises(DeltalightError, match="No frame has come yet"):
-        session.carry_out(request("snapshot", **order))
+        session.execute(request("snapshot", **order))
     feed(session, 7)
     assert session.step() is None  # it waits for the GPU
-    taken = session.carry_out(request("snapshot", **order))
+    taken = session.execute(request("snapshot", **order))
     assert taken == {
         "frame_id": 7,
         "capture_ns": START + 7,
@@ -328,7 +369,7 @@ def test_a_refused_snapshot_is_one_sentence(session: RenderSession, tmp_path: Pa
         ({"folder": str(tmp_path), "pictures": [{"name": "../a"}]}, "name"),
     ):
         with pytest.raises(DeltalightError, match=words):
-            session.carry_out(request("snapshot", **wrong))
+            session.execute(request("snapshot", **wrong))
 
 
 def test_another_source_begins_with_nothing_of_the_one_before(renderer: InvertingRenderer) -> None:
@@ -347,10 +388,10 @@ def test_another_source_begins_with_nothing_of_the_one_before(renderer: Invertin
     session.step()  # waits for the GPU
     session.receive(color(2, START + 2, START))  # waits for its pose and depth
     with pytest.raises(DeltalightError, match="bad is not an endpoint"):
-        session.carry_out(request("set_source", endpoints=["bad"]))
+        session.execute(request("set_source", endpoints=["bad"]))
     assert renderer.sources_begun == 0
     counted = dict(session.drops())
-    answer = session.carry_out(request("set_source", endpoints=None))
+    answer = session.execute(request("set_source", endpoints=None))
     assert (answer, used, renderer.sources_begun) == ({"endpoints": ["tcp://configured"]}, [None], 1)
     assert session.drops() == counted
     session.receive(depth(2, START + 2))
@@ -358,11 +399,11 @@ def test_another_source_begins_with_nothing_of_the_one_before(renderer: Invertin
     assert session.step() is None
     assert renderer.unfinished == []
     with pytest.raises(DeltalightError, match="Nothing was rendered"):
-        session.carry_out(request("pick", x=1, y=1))
+        session.execute(request("pick", x=1, y=1))
     for wrong in ({}, {"endpoints": []}, {"endpoints": "tcp://127.0.0.1:1"}, {"endpoints": ["a"] * 17}):
         with pytest.raises(DeltalightError, match="the command set_source"):
-            session.carry_out(request("set_source", **wrong))
+            session.execute(request("set_source", **wrong))
     for _ in range(2):  # the same again changes nothing
-        assert session.carry_out(request("set_source", endpoints=["x"]))
+        assert session.execute(request("set_source", endpoints=["x"]))
     assert used == [None, ("x",), ("x",)]
     assert renderer.sources_begun == 2

@@ -84,7 +84,8 @@ def test_stop_ends_even_a_child_that_ignores_sigterm() -> None:
 def test_children_end_when_the_supervisor_is_killed(tmp_path: Path) -> None:
     pid_file = tmp_path / "pid"
     child = (
-        "import os, time, pathlib; from services.lifeline import end_with_supervisor; end_with_supervisor();"
+        "import os, time, pathlib; from services.parent_death_signal import end_with_supervisor;"
+        "end_with_supervisor();"
         f"pathlib.Path({str(pid_file)!r}).write_text(str(os.getpid())); time.sleep(600)"
     )
     parent = (

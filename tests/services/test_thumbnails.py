@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from protocol.radiance_files import write_exr
-from services.storage.asset_child import run_limited
+from services.storage.asset_sandbox import run_limited
 from services.storage.faults import RejectedAssetError
 from services.storage.store import Store
 from services.storage.thumbnails import SIZE

@@ -1865,6 +1865,127 @@ export interface components {
             readonly tracked: readonly components["schemas"]["TrackedLamp"][];
         };
         /**
+         * LiveCamera
+         * @description The camera at the picture's size.
+         */
+        readonly LiveCamera: {
+            /** Distortion */
+            readonly distortion: readonly number[];
+            /**
+             * Distortion Model
+             * @enum {string}
+             */
+            readonly distortion_model: "plumb_bob" | "equidistant";
+            /** Height */
+            readonly height: number;
+            /**
+             * Matrix
+             * @description Intrinsics, row by row.
+             */
+            readonly matrix: readonly number[];
+            /** Width */
+            readonly width: number;
+        };
+        /**
+         * LiveHeader
+         * @description The JSON header of a message of `WS /live`.
+         */
+        readonly LiveHeader: {
+            /**
+             * Age Ms
+             * @description Time since the picture's capture.
+             */
+            readonly age_ms: number;
+            /** @description What projects points of the camera's space onto this picture. */
+            readonly camera: components["schemas"]["LiveCamera"];
+            /**
+             * Capture Ns
+             * @description When it was captured, ns since 1970 by the node's clock.
+             */
+            readonly capture_ns: number;
+            /**
+             * Drops
+             * @description What was lost before, by cause.
+             */
+            readonly drops: {
+                readonly [key: string]: number;
+            };
+            /**
+             * Frame Id
+             * @description The camera's frame.
+             */
+            readonly frame_id: number;
+            /**
+             * Frames Per S
+             * @description Rate at which pictures come; null before the second.
+             */
+            readonly frames_per_s: number | null;
+            /**
+             * Lights
+             * @description What it was lit with.
+             */
+            readonly lights: readonly {
+                readonly [key: string]: unknown;
+            }[];
+            /**
+             * Number
+             * @description Counts the pictures that came.
+             */
+            readonly number: number;
+            /**
+             * Pass Times Ms
+             * @description Where its time went.
+             */
+            readonly pass_times_ms: {
+                readonly [key: string]: number;
+            };
+            /** Renderer */
+            readonly renderer: string;
+            /** @description null where another program set the server's scene. */
+            readonly scene: components["schemas"]["ShownScene"] | null;
+            /**
+             * Skipped
+             * @description Pictures that this viewer was too slow for.
+             */
+            readonly skipped: number;
+            /**
+             * Status
+             * @description `no_pose`: the camera's picture as it is.
+             * @enum {string}
+             */
+            readonly status: "ok" | "no_pose";
+            /**
+             * World From Camera
+             * @description null without a pose.
+             */
+            readonly world_from_camera: readonly [
+                readonly [
+                    number,
+                    number,
+                    number,
+                    number
+                ],
+                readonly [
+                    number,
+                    number,
+                    number,
+                    number
+                ],
+                readonly [
+                    number,
+                    number,
+                    number,
+                    number
+                ],
+                readonly [
+                    number,
+                    number,
+                    number,
+                    number
+                ]
+            ] | null;
+        };
+        /**
          * Material
          * @description Surface of a virtual object: metallic/roughness workflow of the Disney BRDF, GGX microfacets.
          */
@@ -2845,6 +2966,16 @@ export interface components {
             readonly name: "auto" | "volume" | "image_based" | "precomputed";
         };
         /**
+         * ShownScene
+         * @description The scene that a picture shows.
+         */
+        readonly ShownScene: {
+            /** Id */
+            readonly id: string;
+            /** Revision */
+            readonly revision: number;
+        };
+        /**
          * SnapshotFacts
          * @description What is known of a snapshot.
          */
@@ -3247,6 +3378,8 @@ export type FisheyeLight = components['schemas']['FisheyeLight'];
 export type FisheyeLights = components['schemas']['FisheyeLights'];
 export type Health = components['schemas']['Health'];
 export type Lights = components['schemas']['Lights'];
+export type LiveCamera = components['schemas']['LiveCamera'];
+export type LiveHeader = components['schemas']['LiveHeader'];
 export type Material = components['schemas']['Material'];
 export type MissingCameras = components['schemas']['MissingCameras'];
 export type ModelGeometry = components['schemas']['ModelGeometry'];
@@ -3277,6 +3410,7 @@ export type SceneObject = components['schemas']['SceneObject'];
 export type SceneSummary = components['schemas']['SceneSummary'];
 export type Settings = components['schemas']['Settings'];
 export type Shading = components['schemas']['Shading'];
+export type ShownScene = components['schemas']['ShownScene'];
 export type SnapshotFacts = components['schemas']['SnapshotFacts'];
 export type SnapshotPicture = components['schemas']['SnapshotPicture'];
 export type SphereLight = components['schemas']['SphereLight'];

@@ -6,6 +6,8 @@ export type {
   AssetAnswer,
   EnvironmentLights,
   FisheyeLights,
+  LiveCamera,
+  LiveHeader,
   Material,
   Output,
   PictureState,

@@ -1,15 +1,16 @@
 // The live picture: newest frame drawn and acknowledged, its header shared with everything that goes over it.
 import { computed, signal } from "@preact/signals";
 import { API } from "../api/http";
+import type { LiveHeader } from "../api/types";
 import { lensOf, type View } from "../math/camera";
 import { note } from "./telemetry";
-import { parseLiveMessage, type FrameHeader } from "./message";
+import { parseLiveMessage } from "./message";
 import { ReconnectingSocket } from "./socket";
 
 // A picture is stale when three frames are missing, within these bounds.
 const STALE_MS = { least: 1500, most: 10_000 };
 
-export const frame = signal<FrameHeader | null>(null);
+export const frame = signal<LiveHeader | null>(null);
 export const pictureSize = signal<{ readonly width: number; readonly height: number } | null>(null);
 const isStale = signal(false);
 let lastArrival = 0;
@@ -27,7 +28,7 @@ export const liveState = computed<"connecting" | "reconnecting" | "waiting" | "s
 /** The newest frame's camera in the world; null without a pose. */
 export const view = computed<View | null>(() => {
   const header = frame.value;
-  if (!header?.camera || !header.world_from_camera) return null;
+  if (!header?.world_from_camera) return null;
   return { lens: lensOf(header.camera), worldFromCamera: header.world_from_camera };
 });
 
@@ -70,7 +71,7 @@ async function receive(event: MessageEvent<unknown>): Promise<void> {
   }
 }
 
-function draw(bitmap: ImageBitmap, header: FrameHeader): void {
+function draw(bitmap: ImageBitmap, header: LiveHeader): void {
   const { width, height } = bitmap;
   if (pictureSize.value?.width !== width || pictureSize.value.height !== height) pictureSize.value = { width, height };
   if (canvas) {

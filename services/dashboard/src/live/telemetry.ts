@@ -1,6 +1,6 @@
 // What the plots show: times, delay and rate of the last frames.
 import { signal } from "@preact/signals";
-import type { FrameHeader } from "./message";
+import type { LiveHeader } from "../api/types";
 
 export interface Sample {
   /** Seconds since the page was opened. */
@@ -21,7 +21,7 @@ export const OTHERS = "others";
 
 export const samples = signal<readonly Sample[]>([]);
 
-export function note(header: FrameHeader, nowMs: number): void {
+export function note(header: LiveHeader, nowMs: number): void {
   const at = nowMs / 1000;
   const shows = header.scene && `${header.scene.id} ${header.scene.revision}`;
   const passes = withKept(samples.value.at(-1), header.pass_times_ms, shows);

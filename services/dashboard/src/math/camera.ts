@@ -1,19 +1,9 @@
 // A frame's own camera (docs/conventions.md): optical axes, pixel centres at integers, OpenCV's lens models.
-import type { Vector } from "../api/types";
+import type { LiveCamera, Vector } from "../api/types";
 import { dot, subtract } from "./vector";
 
-export type Matrix3 = readonly (readonly [number, number, number])[];
 export type Matrix4 = readonly (readonly [number, number, number, number])[];
 export type Pixel = readonly [number, number];
-
-/** `CameraModel.to_dict()` of the protocol. */
-export interface CameraDict {
-  readonly width: number;
-  readonly height: number;
-  readonly matrix: Matrix3 | readonly number[];
-  readonly distortion_model: "plumb_bob" | "equidistant";
-  readonly distortion: readonly number[];
-}
 
 export interface Lens {
   readonly width: number;
@@ -35,9 +25,8 @@ export interface View {
 // Newton's method on smooth lenses ends far below a pixel after so many rounds.
 const UNPROJECT_ROUNDS = 20;
 
-export function lensOf(camera: CameraDict): Lens {
-  const flat = camera.matrix.flat();
-  const at = (index: number): number => flat[index] ?? 0;
+export function lensOf(camera: LiveCamera): Lens {
+  const at = (index: number): number => camera.matrix[index] ?? 0;
   return {
     width: camera.width,
     height: camera.height,

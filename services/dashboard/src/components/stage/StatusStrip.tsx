@@ -21,7 +21,7 @@ export function StatusStrip() {
             value={String(header.scene?.revision ?? "–")}
             tip="Of the scene that this frame shows"
           />
-          <Figure name="Delay" value={header.age_ms === null ? "–" : milliseconds(header.age_ms)} />
+          <Figure name="Delay" value={milliseconds(header.age_ms)} />
           <Figure name="Rate" value={header.frames_per_s === null ? "–" : `${header.frames_per_s.toFixed(1)} fps`} />
           <Figure name="Dropped" value={String(droppedFrames(header.drops))} tip={dropText(header.drops)} />
           <Figure name="Skipped" value={String(header.skipped)} tip="Frames that this browser was too slow for" />

@@ -1,0 +1,107 @@
+"""Who sends a request, and what proves it: a token of the store, a token from a file, or a ticket."""
+
+import hashlib
+import hmac
+import secrets
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from starlette.types import Scope
+
+from protocol.errors import DeltalightError
+from services.storage.tokens import Role
+
+TICKET_LIFE_S = 30.0
+OPEN_TICKETS = 4096  # the oldest of more is forgotten
+_TICKET_BYTES = 32
+SHORTEST, LONGEST = 32, 512  # characters of a token in a file; 32 hex digits are 128 bits
+SECRET_NAME = "token file"
+_KEY = "deltalight.principal"
+
+
+@dataclass(frozen=True)
+class Principal:
+    """Who sends a request, and with which role; `token_id` is None where no token was needed."""
+
+    role: Role
+    token_id: str | None = None
+    name: str = ""
+
+
+def set_principal(scope: Scope, principal: Principal) -> None:
+    """Attach the authenticated principal to a request."""
+    scope[_KEY] = principal
+
+
+def principal_of(scope: Scope) -> Principal:
+    """Return the principal that the middleware attached to a request."""
+    principal = scope[_KEY]
+    assert isinstance(principal, Principal)
+    return principal
+
+
+class SecretToken:
+    """A token in a file, as container engines and systemd hand secrets over.
+
+    Tokens are compared by their hashes in constant time.
+    """
+
+    def __init__(self, path: Path) -> None:
+        try:
+            token = path.read_text(encoding="ascii").strip()
+        except (OSError, UnicodeDecodeError) as fault:
+            raise DeltalightError(
+                f"the token file {path} cannot be read as text; give one that can."
+            ) from fault
+        if not SHORTEST <= len(token) <= LONGEST or not token.isprintable() or " " in token:
+            raise DeltalightError(
+                f"the token file {path} must hold one word of {SHORTEST} to {LONGEST} characters; make one with "
+                "`openssl rand -hex 32`."
+            )
+        self._hash = _hash(token)
+
+    def verify(self, given: str) -> Principal | None:
+        """Return who sends this token, or None if it is another one."""
+        is_equal = hmac.compare_digest(self._hash, _hash(given))
+        return Principal("control", name=SECRET_NAME) if is_equal else None
+
+
+def _hash(token: str) -> bytes:
+    return hashlib.sha256(token.encode("utf-8", "surrogatepass")).digest()
+
+
+class Tickets:
+    """Single-use tickets for addresses that cannot carry a token: WebSockets and pictures in a browser.
+
+    A ticket admits once, with the role of whoever asked for it.
+    """
+
+    def __init__(self, clock_s: Callable[[], float] = time.monotonic) -> None:
+        self._clock_s = clock_s
+        self._open: OrderedDict[str, _Ticket] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def issue(self, principal: Principal) -> str:
+        """Create a ticket for this principal."""
+        ticket = secrets.token_urlsafe(_TICKET_BYTES)
+        with self._lock:
+            self._open[ticket] = _Ticket(principal, self._clock_s() + TICKET_LIFE_S)
+            while len(self._open) > OPEN_TICKETS:
+                self._open.popitem(last=False)
+        return ticket
+
+    def redeem(self, ticket: str) -> Principal | None:
+        """Use up a ticket and return its principal, or None if it is unknown or has expired."""
+        with self._lock:
+            found = self._open.pop(ticket, None)
+        return None if found is None or found.ends_s < self._clock_s() else found.principal
+
+
+@dataclass(frozen=True)
+class _Ticket:
+    principal: Principal
+    ends_s: float

@@ -1,0 +1,165 @@
+"""Recordings in progress: each runs `deltalight record` as a child process."""
+
+import json
+import os
+import signal
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from tempfile import NamedTemporaryFile
+from threading import Lock
+from typing import Any
+
+from protocol.errors import DeltalightError
+from protocol.scene import SceneDocument
+from services.api.child_process import ChildProcess
+from services.api.recording_store import RecordingStore
+from services.storage.faults import ConflictError, NotFoundError
+
+# The writer hands over what it has, syncs the disk and closes: seconds on a slow one.
+STOP_TIMEOUT_S = 20.0
+END_TIMEOUT_S = 5.0
+ENDED_WELL = (0, 128 + signal.SIGINT, 128 + signal.SIGTERM)
+NODE_ANY = ""
+
+
+@dataclass
+class RecordingSession:
+    """A recording in progress; `figures` are those of `recorder.RecordStatus`, None before the first frame."""
+
+    id: str
+    node: str
+    started: datetime
+    figures: Mapping[str, Any] | None = None
+    detail: str = ""
+    child: ChildProcess | None = field(default=None, repr=False)
+
+
+class RecordingSessions:
+    """Starts and stops recordings: one of each node at a time, or one of whichever node is heard first.
+
+    Calls `publish(session, is_growing)` once a second for each, and once at its end.
+    """
+
+    def __init__(
+        self,
+        store: RecordingStore,
+        endpoints: Sequence[str],
+        publish: Callable[[RecordingSession, bool], None],
+    ) -> None:
+        self._store, self._endpoints, self._publish = store, tuple(endpoints), publish
+        self._running: dict[str, RecordingSession] = {}
+        self._lock = Lock()
+
+    def running(self) -> list[RecordingSession]:
+        """Return the recordings in progress."""
+        with self._lock:
+            return list(self._running.values())
+
+    def start(
+        self, name: str | None, node: str | None, duration_s: float | None, scene: SceneDocument | None
+    ) -> RecordingSession:
+        """Start a recording with this scene attached.
+
+        Raises:
+            ConflictError: the name is taken, or this node is being recorded.
+            DeltalightError: the name is not valid, or the recorder cannot be started.
+        """
+        session = RecordingSession(_name_now() if name is None else name, node or NODE_ANY, datetime.now(UTC))
+        with self._lock:
+            for other in self._running.values():
+                if other.node == session.node or NODE_ANY in (other.node, session.node):
+                    raise ConflictError(
+                        f"{session.node or 'a node'} is being recorded already, as {other.id}; stop that first."
+                    )
+            path = self._store.new_path(session.id)
+            self._running[session.id] = session
+        try:
+            session.child = self._child(session, path, duration_s, scene)
+        except BaseException:
+            self._forget(session)
+            raise
+        return session
+
+    def stop(self, name: str) -> None:
+        """Stop a recording and wait until its file is complete.
+
+        Raises:
+            NotFoundError: nothing of this name is being recorded.
+            ConflictError: no frame had come, so that there is no recording.
+            DeltalightError: the disk refused.
+        """
+        session = next((each for each in self.running() if each.id == name), None)
+        if session is None or session.child is None:
+            raise NotFoundError(f"no recording {name!r:.80} is running; list the recordings for their names.")
+        session.child.interrupt()
+        if not session.child.wait(STOP_TIMEOUT_S):
+            session.child.end(END_TIMEOUT_S)
+        if not (session.figures or {}).get("frames"):
+            raise ConflictError(session.detail or "No frame had come, so that nothing was recorded.")
+        if session.detail:
+            raise DeltalightError(session.detail)
+
+    def close(self) -> None:
+        """Stop all recordings and complete their files."""
+        sessions = self.running()
+        for session in sessions:
+            if session.child is not None:
+                session.child.interrupt()
+        for session in sessions:
+            if session.child is not None and not session.child.wait(END_TIMEOUT_S):
+                session.child.end(END_TIMEOUT_S)
+
+    def _child(
+        self, session: RecordingSession, path: Path, duration_s: float | None, scene: SceneDocument | None
+    ) -> ChildProcess:
+        words = [word for endpoint in self._endpoints for word in ("--subscribe", endpoint)]
+        words += [] if session.node == NODE_ANY else ["--name", session.node]
+        words += [] if duration_s is None else ["--duration", str(duration_s)]
+        attached = None if scene is None else _scene_file(scene)
+        words += [] if attached is None else ["--scene", str(attached)]
+
+        def end(child: ChildProcess, code: int) -> None:
+            if attached is not None:
+                attached.unlink(missing_ok=True)
+            self._end(session, child, code)
+
+        command = ("record", "--out", str(path), "--progress", "--json", *words)
+        return ChildProcess(
+            *command, on_line=lambda child, line: self._note(session, child, line), on_end=end
+        )
+
+    def _note(self, session: RecordingSession, child: ChildProcess, line: str) -> None:
+        """Read what the recorder prints once a second; its standard error says why no frame comes."""
+        with suppress(ValueError):
+            figures = json.loads(line)
+            session.figures = figures if figures["frames"] else None
+        session.detail = self._said(child)
+        self._publish(session, True)
+
+    def _end(self, session: RecordingSession, child: ChildProcess, code: int) -> None:
+        session.detail = "" if code in ENDED_WELL and session.figures else self._said(child)
+        self._forget(session)
+        self._publish(session, False)
+
+    def _said(self, child: ChildProcess) -> str:
+        return child.last_sentence.replace(f"{self._store.folder}{os.sep}", "")
+
+    def _forget(self, session: RecordingSession) -> None:
+        with self._lock:
+            self._running.pop(session.id, None)
+
+
+def _name_now() -> str:
+    return time.strftime("take-%Y%m%d-%H%M%S")
+
+
+def _scene_file(scene: SceneDocument) -> Path:
+    with NamedTemporaryFile(
+        "w", prefix="deltalight-", suffix=".json", delete=False, encoding="utf-8"
+    ) as file:
+        file.write(scene.model_dump_json())
+    return Path(file.name)

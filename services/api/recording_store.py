@@ -1,0 +1,221 @@
+"""The recordings in the data folder: their contents, posters, recovery and deletion."""
+
+import json
+import os
+import re
+import time
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Lock
+from typing import Any, Literal
+
+import cv2
+
+from protocol.errors import DeltalightError
+from protocol.recording_format import ACTIVE_SUFFIX
+from protocol.source import open_source
+from services.files import make_output_folder, write_bytes
+from services.new_files import SUFFIX
+from services.recording_copies import recover_recording
+from services.recording_info import describe_recording
+from services.storage.faults import ConflictError, NotFoundError
+
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")  # no dots: nothing that ends like a suffix
+POSTER_EDGE = 640
+POSTER_QUALITY = 85
+LEFT_OVER_AFTER_S = 3600.0  # recovery writes all the time: an older file was left by a killed process
+
+Facts = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class StoredRecording:
+    """A recording on the disk; `facts` are those of `recording_info`, None if it cannot be read, as `detail` says.
+
+    An `interrupted` recording was never ended, because its recorder was killed; it can be recovered.
+    """
+
+    id: str
+    path: Path
+    state: Literal["finished", "interrupted"]
+    size_bytes: int
+    changed_ns: int
+    facts: Facts | None
+    detail: str
+
+
+class RecordingStore:
+    """Recordings by name, `FOLDER/NAME.mcap`; what was read from them is cached in `FOLDER/.cache`.
+
+    Raises:
+        DeltalightError: the folder cannot be written.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = make_output_folder(folder)
+        self._cache = make_output_folder(folder / ".cache")
+        self._reading = Lock()  # one recording is read at a time: it takes the disk
+        for path in folder.glob(f".*.tmp{SUFFIX}*"):
+            if path.stat().st_mtime < time.time() - LEFT_OVER_AFTER_S:
+                path.unlink(missing_ok=True)
+
+    def all(self, growing: Collection[str] = ()) -> list[StoredRecording]:
+        """Return all recordings, the newest first, except growing ones, which would be read whole each time."""
+        found = []
+        for name in {path.name.split(".")[0] for path in self._paths()}.difference(growing):
+            with suppress(NotFoundError):  # deleted meanwhile
+                found.append(self.get(name))
+        return sorted(found, key=lambda each: (-each.changed_ns, each.id))
+
+    def get(self, name: str) -> StoredRecording:
+        """Return one recording.
+
+        Raises:
+            NotFoundError: there is none of this name.
+        """
+        return self._described(self._path(name))
+
+    def new_path(self, name: str) -> Path:
+        """Return the path for a new recording of this name.
+
+        Raises:
+            DeltalightError: it is not a valid name.
+            ConflictError: it is taken.
+        """
+        if not NAME.fullmatch(name):
+            raise DeltalightError(
+                f"{name!r:.80} is no name for a recording; use up to 64 letters, digits, dashes and underscores."
+            )
+        path = self.folder / (name + SUFFIX)
+        if path.exists() or path.with_name(path.name + ACTIVE_SUFFIX).exists():
+            raise ConflictError(f"there is a recording called {name}; choose another name.")
+        return path
+
+    def poster(self, name: str) -> Path:
+        """Return the JPEG file of a recording's first colour picture, made on first request.
+
+        Raises:
+            NotFoundError: there is no such recording.
+            DeltalightError: it cannot be read.
+        """
+        path = self._path(name)
+        cached = self._cache / f"{name}.jpg"
+        with self._reading, _naming(path):
+            if not cached.is_file() or cached.stat().st_mtime_ns < _status(path).st_mtime_ns:
+                write_bytes(cached, _first_picture(path))
+        return cached
+
+    def recover(self, name: str) -> StoredRecording:
+        """Recover an interrupted recording; the result replaces what was left of it.
+
+        Raises:
+            NotFoundError: there is no such recording.
+            ConflictError: it is complete.
+            DeltalightError: nothing in it can be read, or the disk refuses.
+        """
+        path = self._path(name)
+        out = self.folder / (name + SUFFIX)
+        if path == out:
+            raise ConflictError(f"{name} was finished; there is nothing to mend.")
+        with self._reading, _naming(path):
+            recover_recording(path, out, lambda numbers: numbers)
+            path.unlink()
+        return self._described(out)
+
+    def remove(self, name: str) -> None:
+        """Delete a recording.
+
+        Raises:
+            NotFoundError: there is none of this name.
+        """
+        path = self._path(name)
+        # An unfinished file may also lie beside the one that was just recovered from it.
+        unfinished = path.with_name(name + SUFFIX + ACTIVE_SUFFIX)
+        for each in (path, unfinished, self._cache / f"{name}.jpg", self._cache / f"{name}.json"):
+            each.unlink(missing_ok=True)
+
+    def _paths(self) -> Iterator[Path]:
+        """All recordings, unfinished ones too."""
+        for suffix in (SUFFIX + ACTIVE_SUFFIX, SUFFIX):
+            for path in self.folder.glob(f"*{suffix}"):
+                if NAME.fullmatch(path.name.removesuffix(suffix)):
+                    yield path
+
+    def _path(self, name: str) -> Path:
+        for suffix in (SUFFIX, SUFFIX + ACTIVE_SUFFIX):
+            path = self.folder / (name + suffix)
+            if NAME.fullmatch(name) and path.is_file():
+                return path
+        raise _absent(name)
+
+    def _described(self, path: Path) -> StoredRecording:
+        status, name = _status(path), path.name.split(".")[0]
+        facts, detail = self._facts(path, [status.st_size, status.st_mtime_ns])
+        state: Literal["finished", "interrupted"] = "finished" if path.suffix == SUFFIX else "interrupted"
+        return StoredRecording(name, path, state, status.st_size, status.st_mtime_ns, facts, detail)
+
+    def _facts(self, path: Path, key: list[int]) -> tuple[Facts | None, str]:
+        """Return what a recording holds, or why it cannot be read; cached, because the whole file is read."""
+        cached = self._cache / f"{path.name.split('.')[0]}.json"
+        known = _cached_facts(cached, key)
+        if known is not None:
+            return known
+        with self._reading:
+            facts, detail = _read_facts(path)
+            write_bytes(cached, json.dumps({"key": key, "facts": facts, "detail": detail}).encode())
+            return facts, detail
+
+
+def _absent(name: str) -> NotFoundError:
+    return NotFoundError(f"there is no recording {name!r:.80}; list the recordings for their names.")
+
+
+def _status(path: Path) -> os.stat_result:
+    """Return size and time of a recording, which may be deleted or finished after it was found."""
+    try:
+        return path.stat()
+    except FileNotFoundError as fault:
+        raise _absent(path.name.split(".")[0]) from fault
+
+
+def _cached_facts(path: Path, key: list[int]) -> tuple[Facts | None, str] | None:
+    try:
+        cached = json.loads(path.read_text())
+        return (cached["facts"], cached["detail"]) if cached["key"] == key else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None  # there is none yet, or one that a full disk cut short
+
+
+def _read_facts(path: Path) -> tuple[Facts | None, str]:
+    try:
+        with _naming(path):
+            return describe_recording(path), ""
+    except NotFoundError:
+        raise
+    except DeltalightError as fault:
+        return None, str(fault)
+
+
+@contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Name recordings instead of paths in errors: clients know no paths."""
+    try:
+        yield
+    except NotFoundError:
+        raise
+    except FileNotFoundError as fault:  # deleted while it was read
+        raise _absent(path.name.split(".")[0]) from fault
+    except DeltalightError as fault:
+        raise DeltalightError(str(fault).replace(f"{path.parent}{os.sep}", "")) from fault
+
+
+def _first_picture(path: Path) -> bytes:
+    frame = open_source(path)[0]
+    height, width = frame.color.shape[:2]
+    scale = min(1.0, POSTER_EDGE / max(width, height))
+    size = round(width * scale), round(height * scale)
+    small = cv2.resize(frame.color, size, interpolation=cv2.INTER_AREA)
+    _, jpeg = cv2.imencode(".jpg", small[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, POSTER_QUALITY])
+    return jpeg.tobytes()

@@ -1,0 +1,300 @@
+"""Replays a recording in place of the live nodes: a `replay` child publishes it for the render server."""
+
+import threading
+import time
+import uuid
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+import structlog
+
+from protocol.endpoints import parse_endpoint
+from protocol.errors import DeltalightError
+from protocol.keys import Keys
+from protocol.messages import ControlRequest
+from protocol.transport import RequestClient
+from services import ports
+from services.api.child_process import ChildProcess
+from services.api.render_link import RenderLink, UnansweredError
+from services.storage.faults import ConflictError
+
+# A child's imports and its first frame take two seconds on a slow machine, five with two busy cores.
+START_TIMEOUT_S = 20.0
+ASK_TIMEOUT_S, LOOK_PERIOD_S = 2.0, 0.5
+START_ASK_TIMEOUT_S = 0.5  # so soon it is seen that a child ended instead of answering
+END_TIMEOUT_S = 3.0
+NODE = "replay"
+IPC = "ipc://"
+
+log = structlog.get_logger()
+
+
+@dataclass(frozen=True)
+class Position:
+    """Where a replay is, in seconds from the recording's first frame."""
+
+    recording: str
+    position_s: float
+    duration_s: float
+    playing: bool
+    rate: float
+    loop: bool
+
+
+@dataclass(frozen=True)
+class ReplayOrder:
+    """Which recording to replay, from where and how."""
+
+    recording: str
+    path: Path
+    position_s: float = 0.0
+    playing: bool = True
+    rate: float = 1.0
+    loop: bool = True
+
+
+@dataclass(frozen=True)
+class ReplayEndpoints:
+    """Where one replay publishes and is controlled, so that the render server reaches it."""
+
+    streams: str
+    control: str
+
+    @classmethod
+    def beside(cls, server: str) -> Self:
+        """Choose endpoints that the render server reaches: sockets beside its own, else loopback ports.
+
+        Its sockets may lie in a folder shared with another container. The names are always the same, so that a replay
+        takes over what a killed service left.
+
+        Args:
+            server: endpoint of the render server's commands.
+
+        Raises:
+            ConflictError: the render server is on another host.
+        """
+        if server.startswith(IPC):
+            return cls(f"{server}-replay", f"{server}-replay-control")
+        if parse_endpoint(server).leaves_host:
+            raise ConflictError(
+                "the render server is on another host and cannot read a replay of this one; run"
+                " `deltalight replay` there."
+            )
+        streams, control = ports.private_ports(2)
+        return cls(ports.endpoint(streams), ports.endpoint(control))
+
+    def clear(self) -> None:
+        """Remove the files that closed sockets leave behind."""
+        for endpoint in (self.streams, self.control):
+            if endpoint.startswith(IPC):
+                Path(endpoint.removeprefix(IPC)).unlink(missing_ok=True)
+
+
+class ReplayControl:
+    """Runs at most one replay, watched by a thread; when it ends for any reason the live nodes are shown again.
+
+    `server` is the endpoint of the render server's commands. Calls `publish` with the position twice a second while
+    it moves and with None when live is back, and `notice` with sentences for people.
+    """
+
+    def __init__(
+        self,
+        link: RenderLink,
+        server: str,
+        publish: Callable[[Position | None], None],
+        notice: Callable[[str], None],
+        keys: Keys | None = None,
+    ) -> None:
+        self._link, self._server, self._keys = link, server, keys
+        self._publish, self._notice = publish, notice
+        self._changing = threading.Lock()
+        self._replay: _Replay | None = None
+
+    @property
+    def recording(self) -> str | None:
+        """The recording that is replayed; None = live."""
+        replay = self._replay
+        return None if replay is None else replay.order.recording
+
+    def position(self) -> Position | None:
+        """Return where the replay is; None = live."""
+        replay = self._replay
+        if replay is None:
+            return None
+        with suppress(UnansweredError):  # it is slow, or ends just now
+            return replay.ask("position")
+        return replay.last if self._replay is replay else None
+
+    def start(self, order: ReplayOrder) -> Position:
+        """Replay a recording.
+
+        Raises:
+            ConflictError: the render server is on another host.
+            DeltalightError: it cannot be replayed.
+        """
+        with self._changing:
+            endpoints = ReplayEndpoints.beside(self._server)
+            self._end()
+            replay = _Replay(order, endpoints, self._server, self._keys, self._ended)
+            try:
+                position = replay.first_position()
+                self._replay = replay
+                self._use((endpoints.streams,))
+            except BaseException:
+                if self._replay is replay:  # a server that refused may have read from there before it did
+                    with suppress(DeltalightError):
+                        self._use(None)
+                self._replay = None
+                replay.close()
+                raise
+            threading.Thread(target=self._watch, args=(replay,), name="replay-control", daemon=True).start()
+        self._publish(position)
+        return position
+
+    def change(
+        self, position_s: float | None = None, playing: bool | None = None, rate: float | None = None
+    ) -> Position:
+        """Seek, pause, resume, or change the rate.
+
+        Raises:
+            ConflictError: nothing is replayed.
+            DeltalightError: the rate is out of range.
+        """
+        with self._changing:
+            replay = self._replay
+            if replay is None:
+                raise ConflictError("no recording is replayed; begin one with PUT.")
+            if rate is not None:
+                replay.ask("rate", {"rate": rate})
+            if playing is False:
+                replay.ask("pause")
+            if position_s is not None:
+                replay.ask("seek", {"position_s": position_s})
+            position = replay.ask("play" if playing else "position")
+        self._publish(position)
+        return position
+
+    def stop(self) -> None:
+        """Show the live nodes again."""
+        with self._changing:
+            was_replayed = self._end()
+        if was_replayed:
+            self._publish(None)
+
+    def close(self) -> None:
+        """Stop the replay at the end of the service, without publishing."""
+        with self._changing:
+            self._end()
+
+    def _end(self) -> bool:
+        replay, self._replay = self._replay, None
+        if replay is None:
+            return False
+        try:
+            self._use(None)
+        finally:
+            replay.close()
+        return True
+
+    def _use(self, endpoints: tuple[str, ...] | None) -> None:
+        try:
+            self._link.use_source(endpoints)
+        except UnansweredError:  # it is told when it answers
+            log.info("the render server reads from elsewhere as soon as it answers")
+
+    def _ended(self, replay: "_Replay", sentence: str) -> None:
+        """Return to live after a child that ended by itself (called by its thread)."""
+        with self._changing:
+            if self._replay is not replay:
+                return
+            self._end()
+        self._notice(f"The replay of {replay.order.recording} ended, and live is back: {sentence}")
+        self._publish(None)
+
+    def _watch(self, replay: "_Replay") -> None:
+        last = None
+        while self._replay is replay:
+            try:
+                position = replay.ask("position")
+            except DeltalightError:  # it ends, or is slow; its end is told elsewhere
+                position = None
+            if position is not None and position != last and self._replay is replay:
+                self._publish(position)
+                last = position
+            time.sleep(LOOK_PERIOD_S)
+
+
+class _Replay:
+    """A replay's child process and the client that controls it; `last` is its last known position."""
+
+    def __init__(
+        self,
+        order: ReplayOrder,
+        endpoints: ReplayEndpoints,
+        server: str,
+        keys: Keys | None,
+        ended: Callable[["_Replay", str], None],
+    ) -> None:
+        self.order = order
+        self.last: Position | None = None
+        self._endpoints = endpoints
+        self._client = RequestClient(endpoints.control, keys=keys)
+        words = ["replay", str(order.path), "--publish", endpoints.streams, "--control", endpoints.control]
+        words += ["--name", NODE, "--clock", server]
+        words += ["--rate", str(order.rate), "--start", str(order.position_s)]
+        words += (["--loop"] if order.loop else []) + ([] if order.playing else ["--paused"])
+        self._is_closing = self._has_answered = False
+
+        def end(child: ChildProcess, _code: int) -> None:
+            if self._has_answered and not self._is_closing:
+                ended(self, child.last_sentence or "it said nothing.")
+
+        self._child = ChildProcess(*words, on_end=end)
+
+    def first_position(self) -> Position:
+        """Wait until it runs, and return where it is.
+
+        Raises:
+            DeltalightError: it ended, or does not answer.
+        """
+        deadline_s = time.monotonic() + START_TIMEOUT_S
+        while time.monotonic() < deadline_s and self._child.is_running:
+            with suppress(UnansweredError):
+                position = self.ask("position", timeout_s=START_ASK_TIMEOUT_S)
+                self._has_answered = True
+                if self._child.is_running:  # else nobody would hear of its end
+                    return position
+        self._child.wait(START_ASK_TIMEOUT_S)  # for its last words
+        sentence = self._child.last_sentence.replace(str(self.order.path), self.order.recording)
+        raise DeltalightError(sentence or f"The replay of {self.order.recording} does not start; try again.")
+
+    def ask(
+        self, op: str, payload: dict[str, object] | None = None, timeout_s: float = ASK_TIMEOUT_S
+    ) -> Position:
+        """Execute a command and return the position after it.
+
+        Raises:
+            UnansweredError: it does not answer.
+            DeltalightError: it refuses.
+        """
+        request = ControlRequest(
+            node="api", capture_ns=time.time_ns(), id=uuid.uuid4().hex, op=op, payload=payload or {}
+        )
+        try:
+            reply = self._client.request(request, timeout_s)
+        except DeltalightError as fault:
+            raise UnansweredError(f"The replay does not answer ({fault}).") from fault
+        if reply.error is not None:
+            raise DeltalightError(reply.error)
+        self.last = Position(recording=self.order.recording, **reply.payload)  # type: ignore[arg-type]
+        return self.last
+
+    def close(self) -> None:
+        """End the child process."""
+        self._is_closing = True
+        self._child.end(END_TIMEOUT_S)
+        self._client.close()
+        self._endpoints.clear()

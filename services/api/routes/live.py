@@ -1,0 +1,209 @@
+"""Routes of what arrives live: the composite, what a pixel of it shows, the fish-eye picture, events."""
+
+import asyncio
+from collections.abc import AsyncIterator, Coroutine
+from importlib.metadata import version
+from typing import Annotated, Any, Literal
+
+from fastapi import APIRouter, Body, Request, Response, WebSocket, WebSocketDisconnect
+from fastapi.responses import StreamingResponse
+from pydantic import BaseModel, ConfigDict, Field
+
+from protocol.messages import MAX_EDGE_PX, RadianceMessage
+from services.api.context import Shared
+from services.api.credentials import TICKET_LIFE_S, principal_of
+from services.api.events import EventQueue, packed
+from services.api.fisheye import FisheyeLight, lights_in_picture
+from services.api.live_hub import LiveFrame, LiveHub
+from services.api.problems import ProblemError, responses
+from services.storage.faults import NotFoundError
+
+WINDOW = 2  # frames on their way to one viewer before it has to acknowledge
+PICK_TIMEOUT_S = 5.0  # some frames of the slowest renderer
+POLICY_VIOLATION, GOING_AWAY = 1008, 1001  # WebSocket close codes (RFC 6455, 7.4.1)
+BOUNDARY = "frame"
+PICTURE_HEADERS = {"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff"}
+JPEG_ANSWER: dict[int | str, dict[str, Any]] = {200: {"content": {"image/jpeg": {}}}}
+
+live_router = APIRouter(tags=["live"])
+events_router = APIRouter(tags=["state"])
+ROUTERS = (live_router, events_router)
+
+
+class TicketAnswer(BaseModel):
+    """A ticket for one address."""
+
+    ticket: str = Field(description="To be added to the address as `?ticket=...`.")
+    expires_s: float = Field(description="Seconds within which it lets in, once.", examples=[TICKET_LIFE_S])
+
+
+class Pick(BaseModel):
+    """What a pixel of the newest composite shows; points are metres in the world."""
+
+    frame_id: int = Field(description="The frame that was looked at.")
+    kind: Literal["real", "object", "nothing"]
+    object: str | None = Field(description="Id of the virtual object; else null.")
+    point_m: tuple[float, float, float] | None = Field(description="Where the surface is; null for nothing.")
+    normal: tuple[float, float, float] | None = Field(description="Its unit normal; null where unknown.")
+    distance_m: float | None = Field(description="From the camera; null for nothing.")
+
+
+class Pixel(BaseModel):
+    """A place in the composite."""
+
+    model_config = ConfigDict(strict=True)
+
+    x: float = Field(ge=-0.5, le=MAX_EDGE_PX, description="To the right; the first pixel's centre is 0.")
+    y: float = Field(ge=-0.5, le=MAX_EDGE_PX, description="Down; the first pixel's centre is 0.")
+    ignore: str | None = Field(
+        None,
+        max_length=200,
+        description="Id of an object to look through, at the real scene behind it: one that is being dragged.",
+    )
+
+
+class FisheyeAnswer(BaseModel):
+    """The fish-eye picture's size and the lights in it; a light that it does not show is left out."""
+
+    seen_ns: int = Field(description="When it was taken, ns since 1970 by the node's clock.")
+    node: str = Field(description="The node that sees it.")
+    width: int = Field(description="Of the picture, pixels.")
+    height: int
+    clipped_share: float = Field(description="Of what it sees, what was too bright to be measured.")
+    lights: list[FisheyeLight]
+
+
+@live_router.post("/tickets", status_code=201)
+def create_ticket(shared: Shared, request: Request) -> TicketAnswer:
+    """Get a ticket with the caller's role, for addresses that cannot carry a token: WebSockets and pictures."""
+    return TicketAnswer(ticket=shared.tickets.issue(principal_of(request.scope)), expires_s=TICKET_LIFE_S)
+
+
+@live_router.websocket("/live")
+async def live(socket: WebSocket, shared: Shared) -> None:
+    """Send the newest frame whenever this viewer acknowledged enough; others are not affected."""
+    await socket.accept()
+    credits = asyncio.BoundedSemaphore(WINDOW)
+    await _first_of(_send_frames(socket, shared.live, credits), _take_acknowledgements(socket, credits))
+
+
+@live_router.get("/live.mjpg", include_in_schema=False)  # it never ends, which its description could not say
+async def live_mjpeg(shared: Shared) -> StreamingResponse:
+    """The newest frames as one endless multipart answer, for pictures in pages."""
+    media_type = f"multipart/x-mixed-replace; boundary={BOUNDARY}"
+    return StreamingResponse(_mjpeg(shared.live), media_type=media_type, headers=PICTURE_HEADERS)
+
+
+@live_router.get("/live.jpg", response_class=Response, responses={**responses(503), **JPEG_ANSWER})
+async def live_picture(shared: Shared) -> Response:
+    """Return the newest composite."""
+    frame = shared.live.newest
+    if frame is None:
+        raise ProblemError(503, "no-picture", "No picture has come from the render server yet; see /state.")
+    return Response(frame.jpeg, media_type="image/jpeg", headers=PICTURE_HEADERS)
+
+
+@live_router.post("/live/pick", responses=responses(400, 503))
+def pick(shared: Shared, pixel: Annotated[Pixel, Body(examples=[{"x": 320, "y": 200}])]) -> Pick:
+    """Say what a pixel of the newest composite shows: where to put an object, or which one was clicked on."""
+    payload = pixel.model_dump(exclude_none=True)
+    return Pick.model_validate(shared.link.command("pick", payload, PICK_TIMEOUT_S))
+
+
+@live_router.get("/fisheye", responses=responses(404))
+def fisheye(shared: Shared) -> FisheyeAnswer:
+    """Return what the fish-eye camera sees: the size of its picture, and the places of the lights in it."""
+    message, _ = _newest_fisheye(shared)
+    frame = shared.live.newest
+    height, width = message.picture_shape[:2]
+    return FisheyeAnswer(
+        seen_ns=message.capture_ns,
+        node=message.node,
+        width=width,
+        height=height,
+        clipped_share=message.clipped_share,
+        lights=lights_in_picture(message, () if frame is None else frame.message.lights),
+    )
+
+
+@live_router.get("/fisheye.jpg", response_class=Response, responses={**responses(404), **JPEG_ANSWER})
+def fisheye_picture(shared: Shared) -> Response:
+    """Return the newest fish-eye picture."""
+    return Response(_newest_fisheye(shared)[1], media_type="image/jpeg", headers=PICTURE_HEADERS)
+
+
+@events_router.websocket("/events")
+async def events(socket: WebSocket, shared: Shared) -> None:
+    """Send every event from now on."""
+    await socket.accept()
+    with shared.events.listening() as queue:
+        role = principal_of(socket.scope).role
+        await socket.send_text(packed("hello", {"version": version("deltalight"), "role": role}))
+        await _first_of(_send_events(socket, queue), _expect_nothing(socket))
+
+
+async def _first_of(*streams: Coroutine[Any, Any, None]) -> None:
+    """Run coroutines until one of them ends, then end the others."""
+    tasks = {asyncio.ensure_future(each) for each in streams}
+    try:
+        await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def _send_frames(socket: WebSocket, hub: LiveHub, credits: asyncio.Semaphore) -> None:
+    with hub.viewer() as viewer:
+        while True:
+            await credits.acquire()
+            frame = await viewer.next()
+            if frame is None:
+                await socket.close(GOING_AWAY)
+                return
+            await socket.send_bytes(frame.packed(viewer.skipped))
+
+
+async def _take_acknowledgements(socket: WebSocket, credits: asyncio.BoundedSemaphore) -> None:
+    try:
+        while True:
+            await socket.receive_text()
+            credits.release()
+    except WebSocketDisconnect:
+        return
+    except (ValueError, KeyError):  # it acknowledged what it never got, or sent bytes
+        await socket.close(POLICY_VIOLATION, "acknowledge each frame once")
+
+
+async def _mjpeg(hub: LiveHub) -> AsyncIterator[bytes]:
+    with hub.viewer() as viewer:
+        while (frame := await viewer.next()) is not None:
+            yield _part(frame)
+
+
+def _part(frame: LiveFrame) -> bytes:
+    head = f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(frame.jpeg)}\r\n\r\n"
+    return head.encode() + frame.jpeg + b"\r\n"
+
+
+def _newest_fisheye(shared: Shared) -> tuple[RadianceMessage, bytes]:
+    newest = shared.fisheye.newest
+    if newest is None:
+        raise NotFoundError(
+            "no node has sent light of a fish-eye camera; docs/fisheye.md tells how to set one up."
+        )
+    return newest
+
+
+async def _send_events(socket: WebSocket, queue: EventQueue) -> None:
+    while True:
+        await socket.send_text(await queue.next())
+
+
+async def _expect_nothing(socket: WebSocket) -> None:
+    """Wait for the end; clients must not send anything here."""
+    try:
+        await socket.receive_text()
+    except (WebSocketDisconnect, KeyError):
+        return
+    await socket.close(POLICY_VIOLATION, "nothing is taken here")

@@ -1,0 +1,297 @@
+"""Routes of recordings, and of the replay of one in place of the live nodes."""
+
+from datetime import UTC, datetime
+from typing import Annotated, Any, Literal, Self
+
+from fastapi import APIRouter, Body, Path, Response
+from pydantic import Field
+
+from protocol.documents import StrictModel
+from protocol.errors import DeltalightError
+from protocol.messages import Name
+from sensor_node.cameras.playback import MAX_RATE, MIN_RATE
+from services.api.context import Context, Shared
+from services.api.file_response import StoredFileResponse
+from services.api.problems import responses
+from services.api.recording_session import RecordingSession
+from services.api.recording_store import NAME, RecordingStore, StoredRecording
+from services.api.replay_control import Position, ReplayOrder
+from services.api.request_bodies import AS_SENT, checked
+from services.storage.faults import ConflictError
+
+router = APIRouter(tags=["recordings"], prefix="/recordings")
+replay_router = APIRouter(tags=["recordings"], prefix="/replay")
+ROUTERS = (router, replay_router)
+
+RecordingId = Annotated[
+    str,
+    Path(pattern=f"^{NAME.pattern}$", description="The recording's name.", examples=["take-20261121-101500"]),
+]
+Rate = Annotated[float, Field(ge=MIN_RATE, le=MAX_RATE, description="Recorded seconds a second.")]
+Seconds = Annotated[float, Field(ge=0, le=1e6, description="From the recording's first frame.")]
+POSTER_ANSWER: dict[int | str, dict[str, Any]] = {
+    200: {"content": {"image/jpeg": {"schema": {"type": "string", "format": "binary"}}}}
+}
+DOWNLOAD_ANSWER: dict[int | str, dict[str, Any]] = {
+    200: {"content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}}
+}
+
+
+class NewRecording(StrictModel):
+    """What to record; every key has a default."""
+
+    name: str | None = Field(
+        default=None, max_length=64, description="Letters, digits, dashes, underscores; null = the time."
+    )
+    duration_s: float | None = Field(
+        default=None, ge=0.1, le=86_400, description="Ends so long after the first frame; null = by stop."
+    )
+    node: Name | None = Field(
+        default=None, description="Which node; null = the one whose picture comes first."
+    )
+
+
+class Stream(StrictModel):
+    """What one stream of a recording holds."""
+
+    messages: int
+    size_bytes: int = Field(description="Before compression.")
+
+
+class RecordingAnswer(StrictModel):
+    """A recording, finished or growing."""
+
+    id: str = Field(description="Its name, also in addresses.", examples=["take-20261121-101500"])
+    state: Literal["waiting", "recording", "finished", "interrupted"] = Field(
+        description="`waiting` = no frame has come yet; `interrupted` = its recorder was killed: recover it."
+    )
+    detail: str = Field(description="What keeps it from growing, or from being read; else empty.")
+    changed: datetime = Field(description="When it was finished; while it grows: when it was begun.")
+    size_bytes: int
+    duration_s: float | None
+    frames: int | None
+    frames_per_s: float | None
+    lost: dict[str, int] = Field(description="What never came, by stream; known while it grows.")
+    streams: dict[str, Stream]
+    scene: str | None = Field(description="Title of the attached scene, empty for one without; null = none.")
+    notes: list[str] = Field(description="What else is to be known of it.")
+
+    @classmethod
+    def growing(cls, session: RecordingSession) -> Self:
+        """Describe a recording that grows."""
+        figures = session.figures or {}
+        return cls(
+            id=session.id,
+            state="recording" if session.figures else "waiting",
+            detail=session.detail,
+            changed=session.started,
+            size_bytes=figures.get("bytes", 0),
+            duration_s=figures.get("seconds"),
+            frames=figures.get("frames"),
+            frames_per_s=figures.get("frames_per_s"),
+            lost={**figures.get("missing", {}), **figures.get("dropped", {})},
+            streams={},
+            scene=None,
+            notes=[],
+        )
+
+    @classmethod
+    def stored(cls, recording: StoredRecording) -> Self:
+        """Describe a recording on the disk."""
+        facts = recording.facts or {}
+        return cls(
+            id=recording.id,
+            state=recording.state,
+            detail=recording.detail,
+            changed=datetime.fromtimestamp(recording.changed_ns / 1e9, UTC),
+            size_bytes=recording.size_bytes,
+            duration_s=facts.get("duration_s"),
+            frames=facts.get("frames"),
+            frames_per_s=facts.get("frames_per_s"),
+            lost={},
+            streams={
+                topic: Stream(messages=figures["messages"], size_bytes=figures["bytes"])
+                for topic, figures in facts.get("streams", {}).items()
+            },
+            scene=facts.get("scene"),
+            notes=[note.replace(str(recording.path), recording.id) for note in facts.get("notes", [])],
+        )
+
+
+class NewReplay(StrictModel):
+    """What to show."""
+
+    recording: str = Field(
+        pattern=f"^{NAME.pattern}$", description="The recording's name.", examples=["take-20261121-101500"]
+    )
+    position_s: Seconds = 0.0
+    playing: bool = True
+    rate: Rate = 1.0
+    loop: bool = Field(default=True, description="Begin again at the end; else it stays there, paused.")
+
+
+class ReplayChange(StrictModel):
+    """What is to be otherwise; the rest stays."""
+
+    position_s: Seconds | None = None
+    playing: bool | None = None
+    rate: Rate | None = None
+
+
+class ReplayAnswer(StrictModel):
+    """Where the replay is; all null = the live nodes are shown."""
+
+    recording: str | None
+    position_s: float | None = None
+    duration_s: float | None = None
+    playing: bool | None = None
+    rate: float | None = None
+    loop: bool | None = None
+
+
+@router.get("")
+def list_recordings(shared: Shared) -> list[RecordingAnswer]:
+    """List all recordings, those that grow first, then the newest first."""
+    growing = shared.recording_sessions.running()
+    names = {session.id for session in growing}
+    stored = [RecordingAnswer.stored(recording) for recording in shared.recordings.all(growing=names)]
+    return [RecordingAnswer.growing(session) for session in growing] + stored
+
+
+@router.post("", status_code=201, responses=responses(409, 422, 503))
+def start_recording(
+    shared: Shared,
+    response: Response,
+    wanted: Annotated[NewRecording, AS_SENT, Body(examples=[{"name": "two-lamps", "duration_s": 20}])],
+) -> RecordingAnswer:
+    """Begin to record a node, with the active scene attached; events tell how far it is."""
+    order = checked(NewRecording, wanted, "the recording")
+    active = shared.store.scenes.active()
+    scene = None if active is None else active.document
+    session = shared.recording_sessions.start(order.name, order.node, order.duration_s, scene)
+    response.headers["Location"] = f"/api/v1/recordings/{session.id}"
+    return RecordingAnswer.growing(session)
+
+
+@router.get("/{recording_id}", responses=responses(404))
+def get_recording(shared: Shared, recording_id: RecordingId) -> RecordingAnswer:
+    """Return what is known of a recording."""
+    growing = _growing(shared, recording_id)
+    return (
+        RecordingAnswer.stored(shared.recordings.get(recording_id))
+        if growing is None
+        else RecordingAnswer.growing(growing)
+    )
+
+
+@router.post("/{recording_id}/stop", responses=responses(404, 409, 422))
+def stop_recording(shared: Shared, recording_id: RecordingId) -> RecordingAnswer:
+    """End a recording; 409 where no frame had come, so that there is none."""
+    shared.recording_sessions.stop(recording_id)
+    return RecordingAnswer.stored(shared.recordings.get(recording_id))
+
+
+@router.post("/{recording_id}/recover", responses=responses(404, 409, 422))
+def recover_recording(shared: Shared, recording_id: RecordingId) -> RecordingAnswer:
+    """Mend an interrupted recording: all frames that can be read, finished."""
+    _require_at_rest(shared, recording_id)
+    return RecordingAnswer.stored(shared.recordings.recover(recording_id))
+
+
+@router.get(
+    "/{recording_id}/content",
+    response_class=StoredFileResponse,
+    responses=responses(404, 409, 416) | DOWNLOAD_ANSWER,
+)
+def download_recording(shared: Shared, recording_id: RecordingId) -> StoredFileResponse:
+    """Download the .mcap file; ranges of it too."""
+    _require_at_rest(shared, recording_id)
+    recording = shared.recordings.get(recording_id)
+    if recording.state == "interrupted":
+        raise ConflictError(f"{recording.id} was interrupted; recover it, then download it.")
+    path = recording.path
+    return StoredFileResponse(path, media_type="application/octet-stream", filename=path.name)
+
+
+@router.get(
+    "/{recording_id}/poster.jpg",
+    response_class=StoredFileResponse,
+    responses=responses(404, 409, 422) | POSTER_ANSWER,
+)
+def recording_poster(shared: Shared, recording_id: RecordingId) -> StoredFileResponse:
+    """Return the first colour picture, at most 640 pixels wide or high."""
+    _require_at_rest(shared, recording_id)
+    return StoredFileResponse(shared.recordings.poster(recording_id), media_type="image/jpeg")
+
+
+@router.delete("/{recording_id}", status_code=204, responses=responses(404, 409))
+def delete_recording(shared: Shared, recording_id: RecordingId) -> None:
+    """Delete a recording for good; not one that grows or is shown."""
+    _require_at_rest(shared, recording_id)
+    if shared.replay.recording == recording_id:
+        raise ConflictError(f"{recording_id} is being replayed; go back to live, then delete it.")
+    shared.recordings.remove(recording_id)
+
+
+@replay_router.get("", responses=responses(503))
+def get_replay(shared: Shared) -> ReplayAnswer:
+    """Return which recording is shown and where it is."""
+    return replay_answer(shared.replay.position())
+
+
+@replay_router.put("", responses=responses(404, 409, 422, 503))
+def start_replay(
+    shared: Shared,
+    wanted: Annotated[
+        NewReplay, AS_SENT, Body(examples=[{"recording": "two-lamps", "position_s": 2.5, "loop": True}])
+    ],
+) -> ReplayAnswer:
+    """Show a recording instead of the live nodes, or of the recording that is shown."""
+    new = checked(NewReplay, wanted, "the replay")
+    _require_at_rest(shared, new.recording)
+    recording = shared.recordings.get(new.recording)
+    order = ReplayOrder(recording.id, recording.path, new.position_s, new.playing, new.rate, new.loop)
+    return replay_answer(shared.replay.start(order))
+
+
+@replay_router.patch("", responses=responses(409, 422, 503))
+def change_replay(
+    shared: Shared,
+    change: Annotated[ReplayChange, AS_SENT, Body(examples=[{"position_s": 4.2, "playing": False}])],
+) -> ReplayAnswer:
+    """Seek, pause, go on, play slower or faster."""
+    wanted = checked(ReplayChange, change, "the change")
+    return replay_answer(shared.replay.change(wanted.position_s, wanted.playing, wanted.rate))
+
+
+@replay_router.delete("", status_code=204)
+def end_replay(shared: Shared) -> None:
+    """Show the live nodes again."""
+    shared.replay.stop()
+
+
+def replay_answer(position: Position | None) -> ReplayAnswer:
+    """Describe where a replay is; None = live."""
+    return ReplayAnswer(recording=None) if position is None else ReplayAnswer(**vars(position))
+
+
+def recording_event(
+    recordings: RecordingStore, session: RecordingSession, *, is_growing: bool
+) -> dict[str, Any]:
+    """Return the body of the event about a recording while it grows, and at its end."""
+    if is_growing:
+        return RecordingAnswer.growing(session).model_dump()
+    try:
+        ended = RecordingAnswer.stored(recordings.get(session.id))
+    except DeltalightError:  # no frame had come
+        return {**RecordingAnswer.growing(session).model_dump(), "deleted": True}
+    return {**ended.model_dump(), "detail": session.detail or ended.detail}
+
+
+def _growing(shared: Context, recording_id: str) -> RecordingSession | None:
+    return next((each for each in shared.recording_sessions.running() if each.id == recording_id), None)
+
+
+def _require_at_rest(shared: Context, recording_id: str) -> None:
+    if _growing(shared, recording_id) is not None:
+        raise ConflictError(f"{recording_id} is still being recorded; stop it first.")

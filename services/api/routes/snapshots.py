@@ -1,0 +1,154 @@
+"""Routes of snapshots: one frame in any number of views, as pictures to keep."""
+
+from pathlib import Path as FilePath
+from typing import Annotated, Any, get_args
+
+from fastapi import APIRouter, Body, Path, Response
+from pydantic import Field, StrictBool, model_validator
+
+from protocol.documents import StrictModel
+from protocol.messages import Name
+from protocol.scene_method import Method, Output
+from services.api.context import Context, Shared
+from services.api.file_response import StoredFileResponse
+from services.api.problems import ProblemError, responses
+from services.api.request_bodies import AS_SENT, checked
+from services.api.routes.assets import UNCHANGING
+from services.api.snapshot_store import ID, SnapshotFacts, SnapshotPicture, files_of, now
+
+router = APIRouter(tags=["snapshots"], prefix="/snapshots")
+ROUTERS = (router,)
+VIEWS: tuple[str, ...] = ("camera", *get_args(Output.model_fields["view"].annotation))
+MAX_PICTURES = 16
+EXR = "composite.exr"
+# Sixteen pictures by the slowest method, in software.
+TIMEOUT_S = 120.0
+SnapshotId = Annotated[
+    str,
+    Path(pattern=f"^{ID.pattern}$", description="The snapshot's `id`.", examples=["20261121-101500-3fa2c1"]),
+]
+FILE_ANSWER: dict[int | str, dict[str, Any]] = {
+    200: {
+        "content": {
+            media_type: {"schema": {"type": "string", "format": "binary"}}
+            for media_type in ("image/png", "image/x-exr")
+        }
+    }
+}
+
+
+class WantedPicture(StrictModel):
+    """A picture to take."""
+
+    name: Name = Field(description="Its file is called NAME.png.")
+    view: str = Field(default="composite", description=f"One of {', '.join(VIEWS)}.")
+    method: Method | None = Field(default=None, description="Relit by this one; null = as the scene says.")
+
+    @model_validator(mode="after")
+    def _check(self) -> "WantedPicture":
+        if self.view not in VIEWS:
+            raise ValueError(f"the view must be one of {', '.join(VIEWS)}")
+        return self
+
+
+class NewSnapshot(StrictModel):
+    """What to take; by default every view."""
+
+    pictures: tuple[WantedPicture, ...] = Field(
+        default=tuple(WantedPicture(name=view, view=view) for view in VIEWS),
+        min_length=1,
+        max_length=MAX_PICTURES,
+        description="All of one and the same frame.",
+    )
+    exr: StrictBool = Field(default=False, description=f"Add {EXR}: the composite's linear radiance.")
+
+    @model_validator(mode="after")
+    def _check(self) -> "NewSnapshot":
+        names = [picture.name for picture in self.pictures]
+        if len(set(names)) < len(names):
+            raise ValueError("two pictures have the same name")
+        return self
+
+
+@router.get("")
+def list_snapshots(shared: Shared) -> list[SnapshotFacts]:
+    """List all snapshots, the newest first."""
+    return shared.snapshots.all()
+
+
+@router.post("", status_code=201, responses=responses(409, 422, 502, 503))
+def take_snapshot(
+    shared: Shared,
+    response: Response,
+    wanted: Annotated[
+        NewSnapshot,
+        AS_SENT,
+        Body(examples=[{"pictures": [{"name": "paper", "method": {"name": "dvct", "operator": "paper"}}]}]),
+    ],
+) -> SnapshotFacts:
+    """Render the newest frame as each picture says, and keep the files."""
+    order = checked(NewSnapshot, wanted, "the snapshot")
+    taken = shared.snapshots.add(lambda name, folder: _taken(shared, name, folder, order))
+    response.headers["Location"] = f"/api/v1/snapshots/{taken.id}"
+    shared.events.publish("snapshot", taken.model_dump())
+    return taken
+
+
+@router.get("/{snapshot_id}", responses=responses(404))
+def get_snapshot(shared: Shared, snapshot_id: SnapshotId) -> SnapshotFacts:
+    """Return what is known of a snapshot."""
+    return shared.snapshots.get(snapshot_id)
+
+
+@router.get(
+    "/{snapshot_id}/{file}", response_class=StoredFileResponse, responses=responses(404) | FILE_ANSWER
+)
+def snapshot_file(
+    shared: Shared,
+    snapshot_id: SnapshotId,
+    file: Annotated[str, Path(max_length=80, description="One of its files.", examples=["composite.png"])],
+) -> StoredFileResponse:
+    """Return a picture of a snapshot."""
+    path = shared.snapshots.file(snapshot_id, file)
+    media_type = "image/x-exr" if path.suffix == ".exr" else "image/png"
+    return StoredFileResponse(path, media_type=media_type, headers=UNCHANGING)
+
+
+@router.delete("/{snapshot_id}", status_code=204, responses=responses(404))
+def delete_snapshot(shared: Shared, snapshot_id: SnapshotId) -> None:
+    """Delete a snapshot for good."""
+    shared.snapshots.remove(snapshot_id)
+    shared.events.publish("snapshot", {"id": snapshot_id, "deleted": True})
+
+
+def _taken(shared: Context, name: str, folder: FilePath, wanted: NewSnapshot) -> SnapshotFacts:
+    active = shared.store.scenes.active()
+    pictures = [picture.model_dump(mode="json") for picture in wanted.pictures]
+    order: dict[str, object] = {"folder": str(folder), "pictures": pictures, "exr": wanted.exr}
+    answer: dict[str, Any] = shared.link.command("snapshot", order, TIMEOUT_S)
+    files, faults = files_of(answer, folder)
+    if not files:
+        said = next(iter(faults.values()), "it wrote no file into the data folder; run it on this host.")
+        raise ProblemError(502, "no-pictures", f"The render server took no picture: {said}")
+    return SnapshotFacts(
+        id=name,
+        taken=now(),
+        frame_id=answer["frame_id"],
+        capture_ns=answer["capture_ns"],
+        scene_id=None if active is None else active.head.id,
+        scene_revision=None if active is None else active.document.revision,
+        recording=shared.replay.recording,
+        pictures=[_described(picture, files, faults) for picture in wanted.pictures],
+        files=files,
+    )
+
+
+def _described(picture: WantedPicture, files: list[str], faults: dict[str, str]) -> SnapshotPicture:
+    file = f"{picture.name}.png"
+    return SnapshotPicture(
+        name=picture.name,
+        view=picture.view,
+        method=picture.method,
+        file=file if file in files else None,
+        detail=faults.get(picture.name, ""),
+    )

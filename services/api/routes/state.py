@@ -1,0 +1,161 @@
+"""Routes that report on the service, the processes around it, and the cameras of this host."""
+
+from importlib.metadata import version
+from typing import Literal
+
+from fastapi import APIRouter, Response
+from fastapi.responses import PlainTextResponse
+from pydantic import BaseModel, Field
+
+from services.api.camera_finder import CamerasAnswer
+from services.api.context import Shared
+from services.api.live_hub import LiveFrame
+from services.api.metrics import MEDIA_TYPE
+from services.api.models import PictureState, ProcessAnswer
+from services.api.problems import responses
+from services.api.streams import Report
+
+state_router = APIRouter(tags=["state"])
+nodes_router = APIRouter(tags=["nodes"])
+ROUTERS = (state_router, nodes_router)
+
+RENDER_SERVER = "render-server"  # its name unless its settings say another
+
+
+class StreamState(BaseModel):
+    """Whether pictures come."""
+
+    status: Literal["waiting", "ok", "stale"] = Field(
+        description="`waiting` = none came yet; `stale` = none for two seconds."
+    )
+    frame_id: int | None = Field(description="Of the newest.")
+    last_frame_s: float | None = Field(description="Seconds since it came.")
+    frames_per_s: float | None
+
+
+class Health(BaseModel):
+    """Whether the service works; it needs no token."""
+
+    status: Literal["ok", "degraded"] = Field(description="`degraded` = the render server does not answer.")
+    render_server: Literal["answers", "silent"]
+    stream: StreamState
+    version: str
+
+
+class State(BaseModel):
+    """How the render server and the nodes are doing."""
+
+    render_server: Literal["answers", "silent"]
+    picture: PictureState | None = Field(description="What became of the active scene's newest revision.")
+    processes: list[ProcessAnswer] = Field(description="Nodes and render server, as they report each second.")
+    refused: dict[str, int] = Field(description="Requests refused since the start, by kind of problem.")
+
+
+class Settings(BaseModel):
+    """What a client needs to know of the service's settings."""
+
+    version: str
+    needs_token: bool
+    upload_limit_bytes: int
+    requests_per_s: float
+
+
+class NodeAnswer(ProcessAnswer):
+    """A node or render server, with its clock and its delays."""
+
+    kind: Literal["node", "render_server"]
+    clock_offset_ms: float = Field(description="What is added to its times to have the render server's.")
+    delays_ms: dict[str, float] = Field(
+        description="`report`: its newest report's way here. Of a render server also, of the newest picture: "
+        "`capture_to_server`, `rendering` (waiting included), `server_to_api`."
+    )
+
+
+@state_router.get("/health", responses=responses(503))
+def health(shared: Shared) -> Health:
+    """Whether the service works and reads its storage."""
+    shared.store.scenes.all()
+    return Health(
+        status="ok" if shared.link.is_reachable else "degraded",
+        render_server=_server(shared),
+        stream=_stream(shared),
+        version=version("deltalight"),
+    )
+
+
+@state_router.get("/state")
+def state(shared: Shared) -> State:
+    """Rates, drops, delays and remarks of the processes."""
+    delivery = shared.link.delivery
+    return State(
+        render_server=_server(shared),
+        picture=None if delivery is None else PictureState.of(delivery),
+        processes=[ProcessAnswer.of(report) for report in shared.watch.reports()],
+        refused=dict(shared.problems.counts),
+    )
+
+
+@state_router.get("/metrics", response_class=PlainTextResponse)
+def metrics(shared: Shared) -> Response:
+    """Measurements for Prometheus."""
+    return Response(shared.metrics.text(), media_type=MEDIA_TYPE)
+
+
+@state_router.get("/settings")
+def settings(shared: Shared) -> Settings:
+    """Limits of this service."""
+    return Settings(
+        version=version("deltalight"),
+        needs_token=shared.settings.leaves_host,
+        upload_limit_bytes=shared.settings.upload_limit_mb << 20,
+        requests_per_s=shared.settings.requests_per_s,
+    )
+
+
+@nodes_router.get("/nodes")
+def list_nodes(shared: Shared) -> list[NodeAnswer]:
+    """List the nodes and render servers that are heard: state, rates, losses, clock, delays."""
+    frame = shared.live.newest
+    return [_node(report, frame) for report in shared.watch.reports()]
+
+
+@nodes_router.get("/cameras", responses=responses(503))
+def list_cameras(shared: Shared) -> CamerasAnswer:
+    """List the cameras that are attached to this host, and what keeps others from being found."""
+    return shared.cameras.find()
+
+
+def _stream(shared: Shared) -> StreamState:
+    status, since_s = shared.live.state()
+    frame = shared.live.newest
+    return StreamState(
+        status=status,
+        frame_id=None if frame is None else frame.message.frame_id,
+        last_frame_s=None if since_s is None else round(since_s, 3),
+        frames_per_s=shared.live.frames_per_s(),
+    )
+
+
+def _server(shared: Shared) -> Literal["answers", "silent"]:
+    return "answers" if shared.link.is_reachable else "silent"
+
+
+def _node(report: Report, frame: LiveFrame | None) -> NodeAnswer:
+    message = report.message
+    renders = message.node == (RENDER_SERVER if frame is None else frame.message.node)
+    delays_ms = {"report": report.delay_ms, **(_picture_delays_ms(frame) if frame and renders else {})}
+    return NodeAnswer(
+        **ProcessAnswer.of(report).model_dump(),
+        kind="render_server" if renders else "node",
+        clock_offset_ms=message.clock_offset_ns / 1e6,
+        delays_ms={name: round(value, 3) for name, value in delays_ms.items()},
+    )
+
+
+def _picture_delays_ms(frame: LiveFrame) -> dict[str, float]:
+    message = frame.message
+    return {
+        "capture_to_server": (message.received_ns - message.capture_ns - message.clock_offset_ns) / 1e6,
+        "rendering": (message.rendered_ns - message.received_ns) / 1e6,
+        "server_to_api": (frame.arrived_ns - message.rendered_ns) / 1e6,
+    }

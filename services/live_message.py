@@ -1,0 +1,110 @@
+"""One message of the live stream (`WS /live`): a header that describes the picture, then the JPEG.
+
+The models here define the header: the service packs with them, the Python client reads with them, and the dashboard's
+types are generated from the OpenAPI description, whose component `LiveHeader` they are.
+"""
+
+import struct
+from typing import Any, Literal, Self
+
+from pydantic import BaseModel, Field, ValidationError
+
+from protocol.camera_model import DistortionModel
+from protocol.documents import validate
+from protocol.errors import DeltalightError
+from protocol.messages import CompositeMessage
+
+_LENGTH = struct.Struct("<I")
+
+Row = tuple[float, float, float, float]
+
+
+class ShownScene(BaseModel):
+    """The scene that a picture shows."""
+
+    id: str
+    revision: int
+
+
+class LiveCamera(BaseModel):
+    """The camera at the picture's size."""
+
+    width: int
+    height: int
+    matrix: list[float] = Field(min_length=9, max_length=9, description="Intrinsics, row by row.")
+    distortion_model: DistortionModel
+    distortion: list[float]
+
+
+class PictureHeader(BaseModel):
+    """What a header says of the picture, the same for all viewers."""
+
+    number: int = Field(description="Counts the pictures that came.")
+    frame_id: int = Field(description="The camera's frame.")
+    capture_ns: int = Field(description="When it was captured, ns since 1970 by the node's clock.")
+    frames_per_s: float | None = Field(description="Rate at which pictures come; null before the second.")
+    status: Literal["ok", "no_pose"] = Field(description="`no_pose`: the camera's picture as it is.")
+    drops: dict[str, int] = Field(description="What was lost before, by cause.")
+    pass_times_ms: dict[str, float] = Field(description="Where its time went.")
+    lights: list[dict[str, Any]] = Field(description="What it was lit with.")
+    camera: LiveCamera = Field(description="What projects points of the camera's space onto this picture.")
+    world_from_camera: tuple[Row, Row, Row, Row] | None = Field(description="null without a pose.")
+    scene: ShownScene | None = Field(description="null where another program set the server's scene.")
+    renderer: str
+
+    @classmethod
+    def of(
+        cls,
+        message: CompositeMessage,
+        *,
+        number: int,
+        frames_per_s: float | None,
+        renderer: str,
+    ) -> Self:
+        """Describe a composite.
+
+        Raises:
+            DeltalightError: its camera is none.
+        """
+        scene = {"id": message.scene_id, "revision": message.scene_revision}
+        own = {
+            "number": number,
+            "frames_per_s": frames_per_s,
+            "scene": None if message.scene_id is None else scene,
+            "renderer": renderer,
+        }
+        return validate(cls, {**dict(message), **own}, "the composite")
+
+
+class ViewerHeader(BaseModel):
+    """What a header says to one viewer at the moment of sending."""
+
+    age_ms: float = Field(description="Time since the picture's capture.")
+    skipped: int = Field(description="Pictures that this viewer was too slow for.")
+
+
+class LiveHeader(PictureHeader, ViewerHeader):
+    """The JSON header of a message of `WS /live`."""
+
+
+def pack(picture_header: bytes, viewer_header: ViewerHeader, jpeg: bytes) -> bytes:
+    """Return the message: little-endian uint32 length of the JSON header, the header, the JPEG.
+
+    `picture_header` is the JSON text of a `PictureHeader`, encoded once for all viewers.
+    """
+    header = viewer_header.model_dump_json().encode()[:-1] + b"," + picture_header[1:]
+    return _LENGTH.pack(len(header)) + header + jpeg
+
+
+def unpack(message: bytes) -> tuple[LiveHeader, bytes]:
+    """Return the header and the JPEG of a message.
+
+    Raises:
+        DeltalightError: it is no such message.
+    """
+    try:
+        (length,) = _LENGTH.unpack_from(message)
+        end = _LENGTH.size + length
+        return LiveHeader.model_validate_json(message[_LENGTH.size : end]), message[end:]
+    except (struct.error, ValidationError) as fault:
+        raise DeltalightError("The service sent a live picture without a valid header; update it.") from fault

@@ -1,0 +1,68 @@
+"""Runs `asset_worker` on untrusted files, in a process with limits, before anything else may load them."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Literal
+
+from services.storage.asset_kinds import AssetKind, Facts
+from services.storage.faults import RejectedAssetError
+
+WORKER = "services.storage.asset_worker"  # by name: nothing here may import what it imports
+# An 8192 x 4096 map takes 1.6 GB while it is checked, a mesh of 10 M triangles 2 GB.
+MEMORY_LIMIT_BYTES = 3 << 30
+TIME_LIMIT_S = 60
+_ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}  # each thread's buffers count as memory
+
+Task = Literal["mesh", "map", "mesh-thumbnail", "map-thumbnail", "unzip"]
+
+
+def run_limited(
+    task: Task,
+    path: Path,
+    name: str,
+    *arguments: str,
+    memory_bytes: int = MEMORY_LIMIT_BYTES,
+    output_bytes: int = 0,
+) -> Facts:
+    """Run a task on a file in the worker and return its facts; `name` stands for the file in sentences.
+
+    A file that the task writes may have `output_bytes`.
+
+    Raises:
+        RejectedAssetError: the file is not what it must be, or the limits do not allow it.
+    """
+    limits = [str(memory_bytes), str(TIME_LIMIT_S), str(output_bytes)]
+    try:
+        done = subprocess.run(
+            [sys.executable, "-m", WORKER, task, str(path), *limits, *arguments],
+            capture_output=True,
+            text=True,
+            timeout=TIME_LIMIT_S,
+            check=False,
+            env={**os.environ, **_ENVIRONMENT},
+        )
+    except subprocess.TimeoutExpired as fault:
+        raise RejectedAssetError(
+            f"{name} takes longer than {TIME_LIMIT_S} s to load; simplify it."
+        ) from fault
+    try:
+        answer = json.loads(done.stdout.splitlines()[-1])
+    except (IndexError, ValueError) as fault:
+        raise RejectedAssetError(f"{name} ends the program that loads it; export it again.") from fault
+    if "fault" in answer:
+        raise RejectedAssetError(answer["fault"].replace(str(path), name))
+    return dict(answer)
+
+
+def probe(path: Path, kind: AssetKind, name: str, *, memory_bytes: int = MEMORY_LIMIT_BYTES) -> Facts:
+    """Load a file in the worker and return what is known of it then (`asset_facts`).
+
+    `name` stands for the file in sentences.
+
+    Raises:
+        RejectedAssetError: it cannot be loaded, or not within the limits.
+    """
+    return run_limited(kind, path, name, memory_bytes=memory_bytes)

@@ -1,0 +1,53 @@
+"""The process that works on an untrusted file within limits; `asset_sandbox` starts it.
+
+Run as `python -m services.storage.asset_worker TASK PATH MEMORY_BYTES TIME_S OUTPUT_BYTES [ARGUMENT...]`; prints one
+JSON object.
+"""
+
+import json
+import resource
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from protocol.errors import DeltalightError
+from services.storage.asset_kinds import Facts
+
+
+def _limit(memory_bytes: int, time_s: int, output_bytes: int) -> None:
+    resource.setrlimit(resource.RLIMIT_AS, (memory_bytes, memory_bytes))
+    resource.setrlimit(resource.RLIMIT_CPU, (time_s, time_s))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (output_bytes, output_bytes))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+
+def _task(name: str) -> Callable[..., Facts]:
+    """Return the function of a task; imported here, because each needs other heavy packages."""
+    if name == "unzip":
+        from services.storage.gltf_zip import repack
+
+        return repack
+    if name.endswith("-thumbnail"):
+        from services.storage import thumbnails
+
+        return thumbnails.draw_mesh if name == "mesh-thumbnail" else thumbnails.draw_map
+    from services.storage import asset_facts
+
+    return asset_facts.mesh_facts if name == "mesh" else asset_facts.map_facts
+
+
+def _main(task: str, path: str, memory_bytes: str, time_s: str, output_bytes: str, *arguments: str) -> None:
+    _limit(int(memory_bytes), int(time_s), int(output_bytes))
+    try:
+        facts = _task(task)(Path(path), *arguments)
+    except DeltalightError as fault:
+        facts = {"fault": str(fault)}
+    except ModuleNotFoundError as fault:
+        facts = {"fault": f"{path} cannot be checked without {fault.name}: pip install 'deltalight[render]'."}
+    except MemoryError:
+        facts = {"fault": f"{path} needs more than {int(memory_bytes) >> 20} MB to load; simplify it."}
+    print(json.dumps(facts))
+
+
+if __name__ == "__main__":
+    _main(*sys.argv[1:])

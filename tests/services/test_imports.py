@@ -1,0 +1,45 @@
+"""Modules of protocol and services import each other one way; benchmarks are reached through one module."""
+
+import ast
+from functools import cache
+from graphlib import TopologicalSorter
+
+from tests.services.conftest import ROOT
+
+PACKAGES = ("protocol", "services")
+BENCHMARKS_ENTRY = "benchmarks.cli"
+
+
+@cache
+def imports() -> dict[str, set[str]]:
+    """What each module imports, also inside of functions."""
+    paths = [path for package in PACKAGES for path in (ROOT / package).rglob("*.py")]
+    dashboard = ROOT / "services" / "dashboard"
+    return {
+        ".".join(path.relative_to(ROOT).with_suffix("").parts): imported(path.read_text())
+        for path in paths
+        if not path.is_relative_to(dashboard)
+    }
+
+
+def imported(text: str) -> set[str]:
+    found = set()
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Import):
+            found.update(each.name for each in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module is not None:
+            found.add(node.module)
+            found.update(f"{node.module}.{each.name}" for each in node.names)
+    return found
+
+
+def test_no_modules_import_each_other_in_a_circle() -> None:
+    known = imports()
+    order = TopologicalSorter({name: found & known.keys() for name, found in known.items()}).static_order()
+    assert len(list(order)) == len(known) > 100
+
+
+def test_benchmarks_are_imported_through_their_entry_alone() -> None:
+    found = {each for names in imports().values() for each in names if each.split(".")[0] == "benchmarks"}
+    assert {each for each in found if not each.startswith(BENCHMARKS_ENTRY)} == set()
+    assert BENCHMARKS_ENTRY in found
