@@ -1,14 +1,49 @@
-"""Fixtures that every room's tests share."""
+"""Both tiers of the tests, what keeps workers apart that run at the same time, and fixtures that all rooms share."""
 
+import os
 import signal
 from pathlib import Path
 
 import pytest
 
+from services import ports
+
 # A shell starts what it puts into the background with SIGINT ignored, and children inherit that: no test of Ctrl-C
 # could pass.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+SLOW_MARKERS = ("slow", "data")
+WORKER = os.environ.get("PYTEST_XDIST_WORKER")  # gw0, gw1, ...; None where tests are not spread
+if WORKER is not None:
+    number, count = int(WORKER.removeprefix("gw")), int(os.environ["PYTEST_XDIST_WORKER_COUNT"])
+    ports.PRIVATE_PORTS = ports.PRIVATE_PORTS[number::count]
+    os.environ.setdefault("LP_NUM_THREADS", "1")  # the workers share the cores, not each worker's renderer
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--all", action="store_true", help="run the tests marked `slow` or `data` too")
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave slow tests out of the quick tier; in the full one they come first, so that none is waited for alone."""
+    slow = [item for item in items if _is_slow(item)]
+    quick = [item for item in items if not _is_slow(item)]
+    if config.getoption("all") or _are_slow_ones_named(config):
+        items[:] = slow + quick
+    elif slow:
+        config.hook.pytest_deselected(items=slow)
+        items[:] = quick
+
+
+def _is_slow(item: pytest.Item) -> bool:
+    return any(item.get_closest_marker(name) for name in SLOW_MARKERS)
+
+
+def _are_slow_ones_named(config: pytest.Config) -> bool:
+    """Whether the command line says `-m slow` or `file.py::test`."""
+    return any(name in config.option.markexpr for name in SLOW_MARKERS) or "::" in " ".join(config.args)
 
 
 @pytest.fixture(scope="session")
