@@ -14,11 +14,19 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 SLOW_MARKERS = ("slow", "data")
+THREAD_COUNTS = ("LP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 WORKER = os.environ.get("PYTEST_XDIST_WORKER")  # gw0, gw1, ...; None where tests are not spread
+
 if WORKER is not None:
     number, count = int(WORKER.removeprefix("gw")), int(os.environ["PYTEST_XDIST_WORKER_COUNT"])
     ports.PRIVATE_PORTS = ports.PRIVATE_PORTS[number::count]
-    os.environ.setdefault("LP_NUM_THREADS", "1")  # the workers share the cores, not each worker's renderer
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_setupnodes() -> None:
+    """Give each worker that starts now one thread to render and to compute with: together they fill the cores."""
+    for name in THREAD_COUNTS:
+        os.environ.setdefault(name, "1")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
