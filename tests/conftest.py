@@ -2,6 +2,7 @@
 
 import os
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -50,8 +51,17 @@ def _is_slow(item: pytest.Item) -> bool:
 
 
 def _are_slow_ones_named(config: pytest.Config) -> bool:
-    """Whether the command line says `-m slow` or `file.py::test`."""
-    return any(name in config.option.markexpr for name in SLOW_MARKERS) or "::" in " ".join(config.args)
+    """Whether the command line says `-m slow`, `file.py` or `file.py::test`."""
+    is_file_named = any(".py" in argument for argument in config.args)
+    return is_file_named or any(name in config.option.markexpr for name in SLOW_MARKERS)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """What is kept between runs is not the user's: tests neither meet it nor leave anything there."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("DELTALIGHT_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -260,6 +260,7 @@ for frame_id in range(100_000):
 """
 
 
+@pytest.mark.slow
 def test_a_consumer_ten_times_too_slow_gets_fresh_frames_and_keeps_its_memory(
     opened: Callable[[Any], Any],
 ) -> None:
