@@ -60,7 +60,7 @@ def _show_version(wanted: bool) -> None:
 
 @app.callback()
 def _global_options(
-    debug: Annotated[  # read from sys.argv by main(), so that it may stand anywhere
+    debug: Annotated[  # read by run(), so that it may stand anywhere
         bool, typer.Option(DEBUG_FLAG, help="Show the traceback of a fault instead of one sentence.")
     ] = False,
     log_level: Annotated[
@@ -76,16 +76,19 @@ def _global_options(
 
 def main() -> None:
     """Run the command line of this process and exit with its code."""
-    arguments = [argument for argument in sys.argv[1:] if argument != DEBUG_FLAG]
-    debug = len(arguments) < len(sys.argv) - 1
     raise_on_sigterm()
     end_with_supervisor()
-    sys.exit(_run(arguments, debug=debug))
+    sys.exit(run(sys.argv[1:]))
 
 
-def _run(arguments: list[str], *, debug: bool) -> int:
+def run(arguments: list[str]) -> int:
+    """Run one command line in this process and return its exit code.
+
+    Faults become sentences on stderr; with `--debug`, which may stand anywhere, they are raised.
+    """
+    words = [argument for argument in arguments if argument != DEBUG_FLAG]
     try:
-        app(arguments, prog_name="deltalight")
+        app(words, prog_name="deltalight")
     except SystemExit as stop:
         return int(stop.code or 0)
     except Terminated:
@@ -93,7 +96,7 @@ def _run(arguments: list[str], *, debug: bool) -> int:
     except KeyboardInterrupt:
         return 128 + signal.SIGINT
     except Exception as fault:
-        if debug:
+        if DEBUG_FLAG in arguments:
             raise
         return _report(fault)
     return 0

@@ -1,14 +1,67 @@
-"""Fixtures that every room's tests share."""
+"""Both tiers of the tests, what keeps workers apart that run at the same time, and fixtures that all rooms share."""
 
+import os
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+from services import ports
 
 # A shell starts what it puts into the background with SIGINT ignored, and children inherit that: no test of Ctrl-C
 # could pass.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+SLOW_MARKERS = ("slow", "data")
+THREAD_COUNTS = ("LP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
+WORKER = os.environ.get("PYTEST_XDIST_WORKER")  # gw0, gw1, ...; None where tests are not spread
+
+if WORKER is not None:
+    number, count = int(WORKER.removeprefix("gw")), int(os.environ["PYTEST_XDIST_WORKER_COUNT"])
+    ports.PRIVATE_PORTS = ports.PRIVATE_PORTS[number::count]
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_setupnodes() -> None:
+    """Give each worker that starts now one thread to render and to compute with: together they fill the cores."""
+    for name in THREAD_COUNTS:
+        os.environ.setdefault(name, "1")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--all", action="store_true", help="run the tests marked `slow` or `data` too")
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave slow tests out of the quick tier; in the full one they come first, so that none is waited for alone."""
+    slow = [item for item in items if _is_slow(item)]
+    quick = [item for item in items if not _is_slow(item)]
+    if config.getoption("all") or _are_slow_ones_named(config):
+        items[:] = slow + quick
+    elif slow:
+        config.hook.pytest_deselected(items=slow)
+        items[:] = quick
+
+
+def _is_slow(item: pytest.Item) -> bool:
+    return any(item.get_closest_marker(name) for name in SLOW_MARKERS)
+
+
+def _are_slow_ones_named(config: pytest.Config) -> bool:
+    """Whether the command line says `-m slow`, `file.py` or `file.py::test`."""
+    is_file_named = any(".py" in argument for argument in config.args)
+    return is_file_named or any(name in config.option.markexpr for name in SLOW_MARKERS)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """What is kept between runs is not the user's: tests neither meet it nor leave anything there."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("DELTALIGHT_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
 
 
 @pytest.fixture(scope="session")

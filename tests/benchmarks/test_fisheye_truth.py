@@ -23,6 +23,7 @@ from render_server.renderer import SceneRenderer
 if importlib.util.find_spec("mitsuba") is None:
     pytest.skip("Mitsuba is not installed (dev extra)", allow_module_level=True)
 
+pytestmark = pytest.mark.slow
 SIZE = (320, 240)  # smaller, hardly a pixel shows nothing but paper
 LIGHT_PATHS = 32
 ANGLE_DEG, IRRADIANCE_SHARE, LOSS_DB = 3.0, 0.05, 3.0  # the project's goals

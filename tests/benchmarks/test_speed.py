@@ -12,6 +12,7 @@ from services.demo import with_method
 from tests.render_server.scenes import Stage, everyday, frame, look_at
 
 
+@pytest.mark.slow
 def test_each_kind_of_method_has_still_and_moving_frames(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -34,6 +34,7 @@ from sensor_node.fisheye import radiance_map
 if importlib.util.find_spec("mitsuba") is None:
     pytest.skip("Mitsuba is not installed (dev extra)", allow_module_level=True)
 
+pytestmark = pytest.mark.slow
 SIZE = (64, 48)
 SPP = 8
 LAMP = SphereLamp((0.5, -0.4, 0.8), intensity=0.7, radius_m=0.05)

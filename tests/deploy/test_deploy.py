@@ -45,6 +45,7 @@ def compose() -> dict[str, Any]:
     return document
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("files", [[COMPOSE], [COMPOSE, NVIDIA]], ids=["mesa", "nvidia"])
 def test_compose_accepts_the_files(files: list[Path]) -> None:
     options = [part for file in files for part in ("--file", str(file))]
@@ -106,6 +107,7 @@ def healthy(words: list[str]) -> bool:
     )
 
 
+@pytest.mark.slow
 def test_the_commands_of_compose_run_and_their_health_checks_pass(tmp_path: Path) -> None:
     """With the same sockets, secret and checks; only the places of files and the port are others."""
     (port,) = ports.private_ports(1)

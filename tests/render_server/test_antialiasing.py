@@ -89,6 +89,7 @@ def test_the_pattern_holds_one_sample_in_each_row_and_column() -> None:
     assert np.all(np.diff((pattern**2).sum(axis=1)) >= 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turn_deg", [0.0, 90.0, 180.0, 17.0, 45.0])
 @pytest.mark.parametrize("shift", [0.1, 0.37, 0.8])
 def test_share_of_a_half_plane(gpu: GpuContext, stage: Stage, turn_deg: float, shift: float) -> None:

@@ -208,6 +208,7 @@ def test_width_of_a_spots_penumbra(gpu: GpuContext, stage: Stage) -> None:
     assert of_spot.mean() == pytest.approx(of_sphere.mean(), rel=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("light", [spot(radius_m=0.03), PANELS["tilted"]], ids=["spot", "rectangle"])
 @pytest.mark.parametrize("operator", ["exact", "paper"])
 def test_fields_are_linear_in_the_light(

@@ -69,6 +69,7 @@ def on_floor(fields: Fields) -> tuple[np.ndarray, Float64[np.ndarray, "h w"]]:
     return shown, np.hypot(place[..., 0], place[..., 1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [3, 4, 5])
 def test_a_ball_on_the_floor_takes_its_form_factor_of_even_light(
     gpu: GpuContext, stage: Stage, order: int
@@ -154,6 +155,7 @@ def test_products_are_integrals_of_light_cosine_and_harmonics(gpu: GpuContext, s
         )
 
 
+@pytest.mark.slow
 def test_turning_everything_changes_nothing(gpu: GpuContext, stage: Stage) -> None:
     """Object, camera and lamp turned together about the vertical, and the object's file turned against its pose."""
     shape = cube(0.1)

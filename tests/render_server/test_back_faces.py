@@ -54,6 +54,7 @@ def shelf_depth() -> np.ndarray:
     return np.where(on_board, board, floor_depth(pose))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("clean_gl")
 @pytest.mark.parametrize(
     "method",

@@ -88,6 +88,7 @@ def voxel_radiance(
 BURIED = cube(0.02, (0.0, 0.0, -0.2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bounces", [0, 1, 2, 4])
 def test_glowing_box_is_a_geometric_series(gpu: GpuContext, stage: Stage, bounces: int) -> None:
     """Inside a closed box of glow L and albedo a the radiance is L (1 + a + a^2 + ...), a term a gather."""

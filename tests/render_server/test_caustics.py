@@ -130,6 +130,7 @@ def test_ball_throws_what_it_reflects_into_a_ring(gpu: GpuContext, stage: Stage)
     assert abs(mean / expected - 1) < 0.08
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("roughness", [0.1, 0.2, 0.35])
 def test_rough_mirror_blurs_and_keeps_most_of_the_flux(
     gpu: GpuContext, stage: Stage, roughness: float
@@ -142,6 +143,7 @@ def test_rough_mirror_blurs_and_keeps_most_of_the_flux(
     assert rough[patch(found)].mean() < sharp[patch(found)].mean()
 
 
+@pytest.mark.slow
 def test_real_and_virtual_things_stand_in_the_way(gpu: GpuContext, stage: Stage) -> None:
     """A board below the mirror has the light that the floor had; a wall takes the light that the mirror had."""
     free, found = thrown(gpu, mirror_document(stage))

@@ -62,6 +62,7 @@ def share_off(ours: NDArray[np.float64], reference: NDArray[np.float64]) -> floa
     return float(np.abs(ours - reference).sum() / np.abs(reference).sum())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bounces", [0, 1, 2])
 def test_indirect_fields_of_dvct_are_those_of_two_full_solutions(
     gpu: GpuContext, stage: Stage, bounces: int
@@ -194,6 +195,7 @@ def test_what_objects_do_not_change_is_the_cameras(gpu: GpuContext, stage: Stage
     assert set(second.pass_times_ms) == {"upload", "geometry buffer", "composite", "readback"}
 
 
+@pytest.mark.slow
 def test_it_takes_its_turn_while_running(gpu: GpuContext, stage: Stage) -> None:
     cones = everyday(stage)
     renderer = SceneRenderer(gpu, cones)

@@ -232,6 +232,7 @@ def tilted_solution(gpu: GpuContext, stage: Stage, turn: Float64[np.ndarray, "4 
     return solve(gpu, dlpv(document, volume_size=32, volume_edge_m=1.2), frame(plain(), pose=pose))
 
 
+@pytest.mark.slow
 def test_tilting_the_scene_does_not_change_its_light(gpu: GpuContext, stage: Stage) -> None:
     """Grid axes against those of the spherical harmonics, 30 degrees apart: what the picture shows within the 5 % of
     METHOD 7; the volume's own part, of which cells' corners cost some, within 10 %."""
@@ -254,6 +255,7 @@ def test_tilting_the_scene_does_not_change_its_light(gpu: GpuContext, stage: Sta
         assert share == pytest.approx(1.0, abs=tolerance), name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("key", "sizes", "goal"), [("volume_size", (16, 32), 0.05), ("rsm_size", (256, 512), 0.02)]
 )

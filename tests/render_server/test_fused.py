@@ -72,6 +72,7 @@ def test_a_hole_shows_what_earlier_frames_saw_there(gpu: GpuContext, stage: Stag
     assert np.nanmedian(np.abs(seen)) < 0.002
 
 
+@pytest.mark.slow
 def test_noise_is_averaged_over_frames(gpu: GpuContext, stage: Stage) -> None:
     fused = document(stage)
     spread = []

@@ -79,6 +79,7 @@ def test_size_of_the_light_maps(solve_room: Solve, size: int) -> None:
     assert mean < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [32, 128])
 def test_resolution_of_the_volume(solve_room: Solve, size: int) -> None:
     """Goal: mean within 5 %."""
@@ -87,6 +88,7 @@ def test_resolution_of_the_volume(solve_room: Solve, size: int) -> None:
     assert mean < 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turn", [45.0, 20.0])
 def test_turn_of_the_scene_against_the_grid(solve_room: Solve, turn: float) -> None:
     """Goal: 5 %."""

@@ -106,6 +106,7 @@ def top_of_a_cube_under_the_lid(gpu: GpuContext, stage: Stage, color: UInt8[np.n
     return float(np.percentile(found.virtual_radiance[found.matte == 1][:, 1], 95))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("clean_gl")
 def test_the_lid_throws_its_shadow(gpu: GpuContext, tmp_path: Path) -> None:
     stage, (_, shown) = Stage(tmp_path), shelf(ALONG)

@@ -105,6 +105,7 @@ def differing_pixels(one: CompositeFrame, other: CompositeFrame) -> int:
     return int(np.count_nonzero(differs.any(axis=-1)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("has_model", [True, False], ids=["model", "depth"])
 @pytest.mark.parametrize("operator", ["exact", "paper"])
 def test_a_camera_that_steps_aside_and_back(
@@ -120,6 +121,7 @@ def test_a_camera_that_steps_aside_and_back(
     assert differing_pixels(back, fresh(gpu, document, seen(HERE))) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("by", [(-0.06, 0.0, 0.0), (-0.07, 0.0, 0.0), (0.15, -0.1, 0.0)])
 def test_an_object_that_moves_leaves_nothing(gpu: GpuContext, stage: Stage, by: Vector) -> None:
     start = room(stage, has_model=False, operator="exact", volume_edge_m=0.5)

@@ -97,6 +97,7 @@ def matte(gpu: GpuContext, document: SceneDocument, view: ViewFrame) -> np.ndarr
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise_m", [0.0, 0.002])
 def test_mirror_shows_the_object_where_optics_says(gpu: GpuContext, stage: Stage, noise_m: float) -> None:
     """Silhouette within 1.5 pixels, radiance within 3 %, on a noisy depth image too: the declared plane is flat."""

@@ -151,6 +151,7 @@ def test_what_stands_before_or_behind_the_mirror_casts_a_shadow(gpu: GpuContext,
     np.testing.assert_allclose(rho[free], mu[free], atol=0.02)
 
 
+@pytest.mark.slow
 def test_plane_mirrors_only_where_it_is(gpu: GpuContext, stage: Stage) -> None:
     """A board laid on it and a surface declared before it cover it."""
     objects = [stage.virtual(ball(0.06, (0.25, 0.0, 0.06)))]

@@ -65,6 +65,7 @@ def with_output(document: SceneDocument, **changes: object) -> SceneDocument:
     return document.replaced(output=document.output.replaced(**changes))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "changes", [{}, {"antialiasing": True}, {"width": 320}, {"height": 60, "antialiasing": True}]
 )

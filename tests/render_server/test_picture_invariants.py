@@ -215,6 +215,7 @@ def test_moving_there_and_back_leaves_no_trace(gpu: GpuContext, stage: Stage) ->
     assert np.array_equal(first, back)
 
 
+@pytest.mark.slow
 def test_light_that_changes_and_changes_back_leaves_no_trace(gpu: GpuContext, stage: Stage) -> None:
     day = everyday(stage)
     night = day.model_copy(update={"lights": stage.document([], [directional((0.5, 0.2, -1.0), 0.4)]).lights})
@@ -281,6 +282,7 @@ def test_method_none_shows_objects_and_leaves_every_real_pixel_as_it_was(
     assert relit.sum() > 1.5 * drawn.sum()
 
 
+@pytest.mark.slow
 def test_another_real_model_gives_what_a_fresh_renderer_gives(gpu: GpuContext, tmp_path: Path) -> None:
     stage = Stage(tmp_path)
     document = everyday(stage)

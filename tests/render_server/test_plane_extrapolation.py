@@ -197,6 +197,7 @@ def environment(gpu: GpuContext, document: SceneDocument) -> tuple[Float32[np.nd
     return lights.environment, color
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("clean_gl")
 def test_the_wall_in_the_picture_goes_on_beside_it_unless_nothing_is_to_be_found(
     gpu: GpuContext, tmp_path: Path

@@ -14,6 +14,7 @@ from tests.render_server.test_history import HERE, fresh, room, seen
 pytestmark = pytest.mark.usefixtures("clean_gl")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "without"), [("dvct", "cones"), ("dlpv", "none")])
 def test_objects_look_the_same_with_rays_for_the_floors_reflections(
     gpu: GpuContext, tmp_path: Path, name: str, without: str

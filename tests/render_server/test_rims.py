@@ -109,6 +109,7 @@ def test_through_a_lens(gpu: GpuContext, stage: Stage, distortion: float) -> Non
     assert np.abs(found - mixed(a, back=np.full(3, GLOW)))[INSIDE].max() < 0.03
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("back", "tolerance"), [(BACK, 0.02), (0.6 * FRONT, 0.05)])
 def test_in_noise(gpu: GpuContext, stage: Stage, back: np.ndarray, tolerance: float) -> None:
     """A tenth of the contrast or less of the colours: the whole rim is right within `tolerance`, r.m.s."""
@@ -121,6 +122,7 @@ def test_in_noise(gpu: GpuContext, stage: Stage, back: np.ndarray, tolerance: fl
     assert np.sqrt(np.mean(error[rim] ** 2)) < tolerance
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("off_px", [-1, 1])
 def test_depth_that_is_off_by_a_pixel(gpu: GpuContext, stage: Stage, off_px: int) -> None:
     a = shares(0.0)

@@ -65,6 +65,7 @@ def with_method(document: SceneDocument, method: dict[str, object]) -> SceneDocu
     return SceneDocument.model_validate({**document.model_dump(), "method": method})
 
 
+@pytest.mark.slow
 def test_each_picture_is_what_that_view_and_method_alone_would_show(
     gpu: GpuContext, stage: Stage, folder: Path
 ) -> None:
@@ -153,6 +154,7 @@ def learning(stage: Stage) -> SceneDocument:
     )
 
 
+@pytest.mark.slow
 def test_what_is_averaged_over_frames_is_as_if_there_had_been_no_snapshot(
     gpu: GpuContext, stage: Stage, folder: Path
 ) -> None:
@@ -173,6 +175,7 @@ def test_what_is_averaged_over_frames_is_as_if_there_had_been_no_snapshot(
     np.testing.assert_array_equal(*pictures)
 
 
+@pytest.mark.slow
 def test_another_source_begins_as_if_there_had_been_none(gpu: GpuContext, stage: Stage) -> None:
     document = learning(stage)
     pictures = []

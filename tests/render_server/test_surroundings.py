@@ -49,6 +49,7 @@ def sky_light(gpu: GpuContext, scene: SceneDocument, view: ViewFrame) -> np.ndar
     return 2 * np.array(lights[-1]["mean_radiance"]) - ground
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("clean_gl")
 def test_what_lights_do_not_explain_comes_from_above(gpu: GpuContext, tmp_path: Path) -> None:
     color = picture(SUN + np.pi * (KNOWN + OUT_OF_SIGHT))
@@ -56,6 +57,7 @@ def test_what_lights_do_not_explain_comes_from_above(gpu: GpuContext, tmp_path: 
     assert found == pytest.approx(KNOWN + OUT_OF_SIGHT, rel=0.03)  # one code is 1 % of the paper's radiance
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("clean_gl")
 @pytest.mark.parametrize("case", ["paper unknown", "darker than the lights"])
 def test_given_sky_stays_where_nothing_can_be_found(gpu: GpuContext, tmp_path: Path, case: str) -> None:

@@ -14,7 +14,7 @@ pytestmark = pytest.mark.usefixtures("clean_gl")
 METHODS: list[dict[str, object]] = [
     {"name": "dvct"},
     {"name": "dlpv"},
-    {"name": "aroof"},
+    {"name": "aroof", "resolution": 12, "rays": 64},
     {"name": "differential"},
     {"name": "none"},
     {"name": "dvct", "operator": "paper"},
@@ -30,6 +30,9 @@ def test_no_frame_is_lost_and_none_shows_what_was_before(gpu: GpuContext, docume
     renderer = SceneRenderer(gpu, document)
     eyes = [(0.25, -0.9, 0.65), (0.3, -0.9, 0.63)]
     waiting = None
+    composite(
+        gpu, document.replaced(method=METHODS[2]), frame()
+    )  # or its field came only while frames are shown
     try:
         for index, method in enumerate([*METHODS, *METHODS]):
             view = frame(pose=look_at(eyes[index % 2]), frame_id=index)

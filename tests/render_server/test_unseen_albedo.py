@@ -62,6 +62,7 @@ def redness(gpu: GpuContext, scene: SceneDocument, frames: list[ViewFrame]) -> f
     return float(red / blue)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("clean_gl")
 def test_a_wall_out_of_sight_keeps_its_colour(gpu: GpuContext, tmp_path: Path) -> None:
     scene = room(Stage(tmp_path))
@@ -74,6 +75,7 @@ def test_a_wall_out_of_sight_keeps_its_colour(gpu: GpuContext, tmp_path: Path) -
     assert redness(gpu, given, [before, now]) == pytest.approx(1, abs=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("clean_gl")
 def test_another_room_begins_without_memory(gpu: GpuContext, tmp_path: Path) -> None:
     stage = Stage(tmp_path)
@@ -98,6 +100,7 @@ def test_the_interval_grows_and_survives_a_clock_that_is_set_back() -> None:
     assert interval.is_due(35 * 10**9)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("clean_gl")
 def test_registration_is_averaged_over_moved_frames_only(gpu: GpuContext, tmp_path: Path) -> None:
     stage = Stage(tmp_path)

@@ -79,6 +79,7 @@ def test_a_known_pinhole_lens_comes_back(kind: LensKind) -> None:
     assert apart.max() < 3  # in the corners, where few points were
 
 
+@pytest.mark.slow
 def test_the_stated_uncertainty_of_the_focal_length_is_true() -> None:
     """Over sets that differ in their noise only, the focal length scatters as each fit says."""
     found = views(FISHEYE.project, SIZE, poses(10, (0.6, 0.5), 0.4), noise_px=0.0)

@@ -8,12 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import structlog
+from typer.testing import CliRunner
 
 from protocol.camera_model import CameraModel
 from protocol.codecs import encode_color, encode_depth
 from protocol.envelope import encode
 from protocol.messages import ColorMessage, DepthMessage, PoseMessage
 from protocol.transport import ReceivedMultipart
+from services.cli import run
 
 ROOT = Path(__file__).parents[2]
 WIDTH, HEIGHT = 64, 48
@@ -30,12 +32,36 @@ def fresh_logs() -> Iterator[None]:
 
 
 @pytest.fixture
-def cli(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> RunCli:
-    """Runs `deltalight` in a process of its own, with homes of its own unless a test names others."""
+def homes(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Folders for data and settings that are this test's own."""
     for name in ("XDG_DATA_HOME", "XDG_CONFIG_HOME"):
         monkeypatch.setenv(name, str(tmp_path_factory.mktemp(name)))
 
-    def run(*arguments: object, timeout_s: float = 60) -> subprocess.CompletedProcess[str]:
+
+@pytest.fixture
+def cli(homes: None) -> RunCli:
+    """Runs `deltalight` in this process."""
+    del homes
+
+    def run_here(*arguments: object) -> subprocess.CompletedProcess[str]:
+        words = [str(argument) for argument in arguments]
+        with CliRunner().isolation() as (output, error, *_):
+            code = run(words)
+            sys.stdout.flush()
+            sys.stderr.flush()
+            return subprocess.CompletedProcess(
+                words, code, output.getvalue().decode(), error.getvalue().decode()
+            )
+
+    return run_here
+
+
+@pytest.fixture
+def cli_process(homes: None) -> RunCli:
+    """Runs `deltalight` in a process of its own: for what only a process can show."""
+    del homes
+
+    def start(*arguments: object, timeout_s: float = 60) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, "-m", "services.cli", *(str(argument) for argument in arguments)]
         return subprocess.run(
             command,
@@ -46,7 +72,7 @@ def cli(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatc
             check=False,
         )
 
-    return run
+    return start
 
 
 def camera() -> CameraModel:

@@ -334,6 +334,7 @@ def test_a_client_has_only_so_many_places(live: LiveApi) -> None:
 # --- the process ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_the_process_in_spite_of_open_streams_and_it_starts_again(tmp_path: Path) -> None:
     port, control_port, stream_port = ports.private_ports(3)
     stream = StandInStream(stream_port)

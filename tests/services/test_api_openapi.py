@@ -124,6 +124,7 @@ def configuration(known: dict[str, list[str]]) -> str:
     return "\n".join(lines)
 
 
+@pytest.mark.slow
 def test_answers_keep_to_the_description(full_api: RunningApi, tmp_path: Path) -> None:
     description = copy.deepcopy(full_api.app.openapi())  # type: ignore[attr-defined]
     (tmp_path / "openapi.json").write_text(json.dumps(with_plain_tuples(description)))

@@ -1,6 +1,7 @@
 """The dashboard's files: headers, caches, nothing else of the disk."""
 
 from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import httpx
@@ -9,24 +10,33 @@ import pytest
 from tests.services.api_samples import running_api, sentence
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    (tmp_path / "secret.txt").write_text("not for you")
-    dist = tmp_path / "dist"
+def build(place: Path) -> Path:
+    """A build of the dashboard below a folder, and a file beside it that is nobody's business."""
+    (place / "secret.txt").write_text("not for you")
+    dist = place / "dist"
     (dist / "assets").mkdir(parents=True)
     (dist / "index.html").write_text("<!doctype html><title>Deltalight</title>")
     (dist / "assets" / "index-1a2b3c.js").write_text("1")
     return dist
 
 
-@pytest.fixture
-def page(tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[httpx.Client]:
+@contextmanager
+def serving(folder: Path) -> Iterator[httpx.Client]:
     """A client of the root of a service that serves `folder`."""
-    monkeypatch.setattr("services.api.static_page.DASHBOARD", folder)
-    with (
-        running_api(tmp_path / "data") as running,
-        httpx.Client(base_url=f"http://127.0.0.1:{running.client.base_url.port}") as client,
-    ):
+    with pytest.MonkeyPatch.context() as patch, ExitStack() as stack:
+        patch.setattr("services.api.static_page.DASHBOARD", folder)
+        port = stack.enter_context(running_api(folder.parent / "data")).client.base_url.port
+        yield stack.enter_context(httpx.Client(base_url=f"http://127.0.0.1:{port}"))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return build(tmp_path_factory.mktemp("page"))
+
+
+@pytest.fixture(scope="module")
+def page(folder: Path) -> Iterator[httpx.Client]:
+    with serving(folder) as client:
         yield client
 
 
@@ -85,9 +95,11 @@ def test_links_that_lead_out_of_the_folder_are_not_followed(page: httpx.Client, 
     assert sentence(page.post("/"), 405)
 
 
-def test_without_a_build_the_page_says_how_to_make_one(page: httpx.Client, folder: Path) -> None:
+def test_without_a_build_the_page_says_how_to_make_one(tmp_path: Path) -> None:
+    folder = build(tmp_path)
     (folder / "index.html").unlink()
-    answer = page.get("/")
+    with serving(folder) as page:
+        answer = page.get("/")
     assert answer.status_code == 503
     assert "./run demo" in answer.text
     assert "content-security-policy" in answer.headers

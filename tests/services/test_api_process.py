@@ -48,6 +48,7 @@ def wait_for(condition: Callable[[], bool]) -> None:
     pytest.fail("it never came")
 
 
+@pytest.mark.slow
 def test_a_change_is_in_the_real_render_server_and_outlives_kill_9_of_both(tmp_path: Path) -> None:
     port, control_port, publish_port, node_port = ports.private_ports(4)
     control = ports.endpoint(control_port)
@@ -116,6 +117,7 @@ def test_tokens_are_made_listed_and_revoked(tmp_path: Path) -> None:
         run("revoke", "wall")
 
 
+@pytest.mark.slow
 def test_leaving_loopback_makes_and_prints_a_token_once(tmp_path: Path) -> None:
     (port,) = ports.private_ports(1)
     command = [sys.executable, "-m", "services.cli", "api", "--host", "0.0.0.0", "--port", str(port)]

@@ -14,11 +14,18 @@ from services.api.settings import ApiSettings
 from tests.services.api_samples import RunningApi, running_api, sentence
 
 
-@pytest.fixture
-def open_api(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningApi]:
-    """As it is by default, on loopback."""
+@pytest.fixture(scope="module")
+def default_api(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningApi]:
     with running_api(tmp_path_factory.mktemp("data")) as running:
         yield running
+
+
+@pytest.fixture
+def open_api(default_api: RunningApi) -> Iterator[RunningApi]:
+    """As it is by default, on loopback; without scenes."""
+    yield default_api
+    for scene in default_api.store.scenes.all():
+        default_api.store.scenes.delete(scene.id)
 
 
 @pytest.fixture

@@ -15,6 +15,7 @@ from tests.services.dashboard_samples import AXE, SIZE, Desk, Stack, demo_stack,
 
 CHROMIUM = find_chromium()
 pytestmark = [
+    pytest.mark.slow,
     pytest.mark.skipif(
         CHROMIUM is None, reason="no Chromium is installed (Debian: apt-get install chromium)"
     ),
@@ -22,7 +23,8 @@ pytestmark = [
         not (RECORDING.is_file() and SCENE.is_file()), reason="the demo's recording is not in this checkout"
     ),
     pytest.mark.skipif(
-        not (DASHBOARD / "index.html").is_file(), reason="the dashboard is not built; `./run test` builds it"
+        not (DASHBOARD / "index.html").is_file(),
+        reason="the dashboard is not built; `./run test --all` builds it",
     ),
 ]
 FREE_TABLE_M = (0.05, 0.25, 0.0)  # between the board and the boxes, where nothing stands

@@ -11,11 +11,13 @@ from tests.services.live_samples import LiveApi, live_api
 
 CHROMIUM = find_chromium()
 pytestmark = [
+    pytest.mark.slow,
     pytest.mark.skipif(
         CHROMIUM is None, reason="no Chromium is installed (Debian: apt-get install chromium)"
     ),
     pytest.mark.skipif(
-        not (DASHBOARD / "index.html").is_file(), reason="the dashboard is not built; `./run test` builds it"
+        not (DASHBOARD / "index.html").is_file(),
+        reason="the dashboard is not built; `./run test --all` builds it",
     ),
 ]
 SCENE = {

@@ -15,11 +15,13 @@ from tests.services.test_light_chain import LAMP, write_scene, write_take
 
 CHROMIUM = find_chromium()
 pytestmark = [
+    pytest.mark.slow,
     pytest.mark.skipif(
         CHROMIUM is None, reason="no Chromium is installed (Debian: apt-get install chromium)"
     ),
     pytest.mark.skipif(
-        not (DASHBOARD / "index.html").is_file(), reason="the dashboard is not built; `./run test` builds it"
+        not (DASHBOARD / "index.html").is_file(),
+        reason="the dashboard is not built; `./run test --all` builds it",
     ),
 ]
 

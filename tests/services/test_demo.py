@@ -33,10 +33,11 @@ pytestmark = pytest.mark.skipif(
 PATIENCE_S = 90
 
 
-def test_headless_demo_writes_composites_sheet_and_video(cli: RunCli, tmp_path: Path) -> None:
+@pytest.mark.slow
+def test_headless_demo_writes_composites_sheet_and_video(cli_process: RunCli, tmp_path: Path) -> None:
     out = tmp_path / "out"
     options = ("--headless", "--frames", 4, "--out", out, "--method", "paper", "--json")
-    done = cli("demo", *options, timeout_s=PATIENCE_S)
+    done = cli_process("demo", *options, timeout_s=PATIENCE_S)
     assert done.returncode == 0, done.stderr
     assert len(list(out.glob("??????.jpg"))) == 4
     sheet, first = cv2.imread(str(out / "contact_sheet.png")), cv2.imread(str(out / "000000.jpg"))
@@ -63,6 +64,7 @@ def test_headless_demo_needs_a_folder(cli: RunCli) -> None:
     assert "--out" in done.stderr
 
 
+@pytest.mark.slow
 def test_picture_returns_after_node_and_server_are_killed() -> None:
     with session_file(demo_scene("paper")) as session:
         plan = demo_plan(session)
@@ -118,6 +120,7 @@ def current_view(plan: HostPlan) -> str:
     return str(scene["output"]["view"])
 
 
+@pytest.mark.slow
 def test_a_change_by_rest_is_in_the_next_picture_that_is_begun(demo: str) -> None:
     """Of all frames that were captured after the answer, each shows the new revision."""
     client = httpx.Client(base_url=f"http://{demo}/api/v1", timeout=30)
@@ -171,6 +174,7 @@ def demo() -> Iterator[str]:
         process.wait(timeout=20)
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_the_demo_without_orphans_and_it_starts_again() -> None:
     (page_port,) = ports.private_ports(1)
     for _ in range(2):
@@ -197,7 +201,8 @@ def test_page_port_in_use_is_a_sentence(cli: RunCli) -> None:
     assert "--port" in done.stderr
 
 
-def test_up_without_a_gpu_refuses_in_a_sentence(cli: RunCli, tmp_path: Path) -> None:
+@pytest.mark.slow
+def test_up_without_a_gpu_refuses_in_a_sentence(cli: RunCli, cli_process: RunCli, tmp_path: Path) -> None:
     """The server's own sentence ends the command; no restarts are tried."""
     if "llvmpipe" not in cli("doctor", "--json").stdout:
         pytest.skip("this machine has a GPU")
@@ -205,7 +210,7 @@ def test_up_without_a_gpu_refuses_in_a_sentence(cli: RunCli, tmp_path: Path) -> 
     names = ("--port", "--node-port", "--composite-port", "--control-port")
     options = [str(part) for pair in zip(names, numbers, strict=True) for part in pair]
     options += ["--data", str(tmp_path)]
-    done = cli("up", "--source", RECORDING, "--scene", SCENE, *options, timeout_s=PATIENCE_S)
+    done = cli_process("up", "--source", RECORDING, "--scene", SCENE, *options, timeout_s=PATIENCE_S)
     assert done.returncode == 2
     last_line = done.stderr.strip().splitlines()[-1]
     assert "--allow-software" in last_line
@@ -215,7 +220,7 @@ def test_up_without_a_gpu_refuses_in_a_sentence(cli: RunCli, tmp_path: Path) -> 
 def test_bench_speed_reports_every_pass(cli: RunCli, tmp_path: Path) -> None:
     report = tmp_path / "speed.json"
     options = ("--methods", "paper", "--frames", 1, "--size", "160x120", "--no-end-to-end", "--json")
-    done = cli("bench", "speed", *options, "--out", report, timeout_s=PATIENCE_S)
+    done = cli("bench", "speed", *options, "--out", report)
     assert done.returncode == 0, done.stderr
     figures = json.loads(done.stdout)
     assert figures == json.loads(report.read_text())

@@ -1,5 +1,6 @@
 """What `up` shows first, and how its processes are joined."""
 
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -63,6 +64,34 @@ def test_the_web_process_hears_server_and_node(tmp_path: Path) -> None:
     assert here[here.index("--port") + 1] == "81"
     assert web(None, "desk")[-4:-2] == ("--node", "desk")
     assert len(HostPlan("synthetic", tmp_path / "session").specs()) == 2
+
+
+def test_the_processes_meet_at_the_ports_of_their_plan(tmp_path: Path) -> None:
+    plan = HostPlan(
+        "synthetic",
+        tmp_path / "session",
+        data=tmp_path,
+        node_port=81,
+        composite_port=82,
+        control_port=83,
+        page_port=84,
+    )
+    node_at, composite_at, control_at = (ports.endpoint(number) for number in (81, 82, 83))
+    node, server, web = (options(spec.arguments) for spec in plan.specs())
+    assert node["--publish"] == server["--subscribe"] == {node_at}
+    assert server["--publish"] == {composite_at}
+    assert web["--subscribe"] == {composite_at, node_at}
+    assert node["--clock"] == server["--control"] == web["--control"] == {control_at}
+    assert web["--port"] == {"84"}
+
+
+def options(arguments: tuple[str, ...]) -> dict[str, set[str]]:
+    """What is given to each option, which may stand there several times."""
+    given: dict[str, set[str]] = {}
+    for name, value in pairwise(arguments):
+        if name.startswith("--"):
+            given.setdefault(name, set()).add(value)
+    return given
 
 
 def test_a_service_without_a_scene_takes_over_what_is_shown(tmp_path: Path, scene_file: Path) -> None:

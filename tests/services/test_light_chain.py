@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 import trimesh
 from jaxtyping import Float64
 
@@ -25,6 +26,7 @@ from services import ports
 from tests.sensor_node.fisheye_samples import bracket, equidistant
 from tests.services.conftest import ROOT
 
+pytestmark = pytest.mark.slow
 PATIENCE_S = 60.0
 SIZE = 320, 240
 PLACE_M = (0.2, -0.1, 0.05)

@@ -66,6 +66,7 @@ def hears(receiver: Receiver) -> bool:
     return False
 
 
+@pytest.mark.slow
 def test_a_second_node_at_the_same_endpoint_is_refused_and_the_first_goes_on(
     cli: RunCli, take: Path, endpoint: str
 ) -> None:
@@ -98,6 +99,7 @@ def test_a_source_that_breaks_in_the_middle_says_where_and_one_that_ends_is_no_f
     assert_sentence(cli("node", "--source", broken, "--publish", endpoint), picture.name)
 
 
+@pytest.mark.slow
 def test_a_node_tells_its_state_and_what_its_source_lacks(take: Path, endpoint: str, tmp_path: Path) -> None:
     import shutil
 

@@ -106,6 +106,7 @@ class Published:
                 self.captured_ns[header.frame_id] = header.capture_ns
 
 
+@pytest.mark.slow
 def test_a_killed_recorder_loses_at_most_the_last_second(
     published: str, start: Start, cli: RunCli, tmp_path: Path
 ) -> None:
@@ -137,6 +138,7 @@ def test_a_killed_recorder_loses_at_most_the_last_second(
     assert all(watched.captured_ns[frame.frame_id] == frame.timestamp_ns for frame in found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
 def test_a_signal_finishes_the_recording(
     published: str, start: Start, tmp_path: Path, number: signal.Signals, code: int
@@ -164,6 +166,7 @@ def test_a_signal_finishes_the_recording(
         assert np.array_equal(frame.depth.depth_m, original.depth.depth_m)
 
 
+@pytest.mark.slow
 def test_a_full_disk_leaves_what_was_recorded(
     published: str, start: Start, cli: RunCli, tmp_path: Path
 ) -> None:
@@ -182,6 +185,7 @@ def test_a_full_disk_leaves_what_was_recorded(
     assert [frame.frame_id for frame in open_source(out)] == [frame.frame_id for frame in source]
 
 
+@pytest.mark.slow
 def test_ctrl_c_before_any_frame_leaves_no_file(start: Start, tmp_path: Path) -> None:
     endpoint = ports.endpoint(ports.private_ports(1)[0])
     process = start("record", "--out", tmp_path / "a.mcap", "--subscribe", endpoint)
@@ -325,7 +329,7 @@ def test_broken_and_late_messages_are_counted(tmp_path: Path) -> None:
     assert numbered[sent + 2].timestamp_ns in open_source(tmp_path / "a.mcap").timestamps_ns
 
 
-def test_the_scene_comes_from_a_file_or_from_the_render_server(start: Start, tmp_path: Path) -> None:
+def test_the_scene_comes_from_a_file_or_from_the_render_server(cli: RunCli, tmp_path: Path) -> None:
     scene = parse_scene({"name": "kept"})
     (tmp_path / "scene.json").write_text(scene.model_dump_json())
 
@@ -341,9 +345,8 @@ def test_the_scene_comes_from_a_file_or_from_the_render_server(start: Start, tmp
                 "b.mcap": ("--control", server.endpoint),
             }.items():
                 common = ("--out", tmp_path / name, "--subscribe", endpoint, "--frames", 1)
-                process = start("record", *common, *options)
-                _, error = process.communicate(timeout=PATIENCE_S)
-                assert process.returncode == 0, error
+                done = cli("record", *common, *options)
+                assert done.returncode == 0, done.stderr
                 assert open_source(tmp_path / name).scene == scene
     finally:
         server.close()

@@ -2,8 +2,6 @@
 
 import json
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -13,7 +11,7 @@ from protocol.keys import KeySettings
 from render_server.server.process import ServerSettings
 from sensor_node.node import NodeConfig
 from services.settings import load_configuration
-from tests.services.conftest import ROOT
+from tests.services.conftest import RunCli
 
 
 @pytest.fixture
@@ -129,17 +127,7 @@ def test_a_wrong_variable_is_told_of_the_environment(place: Path, monkeypatch: p
         load_configuration().section("node", NodeConfig, {"jpeg_quality": 0})
 
 
-def run_config(place: Path, *arguments: str) -> str:
-    command = [sys.executable, "-m", "services.cli", "config", *arguments]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(
-        command, cwd=place, env=environment, capture_output=True, text=True, timeout=60, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
-def test_what_config_prints_is_a_configuration_file_that_says_the_same(place: Path) -> None:
+def test_what_config_prints_is_a_configuration_file_that_says_the_same(place: Path, cli: RunCli) -> None:
     text = (
         '[node]\nname = "desk"\nsource = "a \\"b\\" \\\\ ü"\n'
         '[node.fisheye]\nsource = "oak"\nexposures_s = [0.001, 0.02]\n'
@@ -147,13 +135,15 @@ def test_what_config_prints_is_a_configuration_file_that_says_the_same(place: Pa
     )
     write(place, text)
     before = load_configuration()
-    printed = run_config(place)
+    done = cli("config")
+    assert done.returncode == 0, done.stderr
+    printed = done.stdout
     assert 'name = "desk"' in printed
     assert "# deltalight.toml" in printed
     write(place, printed)
     after = load_configuration()
     for section, model in (("node", NodeConfig), ("server", ServerSettings), ("keys", KeySettings)):
         assert after.section(section, model) == before.section(section, model)
-    data = json.loads(run_config(place, "--json"))
+    data = json.loads(cli("config", "--json").stdout)
     assert data["values"]["node"]["fisheye"]["exposures_s"] == [0.001, 0.02]
     assert data["origins"]["node.pose_filter.beta"] == "deltalight.toml"

@@ -9,10 +9,13 @@ import time
 from multiprocessing.connection import Connection
 from pathlib import Path
 
+import pytest
+
 from services.storage.documents import patch_document
 from services.storage.store import Store
 from tests.services.storage_samples import TETRAHEDRON, trusting_probe, upload
 
+pytestmark = pytest.mark.slow
 CYCLES = 50
 MOST_AWAITED = 8
 # About what a change takes, so that the kill falls at any point of one.
