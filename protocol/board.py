@@ -1,4 +1,4 @@
-"""The marker board: its description (board.yaml of FORMATS 1) and its geometry in the world frame."""
+"""The marker board: its description (board.yaml of docs/formats.md 1) and its geometry in the world frame."""
 
 from functools import cached_property
 from pathlib import Path
@@ -29,7 +29,7 @@ Length = Annotated[float, Field(gt=0, lt=10)]
 
 
 class CustomDictionary(StrictModel):
-    """A dictionary of one marker that OpenCV does not know (an extension of FORMATS 1, for type `single`).
+    """A dictionary of one marker that OpenCV does not know (an extension of docs/formats.md 1, for type `single`).
 
     In board.yaml either `{marker_size, border_bits, bits}` or `{marker_size, border_bits, image}`: `bits`
     holds the code's cells row by row, 0 = black, 1 = white, without the border; `image` is a picture of the
@@ -102,9 +102,9 @@ MarkerDictionary = Annotated[
 
 
 class BoardSpec(StrictModel):
-    """A printed board of square markers (board.yaml of FORMATS 1).
+    """A printed board of square markers (board.yaml of docs/formats.md 1).
 
-    World coordinates are those of FORMATS 3: origin at the top-left corner of the first marker, +x right
+    World coordinates are those of docs/formats.md 3: origin at the top-left corner of the first marker, +x right
     along the rows, +y up the sheet (rows lie at y <= 0), +z out of the paper; all in metres. For `charuco`,
     `rows` and `columns` count squares, and a square's edge is marker_length_m + separation_m. For `single`,
     separation_m is the width of the white margin around the marker.

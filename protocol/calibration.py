@@ -1,4 +1,4 @@
-"""Transforms between the sensors (calibration/extrinsics.yaml of FORMATS 1)."""
+"""Transforms between the sensors (calibration/extrinsics.yaml of docs/formats.md 1)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields

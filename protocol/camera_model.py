@@ -23,7 +23,7 @@ _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-12)
 
 @dataclass(frozen=True, eq=False)
 class CameraModel:
-    """Size, intrinsics and lens of a camera; pixel centres are at integers (METHOD 1).
+    """Size, intrinsics and lens of a camera; pixel centres are at integers (docs/method.md 1).
 
     `matrix` is (3, 3) without skew. `distortion` holds OpenCV's coefficients: `plumb_bob` 4, 5, 8, 12 or 14,
     `equidistant` 4 (Kannala & Brandt); empty or zeros = no distortion.

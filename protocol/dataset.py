@@ -1,4 +1,4 @@
-"""Reading a dataset folder (FORMATS 1): the TUM RGB-D convention, extended."""
+"""Reading a dataset folder (docs/formats.md 1): the TUM RGB-D convention, extended."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

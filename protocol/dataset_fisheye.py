@@ -1,4 +1,4 @@
-"""The fish-eye pictures of a dataset folder (FORMATS 1)."""
+"""The fish-eye pictures of a dataset folder (docs/formats.md 1)."""
 
 from bisect import bisect_right
 from collections.abc import Sequence

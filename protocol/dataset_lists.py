@@ -1,4 +1,4 @@
-"""The list files of a dataset folder (FORMATS 1): rgb.txt, depth.txt, fisheye.txt, groundtruth.txt."""
+"""The list files of a dataset folder (docs/formats.md 1): rgb.txt, depth.txt, fisheye.txt, groundtruth.txt."""
 
 import statistics
 from bisect import bisect_left

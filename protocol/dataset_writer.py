@@ -1,4 +1,4 @@
-"""Writing a dataset folder (FORMATS 1)."""
+"""Writing a dataset folder (docs/formats.md 1)."""
 
 from pathlib import Path
 from types import TracebackType

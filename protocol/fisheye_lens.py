@@ -1,4 +1,4 @@
-"""Fish-eye cameras: lens, response, vignetting (calibration/fisheye.yaml of FORMATS 1)."""
+"""Fish-eye cameras: lens, response, vignetting (calibration/fisheye.yaml of docs/formats.md 1)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

@@ -54,7 +54,7 @@ class FisheyePictures:
 
 @dataclass(frozen=True, eq=False)
 class RadianceMap:
-    """Radiance that reaches the fish-eye camera from the hemisphere about its axis (METHOD 2).
+    """Radiance that reaches the fish-eye camera from the hemisphere about its axis (docs/method.md 2).
 
     `radiance` is linear R G B in the fish-eye camera's units (1.0 = its white at the reference exposure) on the
     grid of `protocol.hemisphere`, in the axes of its optical frame; 0 where not `seen`. `clipped_share` is the

@@ -1,4 +1,4 @@
-"""Fish-eye pictures in recordings (FORMATS 2).
+"""Fish-eye pictures in recordings (docs/formats.md 2).
 
 Pictures that are new with a frame are a group of messages before the frame's own, at the frame's log time: each
 exposure and the calibration as Foxglove shows them, and last a `FisheyeRecord`, which makes the group complete.
@@ -101,7 +101,7 @@ class FisheyeTrack:
         self._kept: tuple[int, FisheyePictures] | None = None
 
     def at(self, time_ns: int) -> FisheyePictures | None:
-        """Return the newest whole pictures recorded up to a log time; before the first, the first (FORMATS 1).
+        """Return the newest whole pictures recorded up to a log time, else the first ones (docs/formats.md 1).
 
         Raises:
             DeltalightError: a group was written by something else than `fisheye_messages`.

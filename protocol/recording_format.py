@@ -1,4 +1,4 @@
-"""What a recording holds (FORMATS 2): topics, Deltalight's own messages, Foxglove's beside them.
+"""What a recording holds (docs/formats.md 2): topics, Deltalight's own messages, Foxglove's beside them.
 
 Every frame is a group of messages with one log time, the capture time: picture, depth and calibration as
 Foxglove shows them, and last a `FrameRecord`, which makes the group complete. The first group begins with a

@@ -1,4 +1,4 @@
-"""Reading a recording (FORMATS 2), also one that was cut short."""
+"""Reading a recording (docs/formats.md 2), also one that was cut short."""
 
 import struct
 from collections import defaultdict

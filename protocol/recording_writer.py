@@ -1,4 +1,4 @@
-"""Writing a recording (FORMATS 2): an MCAP file that loses at most the last second at any crash."""
+"""Writing a recording (docs/formats.md 2): an MCAP file that loses at most the last second at any crash."""
 
 import json
 import os

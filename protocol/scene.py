@@ -1,4 +1,4 @@
-"""The scene document (FORMATS 3): models, loading from JSON or YAML, JSON Schema."""
+"""The scene document (docs/formats.md 3): models, loading from JSON or YAML, JSON Schema."""
 
 import json
 from collections.abc import Callable, Mapping
@@ -17,7 +17,7 @@ DIGEST_PREFIX = "sha256:"
 
 
 class SceneDocument(StrictModel):
-    """Everything that is to be seen beside the camera picture, and how (FORMATS 3).
+    """Everything that is to be seen beside the camera picture, and how (docs/formats.md 3).
 
     World = the marker board's frame: origin at the top-left corner of its first marker, +x right, +y up the
     sheet, +z out of the paper; metres. Radiometry in camera units (1.0 = sensor white at the reference

@@ -1,4 +1,4 @@
-"""The lights of the scene document (FORMATS 3); radiometry in camera units (METHOD 1)."""
+"""The lights of the scene document (docs/formats.md 3); radiometry in camera units (docs/method.md 1)."""
 
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, Self
@@ -134,7 +134,7 @@ Distance = Annotated[
 
 
 class FisheyeLights(StrictModel):
-    """How lights are taken from the fish-eye picture (METHOD 2); environment maps are split alike."""
+    """How lights are taken from the fish-eye picture (docs/method.md 2); environment maps are split alike."""
 
     count: int = Field(default=4, ge=1, le=16, description="Number of lights.")
     split: Literal["peaks", "all"] = Field(

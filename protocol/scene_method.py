@@ -1,4 +1,4 @@
-"""How the scene document's picture is computed and shown: `method`, `shading`, `output` (FORMATS 3)."""
+"""How the scene document's picture is computed and shown: `method`, `shading`, `output` (docs/formats.md 3)."""
 
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, TypeVar
@@ -30,7 +30,7 @@ ShadowSamples = Annotated[int, Field(ge=1, le=64, description="Samples of a ligh
 
 
 class VoxelConeSettings(StrictModel):
-    """What every method has that traces cones through voxels (METHOD 4)."""
+    """What every method has that traces cones through voxels (docs/method.md 4)."""
 
     volume_size: int | None = Field(
         default=None,
@@ -87,11 +87,11 @@ class VoxelConeSettings(StrictModel):
 
 
 class DvctMethod(VoxelConeSettings):
-    """Delta voxel cone tracing (METHOD 4)."""
+    """Delta voxel cone tracing (docs/method.md 4)."""
 
     name: Literal["dvct"] = "dvct"
     operator: Literal["exact", "paper"] = Field(
-        default="exact", description="Dual march (METHOD 3), or the operator as printed in the paper."
+        default="exact", description="Dual march (docs/method.md 3), or the operator as printed in the paper."
     )
     shadow: Literal["map", "cone"] | None = Field(
         default=None,
@@ -123,7 +123,7 @@ class DvctMethod(VoxelConeSettings):
 
 
 class DlpvMethod(StrictModel):
-    """Delta light propagation volumes (METHOD 5)."""
+    """Delta light propagation volumes (docs/method.md 5)."""
 
     model_config = NEEDS_NAME
 
@@ -271,7 +271,7 @@ class DlpvMethod(StrictModel):
 
 
 class AroofMethod(StrictModel):
-    """Object occlusion fields (METHOD 6): what rigid objects hide of natural light is precomputed."""
+    """Object occlusion fields (docs/method.md 6): what rigid objects hide of natural light is precomputed."""
 
     model_config = NEEDS_NAME
 
@@ -338,7 +338,7 @@ class AroofMethod(StrictModel):
 
 
 class DifferentialMethod(VoxelConeSettings):
-    """Differential rendering: two full solutions, the reference (METHOD 6)."""
+    """Differential rendering: two full solutions, the reference (docs/method.md 6)."""
 
     model_config = NEEDS_NAME
 

@@ -1,4 +1,4 @@
-"""The parts of the scene document that hold geometry and materials: `objects` and `real` (FORMATS 3)."""
+"""The parts of the scene document that hold geometry and materials: `objects` and `real` (docs/formats.md 3)."""
 
 from pathlib import PurePosixPath
 from typing import Annotated, Any, Literal, Self

@@ -118,7 +118,7 @@ class PictureBuffers:
         return {"Surfaces": self._surfaces, "surface_count": len(table), "specular_surfaces": specular}
 
     def set_camera(self, view: CameraView) -> CameraView:
-        """Writes the camera's blocks: for rasters through the lens, and for what reads the objects' geometry buffer."""
+        """Writes the camera's blocks: for rasters through the lens, and for readers of the objects' geometry."""
         self._raster_camera.write(view.without_antialiasing.block())
         self._camera.write(view.block())
         return view
@@ -145,7 +145,7 @@ class PictureBuffers:
         return Observation(self.image, self.real_surface, scan, bindings)
 
     def draw_objects(self, objects: GeometryState, seen: Observation, view: CameraView) -> ObjectSurface:
-        """Rasters the objects and finds how much of each pixel they cover, edges of real things before them unmixed."""
+        """Rasters the objects, finds how much of each pixel they cover, and unmixes edges of real things."""
         rectangle = view.rectangle_around(objects.points)
         if view.antialiased:
             samples = self._draw_samples(objects, seen, view, rectangle)

@@ -1,7 +1,7 @@
 """The frame as a graph: stages that read and write versioned resources and rerun only where an input changed.
 
-A method declares its stages once; every frame sets the sources and runs the graph. Each resource follows the clocks of
-all that it was made from, so that what a moving camera costs can be read from the graph before anything is drawn.
+A method declares its stages once; every frame sets the sources and runs the graph. Each resource follows the clocks
+of all that it was made from, so that what a moving camera costs can be read from the graph before anything is drawn.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence

@@ -1,4 +1,4 @@
-"""One scene from frame to frame: geometry, lights and estimates that outlive a frame, and the graph that renders it."""
+"""One scene from frame to frame: geometry, lights and estimates that outlive a frame, and the graph of its frames."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -15,6 +15,7 @@ from protocol.scene import SceneDocument
 from protocol.scene_method import Output
 from render_server.gpu.context import GpuContext
 from render_server.gpu.readback import AsyncReadback
+from render_server.graph import Graph
 from render_server.live_scene import LiveScene, RelitFrame
 from render_server.picking import Pick, ShownFrame
 from render_server.view import CameraView
@@ -111,6 +112,11 @@ class SceneRenderer:
         if relit is None:
             return _at_once(shown, frame.color)
         return self._composed(shown, relit, lights, with_linear=with_linear or self._with_linear)
+
+    @property
+    def graph(self) -> Graph | None:
+        """The stages of the newest frame and what they made (`graph["cones"].mu`); None before the first."""
+        return None if self._live.graph is None else self._live.graph.graph
 
     def sized(self, frame: ViewFrame) -> ViewFrame:
         """The frame at the composite's size; of the same frame the same one again."""

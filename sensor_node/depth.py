@@ -1,4 +1,4 @@
-"""Depth clean-up (METHOD 2): validity, smoothing guided by colour, small holes filled,
+"""Depth clean-up (docs/method.md 2): validity, smoothing guided by colour, small holes filled,
 rims at depth edges given a surface by colour, large holes left.
 """
 

@@ -1,4 +1,4 @@
-"""Poses of markers that are fixed to lamps (mode 1 of METHOD 2: a tracked lamp)."""
+"""Poses of markers that are fixed to lamps (mode 1 of docs/method.md 2: a tracked lamp)."""
 
 from collections.abc import Sequence
 from typing import NamedTuple

@@ -44,7 +44,7 @@ class BoardDetector:
     """Finds one board in the pictures of one camera, and remembers the last pose to resolve ambiguity.
 
     Corners are refined on linear light: gamma pulls the black edges of a blurred marker inward. The pose is
-    the board frame's of FORMATS 3.
+    the board frame's of docs/formats.md 3.
     """
 
     def __init__(

@@ -36,7 +36,7 @@ TABLE_Z_M = -0.0005
 
 @dataclass(frozen=True)
 class Finish:
-    """Material of a virtual object as the scene document says it (FORMATS 3); linear colours.
+    """Material of a virtual object as the scene document says it (docs/formats.md 3); linear colours.
 
     `metallic` 0 with `specular` 0 is Lambertian; metals and dielectrics have a GGX lobe.
     """

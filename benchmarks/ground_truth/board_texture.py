@@ -1,4 +1,4 @@
-"""The printed marker board as a picture of its albedo, placed as the world frame of FORMATS 3 says."""
+"""The printed marker board as a picture of its albedo, placed as the world frame of docs/formats.md 3 says."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""What the scene document says of a benchmark scene (FORMATS 3)."""
+"""What the scene document says of a benchmark scene (docs/formats.md 3)."""
 
 import json
 from pathlib import Path

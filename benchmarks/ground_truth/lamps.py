@@ -1,4 +1,4 @@
-"""Lights of a benchmark scene, each as Mitsuba shines it and as the scene document says it (FORMATS 3)."""
+"""Lights of a benchmark scene, each as Mitsuba shines it and as the scene document says it (docs/formats.md 3)."""
 
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -143,7 +143,7 @@ class Panel:
         return shape("rectangle", place, emitter={"type": "area", "radiance": rgb(radiance)})
 
     def document(self) -> dict[str, Any]:
-        """Return it as a rectangle light; FORMATS gives its centre as position."""
+        """Return it as a rectangle light; its centre is its position (docs/formats.md 3)."""
         return {
             "type": "rectangle",
             "position_m": list(self.center_m),

@@ -1,6 +1,6 @@
 """The demo's room: corner of a wooden table with a marker board, a book, boxes, a mug and a ball.
 
-World frame, units and light conventions are those of the scene document (FORMATS 3): metres, origin at the
+World frame, units and light conventions are those of the scene document (docs/formats.md 3): metres, origin at the
 board's first marker, +z out of the paper; radiance in camera units (1.0 = sensor white).
 """
 
@@ -61,7 +61,7 @@ def world_from_camera(frame: int) -> Matrix:
 
 
 def scene_document() -> dict[str, Any]:
-    """The scene document of the demo (FORMATS 3): this room's exact lights and the virtual object."""
+    """The scene document of the demo (docs/formats.md 3): this room's exact lights and the virtual object."""
     return {
         "name": "demo",
         "real": {"geometry": "depth"},

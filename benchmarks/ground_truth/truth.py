@@ -54,7 +54,7 @@ class TruthFrame:
 
 @dataclass(frozen=True)
 class Truth:
-    """A finished dataset folder (FORMATS 1) of the room without objects, and the truth beside it."""
+    """A finished dataset folder (docs/formats.md 1) of the room without objects, and the truth beside it."""
 
     folder: Path
     scene: BenchmarkScene

@@ -8,7 +8,7 @@ from benchmarks.quality.figures import linear
 from benchmarks.quality.metrics import Picture
 
 REGULARIZER = 1e-3
-"""Keeps the ratio finite in black; the same share of white as composition uses of the light (METHOD 3)."""
+"""Keeps the ratio finite in black; the same share of white as composition uses of the light (docs/method.md 3)."""
 
 
 def ideal_composite(truth: TruthFrame) -> Picture:

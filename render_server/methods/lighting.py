@@ -135,7 +135,7 @@ def light_stages(
 
 
 def object_extent(g: Graph, s: FrameResources) -> Resource[Points]:
-    """Points that enclose the objects at all times of their animations: volumes and light views are fitted to them."""
+    """Points that enclose the objects at all times of their animations, for fitting volumes and light views."""
     if "object extent" in g:
         return g.resource("object extent")
     return g.stage("object extent", lambda objects: objects.lasting_points, s.objects, same=np.array_equal)

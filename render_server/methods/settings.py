@@ -32,7 +32,7 @@ class ResolvedSettings:
 
 @dataclass(frozen=True, eq=False)
 class Setup(Generic[Settings]):
-    """What a method is declared with: its settings, the picture's width and height, what is precomputed of objects."""
+    """What a method is declared with: settings, width and height of the picture, what is precomputed of objects."""
 
     settings: Settings
     resolved: ResolvedSettings

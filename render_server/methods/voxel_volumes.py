@@ -317,9 +317,9 @@ def delta_voxel_stages(
 class SolutionVoxels(DirectionalVoxels):
     """Voxels of two full solutions: the real scene alone (mu), real and virtual together (rho) (docs/method.md 6).
 
-    Each sums all of its light and opacity, under its own maps, as often as light is gathered. Shared are the pieces of
-    the real triangles and what the camera measured there, which tells solution rho what a surface gives back of its
-    light; and the scene beyond the volume, which objects do not change.
+    Each sums all of its light and opacity, under its own maps, as often as light is gathered. Shared are the pieces
+    of the real triangles and what the camera measured there, which tells solution rho what a surface gives back of
+    its light; and the scene beyond the volume, which objects do not change.
     """
 
     def voxelize_both(self, real: VoxelSet, objects: VoxelSet) -> tuple[VoxelSet, VoxelSet]:

@@ -88,7 +88,7 @@ class Chessboard:
 
 
 class MarkerBoard:
-    """A marker board; its frame is the world's (FORMATS 3)."""
+    """A marker board; its frame is the world's (docs/formats.md 3)."""
 
     def __init__(self, board: BoardSpec) -> None:
         self.board = board

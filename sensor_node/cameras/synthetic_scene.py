@@ -1,7 +1,7 @@
 """A small exact scene for tests and demonstrations: a textured table, a marker board on it, and a box.
 
 Rays of the camera's full lens model, several a pixel for colour, end on the table plane z = 0 or on the box,
-in the world frame of FORMATS 3. Light is one distant lamp and a constant ambient; nothing casts shadows.
+in the world frame of docs/formats.md 3. Light is one distant lamp and a constant ambient; nothing casts shadows.
 """
 
 from functools import cached_property

@@ -1,4 +1,4 @@
-"""Fish-eye light: exposure bracket -> linear radiance on the hemisphere (METHOD 2)."""
+"""Fish-eye light: exposure bracket -> linear radiance on the hemisphere (docs/method.md 2)."""
 
 from sensor_node.fisheye.radiance import light_warnings, radiance_map
 from sensor_node.fisheye.response import estimate_response

@@ -12,8 +12,7 @@ from protocol.fisheye_parts import calibration_of
 from protocol.messages import Message, RadianceMessage
 
 if TYPE_CHECKING:
-    from render_server.lights.lights import Light
-    from render_server.lights.lights import IncidentLight
+    from render_server.lights.lights import IncidentLight, Light
 
 PICTURE_PART = 2  # of a radiance message (SPEC.md, section 3)
 OUTLINE_POINTS = 16

@@ -9,10 +9,10 @@ from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Float32, Int
 
 from protocol.radiance_files import read_linear
-from render_server.scene.asset_check import check_mesh_file
 from render_server.lights.environment import LUMINANCE
-from render_server.scene.triangle_mesh import TriangleMesh
+from render_server.scene.asset_check import check_mesh_file
 from render_server.scene.mesh_loading import load_mesh
+from render_server.scene.triangle_mesh import TriangleMesh
 from services.storage.asset_kinds import Facts
 
 SIZE = 256

@@ -1,4 +1,4 @@
-"""Dataset folders: every form that FORMATS 1 allows, the real captures, and what bad folders are told."""
+"""Dataset folders: every form that docs/formats.md 1 allows, the real captures, and what bad folders are told."""
 
 from collections.abc import Callable
 from pathlib import Path

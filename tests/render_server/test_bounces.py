@@ -1,4 +1,4 @@
-"""Light gathered from voxel to voxel, against closed forms (METHOD 4.3)."""
+"""Light gathered from voxel to voxel, against closed forms (docs/method.md 4.3)."""
 
 from pathlib import Path
 

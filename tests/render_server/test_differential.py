@@ -1,4 +1,4 @@
-"""Two full solutions subtracted: what `dvct` must agree with (METHOD 6 and 7).
+"""Two full solutions subtracted: what `dvct` must agree with (docs/method.md 6 and 7).
 
 Removal is not expressible as a scene of its own: the fields are the difference of solutions rho and mu, so exchanging
 them changes the sign and nothing else.

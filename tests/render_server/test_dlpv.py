@@ -235,7 +235,7 @@ def tilted_solution(gpu: GpuContext, stage: Stage, turn: Float64[np.ndarray, "4 
 @pytest.mark.slow
 def test_tilting_the_scene_does_not_change_its_light(gpu: GpuContext, stage: Stage) -> None:
     """Grid axes against those of the spherical harmonics, 30 degrees apart: what the picture shows within the 5 % of
-    METHOD 7; the volume's own part, of which cells' corners cost some, within 10 %."""
+    docs/method.md 7; the volume's own part, of which cells' corners cost some, within 10 %."""
     straight, tilted = (tilted_solution(gpu, stage, rotated(angle)) for angle in (0.0, 30.0))
     real = (straight.fade == 1) & (tilted.fade == 1) & (straight.matte == 0) & (tilted.matte == 0)
     shown = (straight.matte == 1) & (tilted.matte == 1)
@@ -262,7 +262,7 @@ def test_tilting_the_scene_does_not_change_its_light(gpu: GpuContext, stage: Sta
 def test_resolution_does_not_change_the_light(
     gpu: GpuContext, stage: Stage, key: str, sizes: tuple[int, int], goal: float
 ) -> None:
-    """Means over pixels, within the goals of METHOD 7."""
+    """Means over pixels, within the goals of docs/method.md 7."""
     document = everyday(stage)
     coarse, fine = (solve(gpu, dlpv(document, **{key: value})) for value in sizes)
     seen = (coarse.fade == 1) & (fine.fade == 1) & (coarse.matte == 0)

@@ -1,4 +1,4 @@
-"""Steps of light propagation volumes: energy, even fields, walls, directions (METHOD 5)."""
+"""Steps of light propagation volumes: energy, even fields, walls, directions (docs/method.md 5)."""
 
 import numpy as np
 import pytest

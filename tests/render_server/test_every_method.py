@@ -1,4 +1,4 @@
-"""What holds for every relighting method alike: no object, no change; the same frame, the same bytes (METHOD 7)."""
+"""What holds for every method alike: no object, no change; the same frame, the same bytes (docs/method.md 7)."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Irradiances before composition against closed forms (METHOD 3 and 7); test_differential.py has full solutions."""
+"""Irradiances before composition against closed forms (docs/method.md 3 and 7); full solutions: test_differential.py."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Single cones through voxels of known content: furnace, open planes, form factors (METHOD 4.5 and 7)."""
+"""Single cones through voxels of known content: furnace, open planes, form factors (docs/method.md 4.5 and 7)."""
 
 from collections.abc import Iterator
 

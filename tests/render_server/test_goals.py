@@ -1,4 +1,4 @@
-"""Goals of METHOD 7 that are reported and not required: run with `-s` to see the table.
+"""Goals of docs/method.md 7 that are reported and not required: run with `-s` to see the table.
 
 Each test renders the same scene twice and compares the change of irradiance (rho - mu) over the same floor pixels.
 """

@@ -1,4 +1,4 @@
-"""What must hold for every picture (METHOD 7): bytes are copied, real shadows stay, caches do not show."""
+"""What must hold for every picture (docs/method.md 7): bytes are copied, real shadows stay, caches do not show."""
 
 import hashlib
 import subprocess

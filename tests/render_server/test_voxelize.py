@@ -1,4 +1,4 @@
-"""Voxelisation is exact: no area is lost or made, and a closed mesh gives a closed shell (METHOD 4.2)."""
+"""Voxelisation is exact: no area is lost or made, and a closed mesh gives a closed shell (docs/method.md 4.2)."""
 
 from collections.abc import Iterator
 from typing import Any

@@ -6,7 +6,7 @@ uniform int cone_count;
 // each `width` (0..1) of its own solid angle wide, all turned by `turn` (rad) about the normal.
 struct ConeSet { int parts; int part; float width; float turn; };
 
-// Direction k about z, of equal shares of the projected solid angle (realtime-gi, appendix A).
+// Direction k about z, of equal shares of the projected solid angle (docs/method.md 4.5).
 vec3 cone_direction(int k, ConeSet set) {
     float number = float(set.parts * k + set.part);
     float z = sqrt(1.0 - (number + 0.5) / float(set.parts * cone_count));
