@@ -101,7 +101,7 @@ class LightStages:
         return buffers
 
     def map_mirrors(
-        self, _real: LightBuffers, _objects: LightBuffers, _lights: LightSet, seen: Observation
+        self, _views: LightBuffers, _real: LightBuffers, _objects: LightBuffers, seen: Observation
     ) -> LightBuffers:
         """Maps where smooth planes show the lights."""
         if self.buffers.mirrors:
@@ -129,7 +129,7 @@ def light_stages(
     mirrored = environment
     if mirrors:
         mirrored = g.stage(
-            "mirror visibility", stages.map_mirrors, real_maps, object_maps, s.lights, s.observation
+            "mirror visibility", stages.map_mirrors, views, real_maps, object_maps, s.observation
         )
     return LitScene(stages.buffers, environment, real_maps, object_maps, mirrored)
 

@@ -1,4 +1,4 @@
-"""Irradiances before composition against closed forms (docs/method.md 3 and 7); full solutions: test_differential.py."""
+"""Irradiances before composition against closed forms (docs/method.md 3, 7); full solutions: test_differential.py."""
 
 from pathlib import Path
 
