@@ -106,7 +106,16 @@ def recording(gpu: GpuContext) -> Iterator[Recording]:
         record.store(gpu)
 
 
-@pytest.mark.parametrize("case", [pytest.param(case, id=str(case)) for case in cases()])
+def parameters() -> list[Any]:
+    """Every case; those that `./run test` leaves to `./run test --all` are slow."""
+    quick = [
+        case.geometry == "depth" and (case.kind == "plain" or case.method == "exact") for case in cases()
+    ]
+    marks = [() if is_quick else (pytest.mark.slow,) for is_quick in quick]
+    return [pytest.param(case, id=str(case), marks=mark) for case, mark in zip(cases(), marks, strict=True)]
+
+
+@pytest.mark.parametrize("case", parameters())
 def test_pictures_and_dispatches_are_the_recorded_ones(
     gpu: GpuContext, recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, case: Case
 ) -> None:
