@@ -11,8 +11,7 @@ from jaxtyping import Float32, Float64
 from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Binding, Bindings, Kernel
 from render_server.gpu.uniform_block import Block, Float, Int, UniformBlock
-from render_server.lights.lights import DirectionalLight, Light, RectangleLight, SpotLight
-from render_server.lights.mirror_lights import MirrorLight
+from render_server.lights.lights import DirectionalLight, Light, MirrorLight, RectangleLight, SpotLight
 from render_server.lights.octahedral import octahedral_grid, prefilter, sample_octahedral
 from render_server.passes.shadow_maps import (
     NEAREST_M,
@@ -214,7 +213,7 @@ class LightBuffers:
 
 
 class MirrorVisibility:
-    """Maps where smooth real planes mirror the lights, one map for each image of a light (lights/mirror_lights.py).
+    """Maps where smooth real planes mirror the lights, one map for each image of a light (lights/lights.py).
 
     A map holds how much of the light each point of the plane shows, without and with the objects; its mipmaps average
     that over larger and larger footprints.

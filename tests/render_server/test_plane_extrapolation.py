@@ -9,11 +9,13 @@ from jaxtyping import Float32, Float64
 
 from protocol.frames import decode_lut
 from protocol.scene import SceneDocument
-from render_server.estimation.plane_detection import DetectedPlane, PointCloud, detect_planes
 from render_server.estimation.plane_extrapolation import (
+    DetectedPlane,
     ExtrapolatedPlanes,
+    PointCloud,
     RealSamples,
     ViewFrustum,
+    detect_planes,
     extrapolate_planes,
 )
 from render_server.gpu.context import GpuContext

@@ -19,9 +19,8 @@ from render_server.passes.voxelize import VoxelizePass
 
 from render_server.gpu.context import GpuContext
 from render_server.gpu.textures import bind_samplers
-from render_server.scene.gpu_mesh import GpuMesh, merge_for_gpu
 from render_server.scene.materials import Material
-from render_server.scene.triangle_mesh import TriangleMesh, smooth_normals
+from render_server.scene.triangle_mesh import GpuMesh, TriangleMesh, merge_for_gpu, smooth_normals
 
 DIRECTIONS = 6
 
