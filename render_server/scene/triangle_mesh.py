@@ -1,4 +1,4 @@
-"""Triangle meshes: conversion and checks of a file's geometry, vertex normals, joining, and the form that the GPU takes."""
+"""Triangle meshes: checks and conversion of a file's geometry, vertex normals, joining, and the form for the GPU."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
