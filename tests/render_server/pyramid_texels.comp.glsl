@@ -1,4 +1,4 @@
-// Paints every block (level, direction) of a pyramid with a number of its own, or looks one up (the tests' own shader).
+// Paints every block (level, direction) of a mipmap with a number of its own, or looks one up (the tests' own shader).
 #include "common/volume.glsl"
 
 layout(local_size_x = 64) in;
