@@ -107,7 +107,9 @@ def test_uniforms_arrive_and_removed_ones_do_not_matter(gpu: GpuContext, tmp_pat
     matrix = np.eye(4)
     matrix[:3, 3] = (5, 6, 7)  # row-major: the last column is the translation
     others = {"unknown": 2.0}  # of what is shared, a kernel takes what it needs
-    kernel.run((9, 3), others, Out=out, a=0.5, b=-3, c=True, d=(1.0, 2.0, 3.0), e=(4, 8), m=matrix, removed=1.0)
+    kernel.run(
+        (9, 3), others, Out=out, a=0.5, b=-3, c=True, d=(1.0, 2.0, 3.0), e=(4, 8), m=matrix, removed=1.0
+    )
     values = np.frombuffer(out.read(), np.float32)
     assert values.tolist() == [0.5, -3, 1, 3, 5, 6, 7, 1, 4, 8, 3, 2]
     out.release()
