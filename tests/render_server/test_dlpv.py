@@ -190,7 +190,9 @@ def test_the_delta_is_the_difference_of_two_full_solutions(
 ) -> None:
     """E_rho of an inserted box is E_mu of a renderer to which it is part of the given model (its own object is a
     speck inside): so removal is the negative of insertion. The picture shows albedo 0.5 under even light."""
-    monkeypatch.setattr(AlbedoEstimator, "observe", lambda *_: False)  # what is out of sight has albedo 0.5 too
+    monkeypatch.setattr(
+        AlbedoEstimator, "observe", lambda *_: False
+    )  # what is out of sight has albedo 0.5 too
     mesh = cube(0.12)
     speck = shifted(trimesh.creation.box((0.002,) * 3), *mesh.bounds.mean(axis=0))
     room = floor(1.0) + shifted(trimesh.creation.box((0.02, 1, 0.4)), -0.2, 0, 0.2)
