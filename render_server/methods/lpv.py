@@ -224,25 +224,25 @@ class LpvVolumes:
             self._propagate.run(rho, self._weights, self._steps, through)
         return rho
 
+    def inject_shadow(self, scene: Bindings, lights: LightBuffers, _real: moderngl.Buffer) -> moderngl.Buffer:
+        """Negative lobes of the direct light that objects keep off the real scene; nothing where maps shadow it."""
+        if self._settings.resolved_shadow == "lobe":
+            self._shadow_light.clear()
+            self._maps.add_shadow(self._shadow_light, lights, self._albedo.atlas, scene)
+        return self._shadow_light
+
     def propagate_change(
-        self,
-        change: moderngl.Buffer,
-        scene: Bindings,
-        lights: LightBuffers,
-        through: moderngl.Buffer | None,
+        self, change: moderngl.Buffer, shadow: moderngl.Buffer, through: moderngl.Buffer | None
     ) -> LightVolume | None:
         """V_delta of the paper: one volume of the texels that differ ([P2] 4.3); None of the other operator."""
         if self.change is not None:
-            self._shadow_light.clear()
-            if self._settings.resolved_shadow == "lobe":
-                self._maps.add_shadow(self._shadow_light, lights, self._albedo.atlas, scene)
-            self._start.run(self.change, change, self._shadow_light)
+            self._start.run(self.change, change, shadow)
             self._propagate.run(self.change, self._weights, self._steps, through)
         return self.change
 
-    def show(self, change: moderngl.Buffer, _delta: LightVolume | None, volume: PlacedVolume) -> VoxelMipmap:
+    def show(self, change: moderngl.Buffer, shadow: moderngl.Buffer, volume: PlacedVolume) -> VoxelMipmap:
         """Cells of what was injected of the change."""
-        self._show.run(self.shown, volume.placement.size, change, self._shadow_light)
+        self._show.run(self.shown, volume.placement.size, change, shadow)
         return self.shown
 
     def release(self) -> None:
@@ -304,7 +304,8 @@ def lpv_stages(
     through = g.stage("geometry volume", volumes.cover_joint, objects, volume, through_real)
     first = g.stage("propagate rho", volumes.propagate_rho, real_light, change, through)
     rho = g.stage("bounces", volumes.bounce, first, mu, joint, through)
-    delta = g.stage("propagate delta", volumes.propagate_change, change, joint, lit.object_maps, through)
+    shadow = g.stage("inject shadow", volumes.inject_shadow, joint, lit.object_maps, real_light)
+    delta = g.stage("propagate delta", volumes.propagate_change, change, shadow, through)
     return mu, rho, delta
 
 
@@ -316,7 +317,7 @@ def dlpv(g: Graph, s: FrameResources, setup: Setup[DlpvMethod]) -> Layers:
     volumes = LpvVolumes(g.gpu, settings, resolved.volume_size)
     volume = g.stage("volume", volumes.place, placement)
     mu, rho, delta = lpv_stages(g, s, lit, volumes, volume)
-    shown = g.stage("shown cells", volumes.show, "inject change", delta, volume)
+    shown = g.stage("shown cells", volumes.show, "inject change", "inject shadow", volume)
     options = ShadingOptions(
         caustics=settings.resolved_caustics,
         screen_space=settings.resolved_screen_space,
