@@ -4,14 +4,14 @@ A method declares its stages once; every frame sets the sources and runs the gra
 of all that it was made from, so that what a moving camera costs can be read from the graph before anything is drawn.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from typing import Any, Final, Generic, Literal, TypeVar, get_args
 
 from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import Dispatch
+from render_server.gpu.kernel import Dispatch, watched
 from render_server.gpu.memory import gpu_objects, size_bytes
 from render_server.gpu.timers import PassTimers
 
@@ -29,7 +29,8 @@ class GraphError(RuntimeError):
 class Resource(Generic[T]):
     """A named texture, buffer or plain value, and a number that counts its changes; 0: never written.
 
-    `clocks` are what makes it change: those of its source, or of everything that its stage reads.
+    `clocks` are what makes it change: those of its source, or of everything that its stage reads (known from the
+    graph's first run or report on).
     """
 
     name: str
@@ -76,7 +77,7 @@ class Stage:
 
 @dataclass(frozen=True)
 class StageReport:
-    """One stage as the last run left it; `size_bytes` is the GPU memory of what it writes."""
+    """One stage as the last run left it; `size_bytes` is the GPU memory that it holds and no earlier stage does."""
 
     name: str
     inputs: tuple[str, ...]
@@ -90,8 +91,8 @@ class StageReport:
 class Graph:
     """Stages in the order in which they run, and the resources between them.
 
-    The graph owns what its stages are methods of: it releases them with itself. `checks` tells after every kernel
-    whether the running stage may write what the kernel wrote (slow; for tests).
+    The graph owns what its stages are methods of: it releases them with itself. With `checks`, no kernel may write
+    what belongs to another stage than the running one (slow; for tests).
     """
 
     def __init__(self, gpu: GpuContext, timers: PassTimers | None = None, *, checks: bool = False) -> None:
@@ -104,15 +105,14 @@ class Graph:
         self._order: list[Stage] | None = None
         self._polled: list[tuple[Resource[Any], Callable[[], Any], Same]] = []
         self._owned: list[Any] = []
-        self._running: Stage | None = None
 
     def source(self, name: str, clock: Clock) -> Resource[Any]:
         """Declares a resource that is set from outside (`Resource.write`)."""
-        return self._declare(name, frozenset([clock]), None)
+        return self._declare((name,), None, frozenset([clock]))[0]
 
     def polled(self, name: str, clock: Clock, ask: Callable[[], Any], same: Same) -> Resource[Any]:
-        """Declares a source that is asked for before every run."""
-        resource = self._declare(name, frozenset([clock]), None)
+        """Declares a source that is asked for before every run that needs it."""
+        resource = self.source(name, clock)
         self._polled.append((resource, ask, same))
         return resource
 
@@ -145,24 +145,33 @@ class Graph:
     ) -> tuple[Resource[Any], ...]:
         if any(stage.name == name for stage in self._stages):
             raise GraphError(f"There is a stage `{name}` already; give this one another name.")
-        names = [item if isinstance(item, str) else item.name for item in inputs]
-        known = [self._resources[item] for item in names if item in self._resources]
-        clocks = frozenset(clock for item in known for clock in item.clocks)
+        if not outputs:
+            raise GraphError(f"Stage `{name}` writes no resource, so that nothing would run it.")
+        for item in inputs:
+            if isinstance(item, Resource) and item is not self._resources.get(item.name):
+                raise GraphError(f"Stage `{name}` reads `{item.name}` of another graph.")
         stage = Stage(name, function, (), (), same)
-        stage.outputs = tuple(self._declare(output, clocks, stage) for output in outputs)
+        stage.outputs = self._declare(outputs, stage)
         self._stages.append(stage)
-        self._named[stage] = names
+        self._named[stage] = [item if isinstance(item, str) else item.name for item in inputs]
         self._order = None
         self.own(getattr(function, "__self__", None))
         return stage.outputs
 
-    def _declare(self, name: str, clocks: frozenset[Clock], stage: Stage | None) -> Resource[Any]:
-        if name in self._resources:
-            writer = self._resources[name].stage
-            by = f"stage `{writer.name}`" if writer else "a source"
-            raise GraphError(f"Resource `{name}` is written by {by} already; a resource has one writer.")
-        self._resources[name] = Resource(name, clocks, stage)
-        return self._resources[name]
+    def _declare(
+        self, names: tuple[str, ...], stage: Stage | None, clocks: frozenset[Clock] = frozenset()
+    ) -> tuple[Resource[Any], ...]:
+        """Declares all of the resources or, if one has a writer already, none."""
+        for name in names:
+            if name in self._resources or names.count(name) > 1:
+                writer = self._resources[name].stage if name in self._resources else stage
+                by = " and by ".join(
+                    f"stage `{each.name}`" if each else "a source" for each in (writer, stage)
+                )
+                raise GraphError(f"Resource `{name}` is written by {by}; a resource has one writer.")
+        made = tuple(Resource[Any](name, clocks, stage) for name in names)
+        self._resources.update(zip(names, made, strict=True))
+        return made
 
     def own(self, item: object) -> None:
         """Releases `item` with the graph, if it can be released."""
@@ -176,10 +185,12 @@ class Graph:
             GraphError: there is none.
         """
         if name not in self._resources:
-            close = get_close_matches(name, self._resources, 1)
-            hint = f"; the nearest is `{close[0]}`" if close else ""
-            raise GraphError(f"There is no resource `{name}`{hint}.")
+            raise GraphError(f"There is no resource `{name}`{self._nearest(name)}.")
         return self._resources[name]
+
+    def _nearest(self, name: str) -> str:
+        close = get_close_matches(name, self._resources, 1)
+        return f"; the nearest is `{close[0]}`" if close else ""
 
     def __getitem__(self, name: str) -> Any:  # noqa: ANN401 (as its stage made it)
         """Value of a resource."""
@@ -191,16 +202,20 @@ class Graph:
     def run(self, *targets: Resource[Any]) -> None:
         """Brings the `targets` (all resources if none is named) up to date.
 
+        What a stage raises is raised here; the stage and those that read it run again the next time.
+
         Raises:
             GraphError: stages read each other in a circle, read what nobody writes, or write what they did not
                 declare.
         """
-        for resource, ask, same in self._polled:
-            resource.write(ask(), same)
-        wanted = self._needed_for(targets) if targets else None
-        for stage in self._sorted():
+        order, needed = self._sorted(), self._needed_for(targets or self._resources.values())
+        for stage in order:
             stage.ran = False
-            if wanted is None or stage in wanted:
+        for resource, ask, same in self._polled:
+            if resource in needed:
+                resource.write(ask(), same)
+        for stage in order:
+            if not needed.isdisjoint(stage.outputs):
                 self._update(stage)
 
     def _sorted(self) -> list[Stage]:
@@ -208,53 +223,48 @@ class Graph:
         if self._order is None:
             for stage, names in self._named.items():
                 stage.inputs = tuple(self._read(stage, name) for name in names)
-            self._order = []
+            order: list[Stage] = []
             for stage in self._stages:
-                self._place(stage, [])
-            self._follow_clocks()
+                self._place(stage, order, [])
+            self._order = order
+            self._follow_clocks(order)
         return self._order
 
-    def _place(self, stage: Stage, waiting: list[Stage]) -> None:
+    def _place(self, stage: Stage, order: list[Stage], waiting: list[Stage]) -> None:
         """Puts a stage into the order, behind all that it reads."""
-        assert self._order is not None
-        if stage in self._order:
+        if stage in order:
             return
         if stage in waiting:
-            circle = [*waiting[waiting.index(stage) :], stage]
-            names = " reads ".join(f"`{each.name}`" for each in circle)
-            shared = circle[1].outputs[0].name
-            self._order = None
-            raise GraphError(f"Stages read each other in a circle, through `{shared}` first: {names}.")
+            raise GraphError(
+                f"Stages read each other in a circle: {_links(waiting[waiting.index(stage) :])}."
+            )
         for item in stage.inputs:
             if item.stage is not None:
-                self._place(item.stage, [*waiting, stage])
-                assert self._order is not None
-        self._order.append(stage)
+                self._place(item.stage, order, [*waiting, stage])
+        order.append(stage)
 
     def _read(self, stage: Stage, name: str) -> Resource[Any]:
         if name not in self._resources:
-            close = get_close_matches(name, self._resources, 1)
-            hint = f"; the nearest is `{close[0]}`" if close else ""
-            raise GraphError(f"Stage `{stage.name}` reads `{name}`, which no stage writes{hint}.")
+            raise GraphError(
+                f"Stage `{stage.name}` reads `{name}`, which no stage writes{self._nearest(name)}."
+            )
         return self._resources[name]
 
-    def _follow_clocks(self) -> None:
-        """Clocks of what was named before it was declared."""
-        assert self._order is not None
-        for stage in self._order:
+    def _follow_clocks(self, order: Sequence[Stage]) -> None:
+        for stage in order:
             clocks = frozenset(clock for item in stage.inputs for clock in item.clocks)
             for output in stage.outputs:
                 output.clocks = clocks
 
-    def _needed_for(self, targets: Sequence[Resource[Any]]) -> set[Stage]:
-        self._sorted()
-        needed: set[Stage] = set()
-        open_ = [item.stage for item in targets if item.stage is not None]
+    def _needed_for(self, targets: Iterable[Resource[Any]]) -> set[Resource[Any]]:
+        """The targets and all that they are made from."""
+        needed: set[Resource[Any]] = set()
+        open_ = list(targets)
         while open_:
-            stage = open_.pop()
-            if stage not in needed:
-                needed.add(stage)
-                open_ += [item.stage for item in stage.inputs if item.stage is not None]
+            item = open_.pop()
+            if item not in needed:
+                needed.add(item)
+                open_ += () if item.stage is None else item.stage.inputs
         return needed
 
     def _update(self, stage: Stage) -> None:
@@ -265,58 +275,57 @@ class Graph:
         for item in stage.inputs:
             if item.version == 0:
                 raise GraphError(f"Stage `{stage.name}` reads `{item.name}` before it is written.")
-        with self._measured(stage):
-            found = stage.function(*(item.value for item in stage.inputs))
-        results = found if len(stage.outputs) > 1 else (found,)
-        if len(results) != len(stage.outputs):
-            raise GraphError(
-                f"Stage `{stage.name}` returned {len(results)} values for {len(stage.outputs)} outputs."
-            )
-        for output, value in zip(stage.outputs, results, strict=True):
+        for output, value in zip(stage.outputs, self._call(stage), strict=True):
             output.write(value, stage.same)
         stage.seen, stage.ran = versions, True
 
-    @contextmanager
-    def _measured(self, stage: Stage) -> Iterator[None]:
-        """Times a stage and, with `checks`, watches what it writes."""
-        timer = self.timers.measure(stage.name) if self.timers is not None else nullcontext()
-        self._running = stage
-        if self._checks:
-            self.gpu.watchers.append(self._check)
+    def _call(self, stage: Stage) -> Sequence[Any]:
+        """Runs a stage's function, timed; returns a value for each output."""
+        dispatches: list[Dispatch] = []
         try:
-            with timer:
-                yield
-        finally:
-            self._running = None
-            if self._checks:
-                self.gpu.watchers.remove(self._check)
+            with ExitStack() as around:
+                if self.timers is not None:
+                    around.enter_context(self.timers.measure(stage.name))
+                if self._checks:
+                    around.enter_context(watched(self.gpu, dispatches.append))
+                found = stage.function(*(item.value for item in stage.inputs))
+        except Exception as error:
+            error.add_note(f"Stage `{stage.name}` raised it.")
+            raise
+        results = found if len(stage.outputs) > 1 else (found,)
+        count = len(results) if isinstance(results, tuple | list) else 1
+        if count != len(stage.outputs):
+            names = ", ".join(f"`{item.name}`" for item in stage.outputs)
+            raise GraphError(f"Stage `{stage.name}` returned {count} values for {names}.")
+        self._require_declared(stage, results, dispatches)
+        return results
 
-    def _check(self, dispatch: Dispatch) -> None:
-        """Refuses that a kernel of the running stage writes what belongs to another one."""
-        stage = self._running
-        assert stage is not None
-        own = {id(item) for output in stage.outputs if output.version for item in gpu_objects(output.value)}
-        for other in self._resources.values():
-            if other.stage in (stage, None) or other.version == 0:
+    def _require_declared(self, stage: Stage, results: Sequence[Any], dispatches: Sequence[Dispatch]) -> None:
+        """Refuses that a kernel wrote what another stage made and this one does not hand on."""
+        written = [(run.kernel, name, item) for run in dispatches for name, item in run.written.items()]
+        own = {id(item) for value in results for item in gpu_objects(value)}
+        for other in self._resources.values() if written else ():
+            if other.stage is stage or other.version == 0:
                 continue
             held = {id(item) for item in gpu_objects(other.value)} - own
-            for name, item in dispatch.written.items():
+            for kernel, name, item in written:
                 if id(item) in held:
                     raise GraphError(
-                        f"Stage `{stage.name}` writes `{other.name}` (kernel {dispatch.kernel}, `{name}`), "
-                        "which it did not declare."
+                        f"Stage `{stage.name}` writes `{other.name}` (kernel {kernel}, `{name}`), which it did not "
+                        "declare."
                     )
 
     def report(self) -> list[StageReport]:
         """Every stage in the order in which they run, as the last run left it."""
         times: Mapping[str, float] = {} if self.timers is None else self.timers.times_ms
+        counted: set[int] = set()
         return [
             StageReport(
                 stage.name,
                 tuple(item.name for item in stage.inputs),
                 tuple(item.name for item in stage.outputs),
                 tuple(clock for clock in CLOCKS if clock in stage.clocks),
-                sum(size_bytes(item.value) for item in stage.outputs if item.version),
+                sum(size_bytes(item.value, counted) for item in stage.outputs if item.version),
                 times.get(stage.name),
                 stage.ran,
             )
@@ -328,3 +337,12 @@ class Graph:
         for item in reversed(self._owned):
             item.release()
         self._owned.clear()
+
+
+def _links(circle: Sequence[Stage]) -> str:
+    """What each stage of a circle reads of the next."""
+    links = []
+    for stage, writer in zip(circle, [*circle[1:], circle[0]], strict=True):
+        item = next(item for item in stage.inputs if item.stage is writer)
+        links.append(f"`{stage.name}` reads `{item.name}` of `{writer.name}`")
+    return ", ".join(links)

@@ -52,12 +52,19 @@ class _Plan:
 
 
 class LiveScene:
-    """Holds everything that lives longer than a frame."""
+    """Holds everything that lives longer than a frame. `checks` is `Graph`'s."""
 
     def __init__(
-        self, gpu: GpuContext, scene: SceneDocument, notices: list[str], *, waits: bool = True
+        self,
+        gpu: GpuContext,
+        scene: SceneDocument,
+        notices: list[str],
+        *,
+        waits: bool = True,
+        checks: bool = False,
     ) -> None:
         self._gpu = gpu
+        self._checks = checks
         self._notices = notices
         self.timers = PassTimers(gpu)
         self._objects = VirtualObjects(gpu)
@@ -194,7 +201,9 @@ class LiveScene:
         if self.graph is not None and self.graph.buffers.key != key:
             self._drop_graph()
         if self.graph is None:
-            self.graph = FrameGraph(self._gpu, view, self._plan.method, self._fields, self.timers)
+            self.graph = FrameGraph(
+                self._gpu, view, self._plan.method, self._fields, self.timers, checks=self._checks
+            )
         return self.graph
 
     def describe_lights(self) -> list[dict[str, Any]]:

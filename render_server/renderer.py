@@ -57,15 +57,21 @@ class SceneRenderer:
 
     `with_linear`: composites carry the linear picture too (for files). `notices` collects sentences that a user
     should read (registration, memory), each once. `waits`: the first picture waits for what a method precomputes of
-    objects; pictures after `set_scene` never do.
+    objects; pictures after `set_scene` never do. `checks` is `Graph`'s.
     """
 
     def __init__(
-        self, gpu: GpuContext, scene: SceneDocument, *, with_linear: bool = False, waits: bool = True
+        self,
+        gpu: GpuContext,
+        scene: SceneDocument,
+        *,
+        with_linear: bool = False,
+        waits: bool = True,
+        checks: bool = False,
     ) -> None:
         self._gpu = gpu
         self.notices: list[str] = []
-        self._live = LiveScene(gpu, scene, self.notices, waits=waits)
+        self._live = LiveScene(gpu, scene, self.notices, waits=waits, checks=checks)
         self._readback = AsyncReadback(gpu)
         self._with_linear = with_linear
         self._sized: tuple[ViewFrame, ViewFrame] | None = None

@@ -157,7 +157,10 @@ class _Program:
         for slot in self._images:
             written[slot.name] = self._bind_image(slot, self._find(slot.name, sources))
         for slot in self._storage:
-            written[slot.name] = self._bind_storage(slot, self._find(slot.name, sources))
+            value = self._find(slot.name, sources)
+            self._bind_storage(slot, value)
+            if value is not None:
+                written[slot.name] = value
         for slot in self._blocks:
             self._bind_block(slot, self._find(slot.name, sources))
         for slot in self._uniforms:
@@ -198,12 +201,11 @@ class _Program:
         value.bind_to_image(slot.place, read=True, write=True)
         return value
 
-    def _bind_storage(self, slot: _Slot, value: Binding) -> moderngl.Buffer:
+    def _bind_storage(self, slot: _Slot, value: Binding) -> None:
         buffer = self._gpu.empty_buffer if value is None else value
         if not isinstance(buffer, moderngl.Buffer):
             raise self._wrong(slot, value, "a storage buffer")
         buffer.bind_to_storage_buffer(slot.place)
-        return buffer
 
     def _bind_block(self, slot: _Slot, value: Binding) -> None:
         if not isinstance(value, UniformBlock):

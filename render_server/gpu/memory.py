@@ -5,13 +5,18 @@ from collections.abc import Iterator
 
 import moderngl
 
+from render_server.gpu.context import GpuContext
+
 GPU_KINDS = (moderngl.Texture, moderngl.Texture3D, moderngl.TextureArray, moderngl.Buffer)
 OWN_CODE = "render_server."
 DEEPEST = 4  # attributes of attributes; a pass holds fields, which hold textures
 
 
 def gpu_objects(value: object, depth: int = 0) -> Iterator[object]:
-    """Textures and buffers that `value` is or holds; one that is held twice comes twice."""
+    """Textures and buffers that `value` is or holds; one that is held twice comes twice.
+
+    What a context holds belongs to everybody, and so to nothing that knows the context.
+    """
     if isinstance(value, GPU_KINDS):
         yield value
     elif depth < DEEPEST:
@@ -20,6 +25,8 @@ def gpu_objects(value: object, depth: int = 0) -> Iterator[object]:
 
 
 def _parts(value: object) -> Iterator[object]:
+    if isinstance(value, GpuContext):
+        return
     if isinstance(value, tuple | list):
         yield from value
     elif isinstance(value, dict):
@@ -28,9 +35,13 @@ def _parts(value: object) -> Iterator[object]:
         yield from vars(value).values()
 
 
-def size_bytes(value: object) -> int:
-    """Bytes of the GPU's memory that `value` takes, mip levels left out."""
-    held = {id(item): item for item in gpu_objects(value)}
+def size_bytes(value: object, counted: set[int]) -> int:
+    """Bytes of the GPU's memory that `value` takes, mip levels left out.
+
+    What is `counted` already (by identity) is left out, too; the rest is added there.
+    """
+    held = {id(item): item for item in gpu_objects(value) if id(item) not in counted}
+    counted.update(held)
     return sum(_size(item) for item in held.values())
 
 
