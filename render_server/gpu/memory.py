@@ -1,10 +1,9 @@
 """What objects hold on the GPU: textures and buffers found in their attributes, and the bytes that these take."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import moderngl
-import numpy as np
 
 GPU_KINDS = (moderngl.Texture, moderngl.Texture3D, moderngl.TextureArray, moderngl.Buffer)
 OWN_CODE = "render_server."
@@ -29,10 +28,20 @@ def _parts(value: object) -> Iterator[object]:
         yield from vars(value).values()
 
 
-def size_bytes(value: object) -> int:
-    """Bytes of the GPU's memory that `value` takes, mip levels left out."""
-    held = {id(item): item for item in gpu_objects(value)}
-    return sum(_size(item) for item in held.values())
+def sizes_bytes(values: Sequence[object]) -> list[int]:
+    """Bytes of the GPU's memory that each value takes, mip levels left out; nothing is counted twice.
+
+    What several hold counts for the one of them that holds the fewest things, the first of those.
+    """
+    held = [{id(item): item for item in gpu_objects(value)} for value in values]
+    owners: dict[int, int] = {}
+    for index in sorted(range(len(held)), key=lambda index: len(held[index])):
+        for key in held[index]:
+            owners.setdefault(key, index)
+    return [
+        sum(_size(item) for key, item in each.items() if owners[key] == index)
+        for index, each in enumerate(held)
+    ]
 
 
 def _size(item: object) -> int:
@@ -40,4 +49,4 @@ def _size(item: object) -> int:
         return int(item.size)
     assert isinstance(item, moderngl.Texture | moderngl.Texture3D | moderngl.TextureArray)
     texels = math.prod(item.size)
-    return int(texels * item.components * np.dtype(item.dtype).itemsize)
+    return int(texels * item.components * int(item.dtype[-1]))  # such as f1, f2, u4: the kind and its bytes
