@@ -171,7 +171,8 @@ class FrameGraph:
         )
 
     def upload(self, frame: ViewFrame) -> None:
-        """Uploads a frame's picture: a change, whatever it shows."""
+        """Begins a frame by uploading its picture: a change, whatever it shows."""
+        self.graph.begin_frame()
         self.buffers.image.upload(frame)
         self.resources.image.write(self.buffers.image)
 

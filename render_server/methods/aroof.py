@@ -15,7 +15,14 @@ from render_server.gpu.kernel import Binding, Bindings
 from render_server.gpu.textures import release_all
 from render_server.gpu_scene import GeometryState, PlacedObject
 from render_server.graph import Graph, Resource
-from render_server.methods.lighting import Layers, Shading, ShadingOptions, light_stages, shading_stages
+from render_server.methods.lighting import (
+    Layers,
+    Shading,
+    ShadingOptions,
+    light_stages,
+    no_bindings,
+    shading_stages,
+)
 from render_server.methods.settings import Setup
 from render_server.occlusion_fields import OcclusionFields
 from render_server.passes.cones import ConeFields, LowResGrid
@@ -246,9 +253,10 @@ def aroof(g: Graph, s: FrameResources, setup: Setup[AroofMethod]) -> Layers:
     shading = Shading(g.gpu, size, resolved, lit.buffers, DirectLight(g.gpu, size), options)
     own = FieldShading(g.gpu, settings, resolved.volume_size, shading.cones)
     objects = FieldObjects(g.gpu, setup.fields, field_settings(settings))
+    g.section("occlusion fields")
     found = g.polled("found fields", "objects", lambda: objects.find(s.objects.value), eq)
     items = g.stage("occlusion fields", objects.place, s.objects, found)
-    volume = g.stage("volume", own.place, items, s.objects)
+    volume = g.value("volume", own.place, items, s.objects)
     shown = g.stage("shown cells", own.show, items, volume)
 
     def trace(scene: Resource[Bindings], grid: Resource[LowResGrid]) -> Resource[ConeFields]:
@@ -258,7 +266,7 @@ def aroof(g: Graph, s: FrameResources, setup: Setup[AroofMethod]) -> Layers:
         reflecting = g.stage("object bounce light", own.reflect, changed, scene)
         return g.stage("cones", own.write_fields, changed, reflecting, scene, grid, hidden)
 
-    nothing: Resource[dict[str, Binding]] = g.stage("marching", lambda _: {}, volume)
+    nothing = g.value("marching", no_bindings, volume)
     return shading_stages(g, s, shading, lit, volume, shown, nothing, trace)
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from operator import eq
+from typing import Any
 
 import moderngl
 import numpy as np
@@ -43,19 +44,19 @@ class LitScene:
     """The lights' buffers and the resources that follow them.
 
     `real_maps` and `object_maps`: depth maps of the real scene and of the objects; `mirrored`: where smooth planes
-    mirror the lights. The value of each is `buffers`, which all of them fill a part of.
+    mirror the lights, if the method heeds that. All of them fill a part of `buffers`.
     """
 
     buffers: LightBuffers
-    environment: Resource[LightBuffers]
+    environment: Resource[Any]
     real_maps: Resource[LightBuffers]
     object_maps: Resource[LightBuffers]
-    mirrored: Resource[LightBuffers]
+    mirrored: tuple[Resource[moderngl.TextureArray | None], ...] = ()
 
     @property
-    def all(self) -> tuple[Resource[LightBuffers], ...]:
+    def all(self) -> tuple[Resource[Any], ...]:
         """Everything that shading under these lights depends on."""
-        return self.environment, self.real_maps, self.object_maps, self.mirrored
+        return self.environment, self.real_maps, self.object_maps, *self.mirrored
 
 
 class LightStages:
@@ -69,10 +70,9 @@ class LightStages:
         self._maps = ShadowMaps(gpu)
         self._visibility = MirrorVisibility(gpu)
 
-    def set_environment(self, lights: LightSet) -> LightBuffers:
+    def set_environment(self, lights: LightSet) -> moderngl.TextureArray:
         """Uploads the residual environment."""
-        self.buffers.set_environment(lights.environment)
-        return self.buffers
+        return self.buffers.set_environment(lights.environment)
 
     def fit_views(
         self, lights: LightSet, real: GeometryState, extent: Points, surfaces: SurfaceTable, everywhere: bool
@@ -101,11 +101,12 @@ class LightStages:
 
     def map_mirrors(
         self, _views: LightBuffers, _real: LightBuffers, _objects: LightBuffers, seen: Observation
-    ) -> LightBuffers:
-        """Maps where smooth planes show the lights."""
-        if self.buffers.mirrors:
-            self._visibility.run(self.buffers, seen.scan.bias_m, {**seen.bindings, **self.buffers.bindings})
-        return self.buffers
+    ) -> moderngl.TextureArray | None:
+        """Maps where smooth planes show the lights; None where no plane does."""
+        if not self.buffers.mirrors:
+            return None
+        self._visibility.run(self.buffers, seen.scan.bias_m, {**seen.bindings, **self.buffers.bindings})
+        return self.buffers.mirror_visibility
 
     def release(self) -> None:
         """Frees the GL objects."""
@@ -117,27 +118,46 @@ def light_stages(
     g: Graph, s: FrameResources, resolved: ResolvedSettings, shadow_samples: int, *, mirrors: bool = False
 ) -> LitScene:
     """Environment, views, depth maps of both geometries, and what smooth planes mirror of the lights."""
+    g.section("lights")
     stages = LightStages(g.gpu, resolved.rsm_size, shadow_samples, mirrors=mirrors)
     extent = object_extent(g, s)
     environment = g.stage("environment", stages.set_environment, s.lights)
     views = g.stage("light views", stages.fit_views, s.lights, s.real, extent, s.surfaces, s.everywhere)
-    real_views = g.stage("light views real", lambda lights: lights.real_records, views, same=eq)
-    object_views = g.stage("light views objects", lambda lights: lights.virtual_records, views, same=eq)
+    real_views = g.value("light views real", real_records, views, same=eq)
+    object_views = g.value("light views objects", object_records, views, same=eq)
     real_maps = g.stage("shadow maps real", stages.draw_real, real_views, s.real)
     object_maps = g.stage("shadow maps objects", stages.draw_objects, object_views, s.objects)
-    mirrored = environment
+    mirrored = []
     if mirrors:
-        mirrored = g.stage(
-            "mirror visibility", stages.map_mirrors, views, real_maps, object_maps, s.observation
-        )
-    return LitScene(stages.buffers, environment, real_maps, object_maps, mirrored)
+        given = views, real_maps, object_maps, s.observation
+        mirrored = [g.stage("mirror visibility", stages.map_mirrors, *given, same=_both_none)]
+    return LitScene(stages.buffers, environment, real_maps, object_maps, tuple(mirrored))
+
+
+def real_records(lights: LightBuffers) -> bytes:
+    """Records of the views of real shadows: another value only where a view changed."""
+    return lights.real_records
+
+
+def object_records(lights: LightBuffers) -> bytes:
+    """Records of the views of the objects' shadows: another value only where a view changed."""
+    return lights.virtual_records
+
+
+def _both_none(old: object, new: object) -> bool:
+    return old is None and new is None
 
 
 def object_extent(g: Graph, s: FrameResources) -> Resource[Points]:
     """Points that enclose the objects at all times of their animations, for fitting volumes and light views."""
     if "object extent" in g:
         return g.resource("object extent")
-    return g.stage("object extent", lambda objects: objects.lasting_points, s.objects, same=np.array_equal)
+    return g.value("object extent", _lasting_points, s.objects, same=np.array_equal)
+
+
+def _lasting_points(objects: GeometryState) -> Points:
+    """Points that enclose the objects at all times of their animations."""
+    return objects.lasting_points
 
 
 def volume_placement(
@@ -146,9 +166,15 @@ def volume_placement(
     """The cube of voxels or cells around the objects."""
 
     def place(extent: Points) -> VolumePlacement:
+        """Places a cube around the objects, snapped to its cells."""
         return place_volume(extent.min(axis=0), extent.max(axis=0), size, edge_m)
 
-    return g.stage("volume placement", place, object_extent(g, s), same=eq)
+    return g.value("volume placement", place, object_extent(g, s), same=eq)
+
+
+def no_bindings(_: object) -> dict[str, Binding]:
+    """What cones march through, of a method that marches none."""
+    return {}
 
 
 def surfel_scene(
@@ -243,7 +269,7 @@ class Shading:
         view: CameraView,
         volume: PlacedVolume,
         everywhere: bool,
-        *_lights: LightBuffers,
+        *_lights: object,
     ) -> dict[str, Binding]:
         """Bindings of what stages at pixels read: geometry, lights, volume, and what follows from them."""
         low, high = objects.bounds
@@ -368,7 +394,8 @@ def shading_stages(
     light_directly: Callable[..., DirectLight] | None = None,
 ) -> Layers:
     """Grid, cones (declared by `trace`), caustics, direct light, reflections, change of light, objects."""
-    scene = g.stage(
+    g.section("shading")
+    scene = g.value(
         "shading scene",
         shading.scene,
         s.geometry,

@@ -134,7 +134,7 @@ class LpvVolumes:
         albedo: AlbedoTexture,
         volume: PlacedVolume,
         _lights: LightSet,
-        _environment: LightBuffers,
+        _environment: moderngl.TextureArray,
         lights: LightBuffers,
     ) -> dict[str, Binding]:
         """Bindings of what injects the real scene's light."""
@@ -285,7 +285,7 @@ def lpv_stages(
 ) -> tuple[Resource[LightVolume | None], Resource[LightVolume], Resource[LightVolume | None]]:
     """Inject, block, propagate: V_mu of the real scene, V_rho with the objects, the paper's V_delta."""
     real = g.stage("voxelize real", volumes.voxelize_real, s.real, volume)
-    scene = g.stage(
+    scene = g.value(
         "inject scene",
         volumes.real_scene,
         s.observation,
@@ -299,7 +299,7 @@ def lpv_stages(
     through_real = g.stage("geometry volume real", volumes.cover_real, real, volume)
     mu = g.stage("propagate mu", volumes.propagate_mu, real_light, through_real)
     objects = g.stage("voxelize objects", volumes.voxelize_objects, s.objects, volume)
-    joint = g.stage("inject scene joint", volumes.joint_scene, scene, s.objects, lit.object_maps)
+    joint = g.value("inject scene joint", volumes.joint_scene, scene, s.objects, lit.object_maps)
     change = g.stage("inject change", volumes.inject_change, objects, joint, lit.object_maps, real_light)
     through = g.stage("geometry volume", volumes.cover_joint, objects, volume, through_real)
     first = g.stage("propagate rho", volumes.propagate_rho, real_light, change, through)
@@ -313,9 +313,10 @@ def dlpv(g: Graph, s: FrameResources, setup: Setup[DlpvMethod]) -> Layers:
     """V_rho and V_mu subtracted, or the paper's one volume of the change."""
     settings, resolved, size = setup.settings, setup.resolved, setup.picture_size
     lit = light_stages(g, s, resolved, settings.shadow_samples)
+    g.section("propagation volumes")
     placement = volume_placement(g, s, resolved.volume_size, settings.volume_edge_m)
     volumes = LpvVolumes(g.gpu, settings, resolved.volume_size)
-    volume = g.stage("volume", volumes.place, placement)
+    volume = g.value("volume", volumes.place, placement)
     mu, rho, delta = lpv_stages(g, s, lit, volumes, volume)
     shown = g.stage("shown cells", volumes.show, "inject change", "inject shadow", volume)
     options = ShadingOptions(
@@ -326,7 +327,7 @@ def dlpv(g: Graph, s: FrameResources, setup: Setup[DlpvMethod]) -> Layers:
     direct = DirectLight(g.gpu, size, objects_shadow=settings.resolved_shadow == "map")
     shading = Shading(g.gpu, size, resolved, lit.buffers, direct, options)
     fields = LpvFields(g.gpu, volumes, shading.cones)
-    marching = g.stage("marching", fields.marching, rho)
+    marching = g.value("marching", fields.marching, rho)
 
     def read(scene: Resource[Bindings], grid: Resource[LowResGrid]) -> Resource[ConeFields]:
         return g.stage("cones", fields.read, scene, grid, mu, rho, delta)
