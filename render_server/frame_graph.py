@@ -143,7 +143,11 @@ class FrameGraph:
         self.graph = Graph(gpu, timers, checks=checks)
         self.graph.own(self.buffers)
         self.resources: FrameResources = declare_frame(self.graph, self.buffers)
-        self.layers: Layers = method.declare(self.graph, self.resources, method.setup(view.size, fields))
+        try:
+            self.layers: Layers = method.declare(self.graph, self.resources, method.setup(view.size, fields))
+        except BaseException:
+            self.release()
+            raise
         self._options: Resource[CompositeOptions] = self.graph.source("output", "scene")
         self._composite = self._declare_composition(Composition(gpu, view.size))
         self._inputs: FrameInputs | None = None

@@ -27,14 +27,15 @@ from render_server.methods.lighting import (
     shadow_receivers,
     volume_placement,
 )
-from render_server.methods.settings import ResolvedSettings, Setup, march_defines
+from render_server.methods.method import RelightingMethod
+from render_server.methods.settings import ResolvedSettings, Setup, march_defines, resolve_joint_maps
 from render_server.methods.voxel_volumes import SolutionVoxels, solution_stages
 from render_server.passes.caustics import Caustics
 from render_server.passes.cones import ConeFields, LowResGrid, TraceCones
 from render_server.passes.lights import LightBuffers
 from render_server.passes.shading import DirectLightPair
 from render_server.passes.shadow_maps import ShadowMaps
-from render_server.passes.voxels import VoxelMipmap
+from render_server.passes.voxels import DIRECTIONS, VoxelMipmap, memory_statement
 
 
 class TwoSolutions:
@@ -142,3 +143,15 @@ def differential(g: Graph, s: FrameResources, setup: Setup[DifferentialMethod]) 
     volume = g.stage("volume", lambda voxels: voxels.real.volume, lit_voxels)
     joint = g.stage("joint voxels", lambda voxels: voxels.rho, lit_voxels)
     return shading_stages(g, s, shading, lit, volume, joint, marching, trace, two.light_directly)
+
+
+def state_memory(settings: DifferentialMethod, resolved: ResolvedSettings) -> str:
+    """One sentence on the memory of one solution's volumes.
+
+    Raises:
+        DeltalightError: it is beyond the budget.
+    """
+    return memory_statement(resolved.volume_size, DIRECTIONS, settings.memory_budget_mb)
+
+
+DIFFERENTIAL = RelightingMethod(DifferentialMethod, differential, resolve_joint_maps, state_memory)

@@ -13,7 +13,8 @@ from render_server.methods.lighting import (
     shading_stages,
     volume_placement,
 )
-from render_server.methods.settings import Setup, march_defines
+from render_server.methods.method import RelightingMethod
+from render_server.methods.settings import ResolvedSettings, Setup, march_defines, resolve_voxel_cones
 from render_server.methods.voxel_volumes import (
     DeltaVoxels,
     InjectedVoxels,
@@ -22,7 +23,7 @@ from render_server.methods.voxel_volumes import (
 )
 from render_server.passes.cones import ConeFields, LowResGrid, TraceCones, TraceConesPaper
 from render_server.passes.shading import DirectLight
-from render_server.passes.voxels import DIRECTIONS, PlacedVolume, VoxelMipmap
+from render_server.passes.voxels import DIRECTIONS, PlacedVolume, VoxelMipmap, memory_statement
 
 
 class ExactCones:
@@ -128,3 +129,22 @@ def dvct_paper(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
     joint: Resource[VoxelMipmap] = g.stage("joint voxels", lambda voxels: voxels.rho, injected)
     nothing: Resource[dict[str, Binding]] = g.stage("marching", lambda _: {}, injected)
     return shading_stages(g, s, shading, lit, volume, joint, nothing, trace)
+
+
+def dvct(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
+    """The operator that the settings name."""
+    declare = dvct_exact if setup.settings.operator == "exact" else dvct_paper
+    return declare(g, s, setup)
+
+
+def state_memory(settings: DvctMethod, resolved: ResolvedSettings) -> str:
+    """One sentence on the volumes' memory.
+
+    Raises:
+        DeltalightError: it is beyond the budget.
+    """
+    directions = DIRECTIONS if settings.operator == "exact" else 1
+    return memory_statement(resolved.volume_size, directions, settings.memory_budget_mb)
+
+
+DVCT = RelightingMethod(DvctMethod, dvct, resolve_voxel_cones, state_memory)
