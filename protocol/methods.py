@@ -18,7 +18,7 @@ GROUP = "deltalight.methods"
 class InstalledMethod:
     """A method of a plugin.
 
-    `value` is what its entry point names: a `RelightingMethod` of the renderer, of which only `settings` is known here.
+    `value` is what its entry point names: a `RelightingMethod` of the renderer, of which only `settings` is known.
     Processes that have no OpenGL load it too, to check documents.
     """
 

@@ -102,7 +102,7 @@ class Composition:
         relit = RelitLayers(scene["object_coverage"], *layers)
         self._composite.run(image, relit, {**scene, **options.bindings})
         view = options.output.view
-        if view == "volume":
+        if view == "volume" and relit.voxels is not None:
             self._views.volume(self._composite.code, image, relit.voxels, relit.volume, scene)
         elif view == "rsm":
             self._views.shadow_maps(self._composite.code, relit.lights)

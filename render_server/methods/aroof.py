@@ -137,8 +137,7 @@ class FieldShading:
         low, high = objects.bounds
         reach = [float(item.place["object_radius"]) * float(item.place["object_scale"]) for item in items]  # type: ignore[arg-type]
         edge = float(np.max(high - low)) + 2 * self._settings.reach * max(reach)
-        self._volume.place(place_volume(low, high, self._cells, edge))
-        return self._volume
+        return self._volume.place(place_volume(low, high, self._cells, edge))
 
     def show(self, items: list[FieldObject], volume: PlacedVolume) -> VoxelMipmap:
         """Cells of what the fields hide."""
@@ -261,8 +260,7 @@ def aroof(g: Graph, s: FrameResources, setup: Setup[AroofMethod]) -> Layers:
         reflecting = g.stage("object bounce light", own.reflect, changed, scene)
         return g.stage("cones", own.write_fields, changed, reflecting, scene, grid, hidden)
 
-    nothing: Resource[dict[str, Binding]] = g.stage("marching", lambda _: {}, volume)
-    return shading_stages(g, s, shading, lit, volume, shown, nothing, trace)
+    return shading_stages(g, s, shading, lit, volume, trace, voxels=shown)
 
 
 def field_settings(settings: AroofMethod) -> FieldSettings:

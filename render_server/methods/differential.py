@@ -100,7 +100,7 @@ class TwoSolutions:
         return fields
 
     def light_directly(
-        self, scene: Bindings, grid: LowResGrid, _caustics: Caustics | None, _voxels: VoxelMipmap
+        self, scene: Bindings, grid: LowResGrid, _caustics: Caustics | None, _voxels: VoxelMipmap | None
     ) -> DirectLightPair:
         """Direct light under each solution's own maps."""
         self.direct.run_both(self.mu, self.rho, grid, scene)
@@ -142,7 +142,9 @@ def differential(g: Graph, s: FrameResources, setup: Setup[DifferentialMethod]) 
 
     volume = g.stage("volume", lambda voxels: voxels.real.volume, lit_voxels)
     joint = g.stage("joint voxels", lambda voxels: voxels.rho, lit_voxels)
-    return shading_stages(g, s, shading, lit, volume, joint, marching, trace, two.light_directly)
+    return shading_stages(
+        g, s, shading, lit, volume, trace, voxels=joint, marching=marching, light_directly=two.light_directly
+    )
 
 
 def state_memory(settings: DifferentialMethod, resolved: ResolvedSettings) -> str:

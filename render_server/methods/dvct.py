@@ -87,7 +87,7 @@ def dvct_exact(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
         return g.stage("cones", cones.trace_objects, real, scene, grid, marching)
 
     volume = g.stage("volume", lambda voxels: voxels.volume, "voxelize real")
-    return shading_stages(g, s, shading, lit, volume, rho, marching, trace)
+    return shading_stages(g, s, shading, lit, volume, trace, voxels=rho, marching=marching)
 
 
 class PaperCones:
@@ -127,8 +127,7 @@ def dvct_paper(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
 
     volume: Resource[PlacedVolume] = g.stage("volume", lambda voxels: voxels.real.volume, injected)
     joint: Resource[VoxelMipmap] = g.stage("joint voxels", lambda voxels: voxels.rho, injected)
-    nothing: Resource[dict[str, Binding]] = g.stage("marching", lambda _: {}, injected)
-    return shading_stages(g, s, shading, lit, volume, joint, nothing, trace)
+    return shading_stages(g, s, shading, lit, volume, trace, voxels=joint)
 
 
 def dvct(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:

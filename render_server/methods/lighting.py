@@ -204,7 +204,7 @@ class Layers:
     change: Resource[ChangeRatio]
     radiance: Resource[moderngl.Texture]
     reflection: Resource[moderngl.Texture | None]
-    voxels: Resource[VoxelMipmap]
+    voxels: Resource[VoxelMipmap | None]
     volume: Resource[PlacedVolume]
     lights: Resource[LightBuffers]
 
@@ -283,10 +283,11 @@ class Shading:
         return self._caustics
 
     def light_directly(
-        self, scene: Bindings, grid: LowResGrid, caustics: Caustics | None, voxels: VoxelMipmap
+        self, scene: Bindings, grid: LowResGrid, caustics: Caustics | None, voxels: VoxelMipmap | None
     ) -> DirectLight:
         """Lights the real surfaces by the lights themselves."""
-        self._direct.run(grid, scene, joint=voxels.texture, caustics=caustics)
+        joint = None if voxels is None else voxels.texture
+        self._direct.run(grid, scene, joint=joint, caustics=caustics)
         return self._direct
 
     def reflect_objects(
@@ -363,12 +364,18 @@ def shading_stages(
     shading: Shading,
     lit: LitScene,
     volume: Resource[PlacedVolume],
-    voxels: Resource[VoxelMipmap],
-    marching: Resource[dict[str, Binding]],
     trace: Callable[[Resource[Bindings], Resource[LowResGrid]], Resource[ConeFields]],
+    *,
+    voxels: Resource[VoxelMipmap] | None = None,
+    marching: Resource[dict[str, Binding]] | None = None,
     light_directly: Callable[..., DirectLight] | None = None,
 ) -> Layers:
-    """Grid, cones (declared by `trace`), caustics, direct light, reflections, change of light, objects."""
+    """Grid, cones (declared by `trace`), caustics, direct light, reflections, change of light, objects.
+
+    `voxels`: what the `volume` holds, if anything; `marching`: bindings of what rays march through, if they do.
+    """
+    voxels = voxels or g.stage("voxels", lambda _: None, volume)
+    marching = marching or g.stage("marching", lambda _: {}, volume)
     scene = g.stage(
         "shading scene",
         shading.scene,

@@ -331,7 +331,7 @@ def dlpv(g: Graph, s: FrameResources, setup: Setup[DlpvMethod]) -> Layers:
     def read(scene: Resource[Bindings], grid: Resource[LowResGrid]) -> Resource[ConeFields]:
         return g.stage("cones", fields.read, scene, grid, mu, rho, delta)
 
-    return shading_stages(g, s, shading, lit, volume, shown, marching, read)
+    return shading_stages(g, s, shading, lit, volume, read, voxels=shown, marching=marching)
 
 
 def resolve(settings: DlpvMethod, defaults: ResolvedSettings) -> ResolvedSettings:

@@ -28,8 +28,8 @@ _BY_SETTINGS = {method.settings: method for method in BUILT_IN}
 class MethodChoice:
     """A method whose settings and memory were checked.
 
-    `remark`: a sentence for the user, or none. `relights_real`: objects change the real scene's light too. `plugin`: what
-    the method comes from, unless it is the project's own.
+    `remark`: a sentence for the user, or none. `relights_real`: the real scene changes too.
+    `plugin`: what the method comes from, unless it is the project's own.
     """
 
     method: RelightingMethod[Any]
