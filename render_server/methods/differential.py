@@ -30,7 +30,8 @@ from render_server.methods.lighting import (
     shadow_receivers,
     volume_placement,
 )
-from render_server.methods.settings import ResolvedSettings, Setup, march_defines
+from render_server.methods.method import RelightingMethod
+from render_server.methods.settings import ResolvedSettings, Setup, march_defines, resolve_joint_maps
 from render_server.methods.voxel_volumes import (
     SolutionVoxels,
     joint_voxels,
@@ -43,7 +44,7 @@ from render_server.passes.gbuffer import MeshBuffers
 from render_server.passes.lights import LightBuffers
 from render_server.passes.shading import DirectLightPair
 from render_server.passes.shadow_maps import ShadowMaps
-from render_server.passes.voxels import VoxelMipmap
+from render_server.passes.voxels import DIRECTIONS, VoxelMipmap, memory_statement
 
 
 class SolutionLights:
@@ -87,7 +88,7 @@ class SolutionLights:
         return buffers
 
     def light_directly(
-        self, scene: Bindings, grid: LowResGrid, _caustics: Caustics | None, _voxels: VoxelMipmap
+        self, scene: Bindings, grid: LowResGrid, _caustics: Caustics | None, _voxels: VoxelMipmap | None
     ) -> DirectLightPair:
         """Lights the real surfaces under each solution's own maps."""
         self.direct.run_both(self.mu, self.rho, grid, scene)
@@ -162,4 +163,26 @@ def differential(g: Graph, s: FrameResources, setup: Setup[DifferentialMethod]) 
     lit = LitScene(lights.rho, environment, rho_maps, mu_maps)
     volume = g.value("volume", placed_volume, "voxelize real")
     joint = g.value("joint voxels", joint_voxels, lit_voxels)
-    return shading_stages(g, s, shading, lit, volume, joint, marching, trace, lights.light_directly)
+    return shading_stages(
+        g,
+        s,
+        shading,
+        lit,
+        volume,
+        trace,
+        voxels=joint,
+        marching=marching,
+        light_directly=lights.light_directly,
+    )
+
+
+def state_memory(settings: DifferentialMethod, resolved: ResolvedSettings) -> str:
+    """One sentence on the memory of one solution's volumes.
+
+    Raises:
+        DeltalightError: it is beyond the budget.
+    """
+    return memory_statement(resolved.volume_size, DIRECTIONS, settings.memory_budget_mb)
+
+
+DIFFERENTIAL = RelightingMethod(DifferentialMethod, differential, resolve_joint_maps, state_memory)

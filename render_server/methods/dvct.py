@@ -10,11 +10,11 @@ from render_server.methods.lighting import (
     Shading,
     ShadingOptions,
     light_stages,
-    no_bindings,
     shading_stages,
     volume_placement,
 )
-from render_server.methods.settings import Setup, march_defines
+from render_server.methods.method import RelightingMethod
+from render_server.methods.settings import ResolvedSettings, Setup, march_defines, resolve_voxel_cones
 from render_server.methods.voxel_volumes import (
     DeltaVoxels,
     InjectedVoxels,
@@ -25,7 +25,7 @@ from render_server.methods.voxel_volumes import (
 )
 from render_server.passes.cones import ConeFields, LowResGrid, TraceCones, TraceConesPaper
 from render_server.passes.shading import DirectLight
-from render_server.passes.voxels import DIRECTIONS, VoxelMipmap
+from render_server.passes.voxels import DIRECTIONS, VoxelMipmap, memory_statement
 
 
 class ExactCones:
@@ -90,7 +90,7 @@ def dvct_exact(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
         return g.stage("cones", cones.trace_objects, real, scene, grid, marching)
 
     volume = g.value("volume", placed_volume, "voxelize real")
-    return shading_stages(g, s, shading, lit, volume, rho, marching, trace)
+    return shading_stages(g, s, shading, lit, volume, trace, voxels=rho, marching=marching)
 
 
 class PaperCones:
@@ -131,5 +131,23 @@ def dvct_paper(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
 
     volume = g.value("volume", placed_volume, "voxelize real")
     joint = g.value("joint voxels", joint_voxels, injected)
-    nothing = g.value("marching", no_bindings, injected)
-    return shading_stages(g, s, shading, lit, volume, joint, nothing, trace)
+    return shading_stages(g, s, shading, lit, volume, trace, voxels=joint)
+
+
+def dvct(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
+    """The operator that the settings name."""
+    declare = dvct_exact if setup.settings.operator == "exact" else dvct_paper
+    return declare(g, s, setup)
+
+
+def state_memory(settings: DvctMethod, resolved: ResolvedSettings) -> str:
+    """One sentence on the volumes' memory.
+
+    Raises:
+        DeltalightError: it is beyond the budget.
+    """
+    directions = DIRECTIONS if settings.operator == "exact" else 1
+    return memory_statement(resolved.volume_size, directions, settings.memory_budget_mb)
+
+
+DVCT = RelightingMethod(DvctMethod, dvct, resolve_voxel_cones, state_memory)

@@ -172,6 +172,10 @@ def volume_placement(
     return g.value("volume placement", place, object_extent(g, s), same=eq)
 
 
+def no_voxels(_: object) -> None:
+    """Of a method whose volume holds none."""
+
+
 def no_bindings(_: object) -> dict[str, Binding]:
     """What cones march through, of a method that marches none."""
     return {}
@@ -229,7 +233,7 @@ class Layers:
     change: Resource[ChangeRatio]
     radiance: Resource[moderngl.Texture]
     reflection: Resource[moderngl.Texture | None]
-    voxels: Resource[VoxelMipmap]
+    voxels: Resource[VoxelMipmap | None]
     volume: Resource[PlacedVolume]
     lights: Resource[LightBuffers]
 
@@ -308,10 +312,11 @@ class Shading:
         return self._caustics
 
     def light_directly(
-        self, scene: Bindings, grid: LowResGrid, caustics: Caustics | None, voxels: VoxelMipmap
+        self, scene: Bindings, grid: LowResGrid, caustics: Caustics | None, voxels: VoxelMipmap | None
     ) -> DirectLight:
         """Lights the real surfaces by the lights themselves."""
-        self._direct.run(grid, scene, joint=voxels.texture, caustics=caustics)
+        joint = None if voxels is None else voxels.texture
+        self._direct.run(grid, scene, joint=joint, caustics=caustics)
         return self._direct
 
     def reflect_objects(
@@ -388,12 +393,18 @@ def shading_stages(
     shading: Shading,
     lit: LitScene,
     volume: Resource[PlacedVolume],
-    voxels: Resource[VoxelMipmap],
-    marching: Resource[dict[str, Binding]],
     trace: Callable[[Resource[Bindings], Resource[LowResGrid]], Resource[ConeFields]],
+    *,
+    voxels: Resource[VoxelMipmap] | None = None,
+    marching: Resource[dict[str, Binding]] | None = None,
     light_directly: Callable[..., DirectLight] | None = None,
 ) -> Layers:
-    """Grid, cones (declared by `trace`), caustics, direct light, reflections, change of light, objects."""
+    """Grid, cones (declared by `trace`), caustics, direct light, reflections, change of light, objects.
+
+    `voxels`: what the `volume` holds, if anything; `marching`: bindings of what rays march through, if they do.
+    """
+    shown: Resource[Any] = voxels or g.value("voxels", no_voxels, volume)
+    marching = marching or g.value("marching", no_bindings, volume)
     g.section("shading")
     scene = g.value(
         "shading scene",
@@ -410,12 +421,12 @@ def shading_stages(
     grid = g.stage("low res grid", shading.choose_pixels, scene)
     cones = trace(scene, grid)
     caustics = g.stage("caustics", shading.cast_caustics, scene, grid, bvh, s.observation, volume)
-    direct = g.stage("direct light", light_directly or shading.light_directly, scene, grid, caustics, voxels)
+    direct = g.stage("direct light", light_directly or shading.light_directly, scene, grid, caustics, shown)
     reflection = g.stage("reflections", shading.reflect_objects, scene, grid, bvh, marching)
     change = g.stage("change of light", shading.compare, grid, direct, cones, reflection)
     screen = g.stage("screen cones", shading.trace_screen, scene, direct, cones, bvh, s.observation, marching)
     radiance = g.stage("virtual surface", shading.shade_objects, scene, grid, cones, caustics, screen)
-    return Layers(direct, cones, grid, change, radiance, reflection, voxels, volume, lit.real_maps)
+    return Layers(direct, cones, grid, change, radiance, reflection, shown, volume, lit.real_maps)
 
 
 def shadow_receivers(real: GeometryState, extent: Points) -> Points:

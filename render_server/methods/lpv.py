@@ -24,7 +24,8 @@ from render_server.methods.lighting import (
     surfel_scene,
     volume_placement,
 )
-from render_server.methods.settings import Setup
+from render_server.methods.method import RelightingMethod
+from render_server.methods.settings import ResolvedSettings, Setup
 from render_server.passes.cones import ConeFields, LowResGrid
 from render_server.passes.lights import LightBuffers
 from render_server.passes.lpv import (
@@ -332,4 +333,17 @@ def dlpv(g: Graph, s: FrameResources, setup: Setup[DlpvMethod]) -> Layers:
     def read(scene: Resource[Bindings], grid: Resource[LowResGrid]) -> Resource[ConeFields]:
         return g.stage("cones", fields.read, scene, grid, mu, rho, delta)
 
-    return shading_stages(g, s, shading, lit, volume, shown, marching, read)
+    return shading_stages(g, s, shading, lit, volume, read, voxels=shown, marching=marching)
+
+
+def resolve(settings: DlpvMethod, defaults: ResolvedSettings) -> ResolvedSettings:
+    """Takes the document's values, or the machine's defaults where it says null."""
+    return ResolvedSettings(
+        settings.volume_size,
+        settings.query_scale or defaults.cone_scale,
+        settings.rsm_size or defaults.rsm_size,
+        settings.triangle_budget or defaults.triangle_budget,
+    )
+
+
+DLPV = RelightingMethod(DlpvMethod, dlpv, resolve)

@@ -109,10 +109,11 @@ class PlacedVolume:
         """The uniform block of the current placement."""
         return {"Volume": self._block}
 
-    def place(self, placement: VolumePlacement) -> None:
-        """Moves the volume."""
+    def place(self, placement: VolumePlacement) -> "PlacedVolume":
+        """Moves the volume and returns it."""
         self._placement = placement
         self._block.write(placement.block())
+        return self
 
     def release(self) -> None:
         """Frees the block."""
