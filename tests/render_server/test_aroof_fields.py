@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import trimesh
 from jaxtyping import Float64
-from render_server.relight.frame import PlacedObject
 
+from render_server.gpu_scene import PlacedObject
 from render_server.lights.octahedral import even_directions, harmonics
 from render_server.occlusion_fields import (
     OcclusionFields,

@@ -193,9 +193,9 @@ def environment(gpu: GpuContext, document: SceneDocument) -> tuple[Float32[np.nd
     """The environment that a renderer uses after its first frame, and its picture."""
     renderer = SceneRenderer(gpu, document)
     color = renderer.render(frame(plain(120))).color.tobytes()
-    lights = renderer._relighting.lighting.lights
+    assert renderer.graph is not None
+    lights = renderer.graph["light set"]
     renderer.release()
-    assert lights is not None
     return lights.environment, color
 
 

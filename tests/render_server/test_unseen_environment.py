@@ -1,4 +1,4 @@
-"""Light of what is out of sight, found on the board's paper."""
+"""Light of the unseen environment, found on the board's paper."""
 
 from pathlib import Path
 
