@@ -26,6 +26,7 @@ def document(tmp_path: Path) -> SceneDocument:
     return everyday(Stage(tmp_path))
 
 
+@pytest.mark.slow
 def test_no_frame_is_lost_and_none_shows_what_was_before(gpu: GpuContext, document: SceneDocument) -> None:
     renderer = SceneRenderer(gpu, document)
     eyes = [(0.25, -0.9, 0.65), (0.3, -0.9, 0.63)]
