@@ -118,6 +118,7 @@ PANELS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PANELS)
 def test_irradiance_of_a_rectangle(gpu: GpuContext, stage: Stage, name: str) -> None:
     """Floor and a wall, so that both see the light under all angles, some of it below their horizon."""

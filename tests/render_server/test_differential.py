@@ -136,6 +136,7 @@ def grey_world() -> float:
     return float(2 * decode_lut(None)[GREY, 0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", ["cube", "ball"])
 def test_an_inserted_object_lights_as_if_it_were_real(gpu: GpuContext, stage: Stage, shape: str) -> None:
     """E_rho of an inserted object is E_mu of a renderer to which the object is part of the given model, where both

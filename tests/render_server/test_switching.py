@@ -21,6 +21,7 @@ def document(tmp_path: Path) -> SceneDocument:
     return everyday(Stage(tmp_path))
 
 
+@pytest.mark.slow
 def test_no_frame_is_lost_and_none_shows_what_was_before(gpu: GpuContext, document: SceneDocument) -> None:
     # A renderer that is shown another scene does not wait for occlusion fields: here they are on disk before.
     composite(gpu, document.replaced(method=METHODS["aroof"]), frame())
