@@ -16,9 +16,9 @@ from protocol.scene import SceneDocument, parse_scene
 from protocol.scene_method import AroofMethod
 from render_server.gpu.context import GpuContext
 from render_server.lights.octahedral import even_directions, harmonics, octahedral_grid
+from render_server.occlusion_fields import compute_field
 from render_server.passes.occlusion_fields import LightProbeCapture
 from render_server.renderer import SceneRenderer
-from render_server.scene.occlusion_cache import compute_field
 from render_server.scene.occlusion_field import OcclusionField
 from tests.render_server.scenes import (
     Fields,
