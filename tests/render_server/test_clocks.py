@@ -17,8 +17,8 @@ from tests.render_server.scenes import Stage, ball, checkered, directional, fram
 
 pytestmark = pytest.mark.usefixtures("clean_gl")
 
-LIGHT = {"declared surfaces", "environment", "object extent", "object bvh", "light views", "light views real"}
-MAPS = {"light views objects", "shadow maps real", "shadow maps objects"}
+LIGHT = {"declared surfaces", "environment", "object extent", "object bvh", "light views"}
+MAPS = {"shadow maps real", "shadow maps objects"}
 VOXELS = {"volume placement", "volume", "voxelize real", "voxelize objects"}
 CELLS = {"geometry volume real", "geometry volume"}
 STANDING = {
