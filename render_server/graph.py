@@ -166,10 +166,15 @@ class Graph:
         self._sections.append((len(self._stages), name))
 
     def stages(
-        self, name: str, function: Callable[..., Any], *inputs: Resource[Any] | str, outputs: Sequence[str]
+        self,
+        name: str,
+        function: Callable[..., Any],
+        *inputs: Resource[Any] | str,
+        outputs: Sequence[str],
+        same: Same | None = None,
     ) -> tuple[Resource[Any], ...]:
         """Declares a stage whose function returns a value for each of the `outputs`."""
-        return self._add(name, function, inputs, tuple(outputs), None)
+        return self._add(name, function, inputs, tuple(outputs), same)
 
     def _add(
         self,

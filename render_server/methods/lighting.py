@@ -76,13 +76,16 @@ class LightStages:
 
     def fit_views(
         self, lights: LightSet, real: GeometryState, extent: Points, surfaces: SurfaceTable, everywhere: bool
-    ) -> LightBuffers:
-        """Fits the views: of real shadows around the objects (or `everywhere`), and closely around the objects."""
+    ) -> tuple[bytes, bytes]:
+        """Fits the views: of real shadows around the objects (or `everywhere`), and closely around the objects.
+
+        Returns the records of both, which tell whether their maps are still those of the views.
+        """
         receivers = real.points if everywhere else shadow_receivers(real, extent)
         shining = list(lights.lights)
         mirrors = mirror_lights(shining, surfaces, np.mean(extent, axis=0)) if self._mirrors else []
         self.buffers.place(shining, real.points, receivers, extent, mirrors)
-        return self.buffers
+        return self.buffers.real_records, self.buffers.virtual_records
 
     def draw_real(self, _views: bytes, real: GeometryState) -> LightBuffers:
         """Draws the real scene as the lights see it."""
@@ -122,9 +125,9 @@ def light_stages(
     stages = LightStages(g.gpu, resolved.rsm_size, shadow_samples, mirrors=mirrors)
     extent = object_extent(g, s)
     environment = g.stage("environment", stages.set_environment, s.lights)
-    views = g.stage("light views", stages.fit_views, s.lights, s.real, extent, s.surfaces, s.everywhere)
-    real_views = g.value("light views real", real_records, views, same=eq)
-    object_views = g.value("light views objects", object_records, views, same=eq)
+    fitted = s.lights, s.real, extent, s.surfaces, s.everywhere
+    views = "light views real", "light views objects"
+    real_views, object_views = g.stages("light views", stages.fit_views, *fitted, outputs=views, same=eq)
     real_maps = g.stage("shadow maps real", stages.draw_real, real_views, s.real)
     object_maps = g.stage("shadow maps objects", stages.draw_objects, object_views, s.objects)
     mirrored = []
@@ -132,16 +135,6 @@ def light_stages(
         given = views, real_maps, object_maps, s.observation
         mirrored = [g.stage("mirror visibility", stages.map_mirrors, *given, same=_both_none)]
     return LitScene(stages.buffers, environment, real_maps, object_maps, tuple(mirrored))
-
-
-def real_records(lights: LightBuffers) -> bytes:
-    """Records of the views of real shadows: another value only where a view changed."""
-    return lights.real_records
-
-
-def object_records(lights: LightBuffers) -> bytes:
-    """Records of the views of the objects' shadows: another value only where a view changed."""
-    return lights.virtual_records
 
 
 def _both_none(old: object, new: object) -> bool:
