@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterator
 
 import moderngl
+import numpy as np
 
 GPU_KINDS = (moderngl.Texture, moderngl.Texture3D, moderngl.TextureArray, moderngl.Buffer)
 OWN_CODE = "render_server."
@@ -39,5 +40,4 @@ def _size(item: object) -> int:
         return int(item.size)
     assert isinstance(item, moderngl.Texture | moderngl.Texture3D | moderngl.TextureArray)
     texels = math.prod(item.size)
-    component_bytes = int(item.dtype[-1])  # "f2", "u1"; moderngl's "f1" is no type of NumPy
-    return int(texels * item.components * component_bytes)
+    return int(texels * item.components * np.dtype(item.dtype).itemsize)
