@@ -1,7 +1,8 @@
-"""The frame as a graph: stages that read and write versioned resources and rerun only where an input changed.
+"""The frame as a graph: stages that read and write versioned resources and rerun only when an input changed.
 
-A method declares its stages once; every frame sets the sources and runs the graph. Each resource follows the clocks
-of all that it was made from, so that what a moving camera costs can be read from the graph before anything is drawn.
+A method declares its stages once; every frame sets the sources and runs the graph. Each resource inherits the
+clocks of all that it is computed from, so the graph shows what a moving camera costs before anything is
+drawn.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -22,14 +23,14 @@ Same = Callable[[Any, Any], bool]
 
 
 class GraphError(RuntimeError):
-    """Stages and resources that do not fit together."""
+    """Stages and resources do not fit together."""
 
 
 @dataclass(eq=False)
 class Resource(Generic[T]):
-    """A named texture, buffer or plain value, and a number that counts its changes; 0: never written.
+    """A named texture, buffer or plain value with a version that counts its changes (0: never written).
 
-    `clocks` are what makes it change: those of its source, or of everything that its stage reads.
+    `clocks` make it change: its source's own, or those of everything that its stage reads.
     """
 
     name: str
@@ -40,17 +41,17 @@ class Resource(Generic[T]):
 
     @property
     def value(self) -> T:
-        """What was written last.
+        """The last value written.
 
         Raises:
-            GraphError: nothing was.
+            GraphError: nothing was written yet.
         """
         if self.version == 0:
             raise GraphError(f"Resource `{self.name}` is read before it is written.")
         return self._value  # type: ignore[return-value]
 
     def write(self, value: T, same: Same | None = None) -> None:
-        """Replaces the value; the version stays where `same` says that it is what it was."""
+        """Replaces the value; the version stays if `same` finds the new value equal to the old one."""
         if self.version == 0 or same is None or not same(self._value, value):
             self.version += 1
         self._value = value
@@ -70,13 +71,13 @@ class Stage:
 
     @property
     def clocks(self) -> frozenset[Clock]:
-        """What makes it run."""
+        """The clocks that make it run."""
         return self.outputs[0].clocks
 
 
 @dataclass(frozen=True)
 class StageReport:
-    """One stage as the last run left it; `size_bytes` is the GPU memory of what it writes."""
+    """The state of one stage after the last run; `size_bytes` is the GPU memory of its outputs."""
 
     name: str
     inputs: tuple[str, ...]
@@ -88,10 +89,10 @@ class StageReport:
 
 
 class Graph:
-    """Stages in the order in which they run, and the resources between them.
+    """Stages in execution order, and the resources between them.
 
-    The graph owns what its stages are methods of: it releases them with itself. `checks` tells after every kernel
-    whether the running stage may write what the kernel wrote (slow; for tests).
+    The graph owns the objects whose methods are its stages, and releases them with itself. With `checks` it
+    verifies after every kernel that the running stage may write what the kernel wrote (slow; for tests).
     """
 
     def __init__(self, gpu: GpuContext, timers: PassTimers | None = None, *, checks: bool = False) -> None:
@@ -111,7 +112,7 @@ class Graph:
         return self._declare(name, frozenset([clock]), None)
 
     def polled(self, name: str, clock: Clock, ask: Callable[[], Any], same: Same) -> Resource[Any]:
-        """Declares a source that is asked for before every run."""
+        """Declares a source whose value is requested before every run."""
         resource = self._declare(name, frozenset([clock]), None)
         self._polled.append((resource, ask, same))
         return resource
@@ -123,16 +124,17 @@ class Graph:
         *inputs: Resource[Any] | str,
         same: Same | None = None,
     ) -> Resource[Any]:
-        """Declares a stage that writes one resource of its own name; inputs may be named before they are declared.
+        """Declares a stage that writes one resource, named like the stage.
 
-        `same` compares an old with a new value; where it holds, what reads the resource does not run again.
+        Inputs may be named before they are declared. `same` compares the old value with the new one; readers of
+        the resource do not rerun if it holds.
         """
         return self._add(name, function, inputs, (name,), same)[0]
 
     def stages(
         self, name: str, function: Callable[..., Any], *inputs: Resource[Any] | str, outputs: Sequence[str]
     ) -> tuple[Resource[Any], ...]:
-        """Declares a stage whose function returns a value for each of the `outputs`."""
+        """Declares a stage whose function returns one value for each of the `outputs`."""
         return self._add(name, function, inputs, tuple(outputs), None)
 
     def _add(
@@ -165,12 +167,12 @@ class Graph:
         return self._resources[name]
 
     def own(self, item: object) -> None:
-        """Releases `item` with the graph, if it can be released."""
+        """Releases `item` with the graph if it has a `release` method."""
         if hasattr(item, "release") and not any(item is other for other in self._owned):
             self._owned.append(item)
 
     def resource(self, name: str) -> Resource[Any]:
-        """The resource of that name.
+        """Returns the resource of that name.
 
         Raises:
             GraphError: there is none.
@@ -182,18 +184,18 @@ class Graph:
         return self._resources[name]
 
     def __getitem__(self, name: str) -> Any:  # noqa: ANN401 (as its stage made it)
-        """Value of a resource."""
+        """Returns the value of a resource."""
         return self.resource(name).value
 
     def __contains__(self, name: str) -> bool:
         return name in self._resources
 
     def run(self, *targets: Resource[Any]) -> None:
-        """Brings the `targets` (all resources if none is named) up to date.
+        """Brings the `targets` (by default all resources) up to date.
 
         Raises:
-            GraphError: stages read each other in a circle, read what nobody writes, or write what they did not
-                declare.
+            GraphError: stages depend on each other in a cycle, read a resource that nothing writes, or write
+                one that they did not declare.
         """
         for resource, ask, same in self._polled:
             resource.write(ask(), same)
@@ -204,7 +206,7 @@ class Graph:
                 self._update(stage)
 
     def _sorted(self) -> list[Stage]:
-        """Stages in an order in which each comes after what it reads; by declaration where that leaves a choice."""
+        """Returns the stages in topological order; declaration order breaks ties."""
         if self._order is None:
             for stage, names in self._named.items():
                 stage.inputs = tuple(self._read(stage, name) for name in names)
@@ -215,7 +217,7 @@ class Graph:
         return self._order
 
     def _place(self, stage: Stage, waiting: list[Stage]) -> None:
-        """Puts a stage into the order, behind all that it reads."""
+        """Appends a stage to the order, after everything that it reads."""
         assert self._order is not None
         if stage in self._order:
             return
@@ -239,7 +241,7 @@ class Graph:
         return self._resources[name]
 
     def _follow_clocks(self) -> None:
-        """Clocks of what was named before it was declared."""
+        """Completes the clocks of resources that were named before their declaration."""
         assert self._order is not None
         for stage in self._order:
             clocks = frozenset(clock for item in stage.inputs for clock in item.clocks)
@@ -258,7 +260,7 @@ class Graph:
         return needed
 
     def _update(self, stage: Stage) -> None:
-        """Runs a stage if a version of its inputs is not the one that it saw."""
+        """Runs a stage if the version of any input differs from the one that it saw last."""
         versions = tuple(item.version for item in stage.inputs)
         if versions == stage.seen:
             return
@@ -292,7 +294,7 @@ class Graph:
                 self.gpu.watchers.remove(self._check)
 
     def _check(self, dispatch: Dispatch) -> None:
-        """Refuses that a kernel of the running stage writes what belongs to another one."""
+        """Raises if a kernel of the running stage writes a resource of another stage."""
         stage = self._running
         assert stage is not None
         own = {id(item) for output in stage.outputs if output.version for item in gpu_objects(output.value)}
@@ -308,7 +310,7 @@ class Graph:
                     )
 
     def report(self) -> list[StageReport]:
-        """Every stage in the order in which they run, as the last run left it."""
+        """Reports on every stage in execution order, as of the last run."""
         times: Mapping[str, float] = {} if self.timers is None else self.timers.times_ms
         return [
             StageReport(
@@ -324,7 +326,7 @@ class Graph:
         ]
 
     def release(self) -> None:
-        """Frees everything that the stages hold."""
+        """Frees everything that the stages own."""
         for item in reversed(self._owned):
             item.release()
         self._owned.clear()

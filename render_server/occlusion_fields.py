@@ -1,4 +1,4 @@
-"""The occlusion fields of a scene's objects: found on disk, or computed before rendering begins or beside it."""
+"""Occlusion fields of a scene's objects: loaded from disk, or computed before or during rendering."""
 
 import threading
 from collections.abc import Callable
@@ -27,12 +27,12 @@ log = structlog.get_logger()
 
 
 class _EndedError(Exception):
-    """The renderer is gone; nobody waits for the field."""
+    """The renderer was released; nobody waits for the field."""
 
 
 @dataclass(eq=False)
 class _Entry:
-    """One asset's field with one set of settings; `meshes` are held so that their identity stays theirs."""
+    """One asset's field with one set of settings; holds `meshes`, whose identities are its key."""
 
     meshes: tuple[TriangleMesh, ...]
     name: str
@@ -42,10 +42,11 @@ class _Entry:
 
 
 class OcclusionFields:
-    """Keeps fields as long as a renderer lives; `say` takes sentences for the user.
+    """Caches fields for the lifetime of a renderer; `say` receives sentences for the user.
 
-    `waits`: who asks for a field gets it, with a progress bar on a terminal. Otherwise it is computed in a thread
-    (embree and matrix products leave the interpreter to others), and until it is there None is the answer.
+    With `waits`, `find` blocks until a field is ready and shows a progress bar on a terminal. Without, a
+    thread computes it (embree and matrix products release the interpreter lock) and `find` returns None
+    meanwhile.
     """
 
     def __init__(self, say: Callable[[str], None], folder: Path | None = None, *, waits: bool = True) -> None:
@@ -57,10 +58,10 @@ class OcclusionFields:
         self._ended = threading.Event()
 
     def find(self, item: PlacedObject, settings: FieldSettings) -> OcclusionField | None:
-        """The field of an object's asset; None while it is being computed.
+        """Returns the field of an object's asset; None while it is being computed.
 
         Raises:
-            DeltalightError: it cannot be computed.
+            DeltalightError: the field cannot be computed.
         """
         plain = item.material is not None
         key = (*(id(mesh) for mesh in item.meshes), plain, settings)
@@ -112,17 +113,17 @@ class OcclusionFields:
                 make(step)
         except _EndedError:
             pass
-        except Exception as error:  # whatever it is, the picture goes on without this shadow
+        except Exception as error:  # whatever failed, the picture goes on without this shadow
             entry.fault = f"object `{entry.name}`: its occlusion field cannot be computed ({error})."
             log.debug("occlusion field", exc_info=error)
 
     def release(self) -> None:
-        """Let threads end at their next step."""
+        """Lets threads end at their next step."""
         self._ended.set()
 
 
 def require_rigid(item: SceneObject) -> None:
-    """Refuse an object whose shape may change: what it hides is precomputed.
+    """Refuses an object whose shape may change, because occlusion is precomputed.
 
     Raises:
         DeltalightError: it plays an animation, or is not rigid.

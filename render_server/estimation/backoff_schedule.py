@@ -5,9 +5,9 @@ MAX_WAIT_S = 30.0
 
 
 class BackoffSchedule:
-    """Due at once, then after intervals that double from 1 to 30 s of the frames' own time.
+    """Due immediately, then after intervals that double from 1 to 30 s of the frames' own time.
 
-    An average over time is soon good, and keeping it up to date then costs almost nothing.
+    An average over time converges soon; keeping it up to date then costs almost nothing.
     """
 
     def __init__(self) -> None:
@@ -15,7 +15,7 @@ class BackoffSchedule:
         self._wait_s = FIRST_WAIT_S
 
     def is_due(self, timestamp_ns: int) -> bool:
-        """Whether a measurement is due; if so, the next interval begins. It restarts if the clock is set back."""
+        """Whether a measurement is due; if so, starts the next interval. Restarts if the clock is set back."""
         if self._last_ns is None:
             self._last_ns = timestamp_ns
             return True

@@ -5,15 +5,15 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64
 
-# Twice the planes of a room's corner: things have large faces too.
+# Twice the planes of a room's corner, because things have large faces too.
 MAX_PLANES = 6
-# A smaller fraction of the samples is a thing, or chance.
+# A smaller fraction of the samples is a thing, or coincidence.
 MIN_FRACTION = 0.02
 CANDIDATES = 200
-# Nearer to this plane than to one at a right angle: correlated noise of stereo turns normals by more than 15 degrees.
+# Closer to this plane than to one at a right angle: correlated noise of stereo tilts normals by more than 15 degrees.
 NORMAL_COSINE = float(np.sqrt(0.5))
 MIN_POINTS = 3
-REFINEMENTS = 3  # least-squares fits to the inliers; after that a plane hardly moves
+REFINEMENTS = 3  # least-squares fits to the inliers; a plane hardly moves afterwards
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +25,7 @@ class PointCloud:
     tolerance_m: Float64[np.ndarray, " k"]
 
     def inliers(self, axis: Float64[np.ndarray, "3"], offset: float) -> Bool[np.ndarray, " k"]:
-        """Return which points lie on the plane with this normal and distance from the origin, and face along it."""
+        """Returns which points lie on the plane with this normal and distance from the origin, and face the same way."""
         near = np.abs(self.position @ axis - offset) <= self.tolerance_m
         return np.asarray(near & (self.normal @ axis >= NORMAL_COSINE))
 
@@ -40,7 +40,7 @@ class DetectedPlane:
 
 
 def detect_planes(cloud: PointCloud) -> list[DetectedPlane]:
-    """Return the planes with the most points, largest first; no point belongs to two of them.
+    """Returns the planes with the most points, largest first; no point belongs to two of them.
 
     Sequential RANSAC (Fischler & Bolles 1981) whose hypotheses are single points with their normals, evenly spread
     instead of drawn at random, so that the same frame gives the same planes.
@@ -57,7 +57,7 @@ def detect_planes(cloud: PointCloud) -> list[DetectedPlane]:
 
 
 def _largest_plane(cloud: PointCloud, free: Bool[np.ndarray, " k"]) -> DetectedPlane | None:
-    """Return the plane with the most free points; None if there are too few."""
+    """Returns the plane with the most free points; None if there are too few."""
     remaining = np.flatnonzero(free)
     min_count = max(MIN_FRACTION * len(free), MIN_POINTS)
     if len(remaining) < min_count:
@@ -77,7 +77,7 @@ def _largest_plane(cloud: PointCloud, free: Bool[np.ndarray, " k"]) -> DetectedP
 def _fit_plane(
     position: Float64[np.ndarray, "k 3"], facing: Float64[np.ndarray, "3"]
 ) -> tuple[Float64[np.ndarray, "3"], float]:
-    """Fit a plane to points by least squares; its normal faces to the side of `facing`."""
+    """Fits a plane to points by least squares; its normal faces to the side of `facing`."""
     middle = position.mean(axis=0)
     _, axes = np.linalg.eigh((position - middle).T @ (position - middle))
     axis = axes[:, 0] * np.sign(axes[:, 0] @ facing)

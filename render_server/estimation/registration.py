@@ -1,4 +1,4 @@
-"""The lights' common factor, found from the picture (docs/method.md 1)."""
+"""The lights' common factor, estimated from the picture (docs/method.md 1)."""
 
 from render_server.estimation.registration_fit import (
     Registration,
@@ -11,10 +11,10 @@ from render_server.lights.lights import LightSet
 
 
 def register_lights(graph: FrameGraph, lights: LightSet) -> Registration:
-    """Factor R G B on all lights: from white paper and grey cards, else from the brightest albedo.
+    """Estimates a factor R G B on all lights: from white paper and grey cards, else from the brightest albedo.
 
-    `lights` are not registered yet. The light that other real surfaces reflect is in camera units already (it is
-    measured), so the cones are traced twice: with the environment and without.
+    `lights` are not registered yet. Light that other real surfaces reflect is measured, so it is in camera units
+    already; the cones are therefore traced twice, with and without the environment.
     """
     samples = sample_light(graph, lights, bounced_light(graph, lights))
     known = samples.usable & (samples.albedo > 0)

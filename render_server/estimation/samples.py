@@ -1,6 +1,4 @@
-"""What light falls on the real surfaces that a picture shows, next to what the camera measured there; when to look
-again.
-"""
+"""Samples of the real surfaces in a picture: the light that arrives there, and the measured radiance."""
 
 from dataclasses import dataclass, replace
 
@@ -13,14 +11,14 @@ from render_server.frame_graph import FrameGraph
 from render_server.lights.lights import LightSet
 from render_server.scene.board_albedo import known_albedo, unclipped
 
-UNSHADOWED = 0.95  # fraction of its direct light that a pixel gets, from which on it counts as unshadowed
+UNSHADOWED = 0.95  # fraction of its direct light with which a pixel counts as unshadowed
 
 Bounce = Float64[np.ndarray, "h w 3"]
 
 
 @dataclass(frozen=True, eq=False)
 class LightSamples:
-    """What is known at pixels that show real surfaces; positions in world metres, the rest linear RGB."""
+    """Samples at pixels that show real surfaces; positions in world metres, the rest linear RGB."""
 
     position: Float64[np.ndarray, "k 3"]
     measured: Float64[np.ndarray, "k 3"]
@@ -28,26 +26,26 @@ class LightSamples:
     light: Float64[np.ndarray, "k 3"]
     bounce: Float64[np.ndarray, "k 3"]
     usable: Bool[np.ndarray, " k"]
-    albedo: Float32[np.ndarray, " k"]  # where it is known, else 0
+    albedo: Float32[np.ndarray, " k"]  # 0 where unknown
     lit: Float64[np.ndarray, " k"]  # fraction of the unshadowed direct light
     pixel: Int64[np.ndarray, "k 2"]  # column, row
 
     @property
     def unshadowed(self) -> Bool[np.ndarray, " k"]:
-        """Which samples get nearly all of their direct light."""
+        """Which samples receive nearly all of their direct light."""
         return np.asarray(self.lit >= UNSHADOWED)
 
 
 def bounced_light(graph: FrameGraph, lights: LightSet) -> Bounce:
-    """Irradiance that the cones gather from real surfaces alone: traced under a black environment."""
+    """Returns the irradiance that cones gather from real surfaces alone, traced under a black environment."""
     black = replace(lights, environment=np.zeros_like(lights.environment))
     return read_texture(graph.evaluate(black).cones.mu)[..., :3]
 
 
 def sample_light(graph: FrameGraph, lights: LightSet, bounce: Bounce | None) -> LightSamples:
-    """Reads the fields back where the real scene is in view; cones are those of the pixel's texel of the grid.
+    """Reads the fields back where the real scene is visible; a pixel's cones are those of its texel of the grid.
 
-    Without `bounce` all light that the cones gather counts as the lights'.
+    Without `bounce`, all light that the cones gather is attributed to the lights.
     """
     fields, shown, frame = graph.evaluate(lights), graph.shown(), graph.inputs.frame
     cones, direct = read_texture(fields.cones.mu), read_texture(fields.direct.mu)
@@ -77,7 +75,7 @@ def sample_light(graph: FrameGraph, lights: LightSet, bounce: Bounce | None) -> 
 
 
 def read_texture(texture: moderngl.Texture) -> Float64[np.ndarray, "h w c"]:
-    """Contents of a half-float or float texture."""
+    """Returns the contents of a half-float or float texture."""
     width, height = texture.size
     dtype = np.float16 if texture.dtype == "f2" else np.float32
     return np.frombuffer(texture.read(), dtype).reshape(height, width, -1).astype(np.float64)

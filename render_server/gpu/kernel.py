@@ -1,7 +1,7 @@
-"""Kernels: compute and raster programs whose textures, images, buffers and uniforms are bound by their GLSL names.
+"""Kernels: compute and raster programs whose resources and uniforms are bound by their GLSL names.
 
-Units and binding points are assigned when a program is linked, so no shader states any, and nothing has to be bound
-before a kernel runs: what it needs, it is given.
+Linking assigns units and binding points, so shaders state none, and every run passes all that the kernel
+needs.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -18,8 +18,8 @@ from render_server.gpu.shader_source import SHADERS, Declarations, declarations,
 from render_server.gpu.uniform_block import UniformBlock
 
 SOFTWARE_WALKERS = 1024
-# Mesa's software renderer ends all loops of a thread after 65535 turns in sum, without a word; tracing the cones of
-# one texel takes up to about 5000 (16 cones through 256 voxels and the coarse scene).
+# Mesa's software renderer silently ends all loops of a thread after 65535 iterations in total; tracing the
+# cones of one texel takes up to about 5000 (16 cones through 256 voxels and the coarse scene).
 SOFTWARE_SHARE = 12
 LIST_WALKERS = 16384
 BLOCK_ALIGNMENT = (
@@ -32,7 +32,7 @@ Texture = moderngl.Texture | moderngl.Texture3D | moderngl.TextureArray
 Value = float | int | bool | Sequence[float] | Sequence[Sequence[float]] | np.ndarray[Any, Any]
 Binding = Texture | moderngl.Buffer | UniformBlock[Any] | Value | None
 Bindings = Mapping[str, Binding]
-"""GLSL names and what is bound to them; None stands for nothing: a texture without texels, an empty buffer."""
+"""GLSL names and the values bound to them; None binds nothing: a texture without texels, an empty buffer."""
 
 SAMPLERS: Final = {
     0x8B5E: moderngl.Texture,  # sampler2D
@@ -59,7 +59,7 @@ FORMATS: Final = {
 
 
 class BindingError(RuntimeError):
-    """A kernel was given a name that it does not declare, lacks one that it needs, or got the wrong kind of thing."""
+    """A name is undeclared or missing, or its value is of the wrong kind."""
 
 
 class Drawable(Protocol):
@@ -70,12 +70,12 @@ class Drawable(Protocol):
         """How many triangles are drawn."""
 
     def draw(self, program: moderngl.Program) -> None:
-        """Draws all of it with `program`."""
+        """Draws all triangles with `program`."""
 
 
 @dataclass(frozen=True)
 class Dispatch:
-    """One run of a kernel: workgroups (x, y, z), or triangles drawn; `written` are textures and buffers by name."""
+    """One run of a kernel: workgroups (x, y, z) or triangles drawn, and what it wrote, by name."""
 
     kernel: str
     size: tuple[int, ...]
@@ -84,7 +84,7 @@ class Dispatch:
 
 @dataclass(eq=False)
 class _Slot:
-    """An active resource of a linked program and the unit or binding point that it was given."""
+    """An active resource of a linked program with its unit or binding point."""
 
     name: str
     member: Any
@@ -126,11 +126,11 @@ class _Program:
             (slots if is_texture else self._uniforms).append(slot)
             if is_texture:
                 slot.member.gl_type = (
-                    GL_INT  # a unit is an integer; moderngl 5.13 leaves that of an image3D unset
+                    GL_INT  # units are integers; moderngl 5.13 leaves that of an image3D unset
                 )
 
     def _assign(self) -> None:
-        """Numbers units and binding points, each kind from 0 on."""
+        """Assigns units and binding points, each kind from 0 on."""
         for slots in (self._samplers, self._images):
             for slot in slots:
                 slot.place = slots.index(slot)
@@ -144,7 +144,7 @@ class _Program:
         """Binds everything that the program reads and writes; returns what it may write.
 
         Raises:
-            BindingError: as the class says.
+            BindingError: a name or value does not fit.
         """
         for name in own:
             if name not in self._declared.names:
@@ -215,7 +215,7 @@ class _Program:
         value.bind(slot.place)
 
     def _write(self, slot: _Slot, value: Binding) -> None:
-        """Writes a uniform unless it has this value already; 4x4 arrays are row-major here."""
+        """Writes a uniform if its value changed; 4x4 arrays are row-major here."""
         data: bytes | Value
         if isinstance(value, np.ndarray):
             ordered = value.T if value.ndim == 2 and slot.member.matrix else value
@@ -247,16 +247,16 @@ class _Program:
         }
 
     def report(self, size: tuple[int, ...], written: Mapping[str, object]) -> None:
-        """Tells who watches that the program ran."""
+        """Tells the watchers that the program ran."""
         for watch in self._gpu.watchers:
             watch(Dispatch(self.label, size, written))
 
 
 class Kernel:
-    """A compute shader of the shaders' folder with its defines.
+    """A compute shader of the shaders' folder, compiled with defines.
 
-    The one place where work is dispatched, so that the memory barrier is never forgotten: a missing barrier does not
-    show on a software renderer.
+    All work is dispatched here, so that no memory barrier is forgotten: a missing one does not show on a
+    software renderer.
     """
 
     def __init__(self, gpu: GpuContext, name: str, **defines: float | str) -> None:
@@ -269,13 +269,13 @@ class Kernel:
         self._local = declared.local_size
 
     def run(self, threads: Sequence[int], *shared: Bindings, **own: Binding) -> None:
-        """Runs at least `threads` (x[, y[, z]]) invocations; their writes are visible to what comes after.
+        """Runs at least `threads` (x[, y[, z]]) invocations; later work sees their writes.
 
-        `own` must be names that the shader declares; of `shared` it takes what it needs. `own` comes first, then
-        `shared` in their order.
+        Names in `own` must be declared by the shader; from `shared` it takes what it needs. `own` takes
+        precedence, then `shared` in order.
 
         Raises:
-            BindingError: a name is unknown or missing, or what is bound to it is of another kind or format.
+            BindingError: a name is undeclared or missing, or its value is of the wrong kind or format.
         """
         written = self._program.bind(shared, own)
         counts = [*threads, 1, 1][:3]
@@ -287,7 +287,7 @@ class Kernel:
         self._program.report(groups, written)
 
     def resources(self) -> dict[str, list[str]]:
-        """Names of what the linked program binds, by kind."""
+        """Returns the names of the linked program's bindings, by kind."""
         return self._program.resources()
 
     def release(self) -> None:
@@ -296,7 +296,7 @@ class Kernel:
 
 
 class RasterKernel:
-    """A vertex and a fragment shader of the same name; draws with depth test into a framebuffer."""
+    """A vertex and a fragment shader of one name; draws with depth test into a framebuffer."""
 
     def __init__(self, gpu: GpuContext, name: str, **defines: float | str) -> None:
         self._ctx = gpu.ctx
@@ -338,7 +338,7 @@ class RasterKernel:
         self._program.report((mesh.triangle_count,), {})
 
     def resources(self) -> dict[str, list[str]]:
-        """Names of what the linked program binds, by kind."""
+        """Returns the names of the linked program's bindings, by kind."""
         return self._program.resources()
 
     def release(self) -> None:
@@ -347,13 +347,15 @@ class RasterKernel:
 
 
 def _label(name: str, defines: Mapping[str, float | str]) -> str:
-    """The shader's name and what it was compiled with, e.g. `trace_cones REAL`."""
+    """Returns the shader's name and defines, e.g. `trace_cones REAL`."""
     return " ".join([name, *(key if value == 1 else f"{key}={value}" for key, value in defines.items())])
 
 
 def list_threads(gpu: GpuContext, longest: int = LIST_WALKERS) -> int:
-    """Threads to walk a list whose length only the GPU knows: at most `longest`; few in software, where an idle one
-    costs as much as a busy one, but never so few that a thread's loops are cut off.
+    """Returns the number of threads for walking a list whose length only the GPU knows: at most `longest`.
+
+    Few in software, where an idle thread costs as much as a busy one, but enough that no thread's loops are
+    cut off.
     """
     if not gpu.is_software:
         return longest
@@ -362,7 +364,7 @@ def list_threads(gpu: GpuContext, longest: int = LIST_WALKERS) -> int:
 
 @contextmanager
 def watched(gpu: GpuContext, watch: Callable[[Dispatch], None]) -> Iterator[None]:
-    """Tells `watch` of every run of a kernel of this context."""
+    """Calls `watch` for every run of a kernel of this context."""
     gpu.watchers.append(watch)
     try:
         yield

@@ -1,4 +1,4 @@
-"""What objects hold on the GPU: textures and buffers found in their attributes, and the bytes that these take."""
+"""GPU memory of Python objects: finds the textures and buffers in their attributes and sums their bytes."""
 
 import math
 from collections.abc import Iterator
@@ -8,11 +8,11 @@ import numpy as np
 
 GPU_KINDS = (moderngl.Texture, moderngl.Texture3D, moderngl.TextureArray, moderngl.Buffer)
 OWN_CODE = "render_server."
-DEEPEST = 4  # attributes of attributes; a pass holds fields, which hold textures
+DEEPEST = 4  # nested attributes: a pass holds fields, which hold textures
 
 
 def gpu_objects(value: object, depth: int = 0) -> Iterator[object]:
-    """Textures and buffers that `value` is or holds; one that is held twice comes twice."""
+    """Yields the textures and buffers that `value` is or holds; those held twice come twice."""
     if isinstance(value, GPU_KINDS):
         yield value
     elif depth < DEEPEST:
@@ -30,7 +30,7 @@ def _parts(value: object) -> Iterator[object]:
 
 
 def size_bytes(value: object) -> int:
-    """Bytes of the GPU's memory that `value` takes, mip levels left out."""
+    """Returns the bytes of GPU memory that `value` holds, without mip levels."""
     held = {id(item): item for item in gpu_objects(value)}
     return sum(_size(item) for item in held.values())
 

@@ -25,11 +25,11 @@ class DirectionalLight:
     angular_radius_rad: float
 
     def scaled(self, factor: Float32[np.ndarray, "3"]) -> "DirectionalLight":
-        """Return the light times a factor R G B."""
+        """Returns the light times a factor R G B."""
         return replace(self, irradiance=self.irradiance * factor)
 
     def describe(self) -> dict[str, Any]:
-        """Return plain values for messages and logs."""
+        """Returns plain values for messages and logs."""
         return {
             "type": "directional",
             "direction": self.direction.tolist(),
@@ -47,11 +47,11 @@ class SphereLight:
     radius_m: float
 
     def scaled(self, factor: Float32[np.ndarray, "3"]) -> "SphereLight":
-        """Return the light times a factor R G B."""
+        """Returns the light times a factor R G B."""
         return replace(self, intensity=self.intensity * factor)
 
     def describe(self) -> dict[str, Any]:
-        """Return plain values for messages and logs."""
+        """Returns plain values for messages and logs."""
         return {
             "type": "sphere",
             "position_m": self.position.tolist(),
@@ -80,11 +80,11 @@ class SpotLight:
         return self.half_angle_rad * (1.0 - self.blend)
 
     def scaled(self, factor: Float32[np.ndarray, "3"]) -> "SpotLight":
-        """Return the light times a factor R G B."""
+        """Returns the light times a factor R G B."""
         return replace(self, intensity=self.intensity * factor)
 
     def describe(self) -> dict[str, Any]:
-        """Return plain values for messages and logs."""
+        """Returns plain values for messages and logs."""
         return {
             "type": "spot",
             "position_m": self.position.tolist(),
@@ -115,11 +115,11 @@ class RectangleLight:
         return np.asarray(across / np.linalg.norm(across))
 
     def scaled(self, factor: Float32[np.ndarray, "3"]) -> "RectangleLight":
-        """Return the light times a factor R G B."""
+        """Returns the light times a factor R G B."""
         return replace(self, radiance=self.radiance * factor)
 
     def describe(self) -> dict[str, Any]:
-        """Return plain values for messages and logs."""
+        """Returns plain values for messages and logs."""
         return {
             "type": "rectangle",
             "position_m": self.position.tolist(),
@@ -149,7 +149,7 @@ class LightSet:
     identities: tuple[int, ...] = ()
 
     def registered(self, factor: Float32[np.ndarray, "3"] | None = None) -> "LightSet":
-        """Return the set with the registration (or another factor) multiplied in."""
+        """Returns the set with the registration (or another factor) multiplied in."""
         chosen = np.asarray(self.registration if factor is None else factor, np.float32)
         return replace(
             self,
@@ -159,23 +159,23 @@ class LightSet:
         )
 
     def with_ground(self, radiance: Float32[np.ndarray, "3"]) -> "LightSet":
-        """Return the set with ground of this radiance in `ground_fraction` of its environment."""
+        """Returns the set with ground of this radiance in `ground_fraction` of its environment."""
         ground = np.broadcast_to(radiance, self.environment.shape)
         return self.with_surfaces(ground, self.ground_fraction)
 
     def with_surfaces(
         self, radiance: Float32[np.ndarray, "n n 3"], fraction: Float32[np.ndarray, "n n 1"]
     ) -> "LightSet":
-        """Return the set with surfaces (maps of the environment's size) in front of a fraction of each texel."""
+        """Returns the set with surfaces (maps of the environment's size) in front of a fraction of each texel."""
         return replace(self, environment=(1 - fraction) * self.environment + fraction * radiance)
 
     def with_sky(self, radiance: Float32[np.ndarray, "3"], shape: Float32[np.ndarray, "n n 1"]) -> "LightSet":
-        """Return the set with radiance added above the horizon, times `shape` (of the environment's size)."""
+        """Returns the set with radiance added above the horizon, times `shape` (of the environment's size)."""
         above = above_horizon(len(self.environment))
         return replace(self, environment=self.environment + above * shape * radiance)
 
     def describe(self) -> list[dict[str, Any]]:
-        """Return plain values of all lights and of the environment's mean, for messages and logs."""
+        """Returns plain values of all lights and of the environment's mean, for messages and logs."""
         lights = [light.describe() for light in self.lights]
         for light, identity in zip(lights, self.identities, strict=False):
             light["id"] = identity
@@ -186,7 +186,7 @@ class LightSet:
 
 
 def build_lights(lights: documents.Lights) -> LightSet:
-    """Build the light set of a scene document in mode `manual` or `environment`.
+    """Builds the light set of a scene document in mode `manual` or `environment`.
 
     An environment is split by the settings of `lights.fisheye`, as in mode `fisheye`.
 
@@ -206,7 +206,7 @@ def light_set(
     ground_fraction: Float32[np.ndarray, "n n 1"],
     identities: tuple[int, ...] = (),
 ) -> LightSet:
-    """Assemble a light set with the registration that a scene document requests."""
+    """Assembles a light set with the registration that a scene document requests."""
     given = lights.resolved_registration
     factor = np.ones(3, np.float32) if given == "auto" else np.array(given, np.float32)
     return LightSet(shining, environment, ground_fraction, factor, identities)
@@ -273,7 +273,7 @@ class IncidentLight:
 
 
 def incident_light(light: Light, position: Float64[np.ndarray, "*n 3"]) -> IncidentLight:
-    """Return the unoccluded light at positions (world, m)."""
+    """Returns the unoccluded light at positions (world, m)."""
     if isinstance(light, DirectionalLight):
         to_light = np.broadcast_to(-light.direction.astype(np.float64), position.shape)
         irradiance = np.broadcast_to(light.irradiance.astype(np.float64), position.shape)
@@ -293,7 +293,7 @@ def incident_light(light: Light, position: Float64[np.ndarray, "*n 3"]) -> Incid
 
 
 def _within_cone(light: SpotLight, to_light: Float64[np.ndarray, "*n 3"]) -> Float64[np.ndarray, "*n"]:
-    """Return the fraction of a spot's intensity that it emits against `to_light`."""
+    """Returns the fraction of a spot's intensity that it emits against `to_light`."""
     angle = np.arccos(np.clip(-to_light @ light.direction, -1, 1))
     soft = max(light.half_angle_rad - light.full_angle_rad, 1e-9)
     return np.asarray(np.clip((light.half_angle_rad - angle) / soft, 0, 1))

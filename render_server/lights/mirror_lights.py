@@ -34,7 +34,7 @@ class MirrorLight:
 def mirror_lights(
     lights: Sequence[Light], surfaces: SurfaceTable, objects: Float64[np.ndarray, "3"]
 ) -> list[MirrorLight]:
-    """Return images of lights in smooth declared planes in front of which they and `objects` (a point, m) lie."""
+    """Returns images of lights in smooth declared planes in front of which they and `objects` (a point, m) lie."""
     found = []
     for index, row in enumerate(surfaces.packed):
         roughness = float(surfaces.roughness[index])
@@ -62,7 +62,7 @@ def _plane_towards(
 def _image(
     light: Light, plane: Float64[np.ndarray, "4"], alpha: float, objects: Float64[np.ndarray, "3"]
 ) -> Light | None:
-    """Mirror a light, enlarged by the blur that the objects see; None if it is not in front of the plane.
+    """Mirrors a light, enlarged by the blur that the objects see; None if it is not in front of the plane.
 
     A GGX lobe of alpha spreads directions by 2 alpha; at the light's distance b from the plane that is 2 alpha b.
     """
@@ -94,7 +94,7 @@ def _rectangle_image(
     reflection: Float64[np.ndarray, "3 3"],
     blur_m: float,
 ) -> RectangleLight:
-    """Mirror a rectangle: its axes change places to keep the orientation, and blur widens it at the same flux."""
+    """Mirrors a rectangle: its axes change places to keep the orientation, and blur widens it at the same flux."""
     u, v = (float(np.linalg.norm(axis)) for axis in (light.axis_u, light.axis_v))
     grown = [float(np.hypot(edge, 2 * blur_m) / edge) for edge in (u, v)]
     return RectangleLight(

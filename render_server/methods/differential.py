@@ -1,8 +1,8 @@
-"""Differential rendering: two full solutions by one renderer, subtracted ([D] 3.1.1, docs/method.md 6).
+"""Differential rendering: the difference of two full solutions ([D] 3.1.1, docs/method.md 6).
 
-Solution mu knows the real scene alone, solution rho real and virtual surfaces together. Each has voxels, shadow maps
-of all of its geometry, and one march a cone of its own; nothing is skipped because objects seem not to reach it. So
-this is slow, and what `dvct` must agree with.
+Solution mu contains the real scene alone, solution rho real and virtual surfaces together. Each has its own voxels,
+shadow maps of all its geometry, and cone march; nothing is skipped because objects seem not to reach it. It is slow,
+and the reference for `dvct`.
 """
 
 from copy import copy
@@ -38,7 +38,7 @@ from render_server.passes.voxels import VoxelMipmap
 
 
 class TwoSolutions:
-    """Maps, direct light and cones of both solutions."""
+    """Shadow maps, direct light and cones of both solutions."""
 
     def __init__(
         self,
@@ -57,7 +57,7 @@ class TwoSolutions:
         self._unused: ConeFields | None = None
 
     def set_environment(self, lights: LightSet) -> LightBuffers:
-        """Uploads the residual environment to both."""
+        """Uploads the residual environment to both solutions."""
         for buffers in (self.mu, self.rho):
             buffers.set_environment(lights.environment)
         return self.rho
@@ -65,7 +65,7 @@ class TwoSolutions:
     def fit_views(
         self, lights: LightSet, real: GeometryState, extent: Points, everywhere: bool
     ) -> LightBuffers:
-        """Both solutions look through the same views, so that their maps differ by the objects alone."""
+        """Fits one set of views for both solutions, so that their maps differ by the objects alone."""
         receivers = real.points if everywhere else shadow_receivers(real, extent)
         receivers, points = (np.concatenate([each, extent]) for each in (receivers, real.points))
         for buffers in (self.mu, self.rho):
@@ -75,18 +75,18 @@ class TwoSolutions:
     def draw_maps(
         self, _views: LightBuffers, real: GeometryState, objects: GeometryState
     ) -> tuple[LightBuffers, LightBuffers]:
-        """Draws the real scene alone, and with the objects."""
+        """Draws the maps of the real scene alone, and of the real scene with the objects."""
         for buffers, meshes in ((self.mu, [real.buffers]), (self.rho, [real.buffers, objects.buffers])):
             self._maps.run(buffers.real_atlas, meshes, buffers.real_views, 0, buffers.bindings)
         return self.mu, self.rho
 
     def marching(self, voxels: SolutionVoxels) -> dict[str, Binding]:
-        """Bindings of what cones march through: one solution's voxels, the same twice."""
+        """Returns the bindings for marching one solution's voxels: the same voxels as mu and as rho."""
         voxels.set_support(everywhere=False)
         return voxels.march_bindings(self._cone_count)
 
     def trace(self, fields: ConeFields, scene: Bindings, grid: LowResGrid, marching: Bindings) -> ConeFields:
-        """Each solution's cones through its own voxels; the fields are put together."""
+        """Traces each solution's cones through its own voxels and combines the results."""
         if self._tracing is None or self._unused is None:
             self._tracing = TraceCones(self._gpu, grid.size, self._defines)
             self._unused = ConeFields(self._gpu, grid.size)
@@ -101,7 +101,7 @@ class TwoSolutions:
     def light_directly(
         self, scene: Bindings, grid: LowResGrid, _caustics: Caustics | None, _voxels: VoxelMipmap
     ) -> DirectLightPair:
-        """Direct light under each solution's own maps."""
+        """Computes direct light, each solution under its own maps."""
         self.direct.run_both(self.mu, self.rho, grid, scene)
         return self.direct
 
@@ -113,7 +113,7 @@ class TwoSolutions:
 
 
 def differential(g: Graph, s: FrameResources, setup: Setup[DifferentialMethod]) -> Layers:
-    """E_rho - E_mu and S_rho - S_mu of two solutions; what is not told apart has the maps of rho."""
+    """E_rho - E_mu and S_rho - S_mu of two full solutions; everything shared uses the maps of rho."""
     settings, resolved, size = setup.settings, setup.resolved, setup.picture_size
     voxels = SolutionVoxels(g.gpu, settings, resolved.volume_size)
     two = TwoSolutions(g.gpu, settings, resolved, size, voxels)

@@ -1,4 +1,4 @@
-"""Stages that methods share: the lights' depth maps, and the shading of what the camera sees (docs/method.md 3)."""
+"""Stages that methods share: the lights' depth maps, and shading of the visible surfaces (docs/method.md 3)."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -29,11 +29,11 @@ from render_server.passes.voxels import PlacedVolume, VolumePlacement, VoxelMipm
 from render_server.scene.declared_surfaces import SurfaceTable
 from render_server.view import CameraView
 
-SHADOW_REACH = 4.0  # in longest edges of the objects' bounds: how far around them real shadows are resolved
-LARGE_TRIANGLE = 0.1  # of that reach: from here on a triangle's own extent matters, not only its corners
-SELF_SHADOW_TEXELS = 1.5  # a virtual receiver is lifted by so many texels of the depth map
-SURFEL_SHADOW_SAMPLES = 4  # of a light's area: a voxel averages many surfels
-DEPTH_TOLERANCE = 0.02  # a surfel this near (relative) to what the camera sees is what it sees
+SHADOW_REACH = 4.0  # in longest edges of the objects' bounds: range of real shadows around them
+LARGE_TRIANGLE = 0.1  # of that range: above, a triangle's whole extent matters, not only its corners
+SELF_SHADOW_TEXELS = 1.5  # offset of virtual receivers, in texels of the depth map
+SURFEL_SHADOW_SAMPLES = 4  # over a light's area; few, because a voxel averages many surfels
+DEPTH_TOLERANCE = 0.02  # relative: a surfel this close to the visible depth counts as the visible surface
 SURFEL_PICTURE_LOD = 2.0  # of the linear picture: one sample covers a surfel's pixels
 
 Points = Float64[np.ndarray, "n 3"]
@@ -41,10 +41,10 @@ Points = Float64[np.ndarray, "n 3"]
 
 @dataclass(frozen=True, eq=False)
 class LitScene:
-    """The lights' buffers and the resources that follow them.
+    """The lights' buffers and the resources that fill them.
 
-    `real_maps` and `object_maps`: depth maps of the real scene and of the objects; `mirrored`: where smooth planes
-    mirror the lights. The value of each is `buffers`, which all of them fill a part of.
+    `real_maps` and `object_maps` are depth maps of the real scene and of the objects; `mirrored` are the maps of
+    where smooth planes mirror the lights. The value of each resource is `buffers`; each stage fills a part of it.
     """
 
     buffers: LightBuffers
@@ -60,7 +60,7 @@ class LitScene:
 
 
 class LightStages:
-    """Fits the lights' views around what they have to show, and draws their depth maps."""
+    """Fits the lights' views to their casters and receivers, and draws their depth maps."""
 
     def __init__(
         self, gpu: GpuContext, tile_size: int, shadow_samples: int, *, mirrors: bool = False
@@ -78,7 +78,7 @@ class LightStages:
     def fit_views(
         self, lights: LightSet, real: GeometryState, extent: Points, surfaces: SurfaceTable, everywhere: bool
     ) -> LightBuffers:
-        """Fits the views: of real shadows around the objects (or `everywhere`), and closely around the objects."""
+        """Fits the views of real shadows around the objects (or `everywhere`), and of object shadows tightly."""
         receivers = real.points if everywhere else shadow_receivers(real, extent)
         shining = list(lights.lights)
         mirrors = mirror_lights(shining, surfaces, np.mean(extent, axis=0)) if self._mirrors else []
@@ -86,13 +86,13 @@ class LightStages:
         return self.buffers
 
     def draw_real(self, _views: bytes, real: GeometryState) -> LightBuffers:
-        """Draws the real scene as the lights see it."""
+        """Draws the real scene as seen from the lights."""
         buffers = self.buffers
         self._maps.run(buffers.real_atlas, [real.buffers], buffers.real_views, 0, buffers.bindings)
         return buffers
 
     def draw_objects(self, _views: bytes, objects: GeometryState) -> LightBuffers:
-        """Draws the objects as the lights see them."""
+        """Draws the objects as seen from the lights."""
         buffers = self.buffers
         first = buffers.first_virtual_view
         self._maps.run(
@@ -103,7 +103,7 @@ class LightStages:
     def map_mirrors(
         self, _real: LightBuffers, _objects: LightBuffers, _lights: LightSet, seen: Observation
     ) -> LightBuffers:
-        """Maps where smooth planes show the lights."""
+        """Maps where smooth planes mirror the lights."""
         if self.buffers.mirrors:
             self._visibility.run(self.buffers, seen.scan.bias_m, {**seen.bindings, **self.buffers.bindings})
         return self.buffers
@@ -117,7 +117,7 @@ class LightStages:
 def light_stages(
     g: Graph, s: FrameResources, resolved: ResolvedSettings, shadow_samples: int, *, mirrors: bool = False
 ) -> LitScene:
-    """Environment, views, depth maps of both geometries, and what smooth planes mirror of the lights."""
+    """Declares environment, light views, depth maps of both geometries, and mirror images of the lights."""
     stages = LightStages(g.gpu, resolved.rsm_size, shadow_samples, mirrors=mirrors)
     extent = object_extent(g, s)
     environment = g.stage("environment", stages.set_environment, s.lights)
@@ -135,7 +135,7 @@ def light_stages(
 
 
 def object_extent(g: Graph, s: FrameResources) -> Resource[Points]:
-    """Points that enclose the objects at all times of their animations, for fitting volumes and light views."""
+    """Declares the points that enclose the objects throughout their animations, for fitting volumes and views."""
     if "object extent" in g:
         return g.resource("object extent")
     return g.stage("object extent", lambda objects: objects.lasting_points, s.objects, same=np.array_equal)
@@ -144,7 +144,7 @@ def object_extent(g: Graph, s: FrameResources) -> Resource[Points]:
 def volume_placement(
     g: Graph, s: FrameResources, size: int, edge_m: float | None
 ) -> Resource[VolumePlacement]:
-    """The cube of voxels or cells around the objects."""
+    """Declares the cube of voxels or cells around the objects."""
 
     def place(extent: Points) -> VolumePlacement:
         return place_volume(extent.min(axis=0), extent.max(axis=0), size, edge_m)
@@ -155,12 +155,12 @@ def volume_placement(
 def surfel_scene(
     seen: Observation, lights: LightBuffers, albedo: AlbedoTexture, *, measured: bool = True
 ) -> dict[str, Binding]:
-    """Bindings of what lights real surfels; without `measured`, no surface counts as seen by the camera."""
+    """Returns the bindings for lighting real surfels; without `measured`, none counts as seen by the camera."""
     return {
         **seen.bindings,
         **lights.bindings,
         **albedo.bindings,
-        "Materials": None,  # of objects: declared by what both kinds of surfels share, and not read
+        "Materials": None,  # of objects: declared for both kinds of surfels, but not read here
         "base_color_textures": None,
         "shadow_samples": SURFEL_SHADOW_SAMPLES,
         "bias_real": seen.scan.bias_m,
@@ -171,21 +171,22 @@ def surfel_scene(
 
 
 def reflects_screen(objects: GeometryState) -> bool:
-    """Whether some object is smooth enough to show the picture in it."""
+    """Whether any object is smooth enough to reflect the picture."""
     return bool(objects.materials.smoothest < ROUGHEST)
 
 
 def casts_caustics(objects: GeometryState) -> bool:
-    """Whether some object is smooth enough to throw beams."""
+    """Whether any object is smooth enough to cast caustics."""
     return bool(objects.materials.smoothest**2 < GREATEST_ALPHA)
 
 
 @dataclass(frozen=True, eq=False)
 class ShadingOptions:
-    """What of the shared shading a method uses.
+    """Options of the shared shading.
 
-    `mirror_gather`: kernel that lights reflected points (`mirror_...`), None: no rays in smooth real surfaces.
-    `march`: defines of march.glsl, where smooth objects look among voxels for what the picture does not show.
+    `mirror_gather` names the kernel that lights reflected points (`mirror_...`); None: no rays at smooth real
+    surfaces. `march` are defines of march.glsl, with which smooth objects look up in voxels what the picture does not
+    show.
     """
 
     caustics: bool = False
@@ -196,7 +197,7 @@ class ShadingOptions:
 
 @dataclass(frozen=True, eq=False)
 class Layers:
-    """What a method hands to composition; `voxels`, `volume` and `lights` are there for debug views."""
+    """The layers that a method hands to composition; `voxels`, `volume` and `lights` are for debug views."""
 
     direct: Resource[DirectLight]
     cones: Resource[ConeFields]
@@ -210,9 +211,9 @@ class Layers:
 
 
 class Shading:
-    """Shades what the camera sees: cones at reduced resolution, direct light and objects at full.
+    """Shades the visible surfaces: cones at reduced resolution, direct light and objects at full resolution.
 
-    A method fills `cones` by stages of its own. `marching` gives the bindings of what its cones march through.
+    The method fills `cones` by its own stages; `marching` holds the bindings that its cones march with.
     """
 
     def __init__(
@@ -235,7 +236,7 @@ class Shading:
         self._screen = ScreenCones(gpu, self.grid, options.march) if options.screen_space else None
         self._rays: MirrorRays | None = None
         self.normal_offset: Callable[[Points], float] = lights.virtual_texel_m
-        self.is_everywhere = False  # nothing is skipped because objects seem not to reach it
+        self.is_everywhere = False  # where set, no pixel is skipped for being out of the objects' reach
 
     def scene(
         self,
@@ -246,7 +247,10 @@ class Shading:
         everywhere: bool,
         *_lights: LightBuffers,
     ) -> dict[str, Binding]:
-        """Bindings of what stages at pixels read: geometry, lights, volume, and what follows from them."""
+        """Returns the bindings of stages that shade pixels.
+
+        Geometry, lights, volume, and values derived from them.
+        """
         low, high = objects.bounds
         bounds = volume.placement.voxel_bounds(np.stack([low, high])).astype(float)
         return {
@@ -263,19 +267,19 @@ class Shading:
         }
 
     def set_objects(self, objects: GeometryState) -> ObjectBvh:
-        """Takes the objects' triangles; their hierarchy is built when rays are traced."""
+        """Sets the objects' triangles; their hierarchy is built when rays are traced."""
         self._bvh.set_triangles(objects.corners, objects.bounds, objects.buffers)
         return self._bvh
 
     def choose_pixels(self, scene: Bindings) -> LowResGrid:
-        """Chooses the pixels that stand for blocks of the picture."""
+        """Selects the pixel that represents each block of the picture."""
         self.grid.run(scene)
         return self.grid
 
     def cast_caustics(
         self, scene: Bindings, _grid: LowResGrid, _bvh: ObjectBvh, seen: Observation, volume: PlacedVolume
     ) -> Caustics | None:
-        """Renders caustics, where an object is smooth enough."""
+        """Renders caustics if any object is smooth enough."""
         if self._caustics is None or not scene["has_caustics"]:
             return None
         reach = volume.placement.size * volume.placement.voxel_edge
@@ -285,14 +289,14 @@ class Shading:
     def light_directly(
         self, scene: Bindings, grid: LowResGrid, caustics: Caustics | None, voxels: VoxelMipmap
     ) -> DirectLight:
-        """Lights the real surfaces by the lights themselves."""
+        """Computes the direct light on the real surfaces."""
         self._direct.run(grid, scene, joint=voxels.texture, caustics=caustics)
         return self._direct
 
     def reflect_objects(
         self, scene: Bindings, grid: LowResGrid, bvh: ObjectBvh, marching: Bindings
     ) -> moderngl.Texture | None:
-        """Traces the objects in smooth real surfaces; None where none is declared: cones serve."""
+        """Traces the objects in smooth real surfaces; returns None if none is declared, and cones do."""
         wanted = self._options.mirror_gather
         if wanted is None or not scene["specular_surfaces"]:
             if self._rays is not None:
@@ -307,7 +311,7 @@ class Shading:
     def compare(
         self, grid: LowResGrid, direct: DirectLight, cones: ConeFields, reflection: moderngl.Texture | None
     ) -> ChangeRatio:
-        """Finds where light changes, and by what ratio."""
+        """Finds where light changes, and by which ratio."""
         self._change.run(grid, direct, cones, reflection)
         return self._change
 
@@ -368,7 +372,7 @@ def shading_stages(
     trace: Callable[[Resource[Bindings], Resource[LowResGrid]], Resource[ConeFields]],
     light_directly: Callable[..., DirectLight] | None = None,
 ) -> Layers:
-    """Grid, cones (declared by `trace`), caustics, direct light, reflections, change of light, objects."""
+    """Declares grid, cones (by `trace`), caustics, direct light, reflections, change of light, and objects."""
     scene = g.stage(
         "shading scene",
         shading.scene,
@@ -393,9 +397,9 @@ def shading_stages(
 
 
 def shadow_receivers(real: GeometryState, extent: Points) -> Points:
-    """Real points around the objects; all of them where nothing is near.
+    """Returns the real points around the objects, or all of them if none is near.
 
-    Vertices within reach, and what triangles too large to have any there bring into the cube of that reach.
+    These are the vertices within reach and, for triangles too large to have a vertex there, their part of that cube.
     """
     low, high = extent.min(axis=0), extent.max(axis=0)
     centre, reach = (low + high) / 2, SHADOW_REACH * float(np.max(high - low))

@@ -1,4 +1,4 @@
-"""Which method relights for a scene document's `method`, with what settings."""
+"""Selects the relighting method, with its settings, for a scene document's `method`."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ Declare = Callable[[Graph, FrameResources, Setup[Any]], Layers]
 
 @dataclass(frozen=True)
 class MethodChoice:
-    """A method whose settings and memory were checked. `remark`: a sentence for the user, or none."""
+    """A method with checked settings and memory. `remark`: a sentence for the user, or none."""
 
     settings: Any
     resolved: ResolvedSettings
@@ -38,15 +38,15 @@ class MethodChoice:
 
     @property
     def composition(self) -> Literal["ratio", "additive"]:
-        """How the delta meets the picture."""
+        """How the change of light is composed with the picture."""
         composition: Literal["ratio", "additive"] = self.settings.resolved_composition
         return composition
 
     def require(self, objects: Sequence[SceneObject]) -> None:
-        """Refuses visible objects that the method cannot show.
+        """Refuses visible objects that the method cannot render.
 
         Raises:
-            DeltalightError: an object's shape may change, and the method precomputes.
+            DeltalightError: an object's shape may change, but the method precomputes it.
         """
         if isinstance(self.settings, AroofMethod):
             for item in objects:
@@ -54,15 +54,15 @@ class MethodChoice:
                     require_rigid(item)
 
     def setup(self, picture_size: tuple[int, int], fields: OcclusionFields) -> Setup[Any]:
-        """What the method is declared with for pictures of this size."""
+        """Returns what the method's stages are declared with, for pictures of this size."""
         return Setup(self.settings, self.resolved, picture_size, fields)
 
 
 def choose_method(method: Method, *, software: bool) -> MethodChoice:
-    """Checks what the document asks for; `none` draws the objects as dvct does.
+    """Selects the method that the document requests; `none` draws the objects as dvct does.
 
     Raises:
-        DeltalightError: more memory than its budget.
+        DeltalightError: the method exceeds its memory budget.
     """
     settings = DvctMethod() if isinstance(method, NoneMethod) else method
     if isinstance(settings, DlpvMethod):

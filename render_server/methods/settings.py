@@ -1,4 +1,4 @@
-"""Settings that the scene document leaves open, by what the machine can do."""
+"""Defaults of settings that the scene document leaves open, by the machine's abilities."""
 
 from dataclasses import dataclass
 from typing import Generic, TypeVar
@@ -13,15 +13,15 @@ VOLUME_SIZE = (64, 256)
 CONE_SCALE = (4, 2)
 RSM_SIZE = (512, 1024)
 TRIANGLE_BUDGET = (40_000, 400_000)
-SHOWN_CELLS = 64  # of method aroof, which has no volume: for view `volume` alone
-JOINT_RSM_SIZE = (1024, 2048)  # of maps that hold objects and room at once, and so resolve objects less
+SHOWN_CELLS = 64  # of method aroof, for view `volume` alone
+JOINT_RSM_SIZE = (1024, 2048)  # joint maps of objects and room need double resolution
 
 
 @dataclass(frozen=True)
 class ResolvedSettings:
-    """The settings of a method whose default depends on the machine.
+    """The settings of a method whose defaults depend on the machine.
 
-    `volume_size`: voxels or cells an edge. `cone_scale`: cones and volumes are evaluated at 1/scale of the picture.
+    `volume_size` is in voxels or cells per edge. Cones and volumes are evaluated at 1/`cone_scale` of the picture.
     """
 
     volume_size: int
@@ -32,7 +32,7 @@ class ResolvedSettings:
 
 @dataclass(frozen=True, eq=False)
 class Setup(Generic[Settings]):
-    """What a method is declared with: settings, width and height of the picture, what is precomputed of objects."""
+    """Arguments of a method's declaration: settings, picture size (width, height), precomputed data of objects."""
 
     settings: Settings
     resolved: ResolvedSettings
@@ -41,7 +41,7 @@ class Setup(Generic[Settings]):
 
 
 def march_defines(settings: VoxelConeSettings) -> dict[str, int]:
-    """What march.glsl is compiled with."""
+    """Returns the defines that march.glsl is compiled with."""
     defines = {
         "ISOTROPIC_VOXELS": settings.voxels == "isotropic",
         "MULTIPLIED_COVERAGE": settings.coverage == "multiplied",
@@ -52,7 +52,7 @@ def march_defines(settings: VoxelConeSettings) -> dict[str, int]:
 def resolve_voxel_cones(
     settings: VoxelConeSettings, *, software: bool, rsm_size: tuple[int, int] = RSM_SIZE
 ) -> ResolvedSettings:
-    """Take the document's values, or the machine's defaults where it says null."""
+    """Resolves the document's values, with the machine's defaults for null."""
     column = 0 if software else 1
     return ResolvedSettings(
         settings.volume_size or VOLUME_SIZE[column],
@@ -63,7 +63,7 @@ def resolve_voxel_cones(
 
 
 def resolve_dlpv(settings: DlpvMethod, *, software: bool) -> ResolvedSettings:
-    """Take the document's values, or the machine's defaults where it says null."""
+    """Resolves the document's values, with the machine's defaults for null."""
     column = 0 if software else 1
     return ResolvedSettings(
         settings.volume_size,
@@ -74,7 +74,7 @@ def resolve_dlpv(settings: DlpvMethod, *, software: bool) -> ResolvedSettings:
 
 
 def resolve_aroof(settings: AroofMethod, *, software: bool) -> ResolvedSettings:
-    """Take the document's values, or the machine's defaults where it says null."""
+    """Resolves the document's values, with the machine's defaults for null."""
     column = 0 if software else 1
     return ResolvedSettings(
         SHOWN_CELLS,

@@ -1,4 +1,4 @@
-"""Triangle meshes as the GPU takes them: several in one vertex buffer, or split for voxelisation."""
+"""Triangle meshes as the GPU consumes them: merged into one vertex buffer, or split for voxelisation."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ class GpuMesh:
 
 
 def merge_for_gpu(meshes: Sequence[TriangleMesh]) -> GpuMesh:
-    """Merge meshes (each with its own material, in this order) into one interleaved buffer.
+    """Merges meshes (each with its own material, in this order) into one interleaved buffer.
 
     Raises:
         DeltalightError: there is no mesh.
@@ -60,7 +60,7 @@ def _interleaved(mesh: TriangleMesh, material_id: int) -> Float32[np.ndarray, "n
 
 
 def split_triangles(corners: Float32[np.ndarray, "m 3 c"], max_edge: float) -> Float32[np.ndarray, "k 3 c"]:
-    """Bisect longest edges until none is longer than `max_edge` (same unit as the positions).
+    """Bisects longest edges until none is longer than `max_edge` (same unit as the positions).
 
     Columns 0..2 of a corner are its position; all other columns (normal, uv, material index...) are
     interpolated linearly with it. Triangles that are short enough come first, unchanged and in order.
@@ -82,7 +82,7 @@ def split_triangles(corners: Float32[np.ndarray, "m 3 c"], max_edge: float) -> F
 
 
 def _check_pieces(corners: Float32[np.ndarray, "m 3 c"], max_edge: float) -> None:
-    """Refuse by a lower bound on the number of pieces, before memory runs out.
+    """Refuses by a lower bound on the number of pieces, before memory runs out.
 
     An equilateral triangle is the largest that the limit allows; bisection makes a few times as many.
     """
@@ -97,7 +97,7 @@ def _check_pieces(corners: Float32[np.ndarray, "m 3 c"], max_edge: float) -> Non
 
 
 def _bisected(corners: Float32[np.ndarray, "m 3 c"], edge: np.ndarray) -> Float32[np.ndarray, "k 3 c"]:
-    """Cut every triangle at the midpoint of its edge number `edge` (from corner `edge` to the next)."""
+    """Cuts every triangle at the midpoint of its edge number `edge` (from corner `edge` to the next)."""
     row = np.arange(len(corners))
     start, end, opposite = (corners[row, (edge + step) % 3] for step in range(3))
     middle = (start + end) * np.float32(0.5)

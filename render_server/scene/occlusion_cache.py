@@ -21,20 +21,20 @@ from render_server.scene.occlusion_field import (
 )
 from render_server.scene.occlusion_transfer import LENGTH, compute_transfer, surface_pieces
 
-FIELD_VERSION = 1  # rises when the same input gives another field
+FIELD_VERSION = 1  # increment when the same input gives another field
 CACHE_VARIABLE = "DELTALIGHT_CACHE"
 OCCLUSION_FRACTION = 0.8  # of the computing time
 
 
 def default_folder() -> Path:
-    """Return `occlusion-fields` in DELTALIGHT_CACHE, else in the user's cache folder."""
+    """Returns `occlusion-fields` in DELTALIGHT_CACHE, else in the user's cache folder."""
     given = os.environ.get(CACHE_VARIABLE)
     user = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     return (Path(given) if given else user / "deltalight") / "occlusion-fields"
 
 
 def field_digest(surface: Float32[np.ndarray, "m 3 6"], settings: FieldSettings) -> str:
-    """Return 16 hexadecimal digits that change with the object's triangles, its colours, or the settings.
+    """Returns 16 hexadecimal digits that change with the object's triangles, its colours, or the settings.
 
     Colours count only with indirect light.
     """
@@ -47,7 +47,7 @@ def field_digest(surface: Float32[np.ndarray, "m 3 6"], settings: FieldSettings)
 def compute_field(
     surface: Float32[np.ndarray, "m 3 6"], settings: FieldSettings, progress: ProgressCallback
 ) -> OcclusionField:
-    """Compute the field of an object (`object_surface`, asset's frame); takes seconds.
+    """Computes the field of an object (`object_surface`, asset's frame); takes seconds.
 
     Raises:
         DeltalightError: the package embreex is not installed.
@@ -68,7 +68,7 @@ def compute_field(
 
 
 def store_field(folder: Path, digest: str, field: OcclusionField) -> None:
-    """Write a field; the file appears when it is complete.
+    """Writes a field; the file appears when it is complete.
 
     Raises:
         DeltalightError: the folder cannot be written.
@@ -83,7 +83,7 @@ def store_field(folder: Path, digest: str, field: OcclusionField) -> None:
 
 
 def load_field(folder: Path, digest: str, settings: FieldSettings) -> OcclusionField | None:
-    """Read a field; None where there is none, or where the file is damaged and must be replaced."""
+    """Reads a field; None if there is none, or if the file is damaged and must be replaced."""
     try:
         with np.load(folder / f"{digest}.npz", allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
