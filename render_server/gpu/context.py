@@ -1,4 +1,4 @@
-"""The one OpenGL context of a process (EGL, headless)."""
+"""The OpenGL context of a process (EGL, headless)."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -11,7 +11,7 @@ from protocol.errors import DeltalightError
 
 SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swiftshader", "swrast")
 
-# What EGL and the GL loader say, and what a user can do about it.
+# What EGL and the GL loader report, and what a user can do about it.
 HINTS = {
     "libGL.so not loaded": "OpenGL is not installed: apt-get install --no-install-recommends libegl1 libgl1",
     "libEGL.so not loaded": "EGL is not installed: apt-get install --no-install-recommends libegl1 libgl1",
@@ -25,7 +25,7 @@ HINTS = {
 
 @dataclass(frozen=True)
 class GpuContext:
-    """A current OpenGL 4.3 context and what it runs on.
+    """A current OpenGL 4.3 context and its device.
 
     One process has one context and uses it from one thread.
     """
@@ -35,12 +35,12 @@ class GpuContext:
     version: str
     is_software: bool
     watchers: list[Callable[[Any], None]] = field(default_factory=list)
-    """Told of every run of a kernel (gpu/kernel.py)."""
+    """Called for every run of a kernel (gpu/kernel.py)."""
     compile_watchers: list[Callable[[str, Mapping[str, str]], None]] = field(default_factory=list)
-    """Told of every program that is compiled: its label and the text of each of its stages."""
+    """Called for every program that is compiled, with its label and the source of each stage."""
 
     def compiled(self, label: str, sources: Mapping[str, str]) -> None:
-        """Tells who watches that a program is being compiled."""
+        """Tells the compile watchers about a program."""
         for watch in self.compile_watchers:
             watch(label, sources)
 
@@ -53,12 +53,12 @@ class GpuContext:
         }
 
     def empty_texture(self, kind: type) -> Any:  # noqa: ANN401 (as the kind says)
-        """A texture of zeros that stands where a kernel is given none."""
+        """Returns a texture of zeros to bind where a kernel is given None."""
         return self._empty_textures[kind]
 
     @cached_property
     def empty_buffer(self) -> moderngl.Buffer:
-        """A buffer of zeros that stands where a kernel is given none."""
+        """A buffer of zeros to bind where a kernel is given None."""
         return self.ctx.buffer(bytes(256))
 
     def release(self) -> None:
@@ -72,7 +72,7 @@ def is_software_renderer(name: str) -> bool:
 
 
 def explain_context_failure(text: str) -> str:
-    """One sentence for the error text of a context that could not be made."""
+    """Returns one sentence that explains the error text of a failed context creation."""
     for needle, hint in HINTS.items():
         if needle in text:
             return f"No OpenGL context ({text}): {hint}."
@@ -80,10 +80,11 @@ def explain_context_failure(text: str) -> str:
 
 
 def create_context(device: int | None = None, *, allow_software: bool = True) -> GpuContext:
-    """Make the process's context on EGL device `device` (the driver's first when None).
+    """Creates the process's context on EGL device `device` (default: the driver's first).
 
     Raises:
-        DeltalightError: no driver, no such device, or only a software renderer where none is allowed.
+        DeltalightError: there is no driver, no such device, or only a software renderer although none is
+            allowed.
     """
     options: dict[str, Any] = {"standalone": True, "backend": "egl", "require": 430}
     if device is not None:

@@ -1,4 +1,4 @@
-"""What objects hold on the GPU: textures and buffers found in their attributes, and the bytes that these take."""
+"""GPU memory of Python objects: finds the textures and buffers in their attributes and sums their bytes."""
 
 import math
 from collections.abc import Iterator, Sequence

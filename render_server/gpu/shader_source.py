@@ -1,4 +1,4 @@
-"""Shader text: recursive `#include`, once each, with `#line` marks and defines after `#version`; what it declares."""
+"""Shader source: recursive `#include`, `#line` marks, defines after `#version`, and declared names."""
 
 import re
 from collections.abc import Mapping
@@ -22,9 +22,9 @@ _LOCAL_SIZE = re.compile(r"\blocal_size_([xyz])\s*=\s*(\d+)")
 
 @dataclass(frozen=True)
 class Declarations:
-    """Names that a shader's text declares, whichever of them its defines leave in.
+    """Names that a shader's source declares, with all branches of its defines.
 
-    `formats` are the formats of images (layout qualifiers; none where it is written only and has no format),
+    `formats` are the formats of images (layout qualifiers; absent for write-only images without one),
     `written` the images and storage blocks that are not `readonly`.
     """
 
@@ -35,7 +35,7 @@ class Declarations:
 
 
 def shader_source(path: Path, defines: Mapping[str, int | float | str] | None = None) -> str:
-    """Text of the shader at `path` with its includes (relative to the shaders' folder) and defines."""
+    """Returns the source of the shader at `path` with includes (from the shaders' folder) and defines."""
     files: list[Path] = []
     body = _expand(path, files)
     head = [VERSION, *(f"#define {name} {value}" for name, value in (defines or {}).items())]
@@ -44,7 +44,7 @@ def shader_source(path: Path, defines: Mapping[str, int | float | str] | None = 
 
 
 def _expand(path: Path, seen: list[Path]) -> str:
-    """Text of `path` with every include that was not yet `seen` put in its place."""
+    """Returns the source of `path`, with every include that was not yet `seen` replaced by its text."""
     seen.append(path)
     number = len(seen) - 1
     lines = [f"#line 1 {number}"]
@@ -61,7 +61,7 @@ def _expand(path: Path, seen: list[Path]) -> str:
 
 
 def declarations(source: str) -> Declarations:
-    """What the text of a shader declares for its caller."""
+    """Returns what a shader's source declares for its caller."""
     text = _COMMENT.sub(" ", source)
     names: set[str] = set()
     formats: dict[str, frozenset[str]] = {}

@@ -27,11 +27,11 @@ class DirectionalLight:
     angular_radius_rad: float
 
     def scaled(self, factor: Float32[np.ndarray, "3"]) -> "DirectionalLight":
-        """Return the light times a factor R G B."""
+        """Returns the light times a factor R G B."""
         return replace(self, irradiance=self.irradiance * factor)
 
     def describe(self) -> dict[str, Any]:
-        """Return plain values for messages and logs."""
+        """Returns plain values for messages and logs."""
         return {
             "type": "directional",
             "direction": self.direction.tolist(),
@@ -49,11 +49,11 @@ class SphereLight:
     radius_m: float
 
     def scaled(self, factor: Float32[np.ndarray, "3"]) -> "SphereLight":
-        """Return the light times a factor R G B."""
+        """Returns the light times a factor R G B."""
         return replace(self, intensity=self.intensity * factor)
 
     def describe(self) -> dict[str, Any]:
-        """Return plain values for messages and logs."""
+        """Returns plain values for messages and logs."""
         return {
             "type": "sphere",
             "position_m": self.position.tolist(),
@@ -82,11 +82,11 @@ class SpotLight:
         return self.half_angle_rad * (1.0 - self.blend)
 
     def scaled(self, factor: Float32[np.ndarray, "3"]) -> "SpotLight":
-        """Return the light times a factor R G B."""
+        """Returns the light times a factor R G B."""
         return replace(self, intensity=self.intensity * factor)
 
     def describe(self) -> dict[str, Any]:
-        """Return plain values for messages and logs."""
+        """Returns plain values for messages and logs."""
         return {
             "type": "spot",
             "position_m": self.position.tolist(),
@@ -117,11 +117,11 @@ class RectangleLight:
         return np.asarray(across / np.linalg.norm(across))
 
     def scaled(self, factor: Float32[np.ndarray, "3"]) -> "RectangleLight":
-        """Return the light times a factor R G B."""
+        """Returns the light times a factor R G B."""
         return replace(self, radiance=self.radiance * factor)
 
     def describe(self) -> dict[str, Any]:
-        """Return plain values for messages and logs."""
+        """Returns plain values for messages and logs."""
         return {
             "type": "rectangle",
             "position_m": self.position.tolist(),
@@ -151,7 +151,7 @@ class LightSet:
     identities: tuple[int, ...] = ()
 
     def registered(self, factor: Float32[np.ndarray, "3"] | None = None) -> "LightSet":
-        """Return the set with the registration (or another factor) multiplied in."""
+        """Returns the set with the registration (or another factor) multiplied in."""
         chosen = np.asarray(self.registration if factor is None else factor, np.float32)
         return replace(
             self,
@@ -161,23 +161,23 @@ class LightSet:
         )
 
     def with_ground(self, radiance: Float32[np.ndarray, "3"]) -> "LightSet":
-        """Return the set with ground of this radiance in `ground_fraction` of its environment."""
+        """Returns the set with ground of this radiance in `ground_fraction` of its environment."""
         ground = np.broadcast_to(radiance, self.environment.shape)
         return self.with_surfaces(ground, self.ground_fraction)
 
     def with_surfaces(
         self, radiance: Float32[np.ndarray, "n n 3"], fraction: Float32[np.ndarray, "n n 1"]
     ) -> "LightSet":
-        """Return the set with surfaces (maps of the environment's size) in front of a fraction of each texel."""
+        """Returns the set with surfaces (maps of the environment's size) in front of a fraction of each texel."""
         return replace(self, environment=(1 - fraction) * self.environment + fraction * radiance)
 
     def with_sky(self, radiance: Float32[np.ndarray, "3"], shape: Float32[np.ndarray, "n n 1"]) -> "LightSet":
-        """Return the set with radiance added above the horizon, times `shape` (of the environment's size)."""
+        """Returns the set with radiance added above the horizon, times `shape` (of the environment's size)."""
         above = above_horizon(len(self.environment))
         return replace(self, environment=self.environment + above * shape * radiance)
 
     def describe(self) -> list[dict[str, Any]]:
-        """Return plain values of all lights and of the environment's mean, for messages and logs."""
+        """Returns plain values of all lights and of the environment's mean, for messages and logs."""
         lights = [light.describe() for light in self.lights]
         for light, identity in zip(lights, self.identities, strict=False):
             light["id"] = identity
@@ -188,7 +188,7 @@ class LightSet:
 
 
 def build_lights(lights: documents.Lights) -> LightSet:
-    """Build the light set of a scene document in mode `manual` or `environment`.
+    """Builds the light set of a scene document in mode `manual` or `environment`.
 
     An environment is split by the settings of `lights.fisheye`, as in mode `fisheye`.
 
@@ -208,7 +208,7 @@ def light_set(
     ground_fraction: Float32[np.ndarray, "n n 1"],
     identities: tuple[int, ...] = (),
 ) -> LightSet:
-    """Assemble a light set with the registration that a scene document requests."""
+    """Assembles a light set with the registration that a scene document requests."""
     given = lights.resolved_registration
     factor = np.ones(3, np.float32) if given == "auto" else np.array(given, np.float32)
     return LightSet(shining, environment, ground_fraction, factor, identities)
@@ -275,7 +275,7 @@ class IncidentLight:
 
 
 def incident_light(light: Light, position: Float64[np.ndarray, "*n 3"]) -> IncidentLight:
-    """Return the unoccluded light at positions (world, m)."""
+    """Returns the unoccluded light at positions (world, m)."""
     if isinstance(light, DirectionalLight):
         to_light = np.broadcast_to(-light.direction.astype(np.float64), position.shape)
         irradiance = np.broadcast_to(light.irradiance.astype(np.float64), position.shape)
@@ -295,7 +295,7 @@ def incident_light(light: Light, position: Float64[np.ndarray, "*n 3"]) -> Incid
 
 
 def _within_cone(light: SpotLight, to_light: Float64[np.ndarray, "*n 3"]) -> Float64[np.ndarray, "*n"]:
-    """Return the fraction of a spot's intensity that it emits against `to_light`."""
+    """Returns the fraction of a spot's intensity that it emits against `to_light`."""
     angle = np.arccos(np.clip(-to_light @ light.direction, -1, 1))
     soft = max(light.half_angle_rad - light.full_angle_rad, 1e-9)
     return np.asarray(np.clip((light.half_angle_rad - angle) / soft, 0, 1))
@@ -332,7 +332,7 @@ class MirrorLight:
 def mirror_lights(
     lights: Sequence[Light], surfaces: SurfaceTable, objects: Float64[np.ndarray, "3"]
 ) -> list[MirrorLight]:
-    """Return images of lights in smooth declared planes in front of which they and `objects` (a point, m) lie."""
+    """Returns images of lights in smooth declared planes in front of which they and `objects` (a point, m) lie."""
     found = []
     for index, row in enumerate(surfaces.packed):
         roughness = float(surfaces.roughness[index])
@@ -360,7 +360,7 @@ def _plane_towards(
 def _image(
     light: Light, plane: Float64[np.ndarray, "4"], alpha: float, objects: Float64[np.ndarray, "3"]
 ) -> Light | None:
-    """Mirror a light, enlarged by the blur that the objects see; None if it is not in front of the plane.
+    """Mirrors a light, enlarged by the blur that the objects see; None if it is not in front of the plane.
 
     A GGX lobe of alpha spreads directions by 2 alpha; at the light's distance b from the plane that is 2 alpha b.
     """
@@ -392,7 +392,7 @@ def _rectangle_image(
     reflection: Float64[np.ndarray, "3 3"],
     blur_m: float,
 ) -> RectangleLight:
-    """Mirror a rectangle: its axes change places to keep the orientation, and blur widens it at the same flux."""
+    """Mirrors a rectangle: its axes change places to keep the orientation, and blur widens it at the same flux."""
     u, v = (float(np.linalg.norm(axis)) for axis in (light.axis_u, light.axis_v))
     grown = [float(np.hypot(edge, 2 * blur_m) / edge) for edge in (u, v)]
     return RectangleLight(

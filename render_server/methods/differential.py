@@ -1,8 +1,8 @@
-"""Differential rendering: two full solutions by one renderer, subtracted ([D] 3.1.1, docs/method.md 6).
+"""Differential rendering: the difference of two full solutions ([D] 3.1.1, docs/method.md 6).
 
-Solution mu knows the real scene alone, solution rho real and virtual surfaces together. Each has voxels, shadow maps
-of all of its geometry, and one march a cone of its own; nothing is skipped because objects seem not to reach it. So
-this is slow, and what `dvct` must agree with.
+Solution mu contains the real scene alone, solution rho real and virtual surfaces together. Each has its own voxels,
+shadow maps of all its geometry, and cone march; nothing is skipped because objects seem not to reach it. It is slow,
+and the reference for `dvct`.
 """
 
 from copy import copy
@@ -133,7 +133,7 @@ class SolutionCones:
 
 
 def differential(g: Graph, s: FrameResources, setup: Setup[DifferentialMethod]) -> Layers:
-    """E_rho - E_mu and S_rho - S_mu of two solutions; what is not told apart has the maps of rho."""
+    """E_rho - E_mu and S_rho - S_mu of two full solutions; everything shared uses the maps of rho."""
     settings, resolved, size = setup.settings, setup.resolved, setup.picture_size
     g.section("lights")
     lights = SolutionLights(g.gpu, settings, resolved, size)

@@ -1,5 +1,6 @@
-"""Lit voxels that cones march through: of the real scene (mu), and of real and virtual surfaces (rho)
-(docs/method.md 4).
+"""Lit voxels for cone marching (docs/method.md 4).
+
+mu holds the real scene, rho real and virtual surfaces.
 """
 
 from collections.abc import Sequence
@@ -48,9 +49,9 @@ FAR_MARGIN = 1.05
 
 
 class VoxelSet:
-    """The sparse voxels of one geometry: where the volume lay when they were filled, their surfels and groups.
+    """The sparse voxels of one geometry: the placement that they were filled for, their surfels and groups.
 
-    `is_lit`: its sums hold light, which has to go before it is lit anew.
+    `is_lit`: the sums hold light, which must be cleared before relighting.
     """
 
     def __init__(self, gpu: GpuContext, size: int, directions: int) -> None:
@@ -67,20 +68,20 @@ class VoxelSet:
         placement: VolumePlacement,
         mipmaps: Sequence[VoxelMipmap],
     ) -> None:
-        """Replaces the voxels by those of triangles; the mipmaps lose the texels of the old ones."""
+        """Replaces the voxels by those of the triangles, and clears the old ones from the mipmaps."""
         self._clear.run(self.store, mipmaps, self.volume)
         self.volume.place(placement)
         self._voxelize.run(self.store, corners, self.volume)
         self.is_lit = False
 
     def forget_light(self) -> None:
-        """Empties the sums, unless they are."""
+        """Clears the sums if they hold light."""
         if self.is_lit:
             self.store.sums.clear()
         self.is_lit = True
 
     def counts(self) -> tuple[int, int]:
-        """Touched voxels and surfels; waits for the GPU."""
+        """Returns the numbers of touched voxels and surfels; waits for the GPU."""
         return self.store.counts()
 
     def release(self) -> None:
@@ -89,10 +90,10 @@ class VoxelSet:
 
 
 class FarScene:
-    """The real scene beyond the volume: a coarse mu mipmap around everything that the camera sees.
+    """The real scene beyond the volume: a coarse mu mipmap around everything in view.
 
-    What leaves the volume meets the radiance that the camera measured there, not the environment; unless the
-    volume is not `is_used`.
+    Cones that leave the volume meet the radiance that the camera measured there instead of the environment, if
+    `is_used`.
     """
 
     def __init__(self, gpu: GpuContext, light: LightVoxels, *, is_used: bool) -> None:
@@ -115,7 +116,7 @@ class FarScene:
         return self._set
 
     def light(self, voxels: VoxelSet, scene: Bindings) -> VoxelMipmap:
-        """Gives the voxels the radiance that the camera measured, and filters them."""
+        """Lights the voxels by the radiance that the camera measured, and filters them."""
         if self._is_used:
             voxels.forget_light()
             self._light.light_real(voxels.store, {**scene, **voxels.volume.bindings})
@@ -125,7 +126,7 @@ class FarScene:
 
     @property
     def bindings(self) -> dict[str, Binding]:
-        """Everything that march.glsl reads of it."""
+        """Returns all bindings that march.glsl reads of it."""
         return {"pyramid_far": self.mipmap.texture, "FarVolume": self._block}
 
     def release(self) -> None:
@@ -134,7 +135,7 @@ class FarScene:
 
 
 class DirectionalVoxels:
-    """What the voxels of both marches hold: two anisotropic mipmaps, two sets, the far scene."""
+    """Voxel data of both marches: two anisotropic mipmaps, two voxel sets, and the scene beyond."""
 
     def __init__(self, gpu: GpuContext, settings: VoxelConeSettings, size: int) -> None:
         self._bounces = settings.bounces
@@ -149,7 +150,7 @@ class DirectionalVoxels:
         self._filter = FilterVoxels(gpu)
 
     def voxelize_real(self, real: GeometryState, placement: VolumePlacement) -> VoxelSet:
-        """Voxelises the real scene, with backs of what one camera saw."""
+        """Voxelises the real scene, with back faces if one camera saw it."""
         self.real.fill(real.solid_corners(placement.voxel_edge), placement, [self.mu, self.rho])
         return self.real
 
@@ -172,7 +173,7 @@ class DirectionalVoxels:
         self._filter.run(self.rho, self.real.volume)
 
     def march_bindings(self, cone_count: int) -> dict[str, Binding]:
-        """Everything that march.glsl reads."""
+        """Returns all bindings that march.glsl reads."""
         return {
             **self._light.bindings,
             **self.far.bindings,
@@ -198,9 +199,9 @@ class DirectionalVoxels:
 
 
 class DeltaVoxels(DirectionalVoxels):
-    """Voxels of the exact operator: rho is mu, where objects leave it as it is.
+    """Voxels of the exact operator; rho equals mu where objects change nothing.
 
-    Light is gathered `settings.bounces` times from voxel to voxel, beyond direct and unoccluded ambient light.
+    Light is gathered from voxel to voxel `settings.bounces` times, after direct and unoccluded ambient light.
     """
 
     def __init__(self, gpu: GpuContext, settings: DvctMethod, size: int) -> None:
@@ -215,24 +216,24 @@ class DeltaVoxels(DirectionalVoxels):
         lights: LightBuffers,
         *_light: object,
     ) -> dict[str, Binding]:
-        """Bindings of what lights real voxels."""
+        """Returns the bindings for lighting real voxels."""
         seen.image.build_levels()
         return surfel_scene(seen, lights, albedo, measured=self._measured)
 
     def light_real(self, voxels: VoxelSet, scene: Bindings) -> VoxelSet:
-        """Gives real surfels the radiance that the camera measured, or the lights' where it does not look."""
+        """Lights real surfels: by the measured radiance where the camera sees them, by the lights elsewhere."""
         voxels.forget_light()
         voxels.groups.start(voxels.store)
         self._light.light_real(voxels.store, {**scene, **voxels.volume.bindings}, voxels.groups)
         return voxels
 
     def filter_real(self, _lit: VoxelSet) -> VoxelMipmap:
-        """Makes mu of the lit voxels."""
+        """Filters the lit voxels into mu."""
         self._filter_mu()
         return self.mu
 
     def bounce_real(self, _mu: VoxelMipmap, _far: VoxelMipmap, scene: Bindings) -> VoxelMipmap:
-        """Real surfaces that the camera does not see: what they gather from mu in place of all ambient light."""
+        """Replaces the ambient light of unseen real surfaces by what they gather from mu."""
         if self._bounces == 0:
             return self.mu
         own, store, groups = {**scene, **self.real.volume.bindings}, self.real.store, self.real.groups
@@ -247,7 +248,7 @@ class DeltaVoxels(DirectionalVoxels):
     def joint_scene(
         self, scene: Bindings, objects: GeometryState, lights: LightBuffers, voxels: VoxelSet
     ) -> dict[str, Binding]:
-        """Bindings of what lights the objects' voxels and changes the light of real ones."""
+        """Returns the bindings for lighting the objects' voxels and the change of real ones."""
         return {
             **scene,
             **lights.bindings,
@@ -260,7 +261,7 @@ class DeltaVoxels(DirectionalVoxels):
     def light_objects(
         self, voxels: VoxelSet, objects: GeometryState, scene: Bindings, _mu: VoxelMipmap
     ) -> VoxelSet:
-        """Lights the objects' surfels, and changes the light of real ones by the objects' shadows."""
+        """Lights the objects' surfels, and the change of real ones due to the objects' shadows."""
         voxels.forget_light()
         self._light.start_support(voxels.volume.placement.voxel_bounds(np.stack(objects.bounds)))
         self._light_rho(scene, gathered=False)
@@ -271,12 +272,12 @@ class DeltaVoxels(DirectionalVoxels):
         self._light.light_real_delta(self.real.store, scene, self.real.groups, gathered=gathered)
 
     def filter_joint(self, _lit: VoxelSet) -> VoxelMipmap:
-        """Makes rho of the lit voxels of both sets."""
+        """Filters the lit voxels of both sets into rho."""
         self._filter_rho()
         return self.rho
 
     def bounce_joint(self, _rho: VoxelMipmap, scene: Bindings) -> VoxelMipmap:
-        """Gathers light from mu and rho, lights the objects and changes the real surfaces by it."""
+        """Gathers light from mu and rho, and relights the objects and the change of real surfaces with it."""
         for _ in range(self._bounces):
             marching = {**scene, **self.march_bindings(1)}
             self._gather.gather_real(self.real.store, self.real.groups, self.mu, self.rho, marching)
@@ -289,7 +290,7 @@ class DeltaVoxels(DirectionalVoxels):
 def delta_voxel_stages(
     g: Graph, s: FrameResources, lit: LitScene, voxels: DeltaVoxels, placement: Resource[VolumePlacement]
 ) -> tuple[Resource[VoxelMipmap], Resource[VoxelMipmap]]:
-    """Voxelise, light, filter and bounce: mu of the real scene, then rho with the objects."""
+    """Declares voxelisation, lighting, filtering and bounces: mu of the real scene, then rho with the objects."""
     real = g.stage("voxelize real", voxels.voxelize_real, s.real, placement)
     beyond = g.stage("voxelize far", voxels.far.voxelize, s.real)
     scene = g.value(
@@ -317,13 +318,13 @@ def delta_voxel_stages(
 class SolutionVoxels(DirectionalVoxels):
     """Voxels of two full solutions: the real scene alone (mu), real and virtual together (rho) (docs/method.md 6).
 
-    Each sums all of its light and opacity, under its own maps, as often as light is gathered. Shared are the pieces
-    of the real triangles and what the camera measured there, which tells solution rho what a surface gives back of
-    its light; and the scene beyond the volume, which objects do not change.
+    Each solution sums all its light and opacity under its own maps. Both share the pieces of the real triangles, the
+    camera's measurements on them (which give solution rho its reflectance), and the scene beyond the volume, which
+    objects do not change.
     """
 
     def voxelize_both(self, real: VoxelSet, objects: VoxelSet) -> tuple[VoxelSet, VoxelSet]:
-        """Groups the surfels of both sets, once they are voxelised."""
+        """Groups the surfels of both sets after voxelisation."""
         real.groups.start(real.store)
         if self._bounces > 0:
             self._group.run(real.store, real.groups, real.volume.bindings, has_seen=False)
@@ -356,7 +357,7 @@ class SolutionVoxels(DirectionalVoxels):
         return self
 
     def bounce(self, _lit: "SolutionVoxels", mu: Bindings, rho: Bindings) -> "SolutionVoxels":
-        """Gathers each solution's light from its own voxels, and lights them by it."""
+        """Gathers light from each solution's own voxels, and relights them with it."""
         for _ in range(self._bounces):
             self.set_support(everywhere=True)
             marching = {**mu, **self.march_bindings(1)}
@@ -379,9 +380,7 @@ class SolutionVoxels(DirectionalVoxels):
         self._filter.run(self.rho, real.volume)
 
     def set_support(self, *, everywhere: bool) -> None:
-        """Sets the bounds inside which march.glsl takes mu and rho for different: the whole volume, or nowhere, where
-        both are the same.
-        """
+        """Sets the bounds within which march.glsl distinguishes mu from rho: the whole volume or nothing."""
         size = self.real.volume.placement.size
         low, high = (0, size - 1) if everywhere else (size, -1)
         # Unlike those of a delta, they are known before anything is lit.
@@ -397,7 +396,7 @@ def solution_stages(
     rho_maps: Resource[LightBuffers],
     environment: Resource[tuple[moderngl.TextureArray, ...]],
 ) -> Resource[SolutionVoxels]:
-    """Voxelise both geometries, then light, filter and gather in step."""
+    """Declares voxelisation of both geometries, then lighting and bounces in step."""
     real = g.stage("voxelize real", voxels.voxelize_real, s.real, placement)
     beyond = g.stage("voxelize far", voxels.far.voxelize, s.real)
     objects = g.stage("voxelize objects", voxels.voxelize_objects, s.objects, placement)
@@ -421,7 +420,7 @@ def joint_voxels(voxels: "InjectedVoxels | SolutionVoxels") -> VoxelMipmap:
 
 
 class InjectedVoxels:
-    """V_delta and V_rho with the joint opacity of V_eta, as split-inject fills them ([P1] 3.2).
+    """V_delta and V_rho with the joint opacity of V_eta, filled by split injection ([P1] 3.2).
 
     Two isotropic mipmaps: (V_delta, V_eta) with signed radiance, and (V_rho, V_eta).
     """
@@ -455,7 +454,7 @@ class InjectedVoxels:
         lights: LightBuffers,
         _environment: moderngl.TextureArray,
     ) -> RealAlbedo:
-        """Finds the real scene's albedo as the lights see it."""
+        """Computes the real scene's albedo as seen from the lights."""
         seen.image.build_levels()
         self._albedo.run(lights, {**surfel_scene(seen, lights, albedo), **placed.volume.bindings})
         return self._albedo
@@ -480,7 +479,7 @@ class InjectedVoxels:
         return real
 
     def filter(self, real: VoxelSet) -> "InjectedVoxels":
-        """Makes both mipmaps of the sums."""
+        """Filters the sums into both mipmaps."""
         self._resolve.run(self.delta, self.rho, real.store, self.objects.store, real.volume)
         self._filter.run(self.delta, self.rho, real.volume)
         return self
@@ -502,7 +501,7 @@ class InjectedVoxels:
 def injection_stages(
     g: Graph, s: FrameResources, lit: LitScene, voxels: InjectedVoxels, placement: Resource[VolumePlacement]
 ) -> Resource[InjectedVoxels]:
-    """Voxelise both geometries, find the real albedo, inject, filter."""
+    """Declares voxelisation of both geometries, real albedo, injection and filtering."""
     real = g.stage("voxelize real", voxels.voxelize_real, s.real, placement)
     albedo = g.stage(
         "real albedo",

@@ -1,4 +1,4 @@
-"""What the camera sees: its image, the meshes, and the geometry buffers of the real and the virtual scene."""
+"""The camera's image, the meshes, and the geometry buffers of the real and the virtual scene."""
 
 import cv2
 import moderngl
@@ -12,8 +12,8 @@ from render_server.gpu.textures import release_all, release_target, texture_2d
 from render_server.scene.triangle_mesh import VERTEX_ATTRIBUTES, VERTEX_LAYOUT, GpuMesh
 from render_server.view import CameraView, Rectangle
 
-INVERSE_SIZE = 8192  # steps of the inverse response: a code is at least 16 of them wide
-TEXTURE_SIZE = 1024  # texels an edge of a base-colour texture
+INVERSE_SIZE = 8192  # steps of the inverse response: each code spans at least 16
+TEXTURE_SIZE = 1024  # per edge of a base-colour texture
 UV, COLOR, MATERIAL = slice(6, 8), slice(8, 11), 11  # columns of a vertex
 METALLIC, REFLECTANCE, ROUGHNESS = (
     3,
@@ -23,10 +23,10 @@ METALLIC, REFLECTANCE, ROUGHNESS = (
 
 
 class CameraImage:
-    """Code (RGBA8UI), linear radiance in camera units with levels (RGBA16F), response (256 x 1), pixel rays.
+    """Code (RGBA8UI), linear radiance in camera units with mip levels (RGBA16F), response (256 x 1), pixel rays.
 
-    `edge_correction` (RGBA16F, written by `EdgeUnmixing`): what takes the old background out of a pixel's radiance at
-    the edge of a real thing before an object, and which pixel shows that thing's surface.
+    `edge_correction` (RGBA16F, written by `EdgeUnmixing`) removes the old background from a pixel's radiance at the
+    edge of a real thing in front of an object, and says which pixel shows that thing's surface.
     """
 
     def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
@@ -46,7 +46,7 @@ class CameraImage:
 
     @property
     def bindings(self) -> dict[str, Binding]:
-        """Linear radiance and pixel rays by their GLSL names."""
+        """Linear radiance and pixel rays by GLSL name."""
         return {"linear_picture": self.linear, "picture_rays": self.rays}
 
     def upload(self, frame: ViewFrame) -> None:
@@ -81,7 +81,7 @@ class CameraImage:
         self.inverse_response.write(inverse_response(decode).tobytes(), alignment=1)
 
     def build_levels(self) -> None:
-        """Averages the linear picture over areas (for samples that cover several pixels)."""
+        """Builds the mip levels of the linear picture (for samples that cover several pixels)."""
         self.linear.build_mipmaps()
         self.linear.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
 
@@ -92,7 +92,7 @@ class CameraImage:
 
 
 def inverse_response(decode: Float32[np.ndarray, "256 3"]) -> Float32[np.ndarray, "n 4"]:
-    """Code whose linear value is nearest, for the squares of INVERSE_SIZE even steps from 0 to 1."""
+    """Returns the code with the nearest linear value, for the squares of INVERSE_SIZE even steps from 0 to 1."""
     values = np.linspace(0.0, 1.0, INVERSE_SIZE) ** 2
     table = np.ones((INVERSE_SIZE, 4), np.float32)
     for channel in range(3):
@@ -113,7 +113,7 @@ class MeshBuffers:
 
     @property
     def storage(self) -> dict[str, Binding]:
-        """Vertices (rows of `VERTEX_LAYOUT`) and each triangle's vertex indices, for shaders that trace rays."""
+        """Vertices (rows of `VERTEX_LAYOUT`) and vertex indices of each triangle, for shaders that trace rays."""
         return {"Vertices": self._vertices, "Corners": self._indices}
 
     def write(self, mesh: GpuMesh) -> None:
@@ -145,7 +145,7 @@ class MeshBuffers:
 
 
 def _layout_of(program: moderngl.Program) -> tuple[str, ...]:
-    """Format and attributes of a vertex; attributes that the program's compiler removed become padding."""
+    """Returns format and attributes of a vertex; attributes that the compiler removed become padding."""
     parts = list(zip(VERTEX_LAYOUT.split(), VERTEX_ATTRIBUTES, strict=True))
     active = {name for _, name in parts if program.get(name, None) is not None}
     formats = (part if name in active else f"{int(part[0]) * 4}x" for part, name in parts)
@@ -153,7 +153,7 @@ def _layout_of(program: moderngl.Program) -> tuple[str, ...]:
 
 
 def triangle_corners(mesh: GpuMesh) -> Float32[np.ndarray, "m 3 10"]:
-    """Each triangle's corners as the voxeliser reads them: position, uv, colour, material, double-sided."""
+    """Returns each triangle's corners as the voxeliser reads them: position, uv, colour, material, double-sided."""
     vertices = mesh.vertices
     double_sided = np.array([material.double_sided for material in mesh.materials], np.float32)
     flags = double_sided[vertices[:, MATERIAL].astype(int)][:, None]
@@ -164,7 +164,7 @@ def triangle_corners(mesh: GpuMesh) -> Float32[np.ndarray, "m 3 10"]:
 class MaterialTable:
     """Materials in a storage buffer, their base-colour textures in one array (common/materials.glsl).
 
-    `smoothest`: least roughness of those that reflect at all, 1 if none does.
+    `smoothest` is the least roughness of those that reflect specularly, 1 if none does.
     """
 
     def __init__(self, gpu: GpuContext, mesh: GpuMesh) -> None:
@@ -178,7 +178,7 @@ class MaterialTable:
 
     @property
     def bindings(self) -> dict[str, Binding]:
-        """Table and textures by their GLSL names."""
+        """Table and textures by GLSL name."""
         return {"Materials": self._buffer, "base_color_textures": self._textures}
 
     def release(self) -> None:
@@ -193,7 +193,7 @@ def _smoothest(mesh: GpuMesh) -> float:
 
 
 def _resampled(texture: Float16[np.ndarray, "h w 3"], size: int) -> bytes:
-    """RGBA float16 bytes of a linear texture, area-averaged to size x size."""
+    """Returns the RGBA float16 bytes of a linear texture, area-averaged to size x size."""
     resized = cv2.resize(texture.astype(np.float32), (size, size), interpolation=cv2.INTER_AREA)
     rgba = np.dstack([resized, np.ones((size, size), np.float32)])
     return rgba.astype(np.float16).tobytes()
@@ -213,7 +213,7 @@ class GeometryBuffer:
 
     @property
     def bindings(self) -> dict[str, Binding]:
-        """Its textures by their GLSL names."""
+        """Its textures by GLSL name."""
         return {
             "virtual_raster_position": self.position,
             "virtual_raster_normal": self.normal,
@@ -222,7 +222,7 @@ class GeometryBuffer:
         }
 
     def clear(self, rectangle: Rectangle | None = None) -> None:
-        """Empties it, or only the `rectangle`."""
+        """Clears it, or only the `rectangle`."""
         self.framebuffer.use()  # a clear heeds the scissor of the framebuffer in use
         self.framebuffer.clear(0.0, 0.0, 0.0, 0.0, depth=1.0, viewport=rectangle)
 
@@ -248,10 +248,10 @@ class RasterGeometry:
         offset: tuple[float, float] = (0.0, 0.0),
         rectangle: Rectangle | None = None,
     ) -> None:
-        """Draws `mesh` as `view` sees it, `offset` pixels beside the texels' centres.
+        """Draws `mesh` as `view` sees it, sampled `offset` pixels from the texels' centres.
 
-        `scene` brings the view's camera and the mesh's own materials. `rectangle`: the texels that can show the mesh;
-        the others keep what they held.
+        `scene` brings the view's camera and the mesh's own materials. `rectangle` limits drawing to the texels that
+        can show the mesh; the others keep their contents.
         """
         target.clear(rectangle)
         self._kernel.draw(target.framebuffer, mesh, scene, clip_from_camera=view.clip_from_camera_at(offset))
@@ -275,7 +275,7 @@ class RealSurface:
 
     @property
     def bindings(self) -> dict[str, Binding]:
-        """Its textures by their GLSL names."""
+        """Its textures by GLSL name."""
         return {"real_surface_position": self.position, "real_surface_normal": self.normal}
 
     def from_depth(self, depth: DepthImage, normals: Float32[np.ndarray, "h w 3"], scene: Bindings) -> None:
@@ -292,9 +292,9 @@ class RealSurface:
     ) -> None:
         """Fills it from a raster of the given model or the fused surface, through the lens.
 
-        `tolerance` (m, and m at 1 m that grow with z^2): pixels that the frame's depth filled before keep it where
-        the surface differs by more (something moved), and get the surface, the mean of many frames, where it agrees.
-        None: every pixel gets the surface.
+        `tolerance` (m, and m at 1 m that grow with z^2): a pixel that depth filled before keeps its depth where the
+        surface differs by more (something moved), and takes the surface, the mean of many frames, where it agrees.
+        None: every pixel takes the surface.
         """
         self._from_model.run(
             self.size,

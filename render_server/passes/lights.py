@@ -1,4 +1,4 @@
-"""Lights, their shadow maps and the residual environment, as every pass that shades reads them."""
+"""Lights, their shadow maps and the residual environment, as all passes that shade read them."""
 
 import math
 from collections.abc import Sequence
@@ -37,7 +37,7 @@ MapAxes = tuple[Float64[np.ndarray, "4"], Float64[np.ndarray, "4"]]
 
 @dataclass(frozen=True, eq=False)
 class LightingBlock(Block):
-    """How many lights there are, and how the residual environment is layered."""
+    """The number of lights, and the layers of the residual environment."""
 
     light_count: Int = 0
     environment_layers: Int = 0
@@ -46,7 +46,7 @@ class LightingBlock(Block):
 
 
 class LightBuffers:
-    """What the lights see of the real scene and of the virtual objects, and the records that tell shaders so."""
+    """GPU buffers of the lights: their shadow maps of the real scene and the objects, and their records."""
 
     def __init__(self, gpu: GpuContext, tile_size: int, shadow_samples: int) -> None:
         self._gpu = gpu
@@ -69,7 +69,7 @@ class LightBuffers:
 
     @property
     def bindings(self) -> dict[str, Binding]:
-        """Everything that shaders read of the lights, by its GLSL name."""
+        """All bindings of the lights, by GLSL name."""
         return {
             "Lights": self._light_buffer,
             "LightViews": self._view_buffer,
@@ -109,8 +109,10 @@ class LightBuffers:
         virtual_points: Float64[np.ndarray, "m 3"],
         mirrors: Sequence[MirrorLight] = (),
     ) -> None:
-        """Fits each light's views: around the real points that may receive the objects' shadow, and closely around
-        the virtual objects; those of mirror images before their planes.
+        """Fits each light's views.
+
+        To the real points that may receive the objects' shadow, and to the virtual objects. Views of mirror images
+        are limited to the front of their planes.
         """
         self.mirrors = list(mirrors)
         self._make_mirror_maps()
@@ -224,7 +226,7 @@ class MirrorVisibility:
         self._kernel = Kernel(gpu, "mirror_visibility")
 
     def run(self, lights: LightBuffers, noise_m: float, scene: Bindings) -> None:
-        """Fills `lights.mirror_visibility`. `noise_m`: of depth, m."""
+        """Fills `lights.mirror_visibility`; `noise_m` is the depth noise, m."""
         count = len(lights.mirrors)
         self._kernel.run(
             (MIRROR_MAP_TEXELS, MIRROR_MAP_TEXELS, count),
@@ -242,9 +244,9 @@ class MirrorVisibility:
 
 
 def mirror_map_axes(mirror: MirrorLight, points: Float64[np.ndarray, "n 3"]) -> MapAxes:
-    """Rows that multiply (x, y, z, 1) and give a map's coordinates (0..1) on the plane.
+    """Returns rows that map (x, y, z, 1) to a map's coordinates (0..1) on the plane.
 
-    The map covers where the plane shows the light to the `points`.
+    The map covers the part of the plane that shows the light to the `points`.
     """
     normal, plane = mirror.plane[:3], mirror.plane
     heights = points @ normal + plane[3]
@@ -266,7 +268,7 @@ def mirror_map_axes(mirror: MirrorLight, points: Float64[np.ndarray, "n 3"]) -> 
 
 
 def _pack_mirror(mirror: MirrorLight, layer: int, axes: MapAxes, ranges: Sequence[int]) -> bytes:
-    """std430 Light of an image of a light."""
+    """Packs the std430 Light of a mirror image."""
     own = mirror.tolerance_m, mirror.roughness, float(mirror.surface), float(mirror.source)
     tail = [*mirror.plane, *mirror.f0, float(layer), *axes[0], *axes[1]]
     return _pack_light(mirror.light, ranges, own, tail)
@@ -278,7 +280,7 @@ def _pack_light(
     own: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0),
     tail: Sequence[float] = NOT_MIRRORED,
 ) -> bytes:
-    """std430 Light: place, colour, shape, two axes and an image's own as floats, ranges of its views as integers."""
+    """Packs a std430 Light: position, colour, shape, two axes and mirror data as floats, view ranges as integers."""
     axis_u = axis_v = np.zeros(3)
     shape = (0.0, 1.0, 0.0)
     if isinstance(light, DirectionalLight):
