@@ -103,7 +103,12 @@ class LightStages:
         return buffers
 
     def map_mirrors(
-        self, _views: LightBuffers, _real: LightBuffers, _objects: LightBuffers, seen: Observation
+        self,
+        _real: LightBuffers,
+        _objects: LightBuffers,
+        _lights: LightSet,
+        _extent: Points,
+        seen: Observation,
     ) -> moderngl.TextureArray | None:
         """Maps where smooth planes show the lights; None where no plane does."""
         if not self.buffers.mirrors:
@@ -132,7 +137,7 @@ def light_stages(
     object_maps = g.stage("shadow maps objects", stages.draw_objects, object_views, s.objects)
     mirrored = []
     if mirrors:
-        given = views, real_maps, object_maps, s.observation
+        given = real_maps, object_maps, s.lights, extent, s.observation
         mirrored = [g.stage("mirror visibility", stages.map_mirrors, *given, same=_both_none)]
     return LitScene(stages.buffers, environment, real_maps, object_maps, tuple(mirrored))
 
