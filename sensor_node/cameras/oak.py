@@ -98,12 +98,12 @@ class OakCamera(LiveCamera):
     def capture(self) -> SensorFrame:
         """Wait for the next picture, with its depth if that comes in time."""
         picture, depth = self._pair()
-        self._capture_monotonic_ns = nanoseconds(picture.getTimestamp())
+        self.note_capture(nanoseconds(picture.getTimestamp()))
         self._iso = picture.getSensitivity() or self._iso
         color, jpeg = picture_of(picture, self.source)
         return SensorFrame(
             frame_id=picture.getSequenceNum(),
-            timestamp_ns=self.clock.stamp(self._capture_monotonic_ns),
+            timestamp_ns=self.timestamp_ns,
             color=color,
             camera=self.camera,
             response=self._known.response,

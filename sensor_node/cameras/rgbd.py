@@ -110,7 +110,7 @@ class RgbdCamera(LiveCamera):
         """Wait for the next pair of pictures."""
         if not self._capture.grab():
             raise CameraFailure(f"{self.source} gives no pictures any more; see if it is plugged in.")
-        self._capture_monotonic_ns = time.monotonic_ns()
+        self.note_capture(time.monotonic_ns())
         backend = BACKENDS[self._kind]
         has_color, color = self._capture.retrieve(flag=backend.color)
         has_depth, steps = self._capture.retrieve(flag=backend.depth)
@@ -126,7 +126,7 @@ class RgbdCamera(LiveCamera):
                 f"{self.source} gives {bgr.shape[1]}x{bgr.shape[0]} but is calibrated for "
                 f"{camera.width}x{camera.height}; calibrate at that size."
             )
-        stamp_ns = self.clock.stamp(self._capture_monotonic_ns)
+        stamp_ns = self.timestamp_ns
         depth_camera = known.depth_camera or camera
         depth = (
             None

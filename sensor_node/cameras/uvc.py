@@ -95,7 +95,7 @@ class UvcCamera(LiveCamera):
         self._frames += 1
         return SensorFrame(
             frame_id=self._frames - 1,
-            timestamp_ns=self.clock.stamp(self._capture_monotonic_ns),
+            timestamp_ns=self.timestamp_ns,
             color=color,
             camera=self.camera,
             response=self._response,
@@ -166,7 +166,7 @@ class UvcCamera(LiveCamera):
         given, raw = capture.retrieve()
         # V4L2 tells the time of the buffer by CLOCK_MONOTONIC in ms.
         driver_ns = int(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6) if self._is_v4l2 else grabbed_ns
-        self._capture_monotonic_ns = self.clock.plausible(driver_ns, grabbed_ns)
+        self.note_capture(self.clock.plausible(driver_ns, grabbed_ns))
         return np.asarray(raw if given else np.empty(0, np.uint8))
 
     def _take(self) -> tuple[UInt8[np.ndarray, "h w 3"], bytes | None]:
