@@ -18,8 +18,9 @@ from protocol.messages import Name, StatsMessage
 from protocol.transport import Publisher
 from sensor_node.announce import announced
 from sensor_node.cameras.base import Camera
+from sensor_node.cameras.drivers import SYNTHETIC
 from sensor_node.cameras.fisheye_capture import CameraWithFisheye
-from sensor_node.cameras.open import SYNTHETIC, open_camera, open_fisheye
+from sensor_node.cameras.open import open_camera, open_fisheye
 from sensor_node.cameras.settings import CameraSettings, FisheyeSettings
 from sensor_node.capture import POLL_S, CapturedFrame, CaptureThread, ServerClock
 from sensor_node.depth import DepthSettings

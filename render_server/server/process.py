@@ -24,6 +24,7 @@ from protocol.errors import DeltalightError
 from protocol.files import write_bytes
 from protocol.keys import Keys
 from protocol.messages import ControlRequest, StatsMessage
+from protocol.methods import PLUGINS
 from protocol.scene import SceneDocument, load_scene
 from protocol.transport import Publisher, ReplyServer
 from render_server.gpu.context import create_context
@@ -174,6 +175,8 @@ def run_server(settings: ServerSettings, keys: Keys | None = None) -> None:
         DeltalightError: the scene is wrong, no OpenGL device is suitable, or a port is in use.
     """
     scene = settings.initial_scene()
+    for fault in PLUGINS.faults.values():
+        log.warning(fault)
     with ExitStack() as stack:
         gpu = create_context(settings.device, allow_software=settings.allow_software)
         stack.callback(gpu.release)

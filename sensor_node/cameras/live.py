@@ -153,7 +153,7 @@ class LiveCamera(Camera):
 
     @abstractmethod
     def capture(self) -> SensorFrame:
-        """Wait for the next frame and note when it was captured.
+        """Wait for the next frame and note when it was captured (`note_capture`).
 
         Raises:
             CameraFailure: it gives none.
@@ -180,6 +180,15 @@ class LiveCamera(Camera):
         raise StaleFrameError(
             f"the newest frame of {self.source} is {age_s:.2f} s old, {max_age_s:g} s are allowed; see its cable."
         )
+
+    def note_capture(self, monotonic_ns: int) -> None:
+        """Notes when the newest frame was captured, by CLOCK_MONOTONIC; `capture` calls it for each."""
+        self._capture_monotonic_ns = monotonic_ns
+
+    @property
+    def timestamp_ns(self) -> int:
+        """The same moment by the camera's own clock, which is what frames carry."""
+        return self.clock.stamp(self._capture_monotonic_ns)
 
     @property
     def capture_ns(self) -> int:

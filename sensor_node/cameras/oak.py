@@ -8,8 +8,10 @@ import numpy as np
 from protocol.errors import DeltalightError
 from protocol.frames import SensorFrame
 from sensor_node.cameras.base import EndOfStream, ImuSample
+from sensor_node.cameras.driver import CameraDriver, CameraRequest
 from sensor_node.cameras.live import MM, CameraFailure, LiveCalibration, LiveCamera, capture_size
 from sensor_node.cameras.oak_device import STEREO_SIZE, OakDevice, OakStreams
+from sensor_node.cameras.oak_discovery import find_cameras
 from sensor_node.cameras.oak_frames import (
     Pairing,
     camera_from_calibration,
@@ -96,12 +98,12 @@ class OakCamera(LiveCamera):
     def capture(self) -> SensorFrame:
         """Wait for the next picture, with its depth if that comes in time."""
         picture, depth = self._pair()
-        self._capture_monotonic_ns = nanoseconds(picture.getTimestamp())
+        self.note_capture(nanoseconds(picture.getTimestamp()))
         self._iso = picture.getSensitivity() or self._iso
         color, jpeg = picture_of(picture, self.source)
         return SensorFrame(
             frame_id=picture.getSequenceNum(),
-            timestamp_ns=self.clock.stamp(self._capture_monotonic_ns),
+            timestamp_ns=self.timestamp_ns,
             color=color,
             camera=self.camera,
             response=self._known.response,
@@ -184,3 +186,15 @@ class OakCamera(LiveCamera):
         for depth in streams.depth.tryGetAll():
             self._pairing.add_depth(depth)
         return self._pairing.next()
+
+
+def make_camera(request: CameraRequest) -> OakCamera:
+    """The camera that a request names by its id; the first one where it names none.
+
+    Raises:
+        DeltalightError: the SDK is not installed.
+    """
+    return OakCamera(request.device, request.settings, request.calibration, with_depth=request.depth)
+
+
+DRIVER = CameraDriver("OAK", make_camera, find_cameras)

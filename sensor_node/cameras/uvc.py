@@ -3,6 +3,7 @@
 import os
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -12,6 +13,8 @@ from jaxtyping import UInt8
 from protocol.errors import DeltalightError
 from protocol.frames import SensorFrame
 from protocol.pictures import decode_rgb, is_jpeg
+from sensor_node.cameras.devices import file_text
+from sensor_node.cameras.driver import CameraDriver, CameraRequest, Discovery, FoundCamera, MissingSupport
 from sensor_node.cameras.live import (
     DRIVER_BUFFERS,
     CameraFailure,
@@ -29,6 +32,7 @@ SETTLE_S = 1.0
 BROKEN_IN_A_ROW = 10
 # Marker of a JPEG's Huffman tables; many cameras leave them out, and then few programs can read it.
 HUFFMAN_TABLES = b"\xff\xc4"
+GROUP_HINT = "run `sudo usermod -aG video $USER`, then log in again"
 
 
 class UvcCamera(LiveCamera):
@@ -91,7 +95,7 @@ class UvcCamera(LiveCamera):
         self._frames += 1
         return SensorFrame(
             frame_id=self._frames - 1,
-            timestamp_ns=self.clock.stamp(self._capture_monotonic_ns),
+            timestamp_ns=self.timestamp_ns,
             color=color,
             camera=self.camera,
             response=self._response,
@@ -162,7 +166,7 @@ class UvcCamera(LiveCamera):
         given, raw = capture.retrieve()
         # V4L2 tells the time of the buffer by CLOCK_MONOTONIC in ms.
         driver_ns = int(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6) if self._is_v4l2 else grabbed_ns
-        self._capture_monotonic_ns = self.clock.plausible(driver_ns, grabbed_ns)
+        self.note_capture(self.clock.plausible(driver_ns, grabbed_ns))
         return np.asarray(raw if given else np.empty(0, np.uint8))
 
     def _take(self) -> tuple[UInt8[np.ndarray, "h w 3"], bytes | None]:
@@ -186,3 +190,58 @@ def decode(raw: np.ndarray, name: str) -> tuple[UInt8[np.ndarray, "h w 3"], byte
         return decode_rgb(data, name), data
     except DeltalightError:
         return None
+
+
+def make_camera(request: CameraRequest) -> UvcCamera:
+    """The camera that a request names; the first one where it names none."""
+    return UvcCamera(
+        request.device or "0", request.settings, request.calibration, calibrated=request.calibrated
+    )
+
+
+def find_cameras(root: Path) -> Discovery:
+    """Lists the video devices of Linux."""
+    found = tuple(_video_devices(root))
+    return Discovery(found, () if found else (_nothing_found(root),))
+
+
+def _video_devices(root: Path) -> Iterator[FoundCamera]:
+    """Video devices of Linux, as /sys describes them."""
+    entries = (root / "sys/class/video4linux").glob("video*")
+    for entry in sorted(entries, key=lambda path: int(path.name.removeprefix("video"))):
+        if not _captures(root, entry):
+            continue
+        number = entry.name.removeprefix("video")
+        driver = (entry / "device/driver").resolve().name if (entry / "device/driver").exists() else "?"
+        node = root / "dev" / entry.name
+        yield FoundCamera(
+            name=file_text(entry / "name") or entry.name,
+            source=f"uvc:{number}",
+            kind="uvc",
+            details=f"/dev/{entry.name}, driver {driver}",
+            hint=_access_hint(node, f"/dev/{entry.name}"),
+        )
+
+
+def _captures(root: Path, entry: Path) -> bool:
+    """Whether a video device gives pictures: USB cameras have a second one that gives metadata."""
+    known = root / "run/udev/data" / f"c{file_text(entry / 'dev')}"
+    if known.is_file():
+        return "ID_V4L_CAPABILITIES=" not in (said := file_text(known)) or ":capture:" in said
+    return file_text(entry / "index") in ("", "0")
+
+
+def _access_hint(node: Path, name: str) -> str:
+    if not node.exists():
+        return f"{name} does not exist; in a container, pass it in (--device {name})"
+    return "" if os.access(node, os.R_OK | os.W_OK) else f"no permission for {name}: {GROUP_HINT}"
+
+
+def _nothing_found(root: Path) -> MissingSupport:
+    if not (root / "sys/class").is_dir():
+        return MissingSupport("uvc", "this system does not list its cameras", "try `uvc:0`, `uvc:1`, ...")
+    hint = "plug one in, or pass /dev/video0 and so on into the container"
+    return MissingSupport("uvc", "no video device in /sys/class/video4linux", hint)
+
+
+DRIVER = CameraDriver("USB (UVC)", make_camera, find_cameras)

@@ -10,6 +10,7 @@ from fastapi import FastAPI
 from protocol.errors import DeltalightError
 from protocol.keys import Keys
 from protocol.messages import ControlRequest
+from protocol.methods import PLUGINS
 from protocol.scene import SceneDocument, parse_scene
 from protocol.transport import RequestClient
 from services.api.app import create_app
@@ -44,6 +45,8 @@ def run_api(settings: ApiSettings, keys: Keys | None = None, scene: Path | None 
         make_first_scene(store, settings, keys)
         if settings.leaves_host:
             _announce_access(settings, store)
+        for fault in PLUGINS.faults.values():
+            log.warning(fault)
         server = http_server(create_app(settings, store, keys))
         log.info("web process runs", address=f"http://{settings.host}:{settings.port}")
         server.run(sockets=[listener])

@@ -110,6 +110,7 @@ def _configured_source(config_file: Path | None) -> str:
 def _recording(source: str | None) -> "Source | None":
     """The recording that a source names, None where it is a camera, or another host's."""
     from protocol.source import open_source
-    from sensor_node.cameras.open import SYNTHETIC, is_live
+    from sensor_node.cameras.drivers import SYNTHETIC
+    from sensor_node.cameras.open import is_live
 
     return None if source is None or source == SYNTHETIC or is_live(source) else open_source(Path(source))
