@@ -177,9 +177,11 @@ def demo() -> Iterator[str]:
 @pytest.mark.slow
 def test_ctrl_c_ends_the_demo_without_orphans_and_it_starts_again() -> None:
     (page_port,) = ports.private_ports(1)
-    for _ in range(2):
-        command = [sys.executable, "-m", "services.cli", "demo", "--no-browser", "--port", str(page_port)]
-        demo = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    command = [sys.executable, "-m", "services.cli", "demo", "--no-browser", "--port", str(page_port)]
+    for method in ([], ["--method", "paper"]):
+        demo = subprocess.Popen(
+            [*command, *method], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
         wait_for_frames(f"{ports.LOOPBACK}:{page_port}", PATIENCE_S)
         children = psutil.Process(demo.pid).children(recursive=True)
         assert len(children) == 3
