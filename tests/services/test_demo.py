@@ -182,11 +182,14 @@ def test_ctrl_c_ends_the_demo_without_orphans_and_it_starts_again() -> None:
         demo = subprocess.Popen(
             [*command, *method], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )
-        wait_for_frames(f"{ports.LOOPBACK}:{page_port}", PATIENCE_S)
-        children = psutil.Process(demo.pid).children(recursive=True)
-        assert len(children) == 3
-        demo.send_signal(signal.SIGINT)
-        output, error = demo.communicate(timeout=20)
+        try:
+            wait_for_frames(f"{ports.LOOPBACK}:{page_port}", PATIENCE_S)
+            children = psutil.Process(demo.pid).children(recursive=True)
+            assert len(children) == 3
+            demo.send_signal(signal.SIGINT)
+            output, error = demo.communicate(timeout=20)
+        finally:
+            demo.kill()  # its children end with it
         assert demo.returncode == 130
         assert "Traceback" not in error
         assert f"http://127.0.0.1:{page_port}" in output
