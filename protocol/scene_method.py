@@ -9,7 +9,7 @@ from protocol.documents import StrictModel
 
 DEFAULT_METHOD = "dvct"
 T = TypeVar("T")
-# Without `name` the method is dvct, so the others need the key for a document to match one method only.
+# Without `name` the method is dvct; the others require the key, so that a document matches one method only.
 NEEDS_NAME = ConfigDict(json_schema_extra={"required": ["name"]})
 PictureSize = Annotated[int, Field(ge=16, le=8192)]
 
