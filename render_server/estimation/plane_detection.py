@@ -25,7 +25,7 @@ class PointCloud:
     tolerance_m: Float64[np.ndarray, " k"]
 
     def inliers(self, axis: Float64[np.ndarray, "3"], offset: float) -> Bool[np.ndarray, " k"]:
-        """Returns which points lie on the plane with this normal and distance from the origin, and face the same way."""
+        """Returns which points lie on the plane with this normal and distance from the origin, and face its way."""
         near = np.abs(self.position @ axis - offset) <= self.tolerance_m
         return np.asarray(near & (self.normal @ axis >= NORMAL_COSINE))
 

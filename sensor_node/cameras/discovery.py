@@ -1,4 +1,4 @@
-"""Which cameras this machine has, found without opening one, and what is missing for those it could have."""
+"""Discovery of this machine's cameras without opening one, and of what other kinds still need."""
 
 import os
 from collections.abc import Iterator
@@ -26,7 +26,7 @@ GROUP_HINT = "run `sudo usermod -aG video $USER`, then log in again"
 
 @dataclass(frozen=True)
 class FoundCamera:
-    """A camera that is there; `source` is what opens it, `hint` says what keeps it from being opened."""
+    """A camera that was found; `source` opens it, `hint` says what prevents opening it."""
 
     name: str
     source: str
@@ -35,7 +35,7 @@ class FoundCamera:
     hint: str = ""
 
     def as_dict(self) -> dict[str, str]:
-        """The camera as plain data."""
+        """Return the camera as plain data."""
         return asdict(self)
 
 
@@ -50,7 +50,7 @@ class MissingSupport:
 
 @dataclass(frozen=True)
 class Discovery:
-    """What was found, and for which kinds nothing could be."""
+    """The cameras that were found, and the kinds that could not be."""
 
     cameras: tuple[FoundCamera, ...]
     missing: tuple[MissingSupport, ...]
@@ -62,14 +62,14 @@ def list_cameras() -> list[FoundCamera]:
 
 
 def discover(root: Path = Path("/")) -> Discovery:
-    """Look for cameras in the file system below `root` and through the OAK SDK."""
+    """Find cameras in the file system below `root` and through the OAK SDK."""
     uvc, oak, rgbd = list(_uvc_cameras(root)), _oak_cameras(root), list(_rgbd_cameras(root))
     missing = [*_missing_uvc(root, uvc), *_missing_oak(root, oak), *_missing_rgbd()]
     return Discovery((*oak, *uvc, *rgbd), tuple(missing))
 
 
 def _uvc_cameras(root: Path) -> Iterator[FoundCamera]:
-    """Video devices of Linux, as /sys describes them."""
+    """Yield the video devices of Linux, as /sys describes them."""
     entries = (root / "sys/class/video4linux").glob("video*")
     for entry in sorted(entries, key=lambda path: int(path.name.removeprefix("video"))):
         if not _captures(root, entry):
@@ -87,7 +87,7 @@ def _uvc_cameras(root: Path) -> Iterator[FoundCamera]:
 
 
 def _captures(root: Path, entry: Path) -> bool:
-    """Whether a video device gives pictures: USB cameras have a second one that gives metadata."""
+    """Whether a video device gives pictures: USB cameras have a second one for metadata."""
     known = root / "run/udev/data" / f"c{_text(entry / 'dev')}"
     if known.is_file():
         return "ID_V4L_CAPABILITIES=" not in (said := _text(known)) or ":capture:" in said
@@ -191,7 +191,7 @@ def _usb_devices(root: Path) -> Iterator[Path]:
 
 
 def _text(path: Path) -> str:
-    """Content of a small file, empty where it cannot be read."""
+    """Return the content of a small file, empty if it cannot be read."""
     try:
         return path.read_text(encoding="utf-8", errors="replace").strip()
     except OSError:

@@ -1,4 +1,4 @@
-"""From the words a user gives to a camera: `synthetic`, a folder, an .mcap file, `uvc:0`, `oak`, ..."""
+"""Opening cameras by their names: `synthetic`, a folder, an .mcap file, `uvc:0`, `oak`, ..."""
 
 from pathlib import Path
 
@@ -37,12 +37,12 @@ def open_camera(
     """Return the camera that `source` names, not opened yet (it is a context manager).
 
     Args:
-        source: `synthetic`, a dataset folder, an .mcap recording, or a live camera: `uvc:0`,
-            `uvc:/dev/video2`, `oak`, `oak:<device id>`, `openni2:0`, `orbbec:0`.
+        source: `synthetic`, a dataset folder, an .mcap recording, or a live camera: `uvc:0`, `uvc:/dev/video2`,
+            `oak`, `oak:<device id>`, `openni2:0`, `orbbec:0`.
         settings: how to replay or capture.
-        board: takes the place of the board that the source describes.
+        board: replaces the board that the source describes.
         calibrated: False gives a live camera without calibration a nominal lens, so that it can be calibrated.
-        depth: False asks an OAK for colour only, as the sensor sees it.
+        depth: False requests only colour from an OAK, as the sensor sees it.
 
     Raises:
         DeltalightError: there is no such source, it cannot be read, or its calibration is missing.
@@ -91,7 +91,7 @@ def _number(source: str) -> int:
 def open_fisheye(settings: FisheyeSettings, calibration: Path | None = None) -> FisheyeCapture:
     """Return the camera that sees the light, not opened yet (it is a context manager).
 
-    `calibration` is the folder to look in for fisheye.yaml where the settings name none.
+    `calibration` is the folder to search for fisheye.yaml if the settings name none.
 
     Raises:
         DeltalightError: there is no such source, or its fisheye.yaml is missing or wrong.
@@ -121,7 +121,7 @@ def _fisheye_calibration(source: str, folder: Path | None) -> FisheyeCalibration
 
 
 def _of_fisheye(settings: CameraSettings, known: FisheyeCalibration | None) -> CameraSettings:
-    """Settings at the size of the lens; the folder's rgb.yaml is another camera's."""
+    """Return settings with the lens's size; the folder's rgb.yaml belongs to another camera."""
     size = {} if known is None else {"width": known.lens.width, "height": known.lens.height}
     chosen = settings.model_dump(include={"width", "height"}, exclude_none=True)
     return settings.model_copy(update={"calibration": None, **size, **chosen})
