@@ -1,4 +1,4 @@
-"""Which cameras this machine has, found without opening one, and what is missing for those it could have."""
+"""Discovery of this machine's cameras without opening one, and of what other kinds still need."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""From the words a user gives to a camera: `synthetic`, a folder, an .mcap file, `uvc:0`, `oak`, ..."""
+"""Opening cameras by their names: `synthetic`, a folder, an .mcap file, `uvc:0`, `oak`, ..."""
 
 from pathlib import Path
 
@@ -76,7 +76,7 @@ def _kind(source: str) -> str:
 def open_fisheye(settings: FisheyeSettings, calibration: Path | None = None) -> FisheyeCapture:
     """Return the camera that sees the light, not opened yet (it is a context manager).
 
-    `calibration` is the folder to look in for fisheye.yaml where the settings name none.
+    `calibration` is the folder to search for fisheye.yaml if the settings name none.
 
     Raises:
         DeltalightError: there is no such source, or its fisheye.yaml is missing or wrong.
@@ -106,7 +106,7 @@ def _fisheye_calibration(source: str, folder: Path | None) -> FisheyeCalibration
 
 
 def _of_fisheye(settings: CameraSettings, known: FisheyeCalibration | None) -> CameraSettings:
-    """Settings at the size of the lens; the folder's rgb.yaml is another camera's."""
+    """Return settings with the lens's size; the folder's rgb.yaml belongs to another camera."""
     size = {} if known is None else {"width": known.lens.width, "height": known.lens.height}
     chosen = settings.model_dump(include={"width", "height"}, exclude_none=True)
     return settings.model_copy(update={"calibration": None, **size, **chosen})

@@ -1,4 +1,4 @@
-"""RGB-D cameras that OpenCV reads itself: OpenNI 2 (Asus Xtion, PrimeSense, Orbbec Astra) and Orbbec over UVC."""
+"""RGB-D cameras supported by OpenCV: OpenNI 2 (Asus Xtion, PrimeSense, Orbbec Astra) and Orbbec over UVC."""
 
 import time
 from dataclasses import dataclass
@@ -51,12 +51,12 @@ BACKENDS: dict[Kind, _Backend] = {
 
 
 def has_backend(kind: Kind) -> bool:
-    """Whether the OpenCV in use was built for a kind of camera."""
+    """Whether the installed OpenCV supports a kind of camera."""
     return bool(cv2.videoio_registry.hasBackend(BACKENDS[kind].number))
 
 
 def backend_hint(kind: Kind) -> str:
-    """What to do where it was not."""
+    """Return what to do if it does not."""
     return f"for such a camera, {BACKENDS[kind].advice}"
 
 
@@ -91,10 +91,10 @@ class RgbdCamera(LiveCamera):
         self._frames = 0
 
     def open(self) -> None:
-        """Open the device and ask for depth registered to colour.
+        """Open the device and request depth registered to colour.
 
         Raises:
-            CameraFailure: it is not there, or another program has it.
+            CameraFailure: it is absent, or another program uses it.
         """
         self._interrupted.clear()
         if not self._capture.open(self._number, BACKENDS[self._kind].number):
@@ -103,7 +103,7 @@ class RgbdCamera(LiveCamera):
             self._capture.set(cv2.CAP_PROP_OPENNI_REGISTRATION, 1)
 
     def close(self) -> None:
-        """Give the device back."""
+        """Release the device."""
         self._capture.release()
 
     def capture(self) -> SensorFrame:

@@ -26,11 +26,11 @@ from sensor_node.cameras.settings import CameraSettings
 from sensor_node.cameras.uvc_controls import UvcControls
 
 MJPG = cv2.VideoWriter.fourcc(*"MJPG")
-# Automatic exposure and white balance of usual cameras come to rest within a second.
+# Automatic exposure and white balance of usual cameras settle within a second.
 SETTLE_S = 1.0
-# USB loses a packet now and then, and the JPEG is cut; so many one after the other are a broken cable.
+# USB loses a packet now and then, which truncates the JPEG; this many in a row are a broken cable.
 BROKEN_IN_A_ROW = 10
-# Marker of a JPEG's Huffman tables; many cameras leave them out, and then few programs can read it.
+# Marker of a JPEG's Huffman tables; many cameras omit them, and then few programs can read it.
 HUFFMAN_TABLES = b"\xff\xc4"
 GROUP_HINT = "run `sudo usermod -aG video $USER`, then log in again"
 
@@ -40,9 +40,9 @@ class UvcCamera(LiveCamera):
 
     Args:
         device: number or path of the video device (`0`, `/dev/video2`), or a video that OpenCV opens.
-        settings: size, rate, exposure and white balance to ask for.
-        calibration: the camera at the size to capture, its response, extrinsics, board.
-        calibrated: False = a nominal lens will do.
+        settings: size, rate, exposure and white balance to request.
+        calibration: the camera at its capture size, its response, extrinsics, board.
+        calibrated: False = a nominal lens is acceptable.
 
     Raises:
         DeltalightError: the camera is not calibrated.
@@ -63,8 +63,8 @@ class UvcCamera(LiveCamera):
         """Open the device, lock exposure and white balance as set.
 
         Raises:
-            CameraFailure: it is not there, or another program has it.
-            DeltalightError: it cannot do what the settings ask for.
+            CameraFailure: it is absent, or another program uses it.
+            DeltalightError: it does not support the settings.
         """
         self.close()
         self._interrupted.clear()
@@ -79,13 +79,13 @@ class UvcCamera(LiveCamera):
             raise
 
     def close(self) -> None:
-        """Give the device back."""
+        """Release the device."""
         if self._capture is not None:
             self._capture.release()
         self._capture = None
 
     def set_exposure(self, seconds: float) -> None:
-        """Lock the exposure to the nearest step of 0.1 ms; the next frames but a few have it."""
+        """Lock the exposure to the nearest step of 0.1 ms; it takes effect a few frames later."""
         self._controls.set_exposure(seconds)
 
     def capture(self) -> SensorFrame:
@@ -122,7 +122,7 @@ class UvcCamera(LiveCamera):
 
     def _ask_for(self, capture: cv2.VideoCapture) -> None:
         wanted = {
-            cv2.CAP_PROP_FOURCC: MJPG,  # uncompressed pictures of more than VGA do not fit USB 2 at 30 per second
+            cv2.CAP_PROP_FOURCC: MJPG,  # uncompressed pictures beyond VGA do not fit USB 2 at 30 per second
             cv2.CAP_PROP_FRAME_WIDTH: self.camera.width,
             cv2.CAP_PROP_FRAME_HEIGHT: self.camera.height,
             cv2.CAP_PROP_FPS: self._settings.fps,
@@ -131,7 +131,7 @@ class UvcCamera(LiveCamera):
         for prop, value in wanted.items():
             capture.set(prop, value)
         if self._is_v4l2 and int(capture.get(cv2.CAP_PROP_FOURCC)) == MJPG:
-            capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)  # the JPEG as it comes, if it is a whole one
+            capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)  # the JPEG as it comes, if it is complete
             if HUFFMAN_TABLES not in self._grab().tobytes():
                 capture.set(cv2.CAP_PROP_CONVERT_RGB, 1)
 
@@ -158,19 +158,19 @@ class UvcCamera(LiveCamera):
             )
 
     def _grab(self) -> np.ndarray:
-        """Wait for the next picture as the backend gives it, and note when it was captured."""
+        """Wait for the next picture as the backend gives it, and note its capture time."""
         capture = self._capture
         if capture is None or not capture.grab():
             raise CameraFailure(f"{self.source} gives no pictures any more; see if it is plugged in.")
         grabbed_ns = time.monotonic_ns()
         given, raw = capture.retrieve()
-        # V4L2 tells the time of the buffer by CLOCK_MONOTONIC in ms.
+        # V4L2 reports the time of the buffer by CLOCK_MONOTONIC in ms.
         driver_ns = int(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6) if self._is_v4l2 else grabbed_ns
         self.note_capture(self.clock.plausible(driver_ns, grabbed_ns))
         return np.asarray(raw if given else np.empty(0, np.uint8))
 
     def _take(self) -> tuple[UInt8[np.ndarray, "h w 3"], bytes | None]:
-        """Return the next whole picture, RGB, and its JPEG where that came."""
+        """Return the next complete picture, RGB, and its JPEG if that came."""
         for _ in range(BROKEN_IN_A_ROW):
             picture = decode(self._grab(), self.source)
             if picture is not None:
@@ -179,7 +179,7 @@ class UvcCamera(LiveCamera):
 
 
 def decode(raw: np.ndarray, name: str) -> tuple[UInt8[np.ndarray, "h w 3"], bytes | None] | None:
-    """Return (RGB, JPEG or None) of what OpenCV gave: a BGR picture or a JPEG's bytes; None if it is broken."""
+    """Return (RGB, JPEG or None) of OpenCV's output: a BGR picture or a JPEG's bytes; None if it is broken."""
     if raw.ndim == 3 and raw.shape[2] == 3:
         return np.asarray(cv2.cvtColor(raw, cv2.COLOR_BGR2RGB)), None
     data = raw.tobytes()
