@@ -45,20 +45,30 @@ class GpuContext:
             watch(label, sources)
 
     @cached_property
-    def _empty_textures(self) -> dict[type, Any]:
-        return {
-            moderngl.Texture: self.ctx.texture((1, 1), 4, bytes(4)),
-            moderngl.Texture3D: self.ctx.texture3d((1, 1, 1), 4, bytes(4)),
-            moderngl.TextureArray: self.ctx.texture_array((1, 1, 1), 4, bytes(4)),
-        }
+    def _empty_textures(self) -> dict[tuple[type, str], Any]:
+        return {}
 
-    def empty_texture(self, kind: type) -> Any:  # noqa: ANN401 (as the kind says)
-        """A texture of zeros that stands where a kernel is given none."""
-        return self._empty_textures[kind]
+    def empty_texture(self, kind: type, texels: str) -> Any:  # noqa: ANN401 (as the kind says)
+        """A texture of zeros (`texels`: f, i or u) that stands where a kernel is given none."""
+        if (kind, texels) not in self._empty_textures:
+            make, size = {
+                moderngl.Texture: (self.ctx.texture, (1, 1)),
+                moderngl.Texture3D: (self.ctx.texture3d, (1, 1, 1)),
+                moderngl.TextureArray: (self.ctx.texture_array, (1, 1, 1)),
+            }[kind]
+            texture = make(size, 4, bytes(4), dtype=f"{texels}1")
+            texture.filter = (moderngl.NEAREST, moderngl.NEAREST)
+            self._empty_textures[kind, texels] = texture
+        return self._empty_textures[kind, texels]
 
     @cached_property
     def empty_buffer(self) -> moderngl.Buffer:
-        """A buffer of zeros that stands where a kernel is given none."""
+        """A buffer of zeros that stands where a kernel reads from none."""
+        return self.ctx.buffer(bytes(256))
+
+    @cached_property
+    def discarded_buffer(self) -> moderngl.Buffer:
+        """The buffer that stands where a kernel may write to none."""
         return self.ctx.buffer(bytes(256))
 
     def release(self) -> None:
