@@ -17,7 +17,7 @@ from benchmarks.glb_builder import GlbBuilder
 from render_server.passes.gbuffer import triangle_corners
 from render_server.passes.voxels import pieces_in_volume, place_volume
 from render_server.scene.gltf_meshes import load_gltf
-from render_server.scene.gpu_mesh import merge_for_gpu
+from render_server.scene.triangle_mesh import merge_for_gpu
 
 JOINTS = 40
 REPEATS = 9

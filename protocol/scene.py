@@ -9,8 +9,9 @@ from pydantic import Field, field_validator, model_validator
 
 from protocol.documents import StrictModel, read_mapping, validate
 from protocol.errors import DeltalightError
+from protocol.methods import Method
 from protocol.scene_lights import Lights, default_lights
-from protocol.scene_method import DvctMethod, Method, Output, Shading
+from protocol.scene_method import DvctMethod, Output, Shading
 from protocol.scene_objects import ModelGeometry, PrecomputedMaterial, RealScene, SceneObject
 
 DIGEST_PREFIX = "sha256:"

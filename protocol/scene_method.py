@@ -1,16 +1,13 @@
 """How the scene document's picture is computed and shown: `method`, `shading`, `output` (docs/formats.md 3)."""
 
-from collections.abc import Mapping
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
-from pydantic import ConfigDict, Discriminator, Field, Tag, model_validator
+from pydantic import ConfigDict, Field, model_validator
 
 from protocol.documents import StrictModel
 
 DEFAULT_METHOD = "dvct"
 T = TypeVar("T")
-# Without `name` the method is dvct, so the others need the key for a document to match one method only.
-NEEDS_NAME = ConfigDict(json_schema_extra={"required": ["name"]})
 PictureSize = Annotated[int, Field(ge=16, le=8192)]
 
 
@@ -29,7 +26,30 @@ TriangleBudget = Annotated[
 ShadowSamples = Annotated[int, Field(ge=1, le=64, description="Samples of a light's area for soft shadows.")]
 
 
-class VoxelConeSettings(StrictModel):
+def _require_name(schema: dict[str, Any], model: type["MethodSettings"]) -> None:
+    """Without `name` the method is dvct, so the others need the key for a document to match one method only."""
+    if model.method_name() != DEFAULT_METHOD:
+        schema["required"] = ["name", *schema.get("required", [])]
+
+
+class MethodSettings(StrictModel):
+    """Base of the settings of all methods; each has a field `name`, a literal with its name as default."""
+
+    model_config = ConfigDict(json_schema_extra=_require_name)
+
+    @classmethod
+    def method_name(cls) -> str:
+        """What `method.name` of the scene document calls the method."""
+        (name,) = get_args(cls.model_fields["name"].annotation)
+        return str(name)
+
+    @property
+    def resolved_composition(self) -> Literal["ratio", "additive"]:
+        """How the delta meets the picture."""
+        return "ratio"
+
+
+class VoxelConeSettings(MethodSettings):
     """What every method has that traces cones through voxels (docs/method.md 4)."""
 
     volume_size: int | None = Field(
@@ -122,10 +142,8 @@ class DvctMethod(VoxelConeSettings):
         return self.composition or ("ratio" if self.operator == "exact" else "additive")
 
 
-class DlpvMethod(StrictModel):
+class DlpvMethod(MethodSettings):
     """Delta light propagation volumes (docs/method.md 5)."""
-
-    model_config = NEEDS_NAME
 
     name: Literal["dlpv"] = "dlpv"
     operator: Literal["difference", "paper"] = Field(
@@ -270,10 +288,8 @@ class DlpvMethod(StrictModel):
         return self._choice(self.composition, "ratio", "additive")
 
 
-class AroofMethod(StrictModel):
+class AroofMethod(MethodSettings):
     """Object occlusion fields (docs/method.md 6): what rigid objects hide of natural light is precomputed."""
-
-    model_config = NEEDS_NAME
 
     name: Literal["aroof"] = "aroof"
     sh_order: int = Field(
@@ -340,8 +356,6 @@ class AroofMethod(StrictModel):
 class DifferentialMethod(VoxelConeSettings):
     """Differential rendering: two full solutions, the reference (docs/method.md 6)."""
 
-    model_config = NEEDS_NAME
-
     name: Literal["differential"] = "differential"
     composition: Literal["ratio", "additive"] = Field(
         default="ratio", description="How the difference meets the picture."
@@ -353,28 +367,19 @@ class DifferentialMethod(VoxelConeSettings):
         return self.composition
 
 
-class NoneMethod(StrictModel):
+class NoneMethod(MethodSettings):
     """No relighting of the real scene."""
-
-    model_config = NEEDS_NAME
 
     name: Literal["none"] = "none"
 
 
-def _method_name(value: Any) -> Any:  # noqa: ANN401 - whatever the document holds
-    if isinstance(value, Mapping):
-        return value.get("name", DEFAULT_METHOD)
-    return getattr(value, "name", DEFAULT_METHOD)
-
-
-Method = Annotated[
-    Annotated[DvctMethod, Tag("dvct")]
-    | Annotated[DlpvMethod, Tag("dlpv")]
-    | Annotated[AroofMethod, Tag("aroof")]
-    | Annotated[DifferentialMethod, Tag("differential")]
-    | Annotated[NoneMethod, Tag("none")],
-    Discriminator(_method_name),
-]
+BUILT_IN_METHODS: tuple[type[MethodSettings], ...] = (
+    DvctMethod,
+    DlpvMethod,
+    AroofMethod,
+    DifferentialMethod,
+    NoneMethod,
+)
 
 
 class Shading(StrictModel):

@@ -215,11 +215,12 @@ def declare_frame(graph: Graph, buffers: PictureBuffers) -> FrameResources:
     lights = graph.source("light set", "lights")
     everywhere = graph.source("everywhere", "lights")
     albedo = graph.source("albedo", "world")
-    declared = graph.stage("declared surfaces", buffers.declare_surfaces, surfaces)
-    camera = graph.stage("camera", buffers.set_camera, view)
+    graph.section("surfaces")
+    declared = graph.value("declared surfaces", buffers.declare_surfaces, surfaces)
+    camera = graph.value("camera", buffers.set_camera, view)
     observation = graph.stage("real surface", buffers.observe, scan, real, camera, declared)
     surface = graph.stage("object surface", buffers.draw_objects, objects, observation, camera)
-    geometry = graph.stage("geometry", _geometry_bindings, observation, surface, objects)
+    geometry = graph.value("geometry", _geometry_bindings, observation, surface, objects)
     return FrameResources(
         image, view, scan, real, objects, surfaces, lights, everywhere, albedo, observation, surface, geometry
     )

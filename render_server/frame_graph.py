@@ -102,7 +102,7 @@ class Composition:
         relit = RelitLayers(scene["object_coverage"], *layers)
         self._composite.run(image, relit, {**scene, **options.bindings})
         view = options.output.view
-        if view == "volume":
+        if view == "volume" and relit.voxels is not None:
             self._views.volume(self._composite.code, image, relit.voxels, relit.volume, scene)
         elif view == "rsm":
             self._views.shadow_maps(self._composite.code, relit.lights)
@@ -143,7 +143,11 @@ class FrameGraph:
         self.graph = Graph(gpu, timers, checks=checks)
         self.graph.own(self.buffers)
         self.resources: FrameResources = declare_frame(self.graph, self.buffers)
-        self.layers: Layers = method.declare(self.graph, self.resources, method.setup(view.size, fields))
+        try:
+            self.layers: Layers = method.declare(self.graph, self.resources, method.setup(view.size, fields))
+        except BaseException:
+            self.release()
+            raise
         self._options: Resource[CompositeOptions] = self.graph.source("output", "scene")
         self._composite = self._declare_composition(Composition(gpu, view.size))
         self._inputs: FrameInputs | None = None
@@ -171,7 +175,8 @@ class FrameGraph:
         )
 
     def upload(self, frame: ViewFrame) -> None:
-        """Uploads a frame's picture: a change, whatever it shows."""
+        """Begins a frame by uploading its picture: a change, whatever it shows."""
+        self.graph.begin_frame()
         self.buffers.image.upload(frame)
         self.resources.image.write(self.buffers.image)
 

@@ -30,8 +30,8 @@ class PlacedObject:
 class GeometryState:
     """One set of triangles in the world; another set is another object.
 
-    `corners` are for the voxeliser (`triangle_corners` in passes/gbuffer.py), `points` enclose the set. `swept_points`
-    enclose it at all times of its animations: what is fitted around them stands still while it moves.
+    `corners` are for the voxeliser (`triangle_corners` in passes/gbuffer.py), `points` enclose the set.
+    `swept_points` enclose it at all times of its animations: what is fitted around them stands still while it moves.
     """
 
     buffers: MeshBuffers

@@ -4,6 +4,7 @@ A method declares its stages once; every frame sets the sources and runs the gra
 of all that it was made from, so that what a moving camera costs can be read from the graph before anything is drawn.
 """
 
+import inspect
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -12,7 +13,7 @@ from typing import Any, Final, Generic, Literal, TypeVar, get_args
 
 from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Dispatch, watched
-from render_server.gpu.memory import gpu_objects, size_bytes
+from render_server.gpu.memory import gpu_objects, sizes_bytes
 from render_server.gpu.timers import PassTimers
 
 Clock = Literal["scene", "lights", "world", "objects", "view"]
@@ -76,8 +77,23 @@ class Stage:
 
 
 @dataclass(frozen=True)
+class SourceReport:
+    """One source as the frame left it. `changed`: whether it did in this frame."""
+
+    name: str
+    clock: Clock
+    size_bytes: int
+    changed: bool
+
+
+@dataclass(frozen=True)
 class StageReport:
-    """One stage as the last run left it; `size_bytes` is the GPU memory that it holds and no earlier stage does."""
+    """One stage as the frame left it.
+
+    `size_bytes` is the GPU memory of what it writes, as far as no other stage or source has it by itself; `time_ms`
+    what it took when it last ran. `is_value`: it only puts values together. `summary` and `file` tell what its
+    function does, and where it stands.
+    """
 
     name: str
     inputs: tuple[str, ...]
@@ -86,6 +102,10 @@ class StageReport:
     size_bytes: int
     time_ms: float | None
     ran: bool
+    section: str
+    is_value: bool
+    summary: str
+    file: str
 
 
 class Graph:
@@ -99,6 +119,9 @@ class Graph:
         self.gpu = gpu
         self.timers = timers
         self._checks = checks
+        self._sections: list[tuple[int, str]] = []
+        self._values: set[str] = set()
+        self._begun: tuple[dict[Stage, object], dict[Resource[Any], int]] = {}, {}
         self._resources: dict[str, Resource[Any]] = {}
         self._stages: list[Stage] = []
         self._named: dict[Stage, list[str]] = {}
@@ -128,6 +151,19 @@ class Graph:
         `same` compares an old with a new value; where it holds, what reads the resource does not run again.
         """
         return self._add(name, function, inputs, (name,), same)[0]
+
+    def value(
+        self, name: str, function: Callable[..., Any], *inputs: Resource[Any] | str, same: Same | None = None
+    ) -> Resource[Any]:
+        """Declares a stage that only puts values together: it runs no kernel and is not timed, and pictures of the
+        graph show it with the stage that it serves.
+        """
+        self._values.add(name)
+        return self.stage(name, function, *inputs, same=same)
+
+    def section(self, name: str) -> None:
+        """Begins a section of the frame, for who reads the graph: what is declared from here on belongs to it."""
+        self._sections.append((len(self._stages), name))
 
     def stages(
         self, name: str, function: Callable[..., Any], *inputs: Resource[Any] | str, outputs: Sequence[str]
@@ -284,7 +320,7 @@ class Graph:
         dispatches: list[Dispatch] = []
         try:
             with ExitStack() as around:
-                if self.timers is not None:
+                if self.timers is not None and stage.name not in self._values:
                     around.enter_context(self.timers.measure(stage.name))
                 if self._checks:
                     around.enter_context(watched(self.gpu, dispatches.append))
@@ -315,22 +351,57 @@ class Graph:
                         "declare."
                     )
 
+    def begin_frame(self) -> None:
+        """Begins a frame: reports tell what ran and changed since."""
+        seen = {stage: stage.seen for stage in self._stages}
+        self._begun = dict(seen), {item: item.version for item in self._resources.values()}
+
+    def invalidate(self) -> None:
+        """Makes every stage run again with the next run that needs it."""
+        for stage in self._stages:
+            stage.seen = None
+
     def report(self) -> list[StageReport]:
-        """Every stage in the order in which they run, as the last run left it."""
-        times: Mapping[str, float] = {} if self.timers is None else self.timers.times_ms
-        counted: set[int] = set()
+        """Every stage in the order in which they run, as the frame left it."""
+        times: Mapping[str, float] = {} if self.timers is None else self.timers.last_ms
+        sizes, (seen, _) = self._sizes(), self._begun
         return [
             StageReport(
                 stage.name,
                 tuple(item.name for item in stage.inputs),
                 tuple(item.name for item in stage.outputs),
                 tuple(clock for clock in CLOCKS if clock in stage.clocks),
-                sum(size_bytes(item.value, counted) for item in stage.outputs if item.version),
+                sum(sizes[item] for item in stage.outputs),
                 times.get(stage.name),
-                stage.ran,
+                stage.ran or stage.seen is not seen.get(stage, stage.seen),
+                self._section_of(stage),
+                stage.name in self._values,
+                _summary(stage.function),
+                stage.function.__module__.replace(".", "/") + ".py",
             )
             for stage in self._sorted()
         ]
+
+    def report_sources(self) -> list[SourceReport]:
+        """Every source in the order in which they were declared, as the frame left it."""
+        sizes, (_, versions) = self._sizes(), self._begun
+        return [
+            SourceReport(
+                item.name, next(iter(item.clocks)), sizes[item], item.version != versions.get(item, 0)
+            )
+            for item in self._resources.values()
+            if item.stage is None
+        ]
+
+    def _sizes(self) -> dict[Resource[Any], int]:
+        """GPU memory of each resource."""
+        items = list(self._resources.values())
+        sizes = sizes_bytes([item.value if item.version else None for item in items])
+        return dict(zip(items, sizes, strict=True))
+
+    def _section_of(self, stage: Stage) -> str:
+        index = self._stages.index(stage)
+        return next((name for first, name in reversed(self._sections) if first <= index), "")
 
     def release(self) -> None:
         """Frees everything that the stages hold."""
@@ -346,3 +417,9 @@ def _links(circle: Sequence[Stage]) -> str:
         item = next(item for item in stage.inputs if item.stage is writer)
         links.append(f"`{stage.name}` reads `{item.name}` of `{writer.name}`")
     return ", ".join(links)
+
+
+def _summary(function: Callable[..., Any]) -> str:
+    """First sentence of a function's documentation, without its full stop."""
+    text = " ".join((inspect.getdoc(function) or "").split("\n\n")[0].split())
+    return text.split(". ")[0].rstrip(".")

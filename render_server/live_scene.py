@@ -6,7 +6,7 @@ from typing import Any
 
 from protocol.frames import ViewFrame
 from protocol.scene import SceneDocument
-from protocol.scene_method import NoneMethod, Output
+from protocol.scene_method import Output
 from protocol.scene_objects import Material
 from render_server.estimation.albedo import AlbedoEstimator
 from render_server.estimation.lighting import LightEstimator
@@ -101,8 +101,8 @@ class LiveScene:
     def _take(self, plan: _Plan) -> None:
         old = self._plan
         budget = plan.method.resolved.triangle_budget
-        if self._real is not None and isinstance(plan.scene.method, NoneMethod):
-            budget = self._real.budget  # it asks for none
+        if self._real is not None and not plan.method.relights_real:
+            budget = self._real.budget  # `none` asks for none
         if self._real is None or plan.scene.real != old.scene.real or budget != self._real.budget:
             real = RealGeometry(self._gpu, plan.scene.real, budget)
             if self._real is not None:
@@ -180,9 +180,10 @@ class LiveScene:
         return RelitFrame(graph, self._options(output))
 
     def _options(self, output: Output) -> CompositeOptions:
-        is_none = isinstance(self._plan.scene.method, NoneMethod)
-        additive = self._plan.method.composition == "additive"
-        return CompositeOptions(output, additive, not is_none, with_linear=False)
+        method = self._plan.method
+        return CompositeOptions(
+            output, method.composition == "additive", method.relights_real, with_linear=False
+        )
 
     def _surface_table(self, frame: ViewFrame, *, moved: bool) -> SurfaceTable:
         """The declared surfaces, with the board's sheet among them; renewed when something moved."""

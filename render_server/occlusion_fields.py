@@ -1,27 +1,121 @@
-"""The occlusion fields of a scene's objects: found on disk, or computed before rendering begins or beside it."""
+"""The occlusion fields of a scene's objects: found on disk by content, or computed before or beside rendering."""
 
+import hashlib
+import os
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
+from zipfile import BadZipFile
 
+import numpy as np
 import structlog
+from jaxtyping import Float32
 from rich.console import Console
 from rich.progress import Progress
 
 from protocol.errors import DeltalightError
+from protocol.files import replacing
 from protocol.scene_objects import SceneObject
 from render_server.gpu_scene import PlacedObject
-from render_server.scene.occlusion_cache import (
-    compute_field,
-    default_folder,
-    field_digest,
-    load_field,
-    store_field,
+from render_server.scene.occlusion_field import (
+    FieldSettings,
+    ObjectRays,
+    OcclusionField,
+    ProgressCallback,
+    ShellGrid,
+    compute_occlusion,
+    place_shells,
 )
-from render_server.scene.occlusion_field import FieldSettings, OcclusionField, ProgressCallback
-from render_server.scene.occlusion_transfer import object_surface
+from render_server.scene.occlusion_transfer import LENGTH, compute_transfer, object_surface, surface_pieces
 from render_server.scene.triangle_mesh import TriangleMesh
+
+FIELD_VERSION = 1  # rises when the same input gives another field
+CACHE_VARIABLE = "DELTALIGHT_CACHE"
+OCCLUSION_FRACTION = 0.8  # of the computing time
+
+
+def default_folder() -> Path:
+    """Return `occlusion-fields` in DELTALIGHT_CACHE, else in the user's cache folder."""
+    given = os.environ.get(CACHE_VARIABLE)
+    user = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return (Path(given) if given else user / "deltalight") / "occlusion-fields"
+
+
+def field_digest(surface: Float32[np.ndarray, "m 3 6"], settings: FieldSettings) -> str:
+    """Return 16 hexadecimal digits that change with the object's triangles, its colours, or the settings.
+
+    Colours count only with indirect light.
+    """
+    hasher = hashlib.sha256(repr((FIELD_VERSION, astuple(settings))).encode())
+    counting = surface if settings.indirect else surface[..., :3]
+    hasher.update(np.ascontiguousarray(counting, np.float32).tobytes())
+    return hasher.hexdigest()[:16]
+
+
+def compute_field(
+    surface: Float32[np.ndarray, "m 3 6"], settings: FieldSettings, progress: ProgressCallback
+) -> OcclusionField:
+    """Compute the field of an object (`object_surface`, asset's frame); takes seconds.
+
+    Raises:
+        DeltalightError: the package embreex is not installed.
+    """
+    rays = ObjectRays(np.ascontiguousarray(surface[..., :3]))
+    grid = place_shells(rays, settings)
+    occlusion = compute_occlusion(
+        rays, grid, settings, lambda fraction: progress(OCCLUSION_FRACTION * fraction)
+    )
+    transfer = None
+    if settings.indirect:
+        pieces = surface_pieces(surface, rays.radius)
+        later = 1 - OCCLUSION_FRACTION
+        transfer = compute_transfer(
+            pieces, grid, settings, lambda fraction: progress(OCCLUSION_FRACTION + later * fraction)
+        )
+    return OcclusionField(grid, rays.radius, occlusion, transfer)
+
+
+def store_field(folder: Path, digest: str, field: OcclusionField) -> None:
+    """Write a field; the file appears when it is complete.
+
+    Raises:
+        DeltalightError: the folder cannot be written.
+    """
+    arrays = {"centre": field.grid.centre, "halves": field.grid.halves}
+    arrays |= {"radius": np.array(field.radius), "occlusion": field.occlusion}
+    if field.transfer is not None:
+        arrays["transfer"] = field.transfer
+    with replacing(folder / f"{digest}.npz") as temporary:
+        folder.mkdir(parents=True, exist_ok=True)
+        np.savez(temporary, allow_pickle=False, **arrays)
+
+
+def load_field(folder: Path, digest: str, settings: FieldSettings) -> OcclusionField | None:
+    """Read a field; None where there is none, or where the file is damaged and must be replaced."""
+    try:
+        with np.load(folder / f"{digest}.npz", allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+    except (OSError, ValueError, BadZipFile, EOFError, NotImplementedError):
+        return None
+    if not _is_whole(arrays, settings):
+        return None
+    grid = ShellGrid(arrays["centre"], arrays["halves"])
+    radius = float(arrays["radius"])
+    return OcclusionField(grid, radius, arrays["occlusion"], arrays.get("transfer"))
+
+
+def _is_whole(arrays: dict[str, np.ndarray], settings: FieldSettings) -> bool:
+    """Whether all arrays are there, in the shape that the settings require, and finite."""
+    shells, n = settings.shells, settings.resolution
+    shapes: dict[str, tuple[int, ...]] = {"centre": (3,), "halves": (shells, 3), "radius": ()}
+    shapes["occlusion"] = (shells, n, n, n, settings.order**2)
+    if settings.indirect:
+        shapes["transfer"] = (shells, *[n // 2] * 3, LENGTH, LENGTH, 3)
+    if {name: arrays[name].shape for name in shapes if name in arrays} != shapes:
+        return False
+    return all(array.dtype.kind == "f" and np.isfinite(array).all() for array in arrays.values())
+
 
 log = structlog.get_logger()
 

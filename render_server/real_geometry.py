@@ -14,10 +14,9 @@ from render_server.gpu_scene import GeometryState
 from render_server.passes.gbuffer import MaterialTable, MeshBuffers, triangle_corners
 from render_server.scene.depth_mesh import depth_mesh
 from render_server.scene.depth_surface import DepthSurface, depth_surface, grazing_depth_fill, noise_sigma
-from render_server.scene.gpu_mesh import merge_for_gpu
 from render_server.scene.mesh_loading import load_mesh
 from render_server.scene.motion_detection import MotionDetector
-from render_server.scene.triangle_mesh import TriangleMesh
+from render_server.scene.triangle_mesh import TriangleMesh, merge_for_gpu
 from render_server.scene.tsdf_mesh import TsdfScene
 from render_server.view import CameraView
 

@@ -16,10 +16,9 @@ from render_server.gpu_scene import GeometryState, PlacedObject
 from render_server.passes.gbuffer import MaterialTable, MeshBuffers, triangle_corners
 from render_server.scene.gltf_animation import Clip
 from render_server.scene.gltf_meshes import GltfAsset, Pose
-from render_server.scene.gpu_mesh import GpuMesh, merge_for_gpu
 from render_server.scene.materials import Material
 from render_server.scene.mesh_loading import Asset, load_asset
-from render_server.scene.triangle_mesh import TriangleMesh
+from render_server.scene.triangle_mesh import GpuMesh, TriangleMesh, merge_for_gpu
 
 MARKER_FRAME = "marker:"
 

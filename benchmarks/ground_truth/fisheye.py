@@ -98,7 +98,7 @@ def _register(variant: str) -> None:
 def write_bracket(
     folder: Path, radiance: Float32[np.ndarray, "h w 3"], timestamp_ns: int, rng: np.random.Generator
 ) -> None:
-    """Write the exposure bracket of a fish-eye picture and its calibration into a dataset folder (docs/formats.md 1)."""
+    """Write the exposure bracket of a fish-eye picture and its calibration into a dataset (docs/formats.md 1)."""
     (folder / "fisheye").mkdir()
     lines = ["# timestamp filename exposure_s"]
     for number, exposure_s in enumerate(EXPOSURES_S):

@@ -1,7 +1,6 @@
 """Albedo of real surfaces, kept from what pictures show for when the camera looks elsewhere (docs/method.md 2)."""
 
-from render_server.estimation.backoff_schedule import BackoffSchedule
-from render_server.estimation.samples import sample_light
+from render_server.estimation.samples import BackoffSchedule, sample_light
 from render_server.frame_graph import FrameGraph
 from render_server.gpu.context import GpuContext
 from render_server.lights.lights import LightSet

@@ -8,11 +8,9 @@ from jaxtyping import Float32, UInt8
 from protocol import scene_lights as documents
 from protocol.frames import ViewFrame
 from render_server.debug_view import draw_lights
-from render_server.estimation.backoff_schedule import BackoffSchedule
 from render_server.estimation.plane_extrapolation import ExtrapolatedPlanes
-from render_server.estimation.registration import register_lights
-from render_server.estimation.registration_fit import RegistrationAverage
-from render_server.estimation.samples import bounced_light
+from render_server.estimation.registration import RegistrationAverage, register_lights
+from render_server.estimation.samples import BackoffSchedule, bounced_light
 from render_server.estimation.unseen_environment import (
     find_continued_planes,
     find_unseen_light,

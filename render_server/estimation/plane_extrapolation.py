@@ -1,4 +1,4 @@
-"""Extrapolates planes that the picture's border cuts: walls, table and floor go on beyond it.
+"""Detects the large planes in view, and extrapolates those that the picture's border cuts: walls, table and floor.
 
 How far is unknown. A plane seen over a length L continues for at least d beyond the border with probability
 L / (L + d), because the border cuts it at a place that is independent of it (Gott 1993, Nature 363, for lengths in
@@ -11,9 +11,87 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
-from render_server.estimation.plane_detection import DetectedPlane
 from render_server.lights.lights import Light, incident_light
 from render_server.lights.octahedral import octahedral_grid
+
+# Twice the planes of a room's corner: things have large faces too.
+MAX_PLANES = 6
+# A smaller fraction of the samples is a thing, or chance.
+MIN_FRACTION = 0.02
+CANDIDATES = 200
+# Nearer to this plane than to one at a right angle: correlated noise of stereo turns normals by more than 15 degrees.
+NORMAL_COSINE = float(np.sqrt(0.5))
+MIN_POINTS = 3
+REFINEMENTS = 3  # least-squares fits to the inliers; after that a plane hardly moves
+
+
+@dataclass(frozen=True, eq=False)
+class PointCloud:
+    """Points with unit normals (towards the camera) and the tolerance of their distance to a surface, metres."""
+
+    position: Float64[np.ndarray, "k 3"]
+    normal: Float64[np.ndarray, "k 3"]
+    tolerance_m: Float64[np.ndarray, " k"]
+
+    def inliers(self, axis: Float64[np.ndarray, "3"], offset: float) -> Bool[np.ndarray, " k"]:
+        """Return which points lie on the plane with this normal and distance from the origin, and face along it."""
+        near = np.abs(self.position @ axis - offset) <= self.tolerance_m
+        return np.asarray(near & (self.normal @ axis >= NORMAL_COSINE))
+
+
+@dataclass(frozen=True, eq=False)
+class DetectedPlane:
+    """The plane normal . point = offset (m; unit normal towards the camera), and which samples lie on it."""
+
+    normal: Float64[np.ndarray, "3"]
+    offset: float
+    inliers: Bool[np.ndarray, " k"]
+
+
+def detect_planes(cloud: PointCloud) -> list[DetectedPlane]:
+    """Return the planes with the most points, largest first; no point belongs to two of them.
+
+    Sequential RANSAC (Fischler & Bolles 1981) whose hypotheses are single points with their normals, evenly spread
+    instead of drawn at random, so that the same frame gives the same planes.
+    """
+    free = np.ones(len(cloud.position), bool)
+    found: list[DetectedPlane] = []
+    while len(found) < MAX_PLANES:
+        plane = _largest_plane(cloud, free)
+        if plane is None:
+            break
+        found.append(plane)
+        free &= ~plane.inliers
+    return found
+
+
+def _largest_plane(cloud: PointCloud, free: Bool[np.ndarray, " k"]) -> DetectedPlane | None:
+    """Return the plane with the most free points; None if there are too few."""
+    remaining = np.flatnonzero(free)
+    min_count = max(MIN_FRACTION * len(free), MIN_POINTS)
+    if len(remaining) < min_count:
+        return None
+    candidates = remaining[np.linspace(0, len(remaining) - 1, min(CANDIDATES, len(remaining))).astype(int)]
+    planes = [(cloud.normal[i], float(cloud.position[i] @ cloud.normal[i])) for i in candidates]
+    count = [int((free & cloud.inliers(*plane)).sum()) for plane in planes]
+    axis, offset = planes[int(np.argmax(count))]
+    for _ in range(REFINEMENTS):
+        inliers = free & cloud.inliers(axis, offset)
+        if inliers.sum() < min_count:
+            return None
+        axis, offset = _fit_plane(cloud.position[inliers], axis)
+    return DetectedPlane(axis, offset, inliers)
+
+
+def _fit_plane(
+    position: Float64[np.ndarray, "k 3"], facing: Float64[np.ndarray, "3"]
+) -> tuple[Float64[np.ndarray, "3"], float]:
+    """Fit a plane to points by least squares; its normal faces to the side of `facing`."""
+    middle = position.mean(axis=0)
+    _, axes = np.linalg.eigh((position - middle).T @ (position - middle))
+    axis = axes[:, 0] * np.sign(axes[:, 0] @ facing)
+    return axis, float(middle @ axis)
+
 
 # Fraction of the samples that noise may put behind a wall.
 MAX_STRAY_FRACTION = 0.005

@@ -1,13 +1,166 @@
-"""The lights' common factor, found from the picture (docs/method.md 1)."""
+"""The lights' common factor, found from the picture (docs/method.md 1.4)."""
 
-from render_server.estimation.registration_fit import (
-    Registration,
-    registration_from_albedo_percentile,
-    registration_from_patch,
-)
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Float64
+
 from render_server.estimation.samples import bounced_light, sample_light
 from render_server.frame_graph import FrameGraph
+from render_server.lights.environment import LUMINANCE
 from render_server.lights.lights import LightSet
+from render_server.scene.board_albedo import MIN_PIXELS
+
+OUTLIER_DEVIATIONS = 3.0
+MIN_IRRADIANCE = 1e-4
+MIN_OPEN_FRACTION = 0.05  # of the hemisphere that must be open: below, noise of the paper dominates
+MAX_ALBEDO = 0.95
+PERCENTILE = 99.0
+# Relative misfit from which users are warned: people notice unexplained differences of a few per cent within one
+# surface.
+POOR_RESIDUAL = 0.1
+MAX_AVERAGED = 30  # registrations: reduces noise to a fifth, and still keeps up with slow drift
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """Factor R G B on all lights, how it was estimated, and how well it fits.
+
+    `residual` is the relative root-mean-square difference of predicted and measured radiance (0..), None
+    where nothing was fitted. `warning` is a sentence for the user.
+    """
+
+    factor: Float32[np.ndarray, "3"]
+    source: Literal["patch", "percentile", "given"]
+    residual: float | None = None
+    warning: str | None = None
+
+
+def registration_from_patch(
+    measured: Float[np.ndarray, "k 3"],
+    light_irradiance: Float[np.ndarray, "k 3"],
+    bounce_irradiance: Float[np.ndarray, "k 3"],
+    albedo: Float[np.ndarray, " k"] | float,
+) -> Registration | None:
+    """Fit the factor on pixels of known albedo: albedo/pi (f E_light + E_bounce) = B, each channel.
+
+    Least squares without pixels that are off the median by more than 3 robust deviations (hands, stains, shadows).
+    `measured` must be linear and without clipped pixels (`unclipped`); E_bounce, gathered from the picture itself,
+    already has the camera's scale.
+
+    Returns:
+        None where fewer than 30 pixels are left, or light or the fit vanishes in a channel.
+    """
+    irradiance = _paper_irradiance(measured, albedo) - bounce_irradiance
+    light = np.asarray(light_irradiance, np.float64)
+    usable = np.isfinite(irradiance).all(axis=1) & (light > MIN_IRRADIANCE).all(axis=1)
+    if np.count_nonzero(usable) < MIN_PIXELS:
+        return None
+    irradiance, light = irradiance[usable], light[usable]
+    kept = _without_outliers(irradiance / light)
+    irradiance, light = irradiance[kept], light[kept]
+    factor = (light * irradiance).sum(axis=0) / (light**2).sum(axis=0)
+    if len(irradiance) < MIN_PIXELS or not (factor > 0).all():
+        return None
+    misfit = (factor * light - irradiance) / np.maximum(np.abs(irradiance).mean(axis=0), 1e-9)
+    residual = float(np.sqrt((misfit**2).mean()))
+    warning = _POOR_FIT.format(100 * residual) if residual > POOR_RESIDUAL else None
+    return Registration(factor.astype(np.float32), "patch", residual, warning)
+
+
+def _paper_irradiance(
+    measured: Float[np.ndarray, "k 3"], albedo: Float[np.ndarray, " k"] | float
+) -> Float64[np.ndarray, "k 3"]:
+    """Return the irradiance under which a diffuse surface of this albedo has the measured radiance."""
+    return np.pi * np.asarray(measured, np.float64) / np.asarray(albedo, np.float64).reshape(-1, 1)
+
+
+def unseen_radiance_from_patch(
+    measured: Float[np.ndarray, "k 3"],
+    irradiance: Float[np.ndarray, "k 3"],
+    per_radiance: Float[np.ndarray, "k 3"],
+    albedo: Float[np.ndarray, " k"] | float,
+) -> Float32[np.ndarray, "3"] | None:
+    """Estimate the uniform radiance X >= 0 of unseen surroundings: albedo/pi (E + X E_1) = B on paper, per channel.
+
+    `irradiance` E is explained by lights, environment and the real surfaces in view; `per_radiance` E_1 is what
+    radiance 1 from all other directions would add. The median is robust against stains and shadows.
+
+    Returns:
+        None where fewer than 30 pixels see any of the surroundings.
+    """
+    missing = _paper_irradiance(measured, albedo) - irradiance
+    open_sky = np.asarray(per_radiance, np.float64)
+    usable = np.isfinite(missing).all(axis=1) & (open_sky > MIN_OPEN_FRACTION * np.pi).all(axis=1)
+    if np.count_nonzero(usable) < MIN_PIXELS:
+        return None
+    found = np.median(missing[usable] / open_sky[usable], axis=0)
+    return np.asarray(np.maximum(found, 0.0), np.float32)
+
+
+def _without_outliers(ratios: Float64[np.ndarray, "k 3"]) -> Bool[np.ndarray, " k"]:
+    """Whether all channels are within 3 deviations of their medians (1.4826 times the median deviation)."""
+    deviation = np.abs(ratios - np.median(ratios, axis=0))
+    scale = 1.4826 * np.median(deviation, axis=0)
+    return np.asarray((deviation <= OUTLIER_DEVIATIONS * scale + 1e-9).all(axis=1))
+
+
+def registration_from_albedo_percentile(
+    measured: Float[np.ndarray, "k 3"],
+    light_irradiance: Float[np.ndarray, "k 3"],
+    bounce_irradiance: Float[np.ndarray, "k 3"],
+) -> Registration:
+    """Estimate the common scale at which the 99th percentile of luminance albedo is 0.95 (docs/method.md 1).
+
+    The pixels must be unshadowed, unsaturated and diffuse. Albedo pi B/(f E_light + E_bounce) falls with f,
+    so the percentile of the factors that give each pixel an albedo of 0.95 is the factor sought.
+    """
+    light = np.asarray(light_irradiance, np.float64) @ LUMINANCE
+    wanted = np.pi / MAX_ALBEDO * (np.asarray(measured, np.float64) @ LUMINANCE)
+    rest = wanted - np.asarray(bounce_irradiance, np.float64) @ LUMINANCE
+    usable = np.isfinite(rest) & (light > MIN_IRRADIANCE)
+    if np.count_nonzero(usable) < MIN_PIXELS:
+        return Registration(np.ones(3, np.float32), "given", None, _NOTHING_SEEN)
+    factor = max(float(np.percentile(rest[usable] / light[usable], PERCENTILE)), MIN_IRRADIANCE)
+    return Registration(np.full(3, factor, np.float32), "percentile", None, _NO_PATCH)
+
+
+_POOR_FIT = (
+    "The lights explain the board's paper only within {:.0f} %: see whether the lights' positions are right, and "
+    "whether something shadows the board."
+)
+_NO_PATCH = (
+    "No white paper of the marker board was usable, so the lights' scale comes from the brightest real "
+    "surface, taken to have albedo 0.95: show the board's paper unclipped, or set lights.registration."
+)
+_NOTHING_SEEN = (
+    "No lit real surface was usable to scale the lights, so they are used as given: "
+    "set lights.registration or the exposure."
+)
+
+
+class RegistrationAverage:
+    """Running mean of the registrations over time, over about the last 30.
+
+    A factor from surfaces of known albedo replaces those estimated from the brightest albedo.
+    """
+
+    def __init__(self) -> None:
+        self._mean = np.ones(3)
+        self._source = ""
+        self._count = 0
+
+    def add(self, found: Registration) -> Float32[np.ndarray, "3"]:
+        """Add a registration; returns the factor to use from now on."""
+        ranks = ("", "given", "percentile", "patch")
+        rank, known = ranks.index(found.source), ranks.index(self._source)
+        if rank > known:
+            self._count, self._source = 0, found.source
+        if rank >= known:
+            self._count = min(self._count + 1, MAX_AVERAGED)
+            self._mean = self._mean + (found.factor - self._mean) / self._count
+        return self._mean.astype(np.float32)
 
 
 def register_lights(graph: FrameGraph, lights: LightSet) -> Registration:

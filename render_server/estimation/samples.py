@@ -1,6 +1,4 @@
-"""What light falls on the real surfaces that a picture shows, next to what the camera measured there; when to look
-again.
-"""
+"""Samples of the light that falls on real surfaces, next to what the camera measured there; when to measure again."""
 
 from dataclasses import dataclass, replace
 
@@ -81,3 +79,29 @@ def read_texture(texture: moderngl.Texture) -> Float64[np.ndarray, "h w c"]:
     width, height = texture.size
     dtype = np.float16 if texture.dtype == "f2" else np.float32
     return np.frombuffer(texture.read(), dtype).reshape(height, width, -1).astype(np.float64)
+
+
+FIRST_WAIT_S = 1.0
+MAX_WAIT_S = 30.0
+
+
+class BackoffSchedule:
+    """Due at once, then after intervals that double from 1 to 30 s of the frames' own time.
+
+    An average over time is soon good, and keeping it up to date then costs almost nothing.
+    """
+
+    def __init__(self) -> None:
+        self._last_ns: int | None = None
+        self._wait_s = FIRST_WAIT_S
+
+    def is_due(self, timestamp_ns: int) -> bool:
+        """Whether a measurement is due; if so, the next interval begins. It restarts if the clock is set back."""
+        if self._last_ns is None:
+            self._last_ns = timestamp_ns
+            return True
+        self._last_ns = min(self._last_ns, timestamp_ns)
+        if timestamp_ns - self._last_ns < self._wait_s * 1e9:
+            return False
+        self._last_ns, self._wait_s = timestamp_ns, min(2 * self._wait_s, MAX_WAIT_S)
+        return True

@@ -6,14 +6,15 @@ import numpy as np
 from jaxtyping import Float32
 
 from protocol.frames import decode_lut
-from render_server.estimation.plane_detection import PointCloud, detect_planes
 from render_server.estimation.plane_extrapolation import (
     ExtrapolatedPlanes,
+    PointCloud,
     RealSamples,
     ViewFrustum,
+    detect_planes,
     extrapolate_planes,
 )
-from render_server.estimation.registration_fit import unseen_radiance_from_patch
+from render_server.estimation.registration import unseen_radiance_from_patch
 from render_server.estimation.samples import Bounce, read_texture, sample_light
 from render_server.frame_graph import FrameGraph
 from render_server.lights.environment import LUMINANCE

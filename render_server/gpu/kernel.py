@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from difflib import get_close_matches
+from pathlib import Path
 from typing import Any, Final, Protocol
 
 import moderngl
@@ -261,13 +262,13 @@ class _Program:
 
 
 class Kernel:
-    """A compute shader of the shaders' folder with its defines.
+    """A compute shader with its defines: `name`.comp.glsl of the shaders' folder, or of another one if it is a path.
 
     The one place where work is dispatched, so that the memory barrier is never forgotten: a missing barrier does not
     show on a software renderer.
     """
 
-    def __init__(self, gpu: GpuContext, name: str, **defines: float | str) -> None:
+    def __init__(self, gpu: GpuContext, name: str | Path, **defines: float | str) -> None:
         self._ctx = gpu.ctx
         source = shader_source(SHADERS / f"{name}.comp.glsl", defines)
         declared = declarations(source)
@@ -354,9 +355,10 @@ class RasterKernel:
         self._program.program.release()
 
 
-def _label(name: str, defines: Mapping[str, float | str]) -> str:
+def _label(name: str | Path, defines: Mapping[str, float | str]) -> str:
     """The shader's name and what it was compiled with, e.g. `trace_cones REAL`."""
-    return " ".join([name, *(key if value == 1 else f"{key}={value}" for key, value in defines.items())])
+    stem = name.name if isinstance(name, Path) else name
+    return " ".join([stem, *(key if value == 1 else f"{key}={value}" for key, value in defines.items())])
 
 
 def list_threads(gpu: GpuContext, longest: int = LIST_WALKERS) -> int:

@@ -1,10 +1,9 @@
 """What objects hold on the GPU: textures and buffers found in their attributes, and the bytes that these take."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import moderngl
-import numpy as np
 
 from render_server.gpu.context import GpuContext
 
@@ -36,14 +35,20 @@ def _parts(value: object) -> Iterator[object]:
         yield from vars(value).values()
 
 
-def size_bytes(value: object, counted: set[int]) -> int:
-    """Bytes of the GPU's memory that `value` takes, mip levels left out.
+def sizes_bytes(values: Sequence[object]) -> list[int]:
+    """Bytes of the GPU's memory that each value takes, mip levels left out; nothing is counted twice.
 
-    What is `counted` already (by identity) is left out, too; the rest is added there.
+    What several hold counts for the one of them that holds the fewest things, the first of those.
     """
-    held = {id(item): item for item in gpu_objects(value) if id(item) not in counted}
-    counted.update(held)
-    return sum(_size(item) for item in held.values())
+    held = [{id(item): item for item in gpu_objects(value)} for value in values]
+    owners: dict[int, int] = {}
+    for index in sorted(range(len(held)), key=lambda index: len(held[index])):
+        for key in held[index]:
+            owners.setdefault(key, index)
+    return [
+        sum(_size(item) for key, item in each.items() if owners[key] == index)
+        for index, each in enumerate(held)
+    ]
 
 
 def _size(item: object) -> int:
@@ -51,4 +56,5 @@ def _size(item: object) -> int:
         return int(item.size)
     assert isinstance(item, moderngl.Texture | moderngl.Texture3D | moderngl.TextureArray)
     texels = math.prod(item.size)
-    return int(texels * item.components * np.dtype(item.dtype).itemsize)
+    component_bytes = int(item.dtype[-1])  # "f2", "u1"; moderngl's "f1" is no type of NumPy
+    return int(texels * item.components * component_bytes)

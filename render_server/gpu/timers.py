@@ -24,6 +24,7 @@ class PassTimers:
         self._current: list[tuple[str, moderngl.Query]] = []
         self._clock: dict[str, float] = {}
         self.times_ms: dict[str, float] = {}
+        self.last_ms: dict[str, float] = {}  # of each pass when it last ran
 
     @contextmanager
     def measure(self, name: str) -> Iterator[None]:
@@ -44,6 +45,7 @@ class PassTimers:
         """Close the frame's list and return the newest known times."""
         if self._gpu.is_software:
             self.times_ms, self._clock = self._clock, {}
+            self.last_ms |= self.times_ms
             return self.times_ms
         self._pending.append(self._current)
         self._current = []
@@ -57,4 +59,10 @@ class PassTimers:
         for name, query in queries:
             times[name] = times.get(name, 0.0) + query.elapsed / 1e6
             self._free.append(query)
+        self.last_ms |= times
         return times
+
+    def wait(self) -> None:
+        """Waits for the GPU, so that the times of all frames are known."""
+        while self._pending:
+            self.times_ms = self._read(self._pending.pop(0))

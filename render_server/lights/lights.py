@@ -1,5 +1,6 @@
-"""Lights of a scene as the renderer uses them: light models and a smooth environment around them."""
+"""Lights of a scene as the renderer uses them: light models, their images in smooth planes, a smooth environment."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,6 +11,7 @@ from protocol import scene_lights as documents
 from render_server.lights.environment import load_environment
 from render_server.lights.median_cut import split_environment
 from render_server.lights.octahedral import above_horizon, resample_to_octahedral, solid_angle_mean
+from render_server.scene.declared_surfaces import PLANE, SurfaceTable
 
 ENVIRONMENT_SIZE = 256
 AMBIENT_SIZE = 64  # texels of 1.5 to 5 degrees: a metal of roughness 0.3 still resolves the edge of a wall
@@ -303,3 +305,103 @@ def _angular_radius(
     light: SphereLight | SpotLight, distance: Float64[np.ndarray, "*n"]
 ) -> Float64[np.ndarray, "*n"]:
     return np.asarray(np.arcsin(np.minimum(light.radius_m / distance, 1.0)))
+
+
+# Of planes. From this roughness on, a lobe blurs a light's image so much that cones represent it.
+MIRROR_ROUGHNESS = 0.3
+MIN_COSINE = 0.05  # lights at grazing angles have no image of their own
+
+
+@dataclass(frozen=True, eq=False)
+class MirrorLight:
+    """The image of a light in a plane, which shines in front of it, attenuated by the plane's reflectance.
+
+    `plane` (a, b, c, d; unit normal towards the objects) has ax + by + cz + d > 0 in front of it; `surface` is its
+    row in the table of surfaces, `source` the index of the light.
+    """
+
+    light: Light
+    plane: Float64[np.ndarray, "4"]
+    tolerance_m: float
+    f0: Float32[np.ndarray, "3"]
+    roughness: float
+    surface: int
+    source: int
+
+
+def mirror_lights(
+    lights: Sequence[Light], surfaces: SurfaceTable, objects: Float64[np.ndarray, "3"]
+) -> list[MirrorLight]:
+    """Return images of lights in smooth declared planes in front of which they and `objects` (a point, m) lie."""
+    found = []
+    for index, row in enumerate(surfaces.packed):
+        roughness = float(surfaces.roughness[index])
+        if row[3, 3] != PLANE or roughness >= MIRROR_ROUGHNESS or not surfaces.f0[index].any():
+            continue
+        plane = _plane_towards(row[3, :3].astype(float), row[4, :3].astype(float), objects)
+        for source, light in enumerate(lights):
+            image = _image(light, plane, roughness**2, objects)
+            if image is not None:
+                tolerance_m = float(row[4, 3])
+                found.append(
+                    MirrorLight(image, plane, tolerance_m, surfaces.f0[index], roughness, index, source)
+                )
+    return found
+
+
+def _plane_towards(
+    point: Float64[np.ndarray, "3"], normal: Float64[np.ndarray, "3"], side: Float64[np.ndarray, "3"]
+) -> Float64[np.ndarray, "4"]:
+    unit = normal / np.linalg.norm(normal)
+    plane = np.append(unit, -unit @ point)
+    return plane if unit @ side + plane[3] >= 0 else -plane
+
+
+def _image(
+    light: Light, plane: Float64[np.ndarray, "4"], alpha: float, objects: Float64[np.ndarray, "3"]
+) -> Light | None:
+    """Mirror a light, enlarged by the blur that the objects see; None if it is not in front of the plane.
+
+    A GGX lobe of alpha spreads directions by 2 alpha; at the light's distance b from the plane that is 2 alpha b.
+    """
+    normal = plane[:3]
+    reflection = np.eye(3) - 2 * np.outer(normal, normal)
+    if isinstance(light, DirectionalLight):
+        if -light.direction @ normal < MIN_COSINE:
+            return None
+        radius = float(np.arctan(np.hypot(np.tan(light.angular_radius_rad), 2 * alpha)))
+        return replace(light, direction=_single(reflection @ light.direction), angular_radius_rad=radius)
+    height = float(normal @ light.position + plane[3])
+    position = light.position.astype(float) - 2 * height * normal
+    to_objects = objects - position
+    if height <= 0 or normal @ to_objects < MIN_COSINE * np.linalg.norm(to_objects):
+        return None
+    blur_m = 2 * alpha * height * float(np.linalg.norm(to_objects)) / float(normal @ to_objects)
+    if isinstance(light, RectangleLight):
+        return _rectangle_image(light, position, reflection, blur_m)
+    moved = replace(light, position=_single(position), radius_m=float(np.hypot(light.radius_m, blur_m)))
+    if isinstance(moved, SpotLight):
+        return replace(moved, direction=_single(reflection @ moved.direction))
+    assert isinstance(moved, SphereLight)
+    return moved
+
+
+def _rectangle_image(
+    light: RectangleLight,
+    position: Float64[np.ndarray, "3"],
+    reflection: Float64[np.ndarray, "3 3"],
+    blur_m: float,
+) -> RectangleLight:
+    """Mirror a rectangle: its axes change places to keep the orientation, and blur widens it at the same flux."""
+    u, v = (float(np.linalg.norm(axis)) for axis in (light.axis_u, light.axis_v))
+    grown = [float(np.hypot(edge, 2 * blur_m) / edge) for edge in (u, v)]
+    return RectangleLight(
+        _single(position),
+        _single(reflection @ light.axis_v * grown[1]),
+        _single(reflection @ light.axis_u * grown[0]),
+        light.radiance / np.float32(grown[0] * grown[1]),
+    )
+
+
+def _single(vector: Float64[np.ndarray, "3"]) -> Float32[np.ndarray, "3"]:
+    return np.asarray(vector, np.float32)

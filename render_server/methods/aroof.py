@@ -16,8 +16,9 @@ from render_server.gpu.textures import release_all
 from render_server.gpu_scene import GeometryState, PlacedObject
 from render_server.graph import Graph, Resource
 from render_server.methods.lighting import Layers, Shading, ShadingOptions, light_stages, shading_stages
-from render_server.methods.settings import Setup
-from render_server.occlusion_fields import OcclusionFields
+from render_server.methods.method import RelightingMethod
+from render_server.methods.settings import ResolvedSettings, Setup
+from render_server.occlusion_fields import OcclusionFields, require_rigid
 from render_server.passes.cones import ConeFields, LowResGrid
 from render_server.passes.occlusion_fields import (
     FieldTextures,
@@ -34,6 +35,8 @@ from render_server.passes.occlusion_fields import (
 from render_server.passes.shading import DirectLight
 from render_server.passes.voxels import PlacedVolume, VolumePlacement, VoxelMipmap, place_volume
 from render_server.scene.occlusion_field import FieldSettings, OcclusionField
+
+SHOWN_CELLS = 64  # for view `volume` alone; the method has no volume
 
 
 @dataclass(eq=False)
@@ -134,8 +137,7 @@ class FieldShading:
         low, high = objects.bounds
         reach = [float(item.place["object_radius"]) * float(item.place["object_scale"]) for item in items]  # type: ignore[arg-type]
         edge = float(np.max(high - low)) + 2 * self._settings.reach * max(reach)
-        self._volume.place(place_volume(low, high, self._cells, edge))
-        return self._volume
+        return self._volume.place(place_volume(low, high, self._cells, edge))
 
     def show(self, items: list[FieldObject], volume: PlacedVolume) -> VoxelMipmap:
         """Cells of what the fields hide."""
@@ -246,9 +248,10 @@ def aroof(g: Graph, s: FrameResources, setup: Setup[AroofMethod]) -> Layers:
     shading = Shading(g.gpu, size, resolved, lit.buffers, DirectLight(g.gpu, size), options)
     own = FieldShading(g.gpu, settings, resolved.volume_size, shading.cones)
     objects = FieldObjects(g.gpu, setup.fields, field_settings(settings))
+    g.section("occlusion fields")
     found = g.polled("found fields", "objects", lambda: objects.find(s.objects.value), eq)
     items = g.stage("occlusion fields", objects.place, s.objects, found)
-    volume = g.stage("volume", own.place, items, s.objects)
+    volume = g.value("volume", own.place, items, s.objects)
     shown = g.stage("shown cells", own.show, items, volume)
 
     def trace(scene: Resource[Bindings], grid: Resource[LowResGrid]) -> Resource[ConeFields]:
@@ -258,8 +261,7 @@ def aroof(g: Graph, s: FrameResources, setup: Setup[AroofMethod]) -> Layers:
         reflecting = g.stage("object bounce light", own.reflect, changed, scene)
         return g.stage("cones", own.write_fields, changed, reflecting, scene, grid, hidden)
 
-    nothing: Resource[dict[str, Binding]] = g.stage("marching", lambda _: {}, volume)
-    return shading_stages(g, s, shading, lit, volume, shown, nothing, trace)
+    return shading_stages(g, s, shading, lit, volume, trace, voxels=shown)
 
 
 def field_settings(settings: AroofMethod) -> FieldSettings:
@@ -272,3 +274,16 @@ def field_settings(settings: AroofMethod) -> FieldSettings:
         settings.rays,
         settings.indirect,
     )
+
+
+def resolve(settings: AroofMethod, defaults: ResolvedSettings) -> ResolvedSettings:
+    """Takes the document's values, or the machine's defaults where it says null."""
+    return ResolvedSettings(
+        SHOWN_CELLS,
+        settings.shading_scale or defaults.cone_scale,
+        settings.rsm_size or defaults.rsm_size,
+        settings.triangle_budget or defaults.triangle_budget,
+    )
+
+
+AROOF = RelightingMethod(AroofMethod, aroof, resolve, require=require_rigid)

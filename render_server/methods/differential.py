@@ -6,7 +6,9 @@ this is slow, and what `dvct` must agree with.
 """
 
 from copy import copy
+from operator import eq
 
+import moderngl
 import numpy as np
 
 from protocol.scene_method import DifferentialMethod
@@ -23,22 +25,30 @@ from render_server.methods.lighting import (
     Shading,
     ShadingOptions,
     object_extent,
+    real_records,
     shading_stages,
     shadow_receivers,
     volume_placement,
 )
-from render_server.methods.settings import ResolvedSettings, Setup, march_defines
-from render_server.methods.voxel_volumes import SolutionVoxels, solution_stages
+from render_server.methods.method import RelightingMethod
+from render_server.methods.settings import ResolvedSettings, Setup, march_defines, resolve_joint_maps
+from render_server.methods.voxel_volumes import (
+    SolutionVoxels,
+    joint_voxels,
+    placed_volume,
+    solution_stages,
+)
 from render_server.passes.caustics import Caustics
 from render_server.passes.cones import ConeFields, LowResGrid, TraceCones
+from render_server.passes.gbuffer import MeshBuffers
 from render_server.passes.lights import LightBuffers
 from render_server.passes.shading import DirectLightPair
 from render_server.passes.shadow_maps import ShadowMaps
-from render_server.passes.voxels import VoxelMipmap
+from render_server.passes.voxels import DIRECTIONS, VoxelMipmap, memory_statement
 
 
-class TwoSolutions:
-    """Maps, direct light and cones of both solutions."""
+class SolutionLights:
+    """The lights' maps and direct light, of the real scene alone (mu) and with the objects (rho)."""
 
     def __init__(
         self,
@@ -46,51 +56,69 @@ class TwoSolutions:
         settings: DifferentialMethod,
         resolved: ResolvedSettings,
         size: tuple[int, int],
-        voxels: SolutionVoxels,
     ) -> None:
         self.mu, self.rho = (LightBuffers(gpu, resolved.rsm_size, settings.shadow_samples) for _ in range(2))
         self.direct = DirectLightPair(gpu, size)
-        self._voxels, self._cone_count = voxels, settings.cone_count
         self._maps = ShadowMaps(gpu)
-        self._gpu, self._defines = gpu, march_defines(settings)
-        self._tracing: TraceCones | None = None
-        self._unused: ConeFields | None = None
 
-    def set_environment(self, lights: LightSet) -> LightBuffers:
+    def set_environment(self, lights: LightSet) -> tuple[moderngl.TextureArray, ...]:
         """Uploads the residual environment to both."""
-        for buffers in (self.mu, self.rho):
-            buffers.set_environment(lights.environment)
-        return self.rho
+        return tuple(buffers.set_environment(lights.environment) for buffers in (self.mu, self.rho))
 
     def fit_views(
         self, lights: LightSet, real: GeometryState, extent: Points, everywhere: bool
     ) -> LightBuffers:
-        """Both solutions look through the same views, so that their maps differ by the objects alone."""
+        """Fits the views, the same for both solutions, so that their maps differ by the objects alone."""
         receivers = real.points if everywhere else shadow_receivers(real, extent)
         receivers, points = (np.concatenate([each, extent]) for each in (receivers, real.points))
         for buffers in (self.mu, self.rho):
             buffers.place(list(lights.lights), points, receivers, np.zeros((0, 3)))
         return self.rho
 
-    def draw_maps(
-        self, _views: LightBuffers, real: GeometryState, objects: GeometryState
-    ) -> tuple[LightBuffers, LightBuffers]:
-        """Draws the real scene alone, and with the objects."""
-        for buffers, meshes in ((self.mu, [real.buffers]), (self.rho, [real.buffers, objects.buffers])):
-            self._maps.run(buffers.real_atlas, meshes, buffers.real_views, 0, buffers.bindings)
-        return self.mu, self.rho
+    def draw_mu(self, _views: bytes, real: GeometryState) -> LightBuffers:
+        """Draws the real scene alone as the lights see it."""
+        return self._drawn(self.mu, real.buffers)
+
+    def draw_rho(self, _views: bytes, real: GeometryState, objects: GeometryState) -> LightBuffers:
+        """Draws the real scene with the objects as the lights see both."""
+        return self._drawn(self.rho, real.buffers, objects.buffers)
+
+    def _drawn(self, buffers: LightBuffers, *meshes: MeshBuffers) -> LightBuffers:
+        self._maps.run(buffers.real_atlas, meshes, buffers.real_views, 0, buffers.bindings)
+        return buffers
+
+    def light_directly(
+        self, scene: Bindings, grid: LowResGrid, _caustics: Caustics | None, _voxels: VoxelMipmap | None
+    ) -> DirectLightPair:
+        """Lights the real surfaces under each solution's own maps."""
+        self.direct.run_both(self.mu, self.rho, grid, scene)
+        return self.direct
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        for item in (self.mu, self.rho, self._maps):
+            item.release()
+
+
+class SolutionCones:
+    """Marches each solution's cones through its own voxels."""
+
+    def __init__(
+        self, gpu: GpuContext, settings: DifferentialMethod, voxels: SolutionVoxels, fields: ConeFields
+    ) -> None:
+        self._voxels, self._fields, self._cone_count = voxels, fields, settings.cone_count
+        self._tracing = TraceCones(gpu, fields.mu.size, march_defines(settings))
+        self._unused = ConeFields(gpu, fields.mu.size)
 
     def marching(self, voxels: SolutionVoxels) -> dict[str, Binding]:
         """Bindings of what cones march through: one solution's voxels, the same twice."""
         voxels.set_support(everywhere=False)
         return voxels.march_bindings(self._cone_count)
 
-    def trace(self, fields: ConeFields, scene: Bindings, grid: LowResGrid, marching: Bindings) -> ConeFields:
-        """Each solution's cones through its own voxels; the fields are put together."""
-        if self._tracing is None or self._unused is None:
-            self._tracing = TraceCones(self._gpu, grid.size, self._defines)
-            self._unused = ConeFields(self._gpu, grid.size)
-        mu, rho, own, voxels = copy(fields), copy(fields), {**scene, **marching}, self._voxels
+    def trace(self, scene: Bindings, grid: LowResGrid, marching: Bindings) -> ConeFields:
+        """Traces cones at real surfaces, a solution after the other, and at the objects; puts the fields together."""
+        fields, voxels = self._fields, self._voxels
+        mu, rho, own = copy(fields), copy(fields), {**scene, **marching}
         mu.rho, mu.specular_rho = self._unused.rho, self._unused.specular_rho
         rho.mu, rho.specular_mu = self._unused.mu, self._unused.specular_mu
         self._tracing.trace_real(mu, grid, voxels.mu, voxels.mu, own)
@@ -98,47 +126,63 @@ class TwoSolutions:
         self._tracing.trace_virtual(fields, grid, voxels.rho, voxels.rho, own)
         return fields
 
-    def light_directly(
-        self, scene: Bindings, grid: LowResGrid, _caustics: Caustics | None, _voxels: VoxelMipmap
-    ) -> DirectLightPair:
-        """Direct light under each solution's own maps."""
-        self.direct.run_both(self.mu, self.rho, grid, scene)
-        return self.direct
-
     def release(self) -> None:
         """Frees the GL objects."""
-        for item in (self.mu, self.rho, self._maps, self._tracing, self._unused):
-            if item is not None:
-                item.release()
+        self._tracing.release()
+        self._unused.release()
 
 
 def differential(g: Graph, s: FrameResources, setup: Setup[DifferentialMethod]) -> Layers:
     """E_rho - E_mu and S_rho - S_mu of two solutions; what is not told apart has the maps of rho."""
     settings, resolved, size = setup.settings, setup.resolved, setup.picture_size
-    voxels = SolutionVoxels(g.gpu, settings, resolved.volume_size)
-    two = TwoSolutions(g.gpu, settings, resolved, size, voxels)
-    environment = g.stage("environment", two.set_environment, s.lights)
-    views = g.stage("light views", two.fit_views, s.lights, s.real, object_extent(g, s), s.everywhere)
-    mu_maps, rho_maps = g.stages(
-        "shadow maps", two.draw_maps, views, s.real, s.objects, outputs=("shadow maps mu", "shadow maps rho")
-    )
+    g.section("lights")
+    lights = SolutionLights(g.gpu, settings, resolved, size)
+    environment = g.stage("environment", lights.set_environment, s.lights)
+    views = g.stage("light views", lights.fit_views, s.lights, s.real, object_extent(g, s), s.everywhere)
+    records = g.value("light views real", real_records, views, same=eq)
+    mu_maps = g.stage("shadow maps mu", lights.draw_mu, records, s.real)
+    rho_maps = g.stage("shadow maps rho", lights.draw_rho, records, s.real, s.objects)
+    g.section("voxels")
     placement = volume_placement(g, s, resolved.volume_size, settings.volume_edge_m)
-    lit_voxels = solution_stages(g, s, voxels, placement, mu_maps, rho_maps)
-    lit = LitScene(two.rho, environment, rho_maps, mu_maps, environment)
+    voxels = SolutionVoxels(g.gpu, settings, resolved.volume_size)
+    lit_voxels = solution_stages(g, s, voxels, placement, mu_maps, rho_maps, environment)
     options = ShadingOptions(
         screen_space=settings.screen_space,
         mirror_gather="gather" if settings.reflections == "rays" else None,
         march=march_defines(settings),
     )
-    shading = Shading(g.gpu, size, resolved, two.rho, two.direct, options)
-    shading.normal_offset = two.rho.real_texel_m
+    shading = Shading(g.gpu, size, resolved, lights.rho, lights.direct, options)
+    shading.normal_offset = lights.rho.real_texel_m
     shading.is_everywhere = True
-    marching = g.stage("marching", two.marching, lit_voxels)
-    fields = g.stage("cone fields", lambda _: shading.cones, s.view)
+    cones = SolutionCones(g.gpu, settings, voxels, shading.cones)
+    marching = g.value("marching", cones.marching, lit_voxels)
 
     def trace(scene: Resource[Bindings], grid: Resource[LowResGrid]) -> Resource[ConeFields]:
-        return g.stage("cones", two.trace, fields, scene, grid, marching)
+        return g.stage("cones", cones.trace, scene, grid, marching)
 
-    volume = g.stage("volume", lambda voxels: voxels.real.volume, lit_voxels)
-    joint = g.stage("joint voxels", lambda voxels: voxels.rho, lit_voxels)
-    return shading_stages(g, s, shading, lit, volume, joint, marching, trace, two.light_directly)
+    lit = LitScene(lights.rho, environment, rho_maps, mu_maps)
+    volume = g.value("volume", placed_volume, "voxelize real")
+    joint = g.value("joint voxels", joint_voxels, lit_voxels)
+    return shading_stages(
+        g,
+        s,
+        shading,
+        lit,
+        volume,
+        trace,
+        voxels=joint,
+        marching=marching,
+        light_directly=lights.light_directly,
+    )
+
+
+def state_memory(settings: DifferentialMethod, resolved: ResolvedSettings) -> str:
+    """One sentence on the memory of one solution's volumes.
+
+    Raises:
+        DeltalightError: it is beyond the budget.
+    """
+    return memory_statement(resolved.volume_size, DIRECTIONS, settings.memory_budget_mb)
+
+
+DIFFERENTIAL = RelightingMethod(DifferentialMethod, differential, resolve_joint_maps, state_memory)

@@ -13,16 +13,19 @@ from render_server.methods.lighting import (
     shading_stages,
     volume_placement,
 )
-from render_server.methods.settings import Setup, march_defines
+from render_server.methods.method import RelightingMethod
+from render_server.methods.settings import ResolvedSettings, Setup, march_defines, resolve_voxel_cones
 from render_server.methods.voxel_volumes import (
     DeltaVoxels,
     InjectedVoxels,
     delta_voxel_stages,
     injection_stages,
+    joint_voxels,
+    placed_volume,
 )
 from render_server.passes.cones import ConeFields, LowResGrid, TraceCones, TraceConesPaper
 from render_server.passes.shading import DirectLight
-from render_server.passes.voxels import DIRECTIONS, PlacedVolume, VoxelMipmap
+from render_server.passes.voxels import DIRECTIONS, VoxelMipmap, memory_statement
 
 
 class ExactCones:
@@ -62,6 +65,7 @@ def dvct_exact(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
     """Dual march through one-sided directional voxels."""
     settings, resolved, size = setup.settings, setup.resolved, setup.picture_size
     lit = light_stages(g, s, resolved, settings.shadow_samples, mirrors=settings.mirrored_lights)
+    g.section("voxels")
     placement = volume_placement(g, s, resolved.volume_size, settings.volume_edge_m)
     voxels = DeltaVoxels(g.gpu, settings, resolved.volume_size)
     mu, rho = delta_voxel_stages(g, s, lit, voxels, placement)
@@ -79,14 +83,14 @@ def dvct_exact(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
         ),
     )
     cones = ExactCones(g.gpu, settings, voxels, shading.cones)
-    marching = g.stage("marching", cones.marching, mu, rho)
+    marching = g.value("marching", cones.marching, mu, rho)
 
     def trace(scene: Resource[Bindings], grid: Resource[LowResGrid]) -> Resource[ConeFields]:
         real = g.stage("cones real", cones.trace_real, scene, grid, marching)
         return g.stage("cones", cones.trace_objects, real, scene, grid, marching)
 
-    volume = g.stage("volume", lambda voxels: voxels.volume, "voxelize real")
-    return shading_stages(g, s, shading, lit, volume, rho, marching, trace)
+    volume = g.value("volume", placed_volume, "voxelize real")
+    return shading_stages(g, s, shading, lit, volume, trace, voxels=rho, marching=marching)
 
 
 class PaperCones:
@@ -113,6 +117,7 @@ def dvct_paper(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
     """
     settings, resolved, size = setup.settings, setup.resolved, setup.picture_size
     lit = light_stages(g, s, resolved, settings.shadow_samples)
+    g.section("voxels")
     placement = volume_placement(g, s, resolved.volume_size, settings.volume_edge_m)
     voxels = InjectedVoxels(g.gpu, resolved.volume_size)
     injected = injection_stages(g, s, lit, voxels, placement)
@@ -124,7 +129,25 @@ def dvct_paper(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
     def trace(scene: Resource[Bindings], grid: Resource[LowResGrid]) -> Resource[ConeFields]:
         return g.stage("cones", cones.trace, scene, grid, injected)
 
-    volume: Resource[PlacedVolume] = g.stage("volume", lambda voxels: voxels.real.volume, injected)
-    joint: Resource[VoxelMipmap] = g.stage("joint voxels", lambda voxels: voxels.rho, injected)
-    nothing: Resource[dict[str, Binding]] = g.stage("marching", lambda _: {}, injected)
-    return shading_stages(g, s, shading, lit, volume, joint, nothing, trace)
+    volume = g.value("volume", placed_volume, "voxelize real")
+    joint = g.value("joint voxels", joint_voxels, injected)
+    return shading_stages(g, s, shading, lit, volume, trace, voxels=joint)
+
+
+def dvct(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
+    """The operator that the settings name."""
+    declare = dvct_exact if setup.settings.operator == "exact" else dvct_paper
+    return declare(g, s, setup)
+
+
+def state_memory(settings: DvctMethod, resolved: ResolvedSettings) -> str:
+    """One sentence on the volumes' memory.
+
+    Raises:
+        DeltalightError: it is beyond the budget.
+    """
+    directions = DIRECTIONS if settings.operator == "exact" else 1
+    return memory_statement(resolved.volume_size, directions, settings.memory_budget_mb)
+
+
+DVCT = RelightingMethod(DvctMethod, dvct, resolve_voxel_cones, state_memory)

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from operator import eq
+from typing import Any
 
 import moderngl
 import numpy as np
@@ -13,8 +14,7 @@ from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Binding, Bindings
 from render_server.gpu_scene import GeometryState
 from render_server.graph import Graph, Resource
-from render_server.lights.lights import LightSet
-from render_server.lights.mirror_lights import mirror_lights
+from render_server.lights.lights import LightSet, mirror_lights
 from render_server.methods.settings import ResolvedSettings
 from render_server.passes.caustics import GREATEST_ALPHA, Caustics
 from render_server.passes.composite import ChangeRatio
@@ -44,19 +44,19 @@ class LitScene:
     """The lights' buffers and the resources that follow them.
 
     `real_maps` and `object_maps`: depth maps of the real scene and of the objects; `mirrored`: where smooth planes
-    mirror the lights. The value of each is `buffers`, which all of them fill a part of.
+    mirror the lights, if the method heeds that. All of them fill a part of `buffers`.
     """
 
     buffers: LightBuffers
-    environment: Resource[LightBuffers]
+    environment: Resource[Any]
     real_maps: Resource[LightBuffers]
     object_maps: Resource[LightBuffers]
-    mirrored: Resource[LightBuffers]
+    mirrored: tuple[Resource[moderngl.TextureArray | None], ...] = ()
 
     @property
-    def all(self) -> tuple[Resource[LightBuffers], ...]:
+    def all(self) -> tuple[Resource[Any], ...]:
         """Everything that shading under these lights depends on."""
-        return self.environment, self.real_maps, self.object_maps, self.mirrored
+        return self.environment, self.real_maps, self.object_maps, *self.mirrored
 
 
 class LightStages:
@@ -70,10 +70,9 @@ class LightStages:
         self._maps = ShadowMaps(gpu)
         self._visibility = MirrorVisibility(gpu)
 
-    def set_environment(self, lights: LightSet) -> LightBuffers:
+    def set_environment(self, lights: LightSet) -> moderngl.TextureArray:
         """Uploads the residual environment."""
-        self.buffers.set_environment(lights.environment)
-        return self.buffers
+        return self.buffers.set_environment(lights.environment)
 
     def fit_views(
         self, lights: LightSet, real: GeometryState, extent: Points, surfaces: SurfaceTable, everywhere: bool
@@ -101,12 +100,13 @@ class LightStages:
         return buffers
 
     def map_mirrors(
-        self, _real: LightBuffers, _objects: LightBuffers, _lights: LightSet, seen: Observation
-    ) -> LightBuffers:
-        """Maps where smooth planes show the lights."""
-        if self.buffers.mirrors:
-            self._visibility.run(self.buffers, seen.scan.bias_m, {**seen.bindings, **self.buffers.bindings})
-        return self.buffers
+        self, _views: LightBuffers, _real: LightBuffers, _objects: LightBuffers, seen: Observation
+    ) -> moderngl.TextureArray | None:
+        """Maps where smooth planes show the lights; None where no plane does."""
+        if not self.buffers.mirrors:
+            return None
+        self._visibility.run(self.buffers, seen.scan.bias_m, {**seen.bindings, **self.buffers.bindings})
+        return self.buffers.mirror_visibility
 
     def release(self) -> None:
         """Frees the GL objects."""
@@ -118,27 +118,46 @@ def light_stages(
     g: Graph, s: FrameResources, resolved: ResolvedSettings, shadow_samples: int, *, mirrors: bool = False
 ) -> LitScene:
     """Environment, views, depth maps of both geometries, and what smooth planes mirror of the lights."""
+    g.section("lights")
     stages = LightStages(g.gpu, resolved.rsm_size, shadow_samples, mirrors=mirrors)
     extent = object_extent(g, s)
     environment = g.stage("environment", stages.set_environment, s.lights)
     views = g.stage("light views", stages.fit_views, s.lights, s.real, extent, s.surfaces, s.everywhere)
-    real_views = g.stage("light views real", lambda lights: lights.real_records, views, same=eq)
-    object_views = g.stage("light views objects", lambda lights: lights.virtual_records, views, same=eq)
+    real_views = g.value("light views real", real_records, views, same=eq)
+    object_views = g.value("light views objects", object_records, views, same=eq)
     real_maps = g.stage("shadow maps real", stages.draw_real, real_views, s.real)
     object_maps = g.stage("shadow maps objects", stages.draw_objects, object_views, s.objects)
-    mirrored = environment
+    mirrored = []
     if mirrors:
-        mirrored = g.stage(
-            "mirror visibility", stages.map_mirrors, real_maps, object_maps, s.lights, s.observation
-        )
-    return LitScene(stages.buffers, environment, real_maps, object_maps, mirrored)
+        given = views, real_maps, object_maps, s.observation
+        mirrored = [g.stage("mirror visibility", stages.map_mirrors, *given, same=_both_none)]
+    return LitScene(stages.buffers, environment, real_maps, object_maps, tuple(mirrored))
+
+
+def real_records(lights: LightBuffers) -> bytes:
+    """Records of the views of real shadows: another value only where a view changed."""
+    return lights.real_records
+
+
+def object_records(lights: LightBuffers) -> bytes:
+    """Records of the views of the objects' shadows: another value only where a view changed."""
+    return lights.virtual_records
+
+
+def _both_none(old: object, new: object) -> bool:
+    return old is None and new is None
 
 
 def object_extent(g: Graph, s: FrameResources) -> Resource[Points]:
     """Points that enclose the objects at all times of their animations, for fitting volumes and light views."""
     if "object extent" in g:
         return g.resource("object extent")
-    return g.stage("object extent", lambda objects: objects.lasting_points, s.objects, same=np.array_equal)
+    return g.value("object extent", _lasting_points, s.objects, same=np.array_equal)
+
+
+def _lasting_points(objects: GeometryState) -> Points:
+    """Points that enclose the objects at all times of their animations."""
+    return objects.lasting_points
 
 
 def volume_placement(
@@ -147,9 +166,19 @@ def volume_placement(
     """The cube of voxels or cells around the objects."""
 
     def place(extent: Points) -> VolumePlacement:
+        """Places a cube around the objects, snapped to its cells."""
         return place_volume(extent.min(axis=0), extent.max(axis=0), size, edge_m)
 
-    return g.stage("volume placement", place, object_extent(g, s), same=eq)
+    return g.value("volume placement", place, object_extent(g, s), same=eq)
+
+
+def no_voxels(_: object) -> None:
+    """Of a method whose volume holds none."""
+
+
+def no_bindings(_: object) -> dict[str, Binding]:
+    """What cones march through, of a method that marches none."""
+    return {}
 
 
 def surfel_scene(
@@ -204,7 +233,7 @@ class Layers:
     change: Resource[ChangeRatio]
     radiance: Resource[moderngl.Texture]
     reflection: Resource[moderngl.Texture | None]
-    voxels: Resource[VoxelMipmap]
+    voxels: Resource[VoxelMipmap | None]
     volume: Resource[PlacedVolume]
     lights: Resource[LightBuffers]
 
@@ -244,7 +273,7 @@ class Shading:
         view: CameraView,
         volume: PlacedVolume,
         everywhere: bool,
-        *_lights: LightBuffers,
+        *_lights: object,
     ) -> dict[str, Binding]:
         """Bindings of what stages at pixels read: geometry, lights, volume, and what follows from them."""
         low, high = objects.bounds
@@ -283,10 +312,11 @@ class Shading:
         return self._caustics
 
     def light_directly(
-        self, scene: Bindings, grid: LowResGrid, caustics: Caustics | None, voxels: VoxelMipmap
+        self, scene: Bindings, grid: LowResGrid, caustics: Caustics | None, voxels: VoxelMipmap | None
     ) -> DirectLight:
         """Lights the real surfaces by the lights themselves."""
-        self._direct.run(grid, scene, joint=voxels.texture, caustics=caustics)
+        joint = None if voxels is None else voxels.texture
+        self._direct.run(grid, scene, joint=joint, caustics=caustics)
         return self._direct
 
     def reflect_objects(
@@ -363,13 +393,20 @@ def shading_stages(
     shading: Shading,
     lit: LitScene,
     volume: Resource[PlacedVolume],
-    voxels: Resource[VoxelMipmap],
-    marching: Resource[dict[str, Binding]],
     trace: Callable[[Resource[Bindings], Resource[LowResGrid]], Resource[ConeFields]],
+    *,
+    voxels: Resource[VoxelMipmap] | None = None,
+    marching: Resource[dict[str, Binding]] | None = None,
     light_directly: Callable[..., DirectLight] | None = None,
 ) -> Layers:
-    """Grid, cones (declared by `trace`), caustics, direct light, reflections, change of light, objects."""
-    scene = g.stage(
+    """Grid, cones (declared by `trace`), caustics, direct light, reflections, change of light, objects.
+
+    `voxels`: what the `volume` holds, if anything; `marching`: bindings of what rays march through, if they do.
+    """
+    shown: Resource[Any] = voxels or g.value("voxels", no_voxels, volume)
+    marching = marching or g.value("marching", no_bindings, volume)
+    g.section("shading")
+    scene = g.value(
         "shading scene",
         shading.scene,
         s.geometry,
@@ -384,12 +421,12 @@ def shading_stages(
     grid = g.stage("low res grid", shading.choose_pixels, scene)
     cones = trace(scene, grid)
     caustics = g.stage("caustics", shading.cast_caustics, scene, grid, bvh, s.observation, volume)
-    direct = g.stage("direct light", light_directly or shading.light_directly, scene, grid, caustics, voxels)
+    direct = g.stage("direct light", light_directly or shading.light_directly, scene, grid, caustics, shown)
     reflection = g.stage("reflections", shading.reflect_objects, scene, grid, bvh, marching)
     change = g.stage("change of light", shading.compare, grid, direct, cones, reflection)
     screen = g.stage("screen cones", shading.trace_screen, scene, direct, cones, bvh, s.observation, marching)
     radiance = g.stage("virtual surface", shading.shade_objects, scene, grid, cones, caustics, screen)
-    return Layers(direct, cones, grid, change, radiance, reflection, voxels, volume, lit.real_maps)
+    return Layers(direct, cones, grid, change, radiance, reflection, shown, volume, lit.real_maps)
 
 
 def shadow_receivers(real: GeometryState, extent: Points) -> Points:

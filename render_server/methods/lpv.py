@@ -24,7 +24,8 @@ from render_server.methods.lighting import (
     surfel_scene,
     volume_placement,
 )
-from render_server.methods.settings import Setup
+from render_server.methods.method import RelightingMethod
+from render_server.methods.settings import ResolvedSettings, Setup
 from render_server.passes.cones import ConeFields, LowResGrid
 from render_server.passes.lights import LightBuffers
 from render_server.passes.lpv import (
@@ -134,7 +135,7 @@ class LpvVolumes:
         albedo: AlbedoTexture,
         volume: PlacedVolume,
         _lights: LightSet,
-        _environment: LightBuffers,
+        _environment: moderngl.TextureArray,
         lights: LightBuffers,
     ) -> dict[str, Binding]:
         """Bindings of what injects the real scene's light."""
@@ -224,25 +225,25 @@ class LpvVolumes:
             self._propagate.run(rho, self._weights, self._steps, through)
         return rho
 
+    def inject_shadow(self, scene: Bindings, lights: LightBuffers, _real: moderngl.Buffer) -> moderngl.Buffer:
+        """Negative lobes of the direct light that objects keep off the real scene; nothing where maps shadow it."""
+        if self._settings.resolved_shadow == "lobe":
+            self._shadow_light.clear()
+            self._maps.add_shadow(self._shadow_light, lights, self._albedo.atlas, scene)
+        return self._shadow_light
+
     def propagate_change(
-        self,
-        change: moderngl.Buffer,
-        scene: Bindings,
-        lights: LightBuffers,
-        through: moderngl.Buffer | None,
+        self, change: moderngl.Buffer, shadow: moderngl.Buffer, through: moderngl.Buffer | None
     ) -> LightVolume | None:
         """V_delta of the paper: one volume of the texels that differ ([P2] 4.3); None of the other operator."""
         if self.change is not None:
-            self._shadow_light.clear()
-            if self._settings.resolved_shadow == "lobe":
-                self._maps.add_shadow(self._shadow_light, lights, self._albedo.atlas, scene)
-            self._start.run(self.change, change, self._shadow_light)
+            self._start.run(self.change, change, shadow)
             self._propagate.run(self.change, self._weights, self._steps, through)
         return self.change
 
-    def show(self, change: moderngl.Buffer, _delta: LightVolume | None, volume: PlacedVolume) -> VoxelMipmap:
+    def show(self, change: moderngl.Buffer, shadow: moderngl.Buffer, volume: PlacedVolume) -> VoxelMipmap:
         """Cells of what was injected of the change."""
-        self._show.run(self.shown, volume.placement.size, change, self._shadow_light)
+        self._show.run(self.shown, volume.placement.size, change, shadow)
         return self.shown
 
     def release(self) -> None:
@@ -285,7 +286,7 @@ def lpv_stages(
 ) -> tuple[Resource[LightVolume | None], Resource[LightVolume], Resource[LightVolume | None]]:
     """Inject, block, propagate: V_mu of the real scene, V_rho with the objects, the paper's V_delta."""
     real = g.stage("voxelize real", volumes.voxelize_real, s.real, volume)
-    scene = g.stage(
+    scene = g.value(
         "inject scene",
         volumes.real_scene,
         s.observation,
@@ -299,12 +300,13 @@ def lpv_stages(
     through_real = g.stage("geometry volume real", volumes.cover_real, real, volume)
     mu = g.stage("propagate mu", volumes.propagate_mu, real_light, through_real)
     objects = g.stage("voxelize objects", volumes.voxelize_objects, s.objects, volume)
-    joint = g.stage("inject scene joint", volumes.joint_scene, scene, s.objects, lit.object_maps)
+    joint = g.value("inject scene joint", volumes.joint_scene, scene, s.objects, lit.object_maps)
     change = g.stage("inject change", volumes.inject_change, objects, joint, lit.object_maps, real_light)
     through = g.stage("geometry volume", volumes.cover_joint, objects, volume, through_real)
     first = g.stage("propagate rho", volumes.propagate_rho, real_light, change, through)
     rho = g.stage("bounces", volumes.bounce, first, mu, joint, through)
-    delta = g.stage("propagate delta", volumes.propagate_change, change, joint, lit.object_maps, through)
+    shadow = g.stage("inject shadow", volumes.inject_shadow, joint, lit.object_maps, real_light)
+    delta = g.stage("propagate delta", volumes.propagate_change, change, shadow, through)
     return mu, rho, delta
 
 
@@ -312,11 +314,12 @@ def dlpv(g: Graph, s: FrameResources, setup: Setup[DlpvMethod]) -> Layers:
     """V_rho and V_mu subtracted, or the paper's one volume of the change."""
     settings, resolved, size = setup.settings, setup.resolved, setup.picture_size
     lit = light_stages(g, s, resolved, settings.shadow_samples)
+    g.section("propagation volumes")
     placement = volume_placement(g, s, resolved.volume_size, settings.volume_edge_m)
     volumes = LpvVolumes(g.gpu, settings, resolved.volume_size)
-    volume = g.stage("volume", volumes.place, placement)
+    volume = g.value("volume", volumes.place, placement)
     mu, rho, delta = lpv_stages(g, s, lit, volumes, volume)
-    shown = g.stage("shown cells", volumes.show, "inject change", delta, volume)
+    shown = g.stage("shown cells", volumes.show, "inject change", "inject shadow", volume)
     options = ShadingOptions(
         caustics=settings.resolved_caustics,
         screen_space=settings.resolved_screen_space,
@@ -325,9 +328,22 @@ def dlpv(g: Graph, s: FrameResources, setup: Setup[DlpvMethod]) -> Layers:
     direct = DirectLight(g.gpu, size, objects_shadow=settings.resolved_shadow == "map")
     shading = Shading(g.gpu, size, resolved, lit.buffers, direct, options)
     fields = LpvFields(g.gpu, volumes, shading.cones)
-    marching = g.stage("marching", fields.marching, rho)
+    marching = g.value("marching", fields.marching, rho)
 
     def read(scene: Resource[Bindings], grid: Resource[LowResGrid]) -> Resource[ConeFields]:
         return g.stage("cones", fields.read, scene, grid, mu, rho, delta)
 
-    return shading_stages(g, s, shading, lit, volume, shown, marching, read)
+    return shading_stages(g, s, shading, lit, volume, read, voxels=shown, marching=marching)
+
+
+def resolve(settings: DlpvMethod, defaults: ResolvedSettings) -> ResolvedSettings:
+    """Takes the document's values, or the machine's defaults where it says null."""
+    return ResolvedSettings(
+        settings.volume_size,
+        settings.query_scale or defaults.cone_scale,
+        settings.rsm_size or defaults.rsm_size,
+        settings.triangle_budget or defaults.triangle_budget,
+    )
+
+
+DLPV = RelightingMethod(DlpvMethod, dlpv, resolve)

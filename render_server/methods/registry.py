@@ -1,46 +1,48 @@
 """Which method relights for a scene document's `method`, with what settings."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
-from protocol.scene_method import AroofMethod, DifferentialMethod, DlpvMethod, DvctMethod, Method, NoneMethod
+from protocol.methods import PLUGINS
+from protocol.plugins import Plugin
+from protocol.scene_method import DvctMethod, MethodSettings, NoneMethod
 from protocol.scene_objects import SceneObject
 from render_server.frame import FrameResources
 from render_server.graph import Graph
-from render_server.methods.aroof import aroof
-from render_server.methods.differential import differential
-from render_server.methods.dvct import dvct_exact, dvct_paper
+from render_server.methods.aroof import AROOF
+from render_server.methods.differential import DIFFERENTIAL
+from render_server.methods.dvct import DVCT
 from render_server.methods.lighting import Layers
-from render_server.methods.lpv import dlpv
-from render_server.methods.settings import (
-    JOINT_RSM_SIZE,
-    ResolvedSettings,
-    Setup,
-    resolve_aroof,
-    resolve_dlpv,
-    resolve_voxel_cones,
-)
-from render_server.occlusion_fields import OcclusionFields, require_rigid
-from render_server.passes.voxels import DIRECTIONS, memory_statement
+from render_server.methods.lpv import DLPV
+from render_server.methods.method import RelightingMethod
+from render_server.methods.settings import GPU_DEFAULTS, SOFTWARE_DEFAULTS, ResolvedSettings, Setup
+from render_server.occlusion_fields import OcclusionFields
 
-Declare = Callable[[Graph, FrameResources, Setup[Any]], Layers]
+BUILT_IN: tuple[RelightingMethod[Any], ...] = (DVCT, DLPV, AROOF, DIFFERENTIAL)
+_BY_SETTINGS = {method.settings: method for method in BUILT_IN}
 
 
 @dataclass(frozen=True)
 class MethodChoice:
-    """A method whose settings and memory were checked. `remark`: a sentence for the user, or none."""
+    """A method whose settings and memory were checked.
 
-    settings: Any
+    `remark`: a sentence for the user, or none. `relights_real`: the real scene changes too.
+    `plugin`: what the method comes from, unless it is the project's own.
+    """
+
+    method: RelightingMethod[Any]
+    settings: MethodSettings
     resolved: ResolvedSettings
-    declare: Declare
     remark: str | None = None
+    relights_real: bool = field(default=True, compare=False)
+    plugin: Plugin | None = None
 
     @property
     def composition(self) -> Literal["ratio", "additive"]:
         """How the delta meets the picture."""
-        composition: Literal["ratio", "additive"] = self.settings.resolved_composition
-        return composition
+        return self.settings.resolved_composition
 
     def require(self, objects: Sequence[SceneObject]) -> None:
         """Refuses visible objects that the method cannot show.
@@ -48,32 +50,50 @@ class MethodChoice:
         Raises:
             DeltalightError: an object's shape may change, and the method precomputes.
         """
-        if isinstance(self.settings, AroofMethod):
+        if self.method.require is not None:
             for item in objects:
                 if item.visible:
-                    require_rigid(item)
+                    self.method.require(item)
 
     def setup(self, picture_size: tuple[int, int], fields: OcclusionFields) -> Setup[Any]:
         """What the method is declared with for pictures of this size."""
         return Setup(self.settings, self.resolved, picture_size, fields)
 
+    def declare(self, graph: Graph, resources: FrameResources, setup: Setup[Any]) -> Layers:
+        """Declares the method's stages.
 
-def choose_method(method: Method, *, software: bool) -> MethodChoice:
+        Raises:
+            DeltalightError: a plugin cannot.
+        """
+        with _blamed(self.plugin):
+            return self.method.declare(graph, resources, setup)
+
+
+def choose_method(document: MethodSettings, *, software: bool) -> MethodChoice:
     """Checks what the document asks for; `none` draws the objects as dvct does.
 
     Raises:
-        DeltalightError: more memory than its budget.
+        DeltalightError: more memory than its budget, or a plugin that cannot be used.
     """
-    settings = DvctMethod() if isinstance(method, NoneMethod) else method
-    if isinstance(settings, DlpvMethod):
-        return MethodChoice(settings, resolve_dlpv(settings, software=software), dlpv)
-    if isinstance(settings, AroofMethod):
-        return MethodChoice(settings, resolve_aroof(settings, software=software), aroof)
-    if isinstance(settings, DifferentialMethod):
-        resolved = resolve_voxel_cones(settings, software=software, rsm_size=JOINT_RSM_SIZE)
-        remark = memory_statement(resolved.volume_size, DIRECTIONS, settings.memory_budget_mb)
-        return MethodChoice(settings, resolved, differential, remark)
-    exact = settings.operator == "exact"
-    resolved = resolve_voxel_cones(settings, software=software)
-    remark = memory_statement(resolved.volume_size, DIRECTIONS if exact else 1, settings.memory_budget_mb)
-    return MethodChoice(settings, resolved, dvct_exact if exact else dvct_paper, remark)
+    if isinstance(document, NoneMethod):
+        return replace(choose_method(DvctMethod(), software=software), relights_real=False)
+    method, plugin = _registered(document)
+    with _blamed(plugin):
+        resolved = method.resolve(document, SOFTWARE_DEFAULTS if software else GPU_DEFAULTS)
+        remark = None if method.state_memory is None else method.state_memory(document, resolved)
+    return MethodChoice(method, document, resolved, remark, plugin=plugin)
+
+
+def _registered(settings: MethodSettings) -> tuple[RelightingMethod[Any], Plugin | None]:
+    """The method that has such settings, and the plugin that it comes from."""
+    built_in = _BY_SETTINGS.get(type(settings))
+    if built_in is not None:
+        return built_in, None
+    installed = PLUGINS.values[settings.method_name()]
+    if not isinstance(installed.value, RelightingMethod):
+        raise installed.plugin.fault("it names no RelightingMethod")
+    return installed.value, installed.plugin
+
+
+def _blamed(plugin: Plugin | None) -> AbstractContextManager[None]:
+    return nullcontext() if plugin is None else plugin.blamed()

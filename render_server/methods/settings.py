@@ -1,20 +1,17 @@
-"""Settings that the scene document leaves open, by what the machine can do."""
+"""What methods are declared with: the document's settings, and what the machine decides where they leave it open.
 
-from dataclasses import dataclass
-from typing import Generic, TypeVar
+Like `method`, this module is light to import: processes that have no OpenGL load plugins too.
+"""
 
-from protocol.scene_method import AroofMethod, DlpvMethod, VoxelConeSettings
-from render_server.occlusion_fields import OcclusionFields
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Generic, TypeVar
 
-Settings = TypeVar("Settings")
+from protocol.scene_method import MethodSettings, VoxelConeSettings
 
-# (software, GPU)
-VOLUME_SIZE = (64, 256)
-CONE_SCALE = (4, 2)
-RSM_SIZE = (512, 1024)
-TRIANGLE_BUDGET = (40_000, 400_000)
-SHOWN_CELLS = 64  # of method aroof, which has no volume: for view `volume` alone
-JOINT_RSM_SIZE = (1024, 2048)  # of maps that hold objects and room at once, and so resolve objects less
+if TYPE_CHECKING:
+    from render_server.occlusion_fields import OcclusionFields
+
+Settings = TypeVar("Settings", bound=MethodSettings)
 
 
 @dataclass(frozen=True)
@@ -30,6 +27,10 @@ class ResolvedSettings:
     triangle_budget: int
 
 
+SOFTWARE_DEFAULTS = ResolvedSettings(volume_size=64, cone_scale=4, rsm_size=512, triangle_budget=40_000)
+GPU_DEFAULTS = ResolvedSettings(volume_size=256, cone_scale=2, rsm_size=1024, triangle_budget=400_000)
+
+
 @dataclass(frozen=True, eq=False)
 class Setup(Generic[Settings]):
     """What a method is declared with: settings, width and height of the picture, what is precomputed of objects."""
@@ -37,7 +38,22 @@ class Setup(Generic[Settings]):
     settings: Settings
     resolved: ResolvedSettings
     picture_size: tuple[int, int]
-    fields: OcclusionFields
+    fields: "OcclusionFields"
+
+
+def resolve_voxel_cones(settings: VoxelConeSettings, defaults: ResolvedSettings) -> ResolvedSettings:
+    """Takes the document's values, or the machine's defaults where it says null."""
+    return ResolvedSettings(
+        settings.volume_size or defaults.volume_size,
+        settings.cone_scale or defaults.cone_scale,
+        settings.rsm_size or defaults.rsm_size,
+        settings.triangle_budget or defaults.triangle_budget,
+    )
+
+
+def resolve_joint_maps(settings: VoxelConeSettings, defaults: ResolvedSettings) -> ResolvedSettings:
+    """The same for methods whose shadow maps hold objects and room at once, and so resolve objects less."""
+    return resolve_voxel_cones(settings, replace(defaults, rsm_size=2 * defaults.rsm_size))
 
 
 def march_defines(settings: VoxelConeSettings) -> dict[str, int]:
@@ -47,38 +63,3 @@ def march_defines(settings: VoxelConeSettings) -> dict[str, int]:
         "MULTIPLIED_COVERAGE": settings.coverage == "multiplied",
     }
     return {name: 1 for name, wanted in defines.items() if wanted}
-
-
-def resolve_voxel_cones(
-    settings: VoxelConeSettings, *, software: bool, rsm_size: tuple[int, int] = RSM_SIZE
-) -> ResolvedSettings:
-    """Take the document's values, or the machine's defaults where it says null."""
-    column = 0 if software else 1
-    return ResolvedSettings(
-        settings.volume_size or VOLUME_SIZE[column],
-        settings.cone_scale or CONE_SCALE[column],
-        settings.rsm_size or rsm_size[column],
-        settings.triangle_budget or TRIANGLE_BUDGET[column],
-    )
-
-
-def resolve_dlpv(settings: DlpvMethod, *, software: bool) -> ResolvedSettings:
-    """Take the document's values, or the machine's defaults where it says null."""
-    column = 0 if software else 1
-    return ResolvedSettings(
-        settings.volume_size,
-        settings.query_scale or CONE_SCALE[column],
-        settings.rsm_size or RSM_SIZE[column],
-        settings.triangle_budget or TRIANGLE_BUDGET[column],
-    )
-
-
-def resolve_aroof(settings: AroofMethod, *, software: bool) -> ResolvedSettings:
-    """Take the document's values, or the machine's defaults where it says null."""
-    column = 0 if software else 1
-    return ResolvedSettings(
-        SHOWN_CELLS,
-        settings.shading_scale or CONE_SCALE[column],
-        settings.rsm_size or RSM_SIZE[column],
-        settings.triangle_budget or TRIANGLE_BUDGET[column],
-    )

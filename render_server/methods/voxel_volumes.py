@@ -4,6 +4,7 @@
 
 from collections.abc import Sequence
 
+import moderngl
 import numpy as np
 from jaxtyping import Float32
 
@@ -212,8 +213,7 @@ class DeltaVoxels(DirectionalVoxels):
         albedo: AlbedoTexture,
         _lights: LightSet,
         lights: LightBuffers,
-        _maps: LightBuffers,
-        _mirrored: LightBuffers,
+        *_light: object,
     ) -> dict[str, Binding]:
         """Bindings of what lights real voxels."""
         seen.image.build_levels()
@@ -292,22 +292,22 @@ def delta_voxel_stages(
     """Voxelise, light, filter and bounce: mu of the real scene, then rho with the objects."""
     real = g.stage("voxelize real", voxels.voxelize_real, s.real, placement)
     beyond = g.stage("voxelize far", voxels.far.voxelize, s.real)
-    scene = g.stage(
+    scene = g.value(
         "real voxel scene",
         voxels.real_scene,
         s.observation,
         s.albedo,
         s.lights,
-        lit.environment,
         lit.real_maps,
-        lit.mirrored,
+        lit.environment,
+        *lit.mirrored,
     )
     lit_real = g.stage("light real voxels", voxels.light_real, real, scene)
     far = g.stage("light far voxels", voxels.far.light, beyond, scene)
     filtered = g.stage("filter mu", voxels.filter_real, lit_real)
     mu = g.stage("bounces real", voxels.bounce_real, filtered, far, scene)
     objects = g.stage("voxelize objects", voxels.voxelize_objects, s.objects, placement)
-    joint = g.stage("joint voxel scene", voxels.joint_scene, scene, s.objects, lit.object_maps, objects)
+    joint = g.value("joint voxel scene", voxels.joint_scene, scene, s.objects, lit.object_maps, objects)
     lit_joint = g.stage("light joint voxels", voxels.light_objects, objects, s.objects, joint, mu)
     filtered_joint = g.stage("filter rho", voxels.filter_joint, lit_joint)
     rho = g.stage("bounces joint", voxels.bounce_joint, filtered_joint, joint)
@@ -329,48 +329,46 @@ class SolutionVoxels(DirectionalVoxels):
             self._group.run(real.store, real.groups, real.volume.bindings, has_seen=False)
         return real, objects
 
-    def scenes(
+    def mu_scene(
         self,
         seen: Observation,
         albedo: AlbedoTexture,
-        objects: GeometryState,
         _lights: LightSet,
-        mu: LightBuffers,
-        rho: LightBuffers,
-    ) -> tuple[dict[str, Binding], dict[str, Binding]]:
-        """Bindings of what lights voxels, of solution mu and of rho."""
+        lights: LightBuffers,
+        _environment: tuple[moderngl.TextureArray, ...],
+        voxels: VoxelSet,
+    ) -> dict[str, Binding]:
+        """Bindings of what lights the real scene's voxels under one solution's maps."""
         seen.image.build_levels()
-        shared = {**self.real.volume.bindings, **objects.materials.bindings, "has_caustics": False}
-        first, second = (surfel_scene(seen, each, albedo, measured=self._measured) for each in (mu, rho))
-        return {**first, **shared}, {**second, **shared}
+        scene = surfel_scene(seen, lights, albedo, measured=self._measured)
+        return {**scene, **voxels.volume.bindings, "has_caustics": False}
 
-    def light_far(self, voxels: VoxelSet, scenes: tuple[Bindings, Bindings]) -> VoxelMipmap:
-        """Lights the scene beyond the volume, as solution mu has it."""
-        return self.far.light(voxels, scenes[0])
+    def rho_scene(self, scene: Bindings, objects: GeometryState, lights: LightBuffers) -> dict[str, Binding]:
+        """Bindings of what lights the voxels of both."""
+        own = {**lights.bindings, "shadow_samples": SURFEL_SHADOW_SAMPLES}
+        return {**scene, **own, **objects.materials.bindings}
 
     def light(
-        self, _voxels: tuple[VoxelSet, VoxelSet], _far: VoxelMipmap, scenes: tuple[Bindings, Bindings]
+        self, _voxels: tuple[VoxelSet, VoxelSet], _far: VoxelMipmap, mu: Bindings, rho: Bindings
     ) -> "SolutionVoxels":
         """Lights, resolves and filters mu, then rho."""
-        self._light_both(scenes, gathered=False)
+        self._light_both(mu, rho, gathered=False)
         return self
 
-    def bounce(self, _lit: "SolutionVoxels", scenes: tuple[Bindings, Bindings]) -> "SolutionVoxels":
+    def bounce(self, _lit: "SolutionVoxels", mu: Bindings, rho: Bindings) -> "SolutionVoxels":
         """Gathers each solution's light from its own voxels, and lights them by it."""
         for _ in range(self._bounces):
             self.set_support(everywhere=True)
-            marching = {**scenes[0], **self.march_bindings(1)}
+            marching = {**mu, **self.march_bindings(1)}
             self._gather.gather_real(self.real.store, self.real.groups, self.mu, self.rho, marching)
             self._gather.gather_virtual(self.objects.store, self.objects.groups, self.rho, marching)
-            self._light_both(scenes, gathered=True)
+            self._light_both(mu, rho, gathered=True)
         return self
 
-    def _light_both(self, scenes: tuple[Bindings, Bindings], *, gathered: bool) -> None:
-        real, objects = self.real, self.objects
+    def _light_both(self, mu: Bindings, rho: Bindings, *, gathered: bool) -> None:
+        real, objects, light = self.real, self.objects, self._light
         if not gathered:
             objects.forget_light()
-        mu, rho = scenes
-        light = self._light
         light.light_solution(real.store, mu, real.groups, with_objects=False, gathered=gathered)
         self._resolve.resolve_mu(self.mu, real.store, real.volume)
         light.light_solution(real.store, rho, real.groups, with_objects=True, gathered=gathered)
@@ -397,18 +395,29 @@ def solution_stages(
     placement: Resource[VolumePlacement],
     mu_maps: Resource[LightBuffers],
     rho_maps: Resource[LightBuffers],
+    environment: Resource[tuple[moderngl.TextureArray, ...]],
 ) -> Resource[SolutionVoxels]:
     """Voxelise both geometries, then light, filter and gather in step."""
     real = g.stage("voxelize real", voxels.voxelize_real, s.real, placement)
     beyond = g.stage("voxelize far", voxels.far.voxelize, s.real)
     objects = g.stage("voxelize objects", voxels.voxelize_objects, s.objects, placement)
     both = g.stage("group surfels", voxels.voxelize_both, real, objects)
-    scenes = g.stage(
-        "voxel scenes", voxels.scenes, s.observation, s.albedo, s.objects, s.lights, mu_maps, rho_maps
-    )
-    far = g.stage("light far voxels", voxels.light_far, beyond, scenes)
-    lit = g.stage("light voxels", voxels.light, both, far, scenes)
-    return g.stage("bounces", voxels.bounce, lit, scenes)
+    given = s.observation, s.albedo, s.lights, mu_maps, environment, real
+    mu = g.value("voxel scene mu", voxels.mu_scene, *given)
+    rho = g.value("voxel scene rho", voxels.rho_scene, mu, s.objects, rho_maps)
+    far = g.stage("light far voxels", voxels.far.light, beyond, mu)
+    lit = g.stage("light voxels", voxels.light, both, far, mu, rho)
+    return g.stage("bounces", voxels.bounce, lit, mu, rho)
+
+
+def placed_volume(voxels: VoxelSet) -> PlacedVolume:
+    """Where the voxels lie."""
+    return voxels.volume
+
+
+def joint_voxels(voxels: "InjectedVoxels | SolutionVoxels") -> VoxelMipmap:
+    """The voxels of real and virtual surfaces."""
+    return voxels.rho
 
 
 class InjectedVoxels:
@@ -444,7 +453,7 @@ class InjectedVoxels:
         albedo: AlbedoTexture,
         _lights: LightSet,
         lights: LightBuffers,
-        _environment: LightBuffers,
+        _environment: moderngl.TextureArray,
     ) -> RealAlbedo:
         """Finds the real scene's albedo as the lights see it."""
         seen.image.build_levels()

@@ -71,7 +71,7 @@ class RelitLayers:
     cones: ConeFields
     grid: LowResGrid
     change: ChangeRatio
-    voxels: VoxelMipmap
+    voxels: VoxelMipmap | None
     volume: PlacedVolume
     lights: LightBuffers
     reflection: moderngl.Texture | None = None

@@ -9,7 +9,7 @@ from protocol.frames import DepthImage, ViewFrame, decode_lut
 from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Binding, Bindings, Kernel, RasterKernel
 from render_server.gpu.textures import release_all, release_target, texture_2d
-from render_server.scene.gpu_mesh import VERTEX_ATTRIBUTES, VERTEX_LAYOUT, GpuMesh
+from render_server.scene.triangle_mesh import VERTEX_ATTRIBUTES, VERTEX_LAYOUT, GpuMesh
 from render_server.view import CameraView, Rectangle
 
 INVERSE_SIZE = 8192  # steps of the inverse response: a code is at least 16 of them wide

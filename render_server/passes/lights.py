@@ -11,8 +11,7 @@ from jaxtyping import Float32, Float64
 from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Binding, Bindings, Kernel
 from render_server.gpu.uniform_block import Block, Float, Int, UniformBlock
-from render_server.lights.lights import DirectionalLight, Light, RectangleLight, SpotLight
-from render_server.lights.mirror_lights import MirrorLight
+from render_server.lights.lights import DirectionalLight, Light, MirrorLight, RectangleLight, SpotLight
 from render_server.lights.octahedral import octahedral_grid, prefilter, sample_octahedral
 from render_server.passes.shadow_maps import (
     NEAREST_M,
@@ -85,7 +84,7 @@ class LightBuffers:
             "shadow_samples": self.shadow_samples,
         }
 
-    def set_environment(self, radiance: Float32[np.ndarray, "n n 3"]) -> None:
+    def set_environment(self, radiance: Float32[np.ndarray, "n n 3"]) -> moderngl.TextureArray:
         """Uploads the residual environment R (octahedral), averaged over cones of doubling half-angle."""
         prefiltered = prefilter(radiance)
         size, count = len(radiance), len(prefiltered.levels)
@@ -100,6 +99,7 @@ class LightBuffers:
         self._environment.repeat_x = self._environment.repeat_y = False
         self._environment_half_angle = float(prefiltered.half_angles[0])
         self._write_block()
+        return self._environment
 
     def place(
         self,
@@ -214,7 +214,7 @@ class LightBuffers:
 
 
 class MirrorVisibility:
-    """Maps where smooth real planes mirror the lights, one map for each image of a light (lights/mirror_lights.py).
+    """Maps where smooth real planes mirror the lights, one map for each image of a light (lights/lights.py).
 
     A map holds how much of the light each point of the plane shows, without and with the objects; its mipmaps average
     that over larger and larger footprints.

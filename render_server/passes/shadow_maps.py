@@ -11,8 +11,7 @@ from jaxtyping import Float64
 from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Bindings, RasterKernel
 from render_server.gpu.textures import release_target, texture_2d
-from render_server.lights.lights import DirectionalLight, Light, RectangleLight, SpotLight
-from render_server.lights.mirror_lights import MirrorLight
+from render_server.lights.lights import DirectionalLight, Light, MirrorLight, RectangleLight, SpotLight
 from render_server.passes.gbuffer import MeshBuffers
 
 NEAR_MARGIN = 0.98  # near and far planes lie a little outside of what they enclose

@@ -13,7 +13,7 @@ from protocol.errors import DeltalightError
 from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Binding, Kernel, list_threads
 from render_server.gpu.uniform_block import Block, Float, Int, UniformBlock, Vec3
-from render_server.scene.gpu_mesh import split_triangles
+from render_server.scene.triangle_mesh import split_triangles
 
 MEGABYTE = 1_000_000
 DIRECTIONS = 6  # of an anisotropic volume; isotropic ones have 1
@@ -109,10 +109,11 @@ class PlacedVolume:
         """The uniform block of the current placement."""
         return {"Volume": self._block}
 
-    def place(self, placement: VolumePlacement) -> None:
-        """Moves the volume."""
+    def place(self, placement: VolumePlacement) -> "PlacedVolume":
+        """Moves the volume and returns it."""
         self._placement = placement
         self._block.write(placement.block())
+        return self
 
     def release(self) -> None:
         """Frees the block."""

@@ -14,7 +14,6 @@ from jaxtyping import Bool, Float16, Float32, Int64
 from scipy.spatial import cKDTree
 
 from render_server.lights.octahedral import harmonics
-from render_server.scene.gpu_mesh import split_triangles
 from render_server.scene.occlusion_field import (
     CHUNK,
     FieldSettings,
@@ -25,7 +24,7 @@ from render_server.scene.occlusion_field import (
     direction_set,
     fill_inside,
 )
-from render_server.scene.triangle_mesh import TriangleMesh
+from render_server.scene.triangle_mesh import TriangleMesh, split_triangles
 
 ORDER = 3  # SH bands of incident and reflected light: both are diffuse
 LENGTH = ORDER**2

@@ -13,9 +13,10 @@ from fastapi import Body, Depends, Request, Response
 from pydantic import BaseModel, ValidatorFunctionWrapHandler, WrapValidator
 
 from protocol.documents import parse_mapping, validate, yaml_text
+from protocol.methods import Method
 from protocol.scene import SceneDocument
 from protocol.scene_lights import Lights, ManualLight
-from protocol.scene_method import Method, Output, Shading
+from protocol.scene_method import Output, Shading
 from protocol.scene_objects import RealScene, SceneObject
 from services.api.problems import ProblemError
 

@@ -14,7 +14,7 @@ from typing import Any
 from pydantic import Field, ValidationError
 
 from protocol.documents import StrictModel
-from protocol.scene_method import Method
+from protocol.methods import Method
 from services.files import make_output_folder
 from services.storage.faults import NotFoundError, StorageFaultError
 

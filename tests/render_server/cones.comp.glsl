@@ -1,10 +1,10 @@
-// Fires single cones through the pyramids (the tests' own shader).
-#include "passes/common/march.glsl"
+// Fires single cones through the mipmaps (the tests' own shader).
+#include "common/march.glsl"
 
 layout(local_size_x = 64) in;
 struct Ray { vec4 start; vec4 direction; };   // voxels, cone diameter / distance; unit direction
-layout(std430, binding = 0) readonly buffer Rays { Ray rays[]; };
-layout(std430, binding = 1) writeonly buffer Results { vec4 results[]; };   // red radiance and transmittance: mu, rho
+layout(std430) readonly buffer Rays { Ray rays[]; };
+layout(std430) writeonly buffer Results { vec4 results[]; };   // red radiance and transmittance: mu, rho
 uniform int ray_count;
 
 void main() {

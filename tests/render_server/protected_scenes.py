@@ -15,6 +15,7 @@ from protocol.board import BoardSpec
 from protocol.frames import BoardPose, ViewFrame
 from protocol.scene import SceneDocument, parse_scene
 from render_server.gpu.context import GpuContext
+from render_server.gpu.kernel import Dispatch, watched
 from render_server.renderer import SceneRenderer
 from tests.render_server.gltf_samples import QUARTER_TURN, bent_bar
 from tests.render_server.scenes import (
@@ -211,10 +212,17 @@ def _frame(case: Case, number: int, pose: BoardPose, board: BoardSpec | None) ->
     return frame(checkered(), pose=pose, **more)
 
 
-def pictures_of(gpu: GpuContext, case: Case, folder: Path) -> list[np.ndarray]:
-    """The composites (72, 96, 3; uint8) of the case's frames by a renderer of its own."""
+def pictures_of(gpu: GpuContext, case: Case, folder: Path) -> tuple[list[np.ndarray], list[list[Dispatch]]]:
+    """The composites (72, 96, 3; uint8) of the case's frames, and what was dispatched for each."""
     renderer = SceneRenderer(gpu, scene_of(case, Stage(folder)))
+    pictures: list[np.ndarray] = []
+    dispatches: list[list[Dispatch]] = []
     try:
-        return [renderer.render(one).color for one in frames_of(case)]
+        for one in frames_of(case):
+            trace: list[Dispatch] = []
+            with watched(gpu, trace.append):
+                pictures.append(renderer.render(one).color)
+            dispatches.append(trace)
     finally:
         renderer.release()
+    return pictures, dispatches

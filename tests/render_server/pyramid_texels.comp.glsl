@@ -1,11 +1,11 @@
-// Paints every block (level, direction) of a pyramid with a number of its own, or looks one up (the tests' own shader).
-#include "passes/common/volume.glsl"
+// Paints every block (level, direction) of a mipmap with a number of its own, or looks one up (the tests' own shader).
+#include "common/volume.glsl"
 
 layout(local_size_x = 64) in;
 uniform int level;
 uniform int direction;
 #ifdef PAINT
-layout(binding = 0, rgba16f) writeonly uniform image3D pyramid;
+layout(rgba16f) writeonly uniform image3D pyramid;
 
 void main() {
     int cells = volume_size >> level;
@@ -15,9 +15,9 @@ void main() {
     imageStore(pyramid, level_base(level, direction) + cell, vec4(float(level * 8 + direction + 1)));
 }
 #else
-layout(binding = 0) uniform sampler3D pyramid;
-layout(std430, binding = 0) readonly buffer Places { vec4 places[]; };
-layout(std430, binding = 1) writeonly buffer Found { float found[]; };
+uniform sampler3D pyramid;
+layout(std430) readonly buffer Places { vec4 places[]; };
+layout(std430) writeonly buffer Found { float found[]; };
 
 void main() {
     uint i = gl_GlobalInvocationID.x;

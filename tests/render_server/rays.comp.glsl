@@ -1,9 +1,9 @@
 // Closest hits of given rays, as the passes find them.
-#include "passes/common/ray_mesh.glsl"
+#include "common/ray_mesh.glsl"
 
 layout(local_size_x = 64) in;
-layout(std430, binding = 0) readonly buffer Rays { vec4 rays[]; };      // origin, direction
-layout(std430, binding = 1) writeonly buffer Hits { vec4 hits[]; };     // distance, triangle, barycentric
+layout(std430) readonly buffer Rays { vec4 rays[]; };      // origin, direction
+layout(std430) writeonly buffer Hits { vec4 hits[]; };     // distance, triangle, barycentric
 uniform int count;
 
 void main() {

@@ -211,23 +211,22 @@ def with_neighbours(pixels: np.ndarray) -> np.ndarray:
 
 
 def fields_of(renderer: SceneRenderer) -> Fields:
-    """What the newest frame left in the method's textures."""
-    relighting = renderer._relighting
-    method, resources = relighting._method, relighting._resources
-    assert method is not None
-    assert resources is not None
-    cones_rho = array_of(method._cones.rho)
+    """What the graph of the newest frame holds."""
+    graph = renderer.graph
+    assert graph is not None
+    direct, cones, real = graph["direct light"], graph["cones"], graph["real surface"].surface
+    cones_rho = array_of(cones.rho)
     return Fields(
-        array_of(method._direct.mu)[..., :3],
-        array_of(method._direct.rho)[..., :3],
-        array_of(method._cones.mu)[..., :3],
+        array_of(direct.mu)[..., :3],
+        array_of(direct.rho)[..., :3],
+        array_of(cones.mu)[..., :3],
         cones_rho[..., :3],
         cones_rho[..., 3],
-        array_of(method._cones.virtual)[..., :3],
-        array_of(resources.matte.texture)[..., 0],
-        array_of(resources.real_surface.position),
-        array_of(resources.real_surface.normal)[..., :3],
-        array_of(method._surface.radiance)[..., :3],
+        array_of(cones.virtual)[..., :3],
+        array_of(graph["object surface"].coverage.texture)[..., 0],
+        array_of(real.position),
+        array_of(real.normal)[..., :3],
+        array_of(graph["virtual surface"])[..., :3],
     )
 
 

@@ -124,6 +124,7 @@ def test_area_of_a_small_disc(gpu: GpuContext, stage: Stage, distortion: float) 
     assert found.matte.sum() == pytest.approx(expected, rel=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("distortion", [0.0, -0.3, 0.2])
 @pytest.mark.parametrize("middle", [(0.0, 0.0), (0.5, 0.5), (0.3, -0.2)])
 @pytest.mark.parametrize("radius_px", [8.14, 50.0])

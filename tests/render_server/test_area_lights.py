@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import trimesh
 from numpy.typing import NDArray
-from render_server.passes.light_maps import light_views
 from scipy.optimize import curve_fit
 
 from protocol.scene import SceneDocument, parse_scene
 from render_server.gpu.context import GpuContext
 from render_server.lights.lights import RectangleLight, SpotLight, build_lights
+from render_server.passes.shadow_maps import light_views
 from render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (
     Fields,
@@ -103,9 +103,8 @@ def solve_unshadowed(gpu: GpuContext, document: SceneDocument) -> tuple[Fields, 
     """Fields, and the irradiance of the lights as if nothing were in their way."""
     renderer = SceneRenderer(gpu, document)
     renderer.render(frame(plain(0)))
-    method = renderer._relighting._method
-    assert method is not None
-    found, unshadowed = fields_of(renderer), array_of(method._direct.mu)[..., 3]
+    assert renderer.graph is not None
+    found, unshadowed = fields_of(renderer), array_of(renderer.graph["direct light"].mu)[..., 3]
     renderer.release()
     return found, unshadowed
 
@@ -119,6 +118,7 @@ PANELS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PANELS)
 def test_irradiance_of_a_rectangle(gpu: GpuContext, stage: Stage, name: str) -> None:
     """Floor and a wall, so that both see the light under all angles, some of it below their horizon."""

@@ -7,12 +7,17 @@ import numpy as np
 import pytest
 import trimesh
 from jaxtyping import Float64
-from render_server.relight.frame import PlacedObject
 
+from render_server.gpu_scene import PlacedObject
 from render_server.lights.octahedral import even_directions, harmonics
-from render_server.occlusion_fields import OcclusionFields
+from render_server.occlusion_fields import (
+    OcclusionFields,
+    compute_field,
+    field_digest,
+    load_field,
+    store_field,
+)
 from render_server.scene.materials import Material
-from render_server.scene.occlusion_cache import compute_field, field_digest, load_field, store_field
 from render_server.scene.occlusion_field import FieldSettings, ObjectRays, OcclusionField, place_shells
 from render_server.scene.occlusion_transfer import object_surface
 from render_server.scene.triangle_mesh import TriangleMesh

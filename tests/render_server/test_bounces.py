@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 import trimesh
 from numpy.typing import NDArray
-from render_server.passes.volume import Pyramid
-from render_server.relight.dvct import DvctExact
 
 from protocol.frames import decode_lut
 from protocol.scene import SceneDocument
 from render_server.gpu.context import GpuContext
+from render_server.passes.voxels import VoxelMipmap
 from render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (
     GREY,
@@ -60,9 +59,11 @@ def settings(bounces: int) -> dict[str, float]:
     return {"volume_size": SIZE, "volume_edge_m": EDGE_M, "bounces": bounces}
 
 
-def radiance_at(pyramid: Pyramid, origin: NDArray[np.float64], slab: int, spot_m: float, z: float) -> float:
+def radiance_at(
+    voxels: VoxelMipmap, origin: NDArray[np.float64], slab: int, spot_m: float, z: float
+) -> float:
     """Mean radiance (green) of the faces at height `z` within `spot_m` of the z axis."""
-    texels = np.frombuffer(pyramid.texture.read(), np.float16).reshape(-1, SIZE, SIZE, 4)
+    texels = np.frombuffer(voxels.texture.read(), np.float16).reshape(-1, SIZE, SIZE, 4)
     level = texels[slab * SIZE : (slab + 1) * SIZE].astype(float)
     centres = [o + (np.arange(SIZE) + 0.5) * EDGE_M / SIZE for o in origin]
     rows = np.abs(centres[2] - z) <= EDGE_M / SIZE
@@ -76,11 +77,10 @@ def voxel_radiance(
 ) -> float:
     renderer = SceneRenderer(gpu, document)
     renderer.render(frame(plain()))
-    method = renderer._relighting._method
-    assert isinstance(method, DvctExact)
-    voxels = method._voxels
-    pyramid = voxels.mu if mu else voxels.rho
-    found = radiance_at(pyramid, np.array(voxels.placement.origin), slab, spot_m, z)
+    graph = renderer.graph
+    assert graph is not None
+    voxels = graph["bounces real" if mu else "bounces joint"]
+    found = radiance_at(voxels, np.array(graph["volume"].placement.origin), slab, spot_m, z)
     renderer.release()
     return found
 

@@ -49,14 +49,16 @@ def fields(gpu: GpuContext, document: SceneDocument) -> Fields:
 def thrown(gpu: GpuContext, document: SceneDocument) -> tuple[np.ndarray, Fields]:
     """Irradiance that beams bring to real pixels (h, w, 3), zeros where none were traced; and the fields."""
     renderer = SceneRenderer(gpu, document)
-    times = renderer.render(frame()).pass_times_ms
+    renderer.render(frame())
     found = fields_of(renderer)
-    method = renderer._relighting._method
-    assert method is not None
-    assert method._caustics is not None
-    # Sharp parts a pixel, smooth ones a texel of the reduced grid, which is the picture's here (cone_scale 1).
-    sums = np.frombuffer(method._caustics.sums.read(), np.int32).reshape(2, HEIGHT, WIDTH, 2, 3)
-    light = sums[:, :, :, 0].sum(axis=0) / 2.0**20 if "caustics" in times else np.zeros((HEIGHT, WIDTH, 3))
+    assert renderer.graph is not None
+    caustics = renderer.graph["caustics"]
+    light = np.zeros((HEIGHT, WIDTH, 3))
+    if caustics is not None:
+        # Sharp parts a pixel, smooth ones a texel of the reduced grid, which is the picture's here (cone_scale 1).
+        buffer = caustics.bindings["CausticSums"]
+        sums = np.frombuffer(buffer.read(), np.int32).reshape(2, HEIGHT, WIDTH, 2, 3)
+        light = sums[:, :, :, 0].sum(axis=0) / 2.0**20
     renderer.release()
     return light, found
 

@@ -7,17 +7,16 @@ import numpy as np
 import pytest
 import trimesh
 from jaxtyping import Float64
-from render_server.albedo_watch import AlbedoWatch
-from render_server.passes.light_volume import CONSTANT, LOBE
-from render_server.relight.dlpv import Dlpv
-from render_server.relight.frame import RelightInput
 
 from protocol.errors import DeltalightError
 from protocol.frames import BoardPose, ViewFrame, decode_lut
 from protocol.scene import SceneDocument, parse_scene
 from protocol.scene_method import DlpvMethod
 from protocol.scene_objects import Pose
+from render_server.estimation.albedo import AlbedoEstimator
 from render_server.gpu.context import GpuContext
+from render_server.graph import Graph
+from render_server.passes.lpv import CONSTANT, LOBE
 from render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (
     GREY,
@@ -61,17 +60,15 @@ def run(gpu: GpuContext, document: SceneDocument, view: ViewFrame | None = None)
     return renderer
 
 
-def method_of(renderer: SceneRenderer) -> Dlpv:
-    method = renderer._relighting._method
-    assert isinstance(method, Dlpv)
-    return method
+def graph_of(renderer: SceneRenderer) -> Graph:
+    assert renderer.graph is not None
+    return renderer.graph
 
 
-def flux(method: Dlpv, name: str) -> Float64[np.ndarray, "n n n 3"]:
+def flux(graph: Graph, name: str) -> Float64[np.ndarray, "n n n 3"]:
     """Injected flux of each cell, W in the picture's units."""
-    volumes = method.volumes
-    sums = np.frombuffer(getattr(volumes, name).read(), np.int32).reshape(-1, 3, 4)
-    edge = volumes.placement.voxel_edge
+    sums = np.frombuffer(graph[name].read(), np.int32).reshape(-1, 3, 4)
+    edge = graph["volume"].placement.voxel_edge
     return (sums[..., 0] / FIXED * np.pi / LOBE[0] * edge**2).reshape(CELLS, CELLS, CELLS, 3)
 
 
@@ -82,8 +79,9 @@ def test_injected_is_the_flux_that_a_box_reflects_and_what_the_floor_lost(
     document = stage.document([stage.virtual(cube(0.12), color)], [directional(irradiance=2.0)], floor())
     document = dlpv(document, operator="paper", volume_edge_m=0.5)
     renderer = run(gpu, document)
-    change, shadow = (flux(method_of(renderer), name) for name in ("_change_light", "_shadow_light"))
-    linear = array_of(renderer._relighting._resources.picture.linear)[0, 0, :3]  # type: ignore[union-attr]
+    graph = graph_of(renderer)
+    change, shadow = (flux(graph, name) for name in ("inject change", "inject shadow"))
+    linear = array_of(graph["camera image"].linear)[0, 0, :3]
     renderer.release()
     albedo = np.pi * linear / 2.0
     area = 0.12**2
@@ -98,20 +96,14 @@ def test_a_query_in_an_even_field_is_exact(gpu: GpuContext, stage: Stage) -> Non
     """Radiance 0.3 from everywhere gives every surface of the object E = 0.3 pi."""
     document = dlpv(stage.document([stage.virtual(ball())], [directional()], floor()))
     renderer = run(gpu, document)
-    method, relighting = method_of(renderer), renderer._relighting
+    graph = graph_of(renderer)
     even = np.zeros((3, CELLS, CELLS, CELLS, 4), np.float32)
     even[..., 0] = 1.5 * 0.3 / CONSTANT
-    method.volumes.rho.total.write(even.tobytes())
-    view = frame()
-    assert view.pose is not None
-    relit = relighting.relight(view, relighting._real.view)  # type: ignore[union-attr, arg-type]
-    assert relit is not None
-    scene: RelightInput = relit.input
-    scene.bind_geometry()
-    method.table.bind()
-    scene.virtual.materials.bind()
-    method._trace(scene, method._uniforms(scene, method.volumes.placement))
-    field = array_of(method._cones.virtual)
+    light = graph.resource("bounces")
+    light.value.total.write(even.tobytes())
+    light.write(light.value)
+    graph.run()
+    field = array_of(graph["cones"].virtual)
     renderer.release()
     seen = field[field[..., 3] > 0][:, :3]
     assert len(seen) > 100
@@ -133,8 +125,8 @@ def test_an_object_behind_a_wall_changes_nothing(gpu: GpuContext, stage: Stage, 
 def test_same_input_gives_the_same_bytes(gpu: GpuContext, stage: Stage, operator: str) -> None:
     document = dlpv(everyday(stage), operator=operator)
     first, second = (run(gpu, document, frame(noisy())) for _ in range(2))
-    for name in ("rho", "change" if operator == "paper" else "mu"):
-        totals = [getattr(method_of(renderer).volumes, name).total.read() for renderer in (first, second)]
+    for name in ("bounces", "propagate delta" if operator == "paper" else "propagate mu"):
+        totals = [graph_of(renderer)[name].total.read() for renderer in (first, second)]
         assert totals[0] == totals[1]
     pictures = [renderer.render(frame(noisy())).color for renderer in (first, first, second)]
     for renderer in (first, second):
@@ -147,8 +139,8 @@ def test_a_still_frame_costs_nothing(gpu: GpuContext, stage: Stage) -> None:
     renderer = SceneRenderer(gpu, dlpv(everyday(stage)))
     first, second = (renderer.render(frame(noisy())).pass_times_ms for _ in range(2))
     renderer.release()
-    assert {"inject real", "propagate mu", "inject change", "propagate rho", "query real"} <= set(first)
-    assert set(second) == {"upload", "geometry buffer", "composite", "readback"}
+    assert {"inject real", "propagate mu", "inject change", "propagate rho", "cones"} <= set(first)
+    assert set(second) == {"upload", "composite", "readback"}
 
 
 def test_a_moved_object_leaves_the_real_scenes_volume_alone(gpu: GpuContext, stage: Stage) -> None:
@@ -157,11 +149,13 @@ def test_a_moved_object_leaves_the_real_scenes_volume_alone(gpu: GpuContext, sta
     near = document.objects[0].model_copy(update={"pose": Pose(translation_m=(0.001, 0.0, 0.0))})
     moved = document.replaced(objects=(near, *document.objects[1:]))
     renderer = run(gpu, document, frame(noisy()))
-    mu = method_of(renderer).volumes.mu
+    mu = graph_of(renderer)["propagate mu"]
     renderer.set_scene(moved)
     after = renderer.render(frame(noisy()))
     fresh = run(gpu, moved, frame(noisy()))
-    assert mu is method_of(renderer).volumes.mu
+    assert graph_of(renderer)["propagate mu"] is mu
+    assert {"voxelize objects", "inject change"} <= set(after.pass_times_ms)
+    assert not {"voxelize real", "geometry volume real"} & set(after.pass_times_ms)
     assert np.array_equal(after.color, fresh.render(frame(noisy())).color)
     renderer.release()
     fresh.release()
@@ -196,7 +190,9 @@ def test_the_delta_is_the_difference_of_two_full_solutions(
 ) -> None:
     """E_rho of an inserted box is E_mu of a renderer to which it is part of the given model (its own object is a
     speck inside): so removal is the negative of insertion. The picture shows albedo 0.5 under even light."""
-    monkeypatch.setattr(AlbedoWatch, "look", lambda *_: False)  # what is out of sight has albedo 0.5 too
+    monkeypatch.setattr(
+        AlbedoEstimator, "observe", lambda *_: False
+    )  # what is out of sight has albedo 0.5 too
     mesh = cube(0.12)
     speck = shifted(trimesh.creation.box((0.002,) * 3), *mesh.bounds.mean(axis=0))
     room = floor(1.0) + shifted(trimesh.creation.box((0.02, 1, 0.4)), -0.2, 0, 0.2)

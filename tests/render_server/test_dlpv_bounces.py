@@ -6,15 +6,14 @@ import numpy as np
 import pytest
 import trimesh
 from jaxtyping import Float64
-from render_server.passes.light_volume import CONSTANT, LOBE, LightVolume
-from render_server.relight.dlpv import Dlpv
-from render_server.relight.voxel_sets import bind_lighting
 
 from protocol.errors import DeltalightError
 from protocol.frames import decode_lut
 from protocol.scene import SceneDocument, parse_scene
 from protocol.scene_method import DlpvMethod
 from render_server.gpu.context import GpuContext
+from render_server.passes.lpv import CONSTANT, LOBE, LightVolume, injected_sums
+from render_server.passes.lpv_lighting import LpvBounce
 from render_server.renderer import SceneRenderer
 from tests.render_server.scenes import GREY, Stage, ambient, cube, floor, frame, shifted, solve, sphere_light
 
@@ -33,9 +32,8 @@ def dlpv(document: SceneDocument, **settings: object) -> SceneDocument:
     return document.replaced(method=DlpvMethod.model_validate({"name": "dlpv", **method}))
 
 
-def fill(volume: LightVolume | None, radiance: float) -> None:
+def fill(volume: LightVolume, radiance: float) -> None:
     """Make light of the volume the same everywhere and from everywhere: E = pi radiance on any surface."""
-    assert volume is not None
     even = np.zeros((3, CELLS, CELLS, CELLS, 4), np.float32)
     even[..., 0] = 1.5 * radiance / CONSTANT
     volume.total.write(even.tobytes())
@@ -47,29 +45,20 @@ def bounced_flux(
     """Flux (W in the picture's units) that surfaces send into each cell under even light of both volumes, and the
     height of the lowest cells' bottom (m)."""
     renderer = SceneRenderer(gpu, document)
-    view = frame()
-    renderer.render(view)
-    relighting = renderer._relighting
-    method = relighting._method
-    assert isinstance(method, Dlpv)
-    volumes = method.volumes
-    fill(volumes.mu, radiance_mu)
-    fill(volumes.rho, radiance_rho)
-    relit = relighting.relight(view, relighting._real.view)  # type: ignore[union-attr, arg-type]
-    assert relit is not None
-    bind_lighting(relit.input, method.table)
-    lighting = volumes._lighting(relit.input, method._uniforms(relit.input, volumes.placement))
-    volumes._bounced_light.clear()
-    volumes._bounce.run(
-        volumes._bounced_light,
-        (volumes._real, volumes._virtual),
-        (volumes.mu, volumes.rho),  # type: ignore[arg-type]
-        {**lighting, **volumes.query_uniforms},
-    )
-    sums = np.frombuffer(volumes._bounced_light.read(), np.int32).reshape(CELLS, CELLS, CELLS, 3, 4)
-    bottom_m = volumes.placement.origin[2]
-    edge_m = volumes.placement.voxel_edge
-    renderer.release()
+    renderer.render(frame())
+    graph = renderer.graph
+    assert graph is not None
+    mu, rho = graph["propagate mu"], graph["bounces"]
+    fill(mu, radiance_mu)
+    fill(rho, radiance_rho)
+    bounce, reflected = LpvBounce(gpu), injected_sums(gpu, CELLS)
+    surfels = graph["voxelize real"], graph["voxelize objects"]
+    bounce.run(reflected, surfels, (mu, rho), {**graph["inject scene joint"], **graph["marching"]})
+    sums = np.frombuffer(reflected.read(), np.int32).reshape(CELLS, CELLS, CELLS, 3, 4)
+    placement = graph["volume"].placement
+    bottom_m, edge_m = placement.origin[2], placement.voxel_edge
+    for item in (bounce, reflected, renderer):
+        item.release()
     return sums[..., 0] / FIXED * np.pi / LOBE[0] * edge_m**2, bottom_m
 
 

@@ -3,17 +3,17 @@
 import numpy as np
 import pytest
 from jaxtyping import Float32
-from render_server.passes.light_volume import (
+
+from render_server.gpu.context import GpuContext
+from render_server.passes.lpv import (
     LOBE,
     LightVolume,
+    LpvPropagate,
     StepWeights,
     lobe_weights,
     moment_weights,
-    transmitted_shares,
+    transmitted_fractions,
 )
-from render_server.passes.lpv_propagate import LpvPropagatePass
-
-from render_server.gpu.context import GpuContext
 
 pytestmark = pytest.mark.usefixtures("clean_gl")
 CELLS = 16
@@ -36,16 +36,16 @@ def propagated(
     through: Float32[np.ndarray, "n n n 8"] | None = None,
 ) -> tuple[Float32[np.ndarray, "3 n n n 4"], Float32[np.ndarray, "3 n n n 4"]]:
     """State and total after some steps; `through` of each cell from -x, +x, -y, +y, -z, +z."""
-    volume, step = LightVolume(gpu, light.shape[1]), LpvPropagatePass(gpu, tiled=tiled)
+    volume, step = LightVolume(gpu, light.shape[1]), LpvPropagate(gpu, tiled=tiled)
     volume.state.write(light.tobytes())
     volume.total.write(light.tobytes())
-    shares = None
+    transmitted = None
     if through is not None:
-        shares = transmitted_shares(gpu, volume.cells)
-        shares.write(np.round(255 * through).astype(np.uint8).tobytes())
-    step.run(volume, weights, steps, shares)
+        transmitted = transmitted_fractions(gpu, volume.cells)
+        transmitted.write(np.round(255 * through).astype(np.uint8).tobytes())
+    step.run(volume, weights, steps, transmitted)
     found = cells_of(volume, "state").copy(), cells_of(volume, "total").copy()
-    for item in (volume, step, *(() if shares is None else (shares,))):
+    for item in (volume, step, *(() if transmitted is None else (transmitted,))):
         item.release()
     return found
 
@@ -74,10 +74,10 @@ def test_a_step_in_free_space_keeps_the_energy(
 def test_tiles_in_shared_memory_make_the_same_steps(gpu: GpuContext, weights: StepWeights) -> None:
     through = np.random.default_rng(1).uniform(0, 1, (CELLS, CELLS, CELLS, 8)).astype(np.float32)
     light = np.random.default_rng(2).uniform(-1, 2, (3, CELLS, CELLS, CELLS, 4)).astype(np.float32)
-    plain_way, tiles = (
+    plain, tiles = (
         propagated(gpu, light, weights, 5, tiled=tiled, through=through) for tiled in (False, True)
     )
-    for one, other in zip(plain_way, tiles, strict=True):
+    for one, other in zip(plain, tiles, strict=True):
         assert one == pytest.approx(other, abs=1e-5)
 
 

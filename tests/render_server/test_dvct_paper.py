@@ -1,26 +1,23 @@
 """The paper's operator of delta voxel cone tracing, on a box over a floor that are lit in closed form."""
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import moderngl
 import numpy as np
 import pytest
 import trimesh
 from jaxtyping import Bool, Float32, Float64
-from render_server.passes.trace_paper import TracePaperPass
-from render_server.passes.volume import Pyramid
-from render_server.relight.defaults import resolve_voxel_cones
-from render_server.relight.dvct_paper import DvctPaper
-from render_server.relighting import Relighting, RelitFrame
 
 from protocol.camera_model import CameraModel
 from protocol.frames import BoardPose, ViewFrame, decode_lut
 from protocol.scene import SceneDocument, parse_scene
-from render_server.gpu.context import GpuContext, create_context
+from render_server.gpu.context import GpuContext
+from render_server.graph import Graph
+from render_server.passes.voxels import VoxelMipmap
 from render_server.renderer import SceneRenderer
-from render_server.view import CameraView
 
 WIDTH, HEIGHT, VOXELS = 160, 120, 32
 EDGE = 0.2  # of the box, m
@@ -29,13 +26,6 @@ IRRADIANCE, AMBIENT = 2.0, 0.1
 BASE_COLOR = np.array([0.8, 0.4, 0.2])
 CODE = 150  # of the camera's picture everywhere
 DOWN, OBLIQUE = (0.0, 0.0, -1.0), (0.6, 0.0, -0.8)
-
-
-@pytest.fixture(scope="module")
-def gpu() -> Iterator[GpuContext]:
-    context = create_context()
-    yield context
-    context.release()
 
 
 def cuboid(size: tuple[float, float, float], centre_z: float) -> trimesh.Trimesh:
@@ -92,34 +82,14 @@ def frame(exposure_scale: float = 1.0) -> ViewFrame:
     )
 
 
-class Run(NamedTuple):
-    """The operator's own run over one frame, and what it was given."""
-
-    relit: RelitFrame
-    operator: DvctPaper
-    relighting: Relighting
-
-    def texture(self, name: str) -> Float64[np.ndarray, "h w 4"]:
-        return texels(getattr(self.relit.layers.cones, name))
-
-    def delta(self) -> Float64[np.ndarray, "n n n 3"]:
-        return level_0(self.operator.volume.delta)
-
-    def release(self) -> None:
-        self.operator.release()
-        self.relighting.release()
-
-
-def run(gpu: GpuContext, document: SceneDocument, view_frame: ViewFrame) -> Run:
-    relighting = Relighting(gpu, document, [])
-    assert view_frame.pose is not None
-    view = CameraView(view_frame.camera, view_frame.pose.world_from_camera)
-    relit = relighting.relight(view_frame, view)
-    assert relit is not None
-    settings: Any = document.method
-    operator = DvctPaper(gpu, settings, resolve_voxel_cones(settings, software=True), view.size)
-    layers = operator.relight(relit.input)
-    return Run(RelitFrame(relit.input, layers, relit.uniforms), operator, relighting)
+@contextmanager
+def rendered(gpu: GpuContext, document: SceneDocument, view: ViewFrame | None = None) -> Iterator[Graph]:
+    """The graph of one frame."""
+    renderer = SceneRenderer(gpu, document)
+    renderer.render(frame() if view is None else view)
+    assert renderer.graph is not None
+    yield renderer.graph
+    renderer.release()
 
 
 def texels(texture: moderngl.Texture) -> Float64[np.ndarray, "h w 4"]:
@@ -127,8 +97,8 @@ def texels(texture: moderngl.Texture) -> Float64[np.ndarray, "h w 4"]:
     return np.frombuffer(texture.read(), np.float16).reshape(height, width, 4).astype(np.float64)
 
 
-def level_0(pyramid: Pyramid) -> Float64[np.ndarray, "n n n 3"]:
-    cells = np.frombuffer(pyramid.texture.read(), np.float16).reshape(-1, VOXELS, VOXELS, 4)
+def level_0(voxels: VoxelMipmap) -> Float64[np.ndarray, "n n n 3"]:
+    cells = np.frombuffer(voxels.texture.read(), np.float16).reshape(-1, VOXELS, VOXELS, 4)
     return cells[:VOXELS, ..., :3].astype(np.float64)
 
 
@@ -139,9 +109,8 @@ def camera_radiance() -> float:
 def test_the_delta_holds_the_flux_that_the_box_reflects_and_what_the_floor_lost(
     gpu: GpuContext, assets: Path
 ) -> None:
-    result = run(gpu, scene(assets), frame())
-    cells = result.delta() * np.pi * VOXEL_M**2
-    result.release()
+    with rendered(gpu, scene(assets)) as graph:
+        cells = level_0(graph["filter"].delta) * np.pi * VOXEL_M**2
     albedo = np.pi * camera_radiance() / (IRRADIANCE + np.pi * AMBIENT)
     gained = np.clip(cells, 0, None).sum(axis=(0, 1, 2))
     lost = np.clip(cells, None, 0).sum(axis=(0, 1, 2))
@@ -150,32 +119,30 @@ def test_the_delta_holds_the_flux_that_the_box_reflects_and_what_the_floor_lost(
 
 
 def test_where_the_real_scene_keeps_the_light_off_nothing_changes(gpu: GpuContext, assets: Path) -> None:
-    result = run(gpu, scene(assets, real="roofed"), frame())
-    direct = result.relit.layers.direct
-    mu, rho = texels(direct.mu), texels(direct.rho)
-    cells = result.delta()
-    result.release()
+    with rendered(gpu, scene(assets, real="roofed")) as graph:
+        mu, rho = texels(graph["direct light"].mu), texels(graph["direct light"].rho)
+        cells = level_0(graph["filter"].delta)
     assert (mu[..., 3] > 0).any()
     assert not cells.any()
     assert np.array_equal(mu[..., :3], rho[..., :3])
 
 
 def test_a_second_run_gives_the_same_bits(gpu: GpuContext, assets: Path) -> None:
-    results = [run(gpu, scene(assets, direction=OBLIQUE), frame()) for _ in range(2)]
-    volumes = [result.operator.volume for result in results]
-    first, second = ((volume.delta.texture.read(), volume.rho.texture.read()) for volume in volumes)
-    assert first == second
-    assert np.array_equal(results[0].texture("rho"), results[1].texture("rho"))
-    for result in results:
-        result.release()
+    found = []
+    for _ in range(2):
+        with rendered(gpu, scene(assets, direction=OBLIQUE)) as graph:
+            voxels = graph["filter"]
+            found.append((voxels.delta.texture.read(), voxels.rho.texture.read(), graph["cones"].rho.read()))
+    assert found[0] == found[1]
 
 
 def test_the_change_is_linear_in_the_light(gpu: GpuContext, assets: Path) -> None:
     changes = []
     for gain in (1.0, 4.0):
-        result = run(gpu, scene(assets, gain=gain, direction=OBLIQUE), frame(exposure_scale=1 / gain))
-        changes.append((result.texture("rho") - result.texture("mu"))[..., :3].sum(axis=(0, 1)))
-        result.release()
+        document = scene(assets, gain=gain, direction=OBLIQUE)
+        with rendered(gpu, document, frame(exposure_scale=1 / gain)) as graph:
+            cones = graph["cones"]
+            changes.append((texels(cones.rho) - texels(cones.mu))[..., :3].sum(axis=(0, 1)))
     assert changes[0].max() > 1.0
     assert changes[1] == pytest.approx(4.0 * changes[0], rel=0.01)
 
@@ -184,21 +151,15 @@ def test_the_change_is_linear_in_the_light(gpu: GpuContext, assets: Path) -> Non
 def test_the_nine_cones_of_a_constant_field_bring_pi_times_its_radiance(
     gpu: GpuContext, assets: Path, opacity: float
 ) -> None:
-    result = run(gpu, scene(assets), frame())
-    relit, layers = result.relit.input, result.relit.layers
-    rho = result.operator.volume.rho
-    cells = np.full((*rho.texture.size[::-1], 4), opacity * AMBIENT, np.float16)
-    cells[..., 3] = opacity
-    rho.texture.write(cells.tobytes())
-    relit.bind_geometry()
-    layers.table.bind()
-    relit.virtual.materials.bind()
-    tracing = TracePaperPass(gpu)
-    uniforms = {**relit.view.uniforms(), **layers.placement.uniforms(), **layers.table.uniforms()}
-    tracing.trace_virtual(layers.cones, layers.grid, rho, uniforms)
-    traced = result.texture("virtual")
-    tracing.release()
-    result.release()
+    with rendered(gpu, scene(assets)) as graph:
+        filtered = graph.resource("filter")
+        rho = filtered.value.rho
+        cells = np.full((*rho.texture.size[::-1], 4), opacity * AMBIENT, np.float16)
+        cells[..., 3] = opacity
+        rho.texture.write(cells.tobytes())
+        filtered.write(filtered.value)
+        graph.run()
+        traced = texels(graph["cones"].virtual)
     assert (traced[..., 3] > 0).sum() > 20
     assert traced[traced[..., 3] > 0][:, :3] == pytest.approx(np.pi * AMBIENT, rel=0.01)
 

@@ -1,4 +1,7 @@
-"""Irradiances before composition against closed forms (docs/method.md 3 and 7); full solutions: test_differential.py."""
+"""Irradiances before composition against closed forms (docs/method.md 3 and 7).
+
+Full solutions are in test_differential.py.
+"""
 
 from pathlib import Path
 
@@ -6,10 +9,10 @@ import numpy as np
 import pytest
 import trimesh
 from numpy.typing import NDArray
-from render_server.passes.volume import VolumePlacement
 from scipy.optimize import curve_fit
 
 from render_server.gpu.context import GpuContext
+from render_server.passes.voxels import VolumePlacement
 from tests.render_server.scenes import (
     Fields,
     Stage,

@@ -82,6 +82,7 @@ def test_radiance_and_transmittance_share_the_light(lab: VoxelLab) -> None:
     voxels.release()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start", [0.5, 1.5])
 def test_open_plane_does_not_hide_itself(lab: VoxelLab, start: float) -> None:
     rng = np.random.default_rng(5)

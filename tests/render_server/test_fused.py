@@ -98,12 +98,10 @@ def test_what_moved_shows_where_it_is_now(gpu: GpuContext, stage: Stage) -> None
 def test_a_scene_at_rest_becomes_the_same_picture_bit_for_bit(gpu: GpuContext, stage: Stage) -> None:
     renderer = SceneRenderer(gpu, document(stage))
     pictures = [renderer.render(noisy_floor(number)).color for number in range(STILL_FRAMES + 4)]
-    versions = renderer._relighting._real
-    assert versions is not None
-    assert versions.state is not None
-    settled = versions.state.version
+    assert renderer.graph is not None
+    settled = renderer.graph.resource("real geometry").version
     renderer.render(noisy_floor(99))
-    assert versions.state.version == settled
+    assert renderer.graph.resource("real geometry").version == settled
     renderer.release()
     for picture in pictures[STILL_FRAMES + 2 :]:
         np.testing.assert_array_equal(picture, pictures[STILL_FRAMES + 1])

@@ -11,27 +11,29 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from render_server.gpu.program import ComputeProgram
-from render_server.passes.volume import (
-    Pyramid,
-    VolumePlacement,
-    memory_statement,
-    place_volume,
-    pyramid_shape,
-    volume_memory_bytes,
-)
 
 from protocol.errors import DeltalightError
 from render_server.gpu import shader_source as shader_text
 from render_server.gpu.context import GpuContext, explain_context_failure, is_software_renderer
+from render_server.gpu.kernel import Kernel
+from render_server.gpu.memory import size_bytes
 from render_server.gpu.readback import AsyncReadback
 from render_server.gpu.textures import texture_2d
 from render_server.gpu.timers import PassTimers
+from render_server.passes.voxels import (
+    PlacedVolume,
+    VolumePlacement,
+    VoxelMipmap,
+    memory_statement,
+    mipmap_shape,
+    place_volume,
+    volume_memory_bytes,
+)
 from render_server.renderer import SceneRenderer
 from tests.render_server.scenes import Stage, cube, directional, floor, frame
 
 ROOT = Path(__file__).parents[2]
-TEXELS = Path(__file__).with_name("pyramid_texels.comp.glsl")
+TEXELS = Path(__file__).with_name("pyramid_texels")
 pytestmark = pytest.mark.usefixtures("clean_gl")
 
 
@@ -41,7 +43,7 @@ pytestmark = pytest.mark.usefixtures("clean_gl")
 @pytest.fixture
 def shaders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder that includes are relative to."""
-    monkeypatch.setattr(shader_text, "ROOT", tmp_path)
+    monkeypatch.setattr(shader_text, "SHADERS", tmp_path)
     return tmp_path
 
 
@@ -75,7 +77,7 @@ def test_compiler_errors_name_the_line_in_its_own_file(gpu: GpuContext, shaders:
     main = 'layout(local_size_x = 1) in;\n#include "part.glsl"\nvoid main() {\n' + in_main + "\n}"
     (shaders / "main.comp.glsl").write_text(main)
     with pytest.raises(moderngl.Error) as caught:
-        ComputeProgram(gpu, shaders / "main.comp.glsl")
+        Kernel(gpu, shaders / "main")
     assert {"main": ":4(", "part": ":3("}[broken] in str(caught.value)
     assert "// file 1: " in shader_text.shader_source(shaders / "main.comp.glsl")
 
@@ -85,7 +87,7 @@ def test_compiler_errors_name_the_line_in_its_own_file(gpu: GpuContext, shaders:
 
 UNIFORMS = """
 layout(local_size_x = 4, local_size_y = 2) in;
-layout(std430, binding = 0) buffer Out { vec4 values[]; };
+layout(std430) buffer Out { vec4 values[]; };
 uniform float a; uniform int b; uniform bool c; uniform vec3 d; uniform ivec2 e; uniform mat4 m;
 uniform float removed;
 void main() {
@@ -99,18 +101,19 @@ void main() {
 
 
 def test_uniforms_arrive_and_removed_ones_do_not_matter(gpu: GpuContext, tmp_path: Path) -> None:
-    path = tmp_path / "uniforms.comp.glsl"
-    path.write_text(UNIFORMS)
-    program = ComputeProgram(gpu, path)
+    (tmp_path / "uniforms.comp.glsl").write_text(UNIFORMS)
+    kernel = Kernel(gpu, tmp_path / "uniforms")
     out = gpu.ctx.buffer(reserve=48)
-    out.bind_to_storage_buffer(0)
     matrix = np.eye(4)
     matrix[:3, 3] = (5, 6, 7)  # row-major: the last column is the translation
-    program.run((9, 3), a=0.5, b=-3, c=True, d=(1.0, 2.0, 3.0), e=(4, 8), m=matrix, removed=1.0, unknown=2)
+    others = {"unknown": 2.0}  # of what is shared, a kernel takes what it needs
+    kernel.run(
+        (9, 3), others, Out=out, a=0.5, b=-3, c=True, d=(1.0, 2.0, 3.0), e=(4, 8), m=matrix, removed=1.0
+    )
     values = np.frombuffer(out.read(), np.float32)
     assert values.tolist() == [0.5, -3, 1, 3, 5, 6, 7, 1, 4, 8, 3, 2]
     out.release()
-    program.release()
+    kernel.release()
 
 
 # Readback and timers
@@ -165,6 +168,13 @@ def test_timers_sum_a_pass_by_name_and_begin_anew_each_frame(gpu: GpuContext) ->
     assert all(0 <= value < 1e4 for value in times.values())
     if gpu.is_software:
         assert timers.end_frame() == {}
+
+
+@pytest.mark.parametrize(("kind", "size"), [("f1", 1), ("u1", 1), ("f2", 2), ("i2", 2), ("f4", 4), ("u4", 4)])
+def test_memory_of_a_texture_is_counted_whatever_it_holds(gpu: GpuContext, kind: str, size: int) -> None:
+    texture = texture_2d(gpu, (7, 5), 2, kind)
+    assert size_bytes({"held": [texture, texture]}) == 7 * 5 * 2 * size
+    texture.release()
 
 
 # Context errors
@@ -281,7 +291,7 @@ def test_volume_holds_the_objects_and_moves_by_whole_voxels(
 
 
 def block(size: int, level: int, direction: int) -> tuple[slice, slice, slice]:
-    """Where a level of a direction lies: (z, y, x) of the texture (passes/common/volume.glsl)."""
+    """Where a level of a direction lies: (z, y, x) of the texture (shaders/common/volume.glsl)."""
     cells = size >> level
     x, y, z = 0, 0, direction * size
     if level > 0:
@@ -292,8 +302,8 @@ def block(size: int, level: int, direction: int) -> tuple[slice, slice, slice]:
 
 
 @pytest.mark.parametrize("size", [32, 40, 64, 72, 104, 256, 512])
-def test_blocks_of_the_pyramid_do_not_overlap(size: int) -> None:
-    shape = pyramid_shape(size, 6)[::-1]
+def test_blocks_of_the_mipmap_do_not_overlap(size: int) -> None:
+    shape = mipmap_shape(size, 6)[::-1]
     taken: list[tuple[slice, ...]] = []
     for level in range(VolumePlacement((0, 0, 0), 1.0, size).levels):
         for direction in range(6):
@@ -306,23 +316,23 @@ def test_blocks_of_the_pyramid_do_not_overlap(size: int) -> None:
 
 
 @pytest.fixture(scope="module")
-def programs(gpu: GpuContext) -> Iterator[tuple[ComputeProgram, ComputeProgram]]:
-    made = ComputeProgram(gpu, TEXELS, {"PAINT": 1}), ComputeProgram(gpu, TEXELS)
+def kernels(gpu: GpuContext) -> Iterator[tuple[Kernel, Kernel]]:
+    made = Kernel(gpu, TEXELS, PAINT=1), Kernel(gpu, TEXELS)
     yield made
-    for program in made:
-        program.release()
+    for kernel in made:
+        kernel.release()
 
 
 @pytest.mark.parametrize("size", [32, 40])
-def test_shaders_lay_out_and_look_up_the_pyramid_so(
-    gpu: GpuContext, programs: tuple[ComputeProgram, ComputeProgram], size: int
+def test_shaders_lay_out_and_look_up_the_mipmap_so(
+    gpu: GpuContext, kernels: tuple[Kernel, Kernel], size: int
 ) -> None:
     """Every block painted with its own number is where Python expects it, and a look-up anywhere in the volume,
     up to its borders, meets that number alone."""
-    paint, look_up = programs
+    paint, look_up = kernels
     placement = VolumePlacement((0.0, 0.0, 0.0), 1.0, size)
-    pyramid = Pyramid(gpu, size, 6)
-    expected = np.zeros(pyramid_shape(size, 6)[::-1])
+    volume, mipmap = PlacedVolume(gpu, placement), VoxelMipmap(gpu, size, 6)
+    expected = np.zeros(mipmap_shape(size, 6)[::-1])
     rng = np.random.default_rng(size)
     places = np.ones((500, 4), np.float32)
     places[:, :3] = np.clip(rng.uniform(-1, size + 1, (500, 3)), 0, size)
@@ -330,17 +340,22 @@ def test_shaders_lay_out_and_look_up_the_pyramid_so(
     found = gpu.ctx.buffer(reserve=2000)
     everything = [(level, direction) for level in range(placement.levels) for direction in range(6)]
     for level, direction in everything:
-        pyramid.texture.bind_to_image(0, read=True, write=True)
-        paint.run(((size >> level) ** 3,), level=level, direction=direction, **placement.uniforms())
+        threads = ((size >> level) ** 3,)
+        paint.run(threads, volume.bindings, pyramid=mipmap.texture, level=level, direction=direction)
         expected[block(size, level, direction)] = level * 8 + direction + 1
-    texels = np.frombuffer(pyramid.texture.read(), np.float16).reshape(*expected.shape, 4)
+    texels = np.frombuffer(mipmap.texture.read(), np.float16).reshape(*expected.shape, 4)
     assert np.array_equal(texels[..., 0], expected)
     for level, direction in everything:
-        pyramid.texture.use(0)
-        place_buffer.bind_to_storage_buffer(0)
-        found.bind_to_storage_buffer(1)
-        look_up.run((500,), level=level, direction=direction, **placement.uniforms())
+        look_up.run(
+            (500,),
+            volume.bindings,
+            pyramid=mipmap.texture,
+            Places=place_buffer,
+            Found=found,
+            level=level,
+            direction=direction,
+        )
         values = np.frombuffer(found.read(), np.float32)
         assert values == pytest.approx(level * 8 + direction + 1, abs=1e-3), (level, direction)
-    for item in (pyramid, place_buffer, found):
+    for item in (volume, mipmap, place_buffer, found):
         item.release()

@@ -551,9 +551,8 @@ def test_the_report_tells_what_ran_how_long_and_how_large_it_is(gpu: GpuContext)
         report = graph.report()
         assert [stage.ran for stage in report] == ran
         if gpu.is_software:  # elsewhere times are those of an earlier frame
-            assert [stage.time_ms is not None for stage in report] == ran
             assert set(times) == {stage.name for stage in report if stage.ran}
-            assert all(math.isfinite(stage.time_ms or 0.0) for stage in report)
+            assert all(stage.time_ms is not None and math.isfinite(stage.time_ms) for stage in report)
     assert (report[1].inputs, report[1].outputs, report[1].clocks) == (
         ("b", "grid"),
         ("left", "right"),

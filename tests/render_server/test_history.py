@@ -6,14 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from render_server.passes.volume import VolumePlacement
-from render_server.relight.dvct import DvctExact
-from render_server.relight.dvct_paper import DvctPaper
 
 from protocol.frames import ViewFrame
 from protocol.scene import SceneDocument
 from protocol.scene_objects import Pose, Surface
 from render_server.gpu.context import GpuContext
+from render_server.passes.voxels import VolumePlacement
 from render_server.renderer import CompositeFrame, SceneRenderer
 from tests.render_server.scenes import (
     Stage,
@@ -93,9 +91,10 @@ def fresh(gpu: GpuContext, document: SceneDocument, view: ViewFrame) -> Composit
 
 
 def placement_of(renderer: SceneRenderer) -> VolumePlacement:
-    method = renderer._relighting._method
-    assert isinstance(method, DvctExact | DvctPaper)
-    return (method._voxels if isinstance(method, DvctExact) else method.volume).placement
+    assert renderer.graph is not None
+    placement = renderer.graph["volume placement"]
+    assert isinstance(placement, VolumePlacement)
+    return placement
 
 
 def differing_pixels(one: CompositeFrame, other: CompositeFrame) -> int:

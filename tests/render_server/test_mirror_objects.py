@@ -7,12 +7,12 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from render_server.passes.mirror_objects import RAY_ROUGHNESS
 
 from protocol.frames import ViewFrame, decode_lut
 from protocol.scene import SceneDocument
 from protocol.scene_objects import Surface
 from render_server.gpu.context import GpuContext
+from render_server.passes.reflections import RAY_ROUGHNESS
 from render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (
     HEIGHT,
@@ -79,10 +79,8 @@ def reflection(gpu: GpuContext, document: SceneDocument, view: ViewFrame) -> np.
     """(h, w, 4): reflected radiance of objects, share of the lobe."""
     renderer = SceneRenderer(gpu, document)
     renderer.render(view)
-    method = renderer._relighting._method
-    assert method is not None
-    assert method._reflection is not None
-    found = array_of(method._reflection)
+    assert renderer.graph is not None
+    found = array_of(renderer.graph["reflections"])
     renderer.release()
     return found
 
@@ -90,9 +88,8 @@ def reflection(gpu: GpuContext, document: SceneDocument, view: ViewFrame) -> np.
 def matte(gpu: GpuContext, document: SceneDocument, view: ViewFrame) -> np.ndarray:
     renderer = SceneRenderer(gpu, document)
     renderer.render(view)
-    resources = renderer._relighting._resources
-    assert resources is not None
-    found = array_of(resources.matte.texture)[..., 0]
+    assert renderer.graph is not None
+    found = array_of(renderer.graph["object surface"].coverage.texture)[..., 0]
     renderer.release()
     return found
 
@@ -131,9 +128,8 @@ def test_nothing_is_traced_where_no_smooth_surface_is_declared(gpu: GpuContext, 
     document = glowing_ball(stage)
     renderer = SceneRenderer(gpu, document)
     renderer.render(over_floor())
-    method = renderer._relighting._method
-    assert method is not None
-    assert method._reflection is None
+    assert renderer.graph is not None
+    assert renderer.graph["reflections"] is None
     renderer.release()
     assert not reflection(gpu, declared(document, RAY_ROUGHNESS), over_floor()).any()
     far = {"box": {"min_m": [5, 5, 5], "max_m": [6, 6, 6]}}

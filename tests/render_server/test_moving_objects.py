@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+import moderngl
 import numpy as np
 import pytest
 
@@ -12,6 +13,7 @@ from protocol.frames import ViewFrame
 from protocol.scene import SceneDocument
 from protocol.scene_method import DlpvMethod
 from render_server.gpu.context import GpuContext
+from render_server.passes.gbuffer import MeshBuffers
 from render_server.renderer import SceneRenderer
 from render_server.scene.gltf_meshes import load_gltf
 from render_server.virtual_objects import VirtualObjects
@@ -116,6 +118,12 @@ def test_a_pose_is_the_same_picture_as_the_pose_baked_into_a_still_mesh(
     assert np.array_equal(one, other)
 
 
+def vertices_of(buffers: MeshBuffers) -> bytes:
+    vertices = buffers.storage["Vertices"]
+    assert isinstance(vertices, moderngl.Buffer)
+    return vertices.read()
+
+
 def test_while_it_plays_triangles_are_those_of_the_baked_pose(gpu: GpuContext, stage: Stage) -> None:
     asset = bent_bar(stage.folder)
     pose = {"scale": 0.1, "rotation_wxyz": [0.9, 0.1, 0.2, 0.3], "translation_m": [0.1, 0.2, 0.3]}
@@ -127,7 +135,7 @@ def test_while_it_plays_triangles_are_those_of_the_baked_pose(gpu: GpuContext, s
         objects.update(scene.objects, None, round(0.1 * SECOND))
         state = objects.update(scene.objects, None, round(0.7 * SECOND))
         assert state is not None
-        states.append((state.corners, state.points, objects._buffers._vertices.read()))
+        states.append((state.corners, state.points, vertices_of(state.buffers)))
         objects.release()
     assert np.array_equal(states[0][0], states[1][0])
     assert np.array_equal(states[0][1], states[1][1])
@@ -144,8 +152,9 @@ def test_a_clip_that_stands_gives_the_same_bytes_and_keeps_all_caches(
     first, second = (renderer.render(at(time_s)) for time_s in (2.0, 3.4))
     renderer.release()
     assert np.array_equal(first.color, second.color)
-    assert "voxelize" in first.pass_times_ms
-    assert not {"voxelize", "RSM virtual", "cones real"} & second.pass_times_ms.keys()
+    kept = {"voxelize real", "voxelize objects", "shadow maps objects", "cones real"}
+    assert kept <= first.pass_times_ms.keys()
+    assert not kept & second.pass_times_ms.keys()
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -156,17 +165,19 @@ def test_while_it_moves_the_real_scene_and_the_volume_stand_still(
         gpu, shown(stage, placed(sliding_box(stage.folder), {}), name=method, volume_edge_m=None)
     )
     first = renderer.render(at(0.0))
-    relighting = renderer._relighting
-    assert relighting._method is not None
-    table = relighting._objects._materials
-    before = relighting._method._real_key
+    graph = renderer.graph
+    assert graph is not None
+    table = graph["object geometry"].materials
+    standing = [graph.resource(name) for name in ("real geometry", "volume placement", "light views real")]
+    before = [resource.version for resource in standing]
     second = renderer.render(at(0.6))
-    assert relighting._method._real_key == before, "placement of volume and light views included"
-    assert relighting._objects._materials is table, "materials and textures are not sent again"
+    assert renderer.graph is graph
+    assert [resource.version for resource in standing] == before
+    assert graph["object geometry"].materials is table, "materials and textures are not sent again"
     renderer.release()
-    assert "RSM real" in first.pass_times_ms
-    assert "RSM real" not in second.pass_times_ms
-    assert "RSM virtual" in second.pass_times_ms
+    assert {"voxelize real", "shadow maps real"} <= first.pass_times_ms.keys()
+    assert not {"voxelize real", "shadow maps real"} & second.pass_times_ms.keys()
+    assert "shadow maps objects" in second.pass_times_ms
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -204,7 +215,7 @@ def test_several_objects_move_each_on_its_own(gpu: GpuContext, stage: Stage) -> 
     assert [item.id for item in after.objects if item.moves] == ["slow", "fast", "turning"]
     steps = np.split(np.abs(after.corners - before.corners)[..., :3].max(axis=(1, 2)), range(12, 60, 12))
     assert [step.max() for step in steps] == pytest.approx([0.06, 0.12, 0, 0, 0.0229], abs=1e-3)
-    assert after.version == before.version + 1
+    assert after is not before
     assert np.array_equal(after.lasting_points, before.lasting_points)
     assert objects.update(scene.objects, None, SECOND // 4) is after
     objects.release()

@@ -92,6 +92,7 @@ print(hashlib.sha256(picture.tobytes()).hexdigest())
 """
 
 
+@pytest.mark.slow
 def test_two_processes_give_the_same_bytes(gpu: GpuContext, stage: Stage) -> None:
     command = [sys.executable, "-c", CHILD]
     children = [

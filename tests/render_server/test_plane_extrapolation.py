@@ -9,11 +9,13 @@ from jaxtyping import Float32, Float64
 
 from protocol.frames import decode_lut
 from protocol.scene import SceneDocument
-from render_server.estimation.plane_detection import DetectedPlane, PointCloud, detect_planes
 from render_server.estimation.plane_extrapolation import (
+    DetectedPlane,
     ExtrapolatedPlanes,
+    PointCloud,
     RealSamples,
     ViewFrustum,
+    detect_planes,
     extrapolate_planes,
 )
 from render_server.gpu.context import GpuContext
@@ -191,9 +193,9 @@ def environment(gpu: GpuContext, document: SceneDocument) -> tuple[Float32[np.nd
     """The environment that a renderer uses after its first frame, and its picture."""
     renderer = SceneRenderer(gpu, document)
     color = renderer.render(frame(plain(120))).color.tobytes()
-    lights = renderer._relighting.lighting.lights
+    assert renderer.graph is not None
+    lights = renderer.graph["light set"]
     renderer.release()
-    assert lights is not None
     return lights.environment, color
 
 

@@ -1,4 +1,5 @@
-"""Every method's pictures, protected to the bit on the machine that recorded them and within 60 dB elsewhere.
+"""Every method's pictures, protected to the bit on the machine that recorded them and within 60 dB elsewhere; and
+what was dispatched to make them: how much for each frame, and for plain scenes every kernel with its workgroups.
 
 `DELTALIGHT_REGENERATE_GOLDENS=1 pytest tests/render_server/test_protected_pictures.py` records them anew: look at the
 sheets (goldens/protected_*.png; a column a kind of scene, a row a kind of geometry) and at what changed before they
@@ -17,12 +18,14 @@ import pytest
 from PIL import Image
 
 from render_server.gpu.context import GpuContext
+from render_server.gpu.kernel import Dispatch
 from tests.render_server.protected_scenes import GEOMETRIES, KINDS, METHODS, PICTURE, Case, cases, pictures_of
 from tests.render_server.test_golden import psnr_db
 
 pytestmark = pytest.mark.usefixtures("clean_gl")
 FOLDER = Path(__file__).with_name("goldens")
 RECORD = FOLDER / "protected.json"
+TRACE = FOLDER / "dispatches.json"
 REGENERATE = os.environ.get("DELTALIGHT_REGENERATE_GOLDENS") == "1"
 LEAST_PSNR_DB = 60.0
 TURNED = 1  # the frame that the sheets show
@@ -44,6 +47,16 @@ def digest(picture: np.ndarray) -> str:
     return hashlib.sha256(np.ascontiguousarray(picture).tobytes()).hexdigest()
 
 
+def described(trace: list[list[Dispatch]]) -> list[list[str]]:
+    """Shader and size of each dispatch of each frame."""
+    return [[" ".join([one.kernel.split(" ")[0], *map(str, one.size)]) for one in part] for part in trace]
+
+
+def kernels(trace: list[list[str]]) -> list[list[str]]:
+    """The same without sizes, which follow the number of surfels, and so the last bits of positions."""
+    return [[line.split(" ")[0] for line in part] for part in trace]
+
+
 def sheet_path(method: str) -> Path:
     return FOLDER / f"protected_{method}.png"
 
@@ -61,10 +74,17 @@ class Recording:
     def __init__(self) -> None:
         self.old: dict[str, Any] = json.loads(RECORD.read_text()) if RECORD.exists() else {}
         self.new: dict[str, list[str]] = {}
+        self.counts: dict[str, list[int]] = json.loads(TRACE.read_text())["counts"] if TRACE.exists() else {}
+        self.traces: dict[str, list[list[str]]] = (
+            json.loads(TRACE.read_text())["traces"] if TRACE.exists() else {}
+        )
         self.sheets: dict[str, np.ndarray] = {}
 
-    def add(self, case: Case, pictures: list[np.ndarray]) -> None:
+    def add(self, case: Case, pictures: list[np.ndarray], trace: list[list[str]]) -> None:
         self.new[str(case)] = [digest(picture) for picture in pictures]
+        self.counts[str(case)] = [len(part) for part in trace]
+        if case.kind == "plain" and case.geometry != "fused":
+            self.traces[str(case)] = trace[:2]
         size = len(GEOMETRIES) * PICTURE["height"], len(KINDS) * PICTURE["width"], 3
         sheet = self.sheets.setdefault(case.method, np.zeros(size, np.uint8))
         sheet[tile(case)] = pictures[TURNED]
@@ -72,6 +92,8 @@ class Recording:
     def store(self, gpu: GpuContext) -> None:
         record = {"made_with": made_with(gpu), "pictures": {**self.old.get("pictures", {}), **self.new}}
         RECORD.write_text(json.dumps(record, indent=1, sort_keys=True) + "\n")
+        traces = {"counts": self.counts, "traces": self.traces}
+        TRACE.write_text(json.dumps(traces, indent=0, sort_keys=True) + "\n")
         for method, sheet in self.sheets.items():
             Image.fromarray(sheet).save(sheet_path(method), optimize=True)
 
@@ -84,24 +106,42 @@ def recording(gpu: GpuContext) -> Iterator[Recording]:
         record.store(gpu)
 
 
-@pytest.mark.parametrize("case", [pytest.param(case, id=str(case)) for case in cases()])
-def test_pictures_are_the_recorded_ones(
+def parameters() -> list[Any]:
+    """Every case; those that `./run test` leaves to `./run test --all` are slow."""
+    quick = [
+        case.geometry == "depth" and (case.kind == "plain" or case.method == "exact") for case in cases()
+    ]
+    marks = [() if is_quick else (pytest.mark.slow,) for is_quick in quick]
+    return [pytest.param(case, id=str(case), marks=mark) for case, mark in zip(cases(), marks, strict=True)]
+
+
+@pytest.mark.parametrize("case", parameters())
+def test_pictures_and_dispatches_are_the_recorded_ones(
     gpu: GpuContext, recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, case: Case
 ) -> None:
     monkeypatch.setenv("DELTALIGHT_CACHE", str(tmp_path / "cache"))
-    pictures = pictures_of(gpu, case, tmp_path)
+    pictures, dispatches = pictures_of(gpu, case, tmp_path)
+    trace = described(dispatches)
     if REGENERATE:
-        recording.add(case, pictures)
+        recording.add(case, pictures, trace)
         return
-    if recording.old["made_with"] == made_with(gpu):
+    same_machine = recording.old["made_with"] == made_with(gpu)
+    if same_machine:
         assert [digest(picture) for picture in pictures] == recording.old["pictures"][str(case)]
-        return
-    golden = np.asarray(Image.open(sheet_path(case.method)))[tile(case)]
-    assert psnr_db(pictures[TURNED], golden) >= LEAST_PSNR_DB, recording.old["made_with"]
+    else:
+        golden = np.asarray(Image.open(sheet_path(case.method)))[tile(case)]
+        assert psnr_db(pictures[TURNED], golden) >= LEAST_PSNR_DB, recording.old["made_with"]
+    if gpu.is_software:
+        assert [len(part) for part in trace] == recording.counts[str(case)]
+        recorded = recording.traces.get(str(case), trace[:2])
+        assert kernels(trace[:2]) == kernels(recorded)
+        assert not same_machine or trace[:2] == recorded
 
 
+@pytest.mark.skipif(REGENERATE, reason="the record is being written")
 def test_the_record_is_small_and_complete() -> None:
     record = json.loads(RECORD.read_text())
     assert set(record["pictures"]) == {str(case) for case in cases()}
+    assert set(json.loads(TRACE.read_text())["counts"]) == set(record["pictures"])
     assert {path.name for path in FOLDER.glob("protected_*.png")} == {sheet_path(m).name for m in METHODS}
     assert all(path.stat().st_size < 500_000 for path in FOLDER.glob("protected_*.png"))

@@ -9,10 +9,9 @@ from PIL import Image
 
 from protocol.errors import DeltalightError
 from protocol.scene_objects import Material as MaterialDocument
-from render_server.scene.gpu_mesh import merge_for_gpu, split_triangles
 from render_server.scene.materials import Material
 from render_server.scene.mesh_loading import load_mesh
-from render_server.scene.triangle_mesh import TriangleMesh
+from render_server.scene.triangle_mesh import TriangleMesh, merge_for_gpu, split_triangles
 
 CUBE_OBJ = """
 mtllib cube.mtl

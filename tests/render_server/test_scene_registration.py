@@ -4,7 +4,7 @@ import pytest
 from protocol.board import BoardSpec, GreyCard
 from protocol.camera_model import CameraModel
 from protocol.frames import BoardPose
-from render_server.estimation.registration_fit import (
+from render_server.estimation.registration import (
     Registration,
     RegistrationAverage,
     registration_from_albedo_percentile,

@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from render_server.passes.screen_cones import ROUGHEST
 
 from protocol.scene import SceneDocument
 from protocol.scene_lights import Lights
 from render_server.gpu.context import GpuContext
+from render_server.passes.reflections import ROUGHEST
 from render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (
     FOCAL,
@@ -60,12 +60,9 @@ def reflected(gpu: GpuContext, document: SceneDocument) -> tuple[np.ndarray, np.
     """What the pass wrote (radiance times share, share), which pixels the mirror fills, the picture's radiance."""
     renderer = SceneRenderer(gpu, document)
     renderer.render(frame(checkered()))
-    relighting = renderer._relighting
-    assert relighting._method is not None
-    assert relighting._method._screen is not None
-    assert relighting._resources is not None
-    found = array_of(relighting._method._screen.reflected)
-    linear = array_of(relighting._resources.picture.linear)[..., :3]
+    assert renderer.graph is not None
+    found = array_of(renderer.graph["screen cones"])
+    linear = array_of(renderer.graph["camera image"].linear)[..., :3]
     shown = fields_of(renderer).matte == 1
     renderer.release()
     return found, shown, linear
@@ -148,7 +145,8 @@ def test_what_the_picture_does_not_show_is_as_sharp(gpu: GpuContext, stage: Stag
     renderer = SceneRenderer(gpu, document)
     color = renderer.render(frame()).color
     shown = fields_of(renderer).matte == 1
-    surface = array_of(renderer._relighting._resources.virtual_raster.position)
+    assert renderer.graph is not None
+    surface = array_of(renderer.graph["object surface"].buffer.position)
     renderer.release()
     points = surface[..., :3]
     normal = (points - (0, 0, 0.4)) / 0.1
@@ -166,6 +164,7 @@ def test_what_the_picture_does_not_show_is_as_sharp(gpu: GpuContext, stage: Stag
 def test_rough_objects_are_left_to_the_cones(gpu: GpuContext, stage: Stage) -> None:
     renderer = SceneRenderer(gpu, standing_mirror(stage, roughness=ROUGHEST + 0.05))
     times_ms = renderer.render(frame(checkered())).pass_times_ms
-    renderer.release()
     assert "direct light" in times_ms
-    assert "screen cones" not in times_ms
+    assert renderer.graph is not None
+    assert renderer.graph["screen cones"] is None
+    renderer.release()

@@ -8,7 +8,7 @@ import trimesh
 
 from protocol.frames import BoardPose, ViewFrame
 from protocol.scene import SceneDocument
-from render_server.estimation.backoff_schedule import BackoffSchedule
+from render_server.estimation.samples import BackoffSchedule
 from render_server.gpu.context import GpuContext
 from render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (

@@ -2,28 +2,29 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import trimesh
-from render_server.gpu.program import ComputeProgram
-from render_server.passes.filter_voxels import FilterVoxelsPass
-from render_server.passes.light_table import LightTable
-from render_server.passes.light_voxels import LightVoxelsPass
-from render_server.passes.materials import MaterialTable
-from render_server.passes.mesh_buffers import triangle_corners
-from render_server.passes.resolve_voxels import ResolveVoxelsPass
-from render_server.passes.volume import Pyramid, VolumePlacement
-from render_server.passes.voxel_store import VoxelStore
-from render_server.passes.voxelize import VoxelizePass
 
 from render_server.gpu.context import GpuContext
-from render_server.gpu.textures import bind_samplers
-from render_server.scene.gpu_mesh import GpuMesh, merge_for_gpu
+from render_server.gpu.kernel import Binding, Kernel
+from render_server.gpu.uniform_block import UniformBlock
+from render_server.passes.gbuffer import MaterialTable, triangle_corners
+from render_server.passes.lights import LightBuffers
+from render_server.passes.voxel_light import LightVoxels
+from render_server.passes.voxels import (
+    DIRECTIONS,
+    FarVolumeBlock,
+    FilterVoxels,
+    PlacedVolume,
+    ResolveVoxels,
+    VolumePlacement,
+    Voxelize,
+    VoxelMipmap,
+    VoxelStore,
+)
 from render_server.scene.materials import Material
-from render_server.scene.triangle_mesh import TriangleMesh, smooth_normals
-
-DIRECTIONS = 6
+from render_server.scene.triangle_mesh import GpuMesh, TriangleMesh, merge_for_gpu, smooth_normals
 
 
 def gpu_mesh(mesh: trimesh.Trimesh, radiance: float = 0.0, *, inside_out: bool = False) -> GpuMesh:
@@ -40,10 +41,10 @@ def gpu_mesh(mesh: trimesh.Trimesh, radiance: float = 0.0, *, inside_out: bool =
 
 @dataclass
 class Voxels:
-    """Pyramids of one filling: mu is empty, rho holds the mesh."""
+    """Mipmaps of one filling: mu is empty, rho holds the mesh."""
 
-    mu: Pyramid
-    rho: Pyramid
+    mu: VoxelMipmap
+    rho: VoxelMipmap
     store: VoxelStore
     empty: VoxelStore
 
@@ -58,18 +59,20 @@ class VoxelLab:
     def __init__(self, gpu: GpuContext, size: int = 64) -> None:
         self.gpu = gpu
         self.placement = VolumePlacement((0.0, 0.0, 0.0), 1.0, size)
-        self._voxelize = VoxelizePass(gpu)
-        self._light = LightVoxelsPass(gpu)
-        self._resolve = ResolveVoxelsPass(gpu)
-        self._filter = FilterVoxelsPass(gpu)
-        self._table = LightTable(gpu, 64, 4)
-        self._table.set_environment(np.zeros((16, 16, 3), np.float32))
-        self._cones = ComputeProgram(gpu, Path(__file__).with_name("cones.comp.glsl"))
+        self._volume = PlacedVolume(gpu, self.placement)
+        self._beyond = UniformBlock[FarVolumeBlock](gpu, self.placement.far_block(is_used=False))
+        self._voxelize = Voxelize(gpu)
+        self._light = LightVoxels(gpu)
+        self._resolve = ResolveVoxels(gpu)
+        self._filter = FilterVoxels(gpu)
+        self._lights = LightBuffers(gpu, 64, 4)
+        self._lights.set_environment(np.zeros((16, 16, 3), np.float32))
+        self._cones = Kernel(gpu, Path(__file__).with_name("cones"))
 
     def surfels(self, mesh: GpuMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """World positions, areas, unit normals and voxel coordinates of a mesh's surfels."""
         store = VoxelStore(self.gpu, self.placement.size)
-        self._voxelize.run(store, triangle_corners(mesh), self.placement)
+        self._voxelize.run(store, triangle_corners(mesh), self._volume)
         _, count = store.counts()
         assert count <= store.surfel_capacity
         data = (
@@ -84,22 +87,27 @@ class VoxelLab:
     def fill(self, mesh: GpuMesh) -> Voxels:
         """Voxelise, light by its own glow, filter."""
         size = self.placement.size
-        pyramids = [Pyramid(self.gpu, size, DIRECTIONS) for _ in range(2)]
+        mipmaps = [VoxelMipmap(self.gpu, size, DIRECTIONS) for _ in range(2)]
         stores = [VoxelStore(self.gpu, size) for _ in range(2)]
-        voxels = Voxels(pyramids[0], pyramids[1], stores[0], stores[1])
-        uniforms: dict[str, Any] = {**self.placement.uniforms(), **self._table.uniforms()}
+        voxels = Voxels(mipmaps[0], mipmaps[1], stores[0], stores[1])
         materials = MaterialTable(self.gpu, mesh)
-        self._voxelize.run(voxels.store, triangle_corners(mesh), self.placement)
-        self._table.bind()
-        materials.bind()
-        self._light.light_virtual(voxels.store, {**uniforms, "bias_real": 0.0, "bias_virtual": 0.0})
-        self._resolve.resolve_rho(voxels.rho, voxels.empty, voxels.store, uniforms)
-        self._filter.run(voxels.rho, self.placement)
+        scene: dict[str, Binding] = {
+            **self._volume.bindings,
+            **self._lights.bindings,
+            **materials.bindings,
+            "bias_real": 0.0,
+            "bias_virtual": 0.0,
+            "has_caustics": False,
+        }
+        self._voxelize.run(voxels.store, triangle_corners(mesh), self._volume)
+        self._light.light_virtual(voxels.store, scene)
+        self._resolve.resolve_rho(voxels.rho, voxels.empty, voxels.store, self._volume)
+        self._filter.run(voxels.rho, self._volume)
         materials.release()
         return voxels
 
     def level_zero(self, voxels: Voxels) -> np.ndarray:
-        """(direction, z, y, x, rgba) of the rho pyramid's finest level."""
+        """(direction, z, y, x, rgba) of the finest level of rho."""
         size = self.placement.size
         texels = np.frombuffer(voxels.rho.texture.read(), np.float16).reshape(-1, size, size, 4)
         return np.asarray(texels[: DIRECTIONS * size].reshape(DIRECTIONS, size, size, size, 4), float)
@@ -112,19 +120,35 @@ class VoxelLab:
         ray_buffer = self.gpu.ctx.buffer(rays.tobytes())
         results = self.gpu.ctx.buffer(reserve=count * 16)
         everywhere = np.array([0, 0, 0, *[-self.placement.size] * 3], np.int32)
-        self._light.support.write(everywhere.tobytes())
-        self._light.bind_support()
-        bind_samplers({2: voxels.mu.texture, 3: voxels.rho.texture})
-        ray_buffer.bind_to_storage_buffer(0)
-        results.bind_to_storage_buffer(1)
-        self._cones.run((count,), ray_count=count, far_size=0, **self.placement.uniforms())
+        self._light.start_support(everywhere)
+        self._cones.run(
+            (count,),
+            self._volume.bindings,
+            self._light.bindings,
+            pyramid_mu=voxels.mu.texture,
+            pyramid_rho=voxels.rho.texture,
+            pyramid_far=None,
+            FarVolume=self._beyond,
+            Rays=ray_buffer,
+            Results=results,
+            ray_count=count,
+        )
         found = np.frombuffer(results.read(), np.float32).reshape(count, 4).copy()
         ray_buffer.release()
         results.release()
         return found
 
     def release(self) -> None:
-        for item in (self._voxelize, self._light, self._resolve, self._filter, self._table, self._cones):
+        for item in (
+            self._volume,
+            self._beyond,
+            self._voxelize,
+            self._light,
+            self._resolve,
+            self._filter,
+            self._lights,
+            self._cones,
+        ):
             item.release()
 
 

@@ -2,12 +2,11 @@
 
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-import structlog
 from typer.testing import CliRunner
 
 from protocol.camera_model import CameraModel
@@ -22,13 +21,6 @@ WIDTH, HEIGHT = 64, 48
 IDENTITY = tuple(tuple(float(value) for value in row) for row in np.eye(4))
 
 RunCli = Callable[..., subprocess.CompletedProcess[str]]
-
-
-@pytest.fixture(autouse=True)
-def fresh_logs() -> Iterator[None]:
-    """A command that runs in this process sends log lines to a stderr that pytest closes after the test."""
-    yield
-    structlog.reset_defaults()
 
 
 @pytest.fixture

@@ -70,6 +70,7 @@ def exr(folder: Path) -> bytes:
     return (folder / "map.exr").read_bytes()
 
 
+@pytest.mark.slow
 def test_meshes_are_taken_and_described(api: RunningApi) -> None:
     glb_file = (ROOT / "services" / "demo_assets" / "object.glb").read_bytes()
     answer = upload(api.client, glb_file, "knot.glb")

@@ -217,6 +217,7 @@ def test_up_without_a_gpu_refuses_in_a_sentence(cli: RunCli, cli_process: RunCli
     assert "started again" not in done.stderr
 
 
+@pytest.mark.slow
 def test_bench_speed_reports_every_pass(cli: RunCli, tmp_path: Path) -> None:
     report = tmp_path / "speed.json"
     options = ("--methods", "paper", "--frames", 1, "--size", "160x120", "--no-end-to-end", "--json")

@@ -15,6 +15,7 @@ from tests.services.api_samples import UPLOAD, running_api, sentence
 from tests.services.storage_samples import TETRAHEDRON, glb
 from tests.services.test_gltf_zip import FILES, packed
 
+pytestmark = pytest.mark.slow
 PLY_HEAD = b"""ply
 format ascii 1.0
 element vertex 8

@@ -5,9 +5,10 @@ from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Path, Query, Response
 
+from protocol.methods import Method
 from protocol.scene import SceneDocument
 from protocol.scene_lights import Lights, ManualLight
-from protocol.scene_method import Method, Output, Shading
+from protocol.scene_method import Output, Shading
 from protocol.scene_objects import RealScene, SceneObject
 from services.api.context import ExpectedRevision, IfUnchanged, Shared, with_revision_of
 from services.api.models import RevisionEntry, SceneAnswer, SceneSummary

@@ -8,7 +8,8 @@ from pydantic import Field, StrictBool, model_validator
 
 from protocol.documents import StrictModel
 from protocol.messages import Name
-from protocol.scene_method import Method, Output
+from protocol.methods import Method
+from protocol.scene_method import Output
 from services.api.context import Context, Shared
 from services.api.file_response import StoredFileResponse
 from services.api.problems import ProblemError, responses

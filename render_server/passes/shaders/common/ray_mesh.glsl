@@ -5,7 +5,7 @@
 struct Node { vec3 low; int leaf; vec3 high; int skip; };   // leaf: first triangle << 3 | count, or -1
 layout(std430) readonly buffer Nodes { Node nodes[]; };
 layout(std430) readonly buffer Faces { vec4 faces[]; };           // 3 a triangle: corner and index, 2 edges
-layout(std430) readonly buffer Vertices { float vertices[]; };    // VERTEX_FLOATS each (scene/gpu_mesh.py)
+layout(std430) readonly buffer Vertices { float vertices[]; };    // VERTEX_FLOATS each (scene/triangle_mesh.py)
 layout(std430) readonly buffer Corners { int vertex_of[]; };      // 3 a triangle
 
 const int VERTEX_FLOATS = 12;

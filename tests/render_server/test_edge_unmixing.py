@@ -1,4 +1,4 @@
-"""Rims of real things before objects: told from the old background by colour; nothing else changes."""
+"""Edges of real things before objects: unmixed from the old background by colour; nothing else changes."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -91,7 +91,7 @@ def linear_picture(gpu: GpuContext, document: SceneDocument, view: ViewFrame) ->
     ("turn_deg", "least", "smooth"),
     [(0.0, 0.5, False), (23.0, 0.02, False), (45.0, 0.98, False), (90.0, 0.98, True), (23.0, 0.5, True)],
 )
-def test_rim_shows_the_thing_and_the_object_only(
+def test_edge_shows_the_thing_and_the_object_only(
     gpu: GpuContext, stage: Stage, turn_deg: float, least: float, smooth: bool
 ) -> None:
     """Whichever surface depth gives the mixed pixels to."""
@@ -112,14 +112,14 @@ def test_through_a_lens(gpu: GpuContext, stage: Stage, distortion: float) -> Non
 @pytest.mark.slow
 @pytest.mark.parametrize(("back", "tolerance"), [(BACK, 0.02), (0.6 * FRONT, 0.05)])
 def test_in_noise(gpu: GpuContext, stage: Stage, back: np.ndarray, tolerance: float) -> None:
-    """A tenth of the contrast or less of the colours: the whole rim is right within `tolerance`, r.m.s."""
+    """A tenth of the contrast or less of the colours: the whole edge is right within `tolerance`, r.m.s."""
     a = shares(23.0)
     noise = 0.015 * np.random.default_rng(0).standard_normal((HEIGHT, WIDTH, 3))
     color = coded(np.clip(mixed(a, back=back) + noise, 0, 1))
     found = linear_picture(gpu, unlit(glowing(stage)), seen(a, color, least=0.98))
     error = (found - mixed(a, back=np.full(3, GLOW)))[INSIDE]
-    rim = ((a > 0.01) & (a < 0.99))[INSIDE]
-    assert np.sqrt(np.mean(error[rim] ** 2)) < tolerance
+    edge = ((a > 0.01) & (a < 0.99))[INSIDE]
+    assert np.sqrt(np.mean(error[edge] ** 2)) < tolerance
 
 
 @pytest.mark.slow
@@ -132,8 +132,8 @@ def test_depth_that_is_off_by_a_pixel(gpu: GpuContext, stage: Stage, off_px: int
     assert np.abs(found - mixed(a, back=np.full(3, GLOW)))[INSIDE].max() < 0.03
 
 
-def test_rim_is_lit_like_the_thing_and_not_like_the_shaded_background(gpu: GpuContext, stage: Stage) -> None:
-    """The object shades all of the background, and depth gives the rim's pixels to that."""
+def test_edge_is_lit_like_the_thing_and_not_like_the_shaded_background(gpu: GpuContext, stage: Stage) -> None:
+    """The object shades all of the background, and depth gives the edge's pixels to that."""
     a = shares(0.0)
     document = glowing(stage, directional((0.0, 0.0, -1.0), 2.0))
     found = linear_picture(gpu, document, seen(a, coded(mixed(a)), least=0.98))
@@ -156,7 +156,7 @@ def test_equal_colours_leave_the_choice_to_depth(gpu: GpuContext, stage: Stage) 
 def test_no_negative_pixel_and_the_cameras_bytes_where_no_object_lies_behind(
     gpu: GpuContext, stage: Stage, smooth: bool
 ) -> None:
-    """The rim goes on beyond the object."""
+    """The edge goes on beyond the object."""
     document = antialiased(unlit(glowing(stage, size=60)), smooth)
     view = seen(shares(23.0), noisy())
     renderer = SceneRenderer(gpu, document, with_linear=True)
@@ -173,7 +173,7 @@ def test_no_negative_pixel_and_the_cameras_bytes_where_no_object_lies_behind(
     assert np.array_equal(result.color[matte == 0], noisy()[matte == 0])
 
 
-def test_a_third_colour_along_the_rim_belongs_to_the_thing_as_depth_says(
+def test_a_third_colour_along_the_edge_belongs_to_the_thing_as_depth_says(
     gpu: GpuContext, stage: Stage
 ) -> None:
     """A green line that is neither the thing's red nor the background's blue."""
@@ -186,33 +186,32 @@ def test_a_third_colour_along_the_rim_belongs_to_the_thing_as_depth_says(
     assert np.abs(found - expected)[INSIDE].max() < 0.05
 
 
-def rims_of(gpu: GpuContext, document: SceneDocument, view: ViewFrame) -> np.ndarray:
+def corrections(gpu: GpuContext, document: SceneDocument, view: ViewFrame) -> np.ndarray:
     renderer = SceneRenderer(gpu, document)
     renderer.render(view)
-    resources = renderer._relighting._resources
-    assert resources is not None
-    rims = array_of(resources.picture.rims)
+    assert renderer.graph is not None
+    found = array_of(renderer.graph["camera image"].edge_correction)
     renderer.release()
-    return rims
+    return found
 
 
-def test_the_floor_has_no_rim_where_an_object_stands_on_it(gpu: GpuContext, stage: Stage) -> None:
+def test_the_floor_is_not_unmixed_where_an_object_stands_on_it(gpu: GpuContext, stage: Stage) -> None:
     document = unlit(
         stage.document([stage.virtual(cube()), stage.virtual(ball(at=(0.1, 0, 0.03)))], [ambient(0.2)])
     )
     view = frame(noisy(), depth=depth_image(floor_depth(look_at())))
-    assert not rims_of(gpu, document, view).any()
+    assert not corrections(gpu, document, view).any()
 
 
 def test_what_is_too_thin_to_tell_its_colour_keeps_the_share_by_depth(gpu: GpuContext, stage: Stage) -> None:
     bar = np.abs(np.arange(WIDTH) - WIDTH // 2) < 2
     a = np.broadcast_to(bar.astype(float), (HEIGHT, WIDTH))
-    assert not rims_of(gpu, unlit(glowing(stage)), seen(a, coded(mixed(a)))).any()
+    assert not corrections(gpu, unlit(glowing(stage)), seen(a, coded(mixed(a)))).any()
     found = linear_picture(gpu, unlit(glowing(stage)), seen(a, coded(mixed(a))))
     assert np.abs(found - mixed(a, back=np.full(3, GLOW)))[INSIDE].max() < 0.03
 
 
-def test_an_object_that_moves_away_takes_its_rims_along(gpu: GpuContext, stage: Stage) -> None:
+def test_an_object_that_moves_away_takes_its_corrections_along(gpu: GpuContext, stage: Stage) -> None:
     a = shares(23.0)
     view = seen(a, coded(mixed(a)))
     here = unlit(glowing(stage, size=60))

@@ -1,4 +1,4 @@
-"""Cones that neighbouring texels divide between them: what a ball hides of even light, at every pixel."""
+"""Neighbouring texels share their cones by a bilateral filter: what a ball hides of even light, at every pixel."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Light of what is out of sight, found on the board's paper."""
+"""Light of the unseen environment, found on the board's paper."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ import pytest
 from protocol.board import BoardSpec
 from protocol.frames import ViewFrame, decode_lut
 from protocol.scene import SceneDocument
-from render_server.estimation.registration_fit import unseen_radiance_from_patch
+from render_server.estimation.registration import unseen_radiance_from_patch
 from render_server.gpu.context import GpuContext
 from render_server.renderer import SceneRenderer
 from tests.render_server.scenes import Stage, ambient, cube, directional, floor, frame, plain

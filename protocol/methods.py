@@ -1,0 +1,74 @@
+"""The relighting methods that a scene document may name: the project's own and those of installed plugins."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import reduce
+from operator import or_
+from typing import TYPE_CHECKING, Annotated, Any
+
+from pydantic import BeforeValidator, Discriminator, Tag
+
+from protocol.plugins import LoadedPlugins, Plugin, installed_plugins, load_plugins
+from protocol.scene_method import BUILT_IN_METHODS, DEFAULT_METHOD, MethodSettings
+
+GROUP = "deltalight.methods"
+
+
+@dataclass(frozen=True)
+class InstalledMethod:
+    """A method of a plugin.
+
+    `value` is what its entry point names: a `RelightingMethod` of the renderer, of which only `settings` is known.
+    Processes that have no OpenGL load it too, to check documents.
+    """
+
+    plugin: Plugin
+    settings: type[MethodSettings]
+    value: object
+
+
+def _accept(plugin: Plugin, value: object) -> InstalledMethod:
+    settings = getattr(value, "settings", None)
+    if not (isinstance(settings, type) and issubclass(settings, MethodSettings)):
+        raise plugin.fault("it names no RelightingMethod whose settings are a MethodSettings")
+    if settings.method_name() != plugin.name:
+        raise plugin.fault(f"its settings are called `{settings.method_name()}`; both names must be the same")
+    return InstalledMethod(plugin, settings, value)
+
+
+def load_methods() -> LoadedPlugins[InstalledMethod]:
+    """Loads the plugins of the group."""
+    return load_plugins(
+        installed_plugins(GROUP), _accept, [model.method_name() for model in BUILT_IN_METHODS]
+    )
+
+
+PLUGINS = load_methods()
+SETTINGS = {
+    model.method_name(): model
+    for model in (*BUILT_IN_METHODS, *(method.settings for method in PLUGINS.values.values()))
+}
+
+
+def _name(value: Any) -> Any:  # noqa: ANN401 - whatever the document holds
+    if isinstance(value, Mapping):
+        return value.get("name", DEFAULT_METHOD)
+    return getattr(value, "name", DEFAULT_METHOD)
+
+
+def _refuse_faulty(value: Any) -> Any:  # noqa: ANN401 - as above
+    name = _name(value)
+    fault = PLUGINS.fault(name) if isinstance(name, str) and name not in SETTINGS else None
+    if fault is not None:
+        raise ValueError(fault)
+    return value
+
+
+if TYPE_CHECKING:
+    Method = MethodSettings
+else:
+    Method = Annotated[
+        reduce(or_, (Annotated[model, Tag(name)] for name, model in SETTINGS.items())),
+        Discriminator(_name),
+        BeforeValidator(_refuse_faulty),
+    ]
