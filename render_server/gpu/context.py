@@ -11,7 +11,7 @@ from protocol.errors import DeltalightError
 
 SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swiftshader", "swrast")
 
-# What EGL and the GL loader report, and what a user can do about it.
+# What EGL and the GL loader say, and what a user can do about it.
 HINTS = {
     "libGL.so not loaded": "OpenGL is not installed: apt-get install --no-install-recommends libegl1 libgl1",
     "libEGL.so not loaded": "EGL is not installed: apt-get install --no-install-recommends libegl1 libgl1",
@@ -35,9 +35,9 @@ class GpuContext:
     version: str
     is_software: bool
     watchers: list[Callable[[Any], None]] = field(default_factory=list)
-    """Called for every run of a kernel (gpu/kernel.py)."""
+    """Told of every run of a kernel (gpu/kernel.py)."""
     compile_watchers: list[Callable[[str, Mapping[str, str]], None]] = field(default_factory=list)
-    """Called for every program that is compiled, with its label and the source of each stage."""
+    """Told of every program that is compiled: its label and the text of each of its stages."""
 
     def compiled(self, label: str, sources: Mapping[str, str]) -> None:
         """Tells the compile watchers about a program."""
@@ -45,20 +45,30 @@ class GpuContext:
             watch(label, sources)
 
     @cached_property
-    def _empty_textures(self) -> dict[type, Any]:
-        return {
-            moderngl.Texture: self.ctx.texture((1, 1), 4, bytes(4)),
-            moderngl.Texture3D: self.ctx.texture3d((1, 1, 1), 4, bytes(4)),
-            moderngl.TextureArray: self.ctx.texture_array((1, 1, 1), 4, bytes(4)),
-        }
+    def _empty_textures(self) -> dict[tuple[type, str], Any]:
+        return {}
 
-    def empty_texture(self, kind: type) -> Any:  # noqa: ANN401 (as the kind says)
-        """Returns a texture of zeros to bind where a kernel is given None."""
-        return self._empty_textures[kind]
+    def empty_texture(self, kind: type, texels: str) -> Any:  # noqa: ANN401 (as the kind says)
+        """A texture of zeros (`texels`: f, i or u) that stands where a kernel is given none."""
+        if (kind, texels) not in self._empty_textures:
+            make, size = {
+                moderngl.Texture: (self.ctx.texture, (1, 1)),
+                moderngl.Texture3D: (self.ctx.texture3d, (1, 1, 1)),
+                moderngl.TextureArray: (self.ctx.texture_array, (1, 1, 1)),
+            }[kind]
+            texture = make(size, 4, bytes(4), dtype=f"{texels}1")
+            texture.filter = (moderngl.NEAREST, moderngl.NEAREST)
+            self._empty_textures[kind, texels] = texture
+        return self._empty_textures[kind, texels]
 
     @cached_property
     def empty_buffer(self) -> moderngl.Buffer:
-        """A buffer of zeros to bind where a kernel is given None."""
+        """A buffer of zeros that stands where a kernel reads from none."""
+        return self.ctx.buffer(bytes(256))
+
+    @cached_property
+    def discarded_buffer(self) -> moderngl.Buffer:
+        """The buffer that stands where a kernel may write to none."""
         return self.ctx.buffer(bytes(256))
 
     def release(self) -> None:

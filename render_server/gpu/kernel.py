@@ -35,12 +35,12 @@ Binding = Texture | moderngl.Buffer | UniformBlock[Any] | Value | None
 Bindings = Mapping[str, Binding]
 """GLSL names and what is bound to them; None stands for nothing: a texture without texels, an empty buffer."""
 
-SAMPLERS: Final = {
-    0x8B5E: moderngl.Texture,  # sampler2D
-    0x8DCA: moderngl.Texture,  # isampler2D
-    0x8DD2: moderngl.Texture,  # usampler2D
-    0x8B5F: moderngl.Texture3D,  # sampler3D
-    0x8DC1: moderngl.TextureArray,  # sampler2DArray
+SAMPLERS: Final = {  # of textures, and what their texels are read as: float, signed or unsigned
+    0x8B5E: (moderngl.Texture, "f"),  # sampler2D
+    0x8DCA: (moderngl.Texture, "i"),  # isampler2D
+    0x8DD2: (moderngl.Texture, "u"),  # usampler2D
+    0x8B5F: (moderngl.Texture3D, "f"),  # sampler3D
+    0x8DC1: (moderngl.TextureArray, "f"),  # sampler2DArray
 }
 IMAGES: Final = {
     0x904D: moderngl.Texture,  # image2D
@@ -126,9 +126,7 @@ class _Program:
             slots = self._samplers if slot.kind in SAMPLERS else self._images
             (slots if is_texture else self._uniforms).append(slot)
             if is_texture:
-                slot.member.gl_type = (
-                    GL_INT  # a unit is an integer; moderngl 5.13 leaves that of an image3D unset
-                )
+                slot.member.gl_type = GL_INT  # as units are; moderngl 5.13 leaves that of an image3D unset
 
     def _assign(self) -> None:
         """Assigns units and binding points, each kind from 0 on."""
@@ -181,10 +179,16 @@ class _Program:
         return BindingError(f"Kernel {self.label}: `{slot.name}` is {wanted}, not a {type(value).__name__}.")
 
     def _bind_sampler(self, slot: _Slot, value: Binding) -> None:
-        kind = SAMPLERS[slot.kind]
-        texture: Any = self._gpu.empty_texture(kind) if value is None else value
+        kind, texels = SAMPLERS[slot.kind]
+        texture: Any = self._gpu.empty_texture(kind, texels) if value is None else value
         if not isinstance(texture, Texture) or not isinstance(texture, kind):
             raise self._wrong(slot, value, f"a {kind.__name__} that is sampled")
+        if (
+            texture.dtype[0].replace("n", "f") != texels
+        ):  # n: integers that are read as fractions of their greatest
+            raise BindingError(
+                f"Kernel {self.label}: `{slot.name}` samples texels of type {texels}, not {texture.dtype}."
+            )
         texture.use(location=slot.place)
 
     def _bind_image(self, slot: _Slot, value: Binding) -> Texture:
@@ -202,7 +206,9 @@ class _Program:
         return value
 
     def _bind_storage(self, slot: _Slot, value: Binding) -> None:
-        buffer = self._gpu.empty_buffer if value is None else value
+        is_written = slot.name in self._declared.written
+        nothing = self._gpu.discarded_buffer if is_written else self._gpu.empty_buffer
+        buffer = nothing if value is None else value
         if not isinstance(buffer, moderngl.Buffer):
             raise self._wrong(slot, value, "a storage buffer")
         buffer.bind_to_storage_buffer(slot.place)
@@ -223,8 +229,8 @@ class _Program:
         if isinstance(value, np.ndarray):
             ordered = value.T if value.ndim == 2 and slot.member.matrix else value
             data = np.ascontiguousarray(ordered, dtype="f4").tobytes()
-        elif isinstance(value, bool | int | float | tuple | list | np.number | np.bool_):
-            data = value
+        elif isinstance(value, bool | int | float | tuple | list | np.generic):
+            data = value.item() if isinstance(value, np.generic) else value
         else:
             raise self._wrong(slot, value, "a uniform")
         if self._last.get(slot.name) == data and slot.name in self._last:

@@ -1,7 +1,7 @@
 """Shader source: recursive `#include`, `#line` marks, defines after `#version`, and declared names."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,14 +18,17 @@ _BLOCK = re.compile(
     r"((?:(?:readonly|writeonly|coherent|volatile|restrict)\s+)*)\b(buffer|uniform)\s+(\w+)\s*\{"
 )
 _LOCAL_SIZE = re.compile(r"\blocal_size_([xyz])\s*=\s*(\d+)")
+_WORD = re.compile(r"\b[A-Za-z_]\w*")
+_DIRECTIVE = re.compile(r"\s*#\s*(define|ifdef|ifndef|if|elif|else|endif)\b\s*(\w*)(?:[ \t]+(.*))?")
 
 
 @dataclass(frozen=True)
 class Declarations:
-    """Names that a shader's source declares, with all branches of its defines.
+    """What a shader's text declares for its caller.
 
-    `formats` are the formats of images (layout qualifiers; absent for write-only images without one),
-    `written` the images and storage blocks that are not `readonly`.
+    `names` are those of all variants; the rest is of the one that the defines leave: `formats` of images (layout
+    qualifiers; none where it is written only and has no format), `written` images and storage blocks (all that are
+    not `readonly`).
     """
 
     names: frozenset[str]
@@ -61,23 +64,55 @@ def _expand(path: Path, seen: list[Path]) -> str:
 
 
 def declarations(source: str) -> Declarations:
-    """Returns what a shader's source declares for its caller."""
+    """What the text of a shader, with its defines, declares."""
     text = _COMMENT.sub(" ", source)
-    names: set[str] = set()
+    names = {name for _, _, _, name in _variables(text)} | {name for _, _, name in _BLOCK.findall(text)}
+    text = preprocessed(text)
     formats: dict[str, frozenset[str]] = {}
     written: set[str] = set()
-    for layout, access, kind, declared in _VARIABLE.findall(text):
-        for name in (part.strip().split("[")[0].strip() for part in declared.split(",")):
-            names.add(name)
-            if "image" in kind:
-                format_ = {word.strip() for word in layout.split(",")} - {""}
-                formats[name] = formats.get(name, frozenset()) | format_
-                if "readonly" not in access:
-                    written.add(name)
+    for layout, access, kind, name in _variables(text):
+        if "image" in kind:
+            formats[name] = frozenset(word.strip() for word in layout.split(",")) - {""}
+            written |= set() if "readonly" in access else {name}
     for access, kind, name in _BLOCK.findall(text):
-        names.add(name)
-        if kind == "buffer" and "readonly" not in access:
-            written.add(name)
+        written |= {name} if kind == "buffer" and "readonly" not in access else set()
     sizes = {axis: int(size) for axis, size in _LOCAL_SIZE.findall(text)}
     local_size = (sizes.get("x", 1), sizes.get("y", 1), sizes.get("z", 1))
     return Declarations(frozenset(names), formats, frozenset(written), local_size)
+
+
+def _variables(text: str) -> Iterator[tuple[str, str, str, str]]:
+    """Layout, access, type and name of each uniform variable."""
+    for layout, access, kind, declared in _VARIABLE.findall(text):
+        for part in declared.split(","):
+            yield layout, access, kind, part.split("[")[0].strip()
+
+
+def preprocessed(text: str) -> str:
+    """What `#ifdef` and `#ifndef` leave of a text without comments, macros without parameters expanded.
+
+    Conditions of `#if` and `#elif` are not computed: what hangs on them stays.
+    """
+    macros: dict[str, str] = {}
+    branches: list[bool | None] = []  # of the conditions around a line: taken or not, None: not computed
+    lines = []
+    for line in text.splitlines():
+        directive = _DIRECTIVE.match(line)
+        if directive is None:
+            if False not in branches:
+                lines.append(_WORD.sub(lambda word: macros.get(word[0], word[0]), line))
+            continue
+        kind, name, value = directive.groups()
+        if kind == "define" and False not in branches:
+            macros[name] = value or ""
+        elif kind in ("ifdef", "ifndef"):
+            branches.append((name in macros) == (kind == "ifdef"))
+        elif kind == "if":
+            branches.append(None)
+        elif kind == "elif":
+            branches[-1] = None
+        elif kind == "else":
+            branches[-1] = None if branches[-1] is None else not branches[-1]
+        elif kind == "endif":
+            branches.pop()
+    return "\n".join(lines)
