@@ -51,11 +51,12 @@ class GpuContext:
     def empty_texture(self, kind: type, texels: str) -> Any:  # noqa: ANN401 (as the kind says)
         """A texture of zeros (`texels`: f, i or u) that stands where a kernel is given none."""
         if (kind, texels) not in self._empty_textures:
-            make, size = {
+            makers: dict[type, tuple[Any, tuple[int, ...]]] = {
                 moderngl.Texture: (self.ctx.texture, (1, 1)),
                 moderngl.Texture3D: (self.ctx.texture3d, (1, 1, 1)),
                 moderngl.TextureArray: (self.ctx.texture_array, (1, 1, 1)),
-            }[kind]
+            }
+            make, size = makers[kind]
             texture = make(size, 4, bytes(4), dtype=f"{texels}1")
             texture.filter = (moderngl.NEAREST, moderngl.NEAREST)
             self._empty_textures[kind, texels] = texture
