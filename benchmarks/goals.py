@@ -112,7 +112,8 @@ def floor_irradiance(gpu: GpuContext, folder: Path, noise_m: float) -> Float64[n
     with _rendered(gpu, document, _frame(0, WORLD_FROM_CAMERA, seen)) as graph:
         cones = graph["cones"]
         inside = _texels(cones.rho)[..., 3] > INSIDE
-        return _texels(cones.mu)[inside][:, :3].mean(axis=1) / (np.pi * SURROUNDINGS)
+        irradiance = _texels(cones.mu)[inside][:, :3].mean(axis=1)
+    return np.asarray(irradiance / (np.pi * SURROUNDINGS))
 
 
 @contextmanager
