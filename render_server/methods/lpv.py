@@ -224,9 +224,7 @@ class LpvVolumes:
             self._propagate.run(rho, self._weights, self._steps, through)
         return rho
 
-    def inject_shadow(
-        self, scene: Bindings, lights: LightBuffers, _real: moderngl.Buffer
-    ) -> moderngl.Buffer:
+    def inject_shadow(self, scene: Bindings, lights: LightBuffers, _real: moderngl.Buffer) -> moderngl.Buffer:
         """Negative lobes of the direct light that objects keep off the real scene; nothing where maps shadow it."""
         if self._settings.resolved_shadow == "lobe":
             self._shadow_light.clear()
