@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from protocol.errors import DeltalightError
-from services.commands.options import Method
+from services.commands.options import parse_method
 
 # What `bench quality` compares.
 DEFAULT_METHODS = "camera,none,paper,exact,path"
@@ -125,9 +125,4 @@ def rest(
 
 
 def _methods(text: str) -> list[str]:
-    names = [name.strip() for name in text.split(",")]
-    known = [method.value for method in Method]
-    unknown = [name for name in names if name not in known]
-    if unknown:
-        raise DeltalightError(f"'{unknown[0]}' is no method that is built; use {', '.join(known)}.")
-    return names
+    return [parse_method(name.strip()).value for name in text.split(",")]

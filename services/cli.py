@@ -18,6 +18,7 @@ from services.commands.calibrate import calibrate
 from services.commands.config import config
 from services.commands.demo import demo
 from services.commands.doctor import doctor
+from services.commands.graph import graph
 from services.commands.keys import keys
 from services.commands.node import node
 from services.commands.ping import ping
@@ -41,7 +42,7 @@ app = typer.Typer(
     rich_markup_mode="rich",
     help="Mixed-reality relighting: virtual objects in a camera picture, with light that agrees both ways.",
 )
-for command in (render, demo, node, server, up, record, replay, config, doctor, schema, board, ping):
+for command in (render, demo, node, server, up, record, replay, config, doctor, graph, schema, board, ping):
     app.command()(command)
 app.add_typer(api, name="api")
 app.add_typer(recordings, name="recordings")
