@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from render_server.lights.lights import DirectionalLight, Light, RectangleLight, SphereLight, SpotLight
+from render_server.lights.lights import DirectionalLight, Light
 from render_server.scene.declared_surfaces import PLANE, SurfaceTable
 
 # Of planes. From this roughness on, a lobe blurs a light's image so much that cones represent it.
@@ -79,30 +79,7 @@ def _image(
     if height <= 0 or normal @ to_objects < MIN_COSINE * np.linalg.norm(to_objects):
         return None
     blur_m = 2 * alpha * height * float(np.linalg.norm(to_objects)) / float(normal @ to_objects)
-    if isinstance(light, RectangleLight):
-        return _rectangle_image(light, position, reflection, blur_m)
-    moved = replace(light, position=_single(position), radius_m=float(np.hypot(light.radius_m, blur_m)))
-    if isinstance(moved, SpotLight):
-        return replace(moved, direction=_single(reflection @ moved.direction))
-    assert isinstance(moved, SphereLight)
-    return moved
-
-
-def _rectangle_image(
-    light: RectangleLight,
-    position: Float64[np.ndarray, "3"],
-    reflection: Float64[np.ndarray, "3 3"],
-    blur_m: float,
-) -> RectangleLight:
-    """Mirror a rectangle: its axes change places to keep the orientation, and blur widens it at the same flux."""
-    u, v = (float(np.linalg.norm(axis)) for axis in (light.axis_u, light.axis_v))
-    grown = [float(np.hypot(edge, 2 * blur_m) / edge) for edge in (u, v)]
-    return RectangleLight(
-        _single(position),
-        _single(reflection @ light.axis_v * grown[1]),
-        _single(reflection @ light.axis_u * grown[0]),
-        light.radiance / np.float32(grown[0] * grown[1]),
-    )
+    return light.image(_single(position), reflection, blur_m)
 
 
 def _single(vector: Float64[np.ndarray, "3"]) -> Float32[np.ndarray, "3"]:

@@ -1,6 +1,5 @@
 """Lights, their shadow maps and the residual environment, as every pass that shades reads them."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -11,7 +10,7 @@ from jaxtyping import Float32, Float64
 from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Binding, Bindings, Kernel
 from render_server.gpu.uniform_block import Block, Float, Int, UniformBlock
-from render_server.lights.lights import DirectionalLight, Light, RectangleLight, SpotLight
+from render_server.lights.lights import DirectionalLight, Light
 from render_server.lights.mirror_lights import MirrorLight
 from render_server.lights.octahedral import octahedral_grid, prefilter, sample_octahedral
 from render_server.passes.shadow_maps import (
@@ -31,7 +30,6 @@ EMPTY = b"\0" * 256
 MIRROR_MAP_TEXELS = 256  # an edge of the map of where a plane mirrors a light
 MIRROR_MAP_MARGIN = 1.1  # of the extent that the map has to cover
 NOT_MIRRORED = (0.0,) * 7 + (-1.0,) + (0.0,) * 8
-NARROWEST_BLEND_RAD = 1e-4  # what a spot without blend falls off over
 
 MapAxes = tuple[Float64[np.ndarray, "4"], Float64[np.ndarray, "4"]]
 
@@ -279,20 +277,18 @@ def _pack_light(
     tail: Sequence[float] = NOT_MIRRORED,
 ) -> bytes:
     """std430 Light: place, colour, shape, two axes and an image's own as floats, ranges of its views as integers."""
-    axis_u = axis_v = np.zeros(3)
-    shape = (0.0, 1.0, 0.0)
-    if isinstance(light, DirectionalLight):
-        kind, place, color = 0, light.direction, light.irradiance
-        shape = (math.tan(light.angular_radius_rad), 1.0, 0.0)
-    elif isinstance(light, RectangleLight):
-        kind, place, color = 3, light.position, light.radiance
-        axis_u, axis_v = light.axis_u / 2, light.axis_v / 2
-    elif isinstance(light, SpotLight):
-        kind, place, color, axis_u = 2, light.position, light.intensity, light.direction
-        blend = max(light.half_angle_rad - light.full_angle_rad, NARROWEST_BLEND_RAD)
-        shape = (light.radius_m, light.half_angle_rad / blend, 1.0 / blend)
-    else:
-        kind, place, color = 1, light.position, light.intensity
-        shape = (light.radius_m, 1.0, 0.0)
-    floats = [*place, kind, *color, own[0], *shape, own[1], *axis_u, own[2], *axis_v, own[3], *tail]
+    r = light.record()
+    floats = [
+        *r.place,
+        r.kind,
+        *r.color,
+        own[0],
+        *r.shape,
+        own[1],
+        *r.axis_u,
+        own[2],
+        *r.axis_v,
+        own[3],
+        *tail,
+    ]
     return np.array(floats, np.float32).tobytes() + np.array(ranges, np.int32).tobytes()

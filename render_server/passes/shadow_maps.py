@@ -1,8 +1,9 @@
 """Reflective shadow maps: what each light sees first of a geometry, and the views that its maps need."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import moderngl
 import numpy as np
@@ -11,7 +12,7 @@ from jaxtyping import Float64
 from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Bindings, RasterKernel
 from render_server.gpu.textures import release_target, texture_2d
-from render_server.lights.lights import DirectionalLight, Light, RectangleLight, SpotLight
+from render_server.lights.lights import DirectionalLight, Lamp, Light
 from render_server.lights.mirror_lights import MirrorLight
 from render_server.passes.gbuffer import MeshBuffers
 
@@ -117,17 +118,16 @@ def light_views(
 ) -> list[LightView]:
     """Views that enclose the receivers (world points) as far as the light shines: one, or faces of a cube.
 
-    The occluders set where a view begins: what stands between the light and the receivers is in it. A
-    rectangle looks from its centre.
+    The occluders set where a view begins: what stands between the light and the receivers is in it. A lamp looks
+    from its centre.
     """
     if isinstance(light, DirectionalLight):
         return [_orthographic_view(np.asarray(light.direction, float), receivers, occluders)]
-    position = np.asarray(light.position, float)
-    if isinstance(light, RectangleLight):
-        return _rectangle_views(light, position, receivers, occluders)
-    if isinstance(light, SpotLight):
-        return _spot_views(light, position, receivers, occluders)
-    return _views_around(position, receivers, occluders)
+    if light.front is None:
+        return _lamp_views(light, receivers, occluders)
+    # The lamp's own housing and the wall behind it are left out.
+    front = light.front - np.array([0.0, 0.0, 0.0, NEAREST_M])
+    return _before(front, receivers, occluders, partial(_lamp_views, light))
 
 
 def mirror_views(
@@ -138,10 +138,37 @@ def mirror_views(
 ) -> list[LightView]:
     """Views of an image of a light, of what stands before its plane by more than `above_m`."""
     front = mirror.plane - np.array([0.0, 0.0, 0.0, above_m])
+    return _before(front, receivers, occluders, partial(light_views, mirror.light))
+
+
+def _before(
+    front: Float64[np.ndarray, "4"],
+    receivers: Float64[np.ndarray, "n 3"],
+    occluders: Float64[np.ndarray, "m 3"],
+    views_of: Callable[[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "m 3"]], list[LightView]],
+) -> list[LightView]:
+    """Views of what lies before a plane."""
     receivers, occluders = (points[points @ front[:3] + front[3] > 0] for points in (receivers, occluders))
     if not len(receivers):
         return []
-    return [replace(view, front=front) for view in light_views(mirror.light, receivers, occluders)]
+    return [replace(view, front=front) for view in views_of(receivers, occluders)]
+
+
+def _lamp_views(
+    lamp: Lamp, receivers: Float64[np.ndarray, "n 3"], occluders: Float64[np.ndarray, "m 3"]
+) -> list[LightView]:
+    """Views around the receivers, or the lamp's cone where that is narrower."""
+    position = np.asarray(lamp.position, float)
+    around = _views_around(position, receivers, occluders)
+    if lamp.cone is None:
+        return around
+    axis, half_angle = lamp.cone
+    half = math.tan(half_angle) * 1.01
+    if half > WIDEST_SINGLE_TANGENT or (len(around) == 1 and around[0].half_extent <= half):
+        return around
+    if not ((receivers - position) @ axis > NEAREST_M).any():
+        return []
+    return [_wide_view(position, axis, half, receivers, occluders)]
 
 
 def _views_around(
@@ -158,38 +185,6 @@ def _views_around(
         for axis in axes
         if (_tangents((receivers - position) @ frame_along(axis).T) <= 1.0).any()
     ]
-
-
-def _spot_views(
-    light: SpotLight,
-    position: Float64[np.ndarray, "3"],
-    receivers: Float64[np.ndarray, "n 3"],
-    occluders: Float64[np.ndarray, "m 3"],
-) -> list[LightView]:
-    """The cone, unless a view of the receivers alone is narrower."""
-    half = math.tan(light.half_angle_rad) * 1.01
-    around = _views_around(position, receivers, occluders)
-    if half > WIDEST_SINGLE_TANGENT or (len(around) == 1 and around[0].half_extent <= half):
-        return around
-    axis = np.asarray(light.direction, float)
-    if not ((receivers - position) @ axis > NEAREST_M).any():
-        return []
-    return [_wide_view(position, axis, half, receivers, occluders)]
-
-
-def _rectangle_views(
-    light: RectangleLight,
-    position: Float64[np.ndarray, "3"],
-    receivers: Float64[np.ndarray, "n 3"],
-    occluders: Float64[np.ndarray, "m 3"],
-) -> list[LightView]:
-    """Views of what lies before the rectangle; the lamp's own housing and the wall behind it are left out."""
-    normal = light.normal
-    front = np.append(normal, -normal @ position - NEAREST_M)
-    receivers, occluders = (points[points @ front[:3] + front[3] > 0] for points in (receivers, occluders))
-    if not len(receivers):
-        return []
-    return [replace(view, front=front) for view in _views_around(position, receivers, occluders)]
 
 
 def frame_along(axis: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
