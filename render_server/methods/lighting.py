@@ -14,7 +14,8 @@ from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Binding, Bindings
 from render_server.gpu_scene import GeometryState
 from render_server.graph import Graph, Resource
-from render_server.lights.lights import LightSet, mirror_lights
+from render_server.lights.lights import LightSet
+from render_server.lights.mirror_lights import mirror_lights
 from render_server.methods.settings import ResolvedSettings
 from render_server.passes.caustics import GREATEST_ALPHA, Caustics
 from render_server.passes.composite import ChangeRatio

@@ -1,6 +1,5 @@
 """Lights, their shadow maps and the residual environment, as all passes that shade read them."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -11,7 +10,8 @@ from jaxtyping import Float32, Float64
 from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Binding, Bindings, Kernel
 from render_server.gpu.uniform_block import Block, Float, Int, UniformBlock
-from render_server.lights.lights import DirectionalLight, Light, MirrorLight, RectangleLight, SpotLight
+from render_server.lights.lights import DirectionalLight, Light
+from render_server.lights.mirror_lights import MirrorLight
 from render_server.lights.octahedral import octahedral_grid, prefilter, sample_octahedral
 from render_server.passes.shadow_maps import (
     NEAREST_M,
@@ -30,7 +30,6 @@ EMPTY = b"\0" * 256
 MIRROR_MAP_TEXELS = 256  # an edge of the map of where a plane mirrors a light
 MIRROR_MAP_MARGIN = 1.1  # of the extent that the map has to cover
 NOT_MIRRORED = (0.0,) * 7 + (-1.0,) + (0.0,) * 8
-NARROWEST_BLEND_RAD = 1e-4  # what a spot without blend falls off over
 
 MapAxes = tuple[Float64[np.ndarray, "4"], Float64[np.ndarray, "4"]]
 
@@ -84,7 +83,7 @@ class LightBuffers:
             "shadow_samples": self.shadow_samples,
         }
 
-    def set_environment(self, radiance: Float32[np.ndarray, "n n 3"]) -> moderngl.TextureArray:
+    def set_environment(self, radiance: Float32[np.ndarray, "n n 3"]) -> None:
         """Uploads the residual environment R (octahedral), averaged over cones of doubling half-angle."""
         prefiltered = prefilter(radiance)
         size, count = len(radiance), len(prefiltered.levels)
@@ -99,7 +98,6 @@ class LightBuffers:
         self._environment.repeat_x = self._environment.repeat_y = False
         self._environment_half_angle = float(prefiltered.half_angles[0])
         self._write_block()
-        return self._environment
 
     def place(
         self,
@@ -216,10 +214,10 @@ class LightBuffers:
 
 
 class MirrorVisibility:
-    """Maps where smooth real planes mirror the lights, one map for each image of a light (lights/lights.py).
+    """Computes maps of where smooth real planes mirror the lights, one per mirror image (lights/mirror_lights.py).
 
-    A map holds how much of the light each point of the plane shows, without and with the objects; its mipmaps average
-    that over larger and larger footprints.
+    A map holds the fraction of the light that each point of the plane shows, without and with the objects; its mip
+    levels average over larger and larger footprints.
     """
 
     def __init__(self, gpu: GpuContext) -> None:
@@ -281,20 +279,18 @@ def _pack_light(
     tail: Sequence[float] = NOT_MIRRORED,
 ) -> bytes:
     """Packs a std430 Light: position, colour, shape, two axes and mirror data as floats, view ranges as integers."""
-    axis_u = axis_v = np.zeros(3)
-    shape = (0.0, 1.0, 0.0)
-    if isinstance(light, DirectionalLight):
-        kind, place, color = 0, light.direction, light.irradiance
-        shape = (math.tan(light.angular_radius_rad), 1.0, 0.0)
-    elif isinstance(light, RectangleLight):
-        kind, place, color = 3, light.position, light.radiance
-        axis_u, axis_v = light.axis_u / 2, light.axis_v / 2
-    elif isinstance(light, SpotLight):
-        kind, place, color, axis_u = 2, light.position, light.intensity, light.direction
-        blend = max(light.half_angle_rad - light.full_angle_rad, NARROWEST_BLEND_RAD)
-        shape = (light.radius_m, light.half_angle_rad / blend, 1.0 / blend)
-    else:
-        kind, place, color = 1, light.position, light.intensity
-        shape = (light.radius_m, 1.0, 0.0)
-    floats = [*place, kind, *color, own[0], *shape, own[1], *axis_u, own[2], *axis_v, own[3], *tail]
+    r = light.record()
+    floats = [
+        *r.place,
+        r.kind,
+        *r.color,
+        own[0],
+        *r.shape,
+        own[1],
+        *r.axis_u,
+        own[2],
+        *r.axis_v,
+        own[3],
+        *tail,
+    ]
     return np.array(floats, np.float32).tobytes() + np.array(ranges, np.int32).tobytes()

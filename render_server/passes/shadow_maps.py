@@ -1,8 +1,9 @@
 """Reflective shadow maps: the first surface that each light sees, and the views that its maps need."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import moderngl
 import numpy as np
@@ -11,14 +12,15 @@ from jaxtyping import Float64
 from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Bindings, RasterKernel
 from render_server.gpu.textures import release_target, texture_2d
-from render_server.lights.lights import DirectionalLight, Light, MirrorLight, RectangleLight, SpotLight
+from render_server.lights.lights import DirectionalLight, Lamp, Light
+from render_server.lights.mirror_lights import MirrorLight
 from render_server.passes.gbuffer import MeshBuffers
 
-NEAR_MARGIN = 0.98  # near and far planes lie a little outside of their contents
+NEAR_MARGIN = 0.98  # near and far planes lie a little outside of what they enclose
 FAR_MARGIN = 1.02
-WIDEST_SINGLE_TANGENT = math.tan(math.radians(65))  # wider lights need the six faces of a cube
+WIDEST_SINGLE_TANGENT = math.tan(math.radians(65))  # wider needs the six faces of a cube
 NEAREST_M = 1e-3
-EVERYWHERE = (0.0, 0.0, 0.0, 1.0)  # a plane with everything in front of it
+EVERYWHERE = (0.0, 0.0, 0.0, 1.0)  # the plane before which everything lies
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,19 +116,18 @@ class ShadowMaps:
 def light_views(
     light: Light, receivers: Float64[np.ndarray, "n 3"], occluders: Float64[np.ndarray, "m 3"]
 ) -> list[LightView]:
-    """Returns views that enclose the lit receivers (world points): one, or faces of a cube.
+    """Views that enclose the receivers (world points) as far as the light shines: one, or faces of a cube.
 
-    The occluders set the near plane, so that the view contains whatever stands between light and receivers. A
-    rectangle looks from its centre.
+    The occluders set where a view begins: what stands between the light and the receivers is in it. A lamp looks
+    from its centre.
     """
     if isinstance(light, DirectionalLight):
         return [_orthographic_view(np.asarray(light.direction, float), receivers, occluders)]
-    position = np.asarray(light.position, float)
-    if isinstance(light, RectangleLight):
-        return _rectangle_views(light, position, receivers, occluders)
-    if isinstance(light, SpotLight):
-        return _spot_views(light, position, receivers, occluders)
-    return _views_around(position, receivers, occluders)
+    if light.front is None:
+        return _lamp_views(light, receivers, occluders)
+    # The lamp's own housing and the wall behind it are left out.
+    front = light.front - np.array([0.0, 0.0, 0.0, NEAREST_M])
+    return _before(front, receivers, occluders, partial(_lamp_views, light))
 
 
 def mirror_views(
@@ -137,10 +138,37 @@ def mirror_views(
 ) -> list[LightView]:
     """Returns the views of a mirror image, of what lies more than `above_m` in front of its plane."""
     front = mirror.plane - np.array([0.0, 0.0, 0.0, above_m])
+    return _before(front, receivers, occluders, partial(light_views, mirror.light))
+
+
+def _before(
+    front: Float64[np.ndarray, "4"],
+    receivers: Float64[np.ndarray, "n 3"],
+    occluders: Float64[np.ndarray, "m 3"],
+    views_of: Callable[[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "m 3"]], list[LightView]],
+) -> list[LightView]:
+    """Views of what lies before a plane."""
     receivers, occluders = (points[points @ front[:3] + front[3] > 0] for points in (receivers, occluders))
     if not len(receivers):
         return []
-    return [replace(view, front=front) for view in light_views(mirror.light, receivers, occluders)]
+    return [replace(view, front=front) for view in views_of(receivers, occluders)]
+
+
+def _lamp_views(
+    lamp: Lamp, receivers: Float64[np.ndarray, "n 3"], occluders: Float64[np.ndarray, "m 3"]
+) -> list[LightView]:
+    """Views around the receivers, or the lamp's cone where that is narrower."""
+    position = np.asarray(lamp.position, float)
+    around = _views_around(position, receivers, occluders)
+    if lamp.cone is None:
+        return around
+    axis, half_angle = lamp.cone
+    half = math.tan(half_angle) * 1.01
+    if half > WIDEST_SINGLE_TANGENT or (len(around) == 1 and around[0].half_extent <= half):
+        return around
+    if not ((receivers - position) @ axis > NEAREST_M).any():
+        return []
+    return [_wide_view(position, axis, half, receivers, occluders)]
 
 
 def _views_around(
@@ -157,38 +185,6 @@ def _views_around(
         for axis in axes
         if (_tangents((receivers - position) @ frame_along(axis).T) <= 1.0).any()
     ]
-
-
-def _spot_views(
-    light: SpotLight,
-    position: Float64[np.ndarray, "3"],
-    receivers: Float64[np.ndarray, "n 3"],
-    occluders: Float64[np.ndarray, "m 3"],
-) -> list[LightView]:
-    """Returns the view of the cone, unless a view of the receivers alone is narrower."""
-    half = math.tan(light.half_angle_rad) * 1.01
-    around = _views_around(position, receivers, occluders)
-    if half > WIDEST_SINGLE_TANGENT or (len(around) == 1 and around[0].half_extent <= half):
-        return around
-    axis = np.asarray(light.direction, float)
-    if not ((receivers - position) @ axis > NEAREST_M).any():
-        return []
-    return [_wide_view(position, axis, half, receivers, occluders)]
-
-
-def _rectangle_views(
-    light: RectangleLight,
-    position: Float64[np.ndarray, "3"],
-    receivers: Float64[np.ndarray, "n 3"],
-    occluders: Float64[np.ndarray, "m 3"],
-) -> list[LightView]:
-    """Returns views of what lies in front of the rectangle, without the lamp's housing and the wall behind it."""
-    normal = light.normal
-    front = np.append(normal, -normal @ position - NEAREST_M)
-    receivers, occluders = (points[points @ front[:3] + front[3] > 0] for points in (receivers, occluders))
-    if not len(receivers):
-        return []
-    return [replace(view, front=front) for view in _views_around(position, receivers, occluders)]
 
 
 def frame_along(axis: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
@@ -271,7 +267,7 @@ def _wide_view(
     rotation = frame_along(axis)
     local = (receivers - position) @ rotation.T
     near, far = _depth_range(local, (occluders - position) @ rotation.T, half)
-    # Triangles with vertices beside this view can reach nearer than any vertex in it.
+    # Triangles whose vertices lie beside this view reach nearer than any vertex in it.
     reach = float(np.linalg.norm(local, axis=1).max()) * FAR_MARGIN
     return LightView(_matrix(rotation, position), half, max(0.1 * near, NEAREST_M), max(far, reach), False)
 
