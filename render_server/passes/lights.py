@@ -83,7 +83,7 @@ class LightBuffers:
             "shadow_samples": self.shadow_samples,
         }
 
-    def set_environment(self, radiance: Float32[np.ndarray, "n n 3"]) -> None:
+    def set_environment(self, radiance: Float32[np.ndarray, "n n 3"]) -> moderngl.TextureArray:
         """Uploads the residual environment R (octahedral), averaged over cones of doubling half-angle."""
         prefiltered = prefilter(radiance)
         size, count = len(radiance), len(prefiltered.levels)
@@ -98,6 +98,7 @@ class LightBuffers:
         self._environment.repeat_x = self._environment.repeat_y = False
         self._environment_half_angle = float(prefiltered.half_angles[0])
         self._write_block()
+        return self._environment
 
     def place(
         self,
