@@ -189,8 +189,6 @@ def surfel_scene(
         **seen.bindings,
         **lights.bindings,
         **albedo.bindings,
-        "Materials": None,  # of objects: declared by what both kinds of surfels share, and not read
-        "base_color_textures": None,
         "shadow_samples": SURFEL_SHADOW_SAMPLES,
         "bias_real": seen.scan.bias_m,
         "bias_virtual": seen.scan.bias_m,
