@@ -33,13 +33,15 @@ class Bvh:
         rows.view(np.int32)[:, 3], rows.view(np.int32)[:, 7] = self.leaf, self.skip
         return rows.tobytes()
 
-    def packed_triangles(self, corners: Float32[np.ndarray, "m 3 3"]) -> bytes:
-        """Pack triangles in `order`: (corner, index in the mesh), (edge to second corner, 0), (edge to third, 0)."""
-        rows = np.zeros((len(self.order), 3, 4), np.float32)
+    def packed_triangles(
+        self, corners: Float32[np.ndarray, "m 3 3"], vertices: Int32[np.ndarray, "m 3"]
+    ) -> bytes:
+        """Pack triangles in `order`: first corner, edge to the second, edge to the third, with each one's vertex."""
+        rows = np.empty((len(self.order), 3, 4), np.float32)
         first = corners[self.order, 0]
         rows[:, 0, :3] = first
         rows[:, 1:, :3] = corners[self.order, 1:] - first[:, None]
-        rows.view(np.int32)[:, 0, 3] = self.order
+        rows.view(np.int32)[:, :, 3] = vertices[self.order]
         return rows.tobytes()
 
     @property
