@@ -87,16 +87,13 @@ class LightStages:
     def draw_real(self, _views: bytes, real: GeometryState) -> LightBuffers:
         """Draws the real scene as the lights see it."""
         buffers = self.buffers
-        self._maps.run(buffers.real_atlas, [real.buffers], buffers.real_views, 0, buffers.bindings)
+        self._maps.run(buffers.real_atlas, [real.buffers], buffers.real_views)
         return buffers
 
     def draw_objects(self, _views: bytes, objects: GeometryState) -> LightBuffers:
         """Draws the objects as the lights see them."""
         buffers = self.buffers
-        first = buffers.first_virtual_view
-        self._maps.run(
-            buffers.virtual_atlas, [objects.buffers], buffers.virtual_views, first, buffers.bindings
-        )
+        self._maps.run(buffers.virtual_atlas, [objects.buffers], buffers.virtual_views)
         return buffers
 
     def map_mirrors(
