@@ -84,7 +84,7 @@ class SolutionLights:
         return self._drawn(self.rho, real.buffers, objects.buffers)
 
     def _drawn(self, buffers: LightBuffers, *meshes: MeshBuffers) -> LightBuffers:
-        self._maps.run(buffers.real_atlas, meshes, buffers.real_views, 0, buffers.bindings)
+        self._maps.run(buffers.real_atlas, meshes, buffers.real_views)
         return buffers
 
     def light_directly(

@@ -91,16 +91,13 @@ class LightStages:
     def draw_real(self, _views: bytes, real: GeometryState) -> LightBuffers:
         """Draws the real scene as seen from the lights."""
         buffers = self.buffers
-        self._maps.run(buffers.real_atlas, [real.buffers], buffers.real_views, 0, buffers.bindings)
+        self._maps.run(buffers.real_atlas, [real.buffers], buffers.real_views)
         return buffers
 
     def draw_objects(self, _views: bytes, objects: GeometryState) -> LightBuffers:
         """Draws the objects as seen from the lights."""
         buffers = self.buffers
-        first = buffers.first_virtual_view
-        self._maps.run(
-            buffers.virtual_atlas, [objects.buffers], buffers.virtual_views, first, buffers.bindings
-        )
+        self._maps.run(buffers.virtual_atlas, [objects.buffers], buffers.virtual_views)
         return buffers
 
     def map_mirrors(
@@ -188,8 +185,6 @@ def surfel_scene(
         **seen.bindings,
         **lights.bindings,
         **albedo.bindings,
-        "Materials": None,  # of objects: declared by what both kinds of surfels share, and not read
-        "base_color_textures": None,
         "shadow_samples": SURFEL_SHADOW_SAMPLES,
         "bias_real": seen.scan.bias_m,
         "bias_virtual": seen.scan.bias_m,

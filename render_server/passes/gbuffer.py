@@ -3,7 +3,7 @@
 import cv2
 import moderngl
 import numpy as np
-from jaxtyping import Float16, Float32
+from jaxtyping import Float16, Float32, Int32
 
 from protocol.frames import DepthImage, ViewFrame, decode_lut
 from render_server.gpu.context import GpuContext
@@ -12,8 +12,8 @@ from render_server.gpu.textures import release_all, release_target, texture_2d
 from render_server.scene.triangle_mesh import VERTEX_ATTRIBUTES, VERTEX_LAYOUT, GpuMesh
 from render_server.view import CameraView, Rectangle
 
-INVERSE_SIZE = 8192  # steps of the inverse response: each code spans at least 16
-TEXTURE_SIZE = 1024  # per edge of a base-colour texture
+INVERSE_SIZE = 8192  # steps of the inverse response: a code is at least 16 of them wide
+TEXTURE_SIZE = 1024  # texels an edge of a base-colour texture
 UV, COLOR, MATERIAL = slice(6, 8), slice(8, 11), 11  # columns of a vertex
 METALLIC, REFLECTANCE, ROUGHNESS = (
     3,
@@ -109,18 +109,23 @@ class MeshBuffers:
         self._vertices = gpu.ctx.buffer(reserve=4)
         self._indices = gpu.ctx.buffer(reserve=4)
         self._arrays: dict[int, moderngl.VertexArray] = {}
-        self.triangle_count = 0
+        self.triangles: Int32[np.ndarray, "m 3"] = np.zeros((0, 3), np.int32)
+
+    @property
+    def triangle_count(self) -> int:
+        """How many triangles are drawn."""
+        return len(self.triangles)
 
     @property
     def storage(self) -> dict[str, Binding]:
-        """Vertices (rows of `VERTEX_LAYOUT`) and vertex indices of each triangle, for shaders that trace rays."""
-        return {"Vertices": self._vertices, "Corners": self._indices}
+        """Vertices (rows of `VERTEX_LAYOUT`), for shaders that trace rays."""
+        return {"Vertices": self._vertices}
 
     def write(self, mesh: GpuMesh) -> None:
         """Replaces the contents by those of `mesh`."""
         vertices = np.ascontiguousarray(mesh.vertices, np.float32).tobytes()
-        indices = np.ascontiguousarray(mesh.triangles, np.int32).tobytes()
-        self.triangle_count = len(mesh.triangles)
+        self.triangles = np.ascontiguousarray(mesh.triangles, np.int32)
+        indices = self.triangles.tobytes()
         if len(vertices) > self._vertices.size or len(indices) > self._indices.size:
             self.release()
             self._vertices = self._ctx.buffer(reserve=max(len(vertices), 4))

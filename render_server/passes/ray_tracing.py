@@ -48,7 +48,7 @@ class ObjectBvh:
             bvh = self._renewed(positions)
             self.release()
             self._nodes = self._ctx.buffer(bvh.packed())
-            self._faces = self._ctx.buffer(bvh.packed_triangles(positions))
+            self._faces = self._ctx.buffer(bvh.packed_triangles(positions, self._mesh.triangles))
         return {"Nodes": self._nodes, "Faces": self._faces, **self._mesh.storage}
 
     def _renewed(self, positions: Float32[np.ndarray, "m 3 3"]) -> Bvh:

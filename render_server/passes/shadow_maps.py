@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import Bindings, RasterKernel
+from render_server.gpu.kernel import RasterKernel
 from render_server.gpu.textures import release_target, texture_2d
 from render_server.lights.lights import DirectionalLight, Lamp, Light
 from render_server.lights.mirror_lights import MirrorLight
@@ -87,25 +87,21 @@ class ShadowMaps:
     def __init__(self, gpu: GpuContext) -> None:
         self._kernel = RasterKernel(gpu, "reflective_shadow_map")
 
-    def run(
-        self,
-        atlas: ShadowMapAtlas,
-        meshes: Sequence[MeshBuffers],
-        views: Sequence[LightView],
-        first_view: int,
-        scene: Bindings,
-    ) -> None:
-        """Draws all `meshes` for each view; the views' records begin at `first_view` of `LightViews`."""
+    def run(self, atlas: ShadowMapAtlas, meshes: Sequence[MeshBuffers], views: Sequence[LightView]) -> None:
+        """Draws all `meshes` for each view, tile by tile."""
         atlas.clear()
         for tile, view in enumerate(views):
             for mesh in meshes:
                 self._kernel.draw(
                     atlas.target,
                     mesh,
-                    scene,
                     box=atlas.box(tile),
                     clips=view.front is not None,
-                    view_index=first_view + tile,
+                    view_from_world=view.view_from_world,
+                    half_extent=view.half_extent,
+                    depth_range=(view.near, view.far),
+                    orthographic=view.orthographic,
+                    front=EVERYWHERE if view.front is None else view.front,
                 )
 
     def release(self) -> None:

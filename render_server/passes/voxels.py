@@ -21,10 +21,11 @@ DIRECTIONS = 6  # of an anisotropic volume; isotropic ones have 1
 SURFEL_BYTES = 64
 SUMS_PER_SLOT = 24
 DELTA_SUMS_PER_SLOT = 18
-COUNTER_BYTES = 16
+SURFELS_HEADER_BYTES = 16  # their number, padded
+TOUCHED_HEADER_BYTES = 4
 LEAST_SURFELS = 1024
 
-LONGEST_EDGE_VOXELS = 8.0  # longer ones are split first, which balances the threads and bounds their loops
+LONGEST_EDGE_VOXELS = 8.0  # longer ones are split before: balances the threads, bounds each one's loops
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,8 +179,8 @@ class VoxelStore:
         self.volume_size = volume_size
         self.grid = gpu.ctx.buffer(reserve=volume_size**3 * 4)
         self.grid.clear()
-        self.counters = gpu.ctx.buffer(bytes(COUNTER_BYTES))
         self._allocate(LEAST_SURFELS)
+        self.start(0)
 
     @property
     def slot_capacity(self) -> int:
@@ -193,15 +194,14 @@ class VoxelStore:
             "Grid": self.grid,
             "Touched": self.touched,
             "Surfels": self.surfels,
-            "Counters": self.counters,
             "Sums": self.sums,
         }
 
     def _allocate(self, surfels: int) -> None:
         """Allocates the buffers that grow, with room for `surfels` surfels."""
         self.surfel_capacity = surfels
-        self.surfels = self._ctx.buffer(reserve=surfels * SURFEL_BYTES)
-        self.touched = self._ctx.buffer(reserve=self.slot_capacity * 4)
+        self.surfels = self._ctx.buffer(reserve=SURFELS_HEADER_BYTES + surfels * SURFEL_BYTES)
+        self.touched = self._ctx.buffer(reserve=TOUCHED_HEADER_BYTES + self.slot_capacity * 4)
         self.sums = self._ctx.buffer(reserve=self.slot_capacity * SUMS_PER_SLOT * 4)
         self.delta_sums = self._ctx.buffer(reserve=self.slot_capacity * DELTA_SUMS_PER_SLOT * 4)
 
@@ -214,18 +214,18 @@ class VoxelStore:
         if surfel_bound > self.surfel_capacity:
             self._release_growing()
             self._allocate(int(surfel_bound * 1.25) + LEAST_SURFELS)
-        self.counters.write(np.array([0, 0, self.surfel_capacity, 0], np.uint32).tobytes())
+        self.surfels.write(bytes(SURFELS_HEADER_BYTES))
+        self.touched.write(bytes(TOUCHED_HEADER_BYTES))
 
     def counts(self) -> tuple[int, int]:
         """Returns the numbers of touched voxels and surfels; waits for the GPU (tests and reports only)."""
-        slots, surfels = np.frombuffer(self.counters.read(8), np.uint32)
+        slots, surfels = (np.frombuffer(each.read(4), np.uint32)[0] for each in (self.touched, self.surfels))
         return int(slots), int(surfels)
 
     def release(self) -> None:
         """Frees all buffers."""
         self._release_growing()
         self.grid.release()
-        self.counters.release()
 
 
 class Voxelize:

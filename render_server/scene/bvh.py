@@ -5,12 +5,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
-LEAF_SIZE = 4  # at most: boxes around fewer triangles cost as many tests as they save
-BINS = 16  # candidate split positions per axis (Wald 2007)
-# Of the greatest coordinate: margin of boxes, so that float32 rays do not miss triangles on their faces.
+LEAF_SIZE = 4  # triangles at most: boxes around fewer cost as many tests as they save
+BINS = 16  # places an axis where a node may be split (Wald 2007)
+# Of the greatest coordinate: boxes grow by it, so that float32 rays do not miss what touches them.
 ROUNDING = 1e-6
-COUNT_BITS = 3  # of a leaf: its number of triangles, below the index of the first
-PARALLEL = 1e-12  # determinant (m^2) up to which a ray counts as parallel to the triangle's plane
+COUNT_BITS = 3  # of a leaf: its number of triangles stands below the place of the first
+PARALLEL = 1e-12  # determinant (m^2), from which on a ray counts as going along the triangle's plane
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,13 +33,15 @@ class Bvh:
         rows.view(np.int32)[:, 3], rows.view(np.int32)[:, 7] = self.leaf, self.skip
         return rows.tobytes()
 
-    def packed_triangles(self, corners: Float32[np.ndarray, "m 3 3"]) -> bytes:
-        """Packs triangles in `order`: (corner, index in the mesh), (edge to second corner, 0), (edge to third, 0)."""
-        rows = np.zeros((len(self.order), 3, 4), np.float32)
+    def packed_triangles(
+        self, corners: Float32[np.ndarray, "m 3 3"], vertices: Int32[np.ndarray, "m 3"]
+    ) -> bytes:
+        """Pack triangles in `order`: first corner, edge to the second, edge to the third, with each one's vertex."""
+        rows = np.empty((len(self.order), 3, 4), np.float32)
         first = corners[self.order, 0]
         rows[:, 0, :3] = first
         rows[:, 1:, :3] = corners[self.order, 1:] - first[:, None]
-        rows.view(np.int32)[:, 0, 3] = self.order
+        rows.view(np.int32)[:, :, 3] = vertices[self.order]
         return rows.tobytes()
 
     @property
@@ -53,7 +55,7 @@ class Bvh:
         """Refits the tree to moved triangles: always correct, and efficient while neighbours stay neighbours."""
         held = self.leaf & ((1 << COUNT_BITS) - 1)
         firsts = np.concatenate([[0], np.cumsum(np.where(self.leaf < 0, 0, held))])
-        # A node's triangles are contiguous in `order`, up to the first one after its last descendant.
+        # A node's triangles follow each other in `order`, up to the first of what comes after its last descendant.
         spans = np.stack([firsts[:-1], firsts[self.skip]], axis=1).ravel()
         ordered = corners[self.order]
         margin = np.float32(ROUNDING * float(np.abs(corners).max()))

@@ -16,7 +16,7 @@ from render_server.scene.bvh import LEAF_SIZE, Bvh, build_bvh
 pytestmark = pytest.mark.usefixtures("clean_gl")
 RAYS = 2048
 SHADER = Path(__file__).with_name("rays")
-UNREAD: Bindings = {"Vertices": None, "Corners": None, "Materials": None}  # what the surface at a hit is like
+UNREAD: Bindings = {"Vertices": None, "Materials": None}  # what the surface at a hit is like
 
 
 def soup(count: int, seed: int = 0, size: float = 0.1) -> np.ndarray:
@@ -27,6 +27,11 @@ def soup(count: int, seed: int = 0, size: float = 0.1) -> np.ndarray:
 
 def torus() -> np.ndarray:
     return np.asarray(trimesh.creation.torus(0.5, 0.2, 48, 24).triangles, np.float32)
+
+
+def vertices_of(corners: np.ndarray) -> np.ndarray:
+    """Each corner is a vertex of its own."""
+    return np.arange(3 * len(corners), dtype=np.int32).reshape(-1, 3)
 
 
 def random_rays(seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
@@ -65,12 +70,17 @@ def traced(
     bvh = bvh or build_bvh(corners)
     rows = np.zeros((len(origins), 2, 4), np.float32)
     rows[:, 0, :3], rows[:, 1, :3] = origins, directions
-    contents = [rows.tobytes(), bytes(16 * len(origins)), bvh.packed(), bvh.packed_triangles(corners)]
+    faces = bvh.packed_triangles(corners, vertices_of(corners))
+    contents = [rows.tobytes(), bytes(16 * len(origins)), bvh.packed(), faces]
     buffers = [gpu.ctx.buffer(content) for content in contents]
-    rays, hits, nodes, faces = buffers
+    rays, hits = buffers[:2]
     kernel = Kernel(gpu, SHADER)
-    kernel.run((len(origins),), UNREAD, Rays=rays, Hits=hits, Nodes=nodes, Faces=faces, count=len(origins))
-    found = np.frombuffer(hits.read(), np.float32).reshape(-1, 4)
+    kernel.run(
+        (len(origins),), UNREAD, Rays=rays, Hits=hits, Nodes=buffers[2], Faces=buffers[3], count=len(origins)
+    )
+    found = np.frombuffer(hits.read(), np.float32).reshape(-1, 4).copy()
+    met = found[:, 1] >= 0
+    found[met, 1] = bvh.order[found[met, 1].astype(int)]
     kernel.release()
     for buffer in buffers:
         buffer.release()
@@ -131,7 +141,16 @@ def test_every_triangle_is_in_one_leaf_and_boxes_enclose_what_is_below(corners: 
 def test_same_triangles_give_the_same_bvh() -> None:
     one, other = build_bvh(soup(2000)), build_bvh(soup(2000))
     assert one.packed() == other.packed()
-    assert one.packed_triangles(soup(2000)) == other.packed_triangles(soup(2000))
+    packed = [bvh.packed_triangles(soup(2000), vertices_of(soup(2000))) for bvh in (one, other)]
+    assert packed[0] == packed[1]
+
+
+def test_packed_triangles_name_their_vertices() -> None:
+    corners = soup(50)
+    bvh, vertices = build_bvh(corners), np.random.default_rng(5).integers(0, 99, (50, 3)).astype(np.int32)
+    rows = np.frombuffer(bvh.packed_triangles(corners, vertices), np.float32).reshape(50, 3, 4)
+    np.testing.assert_array_equal(rows.view(np.int32)[:, :, 3], vertices[bvh.order])
+    np.testing.assert_array_equal(rows[:, 0, :3], corners[bvh.order, 0])
 
 
 def test_rays_meet_few_boxes_of_a_large_mesh() -> None:
@@ -176,12 +195,13 @@ def test_a_refitted_bvh_of_shuffled_triangles_is_worn(gpu: GpuContext) -> None:
     shuffled = np.random.default_rng(0).permutation(corners)
     assert build_bvh(corners).refitted(shuffled).cost > 10 * build_bvh(corners).cost
     objects = ObjectBvh(gpu)
-    empty = MeshBuffers(gpu)
+    mesh = MeshBuffers(gpu)
+    mesh.triangles = vertices_of(corners)
     bounds = (corners.min(axis=(0, 1)), corners.max(axis=(0, 1)))
     for each in (corners, shuffled):
-        objects.set_triangles(each, bounds, empty)
+        objects.set_triangles(each, bounds, mesh)
         nodes = objects.bindings["Nodes"]
         assert isinstance(nodes, moderngl.Buffer)
         assert nodes.read() == build_bvh(each).packed()
     objects.release()
-    empty.release()
+    mesh.release()

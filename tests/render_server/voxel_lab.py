@@ -14,6 +14,8 @@ from render_server.passes.lights import LightBuffers
 from render_server.passes.voxel_light import LightVoxels
 from render_server.passes.voxels import (
     DIRECTIONS,
+    SURFEL_BYTES,
+    SURFELS_HEADER_BYTES,
     FarVolumeBlock,
     FilterVoxels,
     PlacedVolume,
@@ -75,9 +77,8 @@ class VoxelLab:
         self._voxelize.run(store, triangle_corners(mesh), self._volume)
         _, count = store.counts()
         assert count <= store.surfel_capacity
-        data = (
-            np.frombuffer(store.surfels.read(max(count, 1) * 64), np.float32).reshape(-1, 16)[:count].copy()
-        )
+        content = store.surfels.read(count * SURFEL_BYTES, offset=SURFELS_HEADER_BYTES) if count else b""
+        data = np.frombuffer(content, np.float32).reshape(-1, 16).copy()
         store.release()
         index = data[:, 10].copy().view(np.uint32).astype(int)
         size = self.placement.size

@@ -8,6 +8,7 @@
 #include "common/ray_pattern.glsl"
 #include "common/lobe.glsl"
 #include "common/packing.glsl"
+#define APPENDS_BEAMS
 #include "common/beams.glsl"
 
 layout(local_size_x = 8, local_size_y = 8) in;

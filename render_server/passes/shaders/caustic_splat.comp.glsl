@@ -3,6 +3,7 @@
 #include "common/geometry.glsl"
 #include "common/basis.glsl"
 #include "common/beams.glsl"
+#define ADDS_CAUSTICS
 #include "common/caustic_sums.glsl"
 
 layout(local_size_x = 64) in;

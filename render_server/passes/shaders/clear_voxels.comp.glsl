@@ -1,5 +1,7 @@
 // Empty the voxels that a set had touched: its grid cells, and their texels in all directions of a pyramid.
 #include "common/volume.glsl"
+#define GRID_ACCESS
+#define TOUCHED_ACCESS readonly
 #include "common/voxel_store.glsl"
 
 layout(local_size_x = 64) in;

@@ -9,19 +9,20 @@
 layout(local_size_x = 64) in;
 layout(rgba8ui) writeonly uniform uimage2D code_out;
 layout(rgba16f) writeonly uniform image2D linear_out;
+// Images, because OpenGL guarantees no more than sixteen samplers.
+layout(rgba16f) readonly uniform image2D lobe_mu;
+layout(rgba16f) readonly uniform image2D lobe_rho;
+layout(rgba16f) readonly uniform image2D virtual_radiance;
 uniform usampler2D picture;
 uniform sampler2D linear_picture;
 uniform sampler2D inverse_response;   // camera code of linear values
 uniform sampler2D object_coverage;
-uniform sampler2D virtual_radiance;
 uniform sampler2D direct_mu;
 uniform sampler2D direct_rho;
 uniform sampler2D cone_mu;
 uniform sampler2D cone_rho;
 uniform sampler2D cone_specular_mu;
 uniform sampler2D cone_specular_rho;
-uniform sampler2D lobe_mu;
-uniform sampler2D lobe_rho;
 uniform sampler2D change_ratio;
 uniform sampler2D reflection;         // of objects in smooth surfaces, by rays; a: fraction of the lobe
 uniform sampler2D edge_correction;    // edge_unmixing.comp.glsl
@@ -86,8 +87,8 @@ Change change_at(ivec2 pixel, vec4 position, vec4 normal) {
             c.hidden = seen.a;
             c.s_rho = c.s_mu;
         }
-        c.s_mu = reflectance * c.s_mu + texelFetch(lobe_mu, pixel, 0).rgb;
-        c.s_rho = reflectance * c.s_rho + texelFetch(lobe_rho, pixel, 0).rgb;
+        c.s_mu = reflectance * c.s_mu + imageLoad(lobe_mu, pixel).rgb;
+        c.s_rho = reflectance * c.s_rho + imageLoad(lobe_rho, pixel).rgb;
     } else {
         c.s_mu = vec3(0.0);
         c.s_rho = vec3(0.0);
@@ -184,7 +185,7 @@ void compose(ivec2 pixel) {
         if (ratio != vec3(1.0)) { result = b * ratio; changed = true; }
     }
     if (shown > 0.0) {
-        result = mix(result, texelFetch(virtual_radiance, pixel, 0).rgb, shown);
+        result = mix(result, imageLoad(virtual_radiance, pixel).rgb, shown);
         changed = true;
     }
     if (changed) {

@@ -4,6 +4,9 @@
 #include "common/environment.glsl"
 #include "common/diffuse_cones.glsl"
 #include "common/voxel_store.glsl"
+#define GROUP_ENTRIES_ACCESS readonly
+#define GROUP_SUMS_ACCESS readonly
+#define GROUP_LIGHT_ACCESS
 #include "common/surfel_groups.glsl"
 
 layout(local_size_x = 64) in;

@@ -1,8 +1,15 @@
 // Find the groups of surfels. Without SUM: give each a slot. SUM: add its area, mean normal and place.
+#define SURFELS_ACCESS readonly
+#define GROUP_GRID_ACCESS
+#define GROUP_ENTRIES_ACCESS
+#define GROUP_SUMS_ACCESS
 #include "common/volume.glsl"
 #include "common/voxel_store.glsl"
 #include "common/surfel_groups.glsl"
+#ifdef SUM
+#define SURFEL_LIGHTS_ACCESS readonly
 #include "common/surfel_light.glsl"
+#endif
 
 layout(local_size_x = 64) in;
 
@@ -37,7 +44,7 @@ void add_to_group(Surfel s, uint surfel, int side, vec3 n) {
 #endif
 
 void main() {
-    uint count = min(surfel_count, surfel_capacity);
+    uint count = surfels_held();
     for (uint i = gl_GlobalInvocationID.x; i < count; i += gl_NumWorkGroups.x * 64u) {
         Surfel s = surfels[i];
         add_to_group(s, i, 0, s.normal_material.xyz);

@@ -7,12 +7,22 @@
 // REAL and VIRTUAL then add by how much L grows.
 // REAL_MU and REAL_RHO sum all of L, each under the maps of its own solution: L_mu as REAL,
 // L_rho = L_mu E_rho / E_mu where the camera measured L_mu, albedo / pi E_rho where it does not look.
+#define SURFELS_ACCESS readonly
+#define SURFEL_LIGHTS_ACCESS
+#define GRID_ACCESS readonly
+#ifndef REAL_DELTA
+#define SUMS_ACCESS
+#endif
 #include "common/volume.glsl"
 #include "common/voxel_store.glsl"
 #include "common/surfel_light.glsl"
-#include "common/lights.glsl"
 #include "common/environment.glsl"
+#ifndef GATHERED
+#include "common/lights.glsl"
+#endif
+#ifdef VIRTUAL
 #include "common/materials.glsl"
+#endif
 
 layout(local_size_x = 64) in;
 uniform float bias_real;      // m
@@ -32,6 +42,9 @@ layout(std430) buffer Support { int support[6]; };        // bounds of changed v
 #endif
 
 #ifdef GATHERED
+#define GROUP_GRID_ACCESS readonly
+#define GROUP_ENTRIES_ACCESS readonly
+#define GROUP_LIGHT_ACCESS readonly
 #include "common/surfel_groups.glsl"
 
 void irradiances(Surfel s, vec3 n, uint own, out vec3 mu, out vec3 rho) {
@@ -193,7 +206,7 @@ void light(Surfel s, uint own, vec3 n) {
 }
 
 void main() {
-    uint count = min(surfel_count, surfel_capacity);
+    uint count = surfels_held();
     for (uint i = gl_GlobalInvocationID.x; i < count; i += gl_NumWorkGroups.x * 64u) {
         Surfel s = surfels[i];
         light(s, 2u * i, s.normal_material.xyz);

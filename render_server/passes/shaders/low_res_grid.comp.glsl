@@ -1,6 +1,7 @@
 // For each texel of the reduced resolution, the picture pixel nearest to its centre that shows a real surface with
 // depth, and the one that shows a virtual object. Where objects hide all real surfaces, one of these as -2 - pixel.
 #include "common/geometry.glsl"
+#define APPENDS_TEXELS
 #include "common/work_list.glsl"
 
 layout(local_size_x = 8, local_size_y = 8) in;

@@ -1,10 +1,9 @@
 // Injection of what surfaces reflect of the light that propagation brought to them: of virtual ones all of it, of real
 // ones what the objects change of it (the picture shows the rest, and that is in V_mu).
+#define SURFELS_ACCESS readonly
 #include "common/volume.glsl"
 #include "common/voxel_store.glsl"
-#include "common/lights.glsl"
 #include "common/environment.glsl"
-#include "common/materials.glsl"
 #include "common/inject_light.glsl"
 #include "common/lpv_light.glsl"
 #include "common/surfel_albedo.glsl"

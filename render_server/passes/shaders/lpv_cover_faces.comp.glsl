@@ -3,6 +3,7 @@
 // behind it. Surfels were clipped to half cells, so each lies in one such cube an axis. Kept are the areas across each
 // axis rather than spherical harmonics of them: only these are ever asked for. The two sides are summed apart, so that
 // both sides of a thin body do not count as two bodies.
+#define SURFELS_ACCESS readonly
 #include "common/voxel_store.glsl"
 #include "common/light_cells.glsl"
 
@@ -24,7 +25,7 @@ void cover(Surfel s, vec3 n) {
 }
 
 void main() {
-    uint count = min(surfel_count, surfel_capacity);
+    uint count = surfels_held();
     for (uint i = gl_GlobalInvocationID.x; i < count; i += gl_NumWorkGroups.x * 64u) {
         Surfel s = surfels[i];
         cover(s, s.normal_material.xyz);

@@ -3,7 +3,9 @@
 // and, negative, what the same rays lit before on the real scene. DIRECT: the light itself that no longer gets there,
 // as negative lobes along its path ([P2] 4.3.2).
 #include "common/light_rays.glsl"
+#ifndef REAL
 #include "common/materials.glsl"
+#endif
 #include "common/packing.glsl"
 #include "common/volume.glsl"
 #include "common/inject_light.glsl"

@@ -2,11 +2,10 @@
 // nothing stood in the volume; so each surface element sends what it reflects of R (and emits), less what would have come
 // through it from behind: E_R(n) albedo - E_R(-n). This is how the volume blocks natural light, and how nothing counts
 // twice where R stands for ground that lies in the volume.
+#define SURFELS_ACCESS readonly
 #include "common/volume.glsl"
 #include "common/voxel_store.glsl"
-#include "common/lights.glsl"
 #include "common/environment.glsl"
-#include "common/materials.glsl"
 #include "common/inject_light.glsl"
 #include "common/surfel_albedo.glsl"
 

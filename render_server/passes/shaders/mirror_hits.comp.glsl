@@ -1,5 +1,6 @@
 // For each texel of the reduced grid one point of the objects that its block of pixels reflects, listed where there is one.
 #include "common/mirror_rays.glsl"
+#define APPENDS_TEXELS
 #include "common/work_list.glsl"
 
 layout(local_size_x = 8, local_size_y = 8) in;

@@ -1,5 +1,6 @@
 // List the pixels of smooth real surfaces whose lobe can reach the virtual objects; the others reflect none.
 #include "common/mirror.glsl"
+#define APPENDS_TEXELS
 #include "common/work_list.glsl"
 
 layout(local_size_x = 8, local_size_y = 8) in;

@@ -2,6 +2,7 @@
 // the picture's own edges. Unknown depth never hides; depth masks the object only, never its delta (docs/method.md 3).
 // Pixels at such an edge are listed: edge_unmixing.comp.glsl looks at them again.
 #include "common/shown_object.glsl"
+#define APPENDS_TEXELS
 #include "common/work_list.glsl"
 
 layout(local_size_x = 8, local_size_y = 8) in;

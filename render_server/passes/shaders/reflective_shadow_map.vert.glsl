@@ -1,6 +1,10 @@
-// One tile of a reflective shadow map: the scene as a light sees it.
-#include "common/lights.glsl"
-uniform int view_index;
+// One tile of a reflective shadow map: the scene as a light sees it (LightView of passes/shadow_maps.py). Uniforms tell
+// of the view, because OpenGL guarantees no storage blocks to vertex shaders.
+uniform mat4 view_from_world;
+uniform float half_extent;
+uniform vec2 depth_range;   // near, far
+uniform bool orthographic;
+uniform vec4 front;
 in vec3 in_position;
 in vec3 in_normal;
 in vec2 in_uv;
@@ -12,14 +16,13 @@ out vec3 tint;
 flat out float material;
 
 void main() {
-    LightView view = light_views[view_index];
-    vec3 v = (view.view_from_world * vec4(in_position, 1.0)).xyz;
-    float near = view.range.x, far = view.range.y, extent = view.tile.w;
-    gl_ClipDistance[0] = dot(view.front, vec4(in_position, 1.0));
+    vec3 v = (view_from_world * vec4(in_position, 1.0)).xyz;
+    float near = depth_range.x, far = depth_range.y;
+    gl_ClipDistance[0] = dot(front, vec4(in_position, 1.0));
     normal = in_normal;
     uv = in_uv;
     tint = in_color;
     material = in_material;
-    if (view.range.z > 0.5) gl_Position = vec4(v.xy / extent, 2.0 * (v.z - near) / (far - near) - 1.0, 1.0);
-    else gl_Position = vec4(v.xy / extent, ((far + near) * v.z - 2.0 * far * near) / (far - near), v.z);
+    if (orthographic) gl_Position = vec4(v.xy / half_extent, 2.0 * (v.z - near) / (far - near) - 1.0, 1.0);
+    else gl_Position = vec4(v.xy / half_extent, ((far + near) * v.z - 2.0 * far * near) / (far - near), v.z);
 }

@@ -1,6 +1,7 @@
 // Fixed-point sums of split-inject -> level 0 of V_delta and V_rho. The marker of V_eta goes with both: opacity 1 in
 // every voxel that real or virtual geometry touches ([P1] 3.2), so that one fetch gives radiance and opacity.
 #include "common/volume.glsl"
+#define TOUCHED_ACCESS readonly
 #include "common/voxel_store.glsl"
 
 layout(local_size_x = 64) in;

@@ -2,6 +2,8 @@
 // MU walks the real set: (c_mu, a_real). RHO_REAL walks it too and adds the change of its light and the virtual set;
 // RHO_VIRTUAL walks the virtual set and writes the voxels that hold nothing real.
 #include "common/volume.glsl"
+#define TOUCHED_ACCESS readonly
+#define SUMS_ACCESS readonly
 #include "common/voxel_store.glsl"
 
 layout(local_size_x = 64) in;

@@ -5,6 +5,7 @@
 #include "common/volume.glsl"
 #include "common/lights.glsl"
 #include "common/low_res_grid.glsl"
+#define APPENDS_TEXELS
 #include "common/work_list.glsl"
 
 layout(local_size_x = 8, local_size_y = 8) in;

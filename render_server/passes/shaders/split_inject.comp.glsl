@@ -2,9 +2,12 @@
 // Phi / (pi h^2). VIRTUAL walks the objects' map: +Phi_rho where the light meets the object (V_delta and V_rho), and
 // -Phi_mu where the same rays met the real scene before (V_delta). REAL walks the real map: +Phi of what the objects
 // leave lit (V_rho).
+#define GRID_ACCESS readonly
 #include "common/voxel_store.glsl"
 #include "common/light_rays.glsl"
+#ifdef VIRTUAL
 #include "common/materials.glsl"
+#endif
 #include "common/packing.glsl"
 #include "common/volume.glsl"
 

@@ -1,6 +1,10 @@
 // Voxelise triangles exactly: each is clipped against every voxel it may touch (Schwarz & Seidel 2010 find the same
 // voxels); area and centroid of each piece become a surfel. Thin, large and tiny triangles keep their area.
 #include "common/volume.glsl"
+#define GRID_ACCESS
+#define TOUCHED_ACCESS
+#define SURFELS_ACCESS
+#define SUMS_ACCESS
 #include "common/voxel_store.glsl"
 
 layout(local_size_x = 64) in;
@@ -70,7 +74,7 @@ vec2 uv_at(Triangle t, vec3 p, vec3 a, vec3 b, vec3 c, vec3 n) {
 void emit(Triangle t, vec4 piece, ivec3 voxel, vec3 a, vec3 b, vec3 c, vec3 n) {
     if (piece.w < 1e-9) return;
     uint index = atomicAdd(surfel_count, 1u);
-    if (index >= surfel_capacity) return;
+    if (index >= uint(surfels.length())) return;
     uint v = voxel_index(voxel, volume_size);
     touch(v);
     surfels[index].position_area =

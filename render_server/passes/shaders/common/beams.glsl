@@ -6,7 +6,11 @@ struct Beam {
     vec4 across;      // inverse of the footprint's variance in basis_around(direction): xx, xy, yy (1/m^2);
                       // w: density on the axis (1/m^2)
 };
-layout(std430) buffer Beams { uint beam_count; uint spare[3]; Beam beams[]; };
+#ifdef APPENDS_BEAMS
+layout(std430) buffer Beams { uint beam_count; Beam beams[]; };
+#else
+layout(std430) readonly buffer Beams { uint beam_count; Beam beams[]; };
+#endif
 
 // A footprint is a normal distribution, cut off at so many deviations.
 const float FOOTPRINT_CUT = 3.0;

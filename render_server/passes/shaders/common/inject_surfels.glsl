@@ -7,7 +7,7 @@ void inject_side(Surfel s, vec3 n) {
 }
 
 void main() {
-    uint count = min(surfel_count, surfel_capacity);
+    uint count = surfels_held();
     for (uint i = gl_GlobalInvocationID.x; i < count; i += gl_NumWorkGroups.x * 64u) {
         Surfel s = surfels[i];
         inject_side(s, s.normal_material.xyz);

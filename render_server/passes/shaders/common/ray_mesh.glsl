@@ -4,16 +4,16 @@
 
 struct Node { vec3 low; int leaf; vec3 high; int skip; };   // leaf: first triangle << 3 | count, or -1
 layout(std430) readonly buffer Nodes { Node nodes[]; };
-layout(std430) readonly buffer Faces { vec4 faces[]; };           // 3 a triangle: corner and index, 2 edges
+layout(std430) readonly buffer Faces { vec4 faces[]; };           // 3 a triangle: corner, 2 edges; w: rows of vertices (bits)
 layout(std430) readonly buffer Vertices { float vertices[]; };    // VERTEX_FLOATS each (scene/triangle_mesh.py)
-layout(std430) readonly buffer Corners { int vertex_of[]; };      // 3 a triangle
 
 const int VERTEX_FLOATS = 12;
 const float EDGE = 1e-5;   // barycentric: neighbours overlap by so much, so that no ray slips between them
 
 struct Ray { vec3 from; vec3 direction; };   // direction: unit length
 
-struct MeshHit { float distance; int triangle; vec2 place; };   // triangle: -1 for none; place: barycentric of corners 1, 2
+// triangle: in the order of the hierarchy, -1 for none; place: barycentric of corners 1, 2
+struct MeshHit { float distance; int triangle; vec2 place; };
 
 // Distance at which the ray enters a box before `limit`; negative if it does not.
 bool meets_box(vec3 low, vec3 high, vec3 from, vec3 inverse, float limit) {
@@ -25,18 +25,18 @@ bool meets_box(vec3 low, vec3 high, vec3 from, vec3 inverse, float limit) {
 
 // Moeller and Trumbore 1997, both sides.
 void meet_triangle(int at, Ray ray, inout MeshHit hit) {
-    vec4 corner = faces[3 * at];
+    vec3 corner = faces[3 * at].xyz;
     vec3 e1 = faces[3 * at + 1].xyz, e2 = faces[3 * at + 2].xyz;
     vec3 p = cross(ray.direction, e2);
     float det = dot(e1, p);
     if (det == 0.0) return;
-    vec3 s = ray.from - corner.xyz;
+    vec3 s = ray.from - corner;
     float u = dot(s, p) / det;
     vec3 q = cross(s, e1);
     float v = dot(ray.direction, q) / det;
     float t = dot(e2, q) / det;
     if (u < -EDGE || v < -EDGE || u + v > 1.0 + EDGE || t <= 0.0 || t >= hit.distance) return;
-    hit = MeshHit(t, floatBitsToInt(corner.w), vec2(u, v));
+    hit = MeshHit(t, at, vec2(u, v));
 }
 
 MeshHit closest_hit(Ray ray) {
@@ -67,7 +67,8 @@ vec3 vertex_vector(ivec3 rows, int column, vec3 weights) {
 
 // The surface at a hit, its normal turned towards the ray's origin as the raster turns it to the camera.
 MeshSurface surface_of(MeshHit hit, Ray ray) {
-    ivec3 rows = ivec3(vertex_of[3 * hit.triangle], vertex_of[3 * hit.triangle + 1], vertex_of[3 * hit.triangle + 2]);
+    int at = 3 * hit.triangle;
+    ivec3 rows = floatBitsToInt(vec3(faces[at].w, faces[at + 1].w, faces[at + 2].w));
     vec3 weights = vec3(1.0 - hit.place.x - hit.place.y, hit.place);
     int material = int(vertices[rows.x * VERTEX_FLOATS + 11]);
     vec3 corner = vertex_vector(rows, 0, vec3(1.0, 0.0, 0.0));

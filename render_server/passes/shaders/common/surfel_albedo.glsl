@@ -1,7 +1,8 @@
-// Albedo of surfels. Needs voxel_store.glsl, lights.glsl, materials.glsl.
+// Albedo of surfels. Needs voxel_store.glsl, environment.glsl.
 const vec2 ALBEDO_RANGE = vec2(0.02, 0.95);
 
 #ifdef REAL
+#include "common/lights.glsl"
 #include "common/real_radiance.glsl"
 uniform float bias_real;   // m
 
@@ -19,6 +20,8 @@ vec3 albedo_at(Surfel s, vec3 n, vec3 indirect) {
     return clamp(PI * measured_radiance(p) / max(e, vec3(1e-6)), ALBEDO_RANGE.x, ALBEDO_RANGE.y);
 }
 #else
+#include "common/materials.glsl"
+
 vec3 virtual_albedo(Surfel s) {
     Material m = material_of(int(s.normal_material.w), s.uv_voxel.xy, s.tint.rgb);
     return min(m.diffuse + m.f0, vec3(ALBEDO_RANGE.y));

@@ -1,5 +1,7 @@
 // Sparse voxel store of one geometry set (real or virtual): a grid of slots, the list of touched voxels, one surfel
 // for every piece of a triangle inside a voxel, and fixed-point sums a slot. Integer atomics keep it bit-identical.
+// OpenGL guarantees no more than eight storage blocks, so a shader declares those that it uses: before this file it
+// defines GRID_ACCESS, TOUCHED_ACCESS, SURFELS_ACCESS or SUMS_ACCESS, as `readonly`, or empty to write the block too.
 struct Surfel {
     vec4 position_area;    // world m, m^2
     vec4 normal_material;  // unit normal, material index
@@ -7,11 +9,20 @@ struct Surfel {
     vec4 tint;             // vertex colour
 };
 
-layout(std430) buffer Grid { uint grid[]; };          // slot + 1 of each voxel, 0 = untouched
-layout(std430) buffer Touched { uint touched[]; };    // voxel index of each slot
-layout(std430) buffer Surfels { Surfel surfels[]; };
-layout(std430) buffer Counters { uint slot_count; uint surfel_count; uint surfel_capacity; uint spare; };
-layout(std430) buffer Sums { int sums[]; };           // SUMS_PER_SLOT a slot
+#ifdef GRID_ACCESS
+layout(std430) GRID_ACCESS buffer Grid { uint grid[]; };   // slot + 1 of each voxel, 0 = untouched
+#endif
+#ifdef TOUCHED_ACCESS
+layout(std430) TOUCHED_ACCESS buffer Touched { uint slot_count; uint touched[]; };   // voxel index of each slot
+#endif
+#ifdef SURFELS_ACCESS
+layout(std430) SURFELS_ACCESS buffer Surfels { uint surfel_count; Surfel surfels[]; };
+
+uint surfels_held() { return min(surfel_count, uint(surfels.length())); }
+#endif
+#ifdef SUMS_ACCESS
+layout(std430) SUMS_ACCESS buffer Sums { int sums[]; };    // SUMS_PER_SLOT a slot
+#endif
 
 const int COVERAGE = 0;          // 6 directions
 const int RADIANCE = 6;          // 6 directions x rgb

@@ -1,0 +1,192 @@
+"""Every shader variant that the renderer compiles conforms to GLSL and keeps within what OpenGL 4.3 guarantees.
+
+Mesa accepts more than the language allows, and has more of everything than drivers must have.
+"""
+
+import re
+import shutil
+import subprocess
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from protocol.scene import SceneDocument, parse_scene
+from render_server.gpu.context import GpuContext, create_context
+from render_server.gpu.kernel import IMAGES, SAMPLERS
+from render_server.gpu.shader_source import SHADERS
+from render_server.passes.lpv import LpvPropagate
+from render_server.renderer import SceneRenderer
+from tests.render_server.protected_scenes import Case, frames_of, scene_of
+from tests.render_server.scenes import Stage
+
+VALIDATOR = shutil.which("glslangValidator")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(VALIDATOR is None, reason="glslangValidator (package glslang-tools) is not installed"),
+]
+
+CASES: dict[Case, dict[str, Any]] = {  # with changes of the method
+    Case("exact", "depth", "mirror"): {},
+    Case("exact", "fused", "antialiased"): {
+        "voxels": "isotropic",
+        "coverage": "multiplied",
+        "shadow": "cone",
+        "volume_size": 40,
+    },
+    Case("paper", "depth", "mirror"): {},
+    Case("differential", "depth", "mirror"): {},
+    Case("dlpv", "model", "mirror"): {},
+    Case("dlpv-paper", "depth", "plain"): {},
+    Case("aroof", "depth", "mirror"): {},
+}
+VIEWS = {
+    Case("exact", "depth", "mirror"): ("effects", "delta", "volume", "rsm"),
+    Case("paper", "depth", "mirror"): ("volume",),
+}
+# What every implementation of OpenGL 4.3 has at least, for a shader of each stage.
+GUARANTEED: Mapping[str, Mapping[str, int]] = {
+    "vert": {"storage blocks": 0, "samplers": 16, "images": 0, "uniform blocks": 12},
+    "frag": {"storage blocks": 8, "samplers": 16, "images": 8, "uniform blocks": 12},
+    "comp": {
+        "storage blocks": 8,
+        "samplers": 16,
+        "images": 8,
+        "uniform blocks": 12,
+        "shared bytes": 32768,
+        "invocations": 1024,
+    },
+}
+ELEMENT_BYTES = {"float": 4, "int": 4, "uint": 4, "bool": 4, "vec2": 8, "vec3": 16, "vec4": 16}
+BLOCK = re.compile(r"\b(buffer|uniform)\s+\w+\s*\{")
+UNIFORM = re.compile(r"^(\w+).*: offset -1, type (\w+), size (\d+)", re.MULTILINE)
+LOCAL_SIZE = re.compile(r"^Local size [XYZ]: (\d+)", re.MULTILINE)
+SHARED = re.compile(r"\bshared\s+(\w+)\s+\w+\s*\[([^\]]+)\]")
+CONSTANT = re.compile(r"\bconst\s+int\s+(\w+)\s*=\s*([^;,]+);")
+
+
+@dataclass(frozen=True)
+class Shader:
+    """One stage of a program: which, its text, and the file that the validator reads."""
+
+    stage: str
+    text: str
+    path: Path
+
+    def validator(self, *options: str) -> str:
+        """What glslangValidator says."""
+        assert VALIDATOR is not None
+        command = [VALIDATOR, *options, str(self.path)]
+        return subprocess.run(command, capture_output=True, text=True, check=False).stdout
+
+
+Programs = dict[str, list[Shader]]
+
+
+@pytest.fixture(scope="module")
+def programs(tmp_path_factory: pytest.TempPathFactory) -> Programs:
+    """The programs that rendering compiles, and those that only a GPU would need, by label."""
+    folder = tmp_path_factory.mktemp("shaders")
+    found: Programs = {}
+
+    def keep(label: str, sources: Mapping[str, str]) -> None:
+        if label not in found:
+            found[label] = []
+            for stage, text in sources.items():
+                path = folder / f"{len(found)}.{stage}"
+                path.write_text(text)
+                found[label].append(Shader(stage, text, path))
+
+    gpu = create_context()
+    gpu.compile_watchers.append(keep)
+    for case, changes in CASES.items():
+        render(gpu, case, changes, tmp_path_factory.mktemp("scene"))
+    for tiled in (False, True):
+        LpvPropagate(gpu, tiled=tiled).release()
+    gpu.release()
+    return found
+
+
+def render(gpu: GpuContext, case: Case, changes: dict[str, Any], folder: Path) -> None:
+    """Renders the case's first frame, in each debug view too that VIEWS names."""
+    scene = changed(scene_of(case, Stage(folder)), "method", changes)
+    renderer = SceneRenderer(gpu, scene)
+    for view in ("composite", *VIEWS.get(case, ())):
+        renderer.set_scene(changed(scene, "output", {"view": view}))
+        renderer.render(frames_of(case)[0])
+    renderer.release()
+
+
+def changed(scene: SceneDocument, part: str, changes: dict[str, Any]) -> SceneDocument:
+    document = scene.model_dump(mode="json", exclude_unset=True)
+    document[part] = {**document[part], **changes}
+    return parse_scene(document)
+
+
+def shaders_of(programs: Programs) -> Iterator[tuple[str, Shader]]:
+    for label, shaders in programs.items():
+        for shader in shaders:
+            yield f"{label} ({shader.stage})", shader
+
+
+def test_every_shader_of_the_project_is_among_them(programs: Programs) -> None:
+    compiled = {(label.split()[0], shader.stage) for label, shaders in programs.items() for shader in shaders}
+    there = {tuple(path.name.removesuffix(".glsl").split(".")) for path in SHADERS.glob("*.glsl")}
+    assert compiled == there
+
+
+def test_every_variant_is_valid_glsl(programs: Programs) -> None:
+    said = {name: shader.validator() for name, shader in shaders_of(programs)}
+    assert {name: text for name, text in said.items() if "ERROR" in text or "WARNING" in text} == {}
+    assert len(said) > 90
+
+
+def test_no_variant_needs_more_than_opengl_guarantees(programs: Programs) -> None:
+    needs = {(name, shader.stage): needs_of(shader) for name, shader in shaders_of(programs)}
+    for (name, _), needed in needs.items():  # shown with a failure
+        print(f"{name:60} " + ", ".join(f"{count} {kind}" for kind, count in needed.items() if count))
+    beyond = {
+        name: {kind: count for kind, count in needed.items() if count > GUARANTEED[stage][kind]}
+        for (name, stage), needed in needs.items()
+    }
+    assert {name: kinds for name, kinds in beyond.items() if kinds} == {}
+    assert max(needed["storage blocks"] for needed in needs.values()) == 8
+    assert max(needed.get("shared bytes", 0) for needed in needs.values()) > 16384
+
+
+def needs_of(shader: Shader) -> dict[str, int]:
+    """What a shader takes of each thing that is limited.
+
+    Blocks count as soon as they are declared (std140 and std430 keep unused ones), textures and images where used.
+    """
+    text = shader.validator("-E")
+    reflection = shader.validator("-l", "-q")
+    blocks = BLOCK.findall(text)
+    needs = {
+        "storage blocks": blocks.count("buffer"),
+        "uniform blocks": blocks.count("uniform"),
+        "samplers": 0,
+        "images": 0,
+    }
+    for _, kind, count in UNIFORM.findall(reflection):
+        for name, kinds in (("samplers", SAMPLERS), ("images", IMAGES)):
+            needs[name] += int(count) if int(kind, 16) in kinds else 0
+    if shader.stage == "comp":
+        needs["shared bytes"] = shared_bytes(text)
+        needs["invocations"] = 1
+        for size in LOCAL_SIZE.findall(reflection):
+            needs["invocations"] *= int(size)
+    return needs
+
+
+def shared_bytes(text: str) -> int:
+    """Shared memory of a preprocessed shader."""
+    constants = dict(CONSTANT.findall(text))
+
+    def value(expression: str) -> int:
+        plain = re.sub(r"\b[A-Za-z_]\w*", lambda name: str(value(constants[name[0]])), expression)
+        return int(eval(plain, {"__builtins__": {}}))
+
+    return sum(ELEMENT_BYTES[kind] * value(length) for kind, length in SHARED.findall(text))
