@@ -1,4 +1,4 @@
-"""Values that several commands take."""
+"""Values shared by several commands."""
 
 from enum import StrEnum
 from pathlib import Path
