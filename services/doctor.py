@@ -1,4 +1,4 @@
-"""What this machine has and what is missing: each check ends in one line with a hint."""
+"""Checks of this machine: each ends in one line with a hint."""
 
 import json
 import subprocess
@@ -32,7 +32,7 @@ print(json.dumps([gpu.renderer_name, gpu.version, gpu.is_software]))
 
 @dataclass(frozen=True)
 class Check:
-    """One finding: `missing` makes the command end with 1; `note` does not."""
+    """One finding: `missing` makes the command exit with 1; `note` does not."""
 
     name: str
     state: Literal["ok", "note", "missing"]
@@ -40,12 +40,12 @@ class Check:
     hint: str = ""
 
     def as_dict(self) -> dict[str, str]:
-        """The check as plain data."""
+        """Return the check as plain data."""
         return asdict(self)
 
 
 def examine() -> Iterator[Check]:
-    """All checks, one after the other."""
+    """Run all checks, one after the other."""
     yield Check("python", "ok", sys.version.split()[0])
     yield from _packages()
     yield _opencv()
@@ -129,7 +129,7 @@ def _methods() -> Iterator[Check]:
 
 
 def _cameras() -> Iterator[Check]:
-    """Every camera that is there, one line each, then the kinds of which none could be found."""
+    """Report every camera that was found, one line each, then the kinds without any."""
     from sensor_node.cameras.discovery import discover
     from sensor_node.cameras.drivers import driver_title
 

@@ -1,4 +1,4 @@
-"""The newest fish-eye picture, and where in it the lights of a composite are."""
+"""The newest fish-eye picture, and the positions of a composite's lights in it."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,17 +16,17 @@ if TYPE_CHECKING:
 
 PICTURE_PART = 2  # of a radiance message (SPEC.md, section 3)
 OUTLINE_POINTS = 16
-ENVIRONMENT = "environment"  # the light that is nowhere in particular
+ENVIRONMENT = "environment"  # the light without a direction
 
 
 @dataclass
 class FisheyeView:
-    """The newest radiance message and its picture for people (JPEG), if any arrived."""
+    """The newest radiance message and its picture for display (JPEG), if any arrived."""
 
     newest: tuple[RadianceMessage, bytes] | None = None
 
     def note(self, message: Message, parts: Sequence[memoryview]) -> None:
-        """Keep the picture of a message that has just arrived."""
+        """Store the picture of a message that has just arrived."""
         assert isinstance(message, RadianceMessage)
         self.newest = message, bytes(parts[PICTURE_PART])
 
@@ -47,7 +47,7 @@ def lights_in_picture(message: RadianceMessage, described: Sequence[Mapping[str,
     """Return the lights that the picture of `message` shows; `described` are those of a composite.
 
     Raises:
-        DeltalightError: the calibration is none.
+        DeltalightError: the calibration is invalid.
     """
     from render_server.lights.lights import LIGHT_TYPES, incident_light
 
@@ -66,7 +66,7 @@ def lights_in_picture(message: RadianceMessage, described: Sequence[Mapping[str,
 def _marked(
     described: Mapping[str, Any], seen: "IncidentLight", pixels: Float64[np.ndarray, "n 2"]
 ) -> FisheyeLight:
-    """`pixels` begin with the light's middle; those of its outline that the picture does not show are NaN."""
+    """Describe a light; `pixels` begin with its middle, and are NaN where the picture does not show its outline."""
     distances = np.linalg.norm(pixels - pixels[0], axis=1)
     red, green, blue = (float(value) for value in seen.irradiance)
     peak = max(red, green, blue, 1e-12)

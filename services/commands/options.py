@@ -1,4 +1,4 @@
-"""Values that several commands take."""
+"""Values shared by several commands."""
 
 from difflib import get_close_matches
 from enum import StrEnum
