@@ -373,7 +373,13 @@ class NoneMethod(MethodSettings):
     name: Literal["none"] = "none"
 
 
-BUILT_IN_METHODS = (DvctMethod, DlpvMethod, AroofMethod, DifferentialMethod, NoneMethod)
+BUILT_IN_METHODS: tuple[type[MethodSettings], ...] = (
+    DvctMethod,
+    DlpvMethod,
+    AroofMethod,
+    DifferentialMethod,
+    NoneMethod,
+)
 
 
 class Shading(StrictModel):

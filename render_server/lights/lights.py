@@ -483,4 +483,5 @@ def _vector(values: Sequence[float] | np.ndarray) -> Float32[np.ndarray, "3"]:
 
 def _strength(values: Mapping[str, Any], key: str) -> Float32[np.ndarray, "3"]:
     """R G B: one strength times the colour, or given as such."""
-    return np.asarray(values[key], np.float32) * _vector(values.get("color_linear", (1.0, 1.0, 1.0)))
+    color = _vector(values.get("color_linear", (1.0, 1.0, 1.0)))
+    return np.asarray(np.asarray(values[key], np.float32) * color)

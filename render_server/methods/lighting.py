@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from operator import eq
+from typing import Any
 
 import moderngl
 import numpy as np
@@ -374,7 +375,7 @@ def shading_stages(
 
     `voxels`: what the `volume` holds, if anything; `marching`: bindings of what rays march through, if they do.
     """
-    voxels = voxels or g.stage("voxels", lambda _: None, volume)
+    held: Resource[Any] = voxels or g.stage("voxels", lambda _: None, volume)
     marching = marching or g.stage("marching", lambda _: {}, volume)
     scene = g.stage(
         "shading scene",
@@ -391,12 +392,12 @@ def shading_stages(
     grid = g.stage("low res grid", shading.choose_pixels, scene)
     cones = trace(scene, grid)
     caustics = g.stage("caustics", shading.cast_caustics, scene, grid, bvh, s.observation, volume)
-    direct = g.stage("direct light", light_directly or shading.light_directly, scene, grid, caustics, voxels)
+    direct = g.stage("direct light", light_directly or shading.light_directly, scene, grid, caustics, held)
     reflection = g.stage("reflections", shading.reflect_objects, scene, grid, bvh, marching)
     change = g.stage("change of light", shading.compare, grid, direct, cones, reflection)
     screen = g.stage("screen cones", shading.trace_screen, scene, direct, cones, bvh, s.observation, marching)
     radiance = g.stage("virtual surface", shading.shade_objects, scene, grid, cones, caustics, screen)
-    return Layers(direct, cones, grid, change, radiance, reflection, voxels, volume, lit.real_maps)
+    return Layers(direct, cones, grid, change, radiance, reflection, held, volume, lit.real_maps)
 
 
 def shadow_receivers(real: GeometryState, extent: Points) -> Points:
