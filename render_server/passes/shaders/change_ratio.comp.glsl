@@ -1,6 +1,6 @@
-// How light changed on the reduced grid. RATIO: E_rho / E_mu at each texel's pixel, and whether anything changed in
-// its block of pixels. Otherwise: list the texels that are within FILL_RADIUS of a change or show an object; only
-// their pixels are composed.
+// Change of light on the reduced grid. RATIO: E_rho / E_mu at each texel's pixel, and whether anything changed in its
+// block of pixels. Otherwise: lists the texels within FILL_RADIUS of a change or that show an object; only their
+// pixels are composed.
 #include "common/work_list.glsl"
 
 layout(local_size_x = 8, local_size_y = 8) in;

@@ -1,4 +1,4 @@
-// Find the groups of surfels. Without SUM: give each a slot. SUM: add its area, mean normal and place.
+// Finds the groups of surfels. Without SUM: gives each a slot. SUM: adds its area, mean normal and position.
 #include "common/volume.glsl"
 #include "common/voxel_store.glsl"
 #include "common/surfel_groups.glsl"
@@ -7,7 +7,7 @@
 layout(local_size_x = 64) in;
 
 #ifdef SUM
-uniform bool has_seen;    // SurfelLights tells which of them the camera looks at
+uniform bool has_seen;    // SurfelLights marks the surfels that the camera sees
 
 void add_to_group(Surfel s, uint surfel, int side, vec3 n) {
     uint entry = group_entry(floatBitsToUint(s.uv_voxel.z), n);

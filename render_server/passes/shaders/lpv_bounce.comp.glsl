@@ -1,5 +1,5 @@
-// Injection of what surfaces reflect of the light that propagation brought to them: of virtual ones all of it, of real
-// ones what the objects change of it (the picture shows the rest, and that is in V_mu).
+// Injects the reflection of propagated light: of virtual surfaces all of it, of real ones only the objects' change of
+// it (the picture shows the rest, which is in V_mu).
 #include "common/volume.glsl"
 #include "common/voxel_store.glsl"
 #include "common/lights.glsl"

@@ -1,13 +1,13 @@
-// Geometry volume: how much of each cell face surfaces cover (after Kaplanyan & Dachsbacher 2010). A face stands for the
-// cube of a cell's edge about its centre, so that a surface blocks between the cell in which its light starts and the one
-// behind it. Surfels were clipped to half cells, so each lies in one such cube an axis. Kept are the areas across each
-// axis rather than spherical harmonics of them: only these are ever asked for. The two sides are summed apart, so that
-// both sides of a thin body do not count as two bodies.
+// Geometry volume: the fraction of each cell face that surfaces cover (after Kaplanyan & Dachsbacher 2010). A face
+// represents the cube of a cell's edge about its centre, so that a surface blocks between the cell in which its light
+// starts and the one behind it. Surfels were clipped to half cells, so each is in one such cube per axis. Stored are
+// the areas across each axis rather than spherical harmonics of them, because only these are used. The two sides are
+// summed separately, so that both sides of a thin body do not count as two bodies.
 #include "common/voxel_store.glsl"
 #include "common/light_cells.glsl"
 
 layout(local_size_x = 64) in;
-layout(std430) buffer Covered { int covered[]; };   // 6 a cell: its low faces on x, y, z; by surfaces that face -, +
+layout(std430) buffer Covered { int covered[]; };   // 6 per cell: its low faces on x, y, z; by surfaces that face -, +
 uniform int cells;
 uniform float cell_edge;   // m
 

@@ -1,7 +1,7 @@
-// Injection of what surfaces do to the light of the environment. The fields outside hold the environment R as if
-// nothing stood in the volume; so each surface element sends what it reflects of R (and emits), less what would have come
-// through it from behind: E_R(n) albedo - E_R(-n). This is how the volume blocks natural light, and how nothing counts
-// twice where R stands for ground that lies in the volume.
+// Injects the surfaces' effect on the environment's light. The fields outside hold the environment R as if the volume
+// were empty; so each surface element sends what it reflects of R (and emits), minus what would have come through it
+// from behind: E_R(n) albedo - E_R(-n). This is how the volume blocks natural light, and why nothing counts twice
+// where R represents ground that is in the volume.
 #include "common/volume.glsl"
 #include "common/voxel_store.glsl"
 #include "common/lights.glsl"

@@ -1,6 +1,6 @@
-// Irradiance that beams bring: first of each pixel, what is sharp, then of each texel of the reduced grid, what is not. A
-// place holds that of its real surface and that of its object.
-layout(std430) buffer CausticSums { int caustic_sums[]; };   // CAUSTIC_SUMS a place
+// Irradiance of caustic beams: the sharp part per pixel, then the smooth part per texel of the reduced grid. Each
+// entry holds that of the real surface and that of the object.
+layout(std430) buffer CausticSums { int caustic_sums[]; };   // CAUSTIC_SUMS per entry
 
 const int REAL_LAYER = 0, OBJECT_LAYER = 3, CAUSTIC_SUMS = 6;
 const float CAUSTIC_STEPS = 1048576.0;   // 2^20 steps: sums of many small parts up to 2047 camera units

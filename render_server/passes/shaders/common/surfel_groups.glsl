@@ -1,9 +1,9 @@
-// Surfels of a block of 2^3 voxels whose normals have the same main axis form a group: one gathering of light serves
-// all. Needs volume.glsl and voxel_store.glsl.
+// Surfels of a block of 2^3 voxels whose normals have the same main axis form a group, for which light is gathered
+// once. Needs volume.glsl and voxel_store.glsl.
 layout(std430) buffer GroupGrid { uint group_grid[]; };         // slot + 1 of each block and main axis
 layout(std430) buffer GroupEntries { uint group_count; uint unseen_count; uint group_entries[]; };
-layout(std430) buffer GroupSums { int group_sums[]; };          // GROUP_SUMS a slot
-layout(std430) buffer GroupLight { vec4 group_light[]; };       // a slot: irradiance of mu, of rho
+layout(std430) buffer GroupSums { int group_sums[]; };          // GROUP_SUMS per slot
+layout(std430) buffer GroupLight { vec4 group_light[]; };       // per slot: irradiance of mu, of rho
 
 const int GROUP_AREA = 0, GROUP_UNSEEN = 1, GROUP_NORMAL = 2, GROUP_PLACE = 5;   // all weighted by area / h^2
 const int GROUP_SUMS = 8;
@@ -19,12 +19,12 @@ uint group_entry(uint voxel, vec3 n) {
     return voxel_index(block, volume_size / 2) * 6u + uint(main_axis(n));
 }
 
-// Low corner (voxels) of the block that an entry of the grid stands for.
+// Low corner (voxels) of the block of an entry of the grid.
 vec3 block_corner(uint entry) { return vec3(2 * voxel_of_index(entry / 6u, volume_size / 2)); }
 
 uint groups_held() { return min(group_count, uint(group_entries.length())); }
 
-// Slot of the group, -1 where there was no room for it.
+// Slot of the group, -1 if there was no room for it.
 int group_slot(uint entry) {
     uint held = group_grid[entry];
     return held == 0u || held > groups_held() ? -1 : int(held) - 1;

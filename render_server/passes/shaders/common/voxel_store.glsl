@@ -1,5 +1,5 @@
 // Sparse voxel store of one geometry set (real or virtual): a grid of slots, the list of touched voxels, one surfel
-// for every piece of a triangle inside a voxel, and fixed-point sums a slot. Integer atomics keep it bit-identical.
+// for every piece of a triangle inside a voxel, and fixed-point sums per slot. Integer atomics keep it bit-identical.
 struct Surfel {
     vec4 position_area;    // world m, m^2
     vec4 normal_material;  // unit normal, material index
@@ -11,7 +11,7 @@ layout(std430) buffer Grid { uint grid[]; };          // slot + 1 of each voxel,
 layout(std430) buffer Touched { uint touched[]; };    // voxel index of each slot
 layout(std430) buffer Surfels { Surfel surfels[]; };
 layout(std430) buffer Counters { uint slot_count; uint surfel_count; uint surfel_capacity; uint spare; };
-layout(std430) buffer Sums { int sums[]; };           // SUMS_PER_SLOT a slot
+layout(std430) buffer Sums { int sums[]; };           // SUMS_PER_SLOT per slot
 
 const int COVERAGE = 0;          // 6 directions
 const int RADIANCE = 6;          // 6 directions x rgb

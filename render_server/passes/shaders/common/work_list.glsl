@@ -1,5 +1,5 @@
-// A list of texels of the reduced grid: passes walk it instead of branching, because software renderers run both sides
-// of a branch, and a GPU keeps its lanes full.
+// A list of texels of the reduced grid: passes walk it instead of branching, because software renderers execute both
+// sides of a branch, and a GPU keeps its lanes full.
 layout(std430) buffer Texels { uint texel_count; uint texels[]; };
 
 void append_texel(ivec2 texel, int grid_width) {
@@ -10,7 +10,7 @@ uint listed_count() { return min(texel_count, uint(texels.length())); }
 
 ivec2 texel_of_index(uint index, int grid_width) { return ivec2(int(index) % grid_width, int(index) / grid_width); }
 
-// Pixel number `inside` of the block of scale x scale pixels that a texel stands for.
+// Pixel number `inside` of the block of scale x scale pixels that a texel represents.
 ivec2 pixel_in_block(ivec2 texel, int inside, int scale) {
     return texel * scale + ivec2(inside % scale, inside / scale);
 }
