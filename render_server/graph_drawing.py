@@ -42,7 +42,8 @@ MEANINGS: Final[dict[Clock, str]] = {
 }
 NOTE = (
     "Colour: the fastest clock that a stage follows; dots: all of them. "
-    "Faded: nothing that the stage reads has changed, so what it made before is kept."
+    "Faded: nothing that the stage reads has changed, so what it made before is kept. "
+    "+: values that are put together for the stage."
 )
 
 

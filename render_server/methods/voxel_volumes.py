@@ -105,7 +105,7 @@ class FarScene:
         self._block = UniformBlock[FarVolumeBlock](gpu, self._set.volume.placement.far_block(is_used=is_used))
 
     def voxelize(self, real: GeometryState) -> VoxelSet:
-        """Voxelises the whole real scene."""
+        """Voxelises the whole real scene coarsely."""
         if self._is_used:
             low, high = real.bounds
             edge = min(float(np.max(high - low)), FAR_EDGE_M) * FAR_MARGIN
@@ -115,7 +115,7 @@ class FarScene:
         return self._set
 
     def light(self, voxels: VoxelSet, scene: Bindings) -> VoxelMipmap:
-        """Gives the voxels the radiance that the camera measured, and filters them."""
+        """Gives the far voxels the radiance that the camera measured, and filters them."""
         if self._is_used:
             voxels.forget_light()
             self._light.light_real(voxels.store, {**scene, **voxels.volume.bindings})
@@ -232,7 +232,7 @@ class DeltaVoxels(DirectionalVoxels):
         return self.mu
 
     def bounce_real(self, _mu: VoxelMipmap, _far: VoxelMipmap, scene: Bindings) -> VoxelMipmap:
-        """Real surfaces that the camera does not see: what they gather from mu in place of all ambient light."""
+        """Gathers from mu, in place of all ambient light, for real surfaces that the camera does not see."""
         if self._bounces == 0:
             return self.mu
         own, store, groups = {**scene, **self.real.volume.bindings}, self.real.store, self.real.groups
