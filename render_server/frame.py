@@ -178,7 +178,7 @@ class PictureBuffers:
         return self._samples
 
     def antialias_interior(self, radiance: moderngl.Texture, surface: ObjectSurface) -> moderngl.Texture:
-        """Antialiases the edges of objects before each other, where samples were drawn."""
+        """Antialiases the edges between objects in their shaded radiance, if samples were drawn."""
         if surface.samples is None:
             return radiance
         if self._interior_edges is None:

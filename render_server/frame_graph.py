@@ -98,7 +98,7 @@ class Composition:
         options: CompositeOptions,
         *layers: Any,  # noqa: ANN401 (of RelitLayers, in their order)
     ) -> Composite:
-        """Composes the relit picture, or overwrites it with a debug view."""
+        """Composes the relit picture."""
         relit = RelitLayers(scene["object_coverage"], *layers)
         self._composite.run(image, relit, {**scene, **options.bindings})
         view = options.output.view

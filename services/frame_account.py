@@ -78,9 +78,10 @@ class FrameAccount:
         """A sentence on what the frame cost and holds."""
         ran = [stage for stage in self.stages if stage.ran]
         time_ms = sum(stage.time_ms or 0 for stage in ran)
-        sizes = [source.size_bytes for source in self.sources] + [stage.size_bytes for stage in self.stages]
-        held = f"{sum(sizes) / 1e6:.1f} MB on the GPU"
-        return f"{len(ran)} of {len(self.stages)} stages ran, {time_ms:.1f} ms; {held}."
+        size = (
+            sum([each.size_bytes for each in self.sources] + [each.size_bytes for each in self.stages]) / 1e6
+        )
+        return f"{len(ran)} of {len(self.stages)} stages ran, {time_ms:.1f} ms; {size:.1f} MB on the GPU."
 
     def as_dict(self) -> dict[str, Any]:
         """The account as plain data."""

@@ -43,7 +43,7 @@ class ExactCones:
         return self._voxels.march_bindings(self._cone_count)
 
     def trace_real(self, scene: Bindings, grid: LowResGrid, marching: Bindings) -> ConeFields:
-        """Traces cones at real surfaces: E_mu, E_rho, and the specular cones."""
+        """Traces the cones at real surfaces: E_mu, E_rho, and the specular cones."""
         voxels = self._voxels
         self._tracing.trace_real(self._fields, grid, voxels.mu, voxels.rho, {**scene, **marching})
         return self._fields
@@ -51,7 +51,7 @@ class ExactCones:
     def trace_objects(
         self, fields: ConeFields, scene: Bindings, grid: LowResGrid, marching: Bindings
     ) -> ConeFields:
-        """Traces cones at the objects: E_rho and the specular cone."""
+        """Traces the cones at the objects: E_rho and the specular cone."""
         voxels = self._voxels
         self._tracing.trace_virtual(fields, grid, voxels.mu, voxels.rho, {**scene, **marching})
         return fields
@@ -101,7 +101,7 @@ class PaperCones:
         self._tracing = TraceConesPaper(gpu)
 
     def trace(self, scene: Bindings, grid: LowResGrid, voxels: InjectedVoxels) -> ConeFields:
-        """Traces cones at real surfaces and at the objects."""
+        """Traces the cones at real surfaces and at the objects."""
         self._tracing.trace_real(self._fields, grid, voxels.delta, scene)
         self._tracing.trace_virtual(self._fields, grid, voxels.rho, scene)
         return self._fields

@@ -115,7 +115,7 @@ class FarScene:
         return self._set
 
     def light(self, voxels: VoxelSet, scene: Bindings) -> VoxelMipmap:
-        """Gives the far voxels the radiance that the camera measured, and filters them."""
+        """Lights the voxels by the radiance that the camera measured, and filters them."""
         if self._is_used:
             voxels.forget_light()
             self._light.light_real(voxels.store, {**scene, **voxels.volume.bindings})
@@ -232,7 +232,7 @@ class DeltaVoxels(DirectionalVoxels):
         return self.mu
 
     def bounce_real(self, _mu: VoxelMipmap, _far: VoxelMipmap, scene: Bindings) -> VoxelMipmap:
-        """Gathers from mu, in place of all ambient light, for real surfaces that the camera does not see."""
+        """Replaces the ambient light of unseen real surfaces by what they gather from mu."""
         if self._bounces == 0:
             return self.mu
         own, store, groups = {**scene, **self.real.volume.bindings}, self.real.store, self.real.groups
