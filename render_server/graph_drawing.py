@@ -15,13 +15,13 @@ LINE = 16
 TITLE = 30  # of a section
 ROW_GAP = 14
 CHANNEL = 34  # between bands
-LANE = 6  # between arrows side by side
+LANE = 6  # at most, between arrows side by side
 LEGEND_TOP = 50
 CARD_HEIGHT = 68  # of a clock in the legend
 TEXT_LEFT = 14  # in a box
 RADIUS = 8  # of an arrow's corners
 LEAST_BYTES = 50_000  # that a box tells of
-LETTER, BOLD_LETTER = 0.57, 0.67  # mean widths, of the font's size
+LETTER, BOLD_LETTER = 0.57, 0.70  # mean widths, of the font's size
 INK, GREY, FAINT, PANEL = "#1c2430", "#5d6673", "#9aa3af", "#f4f6f8"
 Point = tuple[float, float]
 STYLE = "text { font-family: system-ui, 'Segoe UI', 'DejaVu Sans', sans-serif; }"
@@ -42,7 +42,8 @@ MEANINGS: Final[dict[Clock, str]] = {
 }
 NOTE = (
     "Colour: the fastest clock that a stage follows; dots: all of them. "
-    "Faded: nothing that the stage reads has changed, so what it made before is kept."
+    "Faded: nothing that the stage reads has changed, so what it made before is kept. "
+    "+: values that are put together for the stage."
 )
 
 
@@ -181,7 +182,8 @@ def _step(start: Point, end: Point) -> str:
 def _crossing_path(metrics: _Metrics, arrow: Arrow, lanes: dict[Box, int]) -> str:
     """Down the gap beside its box, along the channel above the band that it leads to, and in; a lane a start."""
     start, end = _exit(metrics, arrow.start), _entry(metrics, arrow)
-    shift = LANE * (lanes[arrow.start] - (len(lanes) - 1) / 2)
+    lane = min(LANE, (CHANNEL - 4) / len(lanes))
+    shift = lane * (lanes[arrow.start] - (len(lanes) - 1) / 2)
     channel = metrics.tops[arrow.end.band] - CHANNEL / 2 + shift
     corners = [
         (start[0] + metrics.gap / 2 + shift, start[1]),
@@ -288,9 +290,7 @@ def _tint(color: str) -> str:
 def _rect(parent: ElementTree.Element, box: tuple[float, float, float, float], **style: str) -> None:
     names = ("x", "y", "width", "height")
     place = {name: f"{value:.1f}" for name, value in zip(names, box, strict=True)}
-    ElementTree.SubElement(
-        parent, "rect", {**place, **{key.replace("_", "-"): value for key, value in style.items()}}
-    )
+    ElementTree.SubElement(parent, "rect", {**place, **style})
 
 
 def _text(

@@ -106,7 +106,7 @@ class FarScene:
         self._block = UniformBlock[FarVolumeBlock](gpu, self._set.volume.placement.far_block(is_used=is_used))
 
     def voxelize(self, real: GeometryState) -> VoxelSet:
-        """Voxelises the whole real scene."""
+        """Voxelises the whole real scene coarsely."""
         if self._is_used:
             low, high = real.bounds
             edge = min(float(np.max(high - low)), FAR_EDGE_M) * FAR_MARGIN
