@@ -85,9 +85,7 @@ class ShadowMaps:
     def __init__(self, gpu: GpuContext) -> None:
         self._kernel = RasterKernel(gpu, "reflective_shadow_map")
 
-    def run(
-        self, atlas: ShadowMapAtlas, meshes: Sequence[MeshBuffers], views: Sequence[LightView]
-    ) -> None:
+    def run(self, atlas: ShadowMapAtlas, meshes: Sequence[MeshBuffers], views: Sequence[LightView]) -> None:
         """Draws all `meshes` for each view, tile by tile."""
         atlas.clear()
         for tile, view in enumerate(views):
