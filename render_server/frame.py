@@ -60,12 +60,13 @@ class Observation:
 class ObjectSurface:
     """The objects as the camera sees them: their geometry buffer and how much of each pixel they cover.
 
-    `samples` are the samples that an antialiased geometry buffer was resolved from; `rectangle` encloses the
-    objects.
+    `edge_correction` unmixes the edges of real things in front of the objects. `samples` are the samples that an
+    antialiased geometry buffer was resolved from; `rectangle` encloses the objects.
     """
 
     buffer: GeometryBuffer
     coverage: ObjectCoverage
+    edge_correction: moderngl.Texture
     samples: SampleCoverage | None
     rectangle: Rectangle
 
@@ -107,7 +108,7 @@ class PictureBuffers:
         self._model_raster: GeometryBuffer | None = None
         self._samples: SampleCoverage | None = None
         self._interior_edges: InteriorEdgeAA | None = None
-        self._unmixing = EdgeUnmixing(gpu, self.image)
+        self._unmixing = EdgeUnmixing(gpu, size)
         self._geometry = RasterGeometry(gpu)
         self._raster_camera, self._camera = (UniformBlock[CameraBlock](gpu, view.block()) for _ in range(2))
         self._surfaces = gpu.ctx.buffer(reserve=MAX_SURFACES * 80 + 80)
@@ -148,14 +149,14 @@ class PictureBuffers:
 
     def draw_objects(self, objects: GeometryState, seen: Observation, view: CameraView) -> ObjectSurface:
         """Rasters the objects, computes their coverage of pixels, and unmixes the edges of real things."""
-        rectangle = view.rectangle_around(objects.points)
+        rectangle, correction = view.rectangle_around(objects.points), self._unmixing.texture
         if view.antialiased:
             samples = self._draw_samples(objects, seen, view, rectangle)
-            surface = ObjectSurface(samples.surface, self.coverage, samples, rectangle)
+            surface = ObjectSurface(samples.surface, self.coverage, correction, samples, rectangle)
         else:
             scene = {**seen.bindings, **objects.materials.bindings}
             self._geometry.run(self._raster, objects.buffers, view, scene)
-            surface = ObjectSurface(self._raster, self.coverage, None, rectangle)
+            surface = ObjectSurface(self._raster, self.coverage, correction, None, rectangle)
         scene = {**seen.bindings, **surface.buffer.bindings}
         covered = None if surface.samples is None else surface.samples.texture
         self.coverage.run(rectangle, scene, covered)
@@ -237,6 +238,7 @@ def _geometry_bindings(
         **surface.buffer.bindings,
         **objects.materials.bindings,
         "object_coverage": surface.coverage.texture,
+        "edge_correction": surface.edge_correction,
     }
 
 

@@ -344,7 +344,9 @@ class RasterKernel:
         if clips:
             self._ctx.disable_direct(CLIP_DISTANCE0)
         target.scissor = None  # type: ignore[assignment]  # or it would cut what is cleared next
-        self._program.report((mesh.triangle_count,), {})
+        attachments = [*target.color_attachments, target.depth_attachment]
+        written = {f"attachment {number}": item for number, item in enumerate(attachments)}
+        self._program.report((mesh.triangle_count,), written)
 
     def resources(self) -> dict[str, list[str]]:
         """Returns the names of the linked program's bindings, by kind."""

@@ -126,7 +126,9 @@ class FieldShading:
         self._volume = PlacedVolume(gpu, VolumePlacement((0.0, 0.0, 0.0), 1.0, cells))
         self._shown = VoxelMipmap(gpu, cells, 1)
         self._probes = LightProbeCapture(gpu, length)
-        self._occlusion = OcclusionShade(gpu, size, length)
+        self._at_real, self._at_objects = (
+            OcclusionShade(gpu, size, length, real=real) for real in (True, False)
+        )
         self._change = LightChange(gpu, size)
         self._bounce = ObjectBounceLight(gpu, size)
         self._natural = NaturalFields(gpu)
@@ -155,8 +157,7 @@ class FieldShading:
 
     def hide(self, items: list[FieldObject], scene: Bindings, grid: LowResGrid) -> OcclusionShade:
         """Computes the natural light that the objects leave at real surfaces."""
-        self._occlude(items, _with_hidden(scene), grid, real=True)
-        return self._occlusion
+        return _occluded(self._at_real, items, _with_hidden(scene), grid)
 
     def find_changed_light(
         self, items: list[FieldObject], scene: Bindings, grid: LowResGrid, shade: OcclusionShade
@@ -197,29 +198,28 @@ class FieldShading:
         reflecting: list[FieldObject],
         scene: Bindings,
         grid: LowResGrid,
-        _hidden: OcclusionShade,
+        hidden: OcclusionShade,
     ) -> ConeFields:
         """Writes the fields of real surfaces, then those of the objects, which occlude each other too."""
         own = _with_hidden(scene)
-        self._finish(reflecting, own, grid, real=True)
-        self._occlude(items, own, grid, real=False)
-        self._finish(reflecting, own, grid, real=False)
+        self._finish(hidden, reflecting, own, grid, real=True)
+        self._finish(_occluded(self._at_objects, items, own, grid), reflecting, own, grid, real=False)
         return self._fields
 
-    def _occlude(self, items: list[FieldObject], scene: Bindings, grid: LowResGrid, *, real: bool) -> None:
-        for number, item in enumerate(items):
-            self._occlusion.run(
-                grid, item.probe, item.textures, scene, item.place, first=number == 0, real=real
-            )
-
     def _finish(
-        self, reflecting: list[FieldObject], scene: Bindings, grid: LowResGrid, *, real: bool
+        self,
+        hidden: OcclusionShade,
+        reflecting: list[FieldObject],
+        scene: Bindings,
+        grid: LowResGrid,
+        *,
+        real: bool,
     ) -> None:
         for number, item in enumerate(reflecting):
             assert item.bounce_light is not None
             self._bounce.shade(grid, item.bounce_light, scene, item.place, first=number == 0, real=real)
         bounce = self._bounce if reflecting else None
-        self._natural.run(self._fields, grid, self._occlusion, bounce, scene, real=real)
+        self._natural.run(self._fields, grid, hidden, bounce, scene, real=real)
 
     def release(self) -> None:
         """Frees the GL objects."""
@@ -227,12 +227,22 @@ class FieldShading:
             self._volume,
             self._shown,
             self._probes,
-            self._occlusion,
+            self._at_real,
+            self._at_objects,
             self._change,
             self._bounce,
             self._natural,
             self._show,
         )
+
+
+def _occluded(
+    shade: OcclusionShade, items: list[FieldObject], scene: Bindings, grid: LowResGrid
+) -> OcclusionShade:
+    """Computes the natural light that the objects leave."""
+    for number, item in enumerate(items):
+        shade.run(grid, item.probe, item.textures, scene, item.place, first=number == 0)
+    return shade
 
 
 def _with_hidden(scene: Bindings) -> dict[str, Binding]:

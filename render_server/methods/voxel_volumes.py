@@ -4,6 +4,7 @@ mu holds the real scene, rho real and virtual surfaces.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import moderngl
 import numpy as np
@@ -51,25 +52,22 @@ FAR_MARGIN = 1.05
 class VoxelSet:
     """The sparse voxels of one geometry: the placement that they were filled for, their surfels and groups.
 
-    `is_lit`: the sums hold light, which must be cleared before relighting.
+    `mipmaps` are filtered from them; replaced voxels are cleared from them. `is_lit`: the sums hold light, which must
+    be cleared before relighting.
     """
 
-    def __init__(self, gpu: GpuContext, size: int, directions: int) -> None:
+    def __init__(self, gpu: GpuContext, size: int, mipmaps: Sequence[VoxelMipmap]) -> None:
         self.store = VoxelStore(gpu, size)
         self.volume = PlacedVolume(gpu, VolumePlacement((0.0, 0.0, 0.0), 1.0, size))
         self.groups = SurfelGroups(gpu, size)
         self.is_lit = False
+        self._mipmaps = mipmaps
         self._voxelize = Voxelize(gpu)
-        self._clear = ClearVoxels(gpu, directions)
+        self._clear = ClearVoxels(gpu, mipmaps[0].directions)
 
-    def fill(
-        self,
-        corners: Float32[np.ndarray, "m 3 10"],
-        placement: VolumePlacement,
-        mipmaps: Sequence[VoxelMipmap],
-    ) -> None:
+    def fill(self, corners: Float32[np.ndarray, "m 3 10"], placement: VolumePlacement) -> None:
         """Replaces the voxels by those of the triangles, and clears the old ones from the mipmaps."""
-        self._clear.run(self.store, mipmaps, self.volume)
+        self._clear.run(self.store, self._mipmaps, self.volume)
         self.volume.place(placement)
         self._voxelize.run(self.store, corners, self.volume)
         self.is_lit = False
@@ -99,7 +97,7 @@ class FarScene:
     def __init__(self, gpu: GpuContext, light: LightVoxels, *, is_used: bool) -> None:
         self._is_used = is_used
         self.mipmap = VoxelMipmap(gpu, FAR_SIZE, DIRECTIONS)
-        self._set = VoxelSet(gpu, FAR_SIZE, DIRECTIONS)
+        self._set = VoxelSet(gpu, FAR_SIZE, [self.mipmap])
         self._light = light
         self._resolve = ResolveVoxels(gpu)
         self._filter = FilterVoxels(gpu)
@@ -111,18 +109,18 @@ class FarScene:
             low, high = real.bounds
             edge = min(float(np.max(high - low)), FAR_EDGE_M) * FAR_MARGIN
             corners = real.corners if real.coarse_corners is None else real.coarse_corners
-            self._set.fill(corners, place_volume(low, high, FAR_SIZE, edge), [self.mipmap])
+            self._set.fill(corners, place_volume(low, high, FAR_SIZE, edge))
             self._block.write(self._set.volume.placement.far_block(is_used=True))
         return self._set
 
-    def light(self, voxels: VoxelSet, scene: Bindings) -> VoxelMipmap:
+    def light(self, voxels: VoxelSet, scene: Bindings) -> VoxelSet:
         """Lights the voxels by the radiance that the camera measured, and filters them."""
         if self._is_used:
             voxels.forget_light()
             self._light.light_real(voxels.store, {**scene, **voxels.volume.bindings})
             self._resolve.resolve_mu(self.mipmap, voxels.store, voxels.volume)
             self._filter.run(self.mipmap, voxels.volume)
-        return self.mipmap
+        return voxels
 
     @property
     def bindings(self) -> dict[str, Binding]:
@@ -141,7 +139,8 @@ class DirectionalVoxels:
         self._bounces = settings.bounces
         self._measured = settings.radiance == "measured"
         self.mu, self.rho = (VoxelMipmap(gpu, size, DIRECTIONS) for _ in range(2))
-        self.real, self.objects = (VoxelSet(gpu, size, DIRECTIONS) for _ in range(2))
+        self.real = VoxelSet(gpu, size, [self.mu, self.rho])
+        self.objects = VoxelSet(gpu, size, [self.rho])
         self._light = LightVoxels(gpu)
         self.far = FarScene(gpu, self._light, is_used=settings.far_volume)
         self._group = GroupSurfels(gpu)
@@ -151,12 +150,12 @@ class DirectionalVoxels:
 
     def voxelize_real(self, real: GeometryState, placement: VolumePlacement) -> VoxelSet:
         """Voxelises the real scene, with back faces if one camera saw it."""
-        self.real.fill(real.solid_corners(placement.voxel_edge), placement, [self.mu, self.rho])
+        self.real.fill(real.solid_corners(placement.voxel_edge), placement)
         return self.real
 
     def voxelize_objects(self, objects: GeometryState, placement: VolumePlacement) -> VoxelSet:
         """Voxelises the objects."""
-        self.objects.fill(objects.corners, placement, [self.rho])
+        self.objects.fill(objects.corners, placement)
         self.objects.groups.start(self.objects.store)
         if self._bounces > 0:
             self._group.run(
@@ -198,6 +197,15 @@ class DirectionalVoxels:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class LitVoxels:
+    """The voxels of both geometries with the light of rho, and the bounds of those whose light objects change."""
+
+    real: VoxelSet
+    objects: VoxelSet
+    support: moderngl.Buffer
+
+
 class DeltaVoxels(DirectionalVoxels):
     """Voxels of the exact operator; rho equals mu where objects change nothing.
 
@@ -232,18 +240,20 @@ class DeltaVoxels(DirectionalVoxels):
         self._filter_mu()
         return self.mu
 
-    def bounce_real(self, _mu: VoxelMipmap, _far: VoxelMipmap, scene: Bindings) -> VoxelMipmap:
+    def bounce_real(
+        self, voxels: VoxelSet, _mu: VoxelMipmap, _far: VoxelSet, scene: Bindings
+    ) -> tuple[VoxelMipmap, VoxelSet]:
         """Replaces the ambient light of unseen real surfaces by what they gather from mu."""
         if self._bounces == 0:
-            return self.mu
-        own, store, groups = {**scene, **self.real.volume.bindings}, self.real.store, self.real.groups
+            return self.mu, voxels
+        own, store, groups = {**scene, **voxels.volume.bindings}, voxels.store, voxels.groups
         self._group.run(store, groups, own, has_seen=True)
         _, unseen = groups.counts()
         for _ in range(self._bounces if unseen else 0):
             self._gather.gather_unseen(store, groups, self.mu, {**own, **self.march_bindings(1)})
             self._light.light_real(store, own, groups, gathered=True)
             self._filter_mu()
-        return self.mu
+        return self.mu, voxels
 
     def joint_scene(
         self, scene: Bindings, objects: GeometryState, lights: LightBuffers, voxels: VoxelSet
@@ -258,25 +268,27 @@ class DeltaVoxels(DirectionalVoxels):
             "has_caustics": self._caustics and casts_caustics(objects),
         }
 
-    def light_objects(
-        self, voxels: VoxelSet, objects: GeometryState, scene: Bindings, _mu: VoxelMipmap
-    ) -> VoxelSet:
-        """Lights the objects' surfels, and the change of real ones due to the objects' shadows."""
+    def light_joint(
+        self, real: VoxelSet, voxels: VoxelSet, objects: GeometryState, scene: Bindings
+    ) -> LitVoxels:
+        """Lights the objects' surfels, and changes the light of real ones by the objects' shadows."""
         voxels.forget_light()
         self._light.start_support(voxels.volume.placement.voxel_bounds(np.stack(objects.bounds)))
         self._light_rho(scene, gathered=False)
-        return voxels
+        return LitVoxels(real, voxels, self._light.support)
 
     def _light_rho(self, scene: Bindings, *, gathered: bool) -> None:
         self._light.light_virtual(self.objects.store, scene, self.objects.groups, gathered=gathered)
         self._light.light_real_delta(self.real.store, scene, self.real.groups, gathered=gathered)
 
-    def filter_joint(self, _lit: VoxelSet) -> VoxelMipmap:
+    def filter_joint(self, _lit: LitVoxels) -> VoxelMipmap:
         """Filters the lit voxels of both sets into rho."""
         self._filter_rho()
         return self.rho
 
-    def bounce_joint(self, _rho: VoxelMipmap, scene: Bindings) -> VoxelMipmap:
+    def bounce_joint(
+        self, lit: LitVoxels, _rho: VoxelMipmap, scene: Bindings
+    ) -> tuple[VoxelMipmap, LitVoxels]:
         """Gathers light from mu and rho, and relights the objects and the change of real surfaces with it."""
         for _ in range(self._bounces):
             marching = {**scene, **self.march_bindings(1)}
@@ -284,7 +296,7 @@ class DeltaVoxels(DirectionalVoxels):
             self._gather.gather_virtual(self.objects.store, self.objects.groups, self.rho, marching)
             self._light_rho(scene, gathered=True)
             self._filter_rho()
-        return self.rho
+        return self.rho, lit
 
 
 def delta_voxel_stages(
@@ -306,12 +318,22 @@ def delta_voxel_stages(
     lit_real = g.stage("light real voxels", voxels.light_real, real, scene)
     far = g.stage("light far voxels", voxels.far.light, beyond, scene)
     filtered = g.stage("filter mu", voxels.filter_real, lit_real)
-    mu = g.stage("bounces real", voxels.bounce_real, filtered, far, scene)
+    mu, bounced = g.stages(
+        "bounces real",
+        voxels.bounce_real,
+        *(lit_real, filtered, far, scene),
+        outputs=("bounces real", "bounced real voxels"),
+    )
     objects = g.stage("voxelize objects", voxels.voxelize_objects, s.objects, placement)
     joint = g.value("joint voxel scene", voxels.joint_scene, scene, s.objects, lit.object_maps, objects)
-    lit_joint = g.stage("light joint voxels", voxels.light_objects, objects, s.objects, joint, mu)
+    lit_joint = g.stage("light joint voxels", voxels.light_joint, bounced, objects, s.objects, joint)
     filtered_joint = g.stage("filter rho", voxels.filter_joint, lit_joint)
-    rho = g.stage("bounces joint", voxels.bounce_joint, filtered_joint, joint)
+    rho, _ = g.stages(
+        "bounces joint",
+        voxels.bounce_joint,
+        *(lit_joint, filtered_joint, joint),
+        outputs=("bounces joint", "bounced joint voxels"),
+    )
     return mu, rho
 
 
@@ -350,7 +372,7 @@ class SolutionVoxels(DirectionalVoxels):
         return {**scene, **own, **objects.materials.bindings}
 
     def light(
-        self, _voxels: tuple[VoxelSet, VoxelSet], _far: VoxelMipmap, mu: Bindings, rho: Bindings
+        self, _voxels: tuple[VoxelSet, VoxelSet], _far: VoxelSet, mu: Bindings, rho: Bindings
     ) -> "SolutionVoxels":
         """Lights, resolves and filters mu, then rho."""
         self._light_both(mu, rho, gathered=False)
@@ -429,7 +451,7 @@ class InjectedVoxels:
 
     def __init__(self, gpu: GpuContext, size: int) -> None:
         self.delta, self.rho = (VoxelMipmap(gpu, size, self.directions) for _ in range(2))
-        self.real, self.objects = (VoxelSet(gpu, size, self.directions) for _ in range(2))
+        self.real, self.objects = (VoxelSet(gpu, size, [self.delta, self.rho]) for _ in range(2))
         self._albedo = RealAlbedo(gpu)
         self._inject = SplitInjection(gpu)
         self._resolve = ResolveInjection(gpu)
@@ -437,12 +459,12 @@ class InjectedVoxels:
 
     def voxelize_real(self, real: GeometryState, placement: VolumePlacement) -> VoxelSet:
         """Voxelises the real scene."""
-        self.real.fill(real.corners, placement, [self.delta, self.rho])
+        self.real.fill(real.corners, placement)
         return self.real
 
     def voxelize_objects(self, objects: GeometryState, placement: VolumePlacement) -> VoxelSet:
         """Voxelises the objects."""
-        self.objects.fill(objects.corners, placement, [self.delta, self.rho])
+        self.objects.fill(objects.corners, placement)
         return self.objects
 
     def find_albedo(
@@ -468,7 +490,7 @@ class InjectedVoxels:
         seen: Observation,
         albedo: AlbedoTexture,
         lights: LightBuffers,
-    ) -> VoxelSet:
+    ) -> tuple[VoxelSet, VoxelSet]:
         """Injects the light of all maps."""
         scene = {
             **surfel_scene(seen, lights, albedo),
@@ -476,11 +498,12 @@ class InjectedVoxels:
             **real.volume.bindings,
         }
         self._inject.run(real.store, objects.store, lights, found.atlas, scene)
-        return real
+        return real, objects
 
-    def filter(self, real: VoxelSet) -> "InjectedVoxels":
+    def filter(self, injected: tuple[VoxelSet, VoxelSet]) -> "InjectedVoxels":
         """Filters the sums into both mipmaps."""
-        self._resolve.run(self.delta, self.rho, real.store, self.objects.store, real.volume)
+        real, objects = injected
+        self._resolve.run(self.delta, self.rho, real.store, objects.store, real.volume)
         self._filter.run(self.delta, self.rho, real.volume)
         return self
 

@@ -92,8 +92,9 @@ class Composite:
     def run(self, image: CameraImage, layers: RelitLayers, scene: Bindings) -> None:
         """Composes the picture.
 
-        Besides camera, geometry and declared surfaces, `scene` brings the options `additive`, `relights_real`,
-        `filmic`, `store_linear` (fills `linear`) and `whole` (composes every pixel, not only those near a change).
+        Besides camera, geometry (with `edge_correction`) and declared surfaces, `scene` brings the options
+        `additive`, `relights_real`, `filmic`, `store_linear` (fills `linear`) and `whole` (composes every pixel, not
+        only those near a change).
         """
         self.code.write(image.bytes, alignment=1)
         cones, direct = layers.cones, layers.direct
@@ -103,7 +104,6 @@ class Composite:
             picture=image.code,
             linear_picture=image.linear,
             inverse_response=image.inverse_response,
-            edge_correction=image.edge_correction,
             exposure_scale=image.exposure_scale,
             object_coverage=layers.object_coverage,
             virtual_radiance=layers.virtual_radiance,

@@ -5,7 +5,7 @@ import moderngl
 from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Bindings, Kernel, list_threads
 from render_server.gpu.textures import release_all, release_target, texture_2d
-from render_server.passes.gbuffer import CameraImage, GeometryBuffer, MeshBuffers, RasterGeometry
+from render_server.passes.gbuffer import GeometryBuffer, MeshBuffers, RasterGeometry
 from render_server.view import CameraView, Rectangle
 
 # Sample positions in 1/16 pixels from the pixel's centre, nearest first. Of all patterns of eight with one sample in
@@ -118,14 +118,14 @@ class ObjectCoverage:
 class EdgeUnmixing:
     """Unmixes pixels at the edge of a real thing in front of an object.
 
-    Corrects the objects' coverage by the fraction of the pixel that the thing fills, and writes into the image's
-    `edge_correction` what leaves the thing's own colour.
+    Corrects the objects' coverage by the fraction of the pixel that the thing fills. `texture` (RGBA16F) removes the
+    old background from a pixel's radiance, and says which pixel shows the thing's surface.
     """
 
-    def __init__(self, gpu: GpuContext, image: CameraImage) -> None:
-        self._image = image
+    def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
         self._threads = list_threads(gpu)
-        self._target = gpu.ctx.framebuffer(color_attachments=[image.edge_correction])
+        self.texture = texture_2d(gpu, size, 4, "f2")
+        self._target = gpu.ctx.framebuffer(color_attachments=[self.texture])
         self._kernel = Kernel(gpu, "edge_unmixing", RIM_SIGHT=RIM_SIGHT)
 
     def run(
@@ -140,14 +140,14 @@ class EdgeUnmixing:
             sample_coverage=sample_coverage,
             antialiased=sample_coverage is not None,
             object_coverage=coverage.texture,
-            edge_correction=self._image.edge_correction,
+            edge_correction=self.texture,
             Texels=coverage.edges,
         )
 
     def release(self) -> None:
         """Frees the GL objects."""
         release_target(self._target)
-        self._kernel.release()
+        release_all(self.texture, self._kernel)
 
 
 class InteriorEdgeAA:

@@ -23,11 +23,7 @@ METALLIC, REFLECTANCE, ROUGHNESS = (
 
 
 class CameraImage:
-    """Code (RGBA8UI), linear radiance in camera units with mip levels (RGBA16F), response (256 x 1), pixel rays.
-
-    `edge_correction` (RGBA16F, written by `EdgeUnmixing`) removes the old background from a pixel's radiance at the
-    edge of a real thing in front of an object, and says which pixel shows that thing's surface.
-    """
+    """Code (RGBA8UI), linear radiance in camera units with mip levels (RGBA16F), response (256 x 1), pixel rays."""
 
     def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
         self.size = size
@@ -37,7 +33,6 @@ class CameraImage:
         self.response = texture_2d(gpu, (256, 1), 4, "f4")
         self.inverse_response = texture_2d(gpu, (INVERSE_SIZE, 1), 4, "f4")
         self.rays = texture_2d(gpu, size, 2, "f4")
-        self.edge_correction = texture_2d(gpu, size, 4, "f2")
         self.exposure_scale = 1.0
         self.bytes = b""
         self._linearize = Kernel(gpu, "linearize")
@@ -87,8 +82,7 @@ class CameraImage:
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_all(self.code, self.linear, self.response, self.inverse_response)
-        release_all(self.rays, self.edge_correction, self._linearize)
+        release_all(self.code, self.linear, self.response, self.inverse_response, self.rays, self._linearize)
 
 
 def inverse_response(decode: Float32[np.ndarray, "256 3"]) -> Float32[np.ndarray, "n 4"]:

@@ -193,14 +193,14 @@ def _direction_table() -> Float32[np.ndarray, "texels columns"]:
 class OcclusionShade:
     """Computes the natural light that objects leave on the reduced grid, one object after the other.
 
-    RGBA32F each: `unoccluded` is the remaining fraction of the irradiance; `natural` the weighted irradiance of each
-    object's surroundings; `mirrored` the weighted radiance in mirrors there, a: remaining fraction.
+    At the real surfaces (`real`), or at those of the objects. RGBA32F each: `unoccluded` is the remaining fraction of
+    the irradiance; `natural` the weighted irradiance of each object's surroundings; `mirrored` the weighted radiance
+    in mirrors there, a: remaining fraction.
     """
 
-    def __init__(self, gpu: GpuContext, size: tuple[int, int], length: int) -> None:
+    def __init__(self, gpu: GpuContext, size: tuple[int, int], length: int, *, real: bool) -> None:
         self.unoccluded, self.natural, self.mirrored = (texture_2d(gpu, size, 4, "f4") for _ in range(3))
-        self._real = Kernel(gpu, "occlusion_shade", SH_LENGTH=length, REAL=1)
-        self._virtual = Kernel(gpu, "occlusion_shade", SH_LENGTH=length)
+        self._kernel = Kernel(gpu, "occlusion_shade", SH_LENGTH=length, **({"REAL": 1} if real else {}))
 
     def run(
         self,
@@ -211,11 +211,9 @@ class OcclusionShade:
         place: Bindings,
         *,
         first: bool,
-        real: bool,
     ) -> None:
         """Accumulates one object; the `first` one clears the sums. An object without a field occludes nothing."""
-        kernel = self._real if real else self._virtual
-        kernel.run(
+        self._kernel.run(
             grid.size,
             grid.bindings,
             place,
@@ -232,7 +230,7 @@ class OcclusionShade:
 
     def release(self) -> None:
         """Frees the GL objects."""
-        for item in (self.unoccluded, self.natural, self.mirrored, self._real, self._virtual):
+        for item in (self.unoccluded, self.natural, self.mirrored, self._kernel):
             item.release()
 
 

@@ -212,9 +212,14 @@ def _frame(case: Case, number: int, pose: BoardPose, board: BoardSpec | None) ->
     return frame(checkered(), pose=pose, **more)
 
 
-def pictures_of(gpu: GpuContext, case: Case, folder: Path) -> tuple[list[np.ndarray], list[list[Dispatch]]]:
-    """The composites (72, 96, 3; uint8) of the case's frames, and what was dispatched for each."""
-    renderer = SceneRenderer(gpu, scene_of(case, Stage(folder)))
+def pictures_of(
+    gpu: GpuContext, case: Case, folder: Path, *, checks: bool = False
+) -> tuple[list[np.ndarray], list[list[Dispatch]]]:
+    """The composites (72, 96, 3; uint8) of the case's frames, and what was dispatched for each.
+
+    `checks` is the graph's.
+    """
+    renderer = SceneRenderer(gpu, scene_of(case, Stage(folder)), checks=checks)
     pictures: list[np.ndarray] = []
     dispatches: list[list[Dispatch]] = []
     try:

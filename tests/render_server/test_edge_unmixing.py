@@ -190,7 +190,7 @@ def corrections(gpu: GpuContext, document: SceneDocument, view: ViewFrame) -> np
     renderer = SceneRenderer(gpu, document)
     renderer.render(view)
     assert renderer.graph is not None
-    found = array_of(renderer.graph["camera image"].edge_correction)
+    found = array_of(renderer.graph["object surface"].edge_correction)
     renderer.release()
     return found
 

@@ -618,6 +618,7 @@ def test_a_raster_kernel_binds_by_name_too(
     expected[0, 1:3] = (2, 3, 4, 5)
     assert np.array_equal(drawn, expected)
     assert [(item.kernel, item.size) for item in seen] == [("tiny", (1,))]
+    assert color in seen[0].written.values()
     with pytest.raises(BindingError, match="Kernel tiny needs `z`"):
         kernel.draw(target, triangle, seen=texture, tint=(1, 2, 3, 4))
     with pytest.raises(BindingError, match="Kernel tiny declares no `tin`; the nearest name is `tint`"):
