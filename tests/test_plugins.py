@@ -17,7 +17,7 @@ import structlog
 from protocol.errors import DeltalightError
 from protocol.methods import InstalledMethod, load_methods
 from protocol.plugins import LoadedPlugins
-from protocol.scene_method import DvctMethod
+from protocol.scene_method import BUILT_IN_METHODS, DvctMethod, NoneMethod
 from render_server.methods import registry
 from render_server.methods.method import RelightingMethod
 from sensor_node.cameras.discovery import discover
@@ -248,6 +248,28 @@ def test_a_broken_plugin_is_a_sentence_and_the_others_work(install: Install, nam
 
 
 GROUPS = ("deltalight.methods", "deltalight.cameras")
+
+
+def test_doctor_tells_of_methods(install: Install, monkeypatch: pytest.MonkeyPatch) -> None:
+    install("fog-method", "2.0", {"deltalight.methods": {"fog": "fog_method:method"}}, {})
+    monkeypatch.setattr("protocol.methods.PLUGINS", load_methods())
+    direct, fog = doctor._methods()
+    assert (direct.name, direct.state, direct.detail) == (
+        "method direct",
+        "ok",
+        "of package direct-light 1.0",
+    )
+    assert (fog.name, fog.state, fog.hint) == ("method fog", "note", "mend or uninstall the package")
+    assert "No module named 'fog_method'" in fog.detail
+
+
+def test_every_method_of_the_project_is_registered() -> None:
+    relighting = {method.settings for method in registry.BUILT_IN}
+    assert relighting == set(BUILT_IN_METHODS) - {NoneMethod}
+    for settings in BUILT_IN_METHODS:
+        choice = registry.choose_method(settings(), software=True)
+        assert choice.relights_real is (settings is not NoneMethod)
+        assert choice.plugin is None
 
 
 @pytest.mark.parametrize(
