@@ -48,5 +48,5 @@ def _size(item: object) -> int:
     if isinstance(item, moderngl.Buffer):
         return int(item.size)
     assert isinstance(item, moderngl.Texture | moderngl.Texture3D | moderngl.TextureArray)
-    texels = math.prod(item.size)
-    return int(texels * item.components * int(item.dtype[-1]))  # such as f1, f2, u4: the kind and its bytes
+    component_bytes = int(item.dtype[-1])  # of moderngl's f1, f2, u4, ...
+    return math.prod(item.size) * int(item.components) * component_bytes
