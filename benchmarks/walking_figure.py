@@ -64,7 +64,7 @@ class Limb:
     positions: Float32[np.ndarray, "n 3"]
     normals: Float32[np.ndarray, "n 3"]
     triangles: Int32[np.ndarray, "m 3"]
-    shares: Float64[np.ndarray, "n j"]
+    weights: Float64[np.ndarray, "n j"]
 
 
 def limb(joints: list[str], end: tuple[float, float, float], radii: tuple[float, float], rings: int) -> Limb:
@@ -89,8 +89,8 @@ def limb(joints: list[str], end: tuple[float, float, float], radii: tuple[float,
         face_normals(positions, triangles)[1]
     ]  # without those that the poles degenerate to lines
     source, triangles, normals = smooth_normals(positions, triangles, crease_deg=180)
-    shares = np.repeat(_shares(joints, along, lengths), SIDES, axis=0)
-    return Limb(positions[source], normals, triangles, shares[source])
+    weights = np.repeat(_joint_weights(joints, along, lengths), SIDES, axis=0)
+    return Limb(positions[source], normals, triangles, weights[source])
 
 
 def _tube_triangles(rings: int) -> Int32[np.ndarray, "m 3"]:
@@ -100,18 +100,18 @@ def _tube_triangles(rings: int) -> Int32[np.ndarray, "m 3"]:
     return np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]).astype(np.int32)
 
 
-def _shares(
+def _joint_weights(
     joints: list[str], along: Float64[np.ndarray, " r"], lengths: Float64[np.ndarray, " s"]
 ) -> Float64[np.ndarray, "r j"]:
     """Return the weights of the joints: each bone its own stretch, both of them around a joint."""
-    shares = np.zeros((len(along), len(NAMES)))
+    weights = np.zeros((len(along), len(NAMES)))
     above = np.ones(len(along))
     for number, name in enumerate(joints):
         below = np.clip((along - lengths[number + 1]) / (2 * BLEND_M) + 0.5, 0, 1)
         below = below * (number + 1 < len(joints))
-        shares[:, NAMES.index(name)] = above * (1 - below)
+        weights[:, NAMES.index(name)] = above * (1 - below)
         above = above * below
-    return shares
+    return weights
 
 
 def limbs() -> dict[str, list[Limb]]:
@@ -187,13 +187,13 @@ def _add_mesh(glb: GlbBuilder) -> int:
         material = {"baseColorFactor": [*CLOTHES[name], 1], "metallicFactor": 0, "roughnessFactor": 0.6}
         starts = np.cumsum([0, *(len(part.positions) for part in parts[:-1])])
         triangles = [part.triangles + start for part, start in zip(parts, starts, strict=True)]
-        shares = np.concatenate([part.shares for part in parts])
-        joints = np.argsort(-shares, axis=1, kind="stable")[:, :4]
+        weights = np.concatenate([part.weights for part in parts])
+        joints = np.argsort(-weights, axis=1, kind="stable")[:, :4]
         attributes = {
             "POSITION": glb.floats(np.concatenate([part.positions for part in parts])),
             "NORMAL": glb.floats(np.concatenate([part.normals for part in parts])),
             "JOINTS_0": glb.array(joints.astype(np.uint8)),
-            "WEIGHTS_0": glb.floats(np.take_along_axis(shares, joints, axis=1)),
+            "WEIGHTS_0": glb.floats(np.take_along_axis(weights, joints, axis=1)),
         }
         primitives.append(
             {

@@ -93,7 +93,7 @@ class OcclusionFields:
         if self.waits:
             with Progress(console=Console(stderr=True), transient=True) as progress:
                 task = progress.add_task(f"occlusion field of `{entry.name}`", total=1.0)
-                make(lambda share: progress.update(task, completed=share))
+                make(lambda fraction: progress.update(task, completed=fraction))
             return
         self._say(
             f"object `{entry.name}`: its occlusion field is being computed, once; until then it keeps off no natural "
@@ -103,7 +103,7 @@ class OcclusionFields:
         entry.thread.start()
 
     def _beside(self, entry: _Entry, make: Callable[[ProgressCallback], None]) -> None:
-        def step(_share: float) -> None:
+        def step(_fraction: float) -> None:
             if self._ended.is_set():
                 raise _EndedError
 

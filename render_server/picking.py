@@ -17,7 +17,7 @@ from render_server.scene.depth_surface import depth_surface
 from render_server.scene.triangle_mesh import TriangleMesh
 from render_server.view import CameraView
 
-SHOWN_SHARE = 0.5  # of a pixel that an object must cover to be picked
+SHOWN_FRACTION = 0.5  # of a pixel that an object must cover to be picked
 
 Vector = Float64[np.ndarray, "3"]
 Pixel = tuple[int, int]
@@ -124,7 +124,7 @@ class ShownFrame:
 
 def _object_in_front(shown: ShownBuffers, pixel: Pixel) -> str | None:
     """Returns the id of the virtual object that the pixel shows."""
-    if read_texel(shown.object_coverage, pixel)[0] < SHOWN_SHARE:
+    if read_texel(shown.object_coverage, pixel)[0] < SHOWN_FRACTION:
         return None
     material = read_texel(shown.object_buffer.normal, _raster_texel(shown.view, pixel))[3]
     return _owner(shown.objects.objects, round(float(material)))

@@ -21,7 +21,7 @@ from render_server.scene.triangle_mesh import TriangleMesh
 from render_server.scene.tsdf_mesh import TsdfScene
 from render_server.view import CameraView
 
-COARSE_SHARE = 8  # of the triangles go into the coarse volume: its voxels are several times larger
+COARSE_DIVISOR = 8  # of the triangles, for the coarse volume: its voxels are several times larger
 BOUND_POINTS = 4000  # sampled from a mesh for fitting light views
 # Frames averaged while nothing moves: their noise is a quarter of one frame's. Then the average is frozen, so
 # that a scene at rest gives the same picture bit for bit.
@@ -131,7 +131,7 @@ class RealGeometry:
             settle=self._still_frames == STILL_FRAMES,
         )
         if renewed:
-            fine, coarse = fused.meshes(self.budget, self.budget // COARSE_SHARE)
+            fine, coarse = fused.meshes(self.budget, self.budget // COARSE_DIVISOR)
             self._fused_meshes = fine, coarse
         displaced = moved and self._follow_pose(fused, view)
         if moved:
@@ -172,7 +172,7 @@ class RealGeometry:
         if not len(fine.triangles):
             self.state = None
             return
-        budget = self.budget // COARSE_SHARE
+        budget = self.budget // COARSE_DIVISOR
         coarse = depth_mesh(depth, view.camera, place, budget, self.surface, grazing=grazing)
         self._build([fine], triangle_corners(merge_for_gpu([coarse])), is_open=True)
 

@@ -106,8 +106,8 @@ class Spot:
         axis = np.array(self.direction) / np.linalg.norm(self.direction)
         angle = float(np.degrees(np.arccos(np.clip(way @ axis / np.sqrt(squared), -1, 1))))
         half = self.angle_deg / 2
-        share = np.clip((half - angle) / (half * self.blend), 0, 1)
-        return np.asarray(np.array(self.color_linear) * self.intensity * share / squared)
+        fraction = np.clip((half - angle) / (half * self.blend), 0, 1)
+        return np.asarray(np.array(self.color_linear) * self.intensity * fraction / squared)
 
     def document(self) -> dict[str, Any]:
         """Return it as a spot light."""

@@ -17,7 +17,7 @@ ACROSS_PX = 3
 LEAST_REACH_PX = 4
 """From the middle to either end: a sharp edge is two pixels wide in the picture, with two more beside it."""
 SAMPLES_PER_PX = 2
-PLATEAU_SHARE = 1 / 6
+PLATEAU_FRACTION = 1 / 6
 """Part of the profile at either end that counts as fully lit or fully dark."""
 LEAST_STEP = 0.02
 """Least darkening of a profile with a shadow: three times the rounding of a mid-grey 8-bit code."""
@@ -101,7 +101,7 @@ def step_width(profile: Profile) -> float:
     Noise may cross a level more than once, so the levels are read on the falling curve nearest to the profile (least
     squares).
     """
-    plateau = max(1, round(PLATEAU_SHARE * len(profile)))
+    plateau = max(1, round(PLATEAU_FRACTION * len(profile)))
     high, low = profile[:plateau].mean(), profile[-plateau:].mean()
     if high - low < LEAST_STEP:
         return np.nan

@@ -27,7 +27,7 @@ NO_GROUPS: Final[Bindings] = {"SurfelLights": None}
 GATHER_CONES = 4  # as good as 16 in pictures: cones that see gathered light average over many groups
 # In software, per 64 voxels of edge: lists are short, and more walkers would mostly idle in the last round. Groups
 # lie on surfaces, so their number grows with the square of the edge; this many keep each walker's loops short of
-# where Mesa cuts them off (SOFTWARE_SHARE in gpu/kernel.py).
+# where Mesa cuts them off (SOFTWARE_DIVISOR in gpu/kernel.py).
 SOFTWARE_WALKERS = 256
 
 
