@@ -76,13 +76,13 @@ def limb(joints: list[str], end: tuple[float, float, float], radii: tuple[float,
     first, last = (radius * np.stack([np.sin(cap), np.cos(cap)]) for radius in radii)
     along = np.concatenate([first[0], lengths[-1] * between, lengths[-1] - last[0, ::-1]])
     radius = np.concatenate([first[1], np.interp(between, [0, 1], radii), last[1, ::-1]])
-    way = (stations[-1] - stations[0]) / np.linalg.norm(stations[-1] - stations[0])
+    direction = (stations[-1] - stations[0]) / np.linalg.norm(stations[-1] - stations[0])
     centre = np.stack([np.interp(along, lengths, stations[:, axis]) for axis in range(3)], axis=1)
-    centre += way * (along - np.clip(along, 0, lengths[-1]))[:, None]
-    across = np.cross(way, [0, 0, 1] if abs(way[2]) < 0.9 else [1, 0, 0])
+    centre += direction * (along - np.clip(along, 0, lengths[-1]))[:, None]
+    across = np.cross(direction, [0, 0, 1] if abs(direction[2]) < 0.9 else [1, 0, 0])
     across /= np.linalg.norm(across)
     angle = np.linspace(0, 2 * np.pi, SIDES, endpoint=False)[:, None]
-    circle = np.cos(angle) * across + np.sin(angle) * np.cross(way, across)
+    circle = np.cos(angle) * across + np.sin(angle) * np.cross(direction, across)
     positions = (centre[:, None] + radius[:, None, None] * circle).reshape(-1, 3).astype(np.float32)
     triangles = _tube_triangles(len(along))
     triangles = triangles[
@@ -161,19 +161,19 @@ def hip_height(phase: Float64[np.ndarray, " k"]) -> Float64[np.ndarray, " k"]:
 def motion(time_s: Float64[np.ndarray, " k"]) -> dict[str, Float64[np.ndarray, "k 4"]]:
     """Return the rotations (quaternions x y z w) of the joints that walking moves."""
     phase = 2 * np.pi * time_s / CYCLE_S
-    turns = {
+    rotations = {
         "chest": _about((0, 1, 0), 0.12 * np.sin(phase)),
         "hips": _about((0, 1, 0), -0.08 * np.sin(phase)),
     }
     for side, shift in (("left", 0), ("right", np.pi)):
         thigh, knee, foot = leg_angles(phase + shift)
         arm = np.radians(20) * np.sin(phase + shift + np.pi)
-        turns[f"thigh_{side}"] = _about((1, 0, 0), -thigh)
-        turns[f"shin_{side}"] = _about((1, 0, 0), knee)
-        turns[f"foot_{side}"] = _about((1, 0, 0), -foot)
-        turns[f"arm_{side}"] = _about((1, 0, 0), -arm)
-        turns[f"forearm_{side}"] = _about((1, 0, 0), -np.radians(22) - 0.5 * np.maximum(arm, 0))
-    return turns
+        rotations[f"thigh_{side}"] = _about((1, 0, 0), -thigh)
+        rotations[f"shin_{side}"] = _about((1, 0, 0), knee)
+        rotations[f"foot_{side}"] = _about((1, 0, 0), -foot)
+        rotations[f"arm_{side}"] = _about((1, 0, 0), -arm)
+        rotations[f"forearm_{side}"] = _about((1, 0, 0), -np.radians(22) - 0.5 * np.maximum(arm, 0))
+    return rotations
 
 
 def _about(axis: tuple[float, float, float], angle: Float64[np.ndarray, " k"]) -> Float64[np.ndarray, "k 4"]:
@@ -225,8 +225,8 @@ def _add_clip(glb: GlbBuilder, name: str, cycles: int, radius_m: float) -> None:
     time_s = np.linspace(0, cycles * CYCLE_S, cycles * KEYS_A_CYCLE + 1)
     times = glb.floats(time_s)
     clip: dict[str, Any] = {"name": name}
-    for joint, turns in motion(time_s).items():
-        glb.track(clip, NAMES.index(joint), "rotation", times, turns)
+    for joint, rotations in motion(time_s).items():
+        glb.track(clip, NAMES.index(joint), "rotation", times, rotations)
     height = hip_height(2 * np.pi * time_s / CYCLE_S)
     hips = np.column_stack([np.full(len(time_s), -radius_m), height, np.zeros(len(time_s))])
     glb.track(clip, NAMES.index("hips"), "translation", times, hips)

@@ -213,7 +213,7 @@ class Graph:
             self._order = []
             for stage in self._stages:
                 self._place(stage, [])
-            self._follow_clocks()
+            self._complete_clocks()
         return self._order
 
     def _place(self, stage: Stage, waiting: list[Stage]) -> None:
@@ -240,7 +240,7 @@ class Graph:
             raise GraphError(f"Stage `{stage.name}` reads `{name}`, which no stage writes{hint}.")
         return self._resources[name]
 
-    def _follow_clocks(self) -> None:
+    def _complete_clocks(self) -> None:
         """Completes the clocks of resources that were named before their declaration."""
         assert self._order is not None
         for stage in self._order:

@@ -89,7 +89,7 @@ class ShownFrame:
                 "The newest picture has no place in the world (no marker board in view, or a view that is not the "
                 "camera's); show the board, or another view."
             )
-        owner, found = self._look(self.view, pixel, ignore)
+        owner, found = self._surface_at(self.view, pixel, ignore)
         if found is None:
             return Pick(self.frame.frame_id, "nothing")
         point, normal = found
@@ -97,7 +97,9 @@ class ShownFrame:
         kind: Literal["real", "object"] = "real" if owner is None else "object"
         return Pick(self.frame.frame_id, kind, owner, point, normal / np.linalg.norm(normal), distance_m)
 
-    def _look(self, view: CameraView, pixel: Pixel, ignore: str | None) -> tuple[str | None, Surface | None]:
+    def _surface_at(
+        self, view: CameraView, pixel: Pixel, ignore: str | None
+    ) -> tuple[str | None, Surface | None]:
         """Returns the id of the object in front, if it counts, and the surface there."""
         if self.buffers is None:
             return None, self._in_frame(view, pixel)

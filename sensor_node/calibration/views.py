@@ -74,7 +74,7 @@ class ViewCollector:
             DeltalightError: its size differs from the earlier ones.
         """
         gray = cv2.cvtColor(np.ascontiguousarray(picture.color), cv2.COLOR_RGB2GRAY)
-        self._look(picture.name, gray)
+        self._examine(picture.name, gray)
         if self.views and self.views[-1].moment == picture.moment:
             return False
         sighting = self._target.find(gray)
@@ -89,7 +89,7 @@ class ViewCollector:
         self.views.append(view)
         return True
 
-    def _look(self, name: str, gray: UInt8[np.ndarray, "h w"]) -> None:
+    def _examine(self, name: str, gray: UInt8[np.ndarray, "h w"]) -> None:
         self.seen += 1
         if self.brightest is None:
             self.brightest = gray.copy()

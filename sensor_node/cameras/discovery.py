@@ -90,7 +90,7 @@ def _captures(root: Path, entry: Path) -> bool:
     """Whether a video device gives pictures: USB cameras have a second one for metadata."""
     known = root / "run/udev/data" / f"c{_text(entry / 'dev')}"
     if known.is_file():
-        return "ID_V4L_CAPABILITIES=" not in (said := _text(known)) or ":capture:" in said
+        return "ID_V4L_CAPABILITIES=" not in (properties := _text(known)) or ":capture:" in properties
     return _text(entry / "index") in ("", "0")
 
 

@@ -297,7 +297,7 @@ def test_little_space_is_told_once(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     usage = shutil.disk_usage(tmp_path)._replace(free=1000)
     monkeypatch.setattr("shutil.disk_usage", lambda _: usage)
     monkeypatch.setattr(recorder, "STEADY_AFTER_S", 0.1)
-    monkeypatch.setattr(recorder, "LOOK_PERIOD_S", 0.1)
+    monkeypatch.setattr(recorder, "CHECK_PERIOD_S", 0.1)
     with (
         feeding() as (endpoint, _),
         recording(RecordJob(tmp_path / "a.mcap", (endpoint,), duration_s=1.0)) as (_, notices, end),
