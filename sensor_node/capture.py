@@ -11,7 +11,7 @@ from protocol.clock import Clock, ClockEstimator, clock_exchange, measure_offset
 from protocol.errors import DeltalightError
 from protocol.frames import SensorFrame
 from protocol.keys import Keys
-from protocol.transport import RequestClient
+from protocol.request import RequestClient
 from sensor_node.cameras.base import Camera, EndOfStream
 
 POLL_S = 0.1

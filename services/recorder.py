@@ -16,7 +16,7 @@ from protocol.errors import DeltalightError
 from protocol.frames import SensorFrame
 from protocol.keys import Keys
 from protocol.messages import Message, StatsMessage
-from protocol.recording import RecordingWriter
+from protocol.recording_writer import RecordingWriter
 from protocol.scene import SceneDocument
 from services.new_files import require_new_recording
 from services.raw_frames import RAW_STREAMS, RawFrameAssembler

@@ -29,7 +29,8 @@ from protocol.messages import (
     PoseMessage,
     RadianceMessage,
 )
-from protocol.transport import ReceivedMultipart, Receiver
+from protocol.receiver import Receiver
+from protocol.subscriber import ReceivedMultipart
 
 MAX_ENDPOINTS = 16
 EARLIER_SOURCES = "earlier_sources"

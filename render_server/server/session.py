@@ -22,7 +22,7 @@ from protocol.errors import DeltalightError
 from protocol.frames import ViewFrame
 from protocol.messages import CompositeMessage, ControlRequest, StatsMessage
 from protocol.scene import SceneDocument, parse_scene
-from protocol.transport import ReceivedMultipart
+from protocol.subscriber import ReceivedMultipart
 from render_server.server.frames import AssembledFrame, FrameAssembler, SourceOrder
 from render_server.server.snapshot import SnapshotOrder, take_snapshot
 

@@ -13,7 +13,7 @@ from protocol.envelope import EnvelopeError
 from protocol.errors import DeltalightError
 from protocol.keys import Keys
 from protocol.messages import ControlRequest
-from protocol.transport import RequestClient
+from protocol.request import RequestClient
 from services.api.delivery import SILENT, Change, Deliveries, DeliveryStatus, pending
 from services.storage.scenes import StoredScene
 from services.storage.store import Store

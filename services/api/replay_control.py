@@ -15,7 +15,7 @@ from protocol.endpoints import parse_endpoint
 from protocol.errors import DeltalightError
 from protocol.keys import Keys
 from protocol.messages import ControlRequest
-from protocol.transport import RequestClient
+from protocol.request import RequestClient
 from services import ports
 from services.api.child_process import ChildProcess
 from services.api.render_link import RenderLink, UnansweredError

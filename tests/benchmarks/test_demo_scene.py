@@ -14,7 +14,7 @@ from benchmarks.ground_truth.sensors import ColorSensor, StereoDepthSensor, srgb
 from protocol.board import BoardSpec
 from protocol.errors import DeltalightError
 from protocol.frames import SensorFrame, decode_lut
-from protocol.recording import RecordingReader
+from protocol.recording_reader import RecordingReader
 from protocol.scene import load_scene
 from sensor_node.markers import BoardDetector
 

@@ -24,9 +24,10 @@ from protocol.envelope import decode
 from protocol.errors import DeltalightError
 from protocol.messages import ControlRequest
 from protocol.pictures import depth_from_steps
+from protocol.publisher import Publisher
+from protocol.request import ReplyServer
 from protocol.scene import parse_scene
 from protocol.source import open_source
-from protocol.transport import Publisher, ReplyServer
 from services import ports, recorder
 from services.cli import app
 from services.recorder import Recorder, RecordJob, RecordStatus
