@@ -24,7 +24,7 @@ from protocol.codecs import encode_color
 from protocol.errors import DeltalightError
 from protocol.frames import DepthImage, SensorFrame
 from protocol.pictures import decode_rgb, depth_from_steps
-from protocol.recording import RecordingWriter
+from protocol.recording_writer import RecordingWriter
 from protocol.scene import load_scene
 
 SEED = 20210

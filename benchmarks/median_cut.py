@@ -29,13 +29,13 @@ def room(size: int) -> HemisphereMap:
     rng = np.random.default_rng(4)
     directions = texel_directions(size)
     radiance = np.full((size, size, 3), 0.2, np.float32) + 0.05 * rng.random((size, size, 3), np.float32)
-    for toward, radius_deg, value in (
+    for axis, radius_deg, value in (
         ((1.0, 0.2, 0.5), 14.0, 6.0),
         ((-0.9, 0.6, 0.4), 10.0, 9.0),
         ((0.1, -1.0, 0.6), 12.0, 5.0),
         ((0.1, 0.2, 1.0), 3.0, 80.0),
     ):
-        unit = np.array(toward, np.float32) / np.float32(np.linalg.norm(toward))
+        unit = np.array(axis, np.float32) / np.float32(np.linalg.norm(axis))
         radiance[directions @ unit > np.cos(np.radians(radius_deg))] = value
     return HemisphereMap(radiance, np.ones((size, size), bool), np.eye(3))
 

@@ -28,9 +28,9 @@ MARGIN_M = 0.011  # white paper around the marker, measured in the photograph ag
 TABLE_M = (0.85, 0.6)  # visible part of the table, measured by the marker
 TABLE_CENTRE_M = (-0.04, 0.005)
 BUDDHA_HEIGHT_M = 0.2
-# The light file gives only a direction. The window's size and the room's share are estimates from the mug's shadow.
+# The light file gives only a direction. The window's size and the room's part are estimates from the mug's shadow.
 WINDOW_ANGULAR_RADIUS_DEG = 7.0
-AMBIENT_SHARE = 0.2  # ambient radiance relative to the window's irradiance
+AMBIENT_RATIO = 0.2  # ambient radiance relative to the window's irradiance
 BOARD_YAML = (
     "type: single\n"
     f"marker_length_m: {MARKER_LENGTH_M}\nseparation_m: {MARGIN_M}\nfirst_id: 0\n"
@@ -92,7 +92,7 @@ def scene_document(direction: Float64[np.ndarray, "3"], asset: Path) -> dict[str
                     "irradiance": 1.0,
                     "angular_radius_deg": WINDOW_ANGULAR_RADIUS_DEG,
                 },
-                {"type": "ambient", "radiance": AMBIENT_SHARE},
+                {"type": "ambient", "radiance": AMBIENT_RATIO},
             ],
         },
         "method": {"name": "dvct"},

@@ -100,9 +100,9 @@ def _requests(address: str, seconds: float, mark: Callable[[str], Sample]) -> di
         Call("GET", "/scenes"),
         Call("PATCH", f"{path}/objects/{thing['id']}", moves),
     ]
-    usage, begun = Usage(), mark(address)
+    usage, started = Usage(), mark(address)
     times = asyncio.run(send_paced(address, calls, REQUESTS_PER_S, seconds))
-    usage.add(begun, sample(address), mark(address))
+    usage.add(started, sample(address), mark(address))
     return {**times.figures(), "frames_per_s": usage.frames_per_s, "cores": usage.cores}
 
 
@@ -110,12 +110,12 @@ def _viewers(address: str, seconds: float) -> dict[str, Any]:
     """Measure many viewers against none, in turn: pictures rendered per second, and processor time."""
     alone, watched, got = Usage(), Usage(), list[int]()
     for _ in range(ROUNDS):
-        begun = next_picture(address)
+        started = next_picture(address)
         time.sleep(seconds)
-        alone.add(begun, sample(address), next_picture(address))
-        begun = next_picture(address)
+        alone.add(started, sample(address), next_picture(address))
+        started = next_picture(address)
         got.extend(asyncio.run(watch(address, VIEWERS, VIEWER_FRAMES_PER_S, seconds)))
-        watched.add(begun, sample(address), next_picture(address))
+        watched.add(started, sample(address), next_picture(address))
     more = {name: watched.cores[name] - alone.cores[name] for name in (WEB, CLIENTS)}
     return {
         "viewers": VIEWERS,

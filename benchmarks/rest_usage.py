@@ -31,13 +31,13 @@ class Usage:
     _frames: float = 0.0
     _frames_s: float = 0.0
 
-    def add(self, begun: Sample, ended: Sample, last: Sample) -> None:
+    def add(self, started: Sample, ended: Sample, last: Sample) -> None:
         """Count a round: processor time until it `ended`, pictures until the `last` one."""
-        self.wall_s += ended.at_s - begun.at_s
+        self.wall_s += ended.at_s - started.at_s
         for name in self.cpu_s:
-            self.cpu_s[name] += ended.cpu_s[name] - begun.cpu_s[name]
-        self._frames += last.frames - begun.frames
-        self._frames_s += last.at_s - begun.at_s
+            self.cpu_s[name] += ended.cpu_s[name] - started.cpu_s[name]
+        self._frames += last.frames - started.frames
+        self._frames_s += last.at_s - started.at_s
 
     @property
     def frames_per_s(self) -> float:

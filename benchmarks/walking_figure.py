@@ -64,7 +64,7 @@ class Limb:
     positions: Float32[np.ndarray, "n 3"]
     normals: Float32[np.ndarray, "n 3"]
     triangles: Int32[np.ndarray, "m 3"]
-    shares: Float64[np.ndarray, "n j"]
+    weights: Float64[np.ndarray, "n j"]
 
 
 def limb(joints: list[str], end: tuple[float, float, float], radii: tuple[float, float], rings: int) -> Limb:
@@ -76,21 +76,21 @@ def limb(joints: list[str], end: tuple[float, float, float], radii: tuple[float,
     first, last = (radius * np.stack([np.sin(cap), np.cos(cap)]) for radius in radii)
     along = np.concatenate([first[0], lengths[-1] * between, lengths[-1] - last[0, ::-1]])
     radius = np.concatenate([first[1], np.interp(between, [0, 1], radii), last[1, ::-1]])
-    way = (stations[-1] - stations[0]) / np.linalg.norm(stations[-1] - stations[0])
+    direction = (stations[-1] - stations[0]) / np.linalg.norm(stations[-1] - stations[0])
     centre = np.stack([np.interp(along, lengths, stations[:, axis]) for axis in range(3)], axis=1)
-    centre += way * (along - np.clip(along, 0, lengths[-1]))[:, None]
-    across = np.cross(way, [0, 0, 1] if abs(way[2]) < 0.9 else [1, 0, 0])
+    centre += direction * (along - np.clip(along, 0, lengths[-1]))[:, None]
+    across = np.cross(direction, [0, 0, 1] if abs(direction[2]) < 0.9 else [1, 0, 0])
     across /= np.linalg.norm(across)
     angle = np.linspace(0, 2 * np.pi, SIDES, endpoint=False)[:, None]
-    circle = np.cos(angle) * across + np.sin(angle) * np.cross(way, across)
+    circle = np.cos(angle) * across + np.sin(angle) * np.cross(direction, across)
     positions = (centre[:, None] + radius[:, None, None] * circle).reshape(-1, 3).astype(np.float32)
     triangles = _tube_triangles(len(along))
     triangles = triangles[
         face_normals(positions, triangles)[1]
     ]  # without those that the poles degenerate to lines
     source, triangles, normals = smooth_normals(positions, triangles, crease_deg=180)
-    shares = np.repeat(_shares(joints, along, lengths), SIDES, axis=0)
-    return Limb(positions[source], normals, triangles, shares[source])
+    weights = np.repeat(_joint_weights(joints, along, lengths), SIDES, axis=0)
+    return Limb(positions[source], normals, triangles, weights[source])
 
 
 def _tube_triangles(rings: int) -> Int32[np.ndarray, "m 3"]:
@@ -100,18 +100,18 @@ def _tube_triangles(rings: int) -> Int32[np.ndarray, "m 3"]:
     return np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]).astype(np.int32)
 
 
-def _shares(
+def _joint_weights(
     joints: list[str], along: Float64[np.ndarray, " r"], lengths: Float64[np.ndarray, " s"]
 ) -> Float64[np.ndarray, "r j"]:
     """Return the weights of the joints: each bone its own stretch, both of them around a joint."""
-    shares = np.zeros((len(along), len(NAMES)))
+    weights = np.zeros((len(along), len(NAMES)))
     above = np.ones(len(along))
     for number, name in enumerate(joints):
         below = np.clip((along - lengths[number + 1]) / (2 * BLEND_M) + 0.5, 0, 1)
         below = below * (number + 1 < len(joints))
-        shares[:, NAMES.index(name)] = above * (1 - below)
+        weights[:, NAMES.index(name)] = above * (1 - below)
         above = above * below
-    return shares
+    return weights
 
 
 def limbs() -> dict[str, list[Limb]]:
@@ -161,19 +161,19 @@ def hip_height(phase: Float64[np.ndarray, " k"]) -> Float64[np.ndarray, " k"]:
 def motion(time_s: Float64[np.ndarray, " k"]) -> dict[str, Float64[np.ndarray, "k 4"]]:
     """Return the rotations (quaternions x y z w) of the joints that walking moves."""
     phase = 2 * np.pi * time_s / CYCLE_S
-    turns = {
+    rotations = {
         "chest": _about((0, 1, 0), 0.12 * np.sin(phase)),
         "hips": _about((0, 1, 0), -0.08 * np.sin(phase)),
     }
     for side, shift in (("left", 0), ("right", np.pi)):
         thigh, knee, foot = leg_angles(phase + shift)
         arm = np.radians(20) * np.sin(phase + shift + np.pi)
-        turns[f"thigh_{side}"] = _about((1, 0, 0), -thigh)
-        turns[f"shin_{side}"] = _about((1, 0, 0), knee)
-        turns[f"foot_{side}"] = _about((1, 0, 0), -foot)
-        turns[f"arm_{side}"] = _about((1, 0, 0), -arm)
-        turns[f"forearm_{side}"] = _about((1, 0, 0), -np.radians(22) - 0.5 * np.maximum(arm, 0))
-    return turns
+        rotations[f"thigh_{side}"] = _about((1, 0, 0), -thigh)
+        rotations[f"shin_{side}"] = _about((1, 0, 0), knee)
+        rotations[f"foot_{side}"] = _about((1, 0, 0), -foot)
+        rotations[f"arm_{side}"] = _about((1, 0, 0), -arm)
+        rotations[f"forearm_{side}"] = _about((1, 0, 0), -np.radians(22) - 0.5 * np.maximum(arm, 0))
+    return rotations
 
 
 def _about(axis: tuple[float, float, float], angle: Float64[np.ndarray, " k"]) -> Float64[np.ndarray, "k 4"]:
@@ -187,13 +187,13 @@ def _add_mesh(glb: GlbBuilder) -> int:
         material = {"baseColorFactor": [*CLOTHES[name], 1], "metallicFactor": 0, "roughnessFactor": 0.6}
         starts = np.cumsum([0, *(len(part.positions) for part in parts[:-1])])
         triangles = [part.triangles + start for part, start in zip(parts, starts, strict=True)]
-        shares = np.concatenate([part.shares for part in parts])
-        joints = np.argsort(-shares, axis=1, kind="stable")[:, :4]
+        weights = np.concatenate([part.weights for part in parts])
+        joints = np.argsort(-weights, axis=1, kind="stable")[:, :4]
         attributes = {
             "POSITION": glb.floats(np.concatenate([part.positions for part in parts])),
             "NORMAL": glb.floats(np.concatenate([part.normals for part in parts])),
             "JOINTS_0": glb.array(joints.astype(np.uint8)),
-            "WEIGHTS_0": glb.floats(np.take_along_axis(shares, joints, axis=1)),
+            "WEIGHTS_0": glb.floats(np.take_along_axis(weights, joints, axis=1)),
         }
         primitives.append(
             {
@@ -225,8 +225,8 @@ def _add_clip(glb: GlbBuilder, name: str, cycles: int, radius_m: float) -> None:
     time_s = np.linspace(0, cycles * CYCLE_S, cycles * KEYS_A_CYCLE + 1)
     times = glb.floats(time_s)
     clip: dict[str, Any] = {"name": name}
-    for joint, turns in motion(time_s).items():
-        glb.track(clip, NAMES.index(joint), "rotation", times, turns)
+    for joint, rotations in motion(time_s).items():
+        glb.track(clip, NAMES.index(joint), "rotation", times, rotations)
     height = hip_height(2 * np.pi * time_s / CYCLE_S)
     hips = np.column_stack([np.full(len(time_s), -radius_m), height, np.zeros(len(time_s))])
     glb.track(clip, NAMES.index("hips"), "translation", times, hips)

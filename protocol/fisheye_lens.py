@@ -48,8 +48,8 @@ class FisheyeCalibration:
             self._check_vignetting()
 
     def _check_vignetting(self) -> None:
-        shares = self.transmission(np.linspace(0.0, self._seen_angle(), 181))
-        if not (np.isfinite(shares).all() and shares.min() > 0):
+        transmission = self.transmission(np.linspace(0.0, self._seen_angle(), 181))
+        if not (np.isfinite(transmission).all() and transmission.min() > 0):
             raise DeltalightError(
                 "the fish-eye's `vignetting` is not positive up to 90 degrees; give coefficients of the angle in "
                 "radians, [v1, v2, ...] of 1 + v1 a^2 + v2 a^4 + ..."

@@ -72,33 +72,33 @@ class LiveScene:
         self._surfaces: SurfaceTable | None = None
         self._albedo = AlbedoEstimator(gpu)
         self.graph: FrameGraph | None = None
-        self._fields = OcclusionFields(self._say, waits=waits)
+        self._fields = OcclusionFields(self._notify, waits=waits)
         self._accumulated: ViewFrame | None = None  # last frame already accumulated
         self._plan = self._planned(scene)
         self.lighting = self._plan.lighting
-        self._take(self._plan)
+        self._apply(self._plan)
 
     def _planned(self, scene: SceneDocument) -> _Plan:
         """Checks everything that can fail before anything is replaced."""
         method = choose_method(scene.method, software=self._gpu.is_software)
         if method.remark is not None:
-            self._say(method.remark)
+            self._notify(method.remark)
         method.require(scene.objects)
         self._objects.load(scene.objects)
-        for sentence in ignored_wishes(scene):
-            self._say(sentence)
-        return _Plan(scene, method, LightEstimator(scene.lights, self._say))
+        for sentence in unsupported_requests(scene):
+            self._notify(sentence)
+        return _Plan(scene, method, LightEstimator(scene.lights, self._notify))
 
-    def _say(self, sentence: str) -> None:
+    def _notify(self, sentence: str) -> None:
         if sentence not in self._notices:
             self._notices.append(sentence)
 
     def set_scene(self, scene: SceneDocument) -> None:
         """Replaces the scene, or raises and changes nothing. Pictures do not wait for precomputation."""
-        self._take(self._planned(scene))
+        self._apply(self._planned(scene))
         self._fields.waits = False
 
-    def _take(self, plan: _Plan) -> None:
+    def _apply(self, plan: _Plan) -> None:
         old = self._plan
         budget = plan.method.resolved.triangle_budget
         if self._real is not None and not plan.method.relights_real:
@@ -122,7 +122,7 @@ class LiveScene:
             self.graph.release()
         self.graph = None
 
-    def begin_source(self) -> None:
+    def forget_frames(self) -> None:
         """Forgets all observations and estimates: another camera shows another room."""
         plan = self._planned(self._plan.scene)
         if self._real is not None:
@@ -130,7 +130,7 @@ class LiveScene:
         self._real = None
         self._drop_graph()
         self.lighting = plan.lighting
-        self._take(plan)
+        self._apply(plan)
 
     @property
     def model(self) -> Sequence[TriangleMesh]:
@@ -155,7 +155,7 @@ class LiveScene:
         assert self._real.view is not None
         view = self._real.view  # while nothing moves, the pose's own jitter must not shake the picture
         if self._real.state is None:
-            self._say(
+            self._notify(
                 "Depth showed no surface in some frames; they are passed through as the camera saw them."
             )
             return None
@@ -219,14 +219,14 @@ class LiveScene:
                 item.release()
 
 
-def ignored_wishes(scene: SceneDocument) -> list[str]:
+def unsupported_requests(scene: SceneDocument) -> list[str]:
     """Returns sentences on requests of the document that this release does not render."""
     materials = [item.material for item in scene.objects if isinstance(item.material, Material)]
-    wishes = {
+    requests = {
         "output.camera_artifacts": scene.output.camera_artifacts,
         f"shading.name `{scene.shading.name}`": scene.shading.name not in ("auto", "volume"),
         "a material's transmission": any(material.transmission > 0 for material in materials),
     }
     return [
-        f"{name} arrives with a later release and is left out." for name, asked in wishes.items() if asked
+        f"{name} arrives with a later release and is left out." for name, asked in requests.items() if asked
     ]

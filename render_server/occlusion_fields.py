@@ -136,16 +136,18 @@ class _Entry:
 
 
 class OcclusionFields:
-    """Caches fields for the lifetime of a renderer; `say` receives sentences for the user.
+    """Caches fields for the lifetime of a renderer; `notify` receives sentences for the user.
 
     With `waits`, `find` blocks until a field is ready and shows a progress bar on a terminal. Without, a
     thread computes it (embree and matrix products release the interpreter lock) and `find` returns None
     meanwhile.
     """
 
-    def __init__(self, say: Callable[[str], None], folder: Path | None = None, *, waits: bool = True) -> None:
+    def __init__(
+        self, notify: Callable[[str], None], folder: Path | None = None, *, waits: bool = True
+    ) -> None:
         self.waits = waits
-        self._say = say
+        self._notify = notify
         self._folder = folder or default_folder()
         self._entries: dict[tuple[object, ...], _Entry] = {}
         self._one_at_a_time = threading.Lock()
@@ -166,7 +168,7 @@ class OcclusionFields:
         if entry.thread is not None and self.waits:
             entry.thread.join()
         if entry.fault is not None:
-            self._say(entry.fault)
+            self._notify(entry.fault)
         return entry.field
 
     def _begin(self, entry: _Entry, settings: FieldSettings, *, plain: bool) -> None:
@@ -187,9 +189,9 @@ class OcclusionFields:
         if self.waits:
             with Progress(console=Console(stderr=True), transient=True) as progress:
                 task = progress.add_task(f"occlusion field of `{entry.name}`", total=1.0)
-                make(lambda share: progress.update(task, completed=share))
+                make(lambda fraction: progress.update(task, completed=fraction))
             return
-        self._say(
+        self._notify(
             f"object `{entry.name}`: its occlusion field is being computed, once; until then it keeps off no natural "
             "light."
         )
@@ -197,7 +199,7 @@ class OcclusionFields:
         entry.thread.start()
 
     def _beside(self, entry: _Entry, make: Callable[[ProgressCallback], None]) -> None:
-        def step(_share: float) -> None:
+        def step(_fraction: float) -> None:
             if self._ended.is_set():
                 raise _EndedError
 

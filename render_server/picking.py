@@ -17,7 +17,7 @@ from render_server.scene.depth_surface import depth_surface
 from render_server.scene.triangle_mesh import TriangleMesh
 from render_server.view import CameraView
 
-SHOWN_SHARE = 0.5  # of a pixel that an object must cover to be picked
+SHOWN_FRACTION = 0.5  # of a pixel that an object must cover to be picked
 
 Vector = Float64[np.ndarray, "3"]
 Pixel = tuple[int, int]
@@ -89,7 +89,7 @@ class ShownFrame:
                 "The newest picture has no place in the world (no marker board in view, or a view that is not the "
                 "camera's); show the board, or another view."
             )
-        owner, found = self._look(self.view, pixel, ignore)
+        owner, found = self._surface_at(self.view, pixel, ignore)
         if found is None:
             return Pick(self.frame.frame_id, "nothing")
         point, normal = found
@@ -97,7 +97,9 @@ class ShownFrame:
         kind: Literal["real", "object"] = "real" if owner is None else "object"
         return Pick(self.frame.frame_id, kind, owner, point, normal / np.linalg.norm(normal), distance_m)
 
-    def _look(self, view: CameraView, pixel: Pixel, ignore: str | None) -> tuple[str | None, Surface | None]:
+    def _surface_at(
+        self, view: CameraView, pixel: Pixel, ignore: str | None
+    ) -> tuple[str | None, Surface | None]:
         """Returns the id of the object in front, if it counts, and the surface there."""
         if self.buffers is None:
             return None, self._in_frame(view, pixel)
@@ -124,7 +126,7 @@ class ShownFrame:
 
 def _object_in_front(shown: ShownBuffers, pixel: Pixel) -> str | None:
     """Returns the id of the virtual object that the pixel shows."""
-    if read_texel(shown.object_coverage, pixel)[0] < SHOWN_SHARE:
+    if read_texel(shown.object_coverage, pixel)[0] < SHOWN_FRACTION:
         return None
     material = read_texel(shown.object_buffer.normal, _raster_texel(shown.view, pixel))[3]
     return _owner(shown.objects.objects, round(float(material)))

@@ -20,7 +20,7 @@ from render_server.scene.triangle_mesh import TriangleMesh, merge_for_gpu
 from render_server.scene.tsdf_mesh import TsdfScene
 from render_server.view import CameraView
 
-COARSE_SHARE = 8  # of the triangles go into the coarse volume: its voxels are several times larger
+COARSE_DIVISOR = 8  # of the triangles, for the coarse volume: its voxels are several times larger
 BOUND_POINTS = 4000  # sampled from a mesh for fitting light views
 # Frames averaged while nothing moves: their noise is a quarter of one frame's. Then the average is frozen, so
 # that a scene at rest gives the same picture bit for bit.
@@ -39,7 +39,7 @@ class RealGeometry:
     def __init__(self, gpu: GpuContext, real: RealScene, triangle_budget: int) -> None:
         self._gpu = gpu
         self.budget = triangle_budget
-        self._tracker = MotionDetector()
+        self._motion = MotionDetector()
         self._buffers = MeshBuffers(gpu)
         self._materials: MaterialTable | None = None
         self.state: GeometryState | None = None
@@ -49,9 +49,9 @@ class RealGeometry:
         self.view: CameraView | None = None
         self.surface: DepthSurface | None = None
         self._scan: Scan | None = None
-        self._world_from_fused = np.eye(4)
-        self._fused_meshes: tuple[list[TriangleMesh], list[TriangleMesh]] = [], []
-        self._fused = TsdfScene() if real.geometry == "fused" else None
+        self._world_from_tsdf = np.eye(4)
+        self._tsdf_meshes: tuple[list[TriangleMesh], list[TriangleMesh]] = [], []
+        self._tsdf = TsdfScene() if real.geometry == "fused" else None
         self._still_frames = 0
         self.model: list[TriangleMesh] = []
         if isinstance(real.geometry, ModelGeometry):
@@ -65,7 +65,7 @@ class RealGeometry:
     @property
     def has_unseen(self) -> bool:
         """Whether surfaces exist that the camera may not see: those of a model or of earlier frames."""
-        return self.is_model or self._fused is not None
+        return self.is_model or self._tsdf is not None
 
     @property
     def scan(self) -> Scan:
@@ -84,10 +84,10 @@ class RealGeometry:
             return Scan(None, None, 0.0, 1.0, None)
         known = depth.depth_m[depth.valid]
         typical_depth = float(np.median(known)) if known.size else 1.0
-        rounded_m = 0.0 if self._fused is None else ROUNDED_VOXELS * self._fused.voxel_m
+        rounded_m = 0.0 if self._tsdf is None else ROUNDED_VOXELS * self._tsdf.voxel_m
         sigma = max(noise_sigma(depth), rounded_m / (3 * typical_depth**2))
         # The fused surface agrees with depth up to half a voxel, and three standard deviations of the depth's noise.
-        tolerance = None if self._fused is None else (0.5 * self._fused.voxel_m, 3 * sigma)
+        tolerance = None if self._tsdf is None else (0.5 * self._tsdf.voxel_m, 3 * sigma)
         return Scan(depth, self.surface, sigma, typical_depth, tolerance)
 
     def update(self, frame: ViewFrame, view: CameraView) -> bool:
@@ -100,11 +100,11 @@ class RealGeometry:
             raise DeltalightError(
                 "The source has no depth: record depth, or give the scene a model (`real: {geometry: {model: ...}}`)."
             )
-        moved = self._tracker.update(frame)
+        moved = self._motion.update(frame)
         if moved:
             self.frame, self.view = frame, view
-        if self._fused is not None:
-            changed = self._fuse(self._fused, frame, view, moved)
+        if self._tsdf is not None:
+            changed = self._integrate(self._tsdf, frame, view, moved)
         else:
             changed = moved
             if moved and self.is_model and self.state is None:
@@ -115,14 +115,14 @@ class RealGeometry:
             self._scan = None
         return changed
 
-    def _fuse(self, fused: TsdfScene, frame: ViewFrame, view: CameraView, moved: bool) -> bool:
+    def _integrate(self, tsdf: TsdfScene, frame: ViewFrame, view: CameraView, moved: bool) -> bool:
         """Integrates a frame unless the scene has been at rest for long; returns whether anything changed."""
         self._still_frames = 0 if moved else self._still_frames + 1
         if self._still_frames > STILL_FRAMES:
             return False
         assert frame.depth is not None
         surface = depth_surface(frame.depth, view.camera)
-        renewed = fused.add(
+        renewed = tsdf.add(
             surface,
             view,
             noise_sigma(frame.depth),
@@ -130,30 +130,30 @@ class RealGeometry:
             settle=self._still_frames == STILL_FRAMES,
         )
         if renewed:
-            fine, coarse = fused.meshes(self.budget, self.budget // COARSE_SHARE)
-            self._fused_meshes = fine, coarse
-        displaced = moved and self._follow_pose(fused, view)
+            fine, coarse = tsdf.meshes(self.budget, self.budget // COARSE_DIVISOR)
+            self._tsdf_meshes = fine, coarse
+        displaced = moved and self._realign(tsdf, view)
         if moved:
             self.surface = surface
         if renewed or displaced:
-            self._build_from_fused()
+            self._build_from_tsdf()
         return moved or renewed
 
-    def _follow_pose(self, fused: TsdfScene, view: CameraView) -> bool:
-        """Returns whether the fused surface must be aligned to this frame because its pose drifted.
+    def _realign(self, tsdf: TsdfScene, view: CameraView) -> bool:
+        """Aligns the fused surface to this frame's pose; returns whether that moved it.
 
         The picture is rendered with the frame's pose, so the surface must lie where that pose places the
         frame's depth.
         """
-        assert fused.view is not None
-        before = self._world_from_fused
-        exact = fused.view is view
-        self._world_from_fused = np.eye(4) if exact else view.world_from_camera @ fused.view.camera_from_world
-        return not np.array_equal(before, self._world_from_fused)
+        assert tsdf.view is not None
+        before = self._world_from_tsdf
+        exact = tsdf.view is view
+        self._world_from_tsdf = np.eye(4) if exact else view.world_from_camera @ tsdf.view.camera_from_world
+        return not np.array_equal(before, self._world_from_tsdf)
 
-    def _build_from_fused(self) -> None:
+    def _build_from_tsdf(self) -> None:
         fine, coarse = (
-            [mesh.transformed(self._world_from_fused) for mesh in meshes] for meshes in self._fused_meshes
+            [mesh.transformed(self._world_from_tsdf) for mesh in meshes] for meshes in self._tsdf_meshes
         )
         if not any(len(mesh.triangles) for mesh in coarse):
             self.state = None
@@ -171,7 +171,7 @@ class RealGeometry:
         if not len(fine.triangles):
             self.state = None
             return
-        budget = self.budget // COARSE_SHARE
+        budget = self.budget // COARSE_DIVISOR
         coarse = depth_mesh(depth, view.camera, place, budget, self.surface, grazing=grazing)
         self._build([fine], triangle_corners(merge_for_gpu([coarse])), is_open=True)
 

@@ -91,16 +91,16 @@ class SceneRenderer:
         self._live.set_scene(scene)
         self.scene = scene
 
-    def begin_source(self) -> None:
+    def forget_frames(self) -> None:
         """Forgets everything seen in earlier frames, because the next ones come from another source."""
         self._shown = self._sized = None
-        self._live.begin_source()
+        self._live.forget_frames()
 
     def render(self, frame: ViewFrame, *, with_linear: bool = False) -> CompositeFrame:
         """Renders one frame; without a pose or visible object, returns the camera's picture byte for byte."""
-        return self.start(frame, with_linear=with_linear).finish()
+        return self.submit(frame, with_linear=with_linear).finish()
 
-    def start(self, frame: ViewFrame, *, with_linear: bool = False) -> PendingComposite:
+    def submit(self, frame: ViewFrame, *, with_linear: bool = False) -> PendingComposite:
         """Starts a frame on the GPU; reading its picture back does not stall later frames."""
         frame, self._shown = self.sized(frame), None
         if frame.pose is None:

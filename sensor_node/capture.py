@@ -11,7 +11,7 @@ from protocol.clock import Clock, ClockEstimator, clock_exchange, measure_offset
 from protocol.errors import DeltalightError
 from protocol.frames import SensorFrame
 from protocol.keys import Keys
-from protocol.transport import RequestClient
+from protocol.request import RequestClient
 from sensor_node.cameras.base import Camera, EndOfStream
 
 POLL_S = 0.1
@@ -143,11 +143,11 @@ class ServerClock:
         if abs(jump_ns) < CLOCK_JUMP_NS or self._client is None:
             return False
         self._estimator.forget()
-        self._tell("this host's", jump_ns)
+        self._note_clock_set("this host's", jump_ns)
         self._is_due.set()
         return True
 
-    def _tell(self, whose: str, jump_ns: int) -> None:
+    def _note_clock_set(self, whose: str, jump_ns: int) -> None:
         self._remark = f"{whose} clock was set by {jump_ns / 1e9:+.3g} s and the clocks are compared again"
         self._remark_until_s = time.monotonic() + REMARK_S
 
@@ -169,5 +169,5 @@ class ServerClock:
                     continue
                 jump_ns = self._estimator.add(sample)
                 if jump_ns:
-                    self._tell("the server's", jump_ns)
+                    self._note_clock_set("the server's", jump_ns)
             self._is_due.wait(CLOCK_PERIOD_S)

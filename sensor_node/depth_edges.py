@@ -34,7 +34,7 @@ SPLIT_ROUNDS = 2
 # Keeps a plane through collinear samples solvable; square pixels.
 SLOPE_RIDGE_PX2 = 1.0
 # Fraction of the step between two planes within which their samples must lie; otherwise there are not two.
-STRAY_SHARE = 0.25
+STRAY_FRACTION = 0.25
 # A surface must match this much better than the other: odds of 4 to 1.
 CLEAR_LOG_ODDS = float(np.log(4.0))
 # Limits the vote of a pixel's own colour, so that one stray pixel does not decide it.
@@ -201,7 +201,7 @@ def _seen(
     near, near_stray = _continued(samples - split, nearer, offsets)
     far, far_stray = _continued(samples - split, farther, offsets)
     step = near - far
-    two = (step > sigmas * noise.of_inverse_depth(split)) & (near_stray + far_stray < STRAY_SHARE * step)
+    two = (step > sigmas * noise.of_inverse_depth(split)) & (near_stray + far_stray < STRAY_FRACTION * step)
     two &= np.minimum(nearer.sum(axis=0), farther.sum(axis=0)) >= LEAST_SAMPLES
     places = places[two]
     match = _match(picture.color, places + shifts, places)
@@ -236,16 +236,16 @@ def _continued(values: Samples, taken: Samples, offsets: _Offsets) -> tuple[PerP
     total, sum_x, sum_y, sum_xx, sum_xy, sum_yy = (
         np.concatenate([linear, np.stack([x * x, x * y, y * y])]) * weight @ taken
     )
-    share = 1 / np.maximum(total, EMPTY)
+    norm = 1 / np.maximum(total, EMPTY)
     of_taken = values * taken
-    mean, xv, yv = linear * weight @ of_taken * share
-    mean_x, mean_y = sum_x * share, sum_y * share
-    xx = sum_xx * share - mean_x * mean_x + SLOPE_RIDGE_PX2
-    yy = sum_yy * share - mean_y * mean_y + SLOPE_RIDGE_PX2
-    xy, xv, yv = sum_xy * share - mean_x * mean_y, xv - mean_x * mean, yv - mean_y * mean
+    mean, xv, yv = linear * weight @ of_taken * norm
+    mean_x, mean_y = sum_x * norm, sum_y * norm
+    xx = sum_xx * norm - mean_x * mean_x + SLOPE_RIDGE_PX2
+    yy = sum_yy * norm - mean_y * mean_y + SLOPE_RIDGE_PX2
+    xy, xv, yv = sum_xy * norm - mean_x * mean_y, xv - mean_x * mean, yv - mean_y * mean
     determinant = xx * yy - xy * xy
     slope_x, slope_y = (xv * yy - yv * xy) / determinant, (yv * xx - xv * xy) / determinant
-    variance = weight @ (of_taken * values) * share - mean * mean
+    variance = weight @ (of_taken * values) * norm - mean * mean
     unexplained = np.maximum(variance - slope_x * xv - slope_y * yv, 0)
     return mean - slope_x * mean_x - slope_y * mean_y, np.sqrt(unexplained)
 

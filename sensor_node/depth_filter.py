@@ -109,9 +109,9 @@ class SmoothedDepth:
                     + self._fits.level[window]
                 )
         weight, value = np.array(weights), np.array(values)
-        share = weight / np.maximum(weight.sum(axis=0), EMPTY)
-        mean = (share * value).sum(axis=0)
-        return np.asarray(np.sqrt((share * (value - mean) ** 2).sum(axis=0)))
+        normalized = weight / np.maximum(weight.sum(axis=0), EMPTY)
+        mean = (normalized * value).sum(axis=0)
+        return np.asarray(np.sqrt((normalized * (value - mean) ** 2).sum(axis=0)))
 
 
 def smooth_inverse_depth(
@@ -159,11 +159,11 @@ def _to_cells(
 ) -> _Cells:
     weights = [quarter.astype(np.float32) for quarter in _quarters(valid)]
     count = weights[0] + weights[1] + weights[2] + weights[3]
-    share = 1 / np.maximum(count, 1)
+    norm = 1 / np.maximum(count, 1)
 
     def mean(image: Float32[np.ndarray, "h w"]) -> Grid:
         parts = [weight * part for weight, part in zip(weights, _quarters(image), strict=True)]
-        return np.asarray((parts[0] + parts[1] + parts[2] + parts[3]) * share)
+        return np.asarray((parts[0] + parts[1] + parts[2] + parts[3]) * norm)
 
     # Coordinates from the middle of the picture: small numbers keep the moments exact in single precision.
     rows, columns = count.shape
@@ -189,10 +189,10 @@ def _depth_variance(cells: _Cells, size: int) -> Grid:
 def _fit_windows(cells: _Cells, size: int, ridge: float) -> _Fits:
     """Fit depth on (x, y, guide) in every window by weighted least squares: elimination of the 3x3 system."""
     count = _window_sum(cells.count, size)
-    share = 1 / np.maximum(count, EMPTY)
+    norm = 1 / np.maximum(count, EMPTY)
 
     def mean(image: Grid) -> Grid:
-        return np.asarray(_window_sum(image, size) * share)
+        return np.asarray(_window_sum(image, size) * norm)
 
     x, y, p, g = cells.x, cells.y, cells.depth, cells.guide
     weighted_x, weighted_y, weighted_p = cells.count * x, cells.count * y, cells.count * p
@@ -224,10 +224,10 @@ def _blend(
 ) -> tuple[Float32[np.ndarray, "h w"], Grid]:
     """Average the models of all windows that hold a cell; evaluate them at its pixels, with confidence."""
     total = _window_sum(weight, size)
-    share = 1 / np.maximum(total, EMPTY)
+    norm = 1 / np.maximum(total, EMPTY)
 
     def average(image: Grid) -> Grid:
-        return np.asarray(_window_sum(weight * image, size) * share)
+        return np.asarray(_window_sum(weight * image, size) * norm)
 
     slope_x, slope_y, gain = average(fits.slope_x), average(fits.slope_y), average(fits.gain)
     centre = slope_x * cells.x + slope_y * cells.y + average(fits.level - fits.gain * fits.tone)

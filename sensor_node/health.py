@@ -54,16 +54,16 @@ class Health:
     def _stream(self) -> tuple[State, str]:
         """Return the camera's own state, else that of the newest frame's age."""
         newest_s = self._started_s if self._newest_s is None else self._newest_s
-        said, age_s = self._camera.state, self._now_s() - newest_s
-        if said is not None and said.name != "live":
-            return ("degraded" if said.name == "lost" else "waiting"), f"{said.name}: {said.detail}"
+        state, age_s = self._camera.state, self._now_s() - newest_s
+        if state is not None and state.name != "live":
+            return ("degraded" if state.name == "lost" else "waiting"), f"{state.name}: {state.detail}"
         if age_s >= self._lost_after_s:
             return "degraded", f"lost: no frame for {age_s:.1f} s"
         if self._newest_s is None:
             return "starting", "no frame yet"
         if age_s >= self._stale_after_s:
             return "waiting", f"stale: the newest frame is {age_s:.1f} s old"
-        return "running", "live" if said is None or said.detail == "live" else f"live: {said.detail}"
+        return "running", "live" if state is None or state.detail == "live" else f"live: {state.detail}"
 
     def _board(self) -> str:
         if self._newest_s is None or self._camera.board is None:

@@ -11,7 +11,7 @@ from protocol.board import BoardSpec, LampMarker
 from protocol.camera_model import CameraModel
 from protocol.frames import LampPose
 from sensor_node.marker_edges import refine_corners
-from sensor_node.marker_finder import REACH_SHARE, MarkerFinder, linear_luminance, planar_poses
+from sensor_node.marker_finder import REACH_FRACTION, MarkerFinder, linear_luminance, planar_poses
 from sensor_node.markers import AMBIGUOUS_RATIO, CORNER_NOISE_PX, MAX_ERROR_PX
 
 
@@ -54,7 +54,7 @@ def detect_lamps(
         return ()
     light = linear_luminance(color, response)
     corners = np.array([quads[lamp.id] for lamp in lamps])
-    refined = refine_corners(light, camera, corners, REACH_SHARE * finder.border_share)
+    refined = refine_corners(light, camera, corners, REACH_FRACTION * finder.border_fraction)
     before = {pose.marker: pose.world_from_marker for pose in previous}
     camera_from_world = np.linalg.inv(world_from_camera)
     poses = []

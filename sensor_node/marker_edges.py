@@ -14,7 +14,7 @@ from jaxtyping import Float32, Float64
 from protocol.camera_model import CameraModel
 
 # Positions along an edge, as fractions of its length, at which it is measured; not at the round corners.
-SHARES = np.linspace(0.12, 0.88, 16)
+FRACTIONS = np.linspace(0.12, 0.88, 16)
 # Positions across the edge, from inside to outside, in units of the reach.
 ACROSS = np.linspace(-1, 1, 25)
 REACH_PX = (1.5, 8.0)
@@ -29,7 +29,7 @@ def refine_corners(
     light: Float32[np.ndarray, "h w"],
     camera: CameraModel,
     corners: Float64[np.ndarray, "m 4 2"],
-    reach_share: float,
+    reach_fraction: float,
 ) -> Float64[np.ndarray, "m 4 2"]:
     """Return the refined corners (pixels) of dark markers on white paper.
 
@@ -39,13 +39,13 @@ def refine_corners(
         light: picture, linear in light.
         camera: camera of the picture, with its full lens model.
         corners: pixels of each marker's corners, clockwise as seen, within a pixel or two of the truth.
-        reach_share: search range on either side of an edge, as a fraction of the marker's shortest side; less than
+        reach_fraction: search range on either side of an edge, as a fraction of the marker's shortest side; less than
             the border and the white margin.
     """
     focal = camera.matrix[0, 0]
     quads = focal * camera.unproject(corners.reshape(-1, 2)).reshape(corners.shape)
     sides = np.linalg.norm(quads - np.roll(quads, 1, axis=1), axis=-1).min(axis=-1)
-    pinhole = _refined(_Picture(light, camera), quads, np.clip(reach_share * sides, *REACH_PX))
+    pinhole = _refined(_Picture(light, camera), quads, np.clip(reach_fraction * sides, *REACH_PX))
     return camera.project(_homogeneous(pinhole).reshape(-1, 3) / (focal, focal, 1)).reshape(corners.shape)
 
 
@@ -90,7 +90,7 @@ def _edge_offsets(
     reach_px: Float64[np.ndarray, " m"],
 ) -> tuple[Float64[np.ndarray, "m 4 k"], Float64[np.ndarray, "m 4 k"]]:
     """Return the outward distance of the true edge from the assumed one, in pixels, and the contrast found there."""
-    on_edge = starts[:, :, None] + (ends - starts)[:, :, None] * SHARES[:, None]
+    on_edge = starts[:, :, None] + (ends - starts)[:, :, None] * FRACTIONS[:, None]
     steps = outward[:, :, None, None] * (ACROSS[:, None] * reach_px[:, None, None, None, None])
     profiles = picture.at(on_edge[:, :, :, None] + steps)
     rises = np.maximum(np.diff(profiles, axis=-1), 0)
@@ -107,12 +107,12 @@ def _fit_lines(
     weight = trust
     for _ in range(LINE_ITERATIONS):
         total = np.maximum(weight.sum(axis=-1), TINY)
-        place, value = (weight @ SHARES) / total, (weight * offsets).sum(axis=-1) / total
-        from_place = SHARES - place[..., None]
+        place, value = (weight @ FRACTIONS) / total, (weight * offsets).sum(axis=-1) / total
+        from_place = FRACTIONS - place[..., None]
         square = (weight * from_place**2).sum(axis=-1)
         slope = (weight * from_place * offsets).sum(axis=-1) / np.maximum(square, TINY)
         start = value - slope * place
-        misses = (offsets - start[..., None] - slope[..., None] * SHARES) / OUTLIER_PX
+        misses = (offsets - start[..., None] - slope[..., None] * FRACTIONS) / OUTLIER_PX
         weight = trust / (1 + misses * misses)
     return start, slope
 

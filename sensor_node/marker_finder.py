@@ -15,9 +15,9 @@ from protocol.poses import rigid_matrix
 from sensor_node.marker_edges import refine_corners
 
 # Search range from a marker's edge, as a fraction of the border cell or the white gap.
-REACH_SHARE = 0.6
+REACH_FRACTION = 0.6
 # Half the edge of the window that refines a chessboard corner, as a fraction of the distance to the next marker.
-WINDOW_SHARE = 0.8
+WINDOW_FRACTION = 0.8
 WINDOW_HALF_PX = (2, 8)
 WINDOW_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 0.005)
 # Narrower markers cannot be read.
@@ -49,11 +49,11 @@ class MarkerFinder:
     ) -> Float64[np.ndarray, "n 4 2"]:
         """Return the corners of the board's markers: intersections of lines fitted to their edges (linear light)."""
         board = self._board
-        thin = min(self.border_share, board.separation_m / board.marker_length_m or 1.0)
-        return refine_corners(light, camera, corners, REACH_SHARE * thin)
+        thin = min(self.border_fraction, board.separation_m / board.marker_length_m or 1.0)
+        return refine_corners(light, camera, corners, REACH_FRACTION * thin)
 
     @property
-    def border_share(self) -> float:
+    def border_fraction(self) -> float:
         """Width of the black border as a fraction of a marker's edge."""
         cells = self._board.opencv_dictionary().markerSize + 2 * self._board.border_bits
         return float(self._board.border_bits / cells)
@@ -70,7 +70,7 @@ class MarkerFinder:
         # The window must not reach the markers, which begin half a separation away.
         side = min(shortest_side(quad) for quad in quads.values())
         gap = side * self._board.separation_m / self._board.marker_length_m / 2
-        half = int(np.clip(round(WINDOW_SHARE * gap), *WINDOW_HALF_PX))
+        half = int(np.clip(round(WINDOW_FRACTION * gap), *WINDOW_HALF_PX))
         start = np.ascontiguousarray(corners, np.float32).reshape(-1, 1, 2)
         pixels = cv2.cornerSubPix(light, start, (half, half), (-1, -1), WINDOW_CRITERIA)
         return ids.ravel().astype(np.int64), pixels.reshape(-1, 2).astype(np.float64)

@@ -15,7 +15,7 @@ from protocol.envelope import encode
 from protocol.frames import FisheyePictures, RadianceMap, SensorFrame, ViewFrame
 from protocol.keys import Keys
 from protocol.messages import Name, StatsMessage
-from protocol.transport import Publisher
+from protocol.publisher import Publisher
 from sensor_node.announce import announced
 from sensor_node.cameras.base import Camera
 from sensor_node.cameras.drivers import SYNTHETIC

@@ -80,21 +80,21 @@ class PoseFilter:
         turn_rate = _turn(last.measured, measured) / period_s
         if np.linalg.norm(velocity) > JUMP_M_PER_S or np.linalg.norm(turn_rate) > JUMP_RAD_PER_S:
             return fresh
-        share = _share(SPEED_CUTOFF_HZ, period_s)
-        velocity = last.velocity + share * (velocity - last.velocity)
-        turn_rate = last.turn_rate + share * (turn_rate - last.turn_rate)
-        moved, turned = (self._share(speed, period_s) for speed in (velocity, turn_rate))
+        factor = _smoothing(SPEED_CUTOFF_HZ, period_s)
+        velocity = last.velocity + factor * (velocity - last.velocity)
+        turn_rate = last.turn_rate + factor * (turn_rate - last.turn_rate)
+        moved, turned = (self._smoothing(speed, period_s) for speed in (velocity, turn_rate))
         step, _ = cv2.Rodrigues(turned * _turn(last.smooth, measured))
         place = last.smooth[:3, 3] + moved * (measured[:3, 3] - last.smooth[:3, 3])
         smooth = rigid_matrix(_orthonormal(last.smooth[:3, :3] @ step), place)
         return _State(timestamp_ns, measured, smooth, velocity, turn_rate)
 
-    def _share(self, speed: Float64[np.ndarray, "3"], period_s: float) -> float:
+    def _smoothing(self, speed: Float64[np.ndarray, "3"], period_s: float) -> float:
         settings = self._settings
-        return _share(settings.min_cutoff_hz + settings.beta * float(np.linalg.norm(speed)), period_s)
+        return _smoothing(settings.min_cutoff_hz + settings.beta * float(np.linalg.norm(speed)), period_s)
 
 
-def _share(cutoff_hz: float, period_s: float) -> float:
+def _smoothing(cutoff_hz: float, period_s: float) -> float:
     """Return the weight of the new value in an exponential low-pass filter."""
     return 1 / (1 + 1 / (2 * np.pi * cutoff_hz * period_s))
 

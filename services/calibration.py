@@ -68,7 +68,7 @@ class Watch:
         if taken:
             coverage = measure_coverage(collected.views, collected.size)
             self.console.print(
-                f"view {len(collected.views)}: {100 * coverage.share:.0f} % of the picture seen\n"
+                f"view {len(collected.views)}: {100 * coverage.fraction:.0f} % of the picture seen\n"
                 f"{coverage.text()}",
                 markup=False,
                 highlight=False,
@@ -110,9 +110,9 @@ def lens_report(result: "LensResult") -> dict[str, Any]:
         "pictures": result.pictures,
         "views": len(fit.views),
         "rms_px": round(fit.rms_px, 4),
-        "focal_uncertainty_percent": round(100 * fit.focal_share, 3),
+        "focal_uncertainty_percent": round(100 * fit.focal_fraction, 3),
         "tilt_spread_deg": round(fit.tilt_spread_deg, 1),
-        "coverage_percent": round(100 * result.coverage.share, 1),
+        "coverage_percent": round(100 * result.coverage.fraction, 1),
         "per_view": [
             {"name": view.name, "points": len(view.points), "rms_px": round(float(error), 4)}
             for view, error in zip(fit.views, fit.view_rms_px, strict=True)

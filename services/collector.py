@@ -16,7 +16,9 @@ from protocol.codecs import decode_color
 from protocol.envelope import decode
 from protocol.errors import DeltalightError
 from protocol.messages import CompositeMessage, ControlRequest
-from protocol.transport import ReceivedMultipart, Receiver, RequestClient
+from protocol.receiver import Receiver
+from protocol.request import RequestClient
+from protocol.subscriber import ReceivedMultipart
 from services.files import replacing, write_bytes, write_png
 from services.frame_age import age_ms
 

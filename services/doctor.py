@@ -91,14 +91,16 @@ def _renderers() -> Iterator[Check]:
     only_software = True
     for device in range(MAXIMUM_DEVICES):
         probe = _probe(device)
-        said = (probe.stderr.strip().splitlines() or [f"the driver ended the probe ({probe.returncode})"])[-1]
-        if probe.returncode != 0 and device > 0 and "requested device" in said:
+        output = (probe.stderr.strip().splitlines() or [f"the driver ended the probe ({probe.returncode})"])[
+            -1
+        ]
+        if probe.returncode != 0 and device > 0 and "requested device" in output:
             break
         if probe.returncode != 0:
             # The last line of a traceback is `module.DeltalightError: what is wrong: what to do`.
-            detail = said.partition("DeltalightError: ")[2] or said
+            detail = output.partition("DeltalightError: ")[2] or output
             yield Check(
-                f"OpenGL device {device}", "missing", detail, CONTAINER_HINT if "0 devices" in said else ""
+                f"OpenGL device {device}", "missing", detail, CONTAINER_HINT if "0 devices" in output else ""
             )
             break
         renderer, gl_version, is_software = json.loads(probe.stdout)

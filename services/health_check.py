@@ -8,7 +8,8 @@ from protocol.envelope import decode
 from protocol.errors import DeltalightError
 from protocol.keys import Keys, KeySettings
 from protocol.messages import ControlRequest, StatsMessage
-from protocol.transport import Receiver, RequestClient
+from protocol.receiver import Receiver
+from protocol.request import RequestClient
 
 HEALTH_PATH = "/api/v1/health"
 

@@ -119,7 +119,7 @@ def _render_frames(
         needs_depth=job.scene.real.geometry in ("depth", "fused"),
         needs_light=job.scene.lights.mode in ("fisheye", "tracked"),
     )
-    said: set[str] = set()
+    notified: set[str] = set()
     warnings: list[str] | None = None
     for number in job.frames:
         frame = builder(job.source[number])
@@ -131,9 +131,9 @@ def _render_frames(
         if frame.radiance_map is not None and warnings is None:  # the first map represents all
             warnings = light_warnings(frame.radiance_map)
         for sentence in (*builder.notes, *(warnings or ()), *renderer.notices):
-            if sentence not in said:
+            if sentence not in notified:
                 progress.notice(sentence)
-                said.add(sentence)
+                notified.add(sentence)
         _write_frame(job, number, frame, composite)
         progress.frame_done()
     return summary

@@ -16,7 +16,7 @@ from protocol.errors import DeltalightError
 from protocol.frames import SensorFrame
 from protocol.keys import Keys
 from protocol.messages import Message, StatsMessage
-from protocol.recording import RecordingWriter
+from protocol.recording_writer import RecordingWriter
 from protocol.scene import SceneDocument
 from services.new_files import require_new_recording
 from services.raw_frames import RAW_STREAMS, RawFrameAssembler
@@ -25,7 +25,7 @@ from services.stream_queue import StreamQueue
 POLL_S = 0.1
 IDLE_POLLS = 3  # afterwards, frames whose partners are late are taken as they are
 SILENCE_S = 3.0
-LOOK_PERIOD_S = 0.5
+CHECK_PERIOD_S = 0.5
 LEAST_SPACE_S = 60.0
 STEADY_AFTER_S = 2.0  # earlier, the rate does not predict the future
 
@@ -108,7 +108,7 @@ class Recorder:
         self._files = ExitStack()
         self._writer: RecordingWriter | None = None
         self._last_ns, self._idle_polls = -1, 0
-        self._silent_since_s = self._looked_s = time.monotonic()
+        self._silent_since_s = self._checked_s = time.monotonic()
         self._is_silent = self._warned_of_space = False
         self._node_drops_before: int | None = None
         self._started_s = self._started_cpu_s = 0.0
@@ -123,7 +123,7 @@ class Recorder:
             with closing(self._queue), self._files:
                 while not stop.is_set() and not self._is_enough():
                     self._receive(POLL_S)
-                    self._look_around()
+                    self._check_progress()
                 self._queue.close()
                 while not self._is_enough() and self._receive(0):
                     pass  # what arrived before the end belongs to the recording
@@ -158,10 +158,10 @@ class Recorder:
         if not isinstance(message, StatsMessage):
             self._assembler.add(message, parts)
         elif message.node == self._assembler.node:
-            told = message.drops.get("capture", 0)
-            if self._node_drops_before is None or told < self._node_drops_before:  # it restarted
-                self._node_drops_before = told - self.status.node_drops
-            self.status.node_drops = told - self._node_drops_before
+            drops = message.drops.get("capture", 0)
+            if self._node_drops_before is None or drops < self._node_drops_before:  # it restarted
+                self._node_drops_before = drops - self.status.node_drops
+            self.status.node_drops = drops - self._node_drops_before
 
     def _count_broken(self, error: DeltalightError) -> None:
         if not self.status.dropped["broken"]:
@@ -202,11 +202,11 @@ class Recorder:
         is_long = job.duration_s is not None and time.monotonic() - self._started_s >= job.duration_s
         return is_long or (job.frames is not None and status.frames >= job.frames)
 
-    def _look_around(self) -> None:
+    def _check_progress(self) -> None:
         now_s = time.monotonic()
-        if now_s - self._looked_s < LOOK_PERIOD_S:
+        if now_s - self._checked_s < CHECK_PERIOD_S:
             return
-        self._looked_s = now_s
+        self._checked_s = now_s
         self._measure()
         if not self._is_silent and now_s - self._silent_since_s >= SILENCE_S:
             self._is_silent = True

@@ -5,8 +5,8 @@ import uuid
 from protocol.errors import DeltalightError
 from protocol.keys import Keys
 from protocol.messages import ControlRequest
+from protocol.request import RequestClient
 from protocol.scene import SceneDocument, parse_scene
-from protocol.transport import RequestClient
 
 TIMEOUT_S = 5.0
 

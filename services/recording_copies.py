@@ -7,8 +7,9 @@ from pathlib import Path
 from protocol.dataset import open_dataset
 from protocol.dataset_writer import DEFAULT_DEPTH_SCALE, DatasetWriter
 from protocol.errors import DeltalightError
-from protocol.recording import RecordingReader, RecordingWriter
 from protocol.recording_format import ACTIVE_SUFFIX
+from protocol.recording_reader import RecordingReader
+from protocol.recording_writer import RecordingWriter
 from protocol.scene import SceneDocument, load_scene
 from services.files import make_output_folder
 from services.new_files import appearing, require_absent, require_recording_name

@@ -8,7 +8,7 @@ from protocol.documents import nearest
 from protocol.errors import DeltalightError
 from protocol.keys import Keys
 from protocol.messages import ControlRequest
-from protocol.transport import ReplyServer
+from protocol.request import ReplyServer
 from sensor_node.cameras.playback import PlaybackCamera
 
 OPS = ("position", "play", "pause", "seek", "rate")

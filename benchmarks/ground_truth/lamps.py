@@ -101,13 +101,13 @@ class Spot:
 
     def irradiance(self, point: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3"]:
         """Return the unshadowed irradiance across the beam at a point, linear R G B."""
-        way = point - np.array(self.position_m)
-        squared = float(way @ way)
+        offset = point - np.array(self.position_m)
+        squared = float(offset @ offset)
         axis = np.array(self.direction) / np.linalg.norm(self.direction)
-        angle = float(np.degrees(np.arccos(np.clip(way @ axis / np.sqrt(squared), -1, 1))))
+        angle = float(np.degrees(np.arccos(np.clip(offset @ axis / np.sqrt(squared), -1, 1))))
         half = self.angle_deg / 2
-        share = np.clip((half - angle) / (half * self.blend), 0, 1)
-        return np.asarray(np.array(self.color_linear) * self.intensity * share / squared)
+        fraction = np.clip((half - angle) / (half * self.blend), 0, 1)
+        return np.asarray(np.array(self.color_linear) * self.intensity * fraction / squared)
 
     def document(self) -> dict[str, Any]:
         """Return it as a spot light."""

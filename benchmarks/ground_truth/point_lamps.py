@@ -32,8 +32,8 @@ def with_point_lamps(
     """
     eye = pose[:3, 3]
     for lamp in point_lamps(lamps):
-        way = np.array(lamp.position_m) - eye
-        place = lens.project((way @ pose[:3, :3])[None])[0]
+        offset = np.array(lamp.position_m) - eye
+        place = lens.project((offset @ pose[:3, :3])[None])[0]
         if np.isfinite(place).all() and room.is_free(eye, np.array(lamp.position_m)):
             picture = picture + _blur(lens, place) * lamp.irradiance(eye).astype(np.float32)
     return picture

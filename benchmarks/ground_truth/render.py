@@ -140,10 +140,10 @@ class RoomRenderer:
         """Whether the line between two points (m, world) is unobstructed."""
         import mitsuba as mi
 
-        way = end - start
-        length = float(np.linalg.norm(way))
-        origin, toward = mi.Point3f(*start.tolist()), mi.Vector3f(*(way / length).tolist())
-        hit = self._scene.ray_intersect_preliminary(mi.Ray3f(origin, toward))
+        offset = end - start
+        length = float(np.linalg.norm(offset))
+        origin, direction = mi.Point3f(*start.tolist()), mi.Vector3f(*(offset / length).tolist())
+        hit = self._scene.ray_intersect_preliminary(mi.Ray3f(origin, direction))
         return float(np.array(hit.t).ravel()[0]) >= length
 
     def _mean(

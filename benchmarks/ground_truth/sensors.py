@@ -37,7 +37,7 @@ class StereoDepthSensor:
     sigma_at_1m: float = 0.001
     window_px: float = 2.0
     edge_step: float = 0.02
-    failure_share: float = 0.004
+    failure_fraction: float = 0.004
     step_m: float = 0.001
 
     def measure(
@@ -65,9 +65,9 @@ class StereoDepthSensor:
     def _failures(
         self, depth_m: Float32[np.ndarray, "h w"], rng: np.random.Generator
     ) -> Bool[np.ndarray, "h w"]:
-        """Return small blobs without a match, `failure_share` of all pixels."""
+        """Return small blobs without a match, `failure_fraction` of all pixels."""
         field = cv2.GaussianBlur(rng.standard_normal(depth_m.shape, np.float32), (0, 0), 1.2)
-        return np.asarray(field > np.quantile(field, 1 - self.failure_share))
+        return np.asarray(field > np.quantile(field, 1 - self.failure_fraction))
 
 
 def srgb_coded(linear: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:

@@ -1,7 +1,7 @@
 """The papers' picture of errors: squared, enhanced, red-yellow where too dark, blue-white where too bright.
 
 [P1] fig. 3 and [D] fig. 5.19. With E the signed difference result - reference of the channel that differs most,
-as a share of the 8-bit range, the strength is s = min(1, n E^2), and the colours (8-bit R G B / 255) are
+as a fraction of the 8-bit range, the strength is s = min(1, n E^2), and the colours (8-bit R G B / 255) are
 
     E < 0: (min(1, 2 s), max(0, 2 s - 1), 0)                    black, red, yellow
     E > 0: (max(0, 2 s - 1), max(0, 2 s - 1), min(1, 2 s))      black, blue, white

@@ -17,7 +17,7 @@ ACROSS_PX = 3
 LEAST_REACH_PX = 4
 """From the middle to either end: a sharp edge is two pixels wide in the picture, with two more beside it."""
 SAMPLES_PER_PX = 2
-PLATEAU_SHARE = 1 / 6
+PLATEAU_FRACTION = 1 / 6
 """Part of the profile at either end that counts as fully lit or fully dark."""
 LEAST_STEP = 0.02
 """Least darkening of a profile with a shadow: three times the rounding of a mid-grey 8-bit code."""
@@ -56,9 +56,9 @@ class EdgeOnPicture:
         half *= max(1, LEAST_REACH_PX * pixel_m / np.linalg.norm(half))
         reach_m = float(np.linalg.norm(half))
         aside = np.cross([0, 0, 1], half) / reach_m * pixel_m
-        way = np.linspace(-1, 1, 2 * int(np.ceil(SAMPLES_PER_PX * reach_m / pixel_m)) + 1)
+        positions = np.linspace(-1, 1, 2 * int(np.ceil(SAMPLES_PER_PX * reach_m / pixel_m)) + 1)
         offsets = np.arange(-ACROSS_PX, ACROSS_PX + 1)[:, None, None]
-        points = middle + way[:, None] * half + offsets * aside
+        points = middle + positions[:, None] * half + offsets * aside
         seen = points @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
         return cls(camera.project(seen.reshape(-1, 3)).reshape(*points.shape[:2], 2), 2 * reach_m)
 
@@ -101,12 +101,12 @@ def step_width(profile: Profile) -> float:
     Noise may cross a level more than once, so the levels are read on the falling curve nearest to the profile (least
     squares).
     """
-    plateau = max(1, round(PLATEAU_SHARE * len(profile)))
+    plateau = max(1, round(PLATEAU_FRACTION * len(profile)))
     high, low = profile[:plateau].mean(), profile[-plateau:].mean()
     if high - low < LEAST_STEP:
         return np.nan
     fall = np.asarray(isotonic_regression(profile, increasing=False).x)
-    way = np.linspace(0, 1, len(profile))
+    positions = np.linspace(0, 1, len(profile))
     levels = low + np.array([0.9, 0.1]) * (high - low)
-    begin, end = np.interp(levels, fall[::-1], way[::-1])
+    begin, end = np.interp(levels, fall[::-1], positions[::-1])
     return float(end - begin)

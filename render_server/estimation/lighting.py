@@ -12,7 +12,7 @@ from render_server.estimation.plane_extrapolation import ExtrapolatedPlanes
 from render_server.estimation.registration import RegistrationAverage, register_lights
 from render_server.estimation.samples import BackoffSchedule, bounced_light
 from render_server.estimation.unseen_environment import (
-    find_continued_planes,
+    find_extrapolated_planes,
     find_unseen_light,
     ground_radiance,
     unseen_light_shape,
@@ -29,20 +29,20 @@ class LightEstimator:
 
     Registration, ground and unseen environment are estimated from the first usable frame, and apply to all lights
     that the source delivers afterwards. The registration is a running mean over later frames, measured with
-    exponential back-off. `say` receives sentences for the user.
+    exponential back-off. `notify` receives sentences for the user.
 
     Raises:
         DeltalightError: an environment map cannot be read.
     """
 
-    def __init__(self, wished: documents.Lights, say: Callable[[str], None]) -> None:
-        self._source = open_light_source(wished)
-        self._say = say
-        self._follows_lamps = wished.mode == "tracked"
-        self._wants_registration = wished.resolved_registration == "auto"
-        given = wished.mode in ("manual", "tracked") and not self._wants_registration
-        self._wants_unseen = given and wished.surroundings == "auto"
-        self._wants_ground = self._wants_unseen or wished.mode == "fisheye"
+    def __init__(self, settings: documents.Lights, notify: Callable[[str], None]) -> None:
+        self._source = open_light_source(settings)
+        self._notify = notify
+        self._has_tracked_lamps = settings.mode == "tracked"
+        self._wants_registration = settings.resolved_registration == "auto"
+        given = settings.mode in ("manual", "tracked") and not self._wants_registration
+        self._wants_unseen = given and settings.surroundings == "auto"
+        self._wants_ground = self._wants_unseen or settings.mode == "fisheye"
         self._raw: LightSet | None = None
         self._reset()
         self.lights: LightSet | None = None
@@ -60,9 +60,9 @@ class LightEstimator:
         """Updates the lights from a frame; returns whether there are any yet."""
         raw = self._source.update(frame)
         for sentence in self._source.remarks:
-            self._say(sentence)
+            self._notify(sentence)
         if raw is not None:
-            if self._follows_lamps and self._raw is not None and raw.identities != self._raw.identities:
+            if self._has_tracked_lamps and self._raw is not None and raw.identities != self._raw.identities:
                 self._reset()  # another set of lamps explains other light
             self._raw = raw
             self._apply()
@@ -90,7 +90,7 @@ class LightEstimator:
         assert self._raw is not None
         assert self.lights is not None
         shines = bool(self._raw.lights) or bool(self._raw.environment.any())
-        if self._follows_lamps and not shines:
+        if self._has_tracked_lamps and not shines:
             return self.lights
         due = self._wants_registration and (moved or not self._is_complete)
         if due and self._schedule.is_due(graph.inputs.frame.timestamp_ns):
@@ -116,9 +116,9 @@ class LightEstimator:
         if self._factor is None:
             factor = ", ".join(f"{value:.3g}" for value in found.factor)
             fit = "" if found.residual is None else f", residual {100 * found.residual:.1f} %"
-            self._say(f"lights registered by {found.source}: factor ({factor}){fit}")
+            self._notify(f"lights registered by {found.source}: factor ({factor}){fit}")
         if found.warning is not None:
-            self._say(found.warning)
+            self._notify(found.warning)
         self._factor = self._average.add(found)
 
     def _find_unseen(self, graph: FrameGraph, lights: LightSet) -> None:
@@ -126,11 +126,13 @@ class LightEstimator:
         if self._ground is not None:
             lights = lights.with_ground(self._ground)
         bounce = bounced_light(graph, lights)
-        walls = self._walls = find_continued_planes(graph, lights, bounce)
+        walls = self._walls = find_extrapolated_planes(graph, lights, bounce)
         shape = unseen_light_shape(graph, len(lights.environment)) * (1 - walls.probability)
         lights = lights.with_surfaces(walls.radiance, walls.probability)
         found = find_unseen_light(graph, lights, shape, bounce)
         if found is not None:
             self._sky = (found, shape)
             radiance = ", ".join(f"{value:.3g}" for value in found)
-            self._say(f"surroundings out of sight: radiance up to ({radiance}), found on the board's paper")
+            self._notify(
+                f"surroundings out of sight: radiance up to ({radiance}), found on the board's paper"
+            )

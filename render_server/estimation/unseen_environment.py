@@ -28,7 +28,7 @@ PLANE_SAMPLES = 6000  # pixels used to detect planes: the smallest accepted plan
 FLATNESS = 0.01  # of the distance: tolerance of walls, tables and lenses
 
 
-def find_continued_planes(graph: FrameGraph, lights: LightSet, bounce: Bounce) -> ExtrapolatedPlanes:
+def find_extrapolated_planes(graph: FrameGraph, lights: LightSet, bounce: Bounce) -> ExtrapolatedPlanes:
     """Extrapolates table, walls or floor where the picture's border cuts them (plane_extrapolation.py)."""
     known = sample_light(graph, lights, bounce)
     inputs = graph.inputs

@@ -19,9 +19,9 @@ from render_server.gpu.shader_source import SHADERS, Declarations, declarations,
 from render_server.gpu.uniform_block import UniformBlock
 
 SOFTWARE_WALKERS = 1024
-# Mesa's software renderer ends all loops of a thread after 65535 turns in sum, without a word; tracing the cones of
-# one texel takes up to about 5000 (16 cones through 256 voxels and the coarse scene).
-SOFTWARE_SHARE = 12
+# Mesa's software renderer silently ends all loops of a thread after 65535 iterations in total; tracing the
+# cones of one texel takes up to about 5000 (16 cones through 256 voxels and the coarse scene).
+SOFTWARE_DIVISOR = 12
 LIST_WALKERS = 16384
 BLOCK_ALIGNMENT = (
     16  # bytes that std140 blocks are padded to; drivers may leave the padding out of their size
@@ -371,7 +371,7 @@ def list_threads(gpu: GpuContext, longest: int = LIST_WALKERS) -> int:
     """
     if not gpu.is_software:
         return longest
-    return min(longest, max(SOFTWARE_WALKERS, -(-longest // SOFTWARE_SHARE)))
+    return min(longest, max(SOFTWARE_WALKERS, -(-longest // SOFTWARE_DIVISOR)))
 
 
 @contextmanager

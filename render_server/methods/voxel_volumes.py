@@ -156,7 +156,7 @@ class DirectionalVoxels:
     def voxelize_objects(self, objects: GeometryState, placement: VolumePlacement) -> VoxelSet:
         """Voxelises the objects."""
         self.objects.fill(objects.corners, placement)
-        self.objects.groups.start(self.objects.store)
+        self.objects.groups.reset(self.objects.store)
         if self._bounces > 0:
             self._group.run(
                 self.objects.store, self.objects.groups, self.objects.volume.bindings, has_seen=False
@@ -231,7 +231,7 @@ class DeltaVoxels(DirectionalVoxels):
     def light_real(self, voxels: VoxelSet, scene: Bindings) -> VoxelSet:
         """Lights real surfels: by the measured radiance where the camera sees them, by the lights elsewhere."""
         voxels.forget_light()
-        voxels.groups.start(voxels.store)
+        voxels.groups.reset(voxels.store)
         self._light.light_real(voxels.store, {**scene, **voxels.volume.bindings}, voxels.groups)
         return voxels
 
@@ -273,7 +273,7 @@ class DeltaVoxels(DirectionalVoxels):
     ) -> LitVoxels:
         """Lights the objects' surfels, and changes the light of real ones by the objects' shadows."""
         voxels.forget_light()
-        self._light.start_support(voxels.volume.placement.voxel_bounds(np.stack(objects.bounds)))
+        self._light.reset_support(voxels.volume.placement.voxel_bounds(np.stack(objects.bounds)))
         self._light_rho(scene, gathered=False)
         return LitVoxels(real, voxels, self._light.support)
 
@@ -347,7 +347,7 @@ class SolutionVoxels(DirectionalVoxels):
 
     def voxelize_both(self, real: VoxelSet, objects: VoxelSet) -> tuple[VoxelSet, VoxelSet]:
         """Groups the surfels of both sets after voxelisation."""
-        real.groups.start(real.store)
+        real.groups.reset(real.store)
         if self._bounces > 0:
             self._group.run(real.store, real.groups, real.volume.bindings, has_seen=False)
         return real, objects
@@ -405,8 +405,8 @@ class SolutionVoxels(DirectionalVoxels):
         """Sets the bounds within which march.glsl distinguishes mu from rho: the whole volume or nothing."""
         size = self.real.volume.placement.size
         low, high = (0, size - 1) if everywhere else (size, -1)
-        # Unlike those of a delta, they are known before anything is lit.
-        self._light.start_support(np.array([low, low, low, -high, -high, -high], np.int32))
+        # Unlike those of a delta, these bounds do not depend on the light.
+        self._light.reset_support(np.array([low, low, low, -high, -high, -high], np.int32))
 
 
 def solution_stages(

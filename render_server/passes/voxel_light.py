@@ -27,7 +27,7 @@ NO_GROUPS: Final[Bindings] = {"SurfelLights": None}
 GATHER_CONES = 4  # as good as 16 in pictures: cones that see gathered light average over many groups
 # In software, per 64 voxels of edge: lists are short, and more walkers would mostly idle in the last round. Groups
 # lie on surfaces, so their number grows with the square of the edge; this many keep each walker's loops short of
-# where Mesa cuts them off (SOFTWARE_SHARE in gpu/kernel.py).
+# where Mesa cuts them off (SOFTWARE_DIVISOR in gpu/kernel.py).
 SOFTWARE_WALKERS = 256
 
 
@@ -53,7 +53,7 @@ class SurfelGroups:
             "SurfelLights": self.lights,
         }
 
-    def start(self, store: VoxelStore) -> None:
+    def reset(self, store: VoxelStore) -> None:
         """Clears all groups and makes room for those of `store`."""
         if store.surfel_capacity != self._room:
             self._release_growing()
@@ -168,7 +168,7 @@ class LightVoxels:
             self._kernels[kind, gathered] = Kernel(self._gpu, "light_voxels", **defines)
         return self._kernels[kind, gathered]
 
-    def start_support(self, bounds: np.ndarray[Any, np.dtype[np.int32]]) -> None:
+    def reset_support(self, bounds: np.ndarray[Any, np.dtype[np.int32]]) -> None:
         """Resets the support of the delta to the voxels of the objects (min x, y, z, -max x, y, z)."""
         self.support.write(bounds.tobytes())
 
@@ -188,7 +188,7 @@ class GroupSurfels:
         self._sum = Kernel(gpu, "group_surfels", SUM=1)
 
     def run(self, store: VoxelStore, groups: SurfelGroups, scene: Bindings, *, has_seen: bool) -> None:
-        """Fills `groups` (after their `start`); with `has_seen`, its surfel lights mark what the camera sees."""
+        """Fills `groups` (after their `reset`); with `has_seen`, its surfel lights mark what the camera sees."""
         self._find.run((self._threads,), store.bindings, groups.bindings, scene)
         self._sum.run((self._threads,), store.bindings, groups.bindings, scene, has_seen=has_seen)
 

@@ -180,7 +180,7 @@ class VoxelStore:
         self.grid = gpu.ctx.buffer(reserve=volume_size**3 * 4)
         self.grid.clear()
         self._allocate(LEAST_SURFELS)
-        self.start(0)
+        self.reset(0)
 
     @property
     def slot_capacity(self) -> int:
@@ -209,7 +209,7 @@ class VoxelStore:
         for buffer in (self.surfels, self.touched, self.sums, self.delta_sums):
             buffer.release()
 
-    def start(self, surfel_bound: int) -> None:
+    def reset(self, surfel_bound: int) -> None:
         """Begins a new voxelisation of at most `surfel_bound` surfels; the old voxels must have been cleared."""
         if surfel_bound > self.surfel_capacity:
             self._release_growing()
@@ -238,7 +238,7 @@ class Voxelize:
     def run(self, store: VoxelStore, corners: Float32[np.ndarray, "m 3 10"], volume: PlacedVolume) -> None:
         """Fills the empty `store` with the surfels of the triangles inside the volume."""
         pieces, bound = pieces_in_volume(corners, volume.placement)
-        store.start(bound)
+        store.reset(bound)
         if not len(pieces):
             return
         self._triangles.orphan(pieces.nbytes)
@@ -305,7 +305,7 @@ class ClearVoxels:
                 pyramid=mipmap.texture,
                 free_slots=index == len(mipmaps) - 1,
             )
-        store.start(0)
+        store.reset(0)
 
     def release(self) -> None:
         """Frees the program."""

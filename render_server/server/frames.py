@@ -29,7 +29,8 @@ from protocol.messages import (
     PoseMessage,
     RadianceMessage,
 )
-from protocol.transport import ReceivedMultipart, Receiver
+from protocol.receiver import Receiver
+from protocol.subscriber import ReceivedMultipart
 
 MAX_ENDPOINTS = 16
 EARLIER_SOURCES = "earlier_sources"
@@ -154,7 +155,7 @@ class FrameAssembler:
         self._depth_camera = _Unchanged(CameraModel.from_dict)
         self._board = _Unchanged(_board_spec)
 
-    def begun_anew(self) -> "FrameAssembler":
+    def restarted(self) -> "FrameAssembler":
         """Returns an assembler without messages, for another source; counts continue."""
         fresh = FrameAssembler(self._settings, needs_depth=self.needs_depth)
         fresh.counts = self.counts
@@ -226,8 +227,8 @@ class FrameAssembler:
         own = [held for held in self._radiance if held.message.node == color.node]
         if not own:
             return None
-        begun = [held for held in own if held.message.capture_ns <= color.capture_ns]
-        newest = max(begun, key=_captured) if begun else min(own, key=_captured)
+        earlier = [held for held in own if held.message.capture_ns <= color.capture_ns]
+        newest = max(earlier, key=_captured) if earlier else min(own, key=_captured)
         if self._map is None or self._map[0] is not newest:
             self._map = newest, self._decode_map(newest)
         return self._map[1]

@@ -25,8 +25,9 @@ from protocol.files import write_bytes
 from protocol.keys import Keys
 from protocol.messages import ControlRequest, StatsMessage
 from protocol.methods import PLUGINS
+from protocol.publisher import Publisher
+from protocol.request import ReplyServer
 from protocol.scene import SceneDocument, load_scene
-from protocol.transport import Publisher, ReplyServer
 from render_server.gpu.context import create_context
 from render_server.renderer import SceneRenderer
 from render_server.server.frames import FrameAssembler, FrameSource, PairingSettings

@@ -22,7 +22,7 @@ from protocol.errors import DeltalightError
 from protocol.frames import ViewFrame
 from protocol.messages import CompositeMessage, ControlRequest, StatsMessage
 from protocol.scene import SceneDocument, parse_scene
-from protocol.transport import ReceivedMultipart
+from protocol.subscriber import ReceivedMultipart
 from render_server.server.frames import AssembledFrame, FrameAssembler, SourceOrder
 from render_server.server.snapshot import SnapshotOrder, take_snapshot
 
@@ -91,7 +91,7 @@ class Renderer(Protocol):
     def notices(self) -> Sequence[str]:
         """Sentences for the user; the list only grows."""
 
-    def start(self, frame: ViewFrame, *, with_linear: bool = False) -> Pending:
+    def submit(self, frame: ViewFrame, *, with_linear: bool = False) -> Pending:
         """Starts the composite of one frame; frames finish in the order in which they were started."""
 
     def sized(self, frame: ViewFrame) -> ViewFrame:
@@ -100,7 +100,7 @@ class Renderer(Protocol):
     def pick(self, x: float, y: float, ignore: str | None = None) -> Pick:
         """Picks what the newest picture shows at a pixel, looking through the object `ignore`."""
 
-    def begin_source(self) -> None:
+    def forget_frames(self) -> None:
         """Forgets what earlier frames showed."""
 
     def set_scene(self, scene: SceneDocument) -> None:
@@ -304,8 +304,8 @@ class RenderSession:
         source = self._use_source(order.endpoints)
         if source.is_another:
             self._finished = self._newest = None  # of the previous source
-            self._assembler = self._assembler.begun_anew()
-            self._renderer.begin_source()
+            self._assembler = self._assembler.restarted()
+            self._renderer.forget_frames()
         return {"endpoints": list(source.endpoints)}
 
     def _finish_started(self) -> None:
@@ -319,7 +319,7 @@ class RenderSession:
         if frame is not None:
             self._newest = frame
             self._started = _Started(
-                frame, self._renderer.start(frame.view), self.scene_id, self.scene.revision
+                frame, self._renderer.submit(frame.view), self.scene_id, self.scene.revision
             )
         if before is None and self._started is not None and self._started.pending.immediate:
             before, self._started = self._started, None

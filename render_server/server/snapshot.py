@@ -75,7 +75,7 @@ class SnapshotRenderer(Protocol):
     def sized(self, frame: ViewFrame) -> ViewFrame:
         """Returns the frame at the composite's size."""
 
-    def start(self, frame: ViewFrame, *, with_linear: bool = False) -> StartedPicture:
+    def submit(self, frame: ViewFrame, *, with_linear: bool = False) -> StartedPicture:
         """Starts a composite."""
 
 
@@ -124,7 +124,7 @@ def take_snapshot(
     finally:
         renderer.set_scene(scene)
         with suppress(DeltalightError):  # it was reported when the frame arrived
-            renderer.start(frame).finish()
+            renderer.submit(frame).finish()
     return snapshot
 
 
@@ -134,14 +134,14 @@ def _picture(
     if picture.view == CAMERA_VIEW:
         return renderer.sized(frame).color
     renderer.set_scene(_variant(scene, picture.view, picture.method))
-    return renderer.start(frame).finish().color
+    return renderer.submit(frame).finish().color
 
 
 def _linear(
     renderer: SnapshotRenderer, scene: SceneDocument, frame: ViewFrame
 ) -> Float32[np.ndarray, "h w 3"]:
     renderer.set_scene(_variant(scene, "composite", None))
-    composite = renderer.start(frame, with_linear=True).finish()
+    composite = renderer.submit(frame, with_linear=True).finish()
     return linear_color(frame, composite.color) if composite.linear is None else composite.linear
 
 

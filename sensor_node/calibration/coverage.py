@@ -13,9 +13,9 @@ from sensor_node.calibration.views import View
 # Cells along the width. Distortion is smooth: one corner per eighth determines the polynomial there.
 COLUMNS = 8
 # Light below this fraction of the middle's is scattered by glass and housing outside the image circle.
-CIRCLE_SHARE = 0.1
+CIRCLE_FRACTION = 0.1
 # Residual vectors are scaled so that their rms is this fraction of the picture's width.
-ARROW_SHARE = 0.02
+ARROW_FRACTION = 0.02
 SEEN, UNSEEN, POINT, ARROW = (70, 160, 70), (170, 60, 60), (255, 220, 0), (255, 60, 60)
 
 
@@ -27,7 +27,7 @@ class Coverage:
     counted: Bool[np.ndarray, "r c"]
 
     @property
-    def share(self) -> float:
+    def fraction(self) -> float:
         """Fraction of the counted cells that hold a point."""
         return float((self.points[self.counted] > 0).mean()) if self.counted.any() else 0.0
 
@@ -83,7 +83,7 @@ def image_circle(brightest: UInt8[np.ndarray, "h w"], centre: Float64[np.ndarray
     medians = np.array(
         [np.median(ring) if ring.size else 0 for ring in np.split(brightest.ravel()[order], ends)]
     )
-    dark = medians < CIRCLE_SHARE * medians.max()
+    dark = medians < CIRCLE_FRACTION * medians.max()
     # the ring after which everything is dark
     last = len(dark) - int(np.argmin(dark[::-1]))
     return None if last >= len(dark) else float(last)
@@ -109,7 +109,7 @@ def draw_coverage(
 def draw_misses(brightest: UInt8[np.ndarray, "h w"], fit: LensFit) -> UInt8[np.ndarray, "h w 3"]:
     """Return the picture with an arrow from each found point to its predicted position, enlarged."""
     picture = cv2.cvtColor(brightest // 2, cv2.COLOR_GRAY2RGB)
-    enlarged = ARROW_SHARE * picture.shape[1] / max(fit.rms_px, 1e-6)
+    enlarged = ARROW_FRACTION * picture.shape[1] / max(fit.rms_px, 1e-6)
     for view, misses in zip(fit.views, fit.misses, strict=True):
         for start, miss in zip(view.pixels, misses, strict=True):
             ends = np.rint(np.stack([start, start - enlarged * miss])).astype(int).tolist()

@@ -15,7 +15,7 @@ from sensor_node.markers import BoardDetector
 
 Pose = Float64[np.ndarray, "4 4"]
 # Only depth well inside the board's outline is used: at its border it may be the table's.
-INSIDE_SHARE = 0.9
+INSIDE_FRACTION = 0.9
 # Points farther from the board's plane lie on something else.
 NEAR_M = 0.05
 LEAST_POINTS = 200
@@ -119,7 +119,7 @@ def _patch(
     world = points @ placed[:3, :3].T + placed[:3, 3]
     outline = board.sheet_outline()
     middle, half = outline.mean(axis=0), np.ptp(outline, axis=0) / 2
-    inside = np.all(np.abs(world - middle)[:, :2] < INSIDE_SHARE * half[:2], axis=1)
+    inside = np.all(np.abs(world - middle)[:, :2] < INSIDE_FRACTION * half[:2], axis=1)
     on_board = points[inside & (np.abs(world[:, 2]) < NEAR_M)]
     if len(on_board) < LEAST_POINTS:
         return None

@@ -17,16 +17,16 @@ LEAST_NOISE_PX = 0.05
 class LensFit:
     """A lens with the views that it was fitted to.
 
-    `misses` are, for each view, found minus predicted pixels (n, 2); `poses` camera_from_target; `focal_share` is the
-    standard deviation of the focal length as a fraction of it. `refused` gives the reason for each view that was left
-    out; `refused_points` counts single points left out of views that were kept.
+    `misses` are, for each view, found minus predicted pixels (n, 2); `poses` camera_from_target; `focal_fraction` is
+    the standard deviation of the focal length as a fraction of it. `refused` gives the reason for each view that was
+    left out; `refused_points` counts single points left out of views that were kept.
     """
 
     lens: CameraModel | FisheyeLens
     views: tuple[View, ...]
     poses: tuple[Float64[np.ndarray, "4 4"], ...]
     misses: tuple[Float64[np.ndarray, "n 2"], ...]
-    focal_share: float
+    focal_fraction: float
     refused: tuple[tuple[str, str], ...] = ()
     refused_points: int = 0
 

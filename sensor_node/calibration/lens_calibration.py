@@ -31,9 +31,9 @@ GOOD_PX = 0.3
 LEAST_VIEWS = 8
 LEAST_COVERAGE = 0.4
 # 1.5 px at 1000 px of width is five times the error of found corners: blur, a bent sheet or the wrong model.
-MOST_RMS_SHARE = 1.5e-3
+MOST_RMS_FRACTION = 1.5e-3
 # Depth and size scale with the focal length: 2 % are 2 cm at one metre.
-MOST_FOCAL_SHARE = 0.02
+MOST_FOCAL_FRACTION = 0.02
 # If normals vary less, a fit takes noise for tilts, and its own uncertainty is wrong too: twelve views at one tilt of
 # 15 degrees gave a focal length 23 % off that claimed 1 %; from 5 degrees on the claims are true.
 LEAST_TILT_SPREAD_DEG = 5.0
@@ -155,20 +155,21 @@ def require_good(result: LensResult) -> None:
             " which leaves the focal length open; take views with it tilted by 20 to 45 degrees to the left, right, "
             "front and back."
         )
-    if not fit.focal_share <= MOST_FOCAL_SHARE:
+    if not fit.focal_fraction <= MOST_FOCAL_FRACTION:
         raise DeltalightError(
-            f"the views leave the focal length uncertain by {100 * fit.focal_share:.1f} % (at most "
-            f"{100 * MOST_FOCAL_SHARE:.0f} % will do); take more views, with the target larger in the picture and "
+            f"the views leave the focal length uncertain by {100 * fit.focal_fraction:.1f} % (at most "
+            f"{100 * MOST_FOCAL_FRACTION:.0f} % will do); take more views, with the target larger in the picture and "
             "tilted by 20 to 45 degrees to the left, right, front and back."
         )
-    if not fit.rms_px <= MOST_RMS_SHARE * width:
+    if not fit.rms_px <= MOST_RMS_FRACTION * width:
         raise DeltalightError(
-            f"the lens misses the corners by {fit.rms_px:.2f} px rms (at most {MOST_RMS_SHARE * width:.2f} will do); "
+            f"the lens misses the corners by {fit.rms_px:.2f} px rms "
+            f"(at most {MOST_RMS_FRACTION * width:.2f} will do); "
             "check that the target is flat, the pictures sharp and the model right (fisheye for wide lenses)."
         )
-    if result.coverage.share < LEAST_COVERAGE:
+    if result.coverage.fraction < LEAST_COVERAGE:
         raise DeltalightError(
-            f"the target was seen in {100 * result.coverage.share:.0f} % of the picture's cells and "
+            f"the target was seen in {100 * result.coverage.fraction:.0f} % of the picture's cells and "
             f"{100 * LEAST_COVERAGE:.0f} % are needed; take views with it at the borders and in the corners."
         )
     if isinstance(fit.lens, CameraModel):

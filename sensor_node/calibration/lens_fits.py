@@ -24,7 +24,7 @@ OCAM_POWERS = (0, 2, 3, 4)
 # A lens has up to nine parameters, a view gives two beyond its pose.
 LEAST_START = 5
 # Initial focal lengths, as fractions of the width: fields of view from 115 to 360 degrees across it.
-FOCAL_SHARES = (0.16, 0.23, 0.32, 0.45)
+FOCAL_FRACTIONS = (0.16, 0.23, 0.32, 0.45)
 CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-10)
 
 
@@ -54,8 +54,8 @@ def fit_pinhole(views: Sequence[View], size: tuple[int, int], coefficients: int)
     every = np.nan_to_num(np.concatenate(misses), nan=np.inf)
     parameters = 4 + coefficients + 6 * len(views)
     raised = noise_px(every, parameters) / max(float(np.sqrt(np.sum(every**2) / every.size)), 1e-12)
-    share = np.max(np.ravel(spread)[:2] / np.diag(matrix)[:2]) * max(raised, 1.0)
-    return LensFit(camera, tuple(views), poses, misses, float(share))
+    fraction = np.max(np.ravel(spread)[:2] / np.diag(matrix)[:2]) * max(raised, 1.0)
+    return LensFit(camera, tuple(views), poses, misses, float(fraction))
 
 
 def fit_equidistant(views: Sequence[View], size: tuple[int, int]) -> LensFit:
@@ -66,7 +66,8 @@ def fit_equidistant(views: Sequence[View], size: tuple[int, int]) -> LensFit:
     """
     maker = _equidistant_maker(size)
     numbers = min(
-        (_ideal_lens(size, share) for share in FOCAL_SHARES), key=lambda n: _start_error(views, maker, n)
+        (_ideal_lens(size, fraction) for fraction in FOCAL_FRACTIONS),
+        key=lambda n: _start_error(views, maker, n),
     )
     # The first round may leave out views that its ideal lens does not reach.
     first = _refined(maker, numbers, (0, 1), views)
@@ -74,10 +75,10 @@ def fit_equidistant(views: Sequence[View], size: tuple[int, int]) -> LensFit:
     return _refined(maker, _equidistant_numbers(first.lens), (0, 1), views)
 
 
-def _ideal_lens(size: tuple[int, int], focal_share: float) -> Float64[np.ndarray, "8"]:
+def _ideal_lens(size: tuple[int, int], focal_fraction: float) -> Float64[np.ndarray, "8"]:
     """Return the parameters of an exactly equidistant lens with its axis in the middle of the picture."""
     width, height = size
-    focal = focal_share * width
+    focal = focal_fraction * width
     return np.array([focal, focal, (width - 1) / 2, (height - 1) / 2, 0.0, 0.0, 0.0, 0.0])
 
 
@@ -121,10 +122,10 @@ def _refined(
     seen = tuple(each.view for each in placed)
     bundle = refine(maker, numbers, seen, [each.pose for each in placed])
     places = list(focal)
-    share = np.max(np.sqrt(np.diag(bundle.covariance)[places]) / bundle.numbers[places])
+    fraction = np.max(np.sqrt(np.diag(bundle.covariance)[places]) / bundle.numbers[places])
     lens = maker(bundle.numbers, 0)
     assert isinstance(lens, FisheyeLens)
-    return LensFit(lens, seen, bundle.poses, bundle.misses, float(share), tuple(refused))
+    return LensFit(lens, seen, bundle.poses, bundle.misses, float(fraction), tuple(refused))
 
 
 def _placed(

@@ -234,8 +234,8 @@ def _light(
     return float((light @ LUMINANCE).mean())
 
 
-def _shrunk(quad: Float64[np.ndarray, "4 3"], share: float) -> Float64[np.ndarray, "4 3"]:
-    return np.asarray(quad + (quad.mean(axis=0) - quad) * 2 * share)
+def _shrunk(quad: Float64[np.ndarray, "4 3"], fraction: float) -> Float64[np.ndarray, "4 3"]:
+    return np.asarray(quad + (quad.mean(axis=0) - quad) * 2 * fraction)
 
 
 def _is_covered(patch: Float64[np.ndarray, "4 3"], card: GreyCard) -> bool:

@@ -17,7 +17,7 @@ from sensor_node.marker_finder import MarkerFinder
 
 CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 0.005)
 # Half the edge of the window about a corner, as a fraction of the distance to the next one, which it must not reach.
-WINDOW_SHARE = 0.4
+WINDOW_FRACTION = 0.4
 WINDOW_HALF_PX = (2, 11)
 # A refined marker corner that moved farther was attracted by another edge.
 CAUGHT_PX = 3.0
@@ -79,7 +79,7 @@ class Chessboard:
         grid = start.reshape(self._size[1], self._size[0], 2)
         steps = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1) for axis in (0, 1)]
         gaps = np.minimum(_least_beside(steps[0], 0), _least_beside(steps[1], 1)).ravel()
-        halves = np.clip(np.rint(WINDOW_SHARE * gaps), *WINDOW_HALF_PX).astype(int)
+        halves = np.clip(np.rint(WINDOW_FRACTION * gaps), *WINDOW_HALF_PX).astype(int)
         refined = [
             cv2.cornerSubPix(gray, corner.reshape(1, 1, 2).copy(), (int(half),) * 2, (-1, -1), CRITERIA)
             for corner, half in zip(start, halves, strict=True)

@@ -14,9 +14,9 @@ from sensor_node.calibration.targets import Sighting, Target
 # Fewer points do not determine a pose well.
 LEAST_POINTS = 8
 # A corner that moves by a thousandth of the width between two frames is blurred by at most as much.
-STILL_SHARE = 1e-3
+STILL_FRACTION = 1e-3
 # A view that differs less than this from an earlier one, as a fraction of the width, adds little.
-NEW_SHARE = 0.05
+NEW_FRACTION = 0.05
 
 
 class Picture(NamedTuple):
@@ -74,7 +74,7 @@ class ViewCollector:
             DeltalightError: its size differs from the earlier ones.
         """
         gray = cv2.cvtColor(np.ascontiguousarray(picture.color), cv2.COLOR_RGB2GRAY)
-        self._look(picture.name, gray)
+        self._examine(picture.name, gray)
         if self.views and self.views[-1].moment == picture.moment:
             return False
         sighting = self._target.find(gray)
@@ -89,7 +89,7 @@ class ViewCollector:
         self.views.append(view)
         return True
 
-    def _look(self, name: str, gray: UInt8[np.ndarray, "h w"]) -> None:
+    def _examine(self, name: str, gray: UInt8[np.ndarray, "h w"]) -> None:
         self.seen += 1
         if self.brightest is None:
             self.brightest = gray.copy()
@@ -101,10 +101,10 @@ class ViewCollector:
         np.maximum(self.brightest, gray, out=self.brightest)
 
     def _is_still(self, view: View, last: View | None) -> bool:
-        return last is not None and _apart_px(view, last) < STILL_SHARE * self.size[0]
+        return last is not None and _apart_px(view, last) < STILL_FRACTION * self.size[0]
 
     def _is_new(self, view: View) -> bool:
-        return all(_apart_px(view, taken) > NEW_SHARE * self.size[0] for taken in self.views)
+        return all(_apart_px(view, taken) > NEW_FRACTION * self.size[0] for taken in self.views)
 
 
 def _apart_px(first: View, second: View) -> float:

@@ -22,12 +22,12 @@ class SyntheticNoise:
     """Noise of the synthetic sensors, reproducible by seed and frame.
 
     `color_sigma` is the standard deviation of linear colour (1.0 = sensor white), `depth_sigma_m` that of depth at 1
-    m (it grows with z^2), `hole_share` the fraction of depth pixels without a reading.
+    m (it grows with z^2), `hole_fraction` the fraction of depth pixels without a reading.
     """
 
     color_sigma: float = 0.004
     depth_sigma_m: float = 0.002
-    hole_share: float = 0.01
+    hole_fraction: float = 0.01
     seed: int = 0
 
 
@@ -99,7 +99,7 @@ class SyntheticCamera(PacedCamera):
             random = np.random.default_rng((self._noise.seed, index))
             linear += random.normal(0, self._noise.color_sigma, linear.shape)
             depth_m += random.normal(0, self._noise.depth_sigma_m, depth_m.shape) * depth_m**2
-            depth_m[random.random(depth_m.shape) < self._noise.hole_share] = 0
+            depth_m[random.random(depth_m.shape) < self._noise.hole_fraction] = 0
             sigma = self._noise.depth_sigma_m
         timestamp_ns = index * PERIOD_NS
         return SensorFrame(

@@ -105,8 +105,8 @@ class SyntheticScene:
         # The sheet's texture is negative outside the paper.
         wood = np.where(paper < 0, _look_up(self._wood, hits.x, hits.y), np.float32(0)) * on_table
         size = fine.width // SAMPLES_PER_EDGE, fine.height // SAMPLES_PER_EDGE
-        shares = [np.maximum(paper, 0), wood, hits.box_irradiance, on_table + (hits.box_irradiance > 0)]
-        paper, wood, box, hit = (cv2.resize(share, size, interpolation=cv2.INTER_AREA) for share in shares)
+        layers = [np.maximum(paper, 0), wood, hits.box_irradiance, on_table + (hits.box_irradiance > 0)]
+        paper, wood, box, hit = (cv2.resize(layer, size, interpolation=cv2.INTER_AREA) for layer in layers)
         upward = irradiance(np.array([0, 0, 1.0]))
         reflected = (paper * upward)[..., None] + (wood * upward)[..., None] * TABLE_ALBEDO
         reflected += box[..., None] * BOX_ALBEDO + ((1 - hit) * AMBIENT_IRRADIANCE)[..., None]

@@ -9,9 +9,9 @@ from sensor_node.fisheye.exposures import display_picture, merge_bracket, refere
 from sensor_node.fisheye.resampling import hemisphere_sampler
 
 SIZE = 256
-LEAST_CLIPPED_SHARE = 1e-5
+LEAST_CLIPPED_FRACTION = 1e-5
 """The sun's disc (6.8e-5 sr) relative to the hemisphere: the smallest thing that lights a room."""
-LEAST_COSINE_SHARE = 0.95
+LEAST_COSINE_FRACTION = 0.95
 """Of an even sky's irradiance; beyond, more than the 5 % within which light is measured here is lost."""
 
 
@@ -51,17 +51,17 @@ def radiance_map(
 def light_warnings(radiance: RadianceMap) -> list[str]:
     """Return a sentence for each thing that makes the light of a map wrong, and what to do."""
     sentences = []
-    if radiance.clipped_share >= LEAST_CLIPPED_SHARE:
+    if radiance.clipped_share >= LEAST_CLIPPED_FRACTION:
         sentences.append(
             f"the fish-eye picture is overexposed: {100 * radiance.clipped_share:.2g} % of what it sees is clipped "
             "even at the shortest exposure, so its light is too weak; add a shorter exposure."
         )
     size = len(radiance.seen)
     solid, cosine = texel_solid_angles(size), texel_directions(size)[..., 2]
-    if float((solid * cosine)[radiance.seen].sum()) < LEAST_COSINE_SHARE * np.pi:
-        share = float(solid[radiance.seen].sum()) / (2 * np.pi)
+    if float((solid * cosine)[radiance.seen].sum()) < LEAST_COSINE_FRACTION * np.pi:
+        fraction = float(solid[radiance.seen].sum()) / (2 * np.pi)
         sentences.append(
-            f"the fish-eye lens sees {100 * share:.0f} % of the hemisphere about its axis; light from the rest is "
+            f"the fish-eye lens sees {100 * fraction:.0f} % of the hemisphere about its axis; light from the rest is "
             "guessed, so use a lens of 160 degrees or more, or correct `image_circle` in fisheye.yaml."
         )
     return sentences

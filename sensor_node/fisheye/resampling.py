@@ -42,8 +42,8 @@ class HemisphereSampler:
         texels = _shrunk(samples, self.per_texel)
         texels *= self.scale
         clipped = _shrunk((picture.clipped & (self.inside > 0)).astype(np.float32), self.shrink)
-        share = float((clipped * self.weight).sum() / max(float(self.weight.sum()), 1e-12))
-        return texels, min(share, 1.0)
+        clipped_fraction = float((clipped * self.weight).sum() / max(float(self.weight.sum()), 1e-12))
+        return texels, min(clipped_fraction, 1.0)
 
 
 @lru_cache(maxsize=4)
@@ -56,14 +56,14 @@ def hemisphere_sampler(calibration: FisheyeCalibration, size: int) -> Hemisphere
     shrink = max(1, round(ratio))
     # Half a cell apart, samples hit all cells nearly equally, so that an even sky stays even.
     per_texel = int(np.ceil(2 * ratio / shrink))
-    share = _shrunk(inside.astype(np.float32), shrink)
+    inside_fraction = _shrunk(inside.astype(np.float32), shrink)
     places = _places(lens, size * per_texel, shrink)
-    coverage = _shrunk(cv2.remap(share, places, None, cv2.INTER_LINEAR), per_texel)
+    coverage = _shrunk(cv2.remap(inside_fraction, places, None, cv2.INTER_LINEAR), per_texel)
     seen = coverage > 0.5
     scale = np.where(seen, 1 / np.maximum(coverage, 0.5), 0)
-    angle, solid, up = _cells(lens, share.shape, shrink)
-    gain = _flux_gain(places, size, share, solid) / calibration.transmission(angle)
-    weight = np.where(up, solid * share, 0)
+    angle, solid, up = _cells(lens, inside_fraction.shape, shrink)
+    gain = _flux_gain(places, size, inside_fraction, solid) / calibration.transmission(angle)
+    weight = np.where(up, solid * inside_fraction, 0)
     return HemisphereSampler(
         size=size,
         shrink=shrink,
@@ -140,9 +140,9 @@ def _flux_gain(
     1 near the horizon and the rim of the image circle, where samples end and texels are divided by their coverage.
     """
     per_texel = len(places) // size
-    share = np.repeat(np.repeat(texel_solid_angles(size), per_texel, 0), per_texel, 1) / per_texel**2
-    given = _spread(places, share.astype(np.float64), inside.shape)
-    reached = _spread(places, np.ones_like(share, np.float64), inside.shape) > 0
+    samples = np.repeat(np.repeat(texel_solid_angles(size), per_texel, 0), per_texel, 1) / per_texel**2
+    given = _spread(places, samples.astype(np.float64), inside.shape)
+    reached = _spread(places, np.ones_like(samples, np.float64), inside.shape) > 0
     whole = (reached & (inside > 0.999) & (solid > 0)).astype(np.uint8)
     # Two cells: the sample's footprint, and its own distance from the edge.
     interior = cv2.erode(whole, np.ones((5, 5), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0

@@ -92,10 +92,10 @@ def _pixels(message: RadianceMessage, directions: Float64[np.ndarray, "n 3"]) ->
 
 def _outline(seen: "IncidentLight") -> Float64[np.ndarray, "n 3"]:
     """Return directions around a light, at its angular radius."""
-    toward = seen.to_light
-    side = np.cross(toward, (0.0, 0.0, 1.0) if abs(toward[2]) < 0.9 else (1.0, 0.0, 0.0))
+    direction = seen.to_light
+    side = np.cross(direction, (0.0, 0.0, 1.0) if abs(direction[2]) < 0.9 else (1.0, 0.0, 0.0))
     side /= np.linalg.norm(side)
     turn = np.linspace(0, 2 * np.pi, OUTLINE_POINTS, endpoint=False)[:, None]
-    around = np.cos(turn) * side + np.sin(turn) * np.cross(toward, side)
+    around = np.cos(turn) * side + np.sin(turn) * np.cross(direction, side)
     angle = seen.angular_radius_rad
-    return np.asarray(np.cos(angle) * toward + np.sin(angle) * around)
+    return np.asarray(np.cos(angle) * direction + np.sin(angle) * around)

@@ -13,7 +13,7 @@ from protocol.envelope import EnvelopeError
 from protocol.errors import DeltalightError
 from protocol.keys import Keys
 from protocol.messages import ControlRequest
-from protocol.transport import RequestClient
+from protocol.request import RequestClient
 from services.api.delivery import SILENT, Change, Deliveries, DeliveryStatus, pending
 from services.storage.scenes import StoredScene
 from services.storage.store import Store
@@ -163,7 +163,7 @@ class RenderLink:
                 self._send_newest()
             self._refuse_where_silent()  # the first check may just have found no server
             self._require_alive()
-            return self._ask(op, timeout_s, payload)
+            return self._request(op, timeout_s, payload)
 
     def _refuse_where_silent(self) -> None:
         if self._answers is False:
@@ -172,7 +172,7 @@ class RenderLink:
     def _require_alive(self) -> None:
         """Detect a dead server within a second; only the renderer knows how long its commands take."""
         try:
-            self._ask(CLOCK_OP, ALIVE_TIMEOUT_S)
+            self._request(CLOCK_OP, ALIVE_TIMEOUT_S)
         except UnansweredError:
             self._note_reachable(False)
             self._refuse_where_silent()
@@ -198,7 +198,7 @@ class RenderLink:
     def _send(self, active: StoredScene) -> DeliveryStatus:
         revision = active.document.revision
         try:
-            self._ask(CLOCK_OP, ALIVE_TIMEOUT_S)
+            self._request(CLOCK_OP, ALIVE_TIMEOUT_S)
             self._set_scene(active)
         except UnansweredError:
             self._note_reachable(False)
@@ -217,39 +217,39 @@ class RenderLink:
             self._instance = self._server_instance()
         scene = self._store.assets.localised(active.document).model_dump(mode="json")
         revision = active.document.revision if self._has_scene else None
-        self._ask(
+        self._request(
             "set_scene", COMMAND_TIMEOUT_S, {"scene": scene}, scene_id=active.head.id, revision=revision
         )
         self._has_scene = True
         self._look_due_s = time.monotonic() + LOOK_INTERVAL_S
 
     def _server_instance(self) -> str:
-        return str(self._ask("ping", COMMAND_TIMEOUT_S)["instance"])
+        return str(self._request("ping", COMMAND_TIMEOUT_S)["instance"])
 
     def _run(self) -> None:
         """Send changes; check the server at first, and after each second of silence."""
         while not self._stop.is_set():
             try:
                 with self._asking:
-                    self._look_where_due()
+                    self._check_if_due()
                     self._send_newest()
             except (DeltalightError, OSError) as fault:
                 log.warning("the render server cannot be kept up to date", fault=str(fault))
             self._changed.wait(max(0.0, self._look_due_s - time.monotonic()))
 
-    def _look_where_due(self) -> None:
+    def _check_if_due(self) -> None:
         if time.monotonic() < self._look_due_s:
             return
         try:
-            self._look()
+            self._check_server()
         finally:
             self._look_due_s = time.monotonic() + LOOK_INTERVAL_S
 
-    def _look(self) -> None:
+    def _check_server(self) -> None:
         """Check whether the server answers; send source and scene to one that (re)started."""
         answered_before = self._answers
         try:
-            self._ask(CLOCK_OP, ALIVE_TIMEOUT_S)
+            self._request(CLOCK_OP, ALIVE_TIMEOUT_S)
             # It answers even while the renderer is busy, e.g. compiling shaders for its first picture.
             self._note_reachable(True)
             instance = self._server_instance()
@@ -266,7 +266,7 @@ class RenderLink:
     def _restore_source(self) -> None:
         """Tell a (re)started server where to read from; its source may be left from a killed service."""
         try:
-            self._ask("set_source", COMMAND_TIMEOUT_S, {"endpoints": self._source})
+            self._request("set_source", COMMAND_TIMEOUT_S, {"endpoints": self._source})
         except UnansweredError:
             raise
         except DeltalightError as fault:  # pictures of the wrong source are better than no scene
@@ -277,7 +277,7 @@ class RenderLink:
             log.info("render server answers" if reachable else "render server does not answer")
         self._answers = reachable
 
-    def _ask(
+    def _request(
         self,
         op: str,
         timeout_s: float,

@@ -15,7 +15,7 @@ from protocol.endpoints import parse_endpoint
 from protocol.errors import DeltalightError
 from protocol.keys import Keys
 from protocol.messages import ControlRequest
-from protocol.transport import RequestClient
+from protocol.request import RequestClient
 from services import ports
 from services.api.child_process import ChildProcess
 from services.api.render_link import RenderLink, UnansweredError
@@ -23,7 +23,7 @@ from services.storage.faults import ConflictError
 
 # A child takes two seconds for imports and its first frame on a slow machine, five with two busy cores.
 START_TIMEOUT_S = 20.0
-ASK_TIMEOUT_S, LOOK_PERIOD_S = 2.0, 0.5
+ASK_TIMEOUT_S, POLL_PERIOD_S = 2.0, 0.5
 START_ASK_TIMEOUT_S = 0.5  # short, to notice soon that a child ended instead of answering
 END_TIMEOUT_S = 3.0
 NODE = "replay"
@@ -224,7 +224,7 @@ class ReplayControl:
             if position is not None and position != last and self._replay is replay:
                 self._publish(position)
                 last = position
-            time.sleep(LOOK_PERIOD_S)
+            time.sleep(POLL_PERIOD_S)
 
 
 class _Replay:

@@ -11,8 +11,8 @@ from protocol.errors import DeltalightError
 from protocol.keys import Keys
 from protocol.messages import ControlRequest
 from protocol.methods import PLUGINS
+from protocol.request import RequestClient
 from protocol.scene import SceneDocument, parse_scene
-from protocol.transport import RequestClient
 from services.api.app import create_app
 from services.api.settings import ApiSettings
 from services.host_store import FIRST_SCENE, activate_document

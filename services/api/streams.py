@@ -11,7 +11,8 @@ from protocol.envelope import decode
 from protocol.errors import DeltalightError
 from protocol.keys import Keys
 from protocol.messages import Message, StatsMessage
-from protocol.transport import ReceivedMultipart, Receiver
+from protocol.receiver import Receiver
+from protocol.subscriber import ReceivedMultipart
 
 RECEIVE_TIMEOUT_S = 0.2
 FORGOTTEN_AFTER_S = 3600.0

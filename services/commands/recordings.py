@@ -31,7 +31,7 @@ def info(
 
     with _progress("reading", show_count=False) as progress:
         task = progress.add_task("reading", total=1.0)
-        found = describe_recording(file, lambda share: progress.update(task, completed=share))
+        found = describe_recording(file, lambda fraction: progress.update(task, completed=fraction))
     if as_json:
         typer.echo(json.dumps(found))
     else:

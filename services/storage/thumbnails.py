@@ -23,7 +23,7 @@ AZIMUTH_DEG, ELEVATION_DEG, DISTANCE = -55.0, 25.0, 4.0
 # In camera axes (right, up, towards the camera): a key light from the upper left, a weaker one from the right, and
 # ambient light. White that faces the key light is just not clipped.
 KEY, FILL = np.array([-0.5, 0.7, 0.5], np.float32), np.array([0.9, 0.1, 0.4], np.float32)
-KEY_SHARE, FILL_SHARE, AMBIENT_SHARE = 0.65, 0.2, 0.15
+KEY_LIGHT, FILL_LIGHT, AMBIENT_LIGHT = 0.65, 0.2, 0.15
 TEXTURE_EDGE = 2 * SIZE  # a texture in full view is not finer than the rays
 MIDDLE_GREY = 0.18  # target of the mean logarithm of a map's luminance (Reinhard et al. 2002)
 
@@ -106,9 +106,9 @@ class _Shot:
         normals = _mixed(mesh.normals, corners, weights) @ self._camera_from_file.T
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
         normals *= np.where((normals * directions).sum(axis=1, keepdims=True) > 0, -1, 1)
-        light = np.full((len(normals), 1), AMBIENT_SHARE, np.float32)
-        for share, place in ((KEY_SHARE, KEY), (FILL_SHARE, FILL)):
-            light += share * np.maximum(normals @ (place / np.linalg.norm(place)), 0)[:, None]
+        light = np.full((len(normals), 1), AMBIENT_LIGHT, np.float32)
+        for strength, direction in ((KEY_LIGHT, KEY), (FILL_LIGHT, FILL)):
+            light += strength * np.maximum(normals @ (direction / np.linalg.norm(direction)), 0)[:, None]
         color = np.broadcast_to(mesh.material.base_color, normals.shape)
         if mesh.colors is not None:
             color = color * _mixed(mesh.colors, corners, weights)

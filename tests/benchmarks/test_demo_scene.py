@@ -14,7 +14,7 @@ from benchmarks.ground_truth.sensors import ColorSensor, StereoDepthSensor, srgb
 from protocol.board import BoardSpec
 from protocol.errors import DeltalightError
 from protocol.frames import SensorFrame, decode_lut
-from protocol.recording import RecordingReader
+from protocol.recording_reader import RecordingReader
 from protocol.scene import load_scene
 from sensor_node.markers import BoardDetector
 
@@ -102,7 +102,7 @@ def test_color_noise_grows_with_light_and_repeats_by_seed() -> None:
 
 
 def test_depth_noise_grows_with_distance_squared() -> None:
-    sensor = StereoDepthSensor(failure_share=0.001, step_m=0.0001)
+    sensor = StereoDepthSensor(failure_fraction=0.001, step_m=0.0001)
     for distance_m in (0.5, 1.0, 2.0):
         flat = np.full((240, 320), distance_m, np.float32)
         steps = sensor.measure(flat, np.random.default_rng(2))
@@ -111,7 +111,7 @@ def test_depth_noise_grows_with_distance_squared() -> None:
 
 
 def test_depth_has_an_occlusion_shadow_left_of_near_things() -> None:
-    sensor = StereoDepthSensor(failure_share=0.0001)
+    sensor = StereoDepthSensor(failure_fraction=0.0001)
     depth_m = np.full((120, 200), 1.0, np.float32)
     depth_m[30:90, 80:140] = 0.5
     unknown = sensor.measure(depth_m, np.random.default_rng(3))[60] == 0

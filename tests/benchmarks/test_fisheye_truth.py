@@ -26,7 +26,7 @@ if importlib.util.find_spec("mitsuba") is None:
 pytestmark = pytest.mark.slow
 SIZE = (320, 240)  # smaller, hardly a pixel shows nothing but paper
 LIGHT_PATHS = 32
-ANGLE_DEG, IRRADIANCE_SHARE, LOSS_DB = 3.0, 0.05, 3.0  # the project's goals
+ANGLE_DEG, IRRADIANCE_FRACTION, LOSS_DB = 3.0, 0.05, 3.0  # the project's goals
 SCENES = ("two_lights", "cornell")
 
 
@@ -82,9 +82,9 @@ def test_lamps_are_where_they_are_and_as_strong(case: SceneCase) -> None:
     for light, lamp in zip(lights, lamps, strict=True):
         assert np.degrees(np.arccos(min(1.0, float(light.to_light @ lamp.to_light)))) < ANGLE_DEG
         assert light.irradiance @ LUMINANCE == pytest.approx(
-            lamp.irradiance @ LUMINANCE, rel=IRRADIANCE_SHARE
+            lamp.irradiance @ LUMINANCE, rel=IRRADIANCE_FRACTION
         )
-        assert light.irradiance == pytest.approx(lamp.irradiance, rel=2 * IRRADIANCE_SHARE)
+        assert light.irradiance == pytest.approx(lamp.irradiance, rel=2 * IRRADIANCE_FRACTION)
 
 
 def test_paper_tells_the_lamps_distance(case: SceneCase) -> None:

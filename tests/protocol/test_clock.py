@@ -17,7 +17,7 @@ from protocol.clock import (
 )
 from protocol.errors import DeltalightError
 from protocol.messages import ControlRequest
-from protocol.transport import ReplyServer, RequestClient
+from protocol.request import ReplyServer, RequestClient
 
 MS = 1_000_000
 SECOND = 1_000_000_000

@@ -15,7 +15,9 @@ import structlog
 from protocol.errors import DeltalightError
 from protocol.keys import Keys, create_keys, load_keys, trust
 from protocol.messages import ControlRequest
-from protocol.transport import Publisher, Receiver, ReplyServer, RequestClient
+from protocol.publisher import Publisher
+from protocol.receiver import Receiver
+from protocol.request import ReplyServer, RequestClient
 
 ANY = "tcp://127.0.0.1:0"
 SETTLE_S = 5.0

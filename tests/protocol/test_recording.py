@@ -20,7 +20,8 @@ from protocol.camera_model import CameraModel
 from protocol.errors import DeltalightError
 from protocol.frames import DepthImage, SensorFrame
 from protocol.pictures import depth_from_steps
-from protocol.recording import RecordingReader, RecordingWriter
+from protocol.recording_reader import RecordingReader
+from protocol.recording_writer import RecordingWriter
 from protocol.scene import parse_scene
 from protocol.source import open_source
 from tests.protocol.fisheye_samples import assert_same_frames
@@ -329,7 +330,7 @@ from pathlib import Path
 import numpy as np
 from protocol.camera_model import CameraModel
 from protocol.frames import SensorFrame
-from protocol.recording import RecordingWriter
+from protocol.recording_writer import RecordingWriter
 camera = CameraModel(64, 48, np.array([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]))
 writer = RecordingWriter(Path(sys.argv[1]))
 for index in range(10_000):

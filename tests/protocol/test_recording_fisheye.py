@@ -21,7 +21,8 @@ from protocol.fisheye_lens import FisheyeCalibration, save_fisheye_yaml
 from protocol.frames import FisheyePictures, SensorFrame
 from protocol.light_codecs import fisheye_pictures
 from protocol.messages import FisheyeMessage
-from protocol.recording import RecordingReader, RecordingWriter
+from protocol.recording_reader import RecordingReader
+from protocol.recording_writer import RecordingWriter
 from protocol.source import Source, open_source
 from sensor_node.frame_messages import Stamps, fisheye_multipart
 from tests.protocol.fisheye_samples import BRACKET_S, HEIGHT, WIDTH, assert_same_pictures, coded, linear

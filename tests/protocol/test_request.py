@@ -12,8 +12,7 @@ from protocol.envelope import EnvelopeError, decode, encode
 from protocol.errors import DeltalightError
 from protocol.messages import MAX_HEADER_BYTES, ControlReply, ControlRequest, StatsMessage
 from protocol.payloads import INLINE_CHARACTERS, decode_control, encode_control
-from protocol.request import ReplyMemory
-from protocol.transport import ReplyServer, RequestClient
+from protocol.request import ReplyMemory, ReplyServer, RequestClient
 
 ANY = "tcp://127.0.0.1:0"
 

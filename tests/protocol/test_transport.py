@@ -16,7 +16,10 @@ import zmq
 from protocol.envelope import decode, encode
 from protocol.errors import DeltalightError
 from protocol.messages import MAX_PART_BYTES, StatsMessage
-from protocol.transport import Publisher, Receiver, ReplyServer, RequestClient, check_endpoint
+from protocol.publisher import Publisher
+from protocol.receiver import Receiver
+from protocol.request import ReplyServer, RequestClient
+from protocol.sockets import check_endpoint
 
 ANY = "tcp://127.0.0.1:0"
 SETTLE_S = 5.0
@@ -245,7 +248,7 @@ import sys, time
 import numpy as np
 from protocol.envelope import encode
 from protocol.messages import ColorMessage
-from protocol.transport import Publisher
+from protocol.publisher import Publisher
 
 publisher = Publisher("tcp://127.0.0.1:0")
 print(publisher.endpoint, flush=True)

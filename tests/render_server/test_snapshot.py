@@ -185,7 +185,7 @@ def test_another_source_begins_as_if_there_had_been_none(gpu: GpuContext, stage:
             view = noisy_view(10 + number)
             renderer.render(replace(view, color=255 - view.color))
         if others:
-            renderer.begin_source()
+            renderer.forget_frames()
             with pytest.raises(DeltalightError, match="Nothing was rendered yet"):
                 renderer.pick(1, 1)
         pictures.append([renderer.render(noisy_view(number)).color for number in range(2)])

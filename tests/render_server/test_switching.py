@@ -32,7 +32,7 @@ def test_no_frame_is_lost_and_none_shows_what_was_before(gpu: GpuContext, docume
             view = frame(pose=look_at(EYES[index % 2]), frame_id=index)
             changed = document.replaced(method=method)
             renderer.set_scene(changed)
-            started = renderer.start(view)
+            started = renderer.submit(view)
             if waiting is not None:  # on a GPU the frame before is read only now, after the switch
                 check(waiting.finish(), index - 1)
             waiting = started

@@ -121,7 +121,7 @@ class VoxelLab:
         ray_buffer = self.gpu.ctx.buffer(rays.tobytes())
         results = self.gpu.ctx.buffer(reserve=count * 16)
         everywhere = np.array([0, 0, 0, *[-self.placement.size] * 3], np.int32)
-        self._light.start_support(everywhere)
+        self._light.reset_support(everywhere)
         self._cones.run(
             (count,),
             self._volume.bindings,

@@ -71,7 +71,7 @@ def test_a_known_pinhole_lens_comes_back(kind: LensKind) -> None:
     assert isinstance(result.fit.lens, CameraModel)
     # Noise of 0.1 px a coordinate is 0.14 px a point.
     assert result.fit.rms_px == pytest.approx(0.14, abs=0.02)
-    assert result.fit.focal_share < 0.002
+    assert result.fit.focal_fraction < 0.002
     np.testing.assert_allclose(np.diag(result.fit.lens.matrix)[:2], [520, 523], rtol=0.003)
     np.testing.assert_allclose(result.fit.lens.matrix[:2, 2], [325, 236], atol=1.0)
     apart = np.abs(result.fit.lens.rays() - PINHOLE.rays()).max(axis=-1) * 520
@@ -92,7 +92,7 @@ def test_the_stated_uncertainty_of_the_focal_length_is_true() -> None:
         for _ in range(6)
     ]
     focals = [fit.lens.camera.matrix[0, 0] for fit in fits if isinstance(fit.lens, EquidistantLens)]
-    stated = np.mean([fit.focal_share for fit in fits]) * 190
+    stated = np.mean([fit.focal_fraction for fit in fits]) * 190
     assert np.std(focals) == pytest.approx(stated, rel=0.6)
 
 
@@ -198,7 +198,7 @@ def test_coverage_counts_cells_inside_the_image_circle() -> None:
     inside = measure_coverage(found, SIZE, (np.array([320.0, 240.0]), 150.0))
     assert everywhere.points.shape == (6, 8)
     assert everywhere.points.sum() == sum(len(view.points) for view in found)
-    assert inside.share > everywhere.share
+    assert inside.fraction > everywhere.fraction
     assert inside.text().splitlines()[0].strip() == ""
 
 

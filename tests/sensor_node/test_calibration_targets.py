@@ -206,7 +206,7 @@ def test_a_live_camera_needs_no_calibration_and_is_closed_at_the_end(monkeypatch
 
 
 def test_a_recording_gives_its_frames_and_its_board(tmp_path: Path, synthetic: SyntheticCamera) -> None:
-    from protocol.recording import RecordingWriter
+    from protocol.recording_writer import RecordingWriter
 
     frames = [synthetic.frame_at(index) for index in range(2)]
     with RecordingWriter(tmp_path / "take.mcap", board=synthetic.board) as writer:

@@ -26,7 +26,7 @@ from protocol.messages import (
     StatsMessage,
 )
 from protocol.receiver import Receiver
-from protocol.transport import ReplyServer
+from protocol.request import ReplyServer
 from sensor_node.cameras.synthetic import SyntheticCamera, default_camera
 from sensor_node.capture import CaptureThread
 from sensor_node.frame_messages import depth_multipart, fitting_step_m

@@ -9,7 +9,7 @@ import pytest
 
 from protocol.clock import clock_payload
 from protocol.messages import ControlRequest
-from protocol.transport import ReplyServer
+from protocol.request import ReplyServer
 from sensor_node import capture
 from sensor_node.capture import ServerClock
 

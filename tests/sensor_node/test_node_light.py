@@ -27,7 +27,7 @@ from protocol.messages import (
     RadianceMessage,
     StatsMessage,
 )
-from protocol.transport import Receiver
+from protocol.receiver import Receiver
 from sensor_node import repeater
 from sensor_node.cameras.base import Camera, StreamState
 from sensor_node.cameras.settings import CameraSettings, FisheyeSettings

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import httpx
 
+from protocol.request import ReplyServer
 from protocol.scene import SceneDocument
-from protocol.transport import ReplyServer
 from render_server.server.session import RenderSession
 from services import ports
 from services.api.app import create_app

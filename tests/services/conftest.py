@@ -13,7 +13,7 @@ from protocol.camera_model import CameraModel
 from protocol.codecs import encode_color, encode_depth
 from protocol.envelope import encode
 from protocol.messages import ColorMessage, DepthMessage, PoseMessage
-from protocol.transport import ReceivedMultipart
+from protocol.subscriber import ReceivedMultipart
 from services.cli import run
 
 ROOT = Path(__file__).parents[2]

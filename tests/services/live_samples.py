@@ -19,7 +19,7 @@ from websockets.sync.client import ClientConnection, connect
 from protocol.codecs import encode_color
 from protocol.envelope import encode
 from protocol.messages import CompositeMessage, StatsMessage
-from protocol.transport import Publisher
+from protocol.publisher import Publisher
 from services import ports
 from tests.services.api_samples import RenderServer, RunningApi, running_api
 from tests.services.conftest import HEIGHT, IDENTITY, WIDTH, camera

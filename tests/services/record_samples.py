@@ -15,9 +15,9 @@ from protocol.calibration import Extrinsics
 from protocol.camera_model import CameraModel
 from protocol.frames import BoardPose, SensorFrame
 from protocol.pictures import depth_from_steps
-from protocol.recording import RecordingWriter
+from protocol.publisher import Publisher
+from protocol.recording_writer import RecordingWriter
 from protocol.scene import SceneDocument
-from protocol.transport import Publisher
 from sensor_node.frame_messages import (
     Stamps,
     color_multipart,

@@ -8,7 +8,7 @@ import numpy as np
 
 from protocol.errors import DeltalightError
 from protocol.messages import ControlRequest
-from protocol.transport import ReplyServer
+from protocol.request import ReplyServer
 from services import ports
 
 NOWHERE = {"kind": "nothing", "object": None, "point_m": None, "normal": None, "distance_m": None}

@@ -9,7 +9,7 @@ import pytest
 from protocol.codecs import encode_array, encode_color
 from protocol.envelope import encode
 from protocol.messages import RadianceMessage
-from protocol.transport import Publisher
+from protocol.publisher import Publisher
 from sensor_node.cameras.driver import Discovery, FoundCamera, MissingSupport
 from services import ports
 from services.api import camera_finder

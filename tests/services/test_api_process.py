@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from protocol.documents import validate
 from protocol.errors import DeltalightError
 from protocol.messages import ControlRequest
-from protocol.transport import RequestClient
+from protocol.request import RequestClient
 from services import ports
 from services.api.serve import listening, run_api
 from services.api.settings import ApiSettings

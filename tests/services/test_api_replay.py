@@ -9,7 +9,7 @@ import psutil
 import pytest
 
 from protocol.messages import ControlRequest
-from protocol.transport import RequestClient
+from protocol.request import RequestClient
 from services import ports
 from services.api.replay_control import ReplayEndpoints
 from services.recorder import Recorder as StreamRecorder

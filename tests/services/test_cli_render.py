@@ -18,7 +18,7 @@ import trimesh
 
 from protocol.camera_model import CameraModel
 from protocol.dataset_writer import DatasetWriter
-from protocol.recording import RecordingWriter
+from protocol.recording_writer import RecordingWriter
 from sensor_node.cameras.synthetic import SyntheticCamera
 from tests.services.conftest import ROOT, RunCli
 

@@ -17,7 +17,8 @@ import pytest
 
 from protocol.envelope import decode
 from protocol.messages import CompositeMessage, ControlRequest
-from protocol.transport import Receiver, RequestClient
+from protocol.receiver import Receiver
+from protocol.request import RequestClient
 from services import ports
 from services.api.serve import listening
 from services.demo import RECORDING, SCENE, demo_plan, demo_scene

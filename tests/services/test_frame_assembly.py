@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from protocol.envelope import EnvelopeError, decode
-from protocol.transport import ReceivedMultipart
+from protocol.subscriber import ReceivedMultipart
 from render_server.server.frames import FrameAssembler, PairingSettings
 from tests.services.conftest import color, depth, pose
 

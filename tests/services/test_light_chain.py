@@ -20,7 +20,7 @@ from protocol.codecs import decode_color
 from protocol.dataset_writer import DatasetWriter
 from protocol.envelope import decode
 from protocol.messages import CompositeMessage
-from protocol.transport import Receiver
+from protocol.receiver import Receiver
 from sensor_node.cameras.synthetic import SyntheticCamera, default_camera
 from services import ports
 from tests.sensor_node.fisheye_samples import bracket, equidistant

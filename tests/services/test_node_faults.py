@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from protocol.dataset_writer import DatasetWriter
-from protocol.transport import Receiver
+from protocol.receiver import Receiver
 from sensor_node.cameras.synthetic import SyntheticCamera
 from services import ports
 from tests.services.conftest import ROOT, RunCli

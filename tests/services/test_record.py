@@ -24,9 +24,10 @@ from protocol.envelope import decode
 from protocol.errors import DeltalightError
 from protocol.messages import ControlRequest
 from protocol.pictures import depth_from_steps
+from protocol.publisher import Publisher
+from protocol.request import ReplyServer
 from protocol.scene import parse_scene
 from protocol.source import open_source
-from protocol.transport import Publisher, ReplyServer
 from services import ports, recorder
 from services.cli import app
 from services.recorder import Recorder, RecordJob, RecordStatus
@@ -297,7 +298,7 @@ def test_little_space_is_told_once(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     usage = shutil.disk_usage(tmp_path)._replace(free=1000)
     monkeypatch.setattr("shutil.disk_usage", lambda _: usage)
     monkeypatch.setattr(recorder, "STEADY_AFTER_S", 0.1)
-    monkeypatch.setattr(recorder, "LOOK_PERIOD_S", 0.1)
+    monkeypatch.setattr(recorder, "CHECK_PERIOD_S", 0.1)
     with (
         feeding() as (endpoint, _),
         recording(RecordJob(tmp_path / "a.mcap", (endpoint,), duration_s=1.0)) as (_, notices, end),

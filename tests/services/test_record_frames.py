@@ -11,7 +11,7 @@ from protocol.envelope import decode
 from protocol.errors import DeltalightError
 from protocol.frames import BoardPose, SensorFrame
 from protocol.messages import ColorMessage
-from protocol.transport import Publisher
+from protocol.publisher import Publisher
 from services.raw_frames import RawFrameAssembler
 from services.stream_queue import QUEUED_MESSAGES, StreamQueue
 from tests.protocol.fisheye_samples import assert_same_frames, assert_same_pictures, linear

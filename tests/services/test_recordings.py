@@ -13,8 +13,8 @@ from typer.testing import CliRunner
 
 from protocol.errors import DeltalightError
 from protocol.frames import DepthImage, SensorFrame
-from protocol.recording import RecordingWriter
 from protocol.recording_format import FOXGLOVE_TOPICS
+from protocol.recording_writer import RecordingWriter
 from protocol.scene import parse_scene
 from protocol.source import open_source
 from services.cli import app

@@ -11,8 +11,10 @@ import pytest
 
 from protocol.envelope import decode
 from protocol.messages import CompositeMessage, ControlReply, ControlRequest
+from protocol.publisher import Publisher
+from protocol.receiver import Receiver
+from protocol.request import RequestClient
 from protocol.scene import SceneDocument
-from protocol.transport import Publisher, Receiver, RequestClient
 from render_server.server.process import ServerSettings, serve
 from services import ports
 from tests.services.api_samples import UPLOAD, running_api

@@ -59,7 +59,7 @@ class InvertingRenderer:
         self.ignored: str | None = None
         self.unfinished: list[int] = []
 
-    def start(self, frame: ViewFrame, *, with_linear: bool = False) -> Started:
+    def submit(self, frame: ViewFrame, *, with_linear: bool = False) -> Started:
         self.newest = frame
         if frame.frame_id in self.fails_at:
             raise RuntimeError("the volume fell over")
@@ -84,7 +84,7 @@ class InvertingRenderer:
         self.ignored = ignore
         return Picked(self.newest.frame_id, (x, y))
 
-    def begin_source(self) -> None:
+    def forget_frames(self) -> None:
         self.sources_begun += 1
         self.newest = None
 

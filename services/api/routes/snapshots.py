@@ -129,8 +129,8 @@ def _taken(shared: Context, name: str, folder: FilePath, wanted: NewSnapshot) ->
     answer: dict[str, Any] = shared.link.command("snapshot", order, TIMEOUT_S)
     files, faults = files_of(answer, folder)
     if not files:
-        said = next(iter(faults.values()), "it wrote no file into the data folder; run it on this host.")
-        raise ProblemError(502, "no-pictures", f"The render server took no picture: {said}")
+        reason = next(iter(faults.values()), "it wrote no file into the data folder; run it on this host.")
+        raise ProblemError(502, "no-pictures", f"The render server took no picture: {reason}")
     return SnapshotFacts(
         id=name,
         taken=now(),

@@ -29,9 +29,9 @@ vec2 seen_pixel(vec3 c) {
 
 bool in_picture(vec2 pixel) { return all(greaterThanEqual(pixel, vec2(0.0))) && all(lessThan(pixel, picture_size)); }
 
-// Fraction of the segment from p to p + way (pixels) that is inside the picture; p is.
-float way_in_picture(vec2 p, vec2 way) {
-    vec2 safe = mix(way, vec2(1e-6), lessThan(abs(way), vec2(1e-6)));
+// Fraction of the segment from p to p + path (pixels) that is inside the picture; p is.
+float fraction_in_picture(vec2 p, vec2 path) {
+    vec2 safe = mix(path, vec2(1e-6), lessThan(abs(path), vec2(1e-6)));
     vec2 border = mix(vec2(0.0), picture_size, greaterThan(safe, vec2(0.0)));
     vec2 leave = (border - p) / safe;
     return clamp(min(leave.x, leave.y), 0.0, 1.0);
@@ -44,10 +44,10 @@ ScreenHit screen_hit(vec3 from, vec3 d, float spread) {
     if (a.z <= NEAREST) return hit;
     float reach = v.z < 0.0 ? min(FARTHEST, (NEAREST - a.z) / v.z) : FARTHEST;
     float near_a = 1.0 / a.z, near_b = 1.0 / (a.z + reach * v.z);
-    vec2 first = picture_pixel(a), way = picture_pixel(a + reach * v) - first;
+    vec2 first = picture_pixel(a), path = picture_pixel(a + reach * v) - first;
     if (!in_picture(first)) return hit;
-    float last = way_in_picture(first, way);
-    int steps = min(int(ceil(max(abs(way.x), abs(way.y)) * last)), MOST_STEPS);
+    float last = fraction_in_picture(first, path);
+    int steps = min(int(ceil(max(abs(path.x), abs(path.y)) * last)), MOST_STEPS);
     float before = 0.0;
     for (int i = 1; i <= steps; ++i) {
         float s = last * float(i) / float(steps);
