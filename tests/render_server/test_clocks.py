@@ -25,9 +25,7 @@ STANDING = {
     "none": LIGHT | MAPS | VOXELS | {"voxelize far"},
     "exact": LIGHT | MAPS | VOXELS | {"voxelize far"},
     "paper": LIGHT | MAPS | VOXELS,
-    "differential": LIGHT
-    | VOXELS
-    | {"shadow maps mu", "shadow maps rho", "voxelize far", "voxelize objects", "group surfels"},
+    "differential": LIGHT | VOXELS | {"shadow maps mu", "shadow maps rho", "voxelize far", "group surfels"},
     "dlpv": LIGHT | MAPS | VOXELS | CELLS,
     "dlpv-paper": LIGHT | MAPS | VOXELS | CELLS,
     "aroof": LIGHT | MAPS | {"occlusion fields", "shown cells"},
