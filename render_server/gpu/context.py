@@ -51,12 +51,13 @@ class GpuContext:
     def empty_texture(self, kind: type, texels: str) -> Any:  # noqa: ANN401 (as the kind says)
         """A texture of zeros (`texels`: f, i or u) that stands where a kernel is given none."""
         if (kind, texels) not in self._empty_textures:
-            make, size = {
-                moderngl.Texture: (self.ctx.texture, (1, 1)),
-                moderngl.Texture3D: (self.ctx.texture3d, (1, 1, 1)),
-                moderngl.TextureArray: (self.ctx.texture_array, (1, 1, 1)),
-            }[kind]
-            texture = make(size, 4, bytes(4), dtype=f"{texels}1")
+            texture: Any
+            if kind is moderngl.Texture:
+                texture = self.ctx.texture((1, 1), 4, bytes(4), dtype=f"{texels}1")
+            elif kind is moderngl.Texture3D:
+                texture = self.ctx.texture3d((1, 1, 1), 4, bytes(4), dtype=f"{texels}1")
+            else:
+                texture = self.ctx.texture_array((1, 1, 1), 4, bytes(4), dtype=f"{texels}1")
             texture.filter = (moderngl.NEAREST, moderngl.NEAREST)
             self._empty_textures[kind, texels] = texture
         return self._empty_textures[kind, texels]
