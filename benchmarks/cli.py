@@ -7,9 +7,9 @@ from typing import Annotated
 import typer
 
 from protocol.errors import DeltalightError
-from services.commands.options import Method
+from services.commands.options import parse_method
 
-# What `bench quality` compares.
+# The methods that `bench quality` compares by default.
 DEFAULT_METHODS = "camera,none,paper,exact,path"
 
 bench = typer.Typer(
@@ -42,7 +42,7 @@ def speed(
     from services.files import write_bytes
 
     chosen, size_px = _methods(methods), None if size is None else parse_size(size)
-    from benchmarks.speed import measure_speed, print_report  # needs OpenGL's packages, wrong options do not
+    from benchmarks.speed import measure_speed, print_report  # needs OpenGL's packages, unlike a wrong option
 
     report = measure_speed(chosen, frames, size=size_px, device=device, end_to_end=end_to_end)
     if out is not None:
@@ -113,7 +113,7 @@ def rest(
     from services.files import write_bytes
 
     size_px = None if size is None else parse_size(size)
-    from benchmarks.rest import measure_rest, print_report  # needs the api extra, wrong options do not
+    from benchmarks.rest import measure_rest, print_report  # needs the api extra, unlike a wrong option
 
     report = measure_rest(seconds, size=size_px, device=device)
     if out is not None:
@@ -125,9 +125,4 @@ def rest(
 
 
 def _methods(text: str) -> list[str]:
-    names = [name.strip() for name in text.split(",")]
-    known = [method.value for method in Method]
-    unknown = [name for name in names if name not in known]
-    if unknown:
-        raise DeltalightError(f"'{unknown[0]}' is no method that is built; use {', '.join(known)}.")
-    return names
+    return [parse_method(name.strip()).value for name in text.split(",")]

@@ -1,4 +1,4 @@
-"""Writing GLB files with all that glTF can hold: skins, morph targets, clips."""
+"""Writing GLB files with all features of glTF used here: skins, morph targets, clips."""
 
 import json
 from pathlib import Path
@@ -13,27 +13,27 @@ _JSON_CHUNK, _BIN_CHUNK = 0x4E4F534A, 0x004E4942
 
 
 class GlbBuilder:
-    """Collects entries of a document and the arrays that they name."""
+    """Collects entries of a document and the arrays that they refer to."""
 
     def __init__(self) -> None:
         self.document: dict[str, Any] = {"asset": {"version": "2.0", "generator": "Deltalight"}}
         self._binary = b""
 
     def add(self, kind: str, entry: dict[str, Any]) -> int:
-        """Append to a top-level list of the document; returns its index there."""
+        """Append to a top-level list of the document; return the index there."""
         entries = self.document.setdefault(kind, [])
         entries.append(entry)
         return len(entries) - 1
 
     def view(self, values: Shaped[np.ndarray, "..."]) -> int:
-        """Store an array; returns the index of its buffer view."""
+        """Store an array; return the index of its buffer view."""
         data = np.ascontiguousarray(values).tobytes()
         view = {"buffer": 0, "byteOffset": len(self._binary), "byteLength": len(data)}
         self._binary += data + bytes(-len(data) % 4)
         return self.add("bufferViews", view)
 
     def described(self, values: Shaped[np.ndarray, "n ..."]) -> dict[str, Any]:
-        """What an accessor says of the kind of an array, its extent included."""
+        """Return an accessor's description of an array, its extent included."""
         rows = values.reshape(len(values), -1)
         return {
             "componentType": _COMPONENT_TYPES[values.dtype.str[1:]],
@@ -44,12 +44,12 @@ class GlbBuilder:
         }
 
     def array(self, values: Shaped[np.ndarray, "n ..."], *, normalized: bool = False) -> int:
-        """Store rows of numbers; returns the index of their accessor."""
+        """Store rows of numbers; return the index of their accessor."""
         entry = {"bufferView": self.view(values), **self.described(values)}
         return self.add("accessors", {**entry, "normalized": True} if normalized else entry)
 
     def floats(self, values: Any) -> int:  # noqa: ANN401 - whatever numpy takes
-        """Store rows of numbers as float32; returns the index of their accessor."""
+        """Store rows of numbers as float32; return the index of their accessor."""
         return self.array(np.array(values, np.float32))
 
     def track(  # noqa: PLR0917 - a channel in one line
@@ -68,14 +68,14 @@ class GlbBuilder:
         clip.setdefault("channels", []).append(channel)
 
     def data(self) -> bytes:
-        """The file."""
+        """Return the file's bytes."""
         document = {**self.document, "buffers": [{"byteLength": len(self._binary)}]}
         text = json.dumps(document, separators=(",", ":")).encode()
         chunks = _chunk(_JSON_CHUNK, text + b" " * (-len(text) % 4)) + _chunk(_BIN_CHUNK, self._binary)
         return b"glTF" + (2).to_bytes(4, "little") + (12 + len(chunks)).to_bytes(4, "little") + chunks
 
     def write(self, path: Path) -> Path:
-        """Write the file; returns its path."""
+        """Write the file; return its path."""
         path.write_bytes(self.data())
         return path
 

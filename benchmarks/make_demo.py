@@ -36,7 +36,7 @@ Views = dict[float, tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w
 
 
 def render_views(mesh_folder: Path, spp: int, progress: Progress) -> Views:
-    """Colour and depth without noise for each different pose of the take, by the camera's x coordinate."""
+    """Render colour and depth without noise for each different pose of the take, by the camera's x coordinate."""
     room = RoomRenderer(scene_demo.mitsuba_scene(mesh_folder, with_object=False), scene_demo.CAMERA)
     poses = {_pose_key(frame): scene_demo.world_from_camera(frame) for frame in range(scene_demo.FRAME_COUNT)}
     views: Views = {}
@@ -47,14 +47,14 @@ def render_views(mesh_folder: Path, spp: int, progress: Progress) -> Views:
 
 
 def _pose_key(frame: int) -> float:
-    """The swing goes back on its own way, so most poses occur twice."""
+    """Return a key of the pose: the swing returns along its own path, so most poses occur twice."""
     return round(float(scene_demo.world_from_camera(frame)[0, 3]), 9)
 
 
 def sensor_frame(
     frame: int, color: Float32[np.ndarray, "h w 3"], depth_m: Float32[np.ndarray, "h w"]
 ) -> SensorFrame:
-    """One frame as the sensors deliver it; noise depends on the frame's number alone."""
+    """Return one frame as the sensors deliver it; noise depends only on the frame's number."""
     rng = np.random.default_rng([SEED, frame])
     jpeg = encode_color(ColorSensor().expose(color, rng), "jpeg", JPEG_QUALITY)
     stereo = StereoDepthSensor()
@@ -73,7 +73,7 @@ def sensor_frame(
 
 
 def write_demo(out: Path, spp: int, progress: Progress) -> None:
-    """Write demo.mcap, object.glb and scene.json into `out`; replacing older ones when all are complete."""
+    """Write demo.mcap, object.glb and scene.json into `out`, replacing older ones when all are complete."""
     out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=out, prefix=".making-") as folder:
         made = Path(folder)

@@ -1,4 +1,4 @@
-"""How long a fish-eye picture takes to become lights: split, resampling, filtering; on one core.
+"""Time from a fish-eye picture to lights: split, resampling, filtering; on one core.
 
 `python -m benchmarks.median_cut` prints a table.
 """
@@ -25,7 +25,7 @@ COUNTS = (4, 16)
 
 
 def room(size: int) -> HemisphereMap:
-    """A room with three windows and a lamp, seen from below, with noise: peaks spread over most of the map."""
+    """Return a room with three windows and a lamp, seen from below, with noise: peaks spread over most of the map."""
     rng = np.random.default_rng(4)
     directions = texel_directions(size)
     radiance = np.full((size, size, 3), 0.2, np.float32) + 0.05 * rng.random((size, size, 3), np.float32)
@@ -41,7 +41,7 @@ def room(size: int) -> HemisphereMap:
 
 
 def median_ms(work: Callable[[], object]) -> float:
-    """Median time of a call, ms; the first one, which fills caches, is left out."""
+    """Return the median time of a call, ms, without the first one, which fills caches."""
     work()
     times = []
     for _ in range(ROUNDS):

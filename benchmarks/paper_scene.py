@@ -1,7 +1,7 @@
 """The papers' own scene as a dataset folder: `python -m benchmarks.paper_scene DIRTCHAMBER_DATA OUT`.
 
 DIRTCHAMBER_DATA is the `data` folder of the authors' release (photograph, marker, camera file, light settings,
-Buddha). Nothing of it is part of this project. docs/paper-scene.md tells what is done with it.
+Buddha). None of it is part of this project. docs/paper-scene.md describes the conversion.
 """
 
 import json
@@ -25,12 +25,12 @@ from sensor_node.markers import BoardDetector
 
 MARKER_LENGTH_M = 0.08  # not published: sets the scale of the scene, nothing else depends on it
 MARGIN_M = 0.011  # white paper around the marker, measured in the photograph against the marker
-TABLE_M = (0.85, 0.6)  # what the photograph shows of the table, as the marker measures it
+TABLE_M = (0.85, 0.6)  # visible part of the table, measured by the marker
 TABLE_CENTRE_M = (-0.04, 0.005)
 BUDDHA_HEIGHT_M = 0.2
-# The light file gives a direction only. The window's size and the room's share are estimates from the mug's shadow.
+# The light file gives only a direction. The window's size and the room's share are estimates from the mug's shadow.
 WINDOW_ANGULAR_RADIUS_DEG = 7.0
-AMBIENT_SHARE = 0.2  # ambient radiance against the window's irradiance
+AMBIENT_SHARE = 0.2  # ambient radiance relative to the window's irradiance
 BOARD_YAML = (
     "type: single\n"
     f"marker_length_m: {MARKER_LENGTH_M}\nseparation_m: {MARGIN_M}\nfirst_id: 0\n"
@@ -39,7 +39,7 @@ BOARD_YAML = (
 
 
 def read_camera(path: Path, width: int, height: int) -> CameraModel:
-    """Intrinsics of the authors' OpenCV XML file."""
+    """Return the intrinsics of the authors' OpenCV XML file."""
     root = ElementTree.parse(path).getroot()
     values = {
         name: np.array((root.findtext(f"{name}/data") or "").split(), float)
@@ -49,7 +49,10 @@ def read_camera(path: Path, width: int, height: int) -> CameraModel:
 
 
 def read_light_direction(path: Path) -> Float64[np.ndarray, "3"]:
-    """Direction of travel in the optical frame; the file's camera space is left-handed with y up, z forward."""
+    """Return the direction of travel in the optical frame.
+
+    The file's camera space is left-handed, y up, z forward.
+    """
     root = ElementTree.parse(path).getroot() if path.read_text().count("<camera>") == 0 else _settings(path)
     x, y, z = (float(root.findtext(f"light/direction/{axis}") or 0) for axis in "xyz")
     direction = np.array([x, -y, z])
@@ -57,13 +60,13 @@ def read_light_direction(path: Path) -> Float64[np.ndarray, "3"]:
 
 
 def _settings(path: Path) -> ElementTree.Element:
-    """The settings file has several roots: put one around them."""
+    """Parse the settings file, which has several roots, by wrapping them in one."""
     text = path.read_text().split("?>", 1)[-1]
     return ElementTree.fromstring(f"<settings>{text}</settings>")
 
 
 def scene_document(direction: Float64[np.ndarray, "3"], asset: Path) -> dict[str, Any]:
-    """Table from a model, Buddha on the marker, window light and ambient, registered by the marker's paper."""
+    """Return table from a model, Buddha on the marker, window light and ambient, registered by the marker's paper."""
     mesh = trimesh.load(asset, force="mesh", process=False)
     low, high = mesh.bounds[:, 1]
     scale = BUDDHA_HEIGHT_M / float(high - low)
@@ -97,7 +100,7 @@ def scene_document(direction: Float64[np.ndarray, "3"], asset: Path) -> dict[str
 
 
 def write_scene(source: Path, out: Path) -> None:
-    """Dataset folder, table model and scene document in `out`.
+    """Write dataset folder, table model and scene document into `out`.
 
     Raises:
         DeltalightError: a file of the authors' data is missing, or the marker is not found.
@@ -127,7 +130,7 @@ def write_scene(source: Path, out: Path) -> None:
 
 
 def _board(marker: Path, out: Path) -> BoardSpec:
-    """The one-marker board; its code is read from the authors' picture."""
+    """Return the one-marker board; its code is read from the authors' picture."""
     out.mkdir(parents=True, exist_ok=True)
     (out / "marker.png").write_bytes(marker.read_bytes())
     (out / "board.yaml").write_text(BOARD_YAML)

@@ -1,7 +1,8 @@
-"""What a moving object costs the processor each frame: `python -m benchmarks.posing_speed` (a minute).
+"""Processor time of a moving object per frame: `python -m benchmarks.posing_speed` (a minute).
 
-A ball whose vertices hang on four of forty joints each. The steps are those of `render_server/virtual_objects.py`;
-the last one is the voxeliser's own work before the GPU's, for a volume of 256^3 voxels.
+A ball each of whose vertices depends on four of forty joints. The steps are those of
+`render_server/virtual_objects.py`; the last one is the voxeliser's work before the GPU's, for a volume of 256^3
+voxels.
 """
 
 import tempfile
@@ -48,7 +49,7 @@ def skinned_ball(path: Path, subdivisions: int) -> Path:
 
 
 def timed(work: Callable[[], Any]) -> tuple[float, Any]:
-    """Least processor time, ms (other work on the machine only adds to it), and what came out."""
+    """Return the least processor time, ms (other work on the machine only adds to it), and the result."""
     spent = []
     for _ in range(REPEATS):
         start = time.thread_time()
@@ -58,7 +59,7 @@ def timed(work: Callable[[], Any]) -> tuple[float, Any]:
 
 
 def row(path: Path) -> str:
-    """One line of the table."""
+    """Return one line of the table."""
     asset = load_gltf(path)
     clip = asset.clips[0]
     pose_ms, meshes = timed(lambda: asset.meshes(asset.pose(clip, 0.3)))

@@ -1,4 +1,4 @@
-"""How fast the web process answers, with and without pictures to make beside it; what its viewers cost."""
+"""Response times of the web process, with and without rendering on the same machine, and the cost of its viewers."""
 
 import asyncio
 import gzip
@@ -29,7 +29,7 @@ from services.supervisor import Supervisor
 
 REQUESTS_PER_S = 50.0
 VIEWERS, VIEWER_FRAMES_PER_S = 20, 10.0
-ROUNDS = 3  # of viewers after none: what else the machine does falls on both
+ROUNDS = 3  # of viewers after none: other load of the machine affects both
 START_TIMEOUT_S = 120.0  # a cold shader cache on a slow machine takes a while
 STEP_M = 0.001  # of the object that the requests move
 TEXT_SUFFIXES = (".js", ".css", ".html", ".svg")  # fonts are compressed already
@@ -62,7 +62,7 @@ def measure_rest(seconds: float, *, size: tuple[int, int] | None, device: int | 
 def _running(
     size: tuple[int, int] | None, device: int | None, *, with_rendering: bool
 ) -> Iterator[tuple[str, Supervisor]]:
-    """The demo's processes, or of them the web process alone, with a data folder of their own."""
+    """Start the demo's processes, or the web process alone, with a data folder of their own."""
     scene = with_output(demo_scene("dvct"), size, None)
     with TemporaryDirectory(prefix="deltalight-bench-") as folder:
         data = Path(folder)
@@ -88,7 +88,7 @@ def _wait_for_pictures(address: str, supervisor: Supervisor) -> None:
 
 
 def _requests(address: str, seconds: float, mark: Callable[[str], Sample]) -> dict[str, Any]:
-    """Four times reading, once moving the shown scene's object, over and over; pictures count between two marks."""
+    """Read four times, then move the shown scene's object once, repeatedly; count pictures between two marks."""
     scene = httpx.get(f"{address}/active-scene").raise_for_status().json()
     path, thing = f"/scenes/{scene['id']}", scene["document"]["objects"][0]
     x, y, z = thing["pose"]["translation_m"]
@@ -107,7 +107,7 @@ def _requests(address: str, seconds: float, mark: Callable[[str], Sample]) -> di
 
 
 def _viewers(address: str, seconds: float) -> dict[str, Any]:
-    """What many viewers take, against nobody looking, in turn: pictures rendered a second, and processor time."""
+    """Measure many viewers against none, in turn: pictures rendered per second, and processor time."""
     alone, watched, got = Usage(), Usage(), list[int]()
     for _ in range(ROUNDS):
         begun = next_picture(address)
@@ -132,7 +132,7 @@ def _viewers(address: str, seconds: float) -> dict[str, Any]:
 
 
 def _picture(address: str) -> dict[str, Any]:
-    """The renderer's name and the size of its pictures."""
+    """Return the renderer's name and the size of its pictures."""
     import cv2
     import numpy as np
 
@@ -145,7 +145,7 @@ def _picture(address: str) -> dict[str, Any]:
 
 
 def dashboard_sizes(folder: Path) -> dict[str, Any] | None:
-    """Bytes of the built dashboard's files, as they are and gzipped; None = it is not built."""
+    """Return the bytes of the built dashboard's files, plain and gzipped; None = it is not built."""
     if not (folder / "index.html").is_file():
         return None
     files = {}

@@ -11,12 +11,12 @@ import httpx
 import numpy as np
 
 REQUEST_TIMEOUT_S = 30.0
-WARM_UP_ROUNDS = 5  # a process that has just begun imports and caches at its first answers
+WARM_UP_ROUNDS = 5  # a new process imports and caches in its first responses
 
 
 @dataclass(frozen=True)
 class Call:
-    """A request that is sent again and again; `bodies` in turn."""
+    """A repeated request; `bodies` in turn."""
 
     method: str
     path: str
@@ -25,9 +25,9 @@ class Call:
 
 @dataclass
 class Times:
-    """From when a request was due to the end of its answer, seconds, of each method; and those that failed.
+    """Seconds from when a request was due to the end of its response, by method; and the failed ones.
 
-    `pictures` counts what became of the changes, as their answers say.
+    `pictures` counts the status of the changes, as their responses report it.
     """
 
     seconds: dict[str, list[float]] = field(default_factory=dict)
@@ -35,7 +35,7 @@ class Times:
     pictures: Counter[str] = field(default_factory=Counter)
 
     def figures(self) -> dict[str, Any]:
-        """Median and 99th percentile by method, milliseconds."""
+        """Return median and 99th percentile by method, milliseconds."""
         found: dict[str, Any] = {}
         for method, values in sorted(self.seconds.items()):
             p50_s, p99_s = np.percentile(values, (50, 99))
@@ -48,9 +48,9 @@ class Times:
 
 
 async def send_paced(address: str, calls: Sequence[Call], per_s: float, seconds: float) -> Times:
-    """Send `calls` in turn, `per_s` a second, whether the earlier ones were answered or not.
+    """Send `calls` in turn, `per_s` a second, whether or not earlier ones were answered.
 
-    Times count from when a request was due, so that one that had to wait for its turn is not taken for a fast one.
+    Times count from when a request was due, so that one that had to wait for its turn does not count as fast.
     """
     times = Times()
     limits = httpx.Limits(max_connections=100)
@@ -83,13 +83,13 @@ async def _send(client: httpx.AsyncClient, call: Call, turn: int, due_s: float, 
 
 
 async def watch(address: str, viewers: int, frames_per_s: float, seconds: float) -> list[int]:
-    """Look with many viewers, each at most at this rate; gives how many frames each got."""
+    """Watch with many viewers, each at most at this rate; return how many frames each got."""
     ends_s = time.perf_counter() + seconds
     return list(await asyncio.gather(*(_view(address, 1 / frames_per_s, ends_s) for _ in range(viewers))))
 
 
 async def _view(address: str, period_s: float, ends_s: float) -> int:
-    """One viewer: it acknowledges a frame when the next is due, which is what a slow browser does."""
+    """Run one viewer: it acknowledges a frame when the next is due, like a slow browser."""
     from websockets.asyncio.client import connect
 
     frames = 0

@@ -1,4 +1,4 @@
-"""What a web process says of itself while it is measured: pictures that came, processor time that it used."""
+"""Usage reported by a web process while it is measured: pictures that arrived, processor time used."""
 
 import time
 from dataclasses import dataclass, field
@@ -15,7 +15,7 @@ _FRAMES, _CPU_S = "deltalight_live_frames_received_total", "process_cpu_seconds_
 
 @dataclass(frozen=True)
 class Sample:
-    """Pictures that came from the render server so far, and the processor time that was used, at a time."""
+    """Counts at a moment: pictures from the render server so far, and processor time used."""
 
     at_s: float
     frames: float
@@ -24,7 +24,7 @@ class Sample:
 
 @dataclass
 class Usage:
-    """What happened in rounds of some work."""
+    """Totals over rounds of some work."""
 
     wall_s: float = 0.0
     cpu_s: dict[str, float] = field(default_factory=lambda: {WEB: 0.0, CLIENTS: 0.0})
@@ -41,17 +41,17 @@ class Usage:
 
     @property
     def frames_per_s(self) -> float:
-        """Pictures a second."""
+        """Pictures per second."""
         return self._frames / self._frames_s
 
     @property
     def cores(self) -> dict[str, float]:
-        """How many cores each process kept busy."""
+        """Number of cores that each process kept busy."""
         return {name: used_s / self.wall_s for name, used_s in self.cpu_s.items()}
 
 
 def sample(address: str) -> Sample:
-    """What there is now."""
+    """Return the current counts."""
     lines = httpx.get(f"{address}/metrics").raise_for_status().text.splitlines()
     values = dict(line.rsplit(" ", 1) for line in lines if not line.startswith("#"))
     cpu_s = {WEB: float(values[_CPU_S]), CLIENTS: time.process_time()}
@@ -59,12 +59,12 @@ def sample(address: str) -> Sample:
 
 
 def next_picture(address: str) -> Sample:
-    """What there is when the next picture comes.
+    """Return the counts at the arrival of the next picture.
 
     Rates are measured from one picture to another: a fixed time would be off by one of its twenty pictures.
 
     Raises:
-        DeltalightError: none comes.
+        DeltalightError: none arrives.
     """
     before, deadline_s = sample(address), time.monotonic() + PATIENCE_S
     while (now := sample(address)).frames == before.frames:

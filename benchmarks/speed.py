@@ -1,4 +1,4 @@
-"""How fast this machine renders the demo: each pass, and camera to viewer through all processes."""
+"""Rendering speed of the demo on this machine: each pass, and camera to viewer through all processes."""
 
 import os
 import statistics
@@ -18,7 +18,7 @@ from sensor_node.view_frames import ViewFrameBuilder
 from services.demo import RECORDING, collect_composites, demo_scene
 from services.offline import with_output
 
-CHANGE_PASS = "direct light"  # every method runs it, and only where camera, real scene or objects moved
+CHANGE_PASS = "direct light"  # every method runs it, and only if camera, real scene or objects moved
 WARM_UP_FRAMES = 3  # drivers compile and specialise shaders in the first frames
 
 
@@ -95,7 +95,7 @@ def _measure_end_to_end(scene: SceneDocument, frames: int) -> dict[str, Any]:
 
 
 def print_report(report: dict[str, Any]) -> None:
-    """Print the report as tables: one row a pass, one column pair a method."""
+    """Print the report as tables: one row per pass, one column pair per method."""
 
     console = Console()
     width, height = report["size"]

@@ -22,13 +22,16 @@ BLEND_M = 0.008
 """A limb bends over this length on either side of a joint."""
 THIGH_M, SHIN_M, SOLE_M = 0.042, 0.036, 0.007
 TOE_M, HEEL_M = 0.019, 0.004
-"""The sole's ends before and behind the ankle."""
+"""The sole's ends in front of and behind the ankle."""
 HIP_M = THIGH_M + SHIN_M + SOLE_M
 
 CYCLE_S, CYCLES, KEYS_A_CYCLE = 1.0, 3, 24
 STRIDE_DEG = 23.0
 RADIUS_M = 4 * (THIGH_M + SHIN_M) * np.sin(np.radians(STRIDE_DEG)) * CYCLES / (2 * np.pi)
-"""Of the circle: two steps a cycle, each as long as the legs reach from front to back, so that feet hardly slide."""
+"""Of the circle.
+
+Two steps per cycle, each as long as the legs reach from front to back, so that feet hardly slide.
+"""
 
 CENTRE_M = (0.32, 0.0)
 """Of the circle on the demo's table: clear of ball, book and mug, its shadow on the marker sheet."""
@@ -56,7 +59,7 @@ NAMES = tuple(JOINTS)
 
 @dataclass(frozen=True, eq=False)
 class Limb:
-    """A round limb: vertices, outward normals, triangles, and the share of every joint in each vertex."""
+    """A round limb: vertices, outward normals, triangles, and the weight of every joint in each vertex."""
 
     positions: Float32[np.ndarray, "n 3"]
     normals: Float32[np.ndarray, "n 3"]
@@ -65,7 +68,7 @@ class Limb:
 
 
 def limb(joints: list[str], end: tuple[float, float, float], radii: tuple[float, float], rings: int) -> Limb:
-    """From the first joint over the others to `end`, thinner or thicker towards it, round at both ends."""
+    """Return a limb from the first joint over the others to `end`, tapering towards it, round at both ends."""
     stations = np.array([*(JOINTS[name][1] for name in joints), end], float)
     lengths = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(stations, axis=0), axis=1))])
     cap = np.radians(np.linspace(-90, 0, 5))
@@ -84,7 +87,7 @@ def limb(joints: list[str], end: tuple[float, float, float], radii: tuple[float,
     triangles = _tube_triangles(len(along))
     triangles = triangles[
         face_normals(positions, triangles)[1]
-    ]  # without those that the poles shrink to lines
+    ]  # without those that the poles degenerate to lines
     source, triangles, normals = smooth_normals(positions, triangles, crease_deg=180)
     shares = np.repeat(_shares(joints, along, lengths), SIDES, axis=0)
     return Limb(positions[source], normals, triangles, shares[source])
@@ -100,7 +103,7 @@ def _tube_triangles(rings: int) -> Int32[np.ndarray, "m 3"]:
 def _shares(
     joints: list[str], along: Float64[np.ndarray, " r"], lengths: Float64[np.ndarray, " s"]
 ) -> Float64[np.ndarray, "r j"]:
-    """Each bone its own stretch; around a joint both have a share."""
+    """Return the weights of the joints: each bone its own stretch, both of them around a joint."""
     shares = np.zeros((len(along), len(NAMES)))
     above = np.ones(len(along))
     for number, name in enumerate(joints):
@@ -112,7 +115,7 @@ def _shares(
 
 
 def limbs() -> dict[str, list[Limb]]:
-    """The figure's parts by what covers them."""
+    """Return the figure's parts by what covers them."""
     top = JOINTS["chest"][1][1]
     found: dict[str, list[Limb]] = {
         "shirt": [limb(["hips", "chest"], (0, top + 0.027, 0), (0.017, 0.021), 9)],
@@ -135,7 +138,7 @@ def limbs() -> dict[str, list[Limb]]:
 
 
 def leg_angles(phase: Float64[np.ndarray, " k"]) -> Float64[np.ndarray, "3 k"]:
-    """Thigh (forward), knee (bent) and foot (toes up against the shin's right angle), radians.
+    """Return thigh (forward), knee (bent) and foot (toes up from a right angle with the shin), radians.
 
     The thigh swings evenly; the knee bends while it swings forward, so that the foot clears the ground.
     """
@@ -145,7 +148,7 @@ def leg_angles(phase: Float64[np.ndarray, " k"]) -> Float64[np.ndarray, "3 k"]:
 
 
 def hip_height(phase: Float64[np.ndarray, " k"]) -> Float64[np.ndarray, " k"]:
-    """Height of the hips, m, at which the lowest end of a sole touches the ground."""
+    """Return the height of the hips, m, at which the lowest end of a sole touches the ground."""
     depths = []
     for shift in (0, np.pi):
         thigh, knee, foot = leg_angles(phase + shift)
@@ -156,7 +159,7 @@ def hip_height(phase: Float64[np.ndarray, " k"]) -> Float64[np.ndarray, " k"]:
 
 
 def motion(time_s: Float64[np.ndarray, " k"]) -> dict[str, Float64[np.ndarray, "k 4"]]:
-    """Rotations (quaternions x y z w) of the joints that walking moves."""
+    """Return the rotations (quaternions x y z w) of the joints that walking moves."""
     phase = 2 * np.pi * time_s / CYCLE_S
     turns = {
         "chest": _about((0, 1, 0), 0.12 * np.sin(phase)),
@@ -178,7 +181,7 @@ def _about(axis: tuple[float, float, float], angle: Float64[np.ndarray, " k"]) -
 
 
 def _add_mesh(glb: GlbBuilder) -> int:
-    """One primitive a material, on the figure's joints."""
+    """Add one primitive per material, on the figure's joints."""
     primitives = []
     for name, parts in limbs().items():
         material = {"baseColorFactor": [*CLOTHES[name], 1], "metallicFactor": 0, "roughnessFactor": 0.6}
@@ -203,7 +206,7 @@ def _add_mesh(glb: GlbBuilder) -> int:
 
 
 def _add_joints(glb: GlbBuilder) -> int:
-    """Nodes of the joints, in the order of `NAMES` from node 0 on, and the skin."""
+    """Add the nodes of the joints, in the order of `NAMES` from node 0 on, and the skin."""
     matrices = []
     for name, (parent, place) in JOINTS.items():
         origin = np.array((0, 0, 0) if parent is None else JOINTS[parent][1])
@@ -218,7 +221,7 @@ def _add_joints(glb: GlbBuilder) -> int:
 
 
 def _add_clip(glb: GlbBuilder, name: str, cycles: int, radius_m: float) -> None:
-    """Walk some cycles, once around a circle if it has a radius."""
+    """Add some cycles of walking, once around a circle if it has a radius."""
     time_s = np.linspace(0, cycles * CYCLE_S, cycles * KEYS_A_CYCLE + 1)
     times = glb.floats(time_s)
     clip: dict[str, Any] = {"name": name}
@@ -234,7 +237,7 @@ def _add_clip(glb: GlbBuilder, name: str, cycles: int, radius_m: float) -> None:
 
 
 def build() -> GlbBuilder:
-    """The figure: y up, facing +z, its feet on y = 0."""
+    """Return the figure: y up, facing +z, its feet on y = 0."""
     glb = GlbBuilder()
     skin = _add_joints(glb)
     body = glb.add("nodes", {"name": "body", "mesh": _add_mesh(glb), "skin": skin})
@@ -246,7 +249,7 @@ def build() -> GlbBuilder:
 
 
 def scene_document() -> dict[str, Any]:
-    """The demo's room with the figure in place of the knot."""
+    """Return the demo's room with the figure in place of the knot."""
     room = scene_demo.scene_document()
     figure = {
         "id": "figure",

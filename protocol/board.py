@@ -23,7 +23,7 @@ from protocol.documents import StrictModel, nearest, read_mapping, validate
 from protocol.errors import DeltalightError
 
 ASSUMED_PAPER_ALBEDO = 0.8
-# Patches keep this share of a white gap's width away from the black on either side, where blur mixes both.
+# Patches keep this fraction of a white gap's width away from the black on either side, where blur mixes both.
 PATCH_INSET = 0.2
 Length = Annotated[float, Field(gt=0, lt=10)]
 
@@ -105,13 +105,12 @@ class BoardSpec(StrictModel):
     """A printed board of square markers (board.yaml of docs/formats.md 1).
 
     World coordinates are those of docs/formats.md 3: origin at the top-left corner of the first marker, +x right
-    along the rows, +y up the sheet (rows lie at y <= 0), +z out of the paper; all in metres. For `charuco`,
-    `rows` and `columns` count squares, and a square's edge is marker_length_m + separation_m. For `single`,
-    separation_m is the width of the white margin around the marker.
+    along the rows, +y up the sheet (rows lie at y <= 0), +z out of the paper; all in metres. For `charuco`, `rows`
+    and `columns` count squares, and a square's edge is marker_length_m + separation_m. For `single`, separation_m is
+    the width of the white margin around the marker.
 
-    `dictionary` is OpenCV's name of a dictionary, or, for `single`, a `CustomDictionary` of one marker: a
-    mapping `{marker_size: 6, border_bits: 3, image: marker.png}` or `{marker_size, border_bits, bits:
-    "0101.."}`.
+    `dictionary` is OpenCV's name of a dictionary, or, for `single`, a `CustomDictionary` of one marker: a mapping
+    `{marker_size: 6, border_bits: 3, image: marker.png}` or `{marker_size, border_bits, bits: "0101.."}`.
     """
 
     type: Literal["aruco_grid", "charuco", "apriltag_grid", "single"]
@@ -183,12 +182,12 @@ class BoardSpec(StrictModel):
 
     @model_serializer(mode="wrap")
     def _without_empty_lists(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """A board without cards or lamps is described as it was before there were any."""
+        """Leave out empty lists, so that a board without cards or lamps serialises as before these existed."""
         return {key: value for key, value in dump(self).items() if value not in ((), [])}
 
     @property
     def paper_albedo(self) -> float:
-        """Albedo of the white paper: as given, or 0.8 where unknown."""
+        """Albedo of the white paper: as given, or 0.8 if unknown."""
         return ASSUMED_PAPER_ALBEDO if self.white_albedo is None else self.white_albedo
 
     @property
@@ -208,7 +207,7 @@ class BoardSpec(StrictModel):
 
     @cached_property
     def _cells(self) -> list[tuple[int, int]]:
-        """(row, column) of every marker, in the order of the ids."""
+        """Return (row, column) of every marker, in the order of the ids."""
         every = [(row, column) for row in range(self.rows) for column in range(self.columns)]
         # OpenCV's ChArUco boards (from 4.6 on) start with a black square.
         return [cell for cell in every if self.type != "charuco" or sum(cell) % 2 == 1]
@@ -221,7 +220,7 @@ class BoardSpec(StrictModel):
         return cv2.aruco.Dictionary(cv2.aruco.Dictionary.getByteListFromBits(cells), len(cells), 0)
 
     def _marker_corner(self, row: int, column: int) -> tuple[float, float]:
-        """Top-left corner (x, y) of the marker in a cell."""
+        """Return the top-left corner (x, y) of the marker in a cell."""
         first_row, first_column = self._cells[0]
         return (column - first_column) * self._pitch, -(row - first_row) * self._pitch
 
@@ -240,7 +239,7 @@ class BoardSpec(StrictModel):
         return np.array([(left + column * self._pitch, top - row * self._pitch, 0.0) for row, column in grid])
 
     def _first_square(self) -> tuple[float, float]:
-        """Top-left corner (x, y) of the square in row 0, column 0."""
+        """Return the top-left corner (x, y) of the square in row 0, column 0."""
         x, y = self._marker_corner(0, 0)
         return x - self.separation_m / 2, y + self.separation_m / 2
 
@@ -278,7 +277,7 @@ class BoardSpec(StrictModel):
         ]
 
     def _gaps(self, row: int, column: int) -> list[Float64[np.ndarray, "4 3"]]:
-        """Gaps to the right of and below the marker in a cell, where a neighbour follows."""
+        """Return the gaps to the right of and below the marker in a cell, where it has a neighbour."""
         x, y = self._marker_corner(row, column)
         length, inset = self.marker_length_m, PATCH_INSET * self.separation_m
         thin, quads = self.separation_m - 2 * inset, []
@@ -290,13 +289,13 @@ class BoardSpec(StrictModel):
 
 
 def _rectangle(left: float, top: float, width: float, height: float) -> Float64[np.ndarray, "4 3"]:
-    """Corners from top-left on, clockwise as one looks at the paper (y is up)."""
+    """Return the corners from the top-left one on, clockwise as seen from in front of the paper (y is up)."""
     right, bottom = left + width, top - height
     return np.array([(left, top, 0.0), (right, top, 0.0), (right, bottom, 0.0), (left, bottom, 0.0)])
 
 
 def load_board_yaml(path: Path) -> BoardSpec:
-    """Read a board description; a custom marker's picture is found beside it and turned into bits.
+    """Read a board description; a custom marker's picture is read from beside it and converted to bits.
 
     Raises:
         DeltalightError: the file, a key or the marker's picture is missing or wrong.
@@ -309,7 +308,7 @@ def load_board_yaml(path: Path) -> BoardSpec:
 
 
 def save_board_yaml(path: Path, board: BoardSpec) -> None:
-    """Write a board description that `load_board_yaml` reads again."""
+    """Write a board description in the form that `load_board_yaml` reads."""
     data = board.model_dump(mode="json", exclude_none=True)
     path.write_text(yaml.safe_dump(data, sort_keys=False, default_flow_style=None), encoding="utf-8")
 

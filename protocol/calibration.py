@@ -33,10 +33,10 @@ class Extrinsics:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any], name: str) -> Self:
-        """Check and take over the transforms of a document called `name`.
+        """Validate the transforms of a document called `name`.
 
         Raises:
-            DeltalightError: an unknown key, or a transform that is not a proper rigid one.
+            DeltalightError: a key is unknown, or a transform is not rigid.
         """
         known = [field.name for field in fields(cls)]
         for key in data:

@@ -29,7 +29,7 @@ class CameraModel:
     `equidistant` 4 (Kannala & Brandt); empty or zeros = no distortion.
 
     Raises:
-        DeltalightError: sizes, focal lengths or coefficients that no camera can have.
+        DeltalightError: impossible sizes, focal lengths or coefficients.
     """
 
     width: int
@@ -87,7 +87,7 @@ class CameraModel:
     def rays(self) -> Float32[np.ndarray, "h w 2"]:
         """Return (x/z, y/z) of the ray through every pixel centre, by the full lens model.
 
-        The array is computed once for each instance and is read-only.
+        The array is computed once per instance and is read-only.
 
         Raises:
             DeltalightError: the lens model has no ray for some pixel (it folds inside the picture).
@@ -122,7 +122,9 @@ class CameraModel:
             rays = cv2.fisheye.undistortPoints(
                 points, self.matrix, self._fisheye_coefficients, criteria=_CRITERIA
             )
-        elif hasattr(cv2, "undistortPointsIter"):  # OpenCV 4 has the criteria in a function of its own
+        elif hasattr(
+            cv2, "undistortPointsIter"
+        ):  # OpenCV 4 takes the termination criteria in a separate function
             rays = cv2.undistortPointsIter(
                 points, self.matrix, self._coefficients, np.eye(3), np.eye(3), _CRITERIA
             )
@@ -155,7 +157,7 @@ class CameraModel:
         return self._coefficients if self._coefficients.size else np.zeros(4)
 
     def resized(self, width: int, height: int) -> "CameraModel":
-        """Return the camera of the same picture resampled to another size (pixel centres kept right)."""
+        """Return the camera of the same picture resampled to another size (pixel centres stay correct)."""
         scale = np.array([width / self.width, height / self.height])
         matrix = self.matrix.copy()
         matrix[[0, 1], [0, 1]] *= scale
@@ -174,10 +176,10 @@ class CameraModel:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
-        """Make the camera again that `to_dict` described.
+        """Create the camera from the data of `to_dict`.
 
         Raises:
-            DeltalightError: a key is missing or has a value that no camera can have.
+            DeltalightError: a key is missing or has an impossible value.
         """
         try:
             matrix = np.asarray(data["matrix"], np.float64).reshape(3, 3)
@@ -210,7 +212,7 @@ def load_camera_yaml(path: Path) -> CameraModel:
 
 
 def camera_from_info(info: Mapping[str, Any], path: Path) -> CameraModel:
-    """Make a camera from the keys of a ROS camera_info file; `path` names the file in errors."""
+    """Create a camera from the keys of a ROS camera_info file; `path` names the file in errors."""
     try:
         width, height = int(info["image_width"]), int(info["image_height"])
         matrix = _info_values(info["camera_matrix"]).reshape(3, 3)

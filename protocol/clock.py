@@ -1,8 +1,8 @@
-"""Offset between the clocks of two hosts, with a bound that holds (SPEC.md, section 7).
+"""Offset between the clocks of two hosts, with a guaranteed bound (SPEC.md, section 7).
 
-One exchange gives four stamps as in NTP (RFC 5905, section 8): t0 request sent and t3 reply received by the
-local clock, t1 request received and t2 reply sent by the remote one. Whatever the two delays are, the true
-offset lies within half the round trip of the middle; so the exchange of the shortest round trip is best.
+One exchange gives four stamps as in NTP (RFC 5905, section 8): t0 request sent and t3 reply received by the local
+clock, t1 request received and t2 reply sent by the remote one. Whatever the two delays are, the true offset lies
+within half the round trip of the midpoint; so the exchange with the shortest round trip is best.
 """
 
 import time
@@ -15,7 +15,7 @@ from protocol.errors import DeltalightError
 from protocol.messages import ControlReply, ControlRequest
 
 CLOCK_OP = "clock"
-MAX_DRIFT_PPM = 200.0  # twice what a bad crystal does
+MAX_DRIFT_PPM = 200.0  # twice that of a bad crystal
 WINDOW = 64
 
 Clock = Callable[[], int]
@@ -26,7 +26,7 @@ Exchange = Callable[[], tuple[int, int]]
 class ClockSample:
     """Result of one exchange, nanoseconds.
 
-    local + offset_ns = remote, wrong by at most bound_ns; measured_ns is the local time of the measurement.
+    local + offset_ns = remote, with an error of at most bound_ns; measured_ns is the local time of the measurement.
     """
 
     offset_ns: int
@@ -35,7 +35,7 @@ class ClockSample:
 
 
 def sample_from_stamps(t0: int, t1: int, t2: int, t3: int) -> ClockSample:
-    """Offset and bound of one exchange, from its four stamps in nanoseconds (see the module).
+    """Compute offset and bound of one exchange from its four stamps in nanoseconds (see the module).
 
     Raises:
         DeltalightError: the stamps run backwards, because a clock was set meanwhile.
@@ -48,7 +48,7 @@ def sample_from_stamps(t0: int, t1: int, t2: int, t3: int) -> ClockSample:
 
 
 def measure_offset(exchange: Exchange, rounds: int = 8, now: Clock = time.time_ns) -> ClockSample:
-    """Best of several exchanges: the one with the shortest round trip.
+    """Return the best of several exchanges: the one with the shortest round trip.
 
     `exchange()` asks the remote side and returns its stamps (t1, t2).
 
@@ -71,16 +71,16 @@ def measure_offset(exchange: Exchange, rounds: int = 8, now: Clock = time.time_n
 
 
 class ClockEstimator:
-    """Offset that stays true over time: of the samples, the one whose bound, grown by drift, is smallest."""
+    """Offset that stays valid over time: that of the sample whose bound, widened by drift, is smallest."""
 
     def __init__(self, max_drift_ppm: float = MAX_DRIFT_PPM, window: int = WINDOW) -> None:
         self._drift = max_drift_ppm * 1e-6
         self._samples: deque[ClockSample] = deque(maxlen=window)
 
     def add(self, sample: ClockSample) -> int:
-        """Take in a measurement; returns by how much a clock was set meanwhile, ns, 0 = not at all.
+        """Add a measurement; return by how much a clock was set meanwhile, ns, 0 = not at all.
 
-        One that contradicts those before it (a clock was set) makes them void.
+        A measurement that contradicts earlier ones (a clock was set) discards them.
         """
         jump_ns = 0
         if any(
@@ -92,11 +92,11 @@ class ClockEstimator:
         return jump_ns
 
     def forget(self) -> None:
-        """Make all measurements void, because a clock was set."""
+        """Discard all measurements, because a clock was set."""
         self._samples.clear()
 
     def at(self, local_ns: int) -> ClockSample | None:
-        """Offset and bound at a local time, None before the first measurement."""
+        """Return offset and bound at a local time, None before the first measurement."""
         if not self._samples:
             return None
         best = min(self._samples, key=lambda sample: self._grown(sample, local_ns))
@@ -110,14 +110,14 @@ class ClockEstimator:
 
 
 def clock_payload(received_ns: int, now: Clock = time.time_ns) -> dict[str, object]:
-    """Answer of a server to the op `clock`: when the request came, and now."""
+    """Return the payload of a reply to the op `clock`: when the request arrived, and now."""
     return {"received_ns": received_ns, "sent_ns": now()}
 
 
 def clock_exchange(
     request: Callable[[ControlRequest, float], ControlReply], node: str, timeout_s: float = 1.0
 ) -> Exchange:
-    """Exchange over control requests, for `measure_offset`; `request` is `RequestClient.request`.
+    """Return an exchange by control requests, for `measure_offset`; `request` is `RequestClient.request`.
 
     The exchange raises DeltalightError if the server does not answer or does not know the op.
     """

@@ -1,7 +1,7 @@
-"""Codes of the raw parts: JPEG for pictures, blosc2 with bit shuffle for depth and maps (SPEC.md, section 4).
+"""Codecs of the raw parts: JPEG for pictures, blosc2 with bit shuffle for depth and maps (SPEC.md, section 4).
 
-Colour is RGB in every signature. Decoders compare the size that the coded data states with the shape of the
-message before they allocate a picture.
+Colour is RGB in every signature. Decoders compare the size stated by the encoded data with the shape of the message
+before they allocate a picture.
 """
 
 import math
@@ -30,7 +30,7 @@ _JPEG_OTHER_FRAMES = (0xC3, 0xC5, 0xC6, 0xC7, 0xC9, 0xCA, 0xCB, 0xCD, 0xCE, 0xCF
 def encode_color(
     pixels: UInt8[np.ndarray, "h w 3"], encoding: Literal["jpeg", "raw"] = "jpeg", quality: int = JPEG_QUALITY
 ) -> bytes:
-    """Coded picture; `quality` (1 to 100) counts for jpeg only.
+    """Encode a picture; `quality` (1 to 100) applies to jpeg only.
 
     Raises:
         EnvelopeError: not an 8-bit RGB picture.
@@ -49,10 +49,10 @@ def encode_color(
 def decode_color(
     part: Buffer, encoding: Literal["jpeg", "raw"], shape: tuple[int, int, int]
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """RGB picture of a coded part; a raw one is a read-only view.
+    """Decode a part to an RGB picture; a raw part gives a read-only view.
 
     Raises:
-        EnvelopeError: not a complete jpeg, or of another size than `shape`.
+        EnvelopeError: not a complete jpeg, or its size is not `shape`.
     """
     if encoding == "raw":
         return decode_raw(part, shape, "uint8")
@@ -76,9 +76,9 @@ def encode_depth(
     encoding: Literal["blosc2", "raw"] = "blosc2",
     depth_scale_m: float = DEFAULT_DEPTH_SCALE_M,
 ) -> bytes:
-    """Coded depth in steps of `depth_scale_m` metres.
+    """Encode depth in steps of `depth_scale_m` metres.
 
-    What is not valid, or does not fit 1..65535 steps, is unknown (0).
+    Pixels that are invalid, or do not fit 1..65535 steps, become unknown (0).
 
     Raises:
         EnvelopeError: not a depth image with a mask of its shape.
@@ -94,17 +94,17 @@ def encode_depth(
 def decode_depth(
     part: Buffer, encoding: Literal["blosc2", "raw"], shape: tuple[int, int], depth_scale_m: float
 ) -> tuple[Float32[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """Depth in metres (0 where unknown) and its validity mask.
+    """Decode a part to depth in metres (0 where unknown) and its validity mask.
 
     Raises:
-        EnvelopeError: not a blosc2 chunk as SPEC.md describes it, or of another size than `shape`.
+        EnvelopeError: not a blosc2 chunk as SPEC.md describes it, or its size is not `shape`.
     """
     steps = decode_array(part, encoding, shape, "uint16")
     return steps.astype(np.float32) * np.float32(depth_scale_m), steps > 0
 
 
 def encode_array(values: Shaped[np.ndarray, "..."], encoding: Literal["blosc2", "raw"]) -> bytes:
-    """Coded array of uint8, uint16 or float32, without loss."""
+    """Encode an array of uint8, uint16 or float32, without loss."""
     stored = np.ascontiguousarray(values, values.dtype.newbyteorder("<"))
     return stored.tobytes() if encoding == "raw" else _compress(stored)
 
@@ -112,19 +112,19 @@ def encode_array(values: Shaped[np.ndarray, "..."], encoding: Literal["blosc2", 
 def decode_array(
     part: Buffer, encoding: Literal["blosc2", "raw"], shape: tuple[int, ...], dtype: DType
 ) -> Shaped[np.ndarray, "..."]:
-    """Array of a coded part; a raw one is a read-only view.
+    """Decode a part to an array; a raw part gives a read-only view.
 
     Raises:
-        EnvelopeError: not a blosc2 chunk as SPEC.md describes it, or of another size than `shape`.
+        EnvelopeError: not a blosc2 chunk as SPEC.md describes it, or its size is not `shape`.
     """
     return decode_raw(part, shape, dtype) if encoding == "raw" else _decompress(part, shape, dtype)
 
 
 def decode_response(part: Buffer) -> Float32[np.ndarray, "256 3"]:
-    """Camera response of a colour message: linear value of each 8-bit code and channel.
+    """Decode the camera response of a colour message: linear value of each 8-bit code and channel.
 
     Raises:
-        EnvelopeError: of another size, or with values that are negative or not finite.
+        EnvelopeError: its size is wrong, or values are negative or not finite.
     """
     response = decode_raw(part, RESPONSE_SHAPE, "float32")
     if not np.isfinite(response).all() or (response < 0).any():
@@ -133,7 +133,7 @@ def decode_response(part: Buffer) -> Float32[np.ndarray, "256 3"]:
 
 
 def decode_raw(part: Buffer, shape: tuple[int, ...], dtype: DType) -> Shaped[np.ndarray, "..."]:
-    """Read-only array view of an uncompressed part (little-endian, C order).
+    """Return a read-only array view of an uncompressed part (little-endian, C order).
 
     Raises:
         EnvelopeError: its length is not that of `shape`.
@@ -150,7 +150,7 @@ def decode_raw(part: Buffer, shape: tuple[int, ...], dtype: DType) -> Shaped[np.
 
 
 def jpeg_size(part: Buffer) -> tuple[int, int]:
-    """Height and width that a jpeg states, read from its markers without decoding.
+    """Return height and width from the markers of a jpeg, without decoding it.
 
     Raises:
         EnvelopeError: not a complete 8-bit jpeg.
@@ -201,7 +201,7 @@ def _decompress(part: Buffer, shape: tuple[int, ...], dtype: DType) -> Shaped[np
 
 
 def _check_chunk(data: memoryview, expected: int, expected_item: int) -> None:
-    """Refuse a chunk whose 32-byte header states another size, codec or filter than SPEC.md allows."""
+    """Refuse a chunk whose 32-byte header states a size, codec or filter that SPEC.md does not allow."""
     if len(data) < _BLOSC2_HEADER_BYTES:
         raise EnvelopeError(
             f"a blosc2 chunk has at least 32 bytes and the part has {len(data)}: send it whole"

@@ -1,4 +1,4 @@
-"""Keys on sockets: who may connect, and what is said about connections that were refused."""
+"""Keys on sockets: who may connect, and reports of refused connections."""
 
 import threading
 from typing import Any
@@ -14,7 +14,7 @@ from protocol.keys import Keys
 ZAP_DOMAIN = "deltalight"
 POLL_MS = 200
 STOP_S = 2.0
-# What libzmq says at both ends where keys do not fit, and at the end that has keys where the other has none.
+# Events of libzmq at both ends if the keys do not fit, and at the end with keys if the other has none.
 REFUSALS = (
     zmq.EVENT_HANDSHAKE_FAILED_AUTH
     | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
@@ -31,33 +31,33 @@ def uses_keys(endpoint: Endpoint, keys: Keys | None) -> bool:
 
 
 def secure(socket: zmq.Socket[bytes], endpoint: Endpoint, keys: Keys | None, *, bind: bool) -> None:
-    """Set what the next bind or connect of a socket uses: keys, or none.
+    """Set the keys, or none, for the next bind or connect of a socket.
 
     Raises:
-        DeltalightError: the key of the host behind the endpoint is not known.
+        DeltalightError: the key of the host behind the endpoint is unknown.
     """
     if keys is None or not uses_keys(endpoint, keys):
-        socket.curve_server = False  # also takes back the keys of an endpoint before
+        socket.curve_server = False  # also removes the keys of an earlier endpoint
         return
     socket.curve_publickey, socket.curve_secretkey = keys.public, keys.secret
     if bind:
         socket.curve_server = True
-        # With a domain libzmq refuses everybody while nobody answers for it; without, it would let them in.
+        # With a domain libzmq refuses everybody until an authenticator answers for it; without, it would let them in.
         socket.zap_domain = ZAP_DOMAIN.encode()
     else:
         socket.curve_serverkey = keys.peer(endpoint)
 
 
 class Guard:
-    """Lets trusted keys into the sockets that one context binds, and counts refused connections of a socket.
+    """Lets trusted keys into the sockets that one context binds, and counts a socket's refused connections.
 
-    Make it before the socket is bound or connected; close it before the context is ended.
+    Create it before the socket is bound or connected; close it before the context is terminated.
 
     Args:
         context: of the socket, and of nothing else that is bound.
-        socket: what is watched.
-        keys: own keys and whom they trust.
-        bind: whether the socket is bound; else only refusals by the other end are told.
+        socket: the socket to watch.
+        keys: own keys, and the trusted ones.
+        bind: whether the socket is bound; otherwise only refusals by the other end are reported.
     """
 
     def __init__(self, context: Context, socket: zmq.Socket[bytes], keys: Keys, *, bind: bool) -> None:
@@ -76,7 +76,7 @@ class Guard:
         self._thread.start()
 
     def callback(self, domain: str, key: bytes) -> bool:
-        """Whether a client's public key (Z85) is trusted; the authenticator asks."""
+        """Whether a client's public key (Z85) is trusted; called by the authenticator."""
         del domain
         return key in self._keys.trusted().values()
 
@@ -101,7 +101,7 @@ class Guard:
         if not kind & REFUSALS:
             return
         self.refused += 1
-        if kind not in told:  # a refused peer tries again and again
+        if kind not in told:  # a refused peer keeps trying
             told.add(kind)
             _log.warning("connection refused", endpoint=event["endpoint"].decode(), reason=self._reason(kind))
 
@@ -121,5 +121,5 @@ class Guard:
 
 
 def guard(context: Context, socket: zmq.Socket[bytes], keys: Keys | None, *, bind: bool) -> Guard | None:
-    """Return the guard of a socket, None where there are no keys."""
+    """Return the guard of a socket, None without keys."""
     return None if keys is None else Guard(context, socket, keys, bind=bind)

@@ -40,7 +40,7 @@ from protocol.scene import SceneDocument
 
 @dataclass(frozen=True)
 class DepthCalibration:
-    """The depth sensor: its camera, metres for each step, noise at 1 m (None = unknown)."""
+    """The depth sensor: its camera, metres per step, noise at 1 m (None = unknown)."""
 
     camera: CameraModel
     scale: float
@@ -48,21 +48,21 @@ class DepthCalibration:
 
 
 def open_dataset(path: Path, board: BoardSpec | None = None) -> "DatasetReader":
-    """Open a dataset folder; `board` takes the place of calibration/board.yaml.
+    """Open a dataset folder; `board` replaces calibration/board.yaml.
 
     Raises:
-        DeltalightError: what the folder lacks or what is wrong in it.
+        DeltalightError: something in the folder is missing or wrong.
     """
     return DatasetReader(path, board)
 
 
 class DatasetReader:
-    """The frames of a dataset folder, decoded one by one as they are asked for; a `Source`.
+    """The frames of a dataset folder, decoded on demand; a `Source`.
 
-    Colour and depth are paired by nearest time, at most `tolerance_ns` apart (half the median colour period,
-    at most 20 ms); `unpaired` counts the colour pictures that stay without depth. `notes` says once what is
-    missing and what is used instead. A third column of rgb.txt is the exposure in seconds. `fisheye` lists the
-    fish-eye pictures; frames carry those that hold, decoded when they are first asked for, if their lens is known.
+    Colour and depth are paired by nearest time, at most `tolerance_ns` apart (half the median colour period, at most
+    20 ms); `unpaired` counts the colour pictures left without depth. `notes` says once what is missing and what is
+    used instead. A third column of rgb.txt is the exposure in seconds. `fisheye` lists the fish-eye pictures; frames
+    carry the current ones, decoded on first use, if their lens is known.
     """
 
     def __init__(self, path: Path, board: BoardSpec | None = None) -> None:
@@ -98,8 +98,8 @@ class DatasetReader:
         """Decode one frame; `index` is the zero-based line of rgb.txt.
 
         Raises:
-            IndexError: no such frame.
-            DeltalightError: a picture is unreadable or of another size than its calibration says.
+            IndexError: there is no such frame.
+            DeltalightError: a picture is unreadable, or its size is not that of its calibration.
         """
         index = range(len(self))[index]
         entry = self._colors[index]
@@ -122,7 +122,7 @@ class DatasetReader:
 
     @property
     def depth_scale(self) -> float | None:
-        """Metres for each step of the stored depth; None without depth."""
+        """Metres per step of the stored depth; None without depth."""
         return self._depth.scale if self._depths else None
 
     def _decode_color(self, entry: ListEntry, data: bytes) -> UInt8[np.ndarray, "h w 3"]:
@@ -138,7 +138,7 @@ class DatasetReader:
         return depth_from_steps(steps, self._depth.scale, self._depth.camera, self._depth.noise_sigma_m)
 
     def _check_first_pictures(self) -> None:
-        """Find a folder whose sizes are wrong before anybody has begun to write results."""
+        """Detect a folder with wrong sizes before anybody has begun to write results."""
         first = self._colors[0]
         self._decode_color(first, read_bytes(first.path))
         if self._depths:
@@ -189,7 +189,7 @@ class DatasetReader:
         if not path.is_file():
             return DepthCalibration(self.camera, TUM_DEPTH_SCALE, None)
         info = read_mapping(path)
-        # A file that gives only the scale says that depth is registered to colour.
+        # A file that gives only the scale means that depth is registered to colour.
         camera = camera_from_info(info, path) if "camera_matrix" in info else self.camera
         scale = _positive(info.get("depth_scale", TUM_DEPTH_SCALE), f"{path}: `depth_scale`")
         noise = info.get("noise_sigma_m")

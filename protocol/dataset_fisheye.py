@@ -23,7 +23,9 @@ LIST_HEADER = "# timestamp filename [exposure_s]"
 
 
 def load_fisheye_calibration(folder: Path) -> FisheyeCalibration | None:
-    """Read calibration/fisheye.yaml of a dataset folder, None without; fisheye_response.txt goes before its response.
+    """Read calibration/fisheye.yaml of a dataset folder, None without it.
+
+    Fisheye_response.txt overrides its response.
 
     Raises:
         DeltalightError: one of the files is wrong.
@@ -37,7 +39,7 @@ def load_fisheye_calibration(folder: Path) -> FisheyeCalibration | None:
 
 
 class FisheyeFolder:
-    """The fish-eye pictures that hold at any time; the ones decoded last are kept."""
+    """The current fish-eye pictures at any time; keeps the last ones decoded."""
 
     def __init__(self, entries: Sequence[FisheyeEntry], calibration: FisheyeCalibration) -> None:
         self.calibration = calibration
@@ -46,11 +48,13 @@ class FisheyeFolder:
         self._kept: tuple[int, FisheyePictures] | None = None
 
     def at(self, timestamp_ns: int) -> FisheyePictures:
-        """Return the newest pictures that are not later, before the first the first; the same object while they hold.
+        """Return the newest pictures not later than a time, else the first ones.
+
+        The same object while they are current.
 
         Raises:
-            DeltalightError: a picture is unreadable, of another size than the calibration, or linear in a bracket
-                of coded ones.
+            DeltalightError: a picture is unreadable, has not the calibration's size, or is linear in a bracket of
+                coded ones.
         """
         index = max(bisect_right(self._times, timestamp_ns) - 1, 0)
         if self._kept is None or self._kept[0] != index:
@@ -81,7 +85,7 @@ class FisheyeFolder:
 class FisheyeFolderWriter:
     """Writes fish-eye pictures into a dataset folder, coded ones as PNG and linear ones as OpenEXR.
 
-    The folder is complete after every `add`: its calibration comes first, the lines of the list last.
+    The folder is complete after every `add`: its calibration is written first, the lines of the list last.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -90,10 +94,10 @@ class FisheyeFolderWriter:
         self._count = 0
 
     def add(self, pictures: FisheyePictures) -> None:
-        """Append pictures; those written last are known by their time and not written again.
+        """Append pictures; the last ones written are recognised by their time and not written again.
 
         Raises:
-            DeltalightError: they are earlier than the ones before or of another calibration, or a bracket lacks
+            DeltalightError: they are earlier than the last ones or of another calibration, or a bracket lacks
                 exposures.
         """
         if self._last is not None and pictures.timestamp_ns == self._last.timestamp_ns:

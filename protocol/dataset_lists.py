@@ -21,7 +21,7 @@ MAX_POSE_GAP_NS = 200_000_000
 
 @dataclass(frozen=True)
 class ListEntry:
-    """One line of a list file: capture time, picture, and the exposure where a third column gives it."""
+    """One line of a list file: capture time, picture, and the exposure if a third column gives it."""
 
     timestamp_ns: int
     path: Path
@@ -30,7 +30,7 @@ class ListEntry:
 
 @dataclass(frozen=True)
 class FisheyeEntry:
-    """A fish-eye picture, or the bracket of pictures with one timestamp (exposures None where not given)."""
+    """A fish-eye picture, or the bracket of pictures with one timestamp (exposures None if not given)."""
 
     timestamp_ns: int
     paths: tuple[Path, ...]
@@ -69,10 +69,10 @@ def read_list(path: Path) -> list[ListEntry]:
 
 
 def require_increasing(entries: Sequence[ListEntry], path: Path) -> None:
-    """Refuse two pictures of one time: frames are told apart by their time.
+    """Refuse two pictures of one time, because frames are identified by their time.
 
     Raises:
-        DeltalightError: naming the first picture that repeats a time.
+        DeltalightError: names the first picture that repeats a time.
     """
     for before, entry in pairwise(entries):
         if entry.timestamp_ns == before.timestamp_ns:
@@ -82,7 +82,7 @@ def require_increasing(entries: Sequence[ListEntry], path: Path) -> None:
 
 
 def _lines(path: Path) -> Iterator[tuple[str, list[str]]]:
-    """Yield (place, words) of every line that is not empty or a comment."""
+    """Yield (place, words) of every line that is neither empty nor a comment."""
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -112,7 +112,7 @@ def _exposure(word: str) -> float | None:
 
 
 def parse_timestamp(place: str, word: str) -> int:
-    """Turn seconds as text into nanoseconds, exactly.
+    """Parse seconds as text into nanoseconds, exactly.
 
     Raises:
         DeltalightError: not a number, negative, or beyond 64 bits.
@@ -127,12 +127,12 @@ def parse_timestamp(place: str, word: str) -> int:
 
 
 def format_timestamp(timestamp_ns: int) -> str:
-    """Write nanoseconds as seconds, exactly."""
+    """Format nanoseconds as seconds, exactly."""
     return f"{timestamp_ns // 10**9}.{timestamp_ns % 10**9:09d}"
 
 
 def default_tolerance_ns(timestamps_ns: Sequence[int]) -> int:
-    """Return how far apart a pair's times may be: half the median colour period, at most 20 ms."""
+    """Return the largest time difference of a pair: half the median colour period, at most 20 ms."""
     if len(timestamps_ns) < 2:
         return MAX_PAIRING_NS
     periods = [after - before for before, after in pairwise(timestamps_ns)]
@@ -140,7 +140,7 @@ def default_tolerance_ns(timestamps_ns: Sequence[int]) -> int:
 
 
 def nearest_index(timestamps_ns: Sequence[int], wanted_ns: int, tolerance_ns: int) -> int | None:
-    """Return the index of the nearest of the sorted times, or None where none is within the tolerance."""
+    """Return the index of the nearest of the sorted times, or None if none is within the tolerance."""
     right = bisect_left(timestamps_ns, wanted_ns)
     candidates = [index for index in (right - 1, right) if 0 <= index < len(timestamps_ns)]
     best = min(candidates, key=lambda index: abs(timestamps_ns[index] - wanted_ns), default=None)
@@ -171,7 +171,7 @@ def read_poses(path: Path) -> list[PoseEntry]:
     """Read groundtruth.txt: `timestamp tx ty tz qx qy qz qw` = world_from_camera, sorted by time.
 
     Raises:
-        DeltalightError: naming the first line that is wrong.
+        DeltalightError: names the first line that is wrong.
     """
     return sorted(
         (_pose_entry(place, words) for place, words in _lines(path)), key=lambda pose: pose.timestamp_ns
@@ -193,9 +193,9 @@ def _pose_entry(place: str, words: list[str]) -> PoseEntry:
 def pose_at(
     poses: Sequence[PoseEntry], times_ns: Sequence[int], wanted_ns: int, tolerance_ns: int
 ) -> Float64[np.ndarray, "4 4"] | None:
-    """Return the pose at a time, or None where none is known.
+    """Return the pose at a time, or None if unknown.
 
-    Between two poses at most 0.2 s apart it is interpolated, else the nearest within the tolerance counts.
+    It is interpolated between two poses at most 0.2 s apart, else the nearest one within the tolerance.
     """
     right = bisect_left(times_ns, wanted_ns)
     if 0 < right < len(poses) and times_ns[right] != wanted_ns:

@@ -28,14 +28,14 @@ HEADERS = {
 class DatasetWriter:
     """Writes frames as a dataset folder; use it as a context manager.
 
-    Each picture is written before its line is appended, so the folder is readable after a crash at any time.
-    Colour is kept as the frame's JPEG bytes where it has them, else as PNG. Depth is stored in steps of
-    `depth_scale` metres (default: the first frame's exact step, else 1 mm) as 16-bit PNG. Fish-eye pictures are
-    written without loss, once for all frames that they hold for.
+    Each picture is written before its line is appended, so the folder is readable after a crash at any time. Colour
+    is stored as the frame's JPEG bytes if it has them, else as PNG. Depth is stored in steps of `depth_scale` metres
+    (default: the first frame's exact step, else 1 mm) as 16-bit PNG. Fish-eye pictures are stored without loss, once
+    for all frames that share them.
 
     Raises:
-        DeltalightError: the folder already holds something, or frames differ in camera or response, or the fish-eye
-            pictures in calibration.
+        DeltalightError: the folder is not empty, or frames differ in camera or response, or the fish-eye pictures in
+            calibration.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class DatasetWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Nothing is left to do: every frame is complete when `add` returns."""
+        """Do nothing: every frame is complete when `add` returns."""
 
     def add(self, frame: SensorFrame) -> None:
         """Append a frame; its line number becomes its frame_id."""

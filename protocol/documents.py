@@ -1,4 +1,4 @@
-"""Reading JSON and YAML documents, and turning validation faults into one sentence."""
+"""Reading JSON and YAML documents, and reporting validation errors as one sentence."""
 
 import difflib
 import json
@@ -17,14 +17,14 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 def nearest(word: str, known: Iterable[str]) -> str | None:
-    """Return the known word that looks most like `word`, or None where nothing is alike."""
+    """Return the known word most similar to `word`, or None if none is similar."""
     by_lower = {name.lower(): name for name in known}
     found = difflib.get_close_matches(word.lower(), by_lower, n=1, cutoff=0.4)
     return by_lower[found[0]] if found else None
 
 
 class StrictModel(BaseModel):
-    """A frozen model that refuses unknown keys (naming the nearest) and numbers that are not finite."""
+    """A frozen model that refuses unknown keys (suggesting the nearest) and numbers that are not finite."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -84,16 +84,16 @@ def parse_mapping(text: str, name: str, *, is_json: bool) -> dict[str, Any]:
 
 
 def yaml_text(data: Mapping[str, Any]) -> str:
-    """The YAML of a document, keys in their order, which `parse_mapping` reads again."""
+    """Return the YAML of a document with its keys in order, which `parse_mapping` reads back."""
     return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
 
 
 class _Loader(yaml.SafeLoader):
-    """Reads `1e-3` as the number that it is in YAML 1.2; in YAML 1.1 it is a text."""
+    """Reads `1e-3` as a number, as in YAML 1.2; in YAML 1.1 it is a string."""
 
 
 class _Dumper(yaml.SafeDumper):
-    """Quotes texts that `_Loader` would take for numbers."""
+    """Quotes strings that `_Loader` would take for numbers."""
 
 
 for _kind in (_Loader, _Dumper):
@@ -105,11 +105,11 @@ for _kind in (_Loader, _Dumper):
 def validate(model: type[Model], data: Mapping[str, Any], name: str, *, strict: bool = False) -> Model:
     """Validate a document called `name` against a model.
 
-    `strict`: a number is no text and no truth value, as in the model's JSON schema; else `"2"` and `true` are read as
+    `strict`: strings and booleans are not numbers, as in the model's JSON schema; otherwise `"2"` and `true` count as
     numbers too, which is how they come from the environment.
 
     Raises:
-        DeltalightError: the first fault, as one sentence with the place in the document.
+        DeltalightError: the first fault, as one sentence with its place in the document.
     """
     try:
         return model.model_validate(_plain(data, {}), strict=True) if strict else model.model_validate(data)
@@ -120,9 +120,9 @@ def validate(model: type[Model], data: Mapping[str, Any], name: str, *, strict: 
 
 
 def _plain(value: Any, known: dict[int, Any]) -> Any:  # noqa: ANN401 - JSON
-    """JSON as strict models take it: arrays are tuples, and 2.0 is the integer 2, as JSON has one kind of number.
+    """Convert JSON for strict models: arrays become tuples and 2.0 the integer 2, as JSON has one kind of number.
 
-    What is at several places is made once: YAML can name a part often, which must not become as many copies.
+    A shared part is converted once: YAML can alias a part many times, which must not become as many copies.
     """
     if isinstance(value, float) and value.is_integer():
         return int(value)
@@ -165,7 +165,7 @@ def _given(value: object) -> str:
 
 
 def _place(fault: ErrorDetails, document: Any) -> str:  # noqa: ANN401 - whatever the document holds
-    """Write a fault's location as `a.b[0].c`, without the union tags that pydantic puts between."""
+    """Format a fault's location as `a.b[0].c`, without the union tags that pydantic inserts."""
     place, here = "", document
     for index, step in enumerate(fault["loc"]):
         is_last_missing = fault["type"] == "missing" and index == len(fault["loc"]) - 1

@@ -15,7 +15,7 @@ _IPC = re.compile(r"ipc://.+")
 
 @dataclass(frozen=True)
 class Endpoint:
-    """An endpoint as ZeroMQ takes it (`address`), and the name of the host's key, where one is written.
+    """An endpoint as ZeroMQ takes it (`address`), and the name of the host's key, if one is written.
 
     `host` and `port` are None for `ipc://`; a port `*` is 0.
     """
@@ -27,7 +27,7 @@ class Endpoint:
 
     @property
     def is_tcp(self) -> bool:
-        """Whether it goes through the network stack."""
+        """Whether it uses the network stack."""
         return self.host is not None
 
     @property
@@ -42,10 +42,10 @@ class Endpoint:
 
 
 def parse_endpoint(endpoint: str) -> Endpoint:
-    """Take an endpoint apart.
+    """Parse an endpoint.
 
     Raises:
-        DeltalightError: it is of another transport or form.
+        DeltalightError: its transport or form is not supported.
     """
     if _IPC.fullmatch(endpoint):
         return Endpoint(endpoint)
@@ -57,7 +57,7 @@ def parse_endpoint(endpoint: str) -> Endpoint:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether a host name or address is this host only."""
+    """Whether a host name or address means this host only."""
     if host == "localhost":
         return True
     try:

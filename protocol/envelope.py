@@ -1,7 +1,7 @@
 """Multipart envelope: topic, msgpack header, raw parts (SPEC.md, section 2).
 
-Everything that arrives is checked before anything of its size is allocated; whatever is wrong with it comes
-out as `EnvelopeError` and nothing else.
+Everything that arrives is validated before anything of its size is allocated; any fault raises `EnvelopeError` and
+nothing else.
 """
 
 from collections.abc import Sequence
@@ -28,11 +28,11 @@ Part = Buffer | np.ndarray
 
 
 class EnvelopeError(DeltalightError):
-    """A message, header or coded part that does not keep to the wire format."""
+    """A message, header or encoded part violates the wire format."""
 
 
 def encode(message: Message, parts: Sequence[Part] = ()) -> list[bytes]:
-    """Multipart of a message and its raw parts: [topic, header, part...].
+    """Return the multipart of a message and its raw parts: [topic, header, part...].
 
     Arrays must have the dtype and shape that the message states; they are sent in C order.
 
@@ -48,10 +48,10 @@ def encode(message: Message, parts: Sequence[Part] = ()) -> list[bytes]:
 
 
 def decode(multipart: Sequence[Buffer]) -> tuple[Message, list[memoryview]]:
-    """Message and raw parts (read-only views, not copied) of a multipart [topic, header, part...].
+    """Return message and raw parts (read-only views, not copied) of a multipart [topic, header, part...].
 
     Raises:
-        EnvelopeError: anything about it is malformed.
+        EnvelopeError: it is malformed in any way.
     """
     if not 2 <= len(multipart) <= MAX_PARTS + 2:
         raise EnvelopeError(
@@ -69,7 +69,7 @@ def decode(multipart: Sequence[Buffer]) -> tuple[Message, list[memoryview]]:
 
 
 def pack_header(message: Message) -> bytes:
-    """Header of a message: msgpack map of its fields, in the order of the model.
+    """Return the header of a message: msgpack map of its fields, in the order of the model.
 
     Raises:
         EnvelopeError: the header is larger than 64 kB or holds an integer of more than 64 bits.
@@ -86,7 +86,7 @@ def pack_header(message: Message) -> bytes:
 
 
 def unpack_header(header: Buffer) -> Message:
-    """Message of a msgpack header.
+    """Return the message of a msgpack header.
 
     Raises:
         EnvelopeError: not a header, another schema version (both are named), or a field out of its range.

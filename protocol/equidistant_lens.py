@@ -18,11 +18,11 @@ from protocol.radial_lens import RadialLens, RisingCurve, first_root, require_im
 class EquidistantLens(RadialLens):
     """Radius / focal length = a + k1 a^3 + k2 a^5 + k3 a^7 + k4 a^9 of the angle a from the axis.
 
-    Unlike `CameraModel`, whose rays are (x/z, y/z), it has directions at and behind 90 degrees; its largest
-    angle is where the polynomial stops rising.
+    Unlike `CameraModel`, whose rays are (x/z, y/z), it has directions at and beyond 90 degrees; its largest angle is
+    where the polynomial stops rising.
 
     Raises:
-        DeltalightError: the camera is not `equidistant`, or numbers that no lens has.
+        DeltalightError: the camera is not `equidistant`, or its numbers are impossible.
     """
 
     camera: CameraModel
@@ -45,7 +45,7 @@ class EquidistantLens(RadialLens):
 
     @property
     def largest_radius(self) -> float:
-        """Where the polynomial stops rising, or that of 180 degrees; in focal lengths."""
+        """Radius where the polynomial stops rising, or that of 180 degrees; in focal lengths."""
         return float(self._curve.value(np.array(self._curve.end)))
 
     @cached_property
@@ -78,9 +78,9 @@ class EquidistantLens(RadialLens):
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
-        """Make the lens again that `to_dict` described.
+        """Create the lens from the data of `to_dict`.
 
         Raises:
-            DeltalightError: a key is missing or has a value that no lens can have.
+            DeltalightError: a key is missing or has an impossible value.
         """
         return cls(CameraModel.from_dict(data), data.get("image_circle"))

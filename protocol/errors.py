@@ -1,8 +1,8 @@
-"""The one exception type that reaches users as a sentence."""
+"""The one exception type that is shown to users."""
 
 
 class DeltalightError(Exception):
-    """A fault that a user can mend: the message says in one sentence what is wrong and what to do.
+    """A fault that the user can fix: the message says in one sentence what is wrong and what to do.
 
     The command line prints it without a traceback and exits with code 2.
     """

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, and the picture format that is written without loss."""
+"""Atomic file writes, and the lossless picture format."""
 
 import os
 from collections.abc import Iterator
@@ -16,12 +16,12 @@ PNG_COMPRESSION = 1  # zlib level; higher levels cost more time than a frame tak
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Give a temporary path beside `path`; put it in place at the end, remove it at a fault.
+    """Yield a temporary path beside `path`; move it into place at the end, remove it on an error.
 
-    The suffix is kept, because encoders choose their format by it.
+    The suffix stays, because encoders choose their format by it.
 
     Raises:
-        DeltalightError: the file cannot be written (a full disk, no rights).
+        DeltalightError: the file cannot be written (disk full, no permission).
     """
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
     try:
@@ -32,12 +32,12 @@ def replacing(path: Path) -> Iterator[Path]:
             f"'{path}' cannot be written ({fault.strerror}); free some space or choose another folder."
         ) from fault
     finally:
-        with suppress(OSError):  # the fault above says what is wrong
+        with suppress(OSError):  # the error above says what is wrong
             temporary.unlink()
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Write `content` to `path`, whole or not at all."""
+    """Write `content` to `path` atomically."""
     with replacing(path) as temporary:
         temporary.write_bytes(content)
 

@@ -29,11 +29,11 @@ class FisheyeCalibration:
     """Lens, response and vignetting of a fish-eye camera.
 
     `response` is linear R G B for each code, 1.0 = white (None = sRGB). `vignetting` holds (v1, v2, ...): at the
-    angle a (radians) from the axis the sensor gets 1 + v1 a^2 + v2 a^4 + ... of the light that it gets on the axis;
-    radiance = linear / vignetting. As it is a function of the angle it holds for any size of the picture.
+    angle a (radians) from the axis the sensor receives 1 + v1 a^2 + v2 a^4 + ... of the light that it receives on the
+    axis; radiance = linear / vignetting. As a function of the angle it applies to any size of the picture.
 
     Raises:
-        DeltalightError: the response is no table, or the vignetting is not positive within 90 degrees.
+        DeltalightError: the response is not a table, or the vignetting is not positive within 90 degrees.
     """
 
     lens: FisheyeLens
@@ -56,7 +56,7 @@ class FisheyeCalibration:
             )
 
     def _seen_angle(self) -> float:
-        """Largest angle from the axis that the picture shows, at most 90 degrees."""
+        """Largest angle from the axis within the picture, at most 90 degrees."""
         lens = self.lens
         angles = np.linspace(0.0, np.pi / 2, 181)
         around = np.linspace(0.0, 2 * np.pi, 36, endpoint=False)
@@ -86,10 +86,10 @@ class FisheyeCalibration:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
-        """Make the calibration again that `to_dict` described.
+        """Create the calibration from the data of `to_dict`.
 
         Raises:
-            DeltalightError: a key is missing or has a value that no camera can have.
+            DeltalightError: a key is missing or has an impossible value.
         """
         lens = data.get("lens")
         if not isinstance(lens, Mapping):
@@ -119,10 +119,10 @@ def _coefficients(values: object) -> tuple[float, ...]:
 def load_fisheye_yaml(path: Path) -> FisheyeCalibration:
     """Read calibration/fisheye.yaml: the keys of ROS camera_info with `distortion_model` equidistant or ocam.
 
-    An ocam lens has, in place of `camera_matrix` and `distortion_coefficients`, `ocam: {polynomial, center [x, y],
-    affine [c, d, e]}` or the name of OCamCalib's calib_results.txt beside this file. Optional: `image_circle`
-    (radius in pixels), `vignetting` (coefficients), `response` (256 rows of linear R G B, or the name of a text
-    file with them beside this one).
+    Instead of `camera_matrix` and `distortion_coefficients`, an ocam lens has `ocam: {polynomial, center [x, y],
+    affine [c, d, e]}` or the name of OCamCalib's calib_results.txt beside this file. Optional: `image_circle` (radius
+    in pixels), `vignetting` (coefficients), `response` (256 rows of linear R G B, or the name of a text file with
+    them beside this one).
 
     Raises:
         DeltalightError: the file or one of its keys is missing or wrong.
@@ -157,7 +157,7 @@ def _response(info: Mapping[str, Any], path: Path) -> Float32[np.ndarray, "256 3
 
 
 def save_fisheye_yaml(path: Path, calibration: FisheyeCalibration) -> None:
-    """Write calibration/fisheye.yaml, which `load_fisheye_yaml` reads again to an equal calibration."""
+    """Write calibration/fisheye.yaml, which `load_fisheye_yaml` reads back to an equal calibration."""
     lens, described = calibration.lens, calibration.to_dict()
     extra: dict[str, object] = {}
     if lens.image_circle is not None:

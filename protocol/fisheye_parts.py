@@ -1,4 +1,4 @@
-"""The calibration of a fish-eye camera as plain data and a table of bytes, for messages whose headers are small."""
+"""The calibration of a fish-eye camera as plain data and a table of bytes, because headers of messages are small."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -23,20 +23,20 @@ def describe_calibration(calibration: FisheyeCalibration) -> tuple[dict[str, obj
 
 
 def calibration_of(description: Mapping[str, object], response: bytes | None) -> FisheyeCalibration:
-    """Make the calibration again that `describe_calibration` described; the same object for the same one.
+    """Create the calibration from the data of `describe_calibration`; equal data give the same object.
 
     Raises:
-        DeltalightError: a value that no camera can have.
+        DeltalightError: a value is impossible.
     """
     return _calibration(msgpack.packb(description), response)
 
 
-# A lens caches what is costly to compute, and cameras do not change from picture to picture; few are in use at once.
+# A lens caches costly results, and cameras do not change from picture to picture; few are in use at once.
 @lru_cache(maxsize=8)
 def _calibration(description: bytes, response: bytes | None) -> FisheyeCalibration:
     try:
         calibration = FisheyeCalibration.from_dict(msgpack.unpackb(description))
-    except (ArithmeticError, ValueError) as error:  # of numbers that overflow in the lens's polynomial
+    except (ArithmeticError, ValueError) as error:  # numbers that overflow in the lens's polynomial
         raise DeltalightError(
             f"the fish-eye calibration holds numbers that no lens has ({error}); calibrate again."
         ) from error

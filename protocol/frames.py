@@ -1,4 +1,4 @@
-"""What cameras give and what the renderer takes: pictures, depth, poses."""
+"""Data from cameras to the renderer: pictures, depth, poses."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -13,7 +13,7 @@ from protocol.fisheye_lens import FisheyeCalibration
 
 @dataclass(frozen=True, eq=False)
 class BoardPose:
-    """Where one picture was taken, as the marker board shows it.
+    """The camera's pose in one picture, from the marker board.
 
     `world_from_camera` is (4, 4); `alternative` is the other solution of the planar ambiguity, if known.
     """
@@ -27,9 +27,8 @@ class BoardPose:
 class DepthImage:
     """Depth in metres along the optical axis.
 
-    `depth_m` is 0 where unknown; `valid` is the mask that says so. `camera` is the depth image's own camera,
-    equal to the colour camera if registered. `noise_sigma_m` is the noise at 1 m; it grows with the square of
-    the distance.
+    `depth_m` is 0 where unknown; `valid` is the corresponding mask. `camera` is the depth image's own camera, equal
+    to the colour camera if registered. `noise_sigma_m` is the noise at 1 m; it grows with the square of the distance.
     """
 
     depth_m: Float32[np.ndarray, "h w"]
@@ -40,10 +39,10 @@ class DepthImage:
 
 @dataclass(frozen=True, eq=False)
 class FisheyePictures:
-    """A fish-eye picture, or an exposure bracket of one moment; it holds until the next one comes.
+    """A fish-eye picture, or an exposure bracket of one moment; current until the next one.
 
-    `pictures` are RGB: uint8 is camera-coded (by the calibration's response), float32 is linear. An exposure of
-    None is the reference exposure. Frames for which the same pictures hold carry the same object.
+    `pictures` are RGB: uint8 is camera-coded (by the calibration's response), float32 is linear. An exposure of None
+    is the reference exposure. Frames with the same current pictures share one object.
     """
 
     timestamp_ns: int
@@ -56,10 +55,10 @@ class FisheyePictures:
 class RadianceMap:
     """Radiance that reaches the fish-eye camera from the hemisphere about its axis (docs/method.md 2).
 
-    `radiance` is linear R G B in the fish-eye camera's units (1.0 = its white at the reference exposure) on the
-    grid of `protocol.hemisphere`, in the axes of its optical frame; 0 where not `seen`. `clipped_share` is the
-    share of the seen solid angle that even the shortest exposure clips (so its radiance is a lower bound).
-    `picture` (coded, RGB) shows people what was seen.
+    `radiance` is linear R G B in the fish-eye camera's units (1.0 = its white at the reference exposure) on the grid
+    of `protocol.hemisphere`, in the axes of its optical frame; 0 where not `seen`. `clipped_share` is the fraction of
+    the seen solid angle that even the shortest exposure clips (so its radiance is a lower bound). `picture` (coded,
+    RGB) is for display.
     """
 
     timestamp_ns: int
@@ -73,7 +72,7 @@ class RadianceMap:
 
 @dataclass(frozen=True, eq=False)
 class LampPose:
-    """A marker fixed to a lamp, as the camera sees it: point_world = world_from_marker @ point_marker (4, 4)."""
+    """A marker fixed to a lamp, as seen by the camera: point_world = world_from_marker @ point_marker (4, 4)."""
 
     marker: int
     world_from_marker: Float64[np.ndarray, "4 4"]
@@ -81,12 +80,12 @@ class LampPose:
 
 @dataclass(frozen=True, eq=False)
 class SensorFrame:
-    """One picture with its depth, raw, as captured or recorded.
+    """One raw picture with its depth, as captured or recorded.
 
-    `frame_id` is the zero-based index of the line in rgb.txt for datasets. `color` is RGB, camera-coded.
-    `response` is linear R G B for each code (None = sRGB). `exposure_s` None = reference exposure.
-    `world_from_camera` is a given pose, if any. `color_jpeg` holds the encoded bytes where the source has
-    them. `fisheye` is what the fish-eye camera saw last.
+    `frame_id` is the zero-based index of the line in rgb.txt for datasets. `color` is RGB, camera-coded. `response`
+    is linear R G B for each code (None = sRGB). `exposure_s` None = reference exposure. `world_from_camera` is a
+    given pose, if any. `color_jpeg` holds the encoded bytes if the source has them. `fisheye` are the current
+    fish-eye pictures.
     """
 
     frame_id: int
@@ -106,8 +105,8 @@ class SensorFrame:
 class ViewFrame:
     """The input of one composite.
 
-    Linear camera colour is `decode_lut(response)[color] / exposure_scale`. `depth` is clean and registered to
-    colour; None where the scene gives a model. `board` lets the renderer find the board's white paper.
+    Linear camera colour is `decode_lut(response)[color] / exposure_scale`. `depth` is clean and registered to colour;
+    None if the scene gives a model. `board` lets the renderer find the board's white paper.
     """
 
     frame_id: int

@@ -18,7 +18,7 @@ def hemisphere_direction(uv: Float[np.ndarray, "*shape 2"]) -> Float64[np.ndarra
 
 
 def hemisphere_uv(direction: Float[np.ndarray, "*shape 3"]) -> Float[np.ndarray, "*shape 2"]:
-    """Return the map coordinates of directions of any length; without meaning where z < 0."""
+    """Return the map coordinates of directions of any length; meaningless where z < 0."""
     d = np.asarray(direction)
     x, y, z = np.moveaxis(d, -1, 0)
     scale = np.abs(x) + np.abs(y) + z

@@ -26,16 +26,16 @@ TRUSTED = "trusted"
 CREATE_HINT = "run `deltalight keys create NAME`"
 TRUST_HINT = "copy the other host's public key (NAME.key) here and run `deltalight keys trust NAME.key`"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
-# Permission bits that let anybody but the owner at a secret key.
+# Permission bits that let anybody but the owner access a secret key.
 _OTHERS = stat.S_IRWXG | stat.S_IRWXO
 
 
 @dataclass(frozen=True)
 class Keys:
-    """This host's key pair (Z85 text as bytes) and where the trusted public keys lie.
+    """This host's key pair (Z85 text as bytes) and the folder of trusted public keys.
 
-    The folder is read at each use, so that a key is trusted, or no longer, without a restart. `on_loopback`
-    says that connections which stay on this host use keys too.
+    The folder is read on each use, so that trust can change without a restart. `on_loopback`: connections within this
+    host use keys too.
     """
 
     name: str
@@ -45,16 +45,16 @@ class Keys:
     on_loopback: bool = False
 
     def trusted(self) -> dict[str, bytes]:
-        """Return the public keys that are trusted, with the own one, by name."""
+        """Return the trusted public keys and the own one, by name."""
         return {**trusted_keys(self.folder), self.name: self.public}
 
     def peer(self, endpoint: Endpoint) -> bytes:
         """Return the public key of the host behind an endpoint.
 
-        That is the one that the endpoint names; without a name, the own on loopback, else the only other one.
+        That is the one that the endpoint names; without a name, the own key on loopback, else the only other one.
 
         Raises:
-            DeltalightError: no such key is trusted, or several are and no name says which.
+            DeltalightError: no such key is trusted, or several are and no name selects one.
         """
         trusted = self.trusted()
         if endpoint.peer is not None:
@@ -93,10 +93,10 @@ class KeySettings(StrictModel):
     )
 
     def load(self, endpoints: Iterable[str]) -> Keys | None:
-        """Return the keys that a process with these endpoints uses, None where it needs none.
+        """Return the keys that a process with these endpoints uses, None if it needs none.
 
         Raises:
-            DeltalightError: keys are needed and there are none, or they cannot be used.
+            DeltalightError: keys are required but missing, or they cannot be used.
         """
         parts = [parse_endpoint(endpoint) for endpoint in endpoints]
         if not any(part.needs_keys or (self.on_loopback and part.is_tcp) for part in parts):
@@ -112,12 +112,12 @@ def config_home() -> Path:
 
 
 def key_folder() -> Path:
-    """Return the folder of keys where none is named."""
+    """Return the default folder of keys."""
     return config_home() / "keys"
 
 
 def create_keys(name: str, folder: Path) -> tuple[Path, Path]:
-    """Make a key pair; returns the public and the secret file.
+    """Create a key pair; return the public and the secret file.
 
     Raises:
         DeltalightError: the name is wrong or taken, or the folder cannot be written.
@@ -128,7 +128,7 @@ def create_keys(name: str, folder: Path) -> tuple[Path, Path]:
         raise DeltalightError(f"{folder} has keys called `{name}`: choose another name, or remove them first")
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        # A temporary folder is closed to others, so the secret key is at no time readable by them.
+        # A temporary folder is private, so that others can read the secret key at no time.
         with TemporaryDirectory(dir=folder, prefix=".new-") as closed:
             made_public, made_secret = map(Path, zmq.auth.create_certificates(closed, name))
             made_secret.chmod(0o600)
@@ -168,10 +168,10 @@ def load_keys(name: str | None, folder: Path, *, purpose: str = "this", on_loopb
 
 
 def trust(file: Path, folder: Path, name: str | None = None) -> Path:
-    """Trust another host's public key; returns where it is kept.
+    """Trust another host's public key; return the path where it is stored.
 
     Raises:
-        DeltalightError: the file holds no public key or a secret one, or the name is taken by another key.
+        DeltalightError: the file holds no public key or a secret one, or another key has the name.
     """
     if not file.is_file():
         raise DeltalightError(f"{file} is no file: {TRUST_HINT}")
@@ -197,7 +197,7 @@ def own_keys(folder: Path) -> list[str]:
 
 
 def trusted_keys(folder: Path) -> dict[str, bytes]:
-    """Return the public keys that are trusted in a folder by name; a file that holds none is left out."""
+    """Return the trusted public keys of a folder by name; files without one are left out."""
     found = {}
     for path in sorted((folder / TRUSTED).glob(f"*{PUBLIC}")):
         try:
@@ -208,7 +208,7 @@ def trusted_keys(folder: Path) -> dict[str, bytes]:
 
 
 def _read(path: Path) -> tuple[bytes, bytes | None]:
-    """Public and secret key of a file in pyzmq's form."""
+    """Return public and secret key of a file in pyzmq's form."""
     try:
         return zmq.auth.load_certificate(path)
     except (OSError, ValueError) as error:

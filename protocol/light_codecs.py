@@ -1,4 +1,4 @@
-"""What messages of light hold: fish-eye pictures, radiance maps, lamps (SPEC.md, section 3)."""
+"""Decoding of light messages: fish-eye pictures, radiance maps, lamps (SPEC.md, section 3)."""
 
 from collections.abc import Sequence
 
@@ -19,7 +19,7 @@ def fisheye_pictures(message: FisheyeMessage, parts: Parts) -> FisheyePictures:
     """Return the pictures of a message; their time is its capture time.
 
     Raises:
-        DeltalightError: a picture cannot be decoded, or the calibration is none.
+        DeltalightError: a picture cannot be decoded, or the calibration is invalid.
     """
     pictures = tuple(_picture(message, part) for part in parts[: len(message.exposures_s)])
     return FisheyePictures(message.capture_ns, pictures, message.exposures_s, _calibration(message, parts))
@@ -29,7 +29,7 @@ def radiance_map(message: RadianceMessage, parts: Parts) -> RadianceMap:
     """Return the map of a message; its time is its capture time.
 
     Raises:
-        DeltalightError: a part cannot be decoded or holds values that cannot be, or the calibration is none.
+        DeltalightError: a part cannot be decoded or holds impossible values, or the calibration is invalid.
     """
     size = message.size
     radiance = decode_array(parts[0], message.encoding, (size, size, 3), "float32")

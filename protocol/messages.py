@@ -1,7 +1,7 @@
 """The messages of the wire: one validated model each, whose fields are the header (SPEC.md, section 3).
 
-A model holds everything but the bulk data; pictures and depth travel as raw parts behind the header.
-`part_rules` of a message says which parts follow it and how long each must be.
+A model holds everything but the bulk data; pictures and depth travel as raw parts behind the header. `part_rules` of
+a message states which parts follow it and how long each must be.
 """
 
 import math
@@ -42,7 +42,7 @@ ITEM_SIZE: dict[DType, int] = {"uint8": 1, "uint16": 2, "float32": 4}
 
 
 def _plain(value: object, depth: int = 0) -> object:
-    """Refuse what JSON cannot say: other types, numbers that are not finite, deep nesting."""
+    """Refuse what JSON cannot express: other types, numbers that are not finite, deep nesting."""
     if depth > MAX_PLAIN_DEPTH:
         raise ValueError(f"is nested deeper than {MAX_PLAIN_DEPTH} levels")
     if isinstance(value, dict):
@@ -79,7 +79,7 @@ Count = Annotated[int, Field(ge=0, le=2**63 - 1)]
 Edge = Annotated[int, Field(ge=1, le=MAX_EDGE_PX, strict=True)]
 Coordinate = Annotated[float, Field(ge=-1e6, le=1e6, strict=True)]
 Seconds = Annotated[float, Field(gt=0, le=3600, strict=True)]
-# Tuples are not strict because msgpack has one array type; what is inside them is.
+# Tuples are not strict because msgpack has one array type; their elements are.
 Row4 = Annotated[tuple[Coordinate, Coordinate, Coordinate, Coordinate], Field(strict=False)]
 Matrix4 = Annotated[tuple[Row4, Row4, Row4, Row4], Field(strict=False)]
 RigidMatrix = Annotated[Matrix4, AfterValidator(_rigid)]
@@ -104,7 +104,7 @@ class PartRule:
 
     @property
     def raw_bytes(self) -> int:
-        """Length of the part when it is not compressed, in bytes."""
+        """Length of the uncompressed part, in bytes."""
         return math.prod(self.shape) * ITEM_SIZE[self.dtype]
 
 
@@ -134,7 +134,7 @@ class MessageBase(BaseModel):
         return f"{self.stream}.{self.node}"
 
     def part_rules(self) -> tuple[PartRule, ...]:
-        """Raw parts that follow the header, in order."""
+        """The raw parts that follow the header, in order."""
         return ()
 
     @model_validator(mode="after")

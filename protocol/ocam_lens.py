@@ -20,12 +20,12 @@ from protocol.radial_lens import RadialLens, RisingCurve, first_root, require_im
 class OcamLens(RadialLens):
     """The ray through (x, y) of the lens's plane is (x, y, polynomial(hypot(x, y))), all in pixels.
 
-    `polynomial` has its coefficients from power 0 up; the first is above 0 (OCamCalib has its axis pointing
-    backwards, so its files have all of them negated). `centre` is the pixel (x, y) on the axis. `affine` is
-    OCamCalib's (c, d, e), row = c y + d x + centre row, column = e y + x + centre column.
+    `polynomial` has its coefficients from power 0 up; the first is above 0 (OCamCalib's axis points backwards, so its
+    files have all of them negated). `centre` is the pixel (x, y) on the axis. `affine` is OCamCalib's (c, d, e), row
+    = c y + d x + centre row, column = e y + x + centre column.
 
     Raises:
-        DeltalightError: numbers that no lens can have.
+        DeltalightError: the numbers are impossible.
     """
 
     width: int
@@ -61,7 +61,7 @@ class OcamLens(RadialLens):
 
     @cached_property
     def largest_radius(self) -> float:
-        """Where the angle stops rising, or the farthest corner of the picture; in pixels."""
+        """Radius where the angle stops rising, or that of the farthest corner of the picture; in pixels."""
         polynomial = np.array(self.polynomial)
         corners = np.array([[x, y] for x in (-0.5, self.width - 0.5) for y in (-0.5, self.height - 0.5)])
         farthest = np.linalg.norm(self._plane(corners), axis=1).max()
@@ -70,7 +70,7 @@ class OcamLens(RadialLens):
 
     @cached_property
     def _curve(self) -> RisingCurve:
-        """Angle of the radius."""
+        """Angle as a function of the radius."""
         polynomial = np.array(self.polynomial)
         derivative = polyder(polynomial)
 
@@ -110,10 +110,10 @@ class OcamLens(RadialLens):
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
-        """Make the lens again that `to_dict` described; a polynomial with OCamCalib's sign is turned round.
+        """Create the lens from the data of `to_dict`; a polynomial with OCamCalib's sign is negated.
 
         Raises:
-            DeltalightError: a key is missing or has a value that no lens can have.
+            DeltalightError: a key is missing or has an impossible value.
         """
         try:
             polynomial = [float(v) for v in data["polynomial"]]
@@ -132,12 +132,12 @@ class OcamLens(RadialLens):
 def load_ocam_results(path: Path) -> OcamLens:
     """Read OCamCalib's calib_results.txt.
 
-    Its five number lines are the polynomial (count first; its axis points backwards), the inverse polynomial
-    (not used: the exact inverse is computed), the centre as row and column counted from 0, c d e, and height
-    and width. So a pixel here is (column, row), with no offset.
+    Its five number lines are the polynomial (count first; its axis points backwards), the inverse polynomial (unused:
+    the exact inverse is computed), the centre as row and column counted from 0, c d e, and height and width. So a
+    pixel here is (column, row), without an offset.
 
     Raises:
-        DeltalightError: the file is unreadable or holds something else.
+        DeltalightError: the file is unreadable or has other contents.
     """
     try:
         text = path.read_text(encoding="utf-8", errors="replace")

@@ -1,4 +1,4 @@
-"""Payloads of requests and replies that are too long for a header travel as a part (SPEC.md, section 6)."""
+"""Payloads of requests and replies: those too long for a header travel as a part (SPEC.md, section 6)."""
 
 import json
 from collections.abc import Sequence
@@ -14,7 +14,8 @@ from protocol.messages import (
     ControlRequest,
 )
 
-# A number takes msgpack 9 bytes and JSON at least 5 ("1.0, "), so a payload of so many characters takes less than
+# A number takes 9 bytes in msgpack and at least 5 in JSON ("1.0, "), so a payload of this many characters takes less
+# than half of a header.
 # half of a header.
 INLINE_CHARACTERS = MAX_HEADER_BYTES // 4
 
@@ -22,12 +23,12 @@ Control = TypeVar("Control", ControlRequest, ControlReply)
 
 
 def encode_control(message: ControlRequest | ControlReply) -> list[bytes]:
-    """Multipart of a request or reply, its payload in a part where it is long.
+    """Return the multipart of a request or reply, with a long payload in a part.
 
     Raises:
         EnvelopeError: the payload takes more than 4 MB, or holds an integer of more than 64 bits.
     """
-    text = json.dumps(message.payload)  # ASCII: a character is a byte
+    text = json.dumps(message.payload)  # ASCII: one byte per character
     if len(text) <= INLINE_CHARACTERS:
         return encode(message)
     if len(text) > MAX_PAYLOAD_BYTES:
@@ -38,10 +39,10 @@ def encode_control(message: ControlRequest | ControlReply) -> list[bytes]:
 
 
 def decode_control(multipart: Sequence[Buffer], kind: type[Control]) -> Control:
-    """Request or reply of a multipart, its payload in place.
+    """Return the request or reply of a multipart, with its payload in place.
 
     Raises:
-        EnvelopeError: anything about it is malformed, or it is a message of another kind.
+        EnvelopeError: it is malformed in any way, or a message of another kind.
     """
     message, parts = decode(multipart)
     if not isinstance(message, kind):

@@ -17,7 +17,7 @@ _COLOR = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
 
 
 def is_jpeg(data: bytes) -> bool:
-    """Whether the bytes begin as a JPEG does."""
+    """Whether the bytes begin like a JPEG."""
     return data[:3] == b"\xff\xd8\xff"
 
 
@@ -34,10 +34,10 @@ def read_bytes(path: Path) -> bytes:
 
 
 def decode_rgb(data: bytes, name: str) -> UInt8[np.ndarray, "h w 3"]:
-    """Decode a picture file's bytes to RGB; `name` says in errors which picture it is.
+    """Decode a picture file's bytes to RGB; `name` names the picture in errors.
 
     Raises:
-        DeltalightError: the bytes are no picture that OpenCV reads.
+        DeltalightError: OpenCV cannot read the bytes as a picture.
     """
     picture = _decode(data, _COLOR)
     if picture is None:
@@ -87,7 +87,7 @@ def depth_from_steps(
 
 
 def steps_from_depth(depth: DepthImage, scale: float) -> UInt16[np.ndarray, "h w"]:
-    """Round depth to steps of `scale` metres; what is unknown or too far for 16 bits is 0."""
+    """Round depth to steps of `scale` metres; unknown depth, or too far for 16 bits, becomes 0."""
     with np.errstate(invalid="ignore"):
         steps = np.rint(depth.depth_m / np.float32(scale))
         known = depth.valid & (steps > INVALID_CODES[0]) & (steps < INVALID_CODES[1])
@@ -108,5 +108,5 @@ def _is_exact(depth: DepthImage, scale: float) -> bool:
 
 
 def known_depth(depth: DepthImage) -> Float32[np.ndarray, "h w"]:
-    """Return the depth in metres with 0 wherever the mask says unknown."""
+    """Return the depth in metres, 0 where the mask says unknown."""
     return np.where(depth.valid, depth.depth_m, np.float32(0)).astype(np.float32)

@@ -9,12 +9,13 @@ from typing import Generic, TypeVar
 from protocol.errors import DeltalightError
 
 T = TypeVar("T")
+OWN_PACKAGE = "deltalight"
 LONGEST_REASON = 300  # characters of a sentence
 
 
 @dataclass(frozen=True)
 class Plugin:
-    """An entry point of an installed package; nothing of it runs before it is loaded."""
+    """An entry point of an installed package, or of the project itself; nothing of it runs before it is loaded."""
 
     entry_point: EntryPoint
 
@@ -27,7 +28,7 @@ class Plugin:
     def package(self) -> str:
         """Name and version of the package that brings it."""
         package = self.entry_point.dist
-        return "deltalight" if package is None else f"{package.name} {package.version}"
+        return OWN_PACKAGE if package is None else f"{package.name} {package.version}"
 
     def load(self) -> object:
         """What the entry point names.
@@ -42,7 +43,7 @@ class Plugin:
 
     @contextmanager
     def blamed(self) -> Iterator[None]:
-        """Turns what the plugin's code raises into a sentence that names it; sentences stay as they are.
+        """Turns what a package's code raises into a sentence that names it; sentences stay as they are.
 
         Raises:
             DeltalightError: in place of any other exception.
@@ -52,6 +53,8 @@ class Plugin:
         except DeltalightError:
             raise
         except Exception as error:  # as above
+            if self.entry_point.dist is None:
+                raise
             raise self.fault(f"{type(error).__name__}: {error}") from error
 
     def fault(self, reason: str) -> DeltalightError:

@@ -53,10 +53,10 @@ def rigid_matrix(
 
 
 def require_rigid(matrix: object, name: str) -> Float64[np.ndarray, "4 4"]:
-    """Return a 4x4 matrix that is checked to be a proper rigid transform (orthonormal, determinant +1).
+    """Return a 4x4 matrix after checking that it is a proper rigid transform (orthonormal, determinant +1).
 
     Raises:
-        DeltalightError: `name` says in the sentence which transform it is.
+        DeltalightError: it is not; `name` names the transform in the sentence.
     """
     try:
         values = np.array(matrix, np.float64).reshape(4, 4)
@@ -79,7 +79,7 @@ def require_rigid(matrix: object, name: str) -> Float64[np.ndarray, "4 4"]:
 def interpolate_pose(
     start: Float64[np.ndarray, "4 4"], end: Float64[np.ndarray, "4 4"], fraction: float
 ) -> Float64[np.ndarray, "4 4"]:
-    """Return the pose at `fraction` (0..1) of the way, turning at constant speed about one axis."""
+    """Return the pose at `fraction` (0..1) of the path, rotating at constant speed about one axis."""
     step, _ = cv2.Rodrigues(start[:3, :3].T @ end[:3, :3])
     turn, _ = cv2.Rodrigues(step * fraction)
     return rigid_matrix(start[:3, :3] @ turn, (1 - fraction) * start[:3, 3] + fraction * end[:3, 3])

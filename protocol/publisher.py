@@ -1,4 +1,4 @@
-"""Sender of streams: a PUB socket that never waits for anybody."""
+"""Sender of streams: a PUB socket that never waits for subscribers."""
 
 import threading
 from collections.abc import Sequence
@@ -15,11 +15,11 @@ STREAMS_OF_A_NODE = 8
 
 
 class Publisher:
-    """Publishes multiparts to whoever subscribes; a subscriber that is too slow misses messages.
+    """Publishes multiparts to all subscribers; a subscriber that is too slow misses messages.
 
-    `streams` is how many messages are sent in a row for one frame. The queue to each subscriber holds two
-    frames of so many messages: one shorter than such a row would always lose its last messages (the pose).
-    `keys` are needed where the endpoint leaves the host.
+    `streams` is the number of messages sent in a row for one frame. The queue to each subscriber holds two frames of
+    that many messages: one shorter than such a row would always lose its last messages (the pose). `keys` are
+    required if the endpoint leaves the host.
     """
 
     def __init__(
@@ -42,7 +42,7 @@ class Publisher:
 
     @property
     def refused(self) -> int:
-        """Connections that were refused because their keys are not right."""
+        """Number of connections refused because of wrong keys."""
         return 0 if self._guard is None else self._guard.refused
 
     def send(self, multipart: Sequence[bytes | memoryview]) -> None:
@@ -62,7 +62,7 @@ class Publisher:
             self._socket.send_multipart(multipart)
 
     def close(self) -> None:
-        """Close the socket; what is still queued is thrown away."""
+        """Close the socket; discard what is still queued."""
         if self._guard is not None:
             self._guard.close()
         with self._lock:

@@ -1,4 +1,4 @@
-"""What all fish-eye lens models share: radial symmetry about the axis, the image circle, the picture's limits."""
+"""Common parts of fish-eye lens models: radial symmetry about the axis, image circle, limits of the picture."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -12,7 +12,7 @@ from protocol.errors import DeltalightError
 
 Values = Float64[np.ndarray, "..."]
 ROUNDING_PX = 1e-6
-"""So that the picture's border projects onto itself."""
+"""Tolerance by which the picture's border projects onto itself."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +34,7 @@ class RisingCurve:
         cell = np.clip(np.searchsorted(ys, y), 1, len(xs) - 1)
         low, high = xs[cell - 1], xs[cell]
         x = np.interp(y, ys, xs)
-        for _ in range(8):  # linear convergence (halves) only in the last cell, where the slope may end in 0
+        for _ in range(8):  # linear convergence (halves) only in the last cell, where the slope may vanish
             x = np.clip(x - (self.value(x) - y) / np.maximum(self.slope(x), 1e-12), low, high)
         return np.asarray(x)
 
@@ -42,9 +42,8 @@ class RisingCurve:
 class RadialLens(ABC):
     """A lens whose picture is, up to an affine map, symmetric about its optical axis.
 
-    Pixel centres are at integers; the optical frame has x right, y down and z forward. `centre` is the pixel
-    (x, y) on the axis. `image_circle` is the radius in pixels about it that light reaches; None: as far as the
-    model goes.
+    Pixel centres are at integers; the optical frame has x right, y down and z forward. `centre` is the pixel (x, y)
+    on the axis. `image_circle` is the radius in pixels about it that light reaches; None: as far as the model goes.
 
     A model maps pixels to its plane (affine, the centre is 0) and the radius there to the angle from the axis.
     """
@@ -57,7 +56,7 @@ class RadialLens(ABC):
     @property
     @abstractmethod
     def largest_radius(self) -> float:
-        """Radius in the model's plane up to which the angle rises, which may lie outside the picture."""
+        """Radius in the model's plane up to which the angle rises; it may lie outside the picture."""
 
     @abstractmethod
     def _plane(self, pixels: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "n 2"]: ...
@@ -77,19 +76,19 @@ class RadialLens(ABC):
         plane = self._plane(pixels)
         radius = np.linalg.norm(plane, axis=1)
         angle = self._angle(np.minimum(radius, self.largest_radius))
-        # sin(angle)/radius has a limit on the axis, where the direction is (0, 0, 1) whatever it is.
+        # sin(angle)/radius has a limit on the axis, where the direction is (0, 0, 1) whatever its value.
         stretch = np.sin(angle) / np.maximum(radius, 1e-12)
         result = np.column_stack([plane * stretch[:, None], np.cos(angle)])
         result[~self.has_ray(pixels)] = np.nan
         return result
 
     def has_ray(self, pixels: Float64[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
-        """Whether `directions` gives one, without computing it."""
+        """Whether `directions` gives a ray, without computing it."""
         radius = np.linalg.norm(self._plane(pixels), axis=1)
         return np.asarray(self._is_inside(pixels) & (radius <= self.largest_radius))
 
     def project(self, directions: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 2"]:
-        """Return the pixels (x, y) of directions of any length; NaN where the lens or the picture has none."""
+        """Return the pixels (x, y) of directions of any length; NaN outside the lens or the picture."""
         d = np.asarray(directions, np.float64).reshape(-1, 3)
         across = np.hypot(d[:, 0], d[:, 1])
         angle = np.arctan2(across, d[:, 2])
@@ -100,7 +99,7 @@ class RadialLens(ABC):
         return pixels
 
     def _require_range(self) -> None:
-        """Compute how far the model goes, which fails for numbers that no lens has.
+        """Compute the range of the model, which fails for impossible numbers.
 
         Raises:
             DeltalightError: the polynomial overflows or does not rise at all.
@@ -126,7 +125,7 @@ class RadialLens(ABC):
 
 
 def require_image_circle(value: object) -> float | None:
-    """Return an image circle's radius in pixels, or None where none is given.
+    """Return an image circle's radius in pixels, or None if none is given.
 
     Raises:
         DeltalightError: it is not a positive number.
@@ -139,7 +138,7 @@ def require_image_circle(value: object) -> float | None:
 
 
 def first_root(polynomial: Float64[np.ndarray, " k"], end: float) -> float:
-    """Return the smallest root above 0 of a polynomial (coefficients from power 0 up), `end` where none is below."""
+    """Return a polynomial's smallest root above 0 (coefficients from power 0 up), or `end` if none is below it."""
     roots = np.polynomial.Polynomial(np.trim_zeros(polynomial, "b")).roots()
     real = roots[np.abs(roots.imag) < 1e-9 * (1 + np.abs(roots.real))].real
     return float(min([end, *real[real > 0]]))

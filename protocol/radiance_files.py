@@ -45,7 +45,7 @@ def write_exr(path: Path, linear: Float32[np.ndarray, "h w 3"]) -> None:
 
 
 def require_openexr(purpose: str) -> ModuleType:
-    """Return the OpenEXR package; `purpose` begins the sentence that says who needs it.
+    """Return the OpenEXR package; `purpose` begins the error sentence by naming what needs it.
 
     Raises:
         DeltalightError: it is not installed.
@@ -74,7 +74,7 @@ def _read_exr(path: Path) -> Float32[np.ndarray, "h w 3"]:
         with exr.File(str(path)) as file:
             channels = file.channels()
             (stored,) = (channels[name].pixels for name in ("RGB", "RGBA") if name in channels)
-    except Exception as error:  # the package documents no closed set
+    except Exception as error:  # the package does not document its exceptions
         raise DeltalightError(
             f"{path} cannot be read as an OpenEXR picture of R, G and B; export it again."
         ) from error

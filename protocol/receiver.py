@@ -11,11 +11,11 @@ MAX_TOPICS = 256
 
 
 class Receiver(Subscriber):
-    """Mailbox with one slot for each topic: the newest message wins, and each never taken is counted.
+    """Mailbox with one slot per topic: the newest message wins, and replaced ones are counted.
 
-    The thread empties the socket at once: a slow consumer meets new frames and not a queue of old ones.
-    `topics` are stream names (`color`) or whole topics (`color.desk`); none at all means everything. `keys`
-    are needed where an endpoint leaves the host.
+    The thread empties the socket at once: a slow consumer gets new frames instead of a queue of old ones. `topics`
+    are stream names (`color`) or whole topics (`color.desk`); an empty list means everything. `keys` are required if
+    an endpoint leaves the host.
     """
 
     def __init__(
@@ -34,9 +34,9 @@ class Receiver(Subscriber):
         super().__init__(endpoints, self._topics or ("",), bind=bind, keys=keys)
 
     def latest(self, timeout_s: float) -> dict[str, ReceivedMultipart] | None:
-        """Newest message of every topic that has one not taken yet, by topic; taking empties the slots.
+        """Take the newest message of every topic that has one, by topic.
 
-        Waits until there is one; None after `timeout_s` seconds without any, or when the receiver is closed.
+        Waits for a message; returns None after `timeout_s` seconds without any, or when the receiver is closed.
         """
         with self._changed:
             self._changed.wait_for(lambda: self._slots or self._closed, timeout_s)
@@ -45,13 +45,13 @@ class Receiver(Subscriber):
 
     @property
     def drops(self) -> dict[str, int]:
-        """Messages of each topic that a newer one replaced before they were taken."""
+        """Number of messages of each topic that a newer one replaced before they were taken."""
         with self._changed:
             return dict(self._drops)
 
     @property
     def refused(self) -> int:
-        """Messages thrown away because they had no readable topic, too many parts, or one topic too many."""
+        """Number of messages dropped for an unreadable topic, too many parts, or one topic too many."""
         return self._refused
 
     def _store(self, message: ReceivedMultipart) -> None:
@@ -66,7 +66,7 @@ class Receiver(Subscriber):
             self._changed.notify()
 
     def _accepts(self, topic: str, pieces: int) -> bool:
-        """Whether a message is wanted: subscriptions are prefixes, so `color.a` also brings `color.ab`."""
+        """Whether a message is wanted: subscriptions are prefixes, so `color.a` also matches `color.ab`."""
         if not topic.isascii() or len(topic) > MAX_TOPIC_BYTES or pieces > MAX_PARTS + 2:
             return False
         if self._topics and not any(topic == wish or topic.startswith(wish + ".") for wish in self._topics):

@@ -1,4 +1,4 @@
-"""Recordings (docs/formats.md 2): one `.mcap` file a take."""
+"""Recordings (docs/formats.md 2): one `.mcap` file per take."""
 
 from protocol.recording_reader import RecordingReader
 from protocol.recording_writer import RecordingWriter

@@ -1,8 +1,8 @@
 """Fish-eye pictures in recordings (docs/formats.md 2).
 
 Pictures that are new with a frame are a group of messages before the frame's own, at the frame's log time: each
-exposure and the calibration as Foxglove shows them, and last a `FisheyeRecord`, which makes the group complete.
-Frames that they hold for tell their time in `FrameRecord.fisheye_ns`.
+exposure and the calibration as Foxglove displays them, and last a `FisheyeRecord`, which completes the group. Frames
+that use them refer to their time by `FrameRecord.fisheye_ns`.
 """
 
 from bisect import bisect_right
@@ -74,7 +74,7 @@ def _picture_message(picture: np.ndarray, timestamp_ns: int) -> tuple[str, bytes
 def _camera_message(lens: FisheyeLens, timestamp_ns: int) -> CameraCalibration:
     if isinstance(lens, EquidistantLens):
         return calibration_message(lens.camera, FISHEYE_FRAME, timestamp_ns)
-    # Foxglove knows no such lens; a matrix of zeros says that the camera is not calibrated.
+    # Foxglove knows no such lens; a matrix of zeros marks the camera as not calibrated.
     return CameraCalibration(
         timestamp=timestamp_fields(timestamp_ns),
         frame_id=FISHEYE_FRAME,
@@ -87,11 +87,11 @@ def _camera_message(lens: FisheyeLens, timestamp_ns: int) -> CameraCalibration:
 
 
 class FisheyeTrack:
-    """The fish-eye pictures of a recording by log time; the ones decoded last are kept.
+    """The fish-eye pictures of a recording by log time; keeps the last ones decoded.
 
     Args:
         times_ns: log times of the groups.
-        messages_at: gives the messages (topic, data) of a log time that can still be read, in their order.
+        messages_at: returns the readable messages (topic, data) of a log time, in their order.
         name: of the recording, for errors.
     """
 
@@ -101,10 +101,10 @@ class FisheyeTrack:
         self._kept: tuple[int, FisheyePictures] | None = None
 
     def at(self, time_ns: int) -> FisheyePictures | None:
-        """Return the newest whole pictures recorded up to a log time, else the first ones (docs/formats.md 1).
+        """Return the newest complete pictures recorded up to a log time, else the first ones (docs/formats.md 1).
 
         Raises:
-            DeltalightError: a group was written by something else than `fisheye_messages`.
+            DeltalightError: a group was not written by `fisheye_messages`.
         """
         while self._times:
             index = max(bisect_right(self._times, time_ns), 1)

@@ -1,8 +1,8 @@
-"""What a recording holds (docs/formats.md 2): topics, Deltalight's own messages, Foxglove's beside them.
+"""Contents of a recording (docs/formats.md 2): topics, Deltalight's own messages, and Foxglove's beside them.
 
-Every frame is a group of messages with one log time, the capture time: picture, depth and calibration as
-Foxglove shows them, and last a `FrameRecord`, which makes the group complete. The first group begins with a
-`SessionRecord`. Fish-eye pictures have groups of their own (`recording_fisheye`).
+Every frame is a group of messages with one log time, the capture time: picture, depth and calibration as Foxglove
+displays them, and last a `FrameRecord`, which completes the group. The first group begins with a `SessionRecord`.
+Fish-eye pictures have groups of their own (`recording_fisheye`).
 """
 
 from typing import Annotated, Any, Self
@@ -88,7 +88,7 @@ class _Record(BaseModel):
 
 
 class SessionRecord(_Record):
-    """What holds for the whole recording: the board and the sensors' transforms (4x4 by rows)."""
+    """Data of the whole recording: the board and the sensors' transforms (4x4 by rows)."""
 
     board: BoardSpec | None = None
     extrinsics: dict[str, list[list[float]]] = Field(default_factory=dict)
@@ -96,7 +96,7 @@ class SessionRecord(_Record):
 
 
 class DepthRecord(BaseModel):
-    """How the depth image of a frame is to be read."""
+    """How to decode the depth image of a frame."""
 
     model_config = ConfigDict(frozen=True, allow_inf_nan=False)
 
@@ -107,7 +107,7 @@ class DepthRecord(BaseModel):
 
 
 class FrameRecord(_Record):
-    """What a frame holds beside its pictures; it is written last."""
+    """Data of a frame besides its pictures; written last."""
 
     frame_id: int = Field(ge=0)
     timestamp_ns: int = Field(ge=0, description="Capture time of the colour picture.")
@@ -122,7 +122,7 @@ class FrameRecord(_Record):
 
 
 class FisheyeRecord(_Record):
-    """What fish-eye pictures hold beside their pixels; it is written last."""
+    """Data of fish-eye pictures besides their pixels; written last."""
 
     timestamp_ns: int = Field(ge=0, description="Capture time.")
     exposures_s: list[Seconds | None] = Field(
@@ -145,7 +145,7 @@ def timestamp_fields(timestamp_ns: int) -> dict[str, int]:
 
 
 def calibration_message(camera: CameraModel, frame: str, timestamp_ns: int) -> CameraCalibration:
-    """Describe a camera for Foxglove; lens models that it does not know are shown as a pinhole."""
+    """Describe a camera for Foxglove; unsupported lens models become a pinhole."""
     name, coefficients = _foxglove_lens(camera)
     matrix = camera.matrix
     return CameraCalibration(

@@ -1,4 +1,4 @@
-"""Reading a recording (docs/formats.md 2), also one that was cut short."""
+"""Reading a recording (docs/formats.md 2), even a truncated one."""
 
 import struct
 from collections import defaultdict
@@ -45,7 +45,7 @@ from protocol.scene import SceneDocument, parse_scene, resolve_asset
 MAX_RECORD_BYTES = 512 * 1024 * 1024
 RECORD_TOPICS = (FRAME_TOPIC, FISHEYE_RECORD_TOPIC)
 RECORD_HEAD = struct.Struct("<BQ")
-# What the mcap package raises for damaged records (wrong offsets and lengths end in the last three).
+# Exceptions of the mcap package for damaged records (the last three come from wrong offsets and lengths).
 DAMAGE = (McapError, ZstdError, struct.error, ValueError, LookupError, OverflowError, OSError, MemoryError)
 
 Times = defaultdict[str, set[int]]  # log times of the records of each topic
@@ -53,7 +53,7 @@ Times = defaultdict[str, set[int]]  # log times of the records of each topic
 
 @dataclass(frozen=True)
 class _Span:
-    """Where a chunk begins in the file, and the times of its messages."""
+    """Offset of a chunk in the file, and the times of its messages."""
 
     offset: int
     start_ns: int
@@ -61,10 +61,10 @@ class _Span:
 
 
 class RecordingReader:
-    """The frames of a recording, decoded one by one as they are asked for; a `Source`.
+    """The frames of a recording, decoded on demand; a `Source`.
 
-    `notes` says whether the file was unfinished or damaged and how many frames were found. `board` takes the
-    place of the board in the recording.
+    `notes` says whether the file was unfinished or damaged and how many frames were found. `board` replaces the board
+    in the recording.
 
     Raises:
         DeltalightError: not a recording, of another schema version, or without a complete frame.
@@ -133,7 +133,7 @@ class RecordingReader:
         )
 
     def _camera(self, record: FrameRecord) -> CameraModel:
-        """Give the same instance while the camera stays, so that its rays are computed once."""
+        """Return the camera, the same instance while it does not change, so that its rays are computed once."""
         camera = CameraModel.from_dict(record.camera)
         return self.camera if camera == self.camera else camera
 
@@ -202,7 +202,7 @@ class RecordingReader:
         self._spans.append(_Span(offset, record.message_start_time, record.message_end_time))
 
     def _parts(self, time_ns: int) -> list[tuple[str, bytes]]:
-        """Messages (topic, data) of a time in their order, as far as they can be read."""
+        """Return the readable messages (topic, data) of a time in their order."""
         near = np.flatnonzero((self._starts_ns <= time_ns) & (time_ns <= self._ends_ns))
         messages = (message for index in near for message in self._messages(self._spans[index].offset))
         return [
@@ -212,7 +212,10 @@ class RecordingReader:
         ]
 
     def _messages(self, offset: int) -> list[Message]:
-        """Messages of a chunk, none of a damaged one; the last one is kept, as frames are mostly read in order."""
+        """Return the messages of a chunk, none of a damaged one.
+
+        Caches the last, as frames are mostly read in order.
+        """
         if self._cached[0] != offset:
             try:
                 with self.path.open("rb") as file:
@@ -243,7 +246,7 @@ class RecordingReader:
         try:
             scene = parse_scene(parse_mapping(text, name, is_json=True), name)
             return scene.with_assets(lambda _place, asset: resolve_asset(asset, folder))
-        except DeltalightError as error:  # the frames are good all the same
+        except DeltalightError as error:  # the frames are usable all the same
             self.notes.append(f"the attached scene document is not used: {error}")
             return None
 
@@ -260,7 +263,7 @@ class RecordingReader:
 
 
 def _summary(file: IO[bytes]) -> Summary | None:
-    """Index at the end of the file; None where the file was cut short."""
+    """Return the index at the end of the file; None if the file was truncated."""
     file.seek(0, 2)
     if file.tell() < 2 * len(MCAP0_MAGIC):
         return None
@@ -272,7 +275,7 @@ def _summary(file: IO[bytes]) -> Summary | None:
 
 
 def _walk(file: IO[bytes]) -> Iterator[tuple[int, int]]:
-    """Yield (opcode, offset) of every whole record, up to where the file was cut (or filled with zeros)."""
+    """Yield (opcode, offset) of every complete record, up to where the file was truncated (or filled with zeros)."""
     file.seek(0, 2)
     size, offset = file.tell(), len(MCAP0_MAGIC)
     while offset + RECORD_HEAD.size <= size:
@@ -291,7 +294,7 @@ def _record_at(file: IO[bytes], offset: int) -> Any:  # noqa: ANN401 - one of mc
     _, length = RECORD_HEAD.unpack(head)
     if length > MAX_RECORD_BYTES:
         raise ValueError("a record is longer than any that is written")
-    # From memory, so that a wrong length inside the record cannot ask for more than is there.
+    # From memory, so that a wrong length inside the record cannot request more than is there.
     record = BytesIO(head + file.read(length))
     return next(iter(StreamReader(record, skip_magic=True, emit_chunks=True).records), None)
 

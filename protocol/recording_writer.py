@@ -53,15 +53,14 @@ SYNC_PERIOD_S = 1.0
 class RecordingWriter:
     """Writes frames to an `.mcap` file; use it as a context manager, or call `close`.
 
-    While it grows the file is called `*.mcap.active`. Every frame is handed to the system when `add` returns,
-    in chunks of its own (at most 256 kB, or one message), and the disk is synchronised each second. If the
-    `with` block ends by an exception the file keeps that name (without frames it is removed); else it is
-    renamed.
+    While it grows the file is called `*.mcap.active`. Every frame is handed to the system when `add` returns, in
+    chunks of its own (at most 256 kB, or one message), and the disk is synchronised every second. If the `with` block
+    ends by an exception the file keeps that name (without frames it is removed); otherwise it is renamed.
 
-    Colour is kept as the frame's JPEG bytes where it has them, else as PNG. Depth is kept without loss: in
-    16-bit steps where one of the usual steps is exact, else as 32-bit floats. With `depth_scale` (metres) it
-    is rounded to these steps. Fish-eye pictures are kept without loss, once for all frames that they hold for;
-    they are known by their time. Asset paths of the attached scene are kept relative to the recording.
+    Colour is stored as the frame's JPEG bytes if it has them, else as PNG. Depth is stored without loss: in 16-bit
+    steps if one of the usual steps is exact, else as 32-bit floats. With `depth_scale` (metres) it is rounded to
+    these steps. Fish-eye pictures are stored without loss, once for all frames that share them; they are identified
+    by their time. Asset paths of the attached scene are stored relative to the recording.
 
     Raises:
         DeltalightError: the name is taken or not `*.mcap`, the disk refuses, or frames are out of order.
@@ -101,7 +100,7 @@ class RecordingWriter:
         self._syncing.start()
 
     def __enter__(self) -> Self:
-        """Give the writer."""
+        """Return the writer."""
         return self
 
     def __exit__(
@@ -111,7 +110,7 @@ class RecordingWriter:
         self._finish(rename=error is None)
 
     def close(self) -> None:
-        """Write the index and rename the file; doing it twice does no harm."""
+        """Write the index and rename the file; idempotent."""
         self._finish(rename=True)
 
     def add(self, frame: SensorFrame) -> None:
@@ -125,7 +124,7 @@ class RecordingWriter:
         with self._disk_errors():
             if self._count == 0:
                 self._write(SESSION_TOPIC, frame.timestamp_ns, self._session.packed())
-                # In a chunk with nothing else but the channels, because without these no other chunk can be read.
+                # In a chunk with nothing but the channels, because without these no other chunk can be read.
                 self._writer.flush()
             if frame.fisheye is not None and frame.fisheye.timestamp_ns != self._fisheye_ns:
                 self._write_fisheye(frame.fisheye, frame.timestamp_ns)
@@ -247,13 +246,13 @@ class RecordingWriter:
     def _scale_for(self, depth: DepthImage) -> float | None:
         if self._depth_scale is not None:
             return self._depth_scale
-        # What was exact for the last frame is most likely exact again.
+        # The last frame's exact step is most likely exact again.
         scale = exact_depth_scale(depth, self._usual_scale)
         self._usual_scale = scale
         return scale
 
     def _sync_each_second(self) -> None:
-        """Synchronise in a thread of its own, so that a slow disk does not hold up the frames."""
+        """Synchronise in a separate thread, so that a slow disk does not delay the frames."""
         while not self._stop.wait(SYNC_PERIOD_S):
             os.fsync(self._file.fileno())
 

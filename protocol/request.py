@@ -1,4 +1,4 @@
-"""Control by request and reply: a client that gives up in time, a server that executes nothing twice."""
+"""Control by request and reply: a client with timeouts, and a server that executes nothing twice."""
 
 import threading
 import time
@@ -64,7 +64,7 @@ class ReplyMemory:
         return last.reply.model_copy(update={"id": request.id})
 
     def remember(self, request: ControlRequest, reply: ControlReply, length: int) -> None:
-        """Keep a reply of `length` bytes; a refused request may come again with the same revision."""
+        """Remember a reply of `length` bytes; a refused request may come again with the same revision."""
         self._by_id[request.id] = reply, length
         self._bytes += length
         while len(self._by_id) > self._size or self._bytes > REMEMBERED_BYTES:
@@ -77,14 +77,14 @@ class ReplyMemory:
             self._applied[request.op] = applied
 
 
-LAST_REPLY_MS = 200  # what a closing server waits for its last reply to leave
+LAST_REPLY_MS = 200  # how long a closing server waits for its last reply to leave
 
 
 class ReplyServer:
-    """Answers requests in a thread of its own that owns the socket.
+    """Answers requests in a thread that owns the socket.
 
-    `handler(request)` returns the payload of the reply; a `DeltalightError` from it refuses the request.
-    `keys` are needed where the endpoint leaves the host.
+    `handler(request)` returns the payload of the reply; a `DeltalightError` from it refuses the request. `keys` are
+    required if the endpoint leaves the host.
     """
 
     def __init__(
@@ -113,7 +113,7 @@ class ReplyServer:
         return 0 if self._guard is None else self._guard.refused
 
     def close(self) -> None:
-        """Stop the thread, after the reply to the request that it is at was sent."""
+        """Stop the thread after the reply to the current request was sent."""
         with self._answering:
             pass
         if self._guard is not None:
@@ -159,7 +159,7 @@ class ReplyServer:
             return self._reply(request.id, payload=self._handler(request))
         except DeltalightError as error:
             return self._reply(request.id, error=str(error))
-        except Exception as error:  # the thread must outlive a fault of the handler
+        except Exception as error:  # the thread must survive a fault of the handler
             _log.exception("control handler failed", op=request.op)
             return self._reply(
                 request.id, error=f"{request.op} failed with {error!r}: see the log of {self._node}"
@@ -181,8 +181,8 @@ class ReplyServer:
 class RequestClient:
     """Sends requests to one `ReplyServer`, one at a time; threads may share it.
 
-    A request that got no answer may be sent again as it is: its id keeps it from being executed twice.
-    `keys` are needed where the endpoint leaves the host.
+    A request without an answer may be repeated unchanged: its id prevents a second execution. `keys` are required if
+    the endpoint leaves the host.
     """
 
     def __init__(self, endpoint: str, *, keys: Keys | None = None) -> None:
@@ -198,10 +198,10 @@ class RequestClient:
             raise
 
     def request(self, control: ControlRequest, timeout_s: float) -> ControlReply:
-        """Reply to `control`; look at its `ok` and `error`.
+        """Send `control` and return the reply; check its `ok` and `error`.
 
         Raises:
-            DeltalightError: no answer within `timeout_s` seconds, or the server could not read the request.
+            DeltalightError: there was no answer within `timeout_s` seconds, or the server could not read the request.
         """
         multipart = encode_control(control)
         deadline = time.monotonic() + timeout_s
@@ -235,15 +235,15 @@ class RequestClient:
         return self._socket
 
     def _drop(self) -> None:
-        """A fresh socket for the next request: a late answer must not meet it, nor a dead server's queue."""
+        """Replace the socket, so that the next request meets neither a late answer nor a dead server's queue."""
         if self._socket is not None:
             self._socket.close(0)
             self._socket = None
 
 
 def _exchange(socket: "zmq.Socket[bytes]", multipart: list[bytes], deadline: float) -> bool:
-    """Send a request; whether an answer waits before `deadline` (`time.monotonic`)."""
-    # Where the other end refused the connection there is no pipe left, and a plain send would wait for ever.
+    """Send a request; return whether an answer arrived before `deadline` (`time.monotonic`)."""
+    # If the other end refused the connection no pipe is left, and a plain send would block forever.
     socket.sndtimeo = _left_ms(deadline)
     try:
         socket.send_multipart(multipart)

@@ -22,7 +22,7 @@ def load_response_table(path: Path) -> Float32[np.ndarray, "256 3"]:
 
 
 def require_response(values: object, name: str) -> Float32[np.ndarray, "256 3"]:
-    """Return a response table, read-only; `name` says in errors where it stands.
+    """Return a validated response table, read-only; `name` names it in errors.
 
     Raises:
         DeltalightError: it is not 256 rows of three finite numbers, zero or more.

@@ -81,7 +81,7 @@ def _with_object_assets(place: str, item: SceneObject, rename: Callable[[str, st
 
 
 def parse_scene(data: Mapping[str, Any], name: str = "the scene document") -> SceneDocument:
-    """Validate a scene document; assets are left as they are written.
+    """Validate a scene document; assets stay as written.
 
     Raises:
         DeltalightError: the first fault, with its place in the document.

@@ -7,7 +7,7 @@ from pydantic import AfterValidator, Field, StringConstraints
 
 
 def _unit(values: tuple[float, ...]) -> tuple[float, ...]:
-    """Normalise a vector; one that is already of length 1 keeps its bits."""
+    """Normalise a vector; a unit vector keeps its bits."""
     length = math.sqrt(sum(value * value for value in values))
     if length < 1e-9:
         raise ValueError("its length must not be zero")

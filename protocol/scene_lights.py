@@ -10,7 +10,7 @@ from protocol.documents import StrictModel
 from protocol.scene_fields import ASSET_TEXT, Asset, Direction, Fraction, NonNegative, Point, Radiance
 
 DEFAULT_LIGHT_TYPE = "sphere"
-# Without `type` a light is a sphere, so the other kinds need the key for a document to match one kind only.
+# Without `type` a light is a sphere; the other kinds require the key, so that a document matches one kind only.
 NEEDS_TYPE = ConfigDict(json_schema_extra={"required": ["type"]})
 Factor = Annotated[float, Field(gt=0, le=1e6)]
 
@@ -228,6 +228,6 @@ class Lights(StrictModel):
 
 
 def default_lights() -> Lights:
-    """Return the lights of a document that names none: one from above and a little from everywhere."""
+    """Return the default lights: one from above and weak ambient light."""
     above = DirectionalLight(direction=(0.3, 0.2, -1.0), irradiance=1.5, angular_radius_deg=5.0)
     return Lights(manual=(above, AmbientLight(radiance=0.2)))

@@ -21,7 +21,7 @@ from protocol.scene_fields import (
 )
 
 GLTF_SUFFIXES = (".gltf", ".glb")
-# Turns an asset whose y is up so that its z is up: +90 degrees about x.
+# Rotates an asset whose y is up so that its z is up: +90 degrees about x.
 Z_UP_FROM_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 
 
@@ -99,7 +99,7 @@ class Animation(StrictModel):
     loop: bool = Field(default=True, description="Begin again at the end; false = hold the ends.")
 
     def time_s(self, capture_ns: int, duration_s: float) -> float:
-        """Clip time, s, 0..duration, of a frame that was captured at `capture_ns`."""
+        """Return the clip time, s, 0..duration, of a frame captured at `capture_ns`."""
         time_s = capture_ns / 1e9 * self.speed + self.offset_s
         if self.loop and duration_s > 0:
             return time_s % duration_s
@@ -134,21 +134,21 @@ class SceneObject(StrictModel):
 
     @property
     def resolved_up_axis(self) -> Literal["y", "z"]:
-        """The asset's up axis: as given, or y for glTF and z for all else."""
+        """The asset's up axis: as given, or y for glTF and z otherwise."""
         if self.up_axis is not None:
             return self.up_axis
         return "y" if PurePosixPath(self.asset).suffix.lower() in GLTF_SUFFIXES else "z"
 
     @property
     def playing(self) -> Animation | None:
-        """How a clip is played, if the asset has any; None = the object keeps its shape."""
+        """The animation of the asset's clip, if any; None = the object keeps its shape."""
         return Animation() if self.animation is None and not self.rigid else self.animation
 
     def world_from_object(self) -> Float64[np.ndarray, "4 4"]:
         """Return the 4x4 matrix from asset coordinates to `frame` (the world unless it is a marker).
 
-        The asset is first turned so that its up axis is z (+90 degrees about x where it is y), then scaled,
-        rotated and moved by the pose.
+        The asset is first rotated so that its up axis is z (+90 degrees about x if it is y), then scaled, rotated and
+        moved by the pose.
         """
         matrix = self.pose.matrix()
         return matrix @ Z_UP_FROM_Y_UP if self.resolved_up_axis == "y" else matrix

@@ -1,4 +1,4 @@
-"""What all sockets of the wire share: which endpoints are allowed, and their options (SPEC.md, section 5)."""
+"""Common to all sockets of the wire: allowed endpoints, and socket options (SPEC.md, section 5)."""
 
 import zmq
 
@@ -8,17 +8,17 @@ from protocol.errors import DeltalightError
 from protocol.keys import CREATE_HINT, Keys
 from protocol.messages import MAX_PART_BYTES
 
-HIGH_WATER_MARK = 2  # frames; the default of 1000 showed a slow consumer frames that were seconds old
+HIGH_WATER_MARK = 2  # frames; with the default of 1000 a slow consumer saw frames that were seconds old
 RECONNECT_MS = 100
 RECONNECT_MAX_MS = 1000
 HEARTBEAT_MS = 1000
-# A receiver whose queue is full answers no heartbeat. Cut off for that, it may abort when it comes back (libzmq's
-# issue 3937); no healthy receiver stands still for so long.
+# A receiver whose queue is full answers no heartbeat. If it is cut off for that, it may abort when it reconnects
+# (libzmq's issue 3937); no healthy receiver stalls for this long.
 HEARTBEAT_TIMEOUT_MS = 30_000
 
 
 def check_endpoint(endpoint: str, keys: Keys | None = None) -> Endpoint:
-    """Take an endpoint apart: without keys, `tcp://` on loopback or `ipc://`; with keys any `tcp://`.
+    """Parse an endpoint: without keys, `tcp://` on loopback or `ipc://`; with keys any `tcp://`.
 
     Raises:
         DeltalightError: another transport, or it leaves the host and there are no keys.
@@ -38,7 +38,7 @@ def open_socket(
     high_water_mark: int = HIGH_WATER_MARK,
     max_bytes: int = MAX_PART_BYTES,
 ) -> zmq.Socket[bytes]:
-    """Socket with queues of `high_water_mark` messages, pieces up to `max_bytes`, no linger, heartbeats."""
+    """Create a socket with queues of `high_water_mark` messages, pieces up to `max_bytes`, no linger, heartbeats."""
     socket = context.socket(kind)
     socket.linger = 0
     if kind == zmq.PUB:
@@ -54,20 +54,19 @@ def open_socket(
 
 
 def attach(socket: zmq.Socket[bytes], endpoint: str, *, bind: bool, keys: Keys | None = None) -> str:
-    """Bind or connect; returns the endpoint with the port that was got (port 0 lets the system choose).
+    """Bind or connect; return the endpoint with its actual port (port 0 lets the system choose).
 
     Raises:
-        DeltalightError: the endpoint leaves the host and there are no keys for that, is taken, or is not
-            understood.
+        DeltalightError: the endpoint leaves the host without keys, is taken, or is malformed.
     """
     parts = check_endpoint(endpoint, keys)
     secure(socket, parts, keys, bind=bind)
-    socket.ipv6 = "[" in endpoint  # where it is on, IPv4 addresses come back in their IPv6 form
+    socket.ipv6 = "[" in endpoint  # if on, IPv4 addresses come back in their IPv6 form
     try:
         (socket.bind if bind else socket.connect)(parts.address)
     except zmq.ZMQError as error:
         verb = "listen at" if bind else "connect to"
-        reason = zmq.strerror(error.errno or 0)  # the error's own words would name the endpoint again
+        reason = zmq.strerror(error.errno or 0)  # the error's own text would name the endpoint again
         raise DeltalightError(
             f"cannot {verb} {endpoint} ({reason}): choose another, or stop the program that holds it"
         ) from error

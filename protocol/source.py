@@ -1,4 +1,4 @@
-"""What can be replayed: a dataset folder or a recording, behind one interface."""
+"""Sources of frames that can be replayed: a dataset folder or a recording, behind one interface."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,11 +15,10 @@ RECORDING_SUFFIXES = (".mcap", ".mcap.active")
 
 
 class Source(Protocol):
-    """A sequence of frames with what was known about the cameras and the room.
+    """A sequence of frames with metadata of the cameras and the room.
 
-    `notes` are sentences, each said once, about missing optional parts and what is used instead;
-    `depth_scale` is the step of the stored depth in metres (None where it is not stored in steps); `scene` is
-    the attached scene document.
+    `notes` are sentences, each said once, about missing optional parts and what is used instead; `depth_scale` is the
+    step of the stored depth in metres (None if not stored in steps); `scene` is the attached scene document.
     """
 
     @property
@@ -28,7 +27,7 @@ class Source(Protocol):
 
     @property
     def board(self) -> BoardSpec | None:
-        """Marker board, if it is described."""
+        """Marker board, if described."""
 
     @property
     def extrinsics(self) -> Extrinsics:
@@ -36,7 +35,7 @@ class Source(Protocol):
 
     @property
     def depth_scale(self) -> float | None:
-        """Metres for each step of the stored depth."""
+        """Metres per step of the stored depth."""
 
     @property
     def notes(self) -> list[str]:
@@ -58,9 +57,9 @@ class Source(Protocol):
 
 
 def open_source(path: Path, board: BoardSpec | None = None) -> Source:
-    """Open a dataset folder or a recording (`.mcap`, also one that is still `.mcap.active`).
+    """Open a dataset folder or a recording (`.mcap`, or one still named `.mcap.active`).
 
-    `board` takes the place of the board that the source describes.
+    `board` replaces the board that the source describes.
 
     Raises:
         DeltalightError: there is no such source, or it cannot be read.

@@ -1,4 +1,4 @@
-"""What receives streams: a thread that owns the SUB socket and hands over each message at once."""
+"""Receiving streams: a thread that owns the SUB socket and hands over each message at once."""
 
 import threading
 import time
@@ -14,7 +14,7 @@ from protocol.sockets import HIGH_WATER_MARK, attach, open_socket
 
 
 class ReceivedMultipart(list[memoryview]):
-    """Pieces of one message, [topic, header, part...], and when it arrived."""
+    """Pieces of one message, [topic, header, part...], and its time of arrival."""
 
     received_ns: int
 
@@ -24,12 +24,12 @@ class ReceivedMultipart(list[memoryview]):
 
 
 class Subscriber(ABC):
-    """Subscribes to endpoints; a subclass says where messages are kept, and waits on `_changed` for them.
+    """Subscribes to endpoints; a subclass stores the messages and waits on `_changed` for them.
 
-    Its own fields must be there before this constructor runs, which starts the thread.
+    The subclass must set its own fields before it calls this constructor, which starts the thread.
 
     Raises:
-        DeltalightError: an endpoint that leaves the host without keys, or is not understood.
+        DeltalightError: an endpoint leaves the host without keys, or is malformed.
     """
 
     def __init__(
@@ -59,10 +59,10 @@ class Subscriber(ABC):
 
     @abstractmethod
     def _store(self, message: ReceivedMultipart) -> None:
-        """Keep a message or count it; called by the thread."""
+        """Store a message or count it; called by the thread."""
 
     def close(self) -> None:
-        """Stop the thread and wake whoever waits; what is kept can still be taken."""
+        """Stop the thread and wake all waiters; stored messages can still be taken."""
         self._close_guard()
         self._context.term()  # interrupts the thread, which closes its own socket
         self._thread.join()

@@ -1,1 +1,1 @@
-"""The GPU pipeline and the process that serves it; renderer.py is where to start reading."""
+"""The GPU pipeline and the process that serves it; start reading at renderer.py."""

@@ -1,4 +1,4 @@
-"""Debug view `lights`: light sources drawn on the fish-eye picture, or on the camera's where there is none."""
+"""Debug view `lights`: lights drawn over the fish-eye picture, or over the camera's if there is none."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,20 +15,23 @@ from render_server.lights.lights import IncidentLight, LightSet, incident_light
 from render_server.lights.median_cut import Region, Split
 from render_server.lights.octahedral import solid_angle_mean
 
-OUTLINE_POINTS = 24  # per edge of a region, because a lens bends straight lines
-MIN_RADIUS_RAD = float(np.radians(1.0))  # smaller lights are drawn larger, to be seen at all
-MIN_STRENGTH = 0.35  # of full colour: the weakest light is still visible
+OUTLINE_POINTS = 24  # per edge of a region: a lens bends straight lines
+MIN_RADIUS_RAD = float(np.radians(1.0))  # smaller lights are drawn at this radius, to stay visible
+MIN_STRENGTH = 0.35  # brightness of the weakest light, so that it stays visible
 REGION_COLOR = (255, 210, 60)
 TEXT_COLOR = (255, 255, 255)
-SHIFT = 4  # bits of a pixel's fraction in cv2's drawing calls
-FAR_PX = 20000.0  # beyond, such fixed-point coordinates overflow
+SHIFT = 4  # fractional bits of cv2's fixed-point coordinates
+FAR_PX = 20000.0  # such coordinates overflow beyond this
 
 Project = Callable[[Float64[np.ndarray, "n 3"]], Float64[np.ndarray, "n 2"]]
 
 
 @dataclass(frozen=True, eq=False)
 class _Canvas:
-    """A picture to draw on; `project` gives its pixels for directions (world) from `viewpoint`, NaN if unseen."""
+    """A picture to draw on.
+
+    `project` maps directions (world) from `viewpoint` to pixels, NaN where they are not visible.
+    """
 
     picture: UInt8[np.ndarray, "h w 3"]
     viewpoint: Float64[np.ndarray, "3"]
@@ -36,13 +39,13 @@ class _Canvas:
 
     @property
     def unit(self) -> float:
-        """Size of text and lines, 1 for a picture 480 pixels high."""
+        """Scale of text and lines: 1 for a picture 480 pixels high."""
         return max(0.5, float(self.picture.shape[0] / 480))
 
     def line(
         self, directions: Float64[np.ndarray, "n 3"], color: tuple[int, ...], width: float, *, closed: bool
     ) -> None:
-        """Draw a line through directions, interrupted where they are outside the picture."""
+        """Draws a polyline through directions, with gaps where they leave the picture."""
         pixels = self.project(directions)
         if closed:
             pixels = np.concatenate([pixels, pixels[:1]])
@@ -53,7 +56,7 @@ class _Canvas:
         cv2.polylines(self.picture, lines, False, color, thickness, cv2.LINE_AA, SHIFT)
 
     def text(self, words: str, at: tuple[int, int], color: tuple[int, ...] = TEXT_COLOR) -> None:
-        """Write text with its lower left corner at a pixel, outlined in black to be readable on any background."""
+        """Writes text with its lower left corner at a pixel, outlined in black to stay readable."""
         scale, thickness = 0.45 * self.unit, max(1, round(self.unit))
         places = [(at[0] + x, at[1] + y) for x in (-1, 1) for y in (-1, 1)]
         for place, ink in [*((place, (0, 0, 0)) for place in places), (at, color)]:
@@ -65,9 +68,10 @@ class _Canvas:
 def draw_lights(
     frame: ViewFrame, lights: LightSet, split: Split[HemisphereMap] | None
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Draw lights as discs of their size and colour, with number and irradiance, at the frame's size.
+    """Draws lights as discs of their size and colour, with number and irradiance, at the frame's size.
 
-    Draws on the frame's fish-eye picture if it has one, letterboxed, with the outlines of the regions of `split`.
+    Draws on the frame's fish-eye picture if it has one, letterboxed, with the outlines of the regions of
+    `split`.
     """
     fisheye = frame.radiance_map
     canvas = _camera_canvas(frame) if fisheye is None else _fisheye_canvas(frame, fisheye)
@@ -92,7 +96,7 @@ def draw_lights(
 
 
 def _color(light: IncidentLight, strongest: float) -> tuple[int, ...]:
-    """Return the light's own colour, darker for weaker lights."""
+    """Returns the light's colour, darker for weaker lights."""
     peak = max(float(light.irradiance.max()), 1e-12)
     strength = MIN_STRENGTH + (1 - MIN_STRENGTH) * min(peak / max(strongest, 1e-12), 1.0)
     return tuple(
@@ -107,7 +111,7 @@ def _draw_disc(canvas: _Canvas, light: IncidentLight, color: tuple[int, ...]) ->
 
 
 def _draw_centre(canvas: _Canvas, light: IncidentLight, name: str, color: tuple[int, ...]) -> bool:
-    """Mark the centre of a light; returns whether it is in the picture."""
+    """Marks the centre of a light; returns whether it is inside the picture."""
     centre = canvas.project(light.to_light[None])[0]
     height, width = canvas.picture.shape[:2]
     if not (np.isfinite(centre).all() and (centre >= 0).all() and (centre < (width, height)).all()):
@@ -122,7 +126,7 @@ def _draw_centre(canvas: _Canvas, light: IncidentLight, name: str, color: tuple[
 
 
 def _fisheye_canvas(frame: ViewFrame, seen: RadianceMap) -> _Canvas:
-    """Fit the fish-eye picture into the frame's size, on black."""
+    """Fits the fish-eye picture into the frame's size, on black."""
     width, height = frame.camera.width, frame.camera.height
     rows, columns = seen.picture.shape[:2]
     scale = min(width / columns, height / rows)
@@ -152,7 +156,7 @@ def _camera_canvas(frame: ViewFrame) -> _Canvas:
 
 
 def _outline(region: Region, residual: HemisphereMap) -> Float64[np.ndarray, "n 3"]:
-    """Return directions (world) along the edges of a region."""
+    """Returns directions (world) along the edges of a region."""
     size = len(residual.radiance)
     low, high = np.array([region.left, region.top]) / size, np.array([region.right, region.bottom]) / size
     corners = np.array([low, (high[0], low[1]), high, (low[0], high[1])])
@@ -165,7 +169,7 @@ def _outline(region: Region, residual: HemisphereMap) -> Float64[np.ndarray, "n 
 
 
 def _circle(to_light: Float64[np.ndarray, "3"], radius_rad: float) -> Float64[np.ndarray, "n 3"]:
-    """Return directions at an angle around the one to a light."""
+    """Returns directions on a circle of that angular radius around a light."""
     side = np.cross(to_light, (0.0, 0.0, 1.0) if abs(to_light[2]) < 0.9 else (1.0, 0.0, 0.0))
     side /= np.linalg.norm(side)
     turn = np.linspace(0, 2 * np.pi, 4 * OUTLINE_POINTS, endpoint=False)[:, None]

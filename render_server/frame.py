@@ -1,4 +1,4 @@
-"""What one frame is made of: the resources that every method's stages read, and the stages that make them."""
+"""The resources of one frame that all methods share, and the stages that compute them."""
 
 from dataclasses import dataclass
 from operator import is_
@@ -22,16 +22,16 @@ from render_server.scene.declared_surfaces import DIFFUSE_BOX, MAX_SURFACES, Sur
 from render_server.scene.depth_surface import DepthSurface
 from render_server.view import CameraBlock, CameraView, Rectangle
 
-BIAS_SIGMAS = 3.0  # of depth noise: no real surface shadows itself
+BIAS_SIGMAS = 3.0  # of depth noise: keeps real surfaces from shadowing themselves
 
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """What the camera measured of the real scene when something last moved.
+    """The camera's measurement of the real scene, taken when something last moved.
 
-    `depth` and `surface` are None where a model is given; `noise_sigma` is the depth's noise at 1 m (m, grows with
-    z^2), `typical_depth` its median (m). `tolerance`: up to what difference the fused surface agrees with the depth
-    (m, and m at 1 m); None where nothing is fused.
+    `depth` and `surface` are None if the scene gives a model. `noise_sigma` is the depth noise at 1 m (m,
+    grows with z^2), `typical_depth` the median depth (m). `tolerance` bounds the difference at which the
+    fused surface still agrees with the depth (m, and m at 1 m); None if nothing is fused.
     """
 
     depth: DepthImage | None
@@ -42,13 +42,13 @@ class Scan:
 
     @property
     def bias_m(self) -> float:
-        """What a real surface is lifted by against its own shadow, m."""
+        """Offset of real surfaces against self-shadowing, m."""
         return BIAS_SIGMAS * self.noise_sigma * self.typical_depth**2
 
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """The camera's image and the real surfaces that it shows. `bindings`: everything that shaders read of both."""
+    """The camera's image and the visible real surfaces, with the shader bindings of both."""
 
     image: CameraImage
     surface: RealSurface
@@ -58,10 +58,10 @@ class Observation:
 
 @dataclass(frozen=True, eq=False)
 class ObjectSurface:
-    """The objects as the camera sees them: their geometry buffer, and how much of each pixel they cover.
+    """The objects as the camera sees them: their geometry buffer and how much of each pixel they cover.
 
-    `edge_correction` unmixes the edges of real things before them. With antialiasing, `samples` are what the geometry
-    buffer was made from; `rectangle` encloses the objects.
+    `samples` are the samples that an antialiased geometry buffer was resolved from; `rectangle` encloses the
+    objects; `edge_correction` unmixes the edges of real things in front of them.
     """
 
     buffer: GeometryBuffer
@@ -73,10 +73,11 @@ class ObjectSurface:
 
 @dataclass(frozen=True, eq=False)
 class FrameResources:
-    """What stages read of frame and scene. Sources are set by the renderer; the rest is made by this module's stages.
+    """Resources that every method's stages read. The renderer sets the sources.
 
-    `observation` changes only when something moved: a picture of a scene at rest lights nothing anew. `geometry` are
-    the bindings of both surfaces, `everywhere` asks for light at every pixel (for estimation).
+    This module's stages compute the rest. `observation` changes only when something moved, so a new picture of a
+    scene at rest relights nothing. `geometry` holds the bindings of both surfaces; `everywhere` requests light at
+    every pixel (for estimation).
     """
 
     image: Resource[CameraImage]
@@ -120,13 +121,13 @@ class PictureBuffers:
         return {"Surfaces": self._surfaces, "surface_count": len(table), "specular_surfaces": specular}
 
     def set_camera(self, view: CameraView) -> CameraView:
-        """Writes the camera's blocks: for rasters through the lens, and for readers of the objects' geometry."""
+        """Writes the camera blocks: for rasters through the lens, and for reading the objects' geometry."""
         self._raster_camera.write(view.without_antialiasing.block())
         self._camera.write(view.block())
         return view
 
     def observe(self, scan: Scan, real: GeometryState, view: CameraView, declared: Bindings) -> Observation:
-        """Fills the real geometry buffer from depth, from the given model, or from both for a fused surface."""
+        """Fills the real geometry buffer from depth, from the given model, or from both if depth is fused."""
         raster_scene = {"Camera": self._raster_camera, **self.image.bindings, **declared}
         if scan.depth is not None and scan.surface is not None:
             self.real_surface.from_depth(scan.depth, scan.surface.normals, raster_scene)
@@ -147,7 +148,7 @@ class PictureBuffers:
         return Observation(self.image, self.real_surface, scan, bindings)
 
     def draw_objects(self, objects: GeometryState, seen: Observation, view: CameraView) -> ObjectSurface:
-        """Rasters the objects, finds how much of each pixel they cover, and unmixes edges of real things."""
+        """Rasters the objects, computes their coverage of pixels, and unmixes the edges of real things."""
         rectangle, correction = view.rectangle_around(objects.points), self._unmixing.texture
         if view.antialiased:
             samples = self._draw_samples(objects, seen, view, rectangle)
@@ -165,7 +166,7 @@ class PictureBuffers:
     def _draw_samples(
         self, objects: GeometryState, seen: Observation, view: CameraView, rectangle: Rectangle
     ) -> SampleCoverage:
-        """Several samples a pixel, made into one surface."""
+        """Draws several samples per pixel and resolves them into one surface."""
         if self._samples is None:
             self._samples = SampleCoverage(self._gpu, view.size)
         plain = view.without_antialiasing
@@ -180,7 +181,7 @@ class PictureBuffers:
         return self._samples
 
     def antialias_interior(self, radiance: moderngl.Texture, surface: ObjectSurface) -> moderngl.Texture:
-        """The objects' shaded radiance with the edges before each other antialiased, where samples were drawn."""
+        """Antialiases the edges between objects in their shaded radiance, if samples were drawn."""
         if surface.samples is None:
             return radiance
         if self._interior_edges is None:
@@ -207,7 +208,7 @@ class PictureBuffers:
 
 
 def declare_frame(graph: Graph, buffers: PictureBuffers) -> FrameResources:
-    """Declares the sources of a frame and the stages that come before every method's own."""
+    """Declares the sources of a frame and the stages that precede every method's own."""
     image = graph.source("camera image", "view")
     view = graph.source("view", "view")
     scan = graph.source("scan", "view")
@@ -231,7 +232,7 @@ def declare_frame(graph: Graph, buffers: PictureBuffers) -> FrameResources:
 def _geometry_bindings(
     seen: Observation, surface: ObjectSurface, objects: GeometryState
 ) -> dict[str, Binding]:
-    """Everything that shaders read of both geometry buffers."""
+    """Returns the shader bindings of both geometry buffers."""
     return {
         **seen.bindings,
         **surface.buffer.bindings,
@@ -242,11 +243,11 @@ def _geometry_bindings(
 
 
 def set_source(resource: Resource[Any], value: object) -> None:
-    """Sets a source; the same object again is no change."""
+    """Sets a source; setting the same object again is not a change."""
     resource.write(value, is_)
 
 
 def upload_image(resource: Resource[CameraImage], image: CameraImage, frame: ViewFrame) -> None:
-    """Uploads a frame's picture: a change, whatever it shows."""
+    """Uploads a frame's picture, which always counts as a change."""
     image.upload(frame)
     resource.write(image)

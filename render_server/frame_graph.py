@@ -1,4 +1,4 @@
-"""The graph of one scene's frames: what every method shares, the method's own stages, composition."""
+"""The graph of one scene's frames: shared stages, the method's own stages, and composition."""
 
 from dataclasses import dataclass, replace
 from operator import eq, is_
@@ -29,7 +29,10 @@ from render_server.view import CameraView
 
 @dataclass(frozen=True)
 class CompositeOptions:
-    """How the picture is composed: of a scene document's `output` and `method`. `with_linear`: `linear` is wanted."""
+    """Options of composition, from a scene document's `output` and `method`.
+
+    `with_linear` requests the linear picture too.
+    """
 
     output: Output
     additive: bool
@@ -38,7 +41,7 @@ class CompositeOptions:
 
     @property
     def bindings(self) -> Bindings:
-        """What composite.comp.glsl reads of it."""
+        """Returns the uniforms of composite.comp.glsl."""
         needs_linear = self.with_linear or self.output.view in ("effects", "delta")
         is_filmic = self.output.tone == "aces"
         return {
@@ -52,7 +55,7 @@ class CompositeOptions:
 
 @dataclass(frozen=True, eq=False)
 class FrameInputs:
-    """What one frame is rendered from. Values that are the same objects as before are no change."""
+    """Everything that one frame is rendered from. Passing the same object again is not a change."""
 
     frame: ViewFrame
     view: CameraView
@@ -75,7 +78,7 @@ class Fields:
 
 @dataclass(frozen=True, eq=False)
 class ShownBuffers:
-    """What was drawn of the newest frame, for questions about its pixels."""
+    """The newest frame's geometry buffers, for picking."""
 
     view: CameraView
     object_coverage: moderngl.Texture
@@ -85,7 +88,7 @@ class ShownBuffers:
 
 
 class Composition:
-    """Composes the picture, and overwrites it with a debug view where one is asked for."""
+    """Composes the picture, and overwrites it with a debug view on request."""
 
     def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
         self._composite = Composite(gpu, size)
@@ -98,7 +101,7 @@ class Composition:
         options: CompositeOptions,
         *layers: Any,  # noqa: ANN401 (of RelitLayers, in their order)
     ) -> Composite:
-        """The relit picture."""
+        """Composes the relit picture."""
         relit = RelitLayers(scene["object_coverage"], *layers)
         self._composite.run(image, relit, {**scene, **options.bindings})
         view = options.output.view
@@ -123,9 +126,9 @@ class Composition:
 
 
 class FrameGraph:
-    """Declared once for a method and a picture size; every frame sets its sources and runs it.
+    """The frame graph of one method and picture size: declared once, then run for every frame.
 
-    `timers` are given from outside, because they outlive a graph. `checks` is `Graph`'s.
+    `timers` outlive the graph and are passed in. `checks` is `Graph`'s.
     """
 
     def __init__(
@@ -181,7 +184,7 @@ class FrameGraph:
         self.resources.image.write(self.buffers.image)
 
     def set_inputs(self, inputs: FrameInputs) -> None:
-        """Sets all sources but picture and output."""
+        """Sets all sources except picture and output."""
         s = self.resources
         s.view.write(inputs.view, eq)
         s.scan.write(inputs.scan, is_)
@@ -194,23 +197,23 @@ class FrameGraph:
         self._inputs = inputs
 
     def set_lights(self, lights: LightSet) -> None:
-        """Shines other lights on the same frame."""
+        """Sets other lights for the same frame."""
         assert self._inputs is not None
         self.set_inputs(replace(self._inputs, lights=lights))
 
     def renew_albedo(self) -> None:
-        """Tells the stages that the albedo texture holds something else."""
+        """Marks the contents of the albedo texture as changed."""
         self.resources.albedo.write(self.resources.albedo.value)
 
     @property
     def inputs(self) -> FrameInputs:
-        """What the frame is rendered from."""
+        """Everything that the frame is rendered from."""
         assert self._inputs is not None
         return self._inputs
 
     @property
     def observation(self) -> Observation:
-        """The real surfaces in view, brought up to date."""
+        """The visible real surfaces, brought up to date."""
         self.graph.run(self.resources.observation)
         return self.resources.observation.value
 
@@ -228,7 +231,7 @@ class FrameGraph:
         )
 
     def evaluate(self, lights: LightSet) -> Fields:
-        """Light of the frame under other lights, at every pixel and not only where the objects reach.
+        """Evaluates the frame's light under other lights, at every pixel and not only near the objects.
 
         The sources keep these lights until they are set again.
         """

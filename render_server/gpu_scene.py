@@ -1,4 +1,4 @@
-"""Triangles on the GPU as stages get them: the real scene's, and the virtual objects'."""
+"""Triangles on the GPU as stages receive them: those of the real scene and of the virtual objects."""
 
 from dataclasses import dataclass
 
@@ -13,10 +13,10 @@ from render_server.scene.triangle_mesh import TriangleMesh
 
 @dataclass(frozen=True, eq=False)
 class PlacedObject:
-    """One virtual object: its asset as the file has it, and where that stands (turned, scaled evenly, moved; m).
+    """One virtual object: its asset as loaded, and its pose (rotation, uniform scale, translation; m).
 
-    `material`: what the scene document gives it in place of the asset's own, if it does. `moves`: whether it plays an
-    animation, so that `meshes` hold for this frame alone.
+    `material` is the scene document's replacement for the asset's own, if any. `moves` marks an object that
+    plays an animation: its `meshes` are valid for this frame only.
     """
 
     id: str
@@ -46,7 +46,7 @@ class GeometryState:
     is_open: bool = False  # one camera's view of what is solid: backs are not in it
 
     def solid_corners(self, voxel_edge: float) -> Float32[np.ndarray, "k 3 10"]:
-        """`corners` for voxels of that edge (m), with coarse backs of what one camera saw (scene/depth_mesh.py)."""
+        """Returns `corners` for voxels of that edge (m), with coarse backs if one camera saw the scene."""
         if not self.is_open:
             return self.corners
         fronts = self.corners if self.coarse_corners is None else self.coarse_corners
@@ -59,10 +59,13 @@ class GeometryState:
 
     @property
     def lasting_points(self) -> Float64[np.ndarray, "k 3"]:
-        """Points that enclose the set now and later."""
+        """Points that enclose the set at all times of its animations."""
         return self.points if self.swept_points is None else self.swept_points
 
     @property
     def lasting_bounds(self) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
-        """Least and greatest coordinates now and later, m: volumes and light views are placed by them."""
+        """Least and greatest coordinates at all times of its animations, m.
+
+        Volumes and light views are fitted to them.
+        """
         return self.lasting_points.min(axis=0), self.lasting_points.max(axis=0)

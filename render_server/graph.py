@@ -1,7 +1,8 @@
-"""The frame as a graph: stages that read and write versioned resources and rerun only where an input changed.
+"""The frame as a graph: stages that read and write versioned resources and rerun only when an input changed.
 
-A method declares its stages once; every frame sets the sources and runs the graph. Each resource follows the clocks
-of all that it was made from, so that what a moving camera costs can be read from the graph before anything is drawn.
+A method declares its stages once; every frame sets the sources and runs the graph. Each resource inherits the
+clocks of all that it is computed from, so the graph shows what a moving camera costs before anything is
+drawn.
 """
 
 import inspect
@@ -23,7 +24,7 @@ Same = Callable[[Any, Any], bool]
 
 
 class GraphError(RuntimeError):
-    """Stages and resources that do not fit together."""
+    """Stages and resources do not fit together."""
 
 
 @dataclass(eq=False)
@@ -42,17 +43,17 @@ class Resource(Generic[T]):
 
     @property
     def value(self) -> T:
-        """What was written last.
+        """The last value written.
 
         Raises:
-            GraphError: nothing was.
+            GraphError: nothing was written yet.
         """
         if self.version == 0:
             raise GraphError(f"Resource `{self.name}` is read before it is written.")
         return self._value  # type: ignore[return-value]
 
     def write(self, value: T, same: Same | None = None) -> None:
-        """Replaces the value; the version stays where `same` says that it is what it was."""
+        """Replaces the value; the version stays if `same` finds the new value equal to the old one."""
         if self.version == 0 or same is None or not same(self._value, value):
             self.version += 1
         self._value = value
@@ -72,7 +73,7 @@ class Stage:
 
     @property
     def clocks(self) -> frozenset[Clock]:
-        """What makes it run."""
+        """The clocks that make it run."""
         return self.outputs[0].clocks
 
 
@@ -146,9 +147,10 @@ class Graph:
         *inputs: Resource[Any] | str,
         same: Same | None = None,
     ) -> Resource[Any]:
-        """Declares a stage that writes one resource of its own name; inputs may be named before they are declared.
+        """Declares a stage that writes one resource, named like the stage.
 
-        `same` compares an old with a new value; where it holds, what reads the resource does not run again.
+        Inputs may be named before they are declared. `same` compares the old value with the new one; readers of
+        the resource do not rerun if it holds.
         """
         return self._add(name, function, inputs, (name,), same)[0]
 
@@ -166,10 +168,15 @@ class Graph:
         self._sections.append((len(self._stages), name))
 
     def stages(
-        self, name: str, function: Callable[..., Any], *inputs: Resource[Any] | str, outputs: Sequence[str]
+        self,
+        name: str,
+        function: Callable[..., Any],
+        *inputs: Resource[Any] | str,
+        outputs: Sequence[str],
+        same: Same | None = None,
     ) -> tuple[Resource[Any], ...]:
-        """Declares a stage whose function returns a value for each of the `outputs`."""
-        return self._add(name, function, inputs, tuple(outputs), None)
+        """Declares a stage whose function returns one value for each of the `outputs`."""
+        return self._add(name, function, inputs, tuple(outputs), same)
 
     def _add(
         self,
@@ -210,12 +217,12 @@ class Graph:
         return made
 
     def own(self, item: object) -> None:
-        """Releases `item` with the graph, if it can be released."""
+        """Releases `item` with the graph if it has a `release` method."""
         if hasattr(item, "release") and not any(item is other for other in self._owned):
             self._owned.append(item)
 
     def resource(self, name: str) -> Resource[Any]:
-        """The resource of that name.
+        """Returns the resource of that name.
 
         Raises:
             GraphError: there is none.
@@ -229,7 +236,7 @@ class Graph:
         return f"; the nearest is `{close[0]}`" if close else ""
 
     def __getitem__(self, name: str) -> Any:  # noqa: ANN401 (as its stage made it)
-        """Value of a resource."""
+        """Returns the value of a resource."""
         return self.resource(name).value
 
     def __contains__(self, name: str) -> bool:
@@ -255,7 +262,7 @@ class Graph:
                 self._update(stage)
 
     def _sorted(self) -> list[Stage]:
-        """Stages in an order in which each comes after what it reads; by declaration where that leaves a choice."""
+        """Returns the stages in topological order; declaration order breaks ties."""
         if self._order is None:
             for stage, names in self._named.items():
                 stage.inputs = tuple(self._read(stage, name) for name in names)
@@ -267,7 +274,7 @@ class Graph:
         return self._order
 
     def _place(self, stage: Stage, order: list[Stage], waiting: list[Stage]) -> None:
-        """Puts a stage into the order, behind all that it reads."""
+        """Appends a stage to the order, after everything that it reads."""
         if stage in order:
             return
         if stage in waiting:
@@ -304,7 +311,7 @@ class Graph:
         return needed
 
     def _update(self, stage: Stage) -> None:
-        """Runs a stage if a version of its inputs is not the one that it saw."""
+        """Runs a stage if the version of any input differs from the one that it saw last."""
         versions = tuple(item.version for item in stage.inputs)
         if versions == stage.seen:
             return
@@ -404,7 +411,7 @@ class Graph:
         return next((name for first, name in reversed(self._sections) if first <= index), "")
 
     def release(self) -> None:
-        """Frees everything that the stages hold."""
+        """Frees everything that the stages own."""
         for item in reversed(self._owned):
             item.release()
         self._owned.clear()

@@ -1,4 +1,4 @@
-"""One scene from frame to frame: geometry, lights and estimates that outlive a frame, and the graph of its frames."""
+"""One scene across frames: geometry, lights and estimates that outlive a frame, and the frame graph."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -25,26 +25,26 @@ from render_server.virtual_objects import VirtualObjects
 
 @dataclass(frozen=True, eq=False)
 class RelitFrame:
-    """A frame that is ready to be composed by `graph`."""
+    """A frame that `graph` can compose."""
 
     graph: FrameGraph
     options: CompositeOptions
 
     def compose(self, *, with_linear: bool) -> Composite:
-        """Renders the picture; `with_linear`: its linear radiance too."""
+        """Renders the picture, and its linear radiance if `with_linear`."""
         options = self.options
         return self.graph.render(
             CompositeOptions(options.output, options.additive, options.relights_real, with_linear)
         )
 
     def shown(self) -> ShownBuffers:
-        """The geometry buffers."""
+        """Returns the geometry buffers."""
         return self.graph.shown()
 
 
 @dataclass(frozen=True, eq=False)
 class _Plan:
-    """A scene whose files and memory were checked."""
+    """A scene whose files and memory have been checked."""
 
     scene: SceneDocument
     method: MethodChoice
@@ -94,7 +94,7 @@ class LiveScene:
             self._notices.append(sentence)
 
     def set_scene(self, scene: SceneDocument) -> None:
-        """Replaces the scene; nothing changes if it cannot be used. Pictures do not wait for what is precomputed."""
+        """Replaces the scene, or raises and changes nothing. Pictures do not wait for precomputation."""
         self._take(self._planned(scene))
         self._fields.waits = False
 
@@ -123,7 +123,7 @@ class LiveScene:
         self.graph = None
 
     def begin_source(self) -> None:
-        """Forgets all that was seen and found: another camera shows another room."""
+        """Forgets all observations and estimates: another camera shows another room."""
         plan = self._planned(self._plan.scene)
         if self._real is not None:
             self._real.release()
@@ -134,13 +134,14 @@ class LiveScene:
 
     @property
     def model(self) -> Sequence[TriangleMesh]:
-        """The real scene's meshes, if it is given."""
+        """The real scene's meshes, if a model is given."""
         return () if self._real is None else self._real.model
 
     def relight(self, frame: ViewFrame, view: CameraView) -> RelitFrame | None:
-        """Makes a frame ready to be composed; None if no object is visible, or no light yet.
+        """Prepares a frame for composition; returns None if no object is visible or there is no light yet.
 
-        The same frame again, in another view or by another method, adds nothing to what is averaged over frames.
+        Relighting the same frame again, in another view or by another method, adds nothing to averages over
+        frames.
         """
         again, self._accumulated = frame is self._accumulated, None
         lit = again or self.lighting.update(frame)
@@ -186,7 +187,7 @@ class LiveScene:
         )
 
     def _surface_table(self, frame: ViewFrame, *, moved: bool) -> SurfaceTable:
-        """The declared surfaces, with the board's sheet among them; renewed when something moved."""
+        """Returns the declared surfaces, the board's sheet included; rebuilt when something moved."""
         assert self._real is not None
         if self._surfaces is None or moved:
             declared = self._plan.scene.real.surfaces
@@ -197,7 +198,7 @@ class LiveScene:
         return self._surfaces
 
     def _graph_for(self, view: CameraView) -> FrameGraph:
-        """The graph of the picture's size; another one when the lens or size changes."""
+        """Returns the graph for the picture's size; a new one if lens or size changed."""
         key = (view.size, view.raster[1])
         if self.graph is not None and self.graph.buffers.key != key:
             self._drop_graph()
@@ -208,7 +209,7 @@ class LiveScene:
         return self.graph
 
     def describe_lights(self) -> list[dict[str, Any]]:
-        """Plain values of the lights, registration included."""
+        """Returns the lights as plain values, registration included."""
         return [] if self.lighting.lights is None else self.lighting.lights.describe()
 
     def release(self) -> None:
@@ -219,7 +220,7 @@ class LiveScene:
 
 
 def ignored_wishes(scene: SceneDocument) -> list[str]:
-    """Sentences on what the document asks for and this release leaves out of the picture."""
+    """Returns sentences on requests of the document that this release does not render."""
     materials = [item.material for item in scene.objects if isinstance(item.material, Material)]
     wishes = {
         "output.camera_artifacts": scene.output.camera_artifacts,

@@ -36,14 +36,14 @@ OCCLUSION_FRACTION = 0.8  # of the computing time
 
 
 def default_folder() -> Path:
-    """Return `occlusion-fields` in DELTALIGHT_CACHE, else in the user's cache folder."""
+    """Returns `occlusion-fields` in DELTALIGHT_CACHE, else in the user's cache folder."""
     given = os.environ.get(CACHE_VARIABLE)
     user = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     return (Path(given) if given else user / "deltalight") / "occlusion-fields"
 
 
 def field_digest(surface: Float32[np.ndarray, "m 3 6"], settings: FieldSettings) -> str:
-    """Return 16 hexadecimal digits that change with the object's triangles, its colours, or the settings.
+    """Returns 16 hexadecimal digits that change with the object's triangles, its colours, or the settings.
 
     Colours count only with indirect light.
     """
@@ -56,7 +56,7 @@ def field_digest(surface: Float32[np.ndarray, "m 3 6"], settings: FieldSettings)
 def compute_field(
     surface: Float32[np.ndarray, "m 3 6"], settings: FieldSettings, progress: ProgressCallback
 ) -> OcclusionField:
-    """Compute the field of an object (`object_surface`, asset's frame); takes seconds.
+    """Computes the field of an object (`object_surface`, asset's frame); takes seconds.
 
     Raises:
         DeltalightError: the package embreex is not installed.
@@ -77,7 +77,7 @@ def compute_field(
 
 
 def store_field(folder: Path, digest: str, field: OcclusionField) -> None:
-    """Write a field; the file appears when it is complete.
+    """Writes a field; the file appears when it is complete.
 
     Raises:
         DeltalightError: the folder cannot be written.
@@ -92,7 +92,7 @@ def store_field(folder: Path, digest: str, field: OcclusionField) -> None:
 
 
 def load_field(folder: Path, digest: str, settings: FieldSettings) -> OcclusionField | None:
-    """Read a field; None where there is none, or where the file is damaged and must be replaced."""
+    """Reads a field; None if there is none, or if the file is damaged and must be replaced."""
     try:
         with np.load(folder / f"{digest}.npz", allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
@@ -121,12 +121,12 @@ log = structlog.get_logger()
 
 
 class _EndedError(Exception):
-    """The renderer is gone; nobody waits for the field."""
+    """The renderer was released; nobody waits for the field."""
 
 
 @dataclass(eq=False)
 class _Entry:
-    """One asset's field with one set of settings; `meshes` are held so that their identity stays theirs."""
+    """One asset's field with one set of settings; holds `meshes`, whose identities are its key."""
 
     meshes: tuple[TriangleMesh, ...]
     name: str
@@ -136,10 +136,11 @@ class _Entry:
 
 
 class OcclusionFields:
-    """Keeps fields as long as a renderer lives; `say` takes sentences for the user.
+    """Caches fields for the lifetime of a renderer; `say` receives sentences for the user.
 
-    `waits`: who asks for a field gets it, with a progress bar on a terminal. Otherwise it is computed in a thread
-    (embree and matrix products leave the interpreter to others), and until it is there None is the answer.
+    With `waits`, `find` blocks until a field is ready and shows a progress bar on a terminal. Without, a
+    thread computes it (embree and matrix products release the interpreter lock) and `find` returns None
+    meanwhile.
     """
 
     def __init__(self, say: Callable[[str], None], folder: Path | None = None, *, waits: bool = True) -> None:
@@ -151,10 +152,10 @@ class OcclusionFields:
         self._ended = threading.Event()
 
     def find(self, item: PlacedObject, settings: FieldSettings) -> OcclusionField | None:
-        """The field of an object's asset; None while it is being computed.
+        """Returns the field of an object's asset; None while it is being computed.
 
         Raises:
-            DeltalightError: it cannot be computed.
+            DeltalightError: the field cannot be computed.
         """
         plain = item.material is not None
         key = (*(id(mesh) for mesh in item.meshes), plain, settings)
@@ -211,12 +212,12 @@ class OcclusionFields:
             log.debug("occlusion field", exc_info=error)
 
     def release(self) -> None:
-        """Let threads end at their next step."""
+        """Lets threads end at their next step."""
         self._ended.set()
 
 
 def require_rigid(item: SceneObject) -> None:
-    """Refuse an object whose shape may change: what it hides is precomputed.
+    """Refuses an object whose shape may change, because occlusion is precomputed.
 
     Raises:
         DeltalightError: it plays an animation, or is not rigid.

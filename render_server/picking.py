@@ -1,4 +1,4 @@
-"""What a pixel of the newest picture shows: an object, or a point of the real scene with its normal."""
+"""Picking: what a pixel of the newest picture shows, an object or a point of the real scene."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,18 +17,19 @@ from render_server.scene.depth_surface import depth_surface
 from render_server.scene.triangle_mesh import TriangleMesh
 from render_server.view import CameraView
 
-SHOWN_SHARE = 0.5  # of a pixel that an object must cover to be what the pixel shows
+SHOWN_SHARE = 0.5  # of a pixel that an object must cover to be picked
 
 Vector = Float64[np.ndarray, "3"]
 Pixel = tuple[int, int]
-Surface = tuple[Vector, Vector]  # place, m; normal
+Surface = tuple[Vector, Vector]  # position, m; normal
 
 
 @dataclass(frozen=True, eq=False)
 class Pick:
-    """What a pixel of frame `frame_id` shows; place (world, m), unit normal and distance (m) unless `nothing`.
+    """What a pixel of frame `frame_id` shows.
 
-    `object_id` is that of the scene document, where a virtual object is in front. A normal faces the camera.
+    Position (world, m), unit normal, distance (m) unless `nothing`.
+    `object_id` is the scene document's, if a virtual object is in front. The normal faces the camera.
     """
 
     frame_id: int
@@ -39,7 +40,7 @@ class Pick:
     distance_m: float | None = None
 
     def as_dict(self) -> dict[str, object]:
-        """The pick as plain data."""
+        """Returns the pick as plain data."""
         return {
             "frame_id": self.frame_id,
             "kind": self.kind,
@@ -52,10 +53,10 @@ class Pick:
 
 @dataclass(frozen=True, eq=False)
 class ShownFrame:
-    """The frame that was rendered last (at the picture's size).
+    """The last rendered frame, at the picture's size.
 
-    `view`: with which camera and pose, None if it has no pose or the picture is not the camera's. `buffers`: what was
-    drawn of it, None if nothing was, because the scene shows no object. `model`: the real scene's, if it is given.
+    `view` holds its camera and pose; None without a pose, or if the picture is not the camera's. `buffers`
+    are its geometry buffers; None if the scene shows no object. `model` is the real scene's, if given.
     """
 
     frame: ViewFrame
@@ -65,16 +66,16 @@ class ShownFrame:
 
     @property
     def world_from_camera(self) -> Float64[np.ndarray, "4 4"] | None:
-        """The pose that the picture was made with."""
+        """The pose that the picture was rendered with."""
         return None if self.view is None else self.view.world_from_camera
 
     def pick(self, x: float, y: float, ignore: str | None = None) -> Pick:
-        """What the pixel around (x, y) shows; pixel centres are at integers.
+        """Returns what the pixel around (x, y) shows; pixel centres are at integers.
 
-        Where the object `ignore` (an id) is in front, what counts is the real scene behind it.
+        The object `ignore` (an id) is transparent to the pick.
 
         Raises:
-            DeltalightError: it lies outside of the picture, or the picture has no pose.
+            DeltalightError: the pixel lies outside of the picture, or the picture has no pose.
         """
         camera = self.frame.camera
         pixel = int(np.floor(x + 0.5)), int(np.floor(y + 0.5))
@@ -97,7 +98,7 @@ class ShownFrame:
         return Pick(self.frame.frame_id, kind, owner, point, normal / np.linalg.norm(normal), distance_m)
 
     def _look(self, view: CameraView, pixel: Pixel, ignore: str | None) -> tuple[str | None, Surface | None]:
-        """Id of the object in front, if there is one that counts, and the surface there."""
+        """Returns the id of the object in front, if it counts, and the surface there."""
         if self.buffers is None:
             return None, self._in_frame(view, pixel)
         owner = _object_in_front(self.buffers, pixel)
@@ -106,7 +107,7 @@ class ShownFrame:
         return owner, _surface_in_buffers(self.buffers, pixel, of_object=owner is not None)
 
     def _in_frame(self, view: CameraView, pixel: Pixel) -> Surface | None:
-        """The real scene where nothing was drawn: the given model, or the frame's own depth."""
+        """Returns the real surface without buffers: of the given model, or of the frame's own depth."""
         rotation = view.world_from_camera[:3, :3]
         ray = np.array([*view.camera.unproject(np.array([pixel], np.float64))[0], 1.0])
         if self.model:
@@ -122,7 +123,7 @@ class ShownFrame:
 
 
 def _object_in_front(shown: ShownBuffers, pixel: Pixel) -> str | None:
-    """Id of the virtual object that the pixel shows."""
+    """Returns the id of the virtual object that the pixel shows."""
     if read_texel(shown.object_coverage, pixel)[0] < SHOWN_SHARE:
         return None
     material = read_texel(shown.object_buffer.normal, _raster_texel(shown.view, pixel))[3]
@@ -130,7 +131,7 @@ def _object_in_front(shown: ShownBuffers, pixel: Pixel) -> str | None:
 
 
 def _surface_in_buffers(shown: ShownBuffers, pixel: Pixel, *, of_object: bool) -> Surface | None:
-    """Place and normal in one of the geometry buffers; None where the real surface is unknown."""
+    """Returns position and normal from one geometry buffer; None where the real surface is unknown."""
     texel = _raster_texel(shown.view, pixel) if of_object else pixel
     buffer = shown.object_buffer if of_object else shown.real_surface
     place = read_texel(buffer.position, texel).astype(np.float64)
@@ -140,7 +141,7 @@ def _surface_in_buffers(shown: ShownBuffers, pixel: Pixel, *, of_object: bool) -
 
 
 def _raster_texel(view: CameraView, pixel: Pixel) -> Pixel:
-    """Texel of the objects' raster that a pixel sees (passes/shaders/common/geometry.glsl)."""
+    """Returns the texel of the objects' raster that a pixel sees (passes/shaders/common/geometry.glsl)."""
     if view.antialiased or not view.camera.has_distortion:
         return pixel
     (fx, fy, cx, cy), _ = view.raster
@@ -149,6 +150,6 @@ def _raster_texel(view: CameraView, pixel: Pixel) -> Pixel:
 
 
 def _owner(objects: Sequence[PlacedObject], material: int) -> str:
-    """Id of the object that a material of the merged meshes belongs to: one a mesh, in the objects' order."""
+    """Returns the id of the object that a merged material (one per mesh, in order) belongs to."""
     ends = np.cumsum([len(item.meshes) for item in objects])
     return objects[int(np.searchsorted(ends, material, side="right"))].id

@@ -1,4 +1,4 @@
-"""The real scene's triangles: a mesh of the frame's depth, the fused surface of all frames, or a given model."""
+"""The real scene's triangles: meshed from the frame's depth, fused from all frames, or given as a model."""
 
 from pathlib import Path
 
@@ -20,9 +20,9 @@ from render_server.scene.triangle_mesh import TriangleMesh, merge_for_gpu
 from render_server.scene.tsdf_mesh import TsdfScene
 from render_server.view import CameraView
 
-COARSE_SHARE = 8  # of the triangles, for the coarse volume: its voxels are several times as large
-BOUND_POINTS = 4000  # points kept of a mesh to fit light views around it
-# Frames that are averaged while nothing moves: their noise is a quarter of one frame's. Then all stays as it is, so
+COARSE_SHARE = 8  # of the triangles go into the coarse volume: its voxels are several times larger
+BOUND_POINTS = 4000  # sampled from a mesh for fitting light views
+# Frames averaged while nothing moves: their noise is a quarter of one frame's. Then the average is frozen, so
 # that a scene at rest gives the same picture bit for bit.
 STILL_FRAMES = 16
 # A voxel's surface cuts the corner where two surfaces meet at a right angle, by up to sqrt(2) / 4 of its edge.
@@ -30,9 +30,10 @@ ROUNDED_VOXELS = 0.35
 
 
 class RealGeometry:
-    """Keeps the real scene until it moves (MotionDetector), then rebuilds it.
+    """Holds the real scene, and rebuilds it when it moves (MotionDetector).
 
-    `state` is another object whenever its triangles change, `scan` whenever something moved, the camera included.
+    `state` is a new object whenever the triangles change, `scan` whenever anything moved, the camera
+    included.
     """
 
     def __init__(self, gpu: GpuContext, real: RealScene, triangle_budget: int) -> None:
@@ -63,20 +64,20 @@ class RealGeometry:
 
     @property
     def has_unseen(self) -> bool:
-        """Whether there are surfaces that the camera may not see: of a model or from earlier frames."""
+        """Whether surfaces exist that the camera may not see: those of a model or of earlier frames."""
         return self.is_model or self._fused is not None
 
     @property
     def scan(self) -> Scan:
-        """What the camera measured when something last moved."""
+        """The camera's measurement from when something last moved."""
         if self._scan is None:
             self._scan = self._scanned()
         return self._scan
 
     def _scanned(self) -> Scan:
-        """Depth, its noise, and what the fused surface may differ from it. A model has no noise.
+        """Collects depth, its noise, and the tolerance of the fused surface. A model has no noise.
 
-        Three standard deviations of the noise are at least what voxels round off.
+        Three standard deviations of the noise cover at least what voxels round off.
         """
         depth = None if self.is_model or self.frame is None else self.frame.depth
         if depth is None:
@@ -90,10 +91,10 @@ class RealGeometry:
         return Scan(depth, self.surface, sigma, typical_depth, tolerance)
 
     def update(self, frame: ViewFrame, view: CameraView) -> bool:
-        """Takes the frame's geometry if something moved; returns whether it did.
+        """Updates the geometry from the frame if something moved; returns whether it did.
 
         Raises:
-            DeltalightError: the scene wants depth and the frame has none.
+            DeltalightError: the scene requires depth and the frame has none.
         """
         if not self.is_model and frame.depth is None:
             raise DeltalightError(
@@ -115,7 +116,7 @@ class RealGeometry:
         return changed
 
     def _fuse(self, fused: TsdfScene, frame: ViewFrame, view: CameraView, moved: bool) -> bool:
-        """Average a frame in, unless all stands still long enough; returns whether anything changed."""
+        """Integrates a frame unless the scene has been at rest for long; returns whether anything changed."""
         self._still_frames = 0 if moved else self._still_frames + 1
         if self._still_frames > STILL_FRAMES:
             return False
@@ -139,9 +140,10 @@ class RealGeometry:
         return moved or renewed
 
     def _follow_pose(self, fused: TsdfScene, view: CameraView) -> bool:
-        """Whether the fused surface must be put elsewhere for this frame, because its pose is off.
+        """Returns whether the fused surface must be aligned to this frame because its pose drifted.
 
-        The picture goes by the frame's pose; what its depth shows must lie where that pose puts it.
+        The picture is rendered with the frame's pose, so the surface must lie where that pose places the
+        frame's depth.
         """
         assert fused.view is not None
         before = self._world_from_fused
@@ -161,7 +163,7 @@ class RealGeometry:
     def _build_from_depth(
         self, depth: DepthImage, color: UInt8[np.ndarray, "h w 3"], view: CameraView
     ) -> None:
-        """Mesh the depth image, and once more with few triangles for what lies far from the objects."""
+        """Meshes the depth image, and a second time with few triangles for geometry far from the objects."""
         self.surface = depth_surface(depth, view.camera)
         grazing = grazing_depth_fill(depth, color, view.camera)
         place = view.world_from_camera
@@ -180,7 +182,7 @@ class RealGeometry:
         *,
         is_open: bool = False,
     ) -> None:
-        """Merge and upload."""
+        """Merges the meshes and uploads them."""
         merged = merge_for_gpu(meshes)
         self._buffers.write(merged)
         if self._materials is None:
@@ -195,14 +197,14 @@ class RealGeometry:
         )
 
     def release(self) -> None:
-        """Free the GL objects."""
+        """Frees the GL objects."""
         self._buffers.release()
         if self._materials is not None:
             self._materials.release()
 
 
 def _sample(positions: np.ndarray) -> Float64[np.ndarray, "n 3"]:
-    """At most BOUND_POINTS of the positions, and always those at the extremes of each axis."""
+    """Returns at most BOUND_POINTS of the positions, including the extremes of each axis."""
     stride = max(1, len(positions) // BOUND_POINTS)
     extremes = np.concatenate([positions.argmin(axis=0), positions.argmax(axis=0)])
     return np.concatenate([positions[::stride], positions[extremes]]).astype(np.float64)

@@ -1,4 +1,7 @@
-"""SceneRenderer: (frame, scene) -> composite. GPU only: no sockets, no files but the scene's assets, no clock."""
+"""SceneRenderer: (frame, scene) -> composite. GPU only.
+
+No sockets, no clock, no files except the scene's assets.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -25,9 +28,10 @@ from render_server.view import CameraView
 class CompositeFrame:
     """The finished picture of one frame.
 
-    `color` is camera-coded, `linear` the same in camera units (before the response). `lights` are plain values.
-    `camera` and `world_from_camera` are those that it was made with: while nothing moves, the pose stays that of the
-    frame that the real scene was built from. No pose: the frame has none, or the picture is no camera's.
+    `color` is camera-coded, `linear` the same in camera units (before the response). `lights` are plain
+    values. `camera` and `world_from_camera` are those that the picture was rendered with: while nothing
+    moves, the pose stays that of the frame that the real scene was built from. It is None if the frame has
+    none, or if the picture is not the camera's.
     """
 
     frame_id: int
@@ -43,9 +47,9 @@ class CompositeFrame:
 
 @dataclass(frozen=True)
 class PendingComposite:
-    """A frame that was handed to the GPU. Frames are finished in the order in which they were started.
+    """A frame in flight on the GPU. Frames finish in the order in which they were started.
 
-    `immediate`: nothing is gained by starting another frame first (software renders at once).
+    `immediate`: starting another frame first gains nothing (software renders synchronously).
     """
 
     finish: Callable[[], CompositeFrame]
@@ -79,25 +83,25 @@ class SceneRenderer:
         self.scene = scene
 
     def set_scene(self, scene: SceneDocument) -> None:
-        """Use another scene from the next frame on; on an error the old one stays.
+        """Switches to another scene from the next frame on; keeps the old one on error.
 
         Raises:
-            DeltalightError: the scene needs an asset that cannot be read, or more memory than its budget.
+            DeltalightError: an asset of the scene cannot be read, or the scene exceeds its memory budget.
         """
         self._live.set_scene(scene)
         self.scene = scene
 
     def begin_source(self) -> None:
-        """Forget all that earlier frames showed: the next ones come from elsewhere."""
+        """Forgets everything seen in earlier frames, because the next ones come from another source."""
         self._shown = self._sized = None
         self._live.begin_source()
 
     def render(self, frame: ViewFrame, *, with_linear: bool = False) -> CompositeFrame:
-        """The composite of one frame; without pose or visible object it is the camera's picture, byte for byte."""
+        """Renders one frame; without a pose or visible object, returns the camera's picture byte for byte."""
         return self.start(frame, with_linear=with_linear).finish()
 
     def start(self, frame: ViewFrame, *, with_linear: bool = False) -> PendingComposite:
-        """Hand a frame to the GPU; reading its picture back does not stall the frames after it."""
+        """Starts a frame on the GPU; reading its picture back does not stall later frames."""
         frame, self._shown = self.sized(frame), None
         if frame.pose is None:
             self._shown = ShownFrame(frame, None, None)
@@ -121,11 +125,11 @@ class SceneRenderer:
 
     @property
     def graph(self) -> Graph | None:
-        """The stages of the newest frame and what they made (`graph["cones"].mu`); None before the first."""
+        """The graph of the newest frame with its results (`graph["cones"].mu`); None before the first."""
         return None if self._live.graph is None else self._live.graph.graph
 
     def sized(self, frame: ViewFrame) -> ViewFrame:
-        """The frame at the composite's size; of the same frame the same one again."""
+        """Returns the frame at the composite's size; the same object for the same frame."""
         size = output_size(frame, self.scene.output)
         if size == (frame.camera.width, frame.camera.height):
             return frame
@@ -137,7 +141,7 @@ class SceneRenderer:
         return self._sized[1]
 
     def pick(self, x: float, y: float, ignore: str | None = None) -> Pick:
-        """What the newest picture shows at a pixel, seen through the object `ignore`.
+        """Picks what the newest picture shows at a pixel, looking through the object `ignore`.
 
         Raises:
             DeltalightError: there is no picture yet, it has no pose, or the pixel lies outside.
@@ -166,7 +170,7 @@ class SceneRenderer:
         return PendingComposite(finish, self._gpu.is_software)
 
     def release(self) -> None:
-        """Free all GL objects."""
+        """Frees all GL objects."""
         self._live.release()
         self._readback.release()
 
@@ -177,7 +181,7 @@ def _at_once(
     times: dict[str, float] | None = None,
     lights: list[dict[str, Any]] | None = None,
 ) -> PendingComposite:
-    """A picture that the GPU had no part in: the camera's own, or that of the lights."""
+    """Wraps a picture made without the GPU: the camera's own, or the view of the lights."""
     frame = shown.frame
     status = "no_pose" if frame.pose is None else "ok"
     pose = shown.world_from_camera
@@ -188,7 +192,7 @@ def _at_once(
 
 
 def output_size(frame: ViewFrame, output: Output) -> tuple[int, int]:
-    """Width and height of the composite; where the document gives one of them, the camera's proportions hold."""
+    """Returns width and height of the composite; a missing one follows from the camera's aspect ratio."""
     camera = frame.camera
     if output.width is None and output.height is None:
         return camera.width, camera.height
@@ -197,7 +201,7 @@ def output_size(frame: ViewFrame, output: Output) -> tuple[int, int]:
 
 
 def resized_frame(frame: ViewFrame, width: int, height: int) -> ViewFrame:
-    """The frame at another picture size: colour averaged over areas, depth taken from the nearest pixel."""
+    """Resizes a frame: colour averaged over areas, depth from the nearest pixel."""
     size = (width, height)
     camera = frame.camera.resized(width, height)
     depth = frame.depth

@@ -1,4 +1,4 @@
-"""The camera of one picture: matrices and lens as the passes need them."""
+"""The camera of one picture: matrices and lens, as the passes need them."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -31,10 +31,10 @@ class CameraBlock(Block):
 
 @dataclass(frozen=True, eq=False)
 class CameraView:
-    """Where and through which lens a picture was taken.
+    """Pose and lens of a picture.
 
-    `world_from_camera` is (4, 4), optical frame (+x right, +y down, +z forward). `antialiased`: the objects' geometry
-    buffer holds several samples of a pixel made into one, on the picture's own grid.
+    `world_from_camera` is (4, 4), optical frame (+x right, +y down, +z forward). `antialiased`: the objects'
+    geometry buffer is resolved from several samples per pixel, on the picture's own grid.
     """
 
     camera: CameraModel
@@ -52,12 +52,12 @@ class CameraView:
 
     @cached_property
     def with_antialiasing(self) -> "CameraView":
-        """The same view for stages that read an antialiased geometry buffer of the objects."""
+        """Returns the view for stages that read an antialiased geometry buffer of the objects."""
         return replace(self, antialiased=True)
 
     @cached_property
     def without_antialiasing(self) -> "CameraView":
-        """The same view for what rasters the objects or looks at such a raster through the lens."""
+        """Returns the view for passes that raster the objects, or sample such a raster through the lens."""
         return replace(self, antialiased=False)
 
     @property
@@ -77,9 +77,9 @@ class CameraView:
 
     @cached_property
     def raster(self) -> tuple[Float64[np.ndarray, "4"], tuple[int, int]]:
-        """Pinhole (fx, fy, cx, cy) and size that cover every ray of the lens; the camera's own without distortion.
+        """Pinhole (fx, fy, cx, cy) and size that cover every ray of the lens.
 
-        It is the camera's, grown by whole pixels: where the lens does not bend, each pixel's centre is a texel's.
+        The camera's own, grown by whole pixels: without distortion, each pixel centre is a texel centre.
         """
         matrix = self.camera.matrix
         own = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])
@@ -106,20 +106,20 @@ class CameraView:
         )
 
     def clip_from_camera_at(self, offset: tuple[float, float]) -> Float64[np.ndarray, "4 4"]:
-        """Projection of the raster pinhole whose texels show what is `offset` (x, y) pixels from their centres."""
+        """Returns the raster pinhole's projection, shifted by `offset` (x, y) pixels."""
         matrix = self.clip_from_camera.copy()
         matrix[:2, 2] -= 2.0 * np.array(offset) / self.raster[1]
         return matrix
 
     def rectangle_around(self, points: Float64[np.ndarray, "n 3"]) -> Rectangle:
-        """The pixels that can show the hull of world points.
+        """Returns the pixels that can show the convex hull of world points.
 
-        The whole picture if one of them lies behind the camera; none (0, 0) if all lie beside the picture.
+        The whole picture if any of them lies behind the camera, (0, 0) in size if all lie beside the picture.
         """
         seen = self._in_camera(points)
         if seen is None:
             return _rectangle(None, self.size)
-        # Far beside the picture a lens model may fold back into it.
+        # Far outside the picture a lens model may fold back into it.
         low, high = self._ray_bounds
         rays = np.clip(seen[:, :2] / seen[:, 2:], low, high)
         return _rectangle(self.camera.project(np.column_stack([rays, np.ones(len(rays))])), self.size)
@@ -131,19 +131,19 @@ class CameraView:
         return rays.min(axis=0) - margin, rays.max(axis=0) + margin
 
     def raster_rectangle_around(self, points: Float64[np.ndarray, "n 3"]) -> Rectangle:
-        """The same of the raster's texels."""
+        """Like `rectangle_around`, for the raster's texels."""
         seen = self._in_camera(points)
         (fx, fy, cx, cy), size = self.raster
         return _rectangle(seen[:, :2] / seen[:, 2:] * (fx, fy) + (cx, cy) if seen is not None else None, size)
 
     def _in_camera(self, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"] | None:
-        """World points in the optical frame, None if one of them lies behind the camera."""
+        """Returns world points in the optical frame; None if any of them lies behind the camera."""
         matrix = self.camera_from_world
         seen = points @ matrix[:3, :3].T + matrix[:3, 3]
         return None if (seen[:, 2] <= NEAR_M).any() else seen
 
     def block(self) -> CameraBlock:
-        """What shaders read of the camera."""
+        """Returns the camera's uniform block."""
         matrix = self.camera.matrix
         return CameraBlock(
             camera_from_world=self.camera_from_world,
@@ -157,7 +157,7 @@ class CameraView:
 
 
 def _rectangle(places: Float64[np.ndarray, "n 2"] | None, size: tuple[int, int]) -> Rectangle:
-    """Around places in a picture, with a margin; all of it if there are none or some are not finite."""
+    """Returns the rectangle around positions, with a margin; the whole picture if none is finite."""
     if places is None or not np.isfinite(places).all():
         return 0, 0, *size
     low = np.clip(np.floor(places.min(axis=0)) - RECTANGLE_MARGIN_PX, 0, size)

@@ -1,4 +1,4 @@
-"""The scene document's objects as one set of triangles in the world, animated ones at a frame's capture time."""
+"""The scene document's objects as one set of triangles in the world, animated to a frame's capture time."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -24,7 +24,7 @@ MARKER_FRAME = "marker:"
 
 
 class AnimatedObject:
-    """An object that plays a clip; `meshes` are in the pose that it advanced to, in the asset's frame."""
+    """An object that plays a clip; `meshes` are in its current pose, in the asset's frame."""
 
     def __init__(self, asset: GltfAsset, clip: Clip, animation: Animation) -> None:
         self.asset, self.animation = asset, animation
@@ -43,7 +43,7 @@ class AnimatedObject:
         return self.asset.bounds(self._clip)
 
     def advance_to(self, capture_ns: int) -> bool:
-        """Pose the meshes for a capture time; returns whether they changed."""
+        """Poses the meshes for a capture time; returns whether they changed."""
         time_s = self.animation.time_s(capture_ns, self._clip.duration_s)
         pose = self.asset.pose(self._clip, time_s)
         if pose.equals(self._pose):
@@ -54,10 +54,10 @@ class AnimatedObject:
 
 
 def clip_of(item: SceneObject, asset: GltfAsset | None) -> Clip | None:
-    """Return the clip that an object plays; None if it plays none.
+    """Returns the clip that an object plays; None if it plays none.
 
     Raises:
-        DeltalightError: it names a clip that its asset does not have.
+        DeltalightError: the object names a clip that its asset does not have.
     """
     playing = item.playing
     if playing is None:
@@ -74,7 +74,7 @@ def clip_of(item: SceneObject, asset: GltfAsset | None) -> Clip | None:
 
 
 class VirtualObjects:
-    """Loads assets once, moves them when the document or their clips do."""
+    """Loads assets once; moves them with the document and their clips."""
 
     def __init__(self, gpu: GpuContext) -> None:
         self._gpu = gpu
@@ -89,11 +89,11 @@ class VirtualObjects:
         self.state: GeometryState | None = None
 
     def load(self, objects: Sequence[SceneObject]) -> None:
-        """Read the assets of all visible objects now, so that a bad file is found before the first frame.
+        """Loads the assets of all visible objects, so that a bad file is reported before the first frame.
 
         Raises:
-            DeltalightError: an asset cannot be read, has not the clip that is wanted, or a material that this release
-                lacks.
+            DeltalightError: an asset cannot be read, lacks the requested clip, or uses a material that this
+                release does not support.
         """
         for item in objects:
             if item.visible:
@@ -108,7 +108,7 @@ class VirtualObjects:
                 )
 
     def _animated(self, item: SceneObject) -> AnimatedObject | None:
-        """The object as its clip moves it; None if it plays none."""
+        """Returns the object animated by its clip; None if it plays none."""
         asset = self._assets[item.asset].animated
         clip = clip_of(item, asset)
         if asset is None or clip is None or item.playing is None:
@@ -118,7 +118,7 @@ class VirtualObjects:
     def update(
         self, objects: Sequence[SceneObject], board: BoardSpec | None, capture_ns: int
     ) -> GeometryState | None:
-        """The visible objects' triangles as a frame of that capture time shows them; None if there are none."""
+        """Returns the visible objects' triangles at that capture time; None if there are none."""
         shown = tuple(item for item in objects if item.visible)
         is_new = shown != self._shown or board != self._board
         if is_new:
@@ -133,7 +133,7 @@ class VirtualObjects:
         return self.state
 
     def _build(self) -> GeometryState | None:
-        """Merge and upload; None if all has shrunk to a point."""
+        """Merges and uploads the triangles; returns None if all are degenerate."""
         objects = [self._described(item) for item in self._shown]
         each = [self._placed(item) for item in objects]
         merged = merge_for_gpu([mesh for meshes in each for mesh in meshes])
@@ -152,7 +152,7 @@ class VirtualObjects:
         )
 
     def _material_table(self, merged: GpuMesh) -> MaterialTable:
-        """The table on the GPU, filled anew only if the materials are others than before."""
+        """Returns the table on the GPU, rebuilt only if the materials changed."""
         before = self._materials
         if before is not None:
             same = len(before[0]) == len(merged.materials)
@@ -164,7 +164,7 @@ class VirtualObjects:
         return table
 
     def _described(self, item: SceneObject) -> PlacedObject:
-        """The object by itself, for what is precomputed of its asset."""
+        """Describes the object on its own, as precomputation needs it."""
         moving = self._moving.get(item.id)
         return PlacedObject(
             item.id,
@@ -175,7 +175,7 @@ class VirtualObjects:
         )
 
     def _given_material(self, item: SceneObject) -> Material | None:
-        """The document's material if it gives one; the same object for the same document."""
+        """Returns the document's material, if it gives one; the same object for the same document."""
         if not isinstance(item.material, MaterialDocument):
             return None
         if item.material not in self._given:
@@ -183,7 +183,7 @@ class VirtualObjects:
         return self._given[item.material]
 
     def _placed(self, item: PlacedObject) -> list[TriangleMesh]:
-        """An object's meshes in the world."""
+        """Returns an object's meshes in the world."""
         if item.id in self._standing:
             return self._standing[item.id]
         meshes = [mesh.transformed(item.world_from_asset) for mesh in item.meshes]
@@ -194,7 +194,7 @@ class VirtualObjects:
         return meshes
 
     def _swept(self, item: PlacedObject, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "k 3"]:
-        """Points that enclose the object at all times."""
+        """Returns points that enclose the object at all times."""
         if not item.moves:
             return points
         matrix = item.world_from_asset
@@ -202,19 +202,19 @@ class VirtualObjects:
         return np.asarray(corners @ matrix[:3, :3].T + matrix[:3, 3])
 
     def release(self) -> None:
-        """Free the GL objects."""
+        """Frees the GL objects."""
         self._buffers.release()
         if self._materials is not None:
             self._materials[1].release()
 
 
 def _materials(objects: Sequence[SceneObject]) -> set[MaterialDocument]:
-    """Materials that the document gives its objects."""
+    """Returns the materials that the document gives its objects."""
     return {item.material for item in objects if isinstance(item.material, MaterialDocument)}
 
 
 def world_from_frame(item: SceneObject, board: BoardSpec | None) -> Float64[np.ndarray, "4 4"]:
-    """Frame that an object's pose refers to: the world, or a marker of the board (origin at its top-left corner)."""
+    """Returns the frame of an object's pose: the world, or a board marker (origin at its top-left corner)."""
     matrix = np.eye(4)
     if not item.frame.startswith(MARKER_FRAME):
         return matrix
@@ -230,6 +230,6 @@ def world_from_frame(item: SceneObject, board: BoardSpec | None) -> Float64[np.n
 
 
 def _box_corners(bounds: np.ndarray) -> Float64[np.ndarray, "8 3"]:
-    """Eight corners of a box given as (least, greatest)."""
+    """Returns the eight corners of a box given as (least, greatest)."""
     picks = np.array([[(index >> axis) & 1 for axis in range(3)] for index in range(8)])
     return np.asarray(np.asarray(bounds, np.float64)[picks, np.arange(3)])

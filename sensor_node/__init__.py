@@ -1,1 +1,1 @@
-"""Capture: cameras, depth clean-up, marker pose and the loop of a sensor node."""
+"""Capture: cameras, depth clean-up, marker poses, and the loop of a sensor node."""

@@ -1,4 +1,4 @@
-"""What a node tells the local network about itself: DNS service discovery over multicast (RFC 6762, RFC 6763)."""
+"""Announcement of a node on the local network: DNS service discovery over multicast (RFC 6762, RFC 6763)."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -54,15 +54,15 @@ def announced(
     *,
     interfaces: Sequence[str] | None = None,
 ) -> Iterator[None]:
-    """Announce a node while inside; one that only this host can reach is not announced.
+    """Announce a node for the duration of the context; a node that only this host can reach is not announced.
 
     Args:
         name: of the node.
-        endpoint: where it publishes, with the port that it got.
+        endpoint: where it publishes, with its actual port.
         streams: what it publishes.
         keys: that it uses there, None = none.
-        interfaces: addresses of this host to announce, and to announce on, also where they are loopback; None =
-            those that the endpoint is bound to.
+        interfaces: addresses of this host to announce, and to announce on, even if they are loopback; None = those
+            that the endpoint is bound to.
     """
     parts = parse_endpoint(endpoint)
     addresses = list(interfaces) if interfaces is not None else _addresses(parts)
@@ -85,14 +85,14 @@ def announced(
 
 
 def _addresses(endpoint: Endpoint) -> list[str]:
-    """Addresses by which other hosts reach an endpoint that is bound; none where they do not."""
+    """Return the addresses by which other hosts reach a bound endpoint; none if they cannot."""
     if endpoint.host is None or not endpoint.leaves_host:
         return []
     return _own_addresses() if endpoint.host in EVERY_ADDRESS else [endpoint.host]
 
 
 def _own_addresses() -> list[str]:
-    """IPv4 addresses of this host but loopback."""
+    """Return the IPv4 addresses of this host except loopback."""
     import ifaddr
 
     ips = [str(ip.ip) for adapter in ifaddr.get_adapters() for ip in adapter.ips if ip.is_IPv4]

@@ -1,4 +1,4 @@
-"""A thread that reads a camera into one slot, and one that follows the render server's clock."""
+"""Threads of a node: one reads a camera into a slot, one tracks the render server's clock."""
 
 import queue
 import threading
@@ -18,14 +18,14 @@ POLL_S = 0.1
 CLOCK_PERIOD_S = 2.0
 CLOCK_TIMEOUT_S = 0.5
 CLOCK_ROUNDS = 4
-# Against the monotonic clock, between two looks: less than a frame, more than slewing (500 ppm) does in 30 s.
+# Against the monotonic clock, between two checks: less than a frame, more than slewing (500 ppm) in 30 s.
 CLOCK_JUMP_NS = 15_000_000
 REMARK_S = 10.0
 
 
 @dataclass(frozen=True)
 class CapturedFrame:
-    """A frame and when it was captured, in ns since 1970 by this host's clock."""
+    """A frame and its capture time, in ns since 1970 by this host's clock."""
 
     frame: SensorFrame
     capture_ns: int
@@ -34,8 +34,8 @@ class CapturedFrame:
 class CaptureThread:
     """Reads an open camera into one slot: a newer frame replaces one that nobody took, and `drops` counts it.
 
-    With `keep_all` the camera waits instead. `error` is what ended capture, if anything did but the camera's
-    end or `close`.
+    With `keep_all` the camera waits instead. `error` is the exception that ended capture, except the camera's end or
+    `close`.
     """
 
     def __init__(self, camera: Camera, *, keep_all: bool) -> None:
@@ -47,7 +47,7 @@ class CaptureThread:
         self._thread = threading.Thread(target=self._run, name="capture", daemon=True)
 
     def __enter__(self) -> Self:
-        """Begin to read."""
+        """Start reading."""
         self._thread.start()
         return self
 
@@ -65,7 +65,7 @@ class CaptureThread:
         return not self._thread.is_alive() and self._slot.empty()
 
     def take(self, timeout_s: float) -> CapturedFrame | None:
-        """Return the newest frame, or None if there is none in time."""
+        """Take the newest frame; None if there is none in time."""
         try:
             return self._slot.get(timeout=timeout_s)
         except queue.Empty:
@@ -78,7 +78,7 @@ class CaptureThread:
                 self._put(CapturedFrame(frame, self._camera.capture_ns))
         except EndOfStream:
             pass
-        except Exception as error:  # whoever waits for frames raises it
+        except Exception as error:  # raised by whoever waits for frames
             self.error = error
 
     def _put(self, captured: CapturedFrame) -> None:
@@ -92,15 +92,15 @@ class CaptureThread:
 
 
 class ServerClock:
-    """Follows the clock of a render server in a thread; without an endpoint there is nothing to follow.
+    """Tracks the clock of a render server in a thread; does nothing without an endpoint.
 
-    A clock that is set is noticed: this host's at the next `at`, the server's at the next comparison. Then what was
-    measured before is void.
+    It detects when a clock is set: this host's at the next `at`, the server's at the next comparison. Earlier
+    measurements are then discarded.
 
     Args:
         node: name that the requests carry.
         endpoint: control endpoint of the server.
-        keys: needed where the endpoint leaves the host.
+        keys: required if the endpoint leaves the host.
         now: this host's clock, ns since 1970.
     """
 
@@ -124,7 +124,7 @@ class ServerClock:
 
     @property
     def remark(self) -> str:
-        """A sentence about a clock that was set lately, else nothing."""
+        """Return a sentence about a clock that was set recently, else nothing."""
         with self._lock:
             return self._remark if time.monotonic() < self._remark_until_s else ""
 
@@ -137,7 +137,7 @@ class ServerClock:
             self._client.close()
 
     def _check_own_clock(self) -> bool:
-        """Whether this host's clock was set since the last look; then nothing measured before holds."""
+        """Whether this host's clock was set since the last check, which invalidates earlier measurements."""
         wall_ns = self._now() - time.monotonic_ns()
         jump_ns, self._wall_ns = wall_ns - self._wall_ns, wall_ns
         if abs(jump_ns) < CLOCK_JUMP_NS or self._client is None:
@@ -161,7 +161,7 @@ class ServerClock:
                 return
             try:
                 sample = measure_offset(exchange, CLOCK_ROUNDS, self._now)
-            except DeltalightError:  # no server yet; meanwhile the bound of what was measured grows
+            except DeltalightError:  # no server yet; meanwhile the bound of earlier measurements grows
                 self._closing.wait(POLL_S)
                 continue
             with self._lock:

@@ -1,5 +1,7 @@
-"""Depth clean-up (docs/method.md 2): validity, smoothing guided by colour, small holes filled,
-rims at depth edges given a surface by colour, large holes left.
+"""Depth clean-up (docs/method.md 2).
+
+Validity, smoothing guided by colour, filling of small holes, and assignment of the rims at depth edges to a surface
+by colour; large holes stay.
 """
 
 import cv2
@@ -16,7 +18,7 @@ from sensor_node.depth_filter import NoiseModel, SmoothedDepth, smooth_inverse_d
 # A normal variable's standard deviation is this multiple of its median absolute deviation.
 SIGMA_PER_MAD = 1.4826
 NOISE_FIT_RADIUS_PX = 5
-# Sensors that store depth in steps cannot be more exact than this; keeps noise-free depth filterable.
+# Sensors that store depth in steps cannot be more exact; keeps noise-free depth filterable.
 LEAST_NOISE_SIGMA_M = 1e-4
 UNKNOWN_NOISE_SIGMA_M = 0.0025
 LEAST_NOISE_SAMPLES = 500
@@ -71,10 +73,10 @@ class DepthSettings(StrictModel):
 def clean_depth(
     depth: DepthImage, color: UInt8[np.ndarray, "h w 3"], settings: DepthSettings | None = None
 ) -> DepthImage:
-    """Return smoothed depth with small holes filled and depth edges completed; `color` (RGB) guides all.
+    """Return smoothed depth with small holes filled and depth edges completed, guided by `color` (RGB).
 
-    Known pixels move only where a smooth surface explains them: at depth steps larger than
-    `edge_sigmas` standard deviations they stay as measured. Depth 0 is unknown, never near.
+    Known pixels move only if a smooth surface explains them: at depth steps larger than `edge_sigmas` standard
+    deviations they stay as measured. Depth 0 is unknown, never near.
 
     Raises:
         DeltalightError: depth and colour differ in size (register depth first).
@@ -120,10 +122,10 @@ def clean_depth(
 
 
 def estimate_noise_sigma(depth: DepthImage) -> float:
-    """Measure the depth noise at 1 m, in metres: scaled MAD of the residuals of local plane fits.
+    """Estimate the depth noise at 1 m, in metres: scaled MAD of the residuals of local plane fits.
 
-    Fits run on inverse depth, where noise that grows with z^2 is constant. Only windows without holes or
-    edges count; where too few are left a typical sensor's value is returned.
+    Fits run on inverse depth, where noise that grows with z^2 is constant. Only windows without holes or edges count;
+    if too few are left, a typical sensor's value is returned.
     """
     valid = known_pixels(depth)
     inverse = _inverse(depth.depth_m, valid)
@@ -158,9 +160,9 @@ def _inverse(
 def _fillable(
     valid: Bool[np.ndarray, "h w"], smoothed: SmoothedDepth, noise: NoiseModel, settings: DepthSettings
 ) -> Bool[np.ndarray, "h w"]:
-    """Pixels of small holes about which the windows agree.
+    """Return the pixels of small holes about which the windows agree.
 
-    Where surfaces of different depth reach a hole it stays open rather than being bridged in mid-air.
+    If surfaces of different depth reach a hole it stays open rather than being bridged in mid-air.
     """
     filled = np.zeros(valid.shape, bool)
     rows, columns = _small_holes(valid, settings.fill_area_px)
@@ -174,7 +176,7 @@ def _fillable(
 def _small_holes(
     valid: Bool[np.ndarray, "h w"], area_px: int
 ) -> tuple[Int64[np.ndarray, " n"], Int64[np.ndarray, " n"]]:
-    """Rows and columns of the unknown pixels whose connected area is at most `area_px`."""
+    """Return rows and columns of the unknown pixels whose connected area is at most `area_px`."""
     _, labels, stats, _ = cv2.connectedComponentsWithStats((~valid).view(np.uint8), connectivity=4)
     places = np.flatnonzero(~valid)
     areas = stats[labels.ravel()[places], cv2.CC_STAT_AREA]

@@ -1,12 +1,12 @@
-"""Unknown depth along depth edges gets one of the surfaces beside it, by colour.
+"""Completion of unknown depth along depth edges: a surface beside each pixel, selected by colour.
 
-Stereo leaves a rim without depth around near things: its matching windows straddle the edge, and the second
-camera does not see all that the first one does. The colour picture still shows which surface a pixel of the
-rim belongs to. Each such pixel looks at known samples around it, parts them into a nearer and a farther
-surface, extends a plane of each to itself and takes the one whose colours match it clearly better. The vote
-is shared with neighbours of similar colour, so that the rim comes out smooth. Pixels that see one surface
-only, or match both or neither, stay unknown. So do those that resemble other unknown pixels much more than
-either surface: they show a third one, too steep to be measured, as the top of a box seen along it.
+Stereo leaves a rim without depth around near things: its matching windows straddle the edge, and the second camera
+does not see all that the first one does. The colour picture still shows which surface a pixel of the rim belongs to.
+For each such pixel, known samples around it are split into a nearer and a farther surface, a plane of each is
+extended to the pixel, and the one whose colours match clearly better wins. The vote is shared with neighbours of
+similar colour, so that the rim becomes smooth. Pixels that see only one surface, or match both or neither, stay
+unknown. So do those that resemble other unknown pixels much more than either surface: they show a third one, too
+steep to be measured, such as the top of a box seen along it.
 """
 
 from collections.abc import Iterator
@@ -21,39 +21,39 @@ from sensor_node.depth_filter import NoiseModel
 Samples = Float32[np.ndarray, "samples n"]
 PerPixel = Float32[np.ndarray, " n"]
 
-# Directions and distances of the samples: on a spiral, as many in each doubling of the distance, so that near
-# ones say most and far ones are still found. The golden angle spreads them over all directions.
+# Directions and distances of the samples: on a spiral, equally many per doubling of the distance, so that near ones
+# dominate and far ones are still found. The golden angle spreads them over all directions.
 SAMPLE_COUNT = 64
 GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
-# A pixel of a rim beside one surface has the other one farther off, behind the shadow of the occlusion.
+# A rim pixel beside one surface is farther from the other, which lies beyond the occlusion's shadow.
 SIGHT_PER_REACH = 4.0
-# Samples of either surface that make a plane.
+# Samples of either surface that determine a plane.
 LEAST_SAMPLES = 3
-# Rounds after which the mean of both means hardly moves where there are two surfaces.
+# After these iterations the mean of both means hardly moves if there are two surfaces.
 SPLIT_ROUNDS = 2
-# Keeps a plane through samples in a row solvable; square pixels.
+# Keeps a plane through collinear samples solvable; square pixels.
 SLOPE_RIDGE_PX2 = 1.0
-# Share of the step between two planes below which their samples must lie beside them, else there are not two.
+# Fraction of the step between two planes within which their samples must lie; otherwise there are not two.
 STRAY_SHARE = 0.25
 # A surface must match this much better than the other: odds of 4 to 1.
 CLEAR_LOG_ODDS = float(np.log(4.0))
-# No pixel's own colour counts for more than this in the vote, so that one stray pixel does not turn it.
+# Limits the vote of a pixel's own colour, so that one stray pixel does not decide it.
 MOST_LOG_ODDS = 3 * CLEAR_LOG_ODDS
-# Match of a colour that no surface around has (ten times the contrast away): it speaks for neither.
+# Match of a colour that no surface around has (ten times the contrast away): it favours neither.
 ALIEN_MATCH = 1e-4
-# Unknown pixels are the nearest to an unknown one, so they resemble it most in any case: a third surface takes twice
+# Unknown pixels are nearest to an unknown one, so they resemble it most in any case: a third surface requires twice
 # the evidence (logarithms add) that decides between two.
 OWN_ODDS = 4.0**2
-# Lines thinner than this are edges, where colours mix to one of their own.
+# Thinner lines are edges, where colours mix to one of their own.
 OWN_WIDTH_PX = 3
 VOTE_RADIUS_PX = 2
-# Pixels worked on at a time: what they need stays in the processor's cache.
+# Pixels processed at a time, so that their data stays in the processor's cache.
 CHUNK = 2048
 EMPTY = 1e-9
 
 
 class _Offsets(NamedTuple):
-    """Where the samples of a pixel are, relative to it, in pixels, and their weights."""
+    """Positions of a pixel's samples relative to it, in pixels, and their weights."""
 
     x: Float32[np.ndarray, " samples"]
     y: Float32[np.ndarray, " samples"]
@@ -61,7 +61,7 @@ class _Offsets(NamedTuple):
 
 
 class _Padded(NamedTuple):
-    """Inverse depth (0 = unknown) and colour, flat, with a margin so that no look-up leaves them."""
+    """Inverse depth (0 = unknown) and colour, flat, padded so that no look-up leaves them."""
 
     inverse_depth: Float32[np.ndarray, " padded"]
     color: Float32[np.ndarray, "padded 4"]
@@ -69,7 +69,7 @@ class _Padded(NamedTuple):
 
 
 class _Surfaces(NamedTuple):
-    """Pixels that see two surfaces: flat places in the padded picture, both surfaces continued there (1/m)."""
+    """Pixels that see two surfaces: flat positions in the padded picture, both surfaces extended there (1/m)."""
 
     places: Int64[np.ndarray, " n"]
     near: PerPixel
@@ -77,7 +77,7 @@ class _Surfaces(NamedTuple):
     log_odds: PerPixel
     """For the nearer surface, by colour."""
     own: Bool[np.ndarray, " n"]
-    """Whether the colour is that of unknown pixels around and of neither surface."""
+    """Whether the colour is that of unknown pixels around, and of neither surface."""
 
 
 def assign_edges(
@@ -90,15 +90,15 @@ def assign_edges(
     contrast: float,
     reach_px: int,
 ) -> tuple[Float32[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """Return inverse depth and mask with the clear pixels along depth edges added; known ones stay as given.
+    """Return inverse depth and mask with the clear pixels along depth edges added; known ones stay unchanged.
 
     Args:
-        inverse_depth: 1/m; whatever where not known.
+        inverse_depth: 1/m; anything where not known.
         known: which pixels are known.
         color: RGB picture as coded, 0..255.
         noise: of the depth.
         sigmas: surfaces that differ by less than this many standard deviations of the noise are one.
-        contrast: difference of colour, 0..1, that tells surfaces apart.
+        contrast: difference of colour, 0..1, that distinguishes surfaces.
         reach_px: pixels farther than this from known ones of their surface stay unknown; at least 1.
     """
     offsets = _spiral(reach_px)
@@ -116,7 +116,7 @@ def assign_edges(
 
 
 def _without_own(picture: _Padded, seen: _Surfaces) -> _Surfaces:
-    """Drop the pixels of areas in a colour of their own; where such pixels make but a thin line, they stay."""
+    """Drop the pixels of areas in a colour of their own, unless such pixels form only a thin line."""
     own = np.zeros(len(picture.inverse_depth), np.uint8)
     own[seen.places] = seen.own
     window = np.ones((OWN_WIDTH_PX,) * 2, np.uint8)
@@ -128,8 +128,8 @@ def _without_own(picture: _Padded, seen: _Surfaces) -> _Surfaces:
 def _assign(picture: _Padded, seen: _Surfaces, reach_px: int) -> None:
     """Write the decided pixels into the picture: the clear ones, then those between both surfaces.
 
-    A pixel with both surfaces beside it is on the edge itself, where colours mix: there the likelier will do,
-    as at most that pixel is wrong.
+    A pixel with both surfaces beside it is on the edge itself, where colours mix: the likelier surface is good enough
+    there, as at most that pixel is wrong.
     """
     log_odds = _voted(picture, seen)
     value = np.where(log_odds > 0, seen.near, seen.far)
@@ -147,8 +147,8 @@ def _grow(
 ) -> None:
     """Write pixels that touch their own surface (depth within `near_by`), then those that touch these.
 
-    Spots that only have the colour of a surface but no connection to it stay unknown, and no pixel is farther
-    than the reach from known ones of the surface that it gets.
+    Spots with the colour of a surface but no connection to it stay unknown, and no pixel is farther than the reach
+    from known ones of its surface.
     """
     for _ in range(reach_px):
         beside = picture.inverse_depth[places + _square(picture.stride, 1)]
@@ -158,13 +158,13 @@ def _grow(
 
 
 def _rim(known: Bool[np.ndarray, "h w"], reach_px: int) -> Int64[np.ndarray, " n"]:
-    """Flat places of the unknown pixels within reach of known ones."""
+    """Return flat positions of the unknown pixels within reach of known ones."""
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach_px + 1,) * 2)
     return np.flatnonzero(cv2.dilate(known.view(np.uint8), disc).view(bool) & ~known)
 
 
 def _spiral(reach_px: int) -> _Offsets:
-    """Samples from one pixel off to the end of sight; each weighs as its distance's inverse."""
+    """Return samples from one pixel away to the end of sight, weighted by inverse distance."""
     step = np.arange(SAMPLE_COUNT)
     radius = (SIGHT_PER_REACH * reach_px) ** (step / (SAMPLE_COUNT - 1))
     x, y = (np.rint(radius * f(GOLDEN_ANGLE * step)) for f in (np.cos, np.sin))
@@ -175,7 +175,7 @@ def _spiral(reach_px: int) -> _Offsets:
 def _pad(
     inverse_depth: Float32[np.ndarray, "h w"], color: UInt8[np.ndarray, "h w 3"], margin: int, contrast: float
 ) -> _Padded:
-    """Colour comes in units of the contrast, so that a distance of 1 is one contrast."""
+    """Pad the picture; colour is in units of the contrast, so that a distance of 1 is one contrast."""
     padded = cv2.copyMakeBorder(inverse_depth, *(margin,) * 4, cv2.BORDER_CONSTANT)
     four = cv2.cvtColor(np.ascontiguousarray(color), cv2.COLOR_RGB2RGBA)
     colors = cv2.copyMakeBorder(four, *(margin,) * 4, cv2.BORDER_REPLICATE).astype(np.float32)
@@ -191,7 +191,7 @@ def _chunks(places: Int64[np.ndarray, " n"]) -> Iterator[Int64[np.ndarray, " m"]
 def _seen(
     picture: _Padded, places: Int64[np.ndarray, " n"], offsets: _Offsets, noise: NoiseModel, sigmas: float
 ) -> _Surfaces:
-    """Part the samples around pixels into two surfaces and compare colours; pixels without two drop out."""
+    """Split the samples around pixels into two surfaces and compare colours; drop pixels without two."""
     shifts = (offsets.y * picture.stride + offsets.x).astype(np.int64)[:, None]
     samples = picture.inverse_depth.take(places + shifts)
     split = _split(samples, offsets.weight)
@@ -213,7 +213,7 @@ def _seen(
 
 
 def _split(samples: Samples, weight: Float32[np.ndarray, " samples"]) -> PerPixel:
-    """Inverse depth between nearer and farther samples: the mean of both means, from half-way on."""
+    """Return the inverse depth between nearer and farther samples: the mean of both means, starting half-way."""
     known = (samples > 0).astype(np.float32)
     least = np.where(samples > 0, samples, np.float32(np.inf)).min(axis=0)
     most = samples.max(axis=0)
@@ -225,12 +225,12 @@ def _split(samples: Samples, weight: Float32[np.ndarray, " samples"]) -> PerPixe
 
 
 def _mean(values: Samples, taken: Samples, weight: Float32[np.ndarray, " samples"]) -> PerPixel:
-    """Weighted mean of the values taken (0..1 each); 0 of none."""
+    """Return the weighted mean of the values taken (0..1 each); 0 of none."""
     return np.asarray((weight @ (values * taken)) / np.maximum(weight @ taken, EMPTY))
 
 
 def _continued(values: Samples, taken: Samples, offsets: _Offsets) -> tuple[PerPixel, PerPixel]:
-    """Value at the pixel of the plane through the samples taken, and how far those stray from it (rms)."""
+    """Return the value at the pixel of the plane through the samples taken, and their rms distance from it."""
     x, y, weight = offsets
     linear = np.stack([np.ones_like(x), x, y])
     total, sum_x, sum_y, sum_xx, sum_xy, sum_yy = (
@@ -255,7 +255,7 @@ def _match(
     around: Int64[np.ndarray, "samples n"],
     places: Int64[np.ndarray, " n"],
 ) -> Samples:
-    """How alike the colours are: 1 the same, 1/4 one contrast apart.
+    """Return the similarity of colours: 1 the same, 1/4 one contrast apart.
 
     The long tail still tells which of two colours a mixture of them, far from both, is closer to.
     """
@@ -265,7 +265,7 @@ def _match(
 
 
 def _voted(picture: _Padded, seen: _Surfaces) -> PerPixel:
-    """Mean log odds of a pixel and of its unknown neighbours of similar colour."""
+    """Return the mean log odds of a pixel and its unknown neighbours of similar colour."""
     log_odds, votes = np.zeros((2, len(picture.inverse_depth)), np.float32)
     log_odds[seen.places] = np.clip(seen.log_odds, -MOST_LOG_ODDS, MOST_LOG_ODDS)
     votes[seen.places] = 1
@@ -279,6 +279,6 @@ def _voted(picture: _Padded, seen: _Surfaces) -> PerPixel:
 
 
 def _square(stride: int, radius_px: int) -> Int64[np.ndarray, "pixels 1"]:
-    """Shifts to the pixels of a square around one in the flat picture."""
+    """Return the shifts to the pixels of a square around one in the flat picture."""
     y, x = np.mgrid[-radius_px : radius_px + 1, -radius_px : radius_px + 1]
     return np.asarray((y * stride + x).reshape(-1, 1), np.int64)

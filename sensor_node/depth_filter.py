@@ -1,11 +1,11 @@
 """Edge-preserving smoothing of inverse depth with the colour image as guide; pixels may be unknown.
 
-Works on inverse depth because there planes are linear in pixel coordinates and the noise of stereo and
-structured light, sigma(z) = s z^2, becomes the constant s. In every window the model `a x + b y + d I + c`
-(I: colour guide, as in the guided image filter, He, Sun & Tang 2013; x, y keep slopes out of the colour term)
-is fitted to the known pixels only, and each pixel averages the windows that hold it, weighted by how well
-they fit: windows across a depth step that colour does not explain drop out, so the step stays sharp. Fits run
-on cells of 2x2 pixels (as the fast guided filter, He & Sun 2015).
+Works on inverse depth because there planes are linear in pixel coordinates and the noise of stereo and structured
+light, sigma(z) = s z^2, becomes the constant s. In every window the model `a x + b y + d I + c` (I: colour guide, as
+in the guided image filter, He, Sun & Tang 2013; x, y keep slopes out of the colour term) is fitted to the known
+pixels only, and each pixel averages the windows that contain it, weighted by how well they fit: windows across a
+depth step that colour does not explain drop out, so the step stays sharp. Fits run on cells of 2x2 pixels (as the
+fast guided filter, He & Sun 2015).
 """
 
 from dataclasses import dataclass
@@ -35,7 +35,7 @@ class NoiseModel(NamedTuple):
 
 @dataclass(frozen=True)
 class _Cells:
-    """Cells of 2x2 pixels: number of known pixels, mean inverse depth, mean guide, place."""
+    """Cells of 2x2 pixels: number of known pixels, mean inverse depth, mean guide, position."""
 
     count: Grid
     depth: Grid
@@ -46,7 +46,7 @@ class _Cells:
 
 @dataclass(frozen=True)
 class _Fits:
-    """One local model a window: slope_x x + slope_y y + level + gain (I - tone), x and y in cells.
+    """One local model per window: slope_x x + slope_y y + level + gain (I - tone), x and y in cells.
 
     `level` and `count` (known pixels) come with `variance`, what the model leaves unexplained.
     """
@@ -90,7 +90,7 @@ class SmoothedDepth:
     def spread(
         self, rows: Int64[np.ndarray, " n"], columns: Int64[np.ndarray, " n"]
     ) -> Float32[np.ndarray, " n"]:
-        """Return the standard deviation of what nine windows that hold a pixel say about it, in 1/m.
+        """Return the standard deviation between nine windows that contain a pixel, in 1/m.
 
         Large where surfaces of different depth reach the pixel.
         """
@@ -126,10 +126,10 @@ def smooth_inverse_depth(
     """Fit local models to inverse depth and evaluate them at every pixel.
 
     Args:
-        inverse_depth: 1/m; whatever where not valid.
+        inverse_depth: 1/m; anything where not valid.
         valid: which pixels are known.
         guide: grey picture, 0..1.
-        noise: windows that miss the known pixels by more lose their weight.
+        noise: windows with larger residuals at the known pixels lose their weight.
         radius_px: half the edge of the windows in pixels, at least 2.
         guide_contrast: contrast of the guide (standard deviation in a window) below which it counts little.
     """
@@ -148,7 +148,7 @@ def smooth_inverse_depth(
 
 
 def _quarters(image: Float32[np.ndarray, "h w"]) -> list[Grid]:
-    """Views of the four pixels of every cell: top-left, top-right, bottom-left, bottom-right."""
+    """Return views of the four pixels of every cell: top-left, top-right, bottom-left, bottom-right."""
     return [image[row::2, column::2] for row in (0, 1) for column in (0, 1)]
 
 
@@ -178,7 +178,7 @@ def _window_sum(image: Grid, size: int) -> Grid:
 
 
 def _depth_variance(cells: _Cells, size: int) -> Grid:
-    """Variance of the inverse depth in every window; in double precision, as means cancel."""
+    """Return the variance of the inverse depth in every window; in double precision, because means cancel."""
     count, depth = cells.count.astype(np.float64), cells.depth.astype(np.float64)
     weighted: Float64[np.ndarray, "rows columns"] = count * depth
     total = np.maximum(_window_sum(count, size), EMPTY)
@@ -187,7 +187,7 @@ def _depth_variance(cells: _Cells, size: int) -> Grid:
 
 
 def _fit_windows(cells: _Cells, size: int, ridge: float) -> _Fits:
-    """Weighted least squares of depth on (x, y, guide) in every window, by elimination of the 3x3 system."""
+    """Fit depth on (x, y, guide) in every window by weighted least squares: elimination of the 3x3 system."""
     count = _window_sum(cells.count, size)
     share = 1 / np.maximum(count, EMPTY)
 

@@ -7,7 +7,7 @@ from protocol.camera_model import CameraModel
 from protocol.frames import DepthImage
 from sensor_node.depth import known_pixels
 
-# Pixels are taken a little larger than they are: lenses and slopes stretch some.
+# Pixels are enlarged a little, because lenses and slopes stretch some.
 FOOTPRINT_MARGIN = 1.2
 # A pixel this much larger in the colour picture would mean a calibration in the wrong unit.
 MAX_FOOTPRINT_PX = 8
@@ -18,8 +18,8 @@ def register_depth(
 ) -> DepthImage:
     """Return the depth as the colour camera would see it; unknown where no depth pixel lands.
 
-    Every known pixel is a square that keeps its size under projection (so that a colour camera of higher
-    resolution gets no pinholes); where several land on one colour pixel the nearest counts.
+    Every known pixel is a square that keeps its size under projection (so that a colour camera of higher resolution
+    gets no pinholes); if several land on one colour pixel the nearest counts.
 
     Args:
         depth: depth along the axis of its own camera.

@@ -23,7 +23,7 @@ from protocol.messages import (
     RadianceMessage,
 )
 
-# Depth that does not come in steps is sent in this step times the least power of two that its range fits.
+# Depth without a step of its own is sent in this step times the least power of two that fits its range.
 FINEST_DEPTH_STEP_M = 0.0001
 DEPTH_STEPS = 65535
 
@@ -41,7 +41,7 @@ class Stamps(TypedDict):
 def depth_multipart(
     depth: DepthImage, stamps: Stamps, stream: Literal["depth", "clean_depth"], step_m: float | None = None
 ) -> list[bytes]:
-    """Return the depth message; `step_m` is the step it is stored in, None = as fine as its range allows."""
+    """Return the depth message; `step_m` is the step of the stored depth, None = as fine as its range allows."""
     step_m = step_m or fitting_step_m(depth)
     height, width = depth.depth_m.shape
     message = DepthMessage(
@@ -64,7 +64,7 @@ def fitting_step_m(depth: DepthImage) -> float:
 
 
 def pose_multipart(pose: BoardPose | None, board: BoardSpec | None, stamps: Stamps) -> list[bytes]:
-    """Return the pose message, which says so where no pose is known."""
+    """Return the pose message, which states if no pose is known."""
     described = None if board is None else board.model_dump(mode="json", exclude_none=True)
     if pose is None:
         return encode(PoseMessage(**stamps, status="no_board", board=described))
@@ -82,7 +82,7 @@ def pose_multipart(pose: BoardPose | None, board: BoardSpec | None, stamps: Stam
 def color_multipart(
     frame: SensorFrame, stamps: Stamps, encoding: Literal["jpeg", "raw"], jpeg_quality: int
 ) -> list[bytes]:
-    """Return the colour message; JPEG bytes that the frame came with go out as they are."""
+    """Return the colour message; JPEG bytes of the frame are sent unchanged."""
     recorded = frame.color_jpeg if encoding == "jpeg" else None
     picture = recorded or encode_color(frame.color, encoding, jpeg_quality)
     height, width = frame.color.shape[:2]
@@ -100,7 +100,7 @@ def color_multipart(
 def fisheye_multipart(
     fisheye: FisheyePictures, stamps: Stamps, encoding: Literal["jpeg", "raw"], jpeg_quality: int
 ) -> list[bytes]:
-    """Return the message of fish-eye pictures; linear ones go out raw. The stamps are those of their own capture.
+    """Return the message of fish-eye pictures; linear ones are sent raw. The stamps are those of their own capture.
 
     Raises:
         EnvelopeError: the pictures differ in size or kind.
@@ -131,8 +131,8 @@ def fisheye_multipart(
 def radiance_multipart(radiance: RadianceMap, stamps: Stamps, jpeg_quality: int) -> list[bytes]:
     """Return the message of a radiance map.
 
-    The stamps are those of the first frame that it holds for, also when it is sent again for those who came late:
-    by them a receiver knows that it has the map already.
+    The stamps are those of the map's first frame, even when it is repeated for late subscribers: by them a receiver
+    recognises a map that it already has.
     """
     camera, response = describe_calibration(radiance.calibration)
     height, width = radiance.picture.shape[:2]

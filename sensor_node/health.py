@@ -1,4 +1,4 @@
-"""How a node is doing, in the words of its statistics: live, stale or lost, and what is not as it should be."""
+"""Health of a node for its statistics: live, stale or lost, and what else is wrong."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -15,10 +15,10 @@ class Health:
 
     Args:
         camera: whose frames these are.
-        stale_after_s: age of the newest frame from which the stream is stale; without the board for so long, it is
-            lost from sight.
+        stale_after_s: age of the newest frame from which the stream is stale; after this time without the board, the
+            board counts as out of sight.
         lost_after_s: age of the newest frame from which the camera is lost.
-        now_s: a clock that is never set, s.
+        now_s: a monotonic clock, s.
     """
 
     def __init__(
@@ -34,13 +34,13 @@ class Health:
         self._newest_s: float | None = None
 
     def note(self, pose: BoardPose | None) -> None:
-        """Note that a frame was published, with its pose."""
+        """Record that a frame was published, with its pose."""
         self._newest_s = self._now_s()
         if pose is not None:
             self._posed_s = self._newest_s
 
     def state(self, remarks: Sequence[str] = ()) -> tuple[State, str]:
-        """Return the state on the wire and its sentences: first live, stale or lost, then what else there is.
+        """Return the state on the wire and its sentences: first live, stale or lost, then everything else.
 
         Args:
             remarks: of others; empty ones are left out.
@@ -52,7 +52,7 @@ class Health:
         return state, "; ".join([sentence, *faults])
 
     def _stream(self) -> tuple[State, str]:
-        """What the camera says of itself, else what the age of the newest frame says."""
+        """Return the camera's own state, else that of the newest frame's age."""
         newest_s = self._started_s if self._newest_s is None else self._newest_s
         said, age_s = self._camera.state, self._now_s() - newest_s
         if said is not None and said.name != "live":

@@ -1,8 +1,8 @@
-"""Corners of square markers to a few hundredths of a pixel: crossings of straight lines fitted to the edges.
+"""Corners of square markers to a few hundredths of a pixel: intersections of straight lines fitted to the edges.
 
-The usual corner refinement moves corners inward by the blur of the picture, because blur rounds a corner
-off; on an edge blur is symmetric, if the picture is linear in light. Measured on pictures of the synthetic
-scene with 0 to 1.2 px of blur: 0.05 to 0.07 px rms, where `cv2.cornerSubPix` leaves 0.22 to 0.33 px.
+The usual corner refinement moves corners inward by the blur of the picture, because blur rounds a corner off; on an
+edge blur is symmetric, if the picture is linear in light. Measured on pictures of the synthetic scene with 0 to 1.2
+px of blur: 0.05 to 0.07 px rms, where `cv2.cornerSubPix` leaves 0.22 to 0.33 px.
 """
 
 from typing import NamedTuple
@@ -13,14 +13,14 @@ from jaxtyping import Float32, Float64
 
 from protocol.camera_model import CameraModel
 
-# Places along an edge, as shares of its length, at which its position is measured; not at the round corners.
+# Positions along an edge, as fractions of its length, at which it is measured; not at the round corners.
 SHARES = np.linspace(0.12, 0.88, 16)
-# Places across the edge, from inside to outside, in units of the reach.
+# Positions across the edge, from inside to outside, in units of the reach.
 ACROSS = np.linspace(-1, 1, 25)
 REACH_PX = (1.5, 8.0)
 ROUNDS = 2
 LINE_ITERATIONS = 3
-# Measurements that miss the line by this much count half (a finger or shadow on the edge).
+# Measurements this far from the line have half weight (a finger or shadow on the edge).
 OUTLIER_PX = 0.15
 TINY = 1e-9
 
@@ -33,14 +33,14 @@ def refine_corners(
 ) -> Float64[np.ndarray, "m 4 2"]:
     """Return the refined corners (pixels) of dark markers on white paper.
 
-    Edges are straight where a pinhole camera of the same focal length would see them; there lines are fitted.
+    Edges are straight as a pinhole camera of the same focal length would see them; lines are fitted there.
 
     Args:
         light: picture, linear in light.
         camera: camera of the picture, with its full lens model.
-        corners: pixels of each marker's corners, clockwise as seen, a pixel or two from the truth.
-        reach_share: how far on either side an edge is looked for, in shares of the marker's shortest side;
-            less than the border and the white margin.
+        corners: pixels of each marker's corners, clockwise as seen, within a pixel or two of the truth.
+        reach_share: search range on either side of an edge, as a fraction of the marker's shortest side; less than
+            the border and the white margin.
     """
     focal = camera.matrix[0, 0]
     quads = focal * camera.unproject(corners.reshape(-1, 2)).reshape(corners.shape)
@@ -50,7 +50,7 @@ def refine_corners(
 
 
 class _Picture(NamedTuple):
-    """A picture that is looked up where a pinhole camera would see a point."""
+    """A picture sampled where a pinhole camera would see a point."""
 
     light: Float32[np.ndarray, "h w"]
     camera: CameraModel
@@ -89,7 +89,7 @@ def _edge_offsets(
     outward: Float64[np.ndarray, "m 4 2"],
     reach_px: Float64[np.ndarray, " m"],
 ) -> tuple[Float64[np.ndarray, "m 4 k"], Float64[np.ndarray, "m 4 k"]]:
-    """Distance of the true edge outward from the assumed one, in pixels, and the contrast found there."""
+    """Return the outward distance of the true edge from the assumed one, in pixels, and the contrast found there."""
     on_edge = starts[:, :, None] + (ends - starts)[:, :, None] * SHARES[:, None]
     steps = outward[:, :, None, None] * (ACROSS[:, None] * reach_px[:, None, None, None, None])
     profiles = picture.at(on_edge[:, :, :, None] + steps)
@@ -102,7 +102,7 @@ def _edge_offsets(
 def _fit_lines(
     offsets: Float64[np.ndarray, "m 4 k"], contrast: Float64[np.ndarray, "m 4 k"]
 ) -> tuple[Float64[np.ndarray, "m 4"], Float64[np.ndarray, "m 4"]]:
-    """Robust straight line through each edge's offsets: value at its start, and rise to its end."""
+    """Fit a robust straight line to each edge's offsets; return its value at the start, and its rise to the end."""
     trust = contrast / np.maximum(contrast.max(axis=-1, keepdims=True), TINY)
     weight = trust
     for _ in range(LINE_ITERATIONS):

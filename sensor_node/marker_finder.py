@@ -1,4 +1,4 @@
-"""Finding markers in pictures, and the two poses of a flat target: what board, lamps and calibration share."""
+"""Marker detection in pictures, and the two poses of a flat target, for board, lamps and calibration."""
 
 from collections.abc import Collection
 from functools import cached_property
@@ -14,13 +14,13 @@ from protocol.frames import decode_lut
 from protocol.poses import rigid_matrix
 from sensor_node.marker_edges import refine_corners
 
-# How far from a marker's edge it is looked for, as a share of the border cell or the white gap.
+# Search range from a marker's edge, as a fraction of the border cell or the white gap.
 REACH_SHARE = 0.6
-# Half the edge of the window that refines a chessboard corner, as a share of the way to the next marker.
+# Half the edge of the window that refines a chessboard corner, as a fraction of the distance to the next marker.
 WINDOW_SHARE = 0.8
 WINDOW_HALF_PX = (2, 8)
 WINDOW_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 0.005)
-# Markers narrower than this cannot be read.
+# Narrower markers cannot be read.
 LEAST_SIDE_PX = 10
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
@@ -47,21 +47,21 @@ class MarkerFinder:
     def refined(
         self, light: Float32[np.ndarray, "h w"], camera: CameraModel, corners: Float64[np.ndarray, "n 4 2"]
     ) -> Float64[np.ndarray, "n 4 2"]:
-        """Return the board's markers' corners where straight lines fitted to their edges meet (linear light)."""
+        """Return the corners of the board's markers: intersections of lines fitted to their edges (linear light)."""
         board = self._board
         thin = min(self.border_share, board.separation_m / board.marker_length_m or 1.0)
         return refine_corners(light, camera, corners, REACH_SHARE * thin)
 
     @property
     def border_share(self) -> float:
-        """Width of the black border as a share of a marker's edge."""
+        """Width of the black border as a fraction of a marker's edge."""
         cells = self._board.opencv_dictionary().markerSize + 2 * self._board.border_bits
         return float(self._board.border_bits / cells)
 
     def inner_corners(
         self, gray: UInt8[np.ndarray, "h w"], light: np.ndarray, quads: Quads
     ) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 2"]]:
-        """Return numbers and pixels of a ChArUco board's inner corners, refined on `light`."""
+        """Return indices and pixels of a ChArUco board's inner corners, refined on `light`."""
         markers = [quad[None].astype(np.float32) for quad in quads.values()]
         names = np.array([[name] for name in quads], np.int32)
         corners, ids, _, _ = self._charuco.detectBoard(gray, markerCorners=markers, markerIds=names)

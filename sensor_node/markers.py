@@ -13,12 +13,12 @@ from protocol.frames import BoardPose
 from protocol.poses import rigid_matrix
 from sensor_node.marker_finder import MarkerFinder, linear_luminance, planar_poses
 
-# Corners that miss by more than this and three times the median are hidden by something, and left out.
+# Corners with larger residuals, and above three times the median, are occluded and left out.
 OUTLIER_PX, OUTLIER_MEDIANS = 1.5, 3.0
-# A detection whose mean reprojection error is larger is a mistake: another board, or wrong calibration.
+# A detection with a larger mean reprojection error is a mistake: another board, or wrong calibration.
 MAX_ERROR_PX = 8.0
-# Solutions of the planar ambiguity are told apart by history where their errors, each with the noise of a
-# corner added, differ by less than this factor.
+# Solutions of the planar ambiguity are told apart by history if their errors, each with the noise of a corner added,
+# differ by less than this factor.
 AMBIGUOUS_RATIO, CORNER_NOISE_PX = 1.5, 0.05
 
 
@@ -41,10 +41,10 @@ class _Solution(NamedTuple):
 
 
 class BoardDetector:
-    """Finds one board in the pictures of one camera, and remembers the last pose to resolve ambiguity.
+    """Detects one board in the pictures of one camera, and remembers the last pose to resolve ambiguity.
 
-    Corners are refined on linear light: gamma pulls the black edges of a blurred marker inward. The pose is
-    the board frame's of docs/formats.md 3.
+    Corners are refined on linear light: gamma pulls the black edges of a blurred marker inward. The pose is that of
+    docs/formats.md 3's board frame.
     """
 
     def __init__(
@@ -60,12 +60,12 @@ class BoardDetector:
         self._previous: Float64[np.ndarray, "4 4"] | None = None
 
     def detect(self, color: UInt8[np.ndarray, "h w 3"]) -> BoardPose | None:
-        """Return the pose in a picture (RGB), or None where the board is not seen.
+        """Return the pose in a picture (RGB), or None if the board is not visible.
 
         `reprojection_error_px` is the mean distance between the corners found and the board's corners.
 
         Raises:
-            DeltalightError: the picture is not of the camera's size.
+            DeltalightError: the picture has not the camera's size.
         """
         if color.shape[:2] != (self._camera.height, self._camera.width):
             raise DeltalightError(
@@ -99,7 +99,7 @@ class BoardDetector:
         return _Matches(world, pixels, self._camera.unproject(pixels))
 
     def _solve_seen(self, matches: _Matches) -> list[_Solution]:
-        """Poses by the corners that nothing hides."""
+        """Return the poses by the corners that are not occluded."""
         solutions = self._solve(matches)
         if not solutions:
             return []
@@ -114,7 +114,7 @@ class BoardDetector:
         return [solution for solution in solutions if solution.error_px <= MAX_ERROR_PX]
 
     def _solve(self, matches: _Matches) -> list[_Solution]:
-        """Both poses of the planar ambiguity, refined, that see the sheet from its printed side."""
+        """Return both poses of the planar ambiguity, refined, that see the sheet from its printed side."""
         centre = matches.world.mean(axis=0)
         is_square = len(matches.world) == 4 and self._board.type != "charuco"
         solutions = []
@@ -131,7 +131,7 @@ class BoardDetector:
         return np.asarray(np.nan_to_num(distances, nan=np.inf))
 
     def _choose(self, solutions: list[_Solution]) -> tuple[_Solution, _Solution | None]:
-        """The solution with the smaller error; where that says little, the one nearer to the last pose."""
+        """Return the solution with the smaller error; if that is inconclusive, the one nearer to the last pose."""
         best, other = solutions[0], solutions[1] if len(solutions) > 1 else None
         if other is None or self._previous is None:
             return best, other
@@ -142,5 +142,5 @@ class BoardDetector:
 
 
 def _turn(first: Float64[np.ndarray, "4 4"], second: Float64[np.ndarray, "4 4"]) -> float:
-    """Angle between two orientations in radians."""
+    """Return the angle between two orientations in radians."""
     return float(np.linalg.norm(cv2.Rodrigues(first[:3, :3].T @ second[:3, :3])[0]))

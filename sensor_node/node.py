@@ -18,8 +18,9 @@ from protocol.messages import Name, StatsMessage
 from protocol.transport import Publisher
 from sensor_node.announce import announced
 from sensor_node.cameras.base import Camera
+from sensor_node.cameras.drivers import SYNTHETIC
 from sensor_node.cameras.fisheye_capture import CameraWithFisheye
-from sensor_node.cameras.open import SYNTHETIC, open_camera, open_fisheye
+from sensor_node.cameras.open import open_camera, open_fisheye
 from sensor_node.cameras.settings import CameraSettings, FisheyeSettings
 from sensor_node.capture import POLL_S, CapturedFrame, CaptureThread, ServerClock
 from sensor_node.depth import DepthSettings
@@ -42,7 +43,7 @@ _log = structlog.get_logger(__name__)
 STATS_PERIOD_S = 1.0
 MAX_SENTENCE = 2000  # of the wire (SPEC.md, section 3)
 STREAMS = ("fisheye", "depth", "radiance", "clean_depth", "lamps", "pose", "color", "stats")
-# Fish-eye pictures that are further than this from their frame are stamped by another clock (a loop began again).
+# Fish-eye pictures further than this from their frame are stamped by another clock (a loop restarted).
 LONGEST_HOLD_NS = 60_000_000_000
 
 
@@ -113,11 +114,11 @@ def node_camera(config: NodeConfig) -> Camera:
 def run_node(
     config: NodeConfig, stop: threading.Event, keys: Keys | None = None, camera: Camera | None = None
 ) -> None:
-    """Publish frames until `stop` is set or the source ends; returns within a second of `stop`.
+    """Publish frames until `stop` is set or the source ends; return within a second of `stop`.
 
-    For each frame: fish-eye pictures and radiance where there are new ones, raw depth, clean depth, lamps, pose, then
-    colour, all with its `frame_id` and capture time; so whoever has the colour has had the rest. Statistics go out
-    once a second. `keys` are needed where an endpoint leaves the host; `camera` stands for the configured source.
+    For each frame: fish-eye pictures and radiance if new, raw depth, clean depth, lamps, pose, then colour, all with
+    its `frame_id` and capture time; so a receiver of the colour has received the rest. Statistics are sent once a
+    second. `keys` are required if an endpoint leaves the host; `camera` replaces the configured source.
 
     Raises:
         DeltalightError: the source or the endpoint cannot be used, or a frame of the source is broken.
@@ -139,7 +140,7 @@ def run_node(
 
 
 class _Node:
-    """What happens to each frame, and the statistics."""
+    """Processes each frame, and keeps the statistics."""
 
     def __init__(self, config: NodeConfig, camera: Camera, publisher: Publisher, clock: ServerClock) -> None:
         self._config, self._camera, self._publisher, self._clock = config, camera, publisher, clock
@@ -154,7 +155,7 @@ class _Node:
         self._frames = self._without_board = 0
 
     def run(self, capture: CaptureThread, stop: threading.Event) -> None:
-        """Publish what is captured until `stop` or the end."""
+        """Publish captured frames until `stop` or the end."""
         while not stop.is_set() and not capture.ended:
             captured = capture.take(POLL_S)
             if captured is not None:
@@ -194,13 +195,13 @@ class _Node:
         )
 
     def _filtered(self, view: ViewFrame, frame: SensorFrame) -> ViewFrame:
-        """Smooth a pose that the board gave; one that was given with the frame is the truth."""
+        """Smooth a pose that came from the board; one given with the frame is the truth."""
         if self._filter is None or frame.world_from_camera is not None:
             return view
         return replace(view, pose=self._filter(view.pose, frame.timestamp_ns))
 
     def _send_fisheye(self, frame: SensorFrame, stamps: Stamps) -> None:
-        """Send fish-eye pictures once, and again now and then for whoever came later."""
+        """Send fish-eye pictures once, and repeat them for late subscribers."""
         config, pictures = self._config, frame.fisheye
         if pictures is None:
             return
@@ -214,7 +215,7 @@ class _Node:
         self._fisheye.send(pictures, made, self._publisher.send)
 
     def _send_radiance(self, view: ViewFrame, stamps: Stamps) -> None:
-        """As the fish-eye pictures."""
+        """Send a radiance map once, and repeat it for late subscribers."""
         radiance = view.radiance_map
         if radiance is None:
             return
@@ -244,7 +245,7 @@ class _Node:
         self._period_s, self._frames, self._without_board = time.monotonic(), 0, 0
 
     def _log_state(self, state: str, detail: str) -> None:
-        """Log what the statistics say, once it stays for two of them and differs in more than its numbers."""
+        """Log the state once two statistics agree on it and it differs in more than its numbers."""
         words = re.sub(r"[\d.]+", "", detail)
         if words == self._heard != self._logged:
             self._logged = words

@@ -1,7 +1,7 @@
-"""Steadies the camera pose: the One-Euro filter (Casiez, Roussel and Vogel, CHI 2012) on a rigid motion.
+"""Smoothing of the camera pose: the One-Euro filter (Casiez, Roussel and Vogel, CHI 2012) on a rigid motion.
 
-What is filtered is camera_from_world, the board as the camera sees it: there the noise of the translation is that
-of the corners, while the camera's own place also swings with every error of the rotation.
+The filter runs on camera_from_world, the board as seen by the camera: there the noise of the translation is that of
+the corners, while the camera's own position also swings with every error of the rotation.
 """
 
 from dataclasses import replace
@@ -18,7 +18,7 @@ from protocol.poses import rigid_matrix
 
 # Cut-off of the speed estimate, Hz, as in the paper.
 SPEED_CUTOFF_HZ = 1.0
-# A pose that comes later than this after the last is not smoothed by it: two frames of the slowest useful stream.
+# The filter restarts if a pose comes later than this after the last: two frames of the slowest useful stream.
 GAP_S = 0.5
 # No hand moves or turns a camera faster: such a step is a correction (the other planar solution, another board).
 JUMP_M_PER_S, JUMP_RAD_PER_S = 5.0, 10.0
@@ -39,7 +39,7 @@ class PoseFilterSettings(StrictModel):
 
 
 class _State(NamedTuple):
-    """Last pose as it came and as it went out (camera_from_world), and the speeds of the board."""
+    """Last input and output pose (camera_from_world), and the speeds of the board."""
 
     timestamp_ns: int
     measured: Float64[np.ndarray, "4 4"]
@@ -49,18 +49,18 @@ class _State(NamedTuple):
 
 
 class PoseFilter:
-    """Filters the poses of one camera in the order of time; the first after a gap or a jump goes out as it came."""
+    """Filters the poses of one camera in the order of time; the first after a gap or a jump passes unchanged."""
 
     def __init__(self, settings: PoseFilterSettings) -> None:
         self._settings = settings
         self._state: _State | None = None
 
     def __call__(self, pose: BoardPose | None, timestamp_ns: int) -> BoardPose | None:
-        """Return the smoothed pose (its error and alternative are those of the pose that came).
+        """Return the smoothed pose, with error and alternative of the input pose.
 
         Args:
             pose: as found; None (no board in sight) is returned and changes nothing.
-            timestamp_ns: when the picture was captured.
+            timestamp_ns: capture time of the picture.
         """
         if pose is None:
             return None
@@ -95,16 +95,16 @@ class PoseFilter:
 
 
 def _share(cutoff_hz: float, period_s: float) -> float:
-    """Share of the new value in an exponential low-pass filter."""
+    """Return the weight of the new value in an exponential low-pass filter."""
     return 1 / (1 + 1 / (2 * np.pi * cutoff_hz * period_s))
 
 
 def _turn(first: Float64[np.ndarray, "4 4"], second: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "3"]:
-    """Rotation vector from one orientation to another, radians."""
+    """Return the rotation vector from one orientation to another, radians."""
     return np.asarray(cv2.Rodrigues(first[:3, :3].T @ second[:3, :3])[0]).ravel()
 
 
 def _orthonormal(rotation: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "3 3"]:
-    """The nearest rotation: products of thousands of small turns drift."""
+    """Return the nearest rotation: products of thousands of small rotations drift."""
     left, _, right = np.linalg.svd(rotation)
     return np.asarray(left @ right)

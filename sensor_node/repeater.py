@@ -1,17 +1,17 @@
-"""Sends what holds for long once, and again now and then: a PUB socket keeps nothing for whoever comes later."""
+"""Repeats messages of long-lived content, because a PUB socket stores nothing for late subscribers."""
 
 import time
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
-# Who subscribes late has the light after this time; at 1 MB a map it costs less than one stream of pictures.
+# A late subscriber has the light after this time; at 1 MB per map it costs less than one stream of pictures.
 REPEAT_S = 2.0
 
 Item = TypeVar("Item")
 
 
 class Repeater(Generic[Item]):
-    """Sends one kind of message: when its object is new, and unchanged every REPEAT_S after that."""
+    """Sends one kind of message: when its object is new, and then unchanged every REPEAT_S."""
 
     def __init__(self) -> None:
         self._item: Item | None = None
@@ -19,7 +19,7 @@ class Repeater(Generic[Item]):
         self._sent_s = 0.0
 
     def send(self, item: Item, made: Callable[[], list[bytes]], send: Callable[[list[bytes]], None]) -> None:
-        """Send the message of `item`, which `made` makes, if it is time to."""
+        """Send the message of `item`, created by `made`, if it is due."""
         now_s = time.monotonic()
         if item is not self._item:
             self._item, self._multipart = item, made()

@@ -1,4 +1,4 @@
-"""From a raw frame to the renderer's input: pose, registered and clean depth. The same live and offline."""
+"""Conversion of raw frames to the renderer's input: pose, registered and clean depth. The same live and offline."""
 
 from dataclasses import dataclass, replace
 from typing import Self
@@ -19,7 +19,7 @@ from sensor_node.markers import BoardDetector
 
 @dataclass(frozen=True)
 class _Reference:
-    """What holds for a whole sequence, by one of its frames."""
+    """Data of a whole sequence, from one of its frames."""
 
     exposure_s: float | None
     noise_sigma_m: float | None
@@ -33,18 +33,18 @@ class _Reference:
 
 
 class ViewFrameBuilder:
-    """Makes the renderer's input of the frames of one source or camera.
+    """Creates the renderer's input from the frames of one source or camera.
 
-    The pose is the one given with the frame, else what the board shows, else none. The reference exposure
-    and, where it is unknown, the depth noise are those of the source's first frame, so that a frame's result
-    does not depend on where a run began; of a camera's first frame that comes.
+    The pose is the one given with the frame, else the board's, else none. The reference exposure and, if unknown, the
+    depth noise are those of the source's first frame, so that a frame's result does not depend on where a run began;
+    of a live camera, those of the first frame delivered.
 
     Args:
-        rig: what the frames come from.
+        rig: where the frames come from.
         settings: of the depth clean-up.
         needs_depth: whether the scene's geometry is depth, so that a source without any is an error.
-        needs_light: whether the scene's light is what the node sees (modes `fisheye` and `tracked`); if not,
-            neither `radiance_map` nor `lamps` is filled, which saves their time.
+        needs_light: whether the scene's light comes from the node (modes `fisheye` and `tracked`); if not, neither
+            `radiance_map` nor `lamps` is filled, which saves their time.
 
     Raises:
         DeltalightError: depth is needed and the source has none.
@@ -72,8 +72,8 @@ class ViewFrameBuilder:
     def __call__(self, frame: SensorFrame) -> ViewFrame:
         """Return the renderer's input for a frame.
 
-        `pose` is None where the board is not seen. `depth` is None where the source has no depth; a single
-        frame without has a depth image that is unknown everywhere.
+        `pose` is None if the board is not visible. `depth` is None if the source has no depth; a single frame without
+        has a depth image that is unknown everywhere.
 
         Raises:
             DeltalightError: depth and colour, or colour and camera, do not fit each other.
@@ -121,7 +121,7 @@ class ViewFrameBuilder:
         return self._detector.detect(frame.color)
 
     def _pose_alone(self, frame: SensorFrame) -> BoardPose | None:
-        """The pose of a frame out of turn, which the detector's memory must not hear of."""
+        """Return the pose of a frame out of sequence, without affecting the detector's memory."""
         detector, self._detector = self._detector, None
         try:
             return self._pose(frame)
@@ -160,5 +160,5 @@ def _unknown(frame: SensorFrame) -> DepthImage:
 
 
 def _exposure_scale(exposure_s: float | None, reference_s: float | None) -> float:
-    """Factor of the frame's exposure over the reference (an exposure that is not told is the reference)."""
+    """Return the frame's exposure over the reference (an unreported exposure is the reference)."""
     return 1.0 if exposure_s is None or reference_s is None else exposure_s / reference_s

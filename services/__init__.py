@@ -1,1 +1,1 @@
-"""What people and programs start: command line, supervisor, demo, web process."""
+"""Entry points for people and programs: command line, supervisor, demo, web process."""

@@ -1,4 +1,4 @@
-"""Reading the small languages of command-line values."""
+"""Parsing of command-line values."""
 
 import re
 
@@ -9,7 +9,7 @@ LARGEST_EDGE = 8192
 
 
 def parse_size(text: str) -> tuple[int, int]:
-    """Width and height of `WxH`, in pixels.
+    """Parse `WxH` into width and height in pixels.
 
     Raises:
         DeltalightError: not two whole numbers within the range of the scene document.
@@ -25,7 +25,7 @@ def parse_size(text: str) -> tuple[int, int]:
 
 
 def parse_frames(text: str | None, count: int) -> range:
-    """Frame numbers of the half-open `A:B` (either may be left out) in a source of `count` frames.
+    """Parse the half-open `A:B` (either may be omitted) into frame numbers of a source of `count` frames.
 
     Raises:
         DeltalightError: not such a range, or it reaches outside the source or is empty.

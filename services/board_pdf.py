@@ -12,32 +12,32 @@ from protocol.errors import DeltalightError
 
 MM = 72 / 25.4  # PDF points
 PAPERS_MM = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "letter": (215.9, 279.4)}
-# Printers leave a rim of up to 6 mm white; above the board stand the axes, below it the ruler and the text.
+# Printers leave a white rim of up to 6 mm; the axes are above the board, the ruler and the text below it.
 SIDE_MM, TOP_MM, BOTTOM_MM = 12.0, 18.0, 28.0
 RULER_MM = 100
-# The axes keep this far from the print, so that they are no edge that a marker is taken for.
+# Distance of the axes from the print, so that they are not taken for an edge of a marker.
 AXES_GAP_MM, AXES_MM = 5.0, 9.0
 GREY, RED, GREEN, BLUE = (0.45,) * 3, (0.8, 0.1, 0.1), (0.1, 0.55, 0.1), (0.1, 0.2, 0.8)
 SMALL = 7  # points
 
 
 class Page(NamedTuple):
-    """Paper as it lies before the reader, in mm."""
+    """Paper in its orientation, in mm."""
 
     width: float
     height: float
 
     @property
     def room(self) -> tuple[float, float]:
-        """Width and height that a board may have."""
+        """Maximum width and height of a board."""
         return self.width - 2 * SIDE_MM, self.height - TOP_MM - BOTTOM_MM
 
 
 def choose_page(board: BoardSpec, paper: str) -> Page:
-    """Return the paper upright, or across where the board fits only so.
+    """Return the paper in portrait, or in landscape if the board fits only so.
 
     Raises:
-        DeltalightError: it does not fit; the sentence names what does.
+        DeltalightError: the board does not fit; the sentence names what does.
     """
     width, height = _board_mm(board)
     page = _fitting(width, height, paper)
@@ -48,7 +48,7 @@ def choose_page(board: BoardSpec, paper: str) -> Page:
         min(wide / width, high / height)
         for wide, high in (Page(*edges).room for edges in _orientations(paper))
     )
-    # Whole tenths of a millimetre, downwards.
+    # rounded down to tenths of a millimetre
     sizes = [np.floor(scale * 1e4 * edge) / 10 for edge in (board.marker_length_m, board.separation_m)]
     smaller = f"--marker-mm {sizes[0]:.1f} --separation-mm {sizes[1]:.1f}"
     raise DeltalightError(
@@ -74,7 +74,7 @@ def _board_mm(board: BoardSpec) -> tuple[float, float]:
 
 
 def write_board_pdf(path: Path, board: BoardSpec, paper: str) -> None:
-    """Write the board, and on further pages the markers for lamps.
+    """Write the board, and the markers for lamps on further pages.
 
     Raises:
         DeltalightError: the board or a lamp's marker does not fit on the paper, or reportlab is not installed.
@@ -95,7 +95,7 @@ def write_board_pdf(path: Path, board: BoardSpec, paper: str) -> None:
 
 
 class _Sheet:
-    """One page with the board in its middle; places are world coordinates in mm."""
+    """One page with the board in its middle; positions are world coordinates in mm."""
 
     def __init__(self, canvas: Any, board: BoardSpec, page: Page) -> None:  # noqa: ANN401 - reportlab has no types
         self._canvas, self._board, self._page = canvas, board, page
@@ -121,7 +121,7 @@ class _Sheet:
         self._write()
 
     def _draw_squares(self) -> None:
-        """Black squares of a chessboard, as one path so that they meet without a seam."""
+        """Draw the black squares of a chessboard, as one path so that they meet without a seam."""
         board, path = self._board, self._canvas.beginPath()
         edge = 1e3 * (board.marker_length_m + board.separation_m)
         for row in range(board.rows):
@@ -136,7 +136,7 @@ class _Sheet:
         self._canvas.drawPath(path, stroke=0, fill=1)
 
     def _draw_axes(self) -> None:
-        """World axes beside the print; the lines through them cross at the origin."""
+        """Draw the world axes beside the print; the lines through them cross at the origin."""
         canvas, above, beside = self._canvas, self._top + AXES_GAP_MM, self._left - AXES_GAP_MM
         _draw_arrow(canvas, (0, above), (AXES_MM, above), RED, "x")
         _draw_arrow(canvas, (beside, 0), (beside, AXES_MM), GREEN, "y")
@@ -166,7 +166,7 @@ class _Sheet:
 
 
 def marker_cells(board: BoardSpec) -> dict[int, Bool[np.ndarray, "n n"]]:
-    """White cells of the markers of the board and of its lamps, with the black border, by id."""
+    """Return the white cells of the board's and its lamps' markers, with the black border, by id."""
     dictionary, border = board.opencv_dictionary(), board.border_bits
     size = dictionary.markerSize
     names = [*board.marker_ids, *(lamp.id for lamp in board.lamp_markers)]
@@ -177,7 +177,7 @@ def marker_cells(board: BoardSpec) -> dict[int, Bool[np.ndarray, "n n"]]:
 
 
 def _draw_marker(canvas: Any, cells: Bool[np.ndarray, "n n"], x: float, y: float, length: float) -> None:  # noqa: ANN401
-    """A marker with its top-left corner at (x, y) mm: a black square, its white cells as one path."""
+    """Draw a marker with its top-left corner at (x, y) mm: a black square, its white cells as one path."""
     cell, path = length / len(cells), canvas.beginPath()
     for row, column in np.argwhere(cells).tolist():
         path.rect((x + column * cell) * MM, (y - (row + 1) * cell) * MM, cell * MM, cell * MM)
@@ -225,13 +225,13 @@ def _draw_ruler(canvas: Any, x: float, y: float) -> None:  # noqa: ANN401
 
 
 def _draw_lamps(canvas: Any, board: BoardSpec, page: Page) -> None:  # noqa: ANN401
-    """Pages with the markers for lamps, row by row, each with a line to cut along."""
+    """Draw pages with the markers for lamps, row by row, each with a cutting line."""
     cells, size = marker_cells(board), board.opencv_dictionary().markerSize + 2 * board.border_bits
     x, y, row = SIDE_MM, page.height - TOP_MM, 0.0
     canvas.setPageSize((page.width * MM, page.height * MM))
     for lamp in board.lamp_markers:
         length = 1e3 * lamp.marker_length_m
-        # A detector needs white about as wide as a cell around a marker.
+        # A detector needs about a cell's width of white around a marker.
         rim = max(length / size, 4.0)
         edge = length + 2 * rim
         if edge > page.width - 2 * SIDE_MM:

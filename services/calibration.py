@@ -1,4 +1,4 @@
-"""What the commands under `deltalight calibrate` share: collecting with progress, reports, results on disk."""
+"""Common parts of the `deltalight calibrate` commands: collecting with progress, reports, results on disk."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 
 
 def result_path(folder: Path, name: str, *, force: bool) -> Path:
-    """Path of a new file in `folder`/calibration, asked for before any work is done.
+    """Return the path of a new file in `folder`/calibration; call it before any work is done.
 
     Raises:
-        DeltalightError: it exists and `force` is not given, or the folder cannot be written.
+        DeltalightError: the file exists and `force` is not given, or the folder cannot be written.
     """
     path = folder / "calibration" / name
     if path.exists() and not force:
@@ -35,14 +35,14 @@ def result_path(folder: Path, name: str, *, force: bool) -> Path:
 
 
 def write_result(path: Path, save: Callable[[Path], None]) -> None:
-    """Let `save` write a file aside, then put it in place."""
+    """Let `save` write a temporary file, then move it into place."""
     with replacing(path) as temporary:
         save(temporary)
 
 
 @dataclass
 class Watch:
-    """Shows on stderr how a series is looked through: a bar for files, a line for each view of a live camera."""
+    """Shows the progress through a series on stderr: a bar for files, a line per view of a live camera."""
 
     total: int | None
     console: Console = field(default_factory=lambda: Console(stderr=True, soft_wrap=True))
@@ -104,7 +104,7 @@ def save_pictures(result: "LensResult", stem: Path) -> list[str]:
 
 
 def lens_report(result: "LensResult") -> dict[str, Any]:
-    """Figures of a lens calibration as plain values."""
+    """Return the figures of a lens calibration as plain values."""
     fit = result.fit
     return {
         "pictures": result.pictures,
@@ -141,7 +141,7 @@ def print_lens_report(result: "LensResult") -> None:
 
 
 def print_table(console: Console, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print rows under headings, numbers to the right."""
+    """Print rows under headings, with numbers right-aligned."""
     table = Table(box=None)
     for column, heading in enumerate(headings):
         table.add_column(heading, justify="left" if column == 0 else "right")

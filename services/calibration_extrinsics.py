@@ -21,7 +21,7 @@ TransformName = Literal["rgb_from_fisheye", "world_from_fisheye", "depth_from_rg
 
 
 class ExtrinsicsJob(NamedTuple):
-    """What is wanted from which recording; `board` None = the recording's."""
+    """The transform to find, and its recording; `board` None = the recording's."""
 
     source: Path
     what: TransformName
@@ -49,10 +49,10 @@ def find_transform(job: ExtrinsicsJob, *, force: bool) -> dict[str, Any]:
 
 
 def board_of(source: Source, path: Path) -> BoardSpec:
-    """The board of a source.
+    """Return the board of a source.
 
     Raises:
-        DeltalightError: it describes none.
+        DeltalightError: the source describes none.
     """
     if source.board is None:
         raise DeltalightError(f"{path} describes no marker board; name it with --target board.yaml.")
@@ -98,6 +98,6 @@ def _depth_from_rgb(source: Source, board: BoardSpec) -> tuple[Float64[np.ndarra
 
 
 def _watched(source: Source) -> Iterator[SensorFrame]:
-    """The frames of a source, with a bar on stderr."""
+    """Yield the frames of a source, with a progress bar on stderr."""
     console = Console(stderr=True)
     yield from track(source, "looking for the board", len(source), console=console, transient=True)

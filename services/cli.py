@@ -1,7 +1,7 @@
-"""The `deltalight` command: registers the commands and turns faults into sentences and exit codes.
+"""The `deltalight` command: registers the commands and reports faults by sentences and exit codes.
 
-Exit codes: 0 done, 1 a fault of the program (or `doctor` found one), 2 wrong use or bad input, 130 Ctrl-C,
-143 SIGTERM.
+Exit codes: 0 done, 1 a fault of the program (or `doctor` found one), 2 wrong use or bad input, 130 Ctrl-C, 143
+SIGTERM.
 """
 
 import signal
@@ -18,6 +18,7 @@ from services.commands.calibrate import calibrate
 from services.commands.config import config
 from services.commands.demo import demo
 from services.commands.doctor import doctor
+from services.commands.graph import graph
 from services.commands.keys import keys
 from services.commands.node import node
 from services.commands.ping import ping
@@ -41,7 +42,7 @@ app = typer.Typer(
     rich_markup_mode="rich",
     help="Mixed-reality relighting: virtual objects in a camera picture, with light that agrees both ways.",
 )
-for command in (render, demo, node, server, up, record, replay, config, doctor, schema, board, ping):
+for command in (render, demo, node, server, up, record, replay, config, doctor, graph, schema, board, ping):
     app.command()(command)
 app.add_typer(api, name="api")
 app.add_typer(recordings, name="recordings")
@@ -60,7 +61,7 @@ def _show_version(wanted: bool) -> None:
 
 @app.callback()
 def _global_options(
-    debug: Annotated[  # read by run(), so that it may stand anywhere
+    debug: Annotated[  # read by run(), so that it may appear anywhere
         bool, typer.Option(DEBUG_FLAG, help="Show the traceback of a fault instead of one sentence.")
     ] = False,
     log_level: Annotated[
@@ -84,7 +85,7 @@ def main() -> None:
 def run(arguments: list[str]) -> int:
     """Run one command line in this process and return its exit code.
 
-    Faults become sentences on stderr; with `--debug`, which may stand anywhere, they are raised.
+    Faults become sentences on stderr; with `--debug`, anywhere on the line, they are raised.
     """
     words = [argument for argument in arguments if argument != DEBUG_FLAG]
     try:

@@ -43,7 +43,7 @@ class ApiError(DeltalightError):
 
 @dataclass(frozen=True)
 class Asset:
-    """An uploaded file; `reference` is how scene documents name it, `facts` say size and bounds."""
+    """An uploaded file; `reference` is its name in scene documents, `facts` hold size and bounds."""
 
     reference: str
     names: tuple[str, ...]
@@ -53,14 +53,14 @@ class Asset:
 
     @classmethod
     def of(cls, answer: Json) -> Self:
-        """Read an answer of the service."""
+        """Create it from a response of the service."""
         names = tuple(answer["names"])
         return cls(answer["asset"], names, answer["kind"], answer["size_bytes"], answer["facts"])
 
 
 @dataclass(frozen=True)
 class LiveFrame:
-    """A composite as it arrives; `header` holds the pass times, lights, camera and pose that it was made with."""
+    """A received composite; `header` holds its pass times, lights, camera and pose."""
 
     header: LiveHeader
     jpeg: bytes
@@ -77,7 +77,7 @@ class LiveFrame:
 
     @property
     def scene_id(self) -> str | None:
-        """The scene that it shows; None where another program set it."""
+        """The scene that it shows; None if another program set it."""
         return None if self.header.scene is None else self.header.scene.id
 
     @property
@@ -92,10 +92,10 @@ class LiveFrame:
 
 
 class Scene:
-    """A scene at the revision that was seen last. Each change is one request, and one revision.
+    """A scene at the last known revision. Each change is one request, and one revision.
 
-    A change applies to the newest revision, whoever made it; inside `exclusively()` one that somebody else made in
-    between is refused with an `ApiError` of kind `stale-revision`.
+    A change applies to the newest revision, whoever made it; inside `exclusively()` it is refused with an `ApiError`
+    of kind `stale-revision` if somebody else made a change in between.
     """
 
     def __init__(self, client: "Client", answer: Json) -> None:
@@ -115,22 +115,22 @@ class Scene:
 
     @property
     def document(self) -> SceneDocument:
-        """The scene document as it was seen last."""
+        """The scene document as last known."""
         return SceneDocument.model_validate(self._answer["document"])
 
     @property
     def picture(self) -> tuple[str, str] | None:
-        """What the render server made of it: `shown`, `pending` or `refused`, and why; None unless it is active."""
+        """What the render server did with it: `shown`, `pending` or `refused`, and why; None unless it is active."""
         picture = self._answer["picture"]
         return None if picture is None else (picture["state"], picture["detail"])
 
     def refresh(self) -> None:
-        """See the newest revision."""
+        """Load the newest revision."""
         self._take(self._client.request("GET", self._path()))
 
     @contextmanager
     def exclusively(self) -> Iterator[None]:
-        """Refuse changes to a revision that is not the newest any more."""
+        """Refuse changes to a revision that is no longer the newest."""
         self._guarded = True
         try:
             yield
@@ -138,12 +138,12 @@ class Scene:
             self._guarded = False
 
     def replace(self, document: SceneDocument) -> None:
-        """Put another document in place of this one."""
+        """Replace the document."""
         body = document.model_dump(mode="json", exclude={"revision"})
         self._change("PUT", "", body)
 
     def add_object(self, asset: Asset | str, **keys: Any) -> str:  # noqa: ANN401 - keys of the scene document
-        """Add an object with keys of the scene document (`pose`, `material`, ...); returns its id."""
+        """Add an object with keys of the scene document (`pose`, `material`, ...); return its id."""
         reference = asset.reference if isinstance(asset, Asset) else asset
         before = {item["id"] for item in self._answer["document"]["objects"]}
         self._change("POST", "/objects", {"asset": reference, **keys})
@@ -151,18 +151,18 @@ class Scene:
         return next((each for each in reversed(ids) if each not in before), ids[-1])
 
     def change_object(self, object_id: str, **keys: Any) -> None:  # noqa: ANN401 - keys of the scene document
-        """Change keys of an object; those that are not named stay."""
+        """Change keys of an object; the others stay."""
         self._change("PATCH", f"/objects/{object_id}", keys)
 
     def move(
         self, object_id: str, *, translation_m: Place | None = None, rotation_wxyz: Rotation | None = None
     ) -> None:
-        """Change where an object stands, metres, and how it is turned."""
+        """Change the position, metres, and rotation of an object."""
         pose = {"translation_m": translation_m, "rotation_wxyz": rotation_wxyz}
         self.change_object(object_id, pose={key: value for key, value in pose.items() if value is not None})
 
     def remove_object(self, object_id: str) -> None:
-        """Take an object out."""
+        """Remove an object."""
         self._change("DELETE", f"/objects/{object_id}", None)
 
     def set_lights(self, **keys: Any) -> None:  # noqa: ANN401 - keys of the scene document
@@ -170,7 +170,7 @@ class Scene:
         self._change("PATCH", "/lights", keys)
 
     def set_method(self, name: str, **settings: Any) -> None:  # noqa: ANN401 - settings of the method
-        """Relight with another method, with these settings and the defaults of the others."""
+        """Relight with another method, with these settings and defaults for the others."""
         self._change("PUT", "/method", {"name": name, **settings})
 
     def set_output(self, **keys: Any) -> None:  # noqa: ANN401 - keys of the scene document
@@ -178,11 +178,11 @@ class Scene:
         self._change("PATCH", "/output", keys)
 
     def undo(self) -> None:
-        """Take the last change back."""
+        """Undo the last change."""
         self._change("POST", "/undo", None)
 
     def redo(self) -> None:
-        """Make the change again that was taken back."""
+        """Redo the change that was undone."""
         self._change("POST", "/redo", None)
 
     def activate(self) -> None:
@@ -190,7 +190,7 @@ class Scene:
         self._change("POST", "/activate", None)
 
     def delete(self) -> None:
-        """Delete the scene; not the active one."""
+        """Delete the scene, unless it is active."""
         self._client.request("DELETE", self._path())
 
     def _path(self, rest: str = "") -> str:
@@ -205,10 +205,10 @@ class Scene:
 
 
 class Client:
-    """Speaks with one service. Errors are `ApiError`; a service that does not answer is a `DeltalightError`.
+    """Connects to one service. Errors are `ApiError`; a service that does not answer is a `DeltalightError`.
 
     Raises:
-        DeltalightError: the address is none.
+        DeltalightError: the address is malformed.
     """
 
     def __init__(self, address: str, token: str | None = None, *, timeout_s: float = 60.0) -> None:
@@ -234,24 +234,24 @@ class Client:
         self._http.close()
 
     def scenes(self) -> list[Json]:
-        """Id, name, revision and times of all scenes."""
+        """Return id, name, revision and times of all scenes."""
         return cast(list[Json], self.request("GET", "/scenes"))
 
     def scene(self, scene_id: str) -> Scene:
-        """The scene with this id."""
+        """Return the scene with this id."""
         return Scene(self, self.request("GET", f"/scenes/{scene_id}"))
 
     def active_scene(self) -> Scene:
-        """The scene that is rendered."""
+        """Return the scene that is rendered."""
         return Scene(self, self.request("GET", "/active-scene"))
 
     def create_scene(self, document: SceneDocument | Mapping[str, Any]) -> Scene:
-        """Make a scene; it is shown once it is activated."""
+        """Create a scene; it is shown once activated."""
         body = document.model_dump(mode="json") if isinstance(document, SceneDocument) else dict(document)
         return Scene(self, self.request("POST", "/scenes", json=body))
 
     def assets(self) -> list[Asset]:
-        """All uploaded files, the newest first."""
+        """Return all uploaded files, the newest first."""
         return [Asset.of(answer) for answer in self.request("GET", "/assets")]
 
     def upload(self, path: Path) -> Asset:
@@ -270,7 +270,7 @@ class Client:
         return Asset.of(answer)
 
     def state(self) -> Json:
-        """Rates, drops and delays of the processes."""
+        """Return rates, drops and delays of the processes."""
         return cast(Json, self.request("GET", "/state"))
 
     def snapshot(
@@ -292,20 +292,20 @@ class Client:
         return files
 
     def start_recording(self, name: str | None = None, duration_s: float | None = None) -> Json:
-        """Record what the node sees, until it is stopped or for so long."""
+        """Record the node's streams, until stopped or for this time."""
         body = {"name": name, "duration_s": duration_s}
         body = {key: value for key, value in body.items() if value is not None}
         return cast(Json, self.request("POST", "/recordings", json=body))
 
     def stop_recording(self, recording_id: str) -> Json:
-        """End a recording; its facts."""
+        """Stop a recording; return its facts."""
         return cast(Json, self.request("POST", f"/recordings/{recording_id}/stop"))
 
     def download_recording(self, recording_id: str, path: Path) -> None:
-        """Save a recording as an .mcap file, whole or not at all.
+        """Save a recording as an .mcap file, atomically.
 
         Raises:
-            ApiError: there is none, or it still grows.
+            ApiError: there is none, or it is still growing.
             DeltalightError: the file cannot be written, or the service does not answer.
         """
         address = f"/recordings/{recording_id}/content"
@@ -318,7 +318,7 @@ class Client:
                     file.write(chunk)
 
     def frames(self) -> Iterator[LiveFrame]:
-        """Composites as they come, the newest always; what the caller is too slow for is left out."""
+        """Yield composites as they arrive, always the newest; a slow caller misses some."""
         with self._socket("/live") as socket:
             for message in socket:
                 if isinstance(message, bytes):
@@ -326,13 +326,13 @@ class Client:
                     socket.send("ack")
 
     def events(self) -> Iterator[Json]:
-        """Events as they come: `{type, ...}`; the first says `hello`."""
+        """Yield events as they arrive: `{type, ...}`; the first is `hello`."""
         with self._socket("/events") as socket:
             for message in socket:
                 yield json.loads(message)
 
     def request(self, method: str, path: str, **options: Any) -> Any:  # noqa: ANN401 - JSON
-        """The answer to one request, as JSON; for routes that have no method here.
+        """Send one request and return the response's JSON; for routes without a method here.
 
         Raises:
             ApiError: the service refused it.
@@ -364,7 +364,7 @@ class Client:
 
     @contextmanager
     def _socket(self, path: str) -> Iterator["ClientConnection"]:
-        """Open a WebSocket, with a ticket where the service wants tokens."""
+        """Open a WebSocket, with a ticket if the service requires tokens."""
         from websockets.exceptions import WebSocketException
         from websockets.sync.client import connect
 

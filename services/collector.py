@@ -24,12 +24,12 @@ CONTROL_TIMEOUT_S = 10.0
 SHEET_PICTURES = 20
 SHEET_COLUMNS = 5
 SHEET_WIDTH = 256
-VIDEO_CODEC = "mp4v"  # in every OpenCV wheel, because FFmpeg brings it
+VIDEO_CODEC = "mp4v"  # in every OpenCV wheel, which contains FFmpeg
 FALLBACK_RATE = 10.0
 
 
 class CompositeCollector:
-    """Receives composites in the calling thread's time and, where `out` is given, writes each as it came."""
+    """Receives composites in the calling thread and, if `out` is given, writes each as it came."""
 
     def __init__(self, composite_endpoint: str, control_endpoint: str, out: Path | None) -> None:
         self.messages: list[CompositeMessage] = []
@@ -44,18 +44,18 @@ class CompositeCollector:
 
     @property
     def count(self) -> int:
-        """Composites so far."""
+        """Number of composites so far."""
         return len(self.messages)
 
     def take(self, timeout_s: float, limit: int) -> bool:
-        """Take what arrived within `timeout_s`, up to `limit` composites in all; whether there was one."""
+        """Take what arrived within `timeout_s`, up to `limit` composites in total; return whether there was any."""
         newest = self._receiver.latest(timeout_s) or {}
         for multipart in list(newest.values())[: limit - self.count]:
             self._add(multipart)
         return bool(newest)
 
     def server_stats(self) -> dict[str, Any]:
-        """What the render server says about itself.
+        """Return the render server's own statistics.
 
         Raises:
             DeltalightError: it does not answer.
@@ -135,7 +135,7 @@ class CompositeCollector:
 
 
 def contact_sheet(pictures: list[UInt8[np.ndarray, "h w 3"]]) -> UInt8[np.ndarray, "h w 3"]:
-    """The pictures as small tiles in rows; all have the size of the first."""
+    """Return the pictures as small tiles in rows; all have the size of the first."""
     height, width = pictures[0].shape[:2]
     tile = (SHEET_WIDTH, round(SHEET_WIDTH * height / width))
     tiles = [cv2.resize(picture, tile, interpolation=cv2.INTER_AREA) for picture in pictures]
@@ -146,7 +146,7 @@ def contact_sheet(pictures: list[UInt8[np.ndarray, "h w 3"]]) -> UInt8[np.ndarra
 
 
 def summarize(collector: CompositeCollector, restarts: dict[str, int]) -> dict[str, Any]:
-    """Figures of a finished run, while the render server still answers."""
+    """Return the figures of a finished run, while the render server still answers."""
     passes: dict[str, list[float]] = {}
     for message in collector.messages:
         for name, milliseconds in message.pass_times_ms.items():

@@ -31,7 +31,7 @@ BETWEEN_FRAMES_TIMEOUT_S = 60.0
 
 
 def demo_scene(method: str) -> SceneDocument:
-    """The demo's scene with a method of `services.commands.options.Method`.
+    """Return the demo's scene with a method of `services.commands.options.Method`.
 
     Raises:
         DeltalightError: the demo's files are missing.
@@ -43,7 +43,10 @@ def demo_scene(method: str) -> SceneDocument:
 
 
 def with_method(scene: SceneDocument, method: str) -> SceneDocument:
-    """The scene with another method: `dvct` (as it is), dvct's operator `exact` or `paper`, or NAME[-OPERATOR]."""
+    """Return the scene with another method.
+
+    `dvct` (as it is), its operator `exact` or `paper`, or NAME[-OPERATOR].
+    """
     if method == "dvct":
         return scene
     if method in ("exact", "paper"):
@@ -53,7 +56,7 @@ def with_method(scene: SceneDocument, method: str) -> SceneDocument:
 
 
 def run_live(method: str, *, port: int, with_browser: bool) -> None:
-    """Run the demo with its dashboard until Ctrl-C; what is changed in it is not kept.
+    """Run the demo with its dashboard until Ctrl-C; changes are not kept.
 
     Raises:
         DeltalightError: a port is in use, or a process died for good.
@@ -73,7 +76,7 @@ def run_live(method: str, *, port: int, with_browser: bool) -> None:
 
 @contextmanager
 def _kept(method: str, data: Path) -> Iterator[Path]:
-    """The session's file of the demo's scene, which is also kept in a data folder, as the one that is shown."""
+    """Yield the session file of the demo's scene; a data folder stores the scene too, as the active one."""
     with Store(data) as store:
         scene = activate_document(store, demo_scene(method).replaced(name=NAME))
     with session_file(scene) as session:
@@ -96,7 +99,7 @@ def run_headless(method: str, frames: int, out: Path, *, as_json: bool) -> None:
 
 
 def collect_composites(scene: SceneDocument, frames: int, out: Path | None) -> dict[str, Any]:
-    """Play the demo's recording through real processes and collect composites (into `out`, where given).
+    """Play the demo's recording through real processes and collect composites (into `out`, if given).
 
     Raises:
         DeltalightError: a process died for good, or composites stopped coming.
@@ -131,7 +134,7 @@ def _collect(collector: CompositeCollector, supervisor: Supervisor, frames: int)
 
 
 def demo_plan(session: Path) -> HostPlan:
-    """The demo's processes without the web process, joined by ports of their own."""
+    """Return the demo's processes without the web process, connected by ports of their own."""
     node_port, composite_port, control_port = ports.private_ports(3)
     return HostPlan(
         str(RECORDING),
@@ -145,7 +148,7 @@ def demo_plan(session: Path) -> HostPlan:
 
 
 def _has_display() -> bool:
-    """Without a display `webbrowser` would start a text browser in this terminal."""
+    """Whether there is a display; without one, `webbrowser` would start a text browser in this terminal."""
     return sys.platform == "darwin" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 

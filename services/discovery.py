@@ -1,4 +1,4 @@
-"""Finds the sensor nodes that announce themselves on the local network."""
+"""Discovery of the sensor nodes that announce themselves on the local network."""
 
 import threading
 from collections.abc import Mapping, Sequence
@@ -14,7 +14,7 @@ from sensor_node.announce import SERVICE_TYPE
 if TYPE_CHECKING:
     from zeroconf import ServiceInfo, ServiceStateChange, Zeroconf
 
-# Answers come within 0.12 s (RFC 6762, section 6); the first question is asked again after one second.
+# Answers come within 0.12 s (RFC 6762, section 6); the first question is repeated after one second.
 PATIENCE_S = 2.5
 ANSWER_MS = 1000
 ONLY_NODE = "auto"
@@ -22,7 +22,7 @@ ONLY_NODE = "auto"
 
 @dataclass(frozen=True)
 class FoundNode:
-    """A node as it announces itself; `key` is its public key (Z85), empty without keys."""
+    """A node as announced; `key` is its public key (Z85), empty without keys."""
 
     name: str
     address: str
@@ -32,14 +32,14 @@ class FoundNode:
     key: str = ""
 
     def as_dict(self) -> dict[str, Any]:
-        """The node as plain data."""
+        """Return the node as plain data."""
         return {**asdict(self), "endpoint": f"tcp://{self.address}:{self.port}", "curve": bool(self.key)}
 
     def endpoint(self, trusted: Mapping[str, bytes]) -> str:
         """Return the endpoint to subscribe to, with the name under which the node's key is trusted.
 
         Raises:
-            DeltalightError: it speaks another version, has no keys, or its key is not trusted.
+            DeltalightError: the node uses another version, has no keys, or its key is not trusted.
         """
         if self.schema_version != SCHEMA_VERSION:
             raise DeltalightError(
@@ -102,7 +102,7 @@ def find_nodes(
 
 
 def _node(info: "ServiceInfo") -> FoundNode | None:
-    """What an announcement says, None where it does not say enough."""
+    """Parse an announcement; return None if it is incomplete."""
     texts = {key: value or "" for key, value in info.decoded_properties.items()}
     addresses = info.parsed_addresses()
     if not addresses or info.port is None or not texts.get("name") or not texts.get("schema", "").isdecimal():
@@ -121,7 +121,7 @@ def choose(nodes: Sequence[FoundNode], name: str) -> FoundNode:
     """Return the node called `name`, or for `auto` the only one.
 
     Raises:
-        DeltalightError: it is not there, or `auto` and several are.
+        DeltalightError: it was not found, or `auto` and there are several.
     """
     names = ", ".join(node.name for node in nodes)
     if not nodes:

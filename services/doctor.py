@@ -1,4 +1,4 @@
-"""What this machine has and what is missing: each check ends in one line with a hint."""
+"""Checks of this machine: each ends in one line with a hint."""
 
 import json
 import subprocess
@@ -17,8 +17,6 @@ PACKAGES = {
     "api": ("fastapi", "uvicorn", "websockets", "sqlalchemy", "prometheus-client"),
 }
 
-NAMES_OF_KINDS = {"uvc": "USB (UVC)", "oak": "OAK", "openni2": "OpenNI 2", "orbbec": "Orbbec"}
-
 CONTAINER_HINT = (
     "EGL sees no device: apt-get install --no-install-recommends libegl1 libgl1; in a container with an"
     " NVIDIA GPU set NVIDIA_DRIVER_CAPABILITIES=graphics,compute,utility"
@@ -34,7 +32,7 @@ print(json.dumps([gpu.renderer_name, gpu.version, gpu.is_software]))
 
 @dataclass(frozen=True)
 class Check:
-    """One finding: `missing` makes the command end with 1; `note` does not."""
+    """One finding: `missing` makes the command exit with 1; `note` does not."""
 
     name: str
     state: Literal["ok", "note", "missing"]
@@ -42,16 +40,17 @@ class Check:
     hint: str = ""
 
     def as_dict(self) -> dict[str, str]:
-        """The check as plain data."""
+        """Return the check as plain data."""
         return asdict(self)
 
 
 def examine() -> Iterator[Check]:
-    """All checks, one after the other."""
+    """Run all checks, one after the other."""
     yield Check("python", "ok", sys.version.split()[0])
     yield from _packages()
     yield _opencv()
     yield from _renderers()
+    yield from _methods()
     yield from _cameras()
     yield from _ports()
 
@@ -118,16 +117,28 @@ def _probe(device: int) -> subprocess.CompletedProcess[str]:
         return subprocess.CompletedProcess(command, 1, "", f"no answer within {PROBE_TIMEOUT_S} s")
 
 
+def _methods() -> Iterator[Check]:
+    """Every relighting method of a plugin, one line each."""
+    from protocol.methods import PLUGINS
+
+    for name, method in PLUGINS.values.items():
+        yield Check(f"method {name}", "ok", f"of package {method.plugin.package}")
+    for plugin, fault in PLUGINS.faults.items():
+        detail, _, hint = fault.rstrip(".").rpartition("; ")
+        yield Check(f"method {plugin.name}", "note", detail, hint)
+
+
 def _cameras() -> Iterator[Check]:
-    """Every camera that is there, one line each, then the kinds of which none could be found."""
+    """Report every camera that was found, one line each, then the kinds without any."""
     from sensor_node.cameras.discovery import discover
+    from sensor_node.cameras.drivers import driver_title
 
     found = discover()
     for camera in found.cameras:
         detail = f"{camera.name} ({camera.details})"
         yield Check(f"camera {camera.source}", "note" if camera.hint else "ok", detail, camera.hint)
     for kind in found.missing:
-        yield Check(f"{NAMES_OF_KINDS[kind.kind]} cameras", "note", kind.details, kind.hint)
+        yield Check(f"{driver_title(kind.kind)} cameras", "note", kind.details, kind.hint)
 
 
 def _ports() -> Iterator[Check]:

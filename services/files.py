@@ -1,4 +1,4 @@
-"""Output folders of commands; what is written there appears whole or not at all (protocol/files.py)."""
+"""Output folders of commands; files are written there atomically (protocol/files.py)."""
 
 import os
 from pathlib import Path
@@ -10,7 +10,7 @@ __all__ = ["make_output_folder", "replacing", "write_bytes", "write_png"]
 
 
 def make_output_folder(folder: Path) -> Path:
-    """Create `folder` where missing and prove that files can be written into it.
+    """Create `folder` if missing, and verify that files can be written into it.
 
     Raises:
         DeltalightError: it is a file, or cannot be created or written.

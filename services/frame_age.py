@@ -1,4 +1,4 @@
-"""How old a picture is."""
+"""Age of a picture."""
 
 import time
 
@@ -6,5 +6,5 @@ from protocol.messages import CompositeMessage
 
 
 def age_ms(message: CompositeMessage) -> float:
-    """How long ago the picture was captured, by this host's clock, ms."""
+    """Return the time since the picture's capture, by this host's clock, ms."""
     return (time.time_ns() - message.capture_ns - message.clock_offset_ns) / 1e6

@@ -1,4 +1,4 @@
-"""Whether a process answers: a render server on its control socket, a publisher by its reports, an API over HTTP."""
+"""Health checks: a render server by its control socket, a publisher by its reports, an API over HTTP."""
 
 import urllib.error
 import urllib.request
@@ -17,7 +17,7 @@ def check_health(address: str, *, streams: bool, timeout_s: float) -> str | None
     """Return what is wrong as a sentence, or None.
 
     Raises:
-        DeltalightError: the address is not understood, or needs keys that are not there.
+        DeltalightError: the address is malformed, or requires keys that are missing.
     """
     if address.startswith(("http://", "https://")):
         return _ask_api(address.rstrip("/"), timeout_s)

@@ -1,4 +1,4 @@
-"""The processes of one host and how they are joined: node -> render server -> web process, on loopback."""
+"""The processes of one host and their connections: node -> render server -> web process, on loopback."""
 
 import os
 from dataclasses import dataclass
@@ -13,12 +13,11 @@ from services.supervisor import ChildSpec
 
 @dataclass(frozen=True)
 class HostPlan:
-    """What runs on this host; `session_file` holds the scene document, which survives a server's restart.
+    """The processes of this host; `session_file` holds the scene document, which survives a server's restart.
 
-    `source` is what the node of this host captures; None = there is none, and the server looks for the node called
-    `remote_node` on the network. `config` is the configuration file of all; None = the one they find, and what
-    stands here by default says nothing. `data` is the folder of scenes of the web process, which runs where it is
-    given.
+    `source` is what the node of this host captures; None = there is no node, and the server looks for the one called
+    `remote_node` on the network. `config` is the configuration file of all processes; None = the one they find, which
+    overrides the defaults here. `data` is the folder of scenes of the web process, which runs only if it is given.
     """
 
     source: str | None
@@ -36,7 +35,7 @@ class HostPlan:
     log_level: str = "info"
 
     def specs(self) -> list[ChildSpec]:
-        """The children to supervise, in the order of the stream."""
+        """Return the children to supervise, in the order of the stream."""
         specs = [self._server()] if self.source is None else [self._node(self.source), self._server()]
         return specs if self.data is None else [*specs, self._web(self.data)]
 
@@ -101,7 +100,7 @@ class HostPlan:
 
 
 def choose_scene(source: Source | None, path: Path | None) -> SceneDocument:
-    """The scene document at `path`, else the one that the recording carries.
+    """Return the scene document at `path`, else the one that the recording carries.
 
     Raises:
         DeltalightError: there is neither, or the document is wrong.

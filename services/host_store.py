@@ -1,4 +1,4 @@
-"""The scene that this host's processes begin with: the one that its data folder shows, or one that is imported."""
+"""The initial scene of this host's processes: the active one of its data folder, or an imported one."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,7 +16,7 @@ FIRST_SCENE = "First scene"
 
 @contextmanager
 def session_file(scene: SceneDocument) -> Iterator[Path]:
-    """A temporary file with the scene document, as the render server's `--session` wants it."""
+    """Yield a temporary file with the scene document, for the render server's `--session`."""
     with TemporaryDirectory(prefix="deltalight-") as folder:
         path = Path(folder) / "scene.json"
         write_bytes(path, scene.model_dump_json(indent=1).encode())
@@ -24,7 +24,7 @@ def session_file(scene: SceneDocument) -> Iterator[Path]:
 
 
 def activate_document(store: Store, document: SceneDocument) -> SceneDocument:
-    """Keep a document and its files in the store, show it from now on, and return it as a render server wants it.
+    """Store a document and its files, activate it, and return it as a render server expects it.
 
     Raises:
         DeltalightError: one of its files is wrong.
@@ -34,9 +34,9 @@ def activate_document(store: Store, document: SceneDocument) -> SceneDocument:
 
 
 def scene_to_show(store: Store, source: Source | None, path: Path | None) -> SceneDocument:
-    """The document that is shown first: that of `path`, else the store's active one, else the recording's.
+    """Return the initial document: that of `path`, else the store's active one, else the recording's.
 
-    Where there is none of them, an empty scene is made.
+    Creates an empty scene if there is none.
 
     Raises:
         DeltalightError: the document or one of its files is wrong.

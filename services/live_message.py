@@ -64,7 +64,7 @@ class PictureHeader(BaseModel):
         """Describe a composite.
 
         Raises:
-            DeltalightError: its camera is none.
+            DeltalightError: its camera is invalid.
         """
         scene = {"id": message.scene_id, "revision": message.scene_revision}
         own = {
@@ -100,7 +100,7 @@ def unpack(message: bytes) -> tuple[LiveHeader, bytes]:
     """Return the header and the JPEG of a message.
 
     Raises:
-        DeltalightError: it is no such message.
+        DeltalightError: it is malformed.
     """
     try:
         (length,) = _LENGTH.unpack_from(message)

@@ -1,4 +1,4 @@
-"""Log lines of every process: structlog on stderr, so that stdout stays for data."""
+"""Log lines of every process: structlog on stderr, because stdout is for data."""
 
 import logging
 import sys

@@ -1,4 +1,4 @@
-"""Recordings and folders that appear whole or not at all, and never replace anything."""
+"""New recordings and folders that appear atomically, and never replace anything."""
 
 import os
 import shutil
@@ -14,7 +14,7 @@ SUFFIX = ".mcap"
 
 
 def require_new_recording(path: Path) -> None:
-    """Check the name of a recording that is to grow there; its folder is created where missing.
+    """Check the name of a recording to be written; create its folder if missing.
 
     Raises:
         DeltalightError: the name is taken or not `*.mcap`, or the folder cannot be written.
@@ -24,7 +24,7 @@ def require_new_recording(path: Path) -> None:
 
 
 def require_recording_name(path: Path) -> None:
-    """Check the name of a recording that is to appear there; its folder is created where missing.
+    """Check the name of a recording to appear; create its folder if missing.
 
     Raises:
         DeltalightError: the name is taken or not `*.mcap`, or the folder cannot be written.
@@ -39,7 +39,7 @@ def require_absent(path: Path) -> None:
     """Refuse to replace anything.
 
     Raises:
-        DeltalightError: there is something of that name.
+        DeltalightError: the path exists.
     """
     if path.exists() or path.is_symlink():
         raise DeltalightError(f"{path} already exists; choose another name or remove it.")
@@ -47,12 +47,12 @@ def require_absent(path: Path) -> None:
 
 @contextmanager
 def appearing(path: Path) -> Iterator[Path]:
-    """Give a name beside `path` to write a file or folder to; put it in place at the end, remove it at a fault.
+    """Yield a temporary path beside `path` for a file or folder.
 
-    A killed process leaves it behind, hidden. The suffix is kept.
+    Move it into place at the end, remove it on an error. A killed process leaves it behind, hidden. The suffix stays.
 
     Raises:
-        DeltalightError: there is something at `path` already, or the disk refuses.
+        DeltalightError: `path` exists already, or the disk refuses.
     """
     require_absent(path)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")

@@ -1,4 +1,4 @@
-"""A sensor node in this process, with the settings of a configuration file: what `node` and `replay` run."""
+"""A sensor node in this process, with the settings of a configuration file, for `node` and `replay`."""
 
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -19,16 +19,16 @@ def run_configured_node(
     camera: PlaybackCamera | None = None,
     control: str | None = None,
 ) -> None:
-    """Run a node until Ctrl-C or its end; `given` settings win over the file's.
+    """Run a node until Ctrl-C or its end; `given` settings override the file's.
 
     Args:
         given: settings of the node.
-        config_file: configuration file; None = the one that is found.
-        camera: stands for the source that the settings name.
-        control: endpoint where that camera is controlled.
+        config_file: configuration file; None = the default one.
+        camera: replaces the source of the settings.
+        control: endpoint that controls that camera.
 
     Raises:
-        DeltalightError: wrong settings, or the source, an endpoint or a key cannot be used.
+        DeltalightError: the settings are wrong, or the source, an endpoint or a key cannot be used.
     """
     configuration = load_configuration(config_file)
     config = configuration.section("node", NodeConfig, given)

@@ -1,4 +1,4 @@
-"""Rendering a recording to files, frame by frame: what `deltalight render` does."""
+"""Offline rendering of a recording to files, frame by frame, for `deltalight render`."""
 
 import json
 import time
@@ -23,7 +23,7 @@ INDEX_FILE = "frames.jsonl"
 
 @dataclass(frozen=True)
 class RenderJob:
-    """What to render where; `frames` are indices into the source."""
+    """A render job; `frames` are indices into the source."""
 
     source: Source
     scene: SceneDocument
@@ -35,7 +35,7 @@ class RenderJob:
 
 @dataclass
 class RenderSummary:
-    """What a finished job did; `render_ms` holds each frame's time from input to pixels."""
+    """Summary of a finished job; `render_ms` holds each frame's time from input to pixels."""
 
     renderer: str
     out: Path
@@ -48,7 +48,7 @@ class RenderSummary:
         self.without_pose += composite.status == "no_pose"
 
     def as_dict(self) -> dict[str, Any]:
-        """The summary as plain data."""
+        """Return the summary as plain data."""
         return {
             "frames": len(self.render_ms),
             "no_pose": self.without_pose,
@@ -59,7 +59,7 @@ class RenderSummary:
 
 
 def with_output(scene: SceneDocument, size: tuple[int, int] | None, view: str | None) -> SceneDocument:
-    """The scene with another output size (width, height) or view, where given."""
+    """Return the scene with another output size (width, height) or view, if given."""
     changes: dict[str, object] = {}
     if size is not None:
         changes |= {"width": size[0], "height": size[1]}
@@ -69,23 +69,23 @@ def with_output(scene: SceneDocument, size: tuple[int, int] | None, view: str | 
 
 
 class Progress(Protocol):
-    """Whoever watches a job."""
+    """Observer of a job."""
 
     def renderer(self, name: str, *, is_software: bool) -> None:
-        """The OpenGL renderer that was got."""
+        """Report the OpenGL renderer in use."""
 
     def notice(self, sentence: str) -> None:
-        """Something that a user should read."""
+        """Report something that the user should read."""
 
     def frame_done(self) -> None:
-        """One more frame is on disk."""
+        """Report one more frame on disk."""
 
 
 def run_job(job: RenderJob, progress: Progress) -> RenderSummary:
     """Render every frame of the job.
 
-    A picture is in place before its line in frames.jsonl is written, and each line is written whole, so what
-    an interrupted run leaves is a shorter run.
+    A picture is complete before its line in frames.jsonl is written, and each line is written at once, so an
+    interrupted run leaves a valid shorter run.
 
     Raises:
         DeltalightError: bad input, no OpenGL, or the output cannot be written.
@@ -128,7 +128,7 @@ def _render_frames(
         started_s = time.perf_counter()
         composite = renderer.render(frame)
         summary.add(composite, 1000 * (time.perf_counter() - started_s))
-        if frame.radiance_map is not None and warnings is None:  # the first map speaks for all
+        if frame.radiance_map is not None and warnings is None:  # the first map represents all
             warnings = light_warnings(frame.radiance_map)
         for sentence in (*builder.notes, *(warnings or ()), *renderer.notices):
             if sentence not in said:
@@ -140,7 +140,10 @@ def _render_frames(
 
 
 def _require_light(scene: SceneDocument, frame: ViewFrame, notes: Sequence[str]) -> None:
-    """Refuse a source without fish-eye light for a scene that wants it; the first pictures hold for all before."""
+    """Refuse a source without fish-eye light if the scene needs it.
+
+    The first pictures apply to all earlier frames.
+    """
     if scene.lights.mode == "fisheye" and frame.radiance_map is None and frame.pose is not None:
         reason = "".join(f" ({note.rstrip('.')})" for note in notes)
         raise DeltalightError(
@@ -155,13 +158,13 @@ def _write_frame(job: RenderJob, number: int, frame: ViewFrame, composite: "Comp
         linear = linear_color(frame, composite.color) if composite.linear is None else composite.linear
         with replacing(job.out / f"{number:06d}.exr") as temporary:
             write_exr(temporary, linear)
-    mode = "w" if number == job.frames.start else "a"  # an older run's index goes with the first picture
+    mode = "w" if number == job.frames.start else "a"  # the first picture replaces an older run's index
     with (job.out / INDEX_FILE).open(mode, encoding="utf-8") as index:
         index.write(json.dumps(frame_record(number, frame, composite)) + "\n")
 
 
 def frame_record(number: int, frame: ViewFrame, composite: "CompositeFrame") -> dict[str, Any]:
-    """The line of frames.jsonl for one frame."""
+    """Return the line of frames.jsonl for one frame."""
     return {
         "frame": number,
         "timestamp": frame.timestamp_ns / 1e9,

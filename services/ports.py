@@ -1,4 +1,4 @@
-"""Which loopback port serves what, and whether it is free."""
+"""Loopback ports of the processes, and whether they are free."""
 
 import random
 import socket
@@ -10,18 +10,18 @@ NODE_PORT = 5601  # a sensor node publishes
 COMPOSITE_PORT = 5602  # the render server publishes
 CONTROL_PORT = 5603  # the render server answers
 PAGE_PORT = 8000  # the web process serves dashboard, REST API and live video
-PRIVATE_PORTS = range(20_000, 32_000)  # below the range that the kernel hands to outgoing connections
+PRIVATE_PORTS = range(20_000, 32_000)  # below the kernel's range for outgoing connections
 
 
 def endpoint(port: int) -> str:
-    """ZeroMQ endpoint of a loopback port."""
+    """Return the ZeroMQ endpoint of a loopback port."""
     return f"tcp://{LOOPBACK}:{port}"
 
 
 def is_free(port: int) -> bool:
     """Whether a server could listen on this loopback port now."""
     with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a closed connection's rest is no server
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a connection in TIME_WAIT is no server
         try:
             probe.bind((LOOPBACK, port))
         except OSError:
@@ -52,7 +52,7 @@ def require_free(port: int, purpose: str, option: str) -> None:
 
 
 def private_ports(count: int) -> list[int]:
-    """Free ports for one run's own processes, chosen so that two runs rarely meet.
+    """Return free ports for one run's own processes, chosen so that two runs rarely collide.
 
     Raises:
         DeltalightError: nearly all ports of the range are in use.

@@ -1,7 +1,7 @@
-"""Puts the raw streams of a sensor node together again: the frames as its camera gave them.
+"""Reassembly of a sensor node's raw streams into the frames that its camera delivered.
 
-Each colour picture gets the depth of its moment, the fish-eye picture that holds for it, and its pose where
-that was given; a pose that was found by the marker board is found again when the frame is replayed.
+Each colour picture gets the depth of its moment, the current fish-eye picture, and its pose if one was given; a pose
+found by the marker board is found again when the frame is replayed.
 """
 
 from collections import Counter, deque
@@ -19,12 +19,12 @@ from protocol.frames import DepthImage, FisheyePictures, SensorFrame
 from protocol.light_codecs import fisheye_pictures
 from protocol.messages import ColorMessage, DepthMessage, FisheyeMessage, Message, MessageBase, PoseMessage
 
-# A SUB socket subscribes one by one: colour last, so that whoever gets a colour picture gets its partners.
+# A SUB socket subscribes one by one: colour last, so that a colour picture comes with its partners.
 RAW_STREAMS = ("fisheye", "depth", "pose", "color")
-DEPTH_TOLERANCE_NS = 20_000_000  # as recorded pictures are paired (protocol.dataset_lists)
+DEPTH_TOLERANCE_NS = 20_000_000  # the pairing of recorded pictures (protocol.dataset_lists)
 WAITING_COLORS = 2  # a partner that has not come with the second colour picture after its own is lost
 KEPT_MESSAGES = 8
-KEPT_FISHEYES = 2  # the newest, and the one before for colour pictures that still wait; brackets are large
+KEPT_FISHEYES = 2  # the newest and the previous one, for colour pictures that still wait; brackets are large
 
 Kind = TypeVar("Kind", bound=MessageBase)
 Built = TypeVar("Built")
@@ -37,12 +37,12 @@ class _Held(Generic[Kind]):
 
 
 class RawFrameAssembler:
-    """Takes the decoded messages of one node in their order and gives its raw frames, oldest first.
+    """Takes the decoded messages of one node in order and returns its raw frames, oldest first.
 
-    `node` is the node whose frames these are (None until its first colour picture came); messages of others are
-    counted in `foreign`. `board` is what the node told about it first. `missing` counts by stream what never
-    came: `color` by the numbers of the frames, `depth` and `pose` by the frames without. The very first colour
-    picture is left out, because some of its partners may have been sent before the subscription.
+    `node` is the node whose frames these are (None until its first colour picture); messages of others are counted in
+    `foreign`. `board` is the first one that the node described. `missing` counts losses by stream: `color` by the
+    numbers of the frames, `depth` and `pose` by the frames without. The very first colour picture is left out,
+    because some of its partners may have been sent before the subscription.
     """
 
     def __init__(self, node: str | None = None) -> None:
@@ -60,7 +60,7 @@ class RawFrameAssembler:
         self._last: dict[str, Any] = {}
 
     def add(self, message: Message, parts: Sequence[memoryview]) -> None:
-        """Keep a message until its frame is complete.
+        """Store a message until its frame is complete.
 
         Raises:
             DeltalightError: the board or the fish-eye pictures of the message are broken.
@@ -84,10 +84,10 @@ class RawFrameAssembler:
         self._streams.add(message.stream)
 
     def take(self, *, is_idle: bool = False) -> SensorFrame | None:
-        """Return the oldest frame if it is complete or, when nothing more came (`is_idle`), as it is.
+        """Return the oldest frame if it is complete or, if nothing more arrived (`is_idle`), as it is.
 
         Raises:
-            DeltalightError: the payload of the frame is broken; it is gone, the next call goes on.
+            DeltalightError: the payload of the frame is broken; the frame is dropped, and the next call continues.
         """
         if not self._colors:
             return None
@@ -108,7 +108,7 @@ class RawFrameAssembler:
     def _count(
         self, color: ColorMessage, pose: PoseMessage | None, depth: _Held[DepthMessage] | None
     ) -> None:
-        if self._last_id is not None and color.frame_id > self._last_id:  # else the node was started again
+        if self._last_id is not None and color.frame_id > self._last_id:  # otherwise the node restarted
             self.missing["color"] += color.frame_id - self._last_id - 1
         self._last_id = color.frame_id
         self.missing["pose"] += not self._is_there(pose, "pose")
@@ -155,29 +155,29 @@ class RawFrameAssembler:
         return DepthImage(depth_m, valid, camera, header.noise_sigma_m)
 
     def _fisheye_at(self, capture_ns: int) -> FisheyePictures | None:
-        """The newest that is not later; before the first, the first."""
+        """Return the newest pictures that are not later; before the first, the first."""
         held = (pictures for pictures in reversed(self._fisheyes) if pictures.timestamp_ns <= capture_ns)
         return next(held, self._fisheyes[0] if self._fisheyes else None)
 
     def _add_fisheye(self, message: FisheyeMessage, parts: Sequence[memoryview]) -> None:
-        """Decode fish-eye pictures, unless they are sent again for whoever came late."""
+        """Decode fish-eye pictures, unless they are a repetition for late subscribers."""
         if message.capture_ns == self._fisheye_ns:
             return
         self._fisheye_ns = message.capture_ns
         pictures = fisheye_pictures(message, parts)
-        # A replay that began again stamps them by its first round, and recordings hold them in order.
+        # A restarted replay stamps them by its first round, but recordings require rising times.
         earliest_ns = self._fisheyes[-1].timestamp_ns + 1 if self._fisheyes else 0
         self._fisheyes.append(replace(pictures, timestamp_ns=max(message.capture_ns, earliest_ns)))
 
     def _same(self, stream: str, made: Built) -> Built:
-        """Give the instance of the message before while it is equal, so that its rays are computed once."""
+        """Return the previous message's instance while it is equal, so that its rays are computed once."""
         if self._last.get(stream) != made:
             self._last[stream] = made
         return self._last[stream]  # type: ignore[no-any-return]
 
 
 def _given_pose(pose: PoseMessage) -> np.ndarray | None:
-    """A pose without a reprojection error was given with the frame; no board was looked for."""
+    """Return the pose if it was given with the frame: without a reprojection error, no board was searched."""
     if pose.world_from_camera is None or pose.reprojection_error_px is not None:
         return None
     return np.array(pose.world_from_camera)

@@ -1,4 +1,4 @@
-"""Recording the raw streams of a node: every frame that comes, until somebody says stop."""
+"""Recording of a node's raw streams: every frame that arrives, until stopped."""
 
 import shutil
 import time
@@ -23,19 +23,19 @@ from services.raw_frames import RAW_STREAMS, RawFrameAssembler
 from services.stream_queue import StreamQueue
 
 POLL_S = 0.1
-IDLE_POLLS = 3  # then frames whose partners are late are taken as they are
+IDLE_POLLS = 3  # afterwards, frames whose partners are late are taken as they are
 SILENCE_S = 3.0
 LOOK_PERIOD_S = 0.5
 LEAST_SPACE_S = 60.0
-STEADY_AFTER_S = 2.0  # before, the rate says little about what is to come
+STEADY_AFTER_S = 2.0  # earlier, the rate does not predict the future
 
 
 @dataclass(frozen=True)
 class RecordJob:
-    """What to record where; `node` None is the node at the endpoints whose colour picture comes first.
+    """What to record where; `node` None is the node whose colour picture comes first.
 
-    `duration_s` counts from the first frame. `extrinsics` are the transforms between the sensors, which the
-    streams do not carry.
+    `duration_s` counts from the first frame. `extrinsics` are the transforms between the sensors, which the streams
+    do not carry.
     """
 
     out: Path
@@ -50,12 +50,12 @@ class RecordJob:
 
 @dataclass
 class RecordStatus:
-    """How far a recording is; one thread changes it, others may read.
+    """Progress of a recording; one thread changes it, others may read.
 
-    `missing` counts by stream what never came: `color` by the gaps in the frames' numbers, `depth` and `pose` by
-    the frames without. `dropped` counts what came and was left out: messages by stream because the queue was
-    full, `late` frames not later than the one before, `broken` messages. `node_drops` is what the node says that
-    it dropped itself since the recording began, which is part of `missing`.
+    `missing` counts frames' parts that never came, by stream: `color` by gaps in the frames' numbers, `depth` and
+    `pose` by the frames without. `dropped` counts what came but was left out: messages by stream because the queue
+    was full, `late` frames not later than the one before, `broken` messages. `node_drops` is the node's own count of
+    drops since the recording began, which is part of `missing`.
     """
 
     out: Path
@@ -74,7 +74,7 @@ class RecordStatus:
         return self.size_bytes / self.seconds if self.seconds > 0 else 0.0
 
     def as_dict(self) -> dict[str, Any]:
-        """The figures as plain data."""
+        """Return the figures as plain data."""
         seconds = max(self.seconds, 1e-9)
         return {
             "out": str(self.out),
@@ -93,10 +93,10 @@ class RecordStatus:
 class Recorder:
     """Records one take.
 
-    `notice(sentence)` tells what a user should read; it is called from the thread of `run`.
+    `notice(sentence)` reports what the user should read; it is called from the thread of `run`.
 
     Raises:
-        DeltalightError: the name is taken, its folder cannot be written, or an endpoint is not understood.
+        DeltalightError: the name is taken, its folder cannot be written, or an endpoint is malformed.
     """
 
     def __init__(self, job: RecordJob, notice: Callable[[str], None]) -> None:
@@ -117,7 +117,7 @@ class Recorder:
         """Record until `stop` is set or enough was recorded; without any frame no file is left.
 
         Raises:
-            DeltalightError: the disk refused; it says what of the recording is readable.
+            DeltalightError: the disk refused; the sentence says what of the recording is readable.
         """
         try:
             with closing(self._queue), self._files:
@@ -126,7 +126,7 @@ class Recorder:
                     self._look_around()
                 self._queue.close()
                 while not self._is_enough() and self._receive(0):
-                    pass  # what had come before the end belongs to the recording
+                    pass  # what arrived before the end belongs to the recording
                 self._measure()
             if self._writer is not None:
                 self.status.size_bytes = self._writer.path.stat().st_size
@@ -140,7 +140,7 @@ class Recorder:
         return self.status
 
     def _receive(self, timeout_s: float) -> bool:
-        """Take one message and write what became complete; False where none came."""
+        """Take one message and write complete frames; return False if none came."""
         multipart = self._queue.take(timeout_s)
         self._idle_polls = 0 if multipart is not None else self._idle_polls + 1
         try:
@@ -159,7 +159,7 @@ class Recorder:
             self._assembler.add(message, parts)
         elif message.node == self._assembler.node:
             told = message.drops.get("capture", 0)
-            if self._node_drops_before is None or told < self._node_drops_before:  # it was started again
+            if self._node_drops_before is None or told < self._node_drops_before:  # it restarted
                 self._node_drops_before = told - self.status.node_drops
             self.status.node_drops = told - self._node_drops_before
 

@@ -1,4 +1,4 @@
-"""The scene document that a render server uses now."""
+"""The scene document of a render server."""
 
 import uuid
 
@@ -12,10 +12,10 @@ TIMEOUT_S = 5.0
 
 
 def scene_of_server(endpoint: str, keys: Keys | None) -> SceneDocument:
-    """Ask the render server at a control endpoint.
+    """Request the scene document from the render server at a control endpoint.
 
     Raises:
-        DeltalightError: it does not answer, or what it answers is no scene document.
+        DeltalightError: it does not answer, or its answer is no scene document.
     """
     client = RequestClient(endpoint, keys=keys)
     try:

@@ -1,4 +1,4 @@
-"""Recordings mended, and made of dataset folders and the other way round."""
+"""Copies of recordings: recovery, and conversion from and to dataset folders."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
@@ -16,13 +16,13 @@ from services.recording_info import RecordingScan, scan_recording
 
 SCENE_FILE = "scene.json"
 
-# Goes through frame numbers and shows how far it is.
+# Iterates over frame numbers and shows progress.
 Track = Callable[[range], Iterable[int]]
 
 
 @dataclass(frozen=True)
 class Copied:
-    """What was written: how many frames, how many were lost, and sentences about what a user should know."""
+    """Result of a copy: how many frames were written and lost, and sentences for the user."""
 
     out: Path
     frames: int
@@ -31,14 +31,14 @@ class Copied:
 
 
 def recovered_name(path: Path) -> Path:
-    """Where a recording is mended to unless told: `NAME.mcap` of `NAME.mcap.active`, else a name beside it."""
+    """Return the default path of a recovered recording: `NAME.mcap` of `NAME.mcap.active`, else a name beside it."""
     if path.name.endswith(ACTIVE_SUFFIX):
         return path.with_name(path.name.removesuffix(ACTIVE_SUFFIX))
     return path.with_name(f"{path.stem}-recovered.mcap")
 
 
 def recover_recording(path: Path, out: Path, track: Track) -> Copied | None:
-    """Write all frames that can be read to a new, finished recording; None if there is nothing to mend.
+    """Write all readable frames to a new, finished recording; return None if there is nothing to recover.
 
     The recording itself is only read; `out` appears when it is complete.
 
@@ -81,12 +81,12 @@ def _losses(scan: RecordingScan, lost: int) -> list[str]:
 
 
 def import_folder(folder: Path, out: Path, scene: Path | None, track: Track) -> Copied:
-    """Write a dataset folder as a recording; the scene is `scene`, else scene.json in the folder if it is there.
+    """Write a dataset folder as a recording, with the scene `scene`, else scene.json in the folder if it exists.
 
     Colour keeps its JPEG bytes, everything else its pixels. `out` appears when it is complete.
 
     Raises:
-        DeltalightError: what is wrong with the folder or the scene, `out` is taken, or the disk refuses.
+        DeltalightError: the folder or the scene is wrong, `out` is taken, or the disk refuses.
     """
     require_recording_name(out)
     source = open_dataset(folder)
@@ -112,13 +112,12 @@ def _scene_of(folder: Path, scene: Path | None) -> SceneDocument | None:
 
 
 def export_recording(path: Path, out: Path, track: Track) -> Copied:
-    """Write a recording as a dataset folder, and the scene that it carries beside the lists as scene.json.
+    """Write a recording as a dataset folder, with its scene as scene.json.
 
     The folder appears when it is complete; a killed process leaves a hidden one beside it.
 
     Raises:
-        DeltalightError: a frame is damaged, cameras change within the recording, `out` is taken, or the disk
-            refuses.
+        DeltalightError: a frame is damaged, cameras change within the recording, `out` is taken, or the disk refuses.
     """
     require_absent(out)
     make_output_folder(out.parent)

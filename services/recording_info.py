@@ -1,4 +1,4 @@
-"""What a recording holds, read through once without decoding its pictures."""
+"""Contents of a recording, scanned once without decoding its pictures."""
 
 import mmap
 import statistics
@@ -17,15 +17,15 @@ from protocol.errors import DeltalightError
 from protocol.recording_format import FISHEYE_RECORD_TOPIC, FRAME_TOPIC, FisheyeRecord, FrameRecord
 from protocol.recording_reader import DAMAGE, MAX_RECORD_BYTES, RecordingReader
 
-GAP_PERIODS = 1.5  # a step in time longer than so many usual ones is a gap
+GAP_PERIODS = 1.5  # a step in time longer than this many usual ones is a gap
 
 
 @dataclass
 class RecordingScan:
-    """The records of a recording in their order, and the size of every stream before compression.
+    """The records of a recording in order, and the size of every stream before compression.
 
-    `is_finished` says whether the file has its end; `damaged` counts the chunks that cannot be read,
-    `unread_bytes` what follows the last whole record.
+    `is_finished`: the file has its end; `damaged` counts unreadable chunks, `unread_bytes` what follows the last
+    complete record.
     """
 
     path: Path
@@ -39,19 +39,19 @@ class RecordingScan:
 
     @property
     def depth_scale(self) -> float | None:
-        """Metres for each step of the depth, None where it has none or several."""
+        """Metres per step of the depth, None if it has none or several."""
         scales = {frame.depth.scale for frame in self.frames if frame.depth is not None}
         return scales.pop() if len(scales) == 1 else None
 
     @property
     def skipped(self) -> int:
-        """Frames that the numbers say were never recorded."""
+        """Number of frames never recorded, by the gaps in their numbers."""
         steps = [after.frame_id - before.frame_id - 1 for before, after in pairwise(self.frames)]
-        return sum(step for step in steps if step > 0)  # it falls where the node was started again
+        return sum(step for step in steps if step > 0)  # it falls when the node restarts
 
 
 def scan_recording(path: Path, progress: Callable[[float], None] | None = None) -> RecordingScan:
-    """Read a recording through, as far as it can be read; `progress(share)` is told the share from 0 to 1.
+    """Scan a recording, as far as it is readable; `progress` is called with the fraction from 0 to 1.
 
     Raises:
         DeltalightError: the file cannot be read at all.
@@ -70,7 +70,7 @@ def scan_recording(path: Path, progress: Callable[[float], None] | None = None) 
 
 
 def _messages(data: mmap.mmap, scan: RecordingScan) -> Iterator[tuple[Message, str]]:
-    # Memory that is mapped gives what is there, however much a damaged length asks for.
+    # Mapped memory returns what exists, however much a damaged length requests.
     topics: dict[int, str] = {}
     whole = 0
     try:
@@ -110,7 +110,7 @@ def _take(scan: RecordingScan, topic: str, message: Message) -> None:
 
 
 def describe_recording(path: Path, progress: Callable[[float], None] | None = None) -> dict[str, Any]:
-    """Return what a recording holds as plain data.
+    """Return the contents of a recording as plain data.
 
     Raises:
         DeltalightError: not a recording, of another schema version, or without a complete frame.

@@ -1,4 +1,4 @@
-"""The control endpoint of a replay: where it is, and play, pause, seek, rate (SPEC.md, section 6)."""
+"""The control endpoint of a replay: position, play, pause, seek, rate (SPEC.md, section 6)."""
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -16,7 +16,7 @@ OPS = ("position", "play", "pause", "seek", "rate")
 
 @contextmanager
 def playback_control(camera: PlaybackCamera, endpoint: str, keys: Keys | None) -> Iterator[None]:
-    """Answer requests about a replay until the end of the block.
+    """Answer requests about a replay for the duration of the block.
 
     Raises:
         DeltalightError: the endpoint cannot be used.
@@ -29,7 +29,7 @@ def playback_control(camera: PlaybackCamera, endpoint: str, keys: Keys | None) -
 
 
 def _execute(camera: PlaybackCamera, request: ControlRequest) -> dict[str, object]:
-    """Every op answers with the position after it."""
+    """Execute a request; every op answers with the position after it."""
     match request.op:
         case "position":
             pass

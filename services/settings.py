@@ -1,6 +1,7 @@
 """Settings of processes: the configuration file `deltalight.toml`, the environment, the command line.
 
-A later one wins: what the program brings, the file, environment variables `DELTALIGHT_SECTION__KEY`, options.
+Later ones override earlier ones: defaults of the program, the file, environment variables `DELTALIGHT_SECTION__KEY`,
+options.
 """
 
 import tomllib
@@ -20,7 +21,7 @@ from services.ports import COMPOSITE_PORT, CONTROL_PORT, NODE_PORT, endpoint
 FILE_NAME = "deltalight.toml"
 ENV_PREFIX, ENV_DELIMITER = "DELTALIGHT_", "__"
 DEFAULT, COMMAND_LINE = "default", "command line"
-# What the commands bring where it differs from, or is missing in, the models themselves.
+# Defaults of the commands that differ from, or are missing in, those of the models.
 COMMAND_DEFAULTS: dict[str, dict[str, Any]] = {
     "node": {"loop": False},
     "server": {
@@ -46,7 +47,7 @@ class _File(StrictModel):
 
 
 class _Environment(BaseSettings):
-    """How variables are named; the section is added as a field."""
+    """Naming of variables; the section is added as a field."""
 
     model_config = SettingsConfigDict(
         env_prefix=ENV_PREFIX, env_nested_delimiter=ENV_DELIMITER, env_parse_none_str="null"
@@ -64,21 +65,21 @@ class _Layer:
 
 @dataclass(frozen=True)
 class Configuration:
-    """What the configuration file (`path`, None where there is none) and the environment say."""
+    """Contents of the configuration file (`path`, None if there is none) and of the environment."""
 
     path: Path | None
     sections: Mapping[str, Values]
 
     def section(self, name: str, model: type[Model], given: Mapping[str, Any] | None = None) -> Model:
-        """Return the validated settings of a section; `given` is what the command line says.
+        """Return the validated settings of a section; `given` are those of the command line.
 
         Raises:
-            DeltalightError: an unknown key (with the nearest), or a wrong value, and where it was said.
+            DeltalightError: a key is unknown (the nearest is named), or a value is wrong; names the origin.
         """
         return self._merged(name, model, given or {})[0]
 
     def explained(self, name: str, model: type[Model]) -> tuple[Model, dict[str, str]]:
-        """Return the settings of a section, and for each key (`depth.fill`) where its value comes from.
+        """Return the settings of a section, and the origin of the value of each key (`depth.fill`).
 
         Raises:
             DeltalightError: as `section`.
@@ -105,10 +106,10 @@ class Configuration:
 
 
 def _blame(model: type[BaseModel], layers: list[_Layer]) -> None:
-    """Tell a fault of the layer that brought it: the first with which the settings are wrong.
+    """Attribute a fault to the layer that caused it: the first with which the settings are wrong.
 
     Raises:
-        DeltalightError: always, where the layers together are wrong.
+        DeltalightError: always, if the layers together are wrong.
     """
     merged: Values = {}
     for layer in layers:

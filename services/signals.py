@@ -1,4 +1,4 @@
-"""How a long-running command ends: SIGTERM becomes an exception, so that every `finally` runs."""
+"""Termination of long-running commands: SIGTERM becomes an exception, so that every `finally` runs."""
 
 import os
 import signal
@@ -14,10 +14,10 @@ class Terminated(BaseException):
 
 
 def raise_on_sigterm() -> None:
-    """Make SIGTERM raise `Terminated` in the main thread (SIGINT raises `KeyboardInterrupt` already), once.
+    """Make SIGTERM raise `Terminated` in the main thread (as SIGINT raises `KeyboardInterrupt`), once.
 
-    Linux tells the death of a supervisor once for each of its threads that dies: the second signal would
-    break off what the first one made the program finish.
+    Linux signals the death of a supervisor once for each of its threads that dies: a second exception would interrupt
+    the clean-up that the first one started.
     """
     signal.signal(signal.SIGTERM, _raise_terminated)
     sys.unraisablehook = _deliver_again
@@ -29,7 +29,7 @@ def _raise_terminated(_number: int, _frame: FrameType | None) -> None:
 
 
 def _deliver_again(lost: "sys.UnraisableHookArgs") -> None:
-    """A signal that comes while an object is freed is lost with a traceback: send it once more instead."""
+    """Resend a signal that was lost with a traceback because it arrived while an object was freed."""
     if isinstance(lost.exc_value, Terminated):
         signal.signal(signal.SIGTERM, _raise_terminated)
         again = signal.SIGTERM

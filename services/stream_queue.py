@@ -1,4 +1,4 @@
-"""Receiver for whoever wants every message: a bounded queue."""
+"""Receiver of every message: a bounded queue."""
 
 from collections import Counter, deque
 from collections.abc import Sequence
@@ -7,18 +7,18 @@ from protocol.envelope import MAX_PARTS, MAX_TOPIC_BYTES
 from protocol.keys import Keys
 from protocol.subscriber import ReceivedMultipart, Subscriber
 
-QUEUED_MESSAGES = 64  # of each topic: two seconds at 30 a second, which covers a disk that hesitates
-QUEUED_BYTES = 512 * 1024 * 1024  # of all topics together, where pictures are large and raw
+QUEUED_MESSAGES = 64  # per topic: two seconds at 30 a second, which covers a slow disk
+QUEUED_BYTES = 512 * 1024 * 1024  # of all topics together, if pictures are large and raw
 
 
 class StreamQueue(Subscriber):
-    """Messages in the order of their arrival; what comes while the queue is full is left out and counted.
+    """Messages in the order of their arrival; those that arrive while the queue is full are dropped and counted.
 
     It is the counterpart of `protocol.receiver.Receiver`, whose newest message wins. `topics` are stream names
-    (`color`); subscriptions go out in their order. `keys` are needed where an endpoint leaves the host.
+    (`color`); subscriptions are sent in their order. `keys` are required if an endpoint leaves the host.
 
     Raises:
-        DeltalightError: an endpoint that leaves the host without keys, or is not understood.
+        DeltalightError: an endpoint leaves the host without keys, or is malformed.
     """
 
     def __init__(self, endpoints: Sequence[str], topics: Sequence[str], keys: Keys | None = None) -> None:
@@ -30,7 +30,7 @@ class StreamQueue(Subscriber):
         super().__init__(endpoints, subscriptions, keys=keys, high_water_mark=QUEUED_MESSAGES)
 
     def take(self, timeout_s: float) -> ReceivedMultipart | None:
-        """Return the oldest message; None where none came within `timeout_s` seconds."""
+        """Return the oldest message; None if there was none within `timeout_s` seconds."""
         with self._changed:
             self._changed.wait_for(lambda: self._messages or self._closed, timeout_s)
             if not self._messages:
@@ -42,13 +42,13 @@ class StreamQueue(Subscriber):
 
     @property
     def drops(self) -> dict[str, int]:
-        """Messages of each stream that found the queue full."""
+        """Number of messages of each stream that found the queue full."""
         with self._changed:
             return dict(self._drops)
 
     def _store(self, message: ReceivedMultipart) -> None:
         if len(message) > MAX_PARTS + 2 or len(message[0]) > MAX_TOPIC_BYTES:
-            return  # no message of the wire
+            return  # not a message of the wire
         stream, size = _stream(message), _size(message)
         with self._changed:
             if self._held[stream] >= QUEUED_MESSAGES or self._held_bytes + size > QUEUED_BYTES:
@@ -61,7 +61,7 @@ class StreamQueue(Subscriber):
 
 
 def _stream(message: ReceivedMultipart) -> str:
-    """Stream of a message; subscriptions end in a dot, so that each topic that comes has one."""
+    """Return the stream of a message; subscriptions end in a dot, so every topic has one."""
     return bytes(message[0]).partition(b".")[0].decode("ascii", errors="replace")
 
 

@@ -1,4 +1,4 @@
-"""Keeps the processes of one host alive: restart within a second, give up after too many, end together.
+"""Keeps the processes of one host alive: restarts them within a second, gives up after too many, ends them together.
 
 Each child is a command line of its own (`python -m services.cli ...`): one process, one OpenGL context.
 """
@@ -28,14 +28,14 @@ KEPT_LINES = 20
 
 @dataclass(frozen=True)
 class ChildSpec:
-    """One supervised process: a name for people and the arguments after the interpreter."""
+    """One supervised process: a name for display and the arguments after the interpreter."""
 
     name: str
     arguments: tuple[str, ...]
 
     @classmethod
     def deltalight(cls, name: str, *arguments: str) -> "ChildSpec":
-        """A child that runs a command of this command line."""
+        """Return a child that runs a command of this command line."""
         return cls(name, ("-m", "services.cli", *arguments))
 
 
@@ -72,7 +72,7 @@ class _Child:
                 self.forward(f"{self.spec.name}: {line.rstrip()}")
 
     def last_sentence(self) -> str:
-        """The last line that the child wrote, without the command's name before it."""
+        """Return the last line that the child wrote, without the command's name before it."""
         if self.reader is not None:
             self.reader.join(timeout=1.0)
         line = next((line for line in reversed(self.last_lines) if line.strip()), "it said nothing")
@@ -117,15 +117,15 @@ class Supervisor:
         self.stop()
 
     def process_ids(self) -> dict[str, int]:
-        """Process id of every child that was started, by name."""
+        """Return the process id of every started child, by name."""
         return {c.spec.name: c.process.pid for c in self._children if c.process is not None}
 
     def restarts(self) -> dict[str, int]:
-        """How often each child was started again, by name."""
+        """Return how often each child was restarted, by name."""
         return {child.spec.name: max(child.started - 1, 0) for child in self._children}
 
     def poll(self) -> None:
-        """Look at every child once; start one that died again after `RESTART_DELAY_S`, not one that ended well."""
+        """Check every child once; restart one that died after `RESTART_DELAY_S`, but not one that ended well."""
         for child in self._children:
             code = None if child.process is None else child.process.poll()
             if code == 0:
@@ -135,13 +135,13 @@ class Supervisor:
                 self._restart(child, code)
 
     def run(self, until: Callable[[], bool] = lambda: False) -> None:
-        """Poll until `until` answers true (or an exception ends the process)."""
+        """Poll until `until` returns true (or an exception ends the process)."""
         while not until():
             self.poll()
             time.sleep(POLL_INTERVAL_S)
 
     def stop(self) -> None:
-        """End all children: SIGTERM to all, SIGKILL to what still lives after `STOP_TIMEOUT_S`."""
+        """End all children: SIGTERM to all, SIGKILL to those still alive after `STOP_TIMEOUT_S`."""
         processes = [child.process for child in self._children if child.process is not None]
         try:
             for process in processes:

@@ -1,4 +1,4 @@
-"""A benchmark scene as Mitsuba renders it: without objects, with them, and the objects alone as a mask."""
+"""A benchmark scene for Mitsuba: without objects, with them, and the objects alone as a mask."""
 
 from pathlib import Path
 from typing import Any
@@ -16,12 +16,14 @@ ENVIRONMENT_FILE = "environment.hdr"
 WORLD_FROM_MITSUBA_MAP = np.array(
     [[0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 )
-"""Mitsuba's map has +y up, its centre column looks along +z, and a quarter to the left of that lies +x; ours has
-these at +z, +x and +y."""
+"""Axes of environment maps: Mitsuba's has +y up, looks along +z in its centre, with +x a quarter to the left.
+
+Ours has +z, +x and +y in these places.
+"""
 
 
 def material(finish: Finish) -> dict[str, Any]:
-    """Mitsuba's Disney BRDF, in the same terms as the scene document; Lambertian where the document says so."""
+    """Return Mitsuba's Disney BRDF with the scene document's terms; Lambertian if the document says so."""
     if finish.metallic == 0 and finish.specular == 0:
         return diffuse(rgb(finish.base_color))
     return {
@@ -34,10 +36,10 @@ def material(finish: Finish) -> dict[str, Any]:
 
 
 def environment_light(radiance: Float32[np.ndarray, "h w 3"]) -> dict[str, Any]:
-    """Light from a map that is laid out as in render_server/lights/environment.py.
+    """Return light from a map in the layout of render_server/lights/environment.py.
 
-    Mitsuba puts the first and the last row on the poles, we put row j at (j + 0.5)/h of the way. A map of
-    2 h + 1 rows with ours at the odd ones and their means between is the same function in its layout.
+    Mitsuba puts the first and the last row at the poles, this project row j at (j + 0.5)/h of the height. A map of 2
+    h + 1 rows, with the given ones at the odd rows and their means between, is the same function in its layout.
     """
     import mitsuba as mi
 
@@ -50,9 +52,9 @@ def environment_light(radiance: Float32[np.ndarray, "h w 3"]) -> dict[str, Any]:
 
 
 class Assembly:
-    """Mitsuba dictionaries of a scene; its meshes and its map are written into a folder when this is made.
+    """Mitsuba dictionaries of a scene; constructing it writes the scene's meshes and map into a folder.
 
-    `assets` holds what the scene document names: a PLY for each object, the environment map.
+    `assets` holds the scene document's assets: a PLY for each object, the environment map.
     """
 
     def __init__(self, scene: BenchmarkScene, folder: Path) -> None:
@@ -74,7 +76,7 @@ class Assembly:
         return {"type": "scene", **self._lights, **self._real}
 
     def with_objects(self, frame: int) -> dict[str, Any]:
-        """Return the same and the virtual objects as they stand in a frame.
+        """Return the room with the virtual objects in their poses of a frame.
 
         They come last, so that paths that never meet them draw the same random numbers as without.
         """
@@ -86,9 +88,9 @@ class Assembly:
         return {**self.without(), **objects}
 
     def mask(self, frame: int) -> dict[str, Any]:
-        """Return objects that shine with radiance 1 among dark real things, for `RoomRenderer.cover`.
+        """Return objects that emit radiance 1 among dark real things, for `RoomRenderer.cover`.
 
-        Flat normals: an emitter is dark where its interpolated normal turns away, as it does along outlines.
+        Flat normals: an emitter is dark where its interpolated normal faces away, as along outlines.
         """
         lamps = {name: _dark(lamp) for name, lamp in self._lights.items() if "emitter" in lamp}
         objects = {
@@ -104,7 +106,7 @@ class Assembly:
         return {"type": "scene", **lamps, **self._real, **objects}
 
     def base_m(self) -> Float[np.ndarray, "3"]:
-        """Return the middle of the first object's underside, where it stands in the first frame."""
+        """Return the middle of the first object's underside in the first frame."""
         low, high = self._meshes[0].bounds
         middle = np.array([*(low[:2] + high[:2]) / 2, low[2], 1.0])
         return np.asarray((self.scene.objects[0].world_from_object[0] @ middle)[:3])

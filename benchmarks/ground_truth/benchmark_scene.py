@@ -1,4 +1,4 @@
-"""What a benchmark scene is made of; `scenes/` holds one file a scene."""
+"""The parts of a benchmark scene; `scenes/` holds one file per scene."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -36,7 +36,7 @@ TABLE_Z_M = -0.0005
 
 @dataclass(frozen=True)
 class Finish:
-    """Material of a virtual object as the scene document says it (docs/formats.md 3); linear colours.
+    """Material of a virtual object in the scene document's terms (docs/formats.md 3); linear colours.
 
     `metallic` 0 with `specular` 0 is Lambertian; metals and dielectrics have a GGX lobe.
     """
@@ -50,7 +50,7 @@ class Finish:
 
 @dataclass(frozen=True)
 class VirtualObject:
-    """A virtual object: its mesh (own frame, metres, z up), material, and where it stands in each frame (rigid)."""
+    """A virtual object: its mesh (own frame, metres, z up), material, and pose in each frame (rigid)."""
 
     id: str
     mesh: Callable[[], trimesh.Trimesh]
@@ -60,9 +60,10 @@ class VirtualObject:
 
 @dataclass(frozen=True)
 class ShadowEdge:
-    """A straight way on a real surface across the edge of a virtual object's shadow: from light into shadow.
+    """A straight path on a real surface across the edge of a virtual object's shadow: from light into shadow.
 
-    The share of direct light along it falls from 1 to 0; the distance between 90 % and 10 % is the penumbra's width.
+    The fraction of direct light along it falls from 1 to 0; the distance between 90 % and 10 % is the penumbra's
+    width.
     """
 
     start_m: Triple
@@ -71,12 +72,12 @@ class ShadowEdge:
 
 @dataclass(frozen=True, eq=False)
 class BenchmarkScene:
-    """A real room, virtual objects in it, and what the scene document says of both.
+    """A real room, virtual objects in it, and the scene document's description of both.
 
-    `real` makes the Mitsuba shapes of the room without lights. `environment` is a latitude-longitude map (linear,
+    `real` creates the Mitsuba shapes of the room without lights. `environment` is a latitude-longitude map (linear,
     row 0 up = +z, centre column looks along +x, +y is to its left, as render_server/lights/environment.py reads it);
-    lamps and a map exclude each other. `surfaces` is the document's `real.surfaces`.
-    `world_from_camera` and every object's poses have one entry a frame.
+    a scene has either lamps or a map. `surfaces` is the document's `real.surfaces`. `world_from_camera` and every
+    object's poses have one entry per frame.
     """
 
     name: str
@@ -95,5 +96,5 @@ class BenchmarkScene:
 
     @property
     def frame_count(self) -> int:
-        """Frames of the take."""
+        """Number of frames of the take."""
         return len(self.world_from_camera)

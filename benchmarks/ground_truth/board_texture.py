@@ -1,4 +1,4 @@
-"""The printed marker board as a picture of its albedo, placed as the world frame of docs/formats.md 3 says."""
+"""The printed marker board as a picture of its albedo, positioned in the world frame of docs/formats.md 3."""
 
 from dataclasses import dataclass
 
@@ -27,7 +27,8 @@ class BoardTexture:
 def board_texture(board: BoardSpec, margin_m: float = 0.02) -> BoardTexture:
     """Print `board` with a white margin of `margin_m`, rounded so that marker edges fall on texel edges.
 
-    Raises DeltalightError for boards that are no grid of markers.
+    Raises:
+        DeltalightError: the board is not a grid of markers.
     """
     if board.type == "charuco":
         raise DeltalightError(
@@ -56,5 +57,5 @@ def _texel_of(
     max_m: Float[np.ndarray, "2"],
     texel_m: float,
 ) -> Int[np.ndarray, "2"]:
-    """Column and row of the texel whose upper left corner is `point_m`."""
+    """Return column and row of the texel whose upper left corner is `point_m`."""
     return np.rint(np.array([point_m[0] - min_m[0], max_m[1] - point_m[1]]) / texel_m).astype(int)

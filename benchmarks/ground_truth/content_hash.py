@@ -1,4 +1,4 @@
-"""A hash of everything that a Mitsuba dictionary says, files and pictures included."""
+"""A hash of the whole content of a Mitsuba dictionary, files and pictures included."""
 
 import hashlib
 from collections.abc import Iterator, Mapping
@@ -10,10 +10,10 @@ import numpy as np
 def content_hash(*parts: object) -> str:
     """Return 16 hexadecimal digits that change when any number, name, order or file behind `parts` does.
 
-    Files are named by the key `filename` and count by their bytes, so where they lie does not matter.
+    Files are named by the key `filename` and hashed by their bytes, so their location does not matter.
 
     Raises:
-        TypeError: a part is of a kind whose content is unknown here.
+        TypeError: a part is of an unsupported kind.
     """
     hasher = hashlib.sha256()
     for token in _tokens(parts):

@@ -1,4 +1,4 @@
-"""What the scene document says of a benchmark scene (docs/formats.md 3)."""
+"""The scene document of a benchmark scene (docs/formats.md 3)."""
 
 import json
 from pathlib import Path
@@ -46,7 +46,7 @@ def _object(item: VirtualObject, frame: int, assets: str) -> dict[str, Any]:
 
 
 def _lights(scene: BenchmarkScene, assets: str) -> dict[str, Any]:
-    """Return lights whose strength is known: nothing is registered."""
+    """Return the lights, whose strength is known, so that none is registered."""
     registration = [1.0, 1.0, 1.0]
     if scene.environment is not None:
         map_file = {"map": assets + ENVIRONMENT_FILE}
@@ -56,7 +56,7 @@ def _lights(scene: BenchmarkScene, assets: str) -> dict[str, Any]:
 
 
 def objects_move(scene: BenchmarkScene) -> bool:
-    """Whether any object stands elsewhere in a later frame."""
+    """Whether any object is elsewhere in a later frame."""
     return any(
         not np.array_equal(pose, item.world_from_object[0])
         for item in scene.objects
@@ -65,12 +65,12 @@ def objects_move(scene: BenchmarkScene) -> bool:
 
 
 def document_path(folder: Path, scene: BenchmarkScene, frame: int) -> Path:
-    """Return where the document of a frame lies; scenes at rest have one for all."""
+    """Return the path of a frame's document; scenes at rest have one for all frames."""
     return folder / FRAMES_FOLDER / f"{frame:06d}.json" if objects_move(scene) else folder / DOCUMENT_FILE
 
 
 def write_documents(folder: Path, scene: BenchmarkScene) -> None:
-    """Write the first frame's document and, where objects move, one for each frame."""
+    """Write the first frame's document and, if objects move, one for each frame."""
     _write(folder / DOCUMENT_FILE, scene_document(scene, 0))
     if objects_move(scene):
         (folder / FRAMES_FOLDER).mkdir()

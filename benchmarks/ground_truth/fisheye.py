@@ -1,4 +1,4 @@
-"""The up-looking fish-eye camera at the virtual object's place: its lens in Mitsuba and its exposure bracket."""
+"""The up-looking fish-eye camera at the virtual object's position: its lens in Mitsuba and its exposure bracket."""
 
 from functools import cache
 from pathlib import Path
@@ -36,9 +36,10 @@ clips lies 25 times above the read noise of the next."""
 
 
 def fisheye_sensor(camera: CameraModel, world_from_camera: Float[np.ndarray, "4 4"]) -> dict[str, Any]:
-    """Mitsuba's equidistant lens without film: angle from the axis = radius / focal length, also beyond 90 degrees.
+    """Return Mitsuba's equidistant lens without film.
 
-    Its image circle touches the nearest edge of the picture; beyond it the picture is black.
+    Angle from the axis = radius / focal length, even beyond 90 degrees. Its image circle touches the nearest edge of
+    the picture; beyond it the picture is black.
 
     Raises:
         DeltalightError: the lens has distortion coefficients.
@@ -61,7 +62,7 @@ def fisheye_sensor(camera: CameraModel, world_from_camera: Float[np.ndarray, "4 
 
 @cache
 def _register(variant: str) -> None:
-    """Make the plugin `equidistant` for a variant of Mitsuba, whose types are known only once it is set."""
+    """Create the plugin `equidistant` for a variant of Mitsuba, whose types are known only once it is set."""
     import drjit as dr
     import mitsuba as mi
 
@@ -74,7 +75,7 @@ def _register(variant: str) -> None:
             self.fx, self.fy, self.cx, self.cy, self.largest = (props[name] for name in names)
 
         def sample_ray(self, *sample: Any) -> Any:  # noqa: ANN401 - typed by the variant
-            """Ray through a place on the film, given in shares of its size."""
+            """Return the ray through a position on the film, given as fractions of its size."""
             _time, _wavelength, position, *_ = sample
             size = self.film().size()
             x = (position.x * size[0] - 0.5 - self.cx) / self.fx
@@ -87,7 +88,7 @@ def _register(variant: str) -> None:
             return mi.Ray3f(mi.Point3f(pose.translation()), direction), mi.Spectrum(weight)
 
         def sample_ray_differential(self, *sample: Any) -> Any:  # noqa: ANN401 - typed by the variant
-            """Ray as above; nothing in these scenes asks for differentials."""
+            """Return the same ray; nothing in these scenes needs differentials."""
             ray, weight = self.sample_ray(*sample)
             return mi.RayDifferential3f(ray), weight
 

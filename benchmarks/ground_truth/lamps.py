@@ -1,4 +1,4 @@
-"""Lights of a benchmark scene, each as Mitsuba shines it and as the scene document says it (docs/formats.md 3)."""
+"""Lights of a benchmark scene, each as Mitsuba's emitter and in the scene document (docs/formats.md 3)."""
 
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -12,7 +12,7 @@ WHITE: Triple = (1.0, 1.0, 1.0)
 
 
 class Lamp(Protocol):
-    """A light in both worlds."""
+    """A light in both representations."""
 
     def mitsuba(self) -> dict[str, Any]:
         """Return the emitter, or the shape that carries it."""
@@ -33,7 +33,7 @@ class SphereLamp:
     color_linear: Triple = WHITE
 
     def mitsuba(self) -> dict[str, Any]:
-        """Return a shining sphere: intensity = radiance times the disc that it shows."""
+        """Return an emitting sphere: intensity = radiance times the area of its disc."""
         radiance = np.array(self.color_linear) * self.intensity / (np.pi * self.radius_m**2)
         place = placed(self.position_m, scale=(self.radius_m,) * 3)
         return shape("sphere", place, emitter={"type": "area", "radiance": rgb(radiance)})
@@ -67,10 +67,10 @@ class Ambient:
 
 @dataclass(frozen=True)
 class Spot:
-    """Lamp with a cone: full within the inner part of the half angle, then falling linearly in angle to zero.
+    """Lamp with a cone: constant within the inner part of the half angle, then falling linearly in angle to zero.
 
-    `angle_deg` is the full opening angle, `blend` the share of the half angle in which the light falls.
-    Mitsuba's spot is a point; the document gives it a radius of 0, and cameras see it by `point_lamps` alone.
+    `angle_deg` is the full opening angle, `blend` the fraction of the half angle in which the light falls. Mitsuba's
+    spot is a point; the document gives it a radius of 0, and cameras see it only through `point_lamps`.
     """
 
     position_m: Triple
@@ -125,7 +125,7 @@ class Spot:
 
 @dataclass(frozen=True)
 class Panel:
-    """Shining rectangle around `center_m`; its edges are whole lengths and it shines towards edge_u x edge_v."""
+    """Emitting rectangle around `center_m`; its edges are whole lengths and it shines towards edge_u x edge_v."""
 
     center_m: Triple
     edge_u_m: Triple

@@ -1,4 +1,4 @@
-"""Shapes of benchmark scenes, made here: each in its own frame, metres, z up, standing on z = 0 around the z axis."""
+"""Shapes of benchmark scenes, generated here: in their own frames, metres, z up, on z = 0 around the z axis."""
 
 import numpy as np
 import trimesh
@@ -7,8 +7,8 @@ from skimage.measure import marching_cubes
 
 from benchmarks.ground_truth.parts import Triple
 
-# Centre, half axes and pitch (degrees, nose up) of the rabbit's parts in units of its height; it looks along -y.
-# The left ear and feet are made from the right ones.
+# Centre, half axes and pitch (degrees, nose up) of the rabbit's parts in units of its height; it looks along -y. The
+# left ear and feet mirror the right ones.
 _BODY = (
     ((0.00, 0.10, 0.26), (0.225, 0.30, 0.245), 12.0),  # rump
     ((0.00, -0.08, 0.27), (0.170, 0.20, 0.22), 25.0),  # chest
@@ -23,7 +23,7 @@ _PAIRS = (
     ((0.165, 0.12, 0.20), (0.105, 0.175, 0.170), 20.0),  # thigh
 )
 _BLEND = 0.028
-"""Radius, in heights, over which the parts flow into one another."""
+"""Radius, in heights, over which the parts blend into each other."""
 _CELLS = 60
 """Grid cells along the rabbit's height: 2.5 mm for one of 15 cm, whose outline then bends by less than a pixel."""
 
@@ -61,7 +61,7 @@ _VASE = (
 
 
 def rabbit(height_m: float = 0.15) -> trimesh.Trimesh:
-    """One closed surface around ellipsoids that flow into one another; it looks along -y."""
+    """Return one closed surface around blended ellipsoids; it looks along -y."""
     low, high = np.array([-0.32, -0.46, -0.04]), np.array([0.32, 0.54, 1.04])
     axes = [np.arange(a, b, 1 / _CELLS) for a, b in zip(low, high, strict=True)]
     field = _rabbit_field(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1))
@@ -73,7 +73,7 @@ def rabbit(height_m: float = 0.15) -> trimesh.Trimesh:
 
 
 def _rabbit_field(points: Float[np.ndarray, "x y z 3"]) -> Float[np.ndarray, "x y z"]:
-    """Roughly the distance to the rabbit, negative inside; cut flat by the ground."""
+    """Return the approximate distance to the rabbit, negative inside; cut flat by the ground."""
     mirrored = [((-x, y, z), axes, pitch) for (x, y, z), axes, pitch in _PAIRS]
     parts = [_ellipsoid(points, *part) for part in (*_BODY, *_PAIRS, *mirrored)]
     blended = -_BLEND * np.log(sum(np.exp(-part / _BLEND) for part in parts))
@@ -83,7 +83,7 @@ def _rabbit_field(points: Float[np.ndarray, "x y z 3"]) -> Float[np.ndarray, "x 
 def _ellipsoid(
     points: Float[np.ndarray, "*n 3"], center: Triple, half_axes: Triple, pitch_deg: float
 ) -> Float[np.ndarray, "*n"]:
-    """Distance to an ellipsoid, to first order near its surface."""
+    """Return the distance to an ellipsoid, to first order near its surface."""
     turn = trimesh.transformations.rotation_matrix(np.radians(-pitch_deg), [1, 0, 0])[:3, :3]
     local = (points - np.array(center)) @ turn
     level = np.linalg.norm(local / half_axes, axis=-1)
@@ -92,7 +92,7 @@ def _ellipsoid(
 
 
 def pawn(height_m: float = 0.13) -> trimesh.Trimesh:
-    """A chess pawn: foot, stem, collar and ball."""
+    """Return a chess pawn: foot, stem, collar and ball."""
     angle = np.linspace(-0.72, np.pi / 2, 24)
     ball = np.stack([0.180 * np.cos(angle), 0.82 + 0.180 * np.sin(angle)], axis=1)
     ball[-1, 0] = 0.0
@@ -100,19 +100,19 @@ def pawn(height_m: float = 0.13) -> trimesh.Trimesh:
 
 
 def vase(height_m: float = 0.16) -> trimesh.Trimesh:
-    """A hollow vase with a narrow neck."""
+    """Return a hollow vase with a narrow neck."""
     return _revolved(np.array(_VASE), height_m)
 
 
 def ball(radius_m: float = 0.04) -> trimesh.Trimesh:
-    """A sphere lying on the ground."""
+    """Return a sphere lying on the ground."""
     mesh = trimesh.creation.icosphere(subdivisions=4, radius=radius_m)
     mesh.apply_translation([0, 0, -mesh.bounds[0, 2]])
     return mesh
 
 
 def ring(radius_m: float = 0.055, tube_m: float = 0.015) -> trimesh.Trimesh:
-    """A ring standing upright, its axis along y."""
+    """Return a ring standing upright, its axis along y."""
     mesh = trimesh.creation.torus(radius_m, tube_m, major_sections=96, minor_sections=32)
     mesh.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0]))
     mesh.apply_translation([0, 0, -mesh.bounds[0, 2]])
@@ -120,7 +120,7 @@ def ring(radius_m: float = 0.055, tube_m: float = 0.015) -> trimesh.Trimesh:
 
 
 def block(size_m: Triple) -> trimesh.Trimesh:
-    """A box with sharp edges, every face with its own normals."""
+    """Return a box with sharp edges, every face with its own normals."""
     mesh = trimesh.creation.box(extents=size_m)
     mesh.apply_translation([0, 0, size_m[2] / 2])
     mesh.unmerge_vertices()
@@ -128,7 +128,7 @@ def block(size_m: Triple) -> trimesh.Trimesh:
 
 
 def mug() -> trimesh.Trimesh:
-    """A mug with wall, rounded lip and handle (towards +x)."""
+    """Return a mug with wall, rounded lip and handle (towards +x)."""
     lip = np.linspace(0, np.pi, 7)
     outside = [(0.0, 0.0), (0.032, 0.0), (0.036, 0.002), (0.038, 0.006), (0.038, 0.088)]
     rim = [(0.0365 + 0.0015 * float(np.cos(a)), 0.088 + 0.0015 * float(np.sin(a))) for a in lip[1:-1]]
@@ -144,5 +144,5 @@ def mug() -> trimesh.Trimesh:
 
 
 def _revolved(profile: Float[np.ndarray, "n 2"], height_m: float) -> trimesh.Trimesh:
-    """Turn an outline (radius, height in units of the height) around z."""
+    """Revolve an outline (radius, height in units of the height) around z."""
     return trimesh.creation.revolve(profile * height_m, sections=96)

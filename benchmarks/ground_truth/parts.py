@@ -18,7 +18,7 @@ IDENTITY: Matrix = np.eye(4)
 
 @dataclass(frozen=True)
 class MeshFolder:
-    """Where meshes lie for Mitsuba to read; names must be unique within a scene."""
+    """The folder of meshes for Mitsuba; names must be unique within a scene."""
 
     path: Path
 
@@ -39,35 +39,35 @@ def shape(kind: str, place: Matrix, **parts: object) -> dict[str, Any]:
 def mesh_shape(
     name: str, mesh: trimesh.Trimesh, place: Matrix, folder: MeshFolder, bsdf: dict[str, Any]
 ) -> dict[str, Any]:
-    """Return a triangle mesh that is seen from both sides."""
+    """Return a double-sided triangle mesh."""
     return shape("ply", place, filename=folder.ply(name, mesh), bsdf=two_sided(bsdf))
 
 
 def placed(translation_m: Triple, turn: Matrix = IDENTITY, scale: Triple = (1.0, 1.0, 1.0)) -> Matrix:
-    """World from shape: scaled, then turned, then moved."""
+    """Return world from shape: scaled, then rotated, then moved."""
     translation = trimesh.transformations.translation_matrix(translation_m)
     return np.asarray(translation @ turn @ np.diag([*scale, 1.0]))
 
 
 def turned(axis: Literal["x", "y", "z"], angle_deg: float) -> Matrix:
-    """Rotation about a world axis, right-handed."""
+    """Return the rotation about a world axis, right-handed."""
     direction = [float(axis == name) for name in "xyz"]
     return np.asarray(trimesh.transformations.rotation_matrix(np.radians(angle_deg), direction))
 
 
 def box(center_m: Triple, half_m: Triple, turn_deg: float, color: Triple) -> dict[str, Any]:
-    """Return a diffuse box standing upright, turned about z."""
+    """Return an upright diffuse box, rotated about z."""
     return shape("cube", placed(center_m, turned("z", turn_deg), half_m), bsdf=diffuse(rgb(color)))
 
 
 def rectangle(place: Matrix, albedo: Float32[np.ndarray, "h w 3"] | Triple) -> dict[str, Any]:
-    """Return a diffuse rectangle spanning [-1, 1]^2, of one colour or under a texture whose first row is at v = 1."""
+    """Return a diffuse rectangle spanning [-1, 1]^2, of one colour or with a texture whose first row is at v = 1."""
     reflectance = rgb(albedo) if isinstance(albedo, tuple) else texture(albedo)
     return shape("rectangle", place, bsdf=two_sided(diffuse(reflectance)))
 
 
 def texture(albedo: Float32[np.ndarray, "h w 3"]) -> dict[str, Any]:
-    """Linear colours as a texture."""
+    """Return linear colours as a texture."""
     import mitsuba as mi
 
     picture = mi.Bitmap(np.ascontiguousarray(albedo[::-1], np.float32))
@@ -96,17 +96,17 @@ def two_sided(bsdf: dict[str, Any]) -> dict[str, Any]:
 
 
 def diffuse(reflectance: dict[str, Any]) -> dict[str, Any]:
-    """Lambertian reflection."""
+    """Return a Lambertian material."""
     return {"type": "diffuse", "reflectance": reflectance}
 
 
 def rgb(color: Triple | Float[np.ndarray, "3"]) -> dict[str, Any]:
-    """Linear R G B."""
+    """Return a linear R G B colour."""
     return {"type": "rgb", "value": [float(c) for c in color]}
 
 
 def looking(eye_m: Triple, target_m: Triple) -> Matrix:
-    """World from camera (OpenCV axes: x right, y down, z forward) of an upright camera."""
+    """Return world from camera (OpenCV axes: x right, y down, z forward) of an upright camera."""
     eye, forward = np.array(eye_m), np.subtract(target_m, eye_m)
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, [0.0, 0.0, 1.0])

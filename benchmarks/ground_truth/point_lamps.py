@@ -1,4 +1,4 @@
-"""Lamps without extent in the fish-eye picture: no pixel meets Mitsuba's points, a lens makes a blur of them."""
+"""Point lamps in the fish-eye picture, blurred by the lens, because no pixel's rays hit Mitsuba's points."""
 
 from collections.abc import Iterable
 
@@ -49,7 +49,7 @@ def _blur(lens: EquidistantLens, place: np.ndarray) -> Float32[np.ndarray, "h w 
 
 
 def _solid_angles(lens: EquidistantLens) -> np.ndarray:
-    """Return every pixel's solid angle, sr, by the cross product of the steps of its ray; 0 where there is none."""
+    """Return every pixel's solid angle, sr, by the cross product of the steps of its ray; 0 without a ray."""
     columns, rows = np.meshgrid(np.arange(lens.width, dtype=float), np.arange(lens.height, dtype=float))
     rays = lens.directions(np.stack([columns, rows], axis=-1).reshape(-1, 2)).reshape(
         lens.height, lens.width, 3

@@ -17,7 +17,7 @@ from protocol.camera_model import CameraModel
 from protocol.errors import DeltalightError
 
 LLVM_LIBRARY = "libLLVM.so.19.1"
-"""Dr.Jit aborts the whole process with the older LLVM that Mesa brings along, so the version is pinned."""
+"""Dr.Jit aborts the whole process with the older LLVM that comes with Mesa, so the version is pinned."""
 
 LLVM_PROBE = """
 import mitsuba as mi
@@ -26,7 +26,7 @@ mi.render(mi.load_dict(mi.cornell_box()), spp=1).numpy()
 """
 
 MAX_DEPTH = 8
-"""Longest light path in segments: every bounce that an 8-bit picture can show."""
+"""Longest light path in segments: every bounce that is visible in an 8-bit picture."""
 
 NEAR_CLIP_M = 0.01
 
@@ -36,21 +36,26 @@ INTEGRATORS: dict[str, dict[str, Any]] = {
     "distance": {"type": "aov", "aovs": "distance:depth"},
 }
 SUBPIXELS = 2
-"""Colour is rendered this much finer each way and then filtered here. Mitsuba's own filter lets samples of several
-pixels meet: the order of its threads changes the last digits, so the same seed would not give the same picture."""
+"""Supersampling of colour per axis, filtered here.
+
+Mitsuba's own filter mixes samples of several pixels: the order of its threads changes the last digits, so the same
+seed would not give the same picture.
+"""
 SOFTNESS_PX = 0.5
 """Standard deviation of the lens's blur, as of Mitsuba's default filter; a subpixel's own area is part of it."""
 WAVEFRONT = 20_000_000
-"""Samples that are drawn at once; with Mitsuba's LLVM variant that takes less than half a GB."""
+"""Samples drawn at once; with Mitsuba's LLVM variant that takes less than half a GB."""
 MAX_PASSES = 4096
-"""Seeds are this far apart, so that no two pictures share a pass's seed."""
+"""Distance of seeds, so that no two pictures share a pass's seed."""
 
 
 def choose_variant() -> str:
     """Set and return the fastest Mitsuba variant that works here: `llvm_ad_rgb`, else `scalar_rgb`.
 
     The LLVM variant is tried in a child process because a wrong library aborts instead of raising.
-    Raises DeltalightError where Mitsuba is not installed.
+
+    Raises:
+        DeltalightError: Mitsuba is not installed.
     """
     os.environ.setdefault("DRJIT_LIBLLVM_PATH", LLVM_LIBRARY)
     try:
@@ -72,9 +77,9 @@ def _llvm_works() -> bool:
 
 
 def passes(spp: int, pixels: int) -> tuple[int, ...]:
-    """Split `spp` samples a pixel (rounded up to whole subpixels) into passes, samples a subpixel each.
+    """Split `spp` samples per pixel (rounded up to whole subpixels) into passes of some samples per subpixel.
 
-    They are powers of 4, which the stratified sampler can lay out, and no pass exceeds `WAVEFRONT`.
+    They are powers of 4, as the stratified sampler requires, and no pass exceeds `WAVEFRONT`.
     """
     area = SUBPIXELS**2
     left, taken = -(-spp // area), []
@@ -88,7 +93,7 @@ def passes(spp: int, pixels: int) -> tuple[int, ...]:
 
 
 def _ignore() -> None:
-    """Nobody counts the passes."""
+    """Do nothing: nobody counts the passes."""
 
 
 class RoomRenderer:
@@ -108,20 +113,20 @@ class RoomRenderer:
     def color(
         self, world_from_camera: Matrix, *, spp: int, seed: int, advance: Callable[[], None] = _ignore
     ) -> Float32[np.ndarray, "h w 3"]:
-        """Linear radiance in camera units; `advance` is called after each of the `passes`."""
+        """Render linear radiance in camera units; call `advance` after each of the `passes`."""
         return self._mean("color", world_from_camera, spp, seed, advance)
 
     def cover(
         self, world_from_camera: Matrix, *, spp: int, seed: int, advance: Callable[[], None] = _ignore
     ) -> Float32[np.ndarray, "h w"]:
-        """Share of each pixel, 0..1, that shapes shining with radiance 1 fill; nothing else may shine.
+        """Render the fraction of each pixel, 0..1, covered by shapes with radiance 1; nothing else may emit light.
 
-        The same seed puts the samples where `color` puts them.
+        The same seed places the samples as in `color`.
         """
         return np.ascontiguousarray(self._mean("cover", world_from_camera, spp, seed, advance)[..., 0])
 
     def depth(self, world_from_camera: Matrix, *, spp: int, seed: int) -> Float32[np.ndarray, "h w"]:
-        """Metres along the optical axis, mean over each pixel; 0 where nothing is hit.
+        """Render metres along the optical axis, mean over each pixel; 0 where nothing is hit.
 
         Mitsuba gives the distance along the ray from the near plane; rays() has (x/z, y/z), hence the cosine.
         """
@@ -132,7 +137,7 @@ class RoomRenderer:
         return np.where(distance > 0, depth, 0).astype(np.float32)
 
     def is_free(self, start: Float64[np.ndarray, "3"], end: Float64[np.ndarray, "3"]) -> bool:
-        """Whether nothing stands between two points (m, world)."""
+        """Whether the line between two points (m, world) is unobstructed."""
         import mitsuba as mi
 
         way = end - start
@@ -165,7 +170,7 @@ class RoomRenderer:
 
 
 def filtered(fine: Float32[np.ndarray, "hs ws 3"]) -> Float32[np.ndarray, "h w 3"]:
-    """Blur a picture of subpixels by the lens and sample it at the pixels' centres; borders count what is there."""
+    """Blur a picture of subpixels by the lens and sample it at the pixels' centres; renormalised at borders."""
     taps = 4 * SUBPIXELS  # 2 px to either side: 4 standard deviations
     offset_px = (np.arange(taps) - (taps - 1) / 2) / SUBPIXELS
     variance = SOFTNESS_PX**2 - 1 / (12 * SUBPIXELS**2)
@@ -182,7 +187,7 @@ def filtered(fine: Float32[np.ndarray, "hs ws 3"]) -> Float32[np.ndarray, "h w 3
 
 
 def _sensor(camera: CameraModel, world_from_camera: Matrix, sampler: str) -> dict[str, Any]:
-    """Mitsuba's sensor of a camera, with a film on which every sample stays in its pixel."""
+    """Return Mitsuba's sensor of a camera, with a film on which every sample stays in its pixel."""
     fisheye = camera.distortion_model == "equidistant"
     lens = (fisheye_sensor if fisheye else _pinhole)(camera, world_from_camera)
     film = {
@@ -196,7 +201,7 @@ def _sensor(camera: CameraModel, world_from_camera: Matrix, sampler: str) -> dic
 
 
 def _pinhole(camera: CameraModel, world_from_camera: Matrix) -> dict[str, Any]:
-    """Camera without distortion; pixel centres are at integers here, at halves in Mitsuba."""
+    """Return a camera without distortion; pixel centres are at integers here, at halves in Mitsuba."""
     import mitsuba as mi
 
     fx, fy, cx, cy = camera.matrix[[0, 1, 0, 1], [0, 1, 2, 2]]

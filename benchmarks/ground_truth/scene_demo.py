@@ -52,7 +52,10 @@ FINISH = benchmark_scene.Finish(
 
 
 def world_from_camera(frame: int) -> Matrix:
-    """Pose of one frame: on a tripod first, then `SWING_DEG` around the board and back, symmetric in time."""
+    """Return the pose of one frame.
+
+    On a tripod first, then `SWING_DEG` around the board and back, symmetric in time.
+    """
     phase = (frame - STILL_FRAMES + 0.5) / (FRAME_COUNT - STILL_FRAMES)
     angle = np.radians(SWING_DEG) * np.sin(np.pi * phase) ** 2 if frame >= STILL_FRAMES else 0.0
     turn = trimesh.transformations.rotation_matrix(angle, [0, 0, 1], TARGET_M)
@@ -61,7 +64,7 @@ def world_from_camera(frame: int) -> Matrix:
 
 
 def scene_document() -> dict[str, Any]:
-    """The scene document of the demo (docs/formats.md 3): this room's exact lights and the virtual object."""
+    """Return the scene document of the demo (docs/formats.md 3): this room's exact lights and the virtual object."""
     return {
         "name": "demo",
         "real": {"geometry": "depth"},
@@ -79,7 +82,7 @@ def scene_document() -> dict[str, Any]:
 
 
 def mitsuba_scene(mesh_folder: Path, *, with_object: bool) -> dict[str, Any]:
-    """The room as a Mitsuba scene dictionary without sensor; meshes are written as PLY into `mesh_folder`."""
+    """Return the room as a Mitsuba scene dictionary without sensor; write meshes as PLY into `mesh_folder`."""
     folder = MeshFolder(mesh_folder)
     lights = {"key": KEY_LIGHT.mitsuba(), "ambient": AMBIENT.mitsuba()}
     scene = {"type": "scene", **lights, **room(folder)}
@@ -90,12 +93,12 @@ def mitsuba_scene(mesh_folder: Path, *, with_object: bool) -> dict[str, Any]:
 
 
 def room(folder: MeshFolder) -> dict[str, Any]:
-    """Everything real but the lights."""
+    """Return everything real except the lights."""
     return {**_shell(), **_boxes(), "ball": _ball(), "mug": _mug(folder)}
 
 
 def _shell() -> dict[str, Any]:
-    """Table, two walls and the marker sheet, each a rectangle of two sides spanning [-1, 1]^2."""
+    """Return table, two walls and the marker sheet, each a two-sided rectangle spanning [-1, 1]^2."""
     table = placed((0.30, -0.28, TABLE_Z_M), scale=(0.80, 0.72, 1.0))
     back = placed((0.30, 0.44, 0.60), turned("x", 90), (0.80, 0.62, 1.0))
     left = placed((-0.30, -0.28, 0.60), turned("z", 90) @ turned("x", 90), (0.72, 0.62, 1.0))
@@ -108,7 +111,7 @@ def _shell() -> dict[str, Any]:
 
 
 def _boxes() -> dict[str, Any]:
-    """A book (cover and pages), a cardboard box and a wooden block on it."""
+    """Return a book (cover and pages), a cardboard box and a wooden block on it."""
     return {
         "book": box((0.20, 0.20, 0.115), (0.0800, 0.018, 0.115), -14.0, (0.62, 0.045, 0.035)),
         "pages": box((0.20, 0.20, 0.115), (0.0815, 0.014, 0.111), -14.0, (0.76, 0.72, 0.62)),

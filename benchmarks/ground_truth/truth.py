@@ -1,4 +1,4 @@
-"""The truth of a benchmark scene: rendered once, then kept and found again by the hash of all that determines it."""
+"""Truth of benchmark scenes, rendered once and cached by the hash of everything that determines it."""
 
 import json
 import os
@@ -30,18 +30,18 @@ from protocol.pictures import decode_rgb, read_bytes
 from protocol.scene import SceneDocument, load_scene
 
 RENDER_VERSION = 1
-"""Counts up when rendering changes in a way that the hashed numbers do not show (seeds, samples of depth...)."""
+"""Increment when rendering changes in a way that the hashed numbers do not show (seeds, samples of depth...)."""
 CACHE_VARIABLE = "DELTALIGHT_CACHE"
 
 
 @dataclass(frozen=True, eq=False)
 class TruthFrame:
-    """One frame of truth; pictures are linear in camera units, without noise, where nothing else is said.
+    """One frame of truth; pictures are linear in camera units and noise-free unless stated otherwise.
 
-    `without` and `with_objects` are the room without and with virtual objects, each the mean of two halves of
-    the samples. `halves_psnr_db` is how well the halves of `with_objects` agree in sRGB code of range 255; the
-    mean lies about 6 dB closer to the limit of infinitely many samples. `cover` is the share of each pixel that
-    virtual objects fill, 0..1. The `sensor` pictures are 8-bit sRGB with one and the same draw of camera noise.
+    `without` and `with_objects` are the room without and with virtual objects, each the mean of two halves of the
+    samples. `halves_psnr_db` is the agreement of the halves of `with_objects` in sRGB code of range 255; the mean is
+    about 6 dB closer to the limit of infinitely many samples. `cover` is the fraction of each pixel that virtual
+    objects cover, 0..1. The `sensor` pictures are 8-bit sRGB with the same draw of camera noise.
     """
 
     without: Float32[np.ndarray, "h w 3"]
@@ -63,11 +63,11 @@ class Truth:
 
     @property
     def frame_count(self) -> int:
-        """Frames of the take."""
+        """Number of frames of the take."""
         return self.scene.frame_count
 
     def document(self, frame: int) -> SceneDocument:
-        """Return the scene document of a frame, with objects posed for it and absolute asset paths."""
+        """Return the scene document of a frame, with posed objects and absolute asset paths."""
         return load_scene(document_path(self.folder, self.scene, frame))
 
     def frame(self, frame: int) -> TruthFrame:
@@ -108,8 +108,8 @@ def ensure_truth(
 ) -> Truth:
     """Return the truth of a scene, rendering it if `cache` (default: `default_cache`) does not hold it.
 
-    `size` is width and height in pixels, `spp` the samples a pixel of each picture. The
-    folder appears when it is complete; what is interrupted leaves nothing.
+    `size` is width and height in pixels, `spp` the samples per pixel of each picture. The folder appears when it is
+    complete; an interrupted run leaves nothing.
 
     Raises:
         DeltalightError: Mitsuba is missing, or size or spp cannot be rendered.
@@ -138,7 +138,7 @@ def default_cache() -> Path:
 
 @contextmanager
 def _workshop(cache: Path) -> Iterator[Path]:
-    """Make a folder beside the finished ones that does not outlive the work in it."""
+    """Yield a temporary folder beside the finished ones."""
     try:
         cache.mkdir(parents=True, exist_ok=True)
         workshop = tempfile.TemporaryDirectory(dir=cache, prefix=".making-")
@@ -164,7 +164,7 @@ def _about(scene: BenchmarkScene, size: tuple[int, int], spp: int, variant: str)
 
 
 def _determining(assembly: Assembly, camera: CameraModel) -> list[object]:
-    """Return everything else that the folder's content follows from."""
+    """Return everything else that determines the folder's content."""
     scene = assembly.scene
     poses = [scene.world_from_camera, *(item.world_from_object for item in scene.objects)]
     documents = [scene_document(scene, 0), scene.board.model_dump(mode="json")]
@@ -185,6 +185,6 @@ def _render(
     try:
         made.rename(truth.folder)
     except OSError:
-        # Somebody else may have finished the same truth meanwhile.
+        # Another process may have finished the same truth meanwhile.
         if not truth.folder.is_dir():
             raise

@@ -20,14 +20,14 @@ SEED = 3000
 DEPTH_SAMPLES = 16
 FISHEYE_SAMPLES = 64
 PROBE_HEIGHT_M = 0.05
-"""Height of the fish-eye lens above the object's base: in its place, clear of what it stands on."""
+"""Height of the fish-eye lens above the object's base: at its position, clear of what it stands on."""
 
 Halves = tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w 3"]]
 
 
 @dataclass(frozen=True, eq=False)
 class FramePictures:
-    """What truth knows of a frame, in linear camera units and metres."""
+    """Truth of a frame, in linear camera units and metres."""
 
     without: Float32[np.ndarray, "h w 3"]
     with_objects: Float32[np.ndarray, "h w 3"]
@@ -56,7 +56,7 @@ class TruthRenderer:
 
     @property
     def step_count(self) -> int:
-        """Renderings of the whole take: each pass, a depth picture a pose, the fish-eye picture."""
+        """Number of renderings of the whole take: each pass, a depth picture per pose, the fish-eye picture."""
         scene = self.assembly.scene
         poses = len({pose.tobytes() for pose in scene.world_from_camera})
         half = len(passes(self.spp // 2, self.camera.width * self.camera.height))
@@ -64,7 +64,7 @@ class TruthRenderer:
         return 2 * half * (poses + 2 * scene.frame_count) + poses + lens
 
     def frame(self, index: int) -> FramePictures:
-        """Render one frame. Seeds are the same in all frames: what does not change in truth is exactly still."""
+        """Render one frame. Seeds are the same in all frames, so what does not change in truth is exactly still."""
         pose = self.assembly.scene.world_from_camera[index]
         room = self._room(pose)
         with_objects = RoomRenderer(self.assembly.with_objects(index), self.camera)
@@ -75,7 +75,7 @@ class TruthRenderer:
         return FramePictures(room.color, _mean(halves), coded_psnr(*halves), cover, room.depth_m)
 
     def fisheye(self) -> Float32[np.ndarray, "h w 3"]:
-        """Render the empty room as the fish-eye camera sees it, lamps without extent blurred by its lens."""
+        """Render the empty room as the fish-eye camera sees it, with point lamps blurred by its lens."""
         room = RoomRenderer(self.assembly.without(), fisheye.CAMERA)
         pose = world_from_fisheye(self.assembly)
         picture = room.color(pose, spp=FISHEYE_SAMPLES, seed=SEED, advance=self.advance)
@@ -84,7 +84,7 @@ class TruthRenderer:
         )
 
     def _room(self, pose: Matrix) -> RoomPictures:
-        """Render the room, or remember it: cameras on a tripod see the same room in every frame."""
+        """Render the room from a pose once: cameras on a tripod see the same room in every frame."""
         key = pose.tobytes()
         if key not in self._rooms:
             room = RoomRenderer(self.assembly.without(), self.camera)
@@ -97,12 +97,12 @@ class TruthRenderer:
         return room.color(pose, **self._half(0)), room.color(pose, **self._half(1))
 
     def _half(self, half: int) -> Any:  # noqa: ANN401 - keywords of RoomRenderer
-        """Return how to draw a half; it has the same seeds in whatever picture it is drawn."""
+        """Return how to draw a half; its seeds are the same in every picture."""
         return {"spp": self.spp // 2, "seed": SEED + half, "advance": self.advance}
 
 
 def world_from_fisheye(assembly: Assembly) -> Matrix:
-    """Return where the fish-eye camera lies: over the middle of the first object's underside, looking up.
+    """Return the pose of the fish-eye camera: above the middle of the first object's underside, looking up.
 
     Its axes are the world's: it looks along +z, +x is to the right in its picture and +y down.
     """
@@ -112,11 +112,11 @@ def world_from_fisheye(assembly: Assembly) -> Matrix:
 
 
 def coded_psnr(a: Float32[np.ndarray, "h w 3"], b: Float32[np.ndarray, "h w 3"]) -> float:
-    """Return the PSNR (dB) of two linear pictures in sRGB code of range 255; infinite where they are equal."""
+    """Return the PSNR (dB) of two linear pictures in sRGB code of range 255; infinite if they are equal."""
     error = np.mean(np.square(srgb_coded(a) - srgb_coded(b), dtype=np.float64))
     return float(20 * np.log10(255) - 10 * np.log10(error)) if error > 0 else float("inf")
 
 
 def _mean(halves: Halves) -> Float32[np.ndarray, "h w 3"]:
-    """Return the mean in the precision that is stored (11 bits of mantissa), so that sensors see what is stored."""
+    """Return the mean in the stored precision (11 bits of mantissa), so that sensors see what is stored."""
     return ((halves[0] + halves[1]) / 2).astype(np.float16).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Writing a benchmark scene's truth: the dataset folder that sensors would give, and the pictures to compare with."""
+"""Writing a benchmark scene's truth: the dataset folder of simulated sensors, and the reference pictures."""
 
 import json
 import shutil
@@ -74,7 +74,7 @@ def _exposed(color: Float32[np.ndarray, "h w 3"], index: int) -> np.ndarray:
 
 
 def _write_pictures(folder: Path, index: int, pictures: FramePictures) -> None:
-    """Write linear pictures in half precision: finer than noise and 8-bit code by far."""
+    """Write linear pictures in half precision, which is far finer than noise and 8-bit code."""
     named = {"without": pictures.without, "with": pictures.with_objects, "cover": pictures.cover}
     for name, picture in named.items():
         np.save(picture_path(folder, name, index), picture.astype(np.float16))
@@ -83,5 +83,5 @@ def _write_pictures(folder: Path, index: int, pictures: FramePictures) -> None:
 
 
 def picture_path(folder: Path, name: str, index: int) -> Path:
-    """Return where the linear picture `name` (without, with, cover) of a frame lies."""
+    """Return the path of the linear picture `name` (without, with, cover) of a frame."""
     return folder / f"{name}-{index:06d}.npy"

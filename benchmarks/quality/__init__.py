@@ -1,1 +1,1 @@
-"""How well relighting agrees with ground truth: `deltalight bench quality`."""
+"""Agreement of relighting with ground truth: `deltalight bench quality`."""

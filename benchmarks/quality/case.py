@@ -15,7 +15,7 @@ from sensor_node.view_frames import ViewFrameBuilder
 
 @dataclass(frozen=True, eq=False)
 class SceneCase:
-    """Truth of a scene with what the renderer gets to see of it, a view a frame."""
+    """Truth of a scene with what the renderer sees of it, one view per frame."""
 
     truth: Truth
     frames: Sequence[TruthFrame]
@@ -43,5 +43,5 @@ class SceneCase:
 
     @cached_property
     def references(self) -> list[Picture]:
-        """What the sensor would have seen with the objects, noise included."""
+        """Sensor pictures with the objects, noise included."""
         return [frame.sensor_with for frame in self.frames]

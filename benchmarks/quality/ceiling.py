@@ -1,4 +1,4 @@
-"""The best picture that relighting could make of what the camera saw."""
+"""The best picture that relighting could make from the camera's picture."""
 
 import numpy as np
 
@@ -8,14 +8,14 @@ from benchmarks.quality.figures import linear
 from benchmarks.quality.metrics import Picture
 
 REGULARIZER = 1e-3
-"""Keeps the ratio finite in black; the same share of white as composition uses of the light (docs/method.md 3)."""
+"""Keeps the ratio finite in black; the same fraction of white as in composition (docs/method.md 3)."""
 
 
 def ideal_composite(truth: TruthFrame) -> Picture:
-    """Camera picture times the true change of light, true objects over it, coded.
+    """Return the camera picture times the true change of light, with the true objects over it, coded.
 
-    What then differs from the reference is the sensor's noise: it is scaled with the light here, and absent on
-    the objects.
+    What then differs from the reference is the sensor's noise: it is scaled with the light here, and absent on the
+    objects.
     """
     ratio = (truth.with_objects + REGULARIZER) / (truth.without + REGULARIZER)
     cover = truth.cover[..., None]

@@ -1,4 +1,4 @@
-"""What `deltalight bench quality` does once its options are read."""
+"""`deltalight bench quality` with parsed options."""
 
 import json
 from collections.abc import Sequence

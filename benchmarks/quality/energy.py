@@ -1,4 +1,4 @@
-"""How much light a method adds and takes away, against truth."""
+"""Amount of light that a method adds and removes, relative to truth."""
 
 from dataclasses import dataclass
 
@@ -9,16 +9,15 @@ from jaxtyping import Bool, Float32
 from benchmarks.quality.metrics import Mask
 from benchmarks.quality.regions import Linear, Regions
 
-NEAR_PIXELS = (5, 5)  # as many as leave the noise of single pixels behind, within the edge of a soft shadow
+NEAR_PIXELS = (5, 5)  # enough to average the noise of single pixels, within the edge of a soft shadow
 
 
 @dataclass(frozen=True)
 class Energy:
-    """Ratios ours / truth, 1 is right, nan where truth has nothing of the kind.
+    """Ratios ours / truth; 1 is right, nan where truth has no such light.
 
-    `darkening` and `brightening`: summed linear change of changed real pixels, over the channels that truth
-    darkens or brightens around them; 0 = no change, negative = the wrong way. `virtual`: mean radiance of the
-    objects.
+    `darkening` and `brightening`: summed linear change of changed real pixels, over the channels that truth darkens
+    or brightens around them; 0 = no change, negative = the opposite change. `virtual`: mean radiance of the objects.
     """
 
     darkening: float
@@ -30,8 +29,9 @@ def energy_ratios(result: Linear, camera: Linear, without: Linear, truth: Linear
     """Compare what `result` changes in the `camera` picture with what `truth` changes in `without`.
 
     All are linear camera units; a camera shows nothing above 1, so truth is clipped there. Whether truth darkens or
-    brightens a channel is told by the pixels around it: told by its own value, the path tracer's noise would count as
-    light, always in its own direction (an unbiased result came out at 0.6 where truth adds 1 % of what it takes).
+    brightens a channel is decided by the pixels around it: decided by its own value, the path tracer's noise would
+    count as light, always in its own direction (an unbiased result came out at 0.6 where truth adds 1 % of what it
+    takes).
     """
     ours = result - camera
     theirs = np.minimum(truth, 1) - np.minimum(without, 1)
@@ -44,7 +44,7 @@ def energy_ratios(result: Linear, camera: Linear, without: Linear, truth: Linear
 
 
 def _mean_around(values: Float32[np.ndarray, "h w 3"], mask: Mask) -> Float32[np.ndarray, "h w 3"]:
-    """Mean of the masked pixels near each masked one without itself; 0 elsewhere and where it is alone."""
+    """Return the mean of the masked pixels near each masked one without itself; 0 elsewhere and for isolated ones."""
     kept = mask.astype(np.float64)
     weighted = values * kept[..., None]
     total, count = (

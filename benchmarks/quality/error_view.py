@@ -15,7 +15,7 @@ from jaxtyping import UInt8
 from benchmarks.quality.metrics import CODE_RANGE, Picture
 
 ENHANCEMENT = 64.0
-"""n: the brightest colour stands for an error of 1/8 of the range. ([P1] has n = 16, [D] 4, for larger errors.)"""
+"""n: the brightest colour is an error of 1/8 of the range. ([P1] has n = 16, [D] 4, for larger errors.)"""
 
 
 def error_view(result: Picture, reference: Picture) -> UInt8[np.ndarray, "h w 3"]:

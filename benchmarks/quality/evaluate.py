@@ -24,7 +24,7 @@ CEILING = Variant(
 
 @dataclass(frozen=True)
 class QualityJob:
-    """What to measure; `volume_size` None = the machine's default, `cache` None = where truth is kept by default."""
+    """What to measure; `volume_size` None = the machine's default, `cache` None = the default cache of truth."""
 
     scenes: Sequence[BenchmarkScene]
     variants: Sequence[Variant]
@@ -48,7 +48,7 @@ class VariantResult:
 
 @dataclass(frozen=True, eq=False)
 class SceneResult:
-    """One scene: every variant by name, and what truth itself is like."""
+    """One scene: every variant by name, and figures of truth itself."""
 
     scene: BenchmarkScene
     halves_psnr_db: float
@@ -59,7 +59,7 @@ class SceneResult:
 
 @dataclass(frozen=True, eq=False)
 class QualityResult:
-    """Everything that was measured."""
+    """All results."""
 
     job: QualityJob
     renderer: str
@@ -135,5 +135,5 @@ def _scene_result(case: SceneCase, variants: dict[str, VariantResult]) -> SceneR
 
 
 def _shown_frame(case: SceneCase) -> int:
-    """The middle of a sequence."""
+    """Return the middle of a sequence."""
     return len(case.frames) // 2

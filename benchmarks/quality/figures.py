@@ -1,4 +1,4 @@
-"""All figures of a variant on a scene, by flat names; means over frames and scenes leave out nan."""
+"""All figures of a variant on a scene, by flat names; means over frames and scenes ignore nan."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
@@ -19,16 +19,16 @@ PARTS = ("changed", "changed_real", "changed_virtual")
 
 
 def linear(picture: Picture) -> Linear:
-    """Camera units of an 8-bit sRGB picture."""
+    """Return camera units of an 8-bit sRGB picture."""
     return np.asarray(decode_lut(None)[:, 0][picture])
 
 
 def scene_figures(pictures: Sequence[Picture], case: SceneCase) -> Figures:
-    """Compare a variant's pictures, one a frame, with the truth of their scene.
+    """Compare a variant's pictures, one per frame, with the truth of their scene.
 
     Names: `<part>_<share|psnr_db|ssim|flip>` with the parts picture, changed, changed_real, changed_virtual;
-    `darkening`, `brightening`, `virtual_radiance` (energy.py); `penumbra_error` (first frame);
-    `temporal_unchanged`, `temporal_changed` (temporal.py).
+    `darkening`, `brightening`, `virtual_radiance` (energy.py); `penumbra_error` (first frame); `temporal_unchanged`,
+    `temporal_changed` (temporal.py).
     """
     frames = zip(pictures, case.frames, case.regions, strict=True)
     figures = mean_figures(_frame_figures(*frame) for frame in frames)
@@ -56,7 +56,7 @@ def _frame_figures(picture: Picture, truth: TruthFrame, regions: Regions) -> Fig
 
 
 def _penumbra_error(picture: Picture, case: SceneCase) -> float:
-    """Mean size of the relative errors of all shadow edges; nan where one of them is hidden or has no shadow."""
+    """Return the mean size of the relative errors of all shadow edges; nan if one is hidden or has no shadow."""
     frame, view = case.frames[0], case.views[0]
     pose = case.scene.world_from_camera[0]
     camera = linear(frame.sensor_without)
@@ -71,7 +71,7 @@ def _penumbra_error(picture: Picture, case: SceneCase) -> float:
 
 
 def mean_figures(many: Iterable[Figures]) -> Figures:
-    """Mean of each figure over those that have it; nan where none has."""
+    """Return the mean of each figure over those that have it; nan if none has."""
     rows = list(many)
     names = dict.fromkeys(name for row in rows for name in row)
     found = {name: [row[name] for row in rows if name in row and not np.isnan(row[name])] for name in names}

@@ -9,7 +9,7 @@ from skimage.metrics import structural_similarity
 
 CODE_RANGE = 255.0
 SSIM_SIGMA = 1.5
-"""Standard deviation of SSIM's window, pixels, as its authors have it (Wang et al. 2004)."""
+"""Standard deviation of SSIM's window, pixels, as in the original (Wang et al. 2004)."""
 
 Picture = UInt8[np.ndarray, "h w 3"]
 Mask = Bool[np.ndarray, "h w"]
@@ -17,10 +17,10 @@ Mask = Bool[np.ndarray, "h w"]
 
 @dataclass(frozen=True)
 class Agreement:
-    """How a part of a picture agrees with its reference.
+    """Agreement of a part of a picture with its reference.
 
-    `share` of the picture's pixels; `psnr_db` is infinite where nothing differs; `ssim` 1 is perfect; `flip` 0
-    is. All but `share` are nan where the part is empty.
+    `share` of the picture's pixels; `psnr_db` is infinite if nothing differs; `ssim` 1 is perfect; `flip` 0 is. All
+    but `share` are nan if the part is empty.
     """
 
     share: float
@@ -38,7 +38,7 @@ class Comparison:
         self._flip = flip_map(picture, reference)
 
     def over(self, mask: Mask) -> Agreement:
-        """Agreement over the pixels of a mask. SSIM and FLIP look at neighbours outside it too."""
+        """Return the agreement over the pixels of a mask. SSIM and FLIP include neighbours outside it."""
         if not mask.any():
             return Agreement(0.0, np.nan, np.nan, np.nan)
         return Agreement(
@@ -49,17 +49,17 @@ class Comparison:
         )
 
     def everywhere(self) -> Agreement:
-        """Agreement over the whole picture."""
+        """Return the agreement over the whole picture."""
         return self.over(np.ones(self._squares.shape, bool))
 
 
 def decibels(mean_square: float) -> float:
-    """Peak signal to noise ratio of a mean squared error in 8-bit codes, dB; infinite for 0."""
+    """Return the peak signal to noise ratio of a mean squared error in 8-bit codes, dB; infinite for 0."""
     return float(10 * np.log10(CODE_RANGE**2 / mean_square)) if mean_square > 0 else np.inf
 
 
 def ssim_map(picture: Picture, reference: Picture) -> Float64[np.ndarray, "h w"]:
-    """Structural similarity of each pixel's neighbourhood, mean of the channels (Wang et al. 2004)."""
+    """Return the structural similarity of each pixel's neighbourhood, mean of the channels (Wang et al. 2004)."""
     _, similarity = structural_similarity(
         reference,
         picture,
@@ -74,7 +74,7 @@ def ssim_map(picture: Picture, reference: Picture) -> Float64[np.ndarray, "h w"]
 
 
 def flip_map(picture: Picture, reference: Picture) -> Float32[np.ndarray, "h w"]:
-    """FLIP of each pixel, 0..1, at its default of 67 pixels a degree (Andersson et al. 2020)."""
+    """Return FLIP of each pixel, 0..1, at its default of 67 pixels per degree (Andersson et al. 2020)."""
     pair = [np.asarray(codes / CODE_RANGE, np.float32) for codes in (reference, picture)]
     found, _, _ = flip_evaluator.evaluate(*pair, "LDR", applyMagma=False, computeMeanError=False)
     return np.asarray(found[..., 0], np.float32)

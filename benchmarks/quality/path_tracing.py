@@ -1,4 +1,4 @@
-"""Path tracing with and without the objects in the time of one relit frame: the papers' equal-time rival."""
+"""Path tracing with and without the objects in the time of one relit frame: the papers' equal-time competitor."""
 
 import tempfile
 import time
@@ -17,19 +17,19 @@ from benchmarks.quality.regions import Linear
 from benchmarks.quality.renders import Rendered
 
 SEED = 700_001
-"""Apart from truth's seeds, so that its noise is not this one's."""
+"""Different from truth's seeds, so that their noise is independent."""
 TRIAL_SAMPLES = (1, 9)
 
 
 @dataclass(frozen=True, eq=False)
 class _Pair:
-    """One frame's rooms without and with objects; Mitsuba's geometry is built, as it is not timed."""
+    """One frame's rooms without and with objects; with Mitsuba's geometry built, which is not timed."""
 
     without: RoomRenderer
     with_objects: RoomRenderer
 
     def render(self, case: SceneCase, frame: int, spp: int, seed: int) -> tuple[Linear, Linear]:
-        """Trace both with seeds of their own, as a differential renderer without memory does."""
+        """Trace both with different seeds, as a differential renderer without memory does."""
         pose = case.scene.world_from_camera[frame]
         pictures = (
             room.color(pose, spp=spp, seed=seed + index)
@@ -40,11 +40,11 @@ class _Pair:
 
 
 def trace_in_time(case: SceneCase, frame_ms: float) -> Rendered:
-    """Differential rendering of every frame, with as many samples a pixel as take `frame_ms`, at least one.
+    """Render every frame differentially, with as many samples per pixel as fit in `frame_ms`, at least one.
 
-    Camera picture + (with - without) on real pixels, the traced picture on the objects; both renders have the
-    same number of samples. The time to build Mitsuba's scenes is not counted.
-    Mitsuba's variant must be set (`ensure_truth` does so).
+    Camera picture + (with - without) on real pixels, the traced picture on the objects; both renders have the same
+    number of samples. The time to build Mitsuba's scenes is not counted. Mitsuba's variant must be set
+    (`ensure_truth` does so).
     """
     with tempfile.TemporaryDirectory(prefix="deltalight-path-") as folder:
         assembly = Assembly(case.scene, Path(folder))
@@ -65,7 +65,7 @@ def trace_in_time(case: SceneCase, frame_ms: float) -> Rendered:
 
 
 def _affordable_samples(pair: _Pair, case: SceneCase, frame_ms: float) -> int:
-    """Samples a pixel that fit in a time, from two trials: a fixed part and a part that grows with samples."""
+    """Return the samples per pixel that fit in a time, from two trials: a fixed and a proportional part."""
     times_ms = []
     for spp in TRIAL_SAMPLES:
         pair.render(case, 0, spp, SEED)  # compiles Mitsuba's kernels for this number

@@ -13,14 +13,14 @@ from benchmarks.quality.regions import REAL_COVER, Linear
 from protocol.camera_model import CameraModel
 
 ACROSS_PX = 3
-"""Parallel lines to either side, one a pixel: seven of them average noise down by 2.6."""
+"""Parallel lines to either side, a pixel apart: seven of them reduce noise by 2.6."""
 LEAST_REACH_PX = 4
-"""From the middle to either end: a sharp edge is two pixels wide in the picture, and has two more beside it."""
+"""From the middle to either end: a sharp edge is two pixels wide in the picture, with two more beside it."""
 SAMPLES_PER_PX = 2
 PLATEAU_SHARE = 1 / 6
-"""Part of the profile at either end that is taken as fully lit or fully dark."""
+"""Part of the profile at either end that counts as fully lit or fully dark."""
 LEAST_STEP = 0.02
-"""Darkening of a profile under which there is no shadow: three times the rounding of a mid-grey 8-bit code."""
+"""Least darkening of a profile with a shadow: three times the rounding of a mid-grey 8-bit code."""
 
 Profile = Float64[np.ndarray, " n"]
 
@@ -63,19 +63,25 @@ class EdgeOnPicture:
         return cls(camera.project(seen.reshape(-1, 3)).reshape(*points.shape[:2], 2), 2 * reach_m)
 
     def uncovered(self, cover: Float32[np.ndarray, "h w"]) -> "EdgeOnPicture":
-        """Leave out lines that objects or the picture's border hide."""
+        """Drop lines that objects or the picture's border hide."""
         height, width = cover.shape
         seen = np.all((self.lines >= 0) & (self.lines <= [width - 1, height - 1]), axis=(1, 2))
         free = np.all(_sampled(cover[..., None], self.lines) < REAL_COVER, axis=1)
         return EdgeOnPicture(self.lines[seen & free], self.length_m)
 
     def measure(self, camera: Linear, result: Linear, without: Linear, truth: Linear) -> Penumbra:
-        """Widths of one edge: `truth` against noise-free `without`, `result` against the `camera` picture."""
+        """Measure the widths of one edge.
+
+        `truth` against noise-free `without`, `result` against the `camera` picture.
+        """
         widths = [step_width(self.profile(*pair)) for pair in ((truth, without), (result, camera))]
         return Penumbra(widths[0] * self.length_m, widths[1] * self.length_m)
 
     def profile(self, shadowed: Linear, lit: Linear) -> Profile:
-        """Ratio shadowed / lit along the edge, both averaged over the lines; 1 where nothing is lit or seen."""
+        """Return the ratio shadowed / lit along the edge, both averaged over the lines.
+
+        1 where nothing is lit or seen.
+        """
         sums = [_sampled(picture, self.lines).sum(axis=0) for picture in (shadowed, lit)]
         return np.asarray(np.divide(sums[0], sums[1], out=np.ones_like(sums[0]), where=sums[1] > 0))
 
@@ -83,17 +89,17 @@ class EdgeOnPicture:
 def _sampled(
     picture: Float32[np.ndarray, "h w c"], places: Float64[np.ndarray, "m n 2"]
 ) -> Float64[np.ndarray, "m n"]:
-    """Sum of the channels at places (x, y), bilinear; the border goes on outside."""
+    """Return the sum of the channels at positions (x, y), bilinear; the border is repeated outside."""
     rows_columns = np.moveaxis(places, -1, 0)[::-1]
     total = picture.sum(axis=2, dtype=np.float64)
     return np.asarray(map_coordinates(total, rows_columns, order=1, mode="nearest"))
 
 
 def step_width(profile: Profile) -> float:
-    """Share of a profile's length between 90 % and 10 % of its fall; nan where it does not fall.
+    """Return the fraction of a profile's length between 90 % and 10 % of its fall; nan if it does not fall.
 
-    Noise may cross a level more than once, so the levels are looked up on the falling curve nearest to the
-    profile (least squares).
+    Noise may cross a level more than once, so the levels are read on the falling curve nearest to the profile (least
+    squares).
     """
     plateau = max(1, round(PLATEAU_SHARE * len(profile)))
     high, low = profile[:plateau].mean(), profile[-plateau:].mean()

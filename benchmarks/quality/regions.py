@@ -9,7 +9,7 @@ from benchmarks.ground_truth.sensors import srgb_coded
 from benchmarks.quality.metrics import Mask
 
 CHANGE_CODES = 2
-"""A pixel is changed if a channel moves by more, in 8-bit codes: rounding can move either picture's code by one."""
+"""A pixel is changed if a channel changes by more, in 8-bit codes: rounding can move either picture's code by one."""
 REAL_COVER, VIRTUAL_COVER = 0.01, 0.99
 """Pixels that virtual objects cover less than the first are real, more than the second virtual."""
 
@@ -18,7 +18,7 @@ Linear = Float32[np.ndarray, "h w 3"]
 
 @dataclass(frozen=True, eq=False)
 class Regions:
-    """Masks (h, w): where truth changes, and what is seen there. Edges of objects are neither real nor virtual."""
+    """Masks (h, w): where truth changes, and what is visible there. Edges of objects are neither real nor virtual."""
 
     changed: Mask
     real: Mask
@@ -36,7 +36,7 @@ class Regions:
 
 
 def find_regions(without: Linear, with_objects: Linear, cover: Float32[np.ndarray, "h w"]) -> Regions:
-    """Regions of one frame from noise-free pictures in camera units and the objects' share of each pixel."""
+    """Return the regions of one frame from noise-free pictures in camera units and the objects' coverage."""
     difference = srgb_coded(with_objects) - srgb_coded(without)
     changed = np.abs(difference).max(axis=2) > CHANGE_CODES
     return Regions(changed, cover < REAL_COVER, cover > VIRTUAL_COVER)

@@ -17,16 +17,16 @@ from render_server.renderer import SceneRenderer
 
 TIMED_PAIRS = 2
 STEP_ASIDE_M = 0.05
-"""Far enough for every real surface to be built anew: many pixels at any distance in a room."""
+"""Far enough for every real surface to be rebuilt: many pixels at any distance in a room."""
 
 
 @dataclass(frozen=True, eq=False)
 class Rendered:
-    """Pictures, one a frame.
+    """Pictures, one per frame.
 
-    `frame_ms`: median time of a frame in which everything is built anew. `is_repeatable`: the first frame rendered
-    again at once gave the same bytes. `history_codes`: greatest difference of any channel, in 8-bit codes, when it
-    is rendered once more after other frames. None where nothing was rendered.
+    `frame_ms`: median time of a frame in which everything is rebuilt. `is_repeatable`: rendering the first frame
+    again immediately gave the same bytes. `history_codes`: greatest difference of any channel, in 8-bit codes, when
+    it is rendered once more after other frames. None if nothing was rendered.
     """
 
     pictures: Sequence[Picture]
@@ -40,7 +40,7 @@ def render_variant(gpu: GpuContext, case: SceneCase, variant: Variant, volume_si
     """Render every frame of a scene with a variant of kind `none` or `dvct`.
 
     Raises:
-        DeltalightError: the variant needs more memory than its budget, or asks for what is not built.
+        DeltalightError: the variant exceeds its memory budget, or requests what is not built.
     """
     documents = [variant.applied(case.truth.document(frame), volume_size) for frame in range(len(case.views))]
     renderer = SceneRenderer(gpu, documents[0])
@@ -55,7 +55,7 @@ def render_variant(gpu: GpuContext, case: SceneCase, variant: Variant, volume_si
 
 
 def _time_rebuilds(renderer: SceneRenderer, view: ViewFrame) -> tuple[Picture, float]:
-    """The last picture and the median time (ms) of frames between which the camera steps aside and back."""
+    """Return the last picture and the median time (ms) of frames between which the camera steps aside and back."""
     times_ms: list[float] = []
     aside = _stepped_aside(view)
     for frame in (aside, view) * TIMED_PAIRS:
@@ -75,7 +75,7 @@ def _stepped_aside(view: ViewFrame) -> ViewFrame:
 def _render_rest(
     renderer: SceneRenderer, documents: Sequence[SceneDocument], views: Sequence[ViewFrame]
 ) -> list[Picture]:
-    """The frames after the first, in their order, objects where they are by then."""
+    """Render the frames after the first, in order, with objects in their poses."""
     pictures = []
     for document, view in zip(documents[1:], views[1:], strict=True):
         renderer.set_scene(document)

@@ -1,4 +1,4 @@
-"""The report's folder: quality.json, quality.md, index.html and pictures/, put in place as a whole."""
+"""The report's folder: quality.json, quality.md, index.html and pictures/, moved into place as a whole."""
 
 import json
 import os
@@ -24,7 +24,7 @@ def require_replaceable(folder: Path) -> None:
     """Check, before anything is computed, that a report may be written as `folder`.
 
     Raises:
-        DeltalightError: there is something else of that name.
+        DeltalightError: `folder` exists and is something else.
     """
     make_output_folder(folder.absolute().parent)
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
@@ -40,10 +40,10 @@ def require_replaceable(folder: Path) -> None:
 
 
 def write_report(result: QualityResult, folder: Path) -> None:
-    """Write the report beside `folder` and put it in its place, where an older report goes.
+    """Write the report beside `folder` and move it into its place, replacing an older report.
 
     Raises:
-        DeltalightError: it cannot be written, or something else stands there.
+        DeltalightError: it cannot be written, or `folder` is something else.
     """
     require_replaceable(folder)
     with _put_in_place(folder) as making:
@@ -99,7 +99,7 @@ def _write_pictures(scene: SceneResult, folder: Path) -> ScenePictures:
 
 
 def markdown(result: QualityResult) -> str:
-    """The tables with what their columns mean."""
+    """Return the tables with the meaning of their columns."""
     width, height = result.job.size
     head = [
         "# Quality against ground truth",

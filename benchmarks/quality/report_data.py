@@ -13,7 +13,7 @@ REPORT_KIND = "deltalight quality report"
 
 
 def as_data(result: QualityResult) -> dict[str, Any]:
-    """Everything but the pictures, as JSON can hold it: null where a figure is not defined or infinite."""
+    """Return everything but the pictures, as JSON: null for figures that are undefined or infinite."""
     job = result.job
     return {
         "kind": REPORT_KIND,

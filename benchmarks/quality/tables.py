@@ -18,7 +18,7 @@ CHANGED_PSNR = "changed_psnr_db"
 
 @dataclass(frozen=True)
 class Column:
-    """A figure with its heading and the digits after its point."""
+    """A figure with its heading and number of decimals."""
 
     figure: str
     heading: str
@@ -80,7 +80,7 @@ class Table:
 
 
 def all_tables(result: QualityResult) -> list[Table]:
-    """The report's tables: means over scenes, changed pixels of each scene, the scenes themselves."""
+    """Return the report's tables: means over scenes, changed pixels of each scene, the scenes themselves."""
     return [
         means_table(result, "Agreement with truth, mean over scenes", AGREEMENT),
         means_table(result, "Light, steadiness and time, mean over scenes", LIGHT_AND_TIME),
@@ -90,7 +90,7 @@ def all_tables(result: QualityResult) -> list[Table]:
 
 
 def means_table(result: QualityResult, title: str, columns: Sequence[Column]) -> Table:
-    """One row a variant: figures, mean over scenes."""
+    """Return figures as means over scenes, one row per variant."""
     rows = [
         [name, *(_number(figures.get(column.figure, np.nan), column.digits) for column in columns)]
         for name, figures in result.means().items()
@@ -99,7 +99,7 @@ def means_table(result: QualityResult, title: str, columns: Sequence[Column]) ->
 
 
 def changed_table(result: QualityResult) -> Table:
-    """PSNR over changed pixels: one row a scene, one column a variant."""
+    """Return PSNR over changed pixels: one row per scene, one column per variant."""
     names = [variant.name for variant in result.variants]
     rows = [
         [scene.scene.name, *(_number(scene.variants[name].figures[CHANGED_PSNR], 2) for name in names)]
@@ -109,7 +109,7 @@ def changed_table(result: QualityResult) -> Table:
 
 
 def scenes_table(result: QualityResult) -> Table:
-    """How much each scene changes, how far its truth can be trusted, and whether pictures come out the same again.
+    """Return how much each scene changes, how accurate its truth is, and whether pictures are repeatable.
 
     In brackets the greatest difference of a channel, in 8-bit codes.
     """

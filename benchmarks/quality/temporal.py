@@ -1,4 +1,4 @@
-"""Steadiness of a sequence: what moves in the result that does not move in truth."""
+"""Steadiness of a sequence: changes in the result that are not in truth."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from benchmarks.quality.metrics import Mask, Picture
 class Deviation:
     """Root mean square of the wrong change from frame to frame, in 8-bit codes; nan for a single frame.
 
-    `changed`: pixels that the objects change in one of both frames, `unchanged`: the others.
+    `changed`: pixels that the objects change in either frame, `unchanged`: the others.
     """
 
     unchanged: float

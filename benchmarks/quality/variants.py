@@ -43,7 +43,7 @@ class Variant:
     settings: Mapping[str, Any] = field(default_factory=dict)
 
     def applied(self, document: SceneDocument, volume_size: int | None) -> SceneDocument:
-        """Return the document with this variant's method; `volume_size` is used where no setting names one."""
+        """Return the document with this variant's method; `volume_size` applies if no setting names one."""
         if self.kind == "none":
             return document.replaced(method=NoneMethod())
         if self.kind in METHODS and not isinstance(document.method, METHODS[self.kind]):
@@ -101,10 +101,10 @@ BARE_EXACT: dict[str, Any] = {
     "caustics": False,
     "screen_space": False,
 }
-"""Two sets of voxels marched, everything else as in the paper as far as it can be."""
+"""Two sets of voxels marched, everything else as far as possible as in the paper."""
 
 ABLATION_STEPS: tuple[tuple[str, str, dict[str, Any]], ...] = (
-    # name, sentence, what changes against the row above
+    # name, sentence, change against the previous row
     (
         "paper",
         "the operator as printed in [P1], 64 voxels an edge, cones at every 4th pixel",
@@ -131,7 +131,7 @@ ABLATION_STEPS: tuple[tuple[str, str, dict[str, Any]], ...] = (
 
 
 def ablation_chain() -> list[Variant]:
-    """From the paper's operator to the exact one and beyond, one switch a row."""
+    """Return the chain from the paper's operator to the exact one and beyond, one switch per row."""
     chain: list[Variant] = []
     settings: dict[str, Any] = {}
     for name, sentence, changes in ABLATION_STEPS:
@@ -141,7 +141,7 @@ def ablation_chain() -> list[Variant]:
 
 
 def parse_variants(text: str) -> list[Variant]:
-    """Read `camera,paper,exact:cone_count=32,cone_scale=1`: names with settings, separated by commas.
+    """Parse `camera,paper,exact:cone_count=32,cone_scale=1`: names with settings, separated by commas.
 
     Raises:
         DeltalightError: an unknown name, or a setting that the method does not have or allow.
@@ -149,7 +149,7 @@ def parse_variants(text: str) -> list[Variant]:
     written: list[str] = []
     for piece in (piece.strip() for piece in text.split(",")):
         if "=" in piece and ":" not in piece and written:
-            written[-1] += f",{piece}"  # a further setting of the variant before it
+            written[-1] += f",{piece}"  # a further setting of the previous variant
         else:
             written.append(piece)
     if len(set(written)) < len(written):

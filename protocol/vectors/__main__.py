@@ -1,4 +1,4 @@
-"""Write the byte vectors anew, after a change of the wire and its version: `python -m protocol.vectors`."""
+"""Rewrites the byte vectors after a change of the wire and its version: `python -m protocol.vectors`."""
 
 import base64
 import json

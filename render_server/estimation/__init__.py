@@ -1,1 +1,1 @@
-"""What has to be found from pictures: the lights' common factor, light from out of sight, albedo."""
+"""Estimates from pictures: the lights' registration, light from out of view, and albedo."""

@@ -1,4 +1,4 @@
-"""Albedo of real surfaces, kept from what pictures show for when the camera looks elsewhere (docs/method.md 2)."""
+"""Albedo of real surfaces, remembered for when the camera looks elsewhere (docs/method.md 2)."""
 
 from render_server.estimation.samples import BackoffSchedule, sample_light
 from render_server.frame_graph import FrameGraph
@@ -9,9 +9,9 @@ from render_server.scene.albedo_volume import MEAN_ALBEDO, AlbedoVolume
 
 
 class AlbedoEstimator:
-    """Estimates the albedo volume of one real scene; looks again when the camera or the room has moved.
+    """Estimates the albedo volume of one real scene, with exponential back-off.
 
-    With a given albedo there is nothing to estimate.
+    If the scene gives an albedo there is nothing to estimate.
     """
 
     def __init__(self, gpu: GpuContext) -> None:
@@ -21,7 +21,10 @@ class AlbedoEstimator:
         self._is_given = False
 
     def observe(self, graph: FrameGraph, lights: LightSet) -> bool:
-        """Adds what this frame shows under registered `lights`, if it is time; returns whether it did."""
+        """Adds this frame's observations under registered `lights`, if a measurement is due.
+
+        Returns whether it did.
+        """
         if self._is_given or not self._schedule.is_due(graph.inputs.frame.timestamp_ns):
             return False
         samples = sample_light(graph, lights, None)
@@ -33,7 +36,7 @@ class AlbedoEstimator:
         return True
 
     def reset(self, given: float | None) -> None:
-        """Resets the estimate: another real scene, whose albedo may be `given`."""
+        """Resets the estimate for another real scene, whose albedo may be `given`."""
         self._volume, self._schedule = AlbedoVolume(), BackoffSchedule()
         self._is_given = given is not None
         self.texture.clear(MEAN_ALBEDO if given is None else given)

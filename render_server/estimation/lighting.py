@@ -1,4 +1,4 @@
-"""The lights of one scene document from frame to frame: followed, then completed from what the picture shows."""
+"""The lights of one scene document across frames: tracked, and completed by estimates from the picture."""
 
 from collections.abc import Callable
 
@@ -25,14 +25,14 @@ Rgb = Float32[np.ndarray, "3"]
 
 
 class LightEstimator:
-    """Lights in camera units: `lights`, another object whenever something of them changes.
+    """Lights in camera units: `lights`, a new object whenever any of them changes.
 
-    Factor, ground and unseen environment are found from the first frame that can tell, and hold for all lights that
-    the source brings from then on; the factor is the mean of what later frames tell, after growing intervals. `say`
-    takes sentences for the user.
+    Registration, ground and unseen environment are estimated from the first usable frame, and apply to all lights
+    that the source delivers afterwards. The registration is a running mean over later frames, measured with
+    exponential back-off. `say` receives sentences for the user.
 
     Raises:
-        DeltalightError: an environment map that cannot be read.
+        DeltalightError: an environment map cannot be read.
     """
 
     def __init__(self, wished: documents.Lights, say: Callable[[str], None]) -> None:
@@ -57,19 +57,19 @@ class LightEstimator:
         self._sky: tuple[Rgb, Float32[np.ndarray, "n n 1"]] | None = None
 
     def update(self, frame: ViewFrame) -> bool:
-        """Takes a frame's lights; returns whether there are any lights yet."""
+        """Updates the lights from a frame; returns whether there are any yet."""
         raw = self._source.update(frame)
         for sentence in self._source.remarks:
             self._say(sentence)
         if raw is not None:
             if self._follows_lamps and self._raw is not None and raw.identities != self._raw.identities:
-                self._reset()  # another lamp explains more of what is seen
+                self._reset()  # another set of lamps explains other light
             self._raw = raw
             self._apply()
         return self.lights is not None
 
     def _apply(self) -> LightSet:
-        """Applies what was estimated to the source's lights."""
+        """Applies the estimates to the source's lights."""
         assert self._raw is not None
         lights = self._raw.registered(self._factor)
         if self._ground is not None:
@@ -82,10 +82,10 @@ class LightEstimator:
         return lights
 
     def estimate(self, graph: FrameGraph, *, moved: bool) -> LightSet:
-        """The lights in camera units, with all found that a picture can tell.
+        """Returns the lights in camera units, with all estimates that the picture allows.
 
-        Evaluates the graph under trial lights. Frames are measured again only where the real scene or the camera has
-        `moved`, so that still pictures stay.
+        Evaluates the graph under trial lights. It measures again only if the real scene or the camera has `moved`, so
+        that pictures of a scene at rest do not change.
         """
         assert self._raw is not None
         assert self.lights is not None
@@ -111,7 +111,7 @@ class LightEstimator:
         return draw_lights(frame, self.lights, self._source.split)
 
     def _register(self, graph: FrameGraph, raw: LightSet) -> None:
-        """Finds the lights' factor from this frame and averages it with those before."""
+        """Registers the lights on this frame and averages the result with earlier ones."""
         found = register_lights(graph, raw)
         if self._factor is None:
             factor = ", ".join(f"{value:.3g}" for value in found.factor)
@@ -122,7 +122,7 @@ class LightEstimator:
         self._factor = self._average.add(found)
 
     def _find_unseen(self, graph: FrameGraph, lights: LightSet) -> None:
-        """Estimates the light of what is out of sight, as this frame shows it."""
+        """Estimates the light from out of view, as this frame shows it."""
         if self._ground is not None:
             lights = lights.with_ground(self._ground)
         bounce = bounced_light(graph, lights)

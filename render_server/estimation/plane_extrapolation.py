@@ -34,7 +34,7 @@ class PointCloud:
     tolerance_m: Float64[np.ndarray, " k"]
 
     def inliers(self, axis: Float64[np.ndarray, "3"], offset: float) -> Bool[np.ndarray, " k"]:
-        """Return which points lie on the plane with this normal and distance from the origin, and face along it."""
+        """Returns which points lie on the plane with this normal and distance from the origin, and face its way."""
         near = np.abs(self.position @ axis - offset) <= self.tolerance_m
         return np.asarray(near & (self.normal @ axis >= NORMAL_COSINE))
 
@@ -49,7 +49,7 @@ class DetectedPlane:
 
 
 def detect_planes(cloud: PointCloud) -> list[DetectedPlane]:
-    """Return the planes with the most points, largest first; no point belongs to two of them.
+    """Returns the planes with the most points, largest first; no point belongs to two of them.
 
     Sequential RANSAC (Fischler & Bolles 1981) whose hypotheses are single points with their normals, evenly spread
     instead of drawn at random, so that the same frame gives the same planes.
@@ -66,7 +66,7 @@ def detect_planes(cloud: PointCloud) -> list[DetectedPlane]:
 
 
 def _largest_plane(cloud: PointCloud, free: Bool[np.ndarray, " k"]) -> DetectedPlane | None:
-    """Return the plane with the most free points; None if there are too few."""
+    """Returns the plane with the most free points; None if there are too few."""
     remaining = np.flatnonzero(free)
     min_count = max(MIN_FRACTION * len(free), MIN_POINTS)
     if len(remaining) < min_count:
@@ -86,7 +86,7 @@ def _largest_plane(cloud: PointCloud, free: Bool[np.ndarray, " k"]) -> DetectedP
 def _fit_plane(
     position: Float64[np.ndarray, "k 3"], facing: Float64[np.ndarray, "3"]
 ) -> tuple[Float64[np.ndarray, "3"], float]:
-    """Fit a plane to points by least squares; its normal faces to the side of `facing`."""
+    """Fits a plane to points by least squares; its normal faces to the side of `facing`."""
     middle = position.mean(axis=0)
     _, axes = np.linalg.eigh((position - middle).T @ (position - middle))
     axis = axes[:, 0] * np.sign(axes[:, 0] @ facing)
@@ -107,7 +107,7 @@ class ViewFrustum:
     high: Float64[np.ndarray, "2"]
 
     def inside(self, places: Float64[np.ndarray, "m 3"]) -> Float64[np.ndarray, "m 4"]:
-        """Return signed, unnormalised distances of positions (world) to the four sides, positive inside."""
+        """Returns signed, unnormalised distances of positions (world) to the four sides, positive inside."""
         seen = places @ self.camera_from_world[:3, :3].T + self.camera_from_world[:3, 3]
         x_y, z = seen[:, :2], seen[:, 2:]
         return np.concatenate([x_y - self.low * z, self.high * z - x_y], axis=1)
@@ -128,7 +128,7 @@ class RealSamples:
     tolerance_m: Float64[np.ndarray, " k"]
 
     def only(self, chosen: Bool[np.ndarray, " k"]) -> "RealSamples":
-        """Return the chosen samples."""
+        """Returns the chosen samples."""
         fields = (self.position, self.radiance, self.lit, self.indirect, self.tolerance_m)
         return RealSamples(*(values[chosen] for values in fields))
 
@@ -159,7 +159,7 @@ def extrapolate_planes(
     centre: Float64[np.ndarray, "3"],
     size: int,
 ) -> ExtrapolatedPlanes:
-    """Extrapolate planes that the picture's border cuts, as seen from `centre` (world, m).
+    """Extrapolates planes that the picture's border cuts, as seen from `centre` (world, m).
 
     `size` is the edge of the maps in texels. Nearer planes occlude farther ones.
     """
@@ -184,7 +184,7 @@ def extrapolate_planes(
 
 
 def _nearest_first(layers: Sequence[_PlaneLayer]) -> list[_PlaneLayer]:
-    """Sort layers by distance in each direction: the first of the result is the nearest everywhere."""
+    """Sorts layers by distance in each direction: the first result is the nearest one everywhere."""
     if not layers:
         return []
     distance, probability, radiance = (
@@ -199,7 +199,7 @@ def _nearest_first(layers: Sequence[_PlaneLayer]) -> list[_PlaneLayer]:
 
 
 def _bounds_room(plane: DetectedPlane, samples: RealSamples) -> bool:
-    """Whether nothing is seen behind a plane; the faces of things have the room behind them, and end."""
+    """Whether nothing is visible behind a plane; faces of things have the room behind them, and end."""
     behind = samples.position @ plane.normal < plane.offset - 3 * samples.tolerance_m
     return bool(behind.mean() <= MAX_STRAY_FRACTION)
 
@@ -228,9 +228,10 @@ def _plane_layer(
 def _continuation_probability(
     places: Float64[np.ndarray, "m 3"], seen: RealSamples, frustum: ViewFrustum
 ) -> Float64[np.ndarray, " m"]:
-    """Return the probability that a plane extends to places on it.
+    """Returns the probability that a plane extends to positions on it.
 
-    The seen length is twice that from the centre of the seen part to where the line to the place leaves the view.
+    The visible length is twice that from the centre of the visible part to where the line to the position leaves the
+    view.
     """
     start = frustum.inside(seen.position.mean(axis=0)[None])
     end = frustum.inside(places)
@@ -241,9 +242,9 @@ def _continuation_probability(
 def _expected_radiance(
     places: Float64[np.ndarray, "m 3"], plane: DetectedPlane, seen: RealSamples, lights: Sequence[Light]
 ) -> Float64[np.ndarray, "m 3"]:
-    """Return the radiance at places on a plane: its seen albedo under the expected irradiance.
+    """Returns the radiance at positions on a plane: its visible albedo under the expected irradiance.
 
-    Radiance that an albedo of 1 does not explain comes from unknown lights, and is the same beyond the border.
+    Radiance that an albedo of 1 does not explain comes from unknown lights, and is assumed equal beyond the border.
     """
     direct = _irradiance(lights, seen.position, plane.normal) * seen.lit[:, None]
     irradiance = direct + seen.indirect
@@ -257,7 +258,7 @@ def _expected_radiance(
 def _irradiance(
     lights: Sequence[Light], places: Float64[np.ndarray, "m 3"], normal: Float64[np.ndarray, "3"]
 ) -> Float64[np.ndarray, "m 3"]:
-    """Return the unshadowed irradiance of all lights at places with this normal."""
+    """Returns the unshadowed irradiance of all lights at positions with this normal."""
     total = np.zeros(places.shape)
     for light in lights:
         seen = incident_light(light, places)

@@ -43,7 +43,7 @@ def registration_from_patch(
     bounce_irradiance: Float[np.ndarray, "k 3"],
     albedo: Float[np.ndarray, " k"] | float,
 ) -> Registration | None:
-    """Fit the factor on pixels of known albedo: albedo/pi (f E_light + E_bounce) = B, each channel.
+    """Fits the factor on pixels of known albedo: albedo/pi (f E_light + E_bounce) = B, each channel.
 
     Least squares without pixels that are off the median by more than 3 robust deviations (hands, stains, shadows).
     `measured` must be linear and without clipped pixels (`unclipped`); E_bounce, gathered from the picture itself,
@@ -72,7 +72,7 @@ def registration_from_patch(
 def _paper_irradiance(
     measured: Float[np.ndarray, "k 3"], albedo: Float[np.ndarray, " k"] | float
 ) -> Float64[np.ndarray, "k 3"]:
-    """Return the irradiance under which a diffuse surface of this albedo has the measured radiance."""
+    """Returns the irradiance under which a diffuse surface of this albedo has the measured radiance."""
     return np.pi * np.asarray(measured, np.float64) / np.asarray(albedo, np.float64).reshape(-1, 1)
 
 
@@ -82,7 +82,7 @@ def unseen_radiance_from_patch(
     per_radiance: Float[np.ndarray, "k 3"],
     albedo: Float[np.ndarray, " k"] | float,
 ) -> Float32[np.ndarray, "3"] | None:
-    """Estimate the uniform radiance X >= 0 of unseen surroundings: albedo/pi (E + X E_1) = B on paper, per channel.
+    """Estimates the uniform radiance X >= 0 of unseen surroundings: albedo/pi (E + X E_1) = B on paper, per channel.
 
     `irradiance` E is explained by lights, environment and the real surfaces in view; `per_radiance` E_1 is what
     radiance 1 from all other directions would add. The median is robust against stains and shadows.
@@ -111,7 +111,7 @@ def registration_from_albedo_percentile(
     light_irradiance: Float[np.ndarray, "k 3"],
     bounce_irradiance: Float[np.ndarray, "k 3"],
 ) -> Registration:
-    """Estimate the common scale at which the 99th percentile of luminance albedo is 0.95 (docs/method.md 1).
+    """Estimates the common scale at which the 99th percentile of luminance albedo is 0.95 (docs/method.md 1).
 
     The pixels must be unshadowed, unsaturated and diffuse. Albedo pi B/(f E_light + E_bounce) falls with f,
     so the percentile of the factors that give each pixel an albedo of 0.95 is the factor sought.
@@ -152,7 +152,7 @@ class RegistrationAverage:
         self._count = 0
 
     def add(self, found: Registration) -> Float32[np.ndarray, "3"]:
-        """Add a registration; returns the factor to use from now on."""
+        """Adds a registration; returns the factor to use from now on."""
         ranks = ("", "given", "percentile", "patch")
         rank, known = ranks.index(found.source), ranks.index(self._source)
         if rank > known:
@@ -164,10 +164,10 @@ class RegistrationAverage:
 
 
 def register_lights(graph: FrameGraph, lights: LightSet) -> Registration:
-    """Factor R G B on all lights: from white paper and grey cards, else from the brightest albedo.
+    """Estimates a factor R G B on all lights: from white paper and grey cards, else from the brightest albedo.
 
-    `lights` are not registered yet. The light that other real surfaces reflect is in camera units already (it is
-    measured), so the cones are traced twice: with the environment and without.
+    `lights` are not registered yet. Light that other real surfaces reflect is measured, so it is in camera units
+    already; the cones are therefore traced twice, with and without the environment.
     """
     samples = sample_light(graph, lights, bounced_light(graph, lights))
     known = samples.usable & (samples.albedo > 0)

@@ -18,7 +18,7 @@ Bounce = Float64[np.ndarray, "h w 3"]
 
 @dataclass(frozen=True, eq=False)
 class LightSamples:
-    """What is known at pixels that show real surfaces; positions in world metres, the rest linear RGB."""
+    """Samples at pixels that show real surfaces; positions in world metres, the rest linear RGB."""
 
     position: Float64[np.ndarray, "k 3"]
     measured: Float64[np.ndarray, "k 3"]
@@ -32,20 +32,20 @@ class LightSamples:
 
     @property
     def unshadowed(self) -> Bool[np.ndarray, " k"]:
-        """Which samples get nearly all of their direct light."""
+        """Which samples receive nearly all of their direct light."""
         return np.asarray(self.lit >= UNSHADOWED)
 
 
 def bounced_light(graph: FrameGraph, lights: LightSet) -> Bounce:
-    """Irradiance that the cones gather from real surfaces alone: traced under a black environment."""
+    """Returns the irradiance that cones gather from real surfaces alone, traced under a black environment."""
     black = replace(lights, environment=np.zeros_like(lights.environment))
     return read_texture(graph.evaluate(black).cones.mu)[..., :3]
 
 
 def sample_light(graph: FrameGraph, lights: LightSet, bounce: Bounce | None) -> LightSamples:
-    """Reads the fields back where the real scene is in view; cones are those of the pixel's texel of the grid.
+    """Reads the fields back where the real scene is visible; a pixel's cones are those of its texel of the grid.
 
-    Without `bounce` all light that the cones gather counts as the lights'.
+    Without `bounce`, all light that the cones gather is attributed to the lights.
     """
     fields, shown, frame = graph.evaluate(lights), graph.shown(), graph.inputs.frame
     cones, direct = read_texture(fields.cones.mu), read_texture(fields.direct.mu)
@@ -75,7 +75,7 @@ def sample_light(graph: FrameGraph, lights: LightSet, bounce: Bounce | None) -> 
 
 
 def read_texture(texture: moderngl.Texture) -> Float64[np.ndarray, "h w c"]:
-    """Contents of a half-float or float texture."""
+    """Returns the contents of a half-float or float texture."""
     width, height = texture.size
     dtype = np.float16 if texture.dtype == "f2" else np.float32
     return np.frombuffer(texture.read(), dtype).reshape(height, width, -1).astype(np.float64)
@@ -86,9 +86,9 @@ MAX_WAIT_S = 30.0
 
 
 class BackoffSchedule:
-    """Due at once, then after intervals that double from 1 to 30 s of the frames' own time.
+    """Due immediately, then after intervals that double from 1 to 30 s of the frames' own time.
 
-    An average over time is soon good, and keeping it up to date then costs almost nothing.
+    An average over time converges soon; keeping it up to date then costs almost nothing.
     """
 
     def __init__(self) -> None:
@@ -96,7 +96,7 @@ class BackoffSchedule:
         self._wait_s = FIRST_WAIT_S
 
     def is_due(self, timestamp_ns: int) -> bool:
-        """Whether a measurement is due; if so, the next interval begins. It restarts if the clock is set back."""
+        """Whether a measurement is due; if so, starts the next interval. Restarts if the clock is set back."""
         if self._last_ns is None:
             self._last_ns = timestamp_ns
             return True

@@ -1,4 +1,4 @@
-"""Estimates of unobserved light: of the ground, of planes that go on beyond the picture, of all else around."""
+"""Estimates of unobserved light: from the ground, from planes beyond the picture, and from everything else."""
 
 from dataclasses import replace
 
@@ -24,12 +24,12 @@ from render_server.lights.octahedral import irradiance, octahedral_uv, resample_
 GROUND_SIZES = 2.0
 FACES_UP = 0.7  # cosine to the vertical
 
-PLANE_SAMPLES = 6000  # pixels that planes are looked for in: a plane of the least share still has a hundred
-FLATNESS = 0.01  # of the distance: walls, tables and lenses are that even
+PLANE_SAMPLES = 6000  # pixels used to detect planes: the smallest accepted plane still has a hundred
+FLATNESS = 0.01  # of the distance: tolerance of walls, tables and lenses
 
 
 def find_continued_planes(graph: FrameGraph, lights: LightSet, bounce: Bounce) -> ExtrapolatedPlanes:
-    """Finds what lies beyond the picture where its border cuts table, walls or floor (plane_extrapolation.py)."""
+    """Extrapolates table, walls or floor where the picture's border cuts them (plane_extrapolation.py)."""
     known = sample_light(graph, lights, bounce)
     inputs = graph.inputs
     usable = np.flatnonzero(known.usable)
@@ -52,10 +52,10 @@ def find_continued_planes(graph: FrameGraph, lights: LightSet, bounce: Bounce) -
 def find_unseen_light(
     graph: FrameGraph, lights: LightSet, shape: Float32[np.ndarray, "n n 1"], bounce: Bounce
 ) -> Float32[np.ndarray, "3"] | None:
-    """Radiance, times `shape`, of what neither the camera nor the lights show; None if the paper cannot tell.
+    """Estimates the radiance, times `shape`, of what neither camera nor lights show.
 
-    Walls beside and behind the camera reflect light too. On paper of known albedo the irradiance is known from the
-    picture; what the lights and the visible scene leave unexplained comes from there.
+    Walls beside and behind the camera reflect light too. On paper of known albedo the picture gives the irradiance;
+    what the lights and the visible scene leave unexplained comes from those walls. None without such paper.
     """
     board = graph.inputs.frame.board
     if board is None or (board.white_albedo is None and not board.grey_cards):
@@ -71,7 +71,7 @@ def find_unseen_light(
 
 
 def ground_radiance(graph: FrameGraph) -> Float32[np.ndarray, "3"] | None:
-    """Mean radiance of the ground around the objects: of what faces up within two object sizes (docs/method.md 2)."""
+    """Returns the mean radiance of upward-facing surfaces within two object sizes (docs/method.md 2)."""
     surface, frame = graph.observation.surface, graph.inputs.frame
     position, normal = read_texture(surface.position), read_texture(surface.normal)
     low, high = graph.inputs.objects.bounds
@@ -85,10 +85,11 @@ def ground_radiance(graph: FrameGraph) -> Float32[np.ndarray, "3"] | None:
 
 
 def unseen_light_shape(graph: FrameGraph, size: int) -> Float32[np.ndarray, "n n 1"]:
-    """How the light of what is out of sight is spread over an octahedral map: 1 in its strongest direction.
+    """Returns the distribution of unseen light over an octahedral map: 1 in its strongest direction.
 
-    Unseen walls adjoin seen ones, so it is the light that the seen surfaces above the horizon, as the objects see
-    them, would send to a surface facing each direction: as smooth as irradiance. Even where none is seen.
+    Unseen walls adjoin visible ones, so the distribution is the light that the visible surfaces above the horizon, as
+    seen from the objects, would send to a surface facing each direction: as smooth as irradiance. It is uniform if no
+    such surface is visible.
     """
     frame = graph.inputs.frame
     position = read_texture(graph.observation.surface.position)

@@ -1,1 +1,1 @@
-"""OpenGL through moderngl: context, programs with includes, per-pass timers, asynchronous readback."""
+"""OpenGL through moderngl: context, kernels, uniform blocks, per-pass timers, asynchronous readback."""

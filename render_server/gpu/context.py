@@ -1,4 +1,4 @@
-"""The one OpenGL context of a process (EGL, headless)."""
+"""The OpenGL context of a process (EGL, headless)."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -25,7 +25,7 @@ HINTS = {
 
 @dataclass(frozen=True)
 class GpuContext:
-    """A current OpenGL 4.3 context and what it runs on.
+    """A current OpenGL 4.3 context and its device.
 
     One process has one context and uses it from one thread.
     """
@@ -40,7 +40,7 @@ class GpuContext:
     """Told of every program that is compiled: its label and the text of each of its stages."""
 
     def compiled(self, label: str, sources: Mapping[str, str]) -> None:
-        """Tells who watches that a program is being compiled."""
+        """Tells the compile watchers about a program."""
         for watch in self.compile_watchers:
             watch(label, sources)
 
@@ -51,13 +51,13 @@ class GpuContext:
     def empty_texture(self, kind: type, texels: str) -> Any:  # noqa: ANN401 (as the kind says)
         """A texture of zeros (`texels`: f, i or u) that stands where a kernel is given none."""
         if (kind, texels) not in self._empty_textures:
-            texture: Any
-            if kind is moderngl.Texture:
-                texture = self.ctx.texture((1, 1), 4, bytes(4), dtype=f"{texels}1")
-            elif kind is moderngl.Texture3D:
-                texture = self.ctx.texture3d((1, 1, 1), 4, bytes(4), dtype=f"{texels}1")
-            else:
-                texture = self.ctx.texture_array((1, 1, 1), 4, bytes(4), dtype=f"{texels}1")
+            makers: dict[type, tuple[Any, tuple[int, ...]]] = {
+                moderngl.Texture: (self.ctx.texture, (1, 1)),
+                moderngl.Texture3D: (self.ctx.texture3d, (1, 1, 1)),
+                moderngl.TextureArray: (self.ctx.texture_array, (1, 1, 1)),
+            }
+            make, size = makers[kind]
+            texture = make(size, 4, bytes(4), dtype=f"{texels}1")
             texture.filter = (moderngl.NEAREST, moderngl.NEAREST)
             self._empty_textures[kind, texels] = texture
         return self._empty_textures[kind, texels]
@@ -83,7 +83,7 @@ def is_software_renderer(name: str) -> bool:
 
 
 def explain_context_failure(text: str) -> str:
-    """One sentence for the error text of a context that could not be made."""
+    """Returns one sentence that explains the error text of a failed context creation."""
     for needle, hint in HINTS.items():
         if needle in text:
             return f"No OpenGL context ({text}): {hint}."
@@ -91,10 +91,11 @@ def explain_context_failure(text: str) -> str:
 
 
 def create_context(device: int | None = None, *, allow_software: bool = True) -> GpuContext:
-    """Make the process's context on EGL device `device` (the driver's first when None).
+    """Creates the process's context on EGL device `device` (default: the driver's first).
 
     Raises:
-        DeltalightError: no driver, no such device, or only a software renderer where none is allowed.
+        DeltalightError: there is no driver, no such device, or only a software renderer although none is
+            allowed.
     """
     options: dict[str, Any] = {"standalone": True, "backend": "egl", "require": 430}
     if device is not None:

@@ -1,7 +1,7 @@
-"""Kernels: compute and raster programs whose textures, images, buffers and uniforms are bound by their GLSL names.
+"""Kernels: compute and raster programs whose resources and uniforms are bound by their GLSL names.
 
-Units and binding points are assigned when a program is linked, so no shader states any, and nothing has to be bound
-before a kernel runs: what it needs, it is given.
+Linking assigns units and binding points, so shaders state none, and every run passes all that the kernel
+needs.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -60,7 +60,7 @@ FORMATS: Final = {
 
 
 class BindingError(RuntimeError):
-    """A kernel was given a name that it does not declare, lacks one that it needs, or got the wrong kind of thing."""
+    """A name is undeclared or missing, or its value is of the wrong kind."""
 
 
 class Drawable(Protocol):
@@ -71,12 +71,12 @@ class Drawable(Protocol):
         """How many triangles are drawn."""
 
     def draw(self, program: moderngl.Program) -> None:
-        """Draws all of it with `program`."""
+        """Draws all triangles with `program`."""
 
 
 @dataclass(frozen=True)
 class Dispatch:
-    """One run of a kernel: workgroups (x, y, z), or triangles drawn; `written` are textures and buffers by name."""
+    """One run of a kernel: workgroups (x, y, z) or triangles drawn, and what it wrote, by name."""
 
     kernel: str
     size: tuple[int, ...]
@@ -85,7 +85,7 @@ class Dispatch:
 
 @dataclass(eq=False)
 class _Slot:
-    """An active resource of a linked program and the unit or binding point that it was given."""
+    """An active resource of a linked program with its unit or binding point."""
 
     name: str
     member: Any
@@ -129,7 +129,7 @@ class _Program:
                 slot.member.gl_type = GL_INT  # as units are; moderngl 5.13 leaves that of an image3D unset
 
     def _assign(self) -> None:
-        """Numbers units and binding points, each kind from 0 on."""
+        """Assigns units and binding points, each kind from 0 on."""
         for slots in (self._samplers, self._images):
             for slot in slots:
                 slot.place = slots.index(slot)
@@ -143,7 +143,7 @@ class _Program:
         """Binds everything that the program reads and writes; returns what it may write.
 
         Raises:
-            BindingError: as the class says.
+            BindingError: a name or value does not fit.
         """
         for name in own:
             if name not in self._declared.names:
@@ -224,7 +224,7 @@ class _Program:
         value.bind(slot.place)
 
     def _write(self, slot: _Slot, value: Binding) -> None:
-        """Writes a uniform unless it has this value already; 4x4 arrays are row-major here."""
+        """Writes a uniform if its value changed; 4x4 arrays are row-major here."""
         data: bytes | Value
         if isinstance(value, np.ndarray):
             ordered = value.T if value.ndim == 2 and slot.member.matrix else value
@@ -256,7 +256,7 @@ class _Program:
         }
 
     def report(self, size: tuple[int, ...], written: Mapping[str, object]) -> None:
-        """Tells who watches that the program ran."""
+        """Tells the watchers that the program ran."""
         for watch in self._gpu.watchers:
             watch(Dispatch(self.label, size, written))
 
@@ -278,13 +278,13 @@ class Kernel:
         self._local = declared.local_size
 
     def run(self, threads: Sequence[int], *shared: Bindings, **own: Binding) -> None:
-        """Runs at least `threads` (x[, y[, z]]) invocations; their writes are visible to what comes after.
+        """Runs at least `threads` (x[, y[, z]]) invocations; later work sees their writes.
 
-        `own` must be names that the shader declares; of `shared` it takes what it needs. `own` comes first, then
-        `shared` in their order.
+        Names in `own` must be declared by the shader; from `shared` it takes what it needs. `own` takes
+        precedence, then `shared` in order.
 
         Raises:
-            BindingError: a name is unknown or missing, or what is bound to it is of another kind or format.
+            BindingError: a name is undeclared or missing, or its value is of the wrong kind or format.
         """
         written = self._program.bind(shared, own)
         counts = [*threads, 1, 1][:3]
@@ -296,7 +296,7 @@ class Kernel:
         self._program.report(groups, written)
 
     def resources(self) -> dict[str, list[str]]:
-        """Names of what the linked program binds, by kind."""
+        """Returns the names of the linked program's bindings, by kind."""
         return self._program.resources()
 
     def release(self) -> None:
@@ -305,7 +305,7 @@ class Kernel:
 
 
 class RasterKernel:
-    """A vertex and a fragment shader of the same name; draws with depth test into a framebuffer."""
+    """A vertex and a fragment shader of one name; draws with depth test into a framebuffer."""
 
     def __init__(self, gpu: GpuContext, name: str, **defines: float | str) -> None:
         self._ctx = gpu.ctx
@@ -349,7 +349,7 @@ class RasterKernel:
         self._program.report((mesh.triangle_count,), written)
 
     def resources(self) -> dict[str, list[str]]:
-        """Names of what the linked program binds, by kind."""
+        """Returns the names of the linked program's bindings, by kind."""
         return self._program.resources()
 
     def release(self) -> None:
@@ -358,14 +358,16 @@ class RasterKernel:
 
 
 def _label(name: str | Path, defines: Mapping[str, float | str]) -> str:
-    """The shader's name and what it was compiled with, e.g. `trace_cones REAL`."""
+    """Returns the shader's name and defines, e.g. `trace_cones REAL`."""
     stem = name.name if isinstance(name, Path) else name
     return " ".join([stem, *(key if value == 1 else f"{key}={value}" for key, value in defines.items())])
 
 
 def list_threads(gpu: GpuContext, longest: int = LIST_WALKERS) -> int:
-    """Threads to walk a list whose length only the GPU knows: at most `longest`; few in software, where an idle one
-    costs as much as a busy one, but never so few that a thread's loops are cut off.
+    """Returns the number of threads for walking a list whose length only the GPU knows: at most `longest`.
+
+    Few in software, where an idle thread costs as much as a busy one, but enough that no thread's loops are
+    cut off.
     """
     if not gpu.is_software:
         return longest
@@ -374,7 +376,7 @@ def list_threads(gpu: GpuContext, longest: int = LIST_WALKERS) -> int:
 
 @contextmanager
 def watched(gpu: GpuContext, watch: Callable[[Dispatch], None]) -> Iterator[None]:
-    """Tells `watch` of every run of a kernel of this context."""
+    """Calls `watch` for every run of a kernel of this context."""
     gpu.watchers.append(watch)
     try:
         yield

@@ -1,9 +1,10 @@
-"""What objects hold on the GPU: textures and buffers found in their attributes, and the bytes that these take."""
+"""GPU memory of Python objects: finds the textures and buffers in their attributes and sums their bytes."""
 
 import math
 from collections.abc import Iterator, Sequence
 
 import moderngl
+import numpy as np
 
 from render_server.gpu.context import GpuContext
 
@@ -56,5 +57,4 @@ def _size(item: object) -> int:
         return int(item.size)
     assert isinstance(item, moderngl.Texture | moderngl.Texture3D | moderngl.TextureArray)
     texels = math.prod(item.size)
-    component_bytes = int(item.dtype[-1])  # "f2", "u1"; moderngl's "f1" is no type of NumPy
-    return int(texels * item.components * component_bytes)
+    return int(texels * item.components * np.dtype(item.dtype).itemsize)

@@ -1,4 +1,4 @@
-"""Reading pictures back without stalling the GPU: a ring of pixel buffers that are read later."""
+"""Asynchronous readback: a ring of pixel buffers, so that reading a picture does not stall the GPU."""
 
 from collections import deque
 from typing import Any
@@ -12,7 +12,7 @@ RING = 3
 
 
 class AsyncReadback:
-    """Copies textures into pixel buffers at once and gives their bytes when asked, oldest first."""
+    """Copies textures into pixel buffers immediately and returns their bytes later, oldest first."""
 
     def __init__(self, gpu: GpuContext) -> None:
         self._ctx = gpu.ctx
@@ -23,7 +23,7 @@ class AsyncReadback:
         return len(self._waiting)
 
     def push(self, texture: moderngl.Texture, dtype: str) -> None:
-        """Start copying `texture` (level 0, as `dtype` elements)."""
+        """Starts copying `texture` (level 0, as `dtype` elements)."""
         width, height = texture.size
         shape = (height, width, texture.components)
         size = int(np.prod(shape)) * np.dtype(dtype).itemsize
@@ -32,7 +32,7 @@ class AsyncReadback:
         self._waiting.append((buffer, shape, np.dtype(dtype)))
 
     def pop(self) -> np.ndarray[Any, Any]:
-        """Array (h, w, components) of the oldest texture pushed; waits only if the GPU is not done with it."""
+        """Returns the oldest pushed texture (h, w, components); waits only if the GPU has not finished it."""
         buffer, shape, dtype = self._waiting.popleft()
         size = int(np.prod(shape)) * dtype.itemsize
         array = np.frombuffer(buffer.read(size), dtype=dtype).reshape(shape)
@@ -40,7 +40,7 @@ class AsyncReadback:
         return array
 
     def _take(self, size: int) -> moderngl.Buffer:
-        """A buffer of `size` bytes that nothing waits in."""
+        """Returns an idle buffer of `size` bytes."""
         for index, buffer in enumerate(self._free):
             if buffer.size == size:
                 return self._free.pop(index)
@@ -49,7 +49,7 @@ class AsyncReadback:
         return self._ctx.buffer(reserve=size, dynamic=True)
 
     def release(self) -> None:
-        """Free all buffers."""
+        """Frees all buffers."""
         for buffer in [*self._free, *(entry[0] for entry in self._waiting)]:
             buffer.release()
         self._free.clear()

@@ -1,4 +1,4 @@
-"""Shader text: recursive `#include`, once each, with `#line` marks and defines after `#version`; what it declares."""
+"""Shader source: recursive `#include`, `#line` marks, defines after `#version`, and declared names."""
 
 import re
 from collections.abc import Iterator, Mapping
@@ -38,7 +38,7 @@ class Declarations:
 
 
 def shader_source(path: Path, defines: Mapping[str, int | float | str] | None = None) -> str:
-    """Text of the shader at `path` with its includes (relative to the shaders' folder) and defines."""
+    """Returns the source of the shader at `path` with includes (from the shaders' folder) and defines."""
     files: list[Path] = []
     body = _expand(path, files)
     head = [VERSION, *(f"#define {name} {value}" for name, value in (defines or {}).items())]
@@ -47,7 +47,7 @@ def shader_source(path: Path, defines: Mapping[str, int | float | str] | None = 
 
 
 def _expand(path: Path, seen: list[Path]) -> str:
-    """Text of `path` with every include that was not yet `seen` put in its place."""
+    """Returns the source of `path`, with every include that was not yet `seen` replaced by its text."""
     seen.append(path)
     number = len(seen) - 1
     lines = [f"#line 1 {number}"]

@@ -1,4 +1,4 @@
-"""Textures with the sampling state that every pass wants; reading one texel; freeing GL objects."""
+"""Textures with the sampling state that every pass uses; reading single texels; freeing GL objects."""
 
 from typing import Protocol
 
@@ -25,7 +25,7 @@ def texture_2d(
     linear: bool = False,
     data: bytes | None = None,
 ) -> moderngl.Texture:
-    """Texture of `size` (width, height), clamped at its edges; nearest unless `linear`."""
+    """Creates a texture of `size` (width, height), clamped at its edges; nearest unless `linear`."""
     texture = gpu.ctx.texture(size, components, data, dtype=dtype, alignment=1)
     mode = moderngl.LINEAR if linear else moderngl.NEAREST
     if dtype[0] == "f":
@@ -35,7 +35,7 @@ def texture_2d(
 
 
 def read_texel(texture: moderngl.Texture, place: tuple[int, int]) -> Float32[np.ndarray, " c"]:
-    """Components of the texel at `place` (column, row); waits until the GPU has filled it."""
+    """Returns the components of the texel at `place` (column, row); waits until the GPU has written it."""
     target = texture.ctx.framebuffer([texture])
     try:
         data = target.read(viewport=(*place, 1, 1), components=texture.components, dtype="f4", alignment=1)
@@ -45,13 +45,13 @@ def read_texel(texture: moderngl.Texture, place: tuple[int, int]) -> Float32[np.
 
 
 def release_target(target: moderngl.Framebuffer) -> None:
-    """Frees a framebuffer; a bound one is unbound first, or the next one made would meet a GL error."""
+    """Frees a framebuffer; unbinds it first, or creating the next one would raise a GL error."""
     target.ctx.detect_framebuffer(0).use()
     target.release()
 
 
 def release_all(*items: Releasable | None) -> None:
-    """Frees all items that are there."""
+    """Frees all items except None."""
     for item in items:
         if item is not None:
             item.release()

@@ -1,4 +1,4 @@
-"""Per-pass times: GPU timer queries, or finish + clock where the driver's queries read zero (llvmpipe)."""
+"""Times per pass: GPU timer queries, or finish + clock where the driver's queries read zero (llvmpipe)."""
 
 import time
 from collections.abc import Iterator
@@ -8,13 +8,13 @@ import moderngl
 
 from render_server.gpu.context import GpuContext
 
-QUERIES_IN_FLIGHT = 3  # frames after which a query is read without waiting for the GPU
+QUERIES_IN_FLIGHT = 3  # frames until a query is read without waiting for the GPU
 
 
 class PassTimers:
-    """Milliseconds a pass, by name, for the newest frame whose times are known.
+    """Milliseconds per pass, by name, for the newest frame with known times.
 
-    A pass that runs several times in one frame is summed.
+    A pass that runs several times in a frame is summed.
     """
 
     def __init__(self, gpu: GpuContext) -> None:
@@ -28,7 +28,7 @@ class PassTimers:
 
     @contextmanager
     def measure(self, name: str) -> Iterator[None]:
-        """Time the GL work issued inside."""
+        """Times the GL work issued inside."""
         if self._gpu.is_software:
             start = time.perf_counter()
             yield
@@ -42,7 +42,7 @@ class PassTimers:
         self._current.append((name, query))
 
     def end_frame(self) -> dict[str, float]:
-        """Close the frame's list and return the newest known times."""
+        """Ends the frame and returns the newest known times."""
         if self._gpu.is_software:
             self.times_ms, self._clock = self._clock, {}
             self.last_ms |= self.times_ms
@@ -54,7 +54,7 @@ class PassTimers:
         return self.times_ms
 
     def _read(self, queries: list[tuple[str, moderngl.Query]]) -> dict[str, float]:
-        """Sum the queries of one frame by name and free them."""
+        """Sums the queries of one frame by name and frees them."""
         times: dict[str, float] = {}
         for name, query in queries:
             times[name] = times.get(name, 0.0) + query.elapsed / 1e6

@@ -1,4 +1,4 @@
-"""Uniform blocks (std140): values that many programs share, declared once in GLSL and once as a dataclass."""
+"""Uniform blocks (std140): values shared by many programs, declared once in GLSL and once as a dataclass."""
 
 import struct
 from collections.abc import Sequence
@@ -35,18 +35,18 @@ _MEMBERS: dict[type, tuple[tuple[str, str], ...]] = {}
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Base of a block's dataclass: its fields are the block's members in their order, annotated with their types."""
+    """Base of a block's dataclass: its annotated fields are the block's members in order."""
 
     @classmethod
     def members(cls) -> tuple[tuple[str, str], ...]:
-        """Name and GLSL type of each member."""
+        """Returns name and GLSL type of each member."""
         if cls not in _MEMBERS:
             hints = get_type_hints(cls, include_extras=True)
             _MEMBERS[cls] = tuple((item.name, hints[item.name].__metadata__[0]) for item in fields(cls))
         return _MEMBERS[cls]
 
     def packed(self) -> bytes:
-        """The bytes that a shader reads."""
+        """Returns the block's bytes."""
         data = bytearray()
         for name, kind in self.members():
             align, size, form = STD140[kind]
@@ -62,7 +62,7 @@ Kind = TypeVar("Kind", bound=Block)
 
 
 class UniformBlock(Generic[Kind]):
-    """One block's buffer on the GPU; rewritten when the value changes."""
+    """The GPU buffer of one block; rewritten when the value changes."""
 
     def __init__(self, gpu: GpuContext, value: Kind) -> None:
         self.value = value
@@ -71,7 +71,7 @@ class UniformBlock(Generic[Kind]):
 
     @property
     def size(self) -> int:
-        """Bytes."""
+        """Size in bytes."""
         return len(self._data)
 
     def write(self, value: Kind) -> None:

@@ -1,1 +1,1 @@
-"""Lights of a scene: what shines, where it comes from from frame to frame, and maps of all directions."""
+"""Lights of a scene: light models, their sources over time, and maps of all directions."""

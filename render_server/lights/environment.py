@@ -59,16 +59,16 @@ class EnvironmentMap:
         return float(4 * np.pi)
 
     def with_radiance(self, radiance: Float32[np.ndarray, "h w 3"]) -> Self:
-        """Return the map with other radiance."""
+        """Returns the map with other radiance."""
         return replace(self, radiance=radiance)
 
     def rolled(self, columns: int) -> "EnvironmentMap":
-        """Return the same light on a grid that begins at another column; the map's axes rotate along."""
+        """Returns the same light on a grid that begins at another column; the map's axes rotate along."""
         turned = orientation((0.0, 0.0, 1.0), -360 * columns / self.radiance.shape[1])
         return EnvironmentMap(np.roll(self.radiance, -columns, axis=1), self.world_from_map @ turned)
 
     def resized(self, width: int, height: int) -> "EnvironmentMap":
-        """Return a smaller map by averaging over solid angle; a larger size leaves the map as it is."""
+        """Returns a smaller map by averaging over solid angle; a larger size leaves the map as it is."""
         rows, columns = self.radiance.shape[:2]
         if rows <= height and columns <= width:
             return self
@@ -79,7 +79,7 @@ class EnvironmentMap:
         return EnvironmentMap((weighted / weights[..., None]).astype(np.float32), self.world_from_map)
 
     def sample(self, directions: Float[np.ndarray, "a b 3"]) -> Float32[np.ndarray, "a b 3"]:
-        """Return the radiance from world directions (of any length), bilinear."""
+        """Returns the radiance from world directions (of any length), bilinear."""
         x, y, z = np.moveaxis(directions @ self.world_from_map.astype(np.float32), -1, 0)
         rows, columns = self.radiance.shape[:2]
         u = 0.5 - np.arctan2(y, x) / (2 * np.pi)
@@ -92,13 +92,13 @@ class EnvironmentMap:
 
 
 def row_cosines(rows: int) -> Float32[np.ndarray, " h"]:
-    """Return the mean cosine of the elevation of every pixel row (its solid angle but for a constant)."""
+    """Returns the mean cosine of the elevation of every pixel row (its solid angle but for a constant)."""
     edges = np.sin(np.pi * (0.5 - np.arange(rows + 1) / rows))
     return np.asarray((edges[:-1] - edges[1:]) * rows / np.pi, np.float32)
 
 
 def pixel_solid_angles(rows: int, columns: int) -> Float32[np.ndarray, "h 1"]:
-    """Return the solid angle of the pixels of every row, sr; over all pixels they add up to 4 pi."""
+    """Returns the solid angle of the pixels of every row, sr; over all pixels they add up to 4 pi."""
     return np.asarray(row_cosines(rows)[:, None] * np.float32(2 * np.pi**2 / (rows * columns)))
 
 
@@ -109,7 +109,7 @@ def _grid(rows: int, columns: int) -> SkyGrid:
 
 
 def map_directions(rows: int, columns: int) -> Float32[np.ndarray, "h w 3"]:
-    """Return the directions of all pixels in map axes."""
+    """Returns the directions of all pixels in map axes."""
     azimuth = np.pi * (1 - 2 * (np.arange(columns) + 0.5) / columns)
     elevation = np.pi * (0.5 - (np.arange(rows) + 0.5) / rows)[:, None]
     level = np.cos(elevation)
@@ -122,7 +122,7 @@ def map_directions(rows: int, columns: int) -> Float32[np.ndarray, "h w 3"]:
 
 
 def orientation(up: tuple[float, float, float], rotation_deg: float) -> Float64[np.ndarray, "3 3"]:
-    """Return world_from_map for an up axis and a rotation about it (counter-clockwise seen from above).
+    """Returns world_from_map for an up axis and a rotation about it (counter-clockwise seen from above).
 
     Without rotation the map's centre looks along world +x, projected at right angles to `up` (along world +y
     where `up` is within 25 degrees of the x axis).
@@ -138,7 +138,7 @@ def orientation(up: tuple[float, float, float], rotation_deg: float) -> Float64[
 
 
 def load_environment(settings: EnvironmentLights) -> EnvironmentMap:
-    """Read the environment map that a scene document names, scaled by its intensity.
+    """Reads the environment map that a scene document names, scaled by its intensity.
 
     `.hdr` and `.exr` files are linear; `.png` and `.jpg` are read as sRGB and hold no light brighter than 1.
 
@@ -153,7 +153,7 @@ def load_environment(settings: EnvironmentLights) -> EnvironmentMap:
 
 
 def read_radiance(path: Path) -> Float32[np.ndarray, "h w 3"]:
-    """Read a latitude-longitude picture as linear R G B; negative values become 0.
+    """Reads a latitude-longitude picture as linear R G B; negative values become 0.
 
     Raises:
         DeltalightError: as `load_environment`.

@@ -23,17 +23,17 @@ from render_server.lights.octahedral import texel_solid_angles as octahedral_sol
 from render_server.scene.board_albedo import MIN_PIXELS, known_albedo, unclipped
 
 COARSE_SIZE = 32
-# Power of the cosine that weights seen directions for an unseen one: half at 24 degrees, about the extent of parts of
-# a room (a wall, a window, the ceiling).
+# Power of the cosine that weights visible directions for an unseen one: half at 24 degrees, about the size of parts
+# of a room (a wall, a window, the ceiling).
 LOBE_POWER = 8
-# Weight of all seen directions: decides only where none is close.
+# Weight of all visible directions: decides only where none is close.
 MIN_LOBE_WEIGHT = 1e-4
 # Lights of successive pictures within this angle may be the same. A hand-held lamp at 1 m moves as far within a time
 # constant of half a second; neighbours of a split with four lights are mostly farther apart.
 GATE_RAD = float(np.radians(20.0))
 # Between pictures, lights move in so many steps per time constant, each of which costs a rebuild.
 STEPS_PER_CONSTANT = 5
-SETTLED_CONSTANTS = 7.0  # after which 0.1 % of a change is left: taken as done
+SETTLED_CONSTANTS = 7.0  # after which 0.1 % of a change is left and counts as done
 FORGOTTEN_FRACTION = 1e-3  # of all lights' irradiance: fading lights are dropped below
 NS = 1e-9
 # Candidate inverse distances, 1/m: from far away to 20 cm, finer than the paper resolves.
@@ -64,7 +64,7 @@ class HemisphereMap:
 
     @classmethod
     def of(cls, radiance_map: RadianceMap) -> Self:
-        """Build from a fish-eye camera's radiance map."""
+        """Builds from a fish-eye camera's radiance map."""
         radiance = radiance_map.radiance * radiance_map.seen[..., None]
         return cls(radiance, radiance_map.seen, np.asarray(radiance_map.world_from_fisheye[:3, :3]))
 
@@ -79,7 +79,7 @@ class HemisphereMap:
         return float(self.grid.solid_angles[self.seen].sum(dtype=np.float64))
 
     def with_radiance(self, radiance: Float32[np.ndarray, "n n 3"]) -> Self:
-        """Return the map with other radiance."""
+        """Returns the map with other radiance."""
         return replace(self, radiance=radiance)
 
 
@@ -96,12 +96,12 @@ class WorldSky:
     seen: Float32[np.ndarray, "m m 1"]
 
     def filled(self) -> Float32[np.ndarray, "m m 3"]:
-        """Return radiance in all directions; unseen ones get the weighted mean of nearby seen ones."""
+        """Returns radiance in all directions; unseen ones get the weighted mean of nearby seen ones."""
         return np.asarray(self.radiance + (1 - self.seen) * _nearby_mean(self.radiance, self.seen))
 
 
 def to_world(sky: HemisphereMap, size: int) -> WorldSky:
-    """Average a map over the texels of an octahedral grid in world axes."""
+    """Averages a map over the texels of an octahedral grid in world axes."""
     place, weight = _sampling(sky.world_from_map.astype(np.float64).tobytes(), len(sky.radiance), size)
     rgbs = np.dstack([sky.radiance, sky.seen.astype(np.float32)])
     samples = cv2.remap(rgbs, place, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -114,7 +114,7 @@ def to_world(sky: HemisphereMap, size: int) -> WorldSky:
 def _sampling(
     rotation: bytes, map_size: int, size: int
 ) -> tuple[Float32[np.ndarray, "k k 2"], Float32[np.ndarray, "k k"]]:
-    """Return where to read a map for each sample of the octahedral grid, and the sample's weight (0 behind).
+    """Returns where to read a map for each sample of the octahedral grid, and the sample's weight (0 behind).
 
     Samples are half as far apart as the map's texels, with at least 2x2 per texel of the grid.
     """
@@ -130,7 +130,7 @@ def _sampling(
 def _nearby_mean(
     radiance: Float32[np.ndarray, "m m 3"], seen: Float32[np.ndarray, "m m 1"]
 ) -> Float32[np.ndarray, "m m 3"]:
-    """Return the mean seen radiance around each direction, weighted by a power of the cosine."""
+    """Returns the mean seen radiance around each direction, weighted by a power of the cosine."""
     size = len(radiance)
     coarse = min(size, COARSE_SIZE)
     both = np.dstack([radiance, seen]) * texel_weights(coarse, size // coarse)[..., None]
@@ -178,7 +178,7 @@ class LightTracker:
     def set_target(
         self, timestamp_ns: int, lights: tuple[RegionLight, ...], residual: Float32[np.ndarray, "n n 3"]
     ) -> None:
-        """Approach the split of a new map from this time on."""
+        """Approaches the split of a new map from this time on."""
         self.advance(timestamp_ns, at_once=True)
         self._clock_ns = timestamp_ns
         self._target = self._identified(lights)
@@ -191,7 +191,7 @@ class LightTracker:
             self._settle()
 
     def advance(self, timestamp_ns: int, *, at_once: bool = False) -> bool:
-        """Advance the filter; returns whether lights changed. Small steps are accumulated unless `at_once`."""
+        """Advances the filter; returns whether lights changed. Small steps are accumulated unless `at_once`."""
         self._clock_ns = min(self._clock_ns, timestamp_ns)
         passed_s = (timestamp_ns - self._clock_ns) * NS
         least_s = 0.0 if at_once else self._smoothing_s / STEPS_PER_CONSTANT
@@ -209,7 +209,7 @@ class LightTracker:
         self.lights, self.residual, self._to_settle_s = self._target, self._target_residual, 0.0
 
     def _approach(self, fraction: float) -> None:
-        """Move this fraction of the way to the target; lights without a target fade out."""
+        """Moves this fraction of the way to the target; lights without a target fade out."""
         target = {light.identity: light for light in self._target}
         assert self.residual is not None
         assert self._target_residual is not None
@@ -221,7 +221,7 @@ class LightTracker:
         self.residual = self.residual + np.float32(fraction) * (self._target_residual - self.residual)
 
     def _identified(self, lights: tuple[RegionLight, ...]) -> tuple[TrackedLight, ...]:
-        """Give each new light the identity of the light that it continues, or a new one."""
+        """Gives each new light the identity of the light that it continues, or a new one."""
         old = self._matched(lights)
         numbered = []
         for index, light in enumerate(lights):
@@ -234,7 +234,7 @@ class LightTracker:
         return tuple(numbered)
 
     def _matched(self, lights: tuple[RegionLight, ...]) -> dict[int, int]:
-        """Match new lights (by index) to identities of old ones: pairs close in direction and energy."""
+        """Matches new lights (by index) to identities of old ones: pairs close in direction and energy."""
         # Fading lights may come back; of two at the same distance, the shining one is likelier.
         old = [
             *self._target,
@@ -264,7 +264,7 @@ def _strength(light: TrackedLight | RegionLight) -> float:
 
 
 def _blended(light: TrackedLight, target: TrackedLight | None, fraction: float) -> TrackedLight:
-    """Interpolate between a light and its target."""
+    """Interpolates between a light and its target."""
     if target is None:
         return replace(light, irradiance=(1 - fraction) * light.irradiance)
     to_light = light.to_light + fraction * (target.to_light - light.to_light)
@@ -285,7 +285,7 @@ class PaperLight:
 
 
 def paper_light(frame: ViewFrame) -> PaperLight | None:
-    """Measure irradiance on paper and grey cards; None for fewer than 30 unclipped pixels."""
+    """Measures irradiance on paper and grey cards; None for fewer than 30 unclipped pixels."""
     if frame.board is None or frame.pose is None:
         return None
     albedo = known_albedo(frame.board, frame.camera, frame.pose)
@@ -306,7 +306,7 @@ def fit_distance(
     lights: Sequence[RegionLight],
     ambient: Float64[np.ndarray, "3"],
 ) -> float | None:
-    """Estimate the distance of the lights from the fish-eye camera at `position`, m; None where they seem far away.
+    """Estimates the distance of the lights from the fish-eye camera at `position`, m; None where they seem far away.
 
     The paper's irradiance is f (sum of E_i (D/d)^2 cos + ambient) with a factor f per channel; D, one distance for
     all lights, is fitted by least squares and must be significant. `ambient` is the irradiance of all other light
@@ -332,7 +332,7 @@ def _predicted(
     ambient: Float64[np.ndarray, "3"],
     inverse: float,
 ) -> Float64[np.ndarray, "k 3"]:
-    """Return the irradiance of the paper under lights at an inverse distance."""
+    """Returns the irradiance of the paper under lights at an inverse distance."""
     predicted = np.tile(ambient, (len(paper.points), 1))
     for light in lights:
         to_lamp = light.to_light - inverse * (paper.points - position)  # in units of the lamp's distance
@@ -342,7 +342,7 @@ def _predicted(
 
 
 def _plane(paper: PaperLight, predicted: Float64[np.ndarray, "k 3"]) -> Float64[np.ndarray, "k 3"]:
-    """Fit measured over predicted irradiance by a linear function of position per channel."""
+    """Fits measured over predicted irradiance by a linear function of position per channel."""
     places = np.column_stack([np.ones(len(paper.points)), paper.points[:, :2]])
     kept = _without_outliers(paper.irradiance / predicted)
     return np.stack(
@@ -355,7 +355,7 @@ def _plane(paper: PaperLight, predicted: Float64[np.ndarray, "k 3"]) -> Float64[
 
 
 def _misfit(paper: PaperLight, predicted: Float64[np.ndarray, "k 3"]) -> float:
-    """Return the relative mean squared difference to the measured irradiance, after fitting a factor per channel."""
+    """Returns the relative mean squared difference to the measured irradiance, after fitting a factor per channel."""
     kept = _without_outliers(paper.irradiance / predicted)
     measured, predicted = paper.irradiance[kept], predicted[kept]
     factor = (measured * predicted).sum(axis=0) / (predicted**2).sum(axis=0)

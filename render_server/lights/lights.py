@@ -1,8 +1,10 @@
-"""Lights of a scene as the renderer uses them: light models, their images in smooth planes, a smooth environment."""
+"""Lights of a scene as the renderer uses them: light models and a smooth environment around them."""
 
-from collections.abc import Sequence
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from jaxtyping import Float32, Float64
@@ -11,65 +13,169 @@ from protocol import scene_lights as documents
 from render_server.lights.environment import load_environment
 from render_server.lights.median_cut import split_environment
 from render_server.lights.octahedral import above_horizon, resample_to_octahedral, solid_angle_mean
-from render_server.scene.declared_surfaces import PLANE, SurfaceTable
 
 ENVIRONMENT_SIZE = 256
 AMBIENT_SIZE = 64  # texels of 1.5 to 5 degrees: a metal of roughness 0.3 still resolves the edge of a wall
 MIN_DISTANCE_M = 1e-6
+NARROWEST_BLEND_RAD = 1e-4  # what a spot without blend falls off over on the GPU
+
+Plane = Float64[np.ndarray, "4"]
+Axis = Float32[np.ndarray, "3"] | tuple[float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
-class DirectionalLight:
+class LightRecord:
+    """A light as `Light` of shaders/common/lights.glsl holds it, whose kinds `kind` counts."""
+
+    kind: int
+    place: Float32[np.ndarray, "3"]
+    color: Float32[np.ndarray, "3"]
+    shape: tuple[float, float, float]
+    axis_u: Axis = (0.0, 0.0, 0.0)
+    axis_v: Axis = (0.0, 0.0, 0.0)
+
+
+class LightModel(ABC):
+    """What every type of light can do; `type` is its name in the scene document."""
+
+    type: ClassVar[str]
+
+    @classmethod
+    @abstractmethod
+    def from_values(cls, values: Mapping[str, Any]) -> Self:
+        """Build the light from the keys of its scene document, or from what `describe` made of it."""
+
+    @abstractmethod
+    def describe(self) -> dict[str, Any]:
+        """Return plain values for messages and logs."""
+
+    @abstractmethod
+    def scaled(self, factor: Float32[np.ndarray, "3"]) -> Self:
+        """Return the light times a factor R G B."""
+
+    @abstractmethod
+    def record(self) -> LightRecord:
+        """Return the light as shaders read it."""
+
+
+@dataclass(frozen=True, eq=False)
+class DirectionalLight(LightModel):
     """A distant light: `direction` of travel (unit, world), `irradiance` across the beam."""
 
+    type = "directional"
     direction: Float32[np.ndarray, "3"]
     irradiance: Float32[np.ndarray, "3"]
     angular_radius_rad: float
 
-    def scaled(self, factor: Float32[np.ndarray, "3"]) -> "DirectionalLight":
-        """Return the light times a factor R G B."""
-        return replace(self, irradiance=self.irradiance * factor)
+    @classmethod
+    def from_values(cls, values: Mapping[str, Any]) -> Self:
+        """Build the light from the keys of its scene document, or from what `describe` made of it."""
+        radius = float(np.radians(values["angular_radius_deg"]))
+        return cls(_vector(values["direction"]), _strength(values, "irradiance"), radius)
 
     def describe(self) -> dict[str, Any]:
-        """Return plain values for messages and logs."""
+        """Returns plain values for messages and logs."""
         return {
-            "type": "directional",
+            "type": self.type,
             "direction": self.direction.tolist(),
             "irradiance": self.irradiance.tolist(),
             "angular_radius_deg": float(np.degrees(self.angular_radius_rad)),
         }
 
+    def scaled(self, factor: Float32[np.ndarray, "3"]) -> Self:
+        """Returns the light times a factor R G B."""
+        return replace(self, irradiance=self.irradiance * factor)
+
+    def record(self) -> LightRecord:
+        """Return the light as shaders read it."""
+        return LightRecord(0, self.direction, self.irradiance, (math.tan(self.angular_radius_rad), 1.0, 0.0))
+
 
 @dataclass(frozen=True, eq=False)
-class SphereLight:
-    """An isotropic lamp: E = I cos/d^2; position in metres, world."""
+class Lamp(LightModel):
+    """A light at a place: `position` in metres, world."""
 
     position: Float32[np.ndarray, "3"]
+
+    @property
+    def front(self) -> Plane | None:
+        """Plane a, b, c, d (world) through the lamp: it shines where ax + by + cz + d > 0; None: to all sides."""
+        return None
+
+    @property
+    def cone(self) -> tuple[Float64[np.ndarray, "3"], float] | None:
+        """Axis (unit, as light travels) and half angle, radians, beyond which no light goes; None: no such cone."""
+        return None
+
+    @abstractmethod
+    def arriving(
+        self, to_light: Float64[np.ndarray, "*n 3"], distance: Float64[np.ndarray, "*n"]
+    ) -> tuple[Float64[np.ndarray, "*n 3"], Float64[np.ndarray, "*n"]]:
+        """Return the irradiance on a surface that faces the lamp, and its angular radius.
+
+        `to_light` are the unit directions towards it, `distance` is in metres.
+        """
+
+    @abstractmethod
+    def image(
+        self, position: Float32[np.ndarray, "3"], reflection: Float64[np.ndarray, "3 3"], blur_m: float
+    ) -> Self:
+        """Return the mirror image at `position`: directions go through `reflection`, extents grow by the blur."""
+
+
+@dataclass(frozen=True, eq=False)
+class SphereLight(Lamp):
+    """An isotropic lamp: E = I cos/d^2."""
+
+    type = "sphere"
     intensity: Float32[np.ndarray, "3"]
     radius_m: float
 
-    def scaled(self, factor: Float32[np.ndarray, "3"]) -> "SphereLight":
-        """Return the light times a factor R G B."""
-        return replace(self, intensity=self.intensity * factor)
+    @classmethod
+    def from_values(cls, values: Mapping[str, Any]) -> Self:
+        """Build the light from the keys of its scene document, or from what `describe` made of it."""
+        return cls(_vector(values["position_m"]), _strength(values, "intensity"), float(values["radius_m"]))
 
     def describe(self) -> dict[str, Any]:
-        """Return plain values for messages and logs."""
+        """Returns plain values for messages and logs."""
         return {
-            "type": "sphere",
+            "type": self.type,
             "position_m": self.position.tolist(),
             "intensity": self.intensity.tolist(),
             "radius_m": self.radius_m,
         }
 
+    def scaled(self, factor: Float32[np.ndarray, "3"]) -> Self:
+        """Returns the light times a factor R G B."""
+        return replace(self, intensity=self.intensity * factor)
+
+    def record(self) -> LightRecord:
+        """Return the light as shaders read it."""
+        return LightRecord(1, self.position, self.intensity, (self.radius_m, 1.0, 0.0))
+
+    def arriving(
+        self, to_light: Float64[np.ndarray, "*n 3"], distance: Float64[np.ndarray, "*n"]
+    ) -> tuple[Float64[np.ndarray, "*n 3"], Float64[np.ndarray, "*n"]]:
+        """Return the irradiance and the angular radius."""
+        del to_light
+        return _inverse_square(self.intensity, distance), _angular_radius(self.radius_m, distance)
+
+    def image(
+        self, position: Float32[np.ndarray, "3"], reflection: Float64[np.ndarray, "3 3"], blur_m: float
+    ) -> Self:
+        """Return the mirror image at `position`."""
+        del reflection
+        return replace(self, position=position, radius_m=float(np.hypot(self.radius_m, blur_m)))
+
 
 @dataclass(frozen=True, eq=False)
-class SpotLight:
+class SpotLight(Lamp):
     """A lamp whose intensity is constant up to an angle from its axis, then falls to zero linearly in the angle.
 
-    `direction` (unit, world) is the axis as light travels, `intensity` holds on it; position in metres, world.
+    `direction` (unit, world) is the axis as light travels, `intensity` holds on it.
     """
 
-    position: Float32[np.ndarray, "3"]
+    type = "spot"
     direction: Float32[np.ndarray, "3"]
     intensity: Float32[np.ndarray, "3"]
     radius_m: float
@@ -81,14 +187,27 @@ class SpotLight:
         """Angle from the axis up to which the intensity is constant."""
         return self.half_angle_rad * (1.0 - self.blend)
 
-    def scaled(self, factor: Float32[np.ndarray, "3"]) -> "SpotLight":
-        """Return the light times a factor R G B."""
-        return replace(self, intensity=self.intensity * factor)
+    @property
+    def cone(self) -> tuple[Float64[np.ndarray, "3"], float]:
+        """Axis (unit, as light travels) and half angle, radians, beyond which no light goes."""
+        return self.direction.astype(float), self.half_angle_rad
+
+    @classmethod
+    def from_values(cls, values: Mapping[str, Any]) -> Self:
+        """Build the light from the keys of its scene document, or from what `describe` made of it."""
+        return cls(
+            _vector(values["position_m"]),
+            _vector(values["direction"]),
+            _strength(values, "intensity"),
+            float(values["radius_m"]),
+            float(np.radians(values["angle_deg"] / 2)),
+            float(values["blend"]),
+        )
 
     def describe(self) -> dict[str, Any]:
-        """Return plain values for messages and logs."""
+        """Returns plain values for messages and logs."""
         return {
-            "type": "spot",
+            "type": self.type,
             "position_m": self.position.tolist(),
             "direction": self.direction.tolist(),
             "intensity": self.intensity.tolist(),
@@ -97,15 +216,47 @@ class SpotLight:
             "blend": self.blend,
         }
 
+    def scaled(self, factor: Float32[np.ndarray, "3"]) -> Self:
+        """Returns the light times a factor R G B."""
+        return replace(self, intensity=self.intensity * factor)
+
+    def record(self) -> LightRecord:
+        """Return the light as shaders read it."""
+        blend = max(self.half_angle_rad - self.full_angle_rad, NARROWEST_BLEND_RAD)
+        shape = (self.radius_m, self.half_angle_rad / blend, 1.0 / blend)
+        return LightRecord(2, self.position, self.intensity, shape, self.direction)
+
+    def arriving(
+        self, to_light: Float64[np.ndarray, "*n 3"], distance: Float64[np.ndarray, "*n"]
+    ) -> tuple[Float64[np.ndarray, "*n 3"], Float64[np.ndarray, "*n"]]:
+        """Return the irradiance and the angular radius."""
+        irradiance = _inverse_square(self.intensity, distance) * self._emitted(to_light)[..., None]
+        return irradiance, _angular_radius(self.radius_m, distance)
+
+    def _emitted(self, to_light: Float64[np.ndarray, "*n 3"]) -> Float64[np.ndarray, "*n"]:
+        """Return the fraction of the intensity that goes against `to_light`."""
+        angle = np.arccos(np.clip(-to_light @ self.direction, -1, 1))
+        soft = max(self.half_angle_rad - self.full_angle_rad, 1e-9)
+        return np.asarray(np.clip((self.half_angle_rad - angle) / soft, 0, 1))
+
+    def image(
+        self, position: Float32[np.ndarray, "3"], reflection: Float64[np.ndarray, "3 3"], blur_m: float
+    ) -> Self:
+        """Return the mirror image at `position`."""
+        radius = float(np.hypot(self.radius_m, blur_m))
+        return replace(
+            self, position=position, direction=_vector(reflection @ self.direction), radius_m=radius
+        )
+
 
 @dataclass(frozen=True, eq=False)
-class RectangleLight:
+class RectangleLight(Lamp):
     """A diffuse parallelogram around `position` that shines with `radiance` to the side of axis_u x axis_v.
 
     The axes are whole edges; metres, world.
     """
 
-    position: Float32[np.ndarray, "3"]
+    type = "rectangle"
     axis_u: Float32[np.ndarray, "3"]
     axis_v: Float32[np.ndarray, "3"]
     radiance: Float32[np.ndarray, "3"]
@@ -116,22 +267,67 @@ class RectangleLight:
         across = np.cross(self.axis_u.astype(float), self.axis_v.astype(float))
         return np.asarray(across / np.linalg.norm(across))
 
-    def scaled(self, factor: Float32[np.ndarray, "3"]) -> "RectangleLight":
-        """Return the light times a factor R G B."""
-        return replace(self, radiance=self.radiance * factor)
+    @property
+    def front(self) -> Plane:
+        """The rectangle's own plane."""
+        normal = self.normal
+        return np.append(normal, -normal @ self.position.astype(float))
+
+    @classmethod
+    def from_values(cls, values: Mapping[str, Any]) -> Self:
+        """Build the light from the keys of its scene document, or from what `describe` made of it."""
+        axes = _vector(values["axis_u_m"]), _vector(values["axis_v_m"])
+        return cls(_vector(values["position_m"]), *axes, _strength(values, "radiance"))
 
     def describe(self) -> dict[str, Any]:
-        """Return plain values for messages and logs."""
+        """Returns plain values for messages and logs."""
         return {
-            "type": "rectangle",
+            "type": self.type,
             "position_m": self.position.tolist(),
             "axis_u_m": self.axis_u.tolist(),
             "axis_v_m": self.axis_v.tolist(),
             "radiance": self.radiance.tolist(),
         }
 
+    def scaled(self, factor: Float32[np.ndarray, "3"]) -> Self:
+        """Returns the light times a factor R G B."""
+        return replace(self, radiance=self.radiance * factor)
 
-Light = DirectionalLight | SphereLight | SpotLight | RectangleLight
+    def record(self) -> LightRecord:
+        """Return the light as shaders read it."""
+        shape = (0.0, 1.0, 0.0)
+        return LightRecord(3, self.position, self.radiance, shape, self.axis_u / 2, self.axis_v / 2)
+
+    def arriving(
+        self, to_light: Float64[np.ndarray, "*n 3"], distance: Float64[np.ndarray, "*n"]
+    ) -> tuple[Float64[np.ndarray, "*n 3"], Float64[np.ndarray, "*n"]]:
+        """Return the irradiance and the angular radius."""
+        edges = np.cross(self.axis_u.astype(np.float64), self.axis_v.astype(np.float64))
+        shown = np.maximum(-to_light @ edges, 0.0)  # area across the line of sight, m^2
+        irradiance = self.radiance.astype(np.float64) * (shown / distance**2)[..., None]
+        return irradiance, np.arctan(np.sqrt(shown / np.pi) / distance)
+
+    def image(
+        self, position: Float32[np.ndarray, "3"], reflection: Float64[np.ndarray, "3 3"], blur_m: float
+    ) -> Self:
+        """Return the mirror image at `position`: the axes change places to keep the orientation, and blur widens it
+        at the same flux.
+        """
+        u, v = (float(np.linalg.norm(axis)) for axis in (self.axis_u, self.axis_v))
+        grown = [float(np.hypot(edge, 2 * blur_m) / edge) for edge in (u, v)]
+        return replace(
+            self,
+            position=position,
+            axis_u=_vector(reflection @ self.axis_v * grown[1]),
+            axis_v=_vector(reflection @ self.axis_u * grown[0]),
+            radiance=self.radiance / np.float32(grown[0] * grown[1]),
+        )
+
+
+Light = DirectionalLight | Lamp
+LIGHT_TYPES: Mapping[str, type[Light]] = {
+    light.type: light for light in (DirectionalLight, SphereLight, SpotLight, RectangleLight)
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +347,7 @@ class LightSet:
     identities: tuple[int, ...] = ()
 
     def registered(self, factor: Float32[np.ndarray, "3"] | None = None) -> "LightSet":
-        """Return the set with the registration (or another factor) multiplied in."""
+        """Returns the set with the registration (or another factor) multiplied in."""
         chosen = np.asarray(self.registration if factor is None else factor, np.float32)
         return replace(
             self,
@@ -161,23 +357,23 @@ class LightSet:
         )
 
     def with_ground(self, radiance: Float32[np.ndarray, "3"]) -> "LightSet":
-        """Return the set with ground of this radiance in `ground_fraction` of its environment."""
+        """Returns the set with ground of this radiance in `ground_fraction` of its environment."""
         ground = np.broadcast_to(radiance, self.environment.shape)
         return self.with_surfaces(ground, self.ground_fraction)
 
     def with_surfaces(
         self, radiance: Float32[np.ndarray, "n n 3"], fraction: Float32[np.ndarray, "n n 1"]
     ) -> "LightSet":
-        """Return the set with surfaces (maps of the environment's size) in front of a fraction of each texel."""
+        """Returns the set with surfaces (maps of the environment's size) in front of a fraction of each texel."""
         return replace(self, environment=(1 - fraction) * self.environment + fraction * radiance)
 
     def with_sky(self, radiance: Float32[np.ndarray, "3"], shape: Float32[np.ndarray, "n n 1"]) -> "LightSet":
-        """Return the set with radiance added above the horizon, times `shape` (of the environment's size)."""
+        """Returns the set with radiance added above the horizon, times `shape` (of the environment's size)."""
         above = above_horizon(len(self.environment))
         return replace(self, environment=self.environment + above * shape * radiance)
 
     def describe(self) -> list[dict[str, Any]]:
-        """Return plain values of all lights and of the environment's mean, for messages and logs."""
+        """Returns plain values of all lights and of the environment's mean, for messages and logs."""
         lights = [light.describe() for light in self.lights]
         for light, identity in zip(lights, self.identities, strict=False):
             light["id"] = identity
@@ -188,7 +384,7 @@ class LightSet:
 
 
 def build_lights(lights: documents.Lights) -> LightSet:
-    """Build the light set of a scene document in mode `manual` or `environment`.
+    """Builds the light set of a scene document in mode `manual` or `environment`.
 
     An environment is split by the settings of `lights.fisheye`, as in mode `fisheye`.
 
@@ -208,7 +404,7 @@ def light_set(
     ground_fraction: Float32[np.ndarray, "n n 1"],
     identities: tuple[int, ...] = (),
 ) -> LightSet:
-    """Assemble a light set with the registration that a scene document requests."""
+    """Assembles a light set with the registration that a scene document requests."""
     given = lights.resolved_registration
     factor = np.ones(3, np.float32) if given == "auto" else np.array(given, np.float32)
     return LightSet(shining, environment, ground_fraction, factor, identities)
@@ -217,31 +413,16 @@ def light_set(
 def _manual(
     manual: tuple[documents.ManualLight, ...],
 ) -> tuple[tuple[Light, ...], Float32[np.ndarray, "n n 3"]]:
-    shining = tuple(_light(light) for light in manual if not isinstance(light, documents.AmbientLight))
+    shining = tuple(
+        LIGHT_TYPES[light.type].from_values(light.model_dump())
+        for light in manual
+        if not isinstance(light, documents.AmbientLight)
+    )
     ambient = np.zeros(3, np.float32)
     for light in manual:
         if isinstance(light, documents.AmbientLight):
             ambient += np.float32(light.radiance) * np.array(light.color_linear, np.float32)
     return shining, np.tile(ambient, (AMBIENT_SIZE, AMBIENT_SIZE, 1))
-
-
-_Shining = documents.DirectionalLight | documents.SphereLight | documents.SpotLight | documents.RectangleLight
-
-
-def _light(light: _Shining) -> Light:
-    color = np.array(light.color_linear, np.float32)
-    if isinstance(light, documents.DirectionalLight):
-        direction = np.array(light.direction, np.float32)
-        radius = float(np.radians(light.angular_radius_deg))
-        return DirectionalLight(direction, light.irradiance * color, radius)
-    position = np.array(light.position_m, np.float32)
-    if isinstance(light, documents.SphereLight):
-        return SphereLight(position, light.intensity * color, light.radius_m)
-    if isinstance(light, documents.SpotLight):
-        direction, half = np.array(light.direction, np.float32), float(np.radians(light.angle_deg / 2))
-        return SpotLight(position, direction, light.intensity * color, light.radius_m, half, light.blend)
-    axis_u, axis_v = np.array(light.axis_u_m, np.float32), np.array(light.axis_v_m, np.float32)
-    return RectangleLight(position, axis_u, axis_v, light.radiance * color)
 
 
 def _from_environment(
@@ -275,7 +456,7 @@ class IncidentLight:
 
 
 def incident_light(light: Light, position: Float64[np.ndarray, "*n 3"]) -> IncidentLight:
-    """Return the unoccluded light at positions (world, m)."""
+    """Returns the unoccluded light at positions (world, m)."""
     if isinstance(light, DirectionalLight):
         to_light = np.broadcast_to(-light.direction.astype(np.float64), position.shape)
         irradiance = np.broadcast_to(light.irradiance.astype(np.float64), position.shape)
@@ -283,125 +464,24 @@ def incident_light(light: Light, position: Float64[np.ndarray, "*n 3"]) -> Incid
     offset = light.position.astype(np.float64) - position
     distance = np.maximum(np.linalg.norm(offset, axis=-1), MIN_DISTANCE_M)
     to_light = offset / distance[..., None]
-    if isinstance(light, RectangleLight):
-        edges = np.cross(light.axis_u.astype(np.float64), light.axis_v.astype(np.float64))
-        shown = np.maximum(-to_light @ edges, 0.0)  # area across the line of sight, m^2
-        irradiance = light.radiance.astype(np.float64) * (shown / distance**2)[..., None]
-        return IncidentLight(to_light, irradiance, np.arctan(np.sqrt(shown / np.pi) / distance))
-    irradiance = light.intensity.astype(np.float64) / distance[..., None] ** 2
-    if isinstance(light, SpotLight):
-        irradiance = irradiance * _within_cone(light, to_light)[..., None]
-    return IncidentLight(to_light, irradiance, _angular_radius(light, distance))
+    return IncidentLight(to_light, *light.arriving(to_light, distance))
 
 
-def _within_cone(light: SpotLight, to_light: Float64[np.ndarray, "*n 3"]) -> Float64[np.ndarray, "*n"]:
-    """Return the fraction of a spot's intensity that it emits against `to_light`."""
-    angle = np.arccos(np.clip(-to_light @ light.direction, -1, 1))
-    soft = max(light.half_angle_rad - light.full_angle_rad, 1e-9)
-    return np.asarray(np.clip((light.half_angle_rad - angle) / soft, 0, 1))
+def _inverse_square(
+    intensity: Float32[np.ndarray, "3"], distance: Float64[np.ndarray, "*n"]
+) -> Float64[np.ndarray, "*n 3"]:
+    return np.asarray(intensity.astype(np.float64) / distance[..., None] ** 2)
 
 
-def _angular_radius(
-    light: SphereLight | SpotLight, distance: Float64[np.ndarray, "*n"]
-) -> Float64[np.ndarray, "*n"]:
-    return np.asarray(np.arcsin(np.minimum(light.radius_m / distance, 1.0)))
+def _angular_radius(radius_m: float, distance: Float64[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n"]:
+    return np.asarray(np.arcsin(np.minimum(radius_m / distance, 1.0)))
 
 
-# Of planes. From this roughness on, a lobe blurs a light's image so much that cones represent it.
-MIRROR_ROUGHNESS = 0.3
-MIN_COSINE = 0.05  # lights at grazing angles have no image of their own
+def _vector(values: Sequence[float] | np.ndarray) -> Float32[np.ndarray, "3"]:
+    return np.asarray(values, np.float32)
 
 
-@dataclass(frozen=True, eq=False)
-class MirrorLight:
-    """The image of a light in a plane, which shines in front of it, attenuated by the plane's reflectance.
-
-    `plane` (a, b, c, d; unit normal towards the objects) has ax + by + cz + d > 0 in front of it; `surface` is its
-    row in the table of surfaces, `source` the index of the light.
-    """
-
-    light: Light
-    plane: Float64[np.ndarray, "4"]
-    tolerance_m: float
-    f0: Float32[np.ndarray, "3"]
-    roughness: float
-    surface: int
-    source: int
-
-
-def mirror_lights(
-    lights: Sequence[Light], surfaces: SurfaceTable, objects: Float64[np.ndarray, "3"]
-) -> list[MirrorLight]:
-    """Return images of lights in smooth declared planes in front of which they and `objects` (a point, m) lie."""
-    found = []
-    for index, row in enumerate(surfaces.packed):
-        roughness = float(surfaces.roughness[index])
-        if row[3, 3] != PLANE or roughness >= MIRROR_ROUGHNESS or not surfaces.f0[index].any():
-            continue
-        plane = _plane_towards(row[3, :3].astype(float), row[4, :3].astype(float), objects)
-        for source, light in enumerate(lights):
-            image = _image(light, plane, roughness**2, objects)
-            if image is not None:
-                tolerance_m = float(row[4, 3])
-                found.append(
-                    MirrorLight(image, plane, tolerance_m, surfaces.f0[index], roughness, index, source)
-                )
-    return found
-
-
-def _plane_towards(
-    point: Float64[np.ndarray, "3"], normal: Float64[np.ndarray, "3"], side: Float64[np.ndarray, "3"]
-) -> Float64[np.ndarray, "4"]:
-    unit = normal / np.linalg.norm(normal)
-    plane = np.append(unit, -unit @ point)
-    return plane if unit @ side + plane[3] >= 0 else -plane
-
-
-def _image(
-    light: Light, plane: Float64[np.ndarray, "4"], alpha: float, objects: Float64[np.ndarray, "3"]
-) -> Light | None:
-    """Mirror a light, enlarged by the blur that the objects see; None if it is not in front of the plane.
-
-    A GGX lobe of alpha spreads directions by 2 alpha; at the light's distance b from the plane that is 2 alpha b.
-    """
-    normal = plane[:3]
-    reflection = np.eye(3) - 2 * np.outer(normal, normal)
-    if isinstance(light, DirectionalLight):
-        if -light.direction @ normal < MIN_COSINE:
-            return None
-        radius = float(np.arctan(np.hypot(np.tan(light.angular_radius_rad), 2 * alpha)))
-        return replace(light, direction=_single(reflection @ light.direction), angular_radius_rad=radius)
-    height = float(normal @ light.position + plane[3])
-    position = light.position.astype(float) - 2 * height * normal
-    to_objects = objects - position
-    if height <= 0 or normal @ to_objects < MIN_COSINE * np.linalg.norm(to_objects):
-        return None
-    blur_m = 2 * alpha * height * float(np.linalg.norm(to_objects)) / float(normal @ to_objects)
-    if isinstance(light, RectangleLight):
-        return _rectangle_image(light, position, reflection, blur_m)
-    moved = replace(light, position=_single(position), radius_m=float(np.hypot(light.radius_m, blur_m)))
-    if isinstance(moved, SpotLight):
-        return replace(moved, direction=_single(reflection @ moved.direction))
-    assert isinstance(moved, SphereLight)
-    return moved
-
-
-def _rectangle_image(
-    light: RectangleLight,
-    position: Float64[np.ndarray, "3"],
-    reflection: Float64[np.ndarray, "3 3"],
-    blur_m: float,
-) -> RectangleLight:
-    """Mirror a rectangle: its axes change places to keep the orientation, and blur widens it at the same flux."""
-    u, v = (float(np.linalg.norm(axis)) for axis in (light.axis_u, light.axis_v))
-    grown = [float(np.hypot(edge, 2 * blur_m) / edge) for edge in (u, v)]
-    return RectangleLight(
-        _single(position),
-        _single(reflection @ light.axis_v * grown[1]),
-        _single(reflection @ light.axis_u * grown[0]),
-        light.radiance / np.float32(grown[0] * grown[1]),
-    )
-
-
-def _single(vector: Float64[np.ndarray, "3"]) -> Float32[np.ndarray, "3"]:
-    return np.asarray(vector, np.float32)
+def _strength(values: Mapping[str, Any], key: str) -> Float32[np.ndarray, "3"]:
+    """R G B: one strength times the colour, or given as such."""
+    color = _vector(values.get("color_linear", (1.0, 1.0, 1.0)))
+    return np.asarray(np.asarray(values[key], np.float32) * color)

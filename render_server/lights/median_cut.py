@@ -41,7 +41,7 @@ class SkyMap(Protocol):
         ...
 
     def with_radiance(self, radiance: Float32[np.ndarray, "h w 3"]) -> Self:
-        """Return the map with other radiance."""
+        """Returns the map with other radiance."""
         ...
 
 
@@ -78,7 +78,7 @@ class RegionLight:
 
 @dataclass(frozen=True, eq=False)
 class Split(Generic[MapT]):
-    """Lights and residual of a map; together they are the map."""
+    """Lights and residual of a map, which together are the map."""
 
     lights: tuple[RegionLight, ...]
     residual: MapT
@@ -91,7 +91,7 @@ def split_environment(
     threshold: float = PEAK_THRESHOLD,
     whole_map: bool = False,
 ) -> Split[EnvironmentMap]:
-    """Split a latitude-longitude map as `split_map`, in its working size and opened where it is darkest."""
+    """Splits a latitude-longitude map as `split_map`, in its working size and opened where it is darkest."""
     small = environment.resized(*WORK_SIZE)
     luminance = _luminance(small.radiance)
     limit = threshold * float(np.vdot(luminance, small.grid.solid_angles)) / small.known_solid_angle
@@ -108,7 +108,7 @@ def split_map(
     whole_map: bool = False,
     is_occluded: OcclusionTest | None = None,
 ) -> Split[MapT]:
-    """Split a map into at most `count` lights and a residual (docs/method.md 2).
+    """Splits a map into at most `count` lights and a residual (docs/method.md 2).
 
     R = L min(1, c / lum L) with c = `threshold` times the solid-angle mean of what is known; P = L - R is cut into
     regions, each of which becomes a light. Regions under 1 % of the map's energy go back to R, and so do those whose
@@ -138,13 +138,13 @@ def _luminance(radiance: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h
 
 
 def _fraction_above(luminance: Float32[np.ndarray, "h w"], limit: float) -> Float32[np.ndarray, "h w 1"]:
-    """Return the fraction of each pixel's light above the limit, 0..1."""
+    """Returns the fraction of each pixel's light above the limit, 0..1."""
     above = np.maximum(luminance - np.float32(limit), 0)
     return np.asarray(above / np.maximum(luminance, np.float32(1e-30)))[..., None]
 
 
 def _bounding(luminance: Float32[np.ndarray, "h w"], limit: float, region: Region) -> Region:
-    """Return the least rectangle around a region's pixels above the limit; empty if there are none."""
+    """Returns the least rectangle around a region's pixels above the limit; empty if there are none."""
     above = cv2.compare(luminance[region.window], limit, cv2.CMP_GT)
     left, top, width, height = cv2.boundingRect(above)
     return _moved(Region(top, top + height, left, left + width), region)
@@ -156,7 +156,7 @@ def _moved(region: Region, origin: Region) -> Region:
 
 
 def _region_light(sky: SkyMap, region: Region, peaks: Float32[np.ndarray, "h w 3"]) -> RegionLight:
-    """Integrate a region: E = sum P dw, centroid, radius = sqrt(2 mean squared angle) (a disc's own radius)."""
+    """Integrates a region: E = sum P dw, centroid, radius = sqrt(2 mean squared angle) (a disc's own radius)."""
     directions = sky.grid.directions[region.window]
     solid_angles = sky.grid.solid_angles[region.window]
     weight = (_luminance(peaks) * solid_angles).ravel()
@@ -178,7 +178,7 @@ def _region_light(sky: SkyMap, region: Region, peaks: Float32[np.ndarray, "h w 3
 
 
 def _darkest_column(columns: Float[np.ndarray, " w"]) -> int:
-    """Find where to open the map so that the seam is least likely to cut a light in two."""
+    """Finds where to open the map so that the seam is least likely to cut a light in two."""
     width = max(1, len(columns) // 64)
     around = np.convolve(np.concatenate([columns, columns[: width - 1]]), np.ones(width), "valid")
     return (int(np.argmin(around)) + width // 2) % len(columns)
@@ -218,14 +218,14 @@ class _Table:
         return np.asarray(lower[region.right] - lower[region.left] - upper[region.right] + upper[region.left])
 
     def spread(self, region: Region) -> float:
-        """Return the spread of a region that is worth cutting, else 0."""
+        """Returns the spread of a region that is worth cutting, else 0."""
         sums = self.sums(region)
         spread = float(_spread(sums))
         # Radius as of a light: sqrt(2 mean squared angle).
         return 0.0 if 2 * spread <= MIN_RADIUS_RAD**2 * sums[0] else spread
 
     def halves(self, region: Region) -> tuple[Region, Region] | None:
-        """Cut a region where the sum of both sides' spreads is least; None for a single pixel."""
+        """Cuts a region where the sum of both sides' spreads is least; None for a single pixel."""
         top, bottom, left, right = region.top, region.bottom, region.left, region.right
         row = _best_cut(self.values[top : bottom + 1, right] - self.values[top : bottom + 1, left])
         column = _best_cut(self.values[bottom, left : right + 1] - self.values[top, left : right + 1])
@@ -240,7 +240,7 @@ class _Table:
 
 
 def _best_cut(running: Float64[np.ndarray, "n 4"]) -> tuple[int, float] | None:
-    """Return where to cut a row of running sums, and the spread of both sides; None if it cannot be cut."""
+    """Returns where to cut a row of running sums, and the spread of both sides; None if it cannot be cut."""
     if len(running) < 3:
         return None
     before = running[1:-1] - running[0]
@@ -250,7 +250,7 @@ def _best_cut(running: Float64[np.ndarray, "n 4"]) -> tuple[int, float] | None:
 
 
 def _spread(moments: Float64[np.ndarray, "*n 4"]) -> Float64[np.ndarray, "*n"]:
-    """Return the weighted sum of squared distances of unit vectors to their centroid: W - |sum w d|^2 / W."""
+    """Returns the weighted sum of squared distances of unit vectors to their centroid: W - |sum w d|^2 / W."""
     weight = moments[..., 0]
     pull = np.einsum("...i,...i", moments[..., 1:], moments[..., 1:])
     return np.asarray(np.maximum(weight - pull / np.maximum(weight, 1e-300), 0))

@@ -24,13 +24,13 @@ MAX_ORDER = 5
 
 
 def octahedral_direction(uv: Float[np.ndarray, "*shape 2"]) -> Float64[np.ndarray, "*shape 3"]:
-    """Return the unit direction of map coordinates in 0..1."""
+    """Returns the unit direction of map coordinates in 0..1."""
     folded = _folded_direction(uv)
     return np.asarray(folded / np.linalg.norm(folded, axis=-1, keepdims=True))
 
 
 def _folded_direction(uv: Float[np.ndarray, "*shape 2"]) -> Float64[np.ndarray, "*shape 3"]:
-    """Return the point of the octahedron |x| + |y| + |z| = 1."""
+    """Returns the point of the octahedron |x| + |y| + |z| = 1."""
     p = 2 * np.asarray(uv, np.float64) - 1
     z = 1 - np.abs(p).sum(axis=-1)
     below = np.maximum(-z, 0)[..., None]
@@ -38,7 +38,7 @@ def _folded_direction(uv: Float[np.ndarray, "*shape 2"]) -> Float64[np.ndarray, 
 
 
 def octahedral_uv(direction: Float[np.ndarray, "*shape 3"]) -> Float[np.ndarray, "*shape 2"]:
-    """Return the map coordinates in 0..1 of directions of any length."""
+    """Returns the map coordinates in 0..1 of directions of any length."""
     d = np.asarray(direction)
     d = d / np.abs(d).sum(axis=-1, keepdims=True)
     p = d[..., :2]
@@ -48,7 +48,7 @@ def octahedral_uv(direction: Float[np.ndarray, "*shape 3"]) -> Float[np.ndarray,
 
 @cache
 def octahedral_grid(size: int) -> Float64[np.ndarray, "n n 3"]:
-    """Return the unit directions of the texel centres of a size x size map (read-only)."""
+    """Returns the unit directions of the texel centres of a size x size map (read-only)."""
     directions = octahedral_direction(_grid_uv(size))
     directions.flags.writeable = False
     return directions
@@ -56,7 +56,7 @@ def octahedral_grid(size: int) -> Float64[np.ndarray, "n n 3"]:
 
 @cache
 def texel_weights(size: int, supersampling: int) -> Float32[np.ndarray, "k k"]:
-    """Return the solid angles of supersampling^2 samples a texel, relative to the mean of their texel."""
+    """Returns the solid angles of supersampling^2 samples per texel, relative to the mean of their texel."""
     weight = np.linalg.norm(_folded_direction(_grid_uv(size * supersampling)), axis=-1) ** -3
     mean = weight.reshape(size, supersampling, size, supersampling).mean(axis=(1, 3))
     return np.asarray(weight / mean.repeat(supersampling, 0).repeat(supersampling, 1), np.float32)
@@ -69,7 +69,7 @@ def _grid_uv(size: int) -> Float64[np.ndarray, "n n 2"]:
 
 @cache
 def texel_solid_angles(size: int) -> Float32[np.ndarray, "n n"]:
-    """Return the solid angle of every texel, sr; they add up to 4 pi.
+    """Returns the solid angle of every texel, sr; they add up to 4 pi.
 
     A patch dA of the octahedron seen from the centre at distance r has dA cos / r^2, proportional to r^-3.
     """
@@ -82,7 +82,7 @@ def texel_solid_angles(size: int) -> Float32[np.ndarray, "n n"]:
 
 
 def resample_to_octahedral(sample: SampleMap, size: int, supersampling: int = 2) -> np.ndarray:
-    """Average a radiance function over the texels of an octahedral map, weighted by solid angle.
+    """Averages a radiance function over the texels of an octahedral map, weighted by solid angle.
 
     `sample` maps directions (n, m, 3) to radiance (n, m, c); every texel takes supersampling^2 of them.
     """
@@ -98,12 +98,12 @@ def resample_to_octahedral(sample: SampleMap, size: int, supersampling: int = 2)
 def sample_octahedral(
     radiance: Float32[np.ndarray, "n n 3"], directions: Float[np.ndarray, "a b 3"]
 ) -> Float32[np.ndarray, "a b 3"]:
-    """Read a map bilinearly; texels meet their true neighbours over the map's border."""
+    """Reads a map bilinearly; interpolation continues across the map's border."""
     return _sampled(radiance, _texel_coordinates(directions, len(radiance)))
 
 
 def _texel_coordinates(directions: Float[np.ndarray, "a b 3"], size: int) -> Float32[np.ndarray, "a b 2"]:
-    """Return where `_sampled` reads a map of this size for directions."""
+    """Returns where `_sampled` reads a map of this size for directions."""
     return (octahedral_uv(directions) * size + 0.5).astype(np.float32)
 
 
@@ -114,7 +114,7 @@ def _sampled(
 
 
 def _bordered(radiance: Float32[np.ndarray, "n n 3"]) -> Float32[np.ndarray, "m m 3"]:
-    """Add a border of one texel: across an edge of the map lies the same edge, mirrored about its middle."""
+    """Adds a border of one texel: across an edge of the map lies the same edge, mirrored about its middle."""
     rows = np.concatenate([radiance[:1, ::-1], radiance, radiance[-1:, ::-1]])
     left, right = rows[::-1, :1].copy(), rows[::-1, -1:].copy()
     return np.ascontiguousarray(np.concatenate([left, rows, right], axis=1))
@@ -122,13 +122,13 @@ def _bordered(radiance: Float32[np.ndarray, "n n 3"]) -> Float32[np.ndarray, "m 
 
 @cache
 def above_horizon(size: int) -> Float32[np.ndarray, "n n 1"]:
-    """Return the fraction of each texel above the horizon (+z), blurred by one texel."""
+    """Returns the fraction of each texel above the horizon (+z), blurred by one texel."""
     texel = np.pi / size
     return resample_to_octahedral(lambda d: np.clip(0.5 + d[..., 2:] / texel, 0, 1).astype(np.float32), size)
 
 
 def solid_angle_mean(radiance: Float32[np.ndarray, "n n 3"]) -> Float64[np.ndarray, "3"]:
-    """Return the mean radiance over the sphere."""
+    """Returns the mean radiance over the sphere."""
     weights = texel_solid_angles(len(radiance)).astype(np.float64)
     return np.asarray(np.tensordot(weights, radiance, axes=2) / (4 * np.pi))
 
@@ -146,7 +146,7 @@ class PrefilteredMap:
 
 
 def prefilter(radiance: Float32[np.ndarray, "n n 3"]) -> PrefilteredMap:
-    """Average a map over cones, weighted by the cosine to the axis (so the widest gives irradiance / pi)."""
+    """Averages a map over cones, weighted by the cosine to the axis (so the widest gives irradiance / pi)."""
     size = len(radiance)
     halved = [radiance]
     while len(halved[-1]) > SUMMED_SIZE // 4:
@@ -172,7 +172,7 @@ def _halved(radiance: Float32[np.ndarray, "n n 3"]) -> Float32[np.ndarray, "m m 
 def _cone_average(
     halved: list[Float32[np.ndarray, "n n 3"]], half_angle: float, size: int
 ) -> Float32[np.ndarray, "m m 3"]:
-    """Average over a cone about every texel's direction with samples in a spiral over its projected disc.
+    """Averages over a cone about every texel's direction with samples in a spiral over its projected disc.
 
     Each sample reads the halved map whose texels are about as wide as the samples are apart.
     """
@@ -183,7 +183,7 @@ def _cone_average(
     return np.asarray(samples.mean(axis=1).reshape(size, size, 3))
 
 
-# Maps of one size are filtered again and again while lights are tracked, so sample coordinates are cached.
+# Maps of one size are filtered repeatedly while lights are tracked, so sample coordinates are cached.
 @lru_cache(maxsize=CACHED_LEVELS)
 def _cone_coordinates(half_angle: float, size: int, source_size: int) -> Float32[np.ndarray, "n k 2"]:
     frames = _tangent_frames(octahedral_grid(size).reshape(-1, 3)).astype(np.float32)
@@ -194,7 +194,7 @@ def _cone_coordinates(half_angle: float, size: int, source_size: int) -> Float32
 def _cone_sum(
     source: Float32[np.ndarray, "n n 3"], half_angle: float, size: int
 ) -> Float32[np.ndarray, "m m 3"]:
-    """Average over wide cones by the plain sum over all texels of a source map."""
+    """Averages over wide cones by the plain sum over all texels of a source map."""
     total = _cone_weights(half_angle, size, len(source)) @ source.reshape(-1, 3)
     return np.asarray(total.reshape(size, size, 3), np.float32)
 
@@ -208,7 +208,7 @@ def _cone_weights(half_angle: float, size: int, source_size: int) -> Float32[np.
 
 
 def _spiral(sin_half_angle: float) -> Float64[np.ndarray, "n 3"]:
-    """Return directions about +z that are uniform over the cone's projected disc (cosine-weighted)."""
+    """Returns directions about +z that are uniform over the cone's projected disc (cosine-weighted)."""
     index = np.arange(CONE_SAMPLES) + 0.5
     radius = sin_half_angle * np.sqrt(index / CONE_SAMPLES)
     angle = index * (np.pi * (3 - np.sqrt(5)))
@@ -216,7 +216,7 @@ def _spiral(sin_half_angle: float) -> Float64[np.ndarray, "n 3"]:
 
 
 def _tangent_frames(axis: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3 3"]:
-    """Return rotations whose third column is the axis (Duff et al. 2017)."""
+    """Returns rotations whose third column is the axis (Duff et al. 2017)."""
     x, y, z = axis.T
     sign = np.copysign(1.0, z)
     a = -1 / (sign + z)
@@ -228,7 +228,7 @@ def _tangent_frames(axis: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 
 def irradiance(
     radiance: Float32[np.ndarray, "n n 3"], normals: Float[np.ndarray, "k 3"]
 ) -> Float64[np.ndarray, "k 3"]:
-    """Integrate a map over the hemisphere of each unit normal, by plain summation."""
+    """Integrates a map over the hemisphere of each unit normal, by plain summation."""
     weighted = radiance.reshape(-1, 3) * texel_solid_angles(len(radiance)).reshape(-1, 1)
     directions = octahedral_grid(len(radiance)).reshape(-1, 3)
     return np.asarray(np.maximum(normals @ directions.T, 0) @ weighted.astype(np.float64))
@@ -239,7 +239,7 @@ def _constant(numerator: float, denominator: float) -> float:
 
 
 def harmonics(directions: Float[np.ndarray, "n 3"], order: int) -> Float64[np.ndarray, "n k"]:
-    """Evaluate real spherical harmonics at unit directions as polynomials (Sloan 2008, appendix A2).
+    """Evaluates real spherical harmonics at unit directions as polynomials (Sloan 2008, appendix A2).
 
     k = order^2 functions up to band 4, index l^2 + l + m, orthonormal over the sphere; the same polynomials are in
     passes/shaders/common/harmonics.glsl.
@@ -265,7 +265,7 @@ def harmonics(directions: Float[np.ndarray, "n 3"], order: int) -> Float64[np.nd
 
 
 def even_directions(count: int) -> Float64[np.ndarray, "count 3"]:
-    """Return unit directions of equal solid angle over the sphere (a spiral by the golden angle)."""
+    """Returns unit directions of equal solid angle over the sphere (a spiral by the golden angle)."""
     k = np.arange(count)
     z = 1 - (2 * k + 1) / count
     turn = k * math.pi * (3 - math.sqrt(5))

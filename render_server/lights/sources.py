@@ -43,7 +43,7 @@ class LightSource(Protocol):
     """Lights that may change from frame to frame."""
 
     def update(self, frame: ViewFrame) -> LightSet | None:
-        """Return the unregistered lights of a frame; None where they did not change."""
+        """Returns the unregistered lights of a frame; None where they did not change."""
         ...
 
     @property
@@ -67,7 +67,7 @@ class FixedLights:
         self._lights: LightSet | None = build_lights(lights)
 
     def update(self, frame: ViewFrame) -> LightSet | None:  # noqa: ARG002
-        """Return the lights for the first frame."""
+        """Returns the lights for the first frame."""
         lights, self._lights = self._lights, None
         return lights
 
@@ -83,7 +83,7 @@ class TrackedSource:
         self.split: Split[HemisphereMap] | None = None
 
     def update(self, frame: ViewFrame) -> LightSet | None:
-        """Return the unregistered lights of a frame; None where they did not change."""
+        """Returns the unregistered lights of a frame; None where they did not change."""
         poses = {lamp.marker: lamp.world_from_marker for lamp in frame.lamps}
         self._visible = set(poses)
         changed = not self._started
@@ -153,7 +153,7 @@ class FisheyeSource:
         self.split: Split[HemisphereMap] | None = None
 
     def update(self, frame: ViewFrame) -> LightSet | None:
-        """Return the unregistered lights of a frame; None where they did not change.
+        """Returns the unregistered lights of a frame; None where they did not change.
 
         There are none until a frame brings the first map.
         """
@@ -193,7 +193,7 @@ class FisheyeSource:
         self._find_distance(frame, seen)
 
     def _find_distance(self, frame: ViewFrame, seen: RadianceMap) -> bool:
-        """Estimate the lights' distance on the first frame with enough paper; returns whether that succeeded."""
+        """Estimates the lights' distance on the first frame with enough paper; returns whether that succeeded."""
         assert self.split is not None
         assert self._tracker.residual is not None
         paper = paper_light(frame) if self._wants_distance and self.split.lights else None
@@ -230,7 +230,7 @@ def _distant(light: TrackedLight) -> Light:
 
 
 def _near(light: TrackedLight, position: Float64[np.ndarray, "3"], distance_m: float) -> Light:
-    """Return a sphere with the same irradiance (E = I / d^2) and angular size at `position` as the distant light."""
+    """Returns a sphere with the same irradiance (E = I / d^2) and angular size at `position` as the distant light."""
     return SphereLight(
         (position + distance_m * light.to_light).astype(np.float32),
         (light.irradiance * distance_m**2).astype(np.float32),
@@ -245,7 +245,7 @@ _NO_PICTURE = (
 
 
 def open_light_source(lights: documents.Lights) -> LightSource:
-    """Return the source of a scene document's lights.
+    """Returns the source of a scene document's lights.
 
     Raises:
         DeltalightError: an environment map that cannot be read.

@@ -1,1 +1,1 @@
-"""One relighting method a file; each reads top to bottom as the list of its stages."""
+"""Relighting methods: one per file, each a list of its stages."""

@@ -41,9 +41,9 @@ SHOWN_CELLS = 64  # for view `volume` alone; the method has no volume
 
 @dataclass(eq=False)
 class FieldObject:
-    """One object: samples of its field, light around it, where it stands (`place`).
+    """One object: the samples of its field, the light around it, and its pose (`place`).
 
-    Without `textures` its field is still being computed.
+    `textures` is None while the field is still being computed.
     """
 
     probe: LightProbe
@@ -52,12 +52,12 @@ class FieldObject:
     place: dict[str, Binding] = field(default_factory=dict)
 
     def release(self) -> None:
-        """Frees the GL objects that are its own."""
+        """Frees the GL objects that it owns."""
         release_all(self.probe, self.bounce_light)
 
 
 class FieldObjects:
-    """The scene's objects as occlusion fields have them; objects of one asset share its samples."""
+    """The scene's objects as occlusion fields describe them; objects of one asset share its samples."""
 
     def __init__(self, gpu: GpuContext, fields: OcclusionFields, settings: FieldSettings) -> None:
         self._gpu = gpu
@@ -68,7 +68,7 @@ class FieldObjects:
         self.items: list[FieldObject] = []
 
     def find(self, objects: GeometryState) -> tuple[OcclusionField | None, ...]:
-        """The objects' fields as far as they are there.
+        """Returns the objects' fields, None for those still being computed.
 
         Raises:
             DeltalightError: a field cannot be computed.
@@ -76,7 +76,7 @@ class FieldObjects:
         return tuple(self._fields.find(item, self._settings) for item in objects.objects)
 
     def place(self, objects: GeometryState, found: tuple[OcclusionField | None, ...]) -> list[FieldObject]:
-        """Uploads fields that are new, and puts the objects where they stand now."""
+        """Uploads new fields and updates the objects' poses."""
         if found != self._made_for:
             self._make(found)
             self._made_for = found
@@ -85,7 +85,7 @@ class FieldObjects:
         return self.items
 
     def _make(self, needed: tuple[OcclusionField | None, ...]) -> None:
-        """Makes what lies on the GPU; samples that are there already stay."""
+        """Creates the GPU data of the objects; keeps samples that exist already."""
         for one in set(self._textures) - set(needed):
             if one is not None:
                 self._textures.pop(one).release()
@@ -108,7 +108,7 @@ class FieldObjects:
 
 
 def _standing(item: PlacedObject, found: OcclusionField | None) -> dict[str, Binding]:
-    """Where the object stands, and what it reflects where the field's own colours are 1."""
+    """Returns the object's pose, and its reflectance where the field's own colours are 1."""
     bounds = np.array([mesh.bounds() for mesh in item.meshes])
     around = np.stack([bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)])
     given = item.material
@@ -118,7 +118,7 @@ def _standing(item: PlacedObject, found: OcclusionField | None) -> dict[str, Bin
 
 
 class FieldShading:
-    """Natural light at real surfaces and objects, through what the fields leave of it."""
+    """Computes natural light at real surfaces and objects, as occluded by the fields."""
 
     def __init__(self, gpu: GpuContext, settings: AroofMethod, cells: int, fields: ConeFields) -> None:
         size, length = fields.mu.size, settings.sh_order**2
@@ -135,14 +135,14 @@ class FieldShading:
         self._show = OcclusionShow(gpu)
 
     def place(self, items: list[FieldObject], objects: GeometryState) -> PlacedVolume:
-        """All that the fields reach: lamps must be known there, and view `volume` shows it."""
+        """Returns the extent of the fields: lamps need shadow maps there, and debug view `volume` shows it."""
         low, high = objects.bounds
         reach = [float(item.place["object_radius"]) * float(item.place["object_scale"]) for item in items]  # type: ignore[arg-type]
         edge = float(np.max(high - low)) + 2 * self._settings.reach * max(reach)
         return self._volume.place(place_volume(low, high, self._cells, edge))
 
     def show(self, items: list[FieldObject], volume: PlacedVolume) -> VoxelMipmap:
-        """Cells of what the fields hide."""
+        """Draws what the fields occlude into cells, for debug view `volume`."""
         for number, item in enumerate(items):
             self._show.run(self._shown, item.textures, volume.bindings, item.place, first=number == 0)
         return self._shown
@@ -150,19 +150,19 @@ class FieldShading:
     def find_light(
         self, items: list[FieldObject], scene: Bindings, grid: LowResGrid, seen: Observation
     ) -> list[FieldObject]:
-        """Light around each object, without the objects."""
+        """Captures the light around each object, without the objects."""
         seen.image.build_levels()
         self._capture(items, _with_hidden(scene), grid, None)
         return items
 
     def hide(self, items: list[FieldObject], scene: Bindings, grid: LowResGrid) -> OcclusionShade:
-        """What the objects leave of natural light at real surfaces."""
+        """Computes the natural light that the objects leave at real surfaces."""
         return _occluded(self._at_real, items, _with_hidden(scene), grid)
 
     def find_changed_light(
         self, items: list[FieldObject], scene: Bindings, grid: LowResGrid, shade: OcclusionShade
     ) -> list[FieldObject]:
-        """Light around each object, with what the objects change nearby."""
+        """Captures the light around each object, including the changes that objects cause nearby."""
         if self._settings.near_light == "measured":
             own = _with_hidden(scene)
             self._change.run(grid, shade, own)
@@ -183,7 +183,7 @@ class FieldShading:
             self._probes.resolve(item.probe, scene, item.place)
 
     def reflect(self, items: list[FieldObject], scene: Bindings) -> list[FieldObject]:
-        """What each object sends back of its light; returns those that do."""
+        """Computes the light that each object reflects; returns the objects that reflect any."""
         reflecting = [item for item in items if item.bounce_light is not None]
         own = {**_with_hidden(scene), **self._probes.bindings}
         for item in reflecting:
@@ -200,7 +200,7 @@ class FieldShading:
         grid: LowResGrid,
         hidden: OcclusionShade,
     ) -> ConeFields:
-        """Fields of real surfaces, then those of the objects, which other objects hide from the light too."""
+        """Writes the fields of real surfaces, then those of the objects, which occlude each other too."""
         own = _with_hidden(scene)
         self._finish(hidden, reflecting, own, grid, real=True)
         self._finish(_occluded(self._at_objects, items, own, grid), reflecting, own, grid, real=False)
@@ -246,12 +246,12 @@ def _occluded(
 
 
 def _with_hidden(scene: Bindings) -> dict[str, Binding]:
-    """What objects hide in the picture shines on them."""
+    """Returns the scene for objects, which also receive light from surfaces that objects hide in the picture."""
     return {**scene, "hidden_too": True}
 
 
 def aroof(g: Graph, s: FrameResources, setup: Setup[AroofMethod]) -> Layers:
-    """Lamps by shadow maps, natural light by fields; there is no volume but the one that is looked at."""
+    """Lamps by shadow maps, natural light by occlusion fields; the volume exists only for its debug view."""
     settings, resolved, size = setup.settings, setup.resolved, setup.picture_size
     lit = light_stages(g, s, resolved, settings.shadow_samples)
     options = ShadingOptions(caustics=settings.caustics, screen_space=settings.screen_space)
@@ -275,7 +275,7 @@ def aroof(g: Graph, s: FrameResources, setup: Setup[AroofMethod]) -> Layers:
 
 
 def field_settings(settings: AroofMethod) -> FieldSettings:
-    """What of the method's settings a field depends on."""
+    """Returns the settings of the method that a field depends on."""
     return FieldSettings(
         settings.sh_order,
         settings.shells,

@@ -1,8 +1,8 @@
-"""Differential rendering: two full solutions by one renderer, subtracted ([D] 3.1.1, docs/method.md 6).
+"""Differential rendering: the difference of two full solutions ([D] 3.1.1, docs/method.md 6).
 
-Solution mu knows the real scene alone, solution rho real and virtual surfaces together. Each has voxels, shadow maps
-of all of its geometry, and one march a cone of its own; nothing is skipped because objects seem not to reach it. So
-this is slow, and what `dvct` must agree with.
+Solution mu contains the real scene alone, solution rho real and virtual surfaces together. Each has its own voxels,
+shadow maps of all its geometry, and cone march; nothing is skipped because objects seem not to reach it. It is slow,
+and the reference for `dvct`.
 """
 
 from copy import copy
@@ -25,7 +25,6 @@ from render_server.methods.lighting import (
     Shading,
     ShadingOptions,
     object_extent,
-    real_records,
     shading_stages,
     shadow_receivers,
     volume_placement,
@@ -65,15 +64,16 @@ class SolutionLights:
         """Uploads the residual environment to both."""
         return tuple(buffers.set_environment(lights.environment) for buffers in (self.mu, self.rho))
 
-    def fit_views(
-        self, lights: LightSet, real: GeometryState, extent: Points, everywhere: bool
-    ) -> LightBuffers:
-        """Fits the views, the same for both solutions, so that their maps differ by the objects alone."""
+    def fit_views(self, lights: LightSet, real: GeometryState, extent: Points, everywhere: bool) -> bytes:
+        """Fits the views, the same for both solutions, so that their maps differ by the objects alone.
+
+        Returns their records, which tell whether the maps are still those of the views.
+        """
         receivers = real.points if everywhere else shadow_receivers(real, extent)
         receivers, points = (np.concatenate([each, extent]) for each in (receivers, real.points))
         for buffers in (self.mu, self.rho):
             buffers.place(list(lights.lights), points, receivers, np.zeros((0, 3)))
-        return self.rho
+        return self.rho.real_records
 
     def draw_mu(self, _views: bytes, real: GeometryState) -> LightBuffers:
         """Draws the real scene alone as the lights see it."""
@@ -133,15 +133,15 @@ class SolutionCones:
 
 
 def differential(g: Graph, s: FrameResources, setup: Setup[DifferentialMethod]) -> Layers:
-    """E_rho - E_mu and S_rho - S_mu of two solutions; what is not told apart has the maps of rho."""
+    """E_rho - E_mu and S_rho - S_mu of two full solutions; everything shared uses the maps of rho."""
     settings, resolved, size = setup.settings, setup.resolved, setup.picture_size
     g.section("lights")
     lights = SolutionLights(g.gpu, settings, resolved, size)
     environment = g.stage("environment", lights.set_environment, s.lights)
-    views = g.stage("light views", lights.fit_views, s.lights, s.real, object_extent(g, s), s.everywhere)
-    records = g.value("light views real", real_records, views, same=eq)
-    mu_maps = g.stage("shadow maps mu", lights.draw_mu, records, s.real)
-    rho_maps = g.stage("shadow maps rho", lights.draw_rho, records, s.real, s.objects)
+    fitted = s.lights, s.real, object_extent(g, s), s.everywhere
+    views = g.stage("light views", lights.fit_views, *fitted, same=eq)
+    mu_maps = g.stage("shadow maps mu", lights.draw_mu, views, s.real)
+    rho_maps = g.stage("shadow maps rho", lights.draw_rho, views, s.real, s.objects)
     g.section("voxels")
     placement = volume_placement(g, s, resolved.volume_size, settings.volume_edge_m)
     voxels = SolutionVoxels(g.gpu, settings, resolved.volume_size)

@@ -1,4 +1,4 @@
-"""Delta voxel cone tracing: the exact operator, and the one printed in the paper (docs/method.md 3 and 4)."""
+"""Delta voxel cone tracing: the exact operator, and the one of the paper (docs/method.md 3 and 4)."""
 
 from protocol.scene_method import DvctMethod
 from render_server.frame import FrameResources
@@ -29,7 +29,7 @@ from render_server.passes.voxels import DIRECTIONS, VoxelMipmap, memory_statemen
 
 
 class ExactCones:
-    """Marches each cone through mu and rho at once."""
+    """Marches every cone through mu and rho at once."""
 
     def __init__(
         self, gpu: GpuContext, settings: DvctMethod, voxels: DeltaVoxels, fields: ConeFields
@@ -39,11 +39,11 @@ class ExactCones:
         self._tracing = TraceCones(gpu, size, march_defines(settings))
 
     def marching(self, _mu: VoxelMipmap, _rho: VoxelMipmap) -> dict[str, Binding]:
-        """Bindings of what cones march through."""
+        """Returns the bindings that cones march with."""
         return self._voxels.march_bindings(self._cone_count)
 
     def trace_real(self, scene: Bindings, grid: LowResGrid, marching: Bindings) -> ConeFields:
-        """Cones at real surfaces: E_mu, E_rho, and the specular cones."""
+        """Traces the cones at real surfaces: E_mu, E_rho, and the specular cones."""
         voxels = self._voxels
         self._tracing.trace_real(self._fields, grid, voxels.mu, voxels.rho, {**scene, **marching})
         return self._fields
@@ -51,7 +51,7 @@ class ExactCones:
     def trace_objects(
         self, fields: ConeFields, scene: Bindings, grid: LowResGrid, marching: Bindings
     ) -> ConeFields:
-        """Cones at the objects: E_rho and the specular cone."""
+        """Traces the cones at the objects: E_rho and the specular cone."""
         voxels = self._voxels
         self._tracing.trace_virtual(fields, grid, voxels.mu, voxels.rho, {**scene, **marching})
         return fields
@@ -62,7 +62,7 @@ class ExactCones:
 
 
 def dvct_exact(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
-    """Dual march through one-sided directional voxels."""
+    """Marches both solutions at once through one-sided directional voxels."""
     settings, resolved, size = setup.settings, setup.resolved, setup.picture_size
     lit = light_stages(g, s, resolved, settings.shadow_samples, mirrors=settings.mirrored_lights)
     g.section("voxels")
@@ -94,14 +94,14 @@ def dvct_exact(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
 
 
 class PaperCones:
-    """Marches nine diffuse cones and a specular one through V_delta, and through V_rho on objects."""
+    """Marches nine diffuse cones and a specular one: through V_delta at real surfaces, through V_rho at objects."""
 
     def __init__(self, gpu: GpuContext, fields: ConeFields) -> None:
         self._fields = fields
         self._tracing = TraceConesPaper(gpu)
 
     def trace(self, scene: Bindings, grid: LowResGrid, voxels: InjectedVoxels) -> ConeFields:
-        """Cones at real surfaces and at the objects."""
+        """Traces the cones at real surfaces and at the objects."""
         self._tracing.trace_real(self._fields, grid, voxels.delta, scene)
         self._tracing.trace_virtual(self._fields, grid, voxels.rho, scene)
         return self._fields
@@ -112,8 +112,9 @@ class PaperCones:
 
 
 def dvct_paper(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
-    """The operator as printed in [P1] 3, in radiometric units: V_delta and V_rho by split-inject, visibility from the
-    joint V_eta.
+    """The operator of [P1] 3 in radiometric units.
+
+    Split injection fills V_delta and V_rho; the joint V_eta gives visibility.
     """
     settings, resolved, size = setup.settings, setup.resolved, setup.picture_size
     lit = light_stages(g, s, resolved, settings.shadow_samples)

@@ -1,4 +1,4 @@
-"""Stages that methods share: the lights' depth maps, and the shading of what the camera sees (docs/method.md 3)."""
+"""Stages that methods share: the lights' depth maps, and shading of the visible surfaces (docs/method.md 3)."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -14,7 +14,8 @@ from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Binding, Bindings
 from render_server.gpu_scene import GeometryState
 from render_server.graph import Graph, Resource
-from render_server.lights.lights import LightSet, mirror_lights
+from render_server.lights.lights import LightSet
+from render_server.lights.mirror_lights import mirror_lights
 from render_server.methods.settings import ResolvedSettings
 from render_server.passes.caustics import GREATEST_ALPHA, Caustics
 from render_server.passes.composite import ChangeRatio
@@ -60,7 +61,7 @@ class LitScene:
 
 
 class LightStages:
-    """Fits the lights' views around what they have to show, and draws their depth maps."""
+    """Fits the lights' views to their casters and receivers, and draws their depth maps."""
 
     def __init__(
         self, gpu: GpuContext, tile_size: int, shadow_samples: int, *, mirrors: bool = False
@@ -76,28 +77,36 @@ class LightStages:
 
     def fit_views(
         self, lights: LightSet, real: GeometryState, extent: Points, surfaces: SurfaceTable, everywhere: bool
-    ) -> LightBuffers:
-        """Fits the views: of real shadows around the objects (or `everywhere`), and closely around the objects."""
+    ) -> tuple[bytes, bytes]:
+        """Fits the views: of real shadows around the objects (or `everywhere`), and closely around the objects.
+
+        Returns the records of both, which tell whether their maps are still those of the views.
+        """
         receivers = real.points if everywhere else shadow_receivers(real, extent)
         shining = list(lights.lights)
         mirrors = mirror_lights(shining, surfaces, np.mean(extent, axis=0)) if self._mirrors else []
         self.buffers.place(shining, real.points, receivers, extent, mirrors)
-        return self.buffers
+        return self.buffers.real_records, self.buffers.virtual_records
 
     def draw_real(self, _views: bytes, real: GeometryState) -> LightBuffers:
-        """Draws the real scene as the lights see it."""
+        """Draws the real scene as seen from the lights."""
         buffers = self.buffers
         self._maps.run(buffers.real_atlas, [real.buffers], buffers.real_views)
         return buffers
 
     def draw_objects(self, _views: bytes, objects: GeometryState) -> LightBuffers:
-        """Draws the objects as the lights see them."""
+        """Draws the objects as seen from the lights."""
         buffers = self.buffers
         self._maps.run(buffers.virtual_atlas, [objects.buffers], buffers.virtual_views)
         return buffers
 
     def map_mirrors(
-        self, _views: LightBuffers, _real: LightBuffers, _objects: LightBuffers, seen: Observation
+        self,
+        _real: LightBuffers,
+        _objects: LightBuffers,
+        _lights: LightSet,
+        _extent: Points,
+        seen: Observation,
     ) -> moderngl.TextureArray | None:
         """Maps where smooth planes show the lights; None where no plane does."""
         if not self.buffers.mirrors:
@@ -114,31 +123,21 @@ class LightStages:
 def light_stages(
     g: Graph, s: FrameResources, resolved: ResolvedSettings, shadow_samples: int, *, mirrors: bool = False
 ) -> LitScene:
-    """Environment, views, depth maps of both geometries, and what smooth planes mirror of the lights."""
+    """Declares environment, light views, depth maps of both geometries, and mirror images of the lights."""
     g.section("lights")
     stages = LightStages(g.gpu, resolved.rsm_size, shadow_samples, mirrors=mirrors)
     extent = object_extent(g, s)
     environment = g.stage("environment", stages.set_environment, s.lights)
-    views = g.stage("light views", stages.fit_views, s.lights, s.real, extent, s.surfaces, s.everywhere)
-    real_views = g.value("light views real", real_records, views, same=eq)
-    object_views = g.value("light views objects", object_records, views, same=eq)
+    fitted = s.lights, s.real, extent, s.surfaces, s.everywhere
+    views = "light views real", "light views objects"
+    real_views, object_views = g.stages("light views", stages.fit_views, *fitted, outputs=views, same=eq)
     real_maps = g.stage("shadow maps real", stages.draw_real, real_views, s.real)
     object_maps = g.stage("shadow maps objects", stages.draw_objects, object_views, s.objects)
     mirrored = []
     if mirrors:
-        given = views, real_maps, object_maps, s.observation
+        given = real_maps, object_maps, s.lights, extent, s.observation
         mirrored = [g.stage("mirror visibility", stages.map_mirrors, *given, same=_both_none)]
     return LitScene(stages.buffers, environment, real_maps, object_maps, tuple(mirrored))
-
-
-def real_records(lights: LightBuffers) -> bytes:
-    """Records of the views of real shadows: another value only where a view changed."""
-    return lights.real_records
-
-
-def object_records(lights: LightBuffers) -> bytes:
-    """Records of the views of the objects' shadows: another value only where a view changed."""
-    return lights.virtual_records
 
 
 def _both_none(old: object, new: object) -> bool:
@@ -146,7 +145,7 @@ def _both_none(old: object, new: object) -> bool:
 
 
 def object_extent(g: Graph, s: FrameResources) -> Resource[Points]:
-    """Points that enclose the objects at all times of their animations, for fitting volumes and light views."""
+    """Declares the points that enclose the objects throughout their animations, for fitting volumes and views."""
     if "object extent" in g:
         return g.resource("object extent")
     return g.value("object extent", _lasting_points, s.objects, same=np.array_equal)
@@ -160,7 +159,7 @@ def _lasting_points(objects: GeometryState) -> Points:
 def volume_placement(
     g: Graph, s: FrameResources, size: int, edge_m: float | None
 ) -> Resource[VolumePlacement]:
-    """The cube of voxels or cells around the objects."""
+    """Declares the cube of voxels or cells around the objects."""
 
     def place(extent: Points) -> VolumePlacement:
         """Places a cube around the objects, snapped to its cells."""
@@ -181,7 +180,7 @@ def no_bindings(_: object) -> dict[str, Binding]:
 def surfel_scene(
     seen: Observation, lights: LightBuffers, albedo: AlbedoTexture, *, measured: bool = True
 ) -> dict[str, Binding]:
-    """Bindings of what lights real surfels; without `measured`, no surface counts as seen by the camera."""
+    """Returns the bindings for lighting real surfels; without `measured`, none counts as seen by the camera."""
     return {
         **seen.bindings,
         **lights.bindings,
@@ -195,21 +194,22 @@ def surfel_scene(
 
 
 def reflects_screen(objects: GeometryState) -> bool:
-    """Whether some object is smooth enough to show the picture in it."""
+    """Whether any object is smooth enough to reflect the picture."""
     return bool(objects.materials.smoothest < ROUGHEST)
 
 
 def casts_caustics(objects: GeometryState) -> bool:
-    """Whether some object is smooth enough to throw beams."""
+    """Whether any object is smooth enough to cast caustics."""
     return bool(objects.materials.smoothest**2 < GREATEST_ALPHA)
 
 
 @dataclass(frozen=True, eq=False)
 class ShadingOptions:
-    """What of the shared shading a method uses.
+    """Options of the shared shading.
 
-    `mirror_gather`: kernel that lights reflected points (`mirror_...`), None: no rays in smooth real surfaces.
-    `march`: defines of march.glsl, where smooth objects look among voxels for what the picture does not show.
+    `mirror_gather` names the kernel that lights reflected points (`mirror_...`); None: no rays at smooth real
+    surfaces. `march` are defines of march.glsl, with which smooth objects look up in voxels what the picture does not
+    show.
     """
 
     caustics: bool = False
@@ -220,7 +220,7 @@ class ShadingOptions:
 
 @dataclass(frozen=True, eq=False)
 class Layers:
-    """What a method hands to composition; `voxels`, `volume` and `lights` are there for debug views."""
+    """The layers that a method hands to composition; `voxels`, `volume` and `lights` are for debug views."""
 
     direct: Resource[DirectLight]
     cones: Resource[ConeFields]
@@ -234,9 +234,9 @@ class Layers:
 
 
 class Shading:
-    """Shades what the camera sees: cones at reduced resolution, direct light and objects at full.
+    """Shades the visible surfaces: cones at reduced resolution, direct light and objects at full resolution.
 
-    A method fills `cones` by stages of its own. `marching` gives the bindings of what its cones march through.
+    The method fills `cones` by its own stages; `marching` holds the bindings that its cones march with.
     """
 
     def __init__(
@@ -270,7 +270,10 @@ class Shading:
         everywhere: bool,
         *_lights: object,
     ) -> dict[str, Binding]:
-        """Bindings of what stages at pixels read: geometry, lights, volume, and what follows from them."""
+        """Returns the bindings of stages that shade pixels.
+
+        Geometry, lights, volume, and values derived from them.
+        """
         low, high = objects.bounds
         bounds = volume.placement.voxel_bounds(np.stack([low, high])).astype(float)
         return {
@@ -287,19 +290,19 @@ class Shading:
         }
 
     def set_objects(self, objects: GeometryState) -> ObjectBvh:
-        """Takes the objects' triangles; their hierarchy is built when rays are traced."""
+        """Sets the objects' triangles; their hierarchy is built when rays are traced."""
         self._bvh.set_triangles(objects.corners, objects.bounds, objects.buffers)
         return self._bvh
 
     def choose_pixels(self, scene: Bindings) -> LowResGrid:
-        """Chooses the pixels that stand for blocks of the picture."""
+        """Selects the pixel that represents each block of the picture."""
         self.grid.run(scene)
         return self.grid
 
     def cast_caustics(
         self, scene: Bindings, _grid: LowResGrid, _bvh: ObjectBvh, seen: Observation, volume: PlacedVolume
     ) -> Caustics | None:
-        """Renders caustics, where an object is smooth enough."""
+        """Renders caustics if any object is smooth enough."""
         if self._caustics is None or not scene["has_caustics"]:
             return None
         reach = volume.placement.size * volume.placement.voxel_edge
@@ -309,7 +312,7 @@ class Shading:
     def light_directly(
         self, scene: Bindings, grid: LowResGrid, caustics: Caustics | None, voxels: VoxelMipmap | None
     ) -> DirectLight:
-        """Lights the real surfaces by the lights themselves."""
+        """Computes the direct light on the real surfaces."""
         joint = None if voxels is None else voxels.texture
         self._direct.run(grid, scene, joint=joint, caustics=caustics)
         return self._direct
@@ -317,7 +320,7 @@ class Shading:
     def reflect_objects(
         self, scene: Bindings, grid: LowResGrid, bvh: ObjectBvh, marching: Bindings
     ) -> moderngl.Texture | None:
-        """Traces the objects in smooth real surfaces; None where none is declared: cones serve."""
+        """Traces the objects in smooth real surfaces; returns None if none is declared, and cones do."""
         wanted = self._options.mirror_gather
         if wanted is None or not scene["specular_surfaces"]:
             if self._rays is not None:
@@ -332,7 +335,7 @@ class Shading:
     def compare(
         self, grid: LowResGrid, direct: DirectLight, cones: ConeFields, reflection: moderngl.Texture | None
     ) -> ChangeRatio:
-        """Finds where light changes, and by what ratio."""
+        """Finds where light changes, and by which ratio."""
         self._change.run(grid, direct, cones, reflection)
         return self._change
 
@@ -425,9 +428,9 @@ def shading_stages(
 
 
 def shadow_receivers(real: GeometryState, extent: Points) -> Points:
-    """Real points around the objects; all of them where nothing is near.
+    """Returns the real points around the objects, or all of them if none is near.
 
-    Vertices within reach, and what triangles too large to have any there bring into the cube of that reach.
+    These are the vertices within reach and, for triangles too large to have a vertex there, their part of that cube.
     """
     low, high = extent.min(axis=0), extent.max(axis=0)
     centre, reach = (low + high) / 2, SHADOW_REACH * float(np.max(high - low))

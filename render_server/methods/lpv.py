@@ -55,12 +55,12 @@ from render_server.passes.voxels import PlacedVolume, VolumePlacement, Voxelize,
 
 
 class LpvVolumes:
-    """V_rho, and beside it V_mu (`mu`), or for the paper the change (`change`).
+    """V_rho with V_mu (`mu`), or the paper's V_delta (`change`).
 
-    Injected are two sums: the real scene's light without objects, and the change that objects make. V_mu starts with
-    the first, V_rho with both, the paper's V_delta with the second and the negative lobes of direct light. What V_rho
-    brings to surfaces they reflect: it is propagated anew with that, once a bounce.
-    `shown`: what was injected of the change, for debug view `volume`.
+    Two sums are injected: the real scene's light without objects, and the change due to the objects. V_mu starts from
+    the first, V_rho from both, the paper's V_delta from the second and the negative lobes of direct light. Each
+    bounce propagates V_rho again with the light that surfaces reflect of it. `shown` is the injected change, for
+    debug view `volume`.
     """
 
     def __init__(self, gpu: GpuContext, settings: DlpvMethod, cells: int) -> None:
@@ -102,11 +102,11 @@ class LpvVolumes:
 
     @property
     def query_bindings(self) -> dict[str, Binding]:
-        """How light is read from the volumes (shaders/common/lpv_light.glsl)."""
+        """Returns the bindings for reading light from the volumes (shaders/common/lpv_light.glsl)."""
         return {"has_geometry": self._has_geometry, "damping": self._settings.resolved_damping}
 
     def place(self, placement: VolumePlacement) -> PlacedVolume:
-        """Moves the cells, and the half cells that surfels are made in."""
+        """Places the cells, and the half-size cells for surfels."""
         self.volume.place(placement)
         self._half_cells.place(
             VolumePlacement(placement.origin, placement.voxel_edge / 2, 2 * placement.size)
@@ -114,18 +114,18 @@ class LpvVolumes:
         return self.volume
 
     def voxelize_real(self, real: GeometryState, volume: PlacedVolume) -> VoxelStore:
-        """Surfels of the real scene, where something reads them."""
+        """Voxelises the real scene into surfels, if anything reads them."""
         if self._has_geometry or self._blocks_environment or self._settings.resolved_bounces > 0:
             self._surfels(self.real, real.solid_corners(volume.placement.voxel_edge))
         return self.real
 
     def voxelize_objects(self, objects: GeometryState, _volume: PlacedVolume) -> VoxelStore:
-        """Surfels of the objects."""
+        """Voxelises the objects into surfels."""
         self._surfels(self.objects, objects.corners)
         return self.objects
 
     def _surfels(self, store: VoxelStore, corners: Float32[np.ndarray, "m 3 10"]) -> None:
-        """Surfels of half cells; only these are used of the store."""
+        """Voxelises at half a cell; only the store's surfels are used."""
         store.grid.clear()
         self._voxelize.run(store, corners, self._half_cells)
 
@@ -138,13 +138,13 @@ class LpvVolumes:
         _environment: moderngl.TextureArray,
         lights: LightBuffers,
     ) -> dict[str, Binding]:
-        """Bindings of what injects the real scene's light."""
+        """Returns the bindings for injecting the real scene's light."""
         seen.image.build_levels()
         own = {"blocks_environment": self._blocks_environment}
         return {**surfel_scene(seen, lights, albedo), **volume.bindings, **own}
 
     def inject_real(self, real: VoxelStore, scene: Bindings, lights: LightBuffers) -> moderngl.Buffer:
-        """The real scene's light without objects."""
+        """Injects the real scene's light without objects."""
         self._albedo.run(lights, scene)
         self._real_light.clear()
         self._maps.add_real(self._real_light, lights, self._albedo.atlas, scene)
@@ -153,7 +153,7 @@ class LpvVolumes:
         return self._real_light
 
     def cover_real(self, real: VoxelStore, volume: PlacedVolume) -> moderngl.Buffer | None:
-        """What gets through between cells of the real scene; None: everything."""
+        """Computes the transmittance between cells of the real scene; None: nothing is blocked."""
         if not self._has_geometry:
             return None
         self._cover.run(self._real_covered, real, volume.placement)
@@ -161,7 +161,7 @@ class LpvVolumes:
         return self._through_real
 
     def propagate_mu(self, injected: moderngl.Buffer, through: moderngl.Buffer | None) -> LightVolume | None:
-        """V_mu; the paper has none."""
+        """Propagates V_mu; None with the paper's operator."""
         if self.mu is not None:
             self._start.run(self.mu, injected)
             self._propagate.run(self.mu, self._weights, self._steps, through)
@@ -170,7 +170,7 @@ class LpvVolumes:
     def joint_scene(
         self, scene: Bindings, objects: GeometryState, lights: LightBuffers
     ) -> dict[str, Binding]:
-        """Bindings of what injects the change that objects make."""
+        """Returns the bindings for injecting the objects' change."""
         return {
             **scene,
             **lights.bindings,
@@ -182,7 +182,7 @@ class LpvVolumes:
     def inject_change(
         self, objects: VoxelStore, scene: Bindings, lights: LightBuffers, _real: moderngl.Buffer
     ) -> moderngl.Buffer:
-        """The change that objects make."""
+        """Injects the change due to the objects."""
         self._change_light.clear()
         self._maps.add_change(self._change_light, lights, self._albedo.atlas, scene)
         self._surfaces.add_virtual(self._change_light, objects, scene)
@@ -191,7 +191,7 @@ class LpvVolumes:
     def cover_joint(
         self, objects: VoxelStore, volume: PlacedVolume, _real: moderngl.Buffer | None
     ) -> moderngl.Buffer | None:
-        """What gets through between cells with the objects among them; None: everything."""
+        """Computes the transmittance between cells with the objects; None: nothing is blocked."""
         if not self._has_geometry:
             return None
         self._cover.run(self._virtual_covered, objects, volume.placement)
@@ -203,7 +203,7 @@ class LpvVolumes:
     def propagate_rho(
         self, real: moderngl.Buffer, change: moderngl.Buffer, through: moderngl.Buffer | None
     ) -> LightVolume:
-        """V_rho."""
+        """Propagates V_rho."""
         self._start.run(self.rho, real, change)
         self._propagate.run(self.rho, self._weights, self._steps, through)
         return self.rho
@@ -215,7 +215,7 @@ class LpvVolumes:
         scene: Bindings,
         through: moderngl.Buffer | None,
     ) -> LightVolume:
-        """V_rho once more, with what surfaces reflect of the light that the last one brought them."""
+        """Propagates V_rho again, with the light that surfaces reflect of the previous pass."""
         for _ in range(0 if mu is None else self._settings.resolved_bounces):
             assert mu is not None
             self._bounced_light.clear()
@@ -235,14 +235,17 @@ class LpvVolumes:
     def propagate_change(
         self, change: moderngl.Buffer, shadow: moderngl.Buffer, through: moderngl.Buffer | None
     ) -> LightVolume | None:
-        """V_delta of the paper: one volume of the texels that differ ([P2] 4.3); None of the other operator."""
+        """Propagates the paper's V_delta: a single volume of the difference ([P2] 4.3).
+
+        None with the other operator.
+        """
         if self.change is not None:
             self._start.run(self.change, change, shadow)
             self._propagate.run(self.change, self._weights, self._steps, through)
         return self.change
 
     def show(self, change: moderngl.Buffer, shadow: moderngl.Buffer, volume: PlacedVolume) -> VoxelMipmap:
-        """Cells of what was injected of the change."""
+        """Draws the injected change into cells."""
         self._show.run(self.shown, volume.placement.size, change, shadow)
         return self.shown
 
@@ -252,14 +255,14 @@ class LpvVolumes:
 
 
 class LpvFields:
-    """Reads the fields that cones fill elsewhere from the volumes."""
+    """Reads from the volumes what other methods trace by cones."""
 
     def __init__(self, gpu: GpuContext, volumes: LpvVolumes, fields: ConeFields) -> None:
         self._volumes, self._fields = volumes, fields
         self._query = LpvQuery(gpu)
 
     def marching(self, rho: LightVolume) -> dict[str, Binding]:
-        """Bindings of what reflected points are lit by."""
+        """Returns the bindings for lighting reflected points."""
         return {**light_volume_bindings(rho, rho), **self._volumes.query_bindings}
 
     def read(
@@ -270,7 +273,7 @@ class LpvFields:
         rho: LightVolume,
         change: LightVolume | None,
     ) -> ConeFields:
-        """Irradiance at real surfaces and at the objects."""
+        """Reads the irradiance at real surfaces and at the objects."""
         own = {**scene, **self._volumes.query_bindings}
         self._query.read_real(self._fields, grid, mu, rho if change is None else change, own)
         self._query.read_virtual(self._fields, grid, rho, own)
@@ -284,7 +287,7 @@ class LpvFields:
 def lpv_stages(
     g: Graph, s: FrameResources, lit: LitScene, volumes: LpvVolumes, volume: Resource[PlacedVolume]
 ) -> tuple[Resource[LightVolume | None], Resource[LightVolume], Resource[LightVolume | None]]:
-    """Inject, block, propagate: V_mu of the real scene, V_rho with the objects, the paper's V_delta."""
+    """Declares injection, blocking and propagation: V_mu, V_rho, and the paper's V_delta."""
     real = g.stage("voxelize real", volumes.voxelize_real, s.real, volume)
     scene = g.value(
         "inject scene",
@@ -311,7 +314,7 @@ def lpv_stages(
 
 
 def dlpv(g: Graph, s: FrameResources, setup: Setup[DlpvMethod]) -> Layers:
-    """V_rho and V_mu subtracted, or the paper's one volume of the change."""
+    """Subtracts V_mu from V_rho, or uses the paper's single volume of the change."""
     settings, resolved, size = setup.settings, setup.resolved, setup.picture_size
     lit = light_stages(g, s, resolved, settings.shadow_samples)
     g.section("propagation volumes")

@@ -1,4 +1,4 @@
-"""Which method relights for a scene document's `method`, with what settings."""
+"""Selects the relighting method, with its settings, for a scene document's `method`."""
 
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -41,14 +41,14 @@ class MethodChoice:
 
     @property
     def composition(self) -> Literal["ratio", "additive"]:
-        """How the delta meets the picture."""
+        """How the change of light is composed with the picture."""
         return self.settings.resolved_composition
 
     def require(self, objects: Sequence[SceneObject]) -> None:
-        """Refuses visible objects that the method cannot show.
+        """Refuses visible objects that the method cannot render.
 
         Raises:
-            DeltalightError: an object's shape may change, and the method precomputes.
+            DeltalightError: an object's shape may change, but the method precomputes it.
         """
         if self.method.require is not None:
             for item in objects:
@@ -56,7 +56,7 @@ class MethodChoice:
                     self.method.require(item)
 
     def setup(self, picture_size: tuple[int, int], fields: OcclusionFields) -> Setup[Any]:
-        """What the method is declared with for pictures of this size."""
+        """Returns what the method's stages are declared with, for pictures of this size."""
         return Setup(self.settings, self.resolved, picture_size, fields)
 
     def declare(self, graph: Graph, resources: FrameResources, setup: Setup[Any]) -> Layers:

@@ -16,9 +16,9 @@ Settings = TypeVar("Settings", bound=MethodSettings)
 
 @dataclass(frozen=True)
 class ResolvedSettings:
-    """The settings of a method whose default depends on the machine.
+    """The settings of a method whose defaults depend on the machine.
 
-    `volume_size`: voxels or cells an edge. `cone_scale`: cones and volumes are evaluated at 1/scale of the picture.
+    `volume_size` is in voxels or cells per edge. Cones and volumes are evaluated at 1/`cone_scale` of the picture.
     """
 
     volume_size: int
@@ -33,7 +33,7 @@ GPU_DEFAULTS = ResolvedSettings(volume_size=256, cone_scale=2, rsm_size=1024, tr
 
 @dataclass(frozen=True, eq=False)
 class Setup(Generic[Settings]):
-    """What a method is declared with: settings, width and height of the picture, what is precomputed of objects."""
+    """Arguments of a method's declaration: settings, picture size (width, height), precomputed data of objects."""
 
     settings: Settings
     resolved: ResolvedSettings
@@ -57,7 +57,7 @@ def resolve_joint_maps(settings: VoxelConeSettings, defaults: ResolvedSettings) 
 
 
 def march_defines(settings: VoxelConeSettings) -> dict[str, int]:
-    """What march.glsl is compiled with."""
+    """Returns the defines that march.glsl is compiled with."""
     defines = {
         "ISOTROPIC_VOXELS": settings.voxels == "isotropic",
         "MULTIPLIED_COVERAGE": settings.coverage == "multiplied",

@@ -1,5 +1,6 @@
-"""Lit voxels that cones march through: of the real scene (mu), and of real and virtual surfaces (rho)
-(docs/method.md 4).
+"""Lit voxels for cone marching (docs/method.md 4).
+
+mu holds the real scene, rho real and virtual surfaces.
 """
 
 from collections.abc import Sequence
@@ -49,10 +50,10 @@ FAR_MARGIN = 1.05
 
 
 class VoxelSet:
-    """The sparse voxels of one geometry: where the volume lay when they were filled, their surfels and groups.
+    """The sparse voxels of one geometry: the placement that they were filled for, their surfels and groups.
 
-    `mipmaps` are made of them, and lose the texels of voxels that are replaced. `is_lit`: the sums hold light, which
-    has to go before the voxels are lit anew.
+    `mipmaps` are filtered from them, and lose the texels of voxels that are replaced. `is_lit`: the sums hold light,
+    which must be cleared before relighting.
     """
 
     def __init__(self, gpu: GpuContext, size: int, mipmaps: Sequence[VoxelMipmap]) -> None:
@@ -65,20 +66,20 @@ class VoxelSet:
         self._clear = ClearVoxels(gpu, mipmaps[0].directions)
 
     def fill(self, corners: Float32[np.ndarray, "m 3 10"], placement: VolumePlacement) -> None:
-        """Replaces the voxels by those of triangles."""
+        """Replaces the voxels by those of the triangles, and clears the old ones from the mipmaps."""
         self._clear.run(self.store, self._mipmaps, self.volume)
         self.volume.place(placement)
         self._voxelize.run(self.store, corners, self.volume)
         self.is_lit = False
 
     def forget_light(self) -> None:
-        """Empties the sums, unless they are."""
+        """Clears the sums if they hold light."""
         if self.is_lit:
             self.store.sums.clear()
         self.is_lit = True
 
     def counts(self) -> tuple[int, int]:
-        """Touched voxels and surfels; waits for the GPU."""
+        """Returns the numbers of touched voxels and surfels; waits for the GPU."""
         return self.store.counts()
 
     def release(self) -> None:
@@ -87,10 +88,10 @@ class VoxelSet:
 
 
 class FarScene:
-    """The real scene beyond the volume: a coarse mu mipmap around everything that the camera sees.
+    """The real scene beyond the volume: a coarse mu mipmap around everything in view.
 
-    What leaves the volume meets the radiance that the camera measured there, not the environment; unless the
-    volume is not `is_used`.
+    Cones that leave the volume meet the radiance that the camera measured there instead of the environment, if
+    `is_used`.
     """
 
     def __init__(self, gpu: GpuContext, light: LightVoxels, *, is_used: bool) -> None:
@@ -103,7 +104,7 @@ class FarScene:
         self._block = UniformBlock[FarVolumeBlock](gpu, self._set.volume.placement.far_block(is_used=is_used))
 
     def voxelize(self, real: GeometryState) -> VoxelSet:
-        """Voxelises the whole real scene."""
+        """Voxelises the whole real scene coarsely."""
         if self._is_used:
             low, high = real.bounds
             edge = min(float(np.max(high - low)), FAR_EDGE_M) * FAR_MARGIN
@@ -113,7 +114,7 @@ class FarScene:
         return self._set
 
     def light(self, voxels: VoxelSet, scene: Bindings) -> VoxelSet:
-        """Gives the voxels the radiance that the camera measured, and filters them."""
+        """Lights the voxels by the radiance that the camera measured, and filters them."""
         if self._is_used:
             voxels.forget_light()
             self._light.light_real(voxels.store, {**scene, **voxels.volume.bindings})
@@ -123,7 +124,7 @@ class FarScene:
 
     @property
     def bindings(self) -> dict[str, Binding]:
-        """Everything that march.glsl reads of it."""
+        """Returns all bindings that march.glsl reads of it."""
         return {"pyramid_far": self.mipmap.texture, "FarVolume": self._block}
 
     def release(self) -> None:
@@ -132,7 +133,7 @@ class FarScene:
 
 
 class DirectionalVoxels:
-    """What the voxels of both marches hold: two anisotropic mipmaps, two sets, the far scene."""
+    """Voxel data of both marches: two anisotropic mipmaps, two voxel sets, and the scene beyond."""
 
     def __init__(self, gpu: GpuContext, settings: VoxelConeSettings, size: int) -> None:
         self._bounces = settings.bounces
@@ -148,7 +149,7 @@ class DirectionalVoxels:
         self._filter = FilterVoxels(gpu)
 
     def voxelize_real(self, real: GeometryState, placement: VolumePlacement) -> VoxelSet:
-        """Voxelises the real scene, with backs of what one camera saw."""
+        """Voxelises the real scene, with back faces if one camera saw it."""
         self.real.fill(real.solid_corners(placement.voxel_edge), placement)
         return self.real
 
@@ -171,7 +172,7 @@ class DirectionalVoxels:
         self._filter.run(self.rho, self.real.volume)
 
     def march_bindings(self, cone_count: int) -> dict[str, Binding]:
-        """Everything that march.glsl reads."""
+        """Returns all bindings that march.glsl reads."""
         return {
             **self._light.bindings,
             **self.far.bindings,
@@ -206,9 +207,9 @@ class LitVoxels:
 
 
 class DeltaVoxels(DirectionalVoxels):
-    """Voxels of the exact operator: rho is mu, where objects leave it as it is.
+    """Voxels of the exact operator; rho equals mu where objects change nothing.
 
-    Light is gathered `settings.bounces` times from voxel to voxel, beyond direct and unoccluded ambient light.
+    Light is gathered from voxel to voxel `settings.bounces` times, after direct and unoccluded ambient light.
     """
 
     def __init__(self, gpu: GpuContext, settings: DvctMethod, size: int) -> None:
@@ -223,26 +224,26 @@ class DeltaVoxels(DirectionalVoxels):
         lights: LightBuffers,
         *_light: object,
     ) -> dict[str, Binding]:
-        """Bindings of what lights real voxels."""
+        """Returns the bindings for lighting real voxels."""
         seen.image.build_levels()
         return surfel_scene(seen, lights, albedo, measured=self._measured)
 
     def light_real(self, voxels: VoxelSet, scene: Bindings) -> VoxelSet:
-        """Gives real surfels the radiance that the camera measured, or the lights' where it does not look."""
+        """Lights real surfels: by the measured radiance where the camera sees them, by the lights elsewhere."""
         voxels.forget_light()
         voxels.groups.start(voxels.store)
         self._light.light_real(voxels.store, {**scene, **voxels.volume.bindings}, voxels.groups)
         return voxels
 
     def filter_real(self, _lit: VoxelSet) -> VoxelMipmap:
-        """Makes mu of the lit voxels."""
+        """Filters the lit voxels into mu."""
         self._filter_mu()
         return self.mu
 
     def bounce_real(
         self, voxels: VoxelSet, _mu: VoxelMipmap, _far: VoxelSet, scene: Bindings
     ) -> tuple[VoxelMipmap, VoxelSet]:
-        """Real surfaces that the camera does not see: what they gather from mu in place of all ambient light."""
+        """Replaces the ambient light of unseen real surfaces by what they gather from mu."""
         if self._bounces == 0:
             return self.mu, voxels
         own, store, groups = {**scene, **voxels.volume.bindings}, voxels.store, voxels.groups
@@ -257,7 +258,7 @@ class DeltaVoxels(DirectionalVoxels):
     def joint_scene(
         self, scene: Bindings, objects: GeometryState, lights: LightBuffers, voxels: VoxelSet
     ) -> dict[str, Binding]:
-        """Bindings of what lights the objects' voxels and changes the light of real ones."""
+        """Returns the bindings for lighting the objects' voxels and the change of real ones."""
         return {
             **scene,
             **lights.bindings,
@@ -270,7 +271,7 @@ class DeltaVoxels(DirectionalVoxels):
     def light_joint(
         self, real: VoxelSet, voxels: VoxelSet, objects: GeometryState, scene: Bindings
     ) -> LitVoxels:
-        """Lights the objects' surfels, and changes the light of real ones by the objects' shadows."""
+        """Lights the objects' surfels, and the change of real ones due to the objects' shadows."""
         voxels.forget_light()
         self._light.start_support(voxels.volume.placement.voxel_bounds(np.stack(objects.bounds)))
         self._light_rho(scene, gathered=False)
@@ -281,14 +282,14 @@ class DeltaVoxels(DirectionalVoxels):
         self._light.light_real_delta(self.real.store, scene, self.real.groups, gathered=gathered)
 
     def filter_joint(self, _lit: LitVoxels) -> VoxelMipmap:
-        """Makes rho of the lit voxels of both sets."""
+        """Filters the lit voxels of both sets into rho."""
         self._filter_rho()
         return self.rho
 
     def bounce_joint(
         self, lit: LitVoxels, _rho: VoxelMipmap, scene: Bindings
     ) -> tuple[VoxelMipmap, LitVoxels]:
-        """Gathers light from mu and rho, lights the objects and changes the real surfaces by it."""
+        """Gathers light from mu and rho, and relights the objects and the change of real surfaces with it."""
         for _ in range(self._bounces):
             marching = {**scene, **self.march_bindings(1)}
             self._gather.gather_real(self.real.store, self.real.groups, self.mu, self.rho, marching)
@@ -301,7 +302,7 @@ class DeltaVoxels(DirectionalVoxels):
 def delta_voxel_stages(
     g: Graph, s: FrameResources, lit: LitScene, voxels: DeltaVoxels, placement: Resource[VolumePlacement]
 ) -> tuple[Resource[VoxelMipmap], Resource[VoxelMipmap]]:
-    """Voxelise, light, filter and bounce: mu of the real scene, then rho with the objects."""
+    """Declares voxelisation, lighting, filtering and bounces: mu of the real scene, then rho with the objects."""
     real = g.stage("voxelize real", voxels.voxelize_real, s.real, placement)
     beyond = g.stage("voxelize far", voxels.far.voxelize, s.real)
     scene = g.value(
@@ -339,13 +340,13 @@ def delta_voxel_stages(
 class SolutionVoxels(DirectionalVoxels):
     """Voxels of two full solutions: the real scene alone (mu), real and virtual together (rho) (docs/method.md 6).
 
-    Each sums all of its light and opacity, under its own maps, as often as light is gathered. Shared are the pieces
-    of the real triangles and what the camera measured there, which tells solution rho what a surface gives back of
-    its light; and the scene beyond the volume, which objects do not change.
+    Each solution sums all its light and opacity under its own maps. Both share the pieces of the real triangles, the
+    camera's measurements on them (which give solution rho its reflectance), and the scene beyond the volume, which
+    objects do not change.
     """
 
     def voxelize_both(self, real: VoxelSet, objects: VoxelSet) -> tuple[VoxelSet, VoxelSet]:
-        """Groups the surfels of both sets, once they are voxelised."""
+        """Groups the surfels of both sets after voxelisation."""
         real.groups.start(real.store)
         if self._bounces > 0:
             self._group.run(real.store, real.groups, real.volume.bindings, has_seen=False)
@@ -378,7 +379,7 @@ class SolutionVoxels(DirectionalVoxels):
         return self
 
     def bounce(self, _lit: "SolutionVoxels", mu: Bindings, rho: Bindings) -> "SolutionVoxels":
-        """Gathers each solution's light from its own voxels, and lights them by it."""
+        """Gathers light from each solution's own voxels, and relights them with it."""
         for _ in range(self._bounces):
             self.set_support(everywhere=True)
             marching = {**mu, **self.march_bindings(1)}
@@ -401,9 +402,7 @@ class SolutionVoxels(DirectionalVoxels):
         self._filter.run(self.rho, real.volume)
 
     def set_support(self, *, everywhere: bool) -> None:
-        """Sets the bounds inside which march.glsl takes mu and rho for different: the whole volume, or nowhere, where
-        both are the same.
-        """
+        """Sets the bounds within which march.glsl distinguishes mu from rho: the whole volume or nothing."""
         size = self.real.volume.placement.size
         low, high = (0, size - 1) if everywhere else (size, -1)
         # Unlike those of a delta, they are known before anything is lit.
@@ -419,7 +418,7 @@ def solution_stages(
     rho_maps: Resource[LightBuffers],
     environment: Resource[tuple[moderngl.TextureArray, ...]],
 ) -> Resource[SolutionVoxels]:
-    """Voxelise both geometries, then light, filter and gather in step."""
+    """Declares voxelisation of both geometries, then lighting and bounces in step."""
     real = g.stage("voxelize real", voxels.voxelize_real, s.real, placement)
     beyond = g.stage("voxelize far", voxels.far.voxelize, s.real)
     objects = g.stage("voxelize objects", voxels.voxelize_objects, s.objects, placement)
@@ -443,7 +442,7 @@ def joint_voxels(voxels: "InjectedVoxels | SolutionVoxels") -> VoxelMipmap:
 
 
 class InjectedVoxels:
-    """V_delta and V_rho with the joint opacity of V_eta, as split-inject fills them ([P1] 3.2).
+    """V_delta and V_rho with the joint opacity of V_eta, filled by split injection ([P1] 3.2).
 
     Two isotropic mipmaps: (V_delta, V_eta) with signed radiance, and (V_rho, V_eta).
     """
@@ -477,7 +476,7 @@ class InjectedVoxels:
         lights: LightBuffers,
         _environment: moderngl.TextureArray,
     ) -> RealAlbedo:
-        """Finds the real scene's albedo as the lights see it."""
+        """Computes the real scene's albedo as seen from the lights."""
         seen.image.build_levels()
         self._albedo.run(lights, {**surfel_scene(seen, lights, albedo), **placed.volume.bindings})
         return self._albedo
@@ -502,7 +501,7 @@ class InjectedVoxels:
         return real, objects
 
     def filter(self, injected: tuple[VoxelSet, VoxelSet]) -> "InjectedVoxels":
-        """Makes both mipmaps of the sums."""
+        """Filters the sums into both mipmaps."""
         real, objects = injected
         self._resolve.run(self.delta, self.rho, real.store, objects.store, real.volume)
         self._filter.run(self.delta, self.rho, real.volume)
@@ -525,7 +524,7 @@ class InjectedVoxels:
 def injection_stages(
     g: Graph, s: FrameResources, lit: LitScene, voxels: InjectedVoxels, placement: Resource[VolumePlacement]
 ) -> Resource[InjectedVoxels]:
-    """Voxelise both geometries, find the real albedo, inject, filter."""
+    """Declares voxelisation of both geometries, real albedo, injection and filtering."""
     real = g.stage("voxelize real", voxels.voxelize_real, s.real, placement)
     albedo = g.stage(
         "real albedo",

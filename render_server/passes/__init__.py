@@ -1,1 +1,1 @@
-"""One GPU pass a file, its GLSL beside it with the same stem."""
+"""GPU passes: one family per file, with its GLSL in shaders/."""

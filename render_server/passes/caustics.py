@@ -1,4 +1,4 @@
-"""Caustics: light that smooth virtual surfaces throw on others, as beams from the lights' maps of the objects."""
+"""Caustics: light that smooth virtual surfaces cast on others, as beams traced from the lights' object maps."""
 
 import math
 
@@ -8,22 +8,22 @@ from render_server.passes.cones import LowResGrid
 from render_server.passes.lights import LightBuffers
 from render_server.passes.ray_tracing import ObjectBvh
 
-# A light's map of the objects is cut into so many blocks an edge, each sends so many rays: they start a 128th of the
-# objects' extent apart, and after a convex object has spread them four- to eightfold they are as far apart as voxels.
+# Blocks per edge of a light's object map, each of which sends a beam of rays: they start a 128th of the objects'
+# extent apart, and after a convex object has spread them four- to eightfold they are as far apart as voxels.
 BLOCKS = 64
 RAYS = 4
-# From this GGX alpha on a lobe (2 alpha wide) is wider, at half the objects' extent, than such beams are: then rays
-# sample the lobe, of which each holds a part.
+# Above this GGX alpha a lobe (2 alpha wide) is, at half the objects' extent, wider than such beams: rays then sample
+# the lobe, each with a fraction of its energy.
 WIDE_ALPHA = 1 / 32
-# A lobe that holds 85 % of its energy within 45 degrees and more is as good as diffuse: voxels carry that.
+# A lobe with 85 % of its energy within 45 degrees or more is as good as diffuse: voxels carry its light.
 GREATEST_ALPHA = 0.174
 BEAM_BYTES = 64
 HEADER_BYTES = 16
-SUMS_BYTES = 6 * 4  # of a pixel: three channels on its real surface, three on its object
+SUMS_BYTES = 6 * 4  # per pixel: three channels on its real surface, three on its object
 
 
 class Caustics:
-    """Renders caustics: fixed-point irradiance on real surfaces and objects (shaders/common/caustic_sums.glsl)."""
+    """Renders caustics as fixed-point irradiance on real surfaces and objects (shaders/common/caustic_sums.glsl)."""
 
     def __init__(self, gpu: GpuContext, grid: LowResGrid, objects: ObjectBvh) -> None:
         self._threads, self._grid, self._objects = list_threads(gpu), grid, objects
@@ -37,13 +37,13 @@ class Caustics:
 
     @property
     def bindings(self) -> dict[str, Binding]:
-        """The sums, for the passes that shade."""
+        """The sums, for passes that shade."""
         return {"CausticSums": self._sums}
 
     def run(self, lights: LightBuffers, scene: Bindings, *, bias_m: float, reach_m: float) -> None:
         """Fills the sums.
 
-        `bias_m` moves what may be in real shadow towards the light; beams are followed up to `reach_m`.
+        `bias_m` offsets receivers of real shadows towards the light; beams are traced up to `reach_m`.
         """
         self._sums.clear()
         self._empty_beams(len(lights.virtual_views))
@@ -61,7 +61,7 @@ class Caustics:
         )
 
     def _empty_beams(self, views: int) -> None:
-        """Makes room for the beams of so many views."""
+        """Allocates and clears the beams of that many views."""
         needed = HEADER_BYTES + BEAM_BYTES * max(views * BLOCKS**2 * RAYS, 1)
         if self._beams.size < needed:
             self._beams.orphan(needed)
@@ -70,7 +70,7 @@ class Caustics:
     def _trace_beams(
         self, lights: LightBuffers, view_index: int, scene: Bindings, bias_m: float, reach_m: float
     ) -> None:
-        """Adds the beams of one view: those of mirrors, and those of wider lobes."""
+        """Adds the beams of one view: of mirrors, and of wider lobes."""
         shared: dict[str, Binding] = {
             "view_index": view_index,
             "block_edge": max(lights.tile_size // BLOCKS, 1),

@@ -1,4 +1,4 @@
-"""The relit picture: camera codes and linear radiance; debug views of what it was made from."""
+"""Composition of the relit picture, as camera codes and linear radiance, and debug views."""
 
 from dataclasses import dataclass
 
@@ -15,13 +15,13 @@ from render_server.passes.reflections import RAY_ROUGHNESS
 from render_server.passes.shading import DirectLight
 from render_server.passes.voxels import PlacedVolume, VoxelMipmap
 
-FILL_RADIUS = 3  # texels of the reduced grid over which the change continues into a hole
+FILL_RADIUS = 3  # texels of the reduced grid by which the change extends into a hole
 
 
 class ChangeRatio:
-    """How light changed, on the reduced grid: for holes of the depth map, and to compose only what changed.
+    """The change of light on the reduced grid: extends into holes of the depth map, limits composition to changes.
 
-    `ratio`: rgb E_rho / E_mu, a: 0 unknown, 1 unchanged, 2 changed; `texels`: work list of those near a change.
+    `ratio`: rgb E_rho / E_mu, a: 0 unknown, 1 unchanged, 2 changed. `texels`: work list of texels near a change.
     """
 
     def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
@@ -37,7 +37,7 @@ class ChangeRatio:
         cones: ConeFields,
         reflection: moderngl.Texture | None,
     ) -> None:
-        """Compares the fields of one frame; `reflection` as in RelitLayers."""
+        """Computes the ratio from one frame's fields; `reflection` as in RelitLayers."""
         self._ratio.run(
             grid.size,
             sample_pixels=grid.pixels,
@@ -63,7 +63,7 @@ class ChangeRatio:
 
 @dataclass(frozen=True)
 class RelitLayers:
-    """What a relighting method hands to composition; `voxels`, `volume` and `lights` are for debug views."""
+    """The layers that a relighting method hands to composition; `voxels`, `volume`, `lights` are for debug views."""
 
     object_coverage: Binding
     virtual_radiance: moderngl.Texture
@@ -75,11 +75,11 @@ class RelitLayers:
     volume: PlacedVolume
     lights: LightBuffers
     reflection: moderngl.Texture | None = None
-    """Objects in smooth real surfaces (`MirrorRays`); None: such surfaces have the cones' reflection."""
+    """Objects in smooth real surfaces (`MirrorRays`); None: these surfaces use the cones' reflection."""
 
 
 class Composite:
-    """Writes `code` (RGBA8UI, the camera's response applied) and `linear` (RGBA16F, camera units)."""
+    """Writes `code` (RGBA8UI, with the camera's response) and `linear` (RGBA16F, camera units)."""
 
     def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
         self._threads = list_threads(gpu, size[0] * size[1])
@@ -92,9 +92,9 @@ class Composite:
     def run(self, image: CameraImage, layers: RelitLayers, scene: Bindings) -> None:
         """Composes the picture.
 
-        `scene` brings, besides camera, geometry (with `edge_correction`) and declared surfaces, how: `additive`,
-        `relights_real`, `filmic`, `store_linear` (fills `linear`, too) and `whole` (composes every pixel, not only
-        those near a change).
+        Besides camera, geometry, `edge_correction` and declared surfaces, `scene` brings the options `additive`,
+        `relights_real`, `filmic`, `store_linear` (fills `linear`) and `whole` (composes every pixel, not only those
+        near a change).
         """
         self.code.write(image.bytes, alignment=1)
         cones, direct = layers.cones, layers.direct
@@ -131,7 +131,7 @@ class Composite:
 
 
 class DebugViews:
-    """Overwrites a composite's `code` (RGBA8UI): effects, delta, voxels, reflective shadow maps."""
+    """Overwrites a composite's `code` (RGBA8UI) with a debug view: effects, delta, voxels, reflective shadow maps."""
 
     def __init__(self, gpu: GpuContext) -> None:
         self._gpu = gpu
@@ -177,7 +177,7 @@ class DebugViews:
         )
 
     def shadow_maps(self, code: moderngl.Texture, lights: LightBuffers) -> None:
-        """Shows real maps left, virtual maps right."""
+        """Shows the real maps on the left, the virtual maps on the right."""
         self._kernel("rsm_view").run(code.size, lights.bindings, code_out=code)
 
     def _kernel(self, name: str, **defines: int) -> Kernel:

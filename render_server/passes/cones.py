@@ -1,4 +1,4 @@
-"""Cone tracing at reduced resolution: which pixel stands for each texel, and what cones bring there."""
+"""Cone tracing at reduced resolution: the pixel that represents each texel, and the light that its cones gather."""
 
 from collections.abc import Mapping
 
@@ -11,11 +11,10 @@ from render_server.passes.voxels import VoxelMipmap
 
 
 class LowResGrid:
-    """RGBA16I: pixel of a real surface (x, y) and of a virtual one (x, y), -1 where the block shows none.
+    """For each block of the picture, the pixel of a real surface (x, y) and of a virtual one (x, y), as RGBA16I.
 
-    Where objects hide the block's real surfaces, -2 - pixel stands for one of them.
-
-    `virtual_texels` lists the texels that show an object (count, then indices).
+    -1 marks a block that shows none; -2 - pixel represents real surfaces that objects hide. `virtual_texels` lists
+    the texels that show an object (count, then indices).
     """
 
     def __init__(self, gpu: GpuContext, picture_size: tuple[int, int], scale: int) -> None:
@@ -27,16 +26,16 @@ class LowResGrid:
 
     @property
     def texel_count(self) -> int:
-        """How many texels the grid has."""
+        """Number of texels of the grid."""
         return self.size[0] * self.size[1]
 
     @property
     def bindings(self) -> dict[str, Binding]:
-        """What low_res_grid.glsl and upsample.glsl read of it."""
+        """The bindings of low_res_grid.glsl and upsample.glsl."""
         return {"sample_pixels": self.pixels, "low_resolution_size": self.size, "scale": self.scale}
 
     def run(self, scene: Bindings) -> None:
-        """Chooses the pixels."""
+        """Selects the pixels."""
         self.virtual_texels.write(bytes(4))
         self._kernel.run(
             self.size,
@@ -55,7 +54,7 @@ class LowResGrid:
 
 
 class ConeFields:
-    """What cones bring, at 1/scale of the picture: irradiance (diffuse) and mean radiance (specular cone)."""
+    """Light gathered by cones at 1/scale of the picture: irradiance (diffuse) and mean radiance (specular cone)."""
 
     def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
         self.mu = texture_2d(gpu, size, 4, "f2")
@@ -72,7 +71,7 @@ class ConeFields:
 
 
 class BilateralConeFilter:
-    """Averages neighbouring texels, each of which looked along other cones: a joint bilateral tent over 3 x 3."""
+    """Averages neighbouring texels, whose cones point in different directions: a joint bilateral tent over 3 x 3."""
 
     def __init__(self, gpu: GpuContext) -> None:
         self._real = Kernel(gpu, "bilateral_cone_filter", REAL=1)
@@ -85,7 +84,7 @@ class BilateralConeFilter:
         grid: LowResGrid,
         scene: Bindings,
     ) -> None:
-        """E_mu and E_rho of the real surfaces; where mu and rho are the same they stay the same, bit for bit."""
+        """Filters E_mu and E_rho of real surfaces; where both are equal they stay equal, bit for bit."""
         self._real.run(
             grid.size,
             grid.bindings,
@@ -99,7 +98,7 @@ class BilateralConeFilter:
     def filter_virtual(
         self, traced: moderngl.Texture, filtered: moderngl.Texture, grid: LowResGrid, scene: Bindings
     ) -> None:
-        """E_rho of the virtual surfaces."""
+        """Filters E_rho of virtual surfaces."""
         self._virtual.run(grid.size, grid.bindings, scene, traced_rho=traced, irradiance_rho=filtered)
 
     def release(self) -> None:
@@ -109,10 +108,9 @@ class BilateralConeFilter:
 
 
 class TraceCones:
-    """Traces cones of the exact operator: both marches on real surfaces, that of rho on virtual ones
-    (docs/method.md 3, 4.5).
+    """Traces the cones of the exact operator: both marches at real surfaces, rho's at virtual ones.
 
-    `size` is that of the reduced grid, `defines` are those of march.glsl.
+    See docs/method.md 3 and 4.5. `size` is that of the reduced grid, `defines` are those of march.glsl.
     """
 
     def __init__(self, gpu: GpuContext, size: tuple[int, int], defines: Mapping[str, int]) -> None:
@@ -127,7 +125,7 @@ class TraceCones:
     def trace_real(
         self, fields: ConeFields, grid: LowResGrid, mu: VoxelMipmap, rho: VoxelMipmap, scene: Bindings
     ) -> None:
-        """E_mu, E_rho and the specular cones of the real surfaces."""
+        """Traces E_mu, E_rho and the specular cones of real surfaces."""
         self._empty_list(grid)
         traced: Bindings = {
             "irradiance_mu": self._mu,
@@ -144,7 +142,7 @@ class TraceCones:
     def trace_virtual(
         self, fields: ConeFields, grid: LowResGrid, mu: VoxelMipmap, rho: VoxelMipmap, scene: Bindings
     ) -> None:
-        """E_rho and the specular cone of the virtual surfaces."""
+        """Traces E_rho and the specular cone of virtual surfaces."""
         self._irradiance.write(bytes(8 * grid.texel_count))
         self._virtual.run(
             self._threads(grid),
@@ -159,7 +157,7 @@ class TraceCones:
         self._filter.filter_virtual(self._irradiance, fields.virtual, grid, scene)
 
     def _empty_list(self, grid: LowResGrid) -> None:
-        """Empties the list of real texels, and makes room for all of the grid."""
+        """Clears the list of real texels, and makes room for all of the grid."""
         needed = 4 * (1 + grid.texel_count)
         if self._texels.size < needed:
             self._texels.orphan(needed)
@@ -179,9 +177,9 @@ class TraceCones:
 
 
 class TraceConesPaper:
-    """Traces cones of the paper's operator ([P1] eq. 6 and 8): nine diffuse ones and a specular one.
+    """Traces the cones of the paper's operator ([P1] eq. 6 and 8): nine diffuse ones and a specular one.
 
-    They march through V_delta on real surfaces, through V_rho on virtual ones.
+    They march through V_delta at real surfaces, through V_rho at virtual ones.
     """
 
     def __init__(self, gpu: GpuContext) -> None:
@@ -189,7 +187,7 @@ class TraceConesPaper:
         self._virtual = Kernel(gpu, "trace_cones_paper", DIRECTIONS=1)
 
     def trace_real(self, fields: ConeFields, grid: LowResGrid, delta: VoxelMipmap, scene: Bindings) -> None:
-        """Ambient irradiance without occlusion (mu), the same with C_delta (rho), and the specular cones."""
+        """Computes ambient irradiance without occlusion (mu), the same with C_delta (rho), and specular cones."""
         self._real.run(
             grid.size,
             grid.bindings,
@@ -202,7 +200,7 @@ class TraceConesPaper:
         )
 
     def trace_virtual(self, fields: ConeFields, grid: LowResGrid, rho: VoxelMipmap, scene: Bindings) -> None:
-        """Irradiance and specular cone of the virtual surfaces."""
+        """Computes irradiance and specular cone of virtual surfaces."""
         self._virtual.run(
             grid.size,
             grid.bindings,

@@ -1,4 +1,4 @@
-"""How much of each pixel the virtual objects cover, and the edges of what is seen of them."""
+"""Pixel coverage of the virtual objects, and antialiasing and unmixing of the edges around it."""
 
 import moderngl
 
@@ -8,23 +8,25 @@ from render_server.gpu.textures import release_all, release_target, texture_2d
 from render_server.passes.gbuffer import GeometryBuffer, MeshBuffers, RasterGeometry
 from render_server.view import CameraView, Rectangle
 
-# Where a pixel is sampled, in 1/16 pixels from its centre, nearest first. Of all patterns of eight with one sample in
-# each column and row of eighths (an upright edge is right within 1/16) this is the one whose worst error for an edge
-# at any angle and place is least: 0.17 of a pixel, 0.06 r.m.s. It is its own mirror image in the centre.
+# Sample positions in 1/16 pixels from the pixel's centre, nearest first. Of all patterns of eight with one sample in
+# each column and row of eighths (an upright edge is exact to 1/16) this one has the least worst-case error for an
+# edge at any angle and position: 0.17 of a pixel, 0.06 r.m.s. It is point symmetric.
 PATTERN = ((-3, 1), (3, -1), (1, 5), (-1, -5), (-5, -3), (5, 3), (-7, 7), (7, -7))
 STEPS = 16
 RIM_SIGHT = 6
-"""Pixels within which a pixel at an edge finds the real thing and the background alone: behind the two that may be
-mixed there are four more on either side."""
+"""Pixels within which an edge pixel finds both the real thing and the background unmixed.
+
+Behind the two pixels that may be mixed there are four more on either side.
+"""
 
 
 class SampleCoverage:
-    """Draws the objects once for each sample and gathers what the pixels of the picture see through the lens.
+    """Draws the objects once per sample and gathers what the picture's pixels see through the lens.
 
-    One raster after another goes through the same buffer, so memory does not grow with the number of samples, and
-    vertex work does. `surface` is the geometry buffer on the picture's grid; `texture` (RGBA16F): the fraction in
-    front of the real surface, the fraction behind it, and that fraction times its mean depth.
-    `second_surface` (RGBA32F): place and fraction of samples that show another surface than `surface` does.
+    All rasters share one buffer, so memory does not grow with the number of samples, unlike vertex work. `surface` is
+    the geometry buffer on the picture's grid; `texture` (RGBA16F) holds the fraction in front of the real surface,
+    the fraction behind it, and that fraction times its mean depth; `second_surface` (RGBA32F) the position and
+    fraction of samples that show another surface than `surface`.
     """
 
     def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
@@ -78,7 +80,7 @@ class SampleCoverage:
 
 
 class ObjectCoverage:
-    """Fraction of each pixel that shows an object (R16F), and a work list of the pixels at `edges` of real things."""
+    """Fraction of each pixel that shows an object (R16F); a work list of the pixels at `edges` of real things."""
 
     def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
         self._size = size
@@ -89,9 +91,9 @@ class ObjectCoverage:
     def run(
         self, rectangle: Rectangle, scene: Bindings, sample_coverage: moderngl.Texture | None = None
     ) -> None:
-        """Compares depths and softens along the picture's edges, in the `rectangle`.
+        """Compares depths within `rectangle`, and softens the result along edges of the picture.
 
-        `sample_coverage`: texture of `SampleCoverage`; None: the geometry buffer has one sample a pixel.
+        `sample_coverage` is the texture of `SampleCoverage`; None: the geometry buffer has one sample per pixel.
         """
         self.texture.write(bytes(2 * self._size[0] * self._size[1]), alignment=1)
         self.edges.write(bytes(4))
@@ -114,10 +116,10 @@ class ObjectCoverage:
 
 
 class EdgeUnmixing:
-    """Unmixes pixels at the edge of a real thing before an object.
+    """Unmixes pixels at the edge of a real thing in front of an object.
 
-    Corrects the objects' coverage by how much of the pixel the thing fills. `texture` (RGBA16F): what takes the old
-    background out of a pixel's radiance, and which pixel shows the thing's surface.
+    Corrects the objects' coverage by the fraction of the pixel that the thing fills. `texture` (RGBA16F) removes the
+    old background from the pixel's radiance, and says which pixel shows the thing's surface.
     """
 
     def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
@@ -129,7 +131,7 @@ class EdgeUnmixing:
     def run(
         self, coverage: ObjectCoverage, scene: Bindings, sample_coverage: moderngl.Texture | None = None
     ) -> None:
-        """Unmixes the pixels that `coverage` listed; the other arguments as it had them."""
+        """Unmixes the pixels that `coverage` listed; pass the other arguments as to it."""
         self._target.use()
         self._target.clear()
         self._kernel.run(
@@ -149,9 +151,9 @@ class EdgeUnmixing:
 
 
 class InteriorEdgeAA:
-    """Antialiases the edges of the objects before each other.
+    """Antialiases edges between objects.
 
-    `radiance` (RGBA16F): the objects' light, mixed where a pixel's samples show two of their surfaces.
+    `radiance` (RGBA16F) is the objects' light, mixed where a pixel's samples show two surfaces.
     """
 
     def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
@@ -159,7 +161,7 @@ class InteriorEdgeAA:
         self._kernel = Kernel(gpu, "interior_edge_aa")
 
     def run(self, radiance: moderngl.Texture, coverage: SampleCoverage, rectangle: Rectangle) -> None:
-        """Mixes `radiance`, shaded at the samples that stand for their pixels."""
+        """Mixes `radiance`, which was shaded at one representative sample per pixel."""
         self._kernel.run(
             rectangle[2:],
             coverage.surface.bindings,

@@ -1,4 +1,4 @@
-"""What the camera sees: its image, the meshes, and the geometry buffers of the real and the virtual scene."""
+"""The camera's image, the meshes, and the geometry buffers of the real and the virtual scene."""
 
 import cv2
 import moderngl
@@ -23,7 +23,7 @@ METALLIC, REFLECTANCE, ROUGHNESS = (
 
 
 class CameraImage:
-    """Code (RGBA8UI), linear radiance in camera units with levels (RGBA16F), response (256 x 1), pixel rays."""
+    """Code (RGBA8UI), linear radiance in camera units with mip levels (RGBA16F), response (256 x 1), pixel rays."""
 
     def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
         self.size = size
@@ -41,7 +41,7 @@ class CameraImage:
 
     @property
     def bindings(self) -> dict[str, Binding]:
-        """Linear radiance and pixel rays by their GLSL names."""
+        """Linear radiance and pixel rays by GLSL name."""
         return {"linear_picture": self.linear, "picture_rays": self.rays}
 
     def upload(self, frame: ViewFrame) -> None:
@@ -76,7 +76,7 @@ class CameraImage:
         self.inverse_response.write(inverse_response(decode).tobytes(), alignment=1)
 
     def build_levels(self) -> None:
-        """Averages the linear picture over areas (for samples that cover several pixels)."""
+        """Builds the mip levels of the linear picture (for samples that cover several pixels)."""
         self.linear.build_mipmaps()
         self.linear.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
 
@@ -86,7 +86,7 @@ class CameraImage:
 
 
 def inverse_response(decode: Float32[np.ndarray, "256 3"]) -> Float32[np.ndarray, "n 4"]:
-    """Code whose linear value is nearest, for the squares of INVERSE_SIZE even steps from 0 to 1."""
+    """Returns the code with the nearest linear value, for the squares of INVERSE_SIZE even steps from 0 to 1."""
     values = np.linspace(0.0, 1.0, INVERSE_SIZE) ** 2
     table = np.ones((INVERSE_SIZE, 4), np.float32)
     for channel in range(3):
@@ -144,7 +144,7 @@ class MeshBuffers:
 
 
 def _layout_of(program: moderngl.Program) -> tuple[str, ...]:
-    """Format and attributes of a vertex; attributes that the program's compiler removed become padding."""
+    """Returns format and attributes of a vertex; attributes that the compiler removed become padding."""
     parts = list(zip(VERTEX_LAYOUT.split(), VERTEX_ATTRIBUTES, strict=True))
     active = {name for _, name in parts if program.get(name, None) is not None}
     formats = (part if name in active else f"{int(part[0]) * 4}x" for part, name in parts)
@@ -152,7 +152,7 @@ def _layout_of(program: moderngl.Program) -> tuple[str, ...]:
 
 
 def triangle_corners(mesh: GpuMesh) -> Float32[np.ndarray, "m 3 10"]:
-    """Each triangle's corners as the voxeliser reads them: position, uv, colour, material, double-sided."""
+    """Returns each triangle's corners as the voxeliser reads them: position, uv, colour, material, double-sided."""
     vertices = mesh.vertices
     double_sided = np.array([material.double_sided for material in mesh.materials], np.float32)
     flags = double_sided[vertices[:, MATERIAL].astype(int)][:, None]
@@ -163,7 +163,7 @@ def triangle_corners(mesh: GpuMesh) -> Float32[np.ndarray, "m 3 10"]:
 class MaterialTable:
     """Materials in a storage buffer, their base-colour textures in one array (common/materials.glsl).
 
-    `smoothest`: least roughness of those that reflect at all, 1 if none does.
+    `smoothest` is the least roughness of those that reflect specularly, 1 if none does.
     """
 
     def __init__(self, gpu: GpuContext, mesh: GpuMesh) -> None:
@@ -177,7 +177,7 @@ class MaterialTable:
 
     @property
     def bindings(self) -> dict[str, Binding]:
-        """Table and textures by their GLSL names."""
+        """Table and textures by GLSL name."""
         return {"Materials": self._buffer, "base_color_textures": self._textures}
 
     def release(self) -> None:
@@ -192,7 +192,7 @@ def _smoothest(mesh: GpuMesh) -> float:
 
 
 def _resampled(texture: Float16[np.ndarray, "h w 3"], size: int) -> bytes:
-    """RGBA float16 bytes of a linear texture, area-averaged to size x size."""
+    """Returns the RGBA float16 bytes of a linear texture, area-averaged to size x size."""
     resized = cv2.resize(texture.astype(np.float32), (size, size), interpolation=cv2.INTER_AREA)
     rgba = np.dstack([resized, np.ones((size, size), np.float32)])
     return rgba.astype(np.float16).tobytes()
@@ -212,7 +212,7 @@ class GeometryBuffer:
 
     @property
     def bindings(self) -> dict[str, Binding]:
-        """Its textures by their GLSL names."""
+        """Its textures by GLSL name."""
         return {
             "virtual_raster_position": self.position,
             "virtual_raster_normal": self.normal,
@@ -221,7 +221,7 @@ class GeometryBuffer:
         }
 
     def clear(self, rectangle: Rectangle | None = None) -> None:
-        """Empties it, or only the `rectangle`."""
+        """Clears it, or only the `rectangle`."""
         self.framebuffer.use()  # a clear heeds the scissor of the framebuffer in use
         self.framebuffer.clear(0.0, 0.0, 0.0, 0.0, depth=1.0, viewport=rectangle)
 
@@ -247,10 +247,10 @@ class RasterGeometry:
         offset: tuple[float, float] = (0.0, 0.0),
         rectangle: Rectangle | None = None,
     ) -> None:
-        """Draws `mesh` as `view` sees it, `offset` pixels beside the texels' centres.
+        """Draws `mesh` as `view` sees it, sampled `offset` pixels from the texels' centres.
 
-        `scene` brings the view's camera and the mesh's own materials. `rectangle`: the texels that can show the mesh;
-        the others keep what they held.
+        `scene` brings the view's camera and the mesh's own materials. `rectangle` limits drawing to the texels that
+        can show the mesh; the others keep their contents.
         """
         target.clear(rectangle)
         self._kernel.draw(target.framebuffer, mesh, scene, clip_from_camera=view.clip_from_camera_at(offset))
@@ -274,7 +274,7 @@ class RealSurface:
 
     @property
     def bindings(self) -> dict[str, Binding]:
-        """Its textures by their GLSL names."""
+        """Its textures by GLSL name."""
         return {"real_surface_position": self.position, "real_surface_normal": self.normal}
 
     def from_depth(self, depth: DepthImage, normals: Float32[np.ndarray, "h w 3"], scene: Bindings) -> None:
@@ -291,9 +291,9 @@ class RealSurface:
     ) -> None:
         """Fills it from a raster of the given model or the fused surface, through the lens.
 
-        `tolerance` (m, and m at 1 m that grow with z^2): pixels that the frame's depth filled before keep it where
-        the surface differs by more (something moved), and get the surface, the mean of many frames, where it agrees.
-        None: every pixel gets the surface.
+        `tolerance` (m, and m at 1 m that grow with z^2): a pixel that depth filled before keeps its depth where the
+        surface differs by more (something moved), and takes the surface, the mean of many frames, where it agrees.
+        None: every pixel takes the surface.
         """
         self._from_model.run(
             self.size,

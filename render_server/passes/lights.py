@@ -1,6 +1,5 @@
-"""Lights, their shadow maps and the residual environment, as every pass that shades reads them."""
+"""Lights, their shadow maps and the residual environment, as all passes that shade read them."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -11,7 +10,8 @@ from jaxtyping import Float32, Float64
 from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Binding, Bindings, Kernel
 from render_server.gpu.uniform_block import Block, Float, Int, UniformBlock
-from render_server.lights.lights import DirectionalLight, Light, MirrorLight, RectangleLight, SpotLight
+from render_server.lights.lights import DirectionalLight, Light
+from render_server.lights.mirror_lights import MirrorLight
 from render_server.lights.octahedral import octahedral_grid, prefilter, sample_octahedral
 from render_server.passes.shadow_maps import (
     NEAREST_M,
@@ -30,14 +30,13 @@ EMPTY = b"\0" * 256
 MIRROR_MAP_TEXELS = 256  # an edge of the map of where a plane mirrors a light
 MIRROR_MAP_MARGIN = 1.1  # of the extent that the map has to cover
 NOT_MIRRORED = (0.0,) * 7 + (-1.0,) + (0.0,) * 8
-NARROWEST_BLEND_RAD = 1e-4  # what a spot without blend falls off over
 
 MapAxes = tuple[Float64[np.ndarray, "4"], Float64[np.ndarray, "4"]]
 
 
 @dataclass(frozen=True, eq=False)
 class LightingBlock(Block):
-    """How many lights there are, and how the residual environment is layered."""
+    """The number of lights, and the layers of the residual environment."""
 
     light_count: Int = 0
     environment_layers: Int = 0
@@ -46,7 +45,7 @@ class LightingBlock(Block):
 
 
 class LightBuffers:
-    """What the lights see of the real scene and of the virtual objects, and the records that tell shaders so."""
+    """GPU buffers of the lights: their shadow maps of the real scene and the objects, and their records."""
 
     def __init__(self, gpu: GpuContext, tile_size: int, shadow_samples: int) -> None:
         self._gpu = gpu
@@ -69,7 +68,7 @@ class LightBuffers:
 
     @property
     def bindings(self) -> dict[str, Binding]:
-        """Everything that shaders read of the lights, by its GLSL name."""
+        """All bindings of the lights, by GLSL name."""
         return {
             "Lights": self._light_buffer,
             "LightViews": self._view_buffer,
@@ -109,8 +108,10 @@ class LightBuffers:
         virtual_points: Float64[np.ndarray, "m 3"],
         mirrors: Sequence[MirrorLight] = (),
     ) -> None:
-        """Fits each light's views: around the real points that may receive the objects' shadow, and closely around
-        the virtual objects; those of mirror images before their planes.
+        """Fits each light's views.
+
+        To the real points that may receive the objects' shadow, and to the virtual objects. Views of mirror images
+        are limited to the front of their planes.
         """
         self.mirrors = list(mirrors)
         self._make_mirror_maps()
@@ -214,17 +215,17 @@ class LightBuffers:
 
 
 class MirrorVisibility:
-    """Maps where smooth real planes mirror the lights, one map for each image of a light (lights/lights.py).
+    """Computes maps of where smooth real planes mirror the lights, one per mirror image (lights/mirror_lights.py).
 
-    A map holds how much of the light each point of the plane shows, without and with the objects; its mipmaps average
-    that over larger and larger footprints.
+    A map holds the fraction of the light that each point of the plane shows, without and with the objects; its mip
+    levels average over larger and larger footprints.
     """
 
     def __init__(self, gpu: GpuContext) -> None:
         self._kernel = Kernel(gpu, "mirror_visibility")
 
     def run(self, lights: LightBuffers, noise_m: float, scene: Bindings) -> None:
-        """Fills `lights.mirror_visibility`. `noise_m`: of depth, m."""
+        """Fills `lights.mirror_visibility`; `noise_m` is the depth noise, m."""
         count = len(lights.mirrors)
         self._kernel.run(
             (MIRROR_MAP_TEXELS, MIRROR_MAP_TEXELS, count),
@@ -242,9 +243,9 @@ class MirrorVisibility:
 
 
 def mirror_map_axes(mirror: MirrorLight, points: Float64[np.ndarray, "n 3"]) -> MapAxes:
-    """Rows that multiply (x, y, z, 1) and give a map's coordinates (0..1) on the plane.
+    """Returns rows that map (x, y, z, 1) to a map's coordinates (0..1) on the plane.
 
-    The map covers where the plane shows the light to the `points`.
+    The map covers the part of the plane that shows the light to the `points`.
     """
     normal, plane = mirror.plane[:3], mirror.plane
     heights = points @ normal + plane[3]
@@ -266,7 +267,7 @@ def mirror_map_axes(mirror: MirrorLight, points: Float64[np.ndarray, "n 3"]) -> 
 
 
 def _pack_mirror(mirror: MirrorLight, layer: int, axes: MapAxes, ranges: Sequence[int]) -> bytes:
-    """std430 Light of an image of a light."""
+    """Packs the std430 Light of a mirror image."""
     own = mirror.tolerance_m, mirror.roughness, float(mirror.surface), float(mirror.source)
     tail = [*mirror.plane, *mirror.f0, float(layer), *axes[0], *axes[1]]
     return _pack_light(mirror.light, ranges, own, tail)
@@ -278,21 +279,19 @@ def _pack_light(
     own: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0),
     tail: Sequence[float] = NOT_MIRRORED,
 ) -> bytes:
-    """std430 Light: place, colour, shape, two axes and an image's own as floats, ranges of its views as integers."""
-    axis_u = axis_v = np.zeros(3)
-    shape = (0.0, 1.0, 0.0)
-    if isinstance(light, DirectionalLight):
-        kind, place, color = 0, light.direction, light.irradiance
-        shape = (math.tan(light.angular_radius_rad), 1.0, 0.0)
-    elif isinstance(light, RectangleLight):
-        kind, place, color = 3, light.position, light.radiance
-        axis_u, axis_v = light.axis_u / 2, light.axis_v / 2
-    elif isinstance(light, SpotLight):
-        kind, place, color, axis_u = 2, light.position, light.intensity, light.direction
-        blend = max(light.half_angle_rad - light.full_angle_rad, NARROWEST_BLEND_RAD)
-        shape = (light.radius_m, light.half_angle_rad / blend, 1.0 / blend)
-    else:
-        kind, place, color = 1, light.position, light.intensity
-        shape = (light.radius_m, 1.0, 0.0)
-    floats = [*place, kind, *color, own[0], *shape, own[1], *axis_u, own[2], *axis_v, own[3], *tail]
+    """Packs a std430 Light: position, colour, shape, two axes and mirror data as floats, view ranges as integers."""
+    r = light.record()
+    floats = [
+        *r.place,
+        r.kind,
+        *r.color,
+        own[0],
+        *r.shape,
+        own[1],
+        *r.axis_u,
+        own[2],
+        *r.axis_v,
+        own[3],
+        *tail,
+    ]
     return np.array(floats, np.float32).tobytes() + np.array(ranges, np.int32).tobytes()

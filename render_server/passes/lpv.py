@@ -1,6 +1,6 @@
-"""Light propagation volumes: their buffers, the weights of a step, and what fills and propagates them.
+"""Light propagation volumes: buffers, transfer weights, initialisation and propagation.
 
-docs/method.md 5; the cells' layout is in shaders/common/light_cells.glsl.
+See docs/method.md 5; shaders/common/light_cells.glsl has the cells' layout.
 """
 
 import math
@@ -14,23 +14,23 @@ from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Bindings, Kernel, list_threads
 from render_server.passes.voxels import VolumePlacement, VoxelMipmap, VoxelStore
 
-COEFFICIENT_BYTES = 16  # a cell and channel: 4 floats
-INJECTED_SUMS = 12  # a cell: 4 coefficients x 3 channels
-COVERED_SUMS = 6  # a cell: its low faces on three axes, surfaces that face - and +
-TRANSMITTED_BYTES = 8  # a cell: its six neighbours, a byte each, padded
+COEFFICIENT_BYTES = 16  # per cell and channel: 4 floats
+INJECTED_SUMS = 12  # per cell: 4 coefficients x 3 channels
+COVERED_SUMS = 6  # per cell: its low faces on three axes, surfaces that face - and +
+TRANSMITTED_BYTES = 8  # per cell: its six neighbours, a byte each, padded
 CONSTANT, LINEAR = 0.5 / math.sqrt(math.pi), math.sqrt(3 / (4 * math.pi))  # Y_0 and Y_1 along its axis
-LOBE = (math.sqrt(math.pi) / 2, math.sqrt(math.pi / 3))  # clamped cosine in them
-FAR_FACE_SR, SIDE_FACE_SR = 0.40067, 0.42343  # as seen from the centre of the neighbouring cell
-DIRECTION_LENGTH = 10 / 32  # of the volume's edge: over so much a step's filter lets directions fade
-FUSED_STEPS = 2  # a dispatch: the rim of two cells still fits 32 KB of shared memory
+LOBE = (math.sqrt(math.pi) / 2, math.sqrt(math.pi / 3))  # of the clamped cosine in them
+FAR_FACE_SR, SIDE_FACE_SR = 0.40067, 0.42343  # solid angles seen from the centre of the neighbouring cell
+DIRECTION_LENGTH = 10 / 32  # of the volume's edge: distance over which a step's filter fades directions
+FUSED_STEPS = 2  # per dispatch: the border of two cells still fits 32 KB of shared memory
 
 
 @dataclass(frozen=True)
 class StepWeights:
-    """What of a cell's coefficients goes on to a neighbour, for both directions of an axis up to sign.
+    """Transfer of a cell's coefficients to a neighbour, for both directions of an axis up to sign.
 
-    `transfer`: (constant from constant, constant from along, along from constant, along from along);
-    `sideways`: across from across, the same for both. The 4x4 matrix has no other non-zeros.
+    `transfer`: (constant from constant, constant from along, along from constant, along from along); `sideways`:
+    across from across, the same for both. The 4x4 matrix has no other non-zeros.
     """
 
     transfer: tuple[float, float, float, float]
@@ -38,7 +38,7 @@ class StepWeights:
 
 
 def lobe_weights() -> StepWeights:
-    """Flux through each far and side face of the cell, sent on as a cosine lobe about that face.
+    """Weights that send the flux through each far and side face of the cell on as a cosine lobe.
 
     [P2], docs/method.md 5.
     """
@@ -56,13 +56,13 @@ def lobe_weights() -> StepWeights:
 
 
 def moment_weights(cells: int) -> StepWeights:
-    """Light keeps its direction: the integral of y_i y_j over the directions that pass the shared face.
+    """Weights that preserve direction: the integral of y_i y_j over the directions through the shared face.
 
-    A sixth of the sphere each, so the six matrices sum to the identity. Then a small fraction of the linear part is
-    left out (a filter as for P_N transport, McClarren & Hauck 2010): without it, steps of the truncated series
-    overshoot. DIRECTION_LENGTH is such that a square emitter of a quarter of the volume's edge does not light itself;
-    it then lights a floor before it within 0.02 of the form factor. Cosine lobes light it with half of its own
-    radiosity.
+    Each face gets a sixth of the sphere, so the six matrices sum to the identity. A small fraction of the linear part
+    is then dropped (a filter as for P_N transport, McClarren & Hauck 2010): without it, steps of the truncated series
+    overshoot. DIRECTION_LENGTH is chosen so that a square emitter of a quarter of the volume's edge does not light
+    itself; it then lights a floor in front of it within 0.02 of the form factor. Cosine lobes light the emitter with
+    half of its own radiosity.
     """
     kept = 1 - 1 / (DIRECTION_LENGTH * cells)
     nodes, weights = np.polynomial.legendre.leggauss(32)
@@ -82,7 +82,7 @@ def moment_weights(cells: int) -> StepWeights:
 
 
 class LightVolume:
-    """State between steps (two buffers in turn) and the total, 3 channels x cells x 4 coefficients each."""
+    """The state between steps (two buffers that swap) and the total; 3 channels x cells x 4 coefficients each."""
 
     def __init__(self, gpu: GpuContext, cells: int) -> None:
         self.cells = cells
@@ -90,7 +90,7 @@ class LightVolume:
         self.state, self.next_state, self.total = (gpu.ctx.buffer(reserve=size) for _ in range(3))
 
     def swap(self) -> None:
-        """Makes what was written the state."""
+        """Makes the last output the current state."""
         self.state, self.next_state = self.next_state, self.state
 
     def release(self) -> None:
@@ -100,17 +100,17 @@ class LightVolume:
 
 
 def injected_sums(gpu: GpuContext, cells: int) -> moderngl.Buffer:
-    """Fixed-point sums of injected light, empty."""
+    """Creates empty fixed-point sums of injected light."""
     return _zeros(gpu, cells**3 * INJECTED_SUMS * 4)
 
 
 def covered_sums(gpu: GpuContext, cells: int) -> moderngl.Buffer:
-    """Fixed-point sums of covered faces, empty."""
+    """Creates empty fixed-point sums of covered faces."""
     return _zeros(gpu, cells**3 * COVERED_SUMS * 4)
 
 
 def transmitted_fractions(gpu: GpuContext, cells: int) -> moderngl.Buffer:
-    """What gets into each cell from its neighbours, packed; nothing until `LpvTransmit` writes it."""
+    """Creates packed transmittances into each cell from its neighbours; zero until `LpvTransmit` writes them."""
     return _zeros(gpu, cells**3 * TRANSMITTED_BYTES)
 
 
@@ -121,13 +121,13 @@ def _zeros(gpu: GpuContext, size: int) -> moderngl.Buffer:
 
 
 class LpvStart:
-    """Turns fixed-point sums of injected light into the state before the first step."""
+    """Converts fixed-point sums of injected light into the state before the first step."""
 
     def __init__(self, gpu: GpuContext) -> None:
         self._kernel = Kernel(gpu, "lpv_start")
 
     def run(self, volume: LightVolume, *sums: moderngl.Buffer) -> None:
-        """Starts state and total of `volume` with one to three `sums`, added up."""
+        """Initialises state and total of `volume` with one to three `sums`, added up."""
         first, second, third = (*sums, None, None)[:3]
         self._kernel.run(
             (volume.cells**3,),
@@ -163,7 +163,10 @@ class LpvShow:
 
 
 class LpvCoverFaces:
-    """Builds the geometry volume: how much of each cell face surfaces cover (Kaplanyan & Dachsbacher 2010)."""
+    """Builds the geometry volume.
+
+    The fraction of each cell face that surfaces cover (Kaplanyan & Dachsbacher 2010).
+    """
 
     def __init__(self, gpu: GpuContext) -> None:
         self._threads = list_threads(gpu)
@@ -172,7 +175,7 @@ class LpvCoverFaces:
     def run(self, covered: moderngl.Buffer, store: VoxelStore, cells: VolumePlacement) -> None:
         """Replaces the sums of `covered` by those of the surfels of `store`.
 
-        `cells` is the placement of the cells; `store` was voxelized at half a cell an edge.
+        `cells` is the placement of the cells; `store` was voxelised at half a cell per edge.
         """
         covered.clear()
         self._kernel.run(
@@ -185,7 +188,7 @@ class LpvCoverFaces:
 
 
 class LpvTransmit:
-    """Computes the fraction of light that gets into each cell from its neighbours past covered faces."""
+    """Computes the fraction of light that enters each cell from its neighbours past covered faces."""
 
     def __init__(self, gpu: GpuContext) -> None:
         self._real = Kernel(gpu, "lpv_transmit")
@@ -207,7 +210,7 @@ class LpvTransmit:
 class LpvPropagate:
     """Propagates light from cell to cell (docs/method.md 5).
 
-    `tiled`: in shared memory, several steps a dispatch (default on a GPU), else one by one.
+    `tiled` runs several steps per dispatch in shared memory (default on a GPU); otherwise each is a dispatch.
     """
 
     def __init__(self, gpu: GpuContext, *, tiled: bool | None = None) -> None:
@@ -221,14 +224,14 @@ class LpvPropagate:
     def run(
         self, volume: LightVolume, weights: StepWeights, steps: int, transmitted: moderngl.Buffer | None
     ) -> None:
-        """Makes `steps` steps; without `transmitted` nothing blocks."""
+        """Runs `steps` steps; without `transmitted` nothing blocks light."""
         medium: Bindings = {
             "Transmitted": transmitted,
             "has_geometry": transmitted is not None,
             "transfer": weights.transfer,
             "sideways": weights.sideways,
         }
-        channels = 3 if self._tiled else 1  # the plain step walks over them
+        channels = 3 if self._tiled else 1  # the plain kernel loops over them
         threads = (volume.cells, volume.cells, channels * volume.cells)
         while steps > 0:
             count = max(count for count in self._kernels if count <= steps)

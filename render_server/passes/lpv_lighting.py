@@ -1,4 +1,4 @@
-"""Light into and out of light propagation volumes: injection, bounces, irradiance of surfaces (docs/method.md 5)."""
+"""Light into and out of light propagation volumes: injection, bounces, surface irradiance (docs/method.md 5)."""
 
 import moderngl
 
@@ -12,7 +12,7 @@ from render_server.passes.voxels import VoxelStore
 
 
 def light_volume_bindings(mu: LightVolume, rho: LightVolume) -> dict[str, Binding]:
-    """The light without and with objects, as shaders/common/lpv_light.glsl reads it."""
+    """Returns the light without and with objects, as shaders/common/lpv_light.glsl reads it."""
     return {"WithoutObjects": mu.total, "WithObjects": rho.total}
 
 
@@ -27,21 +27,21 @@ class LpvInjectMaps:
     def add_real(
         self, sums: moderngl.Buffer, lights: LightBuffers, real_albedo: moderngl.Texture, scene: Bindings
     ) -> None:
-        """Adds what the real scene reflects, as if no object stood in the way."""
+        """Adds the light that the real scene reflects as if there were no objects."""
         views = range(len(lights.real_views))
         _inject_views(self._real, views, lights, scene, Injected=sums, real_albedo=real_albedo)
 
     def add_change(
         self, sums: moderngl.Buffer, lights: LightBuffers, real_albedo: moderngl.Texture, scene: Bindings
     ) -> None:
-        """Adds what the objects reflect, less what the real scene behind them reflected."""
+        """Adds the light that the objects reflect, minus what the real scene behind them reflected."""
         views = _virtual_views(lights)
         _inject_views(self._change, views, lights, scene, Injected=sums, real_albedo=real_albedo)
 
     def add_shadow(
         self, sums: moderngl.Buffer, lights: LightBuffers, real_albedo: moderngl.Texture, scene: Bindings
     ) -> None:
-        """Subtracts the light itself where the objects keep it off the real scene."""
+        """Subtracts the direct light that the objects block from the real scene."""
         views = _virtual_views(lights)
         _inject_views(self._direct, views, lights, scene, Injected=sums, real_albedo=real_albedo)
 
@@ -64,7 +64,7 @@ def _inject_views(
 
 
 class LpvInjectSurfaces:
-    """Adds what surfaces do to the light of the environment, and what they emit, to fixed-point sums."""
+    """Adds the surfaces' reflection of environment light, and their emission, to fixed-point sums."""
 
     def __init__(self, gpu: GpuContext) -> None:
         self._threads = list_threads(gpu)
@@ -86,7 +86,7 @@ class LpvInjectSurfaces:
 
 
 class LpvBounce:
-    """Adds what surfaces reflect of the light that propagation brought to them to fixed-point sums."""
+    """Adds the surfaces' reflection of propagated light to fixed-point sums."""
 
     def __init__(self, gpu: GpuContext) -> None:
         self._threads = list_threads(gpu)
@@ -112,7 +112,7 @@ class LpvBounce:
 
 
 class LpvQuery:
-    """Reads irradiance from light volumes on the reduced grid, into the fields that cones fill elsewhere."""
+    """Reads irradiance from light volumes on the reduced grid, into the fields that other methods trace by cones."""
 
     def __init__(self, gpu: GpuContext) -> None:
         self._real = Kernel(gpu, "lpv_query", REAL=1)
@@ -141,7 +141,7 @@ class LpvQuery:
         )
 
     def read_virtual(self, fields: ConeFields, grid: LowResGrid, rho: LightVolume, scene: Bindings) -> None:
-        """Writes the irradiance of virtual surfaces, and what a mirror there would show."""
+        """Writes the irradiance of virtual surfaces, and the radiance that a mirror there would show."""
         self._virtual.run(
             grid.size,
             grid.bindings,

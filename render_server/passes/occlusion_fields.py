@@ -1,6 +1,6 @@
-"""Occlusion fields of rigid objects: light around them, what they hide of it and what they reflect ([D] 5.2).
+"""Occlusion fields of rigid objects: light around them, occlusion and reflection of it ([D] 5.2, docs/method.md 6).
 
-docs/method.md 6. `place` is where one object stands (`standing_uniforms`, shaders/common/object_field.glsl).
+`place` holds one object's pose (`standing_uniforms`, shaders/common/object_field.glsl).
 """
 
 import moderngl
@@ -23,7 +23,7 @@ PROBE_TEXELS = PROBE_SIZE**2
 
 
 class FieldTextures:
-    """The samples of one field: RGBA16F, four coefficients a slab; and the transfer of reflected light."""
+    """The samples of one field (RGBA16F, four coefficients per slab), and the transfer of reflected light."""
 
     def __init__(self, gpu: GpuContext, field: OcclusionField) -> None:
         self.field = field
@@ -36,12 +36,12 @@ class FieldTextures:
 
     @property
     def slabs(self) -> int:
-        """Slabs of `occlusion` a shell."""
+        """Number of slabs of `occlusion` per shell."""
         return _slab_count(self.field.occlusion)
 
     @property
     def bounce_shape(self) -> tuple[int, int, int]:
-        """Texels of the texture that holds what is reflected under one light: a slab a shell and coefficient."""
+        """Size of the texture of light reflected under one light: a slab per shell and coefficient."""
         size = self.bounce_size
         return size, size, size * len(self.field.occlusion) * LENGTH
 
@@ -69,7 +69,7 @@ def _slabs(gpu: GpuContext, samples: Float16[np.ndarray, "shells n n n k"]) -> m
 
 
 def field_texture(gpu: GpuContext, shape: tuple[int, int, int]) -> moderngl.Texture3D:
-    """RGBA16F volume that is read trilinearly."""
+    """Creates an RGBA16F volume with trilinear filtering."""
     texture = gpu.ctx.texture3d(shape, 4, dtype="f2")
     texture.filter = (moderngl.LINEAR, moderngl.LINEAR)
     texture.repeat_x = texture.repeat_y = texture.repeat_z = False
@@ -81,7 +81,7 @@ def standing_uniforms(
     field: OcclusionField | None,
     bounds: Float32[np.ndarray, "2 3"],
 ) -> dict[str, Binding]:
-    """Where an object and its shells stand; without a field `bounds` (asset's frame) say where its middle is."""
+    """Returns the pose of an object and its shells; without a field, `bounds` (asset's frame) locate its middle."""
     linear = world_from_asset[:3, :3]
     scale = float(np.cbrt(np.linalg.det(linear)))
     low, high = bounds.astype(np.float64)
@@ -104,7 +104,7 @@ def standing_uniforms(
 class LightProbe:
     """Light around one object.
 
-    `radiance`: RGBA16F, octahedral in the asset's axes, a: fraction that the camera sees; `products`: of that
+    `radiance`: RGBA16F, octahedral in the asset's axes, a: fraction seen by the camera. `products`: those of that
     radiance with transfer and harmonics, for every normal.
     """
 
@@ -120,7 +120,7 @@ class LightProbe:
 
 
 class LightProbeCapture:
-    """Fills probes one after the other; `length` is the number of harmonics of an occlusion field."""
+    """Captures probes one after the other; `length` is the number of harmonics of an occlusion field."""
 
     def __init__(self, gpu: GpuContext, length: int) -> None:
         self._length = length
@@ -143,7 +143,7 @@ class LightProbeCapture:
     ) -> None:
         """Sums what the camera sees around the object; reads mip levels of `linear_picture`.
 
-        `changes`: by what factor objects change the light at each texel of the grid; the sum is then of that.
+        `changes` is the factor by which objects change the light at each texel of the grid, applied to the sum.
         """
         self._sums.clear()
         kernel = self._gather if changes is None else self._gather_changed
@@ -158,11 +158,11 @@ class LightProbeCapture:
         )
 
     def forget(self) -> None:
-        """Drops what was gathered, so that the environment alone shines."""
+        """Drops what was gathered, so that only the environment is left."""
         self._sums.clear()
 
     def resolve(self, probe: LightProbe, scene: Bindings, place: Bindings) -> None:
-        """Computes radiance from what was gathered and the environment, and its products."""
+        """Computes radiance from the gathered sums and the environment, and its products."""
         threads = (PROBE_TEXELS,)
         self._resolve.run(threads, place, scene, self.bindings, ProbeSums=self._sums, probe=probe.radiance)
         self.multiply(probe)
@@ -183,7 +183,7 @@ class LightProbeCapture:
 
 
 def _direction_table() -> Float32[np.ndarray, "texels columns"]:
-    """Solid angle (sr) and harmonics of each texel of a probe."""
+    """Returns the solid angle (sr) and harmonics of each texel of a probe."""
     directions = octahedral_grid(PROBE_SIZE).reshape(-1, 3)
     solid_angles = texel_solid_angles(PROBE_SIZE).ravel()
     table = np.column_stack([solid_angles, harmonics(directions, MAX_ORDER)])
@@ -191,11 +191,11 @@ def _direction_table() -> Float32[np.ndarray, "texels columns"]:
 
 
 class OcclusionShade:
-    """Computes what objects leave of natural light on the reduced grid, one object after the other.
+    """Computes the natural light that objects leave on the reduced grid, one object after the other.
 
-    At the real surfaces (`real`), or at the objects'.
-    RGBA32F each: `unoccluded` is the fraction of the irradiance that is left; `natural` the weighted irradiance of
-    each object's surroundings; `mirrored` the weighted radiance in mirrors there, a: fraction that is left.
+    At the real surfaces (`real`) or at the objects'. RGBA32F each: `unoccluded` is the remaining fraction of the
+    irradiance; `natural` the weighted irradiance of each object's surroundings; `mirrored` the weighted radiance in
+    mirrors there, a: remaining fraction.
     """
 
     def __init__(self, gpu: GpuContext, size: tuple[int, int], length: int, *, real: bool) -> None:
@@ -212,7 +212,7 @@ class OcclusionShade:
         *,
         first: bool,
     ) -> None:
-        """Takes one object into account; the `first` one begins anew. Without a field it hides nothing."""
+        """Accumulates one object; the `first` one clears the sums. An object without a field occludes nothing."""
         self._kernel.run(
             grid.size,
             grid.bindings,
@@ -251,7 +251,7 @@ class OcclusionShow:
     ) -> None:
         """Adds one object to level 0 of `shown`, which has one direction.
 
-        The `first` object begins anew, and without a field shows nothing.
+        The `first` object clears it. An object without a field shows nothing.
         """
         cells = shown.texture.width
         self._kernel.run(
@@ -271,7 +271,7 @@ class OcclusionShow:
 
 
 class LightChange:
-    """Computes by what factor the objects change the light of the real surfaces, on the reduced grid.
+    """Computes the factor by which objects change the light of real surfaces, on the reduced grid.
 
     `changes` (RGBA16F): E_rho / E_mu of lamps and natural light.
     """
@@ -281,7 +281,7 @@ class LightChange:
         self._kernel = Kernel(gpu, "light_change", REAL=1)
 
     def run(self, grid: LowResGrid, shade: OcclusionShade, scene: Bindings) -> None:
-        """Compares what `shade` found for the real surfaces."""
+        """Computes the factor from what `shade` found for the real surfaces."""
         self._kernel.run(
             grid.size,
             grid.bindings,
@@ -298,7 +298,7 @@ class LightChange:
 
 
 class ObjectBounceLight:
-    """Computes the light that objects reflect onto what is around them, from their transfer fields.
+    """Computes the light that objects reflect onto their surroundings, from their transfer fields.
 
     `irradiance` and `mirrored` (radiance of objects in mirrors) are RGBA32F on the reduced grid.
     """
@@ -319,9 +319,9 @@ class ObjectBounceLight:
         scene: Bindings,
         place: Bindings,
     ) -> None:
-        """Writes what the object sends back of its light into `bounce_light`.
+        """Writes the light that the object reflects into `bounce_light`.
 
-        `scene` holds the bindings of the `LightProbeCapture` too, `place` the object's `reflectance`.
+        `scene` includes the bindings of the `LightProbeCapture`, `place` the object's `reflectance`.
         """
         assert field.transfer is not None
         self._light.run((LENGTH,), place, scene, probe=probe.radiance, Incident=self._incident)
@@ -345,7 +345,7 @@ class ObjectBounceLight:
         first: bool,
         real: bool,
     ) -> None:
-        """Adds one object's light; the `first` one begins anew."""
+        """Adds one object's light; the `first` one clears the sums."""
         kernel = self._real if real else self._virtual
         kernel.run(
             grid.size,
@@ -367,7 +367,7 @@ class ObjectBounceLight:
 
 
 class NaturalFields:
-    """Writes natural light without and with the objects into the fields that cones fill elsewhere."""
+    """Writes natural light without and with the objects into the fields that other methods trace by cones."""
 
     def __init__(self, gpu: GpuContext) -> None:
         self._real = Kernel(gpu, "natural_fields", REAL=1)
@@ -383,7 +383,7 @@ class NaturalFields:
         *,
         real: bool,
     ) -> None:
-        """Writes those of real or of virtual surfaces; without `bounce_light` objects reflect nothing."""
+        """Writes the fields of real or of virtual surfaces; without `bounce_light` objects reflect nothing."""
         kernel = self._real if real else self._virtual
         written: Bindings = {"irradiance_rho": fields.virtual, "specular_rho": fields.virtual_specular}
         if real:

@@ -1,4 +1,4 @@
-"""The objects' triangles and the hierarchy over them on the GPU, for rays."""
+"""The objects' triangles and a bounding volume hierarchy over them on the GPU, for ray tracing."""
 
 import numpy as np
 from jaxtyping import Float32, Float64
@@ -8,13 +8,13 @@ from render_server.gpu.kernel import Binding
 from render_server.passes.gbuffer import MeshBuffers
 from render_server.scene.bvh import Bvh, build_bvh
 
-# Refitting costs a tenth of building (9 000 triangles: 5 against 51 ms; 78 000: 53 against 806), so a hierarchy may
-# come to cost rays half as much again before it is built anew.
+# Refitting costs a tenth of building (9 000 triangles: 5 against 51 ms; 78 000: 53 against 806), so rays through a
+# hierarchy may become half as expensive again before it is rebuilt.
 WORN = 1.5
 
 
 class ObjectBvh:
-    """Bounding volume hierarchy of the objects; renewed only when they moved and rays are really traced."""
+    """Bounding volume hierarchy of the objects; updated only when they moved and rays are traced."""
 
     def __init__(self, gpu: GpuContext) -> None:
         self._ctx = gpu.ctx
@@ -33,14 +33,14 @@ class ObjectBvh:
         bounds: tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]],
         mesh: MeshBuffers,
     ) -> None:
-        """Takes triangles (positions first), their bounds (m) and their vertices; another array is another shape."""
+        """Sets triangles (positions first), their bounds (m) and vertices; a changed array is a changed shape."""
         low, high = bounds
         self.centre, self.radius = (low + high) / 2, float(np.linalg.norm(high - low) / 2)
         self._corners, self._mesh = corners, mesh
 
     @property
     def bindings(self) -> dict[str, Binding]:
-        """What shaders/common/ray_mesh.glsl reads; brings the hierarchy up to date first."""
+        """The bindings of shaders/common/ray_mesh.glsl; brings the hierarchy up to date first."""
         assert self._mesh is not None
         if self._corners is not self._built:
             self._built = self._corners
@@ -52,7 +52,7 @@ class ObjectBvh:
         return {"Nodes": self._nodes, "Faces": self._faces, **self._mesh.storage}
 
     def _renewed(self, positions: Float32[np.ndarray, "m 3 3"]) -> Bvh:
-        """The hierarchy of the triangles as they are: the old one refitted, as long as it serves."""
+        """Returns the hierarchy of the current triangles: the old one refitted, as long as it is good enough."""
         bvh = self._bvh
         if bvh is not None and len(bvh.order) == len(positions):
             bvh = bvh.refitted(positions)

@@ -13,19 +13,19 @@ from render_server.passes.cones import ConeFields, LowResGrid
 from render_server.passes.ray_tracing import ObjectBvh
 from render_server.passes.shading import DirectLight
 
-# Of equal energy each: up to RAY_ROUGHNESS they stand closer than voxels do. There the cone of the lobe is 48 degrees
-# wide and the rays some 12 apart: a fifth of an object's length away from it, six of 64 voxels.
+# Of equal energy each: up to RAY_ROUGHNESS they are closer together than voxels. There the cone of the lobe is 48
+# degrees wide and the rays some 12 apart: a fifth of an object's length away from it, six of 64 voxels.
 RAY_COUNT = 16
-# Of surfaces; from here on cones serve. They span many voxels there, and so few rays would show as grain.
+# Of surfaces; rougher ones use cones. These span many voxels there, and so few rays would show as grain.
 RAY_ROUGHNESS = 0.3
-GROUP = 64  # invocations of a workgroup, one a ray
-ROW = 256  # workgroups a row: OpenGL promises no more than 65535
+GROUP = 64  # invocations of a workgroup, one per ray
+ROW = 256  # workgroups per row: OpenGL guarantees at most 65535
 
-# A lobe that holds 85 % of its energy within 45 degrees and more is as good as diffuse: the wider cones serve.
+# A lobe with 85 % of its energy within 45 degrees or more is as good as diffuse: the wider cones serve.
 ROUGHEST = GREATEST_ALPHA**0.5
 CONE_COUNT = 4
-# A disc of even weight whose median is that of the GGX lobe has so many times alpha as its half-angle (rad): half of
-# the lobe lies within 2 alpha, half of a disc within 1 / sqrt(2) of its radius. The cones share the disc.
+# A uniform disc with the median of the GGX lobe has this multiple of alpha as its half-angle (rad): half of the lobe
+# lies within 2 alpha, half of a disc within 1 / sqrt(2) of its radius. The cones share the disc.
 MEDIAN_DISC = 2.0 * 2.0**0.5 / CONE_COUNT**0.5
 
 
@@ -33,8 +33,8 @@ class MirrorRays:
     """Traces the virtual objects in smooth real surfaces by rays, because cones through voxels would blur them.
 
     `reflection` (RGBA16F): radiance of the objects times the fraction of the lobe that they fill, and that fraction.
-    `gather` completes the name of the kernel that finds the light of reflected points (`mirror_gather...`); `defines`
-    are those that it needs.
+    `gather` completes the name of the kernel that lights reflected points (`mirror_gather...`); `defines` are that
+    kernel's.
     """
 
     def __init__(
@@ -61,9 +61,9 @@ class MirrorRays:
         )
 
     def run(self, light: Bindings, scene: Bindings) -> None:
-        """Fills `reflection`; `light` is what the gathering kernel reads beside the scene.
+        """Fills `reflection`; `light` holds what the gathering kernel reads besides the scene.
 
-        Waits for the GPU to say how many pixels need rays: where none do, nothing is built or traced.
+        Waits for the GPU to count the pixels that need rays; builds and traces nothing if there are none.
         """
         count = self._list_pixels(scene)
         if not count:
@@ -80,7 +80,7 @@ class MirrorRays:
         )
 
     def _list_pixels(self, scene: Bindings) -> int:
-        """Lists the pixels that need rays and returns how many they are; the others reflect nothing."""
+        """Lists the pixels that need rays and returns their number; the others reflect nothing."""
         _clear_list(self._pixels)
         self._select.run(
             self._grid.picture_size,
@@ -95,7 +95,7 @@ class MirrorRays:
         return _list_length(self._pixels)
 
     def _gather_light(self, light: Bindings, scene: Bindings) -> None:
-        """Finds the light at reflected points, at the resolution of the cones."""
+        """Computes the light at reflected points, at the resolution of the cones."""
         grid = self._grid
         _clear_list(self._texels)
         self._hits.run(
@@ -145,11 +145,11 @@ class MirrorRays:
 
 
 class ScreenCones:
-    """Traces what smooth virtual surfaces reflect of the real scene that the camera sees ([D] 4.4.2).
+    """Traces what smooth virtual surfaces reflect of the visible real scene ([D] 4.4.2).
 
     `reflected` (RGBA16F): radiance times fraction of the specular lobe, and that fraction, on the picture's grid.
-    `march`: the defines of march.glsl where what the picture does not show is looked for among voxels and in the
-    environment; the fraction is 1 then. None: that fraction of the lobe remains for others.
+    `march` are defines of march.glsl to look up in voxels and environment what the picture does not show; the
+    fraction is then 1. None: that fraction of the lobe is left to other passes.
     """
 
     def __init__(self, gpu: GpuContext, grid: LowResGrid, march: Mapping[str, float | str] | None) -> None:
@@ -162,7 +162,7 @@ class ScreenCones:
         )
 
     def run(self, direct: DirectLight, cones: ConeFields, objects: ObjectBvh, scene: Bindings) -> None:
-        """Fills `reflected`; the picture needs its levels (`CameraImage.build_levels`)."""
+        """Fills `reflected`; the picture needs its mip levels (`CameraImage.build_levels`)."""
         self._kernel.run(
             (self._threads,),
             objects.bindings,
@@ -184,10 +184,10 @@ class ScreenCones:
 
 
 def _clear_list(texels: moderngl.Buffer) -> None:
-    """Empties a list of shaders/common/work_list.glsl."""
+    """Clears a list of shaders/common/work_list.glsl."""
     texels.write(bytes(4))
 
 
 def _list_length(texels: moderngl.Buffer) -> int:
-    """Waits for the GPU and returns how many texels a list holds."""
+    """Returns the length of a list of texels; waits for the GPU."""
     return int(np.frombuffer(texels.read(4), np.uint32)[0])

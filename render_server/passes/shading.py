@@ -1,4 +1,4 @@
-"""Full-resolution shading: direct light on the real surfaces, and the radiance of the virtual ones."""
+"""Full-resolution shading: direct light on the real surfaces, and radiance of the virtual ones."""
 
 import moderngl
 
@@ -13,8 +13,8 @@ from render_server.passes.lights import LightBuffers
 class DirectLight:
     """E_mu and E_rho of the lights (RGBA16F), and their lobes on declared specular surfaces.
 
-    With `shadow_cones` the objects' shadows come from cones through voxels ([P1] eq. 4) of so many directions;
-    without, from the shadow maps; without `objects_shadow`, from elsewhere, and E_rho is E_mu.
+    With `shadow_cones`, that many cones through voxels give the objects' shadows ([P1] eq. 4); without, shadow maps
+    do. Without `objects_shadow` other passes do, and E_rho is E_mu.
     """
 
     def __init__(
@@ -37,7 +37,7 @@ class DirectLight:
 
     @property
     def bindings(self) -> dict[str, Binding]:
-        """What is filled, by its name in shaders."""
+        """Its textures by GLSL name."""
         return {
             "direct_mu": self.mu,
             "direct_rho": self.rho,
@@ -53,7 +53,7 @@ class DirectLight:
         joint: moderngl.Texture3D | None = None,
         caustics: Caustics | None = None,
     ) -> None:
-        """Shades every pixel. `joint`: the voxels that shadow cones go through; `caustics`: added to E_rho."""
+        """Shades every pixel. `joint`: the voxels that shadow cones march through; `caustics`: added to E_rho."""
         voxels: dict[str, Binding] = {} if joint is None else {"joint_pyramid": joint}
         self._kernel.run(self._size, self.bindings, voxels, _caustics_on(grid, caustics), scene)
 
@@ -74,7 +74,7 @@ class DirectLightPair(DirectLight):
         self._unused = texture_2d(gpu, size, 4, "f2")
 
     def run_both(self, mu: LightBuffers, rho: LightBuffers, grid: LowResGrid, scene: Bindings) -> None:
-        """Shades every pixel twice."""
+        """Shades every pixel in both solutions."""
         self.run(grid, {**scene, **mu.bindings})
         self._kernel.run(
             self._size,
@@ -91,7 +91,7 @@ class DirectLightPair(DirectLight):
 
 
 class VirtualSurface:
-    """Radiance of the virtual surfaces (RGBA16F) on the picture's grid, where the objects cover it."""
+    """Radiance of the virtual surfaces (RGBA16F) on the picture's grid, where objects cover it."""
 
     def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
         self._threads = list_threads(gpu, size[0] * size[1])
@@ -127,6 +127,6 @@ class VirtualSurface:
 
 
 def _caustics_on(grid: LowResGrid, caustics: Caustics | None) -> dict[str, Binding]:
-    """What shaders/common/caustics.glsl reads beside the scene."""
+    """Returns the bindings that shaders/common/caustics.glsl reads besides the scene."""
     sums: dict[str, Binding] = {"CausticSums": None} if caustics is None else caustics.bindings
     return {"sample_pixels": grid.pixels, "scale": grid.scale, **sums}

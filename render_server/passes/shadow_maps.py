@@ -1,8 +1,9 @@
-"""Reflective shadow maps: what each light sees first of a geometry, and the views that its maps need."""
+"""Reflective shadow maps: the first surface that each light sees, and the views that its maps need."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import moderngl
 import numpy as np
@@ -11,7 +12,8 @@ from jaxtyping import Float64
 from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import RasterKernel
 from render_server.gpu.textures import release_target, texture_2d
-from render_server.lights.lights import DirectionalLight, Light, MirrorLight, RectangleLight, SpotLight
+from render_server.lights.lights import DirectionalLight, Lamp, Light
+from render_server.lights.mirror_lights import MirrorLight
 from render_server.passes.gbuffer import MeshBuffers
 
 NEAR_MARGIN = 0.98  # near and far planes lie a little outside of what they enclose
@@ -23,10 +25,10 @@ EVERYWHERE = (0.0, 0.0, 0.0, 1.0)  # the plane before which everything lies
 
 @dataclass(frozen=True, eq=False)
 class LightView:
-    """One tile of a light's depth map: the frame (light at the origin, looking along +z) and what it encloses.
+    """One tile of a light's depth map: its frame (light at the origin, looking along +z) and extent.
 
-    `half_extent` is in metres for a directional light, the tangent of the half angle for all others.
-    `front` is the plane a, b, c, d (world) before which ax + by + cz + d >= 0 the light shines, if only there.
+    `half_extent` is in metres for a directional light, the tangent of the half angle for all others. `front` is a
+    plane a, b, c, d (world): the light shines only where ax + by + cz + d >= 0.
     """
 
     view_from_world: Float64[np.ndarray, "4 4"]
@@ -38,14 +40,14 @@ class LightView:
 
     @property
     def texel_span(self) -> float:
-        """Extent of the tile; divided by its texels: m (directional) or tangent a texel."""
+        """Extent of the tile; divided by its texels: m (directional) or tangent per texel."""
         return 2.0 * self.half_extent
 
 
 class ShadowMapAtlas:
     """One depth texture and its reflective layers, a tile for every light view of one geometry set.
 
-    `normal` (RGBA16F) holds the normal and the material, `uv` (RGBA32F) the texture coordinate and the vertex colour.
+    `normal` (RGBA16F) holds normal and material, `uv` (RGBA32F) texture coordinates and vertex colour.
     """
 
     def __init__(self, gpu: GpuContext, tiles: int, tile_size: int) -> None:
@@ -62,13 +64,13 @@ class ShadowMapAtlas:
         self.clear()
 
     def clear(self) -> None:
-        """Empties all tiles."""
+        """Clears all tiles."""
         self.target.use()
         self.target.viewport = (0, 0, *self.size)
         self.target.clear(0.0, 0.0, 0.0, 0.0, depth=1.0)
 
     def box(self, tile: int) -> tuple[int, int, int, int]:
-        """Where a tile lies: x, y, width, height in texels."""
+        """Returns the position of a tile: x, y, width, height in texels."""
         x, y = tile % self.columns, tile // self.columns
         return x * self.tile_size, y * self.tile_size, self.tile_size, self.tile_size
 
@@ -112,17 +114,16 @@ def light_views(
 ) -> list[LightView]:
     """Views that enclose the receivers (world points) as far as the light shines: one, or faces of a cube.
 
-    The occluders set where a view begins: what stands between the light and the receivers is in it. A
-    rectangle looks from its centre.
+    The occluders set where a view begins: what stands between the light and the receivers is in it. A lamp looks
+    from its centre.
     """
     if isinstance(light, DirectionalLight):
         return [_orthographic_view(np.asarray(light.direction, float), receivers, occluders)]
-    position = np.asarray(light.position, float)
-    if isinstance(light, RectangleLight):
-        return _rectangle_views(light, position, receivers, occluders)
-    if isinstance(light, SpotLight):
-        return _spot_views(light, position, receivers, occluders)
-    return _views_around(position, receivers, occluders)
+    if light.front is None:
+        return _lamp_views(light, receivers, occluders)
+    # The lamp's own housing and the wall behind it are left out.
+    front = light.front - np.array([0.0, 0.0, 0.0, NEAREST_M])
+    return _before(front, receivers, occluders, partial(_lamp_views, light))
 
 
 def mirror_views(
@@ -131,12 +132,39 @@ def mirror_views(
     occluders: Float64[np.ndarray, "m 3"],
     above_m: float = 0.0,
 ) -> list[LightView]:
-    """Views of an image of a light, of what stands before its plane by more than `above_m`."""
+    """Returns the views of a mirror image, of what lies more than `above_m` in front of its plane."""
     front = mirror.plane - np.array([0.0, 0.0, 0.0, above_m])
+    return _before(front, receivers, occluders, partial(light_views, mirror.light))
+
+
+def _before(
+    front: Float64[np.ndarray, "4"],
+    receivers: Float64[np.ndarray, "n 3"],
+    occluders: Float64[np.ndarray, "m 3"],
+    views_of: Callable[[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "m 3"]], list[LightView]],
+) -> list[LightView]:
+    """Views of what lies before a plane."""
     receivers, occluders = (points[points @ front[:3] + front[3] > 0] for points in (receivers, occluders))
     if not len(receivers):
         return []
-    return [replace(view, front=front) for view in light_views(mirror.light, receivers, occluders)]
+    return [replace(view, front=front) for view in views_of(receivers, occluders)]
+
+
+def _lamp_views(
+    lamp: Lamp, receivers: Float64[np.ndarray, "n 3"], occluders: Float64[np.ndarray, "m 3"]
+) -> list[LightView]:
+    """Views around the receivers, or the lamp's cone where that is narrower."""
+    position = np.asarray(lamp.position, float)
+    around = _views_around(position, receivers, occluders)
+    if lamp.cone is None:
+        return around
+    axis, half_angle = lamp.cone
+    half = math.tan(half_angle) * 1.01
+    if half > WIDEST_SINGLE_TANGENT or (len(around) == 1 and around[0].half_extent <= half):
+        return around
+    if not ((receivers - position) @ axis > NEAREST_M).any():
+        return []
+    return [_wide_view(position, axis, half, receivers, occluders)]
 
 
 def _views_around(
@@ -155,40 +183,8 @@ def _views_around(
     ]
 
 
-def _spot_views(
-    light: SpotLight,
-    position: Float64[np.ndarray, "3"],
-    receivers: Float64[np.ndarray, "n 3"],
-    occluders: Float64[np.ndarray, "m 3"],
-) -> list[LightView]:
-    """The cone, unless a view of the receivers alone is narrower."""
-    half = math.tan(light.half_angle_rad) * 1.01
-    around = _views_around(position, receivers, occluders)
-    if half > WIDEST_SINGLE_TANGENT or (len(around) == 1 and around[0].half_extent <= half):
-        return around
-    axis = np.asarray(light.direction, float)
-    if not ((receivers - position) @ axis > NEAREST_M).any():
-        return []
-    return [_wide_view(position, axis, half, receivers, occluders)]
-
-
-def _rectangle_views(
-    light: RectangleLight,
-    position: Float64[np.ndarray, "3"],
-    receivers: Float64[np.ndarray, "n 3"],
-    occluders: Float64[np.ndarray, "m 3"],
-) -> list[LightView]:
-    """Views of what lies before the rectangle; the lamp's own housing and the wall behind it are left out."""
-    normal = light.normal
-    front = np.append(normal, -normal @ position - NEAREST_M)
-    receivers, occluders = (points[points @ front[:3] + front[3] > 0] for points in (receivers, occluders))
-    if not len(receivers):
-        return []
-    return [replace(view, front=front) for view in _views_around(position, receivers, occluders)]
-
-
 def frame_along(axis: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
-    """Rotation whose rows are right, down, and the unit axis."""
+    """Returns the rotation whose rows are right, down, and the unit axis."""
     z = axis / np.linalg.norm(axis)
     helper = np.eye(3)[np.argmin(np.abs(z))]
     x = np.cross(helper, z)
@@ -199,7 +195,7 @@ def frame_along(axis: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
 def _matrix(
     rotation: Float64[np.ndarray, "3 3"], origin: Float64[np.ndarray, "3"]
 ) -> Float64[np.ndarray, "4 4"]:
-    """view_from_world of a frame with its origin in the world."""
+    """Returns view_from_world of a frame with its origin in the world."""
     matrix = np.eye(4)
     matrix[:3, :3] = rotation
     matrix[:3, 3] = -rotation @ origin
@@ -223,7 +219,7 @@ def _orthographic_view(
 
 
 def _tangents(local: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:
-    """Greater tangent of each point's direction against +z, per axis; infinite behind the light."""
+    """Returns the greater tangent of each point's direction to +z, per axis; infinite behind the light."""
     tangents = np.abs(local[:, :2]).max(axis=1) / np.maximum(local[:, 2], NEAREST_M)
     return np.where(local[:, 2] > NEAREST_M, tangents, np.inf)
 
@@ -231,7 +227,7 @@ def _tangents(local: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:
 def _depth_range(
     local: Float64[np.ndarray, "n 3"], blocking: Float64[np.ndarray, "m 3"], half: float
 ) -> tuple[float, float]:
-    """Near plane before all that can block within the view, far plane behind the receivers."""
+    """Returns a near plane in front of all that can block within the view, a far plane behind the receivers."""
     within = blocking[_tangents(blocking) <= half]
     depths = np.concatenate([within[:, 2], local[_tangents(local) <= half][:, 2]])
     near = max(float(depths.min(initial=local[:, 2].max())) * NEAR_MARGIN, NEAREST_M)
@@ -244,7 +240,7 @@ def _perspective_view(
     receivers: Float64[np.ndarray, "n 3"],
     occluders: Float64[np.ndarray, "m 3"],
 ) -> LightView | None:
-    """View along `axis` around all receivers; None if that is too wide for one view."""
+    """Returns the view along `axis` around all receivers; None if that is too wide for one view."""
     if np.linalg.norm(axis) < NEAREST_M:
         return None
     rotation = frame_along(axis)
@@ -263,7 +259,7 @@ def _wide_view(
     receivers: Float64[np.ndarray, "n 3"],
     occluders: Float64[np.ndarray, "m 3"],
 ) -> LightView:
-    """View along `axis` up to the tangent `half`, whatever of the receivers lies in it."""
+    """Returns the view along `axis` up to the tangent `half`, whichever receivers lie in it."""
     rotation = frame_along(axis)
     local = (receivers - position) @ rotation.T
     near, far = _depth_range(local, (occluders - position) @ rotation.T, half)
@@ -273,18 +269,18 @@ def _wide_view(
 
 
 def texel_size_m(view: LightView, tile_size: int, distance_m: float) -> float:
-    """What a texel spans at a distance from the light, m."""
+    """Returns the size of a texel at a distance from the light, m."""
     span = view.texel_span / tile_size
     return span if view.orthographic else span * float(np.abs(distance_m))
 
 
 def tile_columns(count: int) -> int:
-    """Tiles a row of an atlas of `count` tiles."""
+    """Returns the tiles per row of an atlas of `count` tiles."""
     return max(1, math.ceil(math.sqrt(count)))
 
 
 def pack_view(view: LightView, tile: int, columns: int, tile_size: int) -> Float64[np.ndarray, "28"]:
-    """std430 LightView: matrix by columns, tile, range, front."""
+    """Packs a std430 LightView: matrix by columns, tile, range, front."""
     x, y = (tile % columns) * tile_size, (tile // columns) * tile_size
     return np.concatenate(
         [

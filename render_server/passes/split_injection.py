@@ -8,13 +8,13 @@ from render_server.gpu.textures import texture_2d
 from render_server.passes.lights import LightBuffers
 from render_server.passes.voxels import PlacedVolume, VoxelMipmap, VoxelStore
 
-LIGHT_SUMS = 6  # a slot: V_delta and V_rho, three channels each
+LIGHT_SUMS = 6  # per slot: V_delta and V_rho, three channels each
 
 
 class RealAlbedo:
-    """Albedo of the real scene as the lights see it ([P2] eq. 1): an RGBA16F atlas beside the real depth maps.
+    """Albedo of the real scene as seen from the lights ([P2] eq. 1): an RGBA16F atlas like the real depth maps.
 
-    Only the texels of which a part may lie inside the volume are filled.
+    Only texels that may lie inside the volume are filled.
     """
 
     def __init__(self, gpu: GpuContext) -> None:
@@ -38,7 +38,7 @@ class RealAlbedo:
 
 
 class SplitInjection:
-    """Sums into `delta_sums` of both stores (fixed point, so that the order of threads does not matter)."""
+    """Sums into `delta_sums` of both stores, in fixed point, so that the order of threads does not matter."""
 
     def __init__(self, gpu: GpuContext) -> None:
         self._real = Kernel(gpu, "split_inject")
@@ -77,7 +77,7 @@ class SplitInjection:
 class ResolveInjection:
     """Writes the sums to level 0 of V_delta and V_rho, with the marker of V_eta.
 
-    It walks the real set, then what only the virtual set touched.
+    Processes the real set, then what only the virtual set touched.
     """
 
     def __init__(self, gpu: GpuContext) -> None:
@@ -112,7 +112,7 @@ class ResolveInjection:
 
 
 class FilterIsotropic:
-    """Filters the levels of V_delta and V_rho above level 0, one dispatch a level for both."""
+    """Filters the levels of V_delta and V_rho above level 0, one dispatch per level for both."""
 
     def __init__(self, gpu: GpuContext) -> None:
         self._kernel = Kernel(gpu, "filter_isotropic", DIRECTIONS=1)

@@ -1,4 +1,7 @@
-"""Light of voxels: direct and measured, and what surfels gather from voxels around them (docs/method.md 4.3)."""
+"""Light of voxels.
+
+Direct and measured, and light that surfels gather from voxels around them (docs/method.md 4.3).
+"""
 
 from collections.abc import Mapping
 from typing import Any, Final
@@ -21,17 +24,17 @@ GROUP_LIGHT_BYTES = 32
 HEADER_BYTES = 8
 NO_GROUPS: Final[Bindings] = {"SurfelLights": None}
 
-GATHER_CONES = 4  # as good as 16 in pictures: the cones that see gathered light average over many groups
-# In software, by 64 voxels an edge: lists are short here, and the last round of more walkers would mostly be idle.
-# Groups lie on surfaces, so their number grows with the square of the edge; so few each keep a walker's loops short
-# of where Mesa cuts them off (SOFTWARE_SHARE in gpu/kernel.py).
+GATHER_CONES = 4  # as good as 16 in pictures: cones that see gathered light average over many groups
+# In software, per 64 voxels of edge: lists are short, and more walkers would mostly idle in the last round. Groups
+# lie on surfaces, so their number grows with the square of the edge; this many keep each walker's loops short of
+# where Mesa cuts them off (SOFTWARE_SHARE in gpu/kernel.py).
 SOFTWARE_WALKERS = 256
 
 
 class SurfelGroups:
-    """Groups of surfels for which light is gathered together, and each surfel's own light, beside one voxel store.
+    """Groups of surfels that gather light together, and each surfel's own light, for one voxel store.
 
-    There is room for a group a surfel; blocks of 2^3 voxels mostly hold many surfels of one main axis.
+    There is room for one group per surfel; blocks of 2^3 voxels mostly hold many surfels of one main axis.
     """
 
     def __init__(self, gpu: GpuContext, volume_size: int) -> None:
@@ -51,7 +54,7 @@ class SurfelGroups:
         }
 
     def start(self, store: VoxelStore) -> None:
-        """Forgets all groups and makes room for those of `store`."""
+        """Clears all groups and makes room for those of `store`."""
         if store.surfel_capacity != self._room:
             self._release_growing()
             self._allocate(store.surfel_capacity)
@@ -59,7 +62,7 @@ class SurfelGroups:
         self._entries.write(bytes(HEADER_BYTES))
 
     def _allocate(self, surfels: int) -> None:
-        """Makes the buffers that grow, with room for `surfels` surfels."""
+        """Allocates the buffers that grow, with room for `surfels` surfels."""
         self._room = surfels
         self.lights = self._ctx.buffer(reserve=max(surfels, 1) * SURFEL_LIGHT_BYTES)
         self._entries = self._ctx.buffer(reserve=HEADER_BYTES + surfels * 4)
@@ -71,7 +74,7 @@ class SurfelGroups:
             buffer.release()
 
     def counts(self) -> tuple[int, int]:
-        """Groups, and those among them with surfels that the camera does not see; waits for the GPU."""
+        """Returns the number of groups, and of those with surfels that the camera does not see; waits for the GPU."""
         groups, unseen = np.frombuffer(self._entries.read(HEADER_BYTES), np.uint32)
         return int(groups), int(unseen)
 
@@ -82,11 +85,11 @@ class SurfelGroups:
 
 
 class LightVoxels:
-    """Sums the radiance and opacity of each surfel per direction: real without objects, real's change, virtual; real
-    of a full solution.
+    """Sums the radiance and opacity of each surfel per direction, by kind of sum.
 
-    With `gathered`, what the surfels' groups gathered takes the place of the unoccluded ambient light, and the sums
-    change by that; direct light is that of the last walk without.
+    The kinds are real light without objects, the real change, virtual light, and real light of a full solution. With
+    `gathered`, gathered light replaces unoccluded ambient light, and the sums change by the difference; direct light
+    is that of the last run without.
     """
 
     def __init__(self, gpu: GpuContext) -> None:
@@ -114,7 +117,7 @@ class LightVoxels:
     def light_real_delta(
         self, store: VoxelStore, scene: Bindings, groups: SurfelGroups, *, gathered: bool = False
     ) -> None:
-        """Sums c_rho - c_mu of real surfaces, of which `groups` keep L_mu; the support grows."""
+        """Sums c_rho - c_mu of real surfaces, whose L_mu `groups` hold; extends the support."""
         store.delta_sums.clear()
         self._run("REAL_DELTA", store, groups, scene, gathered=gathered)
 
@@ -126,7 +129,7 @@ class LightVoxels:
         *,
         gathered: bool = False,
     ) -> None:
-        """Sums c and a of the virtual surfaces; `groups` keep each surfel's light."""
+        """Sums c and a of virtual surfaces; `groups` keep each surfel's light."""
         self._run("VIRTUAL", store, groups, scene, gathered=gathered)
 
     def light_solution(
@@ -138,8 +141,9 @@ class LightVoxels:
         with_objects: bool,
         gathered: bool = False,
     ) -> None:
-        """Sums anew all light and opacity of real surfaces under the maps of `scene`; without objects first, as
-        `groups` keep E_mu for the other.
+        """Sums all light and opacity of real surfaces under the maps of `scene`.
+
+        Run it without objects first, so that `groups` hold E_mu for the other solution.
         """
         store.sums.clear()
         self._run("REAL_RHO" if with_objects else "REAL_MU", store, groups, scene, gathered=gathered)
@@ -158,7 +162,7 @@ class LightVoxels:
         )
 
     def _kernel(self, kind: str, *, gathered: bool) -> Kernel:
-        """Compiled when it is first needed."""
+        """Returns the kernel, compiled on first use."""
         if (kind, gathered) not in self._kernels:
             defines = {kind: 1, "GREATEST_ALPHA": GREATEST_ALPHA, **({"GATHERED": 1} if gathered else {})}
             self._kernels[kind, gathered] = Kernel(self._gpu, "light_voxels", **defines)
@@ -176,7 +180,7 @@ class LightVoxels:
 
 
 class GroupSurfels:
-    """Walks the surfels twice: finds the groups, then adds up each one's area, normal and place."""
+    """Walks the surfels twice: finds the groups, then sums each group's area, normal and position."""
 
     def __init__(self, gpu: GpuContext) -> None:
         self._threads = list_threads(gpu)
@@ -184,7 +188,7 @@ class GroupSurfels:
         self._sum = Kernel(gpu, "group_surfels", SUM=1)
 
     def run(self, store: VoxelStore, groups: SurfelGroups, scene: Bindings, *, has_seen: bool) -> None:
-        """Fills `groups` (started before); `has_seen`: its surfel lights tell what the camera sees."""
+        """Fills `groups` (after their `start`); with `has_seen`, its surfel lights mark what the camera sees."""
         self._find.run((self._threads,), store.bindings, groups.bindings, scene)
         self._sum.run((self._threads,), store.bindings, groups.bindings, scene, has_seen=has_seen)
 
@@ -195,7 +199,7 @@ class GroupSurfels:
 
 
 class GatherVoxels:
-    """Gathers the light of a few cones for each group. `defines`: those of march.glsl."""
+    """Gathers the light of a few cones for each group. `defines` are those of march.glsl."""
 
     def __init__(self, gpu: GpuContext, defines: Mapping[str, int]) -> None:
         self._gpu = gpu
@@ -205,19 +209,19 @@ class GatherVoxels:
     def gather_unseen(
         self, store: VoxelStore, groups: SurfelGroups, mu: VoxelMipmap, scene: Bindings
     ) -> None:
-        """E_mu of the groups that hold surfels which the camera does not see."""
+        """Gathers E_mu of the groups with surfels that the camera does not see."""
         self._run(self._one, store, groups, (mu, mu), scene, only_unseen=True)
 
     def gather_real(
         self, store: VoxelStore, groups: SurfelGroups, mu: VoxelMipmap, rho: VoxelMipmap, scene: Bindings
     ) -> None:
-        """E_mu and E_rho of every group."""
+        """Gathers E_mu and E_rho of every group."""
         self._run(self._dual, store, groups, (mu, rho), scene, only_unseen=False)
 
     def gather_virtual(
         self, store: VoxelStore, groups: SurfelGroups, rho: VoxelMipmap, scene: Bindings
     ) -> None:
-        """E_rho of every group."""
+        """Gathers E_rho of every group."""
         self._run(self._one, store, groups, (rho, rho), scene, only_unseen=False)
 
     def _run(
@@ -254,9 +258,9 @@ class GatherVoxels:
 
 
 class AlbedoTexture:
-    """A 3-D texture of albedo over a cube in world axes, for real surfaces that the camera does not look at.
+    """A 3-D texture of albedo over a cube in world axes, for real surfaces out of the camera's view.
 
-    It holds the mean of rooms until something was observed.
+    Until something was observed, it holds the mean of rooms.
     """
 
     def __init__(self, gpu: GpuContext) -> None:
@@ -266,16 +270,16 @@ class AlbedoTexture:
 
     @property
     def bindings(self) -> dict[str, Binding]:
-        """What real_radiance.glsl reads of it."""
+        """The bindings of real_radiance.glsl."""
         return {"albedo_volume": self._texture, "albedo_cube": self._cube}
 
     def clear(self, albedo: float) -> None:
-        """Takes the same albedo everywhere."""
+        """Sets the same albedo everywhere."""
         self._replace(np.full((1, 1, 1, 3), albedo, np.float32))
         self._cube = (0.0, 0.0, 0.0, 1.0)
 
     def upload(self, memory: AlbedoVolume) -> None:
-        """Takes over everything that was observed."""
+        """Uploads everything that was observed."""
         self._replace(memory.filled())
         x, y, z = (float(v) for v in memory.origin)
         self._cube = (x, y, z, 1 / memory.edge)

@@ -1,4 +1,4 @@
-"""The voxel volume: its placement and mipmaps; sparse voxel sets from triangles to filtered texels."""
+"""The voxel volume: placement and mipmaps; sparse voxel sets, from triangles to filtered texels."""
 
 import math
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ LONGEST_EDGE_VOXELS = 8.0  # longer ones are split before: balances the threads,
 
 @dataclass(frozen=True, eq=False)
 class VolumeBlock(Block):
-    """`Volume` of shaders/common/volume.glsl."""
+    """Uniform block `Volume` of shaders/common/volume.glsl."""
 
     volume_origin: Vec3
     voxel_edge: Float
@@ -40,7 +40,7 @@ class VolumeBlock(Block):
 
 @dataclass(frozen=True, eq=False)
 class FarVolumeBlock(Block):
-    """`FarVolume` of shaders/common/march.glsl: the coarse volume beyond; size 0 where none is used."""
+    """Uniform block `FarVolume` of shaders/common/march.glsl: the coarse volume beyond; size 0 if unused."""
 
     far_origin: Vec3
     far_edge: Float
@@ -58,7 +58,7 @@ class VolumePlacement:
 
     @property
     def levels(self) -> int:
-        """Mipmap levels: halvings that leave whole cells, down to 2 or 3 cells an edge."""
+        """Number of mip levels: halvings that leave whole cells, down to 2 or 3 cells per edge."""
         levels, cells = 1, self.size
         while cells % 2 == 0 and cells > 2:
             cells //= 2
@@ -66,15 +66,15 @@ class VolumePlacement:
         return levels
 
     def block(self) -> VolumeBlock:
-        """The placement as shaders read it."""
+        """Returns the placement's uniform block."""
         return VolumeBlock(self.origin, self.voxel_edge, self.size, self.levels)
 
     def far_block(self, *, is_used: bool) -> FarVolumeBlock:
-        """The placement as that of the coarse volume beyond; cones end before it unless it `is_used`."""
+        """Returns the placement's block as the coarse volume beyond; cones end before it unless it `is_used`."""
         return FarVolumeBlock(self.origin, self.voxel_edge, self.size if is_used else 0, self.levels)
 
     def voxel_bounds(self, points: Float64[np.ndarray, "n 3"]) -> np.ndarray[Any, np.dtype[np.int32]]:
-        """(min x, y, z, -max x, y, z) of the voxels that hold the world points, clipped to the volume."""
+        """Returns (min x, y, z, -max x, y, z) of the voxels that hold the world points, clipped to the volume."""
         voxels = np.floor((points - np.array(self.origin)) / self.voxel_edge)
         voxels = np.clip(voxels, 0, self.size - 1)
         return np.concatenate([voxels.min(axis=0), -voxels.max(axis=0)]).astype(np.int32)
@@ -83,9 +83,9 @@ class VolumePlacement:
 def place_volume(
     low: Float64[np.ndarray, "3"], high: Float64[np.ndarray, "3"], size: int, edge_m: float | None
 ) -> VolumePlacement:
-    """Cube around the objects' bounds: twice their longest edge ([P1]) unless `edge_m` is given, snapped to voxels.
+    """Places a cube around the objects' bounds: twice their longest edge ([P1]) unless `edge_m` is given.
 
-    Snapping keeps the grid still in the world while the objects move.
+    Snapping to voxels keeps the grid fixed in the world while the objects move.
     """
     edge = edge_m if edge_m is not None else 2.0 * float(np.max(high - low))
     voxel = edge / size
@@ -94,7 +94,7 @@ def place_volume(
 
 
 class PlacedVolume:
-    """A volume's current placement, and the uniform block that tells shaders of it."""
+    """A volume's current placement and its uniform block."""
 
     def __init__(self, gpu: GpuContext, placement: VolumePlacement) -> None:
         self._placement = placement
@@ -102,7 +102,7 @@ class PlacedVolume:
 
     @property
     def placement(self) -> VolumePlacement:
-        """Where the volume lies now."""
+        """The current placement."""
         return self._placement
 
     @property
@@ -122,20 +122,20 @@ class PlacedVolume:
 
 
 def mipmap_shape(size: int, directions: int) -> tuple[int, int, int]:
-    """Texels (x, y, z) of the texture that holds all levels of all directions (shaders/common/volume.glsl)."""
+    """Returns the size (x, y, z) of the texture of all levels and directions (shaders/common/volume.glsl)."""
     return size, size, directions * size + math.ceil(directions / 2) * size // 2
 
 
 def volume_memory_bytes(size: int, directions: int) -> int:
-    """Bytes of a volume set: two RGBA16F mipmaps and two slot grids."""
+    """Returns the bytes of a volume set: two RGBA16F mipmaps and two slot grids."""
     return 2 * math.prod(mipmap_shape(size, directions)) * 8 + 2 * size**3 * 4
 
 
 def memory_statement(size: int, directions: int, budget_mb: int) -> str:
-    """One sentence that states the memory of the volume set.
+    """Returns a sentence that states the memory of the volume set.
 
     Raises:
-        DeltalightError: it is beyond the budget.
+        DeltalightError: it exceeds the budget.
     """
     needed = math.ceil(volume_memory_bytes(size, directions) / MEGABYTE)
     if needed > budget_mb:
@@ -147,7 +147,7 @@ def memory_statement(size: int, directions: int, budget_mb: int) -> str:
 
 
 class VoxelMipmap:
-    """One RGBA16F volume with its levels: premultiplied radiance and coverage, a direction a slab."""
+    """An RGBA16F volume with mip levels: premultiplied radiance and coverage, a slab per direction."""
 
     def __init__(self, gpu: GpuContext, size: int, directions: int) -> None:
         shape = mipmap_shape(size, directions)
@@ -169,9 +169,9 @@ class VoxelMipmap:
 
 
 class VoxelStore:
-    """Slots, surfels and fixed-point sums of the real or of the virtual geometry (shaders/common/voxel_store.glsl).
+    """Slots, surfels and fixed-point sums of the real or the virtual geometry (shaders/common/voxel_store.glsl).
 
-    Buffers grow with the number of surfels that a mesh can make; the grid is as large as the volume.
+    Buffers grow with the number of surfels that a mesh can produce; the grid is as large as the volume.
     """
 
     def __init__(self, gpu: GpuContext, volume_size: int) -> None:
@@ -198,7 +198,7 @@ class VoxelStore:
         }
 
     def _allocate(self, surfels: int) -> None:
-        """Makes the buffers that grow, with room for `surfels` surfels."""
+        """Allocates the buffers that grow, with room for `surfels` surfels."""
         self.surfel_capacity = surfels
         self.surfels = self._ctx.buffer(reserve=SURFELS_HEADER_BYTES + surfels * SURFEL_BYTES)
         self.touched = self._ctx.buffer(reserve=TOUCHED_HEADER_BYTES + self.slot_capacity * 4)
@@ -210,7 +210,7 @@ class VoxelStore:
             buffer.release()
 
     def start(self, surfel_bound: int) -> None:
-        """Begins a new voxelisation of at most `surfel_bound` surfels; the old voxels have been cleared."""
+        """Begins a new voxelisation of at most `surfel_bound` surfels; the old voxels must have been cleared."""
         if surfel_bound > self.surfel_capacity:
             self._release_growing()
             self._allocate(int(surfel_bound * 1.25) + LEAST_SURFELS)
@@ -218,7 +218,7 @@ class VoxelStore:
         self.touched.write(bytes(TOUCHED_HEADER_BYTES))
 
     def counts(self) -> tuple[int, int]:
-        """Touched voxels and surfels; waits for the GPU (tests and reports only)."""
+        """Returns the numbers of touched voxels and surfels; waits for the GPU (tests and reports only)."""
         slots, surfels = (np.frombuffer(each.read(4), np.uint32)[0] for each in (self.touched, self.surfels))
         return int(slots), int(surfels)
 
@@ -236,7 +236,7 @@ class Voxelize:
         self._triangles = gpu.ctx.buffer(reserve=64)
 
     def run(self, store: VoxelStore, corners: Float32[np.ndarray, "m 3 10"], volume: PlacedVolume) -> None:
-        """Fills `store` (empty before) with the surfels of the triangles inside the volume."""
+        """Fills the empty `store` with the surfels of the triangles inside the volume."""
         pieces, bound = pieces_in_volume(corners, volume.placement)
         store.start(bound)
         if not len(pieces):
@@ -260,7 +260,7 @@ class Voxelize:
 def pieces_in_volume(
     corners: Float32[np.ndarray, "m 3 10"], placement: VolumePlacement
 ) -> tuple[Float32[np.ndarray, "k 3 10"], int]:
-    """Triangles that meet the volume, long ones split, and the greatest number of surfels that they can make."""
+    """Returns the triangles that meet the volume, long ones split, and a bound on their number of surfels."""
     low, high = _voxel_extents(corners, placement)
     met = np.all((high >= 0) & (low < placement.size), axis=1)
     short = np.all(high - low < LONGEST_EDGE_VOXELS / 2, axis=1)
@@ -275,7 +275,7 @@ def pieces_in_volume(
 def _voxel_extents(
     corners: Float32[np.ndarray, "m 3 10"], placement: VolumePlacement
 ) -> tuple[Float64[np.ndarray, "m 3"], Float64[np.ndarray, "m 3"]]:
-    """Lowest and highest voxel coordinates of each triangle."""
+    """Returns the lowest and highest voxel coordinates of each triangle."""
     a, b, c = (np.floor((corners[:, i, :3] - placement.origin) / placement.voxel_edge) for i in range(3))
     return np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
 
@@ -283,20 +283,20 @@ def _voxel_extents(
 def _voxels_in(
     low: Float64[np.ndarray, "m 3"], high: Float64[np.ndarray, "m 3"], placement: VolumePlacement
 ) -> int:
-    """Number of voxels in the boxes, as far as they are in the volume."""
+    """Returns the number of voxels in the boxes, clipped to the volume."""
     first, last = (np.clip(v, 0, placement.size - 1) for v in (low, high))
     return int(np.prod(last - first + 1, axis=1).sum())
 
 
 class ClearVoxels:
-    """Empties the voxels that a set had touched, instead of whole volumes: its slots, its texels of level 0."""
+    """Clears the voxels that a set touched, instead of whole volumes: its slots and its texels of level 0."""
 
     def __init__(self, gpu: GpuContext, directions: int) -> None:
         self._threads = list_threads(gpu)
         self._kernel = Kernel(gpu, "clear_voxels", DIRECTIONS=directions)
 
     def run(self, store: VoxelStore, mipmaps: Sequence[VoxelMipmap], volume: PlacedVolume) -> None:
-        """Empties `store`, and its voxels' texels in each of the mipmaps (at least one)."""
+        """Clears `store`, and its voxels' texels in each of the mipmaps (at least one)."""
         for index, mipmap in enumerate(mipmaps):
             self._kernel.run(
                 (self._threads,),
@@ -322,13 +322,13 @@ class ResolveVoxels:
         self._rho_virtual = Kernel(gpu, "resolve_voxels", RHO_VIRTUAL=1)
 
     def resolve_mu(self, mu: VoxelMipmap, real: VoxelStore, volume: PlacedVolume) -> None:
-        """(c_mu, a_real)."""
+        """Writes (c_mu, a_real)."""
         self._mu.run((self._threads,), real.bindings, volume.bindings, pyramid=mu.texture)
 
     def resolve_rho(
         self, rho: VoxelMipmap, real: VoxelStore, virtual: VoxelStore, volume: PlacedVolume
     ) -> None:
-        """(c_rho, a_real + a_virtual)."""
+        """Writes (c_rho, a_real + a_virtual)."""
         self._rho_real.run(
             (self._threads,),
             real.bindings,
@@ -349,7 +349,7 @@ class ResolveVoxels:
 
 
 class FilterVoxels:
-    """Filters the levels of an anisotropic mipmap, one dispatch a level (docs/method.md 4.4)."""
+    """Filters the levels of an anisotropic mipmap, one dispatch per level (docs/method.md 4.4)."""
 
     def __init__(self, gpu: GpuContext) -> None:
         self._kernel = Kernel(gpu, "filter_voxels")

@@ -29,7 +29,7 @@ class AlbedoVolume:
         measured: Float[np.ndarray, "k 3"],
         irradiance: Float[np.ndarray, "k 3"],
     ) -> None:
-        """Accumulate the unshadowed, unclipped pixels of diffuse surfaces in one picture.
+        """Accumulates the unshadowed, unclipped pixels of diffuse surfaces in one picture.
 
         Args:
             bounds: least and greatest coordinates of the real scene, world metres; if they leave the cube, all
@@ -63,7 +63,7 @@ class AlbedoVolume:
         return (z * CELLS + y) * CELLS + x, inside
 
     def filled(self) -> Float32[np.ndarray, "z y x 3"]:
-        """Return the albedo of every cell; empty cells take it from the finest coarser level with samples."""
+        """Returns the albedo of every cell; empty cells take it from the finest coarser level with samples."""
         levels = [self._sums.reshape((CELLS,) * 3 + (7,))]
         while len(levels[-1]) > 1:
             half = len(levels[-1]) // 2

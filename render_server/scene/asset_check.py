@@ -30,7 +30,7 @@ _HARMLESS_EXTENSIONS = re.compile(
 
 
 def check_mesh_file(path: Path) -> str:
-    """Return the suffix of a mesh file that exists, is of a known type and not too large.
+    """Returns the suffix of a mesh file that exists, is of a known type and not too large.
 
     Raises:
         DeltalightError: otherwise.
@@ -48,7 +48,7 @@ def check_mesh_file(path: Path) -> str:
 
 
 def _check_ply_counts(path: Path) -> None:
-    """Check the element counts of a PLY file: every element takes at least a byte."""
+    """Checks the element counts of a PLY file: every element takes at least a byte."""
     with path.open("rb") as file:
         header = file.read(1 << 16).split(b"end_header")[0]
     counts = re.findall(rb"^\s*element\s+\S+\s+(\d{1,18})\s*$", header, re.MULTILINE)
@@ -57,9 +57,9 @@ def _check_ply_counts(path: Path) -> None:
 
 
 def read_gltf(path: Path) -> GltfDocument:
-    """Read a .gltf or .glb file and check every count in it against the bytes that are there.
+    """Reads a .gltf or .glb file and checks every count in it against the bytes that are there.
 
-    Loaders allocate by accessor counts; a few hundred bytes can otherwise ask for gigabytes.
+    Loaders allocate by accessor counts; otherwise a few hundred bytes could request gigabytes.
 
     Raises:
         DeltalightError: the document is malformed, refers to files outside its folder, or needs extensions
@@ -160,7 +160,7 @@ class _Views:
     sizes: list[int]
 
     def check(self, index: int, place: dict[str, Any], count: int, element: int) -> None:
-        """Check that `count` elements of `element` bytes lie within the view that part of an accessor names."""
+        """Checks that `count` elements of `element` bytes lie within the view that part of an accessor names."""
         view = _count(place["bufferView"])
         stride = _count(self.views[view].get("byteStride", element))
         needed = _count(place.get("byteOffset", 0)) + max(count - 1, 0) * stride + element * (count > 0)
@@ -196,7 +196,7 @@ def _check_sparse(index: int, accessor: dict[str, Any], element: int, views: _Vi
 
 
 def _check_nodes(nodes: list[dict[str, Any]]) -> None:
-    """Check that nodes form trees, so that traversals end."""
+    """Checks that nodes form trees, so that traversals end."""
     children = [_count(child) for node in nodes for child in node.get("children", [])]
     if len(set(children)) != len(children) or any(child >= len(nodes) for child in children):
         raise GltfFaultError("its nodes do not form a tree")
@@ -208,7 +208,7 @@ def _check_nodes(nodes: list[dict[str, Any]]) -> None:
 
 
 def _check_triangles(document: dict[str, Any]) -> None:
-    """Bound the triangles of all instances."""
+    """Bounds the triangles of all instances."""
     accessors = document.get("accessors", [])
     sizes = [
         sum(_primitive_triangles(primitive, accessors) for primitive in mesh["primitives"])

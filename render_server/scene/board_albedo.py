@@ -13,8 +13,9 @@ from render_server.lights.environment import LUMINANCE
 
 MIN_PIXELS = 30
 SUFFICIENT_PIXELS = 10 * MIN_PIXELS
-MAX_COORDINATE_PX = 1e5  # beyond, fixed-point outlines overflow
-# Margin inside a patch's edges, where lens and sampling mix it with its neighbours; the second if few are left.
+MAX_COORDINATE_PX = 1e5  # fixed-point outlines overflow beyond this
+# Margin inside a patch's edges, where lens and sampling mix it with its neighbours; the second if few pixels are
+# left.
 INSETS_PX = (2, 1)
 EDGE_POINTS = 8
 # Limits of linear values and codes within which a pixel carries its true radiance.
@@ -24,7 +25,7 @@ DARK_LINEAR = 0.005
 
 
 def known_albedo(board: BoardSpec, camera: CameraModel, pose: BoardPose) -> Float32[np.ndarray, "h w"]:
-    """Return the albedo of every pixel that shows a surface of known albedo; 0 elsewhere.
+    """Returns the albedo of every pixel that shows a surface of known albedo; 0 elsewhere.
 
     Grey cards have the albedo that board.yaml gives them. White paper counts where its albedo is given too, and with
     the assumed one where no card is in view. Things that cover the board are not detected here.
@@ -39,7 +40,7 @@ def known_albedo(board: BoardSpec, camera: CameraModel, pose: BoardPose) -> Floa
 
 
 def paper_pixels(board: BoardSpec, camera: CameraModel, pose: BoardPose) -> Bool[np.ndarray, "h w"]:
-    """Return which pixels show white paper between the board's markers, well inside its edges."""
+    """Returns which pixels show white paper between the board's markers, well inside its edges."""
     covered = [_mask(card.outline(), camera, pose) for card in board.grey_cards]
     paper = _inside(_masks(board.paper_patches(), camera, pose), camera)
     for mask in covered:
@@ -51,14 +52,14 @@ def paper_pixels(board: BoardSpec, camera: CameraModel, pose: BoardPose) -> Bool
 def card_pixels(
     outline: Float64[np.ndarray, "4 3"], camera: CameraModel, pose: BoardPose
 ) -> Bool[np.ndarray, "h w"]:
-    """Return which pixels show a card, well inside its edges."""
+    """Returns which pixels show a card, well inside its edges."""
     return _inside(_masks([outline], camera, pose), camera)
 
 
 def unclipped(
     color: UInt8[np.ndarray, "h w 3"], linear: Float[np.ndarray, "h w 3"]
 ) -> Bool[np.ndarray, "h w"]:
-    """Return which pixels carry their true radiance: no channel clipped, and not nearly black.
+    """Returns which pixels carry their true radiance: no channel clipped, and not nearly black.
 
     `linear` is the picture decoded by the response alone, before division by the exposure.
     """
@@ -67,7 +68,7 @@ def unclipped(
 
 
 def _inside(masks: list[UInt8[np.ndarray, "h w"]], camera: CameraModel) -> Bool[np.ndarray, "h w"]:
-    """Return the patches without their edges: 2 pixels, or 1 where few pixels would be left."""
+    """Returns the patches without their edges: 2 pixels, or 1 where few pixels would be left."""
     found = np.zeros((camera.height, camera.width), np.uint8)
     for inset in INSETS_PX:
         for mask in masks:
@@ -91,7 +92,7 @@ def _masks(
 def _mask(
     patch: Float64[np.ndarray, "4 3"], camera: CameraModel, pose: BoardPose
 ) -> UInt8[np.ndarray, "h w"] | None:
-    """Return the pixels of a quad in world coordinates; None where it is not wholly in front of the camera."""
+    """Returns the pixels of a quad in world coordinates; None where it is not wholly in front of the camera."""
     camera_from_world = np.linalg.inv(pose.world_from_camera)
     outline = _dense_outline(patch) @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
     pixels = camera.project(outline)
@@ -103,7 +104,7 @@ def _mask(
 
 
 def _dense_outline(patch: Float64[np.ndarray, "4 3"]) -> Float64[np.ndarray, "n 3"]:
-    """Return points along a quad's edges, because a lens bends straight lines."""
+    """Returns points along a quad's edges, because a lens bends straight lines."""
     fraction = np.linspace(0, 1, EDGE_POINTS, endpoint=False)[:, None]
     following = np.roll(patch, -1, axis=0)
     return np.concatenate(

@@ -15,9 +15,9 @@ PARALLEL = 1e-12  # determinant (m^2), from which on a ray counts as going along
 
 @dataclass(frozen=True, eq=False)
 class Bvh:
-    """Nodes in depth-first order: after a node comes its first child; `skip` is the node after its last descendant.
+    """Nodes in depth-first order: a node's first child follows it; `skip` is the node after its last descendant.
 
-    `leaf` is -1 for inner nodes, else the place of the first triangle in `order` << 3 | number of triangles.
+    `leaf` is -1 for inner nodes, else the index of the first triangle in `order` << 3 | number of triangles.
     """
 
     low: Float32[np.ndarray, "k 3"]
@@ -27,7 +27,7 @@ class Bvh:
     order: Int32[np.ndarray, " m"]
 
     def packed(self) -> bytes:
-        """Pack nodes as the shader's struct: low corner, leaf, high corner, skip (32 bytes)."""
+        """Packs nodes as the shader's struct: low corner, leaf, high corner, skip (32 bytes)."""
         rows = np.empty((len(self.leaf), 8), np.float32)
         rows[:, 0:3], rows[:, 4:7] = self.low, self.high
         rows.view(np.int32)[:, 3], rows.view(np.int32)[:, 7] = self.leaf, self.skip
@@ -52,7 +52,7 @@ class Bvh:
         return float(areas.sum() / areas[0])
 
     def refitted(self, corners: Float32[np.ndarray, "m 3 3"]) -> "Bvh":
-        """Refit the tree to moved triangles: always correct, and good while neighbours stay neighbours."""
+        """Refits the tree to moved triangles: always correct, and efficient while neighbours stay neighbours."""
         held = self.leaf & ((1 << COUNT_BITS) - 1)
         firsts = np.concatenate([[0], np.cumsum(np.where(self.leaf < 0, 0, held))])
         # A node's triangles follow each other in `order`, up to the first of what comes after its last descendant.
@@ -67,7 +67,7 @@ class Bvh:
 def _over_spans(
     reduce: np.ufunc, rows: Float32[np.ndarray, "m 3"], spans: Int64[np.ndarray, " 2k"]
 ) -> Float32[np.ndarray, "k 3"]:
-    """Reduce rows from each span's start to its end; the last row is repeated, because an end may lie behind all."""
+    """Reduces rows from each span's start to its end; the last row is repeated, because an end may lie behind all."""
     return np.asarray(reduce.reduceat(np.concatenate([rows, rows[-1:]]), spans)[::2])
 
 
@@ -90,7 +90,7 @@ class _Boxes:
 
 
 def build_bvh(corners: Float32[np.ndarray, "m 3 3"]) -> Bvh:
-    """Build a tree by the binned surface area heuristic, all nodes of a depth at once; m >= 1.
+    """Builds a tree by the binned surface area heuristic, all nodes of a depth at once; m >= 1.
 
     Deterministic: the same triangles give the same tree.
     """
@@ -112,7 +112,7 @@ def _split(
     leaf_of: Int64[np.ndarray, "m 2"],
     depth: int,
 ) -> tuple[_Level, Int64[np.ndarray, " b"], Int64[np.ndarray, " b"]]:
-    """Return the level of `triangles`, sorted by their `node` in it, and triangles and nodes of the next level."""
+    """Returns the level of `triangles`, sorted by their `node` in it, and triangles and nodes of the next level."""
     counts = np.bincount(node)
     starts = np.cumsum(counts) - counts
     low = np.minimum.reduceat(boxes.low[triangles], starts)
@@ -129,7 +129,7 @@ def _split(
 def _children(
     boxes: _Boxes, triangles: Int64[np.ndarray, " a"], node: Int64[np.ndarray, " a"]
 ) -> tuple[Int64[np.ndarray, " a"], Int64[np.ndarray, " a"]]:
-    """Sort each node's triangles along its longest axis and divide them between its two children."""
+    """Sorts each node's triangles along its longest axis and divides them between its two children."""
     counts = np.bincount(node)
     starts = np.cumsum(counts) - counts
     centre = boxes.centre[triangles]
@@ -153,7 +153,7 @@ def _best_split(
     cell: Int64[np.ndarray, " a"],
     counts: Int64[np.ndarray, " s"],
 ) -> Int64[np.ndarray, " s"]:
-    """Return how many triangles of each node, sorted by cell, the first child gets: half where all lie in one bin."""
+    """Returns how many triangles of each node, sorted by cell, the first child gets: half if all lie in one bin."""
     held = np.bincount(cell, minlength=len(counts) * BINS)
     used = np.flatnonzero(held)
     starts = np.cumsum(held[used]) - held[used]
@@ -175,14 +175,14 @@ def _best_split(
 def _areas(
     low: Float32[np.ndarray, "s b 3"], high: Float32[np.ndarray, "s b 3"]
 ) -> Float32[np.ndarray, "s b"]:
-    """Return half the surface area of the box around the first bins; 0 where they are empty."""
+    """Returns half the surface area of the box around the first bins; 0 where they are empty."""
     extent = np.maximum.accumulate(high, axis=1) - np.minimum.accumulate(low, axis=1)
     extent = np.where(np.isfinite(extent), extent, 0)
     return np.asarray((extent * np.roll(extent, 1, axis=-1)).sum(axis=-1))
 
 
 def _flattened(levels: list[_Level], leaf_of: Int64[np.ndarray, "m 2"], margin: float) -> Bvh:
-    """Order nodes depth first: subtree sizes bottom-up, then places top-down."""
+    """Orders nodes depth first: subtree sizes bottom-up, then positions top-down."""
     sizes = [np.ones(len(level.inner), np.int64) for level in levels]
     for depth in reversed(range(len(levels) - 1)):
         sizes[depth][levels[depth].inner] += sizes[depth + 1].reshape(-1, 2).sum(axis=1)
@@ -200,7 +200,7 @@ def _assembled(
     leaf_of: Int64[np.ndarray, "m 2"],
     margin: float,
 ) -> Bvh:
-    """Put the nodes of all levels in their places, and the triangles in the order of their leaves."""
+    """Puts the nodes of all levels in their positions, and the triangles in the order of their leaves."""
     place, size = np.concatenate(places), np.concatenate(sizes)
     back = np.argsort(place)
     starts = np.cumsum([0] + [len(level.inner) for level in levels])
@@ -222,7 +222,7 @@ def first_hit(
     origin: Float64[np.ndarray, "3"],
     direction: Float64[np.ndarray, "3"],
 ) -> tuple[float, Float64[np.ndarray, "3"]] | None:
-    """Intersect a single ray with all triangles (Möller and Trumbore 1997); building a tree would not pay off.
+    """Intersects a single ray with all triangles (Möller and Trumbore 1997); building a tree would not pay off.
 
     Returns:
         The distance to the nearest hit in lengths of `direction`, and its unit normal towards the origin; else None.

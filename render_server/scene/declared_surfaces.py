@@ -19,13 +19,13 @@ ASSUMED_METAL_F0 = 0.9
 
 @dataclass(frozen=True, eq=False)
 class SurfaceTable:
-    """Declared surfaces in the order of the document; the first row whose region holds a point wins.
+    """Declared surfaces in the document's order; the first row whose region contains a point applies.
 
     A row of `packed` is five vectors (SurfaceEntry of passes/shaders/common/surfaces.glsl): (F0 R G B, metallic);
-    (roughness, 0, 0, 0); (albedo R G B, 1 if declared); and the region, whose kind is the first vector's
-    last component. 0 plane: (point, kind), (unit normal, tolerance); 1 box: (lower corner, kind), (upper
-    corner, 0); 2 material of the given model: (its index, 0, 0,
-    kind), zeros; 3 box in which all is diffuse: the marker sheet, which comes first.
+    (roughness, 0, 0, 0); (albedo R G B, 1 if declared); and two for the region, whose kind is the last component of
+    the first. 0 plane: (point, kind), (unit normal, tolerance); 1 box: (lower corner, kind), (upper corner, 0); 2
+    material of the given model: (its index, 0, 0, kind), zeros; 3 box in which everything is diffuse: the marker
+    sheet, which comes first.
     """
 
     packed: Float32[np.ndarray, "n 5 4"]
@@ -50,7 +50,7 @@ class SurfaceTable:
     def lookup(
         self, points: Float[np.ndarray, "k 3"], materials: Int32[np.ndarray, " k"] | None = None
     ) -> Int32[np.ndarray, " k"]:
-        """Return the row of each world point's surface, -1 for diffuse (reference for the shaders).
+        """Returns the row of each world point's surface, -1 for diffuse (reference for the shaders).
 
         `materials` are the material indices of points on a given model.
         """
@@ -81,7 +81,7 @@ def _inside(
 def build_surface_table(
     surfaces: Sequence[Surface], board: BoardSpec | None = None, material_names: Sequence[str] = ()
 ) -> SurfaceTable:
-    """Compile the declared surfaces; `material_names` are those of the given model, by index.
+    """Compiles the declared surfaces; `material_names` are those of the given model, by index.
 
     F0 is 0.08 specular, mixed by `metallic` with the albedo (0.9 where none is given).
 
@@ -123,7 +123,7 @@ def _region(region: Region, material_names: Sequence[str]) -> tuple[list[float],
 
 
 def _sheet_row(board: BoardSpec) -> list[list[float]]:
-    """Return the row of the board's printed sheet, 5 mm thick to either side."""
+    """Returns the row of the board's printed sheet, 5 mm thick to either side."""
     outline = board.sheet_outline()
     thickness = np.array([0, 0, SHEET_TOLERANCE_M])
     low, high = outline.min(axis=0) - thickness, outline.max(axis=0) + thickness

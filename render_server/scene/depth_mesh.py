@@ -24,7 +24,7 @@ CELL_SAMPLES = 6
 # Pixels of two neighbouring nodes are at most this many cells apart: two in each direction.
 MAX_CELL_DISTANCE = 2 * float(np.sqrt(2))
 REAL_MATERIAL = Material(roughness=1.0, specular=0.0, name="real")
-# A ray that leaves a surface samples the cells around its own, and must not meet the back face of the surface there.
+# A ray that leaves a surface samples the cells around its own, which must not contain the surface's back face.
 BACK_OFFSET_VOXELS = 2.0
 
 
@@ -47,14 +47,14 @@ def depth_mesh(
     *,
     grazing: Float32[np.ndarray, "h w"] | None = None,
 ) -> TriangleMesh:
-    """Mesh a clean depth image that is registered to `camera`, in the world.
+    """Meshes a clean depth image, registered to `camera`, in the world.
 
-    A node stands for each cell of stride x stride pixels, at the cell's centre, with the cell's median depth
-    (moved to the centre along the fitted surface); the stride is the least that keeps to the budget. No
-    triangle crosses a depth discontinuity; cells without depth or normal are holes. `uv` is the pixel
-    coordinate (pixel centres at integers) of the vertex in the camera's picture. `surface` is `depth_surface(depth,
-    camera)` where it is already known. `grazing` is the inverse depth of surfaces too oblique to measure
-    (`grazing_depth_fill`), which join their two sides. Without any valid depth the mesh is empty.
+    A node represents each cell of stride x stride pixels, at the cell's centre, with the cell's median depth (moved
+    to the centre along the fitted surface); the stride is the least within the budget. No triangle crosses a depth
+    discontinuity; cells without depth or normal are holes. `uv` is the vertex's pixel coordinate (pixel centres at
+    integers) in the camera's picture. `surface` is `depth_surface(depth, camera)` if already computed. `grazing` is
+    the inverse depth of surfaces too oblique to measure (`grazing_depth_fill`), which join their two sides. Without
+    any valid depth the mesh is empty.
 
     Raises:
         DeltalightError: the budget is below 2, or depth and camera differ in size.
@@ -75,7 +75,7 @@ def depth_mesh(
 
 
 def stride_for_budget(width: int, height: int, triangle_budget: int) -> int:
-    """Return the least cell edge in pixels whose grid has at most `triangle_budget` triangles."""
+    """Returns the least cell edge in pixels whose grid has at most `triangle_budget` triangles."""
     stride = 1
     while 2 * (-(-width // stride) - 1) * (-(-height // stride) - 1) > triangle_budget:
         stride += 1
@@ -91,7 +91,7 @@ def _nodes(surface: DepthSurface, camera: CameraModel, stride: int) -> _Nodes:
     gradient = surface.gradient.reshape(2, -1)[:, flat]
     moved = rays - camera.rays().reshape(-1, 2)[flat]
     shift = gradient[0] * moved[..., 0] + gradient[1] * moved[..., 1]
-    # A wild slope must not throw the node off the depths of its cell.
+    # An outlier of the slope must not throw the node off the depths of its cell.
     at_centre = chosen + np.clip(shift, -0.1 * chosen, 0.1 * chosen)
     return _Nodes(pixels, rays, np.where(chosen > 0, at_centre, 0), surface.normals.reshape(-1, 3)[flat])
 
@@ -99,7 +99,7 @@ def _nodes(surface: DepthSurface, camera: CameraModel, stride: int) -> _Nodes:
 def _with_grazing(
     nodes: _Nodes, grazing: Float32[np.ndarray, "h w"], camera: CameraModel, stride: int
 ) -> tuple[_Nodes, Float32[np.ndarray, "gh gw"]]:
-    """Fill holes with nodes of grazing surfaces; the second value is the step (1/m) that their slopes explain."""
+    """Fills holes with nodes of grazing surfaces; the second value is the step (1/m) that their slopes explain."""
     flat = _median_pixels(grazing, stride)
     by_pixel = _slopes(grazing)
     normals = surface_normals(grazing, by_ray(by_pixel, camera), camera).reshape(-1, 3)[flat]
@@ -115,7 +115,7 @@ def _with_grazing(
 
 
 def _slopes(inverse: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "2 h w"]:
-    """Return differences per pixel, to the right and down, among non-zero pixels; NaN for isolated ones."""
+    """Returns differences per pixel, to the right and down, among non-zero pixels; NaN for isolated ones."""
     known = np.where(inverse > 0, inverse, np.float32(np.nan))
     slopes = np.empty((2, *inverse.shape), np.float32)
     for slope, values in ((slopes[0], known), (slopes[1].T, known.T)):
@@ -128,7 +128,7 @@ def _slopes(inverse: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "2 h w"]
 def _node_rays(
     camera: CameraModel, stride: int
 ) -> tuple[Float32[np.ndarray, "gh gw 2"], Float32[np.ndarray, "gh gw 2"]]:
-    """Return pixel coordinates and rays of the cells' centres (those of cells cut by the border as well)."""
+    """Returns pixel coordinates and rays of the cells' centres (those of cells cut by the border as well)."""
     columns = _cell_centres(camera.width, stride)
     rows = _cell_centres(camera.height, stride)
     pixels = np.stack(np.meshgrid(columns, rows), axis=-1)
@@ -142,10 +142,10 @@ def _cell_centres(length: int, stride: int) -> Float64[np.ndarray, " n"]:
 
 
 def _median_pixels(inverse: Float32[np.ndarray, "h w"], stride: int) -> Int64[np.ndarray, "gh gw"]:
-    """Return the flat index of the pixel with the median inverse depth among the valid ones of each cell.
+    """Returns the flat index of the pixel with the median inverse depth among the valid ones of each cell.
 
-    Cells without a valid pixel give an invalid one. Large cells are judged by 6 x 6 of their pixels.
-    Positive floats sort as their bits do; the lowest bits make way for the pixel's number in the cell.
+    Cells without a valid pixel get an invalid one. Large cells are judged by 6 x 6 of their pixels. Positive floats
+    sort like their bits; the lowest bits are replaced by the pixel's number in the cell.
     """
     height, width = inverse.shape
     rows, columns = -(-height // stride), -(-width // stride)
@@ -167,7 +167,7 @@ def _median_pixels(inverse: Float32[np.ndarray, "h w"], stride: int) -> Int64[np
 
 
 def _sort_planes(planes: list[UInt32[np.ndarray, "a b"]]) -> None:
-    """Sort every element's values over the planes, in place: Batcher's odd-even merge network."""
+    """Sorts every element's values over the planes, in place: Batcher's odd-even merge network."""
     count, run = len(planes), 1
     while run < count:
         gap = run
@@ -186,7 +186,7 @@ def _grid_triangles(
     threshold: Float32[np.ndarray, "gh gw"],
     slack: Float32[np.ndarray, "gh gw"],
 ) -> Int32[np.ndarray, "m 3"]:
-    """Join neighbouring nodes on one surface; quads are cut along the diagonal with the lesser step.
+    """Joins neighbouring nodes on one surface; quads are cut along the diagonal with the lesser step.
 
     Steps may exceed the threshold by the slack of either node. Seen from the camera, triangles are counter-clockwise.
     """
@@ -223,7 +223,7 @@ def _grid_triangles(
 def _world_mesh(
     nodes: _Nodes, triangles: Int32[np.ndarray, "m 3"], world_from_camera: Float64[np.ndarray, "4 4"]
 ) -> TriangleMesh:
-    """Keep the nodes that triangles use and bring them to the world."""
+    """Keeps the nodes that triangles use and transforms them to the world."""
     used = np.zeros(nodes.inverse_depth.size, bool)
     used[triangles.ravel()] = True
     numbers = np.cumsum(used, dtype=np.int32) - 1
@@ -244,7 +244,7 @@ def _world_mesh(
 
 
 def back_faces(corners: Float32[np.ndarray, "m 3 10"], voxel_edge: float) -> Float32[np.ndarray, "m 3 10"]:
-    """Return the back face of each triangle (three corners, position first), reversed and some voxels behind it.
+    """Returns the back face of each triangle (three corners, position first), reversed and some voxels behind it.
 
     A depth camera sees only the front of things, but they block light from behind too: the underside of a shelf
     blocks the light from above it and reflects that from below. The thickness is unknown, so a back face lies as near

@@ -28,7 +28,7 @@ MAX_RADIUS = 5
 SHIFTS = ((0, -1), (0, 1), (-1, 0), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1))
 # Least spread of a window's valid pixels relative to a full window (determinant of their covariance).
 MIN_SUPPORT = 0.01
-# A thinner strip is an edge, where colours mix.
+# Thinner strips are edges, where colours mix.
 MIN_STRIP_WIDTH_PX = 3
 # Smaller strips are remains of edges: depth comes with holes up to this size filled.
 MIN_STRIP_AREA_PX = 64
@@ -63,12 +63,12 @@ class DepthSurface:
 
 
 def noise_sigma(depth: DepthImage) -> float:
-    """Return the depth noise at 1 m, metres (2 mm, between structured light and stereo, where unknown)."""
+    """Returns the depth noise at 1 m, metres (if unknown 2 mm, between structured light and stereo)."""
     return ASSUMED_NOISE_SIGMA_M if depth.noise_sigma_m is None else depth.noise_sigma_m
 
 
 def depth_surface(depth: DepthImage, camera: CameraModel) -> DepthSurface:
-    """Fit a plane to the surroundings of every valid pixel by least squares, without crossing edges.
+    """Fits a plane to the surroundings of every valid pixel by least squares, without crossing edges.
 
     The window grows with the noise until normals are good to about 3 degrees at the mean distance. Where it
     would hold a discontinuity, the window is moved aside to one that holds the pixel but no discontinuity
@@ -94,7 +94,7 @@ def jump_threshold(
     inverse_depth: Float32[np.ndarray, "h w"],
     step_px: float | Float32[np.ndarray, "h w"] = 1.0,
 ) -> Float32[np.ndarray, "h w"]:
-    """Return the change of w over `step_px` pixels beyond which two points are not on one surface.
+    """Returns the change of w over `step_px` pixels beyond which two points are not on one surface.
 
     Three sigma of a difference, and the change on a surface that is 80 degrees from facing the camera:
     |dw| = w tan(slope) / f.
@@ -107,7 +107,7 @@ def jump_threshold(
 def _window_radius(
     sigma_px: float, inverse: Float32[np.ndarray, "h w"], mask: Float32[np.ndarray, "h w"]
 ) -> int:
-    """Return the least radius whose slope error, sigma f z / sqrt(sum of squared offsets), is acceptable."""
+    """Returns the least radius whose slope error, sigma f z / sqrt(sum of squared offsets), is acceptable."""
     mean = float(inverse.sum(dtype=np.float64) / max(float(mask.sum(dtype=np.float64)), 1.0))
     error = sigma_px / max(mean, 1e-6)
     for radius in range(1, MAX_RADIUS):
@@ -119,7 +119,7 @@ def _window_radius(
 def _window_gradient(
     inverse: Float32[np.ndarray, "h w"], mask: Float32[np.ndarray, "h w"], radius: int
 ) -> Float32[np.ndarray, "2 h w"]:
-    """Return the slope of w by pixel: least squares over a square window, valid pixels only.
+    """Returns the slope of w by pixel: least squares over a square window, valid pixels only.
 
     Offsets count from the pixel itself, so that no large numbers cancel. Where pixels are too few or in a
     line, the slope is NaN.
@@ -157,7 +157,7 @@ def _filtered(
 def _jumps(
     inverse: Float32[np.ndarray, "h w"], threshold: Float32[np.ndarray, "h w"], valid: Bool[np.ndarray, "h w"]
 ) -> tuple[UInt8[np.ndarray, "h w"], UInt8[np.ndarray, "h w"]]:
-    """Return where a pixel and the next one down, and right, are valid but on different surfaces (1)."""
+    """Returns where a pixel and the next one down, and right, are valid but on different surfaces (1)."""
     down, right = np.zeros((2, *valid.shape), np.uint8)
     down[:-1] = (np.abs(inverse[1:] - inverse[:-1]) > threshold[:-1]) & valid[1:] & valid[:-1]
     right[:, :-1] = (
@@ -196,7 +196,7 @@ def _crosses_edge(
 def _move_windows(
     gradient: Float32[np.ndarray, "2 h w"], crossed: Bool[np.ndarray, "h w"], radius: int
 ) -> None:
-    """Give pixels whose window crosses an edge the slope of a shifted window that does not, in place."""
+    """Gives pixels whose window crosses an edge the slope of a shifted window that does not, in place."""
     width = crossed.shape[1]
     clean = (~crossed & np.isfinite(gradient[0])).ravel()
     slopes = gradient.reshape(2, -1)
@@ -213,7 +213,7 @@ def _move_windows(
 
 
 def by_ray(by_pixel: Float32[np.ndarray, "2 h w"], camera: CameraModel) -> Float32[np.ndarray, "2 h w"]:
-    """Turn a change by pixel into a change by ray coordinate."""
+    """Turns a change by pixel into a change by ray coordinate."""
     if not camera.has_distortion:
         return by_pixel * camera.matrix[[0, 1], [0, 1]].astype(np.float32)[:, None, None]
     inverse = _pixel_from_ray(camera)
@@ -222,7 +222,7 @@ def by_ray(by_pixel: Float32[np.ndarray, "2 h w"], camera: CameraModel) -> Float
 
 @lru_cache(maxsize=4)
 def _pixel_from_ray(camera: CameraModel) -> Float32[np.ndarray, "2 2 h w"]:
-    """Return the change of pixel coordinates (first axis) by ray coordinates (second) at every pixel."""
+    """Returns the change of pixel coordinates (first axis) by ray coordinates (second) at every pixel."""
     rays = camera.rays().astype(np.float64)
     jacobian = np.stack([np.gradient(rays, axis=1), np.gradient(rays, axis=0)], axis=-1)
     return np.ascontiguousarray(np.linalg.inv(jacobian).transpose(2, 3, 0, 1), np.float32)
@@ -233,7 +233,7 @@ def surface_normals(
     gradient: Float32[np.ndarray, "2 h w"],
     camera: CameraModel,
 ) -> Float32[np.ndarray, "h w 3"]:
-    """Return unit normals of inverse depth and its change by ray; zero where unknown.
+    """Returns unit normals of inverse depth and its change by ray; zero where unknown.
 
     They are in the optical frame, towards the camera. A plane n.P = d has w = (n/d).(x/z, y/z, 1), so n is along
     (gradient, w - gradient.ray).
@@ -264,7 +264,7 @@ class _Side:
 
 
 def grazing_depth_fill(depth: DepthImage, color: UInt8[np.ndarray, "h w 3"], camera: CameraModel) -> Map:
-    """Return the inverse depth (1/m) of surfaces at grazing angles where `depth` has none; 0 elsewhere.
+    """Returns the inverse depth (1/m) of surfaces at grazing angles where `depth` has none; 0 elsewhere.
 
     `depth` is clean and registered to `color` (RGB) and `camera`. In inverse depth a plane is an affine function of
     the pixel, so strips are filled linearly from their near to their far side.
@@ -289,7 +289,7 @@ def grazing_depth_fill(depth: DepthImage, color: UInt8[np.ndarray, "h w 3"], cam
 
 
 def _strip_window(box: Int32[np.ndarray, "5"]) -> tuple[slice, slice]:
-    """Return rows and columns of a strip (box: left, top, width, height, area) and the surfaces beside it."""
+    """Returns rows and columns of a strip (box: left, top, width, height, area) and the surfaces beside it."""
     margin = 2 * BORDER_RADIUS_PX
     left, top, width, height = (int(value) for value in box[:4])
     return (
@@ -299,7 +299,7 @@ def _strip_window(box: Int32[np.ndarray, "5"]) -> tuple[slice, slice]:
 
 
 def _may_be_grazing(strip: Mask, around: Map, to_known: Map, depth: DepthImage, camera: CameraModel) -> bool:
-    """Rule out most strips cheaply: no depth step beside them could make most of their pixels grazing.
+    """Rules out most strips cheaply: no depth step beside them could make most of their pixels grazing.
 
     `around` is the inverse depth beside the strip, 0 elsewhere, `to_known` the distance of pixels from known ones: a
     strip is at least twice as wide there.
@@ -315,7 +315,7 @@ def _may_be_grazing(strip: Mask, around: Map, to_known: Map, depth: DepthImage, 
 def _bridge(
     strip: Mask, around: Map, color: UInt8[np.ndarray, "h w 3"], depth: DepthImage, camera: CameraModel
 ) -> tuple[Mask, Map]:
-    """Return which pixels of a strip are a grazing surface, and their inverse depth, bridged between its sides."""
+    """Returns which pixels of a strip are a grazing surface, and their inverse depth, bridged between its sides."""
     split = (around[around > 0].min() + around.max()) / 2
     near, far = _side(around > split), _side((around > 0) & (around <= split))
     before, behind = around.ravel()[near.nearest_pixel], around.ravel()[far.nearest_pixel]
@@ -335,7 +335,7 @@ def _dilated(mask: Mask, radius_px: int) -> Mask:
 
 
 def _side(surface: Mask) -> _Side:
-    """Find the nearest pixel of a surface from every pixel."""
+    """Finds the nearest pixel of a surface from every pixel."""
     distance, labels = cv2.distanceTransformWithLabels(
         (~surface).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE, labelType=cv2.DIST_LABEL_PIXEL
     )
@@ -357,7 +357,7 @@ def _differs_in_color(
 
 
 def _color_statistics(color: Colors, mask: Mask) -> tuple[Colors, Map]:
-    """Return mean and total variance of a mask's colours in the window around each pixel; infinite without any."""
+    """Returns mean and total variance of a mask's colours in the window around each pixel; infinite without any."""
     weight = mask.astype(np.float32)
 
     def summed(values: np.ndarray) -> np.ndarray:

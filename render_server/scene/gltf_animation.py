@@ -32,7 +32,7 @@ class Track:
     nodes: Int64[np.ndarray, " c"]
 
     def at(self, time_s: float) -> Float64[np.ndarray, "c w"]:
-        """Sample the values at a time, clamped to the first and the last key."""
+        """Samples the values at a time, clamped to the first and the last key."""
         after = int(np.searchsorted(self.times, time_s, side="right"))
         value = self.keys.shape[1] // 2
         if after in (0, len(self.times)):
@@ -72,7 +72,7 @@ class Clip:
         return np.unique(np.concatenate([np.zeros(1), *(track.times for track in self.tracks)]))
 
     def motion(self, rest: NodeMotion, time_s: float) -> NodeMotion:
-        """Return the nodes' transforms at a time; properties without a track keep the rest pose."""
+        """Returns the nodes' transforms at a time; properties without a track keep the rest pose."""
         motion = rest.copy()
         for track in self.tracks:
             values = track.at(time_s)
@@ -85,7 +85,7 @@ class Clip:
 
 
 def unit(quaternions: Float64[np.ndarray, "c 4"]) -> Float64[np.ndarray, "c 4"]:
-    """Normalize quaternions."""
+    """Normalizes quaternions."""
     lengths = np.linalg.norm(quaternions, axis=1, keepdims=True)
     return np.asarray(quaternions / np.maximum(lengths, 1e-30))
 
@@ -93,7 +93,7 @@ def unit(quaternions: Float64[np.ndarray, "c 4"]) -> Float64[np.ndarray, "c 4"]:
 def slerp(
     first: Float64[np.ndarray, "c 4"], second: Float64[np.ndarray, "c 4"], fraction: float
 ) -> Float64[np.ndarray, "c 4"]:
-    """Interpolate unit quaternions along the shorter arc (Shoemake 1985)."""
+    """Interpolates unit quaternions along the shorter arc (Shoemake 1985)."""
     cosine = np.einsum("cw,cw->c", first, second)[:, None]
     second = np.where(cosine < 0, -second, second)
     angle = np.arccos(np.clip(np.abs(cosine), 0, 1))
@@ -108,7 +108,7 @@ def slerp(
 def _hermite(
     before: Float64[np.ndarray, "3 c w"], after: Float64[np.ndarray, "3 c w"], span_s: float, fraction: float
 ) -> Float64[np.ndarray, "c w"]:
-    """Evaluate a cubic Hermite spline (appendix C.5); tangents are per second."""
+    """Evaluates a cubic Hermite spline (appendix C.5); tangents are per second."""
     square, cube = fraction**2, fraction**3
     return np.asarray(
         (2 * cube - 3 * square + 1) * before[1]
@@ -119,7 +119,7 @@ def _hermite(
 
 
 def read_clips(gltf: GltfDocument, nodes: NodeTree) -> tuple[Clip, ...]:
-    """Read all clips of a document.
+    """Reads all clips of a document.
 
     Raises:
         GltfFaultError: a channel without its sampler, keys that do not fit, times that do not rise, a node that does
@@ -138,7 +138,7 @@ def read_clips(gltf: GltfDocument, nodes: NodeTree) -> tuple[Clip, ...]:
 
 
 def _tracks(gltf: GltfDocument, nodes: NodeTree, animation: dict[str, Any]) -> tuple[Track, ...]:
-    """Group channels of the same times, property and width into tracks, which are sampled at once."""
+    """Groups channels of the same times, property and width into tracks, which are sampled at once."""
     together: dict[tuple[Any, ...], list[tuple[int, np.ndarray]]] = defaultdict(list)
     for number, channel in enumerate(animation.get("channels", [])):
         path, node = channel["target"].get("path"), channel["target"].get("node")

@@ -27,7 +27,7 @@ class GltfFaultError(Exception):
 
 @contextmanager
 def faults_named(path: Path) -> Iterator[None]:
-    """Turn everything that a malformed document can raise into a DeltalightError that names the file."""
+    """Turns everything that a malformed document can raise into a DeltalightError that names the file."""
     try:
         yield
     except GltfFaultError as fault:
@@ -45,11 +45,11 @@ class GltfDocument:
     buffers: tuple[bytes, ...]
 
     def entries(self, name: str) -> list[dict[str, Any]]:
-        """Return a top-level list of the document."""
+        """Returns a top-level list of the document."""
         return list(self.root.get(name, []))
 
     def array(self, index: int) -> Shaped[np.ndarray, "n c"]:
-        """Return the rows of an accessor: as stored, or float32 in -1..1 or 0..1 if it is normalised."""
+        """Returns the rows of an accessor: as stored, or float32 in -1..1 or 0..1 if it is normalised."""
         accessor = self.root["accessors"][index]
         columns, kind = COMPONENTS[accessor["type"]], np.dtype(COMPONENT_TYPES[accessor["componentType"]])
         if "bufferView" in accessor:
@@ -61,7 +61,7 @@ class GltfDocument:
         return _normalized(rows) if accessor.get("normalized", False) else rows
 
     def floats(self, index: int, columns: int) -> Float32[np.ndarray, "n c"]:
-        """Return the rows of an accessor as float32.
+        """Returns the rows of an accessor as float32.
 
         Raises:
             GltfFaultError: it has another number of columns or holds what is not finite.
@@ -94,7 +94,7 @@ class GltfDocument:
         return replaced
 
     def texture(self, index: int) -> "Image.Image | None":
-        """Open the image of a texture without decoding it; None for unsupported kinds.
+        """Opens the image of a texture without decoding it; None for unsupported kinds.
 
         Raises:
             GltfFaultError: it is missing or no picture.
@@ -120,7 +120,7 @@ class GltfDocument:
 
 
 def uri_bytes(uri: str, folder: Path) -> bytes:
-    """Read what a URI refers to: embedded data, or a file inside the document's folder."""
+    """Reads what a URI refers to: embedded data, or a file inside the document's folder."""
     if uri.startswith("data:"):
         return base64.b64decode(uri.partition("base64,")[2])
     path = file_inside(uri, folder)
@@ -130,7 +130,7 @@ def uri_bytes(uri: str, folder: Path) -> bytes:
 
 
 def file_inside(uri: str, folder: Path) -> Path:
-    """Resolve the file that a URI names; it must lie inside `folder`."""
+    """Resolves the file that a URI names; it must lie inside `folder`."""
     path = (folder / unquote(uri)).resolve()
     if not path.is_relative_to(folder.resolve()):
         raise GltfFaultError(f"it refers to {uri}, outside its own folder")
@@ -138,7 +138,7 @@ def file_inside(uri: str, folder: Path) -> Path:
 
 
 def _normalized(rows: Shaped[np.ndarray, "n c"]) -> Float32[np.ndarray, "n c"]:
-    """Convert integers to fractions of their greatest value (glTF 2.0, section 3.11)."""
+    """Converts integers to fractions of their greatest value (glTF 2.0, section 3.11)."""
     if rows.dtype.kind == "f":
         return rows.astype(np.float32)
     fractions = rows.astype(np.float32) / np.float32(np.iinfo(rows.dtype).max)
@@ -155,7 +155,7 @@ class NodeMotion:
     weights: tuple[Float64[np.ndarray, " _"], ...]
 
     def copy(self) -> "NodeMotion":
-        """Return a deep copy."""
+        """Returns a deep copy."""
         weights = tuple(values.copy() for values in self.weights)
         return NodeMotion(self.translation.copy(), self.rotation.copy(), self.scale.copy(), weights)
 
@@ -175,7 +175,7 @@ class NodeTree:
     has_matrix: Bool[np.ndarray, " n"]
 
     def asset_from_node(self, motion: NodeMotion) -> Float64[np.ndarray, "n 4 4"]:
-        """Return the global transform of each node."""
+        """Returns the global transform of each node."""
         matrices = np.tile(np.eye(4), (len(self.parents), 1, 1))
         matrices[:, :3, :3] = _rotations(motion.rotation) * motion.scale[:, None, :]
         matrices[:, :3, 3] = motion.translation
@@ -186,7 +186,7 @@ class NodeTree:
 
 
 def read_nodes(gltf: GltfDocument) -> NodeTree:
-    """Read the nodes of a document; they form trees (asset_check.py).
+    """Reads the nodes of a document; they form trees (asset_check.py).
 
     Raises:
         GltfFaultError: numbers that are not finite, a rotation of length 0, or a wrong number of weights.
@@ -210,7 +210,7 @@ def read_nodes(gltf: GltfDocument) -> NodeTree:
 
 
 def target_count(mesh: dict[str, Any]) -> int:
-    """Return the number of morph targets of a mesh."""
+    """Returns the number of morph targets of a mesh."""
     return len(mesh["primitives"][0].get("targets", []))
 
 
@@ -223,7 +223,7 @@ def _vectors(nodes: list[dict[str, Any]], key: str, default: Any) -> Float64[np.
 
 
 def _rest_weights(gltf: GltfDocument, node: dict[str, Any]) -> Float64[np.ndarray, " t"]:
-    """Return the node's own morph weights, else the mesh's, else none."""
+    """Returns the node's own morph weights, else the mesh's, else none."""
     if "mesh" not in node:
         return np.zeros(0)
     mesh = gltf.root["meshes"][node["mesh"]]
@@ -235,7 +235,7 @@ def _rest_weights(gltf: GltfDocument, node: dict[str, Any]) -> Float64[np.ndarra
 
 
 def _levels(nodes: list[dict[str, Any]]) -> tuple[Int64[np.ndarray, " n"], tuple[np.ndarray, ...]]:
-    """Return the parent of each node, -1 for roots, and the nodes of each depth."""
+    """Returns the parent of each node, -1 for roots, and the nodes of each depth."""
     parents = np.full(len(nodes), -1)
     for index, node in enumerate(nodes):
         parents[node.get("children", [])] = index
@@ -247,7 +247,7 @@ def _levels(nodes: list[dict[str, Any]]) -> tuple[Int64[np.ndarray, " n"], tuple
 
 
 def _shown(gltf: GltfDocument, nodes: list[dict[str, Any]]) -> tuple[int, ...]:
-    """Return the nodes of the default scene in depth-first order; all nodes where there is no scene."""
+    """Returns the nodes of the default scene in depth-first order; all nodes where there is no scene."""
     scenes = gltf.entries("scenes")
     if not scenes:
         return tuple(range(len(nodes)))

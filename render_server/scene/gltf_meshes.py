@@ -70,7 +70,7 @@ class GltfPart:
     skin: Skin | None
 
     def of_vertices(self, rows: Int64[np.ndarray, " k"]) -> "GltfPart":
-        """Return the part with some of its vertices only, to track their positions."""
+        """Returns the part with some of its vertices only, to track their positions."""
         morph, skin = self.morph, self.skin
         if morph is not None:
             morph = Morph(tuple(delta[rows] for delta in morph.positions), None)
@@ -90,7 +90,7 @@ class PartReader:
         self._primitives: dict[tuple[int, int], ConvertedMesh | None] = {}
 
     def read(self) -> list[tuple[int | None, GltfPart]]:
-        """Read the parts of all shown nodes, with the index of their material.
+        """Reads the parts of all shown nodes, with the index of their material.
 
         Raises:
             GltfFaultError: attributes that do not fit each other, or joints that do not exist.
@@ -158,7 +158,7 @@ def _material(gltf: GltfDocument, index: int | None) -> Material:
 
 
 def _geometry(gltf: GltfDocument, primitive: dict[str, Any]) -> FileGeometry | None:
-    """Return the geometry of a primitive; None for points and lines."""
+    """Returns the geometry of a primitive; None for points and lines."""
     mode = primitive.get("mode", _TRIANGLES)
     if mode not in (_TRIANGLES, _STRIP, _FAN):
         return None
@@ -195,7 +195,7 @@ def _triangles(
 def _attribute(
     gltf: GltfDocument, attributes: dict[str, int], name: str, count: int, columns: int
 ) -> Float32[np.ndarray, "n c"] | None:
-    """Return the first columns of an attribute (integer colours as 0..1); None where the primitive lacks it."""
+    """Returns the first columns of an attribute (integer colours as 0..1); None where the primitive lacks it."""
     if name not in attributes:
         return None
     rows = gltf.array(attributes[name])
@@ -211,7 +211,7 @@ def _uv(gltf: GltfDocument, attributes: dict[str, int], count: int) -> Float32[n
 
 
 def _morph(gltf: GltfDocument, primitive: dict[str, Any], made: ConvertedMesh, count: int) -> Morph:
-    """Return the morph targets of a primitive, for the vertices of its converted mesh."""
+    """Returns the morph targets of a primitive, for the vertices of its converted mesh."""
     targets: Sequence[dict[str, int]] = primitive.get("targets", [])
     if len(targets) != count:
         raise GltfFaultError("the primitives of a mesh have different numbers of morph targets")
@@ -233,7 +233,7 @@ def _delta(
 
 
 def _joint_weights(gltf: GltfDocument, primitive: dict[str, Any], joint_count: int) -> csr_array:
-    """Return the weight of each joint at each of the file's vertices."""
+    """Returns the weight of each joint at each of the file's vertices."""
     attributes = primitive["attributes"]
     sets = [name.removeprefix("JOINTS_") for name in sorted(attributes) if name.startswith("JOINTS_")]
     joints = np.hstack([gltf.array(attributes[f"JOINTS_{name}"]) for name in sets]).astype(np.int64)
@@ -249,7 +249,7 @@ def _joint_weights(gltf: GltfDocument, primitive: dict[str, Any], joint_count: i
     if joints.max(initial=0) >= joint_count:
         raise GltfFaultError(f"a skinned mesh hangs on joint {joints.max()} of a skin of {joint_count}")
     sums = weights.sum(axis=1, keepdims=True)
-    weights[sums[:, 0] == 0, 0] = 1.0  # as viewers do: vertices without weights follow their first joint
+    weights[sums[:, 0] == 0, 0] = 1.0  # as viewers do: vertices without weights move with their first joint
     weights /= np.where(sums == 0, 1, sums)
     rows = np.repeat(np.arange(len(joints)), joints.shape[1])
     # Duplicates are added up, and entries of a row sorted: the same file gives the same sums.
@@ -288,24 +288,24 @@ class GltfAsset:
         self._bounds: dict[str, Float64[np.ndarray, "2 3"]] = {}
 
     def clip(self, wanted: int | str | None) -> Clip | None:
-        """Return the clip of this number or name (None: the first); None if there is none."""
+        """Returns the clip of this number or name (None: the first); None if there is none."""
         if isinstance(wanted, str):
             return next((clip for clip in self.clips if clip.name == wanted), None)
         number = 0 if wanted is None else wanted
         return self.clips[number] if number < len(self.clips) else None
 
     def pose(self, clip: Clip | None, time_s: float) -> Pose:
-        """Return the pose of a clip at a time, or the rest pose."""
+        """Returns the pose of a clip at a time, or the rest pose."""
         rest = self._nodes.rest
         motion = rest if clip is None else clip.motion(rest, time_s)
         return Pose(self._nodes.asset_from_node(motion), motion.weights)
 
     def meshes(self, pose: Pose) -> list[TriangleMesh]:
-        """Return the meshes in a pose."""
+        """Returns the meshes in a pose."""
         return [_posed(rest, same, pose) for rest, same in zip(self._rest, self._parts, strict=True)]
 
     def bounds(self, clip: Clip) -> Float64[np.ndarray, "2 3"]:
-        """Return least and greatest coordinates over a whole clip, with a margin of 2 %; computed once.
+        """Returns least and greatest coordinates over a whole clip, with a margin of 2 %; computed once.
 
         Raises:
             DeltalightError: it moves vertices beyond 10 km.
@@ -331,7 +331,7 @@ class GltfAsset:
 
 
 def load_gltf(path: Path) -> GltfAsset:
-    """Read a .glb or .gltf file with its clips.
+    """Reads a .glb or .gltf file with its clips.
 
     Raises:
         DeltalightError: it is damaged, empty, or holds what cannot be shown.
@@ -353,13 +353,13 @@ def _sweep_times(clip: Clip) -> Float64[np.ndarray, " k"]:
 
 
 def _sampled_vertices(part: GltfPart, vertex_count: int) -> GltfPart:
-    """Return a part with the vertices that triangles use, or a subset where the asset has many."""
+    """Returns a part with the vertices that triangles use, or a subset where the asset has many."""
     used = np.unique(part.mesh.triangles)
     return part.of_vertices(used[:: -(-vertex_count // MAX_SWEEP_VERTICES)])
 
 
 def _posed(rest: TriangleMesh, parts: Sequence[GltfPart], pose: Pose) -> TriangleMesh:
-    """Return the mesh of one material in a pose."""
+    """Returns the mesh of one material in a pose."""
     shaped = [_shaped(part, pose) for part in parts]
     return replace(
         rest,
@@ -372,7 +372,7 @@ def _posed(rest: TriangleMesh, parts: Sequence[GltfPart], pose: Pose) -> Triangl
 
 
 def _shaped(part: GltfPart, pose: Pose) -> TriangleMesh:
-    """Morph a part, then place it by its skin or its node. A mirroring node reverses the winding."""
+    """Morphs a part, then places it by its skin or its node. A mirroring node reverses the winding."""
     matrices = _matrices(part, pose)
     positions = _placed(_morphed(part, pose), matrices)
     mirrored = part.skin is None and np.linalg.det(matrices[:3, :3]) < 0
@@ -385,14 +385,14 @@ def _shaped(part: GltfPart, pose: Pose) -> TriangleMesh:
 
 
 def _matrices(part: GltfPart, pose: Pose) -> Float64[np.ndarray, "*n 4 4"]:
-    """Return asset_from_mesh: one matrix, or with a skin one per vertex. The node of a skinned mesh has no effect."""
+    """Returns asset_from_mesh: one matrix, or one per vertex of a skinned mesh, whose node has no effect."""
     if part.skin is None:
         return np.asarray(pose.asset_from_node[part.node])
     return _blended(part.skin, pose)
 
 
 def _blended(skin: Skin, pose: Pose) -> Float64[np.ndarray, "n 4 4"]:
-    """Blend the joints' matrices linearly."""
+    """Blends the joints' matrices linearly."""
     asset_from_mesh = pose.asset_from_node[skin.joints] @ skin.joint_from_mesh
     return np.asarray((skin.weights @ asset_from_mesh.reshape(-1, 16)).reshape(-1, 4, 4))
 
@@ -400,7 +400,7 @@ def _blended(skin: Skin, pose: Pose) -> Float64[np.ndarray, "n 4 4"]:
 def _placed(
     positions: Float32[np.ndarray, "n 3"], matrices: Float64[np.ndarray, "*n 4 4"]
 ) -> Float32[np.ndarray, "n 3"]:
-    """Transform positions by one matrix, or one each."""
+    """Transforms positions by one matrix, or one each."""
     turned = (matrices[..., :3, :3] @ positions[..., None].astype(np.float64))[..., 0]
     return np.asarray(turned + matrices[..., :3, 3], np.float32)
 
@@ -416,7 +416,7 @@ def _added(
     deltas: Sequence[Float32[np.ndarray, "n 3"]],
     weights: Float64[np.ndarray, " t"],
 ) -> Float32[np.ndarray, "n 3"]:
-    """Add weighted deltas."""
+    """Adds weighted deltas."""
     total = base.copy()
     for delta, weight in zip(deltas, weights, strict=True):
         if weight != 0:
@@ -437,7 +437,7 @@ def _turned(
     *,
     mirrored: bool,
 ) -> Float32[np.ndarray, "n 3"]:
-    """Transform normals by one matrix, or one each, to unit length.
+    """Transforms normals by one matrix, or one each, to unit length.
 
     Uses the cofactor matrix, which is the inverse transpose but for a factor and exists for singular matrices too:
     clips often hide things by a scale of 0. A normal of length 0 is replaced by that of `instead`.

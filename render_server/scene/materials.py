@@ -49,7 +49,7 @@ class Material:
 
     @classmethod
     def from_document(cls, document: MaterialDocument) -> Self:
-        """Make a material from a scene document, which replaces the asset's own."""
+        """Makes a material from a scene document, which replaces the asset's own."""
         return cls(
             base_color=np.array(document.base_color, np.float32),
             metallic=document.metallic,
@@ -62,7 +62,7 @@ class Material:
 
     @classmethod
     def from_gltf(cls, description: dict[str, Any], base_color: Image.Image | None) -> Self:
-        """Make a material from an entry of a glTF document's `materials` and its decoded texture.
+        """Makes a material from an entry of a glTF document's `materials` and its decoded texture.
 
         Roughness and metallic textures are left out: their factors alone count.
         """
@@ -86,7 +86,7 @@ class Material:
 
     @classmethod
     def from_mtl(cls, name: str, keys: dict[str, Any], image: Image.Image | None) -> Self:
-        """Make a material from the lower-case keys of an OBJ material library.
+        """Makes a material from the lower-case keys of an OBJ material library.
 
         Kd and Ke are linear. The Phong exponent Ns becomes alpha = sqrt(2/(Ns + 2)) (Walter et al. 2007); Ks
         only tells whether the surface is specular at all, for it is no reflectance at normal incidence.
@@ -103,7 +103,7 @@ class Material:
         )
 
     def checked(self, place: str) -> Self:
-        """Return the material with colour, metallic and roughness clipped to 1.
+        """Returns the material with colour, metallic and roughness clipped to 1.
 
         Raises:
             DeltalightError: a value is not finite or negative; `place` names the file.
@@ -134,7 +134,7 @@ def _first(value: Any, default: float) -> float:  # noqa: ANN401 - as in the fil
 
 
 def linear_texture(image: Image.Image) -> Float16[np.ndarray, "h w 3"]:
-    """Decode an sRGB picture to linear R G B.
+    """Decodes an sRGB picture to linear R G B.
 
     Raises:
         DeltalightError: it has more than 64 million pixels or cannot be decoded.
@@ -149,7 +149,7 @@ def linear_texture(image: Image.Image) -> Float16[np.ndarray, "h w 3"]:
 
 
 def material_table(materials: Sequence[Material]) -> Float32[np.ndarray, "k 16"]:
-    """Pack materials for a shader, four vectors each.
+    """Packs materials for a shader, four vectors each.
 
     (base color, metallic), (dielectric F0 three times, roughness), (emission, transmission),
     (double sided 0/1, index of the texture among those that have one or -1, 0, 0).

@@ -31,7 +31,7 @@ class Asset:
 
 
 def load_mesh(path: Path) -> list[TriangleMesh]:
-    """Read a GLB, glTF, OBJ, PLY or STL file: one mesh a material, in the file's own axes and units.
+    """Reads a GLB, glTF, OBJ, PLY or STL file: one mesh per material, in the file's own axes and units.
 
     Applies the scene graph's transforms (and skins and morph targets of glTF, in the rest pose), drops degenerate
     triangles, and computes missing normals (sharp at edges beyond 60 degrees). Vertex colours are sRGB bytes, in
@@ -45,7 +45,7 @@ def load_mesh(path: Path) -> list[TriangleMesh]:
 
 
 def load_asset(path: Path) -> Asset:
-    """Read a mesh file as `load_mesh` does, and the clips of a glTF file.
+    """Reads a mesh file as `load_mesh` does, and the clips of a glTF file.
 
     Raises:
         DeltalightError: as `load_mesh`, or a malformed clip.
@@ -71,7 +71,7 @@ def _open_scene(path: Path) -> trimesh.Scene:
 
 
 def _parts(scene: trimesh.Scene, path: Path) -> list[tuple[int, TriangleMesh]]:
-    """Return (material key, mesh in the file's frame) of every node that shows triangles."""
+    """Returns (material key, mesh in the file's frame) of every node that shows triangles."""
     materials: dict[int, Material] = {}
     parts = []
     for node in scene.graph.nodes_geometry:
@@ -119,7 +119,7 @@ def _file_geometry(geometry: trimesh.Trimesh) -> FileGeometry:
 
 
 def _uv(geometry: trimesh.Trimesh, count: int) -> Float32[np.ndarray, "n 2"] | None:
-    """Return texture coordinates with the origin at the top; the loader has it at the bottom."""
+    """Returns texture coordinates with the origin at the top; the loader has it at the bottom."""
     uv = getattr(geometry.visual, "uv", None)
     if uv is None or np.shape(uv) != (count, 2) or not np.isfinite(uv).all():
         return None
@@ -127,7 +127,7 @@ def _uv(geometry: trimesh.Trimesh, count: int) -> Float32[np.ndarray, "n 2"] | N
 
 
 def _colors(geometry: trimesh.Trimesh) -> Float32[np.ndarray, "n 3"] | None:
-    """Return linear vertex colours: sRGB bytes of PLY, STL and OBJ."""
+    """Returns linear vertex colours: sRGB bytes of PLY, STL and OBJ."""
     if geometry.visual.kind != "vertex":
         return None
     codes = np.asarray(geometry.visual.vertex_colors, np.uint8)[:, :3]

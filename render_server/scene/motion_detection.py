@@ -51,7 +51,7 @@ class MotionDetector:
         self._reference: _Reference | None = None
 
     def update(self, frame: ViewFrame) -> bool:
-        """Return whether the real scene must be rebuilt; if so, `frame` becomes the reference."""
+        """Returns whether the real scene must be rebuilt; if so, `frame` becomes the reference."""
         current = _Reference(frame, _downsampled_color(frame), _subsampled_inverse_depth(frame.depth))
         if self._reference is not None and not self._changed(self._reference, current):
             return False
@@ -69,7 +69,7 @@ class MotionDetector:
         )
 
     def _moved_fraction(self, old: _Reference, new: _Reference) -> float:
-        """Return the fraction of common samples whose inverse depth differs by more than noise explains."""
+        """Returns the fraction of common samples whose inverse depth differs by more than noise explains."""
         before, after, depth = old.inverse_depth, new.inverse_depth, new.frame.depth
         if before is None or after is None or depth is None:
             return 0.0
@@ -81,7 +81,7 @@ class MotionDetector:
         return float(np.count_nonzero(moved)) / max(int(np.count_nonzero(both)), 1)
 
     def _recolored_fraction(self, old: _Reference, new: _Reference) -> float:
-        """Return the fraction of block means whose linear colour differs in any channel by more than noise explains.
+        """Returns the fraction of block means whose linear colour differs in any channel by more than noise explains.
 
         A block's mean has the noise of a pixel divided by the block's edge; codecs leave some more.
         """
@@ -91,7 +91,7 @@ class MotionDetector:
 
 
 def _downsampled_color(frame: ViewFrame) -> Float32[np.ndarray, "gh gw 3"]:
-    """Return linear colour averaged over blocks of 4 x 4 pixels."""
+    """Returns linear colour averaged over blocks of 4 x 4 pixels."""
     height, width = frame.color.shape[:2]
     size = (max(width // GRID_STEP_PX, 1), max(height // GRID_STEP_PX, 1))
     table = decode_lut(frame.response)[None] / np.float32(frame.exposure_scale)
@@ -100,7 +100,7 @@ def _downsampled_color(frame: ViewFrame) -> Float32[np.ndarray, "gh gw 3"]:
 
 
 def _subsampled_inverse_depth(depth: DepthImage | None) -> Float32[np.ndarray, "gh gw"] | None:
-    """Return 1/z of every fourth pixel, 0 where unknown."""
+    """Returns 1/z of every fourth pixel, 0 where unknown."""
     if depth is None:
         return None
     grid = np.s_[GRID_STEP_PX // 2 :: GRID_STEP_PX, GRID_STEP_PX // 2 :: GRID_STEP_PX]
@@ -114,7 +114,7 @@ def _subsampled_inverse_depth(depth: DepthImage | None) -> Float32[np.ndarray, "
 def _image_motion(
     before: ViewFrame, after: ViewFrame, inverse_depth: Float32[np.ndarray, "gh gw"] | None
 ) -> float:
-    """Return the greatest motion in pixels of points at the scene's distance between two poses.
+    """Returns the greatest motion in pixels of points at the scene's distance between two poses.
 
     Points on a coarse grid of pixels are placed at the nearest and at the mean distance of the old frame.
     """
@@ -139,7 +139,7 @@ def _image_motion(
 def _distances(
     inverse_depth: Float32[np.ndarray, "gh gw"] | None, world_from_camera: Float64[np.ndarray, "4 4"]
 ) -> tuple[float, ...]:
-    """Return the nearest (5 % are nearer) and the mean distance; without depth that of the world's origin."""
+    """Returns the nearest (5 % are nearer) and the mean distance; without depth that of the world's origin."""
     known = np.zeros(0) if inverse_depth is None else inverse_depth[inverse_depth > 0]
     if known.size == 0:
         return (max(float(np.linalg.norm(world_from_camera[:3, 3])), 0.1),)

@@ -18,14 +18,14 @@ from protocol.errors import DeltalightError
 from render_server.lights.octahedral import even_directions, harmonics
 
 Vectors = Float32[np.ndarray, "m 3"]
-FINER = 4  # ratio of directions of successive sets
-FINEST = 2  # sets beyond the first: of all directions, few meet a ball seen from afar
+FINER = 4  # ratio of the numbers of directions of successive sets
+FINEST = 2  # sets beyond the first: from afar, few of all directions hit the object
 INSIDE = (
     0.75  # fraction of directions that meet back faces from a point inside the object, or in a closed gap
 )
 CHUNK = 400_000  # rays traced at once: some 5 ms, after which another thread may run
-AIM = 1.02  # margin of the enclosing radius: the rim of an object that fills its sphere is met too
-BLEND_CELLS = 2  # over which a shell blends into the next at its border; the object lies within
+AIM = 1.02  # margin of the enclosing radius, so that the silhouette of an object that fills its sphere is hit too
+BLEND_CELLS = 2  # over which a shell blends into the next at its border; the object lies further inside
 
 ProgressCallback = Callable[[float], None]
 """Takes the fraction of the work that is done (0..1); may raise to cancel the rest."""
@@ -45,7 +45,7 @@ class DirectionSet:
 
 @cache
 def direction_set(count: int) -> DirectionSet:
-    """Return a set of `count` directions."""
+    """Returns a set of `count` directions."""
     return DirectionSet(even_directions(count).astype(np.float32))
 
 
@@ -88,7 +88,7 @@ class ObjectRays:
     def trace(
         self, points: Vectors, count: int
     ) -> Iterator[tuple[Int64[np.ndarray, " p"], DirectionSet, RayHits]]:
-        """Trace rays from all points, in chunks: yields point indices, their direction set, and the hits.
+        """Traces rays from all points, in chunks: yields point indices, their direction set, and the hits.
 
         Points within the enclosing sphere use `count` directions; from farther away the object fills less of the
         sphere, and finer sets hit it about as often. Only directions that may hit it are traced.
@@ -102,18 +102,18 @@ class ObjectRays:
                 yield part, chosen, self._trace_aimed(points[part], chosen)
 
     def inside(self, hits: RayHits, points: int, chosen: DirectionSet) -> Bool[np.ndarray, " points"]:
-        """Return which of a chunk's points lie inside the object."""
+        """Returns which of a chunk's points lie inside the object."""
         behind = np.bincount(hits.point[hits.behind], minlength=points)
         return np.asarray(behind > INSIDE * len(chosen.directions))
 
     def _finer(self, points: Vectors) -> Int64[np.ndarray, " m"]:
-        """Return the level of the direction set of each point."""
+        """Returns the level of the direction set of each point."""
         fraction = (1 - self._aim_cosine(points)) / 2
         steps = np.ceil(np.log(1 / np.maximum(fraction, 1e-9)) / math.log(FINER) - 1e-9)
         return np.clip(steps, 0, FINEST).astype(np.int64)
 
     def _aim_cosine(self, points: Vectors) -> Float64[np.ndarray, " m"]:
-        """Return the cosine of the half-angle of the enclosing sphere from each point; -1 from inside."""
+        """Returns the cosine of the half-angle of the enclosing sphere from each point; -1 from inside."""
         ratio = AIM * self.radius / np.maximum(np.linalg.norm(points - self.centre, axis=1), 1e-12)
         return np.where(ratio < 1, np.sqrt(np.maximum(1 - ratio**2, 0)), -1.0)
 
@@ -125,7 +125,7 @@ class ObjectRays:
         return self._trace(points[point], chosen.directions[direction], point, direction)
 
     def trace_hemisphere(self, points: Vectors, normals: Vectors, chosen: DirectionSet) -> RayHits:
-        """Trace all directions of the set above each point's horizon."""
+        """Traces all directions of the set above each point's horizon."""
         point, direction = np.nonzero(normals @ chosen.directions.T > 0)
         return self._trace(points[point], chosen.directions[direction], point, direction)
 
@@ -167,7 +167,7 @@ class ShellGrid:
     halves: Float64[np.ndarray, "shells 3"]
 
     def points(self, shell: int, resolution: int) -> Float32[np.ndarray, "n 3"]:
-        """Return the sample points of a shell, x fastest; the outermost lie on its faces."""
+        """Returns the sample points of a shell, x fastest; the outermost lie on its faces."""
         steps = np.linspace(-1, 1, resolution)
         z, y, x = np.meshgrid(steps, steps, steps, indexing="ij")
         unit = np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
@@ -175,7 +175,7 @@ class ShellGrid:
 
 
 def place_shells(rays: ObjectRays, settings: FieldSettings) -> ShellGrid:
-    """Place shells from just around the object to `reach` times its radius, in even ratios along each axis."""
+    """Places shells from just around the object to `reach` times its radius, in even ratios along each axis."""
     margin = 1 - 2 * BLEND_CELLS / (settings.resolution - 1)
     cell = 2 * rays.radius / (settings.resolution - 1)
     first = np.maximum(rays.half / margin, rays.half + BLEND_CELLS * cell / 2)
@@ -201,7 +201,7 @@ class OcclusionField:
 def compute_occlusion(
     rays: ObjectRays, grid: ShellGrid, settings: FieldSettings, progress: ProgressCallback
 ) -> Float16[np.ndarray, "shells n n n k"]:
-    """Sample the occlusion on all shells."""
+    """Samples the occlusion on all shells."""
     n, count = settings.resolution, settings.order**2
     found = np.empty((settings.shells, n, n, n, count), np.float16)
     for shell in range(settings.shells):
@@ -220,7 +220,7 @@ def compute_occlusion(
 def _occlusion_at(
     rays: ObjectRays, points: Float32[np.ndarray, "n 3"], settings: FieldSettings, report: ProgressCallback
 ) -> tuple[Float32[np.ndarray, "n k"], Bool[np.ndarray, " n"]]:
-    """Return the coefficients at points, and which points lie inside the object."""
+    """Returns the coefficients at points, and which points lie inside the object."""
     values = np.zeros((len(points), settings.order**2), np.float32)
     inside, finished = np.zeros(len(points), bool), 0
     for part, chosen, hits in rays.trace(points, settings.rays):
@@ -238,7 +238,7 @@ def fill_inside(
     inside: Bool[np.ndarray, "n n n"],
     spacing: Float64[np.ndarray, "3"],
 ) -> Float32[np.ndarray, "n n n *rest"]:
-    """Give samples inside the object the nearest value outside: all is occluded inside, half at the surface."""
+    """Gives samples inside the object the nearest value outside: all is occluded inside, half at the surface."""
     if not inside.any() or inside.all():
         return values
     nearest = distance_transform_edt(inside, sampling=spacing, return_distances=False, return_indices=True)

@@ -56,7 +56,7 @@ class SurfacePieces:
 
 
 def object_surface(meshes: Sequence[TriangleMesh], *, plain: bool) -> Float32[np.ndarray, "m 3 6"]:
-    """Return the corners of all triangles: position, diffuse reflectance (linear RGB).
+    """Returns the corners of all triangles: position, diffuse reflectance (linear RGB).
 
     `plain`: reflectance 1, because the scene document's material replaces the asset's.
     """
@@ -64,7 +64,7 @@ def object_surface(meshes: Sequence[TriangleMesh], *, plain: bool) -> Float32[np
 
 
 def surface_pieces(surface: Float32[np.ndarray, "m 3 6"], radius: float) -> SurfacePieces:
-    """Split large triangles into pieces."""
+    """Splits large triangles into pieces."""
     pieces = split_triangles(surface, PIECE_EDGE * radius)
     return SurfacePieces(np.ascontiguousarray(pieces[..., :3]), pieces[..., 3:].mean(axis=1))
 
@@ -83,7 +83,7 @@ def _with_reflectance(mesh: TriangleMesh, *, plain: bool) -> Float32[np.ndarray,
 
 
 def _texels(texture: Float16[np.ndarray, "h w 3"], uv: Float32[np.ndarray, "m 3 2"]) -> np.ndarray:
-    """Return the nearest texels at corners; the texture repeats."""
+    """Returns the nearest texels at corners; the texture repeats."""
     rows, columns = texture.shape[:2]
     x = np.minimum((uv[..., 0] % 1 * columns).astype(int), columns - 1)
     y = np.minimum((uv[..., 1] % 1 * rows).astype(int), rows - 1)
@@ -93,7 +93,7 @@ def _texels(texture: Float16[np.ndarray, "h w 3"], uv: Float32[np.ndarray, "m 3 
 def compute_transfer(
     pieces: SurfacePieces, grid: ShellGrid, settings: FieldSettings, progress: ProgressCallback
 ) -> Float16[np.ndarray, "shells h h h 9 9 3"]:
-    """Sample the radiance reflected by the object on all shells, at half the resolution of the occlusion."""
+    """Samples the radiance reflected by the object on all shells, at half the resolution of the occlusion."""
     n = settings.resolution // 2
     rays = ObjectRays(pieces.corners)
     reflected = _reflected_light(pieces, rays, settings.rays)
@@ -107,7 +107,7 @@ def compute_transfer(
 
 
 def _reflected_light(pieces: SurfacePieces, rays: ObjectRays, count: int) -> Float32[np.ndarray, "2m 9 3"]:
-    """Return the radiance of each piece's front for unit light coefficients, then that of each piece's back."""
+    """Returns the radiance of each piece's front for unit light coefficients, then that of each piece's back."""
     chosen, representative = _representative_pieces(pieces, rays.radius)
     normals = pieces.normals[chosen]
     front, back = (_irradiance(pieces.centres[chosen], side * normals, rays, count) for side in (1, -1))
@@ -120,7 +120,7 @@ def _reflected_light(pieces: SurfacePieces, rays: ObjectRays, count: int) -> Flo
 def _representative_pieces(
     pieces: SurfacePieces, radius: float
 ) -> tuple[Int64[np.ndarray, " c"], Int64[np.ndarray, " m"]]:
-    """Choose pieces with a transfer vector of their own, evenly by area, and the one that represents each piece."""
+    """Chooses pieces with a transfer vector of their own, evenly by area, and the one that represents each piece."""
     count = len(pieces.corners)
     if count <= MAX_PIECES:
         return np.arange(count), np.arange(count)
@@ -134,7 +134,7 @@ def _representative_pieces(
 def _irradiance(
     points: Float32[np.ndarray, "c 3"], normals: Float32[np.ndarray, "c 3"], rays: ObjectRays, count: int
 ) -> Float32[np.ndarray, "c 9"]:
-    """Return transfer vectors: the integral of visibility, clamped cosine and each harmonic."""
+    """Returns transfer vectors: the integral of visibility, clamped cosine and each harmonic."""
     directions = direction_set(count)
     basis = (harmonics(directions.directions, ORDER) * directions.solid_angle).astype(np.float32)
     start = (points + LIFT * rays.radius * normals).astype(np.float32)
@@ -150,7 +150,7 @@ def _irradiance(
 def _received_light(
     rays: ObjectRays, points: Float32[np.ndarray, "n 3"], reflected: Float32[np.ndarray, "m 9 3"], count: int
 ) -> tuple[Float32[np.ndarray, "n 9 27"], Bool[np.ndarray, " n"]]:
-    """Return coefficients of the radiance at points, by light coefficient and colour, and which points lie inside."""
+    """Returns radiance coefficients at points, by light coefficient and colour, and which points lie inside."""
     values = np.zeros((len(points), LENGTH, LENGTH * 3), np.float32)
     inside = np.zeros(len(points), bool)
     flat = reflected.reshape(len(reflected), -1)
@@ -168,7 +168,7 @@ def _accumulate(
     basis: Float32[np.ndarray, "d 9"],
     reflected: Float32[np.ndarray, "m 27"],
 ) -> None:
-    """Sum over each point's rays; hits are ordered by point."""
+    """Sums over each point's rays; hits are ordered by point."""
     pieces = len(reflected) // 2
     light = reflected[hits.triangle + pieces * hits.behind]
     seen = basis[hits.direction]

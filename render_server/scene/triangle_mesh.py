@@ -25,7 +25,7 @@ MAX_COORDINATE_M = 1e4
 def face_normals(
     positions: Float32[np.ndarray, "n 3"], triangles: Int32[np.ndarray, "m 3"]
 ) -> tuple[Float64[np.ndarray, "m 3"], Bool[np.ndarray, " m"]]:
-    """Return unit normals by the right-hand rule, and which triangles are not degenerate."""
+    """Returns unit normals by the right-hand rule, and which triangles are not degenerate."""
     corners = positions.astype(np.float64)[triangles]
     edges = np.roll(corners, -1, axis=1) - corners
     normals = np.cross(edges[:, 0], edges[:, 1])
@@ -45,7 +45,7 @@ class Smoothing:
     def normals(
         self, positions: Float32[np.ndarray, "n 3"], triangles: Int32[np.ndarray, "m 3"]
     ) -> Float32[np.ndarray, "n 3"]:
-        """Return angle-weighted mean normals (Thuermer & Wuethrich 1998) of each group."""
+        """Returns angle-weighted mean normals (Thuermer & Wuethrich 1998) of each group."""
         normals, _ = face_normals(positions, triangles)
         weights = _corner_angles(positions.astype(np.float64)[triangles]).ravel()[:, None]
         weighted = weights * np.repeat(normals, 3, axis=0)
@@ -60,7 +60,7 @@ def split_at_creases(
     triangles: Int32[np.ndarray, "m 3"],
     crease_deg: float = CREASE_ANGLE_DEG,
 ) -> tuple[Int64[np.ndarray, " k"], Int32[np.ndarray, "m 3"], Smoothing]:
-    """Split vertices where normals must not be smoothed over a crease.
+    """Splits vertices where normals must not be smoothed over a crease.
 
     Vertices at one position count as one. Around each, triangles that hang together over edges with less
     than `crease_deg` between their normals share a normal. Triangles must not be degenerate.
@@ -82,7 +82,7 @@ def smooth_normals(
     triangles: Int32[np.ndarray, "m 3"],
     crease_deg: float = CREASE_ANGLE_DEG,
 ) -> tuple[Int64[np.ndarray, " k"], Int32[np.ndarray, "m 3"], Float32[np.ndarray, "k 3"]]:
-    """Compute normals that do not smooth over creases.
+    """Computes normals that do not smooth over creases.
 
     Returns:
         (source, triangles, normals): as of `split_at_creases`.
@@ -94,14 +94,14 @@ def smooth_normals(
 def unit_or(
     vectors: Float[np.ndarray, "n 3"], instead: Float[np.ndarray, "n 3"]
 ) -> Float32[np.ndarray, "n 3"]:
-    """Normalize vectors; those of length 0 become `instead`. Unit vectors within float32 rounding keep their bits."""
+    """Normalizes vectors; zero vectors become `instead`, unit vectors within float32 rounding keep their bits."""
     lengths = np.linalg.norm(vectors.astype(np.float64), axis=1, keepdims=True)
     lengths[np.abs(lengths - 1) < UNIT_ROUNDING] = 1
     return np.where(lengths > 0, vectors / np.maximum(lengths, 1e-300), instead).astype(np.float32)
 
 
 def weld(positions: Float32[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
-    """Return the index of each vertex's position; equal positions share an index."""
+    """Returns the index of each vertex's position; equal positions share an index."""
     order = np.lexsort(positions.T)
     ordered = positions[order]
     fresh = np.concatenate([[False], (ordered[1:] != ordered[:-1]).any(axis=1)])
@@ -113,7 +113,7 @@ def weld(positions: Float32[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
 def _smoothing_groups(
     welded: Int64[np.ndarray, "m 3"], normals: Float64[np.ndarray, "m 3"], cos_crease: float
 ) -> Int32[np.ndarray, " c"]:
-    """Return the smoothing group of every corner (3 * triangle + k)."""
+    """Returns the smoothing group of every corner (3 * triangle + k)."""
     start, end = welded.ravel(), np.roll(welded, -1, axis=1).ravel()
     low, high = np.minimum(start, end), np.maximum(start, end)
     order = np.lexsort((low, high))
@@ -158,12 +158,12 @@ class TriangleMesh:
     colors: Float32[np.ndarray, "n 3"] | None = None
 
     def bounds(self) -> Float32[np.ndarray, "2 3"]:
-        """Return the least and greatest coordinates of the vertices that triangles use."""
+        """Returns the least and greatest coordinates of the vertices that triangles use."""
         used = self.positions[self.triangles.ravel()]
         return np.stack([used.min(axis=0), used.max(axis=0)])
 
     def transformed(self, matrix: Float64[np.ndarray, "4 4"]) -> "TriangleMesh":
-        """Return the mesh in another frame; a mirroring matrix reverses the winding."""
+        """Returns the mesh in another frame; a mirroring matrix reverses the winding."""
         linear = matrix[:3, :3]
         positions = self.positions @ linear.T + matrix[:3, 3]
         normals = self.normals @ np.linalg.inv(linear)
@@ -200,7 +200,7 @@ class ConvertedMesh:
 def converted(
     given: FileGeometry, material: Material, path: Path, *, keeps_degenerate: bool = False
 ) -> ConvertedMesh | None:
-    """Convert a file's mesh; None if no triangle is left after dropping degenerate ones.
+    """Converts a file's mesh; None if no triangle is left after dropping degenerate ones.
 
     Computes missing normals (sharp at edges beyond 60 degrees).
 
@@ -248,7 +248,7 @@ def _check_geometry(
 def _unit_normals(
     normals: Float32[np.ndarray, "n 3"] | None, count: int, path: Path
 ) -> Float32[np.ndarray, "n 3"] | None:
-    """Return the file's own normals at unit length; None where it has none or some of length zero."""
+    """Returns the file's own normals at unit length; None where it has none or some of length zero."""
     if normals is None or normals.shape != (count, 3):
         return None
     if not np.isfinite(normals).all():
@@ -257,7 +257,7 @@ def _unit_normals(
 
 
 def joined(parts: Sequence[TriangleMesh]) -> TriangleMesh:
-    """Concatenate meshes of one material."""
+    """Concatenates meshes of one material."""
     if len(parts) == 1:
         return parts[0]
     return TriangleMesh(
@@ -273,7 +273,7 @@ def joined(parts: Sequence[TriangleMesh]) -> TriangleMesh:
 def joined_triangles(
     parts: Sequence[Int32[np.ndarray, "_ 3"]], vertex_counts: Sequence[int]
 ) -> Int32[np.ndarray, "m 3"]:
-    """Concatenate triangles whose vertices are concatenated too."""
+    """Concatenates triangles whose vertices are concatenated too."""
     starts = np.cumsum([0, *vertex_counts[:-1]])
     moved = [triangles + start for triangles, start in zip(parts, starts, strict=True)]
     return np.concatenate(moved).astype(np.int32)
@@ -282,7 +282,7 @@ def joined_triangles(
 def _joined_attribute(
     values: Sequence[np.ndarray | None], parts: Sequence[TriangleMesh], default: float
 ) -> np.ndarray | None:
-    """Concatenate an attribute; parts without it get the default; None if no part has it."""
+    """Concatenates an attribute; parts without it get the default; None if no part has it."""
     width = next((value.shape[1] for value in values if value is not None), None)
     if width is None:
         return None
@@ -315,7 +315,7 @@ class GpuMesh:
 
 
 def merge_for_gpu(meshes: Sequence[TriangleMesh]) -> GpuMesh:
-    """Merge meshes (each with its own material, in this order) into one interleaved buffer.
+    """Merges meshes (each with its own material, in this order) into one interleaved buffer.
 
     Raises:
         DeltalightError: there is no mesh.
@@ -343,7 +343,7 @@ def _interleaved(mesh: TriangleMesh, material_id: int) -> Float32[np.ndarray, "n
 
 
 def split_triangles(corners: Float32[np.ndarray, "m 3 c"], max_edge: float) -> Float32[np.ndarray, "k 3 c"]:
-    """Bisect longest edges until none is longer than `max_edge` (same unit as the positions).
+    """Bisects longest edges until none is longer than `max_edge` (same unit as the positions).
 
     Columns 0..2 of a corner are its position; all other columns (normal, uv, material index...) are
     interpolated linearly with it. Triangles that are short enough come first, unchanged and in order.
@@ -365,7 +365,7 @@ def split_triangles(corners: Float32[np.ndarray, "m 3 c"], max_edge: float) -> F
 
 
 def _check_pieces(corners: Float32[np.ndarray, "m 3 c"], max_edge: float) -> None:
-    """Refuse by a lower bound on the number of pieces, before memory runs out.
+    """Refuses by a lower bound on the number of pieces, before memory runs out.
 
     An equilateral triangle is the largest that the limit allows; bisection makes a few times as many.
     """
@@ -380,7 +380,7 @@ def _check_pieces(corners: Float32[np.ndarray, "m 3 c"], max_edge: float) -> Non
 
 
 def _bisected(corners: Float32[np.ndarray, "m 3 c"], edge: np.ndarray) -> Float32[np.ndarray, "k 3 c"]:
-    """Cut every triangle at the midpoint of its edge number `edge` (from corner `edge` to the next)."""
+    """Cuts every triangle at the midpoint of its edge number `edge` (from corner `edge` to the next)."""
     row = np.arange(len(corners))
     start, end, opposite = (corners[row, (edge + step) % 3] for step in range(3))
     middle = (start + end) * np.float32(0.5)

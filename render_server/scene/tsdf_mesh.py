@@ -21,11 +21,11 @@ from render_server.scene.tsdf_volume import (
 from render_server.view import CameraView
 
 EDGES = tuple((a, b) for a in range(8) for b in range(a + 1, 8) if np.abs(CORNERS[a] - CORNERS[b]).sum() == 1)
-VOXELS = GRID * BLOCK  # voxels an edge of the whole grid
-# Growth of the clusters while there are still too many triangles.
+VOXELS = GRID * BLOCK  # per edge of the whole grid
+# Growth of the clusters while there are too many triangles.
 CLUSTER_GROWTH = 1.15
-# Points beyond so many median distances go to a second, coarser volume: a far wall would otherwise use up the voxels
-# that near things need.
+# Points beyond this many median distances go to a second, coarser volume: a far wall would otherwise use up the
+# voxels that near things need.
 NEAR_MEDIANS = 2.0
 # Triangles of the near and the far volume at full resolution, before decimation: integrating a frame and extracting
 # the meshes take a core 30 ms each at 320x240.
@@ -36,7 +36,7 @@ TRIANGLES_PER_CELL = 3.0
 # Memory for four times the blocks that the first frame fills (measured: a block per 54 triangles), 36 MB for the near
 # volume; blocks beyond are left out.
 TRIANGLES_PER_BLOCK = 54 / 4
-# Fraction of a box's edge that the first frame fills: the camera will look elsewhere.
+# Fraction of a box's edge that the first frame fills: later frames look elsewhere.
 FIRST_FRACTION = 0.5
 # Meshes are extracted again when this fraction of the voxels at surfaces moved by more than this fraction of a voxel:
 # less hardly changes how much of the scene's voxels they cover.
@@ -51,7 +51,7 @@ class _Cells(NamedTuple):
 
 
 def extract_mesh(volume: TsdfVolume) -> TriangleMesh:
-    """Extract the zero level set, in the world, from cells whose corners are all known.
+    """Extracts the zero level set, in the world, from cells whose corners are all known.
 
     Triangles are counter-clockwise seen from free space; normals are the field's gradient. Behind the rim of a thing
     that was seen from one side only, the surface continues up to the truncation distance.
@@ -68,7 +68,7 @@ def extract_mesh(volume: TsdfVolume) -> TriangleMesh:
 
 
 def decimated(mesh: TriangleMesh, triangle_budget: int) -> TriangleMesh:
-    """Return a mesh of at most `triangle_budget` triangles: vertices within a cube become one (Rossignac 1993)."""
+    """Returns a mesh of at most `triangle_budget` triangles: vertices within a cube become one (Rossignac 1993)."""
     if len(mesh.triangles) <= triangle_budget:
         return mesh
     corners = mesh.positions[mesh.triangles]
@@ -99,7 +99,7 @@ def _clustered(mesh: TriangleMesh, cell_m: float) -> TriangleMesh:
 
 
 def _without_copies(triangles: Int64[np.ndarray, "m 3"]) -> Int64[np.ndarray, "k 3"]:
-    """Drop all but one of the triangles with the same corners."""
+    """Drops all but one of the triangles with the same corners."""
     low, middle, high = np.sort(triangles, axis=1).T
     count = int(triangles.max(initial=0)) + 1
     _, first = np.unique((low * count + middle) * count + high, return_index=True)
@@ -115,7 +115,7 @@ def _unit(vectors: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
 
 
 def _crossed_cells(volume: TsdfVolume) -> _Cells:
-    """Return the cells with known distances of both signs at their corners."""
+    """Returns the cells with known distances of both signs at their corners."""
     # Distances at the corners of a crossed cell are below sqrt(3) voxels.
     near = np.abs(volume.distance) < 2 * volume.placement.voxel_m
     blocks = np.flatnonzero(near.any(axis=1))
@@ -133,7 +133,7 @@ def _crossed_cells(volume: TsdfVolume) -> _Cells:
 
 
 def _with_border(volume: TsdfVolume, blocks: Int64[np.ndarray, " k"]) -> Float32[np.ndarray, "k 9 9 9"]:
-    """Return the distances of blocks with the next voxels of their neighbours, NaN where unknown."""
+    """Returns the distances of blocks with the next voxels of their neighbours, NaN where unknown."""
     known = volume.known_distance()
     result = np.full((len(blocks), *(BLOCK + 1,) * 3), np.nan, np.float32)
     for step in CORNERS:
@@ -149,7 +149,7 @@ def _with_border(volume: TsdfVolume, blocks: Int64[np.ndarray, " k"]) -> Float32
 
 
 def _vertices(cells: _Cells) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
-    """Return the mean of the zero crossings on a cell's edges (voxels from its first corner), and normals."""
+    """Returns the mean of the zero crossings on a cell's edges (voxels from its first corner), and normals."""
     total = np.zeros((len(cells.voxel), 3))
     count = np.zeros((len(cells.voxel), 1))
     for a, b in EDGES:
@@ -163,7 +163,7 @@ def _vertices(cells: _Cells) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.nda
 
 
 def _triangles(cells: _Cells) -> Int64[np.ndarray, "m 3"]:
-    """Connect the four cells around each lattice edge that the surface crosses by two triangles."""
+    """Connects the four cells around each lattice edge that the surface crosses by two triangles."""
     keys = np.ravel_multi_index(tuple(cells.voxel.T), (VOXELS,) * 3)
     order = np.argsort(keys)
     inside = cells.corners < 0
@@ -189,7 +189,7 @@ def _triangles(cells: _Cells) -> Int64[np.ndarray, "m 3"]:
 def _find(
     keys: Int64[np.ndarray, " n"], order: Int64[np.ndarray, " n"], voxel: Int64[np.ndarray, "m 3"]
 ) -> Int64[np.ndarray, " m"]:
-    """Return the index of the cell at each voxel, -1 for none."""
+    """Returns the index of the cell at each voxel, -1 for none."""
     if not len(keys):
         return np.full(len(voxel), -1)
     wanted = np.ravel_multi_index(tuple(np.maximum(voxel, 0).T), (VOXELS,) * 3)
@@ -241,7 +241,7 @@ class TsdfScene:
         align: bool = False,
         settle: bool = False,
     ) -> bool:
-        """Integrate a frame; returns whether the meshes changed.
+        """Integrates a frame; returns whether the meshes changed.
 
         Args:
             surface: the frame's depth; without any known pixel nothing changes.
@@ -268,7 +268,7 @@ class TsdfScene:
         return True
 
     def meshes(self, *triangle_budgets: int) -> list[list[TriangleMesh]]:
-        """Return near and far mesh within each triangle budget (in falling order); none before the first frame."""
+        """Returns near and far mesh within each triangle budget (in falling order); none before the first frame."""
         meshes, result = self._meshes, []
         for budget in triangle_budgets:
             fraction = min(1.0, budget / max(sum(len(mesh.triangles) for mesh in meshes), 1))
@@ -277,14 +277,14 @@ class TsdfScene:
         return result
 
     def _moved_fraction(self) -> float:
-        """Return the fraction of voxels at surfaces that moved since the meshes were extracted."""
+        """Returns the fraction of voxels at surfaces that moved since the meshes were extracted."""
         pairs = zip(self.volumes, self._meshed, strict=True)
         counts = np.array([_count_moved(volume, meshed) for volume, meshed in pairs]).sum(axis=0)
         return float(counts[0] / max(counts[1], 1))
 
 
 def _count_moved(volume: TsdfVolume, meshed: Float32[np.ndarray, "b 512"]) -> tuple[int, int]:
-    """Count the voxels at surfaces that moved, and all voxels at surfaces."""
+    """Counts the voxels at surfaces that moved, and all voxels at surfaces."""
     now, voxel_m = volume.known_distance(), volume.placement.voxel_m
     before = np.full_like(now, np.nan)
     before[: len(meshed)] = meshed
@@ -307,7 +307,7 @@ class _SeenPoints(NamedTuple):
 def place_volumes(
     surface: DepthSurface, view: CameraView, noise_sigma: float
 ) -> tuple[TsdfPlacement, TsdfPlacement]:
-    """Place a cube around the near points of a frame, and a coarser one around all of them."""
+    """Places a cube around the near points of a frame, and a coarser one around all of them."""
     shown = _seen_points(surface, view)
     near = shown.z <= NEAR_MEDIANS * np.median(shown.z)
     details_1m = noise_sigma, 1 / float(view.camera.matrix[0, 0])
@@ -320,7 +320,7 @@ def place_volumes(
 def _placement(
     held: _SeenPoints, counted: _SeenPoints, details_1m: tuple[float, float], triangles: int
 ) -> TsdfPlacement:
-    """Place a cube around the points `held`, with voxels so small that the points `counted` give so many triangles.
+    """Places a cube around the points `held`, with voxels so small that the points `counted` give so many triangles.
 
     Voxels are no smaller than a frame's noise and a pixel's footprint (`details_1m`: at 1 m) at the median distance,
     and so large that the cube leaves room around what it holds.
@@ -337,12 +337,12 @@ def _placement(
 
 
 def _seen_points(surface: DepthSurface, view: CameraView) -> _SeenPoints:
-    """Return the points of known pixels; a pixel's area is z^2 / f^2 / cos(slant), with a slant up to 80 degrees."""
+    """Returns the points of known pixels; a pixel's area is z^2 / f^2 / cos(slant), with a slant up to 80 degrees."""
     known = surface.inverse_depth > 0
     z = 1 / surface.inverse_depth[known].astype(np.float64)
     rays = np.dstack([view.camera.rays(), np.ones(known.shape, np.float32)])[known].astype(np.float64)
     cosine = np.abs(np.einsum("ni,ni->n", rays, surface.normals[known])) / np.linalg.norm(rays, axis=1)
-    cosine = np.where(cosine > 0, cosine, 1)  # no normal: as if it faced the camera
+    cosine = np.where(cosine > 0, cosine, 1)  # unknown normals count as facing the camera
     matrix, focal = view.world_from_camera, view.camera.matrix
     area = z * z / (focal[0, 0] * focal[1, 1]) / np.maximum(cosine, np.cos(np.radians(80)))
     return _SeenPoints(rays * z[:, None] @ matrix[:3, :3].T + matrix[:3, 3], z, area)

@@ -21,15 +21,15 @@ from protocol.camera_model import CameraModel
 from render_server.scene.depth_surface import DepthSurface
 from render_server.view import NEAR_M, CameraView
 
-BLOCK = 8  # voxels an edge of a block
-GRID = 128  # blocks an edge of the largest box
-# Weights saturate at so many frames, so that the field keeps up with slow changes of the scene.
+BLOCK = 8  # voxels per edge of a block
+GRID = 128  # blocks per edge of the largest box
+# Weights saturate at this many frames, so that the field follows slow changes of the scene.
 MAX_MEMORY_FRAMES = 32
 # Truncation distance: gradients need three voxels, depth noise three sigma.
 REACH_VOXELS, REACH_SIGMAS = 3.0, 3.0
 CHUNK_BLOCKS = 128  # blocks updated at once: their arrays fit a core's cache
 ALIGNMENT_SAMPLES = 4000
-# Errors of neighbouring pixels are correlated (filters, calibration): so many count as one.
+# Errors of neighbouring pixels are correlated (filters, calibration): this many count as one.
 CORRELATED_PIXELS = 100
 # Prior of the pose, standard deviations: some millimetres at a metre. Where shape is ambiguous, along a bare wall,
 # say, the board's pose stays.
@@ -70,7 +70,7 @@ class TsdfPlacement:
 class PixelPlanes:
     """The plane at each pixel in the optical frame: rows of (nx, ny, nz, n.P, noise, weight), and 1/z of the pixels.
 
-    The last row stands for no pixel at all. `noise` is three standard deviations of depth, m; weights are inverse
+    The last row is a sentinel for no pixel. `noise` is three standard deviations of depth, m; weights are inverse
     variances relative to the noise at 1 m.
     """
 
@@ -79,7 +79,7 @@ class PixelPlanes:
 
     @classmethod
     def of(cls, surface: DepthSurface, camera: CameraModel, noise_sigma: float) -> Self:
-        """Build from a frame's depth, registered to `camera`, with noise of `noise_sigma` m at 1 m."""
+        """Builds from a frame's depth, registered to `camera`, with noise of `noise_sigma` m at 1 m."""
         inverse, rays = surface.inverse_depth.ravel(), _pixel_rays(camera)
         z = np.divide(1, inverse, out=np.zeros_like(inverse), where=inverse > 0)
         normals = surface.normals.reshape(-1, 3)
@@ -105,18 +105,18 @@ class TsdfVolume:
         self.weight: Float32[np.ndarray, "b 512"] = np.zeros((0, BLOCK**3), np.float32)
 
     def integrate(self, planes: PixelPlanes, view: CameraView) -> None:
-        """Average one frame, seen from `view`, into the field."""
+        """Averages one frame, seen from `view`, into the field."""
         self._allocate(planes, view)
         blocks = self._blocks_in_view(view)
         for start in range(0, len(blocks), CHUNK_BLOCKS):
             self._update(blocks[start : start + CHUNK_BLOCKS], planes, view)
 
     def known_distance(self) -> Float32[np.ndarray, "b 512"]:
-        """Return the distances, NaN where nothing was measured."""
+        """Returns the distances, NaN where nothing was measured."""
         return np.where(self.weight > 0, self.distance, np.float32(np.nan))
 
     def _allocate(self, planes: PixelPlanes, view: CameraView) -> None:
-        """Allocate blocks within the truncation distance of this frame's surfaces."""
+        """Allocates blocks within the truncation distance of this frame's surfaces."""
         half_block = self.placement.block_m / 2
         chosen = _spread_pixels(planes, view, half_block)
         matrix = view.world_from_camera.astype(np.float32)
@@ -146,7 +146,7 @@ class TsdfVolume:
         self.weight = np.concatenate([self.weight, empty])
 
     def _blocks_in_view(self, view: CameraView) -> Int64[np.ndarray, " k"]:
-        """Return the blocks whose bounding sphere touches the view frustum."""
+        """Returns the blocks whose bounding sphere touches the view frustum."""
         edge = self.placement.block_m
         centre = (self.places + (0.5 - 0.5 / BLOCK)) * edge + self.placement.origin
         matrix = view.camera_from_world
@@ -176,7 +176,7 @@ class TsdfVolume:
         self._average(at, np.minimum(distance, reach)[kept], reach[kept], weight[kept])
 
     def _reach(self, noise: Float32[np.ndarray, " n"]) -> Float32[np.ndarray, " n"]:
-        """Return the truncation distance, m."""
+        """Returns the truncation distance, m."""
         return np.asarray(np.maximum(noise, np.float32(REACH_VOXELS * self.placement.voxel_m)))
 
     def _average(
@@ -188,7 +188,7 @@ class TsdfVolume:
     ) -> None:
         distances, weights = self.distance.ravel(), self.weight.ravel()
         old, before = distances[at], weights[at]
-        # A difference beyond the truncation distance is no noise: something moved. Halve the old weight.
+        # A difference beyond the truncation distance is not noise: something moved. Halve the old weight.
         before = np.where(np.abs(new - old) > reach, before / 2, before)
         total = before + weight
         distances[at] = (old * before + new * weight) / total
@@ -200,7 +200,7 @@ def _inside(points: Float32[np.ndarray, "n 3"], box: Float64[np.ndarray, "2 3"])
 
 
 def _in_hole(places: Int32[np.ndarray, "n 3"], placement: TsdfPlacement) -> Bool[np.ndarray, " n"]:
-    """Return which blocks lie entirely inside the hole."""
+    """Returns which blocks lie entirely inside the hole."""
     if placement.hole is None:
         return np.zeros(len(places), bool)
     low = places * placement.block_m + placement.origin
@@ -209,7 +209,7 @@ def _in_hole(places: Int32[np.ndarray, "n 3"], placement: TsdfPlacement) -> Bool
 
 
 def _spread_pixels(planes: PixelPlanes, view: CameraView, distance_m: float) -> Int64[np.ndarray, " k"]:
-    """Return pixels whose points lie at most `distance_m` apart: each 1st, 2nd, 4th... by its footprint."""
+    """Returns pixels whose points lie at most `distance_m` apart: each 1st, 2nd, 4th... by its footprint."""
     camera, inverse = view.camera, planes.inverse_depth
     # A pixel is z / f wide, and longer by 1 / cos(slant) = z |ray| / |n.P|.
     cosine = np.abs(planes.rows[:-1, 3]) * inverse / np.linalg.norm(_pixel_rays(camera), axis=1)
@@ -221,7 +221,7 @@ def _spread_pixels(planes: PixelPlanes, view: CameraView, distance_m: float) -> 
 
 @lru_cache(maxsize=4)
 def _pixel_rays(camera: CameraModel) -> Float32[np.ndarray, "n 3"]:
-    """Return (x/z, y/z, 1) of each pixel."""
+    """Returns (x/z, y/z, 1) of each pixel."""
     rays = camera.rays().reshape(-1, 2)
     return np.column_stack([rays, np.ones(len(rays), np.float32)])
 
@@ -229,7 +229,7 @@ def _pixel_rays(camera: CameraModel) -> Float32[np.ndarray, "n 3"]:
 def _voxels_in_camera(
     places: Int32[np.ndarray, "k 3"], placement: TsdfPlacement, view: CameraView
 ) -> Float32[np.ndarray, "3 n"]:
-    """Return the voxel centres of blocks in the optical frame, m."""
+    """Returns the voxel centres of blocks in the optical frame, m."""
     matrix = view.camera_from_world
     first = places * placement.block_m + np.array(placement.origin)
     starts = (first @ matrix[:3, :3].T + matrix[:3, 3]).astype(np.float32)
@@ -243,7 +243,7 @@ def _lattice() -> Int64[np.ndarray, "512 3"]:
 
 
 def _pixel_rows(points: Float32[np.ndarray, "3 n"], view: CameraView) -> Int32[np.ndarray, " n"]:
-    """Project points of the optical frame to pixels (rows of `PixelPlanes`); the last row where none sees it."""
+    """Projects points of the optical frame to pixels (rows of `PixelPlanes`); the last row where none sees it."""
     (fx, fy, cx, cy), (width, height) = view.raster
     table = _pixel_table(view.camera)
     x, y, z = points
@@ -257,7 +257,7 @@ def _pixel_rows(points: Float32[np.ndarray, "3 n"], view: CameraView) -> Int32[n
 
 @lru_cache(maxsize=4)
 def _pixel_table(camera: CameraModel) -> Int32[np.ndarray, " n"]:
-    """Return for each texel of the view's pinhole raster the pixel with the same ray, width * height for none."""
+    """Returns for each texel of the view's pinhole raster the pixel with the same ray, width * height for none."""
     (fx, fy, cx, cy), (width, height) = CameraView(camera, np.eye(4)).raster
     none = camera.width * camera.height
     if not camera.has_distortion:
@@ -272,7 +272,7 @@ def _pixel_table(camera: CameraModel) -> Int32[np.ndarray, " n"]:
 def aligned_view(
     volumes: list[TsdfVolume], surface: DepthSurface, view: CameraView, noise_sigma: float
 ) -> CameraView:
-    """Return the view from which a depth image fits the volumes best; `view` itself where too few samples match.
+    """Returns the view from which a depth image fits the volumes best; `view` itself where too few samples match.
 
     Args:
         volumes: the field so far.
@@ -298,7 +298,7 @@ def aligned_view(
 def _displaced(
     motion: Float64[np.ndarray, "6"], pose: Float64[np.ndarray, "4 4"]
 ) -> Float64[np.ndarray, "4 4"]:
-    """Return the pose rotated about the camera's centre (first three, rad) and translated (m), in world axes."""
+    """Returns the pose rotated about the camera's centre (first three, rad) and translated (m), in world axes."""
     result = pose.copy()
     result[:3, :3] = cv2.Rodrigues(motion[:3])[0] @ pose[:3, :3]
     result[:3, 3] += motion[3:]
@@ -308,7 +308,7 @@ def _displaced(
 def _alignment_points(
     surface: DepthSurface, view: CameraView, noise_sigma: float
 ) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, " n"]]:
-    """Return points spread over the picture (optical frame, m), and their standard deviations along the ray, m."""
+    """Returns points spread over the picture (optical frame, m), and their standard deviations along the ray, m."""
     stride = max(1, int(np.sqrt(surface.inverse_depth.size / ALIGNMENT_SAMPLES)))
     grid = np.s_[stride // 2 :: stride, stride // 2 :: stride]
     inverse = surface.inverse_depth[grid]
@@ -325,7 +325,7 @@ def _gauss_newton_step(
     total: Float64[np.ndarray, "6"],
     centre: Float64[np.ndarray, "3"],
 ) -> Float64[np.ndarray, "6"] | None:
-    """Return one Gauss-Newton step of the motion; None where too few samples meet a known surface."""
+    """Returns one Gauss-Newton step of the motion; None where too few samples meet a known surface."""
     rows, residuals, information = [], [], []
     for volume in volumes:
         found, distance, gradient = interpolate(volume, world)
@@ -346,7 +346,7 @@ def _gauss_newton_step(
 def interpolate(
     volume: TsdfVolume, world: Float64[np.ndarray, "n 3"]
 ) -> tuple[Int64[np.ndarray, " m"], Float64[np.ndarray, " m"], Float64[np.ndarray, "m 3"]]:
-    """Interpolate trilinearly: indices of points in known cells, their distances (m) and unit gradients."""
+    """Interpolates trilinearly: indices of points in known cells, their distances (m) and unit gradients."""
     placement = volume.placement
     at = (world - placement.origin) / placement.voxel_m
     found = np.flatnonzero(((at >= 0) & (at < placement.blocks * BLOCK - 1)).all(axis=1))
@@ -370,7 +370,7 @@ def interpolate(
 
 
 def _at_voxels(volume: TsdfVolume, voxel: Int64[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:
-    """Return the distances at voxels of the cube, NaN where unknown."""
+    """Returns the distances at voxels of the cube, NaN where unknown."""
     block, inside = np.divmod(voxel, BLOCK)
     slot = volume.slots[tuple(block.T)]
     index = np.ravel_multi_index(tuple(inside.T), (BLOCK,) * 3)

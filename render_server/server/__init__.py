@@ -1,1 +1,1 @@
-"""The render server: its process, the session of one scene, frames in, snapshots out."""
+"""The render server: its process, the session of one scene, incoming frames, and snapshots."""

@@ -1,4 +1,4 @@
-"""Frames from sensor nodes: the endpoints that are read, and their streams paired to complete frames.
+"""Frames from sensor nodes: the endpoints that are read, and pairing of their streams into complete frames.
 
 A colour frame triggers; pose and lamps are those of the same frame, the depth the nearest in capture time within a
 tolerance, the radiance map the latest. Frames without a partner, or overtaken by a newer frame, are counted.
@@ -34,7 +34,7 @@ from protocol.transport import ReceivedMultipart, Receiver
 MAX_ENDPOINTS = 16
 EARLIER_SOURCES = "earlier_sources"
 TOPICS = ("color", "clean_depth", "pose", "radiance", "lamps")
-KEPT_MESSAGES = 8  # per stream; a renderer that is slower than this many frames drops them anyway
+KEPT_MESSAGES = 8  # per stream; a renderer that falls behind further drops frames anyway
 
 Built = TypeVar("Built")
 Kind = TypeVar("Kind", bound=MessageBase)
@@ -47,12 +47,12 @@ class SourceOrder(StrictModel):
 
 
 class FrameSource:
-    """Receives the streams of the `configured` endpoints until `use` names others.
+    """Receives the streams of the `configured` endpoints until `use` selects others.
 
-    `keys` are needed where an endpoint leaves the host.
+    `keys` are required if an endpoint leaves the host.
 
     Raises:
-        DeltalightError: an endpoint that leaves the host without keys, or is not understood.
+        DeltalightError: an endpoint leaves the host without keys, or is malformed.
     """
 
     def __init__(self, configured: Sequence[str], keys: Keys | None = None) -> None:
@@ -63,16 +63,16 @@ class FrameSource:
 
     @property
     def endpoints(self) -> tuple[str, ...]:
-        """Endpoints that are read now."""
+        """The endpoints being read."""
         return self._endpoints
 
     def use(self, endpoints: Sequence[str] | None) -> bool:
-        """Switch to these endpoints, None = the configured ones; returns whether that is a change.
+        """Switches to these endpoints (None: the configured ones); returns whether that is a change.
 
-        If so, waiting messages are dropped.
+        A change drops waiting messages.
 
         Raises:
-            DeltalightError: as above; then all stays as it was.
+            DeltalightError: as the class; nothing changes then.
         """
         wanted = self._configured if endpoints is None else tuple(endpoints)
         if wanted == self._endpoints:
@@ -84,20 +84,20 @@ class FrameSource:
         return True
 
     def latest(self, timeout_s: float) -> dict[str, ReceivedMultipart] | None:
-        """Newest message of every topic (`Receiver.latest`)."""
+        """Returns the newest message of every topic (`Receiver.latest`)."""
         return self._receiver.latest(timeout_s)
 
     @property
     def drops(self) -> dict[str, int]:
-        """Messages of each topic that a newer one replaced before they were taken.
+        """Number of messages of each topic that a newer one replaced before they were taken.
 
-        Those of earlier sources are one number, because there is no end to their names.
+        Those of earlier sources are one number, because the number of their names is unbounded.
         """
         earlier = {EARLIER_SOURCES: self._earlier_drops} if self._earlier_drops else {}
         return {**earlier, **self._receiver.drops}
 
     def close(self) -> None:
-        """Stop receiving."""
+        """Stops receiving."""
         self._receiver.close()
 
 
@@ -117,7 +117,7 @@ class PairingSettings(StrictModel):
 
 @dataclass(frozen=True)
 class AssembledFrame:
-    """The renderer's input, and the header of the colour frame that it is made from."""
+    """The renderer's input, and the header of its colour frame."""
 
     view: ViewFrame
     color: ColorMessage
@@ -132,11 +132,11 @@ class _Held(Generic[Kind]):
 
 
 class FrameAssembler:
-    """Takes decoded messages in any order and gives the newest frame that is complete.
+    """Takes decoded messages in any order and returns the newest complete frame.
 
-    `needs_depth` says whether the scene's real geometry comes from depth. Payloads are decoded for the chosen
-    frame only. `counts` holds what happened to the others: `superseded` (overtaken by a newer frame),
-    `unpaired_pose` (passed through when the patience ran out), `unpaired_depth` (dropped: no depth near its time).
+    `needs_depth`: the scene's real geometry comes from depth. Payloads are decoded for the selected frame only.
+    `counts` counts the others: `superseded` (overtaken by a newer frame), `unpaired_pose` (passed through when the
+    wait for a pose timed out), `unpaired_depth` (dropped: no depth near its time).
     """
 
     def __init__(self, settings: PairingSettings | None = None, *, needs_depth: bool = True) -> None:
@@ -148,20 +148,20 @@ class FrameAssembler:
         self._poses: deque[_Held[PoseMessage]] = deque(maxlen=KEPT_MESSAGES)
         self._lamps: deque[LampsMessage] = deque(maxlen=KEPT_MESSAGES)
         self._radiance: deque[_Held[RadianceMessage]] = deque(maxlen=KEPT_MESSAGES)
-        self._map: tuple[_Held[RadianceMessage], RadianceMap] | None = None  # the one decoded last
+        self._map: tuple[_Held[RadianceMessage], RadianceMap] | None = None  # the last one decoded
         self._reference_exposure_s: float | None = None  # of the first frame, as for recordings
         self._camera = _Unchanged(CameraModel.from_dict)
         self._depth_camera = _Unchanged(CameraModel.from_dict)
         self._board = _Unchanged(_board_spec)
 
     def begun_anew(self) -> "FrameAssembler":
-        """Return an assembler without any message, for another source; it goes on counting."""
+        """Returns an assembler without messages, for another source; counts continue."""
         fresh = FrameAssembler(self._settings, needs_depth=self.needs_depth)
         fresh.counts = self.counts
         return fresh
 
     def add(self, message: Message, parts: Sequence[memoryview], received_ns: int) -> None:
-        """Keep a message until its partners come; other streams than `TOPICS` are ignored."""
+        """Stores a message until its partners arrive; ignores streams other than `TOPICS`."""
         match message:
             case ColorMessage():
                 self._colors.append(_Held(message, parts, received_ns))
@@ -173,15 +173,16 @@ class FrameAssembler:
             case LampsMessage():
                 self._lamps.append(message)
             case RadianceMessage():
-                # Maps are sent again for those who come late.
+                # Maps are sent repeatedly, for late subscribers.
                 if all(_identity(held.message) != _identity(message) for held in self._radiance):
                     self._radiance.append(_Held(message, parts, received_ns))
 
     def take(self, now_ns: int) -> AssembledFrame | None:
-        """The newest complete frame, or the newest whose patience ran out; older ones are dropped.
+        """Returns the newest complete frame, or the newest that has waited too long; drops older ones.
 
         Raises:
-            DeltalightError: the chosen frame's payload is broken; it is gone, the next call goes on.
+            DeltalightError: the selected frame's payload is broken; the frame is dropped, and the next call
+                continues.
         """
         expired_ns = now_ns - int(1e6 * self._settings.patience_ms)
         for index in reversed(range(len(self._colors))):
@@ -204,7 +205,7 @@ class FrameAssembler:
             self.counts["superseded"] += 1
 
     def _pose_of(self, color: ColorMessage) -> _Held[PoseMessage] | None:
-        """The pose of this very frame; the capture time tells turns of a looped recording apart."""
+        """Returns the pose of this very frame; the capture time distinguishes the rounds of a looped recording."""
         poses = (held for held in self._poses if _identity(held.message) == _identity(color))
         return next(poses, None)
 
@@ -221,7 +222,7 @@ class FrameAssembler:
         return next((lamp_poses(message) for message in own), ())
 
     def _map_of(self, color: ColorMessage) -> RadianceMap | None:
-        """The newest map that is not later than the frame; before the first the first."""
+        """Returns the newest map not later than the frame; before the first map, the first."""
         own = [held for held in self._radiance if held.message.node == color.node]
         if not own:
             return None
@@ -235,7 +236,7 @@ class FrameAssembler:
         try:
             return radiance_map(held.message, held.parts)
         except DeltalightError:
-            self._radiance.remove(held)  # so that it costs one frame and not all that it holds for
+            self._radiance.remove(held)  # so that it costs one frame, and not every frame that would use it
             raise
 
     def _build(
@@ -267,7 +268,7 @@ class FrameAssembler:
 
 
 class _Unchanged(Generic[Built]):
-    """Builds an object from plain data and keeps it while the data stays equal.
+    """Builds an object from plain data, and reuses it while the data stays equal.
 
     A camera model caches its rays, and neither camera nor board change from frame to frame.
     """

@@ -24,6 +24,7 @@ from protocol.errors import DeltalightError
 from protocol.files import write_bytes
 from protocol.keys import Keys
 from protocol.messages import ControlRequest, StatsMessage
+from protocol.methods import PLUGINS
 from protocol.scene import SceneDocument, load_scene
 from protocol.transport import Publisher, ReplyServer
 from render_server.gpu.context import create_context
@@ -31,8 +32,8 @@ from render_server.renderer import SceneRenderer
 from render_server.server.frames import FrameAssembler, FrameSource, PairingSettings
 from render_server.server.session import RenderedFrame, Renderer, RenderSession, SourceInUse
 
-GPU_TIMEOUT_S = 0.002  # a started frame is read back after so long, should no other follow
-RECEIVE_TIMEOUT_S = 0.05  # bounds how long a command waits while no frames come
+GPU_TIMEOUT_S = 0.002  # a started frame is read back after this time if no other one comes
+RECEIVE_TIMEOUT_S = 0.05  # bounds how long a command waits while no frames arrive
 STATS_INTERVAL_S = 1.0
 ANSWER_TIMEOUT_S = 20.0
 SNAPSHOT_TIMEOUT_S = 120.0  # a frame in many views and by several methods, in software
@@ -59,10 +60,10 @@ class ServerSettings(StrictModel):
     pairing: PairingSettings = Field(default_factory=PairingSettings)
 
     def initial_scene(self) -> SceneDocument:
-        """The kept scene where there is one, else the scene document, else an empty scene.
+        """Returns the kept scene if there is one, else the scene document, else an empty scene.
 
         Raises:
-            DeltalightError: the document is wrong.
+            DeltalightError: the document is invalid.
         """
         if self.session is not None and self.session.is_file():
             return load_scene(self.session)
@@ -70,14 +71,14 @@ class ServerSettings(StrictModel):
 
 
 class CommandQueue:
-    """Passes commands from the thread that receives them to the one that may use OpenGL."""
+    """Passes commands from the thread that receives them to the thread that may use OpenGL."""
 
     def __init__(self) -> None:
         self._closed = False
         self._pending: queue.SimpleQueue[tuple[ControlRequest, Future[Payload]]] = queue.SimpleQueue()
 
     def ask(self, request: ControlRequest) -> Payload:
-        """Queue a command and wait for the payload of its reply (the reply server's thread).
+        """Queues a command and waits for the payload of its reply (called by the reply server's thread).
 
         Raises:
             DeltalightError: the command was refused, or the renderer did not answer in time.
@@ -97,16 +98,16 @@ class CommandQueue:
             ) from fault
 
     def serve(self, execute: Callable[[ControlRequest], Payload]) -> None:
-        """Execute all queued commands (the thread that renders)."""
+        """Executes all queued commands (called by the rendering thread)."""
         while not self._pending.empty():
             request, answer = self._pending.get()
             try:
                 answer.set_result(execute(request))
-            except Exception as fault:  # it belongs to whoever asked, and the renderer goes on
+            except Exception as fault:  # the fault goes to whoever asked, and rendering continues
                 answer.set_exception(fault)
 
     def close(self) -> None:
-        """Refuse queued and later commands, so that nobody waits for a renderer that is gone."""
+        """Refuses queued and later commands, so that nobody waits for a renderer that is gone."""
         self._closed = True
         self.serve(_refuse)
 
@@ -116,7 +117,7 @@ def _refuse(request: ControlRequest) -> Payload:
 
 
 class Sender:
-    """Encodes and publishes in a thread of its own, so that the next frame is rendered meanwhile.
+    """Encodes and publishes in its own thread, while the next frame is rendered.
 
     OpenCV encodes without the interpreter lock. Two messages may wait; the renderer never does.
     """
@@ -125,25 +126,25 @@ class Sender:
         self.dropped = 0
         self._publisher = publisher
         self._quality = jpeg_quality
-        self._generation = 0  # pictures of an earlier one are not sent
+        self._generation = 0  # pictures of earlier generations are not sent
         self._waiting: queue.Queue[tuple[RenderedFrame | StatsMessage | None, int]] = queue.Queue(maxsize=2)
         self._thread = threading.Thread(target=self._run, name="sender", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """Send what waits, then end the thread."""
+        """Sends waiting messages, then ends the thread."""
         self._waiting.put((None, self._generation))
         self._thread.join(timeout=1.0)
 
     def offer(self, item: RenderedFrame | StatsMessage) -> None:
-        """Send it soon, or count it as dropped where sending is slower than rendering."""
+        """Queues an item, or counts it as dropped if sending is slower than rendering."""
         try:
             self._waiting.put_nowait((item, self._generation))
         except queue.Full:
             self.dropped += 1
 
     def forget(self) -> None:
-        """Send no picture that was offered before."""
+        """Discards all pictures offered so far."""
         self._generation += 1
 
     def _run(self) -> None:
@@ -166,14 +167,16 @@ class Sender:
 
 
 def run_server(settings: ServerSettings, keys: Keys | None = None) -> None:
-    """Serve until a `shutdown` command or an exception (Ctrl-C, SIGTERM) ends it.
+    """Serves until a `shutdown` command or an exception (Ctrl-C, SIGTERM) ends it.
 
-    `keys` are needed where an endpoint leaves the host.
+    `keys` are required if an endpoint leaves the host.
 
     Raises:
-        DeltalightError: a wrong scene, no fit OpenGL device, or a port in use.
+        DeltalightError: the scene is wrong, no OpenGL device is suitable, or a port is in use.
     """
     scene = settings.initial_scene()
+    for fault in PLUGINS.faults.values():
+        log.warning(fault)
     with ExitStack() as stack:
         gpu = create_context(settings.device, allow_software=settings.allow_software)
         stack.callback(gpu.release)
@@ -192,10 +195,12 @@ def serve(
     renderer_name: str,
     keys: Keys | None = None,
 ) -> None:
-    """Open the sockets around a renderer that shows `scene`; serve until a `shutdown` command. This thread renders.
+    """Opens the sockets around a renderer that shows `scene`, and serves until a `shutdown` command.
+
+    Renders in the calling thread.
 
     Raises:
-        DeltalightError: a port in use, or an endpoint that leaves the host without keys.
+        DeltalightError: a port is in use, or an endpoint leaves the host without keys.
     """
     with ExitStack() as stack:
         publisher = Publisher(settings.publish, keys=keys)
@@ -230,7 +235,7 @@ def serve(
 
 
 def _patience_s(session: RenderSession) -> float:
-    """How long to wait for a message."""
+    """Returns how long to wait for a message."""
     return GPU_TIMEOUT_S if session.is_waiting_for_gpu else RECEIVE_TIMEOUT_S
 
 

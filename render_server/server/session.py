@@ -1,6 +1,6 @@
-"""One scene's render session: newest frame in, composite out, commands in between.
+"""The render session of one scene: newest frame in, composite out, commands in between.
 
-No sockets, no threads: `server.py` feeds it and sends what comes out, tests give it messages and a renderer.
+No sockets, no threads: process.py feeds it and sends its output; tests pass messages and a renderer.
 """
 
 import time
@@ -34,7 +34,7 @@ log = structlog.get_logger()
 
 
 class Composite(Protocol):
-    """What a renderer gives back (`renderer.CompositeFrame`)."""
+    """The result of a renderer (`renderer.CompositeFrame`)."""
 
     @property
     def color(self) -> UInt8[np.ndarray, "h w 3"]:
@@ -50,7 +50,7 @@ class Composite(Protocol):
 
     @property
     def world_from_camera(self) -> Float64[np.ndarray, "4 4"] | None:
-        """Where it stood; None without a pose."""
+        """The camera's pose; None if there is none."""
 
     @property
     def pass_times_ms(self) -> dict[str, float]:
@@ -58,18 +58,18 @@ class Composite(Protocol):
 
     @property
     def lights(self) -> Sequence[dict[str, Any]]:
-        """The lights that the picture was made with."""
+        """The lights that the picture was rendered with."""
 
     @property
     def linear(self) -> Float32[np.ndarray, "h w 3"] | None:
-        """The picture before the camera's response, where that was asked for."""
+        """The picture before the camera's response, if requested."""
 
 
 class Pick(Protocol):
     """What a pixel shows (`picking.Pick`)."""
 
     def as_dict(self) -> dict[str, object]:
-        """The pick as plain data."""
+        """Returns the pick as plain data."""
 
 
 class Pending(Protocol):
@@ -77,39 +77,39 @@ class Pending(Protocol):
 
     @property
     def immediate(self) -> bool:
-        """Whether nothing is gained by starting another frame first."""
+        """Whether starting another frame first gains nothing."""
 
     @property
     def finish(self) -> Callable[[], Composite]:
-        """Gives the composite; waits for the GPU if it must."""
+        """Returns the composite; waits for the GPU if it must."""
 
 
 class Renderer(Protocol):
-    """What a session needs of `renderer.SceneRenderer`."""
+    """The part of `renderer.SceneRenderer` that a session uses."""
 
     @property
     def notices(self) -> Sequence[str]:
-        """Sentences that a user should read; the list only grows."""
+        """Sentences for the user; the list only grows."""
 
     def start(self, frame: ViewFrame, *, with_linear: bool = False) -> Pending:
-        """Begin the composite of one frame; frames finish in the order in which they were started."""
+        """Starts the composite of one frame; frames finish in the order in which they were started."""
 
     def sized(self, frame: ViewFrame) -> ViewFrame:
-        """The frame at the composite's size."""
+        """Returns the frame at the composite's size."""
 
     def pick(self, x: float, y: float, ignore: str | None = None) -> Pick:
-        """What the newest picture shows at a pixel, seen through the object `ignore`."""
+        """Picks what the newest picture shows at a pixel, looking through the object `ignore`."""
 
     def begin_source(self) -> None:
-        """Forget what earlier frames showed."""
+        """Forgets what earlier frames showed."""
 
     def set_scene(self, scene: SceneDocument) -> None:
-        """Use another scene from the next frame on."""
+        """Switches to another scene from the next frame on."""
 
 
 @dataclass(frozen=True)
 class RenderedFrame:
-    """A composite that is to be encoded and sent; `pixels` belong to `message` (stated as raw)."""
+    """A composite to be encoded and sent; `pixels` belong to `message` (declared as raw)."""
 
     message: CompositeMessage
     pixels: UInt8[np.ndarray, "h w 3"]
@@ -117,7 +117,7 @@ class RenderedFrame:
 
 @dataclass(frozen=True)
 class _Started:
-    """A frame at the GPU, and the id and revision of the scene that it was begun with."""
+    """A frame in flight on the GPU, with the id and revision of the scene that it was started with."""
 
     frame: AssembledFrame
     pending: Pending
@@ -127,7 +127,7 @@ class _Started:
 
 @dataclass(frozen=True)
 class SourceInUse:
-    """Endpoints that are read now, and whether they are others than before."""
+    """The endpoints being read, and whether they changed."""
 
     endpoints: Sequence[str]
     is_another: bool
@@ -148,9 +148,9 @@ def _only_configured(_endpoints: Sequence[str] | None) -> SourceInUse:
 
 
 class RenderSession:
-    """Keeps one scene, its renderer and the frames that wait for it.
+    """Holds one scene, its renderer and the frames that wait for it.
 
-    `scene_id` is the sender's id of the scene, if they gave one; `instance` tells this session from those before a
+    `scene_id` is the sender's id of the scene, if given; `instance` distinguishes this session from those before a
     restart. `keep_scene` is called with every accepted scene, so that a restart can resume with it; `mailbox_drops`
     returns what the receiver dropped, by topic; `use_source` makes it read other endpoints (None: those configured).
     """
@@ -191,7 +191,7 @@ class RenderSession:
         self._logged_notices = 0
 
     def receive(self, multipart: ReceivedMultipart) -> None:
-        """Take a message of the sensor node; a malformed one is counted and logged."""
+        """Takes a message of the sensor node; a malformed one is counted and logged."""
         try:
             message, parts = decode(multipart)
         except DeltalightError as fault:
@@ -201,19 +201,17 @@ class RenderSession:
 
     @property
     def is_waiting_for_gpu(self) -> bool:
-        """Whether a started frame is to be finished by the next step."""
+        """Whether the next step is to finish a started frame."""
         return self._started is not None
 
     def step(self) -> RenderedFrame | None:
-        """Start the newest frame, if one is ready, and give the one that was started before (in software: itself).
+        """Starts the newest frame, if one is ready, and returns the one started before (in software: itself).
 
-        A picture that a command finished comes first.
-
-        A frame that cannot be rendered is counted and logged.
+        A picture that a command finished comes first. A frame that cannot be rendered is counted and logged.
 
         Raises:
-            Exception: nothing but unexpected faults `MAXIMUM_FAULTS_IN_A_ROW` times: the renderer is broken,
-                not the frames, and only a restart of the process helps.
+            Exception: `MAXIMUM_FAULTS_IN_A_ROW` unexpected faults without a picture: the renderer is broken, not the
+                frames, and only a restart of the process helps.
         """
         if self._finished is not None:
             finished, self._finished = self._finished, None
@@ -223,7 +221,7 @@ class RenderSession:
             return self._render(frame)
         except DeltalightError as fault:
             self._count_fault("bad_frames", fault)
-        except Exception as fault:  # whatever it is, the next frame must still be rendered
+        except Exception as fault:  # whatever failed, the next frame must still be rendered
             self._count_fault("bad_frames", fault)
             self._faults_in_a_row += 1
             if self._faults_in_a_row >= MAXIMUM_FAULTS_IN_A_ROW:
@@ -231,11 +229,11 @@ class RenderSession:
         return None
 
     def drops(self) -> dict[str, int]:
-        """What was lost so far, and where."""
+        """Returns the numbers of lost frames, by cause."""
         return {**self._mailbox_drops(), **self._assembler.counts, **self.counts}
 
     def stats(self) -> StatsMessage:
-        """How the session is doing."""
+        """Returns the state of the session."""
         now_ns = self._clock_ns()
         while self._rendered_ns and self._rendered_ns[0] < now_ns - RATE_WINDOW_S * 1e9:
             self._rendered_ns.popleft()
@@ -250,10 +248,10 @@ class RenderSession:
         )
 
     def execute(self, request: ControlRequest) -> dict[str, object]:
-        """Execute a command between two frames and return the payload of the reply.
+        """Executes a command between two frames and returns the payload of the reply.
 
         Raises:
-            DeltalightError: an unknown command, or one that is refused.
+            DeltalightError: the command is unknown, or refused.
         """
         commands: dict[str, Callable[[ControlRequest], dict[str, object]]] = {
             "ping": self._ping,
@@ -275,7 +273,7 @@ class RenderSession:
         return {"scene_id": self.scene_id, "revision": self.scene.revision, "instance": self.instance}
 
     def _set_view(self, request: ControlRequest) -> dict[str, object]:
-        """The scene that results is none that the sender of the one before knows."""
+        """Changes the view; the sender of the previous scene does not know the result, so its id is dropped."""
         return self._use_scene(_with_view(self.scene, request.payload.get("view")), scene_id=None)
 
     def _shut_down(self, _request: ControlRequest) -> dict[str, object]:
@@ -305,13 +303,13 @@ class RenderSession:
         self._finish_started()
         source = self._use_source(order.endpoints)
         if source.is_another:
-            self._finished = self._newest = None  # of the source before
+            self._finished = self._newest = None  # of the previous source
             self._assembler = self._assembler.begun_anew()
             self._renderer.begin_source()
         return {"endpoints": list(source.endpoints)}
 
     def _finish_started(self) -> None:
-        """Wait for the frame at the GPU, so that a command may use it; its picture comes with the next step."""
+        """Waits for the frame on the GPU, so that a command can use it; the next step returns its picture."""
         before, self._started = self._started, None
         if before is not None:
             self._finished = self._finish(before)
@@ -356,7 +354,7 @@ class RenderSession:
         return RenderedFrame(message, composite.color)
 
     def _set_scene(self, request: ControlRequest) -> dict[str, object]:
-        """Idempotent by scene id and revision: confirms the current revision and refuses an older one."""
+        """Sets a scene, idempotently by id and revision: confirms the current revision and refuses an older one."""
         scene = self._scene_of(request)
         current = self.scene.revision
         if request.revision is None or request.scene_id != self.scene_id or scene.revision > current:
@@ -368,7 +366,10 @@ class RenderSession:
         return {"revision": current}
 
     def _scene_of(self, request: ControlRequest) -> SceneDocument:
-        """The document of a request; its revision is the request's, and counts on where the sender knows none."""
+        """Returns the document of a request, with the request's revision.
+
+        Without id and revision it gets the next one.
+        """
         document = request.payload.get("scene")
         if not isinstance(document, dict):
             raise DeltalightError("The command set_scene needs the scene document as `scene` in its payload.")

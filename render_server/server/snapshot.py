@@ -1,4 +1,4 @@
-"""One frame rendered several ways into files: other views, other methods, the camera's picture, linear radiance."""
+"""Snapshots: one frame rendered into files in several views and by several methods, with linear radiance."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -47,7 +47,7 @@ class SnapshotOrder(StrictModel):
 
 
 class RenderedPicture(Protocol):
-    """What a snapshot needs of a composite; `linear` is None where nothing was rendered."""
+    """The part of a composite that a snapshot uses; `linear` is None if nothing was rendered."""
 
     @property
     def color(self) -> UInt8[np.ndarray, "h w 3"]:
@@ -59,36 +59,36 @@ class RenderedPicture(Protocol):
 
 
 class StartedPicture(Protocol):
-    """A frame that was handed to the GPU."""
+    """A frame in flight on the GPU."""
 
     @property
     def finish(self) -> Callable[[], RenderedPicture]:
-        """Gives the composite."""
+        """Returns the composite."""
 
 
 class SnapshotRenderer(Protocol):
-    """What a snapshot needs of `renderer.SceneRenderer`."""
+    """The part of `renderer.SceneRenderer` that a snapshot uses."""
 
     def set_scene(self, scene: SceneDocument) -> None:
-        """Use another scene."""
+        """Switches to another scene."""
 
     def sized(self, frame: ViewFrame) -> ViewFrame:
-        """The frame at the composite's size."""
+        """Returns the frame at the composite's size."""
 
     def start(self, frame: ViewFrame, *, with_linear: bool = False) -> StartedPicture:
-        """Begin a composite."""
+        """Starts a composite."""
 
 
 @dataclass
 class Snapshot:
-    """Names of the files that were written, and by a picture's name why it was not."""
+    """Names of the files that were written, and by picture name the reasons for those that were not."""
 
     files: list[str] = field(default_factory=list)
     errors: dict[str, str] = field(default_factory=dict)
 
     @contextmanager
     def writing(self, name: str, file: str) -> Iterator[None]:
-        """Note `file` as written, or what kept it from being."""
+        """Records `file` as written, or the error that prevented it."""
         try:
             yield
         except DeltalightError as fault:
@@ -100,12 +100,12 @@ class Snapshot:
 def take_snapshot(
     renderer: SnapshotRenderer, scene: SceneDocument, frame: ViewFrame, order: SnapshotOrder
 ) -> Snapshot:
-    """Write what was ordered of one frame; the renderer is back at `scene`, with that frame rendered, afterwards.
+    """Writes the ordered pictures of one frame; afterwards the renderer shows `scene` and that frame again.
 
-    No frame may wait to be finished. The same frame again adds nothing to what is averaged over frames.
+    No frame may be in flight. Rendering the same frame again adds nothing to averages over frames.
 
     Raises:
-        DeltalightError: there is no such folder.
+        DeltalightError: the folder does not exist.
     """
     folder = order.folder
     if not folder.is_dir():
@@ -123,7 +123,7 @@ def take_snapshot(
                 write_exr(temporary, _linear(renderer, scene, frame))
     finally:
         renderer.set_scene(scene)
-        with suppress(DeltalightError):  # it was reported when the frame came
+        with suppress(DeltalightError):  # it was reported when the frame arrived
             renderer.start(frame).finish()
     return snapshot
 
@@ -146,10 +146,9 @@ def _linear(
 
 
 def _variant(scene: SceneDocument, view: str, method: dict[str, Any] | None) -> SceneDocument:
-    """The scene in another view, by another method.
+    """Returns the scene in another view, by another method.
 
-    The mesh of the real scene stays as fine as it is: with another triangle budget it would be begun anew, and what
-    earlier frames showed would be lost.
+    Keeps the triangle budget of the real scene's mesh: another one would restart the mesh, and lose earlier frames.
     """
     document = scene.model_dump(mode="json")
     document["output"]["view"] = view

@@ -17,22 +17,22 @@ from sensor_node.calibration.views import View
 Pixels = Float64[np.ndarray, "n 2"]
 Poses = Float64[np.ndarray, "v 6"]
 _Values = tuple[Float64[np.ndarray, " k"], Poses]
-# Makes a lens of its numbers, its picture enlarged by a margin on every side, so that predictions of corners
-# near the border never fall outside.
+# Creates a lens from its parameters, with its picture enlarged by a margin on every side, so that predictions of
+# corners near the border never fall outside.
 LensMaker = Callable[[Float64[np.ndarray, " k"], int], RadialLens]
-# Step of the difference quotients, as a share of a number (at least of 1): about the cube root of 1e-16.
+# Step of the difference quotients, as a fraction of a parameter (at least of 1): about the cube root of 1e-16.
 STEP = 1e-5
 MAX_ROUNDS = 100
-# Relative gain of a round at which the result is as good as differences of squares can tell.
+# Relative gain of an iteration below which differences of squares cannot tell results apart.
 DONE = 1e-9
-# With more the step is below a hundred-millionth of the numbers.
+# Beyond this the step is below a hundred-millionth of the parameters.
 MOST_DAMPING = 1e8
-# Keeps the equations solvable where a number has no effect.
+# Keeps the equations solvable if a parameter has no effect.
 LEAST_DAMPING = 1e-9
 
 
 class Bundle(NamedTuple):
-    """The refined numbers of the lens with their covariance, the poses and the remaining misses."""
+    """The refined parameters of the lens with their covariance, the poses and the remaining residuals."""
 
     numbers: Float64[np.ndarray, " k"]
     covariance: Float64[np.ndarray, "k k"]
@@ -49,10 +49,10 @@ def refine(
     """Minimise the squared distances in pixels over the lens and the poses.
 
     Args:
-        make_lens: the lens of a list of numbers.
-        start: numbers to begin with.
-        views: what was seen, from everywhere.
-        poses: camera_from_target of each view to begin with.
+        make_lens: creates the lens of a list of parameters.
+        start: initial parameters.
+        views: views of the target.
+        poses: initial camera_from_target of each view.
     """
     problem = _Problem(make_lens, views, len(start))
     vectors = [np.concatenate([cv2.Rodrigues(pose[:3, :3])[0].ravel(), pose[:3, 3]]) for pose in poses]
@@ -72,10 +72,10 @@ def refine(
 def _least_squares(
     problem: "_Problem", values: Float64[np.ndarray, " m"]
 ) -> tuple[Float64[np.ndarray, " m"], Float64[np.ndarray, "r m"]]:
-    """Levenberg-Marquardt (Marquardt 1963) by normal equations; returns the values and the Jacobian there.
+    """Levenberg-Marquardt (Marquardt 1963) by normal equations; return the values and the Jacobian there.
 
-    scipy's solvers decompose the whole Jacobian each round or converge slowly without; this takes a twentieth of
-    their time, and a node needs no scipy.
+    scipy's solvers decompose the whole Jacobian in each iteration, or converge slowly without; this takes a twentieth
+    of their time, and a node needs no scipy.
     """
     misses, damping = problem.misses(values), 1e-3
     for _ in range(MAX_ROUNDS):
@@ -86,7 +86,7 @@ def _least_squares(
             damped = normal + np.diag(damping * np.maximum(np.diag(normal), 1e-12))
             step = cv2.solve(damped, gradient[:, None], flags=cv2.DECOMP_CHOLESKY)[1].ravel()
             after = problem.misses(values - step)
-            # Where the lens does not reach a point, the cost is not a number and the step is refused.
+            # If the lens does not reach a point, the cost is NaN and the step is refused.
             gain = float(cost - np.nan_to_num(after @ after, nan=np.inf))
             damping = max(damping * (0.1 if gain > 0 else 10.0), LEAST_DAMPING)
         if gain <= 0:
@@ -129,7 +129,7 @@ class _Problem:
 
     def _slope(self, after: _Values, before: _Values, step: float) -> Float64[np.ndarray, " r"]:
         difference = self._predicted(*after) - self._predicted(*before)
-        # Where a step crosses the end of the lens there is no slope; the point itself is within reach.
+        # Across the end of the lens there is no slope; the point itself is within reach.
         return np.asarray(np.nan_to_num(difference.ravel() / (2 * step)))
 
     def _predicted(self, numbers: Float64[np.ndarray, " k"], poses: Poses) -> Pixels:
@@ -139,7 +139,7 @@ class _Problem:
         ]
         try:
             lens = self._make_lens(numbers, self._margin)
-        except DeltalightError:  # a step to numbers that no lens has; the solver takes a shorter one
+        except DeltalightError:  # impossible parameters; the solver takes a shorter step
             return np.full_like(self._found, np.nan)
         return np.asarray(lens.project(np.concatenate(points)) - self._margin)
 

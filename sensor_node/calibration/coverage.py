@@ -1,4 +1,4 @@
-"""Which parts of the picture a calibration has seen, as a grid of cells, as text and as pictures."""
+"""Which parts of the picture a calibration has covered, as a grid of cells, as text and as pictures."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,11 +10,11 @@ from jaxtyping import Bool, Float64, Int64, UInt8
 from sensor_node.calibration.fits import LensFit
 from sensor_node.calibration.views import View
 
-# Cells along the width. Distortion is smooth: what a polynomial does over an eighth, one corner there tells.
+# Cells along the width. Distortion is smooth: one corner per eighth determines the polynomial there.
 COLUMNS = 8
-# Light below this share of what the middle gets is what glass and housing scatter outside the image circle.
+# Light below this fraction of the middle's is scattered by glass and housing outside the image circle.
 CIRCLE_SHARE = 0.1
-# Miss vectors are drawn so long that the rms is this share of the picture's width.
+# Residual vectors are scaled so that their rms is this fraction of the picture's width.
 ARROW_SHARE = 0.02
 SEEN, UNSEEN, POINT, ARROW = (70, 160, 70), (170, 60, 60), (255, 220, 0), (255, 60, 60)
 
@@ -28,11 +28,11 @@ class Coverage:
 
     @property
     def share(self) -> float:
-        """Share of the counted cells that hold a point."""
+        """Fraction of the counted cells that hold a point."""
         return float((self.points[self.counted] > 0).mean()) if self.counted.any() else 0.0
 
     def text(self) -> str:
-        """Return the grid with a digit for each cell: points in it, 9 = nine or more, `.` = none, space = dark."""
+        """Return the grid with a character per cell: points in it, 9 = nine or more, `.` = none, space = dark."""
         rows = []
         for counts, inside in zip(self.points, self.counted, strict=True):
             rows.append(" ".join(_mark(int(n), bool(is_in)) for n, is_in in zip(counts, inside, strict=True)))
@@ -51,9 +51,9 @@ def measure_coverage(
     """Count the points of views in the cells of a picture.
 
     Args:
-        views: what was found.
+        views: views of the target.
         size: width and height of the picture.
-        circle: centre (pixels) and radius of the image circle of a fish-eye; None = light is everywhere.
+        circle: centre (pixels) and radius of a fish-eye's image circle; None = light is everywhere.
     """
     width, height = size
     rows = max(1, round(COLUMNS * height / width))
@@ -71,10 +71,9 @@ def measure_coverage(
 
 
 def image_circle(brightest: UInt8[np.ndarray, "h w"], centre: Float64[np.ndarray, "2"]) -> float | None:
-    """Return the radius in pixels about `centre` that light reaches, None where it fills the picture.
+    """Return the radius in pixels about `centre` that light reaches, None if it fills the picture.
 
-    On every ring the median of the brightest that each pixel ever was is taken, so that a dark thing on one side
-    does not count.
+    Uses the median over each ring of each pixel's brightest value, so that a dark thing on one side does not count.
     """
     height, width = brightest.shape
     columns, rows = np.meshgrid(np.arange(width), np.arange(height))
@@ -85,7 +84,7 @@ def image_circle(brightest: UInt8[np.ndarray, "h w"], centre: Float64[np.ndarray
         [np.median(ring) if ring.size else 0 for ring in np.split(brightest.ravel()[order], ends)]
     )
     dark = medians < CIRCLE_SHARE * medians.max()
-    # The ring after which all is dark.
+    # the ring after which everything is dark
     last = len(dark) - int(np.argmin(dark[::-1]))
     return None if last >= len(dark) else float(last)
 
@@ -108,7 +107,7 @@ def draw_coverage(
 
 
 def draw_misses(brightest: UInt8[np.ndarray, "h w"], fit: LensFit) -> UInt8[np.ndarray, "h w 3"]:
-    """Return the picture with an arrow from each found point to where the lens predicts it, enlarged."""
+    """Return the picture with an arrow from each found point to its predicted position, enlarged."""
     picture = cv2.cvtColor(brightest // 2, cv2.COLOR_GRAY2RGB)
     enlarged = ARROW_SHARE * picture.shape[1] / max(fit.rms_px, 1e-6)
     for view, misses in zip(fit.views, fit.misses, strict=True):

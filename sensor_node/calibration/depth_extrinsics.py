@@ -1,4 +1,4 @@
-"""Where the depth sensor is: the plane it measures on the marker board must be the plane the colour camera sees."""
+"""Pose of the depth sensor: the plane that it measures on the marker board must be the board's plane."""
 
 from collections.abc import Iterable, Iterator
 from typing import NamedTuple
@@ -14,19 +14,19 @@ from protocol.poses import rigid_matrix
 from sensor_node.markers import BoardDetector
 
 Pose = Float64[np.ndarray, "4 4"]
-# Only depth well inside the board's outline is taken: at its border the table may be meant.
+# Only depth well inside the board's outline is used: at its border it may be the table's.
 INSIDE_SHARE = 0.9
-# What is farther from the board's plane than this lies on something else.
+# Points farther from the board's plane lie on something else.
 NEAR_M = 0.05
 LEAST_POINTS = 200
-# Of the pixels of a depth image: enough that a board a fifth of the width has some thousand.
+# Per depth image: enough for some thousand points on a board a fifth of the width.
 MOST_POINTS = 40_000
 # Three tilts determine a transform; more show whether they agree.
 LEAST_VIEWS = 6
 ROUNDS = 20
-# A hundredth of a millimetre, or of a milliradian, is below what depth can tell.
+# A hundredth of a millimetre, or of a milliradian, is below the accuracy of depth.
 DONE = 1e-5
-# Uncertainty above which the board's tilts did not determine the transform: more than a pixel at VGA and 1 m.
+# Above this uncertainty the board's tilts did not determine the transform: more than a pixel at VGA and 1 m.
 MOST_SIGMA_M, MOST_SIGMA_DEG = 0.004, 0.3
 MOST_RMS_M = 0.01
 
@@ -59,14 +59,14 @@ def depth_views(frames: Iterable[SensorFrame], board: BoardSpec) -> Iterator[Dep
 
 
 def place_depth_sensor(views: Iterable[DepthView], board: BoardSpec, start: Pose) -> DepthPlacement:
-    """Return depth_from_rgb that puts the measured planes into the board's plane, by Gauss-Newton.
+    """Return the depth_from_rgb that puts the measured planes into the board's plane, by Gauss-Newton.
 
-    Each view counts as four points of the plane fitted to its depth, as errors of depth hold for a whole picture.
+    Each view counts as four points of the plane fitted to its depth, because depth errors are common to a picture.
 
     Args:
         views: frames with the board tilted in different directions.
         board: the board.
-        start: depth_from_rgb to begin with; the identity where the sensors lie beside each other.
+        start: initial depth_from_rgb; the identity if the sensors are side by side.
 
     Raises:
         DeltalightError: there are too few views, or their tilts do not determine the transform.
@@ -92,7 +92,7 @@ def place_depth_sensor(views: Iterable[DepthView], board: BoardSpec, start: Pose
 def _equations(
     seen: list[tuple[DepthView, Float64[np.ndarray, "4 3"]]], rgb_from_depth: Pose
 ) -> tuple[Float64[np.ndarray, "m 6"], Float64[np.ndarray, " m"]]:
-    """Heights of the patches' points over the board, and their derivatives by a turn and shift of the sensor."""
+    """Return the heights of the patches' points over the board, and their derivatives by the sensor's motion."""
     rows, misses = [], []
     for view, patch in seen:
         points = patch @ rgb_from_depth[:3, :3].T + rgb_from_depth[:3, 3]
@@ -103,7 +103,7 @@ def _equations(
 
 
 def _points(depth: DepthImage) -> Float64[np.ndarray, "n 3"]:
-    """Some of the points that a depth image holds, in its camera's frame, evenly over the image."""
+    """Return some of the points of a depth image, in its camera's frame, evenly over the image."""
     step = int(np.ceil(np.sqrt(depth.depth_m.size / MOST_POINTS)))
     few = (slice(None, None, step), slice(None, None, step))
     known = (depth.valid & (depth.depth_m > 0))[few]
@@ -114,7 +114,7 @@ def _points(depth: DepthImage) -> Float64[np.ndarray, "n 3"]:
 def _patch(
     points: Float64[np.ndarray, "n 3"], view: DepthView, board: BoardSpec, rgb_from_depth: Pose
 ) -> Float64[np.ndarray, "4 3"] | None:
-    """Four corners (in the depth sensor's frame) of the plane that it measured on the board."""
+    """Return four corners (in the depth sensor's frame) of the plane measured on the board."""
     placed = view.world_from_camera @ rgb_from_depth
     world = points @ placed[:3, :3].T + placed[:3, 3]
     outline = board.sheet_outline()
@@ -134,7 +134,7 @@ def _checked(
 ) -> DepthPlacement:
     rms = float(np.sqrt(np.mean(misses**2)))
     variance = np.sum(misses**2) / max(len(misses) - 6, 1)
-    # A millimetre is the least that a depth sensor is off by.
+    # A millimetre is the least error of a depth sensor.
     sigmas = np.sqrt(np.diag(np.linalg.pinv(rows.T @ rows, hermitian=True)) * max(variance, 1e-6))
     rank = np.linalg.matrix_rank(rows, tol=1e-6 * np.linalg.norm(rows))
     sigma_deg, sigma_m = float(np.degrees(sigmas[:3].max())), float(sigmas[3:].max())

@@ -1,4 +1,4 @@
-"""Where the fish-eye camera is: from pictures in which it, or it and the colour camera, see the marker board."""
+"""Pose of the fish-eye camera: from pictures in which it, or it and the colour camera, see the marker board."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
@@ -19,16 +19,16 @@ from sensor_node.calibration.views import LEAST_POINTS
 from sensor_node.markers import BoardDetector
 
 Pose = Float64[np.ndarray, "4 4"]
-# A mean of fewer says nothing about its spread.
+# A mean of fewer poses says nothing about its spread.
 LEAST_POSES = 5
 # One degree moves a lamp two metres away by 3.5 cm, and a highlight by twice the angle.
 MOST_SPREAD_M, MOST_SPREAD_DEG = 0.01, 1.0
-# A pose that is off by more than three times the median and this is a mistake.
+# A pose that differs by more than three times the median and this is a mistake.
 OUTLIER_MEDIANS, OUTLIER_M, OUTLIER_DEG = 3.0, 0.002, 0.2
 
 
 class Placement(NamedTuple):
-    """A mean transform with the rms offsets of the poses it is the mean of."""
+    """A mean transform with the rms offsets of the averaged poses."""
 
     transform: Pose
     poses: int
@@ -38,7 +38,7 @@ class Placement(NamedTuple):
 
 
 def fisheye_in_world(pictures: FisheyePictures, board: MarkerBoard) -> Pose | None:
-    """Return world_from_fisheye by the board in a fish-eye picture (of a bracket: the first that shows it)."""
+    """Return world_from_fisheye by the board in a fish-eye picture (of a bracket: the first one that shows it)."""
     for picture in pictures.pictures:
         if picture.dtype == np.uint8:
             pose = _board_pose(picture, pictures.calibration.lens, board)
@@ -62,7 +62,7 @@ def _board_pose(color: UInt8[np.ndarray, "h w 3"], lens: FisheyeLens, board: Mar
 
 
 def world_from_fisheye_poses(frames: Iterable[SensorFrame], board: BoardSpec) -> Iterator[Pose]:
-    """Yield the pose of a fixed fish-eye camera by each of its pictures that shows the board."""
+    """Yield the pose of a fixed fish-eye camera from each of its pictures that shows the board."""
     target, last = MarkerBoard(board), None
     for frame in frames:
         if frame.fisheye is not None and frame.fisheye is not last:
@@ -73,7 +73,7 @@ def world_from_fisheye_poses(frames: Iterable[SensorFrame], board: BoardSpec) ->
 
 
 def rgb_from_fisheye_poses(frames: Iterable[SensorFrame], board: BoardSpec) -> Iterator[Pose]:
-    """Yield the transform by each moment (within 20 ms) in which both cameras see the board."""
+    """Yield the transform from each moment (within 20 ms) at which both cameras see the board."""
     target, detector = MarkerBoard(board), None
     for frame in frames:
         if frame.fisheye is None or abs(frame.timestamp_ns - frame.fisheye.timestamp_ns) > MAX_PAIRING_NS:
@@ -86,7 +86,7 @@ def rgb_from_fisheye_poses(frames: Iterable[SensorFrame], board: BoardSpec) -> I
 
 
 def mean_placement(poses: Sequence[Pose], name: str) -> Placement:
-    """Return the mean of poses without outliers; `name` is the transform's, for the sentences.
+    """Return the mean of poses without outliers; `name` names the transform in sentences.
 
     Raises:
         DeltalightError: there are too few poses, or they differ too much.

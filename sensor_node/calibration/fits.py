@@ -1,4 +1,4 @@
-"""What a calibration of a lens gives, whatever the model."""
+"""Result of a lens calibration, for every lens model."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ from protocol.camera_model import CameraModel
 from protocol.fisheye_lens import FisheyeLens
 from sensor_node.calibration.views import View
 
-# Corners are found to a few hundredths of a pixel at best: a fit that claims less noise has too few views.
+# Corners are found to a few hundredths of a pixel at best: a fit with less noise has too few views.
 LEAST_NOISE_PX = 0.05
 
 
@@ -17,9 +17,9 @@ LEAST_NOISE_PX = 0.05
 class LensFit:
     """A lens with the views that it was fitted to.
 
-    `misses` are, for each view, found minus predicted pixels (n, 2); `poses` camera_from_target; `focal_share` is
-    the standard deviation of the focal length as a share of it. `refused` says of views that were left out, why;
-    `refused_points` counts single points left out of views that were kept.
+    `misses` are, for each view, found minus predicted pixels (n, 2); `poses` camera_from_target; `focal_share` is the
+    standard deviation of the focal length as a fraction of it. `refused` gives the reason for each view that was left
+    out; `refused_points` counts single points left out of views that were kept.
     """
 
     lens: CameraModel | FisheyeLens
@@ -37,7 +37,7 @@ class LensFit:
 
     @property
     def view_rms_px(self) -> Float64[np.ndarray, " v"]:
-        """`rms_px` of every view alone."""
+        """`rms_px` of each view."""
         return np.array([rms(misses) for misses in self.misses])
 
     @property
@@ -52,11 +52,11 @@ class LensFit:
 
 
 def rms(misses: Float64[np.ndarray, "n 2"]) -> float:
-    """Root mean square length of 2-D differences."""
+    """Return the root mean square length of 2-D differences."""
     return float(np.sqrt(np.mean(np.sum(misses**2, axis=-1))))
 
 
 def noise_px(misses: Float64[np.ndarray, "n 2"], parameters: int) -> float:
-    """Standard deviation of one coordinate of a point, from the residuals of a fit."""
+    """Return the standard deviation of one coordinate of a point, from the residuals of a fit."""
     freedom = max(misses.size - parameters, 1)
     return max(float(np.sqrt(np.sum(misses**2) / freedom)), LEAST_NOISE_PX)

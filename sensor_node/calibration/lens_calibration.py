@@ -1,4 +1,4 @@
-"""From the views of a target to a lens that is good enough, or a sentence that says why it is not."""
+"""Calibration of a lens from views of a target, with checks that refuse misleading results."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -19,28 +19,29 @@ from sensor_node.calibration.views import View, ViewCollector
 
 LensKind = Literal["plumb_bob_5", "plumb_bob_8", "equidistant", "ocam"]
 Fitter = Callable[[Sequence[View], tuple[int, int]], LensFit]
-# A view that misses by so many times the median is blurred or its target was taken for another.
+# A view whose residual is this many times the median is blurred, or its target was misidentified.
 BAD_MEDIANS = 3.0
-# A point that misses by this much and six times its view's median (noise reaches four) is another corner; where a
-# tenth of the points do, the view as a whole is judged.
+# A point whose residual exceeds this and six times its view's median (noise reaches four) is another corner; if a
+# tenth of the points are such, the whole view is judged.
 OUTLIER_PX, OUTLIER_MEDIANS, MOST_OUTLIERS = 1.0, 6.0, 0.1
-# Below this a view is no worse than corners are found, whatever the others are.
+# Below this, a view is as good as corner detection, whatever the others are.
 GOOD_PX = 0.3
-# A view gives two equations beyond its pose, a lens has up to twelve numbers; with 8 views none hangs on one view.
+# A view gives two equations beyond its pose, a lens has up to twelve parameters; with 8 views none depends on a
+# single view.
 LEAST_VIEWS = 8
 LEAST_COVERAGE = 0.4
-# 1.5 px at 1000 px of width is five times what found corners miss by: blur, a bent sheet or the wrong model.
+# 1.5 px at 1000 px of width is five times the error of found corners: blur, a bent sheet or the wrong model.
 MOST_RMS_SHARE = 1.5e-3
-# Depth and size go with the focal length: 2 % are 2 cm at one metre.
+# Depth and size scale with the focal length: 2 % are 2 cm at one metre.
 MOST_FOCAL_SHARE = 0.02
-# With normals that vary less, a fit takes noise for tilts, and its own uncertainty is wrong too: twelve views at one
-# tilt of 15 degrees gave a focal length 23 % off that claimed 1 %; from 5 degrees on the claims are true.
+# If normals vary less, a fit takes noise for tilts, and its own uncertainty is wrong too: twelve views at one tilt of
+# 15 degrees gave a focal length 23 % off that claimed 1 %; from 5 degrees on the claims are true.
 LEAST_TILT_SPREAD_DEG = 5.0
 
 
 @dataclass(frozen=True, eq=False)
 class LensResult:
-    """A fitted lens with what was seen; `fit.refused` names the views left out, with the reason."""
+    """A fitted lens with its coverage; `fit.refused` names the views left out, with the reason."""
 
     fit: LensFit
     coverage: Coverage
@@ -49,7 +50,7 @@ class LensResult:
 
 
 def calibrate_lens(collected: ViewCollector, target: Target, kind: LensKind) -> LensResult:
-    """Fit a lens: once to the points as found, again to points found better with it, without the bad views.
+    """Fit a lens: first to the points as found, then to points refined with it, without the bad views.
 
     Raises:
         DeltalightError: there are too few views, or no lens fits them.
@@ -93,7 +94,7 @@ def _with_circle(lens: EquidistantLens | OcamLens, radius: float | None) -> Equi
 
 
 def fit_without_bad(fitter: Fitter, views: Sequence[View], size: tuple[int, int]) -> LensFit:
-    """Fit, leave out single points that are not what they were taken for, then bad views, until all is good.
+    """Fit a lens, discarding misidentified points and then bad views until all are good.
 
     Raises:
         DeltalightError: no lens fits.
@@ -116,7 +117,7 @@ def fit_without_bad(fitter: Fitter, views: Sequence[View], size: tuple[int, int]
 
 
 def _without_outliers(view: View, misses: Float64[np.ndarray, "n 2"] | None) -> View:
-    """The view without points that miss far more than the others; as it is where that would be many."""
+    """Return the view without points whose residuals are far larger than the others; unchanged if these are many."""
     if misses is None:
         return view
     distances = np.linalg.norm(misses, axis=1)
@@ -125,7 +126,7 @@ def _without_outliers(view: View, misses: Float64[np.ndarray, "n 2"] | None) -> 
 
 
 def _bad_views(fit: LensFit) -> dict[str, str]:
-    """Views that miss far more than the others, with the reason."""
+    """Return views whose residuals are far larger than the others, with the reason."""
     errors = fit.view_rms_px
     median = float(np.median(errors))
     limit = max(GOOD_PX, BAD_MEDIANS * median)

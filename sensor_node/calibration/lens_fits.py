@@ -19,11 +19,11 @@ from sensor_node.calibration.fits import LensFit, noise_px, rms
 from sensor_node.calibration.poses import target_pose
 from sensor_node.calibration.views import View
 
-# Powers of the radius in Scaramuzza's polynomial; the first has slope 0 on the axis, where lenses are smooth.
+# Powers of the radius in Scaramuzza's polynomial; slope 0 on the axis, because lenses are smooth there.
 OCAM_POWERS = (0, 2, 3, 4)
-# A lens has up to nine numbers, a view gives two beyond its pose.
+# A lens has up to nine parameters, a view gives two beyond its pose.
 LEAST_START = 5
-# Focal lengths to begin with, as shares of the width: fields of view from 115 to 360 degrees across it.
+# Initial focal lengths, as fractions of the width: fields of view from 115 to 360 degrees across it.
 FOCAL_SHARES = (0.16, 0.23, 0.32, 0.45)
 CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-10)
 
@@ -61,8 +61,8 @@ def fit_pinhole(views: Sequence[View], size: tuple[int, int], coefficients: int)
 def fit_equidistant(views: Sequence[View], size: tuple[int, int]) -> LensFit:
     """Fit Kannala & Brandt's lens, also to points beyond 90 degrees.
 
-    `cv2.fisheye.calibrate` is not used: its start fails on views that reach the rim of the picture, and which view
-    it then names is chance (of sixteen views of a good set it accepted none as culprit).
+    `cv2.fisheye.calibrate` is not used: its initialisation fails on views that reach the rim of the picture, and the
+    view that it then names is random (of sixteen views of a good set it accepted none as culprit).
     """
     maker = _equidistant_maker(size)
     numbers = min(
@@ -75,14 +75,14 @@ def fit_equidistant(views: Sequence[View], size: tuple[int, int]) -> LensFit:
 
 
 def _ideal_lens(size: tuple[int, int], focal_share: float) -> Float64[np.ndarray, "8"]:
-    """Numbers of an exactly equidistant lens with its axis in the middle of the picture."""
+    """Return the parameters of an exactly equidistant lens with its axis in the middle of the picture."""
     width, height = size
     focal = focal_share * width
     return np.array([focal, focal, (width - 1) / 2, (height - 1) / 2, 0.0, 0.0, 0.0, 0.0])
 
 
 def _start_error(views: Sequence[View], maker: LensMaker, numbers: Float64[np.ndarray, " k"]) -> float:
-    """Median over the views of the rms with a lens that is not refined; infinite for views out of its reach."""
+    """Return the median over the views of the rms of an unrefined lens; infinite for views out of its reach."""
     errors = [placed.rms_px for placed in _placed(views, maker, numbers)[0]]
     return float(np.median([*errors, *[np.inf] * (len(views) - len(errors))]))
 
@@ -104,7 +104,7 @@ def fit_ocam(views: Sequence[View], size: tuple[int, int]) -> LensFit:
 
 
 class _Placed(NamedTuple):
-    """A view with its pose by some lens."""
+    """A view with its pose by a given lens."""
 
     view: View
     pose: Float64[np.ndarray, "4 4"]
@@ -114,7 +114,7 @@ class _Placed(NamedTuple):
 def _refined(
     maker: LensMaker, numbers: Float64[np.ndarray, " k"], focal: tuple[int, ...], views: Sequence[View]
 ) -> LensFit:
-    """Refine a lens and all poses; `focal` says which of its numbers are focal lengths."""
+    """Refine a lens and all poses; `focal` lists the parameters that are focal lengths."""
     placed, refused = _placed(views, maker, numbers)
     if len(placed) < LEAST_START:
         raise _no_start(views)
@@ -130,7 +130,7 @@ def _refined(
 def _placed(
     views: Sequence[View], maker: LensMaker, numbers: Float64[np.ndarray, " k"]
 ) -> tuple[list[_Placed], list[tuple[str, str]]]:
-    """Views with their poses by a lens, and those that it does not reach."""
+    """Return the views with their poses by a lens, and those that it does not reach."""
     placed, refused = [], []
     for view in views:
         margin = view.gray.shape[1]
@@ -163,9 +163,10 @@ def _equidistant_maker(size: tuple[int, int]) -> LensMaker:
 
 
 def _ocam_maker(size: tuple[int, int]) -> LensMaker:
-    """Numbers: polynomial in units of half the width (so that all are alike in size), centre, c d.
+    """Return a maker whose parameters are the polynomial in units of half the width, the centre, and c d.
 
-    e stays 0: a turn about the axis, which it would add, is no different from one of all poses.
+    These units make all parameters similar in size. e stays 0: the rotation about the axis that it would add is the
+    same as one of all poses.
     """
     unit = size[0] / 2
 
@@ -181,7 +182,7 @@ def _ocam_maker(size: tuple[int, int]) -> LensMaker:
 
 
 def _ocam_numbers(lens: EquidistantLens) -> Float64[np.ndarray, " k"]:
-    """Least-squares polynomial of z over the radius of an equidistant lens within the picture."""
+    """Return the least-squares polynomial of z over the radius of an equidistant lens within the picture."""
     fx, fy, x, y = lens.camera.matrix[[0, 1, 0, 1], [0, 1, 2, 2]]
     unit = lens.width / 2
     radii = np.linspace(0.02, min(lens.largest_radius * fx, 0.999 * (lens.width - x)) / unit, 200)
@@ -189,7 +190,7 @@ def _ocam_numbers(lens: EquidistantLens) -> Float64[np.ndarray, " k"]:
     known = np.isfinite(directions).all(axis=1) & (directions[:, 0] > 0)
     z = radii[known] * directions[known, 2] / directions[known, 0]
     powers = radii[known, None] ** np.array(OCAM_POWERS)
-    # Weighted by the cosine of the ray so that an error counts as one of the angle.
+    # Weighted by the cosine of the ray, so that errors are those of the angle.
     weight = directions[known, 0]
     polynomial = np.linalg.lstsq(powers * weight[:, None], z * weight, rcond=None)[0]
     return np.array([*polynomial, x, y, fy / fx, 0.0])

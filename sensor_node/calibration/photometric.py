@@ -18,7 +18,7 @@ from sensor_node.fisheye.response import estimate_response
 from sensor_node.marker_finder import LUMINANCE
 from sensor_node.markers import BoardDetector
 
-# Codes between which a pixel says how much light there was: not noise, not white.
+# Codes between which a pixel measures light: neither noise nor white.
 USABLE_CODES = (20, 235)
 # Exposures that disagree more about the light did not see the same scene, or their times are wrong.
 MOST_RESIDUAL = 0.1
@@ -26,12 +26,12 @@ MOST_RESIDUAL = 0.1
 EXIF_BLOCK, EXPOSURE_TIME = 0x8769, 0x829A
 # Points along an edge of a patch; the mean of 8 x 8 leaves a few tenths of a code of noise.
 SAMPLES = 8
-# The outer share of the card is left out on each side: blur mixes it with the paper.
+# The outer fraction of the card is left out on each side: blur mixes it with the paper.
 CARD_INSET = 0.2
-# Fewer gaps between markers cannot show how the light changes over the sheet.
+# Fewer gaps between markers do not determine how the light varies over the sheet.
 LEAST_PATCHES = 4
 WHITE_CODE = 250
-# White paper is within these; else the card lies elsewhere or is of another reflectance.
+# Range of white paper; outside it the card's position or reflectance is wrong.
 POSSIBLE_ALBEDO = (0.4, 1.0)
 MOST_SPREAD = 0.05
 
@@ -44,7 +44,7 @@ class Bracket(NamedTuple):
 
 
 class Response(NamedTuple):
-    """Linear R G B of each code; `residual` is by what share exposures disagree (rms) about the light."""
+    """Linear R G B of each code; `residual` is the relative disagreement (rms) of exposures about the light."""
 
     table: Float32[np.ndarray, "256 3"]
     pictures: int
@@ -52,8 +52,11 @@ class Response(NamedTuple):
 
 
 class PaperAlbedo(NamedTuple):
-    """Albedo of the paper; `spread` is its relative standard deviation over the pictures, `residual` by what share
-    the light on the paper differs from a smooth one."""
+    """Albedo of the paper.
+
+    `spread` is its relative standard deviation over the pictures, `residual` the relative difference of the light on
+    the paper from a smooth one.
+    """
 
     albedo: float
     pictures: int
@@ -101,7 +104,7 @@ def calibrate_response(bracket: Bracket) -> Response:
     """Return the response of the camera that took a bracket.
 
     Raises:
-        DeltalightError: too few exposures, or pictures that do not show the same light.
+        DeltalightError: there are too few exposures, or the pictures do not show the same light.
     """
     _require_exposures(bracket.exposures_s)
     table = estimate_response(bracket.pictures, bracket.exposures_s)
@@ -123,7 +126,7 @@ def _require_exposures(exposures_s: Sequence[float]) -> None:
 
 
 def bracket_residual(bracket: Bracket, table: Float32[np.ndarray, "256 3"]) -> float:
-    """Rms relative difference between the light that exposures of one pixel say was there."""
+    """Return the rms relative difference between the light that the exposures of one pixel indicate."""
     squares, count = 0.0, 0
     logs = np.log(np.maximum(decode_lut(table), 1e-9))
     order = np.argsort(bracket.exposures_s)
@@ -133,24 +136,25 @@ def bracket_residual(bracket: Bracket, table: Float32[np.ndarray, "256 3"]) -> f
             codes = [bracket.pictures[which][..., channel] for which in (first, second)]
             usable = np.all([(USABLE_CODES[0] <= code) & (code <= USABLE_CODES[1]) for code in codes], axis=0)
             rise = logs[codes[1][usable], channel] - logs[codes[0][usable], channel] - step
-            # Half of a pair's variance is that of one exposure.
+            # half of a pair's variance is that of one exposure
             squares, count = squares + float(np.sum(rise**2)) / 2, count + rise.size
     return float(np.sqrt(squares / count)) if count else float("inf")
 
 
 def paper_albedo(frames: Iterable[SensorFrame], board: BoardSpec, card: GreyCard) -> PaperAlbedo:
-    """Return the albedo of the board's paper by a card of known albedo that lies on or beside it.
+    """Return the albedo of the board's paper, measured with a card of known albedo that lies on or beside it.
 
-    Light falls differently on every place of the sheet: the logarithm of the paper's light is fitted by a plane over
-    the gaps between the markers and compared with the card where the card lies.
+    Light varies over the sheet: the logarithm of the paper's light is fitted by a plane over the gaps between the
+    markers, and compared with the card at the card's position.
 
     Args:
         frames: pictures of the board and the card, of a calibrated camera.
         board: the board.
-        card: the card's place and albedo.
+        card: the card's position and albedo.
 
     Raises:
-        DeltalightError: the board is not seen, the card or paper is white, or the result is no paper's.
+        DeltalightError: the board is not visible, the card or paper is clipped, or the result is impossible for
+            paper.
     """
     detector: BoardDetector | None = None
     found: list[tuple[float, float]] = []
@@ -190,7 +194,7 @@ def _ratio(
     board: BoardSpec,
     card: GreyCard,
 ) -> tuple[float, float]:
-    """Paper's light over the card's at the card's place, and the relative misfit of the paper's plane."""
+    """Return the paper's light over the card's at the card's position, and the relative misfit of the plane."""
     outline = card.outline()
     card_light = _light(frame, world_from_camera, _shrunk(outline, CARD_INSET))
     patches = [patch for patch in board.paper_patches() if not _is_covered(patch, card)]
@@ -212,7 +216,7 @@ def _ratio(
 def _light(
     frame: SensorFrame, world_from_camera: Float64[np.ndarray, "4 4"], quad: Float64[np.ndarray, "4 3"]
 ) -> float | None:
-    """Mean linear luminance of a quad on the sheet; None where it leaves the picture or is white."""
+    """Return the mean linear luminance of a quad on the sheet; None if it leaves the picture or is clipped."""
     steps = (np.arange(SAMPLES) + 0.5) / SAMPLES
     s, t = (grid.reshape(-1, 1) for grid in np.meshgrid(steps, steps))
     points = quad[0] + s * (quad[1] - quad[0]) + t * (quad[3] - quad[0])
@@ -235,7 +239,7 @@ def _shrunk(quad: Float64[np.ndarray, "4 3"], share: float) -> Float64[np.ndarra
 
 
 def _is_covered(patch: Float64[np.ndarray, "4 3"], card: GreyCard) -> bool:
-    """Whether the card may lie on a part of a patch (compared as boxes in the card's axes)."""
+    """Whether the card may cover a part of a patch (compared as boxes in the card's axes)."""
     outline = card.outline()
     axes = np.stack([outline[1] - outline[0], outline[0] - outline[3]])
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
@@ -244,10 +248,10 @@ def _is_covered(patch: Float64[np.ndarray, "4 3"], card: GreyCard) -> bool:
 
 
 def parse_card(text: str, albedo: float) -> GreyCard:
-    """Return the card that `x0,y0,x1,y1` (two opposite corners, metres in the board's frame) describes.
+    """Return the card described by `x0,y0,x1,y1` (two opposite corners, metres in the board's frame).
 
     Raises:
-        DeltalightError: not four numbers, or no area, or no albedo.
+        DeltalightError: not four numbers, no area, or no valid albedo.
     """
     try:
         x0, y0, x1, y1 = (float(word) for word in text.split(","))

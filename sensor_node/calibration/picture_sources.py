@@ -1,4 +1,4 @@
-"""Where the pictures for a calibration come from: files, a dataset folder, a recording, a live camera."""
+"""Pictures for a calibration: from files, a dataset folder, a recording, or a live camera."""
 
 import re
 import statistics
@@ -20,14 +20,14 @@ from sensor_node.calibration.views import Picture
 
 Eye = Literal["rgb", "fisheye"]
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg")
-# Pictures that follow each other faster were filmed, slower ones were taken one by one.
+# Pictures in faster succession were filmed, slower ones were taken one by one.
 FILM_PERIOD_NS = 500_000_000
 
 
 class Series(NamedTuple):
-    """Pictures of one camera, decoded as they are asked for; `total` None = a camera that goes on.
+    """Pictures of one camera, decoded on demand; `total` is None for an endless camera.
 
-    `folder` holds the pictures; `board` is what a recording describes.
+    `folder` holds the pictures; `board` is the one that a recording describes.
     """
 
     pictures: Generator[Picture]
@@ -38,11 +38,11 @@ class Series(NamedTuple):
 
 
 def open_series(source: str, eye: Eye) -> Series:
-    """Open the pictures that one eye took.
+    """Open the pictures of one eye.
 
     Args:
-        source: a folder of pictures, a pattern such as `shots/left*.jpg`, a dataset folder, an .mcap recording,
-            or a camera such as `uvc:0`.
+        source: a folder of pictures, a pattern such as `shots/left*.jpg`, a dataset folder, an .mcap recording, or a
+            camera such as `uvc:0`.
         eye: which camera's pictures of a dataset or recording.
 
     Raises:
@@ -125,11 +125,11 @@ def _live(source: str, eye: Eye) -> Generator[Picture]:
 
     with closing(frames()) as captured:
         for frame in captured:
-            # A fish-eye camera that is opened alone gives its pictures as colour.
+            # a fish-eye camera opened alone delivers its pictures as colour
             own = "rgb" if frame.fisheye is None else eye
             yield from _of_frames([frame], own)
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:
-    """Sort key by which shot2 comes before shot10."""
+    """Return a sort key by which shot2 comes before shot10."""
     return [(int(word), "") if word.isdigit() else (-1, word) for word in re.split(r"(\d+)", path.name)]

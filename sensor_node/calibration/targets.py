@@ -1,4 +1,4 @@
-"""Flat targets whose points are found in a picture without knowing the lens: chessboards and marker boards."""
+"""Flat targets whose points can be found without knowing the lens: chessboards and marker boards."""
 
 import re
 from collections.abc import Sequence
@@ -16,16 +16,16 @@ from protocol.frames import decode_lut
 from sensor_node.marker_finder import MarkerFinder
 
 CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 0.005)
-# Half the edge of the window about a corner, as a share of the way to the next one: it must not reach that.
+# Half the edge of the window about a corner, as a fraction of the distance to the next one, which it must not reach.
 WINDOW_SHARE = 0.4
 WINDOW_HALF_PX = (2, 11)
-# A refined marker corner that moved farther than this was caught by another edge.
+# A refined marker corner that moved farther was attracted by another edge.
 CAUGHT_PX = 3.0
 CHESSBOARD = re.compile(r"chessboard:(\d{1,3})x(\d{1,3}):(\d*\.?\d+)")
 
 
 class Sighting(NamedTuple):
-    """Points of a target that were found: their numbers in `Target.points`, and the pixels."""
+    """Points of a target that were found: their indices in `Target.points`, and the pixels."""
 
     numbers: Int64[np.ndarray, " n"]
     pixels: Float64[np.ndarray, "n 2"]
@@ -39,10 +39,10 @@ class Target(Protocol):
         """All points in metres, in the target's frame."""
 
     def find(self, gray: UInt8[np.ndarray, "h w"]) -> Sighting | None:
-        """Find the target in a picture of a camera that is not known yet."""
+        """Find the target in a picture of an uncalibrated camera."""
 
     def refined(self, gray: UInt8[np.ndarray, "h w"], sighting: Sighting, camera: CameraModel) -> Sighting:
-        """Return the same points, found better because the lens is nearly known."""
+        """Return the same points, refined with the nearly known lens."""
 
 
 class Chessboard:
@@ -59,7 +59,7 @@ class Chessboard:
         return self._points
 
     def find(self, gray: UInt8[np.ndarray, "h w"]) -> Sighting | None:
-        """Find all inner corners, or nothing."""
+        """Find all inner corners, or none."""
         flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
         found, corners = cv2.findChessboardCorners(gray, self._size, flags=flags)
         if not found:
@@ -68,14 +68,14 @@ class Chessboard:
         return Sighting(np.arange(len(start)), self._saddles(gray, start))
 
     def refined(self, gray: UInt8[np.ndarray, "h w"], sighting: Sighting, camera: CameraModel) -> Sighting:
-        """Return the sighting as it is: a saddle is where it is whatever the lens."""
+        """Return the sighting unchanged: a saddle point does not depend on the lens."""
         del gray, camera
         return sighting
 
     def _saddles(
         self, gray: UInt8[np.ndarray, "h w"], start: Float32[np.ndarray, "n 2"]
     ) -> Float64[np.ndarray, "n 2"]:
-        """Refine each corner in a window of its own: towards the rim of a fish-eye squares get small."""
+        """Refine each corner in its own window, because squares get small towards the rim of a fish-eye."""
         grid = start.reshape(self._size[1], self._size[0], 2)
         steps = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1) for axis in (0, 1)]
         gaps = np.minimum(_least_beside(steps[0], 0), _least_beside(steps[1], 1)).ravel()
@@ -100,11 +100,11 @@ class MarkerBoard:
 
     @property
     def points(self) -> Float64[np.ndarray, "m 3"]:
-        """Corners of the markers by order of the ids, or of a ChArUco board its inner corners."""
+        """Corners of the markers by order of the ids, or the inner corners of a ChArUco board."""
         return self._points
 
     def find(self, gray: UInt8[np.ndarray, "h w"]) -> Sighting | None:
-        """Find the board's markers, or of a ChArUco board the inner corners beside them."""
+        """Find the board's markers, or on a ChArUco board the inner corners beside them."""
         quads = self._finder.quads(gray, self._first)
         if not quads:
             return None
@@ -113,16 +113,16 @@ class MarkerBoard:
             return Sighting(numbers, pixels) if len(numbers) else None
         numbers = np.concatenate([self._first[name] + np.arange(4) for name in quads])
         start = Sighting(numbers, np.concatenate(list(quads.values())))
-        # A marker is small enough that its edges are nearly straight in any lens.
+        # A marker is so small that its edges are nearly straight in any lens.
         height, width = gray.shape
         matrix = np.array([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1.0]])
         return self.refined(gray, start, CameraModel(width, height, matrix))
 
     def refined(self, gray: UInt8[np.ndarray, "h w"], sighting: Sighting, camera: CameraModel) -> Sighting:
-        """Fit the markers' edges where the lens makes them straight."""
+        """Fit the markers' edges, straightened by the lens model."""
         if self.board.type == "charuco":
             return sighting
-        # Paper and ink are grey, so their grey code decodes to their light.
+        # Paper and ink are grey, so their grey code decodes to linear light.
         light = decode_lut(None)[:, 0][gray]
         better = self._finder.refined(light, camera, sighting.pixels.reshape(-1, 4, 2)).reshape(-1, 2)
         moved = np.linalg.norm(better - sighting.pixels, axis=1)
@@ -131,15 +131,15 @@ class MarkerBoard:
 
 
 def parse_target(text: str | None, known: BoardSpec | None, folders: Sequence[Path | None]) -> Target:
-    """Return the target that `--target` names, or without it the board that is known.
+    """Return the target that `--target` names, or by default the known board.
 
     Args:
         text: `chessboard:COLUMNSxROWS:SQUARE_M` (inner corners, metres) or the path of a board.yaml.
         known: the board that a recording describes.
-        folders: dataset folders whose calibration/board.yaml is taken, the first that has one.
+        folders: dataset folders; the first one with a calibration/board.yaml is used.
 
     Raises:
-        DeltalightError: none is given, or what is given is wrong.
+        DeltalightError: no target is given, or the given one is wrong.
     """
     if text is None:
         boards = [folder / "calibration" / "board.yaml" for folder in folders if folder is not None]
@@ -163,7 +163,7 @@ def parse_target(text: str | None, known: BoardSpec | None, folders: Sequence[Pa
 
 
 def _least_beside(steps: Float64[np.ndarray, "r c"], axis: int) -> Float64[np.ndarray, "r c"]:
-    """Distance to the nearer neighbour along an axis, for every corner of the grid."""
+    """Return the distance to the nearer neighbour along an axis, for every corner of the grid."""
     ends = [(1, 0) if each == axis else (0, 0) for each in (0, 1)]
     starts = [(0, 1) if each == axis else (0, 0) for each in (0, 1)]
     pads = [np.pad(steps, width, constant_values=np.inf) for width in (ends, starts)]

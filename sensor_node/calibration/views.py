@@ -1,4 +1,4 @@
-"""Views of a target: which pictures of a series are taken for calibration."""
+"""Views of a target: selection of pictures for calibration."""
 
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -11,11 +11,11 @@ from protocol.camera_model import CameraModel
 from protocol.errors import DeltalightError
 from sensor_node.calibration.targets import Sighting, Target
 
-# Fewer points say too little about a pose of their own.
+# Fewer points do not determine a pose well.
 LEAST_POINTS = 8
 # A corner that moves by a thousandth of the width between two frames is blurred by at most as much.
 STILL_SHARE = 1e-3
-# A view that differs less than this from one already taken, as a share of the width, adds little.
+# A view that differs less than this from an earlier one, as a fraction of the width, adds little.
 NEW_SHARE = 0.05
 
 
@@ -39,7 +39,7 @@ class View:
     moment: int
 
     def refined(self, target: Target, camera: CameraModel) -> "View":
-        """Return the view with its points found better by the nearly known lens."""
+        """Return the view with its points refined by the nearly known lens."""
         sighting = target.refined(self.gray, Sighting(self.numbers, self.pixels), camera)
         return replace(self, pixels=sighting.pixels)
 
@@ -49,11 +49,10 @@ class View:
 
 
 class ViewCollector:
-    """Takes the views of a series of pictures.
+    """Selects the views from a series of pictures.
 
-    Of a `moving` series (a recording, a live camera) only those are taken in which the target stands still and
-    is not where it was in one taken before; of a folder of pictures, all. `brightest` is the brightest that every
-    pixel was.
+    Of a `moving` series (a recording, a live camera), only those in which the target stands still, at a new position;
+    of a folder of pictures, all. `brightest` is the brightest value of every pixel.
     """
 
     def __init__(self, target: Target, *, moving: bool) -> None:
@@ -69,10 +68,10 @@ class ViewCollector:
         return (0, 0) if self.brightest is None else (self.brightest.shape[1], self.brightest.shape[0])
 
     def add(self, picture: Picture) -> bool:
-        """Look at the next picture; return whether it was taken as a view.
+        """Examine the next picture; return whether it was taken as a view.
 
         Raises:
-            DeltalightError: it is of another size than those before.
+            DeltalightError: its size differs from the earlier ones.
         """
         gray = cv2.cvtColor(np.ascontiguousarray(picture.color), cv2.COLOR_RGB2GRAY)
         self._look(picture.name, gray)
@@ -109,7 +108,7 @@ class ViewCollector:
 
 
 def _apart_px(first: View, second: View) -> float:
-    """Mean distance between the points that both views show; infinite where there are none."""
+    """Return the mean distance between the points that both views show; infinite if there are none."""
     _, ours, theirs = np.intersect1d(first.numbers, second.numbers, return_indices=True)
     if not len(ours):
         return float("inf")

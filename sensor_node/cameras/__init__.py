@@ -1,1 +1,1 @@
-"""Cameras behind one small interface: replayed recordings and a synthetic scene."""
+"""Cameras behind one interface: live devices, replayed recordings and a synthetic scene."""

@@ -26,7 +26,7 @@ class StaleFrameError(DeltalightError):
 
 @dataclass(frozen=True)
 class StreamState:
-    """How a live camera is doing, with a sentence for people."""
+    """Health of a live camera's stream, with a sentence for the user."""
 
     name: Literal["live", "stale", "lost"]
     detail: str
@@ -42,13 +42,13 @@ class ImuSample:
 
 
 class Camera(ABC):
-    """A source of frames in real time (or as fast as asked for); use it as a context manager.
+    """A source of frames in real time (or as fast as requested); use it as a context manager.
 
-    One thread uses a camera. `timestamp_ns` of a frame is when it was captured, by the camera's own clock;
-    `capture_ns` is the same moment by this host's clock. `depth_scale` is metres for each step of the depth,
-    None where it does not come in steps. A live camera may know these, and `camera`, only once it is open.
-    `exposure_is_measured` says that each frame's `exposure_s` is what the sensor did, not what was asked. `notes` are
-    sentences about missing optional parts and what is used instead, complete once it is open.
+    One thread uses a camera. `timestamp_ns` of a frame is its capture time by the camera's own clock; `capture_ns` is
+    the same moment by this host's clock. `depth_scale` is metres per step of the depth, None if it does not come in
+    steps. A live camera may know these, and `camera`, only once it is open. `exposure_is_measured`: each frame's
+    `exposure_s` is what the sensor did, not what was requested. `notes` are sentences about missing optional parts
+    and what is used instead, complete once it is open.
     """
 
     camera: CameraModel
@@ -64,11 +64,11 @@ class Camera(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Stop capture and give the device back; may be called twice."""
+        """Stop capture and release the device; idempotent."""
 
     @abstractmethod
     def read(self) -> SensorFrame:
-        """Wait for the next frame and return it; none is left out.
+        """Wait for the next frame and return it, without skipping any.
 
         Raises:
             EndOfStream: there are no further frames.
@@ -76,7 +76,7 @@ class Camera(ABC):
 
     @abstractmethod
     def read_latest(self, max_age_s: float) -> SensorFrame:
-        """Return the newest frame at once, leaving out those before it.
+        """Return the newest frame at once, skipping older ones.
 
         Raises:
             StaleFrameError: the newest frame is older than `max_age_s` seconds.
@@ -86,23 +86,23 @@ class Camera(ABC):
     @property
     @abstractmethod
     def capture_ns(self) -> int:
-        """When the frame returned last was captured, in ns since 1970 by this host's clock."""
+        """Capture time of the last returned frame, in ns since 1970 by this host's clock."""
 
     @abstractmethod
     def interrupt(self) -> None:
-        """Make a waiting `read`, and later ones, end at once with EndOfStream; any thread may call it."""
+        """Make a waiting `read`, and later ones, end at once with EndOfStream; callable from any thread."""
 
     @property
     def state(self) -> StreamState | None:
-        """What a live camera says of its stream; None where only the age of the frames tells."""
+        """State of a live camera's stream; None if only the age of the frames tells."""
         return None
 
     def imu_samples(self) -> list[ImuSample]:
-        """Return what the camera's inertial unit measured since the last call, the last seconds at most."""
+        """Return the inertial unit's measurements since the last call, at most the last seconds."""
         return []
 
     def set_exposure(self, seconds: float) -> None:
-        """Lock the exposure; frames some way ahead have it.
+        """Lock the exposure; it takes effect some frames later.
 
         Raises:
             DeltalightError: the exposure of this camera cannot be set.

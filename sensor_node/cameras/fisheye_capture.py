@@ -1,4 +1,4 @@
-"""Fish-eye pictures from any camera, taken in a thread: one picture at a time, or an exposure bracket in turn."""
+"""Fish-eye pictures from any camera, captured in a thread: single pictures, or an exposure bracket in turn."""
 
 import threading
 import time
@@ -12,24 +12,24 @@ from protocol.fisheye_lens import FisheyeCalibration
 from protocol.frames import FisheyePictures, SensorFrame
 from sensor_node.cameras.base import Camera, EndOfStream, ImuSample, StreamState
 
-# A told exposure is the one asked for within 5 % or two lines of a usual rolling shutter (15 us each).
+# A reported exposure counts as the requested one within 5 % or two lines of a usual rolling shutter (15 us each).
 SAME_EXPOSURE, SAME_EXPOSURE_S = 0.05, 30e-6
-# Frames to wait for a camera that tells its exposures: the slowest known take ten to follow.
+# Frames to wait for a camera that reports its exposures: the slowest known ones take ten to respond.
 LONGEST_SETTLE = 15
 RETRY_S = 1.0
 
 
 class FisheyeCapture:
-    """Keeps the newest fish-eye pictures of a camera; use it as a context manager.
+    """Holds the newest fish-eye pictures of a camera; use it as a context manager.
 
-    A frame that carries fish-eye pictures of its own (a replay) gives those; of any other its colour is taken. With
-    `exposures_s` the camera takes these in turn, each once the change is seen in the frames.
+    A frame with fish-eye pictures of its own (a replay) supplies those; of any other frame the colour is used. With
+    `exposures_s` the camera takes these exposures in turn, each once the change has reached the frames.
 
     Args:
         camera: not opened yet; this opens and closes it.
-        calibration: lens of the camera; may be None where the frames carry their own.
+        calibration: lens of the camera; may be None if the frames carry their own.
         exposures_s: the bracket; empty = pictures as they come.
-        settle_frames: frames to leave out after a change, where the camera does not tell its exposures.
+        settle_frames: frames to skip after a change, if the camera does not report its exposures.
     """
 
     def __init__(
@@ -48,7 +48,7 @@ class FisheyeCapture:
         self._thread = threading.Thread(target=self._run, name="fisheye", daemon=True)
 
     def __enter__(self) -> Self:
-        """Open the camera and begin.
+        """Open the camera and start capture.
 
         Raises:
             DeltalightError: the camera cannot be opened.
@@ -72,7 +72,7 @@ class FisheyeCapture:
 
     @property
     def state(self) -> StreamState | None:
-        """How the camera is doing; `stale` where its pictures cannot be used."""
+        """State of the camera; `stale` if its pictures cannot be used."""
         state = self._camera.state
         is_well = state is None or state.name == "live"
         return StreamState("stale", self._fault) if is_well and self._fault else state
@@ -83,7 +83,7 @@ class FisheyeCapture:
                 self._newest, self._fault = self._take(), ""
             except EndOfStream:
                 return
-            except DeltalightError as error:  # the old pictures hold on, and `state` says why
+            except DeltalightError as error:  # the old pictures remain, and `state` gives the reason
                 self._fault = str(error)
                 self._closing.wait(RETRY_S)
 
@@ -99,7 +99,7 @@ class FisheyeCapture:
         if not self._camera.exposure_is_measured:
             changed_ns = time.time_ns()
             frame = self._camera.read()
-            while self._camera.capture_ns < changed_ns:  # still in the queue from before
+            while self._camera.capture_ns < changed_ns:  # queued before the change
                 frame = self._camera.read()
             for _ in range(self._settle_frames):
                 frame = self._camera.read()
@@ -179,12 +179,12 @@ class CameraWithFisheye(Camera):
 
     @property
     def capture_ns(self) -> int:
-        """When the camera's frame was captured, in ns since 1970 by this host's clock."""
+        """Capture time of the camera's frame, in ns since 1970 by this host's clock."""
         return self._camera.capture_ns
 
     @property
     def state(self) -> StreamState | None:
-        """The camera's state; while that is well, the fish-eye camera's if it is not."""
+        """The camera's state; while that is live, the fish-eye camera's if it is not."""
         state, fisheye = self._camera.state, self._fisheye.state
         is_well = state is None or state.name == "live"
         if not is_well or fisheye is None or fisheye.name == "live":

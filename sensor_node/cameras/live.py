@@ -1,4 +1,4 @@
-"""What live cameras share: their calibration folder, the host's clocks, and how they fail."""
+"""Common parts of live cameras: their calibration folder, the host's clocks, and failures."""
 
 import threading
 import time
@@ -29,14 +29,14 @@ NOMINAL_FIELD_RAD = np.radians(65.0)
 
 
 class CameraFailure(DeltalightError):  # noqa: N818 - the camera's, not the program's
-    """A live camera cannot be opened, or gives no pictures any more; it may come back."""
+    """A live camera cannot be opened, or stopped delivering pictures; it may come back."""
 
 
 @dataclass(frozen=True)
 class LiveCalibration:
-    """What a calibration folder says of a live camera; None where it does not say it.
+    """Contents of a live camera's calibration folder; None for missing parts.
 
-    `depth_camera` is the depth image's own camera (None: registered to colour), `depth_scale` metres a step.
+    `depth_camera` is the depth image's own camera (None: registered to colour), `depth_scale` metres per step.
     """
 
     camera: CameraModel | None = None
@@ -51,7 +51,7 @@ class LiveCalibration:
 def load_calibration(folder: Path | None, board: BoardSpec | None = None) -> LiveCalibration:
     """Read a calibration folder (YAML files in it, or in its `calibration` as `deltalight calibrate` writes them).
 
-    `board` takes the place of its board.yaml.
+    `board` replaces its board.yaml.
 
     Raises:
         DeltalightError: there is no such folder, or a file in it is wrong.
@@ -88,10 +88,10 @@ def _positive(info: dict[str, object], key: str, path: Path) -> float | None:
 def colour_camera(
     source: str, known: CameraModel | None, settings: CameraSettings, *, calibrated: bool
 ) -> CameraModel:
-    """Return the colour camera at the size to capture in; without calibration a nominal one, if that will do.
+    """Return the colour camera at its capture size; without calibration a nominal one, if allowed.
 
     Raises:
-        DeltalightError: there is no calibration, or it is for pictures of another shape.
+        DeltalightError: there is no calibration, or its aspect ratio differs.
     """
     width, height = capture_size(known, settings)
     if known is None and calibrated:
@@ -112,28 +112,28 @@ def colour_camera(
 
 
 def capture_size(known: CameraModel | None, settings: CameraSettings) -> tuple[int, int]:
-    """Return (width, height) to capture in: as set, else as calibrated, else 1280x720."""
+    """Return (width, height) of capture: as set, else as calibrated, else 1280x720."""
     default = (1280, 720) if known is None else (known.width, known.height)
     return settings.width or default[0], settings.height or default[1]
 
 
 class HostClock:
-    """Turns times of CLOCK_MONOTONIC into ns since 1970.
+    """Converts times of CLOCK_MONOTONIC into ns since 1970.
 
-    `stamp` rises steadily although the wall clock may be set meanwhile: it is the camera's own clock. `now` is the
-    moment by this host's clock as that stands at present.
+    `stamp` rises steadily even if the wall clock is set: it is the camera's own clock. `now` is the same moment by
+    the host's current wall clock.
     """
 
     def __init__(self) -> None:
         self._offset_ns = time.time_ns() - time.monotonic_ns()
 
     def stamp(self, monotonic_ns: int) -> int:
-        """Time of a frame by the camera's own clock, in ns since 1970 by the host's when it was opened first."""
+        """Return the time of a frame by the camera's own clock, in ns since 1970."""
         return monotonic_ns + self._offset_ns
 
     @staticmethod
     def now(monotonic_ns: int) -> int:
-        """The same moment in ns since 1970 by the host's present clock."""
+        """Return the same moment in ns since 1970 by the host's current clock."""
         return time.time_ns() - (time.monotonic_ns() - monotonic_ns)
 
     @staticmethod
@@ -143,7 +143,7 @@ class HostClock:
 
 
 class LiveCamera(Camera):
-    """A camera that captures now; `remark` says what of the settings it could not follow."""
+    """A camera that captures now; `remark` says which settings it could not apply."""
 
     def __init__(self, source: str) -> None:
         self.source, self.remark = source, ""
@@ -153,14 +153,14 @@ class LiveCamera(Camera):
 
     @abstractmethod
     def capture(self) -> SensorFrame:
-        """Wait for the next frame and note when it was captured.
+        """Wait for the next frame and note when it was captured (`note_capture`).
 
         Raises:
             CameraFailure: it gives none.
         """
 
     def read(self) -> SensorFrame:
-        """Wait for the next frame that the device gives; it keeps few, so read on."""
+        """Wait for the next frame of the device; it buffers few, so keep reading."""
         if self._interrupted.is_set():
             raise EndOfStream
         try:
@@ -171,7 +171,7 @@ class LiveCamera(Camera):
             raise
 
     def read_latest(self, max_age_s: float) -> SensorFrame:
-        """Return the newest frame, leaving out older ones that the driver still holds."""
+        """Return the newest frame, skipping older ones that the driver still buffers."""
         for _ in range(DRIVER_BUFFERS + 1):
             frame = self.read()
             age_s = (time.monotonic_ns() - self._capture_monotonic_ns) / 1e9
@@ -181,9 +181,18 @@ class LiveCamera(Camera):
             f"the newest frame of {self.source} is {age_s:.2f} s old, {max_age_s:g} s are allowed; see its cable."
         )
 
+    def note_capture(self, monotonic_ns: int) -> None:
+        """Notes when the newest frame was captured, by CLOCK_MONOTONIC; `capture` calls it for each."""
+        self._capture_monotonic_ns = monotonic_ns
+
+    @property
+    def timestamp_ns(self) -> int:
+        """The same moment by the camera's own clock, which is what frames carry."""
+        return self.clock.stamp(self._capture_monotonic_ns)
+
     @property
     def capture_ns(self) -> int:
-        """When the frame returned last was captured, in ns since 1970 by this host's present clock."""
+        """Capture time of the last returned frame, in ns since 1970 by this host's current clock."""
         return self.clock.now(self._capture_monotonic_ns)
 
     def interrupt(self) -> None:

@@ -8,8 +8,10 @@ import numpy as np
 from protocol.errors import DeltalightError
 from protocol.frames import SensorFrame
 from sensor_node.cameras.base import EndOfStream, ImuSample
+from sensor_node.cameras.driver import CameraDriver, CameraRequest
 from sensor_node.cameras.live import MM, CameraFailure, LiveCalibration, LiveCamera, capture_size
 from sensor_node.cameras.oak_device import STEREO_SIZE, OakDevice, OakStreams
+from sensor_node.cameras.oak_discovery import find_cameras
 from sensor_node.cameras.oak_frames import (
     Pairing,
     camera_from_calibration,
@@ -24,19 +26,19 @@ from sensor_node.cameras.oak_frames import (
 from sensor_node.cameras.oak_sdk import load_depthai
 from sensor_node.cameras.settings import CameraSettings
 
-# How often a waiting read looks for `interrupt` and for a device that went away.
+# How often a waiting read checks for `interrupt` and for a lost device.
 POLL = timedelta(seconds=0.1)
-# Automatic exposure and white balance come to rest within a second.
+# Automatic exposure and white balance settle within a second.
 SETTLE_S = 1.0
-# Sensitivity of an exposure that the settings give, so that pictures are equally bright at every start.
+# Sensitivity of an exposure given by the settings, so that pictures are equally bright at every start.
 DEFAULT_ISO = 100
 
 
 class OakCamera(LiveCamera):
-    """An OAK by its id (empty: the first found). Its own calibration is used unless the folder has rgb.yaml.
+    """An OAK by its id (empty: the first found). Its own calibration applies unless the folder has rgb.yaml.
 
-    Colour is freed of distortion on the device where there is stereo depth, which is aligned to it; else it comes
-    as the sensor sees it, with the full lens model. `exposure_s` of each frame is the sensor's own word.
+    With stereo depth, the device undistorts colour, and aligns depth to it; otherwise colour comes as the sensor sees
+    it, with the full lens model. `exposure_s` of each frame is reported by the sensor.
     """
 
     exposure_is_measured = True
@@ -60,11 +62,11 @@ class OakCamera(LiveCamera):
         self._iso = DEFAULT_ISO
 
     def open(self) -> None:
-        """Boot the device, learn its lens from the first picture, lock exposure and white balance as set.
+        """Boot the device, read its lens from the first picture, and lock exposure and white balance as set.
 
         Raises:
-            CameraFailure: it is not there or does not start.
-            DeltalightError: its calibration is missing or cannot be used.
+            CameraFailure: it is absent or does not start.
+            DeltalightError: its calibration is missing or unusable.
         """
         self.close()
         self._interrupted.clear()
@@ -81,7 +83,7 @@ class OakCamera(LiveCamera):
             raise
 
     def close(self) -> None:
-        """Give the device back."""
+        """Release the device."""
         if self._streams is not None:
             self.unpaired += self._pairing.unpaired
         self._streams = None
@@ -94,14 +96,14 @@ class OakCamera(LiveCamera):
         self._device.send(control)
 
     def capture(self) -> SensorFrame:
-        """Wait for the next picture, with its depth if that comes in time."""
+        """Wait for the next picture, with its depth if that arrives in time."""
         picture, depth = self._pair()
-        self._capture_monotonic_ns = nanoseconds(picture.getTimestamp())
+        self.note_capture(nanoseconds(picture.getTimestamp()))
         self._iso = picture.getSensitivity() or self._iso
         color, jpeg = picture_of(picture, self.source)
         return SensorFrame(
             frame_id=picture.getSequenceNum(),
-            timestamp_ns=self.clock.stamp(self._capture_monotonic_ns),
+            timestamp_ns=self.timestamp_ns,
             color=color,
             camera=self.camera,
             response=self._known.response,
@@ -112,7 +114,7 @@ class OakCamera(LiveCamera):
         )
 
     def imu_samples(self) -> list[ImuSample]:
-        """Return what the IMU measured since the last call, the last seconds at most."""
+        """Return the IMU's measurements since the last call, at most the last seconds."""
         queue = None if self._streams is None else self._streams.imu
         if queue is None or queue.isClosed():
             return []
@@ -184,3 +186,15 @@ class OakCamera(LiveCamera):
         for depth in streams.depth.tryGetAll():
             self._pairing.add_depth(depth)
         return self._pairing.next()
+
+
+def make_camera(request: CameraRequest) -> OakCamera:
+    """The camera that a request names by its id; the first one where it names none.
+
+    Raises:
+        DeltalightError: the SDK is not installed.
+    """
+    return OakCamera(request.device, request.settings, request.calibration, with_depth=request.depth)
+
+
+DRIVER = CameraDriver("OAK", make_camera, find_cameras)

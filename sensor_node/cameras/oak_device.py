@@ -1,4 +1,4 @@
-"""The only place that touches an OAK: opens it, builds its pipeline, sends it controls."""
+"""Access to an OAK device: opens it, builds its pipeline, sends it controls."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -9,9 +9,9 @@ from sensor_node.cameras.oak_frames import SUBPIXEL_BITS
 from sensor_node.cameras.oak_sdk import load_depthai
 from sensor_node.cameras.settings import CameraSettings
 
-# Half of the 1280x800 of the stereo cameras: what the device matches at 30 per second; depth from 0.35 m on.
+# Half of the stereo cameras' 1280x800: what the device matches at 30 per second; depth from 0.35 m on.
 STEREO_SIZE = (640, 400)
-# Queues keep few messages, so that what comes out is new.
+# Short queues, so that messages are recent.
 QUEUE_SIZE = 4
 JPEG_QUALITY = 95
 IMU_RATE_HZ = 200
@@ -19,10 +19,10 @@ IMU_RATE_HZ = 200
 
 @dataclass
 class OakStreams:
-    """What a running device gives: queues of the SDK and its calibration.
+    """Outputs of a running device: queues of the SDK, and its calibration.
 
-    `corrected`: the colour's distortion is removed, which alignment of depth needs. `depth` is None without a
-    stereo pair, `imu` without an IMU.
+    `corrected`: the colour's distortion is removed, as alignment of depth requires. `depth` is None without a stereo
+    pair, `imu` without an IMU.
     """
 
     color: Any
@@ -54,7 +54,7 @@ class OakDevice:
         info = self._find(dai)
         try:
             self._device = dai.Device(info)
-            self._device.setMaxReconnectionAttempts(0)  # reconnecting is ours, with its state visible
+            self._device.setMaxReconnectionAttempts(0)  # this project reconnects itself, with a visible state
             self._pipeline = dai.Pipeline(self._device)
             streams = self._build(dai, settings, size, with_depth=with_depth)
             self._pipeline.start()
@@ -66,7 +66,7 @@ class OakDevice:
         return streams
 
     def close(self) -> None:
-        """Stop the pipeline and give the device back."""
+        """Stop the pipeline and release the device."""
         if self._pipeline is not None:
             self._pipeline.stop()
             self._pipeline.wait()
@@ -76,7 +76,7 @@ class OakDevice:
 
     @property
     def is_running(self) -> bool:
-        """Whether the pipeline still runs and the device is still there."""
+        """Whether the pipeline still runs and the device is still connected."""
         return self._pipeline is not None and self._pipeline.isRunning() and not self._device.isClosed()
 
     def send(self, control: Any) -> None:  # noqa: ANN401 - a CameraControl of the SDK
@@ -131,20 +131,20 @@ class OakDevice:
     def _start_controls(self, dai: Any, control: Any, settings: CameraSettings, calibration: Any) -> None:  # noqa: ANN401
         if settings.white_balance_k is not None:
             control.setManualWhiteBalance(settings.white_balance_k)
-        # The factory calibration holds at one position of a lens that moves; 0 = it does not move.
+        # The factory calibration applies to one position of a lens that moves; 0 = it does not move.
         position = calibration.getLensPosition(dai.CameraBoardSocket.CAM_A)
         if position > 0:
             control.setManualFocus(position)
 
     def _encoded(self, dai: Any, color: Any, fps: float) -> Any:  # noqa: ANN401
-        """JPEG made on the device: one tenth of the bytes, which USB 2 and Ethernet can carry."""
+        """Add a JPEG encoder on the device: a tenth of the bytes, which USB 2 and Ethernet can carry."""
         profile = dai.VideoEncoderProperties.Profile.MJPEG
         encoder = self._pipeline.create(dai.node.VideoEncoder)
         encoder.build(color, frameRate=fps, profile=profile, quality=JPEG_QUALITY)
         return _queue(encoder.out)
 
     def _aligned_depth(self, dai: Any, color: Any, fps: float) -> Any:  # noqa: ANN401
-        """Stereo depth in mm, seen from the colour camera. Filters over time are the node's own business."""
+        """Add stereo depth in mm, aligned to the colour camera; temporal filters are the node's task."""
         left, right = (
             self._pipeline.create(dai.node.Camera).build(socket).requestOutput(STEREO_SIZE, fps=fps)
             for socket in (dai.CameraBoardSocket.CAM_B, dai.CameraBoardSocket.CAM_C)
@@ -171,5 +171,5 @@ class OakDevice:
 
 
 def _queue(output: Any, size: int = QUEUE_SIZE) -> Any:  # noqa: ANN401 - an Output of the SDK
-    """A queue in which a new message replaces the oldest when nobody reads."""
+    """Create a queue in which a new message replaces the oldest if nobody reads."""
     return output.createOutputQueue(maxSize=size, blocking=False)

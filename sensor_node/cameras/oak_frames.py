@@ -1,4 +1,4 @@
-"""From messages and calibration of the OAK SDK to this project's frames and camera models."""
+"""Conversion of the OAK SDK's messages and calibration to this project's frames and camera models."""
 
 from collections import deque
 from datetime import timedelta
@@ -18,17 +18,17 @@ from sensor_node.cameras.live import MM
 Message = Any  # of the SDK, which is optional
 Lens = Literal["plumb_bob", "equidistant"]
 
-# Lens models of the SDK and ours. Its coefficients have OpenCV's order: k1 k2 p1 p2 k3 k4 k5 k6 s1..s4 tx ty, or
+# Lens models of the SDK and ours. Its coefficients are in OpenCV's order: k1 k2 p1 p2 k3 k4 k5 k6 s1..s4 tx ty, or
 # k1..k4 of the equidistant fish-eye.
 _MODELS: dict[str, Lens] = {"Perspective": "plumb_bob", "Fisheye": "equidistant"}
 # Stereo matching repeats to about one step of the subpixel disparity: three bits on the device.
 SUBPIXEL_BITS = 3
-# Colour waits for its depth no longer than so many frames: stereo matching takes two to three periods.
+# Frames that colour waits for its depth: stereo matching takes two to three periods.
 LONGEST_WAIT_FRAMES = 5
 
 
 def nanoseconds(time: timedelta) -> int:
-    """A time of the SDK: CLOCK_MONOTONIC of the host, to the microsecond."""
+    """Return a time of the SDK in ns: CLOCK_MONOTONIC of the host, to the microsecond."""
     return time // timedelta(microseconds=1) * 1000
 
 
@@ -36,7 +36,7 @@ def camera_from_calibration(handler: Any, socket: Any, width: int, height: int) 
     """Return the camera of uncorrected pictures of a size that is cropped to its shape, then scaled.
 
     Raises:
-        DeltalightError: the device was not calibrated, or its lens model is of a kind that is not known here.
+        DeltalightError: the device was not calibrated, or its lens model is not supported.
     """
     if not handler.hasCameraCalibration(socket):
         raise DeltalightError(
@@ -53,9 +53,9 @@ def camera_from_calibration(handler: Any, socket: Any, width: int, height: int) 
 
 
 def camera_from_picture(message: Message, *, corrected: bool) -> CameraModel | None:
-    """Return the camera that a picture says it was taken with; None if it does not say.
+    """Return the camera that a picture reports; None if it reports none.
 
-    `corrected` pictures had their distortion removed on the device; what they carry is the sensor's.
+    `corrected` pictures were undistorted on the device; the camera they carry is the sensor's.
     """
     transformation = message.getTransformation()
     matrix = np.array(transformation.getIntrinsicMatrix(), np.float64)
@@ -98,7 +98,7 @@ def picture_of(message: Message, name: str) -> tuple[UInt8[np.ndarray, "h w 3"],
 
 
 def depth_of(message: Message, camera: CameraModel, noise_sigma_m: float | None) -> DepthImage:
-    """Return the depth of a 16-bit ImgFrame in mm that is aligned with `camera`, maybe at another size."""
+    """Return the depth of a 16-bit ImgFrame in mm that is aligned with `camera`, possibly at another size."""
     steps = np.asarray(message.getFrame(), np.uint16)
     height, width = steps.shape
     own = camera if (width, height) == (camera.width, camera.height) else camera.resized(width, height)
@@ -106,13 +106,13 @@ def depth_of(message: Message, camera: CameraModel, noise_sigma_m: float | None)
 
 
 def exposure_of(message: Message) -> float | None:
-    """Exposure of a picture as the sensor had it, in seconds."""
+    """Return the exposure of a picture as reported by the sensor, in seconds."""
     seconds: float = message.getExposureTime().total_seconds()
     return seconds if seconds > 0 else None
 
 
 def imu_samples(message: Message, stamp: Any) -> list[ImuSample]:  # noqa: ANN401 - ns -> ns
-    """Return the readings of an IMUData message; `stamp` turns CLOCK_MONOTONIC into the time of the frames."""
+    """Return the readings of an IMUData message; `stamp` converts CLOCK_MONOTONIC to the time of the frames."""
     samples = []
     for packet in message.packets:
         force, rate = packet.acceleroMeter, packet.gyroscope
@@ -127,9 +127,9 @@ def imu_samples(message: Message, stamp: Any) -> list[ImuSample]:  # noqa: ANN40
 
 
 class Pairing:
-    """Pairs pictures with depth by capture time; a picture whose depth does not come goes on without it.
+    """Pairs pictures with depth by capture time; a picture without depth continues alone.
 
-    The SDK's own synchronisation drops both when they are a little too far apart, so that nothing may come at all.
+    The SDK's own synchronisation drops both when they are slightly too far apart, so that nothing may arrive at all.
     `unpaired` counts the pictures without depth.
     """
 
@@ -140,19 +140,19 @@ class Pairing:
         self._depths: deque[tuple[int, Message]] = deque(maxlen=2 * LONGEST_WAIT_FRAMES)
 
     def add_picture(self, message: Message) -> None:
-        """Take a picture in."""
+        """Add a picture."""
         self._pictures.append((nanoseconds(message.getTimestamp()), message))
 
     def add_depth(self, message: Message) -> None:
-        """Take a depth image in."""
+        """Add a depth image."""
         self._depths.append((nanoseconds(message.getTimestamp()), message))
 
     def next(self) -> tuple[Message, Message | None] | None:
-        """Return the oldest picture with its depth, once it is known whether there is any."""
+        """Return the oldest picture with its depth, once it is certain whether there is any."""
         if not self._pictures:
             return None
         time_ns, picture = self._pictures[0]
-        # Depth within the tolerance, half a period, is the nearest: the next is further on.
+        # Depth within the tolerance, half a period, is the nearest: the next one is farther.
         while self._depths and self._depths[0][0] < time_ns - self._tolerance_ns:
             self._depths.popleft()
         if not self._depths and len(self._pictures) <= LONGEST_WAIT_FRAMES:

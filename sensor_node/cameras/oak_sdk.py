@@ -6,8 +6,8 @@ from typing import Any
 
 from protocol.errors import DeltalightError
 
-# The SDK reads these when it is imported. Its log goes to standard output, where it would spoil `--json`;
-# its telemetry is on unless it is refused; its signal handlers would replace those of the supervisor.
+# The SDK reads these on import. Its log goes to standard output, where it would corrupt `--json`; its telemetry is on
+# unless refused; its signal handlers would replace those of the supervisor.
 ENVIRONMENT = {
     "DEPTHAI_LEVEL": "error",
     "DEPTHAI_TELEMETRY": "0",
@@ -17,7 +17,7 @@ INSTALL_HINT = "pip install 'deltalight[oak]'"
 
 
 def sdk_version() -> str | None:
-    """Version of the SDK; None where it is not installed."""
+    """Return the version of the SDK; None if it is not installed."""
     try:
         return version("depthai")
     except PackageNotFoundError:
@@ -25,7 +25,7 @@ def sdk_version() -> str | None:
 
 
 def load_depthai() -> Any:  # noqa: ANN401 - the SDK is optional, so its types are not at hand
-    """Import the SDK; what the user has set in the environment is kept.
+    """Import the SDK; the user's own environment variables take precedence.
 
     Raises:
         DeltalightError: it is not installed, or not version 3.

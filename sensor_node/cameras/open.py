@@ -1,4 +1,4 @@
-"""From the words a user gives to a camera: `synthetic`, a folder, an .mcap file, `uvc:0`, `oak`, ..."""
+"""Opening cameras by their names: `synthetic`, a folder, an .mcap file, `uvc:0`, `oak`, ..."""
 
 from pathlib import Path
 
@@ -9,6 +9,8 @@ from protocol.errors import DeltalightError
 from protocol.fisheye_lens import FisheyeCalibration, load_fisheye_yaml
 from protocol.source import RECORDING_SUFFIXES, open_source
 from sensor_node.cameras.base import Camera
+from sensor_node.cameras.driver import CameraRequest
+from sensor_node.cameras.drivers import SYNTHETIC, driver_plugins, load_driver
 from sensor_node.cameras.fisheye_capture import FisheyeCapture
 from sensor_node.cameras.live import load_calibration
 from sensor_node.cameras.reconnect import ReconnectingCamera
@@ -16,14 +18,12 @@ from sensor_node.cameras.replay import ReplayCamera
 from sensor_node.cameras.settings import CameraSettings, FisheyeSettings
 from sensor_node.cameras.synthetic import SyntheticCamera
 
-SYNTHETIC = "synthetic"
-LIVE_KINDS = ("uvc", "oak", "openni2", "orbbec")
 _DEFAULTS = CameraSettings()
 
 
 def is_live(source: str) -> bool:
     """Whether `source` names a camera that captures now (`uvc:0`), not a replay or `synthetic`."""
-    return source.partition(":")[0] in LIVE_KINDS
+    return _kind(source) in [plugin.name for plugin in driver_plugins()]
 
 
 def open_camera(
@@ -38,7 +38,7 @@ def open_camera(
 
     Args:
         source: `synthetic`, a dataset folder, an .mcap recording, or a live camera: `uvc:0`,
-            `uvc:/dev/video2`, `oak`, `oak:<device id>`, `openni2:0`, `orbbec:0`.
+            `uvc:/dev/video2`, `oak`, `oak:<device id>`, `openni2:0`, `orbbec:0`, or a plugin's name.
         settings: how to replay or capture.
         board: takes the place of the board that the source describes.
         calibrated: False gives a live camera without calibration a nominal lens, so that it can be calibrated.
@@ -60,38 +60,23 @@ def open_camera(
 def _open_live(
     source: str, settings: CameraSettings, board: BoardSpec | None, *, calibrated: bool, depth: bool
 ) -> Camera:
+    plugin, driver = load_driver(_kind(source))
     calibration = load_calibration(settings.calibration, board)
-    kind, _, device = source.partition(":")
-    inner: Camera
-    match kind:
-        case "uvc":
-            from sensor_node.cameras.uvc import UvcCamera
-
-            inner = UvcCamera(device or "0", settings, calibration, calibrated=calibrated)
-        case "oak":
-            from sensor_node.cameras.oak import OakCamera
-
-            inner = OakCamera(device, settings, calibration, with_depth=depth)
-        case "openni2" | "orbbec":
-            from sensor_node.cameras.rgbd import RgbdCamera
-
-            inner = RgbdCamera(kind, _number(source), settings, calibration, calibrated=calibrated)
-        case _:
-            raise AssertionError(kind)
+    with plugin.blamed():
+        inner = driver.make(CameraRequest(source, settings, calibration, calibrated=calibrated, depth=depth))
+    if not isinstance(inner, Camera):
+        raise plugin.fault("its driver makes no Camera")
     return ReconnectingCamera(inner, source, stall_s=settings.stall_s)
 
 
-def _number(source: str) -> int:
-    number = source.partition(":")[2] or "0"
-    if not number.isdecimal():
-        raise DeltalightError(f"{source} names no camera; write a number after the colon, such as 0.")
-    return int(number)
+def _kind(source: str) -> str:
+    return source.partition(":")[0]
 
 
 def open_fisheye(settings: FisheyeSettings, calibration: Path | None = None) -> FisheyeCapture:
     """Return the camera that sees the light, not opened yet (it is a context manager).
 
-    `calibration` is the folder to look in for fisheye.yaml where the settings name none.
+    `calibration` is the folder to search for fisheye.yaml if the settings name none.
 
     Raises:
         DeltalightError: there is no such source, or its fisheye.yaml is missing or wrong.
@@ -121,7 +106,7 @@ def _fisheye_calibration(source: str, folder: Path | None) -> FisheyeCalibration
 
 
 def _of_fisheye(settings: CameraSettings, known: FisheyeCalibration | None) -> CameraSettings:
-    """Settings at the size of the lens; the folder's rgb.yaml is another camera's."""
+    """Return settings with the lens's size; the folder's rgb.yaml belongs to another camera."""
     size = {} if known is None else {"width": known.lens.width, "height": known.lens.height}
     chosen = settings.model_dump(include={"width", "height"}, exclude_none=True)
     return settings.model_copy(update={"calibration": None, **size, **chosen})
@@ -129,7 +114,7 @@ def _of_fisheye(settings: CameraSettings, known: FisheyeCalibration | None) -> C
 
 def _unknown(source: str) -> DeltalightError:
     head, _, rest = source.partition(":")
-    hint = nearest(head, (SYNTHETIC, *LIVE_KINDS))
+    hint = nearest(head, (SYNTHETIC, *(plugin.name for plugin in driver_plugins())))
     if hint is None:
         advice = "give a dataset folder, an .mcap recording, `synthetic`, or a camera such as `uvc:0`"
     else:

@@ -1,4 +1,4 @@
-"""A recording that can be paused, sought through and played at another rate while it is published."""
+"""Playback of a recording while it is published: pause, seek, and playback rate."""
 
 import math
 import threading
@@ -14,15 +14,15 @@ from sensor_node.cameras.base import Camera, EndOfStream
 from sensor_node.cameras.replay import CLOCK_STEP_NS, DEFAULT_PERIOD_NS, LATE_NS
 
 MIN_RATE, MAX_RATE = 0.05, 20.0
-# While nothing moves the frame is published again so often: a change of the scene shows, and nothing looks lost.
+# Period of repeating a frame that stands still: a change of the scene shows, and nothing looks lost.
 REPEAT_NS = 500_000_000
-# What lies on both sides of a jump is so far apart in the frames' times: longer than any filter reaches.
+# Time between frames on both sides of a jump: longer than the memory of any filter.
 JUMP_NS = 1_000_000_000
 
 
 @dataclass(frozen=True)
 class PlaybackState:
-    """Where a replay is; times in seconds from the first frame of the recording."""
+    """Position of a replay; times in seconds from the first frame of the recording."""
 
     position_s: float
     duration_s: float
@@ -32,18 +32,18 @@ class PlaybackState:
 
 
 class PlaybackCamera(Camera):
-    """The frames of a recording in real time, under control of other threads.
+    """The frames of a recording in real time, controlled by other threads.
 
-    Every frame is stamped with the moment at which it is due here, whatever its place in the recording: numbers,
-    times and stamps go on rising after a pause, a seek or a new round, so that whoever pairs, smooths or records the
-    streams sees one camera. While paused, the frame is given again twice a second.
+    Every frame is stamped with the moment at which it is due here, whatever its position in the recording: numbers,
+    times and stamps keep rising after a pause, a seek or a new round, so that whoever pairs, smooths or records the
+    streams sees one camera. While paused, the frame is repeated twice a second.
 
     Args:
         source: what to replay.
-        loop: begin again after the last frame.
-        rate: recorded seconds a second.
-        start_s: where to begin, seconds from the first frame.
-        playing: False begins paused.
+        loop: restart after the last frame.
+        rate: recorded seconds per second.
+        start_s: initial position, seconds from the first frame.
+        playing: False starts paused.
         stays: wait at the end for another command instead of ending.
 
     Raises:
@@ -68,10 +68,10 @@ class PlaybackCamera(Camera):
         self._playing = playing
         self._changed = threading.Condition()
         self._interrupted = False
-        self._index = self._index_at(start_s)  # the frame that is due next, or stands
+        self._index = self._index_at(start_s)  # the frame that is due next, or shown
         self._is_shown = False
         self._jumped = False
-        self._due_ns = 0  # when that frame was or is due, monotonic
+        self._due_ns = 0  # monotonic time at which that frame was or is due
         self._wall_ns = self._capture_ns = 0
         self._numbered = _RisingNumbers(self._period_ns)
         self.camera, self.board, self.extrinsics = source.camera, source.board, source.extrinsics
@@ -95,12 +95,12 @@ class PlaybackCamera(Camera):
 
     @property
     def capture_ns(self) -> int:
-        """When the frame returned last was due, in ns since 1970 by this host's clock."""
+        """Time at which the last returned frame was due, in ns since 1970 by this host's clock."""
         return self._capture_ns
 
     @property
     def playback(self) -> PlaybackState:
-        """Where the replay is (any thread)."""
+        """Position of the replay (any thread)."""
         with self._changed:
             return PlaybackState(
                 position_s=float(self._times[self._index] - self._times[0]) / 1e9,
@@ -111,7 +111,7 @@ class PlaybackCamera(Camera):
             )
 
     def play(self) -> None:
-        """Go on; from the beginning where it stands at the end (any thread)."""
+        """Resume, from the beginning if it is at the end (any thread)."""
         with self._changed:
             if not self._playing:
                 self._playing = True
@@ -120,36 +120,36 @@ class PlaybackCamera(Camera):
                 self._begin(0 if is_at_end else self._index, is_shown=not is_at_end)
 
     def pause(self) -> None:
-        """Stand still at the frame that is shown (any thread)."""
+        """Pause at the current frame (any thread)."""
         with self._changed:
             self._playing = False
             self._changed.notify_all()
 
     def seek(self, position_s: float) -> None:
-        """Go on from another place, seconds from the first frame, which is kept within the recording (any thread).
+        """Continue at another position, seconds from the first frame, clamped to the recording (any thread).
 
         Raises:
-            DeltalightError: it is no number.
+            DeltalightError: the position is not a number.
         """
         with self._changed:
             self._jumped = True
             self._begin(self._index_at(position_s))
 
     def set_rate(self, rate: float) -> None:
-        """Play so many recorded seconds a second (any thread).
+        """Play this many recorded seconds per second (any thread).
 
         Raises:
-            DeltalightError: out of range.
+            DeltalightError: the rate is out of range.
         """
         with self._changed:
             self._rate = _checked_rate(rate)
             self._begin(self._index, is_shown=self._is_shown)
 
     def read(self) -> SensorFrame:
-        """Wait for the next frame, or for the time to give the one that stands again.
+        """Wait for the next frame, or for the time to repeat the current one.
 
         Raises:
-            EndOfStream: the recording is at its end, and does not stay there.
+            EndOfStream: the recording has ended, and does not stay there.
         """
         with self._changed:
             index, due_ns = self._wait()
@@ -159,11 +159,14 @@ class PlaybackCamera(Camera):
         return self._numbered(self._source[index], index, self._capture_ns, jumped=jumped)
 
     def read_latest(self, max_age_s: float) -> SensorFrame:  # noqa: ARG002 - a replayed frame is never old
-        """As `read`: there is no newer frame than the one that is due."""
+        """Like `read`: no frame is newer than the one that is due."""
         return self.read()
 
     def _wait(self) -> tuple[int, int]:
-        """Wait until a frame is due and return its index and time (monotonic ns); commands change both meanwhile."""
+        """Wait until a frame is due and return its index and time (monotonic ns).
+
+        Commands may change both meanwhile.
+        """
         while not self._interrupted:
             index, due_ns = self._next()
             wait_ns = due_ns - time.monotonic_ns()
@@ -184,7 +187,7 @@ class PlaybackCamera(Camera):
         return self._following()
 
     def _following(self) -> tuple[int, int]:
-        """The next frame; where the replay is far behind, the newest that is due."""
+        """Return the next frame; if the replay is far behind, the newest that is due."""
         index, due_ns, late_ns = self._index, self._due_ns, time.monotonic_ns() - self._due_ns
         if index == len(self._times) - 1:
             return 0, due_ns + int(self._period_ns / self._rate)
@@ -195,7 +198,7 @@ class PlaybackCamera(Camera):
         return following, due_ns + int((self._times[following] - self._times[index]) / self._rate)
 
     def _begin(self, index: int, *, is_shown: bool = False) -> None:
-        """Let a frame be due now; one that is not shown yet does not follow the one before."""
+        """Make a frame due now; unless it `is_shown` already, it is the target of a jump."""
         self._index, self._is_shown, self._due_ns = index, is_shown, time.monotonic_ns()
         self._changed.notify_all()
 
@@ -206,7 +209,7 @@ class PlaybackCamera(Camera):
         return max(int(np.searchsorted(self._times, wanted, "right")) - 1, 0)
 
     def _stamp_of(self, due_ns: int) -> int:
-        """What this host's clock showed, or shows, at a monotonic time; a clock that is set is followed."""
+        """Return this host's clock at a monotonic time, even after the clock was set."""
         wall_ns = time.time_ns() - time.monotonic_ns()
         if abs(wall_ns - self._wall_ns) > CLOCK_STEP_NS:
             self._wall_ns = wall_ns
@@ -214,7 +217,7 @@ class PlaybackCamera(Camera):
 
 
 class _RisingNumbers:
-    """Gives frames numbers and times that rise from one to the next, whatever their places in the recording."""
+    """Gives frames rising numbers and times, whatever their positions in the recording."""
 
     def __init__(self, period_ns: int) -> None:
         self._period_ns = period_ns
@@ -224,7 +227,7 @@ class _RisingNumbers:
         self._pictures: tuple[FisheyePictures, FisheyePictures] | None = None
 
     def __call__(self, frame: SensorFrame, index: int, capture_ns: int, *, jumped: bool) -> SensorFrame:
-        """Return frame `index`, due at `capture_ns`, renumbered; `jumped` says that a command chose it."""
+        """Return frame `index`, due at `capture_ns`, renumbered; `jumped` if a command selected it."""
         last, is_again = self._last, index == self._index
         if last is not None and (jumped or index <= self._index):
             gap_ns = JUMP_NS if jumped else capture_ns - self._capture_ns if is_again else self._period_ns
@@ -244,7 +247,7 @@ class _RisingNumbers:
         return self._last
 
     def _held(self, pictures: FisheyePictures) -> FisheyePictures:
-        """The same object for as long as they hold; those that a jump led to came with it."""
+        """Return the restamped pictures, not before the last jump; the same object while they are current."""
         if self._pictures is None or self._pictures[0] is not pictures:
             shown_ns = max(pictures.timestamp_ns + self._shift_ns, self._since_ns)
             self._pictures = pictures, replace(pictures, timestamp_ns=shown_ns)

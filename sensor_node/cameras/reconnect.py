@@ -1,4 +1,4 @@
-"""A live camera that comes back: when it fails or stalls it is closed and opened again, ever more rarely."""
+"""A live camera that reconnects: after a failure or stall it is reopened, at growing intervals."""
 
 import threading
 import time
@@ -11,9 +11,9 @@ from protocol.frames import SensorFrame
 from sensor_node.cameras.base import Camera, EndOfStream, ImuSample, StaleFrameError, StreamState
 
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.5, 10.0
-# Frames kept for a reader that is late: an eighth of a second at 30 per second.
+# Frames buffered for a late reader: an eighth of a second at 30 per second.
 KEPT_FRAMES = 4
-# How long `close` waits for a driver that hangs; its thread ends by itself afterwards.
+# How long `close` waits for a hanging driver; its thread ends by itself afterwards.
 CLOSE_S = 1.0
 
 
@@ -24,16 +24,16 @@ class _Kept:
 
 
 class ReconnectingCamera(Camera):
-    """Reads `inner` in a thread and opens it again after a failure: after 0.5 s, then 1 s, 2 s ... 10 s.
+    """Reads `inner` in a thread and reopens it after a failure: after 0.5 s, then 1 s, 2 s ... 10 s.
 
-    Frame ids and timestamps go on rising over it; ids that are left out are frames that nobody took in time, or
-    that the camera lost. The first `open` fails as the camera's own does; later failures are told by `state`.
+    Frame ids and timestamps keep rising across reopening; missing ids are frames that nobody took in time, or that
+    the camera lost. The first `open` fails like the camera's own; `state` reports later failures.
 
     Args:
-        inner: the camera; its `interrupt` must end a `read` that waits, or that must end by itself.
-        name: what to call it in sentences.
-        stall_s: time without a frame after which it is given up.
-        first_wait_s: time before the first attempt to open it again.
+        inner: the camera; its `interrupt` must end a waiting `read`, unless that ends by itself.
+        name: how to call it in sentences.
+        stall_s: time without a frame after which it counts as failed.
+        first_wait_s: time before the first attempt to reopen it.
     """
 
     def __init__(
@@ -54,10 +54,10 @@ class ReconnectingCamera(Camera):
         self._describe()
 
     def open(self) -> None:
-        """Open the camera and begin to read it.
+        """Open the camera and start reading.
 
         Raises:
-            DeltalightError: it cannot be opened, or its driver still hangs in the reading before.
+            DeltalightError: it cannot be opened, or its driver still hangs in an earlier read.
         """
         self.close()
         if self._thread is not None:
@@ -70,14 +70,14 @@ class ReconnectingCamera(Camera):
         self._thread.start()
 
     def close(self) -> None:
-        """Stop reading and give the device back."""
+        """Stop reading and release the device."""
         self.interrupt()
         if self._thread is not None:
             self._thread.join(CLOSE_S)
             self._thread = self._thread if self._thread.is_alive() else None
 
     def interrupt(self) -> None:
-        """End a waiting `read` and the attempts to open the camera again."""
+        """End a waiting `read` and the attempts to reopen the camera."""
         self._closing.set()
         self._inner.interrupt()
         with self._changed:
@@ -85,12 +85,12 @@ class ReconnectingCamera(Camera):
 
     @property
     def capture_ns(self) -> int:
-        """When the frame returned last was captured, in ns since 1970 by this host's clock."""
+        """Capture time of the last returned frame, in ns since 1970 by this host's clock."""
         return self._capture_ns
 
     @property
     def state(self) -> StreamState:
-        """`live`, `stale` (no frame for longer than the stall time) or `lost` (closed; opened again later)."""
+        """`live`, `stale` (no frame for longer than the stall time) or `lost` (closed, to be reopened)."""
         with self._changed:
             now = time.monotonic()
             if self._fault is not None:
@@ -108,7 +108,7 @@ class ReconnectingCamera(Camera):
         """Lock the exposure between two frames.
 
         Raises:
-            DeltalightError: the camera cannot, or it is away.
+            DeltalightError: the camera cannot, or it is disconnected.
         """
         done: Future[None] = Future()
         with self._changed:
@@ -121,12 +121,12 @@ class ReconnectingCamera(Camera):
             raise self._away() from None
 
     def imu_samples(self) -> list[ImuSample]:
-        """Return what the camera's inertial unit measured since the last call; nothing while it is away."""
+        """Return the inertial unit's measurements since the last call; none while the camera is disconnected."""
         with self._changed:
             return [] if self._fault is not None else self._inner.imu_samples()
 
     def read(self) -> SensorFrame:
-        """Wait for the next frame, however long the camera is away."""
+        """Wait for the next frame, however long the camera is disconnected."""
         with self._changed:
             while not self._kept and not self._closing.is_set():
                 self._wait()
@@ -156,7 +156,7 @@ class ReconnectingCamera(Camera):
         return kept.frame
 
     def _wait(self) -> None:
-        """Wait for a frame; a camera that stalls is told to end its read, which then counts as a failure."""
+        """Wait for a frame; a stalled camera is told to end its read, which then counts as a failure."""
         left_s = self._seen_at + self._stall_s - time.monotonic()
         if left_s <= 0 and self._fault is None and not self._is_given_up:
             self._is_given_up = True
@@ -202,7 +202,7 @@ class ReconnectingCamera(Camera):
             done.set_exception(error)
 
     def _refuse_exposure(self) -> None:
-        """Let nobody wait for an exposure that will not be set."""
+        """Wake those who wait for an exposure that will not be set."""
         with self._changed:
             request, self._exposure = self._exposure, None
         if request is not None:
@@ -227,7 +227,7 @@ class ReconnectingCamera(Camera):
             self._numbering.restart()
 
     def _describe(self) -> None:
-        """Take over what the camera knows of itself; a live one may know its lens only once it is open."""
+        """Copy the camera's properties; a live one may know its lens only once it is open."""
         inner = self._inner
         if hasattr(inner, "camera"):
             self.camera = inner.camera
@@ -236,7 +236,7 @@ class ReconnectingCamera(Camera):
 
 
 class _Numbering:
-    """Frame ids and timestamps that go on rising when a camera begins anew; gaps in its own ids are kept."""
+    """Frame ids and timestamps that keep rising when a camera restarts; gaps in its own ids stay."""
 
     def __init__(self) -> None:
         self._next_id, self._last_ns = 0, 0

@@ -14,21 +14,21 @@ from protocol.frames import FisheyePictures, SensorFrame
 from protocol.source import Source
 from sensor_node.cameras.base import Camera, EndOfStream, StaleFrameError
 
-# Gap between the last frame and the first of the next round where one frame alone tells no period.
+# Gap between the last frame and the first of the next round if a single frame has no period.
 DEFAULT_PERIOD_NS = 33_333_333
-# A clock that is only steered drifts by less within an hour; then the stamps follow it in such steps.
+# A clock that is only steered drifts by less within an hour; stamps then follow it in steps of this size.
 CLOCK_STEP_NS = 10_000_000
-# A replay that is further behind leaves frames out; a shorter delay it makes good.
+# A replay that is further behind skips frames; it catches up with a shorter delay.
 LATE_NS = 500_000_000
 
 
 class PacedCamera(Camera):
-    """Frames that are known beforehand, handed out when their time has come.
+    """Frames that are known in advance, handed out when they are due.
 
-    In real time the first frame is due at `open`, the others as much later as their timestamps are; a frame
-    that is asked for late comes at once, with the capture time it would have had. Without real time each
-    frame is captured when it is asked for. In a loop, frame ids and timestamps go on rising, and whoever falls
-    behind by more than half a second misses frames, as before a camera, else the delay would grow for ever.
+    In real time the first frame is due at `open`, the others later by their timestamps; a frame that is requested
+    late is returned at once, with the capture time it would have had. Without real time each frame is captured when
+    it is requested. In a loop, frame ids and timestamps keep rising, and a reader more than half a second behind
+    misses frames, as with a camera; otherwise the delay would grow forever.
     """
 
     def __init__(self, timestamps_ns: Sequence[int], *, realtime: bool, loop: bool) -> None:
@@ -65,7 +65,7 @@ class PacedCamera(Camera):
 
     @property
     def capture_ns(self) -> int:
-        """When the frame returned last was due, or asked for, in ns since 1970 by this host's clock."""
+        """Time at which the last returned frame was due, or requested, in ns since 1970 by this host's clock."""
         return self._capture_ns
 
     def read(self) -> SensorFrame:
@@ -98,7 +98,7 @@ class PacedCamera(Camera):
         return time.monotonic_ns() - self._opened_monotonic_ns
 
     def _due_ns(self, number: int) -> int:
-        """Time after `open` at which the frame `number`, counted over all rounds, is due."""
+        """Return the time after `open` at which frame `number`, counted over all rounds, is due."""
         rounds, index = divmod(number, len(self._times))
         return rounds * self._round_ns + int(self._times[index] - self._times[0])
 
@@ -132,7 +132,7 @@ class PacedCamera(Camera):
         )
 
     def _fisheye_of_round(self, pictures: FisheyePictures, later_ns: int) -> FisheyePictures:
-        """Return the pictures with the time of this round, the same object for as long as they hold."""
+        """Return the pictures with the time of this round, the same object while they are current."""
         known = self._repeated
         if known is None or known[0] is not pictures or known[1] != later_ns:
             shifted = replace(pictures, timestamp_ns=pictures.timestamp_ns + later_ns)
@@ -145,8 +145,8 @@ class ReplayCamera(PacedCamera):
 
     Args:
         source: what to replay.
-        realtime: obey the recorded times; else frames come as fast as they are asked for.
-        loop: begin again after the last frame.
+        realtime: obey the recorded times; otherwise frames come as fast as they are requested.
+        loop: restart after the last frame.
         start: first frame.
         stop: frame after the last one; None = to the end.
     """

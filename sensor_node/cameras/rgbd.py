@@ -1,7 +1,9 @@
-"""RGB-D cameras that OpenCV reads itself: OpenNI 2 (Asus Xtion, PrimeSense, Orbbec Astra) and Orbbec over UVC."""
+"""RGB-D cameras supported by OpenCV: OpenNI 2 (Asus Xtion, PrimeSense, Orbbec Astra) and Orbbec over UVC."""
 
 import time
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 from typing import Literal
 
 import cv2
@@ -11,6 +13,8 @@ from jaxtyping import UInt8, UInt16
 from protocol.errors import DeltalightError
 from protocol.frames import SensorFrame
 from protocol.pictures import depth_from_steps
+from sensor_node.cameras.devices import file_text, usb_devices
+from sensor_node.cameras.driver import CameraDriver, CameraRequest, Discovery, FoundCamera, MissingSupport
 from sensor_node.cameras.live import CameraFailure, LiveCalibration, LiveCamera, colour_camera
 from sensor_node.cameras.settings import CameraSettings
 
@@ -19,11 +23,12 @@ Kind = Literal["openni2", "orbbec"]
 
 @dataclass(frozen=True)
 class _Backend:
-    """OpenCV's numbers for one kind of camera."""
+    """OpenCV's numbers for one kind of camera, the USB vendor of such cameras, what to do where OpenCV lacks it."""
 
     number: int
     color: int
     depth: int
+    vendor: str
     advice: str
 
 
@@ -32,24 +37,26 @@ BACKENDS: dict[Kind, _Backend] = {
         cv2.CAP_OPENNI2,
         cv2.CAP_OPENNI_BGR_IMAGE,
         cv2.CAP_OPENNI_DEPTH_MAP,
+        "1d27",  # PrimeSense, also Kinect-like
         "install an OpenCV built with WITH_OPENNI2=ON",
     ),
     "orbbec": _Backend(
         cv2.CAP_OBSENSOR,
         cv2.CAP_OBSENSOR_BGR_IMAGE,
         cv2.CAP_OBSENSOR_DEPTH_MAP,
+        "2bc5",
         "run pip install 'opencv-contrib-python-headless<5', as packages of OpenCV 4 have it",
     ),
 }
 
 
 def has_backend(kind: Kind) -> bool:
-    """Whether the OpenCV in use was built for a kind of camera."""
+    """Whether the installed OpenCV supports a kind of camera."""
     return bool(cv2.videoio_registry.hasBackend(BACKENDS[kind].number))
 
 
 def backend_hint(kind: Kind) -> str:
-    """What to do where it was not."""
+    """Return what to do if it does not."""
     return f"for such a camera, {BACKENDS[kind].advice}"
 
 
@@ -84,10 +91,10 @@ class RgbdCamera(LiveCamera):
         self._frames = 0
 
     def open(self) -> None:
-        """Open the device and ask for depth registered to colour.
+        """Open the device and request depth registered to colour.
 
         Raises:
-            CameraFailure: it is not there, or another program has it.
+            CameraFailure: it is absent, or another program uses it.
         """
         self._interrupted.clear()
         if not self._capture.open(self._number, BACKENDS[self._kind].number):
@@ -96,14 +103,14 @@ class RgbdCamera(LiveCamera):
             self._capture.set(cv2.CAP_PROP_OPENNI_REGISTRATION, 1)
 
     def close(self) -> None:
-        """Give the device back."""
+        """Release the device."""
         self._capture.release()
 
     def capture(self) -> SensorFrame:
         """Wait for the next pair of pictures."""
         if not self._capture.grab():
             raise CameraFailure(f"{self.source} gives no pictures any more; see if it is plugged in.")
-        self._capture_monotonic_ns = time.monotonic_ns()
+        self.note_capture(time.monotonic_ns())
         backend = BACKENDS[self._kind]
         has_color, color = self._capture.retrieve(flag=backend.color)
         has_depth, steps = self._capture.retrieve(flag=backend.depth)
@@ -119,7 +126,7 @@ class RgbdCamera(LiveCamera):
                 f"{self.source} gives {bgr.shape[1]}x{bgr.shape[0]} but is calibrated for "
                 f"{camera.width}x{camera.height}; calibrate at that size."
             )
-        stamp_ns = self.clock.stamp(self._capture_monotonic_ns)
+        stamp_ns = self.timestamp_ns
         depth_camera = known.depth_camera or camera
         depth = (
             None
@@ -135,3 +142,36 @@ class RgbdCamera(LiveCamera):
             depth=depth,
             depth_timestamp_ns=None if depth is None else stamp_ns,
         )
+
+
+def make_camera(kind: Kind, request: CameraRequest) -> RgbdCamera:
+    """The camera that a request names by its number.
+
+    Raises:
+        DeltalightError: it names no number.
+    """
+    number = request.device or "0"
+    if not number.isdecimal():
+        raise DeltalightError(f"{request.source} names no camera; write a number after the colon, such as 0.")
+    return RgbdCamera(kind, int(number), request.settings, request.calibration, calibrated=request.calibrated)
+
+
+def find_cameras(kind: Kind, root: Path) -> Discovery:
+    """Lists the USB devices of the vendor."""
+    has_support = has_backend(kind)
+    found = tuple(
+        FoundCamera(
+            name=file_text(device / "product") or kind,
+            source=f"{kind}:{number}",
+            kind=kind,
+            details=f"USB {file_text(device / 'idVendor')}:{file_text(device / 'idProduct')} at {device.name}",
+            hint="" if has_support else backend_hint(kind),
+        )
+        for number, device in enumerate(usb_devices(root, BACKENDS[kind].vendor))
+    )
+    missing = MissingSupport(kind, "this OpenCV was built without it", backend_hint(kind))
+    return Discovery(found, () if has_support else (missing,))
+
+
+OPENNI2 = CameraDriver("OpenNI 2", partial(make_camera, "openni2"), partial(find_cameras, "openni2"))
+ORBBEC = CameraDriver("Orbbec", partial(make_camera, "orbbec"), partial(find_cameras, "orbbec"))

@@ -1,4 +1,4 @@
-"""Settings of cameras: what a node's configuration says about capture."""
+"""Settings of cameras in a node's configuration."""
 
 from pathlib import Path
 from typing import Annotated

@@ -1,4 +1,4 @@
-"""A camera that needs no hardware: it circles above a synthetic scene and knows the truth."""
+"""A camera without hardware: it circles above a synthetic scene with known ground truth."""
 
 from dataclasses import dataclass
 
@@ -19,10 +19,10 @@ TILT_RAD = 0.75
 
 @dataclass(frozen=True)
 class SyntheticNoise:
-    """Noise of the synthetic sensors, the same for the same seed and frame.
+    """Noise of the synthetic sensors, reproducible by seed and frame.
 
-    `color_sigma` is the standard deviation of linear colour (1.0 = sensor white), `depth_sigma_m` that of
-    depth at 1 m (it grows with z^2), `hole_share` the share of depth pixels without a reading.
+    `color_sigma` is the standard deviation of linear colour (1.0 = sensor white), `depth_sigma_m` that of depth at 1
+    m (it grows with z^2), `hole_share` the fraction of depth pixels without a reading.
     """
 
     color_sigma: float = 0.004
@@ -53,7 +53,7 @@ def default_camera() -> CameraModel:
 class SyntheticCamera(PacedCamera):
     """Frames of a `SyntheticScene`: sRGB colour, depth registered to it, and no given pose.
 
-    The pose is what marker detection should find; `pose_at` tells the truth. Without `noise` depth is exact.
+    Marker detection should find the pose; `pose_at` returns the true one. Without `noise` depth is exact.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class SyntheticCamera(PacedCamera):
         self._noise = noise
 
     def pose_at(self, index: int) -> Float64[np.ndarray, "4 4"]:
-        """Return the true world_from_camera of a frame, which sways in front of the board's middle."""
+        """Return the true world_from_camera of a frame, swaying in front of the board's middle."""
         phase = 2 * np.pi * (index % FRAMES_PER_ROUND) / FRAMES_PER_ROUND
         sway, tilt = SWAY_RAD * np.sin(phase), TILT_RAD + 0.1 * np.cos(phase)
         # The board fills about half the picture's width.
@@ -118,7 +118,7 @@ def _srgb_table(size: int) -> UInt8[np.ndarray, " n"]:
     return np.asarray(np.rint(coded * 255), np.uint8)
 
 
-# Fine enough that every code is met: the steepest step of the curve is 12.92.
+# Fine enough to reach every code: the steepest slope of the curve is 12.92.
 _SRGB_OF_LINEAR = _srgb_table(1 << 14)
 
 

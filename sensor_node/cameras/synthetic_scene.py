@@ -1,7 +1,7 @@
 """A small exact scene for tests and demonstrations: a textured table, a marker board on it, and a box.
 
-Rays of the camera's full lens model, several a pixel for colour, end on the table plane z = 0 or on the box,
-in the world frame of docs/formats.md 3. Light is one distant lamp and a constant ambient; nothing casts shadows.
+Rays of the camera's full lens model, several per pixel for colour, end on the table plane z = 0 or on the box, in the
+world frame of docs/formats.md 3. Light is one distant lamp and constant ambient light; nothing casts shadows.
 """
 
 from functools import cached_property
@@ -20,9 +20,9 @@ TABLE_ALBEDO = np.array([0.45, 0.33, 0.22], np.float32)
 BOX_ALBEDO = np.array([0.2, 0.35, 0.6], np.float32)
 TO_LAMP = np.array([0.3, -0.2, 0.93]) / np.linalg.norm([0.3, -0.2, 0.93])
 LAMP_IRRADIANCE, AMBIENT_IRRADIANCE = 1.8, 0.9
-# White paper around the printed area, as a share of a marker's edge.
+# White paper around the printed area, as a fraction of a marker's edge.
 SHEET_MARGIN = 0.35
-# Texels of the printed sheet for each cell of a marker, and samples a texel edge where it is drawn.
+# Texels of the printed sheet per cell of a marker, and samples per texel edge when it is drawn.
 TEXELS_PER_CELL, SAMPLES_PER_TEXEL = 16, 4
 WOOD_PERIOD_M, WOOD_EDGE_M, WOOD_TEXEL_M = 0.037, 4.0, 0.003
 
@@ -32,7 +32,7 @@ Field = Float32[np.ndarray, "h w"]
 class Hits(NamedTuple):
     """Where rays end: depth along the optical axis (0: nowhere), table coordinates, light on the box.
 
-    `box_irradiance` is 0 where the ray does not end on the box.
+    `box_irradiance` is 0 for rays that do not end on the box.
     """
 
     depth_m: Field
@@ -59,7 +59,7 @@ class SyntheticScene:
 
     @property
     def aim(self) -> Float64[np.ndarray, "3"]:
-        """Middle of what there is to see: board and box, on the table."""
+        """Middle of board and box, on the table."""
         left, right = self.board.sheet_outline()[0, 0], self.box_bounds[1, 0]
         return np.array([(left + right) / 2, self.center[1], 0.0])
 
@@ -113,7 +113,7 @@ class SyntheticScene:
         return np.asarray(reflected / np.pi, np.float32)
 
     def _box_hit(self, eye: Float64[np.ndarray, "3"], direction: list[Field]) -> tuple[Field, Field]:
-        """Distance at which each ray enters the box (infinity: never), and the irradiance of that face."""
+        """Return the distance at which each ray enters the box (infinity: never), and the irradiance of that face."""
         enter, leave = np.full_like(direction[0], -np.inf), np.full_like(direction[0], np.inf)
         light = np.zeros_like(enter)
         for axis, (low, high) in enumerate(self.box_bounds.T - eye[:, None]):
@@ -136,7 +136,7 @@ class SyntheticScene:
 
     @cached_property
     def _sheet(self) -> "_Texture":
-        """Albedo of the printed sheet, exact on average over each texel."""
+        """Return the albedo of the printed sheet, exact on average over each texel."""
         board, outline = self.board, self.board.sheet_outline()
         cells = board.opencv_dictionary().markerSize + 2 * board.border_bits
         texel = board.marker_length_m / cells / TEXELS_PER_CELL
@@ -162,7 +162,7 @@ class SyntheticScene:
     def _print_squares(
         self, albedo: Field, right: Float64[np.ndarray, " w"], down: Float64[np.ndarray, " h"]
     ) -> None:
-        """The black squares of a ChArUco board; (row + column) even."""
+        """Print the black squares of a ChArUco board; (row + column) even."""
         square = self.board.marker_length_m + self.board.separation_m
         column, row = np.floor(right / square), np.floor(down / square)
         black = (column[None] + row[:, None]) % 2 == 0
@@ -202,7 +202,7 @@ def _print(
     down: Float64[np.ndarray, " h"],
     length_m: float,
 ) -> None:
-    """Print a marker; `right` and `down` are the places of the columns and rows from its top-left corner."""
+    """Print a marker; `right` and `down` are the positions of the columns and rows from its top-left corner."""
     columns, rows = (np.flatnonzero((place >= 0) & (place < length_m)) for place in (right, down))
     column, row = (
         (right[columns] / length_m * len(cells)).astype(int),
@@ -213,7 +213,7 @@ def _print(
 
 
 def _marker_cells(board: BoardSpec, name: int) -> Bool[np.ndarray, "n n"]:
-    """Cells of a marker with its black border, True = white."""
+    """Return the cells of a marker with its black border, True = white."""
     dictionary = board.opencv_dictionary()
     cells = dictionary.markerSize + 2 * board.border_bits
     return np.asarray(dictionary.generateImageMarker(name, cells, borderBits=board.border_bits) > 127)

@@ -3,6 +3,7 @@
 import os
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -12,6 +13,8 @@ from jaxtyping import UInt8
 from protocol.errors import DeltalightError
 from protocol.frames import SensorFrame
 from protocol.pictures import decode_rgb, is_jpeg
+from sensor_node.cameras.devices import file_text
+from sensor_node.cameras.driver import CameraDriver, CameraRequest, Discovery, FoundCamera, MissingSupport
 from sensor_node.cameras.live import (
     DRIVER_BUFFERS,
     CameraFailure,
@@ -23,12 +26,13 @@ from sensor_node.cameras.settings import CameraSettings
 from sensor_node.cameras.uvc_controls import UvcControls
 
 MJPG = cv2.VideoWriter.fourcc(*"MJPG")
-# Automatic exposure and white balance of usual cameras come to rest within a second.
+# Automatic exposure and white balance of usual cameras settle within a second.
 SETTLE_S = 1.0
-# USB loses a packet now and then, and the JPEG is cut; so many one after the other are a broken cable.
+# USB loses a packet now and then, which truncates the JPEG; this many in a row are a broken cable.
 BROKEN_IN_A_ROW = 10
-# Marker of a JPEG's Huffman tables; many cameras leave them out, and then few programs can read it.
+# Marker of a JPEG's Huffman tables; many cameras omit them, and then few programs can read it.
 HUFFMAN_TABLES = b"\xff\xc4"
+GROUP_HINT = "run `sudo usermod -aG video $USER`, then log in again"
 
 
 class UvcCamera(LiveCamera):
@@ -36,9 +40,9 @@ class UvcCamera(LiveCamera):
 
     Args:
         device: number or path of the video device (`0`, `/dev/video2`), or a video that OpenCV opens.
-        settings: size, rate, exposure and white balance to ask for.
-        calibration: the camera at the size to capture, its response, extrinsics, board.
-        calibrated: False = a nominal lens will do.
+        settings: size, rate, exposure and white balance to request.
+        calibration: the camera at its capture size, its response, extrinsics, board.
+        calibrated: False = a nominal lens is acceptable.
 
     Raises:
         DeltalightError: the camera is not calibrated.
@@ -59,8 +63,8 @@ class UvcCamera(LiveCamera):
         """Open the device, lock exposure and white balance as set.
 
         Raises:
-            CameraFailure: it is not there, or another program has it.
-            DeltalightError: it cannot do what the settings ask for.
+            CameraFailure: it is absent, or another program uses it.
+            DeltalightError: it does not support the settings.
         """
         self.close()
         self._interrupted.clear()
@@ -75,13 +79,13 @@ class UvcCamera(LiveCamera):
             raise
 
     def close(self) -> None:
-        """Give the device back."""
+        """Release the device."""
         if self._capture is not None:
             self._capture.release()
         self._capture = None
 
     def set_exposure(self, seconds: float) -> None:
-        """Lock the exposure to the nearest step of 0.1 ms; the next frames but a few have it."""
+        """Lock the exposure to the nearest step of 0.1 ms; it takes effect a few frames later."""
         self._controls.set_exposure(seconds)
 
     def capture(self) -> SensorFrame:
@@ -91,7 +95,7 @@ class UvcCamera(LiveCamera):
         self._frames += 1
         return SensorFrame(
             frame_id=self._frames - 1,
-            timestamp_ns=self.clock.stamp(self._capture_monotonic_ns),
+            timestamp_ns=self.timestamp_ns,
             color=color,
             camera=self.camera,
             response=self._response,
@@ -118,7 +122,7 @@ class UvcCamera(LiveCamera):
 
     def _ask_for(self, capture: cv2.VideoCapture) -> None:
         wanted = {
-            cv2.CAP_PROP_FOURCC: MJPG,  # uncompressed pictures of more than VGA do not fit USB 2 at 30 per second
+            cv2.CAP_PROP_FOURCC: MJPG,  # uncompressed pictures beyond VGA do not fit USB 2 at 30 per second
             cv2.CAP_PROP_FRAME_WIDTH: self.camera.width,
             cv2.CAP_PROP_FRAME_HEIGHT: self.camera.height,
             cv2.CAP_PROP_FPS: self._settings.fps,
@@ -127,7 +131,7 @@ class UvcCamera(LiveCamera):
         for prop, value in wanted.items():
             capture.set(prop, value)
         if self._is_v4l2 and int(capture.get(cv2.CAP_PROP_FOURCC)) == MJPG:
-            capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)  # the JPEG as it comes, if it is a whole one
+            capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)  # the JPEG as it comes, if it is complete
             if HUFFMAN_TABLES not in self._grab().tobytes():
                 capture.set(cv2.CAP_PROP_CONVERT_RGB, 1)
 
@@ -154,19 +158,19 @@ class UvcCamera(LiveCamera):
             )
 
     def _grab(self) -> np.ndarray:
-        """Wait for the next picture as the backend gives it, and note when it was captured."""
+        """Wait for the next picture as the backend gives it, and note its capture time."""
         capture = self._capture
         if capture is None or not capture.grab():
             raise CameraFailure(f"{self.source} gives no pictures any more; see if it is plugged in.")
         grabbed_ns = time.monotonic_ns()
         given, raw = capture.retrieve()
-        # V4L2 tells the time of the buffer by CLOCK_MONOTONIC in ms.
+        # V4L2 reports the time of the buffer by CLOCK_MONOTONIC in ms.
         driver_ns = int(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6) if self._is_v4l2 else grabbed_ns
-        self._capture_monotonic_ns = self.clock.plausible(driver_ns, grabbed_ns)
+        self.note_capture(self.clock.plausible(driver_ns, grabbed_ns))
         return np.asarray(raw if given else np.empty(0, np.uint8))
 
     def _take(self) -> tuple[UInt8[np.ndarray, "h w 3"], bytes | None]:
-        """Return the next whole picture, RGB, and its JPEG where that came."""
+        """Return the next complete picture, RGB, and its JPEG if that came."""
         for _ in range(BROKEN_IN_A_ROW):
             picture = decode(self._grab(), self.source)
             if picture is not None:
@@ -175,7 +179,7 @@ class UvcCamera(LiveCamera):
 
 
 def decode(raw: np.ndarray, name: str) -> tuple[UInt8[np.ndarray, "h w 3"], bytes | None] | None:
-    """Return (RGB, JPEG or None) of what OpenCV gave: a BGR picture or a JPEG's bytes; None if it is broken."""
+    """Return (RGB, JPEG or None) of OpenCV's output: a BGR picture or a JPEG's bytes; None if it is broken."""
     if raw.ndim == 3 and raw.shape[2] == 3:
         return np.asarray(cv2.cvtColor(raw, cv2.COLOR_BGR2RGB)), None
     data = raw.tobytes()
@@ -186,3 +190,58 @@ def decode(raw: np.ndarray, name: str) -> tuple[UInt8[np.ndarray, "h w 3"], byte
         return decode_rgb(data, name), data
     except DeltalightError:
         return None
+
+
+def make_camera(request: CameraRequest) -> UvcCamera:
+    """The camera that a request names; the first one where it names none."""
+    return UvcCamera(
+        request.device or "0", request.settings, request.calibration, calibrated=request.calibrated
+    )
+
+
+def find_cameras(root: Path) -> Discovery:
+    """Lists the video devices of Linux."""
+    found = tuple(_video_devices(root))
+    return Discovery(found, () if found else (_nothing_found(root),))
+
+
+def _video_devices(root: Path) -> Iterator[FoundCamera]:
+    """Video devices of Linux, as /sys describes them."""
+    entries = (root / "sys/class/video4linux").glob("video*")
+    for entry in sorted(entries, key=lambda path: int(path.name.removeprefix("video"))):
+        if not _captures(root, entry):
+            continue
+        number = entry.name.removeprefix("video")
+        driver = (entry / "device/driver").resolve().name if (entry / "device/driver").exists() else "?"
+        node = root / "dev" / entry.name
+        yield FoundCamera(
+            name=file_text(entry / "name") or entry.name,
+            source=f"uvc:{number}",
+            kind="uvc",
+            details=f"/dev/{entry.name}, driver {driver}",
+            hint=_access_hint(node, f"/dev/{entry.name}"),
+        )
+
+
+def _captures(root: Path, entry: Path) -> bool:
+    """Whether a video device gives pictures: USB cameras have a second one that gives metadata."""
+    known = root / "run/udev/data" / f"c{file_text(entry / 'dev')}"
+    if known.is_file():
+        return "ID_V4L_CAPABILITIES=" not in (said := file_text(known)) or ":capture:" in said
+    return file_text(entry / "index") in ("", "0")
+
+
+def _access_hint(node: Path, name: str) -> str:
+    if not node.exists():
+        return f"{name} does not exist; in a container, pass it in (--device {name})"
+    return "" if os.access(node, os.R_OK | os.W_OK) else f"no permission for {name}: {GROUP_HINT}"
+
+
+def _nothing_found(root: Path) -> MissingSupport:
+    if not (root / "sys/class").is_dir():
+        return MissingSupport("uvc", "this system does not list its cameras", "try `uvc:0`, `uvc:1`, ...")
+    hint = "plug one in, or pass /dev/video0 and so on into the container"
+    return MissingSupport("uvc", "no video device in /sys/class/video4linux", hint)
+
+
+DRIVER = CameraDriver("USB (UVC)", make_camera, find_cameras)

@@ -15,17 +15,17 @@ MANUAL, AUTOMATIC = 1.0, 3.0
 
 
 class Properties(Protocol):
-    """What of `cv2.VideoCapture` is needed here."""
+    """The part of `cv2.VideoCapture` used here."""
 
     def get(self, prop: int, /) -> float:
-        """Value of a property; -1 or 0 where it is not known."""
+        """Return the value of a property; -1 or 0 if unknown."""
 
     def set(self, prop: int, value: float, /) -> bool:
-        """Change a property; False where it cannot be."""
+        """Set a property; return False if that fails."""
 
 
 class UvcControls:
-    """The controls of an open camera; `known` False (another backend than V4L2): its units are not, use none."""
+    """The controls of an open camera; if `known` is False (not V4L2) their units are unknown, and none is used."""
 
     def __init__(self, source: str, capture: Properties, *, known: bool) -> None:
         self._source, self._capture, self._known = source, capture, known
@@ -33,14 +33,14 @@ class UvcControls:
 
     @property
     def exposure_s(self) -> float | None:
-        """Exposure of the frames that come now, in seconds, as locked or read back; None where it is not told."""
+        """Exposure of the current frames, in seconds, as locked or read back; None if not reported."""
         return self._locked_s if self._locked_s is not None else self._read_exposure()
 
     def set_exposure(self, seconds: float) -> None:
         """Lock the exposure to the nearest of the camera's steps.
 
         Raises:
-            DeltalightError: the camera has no such control, or does not take this value.
+            DeltalightError: the camera has no such control, or refuses this value.
         """
         steps = max(round(seconds / EXPOSURE_STEP_S), 1)
         self._choose(cv2.CAP_PROP_AUTO_EXPOSURE, MANUAL)
@@ -64,16 +64,16 @@ class UvcControls:
             )
 
     def release(self) -> None:
-        """Let the camera choose both by itself, so that it can settle; controls outlive the program before."""
+        """Let the camera choose both, so that it can settle; controls persist from earlier programs."""
         self._locked_s = None
         self._choose(cv2.CAP_PROP_AUTO_EXPOSURE, AUTOMATIC)
         self._choose(cv2.CAP_PROP_AUTO_WB, 1.0)
 
     def keep(self, *, exposure: bool, white_balance: bool) -> str:
-        """Lock what the camera has chosen; returns what could not be locked, for people."""
+        """Lock what the camera has chosen; return what could not be locked, for the user."""
         seconds, kelvin = self._read_exposure(), self._capture.get(cv2.CAP_PROP_WB_TEMPERATURE)
         refused = []
-        # A value that the camera does not tell must not be guessed: the picture could become black.
+        # A value that the camera does not report must not be guessed: the picture could become black.
         if exposure and (seconds is None or not _taken(partial(self.set_exposure, seconds))):
             refused.append("exposure")
         if white_balance and (kelvin <= 0 or not _taken(partial(self.set_white_balance, int(kelvin)))):

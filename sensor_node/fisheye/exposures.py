@@ -11,10 +11,12 @@ from protocol.errors import DeltalightError
 from protocol.frames import FisheyePictures, decode_lut
 
 CLIPPED_CODE = 250
-"""Codes from here are white: the last 2 % of a code hold the shoulder of a response and the ringing of JPEG."""
+"""Codes from here are white: the last 2 % hold the shoulder of a response and the ringing of JPEG."""
 FULL_WELL = 1e4
-"""Electrons at white, which sets the Poisson noise: 5,000 to 50,000 for the sensors of webcams to reflex cameras.
-Beside the steps of an 8-bit code it matters little, so neither does the number."""
+"""Electrons at white, for Poisson noise: 5,000 to 50,000 for sensors from webcams to reflex cameras.
+
+Beside the steps of an 8-bit code it matters little, so an approximate number is enough.
+"""
 READ_NOISE = 1e-3
 """Of white: some 10 electrons; linear pictures have no steps that would bound their weight in the dark."""
 
@@ -22,32 +24,32 @@ Picture = UInt8[np.ndarray, "h w 3"] | Float32[np.ndarray, "h w 3"]
 
 
 class LinearPicture(NamedTuple):
-    """What the sensor got, 1.0 = white at the reference exposure; `clipped` where it is a lower bound."""
+    """The sensor's light, 1.0 = white at the reference exposure; `clipped` where it is a lower bound."""
 
     linear: Float32[np.ndarray, "h w 3"]
     clipped: Bool[np.ndarray, "h w"]
 
 
 def reference_exposure(exposures_s: Iterable[float | None]) -> float | None:
-    """Return the exposure in which 1.0 is white: the longest of a bracket, None where none is told."""
+    """Return the exposure in which 1.0 is white: the longest of a bracket, None if none is reported."""
     return max((each for each in exposures_s if each is not None), default=None)
 
 
 def merge_bracket(bracket: FisheyePictures, reference_s: float | None) -> LinearPicture:
-    """Merge exposures, each weighted by the inverse variance of the light that it says was there.
+    """Merge exposures, each weighted by the inverse variance of the light that it indicates.
 
-    An exposure of t (in reference exposures) that shows the linear value c says c/t with a variance of v(c)/t^2, v
-    being Poisson noise, read noise and the rounding of the code. Clipped values weigh nothing, nor do values beside
-    clipped ones in the same exposure (demosaicing, JPEG and resizing mix them), except in the shortest exposure:
-    where that clips, the value is a lower bound. Linear (float32) pictures clip at 1.0 in a bracket; a single one is
-    taken as a finished picture that clips nowhere.
+    An exposure of t (in reference exposures) that shows the linear value c indicates c/t with a variance of v(c)/t^2,
+    v being Poisson noise, read noise and the rounding of the code. Clipped values have no weight, nor do values
+    beside clipped ones in the same exposure (demosaicing, JPEG and resizing mix them), except in the shortest
+    exposure: where that clips, the value is a lower bound. Linear (float32) pictures clip at 1.0 in a bracket; a
+    single one counts as a finished picture that clips nowhere.
 
     Args:
         bracket: pictures of one moment.
         reference_s: exposure in which white is 1.0; an exposure of None is this one.
 
     Raises:
-        DeltalightError: pictures that fit neither each other nor the calibration, or values that are not finite.
+        DeltalightError: the pictures do not fit each other or the calibration, or values are not finite.
     """
     _check(bracket)
     scales = [_scale(exposure, reference_s) for exposure in bracket.exposures_s]
@@ -76,7 +78,7 @@ def merge_bracket(bracket: FisheyePictures, reference_s: float | None) -> Linear
 
 
 class _Reading(NamedTuple):
-    """Of every value of one exposure: inverse variance of the light that it says, that times the light, and white."""
+    """For every value of one exposure: inverse variance of the indicated light, that times the light, and white."""
 
     weight: Float32[np.ndarray, "h w 3"]
     weighted_light: Float32[np.ndarray, "h w 3"]
@@ -108,7 +110,7 @@ def _single(bracket: FisheyePictures, scale: float) -> LinearPicture:
 
 
 def _scale(exposure_s: float | None, reference_s: float | None) -> float:
-    """The exposure in units of the reference."""
+    """Return the exposure in units of the reference."""
     return 1.0 if exposure_s is None or reference_s is None else exposure_s / reference_s
 
 
@@ -140,9 +142,9 @@ def _check_picture(picture: Picture, width: int, height: int) -> None:
 def display_picture(
     pictures: Sequence[Picture], merged: LinearPicture, inside: Bool[np.ndarray, "h w"]
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Return a coded picture for people: the exposure nearest to middle grey, of linear ones a coded one.
+    """Return a coded picture for display: the exposure nearest to middle grey, or linear pictures coded.
 
-    `inside` is where the lens sees; what lies outside says nothing about the exposure.
+    `inside` is where the lens sees; pixels outside say nothing about the exposure.
     """
     some = inside[::4, ::4]
     coded = [picture for picture in pictures if picture.dtype == np.uint8]

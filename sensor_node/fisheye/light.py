@@ -1,4 +1,4 @@
-"""The radiance maps that belong to the frames of one source or camera."""
+"""Radiance maps for the frames of one source or camera."""
 
 from collections.abc import Callable
 
@@ -13,14 +13,14 @@ from sensor_node.fisheye.radiance import SIZE, radiance_map
 
 
 class FisheyeLight:
-    """Makes a map of each set of fish-eye pictures once, where the camera was when it took them.
+    """Creates one map per set of fish-eye pictures, with the camera's pose when it took them.
 
-    The reference exposure is the longest of the first bracket of the source, of a camera's first that comes.
+    The reference exposure is the longest of the source's first bracket, or of the first one that a camera delivers.
 
     Args:
-        rig: what the frames come from.
+        rig: where the frames come from.
         pose_of: finds the pose of one of its frames, without memory of others.
-        size: texels an edge of the maps.
+        size: texels per edge of the maps.
     """
 
     def __init__(
@@ -33,12 +33,12 @@ class FisheyeLight:
         self._map: RadianceMap | None = None
 
     def at(self, frame: SensorFrame, pose: BoardPose | None) -> RadianceMap | None:
-        """Return the map for a frame whose pose is `pose`: the same object as long as its pictures hold.
+        """Return the map for a frame whose pose is `pose`: the same object while its pictures are current.
 
-        None without pictures, and until it is known where the fish-eye camera was; `notes` says what is missing.
+        None without pictures, and until the pose of the fish-eye camera is known; `notes` says what is missing.
 
         Raises:
-            DeltalightError: pictures that fit neither each other nor their calibration.
+            DeltalightError: the pictures do not fit each other or their calibration.
         """
         pictures = frame.fisheye
         if pictures is None:
@@ -73,7 +73,7 @@ class FisheyeLight:
         return None if taken is None else taken.world_from_camera @ extrinsics.rgb_from_fisheye
 
     def _pose_when_taken(self, frame: SensorFrame, pictures: FisheyePictures) -> BoardPose | None:
-        """Pose of the source's frame nearest in time; a live camera has just taken its pictures."""
+        """Return the pose of the source's frame nearest in time; a live camera has just taken its pictures."""
         if isinstance(self._rig, Camera):
             return None
         times = np.asarray(self._rig.timestamps_ns)

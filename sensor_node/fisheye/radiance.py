@@ -1,4 +1,4 @@
-"""Pictures of a fish-eye camera -> radiance map, and what is wrong with it in words."""
+"""Radiance maps from the pictures of a fish-eye camera, and warnings about them."""
 
 import numpy as np
 from jaxtyping import Float64
@@ -10,9 +10,9 @@ from sensor_node.fisheye.resampling import hemisphere_sampler
 
 SIZE = 256
 LEAST_CLIPPED_SHARE = 1e-5
-"""The sun's disc (6.8e-5 sr) of the hemisphere: the smallest thing that lights a room."""
+"""The sun's disc (6.8e-5 sr) relative to the hemisphere: the smallest thing that lights a room."""
 LEAST_COSINE_SHARE = 0.95
-"""Of an even sky's irradiance; what is lost beyond is more than the 5 % within which light is measured here."""
+"""Of an even sky's irradiance; beyond, more than the 5 % within which light is measured here is lost."""
 
 
 def radiance_map(
@@ -24,14 +24,14 @@ def radiance_map(
     """Merge a bracket and resample it to the hemisphere about the lens's axis.
 
     Args:
-        pictures: what the camera took at one moment.
+        pictures: the camera's pictures of one moment.
         world_from_fisheye: pose of its optical frame, (4, 4), metres.
-        size: texels an edge of the map.
-        reference_s: exposure in which white is 1.0, s; None = the longest of this bracket. Give the same for all
+        size: texels per edge of the map.
+        reference_s: exposure in which white is 1.0, s; None = the longest of this bracket. Pass the same for all
             pictures of a camera, so that the map's units stay.
 
     Raises:
-        DeltalightError: pictures that fit neither each other nor the calibration.
+        DeltalightError: the pictures do not fit each other or the calibration.
     """
     reference = reference_exposure(pictures.exposures_s) if reference_s is None else reference_s
     merged = merge_bracket(pictures, reference)

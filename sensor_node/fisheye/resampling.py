@@ -1,4 +1,4 @@
-"""Fish-eye picture -> hemi-octahedral map without loss of energy, by tables that are made once."""
+"""Resampling of fish-eye pictures to hemi-octahedral maps without loss of energy, by precomputed tables."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -17,10 +17,10 @@ class HemisphereSampler:
     """Resamples pictures of one calibration onto a map of `size` x `size` texels.
 
     The picture is averaged over squares of `shrink` pixels ("cells", about a texel wide), multiplied by `gain`, and
-    sampled bilinearly at `per_texel`^2 places of each texel, whose mean is the texel's value. Samples do not meet
-    all cells equally often, so `gain` holds, beside 1/vignetting, each cell's solid angle over the solid angle that
-    the map gives it: thus the flux of a lamp is kept wherever it stands, however small it is. Texels are `seen` where
-    the lens sees more than half of them; `scale` makes their values means of what it sees, 0 elsewhere.
+    sampled bilinearly at `per_texel`^2 positions of each texel, whose mean is the texel's value. Samples do not hit
+    all cells equally often, so `gain` holds, besides 1/vignetting, each cell's solid angle over the solid angle that
+    the map gives it: this preserves the flux of a lamp at any position, however small it is. Texels are `seen` if the
+    lens sees more than half of them; `scale` makes their values means of what it sees, 0 elsewhere.
     """
 
     size: int
@@ -34,7 +34,7 @@ class HemisphereSampler:
     scale: Float32[np.ndarray, "size size 1"]
 
     def resample(self, picture: LinearPicture) -> tuple[Float32[np.ndarray, "size size 3"], float]:
-        """Return the radiance map, 0 where nothing is seen, and the clipped share of the seen solid angle."""
+        """Return the radiance map, 0 where nothing is seen, and the clipped fraction of the seen solid angle."""
         cells = _shrunk(cv2.copyTo(picture.linear, self.inside), self.shrink)
         samples = cv2.remap(
             cells * self.gain[..., None], self.places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT
@@ -48,13 +48,13 @@ class HemisphereSampler:
 
 @lru_cache(maxsize=4)
 def hemisphere_sampler(calibration: FisheyeCalibration, size: int) -> HemisphereSampler:
-    """Make the tables for a calibration (compared by value) and a map's size."""
+    """Create the tables for a calibration (compared by value) and a map's size."""
     lens = calibration.lens
     pixel = np.stack(np.meshgrid(np.arange(lens.width), np.arange(lens.height)), axis=-1)
     inside = lens.has_ray(pixel.reshape(-1, 2).astype(np.float64)).reshape(lens.height, lens.width)
     ratio = np.sqrt(2 * np.pi) / size / _pixel_angle(lens)
     shrink = max(1, round(ratio))
-    # Half a cell apart, samples meet all cells nearly equally, so that an even sky stays even.
+    # Half a cell apart, samples hit all cells nearly equally, so that an even sky stays even.
     per_texel = int(np.ceil(2 * ratio / shrink))
     share = _shrunk(inside.astype(np.float32), shrink)
     places = _places(lens, size * per_texel, shrink)
@@ -78,14 +78,14 @@ def hemisphere_sampler(calibration: FisheyeCalibration, size: int) -> Hemisphere
 
 
 def _pixel_angle(lens: FisheyeLens) -> float:
-    """Angle that a pixel spans on the axis, radians."""
+    """Return the angle that a pixel spans on the axis, radians."""
     centre = np.clip(lens.centre, 1, [lens.width - 2, lens.height - 2])
     rays = lens.directions(centre + np.array([[-0.5, 0.0], [0.5, 0.0]]))
     return float(np.linalg.norm(rays[1] - rays[0]))
 
 
 def _shrunk(picture: Float32[np.ndarray, "h w *c"], factor: int) -> Float32[np.ndarray, "cells_y cells_x *c"]:
-    """Mean over squares of pixels; the picture is filled up with zeros to whole squares."""
+    """Return the mean over squares of pixels; the picture is padded with zeros to whole squares."""
     if factor == 1:
         return picture
     height, width = picture.shape[:2]
@@ -97,7 +97,10 @@ def _shrunk(picture: Float32[np.ndarray, "h w *c"], factor: int) -> Float32[np.n
 
 
 def _places(lens: FisheyeLens, edge: int, shrink: int) -> Float32[np.ndarray, "edge edge 2"]:
-    """Where in the shrunk picture each sample of the map lies; far outside where the lens does not see it."""
+    """Return the position of each sample of the map in the shrunk picture.
+
+    Far outside if the lens does not see it.
+    """
     centres = (np.arange(edge) + 0.5) / edge
     uv = np.stack(np.meshgrid(centres, centres), axis=-1)
     pixels = lens.project(hemisphere_direction(uv).reshape(-1, 3))
@@ -108,7 +111,10 @@ def _places(lens: FisheyeLens, edge: int, shrink: int) -> Float32[np.ndarray, "e
 def _cells(
     lens: FisheyeLens, shape: tuple[int, ...], shrink: int
 ) -> tuple[Float64[np.ndarray, "y x"], Float64[np.ndarray, "y x"], Bool[np.ndarray, "y x"]]:
-    """Of every cell: angle from the axis (at most 90 degrees), solid angle (0 at the rim), if it is in the map."""
+    """Return for every cell its angle from the axis (at most 90 degrees), solid angle (0 at the rim), and membership.
+
+    A cell is a member if it is in the map.
+    """
     rows, columns = shape
     corner = np.stack(np.meshgrid(np.arange(columns + 1.0), np.arange(rows + 1.0)), axis=-1) * shrink - 0.5
     rays = lens.directions(corner.reshape(-1, 2)).reshape(rows + 1, columns + 1, 3)
@@ -129,7 +135,7 @@ def _flux_gain(
     inside: Float32[np.ndarray, "y x"],
     solid: Float64[np.ndarray, "y x"],
 ) -> Float64[np.ndarray, "y x"]:
-    """Each cell's solid angle over the one that the map's samples give it.
+    """Return each cell's solid angle over the one that the map's samples give it.
 
     1 near the horizon and the rim of the image circle, where samples end and texels are divided by their coverage.
     """
@@ -138,7 +144,7 @@ def _flux_gain(
     given = _spread(places, share.astype(np.float64), inside.shape)
     reached = _spread(places, np.ones_like(share, np.float64), inside.shape) > 0
     whole = (reached & (inside > 0.999) & (solid > 0)).astype(np.uint8)
-    # Two cells: what a sample reads, and the sample's own distance from the edge.
+    # Two cells: the sample's footprint, and its own distance from the edge.
     interior = cv2.erode(whole, np.ones((5, 5), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
     return np.where(interior, solid / np.maximum(given, 1e-30), 1.0)
 
@@ -148,7 +154,7 @@ def _spread(
     values: Float64[np.ndarray, "edge edge"],
     shape: tuple[int, ...],
 ) -> Float64[np.ndarray, "y x"]:
-    """Add every sample's value to the four cells that it reads, by the weights with which it reads them."""
+    """Add every sample's value to the four cells that it reads, with the same weights."""
     result = np.zeros(shape[0] * shape[1])
     low = np.floor(places).astype(np.intp)
     part = places - low

@@ -1,4 +1,4 @@
-"""Camera response out of an exposure bracket (Debevec & Malik 1997)."""
+"""Camera response from an exposure bracket (Debevec & Malik 1997)."""
 
 from collections.abc import Sequence
 
@@ -10,10 +10,12 @@ from protocol.errors import DeltalightError
 from sensor_node.fisheye.exposures import CLIPPED_CODE
 
 SAMPLES = 256
-"""Pixels whose codes are compared: as many as codes, so that each code is met about once an exposure."""
+"""Pixels whose codes are compared: as many as codes, so that each code occurs about once per exposure."""
 SMOOTHNESS = 20.0
-"""Weight of the curve's second differences: it ties a code to its neighbours within about 20^(1/2) codes, which is
-as fine as responses bend; 100 gives the same curve within 0.01 of white."""
+"""Weight of the curve's second differences, which couples codes within about 20^(1/2) codes.
+
+Responses bend no finer; 100 gives the same curve within 0.01 of white.
+"""
 BLACK_CODE = 5
 """Codes up to here are noise, dark offset and stray light rather than the scene."""
 
@@ -23,7 +25,7 @@ def estimate_response(
 ) -> Float32[np.ndarray, "256 3"]:
     """Return linear R G B of each code, 1.0 = white in each channel, from pictures of one still scene.
 
-    Exposures need right ratios only; three or more, one to three stops apart, that cover black to white.
+    Only the ratios of exposures matter; three or more, one to three stops apart, that cover black to white.
 
     Raises:
         DeltalightError: fewer than two different exposures, or pictures that are not coded in 8 bits.
@@ -41,7 +43,7 @@ def estimate_response(
 
 
 def _sample(pictures: Sequence[UInt8[np.ndarray, "h w 3"]]) -> UInt8[np.ndarray, "exposures n 3"]:
-    """Codes of pixels in flat places (so that blur does not mix them), spread evenly over brightness."""
+    """Return codes of pixels in flat areas (so that blur does not mix them), spread evenly over brightness."""
     total = np.sum([picture.astype(np.float32).mean(axis=-1) for picture in pictures], axis=0)
     window = np.ones((5, 5), np.uint8)
     roughness = (cv2.dilate(total, window) - cv2.erode(total, window)).ravel()
@@ -56,7 +58,7 @@ def _sample(pictures: Sequence[UInt8[np.ndarray, "h w 3"]]) -> UInt8[np.ndarray,
 def _solve(
     codes: UInt8[np.ndarray, "exposures n"], log_exposures: Float64[np.ndarray, " exposures"]
 ) -> Float64[np.ndarray, "256"]:
-    """Least squares of g(code) = ln radiance + ln exposure with a hat weight and a smooth g."""
+    """Solve g(code) = ln radiance + ln exposure by least squares, with a hat weight and a smooth g."""
     count, pixels = codes.shape
     code = np.arange(256)
     hat = np.minimum(code - BLACK_CODE, CLIPPED_CODE - code) / ((CLIPPED_CODE - BLACK_CODE) / 2)
@@ -70,7 +72,7 @@ def _solve(
     for offset, factor in enumerate((1.0, -2.0, 1.0)):
         bend[np.arange(254), np.arange(254) + offset] = factor * SMOOTHNESS
     fix = np.zeros((1, 256 + pixels))
-    fix[0, 128] = 1.0  # g is known up to a constant: any value will do
+    fix[0, 128] = 1.0  # g is determined up to a constant: any value will do
     target = np.concatenate([weight * np.repeat(log_exposures, pixels), np.zeros(255)])
     g = np.linalg.lstsq(np.vstack([data, bend, fix]), target, rcond=None)[0][:256]
     return np.asarray(np.exp(np.maximum.accumulate(g) - g.max()))

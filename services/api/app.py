@@ -45,7 +45,7 @@ ROUTERS = (
     *snapshots.ROUTERS,
     *state.ROUTERS,
 )
-ANYWHERE = (400, 401, 403, 413, 422, 429, 503)  # refusals of the middleware, of a body, or of the disk
+ANYWHERE = (400, 401, 403, 413, 422, 429, 503)  # raised by the middleware, by a body, or by the disk
 DESCRIPTION = """Scenes, assets and the state of a Deltalight installation.
 
 Every change of a scene is a revision; `If-Match` with the revision that a change is made to refuses it (409) where
@@ -75,7 +75,7 @@ TAGS = [
 
 
 class _App(FastAPI):
-    """FastAPI whose OpenAPI document also has the media type of problems, tokens, and the live header."""
+    """FastAPI with additions to its OpenAPI document: media type of problems, tokens, and the live header."""
 
     def openapi(self) -> dict[str, Any]:
         """Return the OpenAPI document."""
@@ -89,7 +89,7 @@ class _App(FastAPI):
 
 
 def _live_header_schemas() -> dict[str, Any]:
-    """Return the schemas of a live picture's header, which no route of HTTP answers with."""
+    """Return the schemas of a live picture's header, which no HTTP route returns."""
     template = "#/components/schemas/{model}"
     _, schema = models_json_schema([(LiveHeader, "serialization")], ref_template=template)
     definitions: dict[str, Any] = schema["$defs"]
@@ -123,7 +123,7 @@ def create_app(settings: ApiSettings, store: Store, keys: Keys | None = None) ->
         version=version("deltalight"),
         description=DESCRIPTION,
         openapi_tags=TAGS,
-        docs_url=None,  # its page would load scripts from elsewhere
+        docs_url=None,  # its page would load scripts from other hosts
         redoc_url=None,
         lifespan=lifespan,
         separate_input_output_schemas=False,

@@ -18,12 +18,12 @@ from services.api.problems import ProblemError, Problems
 from services.ports import LOOPBACK
 from services.storage.tokens import TokenStore
 
-BODY_LIMIT_BYTES = 2 << 20  # three times a document with the most objects that one may have
+BODY_LIMIT_BYTES = 2 << 20  # three times a document with the maximum number of objects
 UPLOAD_PATH = "/api/v1/assets"
 PROTECTED = "/api/"  # the page's files and the API's description are public
-OPEN_PATHS = frozenset({"/api/v1/health"})  # it reveals nothing that needs a token
-STREAM_PATHS = frozenset({"/api/v1/live.mjpg"})  # these answers do not end by themselves; no WebSocket does
-# POST requests that change nothing.
+OPEN_PATHS = frozenset({"/api/v1/health"})  # it reveals nothing that requires a token
+STREAM_PATHS = frozenset({"/api/v1/live.mjpg"})  # endless responses that are no WebSockets
+# POST requests without side effects.
 READ_ONLY_PATHS = frozenset({"/api/v1/tickets", "/api/v1/live/pick"})
 WRONG_TOKENS_PER_S, WRONG_TOKENS_AT_ONCE = 1 / 6, 10
 LOOPBACK_NAMES = frozenset({LOOPBACK, "localhost", "::1"})
@@ -33,7 +33,7 @@ POLICY_VIOLATION = 1008  # WebSocket close code
 
 @dataclass(frozen=True)
 class AuthRules:
-    """What the middleware requires; without `needs_token` the Host header must be that of loopback."""
+    """Requirements of the middleware; without `needs_token` the Host header must be that of loopback."""
 
     needs_token: bool
     requests_per_s: float
@@ -43,8 +43,8 @@ class AuthRules:
 class AuthMiddleware:
     """Authenticates and authorises requests, and answers those that it refuses.
 
-    There are no cookies, so a browser never sends credentials by itself. Checking Origin and Host keeps pages of
-    other sites from reaching a service on loopback that needs no token.
+    There are no cookies, so a browser never sends credentials by itself. Checking Origin and Host prevents pages of
+    other sites from reaching a loopback service that requires no token.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class AuthMiddleware:
         except ProblemError as refusal:
             await self._problems.of_http(refusal)(scope, receive, send)
             return
-        except DeltalightError as fault:  # the tokens cannot be read now
+        except DeltalightError as fault:  # the tokens cannot be read at the moment
             await self._problems.of_fault(fault)(scope, receive, send)
             return
         await self._app(scope, limit.receive, send)
@@ -97,7 +97,7 @@ class AuthMiddleware:
         set_principal(scope, principal)
 
     async def _stream(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass on a connection that stays open; it counts as a stream, and ends when its token is revoked."""
+        """Pass on a long-lived connection; it counts as a stream, and ends when its token is revoked."""
         token_id = principal_of(scope).token_id
 
         async def is_allowed() -> bool:
@@ -130,7 +130,7 @@ class AuthMiddleware:
         self._rate.take(client)
 
     async def _authenticate(self, scope: Scope, headers: Headers) -> Principal:
-        """A token or ticket that is sent must be valid, even where none is needed."""
+        """Authenticate a request; a token or ticket must be valid if sent, even where none is required."""
         scheme, _, token = headers.get("authorization", "").partition(" ")
         ticket = QueryParams(scope["query_string"]).get("ticket")
         if not scheme and (ticket is None or not _takes_tickets(scope)):
@@ -199,7 +199,7 @@ def _is_protected(scope: Scope) -> bool:
 
 
 def _is_embedded(headers: Headers) -> bool:
-    """Whether a page of another site loads this as a part of it, which says no Origin for pictures and frames."""
+    """Whether a page of another site embeds this; browsers send no Origin for pictures and frames."""
     return (
         headers.get("sec-fetch-site") in ("cross-site", "same-site")
         and headers.get("sec-fetch-dest") != "document"
@@ -239,7 +239,7 @@ def _host_of(origin: str) -> str:
 
 
 def _host_name(host: str) -> str | None:
-    """The name in a Host header, without its port."""
+    """Return the name in a Host header, without its port."""
     try:
         return urlsplit(f"//{host}").hostname
     except ValueError:

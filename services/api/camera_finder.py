@@ -71,5 +71,5 @@ def _find(search: "Future[CamerasAnswer]") -> None:
         cameras = [CameraAnswer.model_validate(camera.as_dict()) for camera in found.cameras]
         missing = [MissingCameras(kind=m.kind, details=m.details, hint=m.hint) for m in found.missing]
         search.set_result(CamerasAnswer(cameras=cameras, missing=missing))
-    except Exception as fault:  # it belongs to those who wait
+    except Exception as fault:  # raised by those who wait
         search.set_exception(fault)

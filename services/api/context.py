@@ -1,4 +1,4 @@
-"""What the routes share: the service's parts, and how a request states the revision that it changes."""
+"""What the routes share: the service's parts, and the revision that a request expects."""
 
 import re
 from collections.abc import Mapping
@@ -33,9 +33,9 @@ _ENTITY_TAG = re.compile(r'(?:W/)?"([0-9]{1,18})"|([0-9]{1,18})')
 
 @dataclass(frozen=True)
 class Precondition:
-    """What a change depends on: `expected` is the revision that it applies to (None = the newest).
+    """The precondition of a change: `expected` is the revision that it applies to (None = the newest).
 
-    Changes in a row with the same `gesture` are undone together.
+    Consecutive changes with the same `gesture` are undone together.
     """
 
     expected: int | None
@@ -70,7 +70,7 @@ class Context:
         return self.answer(scene, response, changed=True)
 
     def answer(self, scene: StoredScene, response: Response, *, changed: bool = False) -> SceneAnswer:
-        """Describe a scene, with its revision as entity tag; a change is announced to all listeners first."""
+        """Describe a scene, with its revision as entity tag; announce a change to all listeners first."""
         if changed:
             self._announce(scene)
         delivery = self.link.show(scene) if changed and scene.head.is_active else self.link.delivery

@@ -1,4 +1,4 @@
-"""Who sends a request, and what proves it: a token of the store, a token from a file, or a ticket."""
+"""The sender of a request and its credentials: a token of the store, a token from a file, or a ticket."""
 
 import hashlib
 import hmac
@@ -16,7 +16,7 @@ from protocol.errors import DeltalightError
 from services.storage.tokens import Role
 
 TICKET_LIFE_S = 30.0
-OPEN_TICKETS = 4096  # the oldest of more is forgotten
+OPEN_TICKETS = 4096  # beyond these, the oldest one expires
 _TICKET_BYTES = 32
 SHORTEST, LONGEST = 32, 512  # characters of a token in a file; 32 hex digits are 128 bits
 SECRET_NAME = "token file"
@@ -25,7 +25,7 @@ _KEY = "deltalight.principal"
 
 @dataclass(frozen=True)
 class Principal:
-    """Who sends a request, and with which role; `token_id` is None where no token was needed."""
+    """The sender of a request and its role; `token_id` is None if no token was required."""
 
     role: Role
     token_id: str | None = None
@@ -45,7 +45,7 @@ def principal_of(scope: Scope) -> Principal:
 
 
 class SecretToken:
-    """A token in a file, as container engines and systemd hand secrets over.
+    """A token in a file, as container engines and systemd provide secrets.
 
     Tokens are compared by their hashes in constant time.
     """
@@ -65,7 +65,7 @@ class SecretToken:
         self._hash = _hash(token)
 
     def verify(self, given: str) -> Principal | None:
-        """Return who sends this token, or None if it is another one."""
+        """Return the principal of this token, or None if it is not the file's."""
         is_equal = hmac.compare_digest(self._hash, _hash(given))
         return Principal("control", name=SECRET_NAME) if is_equal else None
 
@@ -77,7 +77,7 @@ def _hash(token: str) -> bytes:
 class Tickets:
     """Single-use tickets for addresses that cannot carry a token: WebSockets and pictures in a browser.
 
-    A ticket admits once, with the role of whoever asked for it.
+    A ticket admits once, with the role of the principal that requested it.
     """
 
     def __init__(self, clock_s: Callable[[], float] = time.monotonic) -> None:
@@ -95,7 +95,7 @@ class Tickets:
         return ticket
 
     def redeem(self, ticket: str) -> Principal | None:
-        """Use up a ticket and return its principal, or None if it is unknown or has expired."""
+        """Consume a ticket and return its principal, or None if it is unknown or has expired."""
         with self._lock:
             found = self._open.pop(ticket, None)
         return None if found is None or found.ends_s < self._clock_s() else found.principal

@@ -1,4 +1,4 @@
-"""Tracks whether the render server has taken a change of the active scene, for the requests that wait for it."""
+"""Delivery of changes of the active scene to the render server, for the requests that wait for it."""
 
 import threading
 from collections.abc import Collection
@@ -7,10 +7,10 @@ from concurrent.futures import TimeoutError as FutureTimeoutError
 from dataclasses import dataclass
 from typing import Literal
 
-# Several pictures of a renderer in software (1 to 2 a second), and less than the 5 s after which common HTTP
-# clients give up by themselves.
+# Several pictures of a software renderer (1 to 2 a second), and less than the 5 s after which common HTTP clients
+# time out.
 WAIT_S = 4.0
-WAITERS = 8  # of the 40 threads that answer requests
+WAITERS = 8  # of the 40 threads that handle requests
 
 SILENT = "The render server does not answer; the scene is shown as soon as it does."
 BUSY = "The render server is still busy; the event `picture` tells when it has taken this."
@@ -26,10 +26,10 @@ class Change:
 
 @dataclass(frozen=True)
 class DeliveryStatus:
-    """What became of a revision.
+    """The status of a revision.
 
-    `shown` = from the next frame on, `pending` = the server has not taken it yet, `refused` = it cannot render it
-    and shows what it had before, `superseded` = a newer one was stored before the server had taken this one.
+    `shown`: from the next frame on; `pending`: the server has not taken it yet; `refused`: the server cannot render
+    it and still shows the previous one; `superseded`: a newer one was stored before the server took this one.
     """
 
     state: Literal["shown", "pending", "refused", "superseded"]
@@ -59,7 +59,7 @@ class Deliveries:
 
     @property
     def awaited(self) -> Collection[Change]:
-        """Changes whose status is not known yet."""
+        """Changes whose status is unknown yet."""
         with self._lock:
             return tuple(self._awaited)
 
@@ -78,7 +78,7 @@ class Deliveries:
             return self._awaited.setdefault(change, Future())
 
     def wait(self, change: Change, outcome: Future[DeliveryStatus]) -> DeliveryStatus:
-        """Return the status of a change; `pending` if it is not known soon, or too many wait already."""
+        """Return the status of a change; `pending` if it takes long, or too many requests wait already."""
         if outcome.done():
             return outcome.result()
         if not self._waiters.acquire(blocking=False):
@@ -91,7 +91,7 @@ class Deliveries:
             self._waiters.release()
 
     def note(self, status: DeliveryStatus, awaited: Collection[Change]) -> None:
-        """Resolve the change that was sent; `awaited` were stored before the newest was read, and are superseded."""
+        """Resolve the change that was sent; supersede those `awaited` that were stored before the newest was read."""
         with self._lock:
             self._newest = status
             self._resolve(status.change, status)
@@ -99,7 +99,7 @@ class Deliveries:
                 self._resolve(change, _superseded(change))
 
     def forget(self) -> None:
-        """Note that the server lost what it was sent; it is to be sent again."""
+        """Record that the server lost its scene, which must be sent again."""
         with self._lock:
             if self._newest is not None:
                 self._newest = pending(self._newest.change, BUSY)

@@ -10,7 +10,7 @@ from typing import Literal
 
 from pydantic_core import to_json
 
-QUEUE_EVENTS = 256  # how far a client may fall behind: a minute of reports from four processes
+QUEUE_EVENTS = 256  # how far a client may lag: a minute of reports from four processes
 
 EventType = Literal[
     "hello", "scene", "asset", "picture", "process", "recording", "replay", "snapshot", "notice", "lost"
@@ -19,7 +19,7 @@ EventType = Literal[
 
 @dataclass(eq=False)
 class EventQueue:
-    """Events that one client was not sent yet; a full queue drops the oldest and counts it."""
+    """Events that are still to be sent to one client; a full queue drops the oldest and counts it."""
 
     loop: asyncio.AbstractEventLoop
     lost: int = 0
@@ -38,7 +38,7 @@ class EventQueue:
             self.loop.call_soon_threadsafe(self._arrived.set)
 
     async def next(self) -> str:
-        """Wait for the oldest event; the number of those lost before it comes first."""
+        """Wait for the oldest event; if any were dropped before it, their number comes first."""
         while True:
             with self._lock:
                 if self.lost:
@@ -51,7 +51,7 @@ class EventQueue:
 
 
 class EventHub:
-    """Publishes each event to all listeners; it is encoded once, and slow listeners delay nobody."""
+    """Publishes events to all listeners; each is encoded once, and slow listeners delay nobody."""
 
     def __init__(self) -> None:
         self._queues: set[EventQueue] = set()

@@ -21,7 +21,7 @@ class StoredFileResponse(FileResponse):
         head: Message | None = None
 
         async def after_reading(message: Message) -> None:
-            """Hold the head back until the file was read: it is opened only after the head is sent."""
+            """Delay the head until the file was read, because the file is opened only after the head is sent."""
             nonlocal head
             if message["type"] == "http.response.start":
                 if message["status"] >= 400:

@@ -1,4 +1,4 @@
-"""The newest fish-eye picture, and where in it the lights of a composite are."""
+"""The newest fish-eye picture, and the positions of a composite's lights in it."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,21 +12,21 @@ from protocol.fisheye_parts import calibration_of
 from protocol.messages import Message, RadianceMessage
 
 if TYPE_CHECKING:
-    from render_server.lights.lights import IncidentLight, Light
+    from render_server.lights.lights import IncidentLight
 
 PICTURE_PART = 2  # of a radiance message (SPEC.md, section 3)
 OUTLINE_POINTS = 16
-ENVIRONMENT = "environment"  # the light that is nowhere in particular
+ENVIRONMENT = "environment"  # the light without a direction
 
 
 @dataclass
 class FisheyeView:
-    """The newest radiance message and its picture for people (JPEG), if any arrived."""
+    """The newest radiance message and its picture for display (JPEG), if any arrived."""
 
     newest: tuple[RadianceMessage, bytes] | None = None
 
     def note(self, message: Message, parts: Sequence[memoryview]) -> None:
-        """Keep the picture of a message that has just arrived."""
+        """Store the picture of a message that has just arrived."""
         assert isinstance(message, RadianceMessage)
         self.newest = message, bytes(parts[PICTURE_PART])
 
@@ -47,16 +47,16 @@ def lights_in_picture(message: RadianceMessage, described: Sequence[Mapping[str,
     """Return the lights that the picture of `message` shows; `described` are those of a composite.
 
     Raises:
-        DeltalightError: the calibration is none.
+        DeltalightError: the calibration is invalid.
     """
-    from render_server.lights.lights import incident_light
+    from render_server.lights.lights import LIGHT_TYPES, incident_light
 
     viewpoint = np.array(message.world_from_fisheye)[:3, 3]
     found = []
     for each in described:
         if each.get("type") == ENVIRONMENT:
             continue
-        seen = incident_light(_light(each), viewpoint)
+        seen = incident_light(LIGHT_TYPES[each["type"]].from_values(each), viewpoint)
         pixels = _pixels(message, np.vstack([seen.to_light, _outline(seen)]))
         if np.isfinite(pixels[0]).all():
             found.append(_marked(each, seen, pixels))
@@ -66,7 +66,7 @@ def lights_in_picture(message: RadianceMessage, described: Sequence[Mapping[str,
 def _marked(
     described: Mapping[str, Any], seen: "IncidentLight", pixels: Float64[np.ndarray, "n 2"]
 ) -> FisheyeLight:
-    """`pixels` begin with the light's middle; those of its outline that the picture does not show are NaN."""
+    """Describe a light; `pixels` begin with its middle, and are NaN where the picture does not show its outline."""
     distances = np.linalg.norm(pixels - pixels[0], axis=1)
     red, green, blue = (float(value) for value in seen.irradiance)
     peak = max(red, green, blue, 1e-12)
@@ -99,30 +99,3 @@ def _outline(seen: "IncidentLight") -> Float64[np.ndarray, "n 3"]:
     around = np.cos(turn) * side + np.sin(turn) * np.cross(toward, side)
     angle = seen.angular_radius_rad
     return np.asarray(np.cos(angle) * toward + np.sin(angle) * around)
-
-
-def _light(described: Mapping[str, Any]) -> "Light":
-    """Return the light that a composite's message describes."""
-    from render_server.lights.lights import DirectionalLight, RectangleLight, SphereLight, SpotLight
-
-    def vector(key: str) -> np.ndarray:
-        return np.asarray(described[key], np.float32)
-
-    match described["type"]:
-        case "directional":
-            angle = float(np.radians(described["angular_radius_deg"]))
-            return DirectionalLight(vector("direction"), vector("irradiance"), angle)
-        case "rectangle":
-            axes = vector("axis_u_m"), vector("axis_v_m")
-            return RectangleLight(vector("position_m"), *axes, vector("radiance"))
-        case "spot":
-            return SpotLight(
-                vector("position_m"),
-                vector("direction"),
-                vector("intensity"),
-                float(described["radius_m"]),
-                float(np.radians(described["angle_deg"])) / 2,
-                float(described["blend"]),
-            )
-        case _:
-            return SphereLight(vector("position_m"), vector("intensity"), float(described["radius_m"]))

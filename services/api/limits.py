@@ -1,4 +1,4 @@
-"""How much one client may ask for: requests a second, and connections that stay open."""
+"""Limits per client: requests per second, and long-lived connections."""
 
 import asyncio
 import time
@@ -9,14 +9,14 @@ from contextlib import contextmanager
 from services.api.problems import ProblemError
 
 REMEMBERED_CLIENTS = 4096
-# Behind an SSH tunnel or a proxy all people of a house are one client; four dashboards of one person need eight.
+# Behind an SSH tunnel or a proxy all users of a house are one client; four dashboards of one user need eight.
 STREAMS_PER_CLIENT = 64
-MAX_STREAMS = 192  # three quarters of all connections, so that requests get through beside them
+MAX_STREAMS = 192  # three quarters of all connections, so that requests still get through
 CHECK_INTERVAL_S = 5.0
 
 
 class RateLimit:
-    """A token bucket for each client: `per_s` requests a second sustained, `burst` at once (one thread)."""
+    """A token bucket per client: `per_s` requests per second sustained, `burst` at once (one thread)."""
 
     def __init__(self, per_s: float, burst: float, clock_s: Callable[[], float] = time.monotonic) -> None:
         self._per_s = per_s
@@ -51,10 +51,10 @@ class StreamLimits:
 
     @contextmanager
     def slot(self, client: str) -> Iterator[None]:
-        """Occupy one of the client's streams while the block runs.
+        """Occupy one of the client's streams for the duration of the block.
 
         Raises:
-            ProblemError: this client has too many, or all together have.
+            ProblemError: this client has too many streams, or all clients together have.
         """
         if self._open[client] >= STREAMS_PER_CLIENT:
             raise _full("This client has too many live connections; close some.")
@@ -70,7 +70,7 @@ class StreamLimits:
 
 
 async def run_while(stream: Awaitable[None], is_allowed: Callable[[], Awaitable[bool]]) -> bool:
-    """Run a stream and return whether it ended by itself; it is cancelled soon after it is no longer allowed."""
+    """Run a stream and return whether it ended by itself; cancel it soon after it is no longer allowed."""
     running = asyncio.ensure_future(stream)
     try:
         while not (await asyncio.wait({running}, timeout=CHECK_INTERVAL_S))[0]:

@@ -19,7 +19,7 @@ STALE_AFTER_S = 2.0
 
 @dataclass(frozen=True)
 class LiveFrame:
-    """A composite as viewers get it; `number` counts the frames that arrived, `header` is a `PictureHeader` as JSON.
+    """A composite for viewers; `number` counts the frames that arrived, `header` is a `PictureHeader` as JSON.
 
     It arrived at `arrived_s` of the monotonic clock and `arrived_ns` of this host's.
     """
@@ -74,10 +74,10 @@ class LiveHub:
         self._loop = loop
 
     def publish(self, message: CompositeMessage, jpeg: bytes, renderer: str) -> None:
-        """Make this composite the newest and wake all viewers that wait (any thread).
+        """Publish a composite as the newest, and wake all waiting viewers (any thread).
 
         Raises:
-            DeltalightError: no header can be made of it.
+            DeltalightError: its header is invalid.
         """
         now_s = time.monotonic()
         with self._lock:
@@ -122,7 +122,7 @@ class LiveHub:
         return None
 
     def note_sent(self, missed: int) -> None:
-        """Count a frame that a viewer takes, and those that it missed since its last."""
+        """Count a frame that a viewer takes, and those that it missed since its last one."""
         self.sent += 1
         self.skipped += missed
 

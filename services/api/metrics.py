@@ -15,17 +15,17 @@ from services.api.problems import Problems
 from services.api.streams import ProcessWatch
 
 MEDIA_TYPE = "text/plain; version=0.0.4; charset=utf-8"
-# From a read out of the cache to a mesh that takes the time limit of its check.
+# From a read out of the cache to a mesh that reaches the time limit of its check.
 _SECONDS = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 5, 20, 60)
 NO_OPERATION = "none"  # refused before a route was found
 
 
 class Reachable(Protocol):
-    """Tells whether the render server answers."""
+    """Knows whether the render server answers."""
 
     @property
     def is_reachable(self) -> bool:
-        """Whether it answered when it was last asked."""
+        """Whether it answered the last request."""
 
 
 class Metrics:
@@ -50,8 +50,8 @@ class Metrics:
         self._registry.register(_Streams(live, events))
 
     def note(self, scope: Scope, status: int, seconds: float) -> None:
-        """Count a request that was answered."""
-        # Not by address: those would be endless labels.
+        """Count a completed request."""
+        # Not by address, because that would make the labels unbounded.
         operation = getattr(scope.get("route"), "name", NO_OPERATION)
         self._requests.labels(operation, status).inc()
         self._seconds.labels(operation).observe(seconds)
@@ -69,7 +69,7 @@ class Meter:
         self._metrics = metrics
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass a request on and note how it ended."""
+        """Pass a request on and record how it ended."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
@@ -88,7 +88,7 @@ class Meter:
 
 
 class _Reported(Collector):
-    """Collects what other parts of the service count."""
+    """Collects the counts of other parts of the service."""
 
     def __init__(self, problems: Problems, watch: ProcessWatch, link: Reachable) -> None:
         self._problems = problems
@@ -127,7 +127,7 @@ class _Reported(Collector):
 
 
 class _Streams(Collector):
-    """Collects the number of viewers and listeners, and what they were sent."""
+    """Collects the numbers of viewers and listeners, and of frames and events sent to them."""
 
     def __init__(self, live: LiveHub, events: EventHub) -> None:
         self._live = live

@@ -1,4 +1,4 @@
-"""What the REST API answers; the documents themselves are the protocol's."""
+"""Responses of the REST API; the documents themselves are the protocol's."""
 
 from datetime import UTC, datetime
 from typing import Any, Literal, Self

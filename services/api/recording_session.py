@@ -19,7 +19,7 @@ from services.api.child_process import ChildProcess
 from services.api.recording_store import RecordingStore
 from services.storage.faults import ConflictError, NotFoundError
 
-# The writer hands over what it has, syncs the disk and closes: seconds on a slow one.
+# The writer flushes, syncs the disk and closes: seconds on a slow one.
 STOP_TIMEOUT_S = 20.0
 END_TIMEOUT_S = 5.0
 ENDED_WELL = (0, 128 + signal.SIGINT, 128 + signal.SIGTERM)
@@ -39,7 +39,7 @@ class RecordingSession:
 
 
 class RecordingSessions:
-    """Starts and stops recordings: one of each node at a time, or one of whichever node is heard first.
+    """Starts and stops recordings: one per node at a time, or one of whichever node is heard first.
 
     Calls `publish(session, is_growing)` once a second for each, and once at its end.
     """
@@ -88,8 +88,8 @@ class RecordingSessions:
         """Stop a recording and wait until its file is complete.
 
         Raises:
-            NotFoundError: nothing of this name is being recorded.
-            ConflictError: no frame had come, so that there is no recording.
+            NotFoundError: no recording of this name is in progress.
+            ConflictError: no frame arrived, so there is no recording.
             DeltalightError: the disk refused.
         """
         session = next((each for each in self.running() if each.id == name), None)
@@ -133,7 +133,7 @@ class RecordingSessions:
         )
 
     def _note(self, session: RecordingSession, child: ChildProcess, line: str) -> None:
-        """Read what the recorder prints once a second; its standard error says why no frame comes."""
+        """Parse the recorder's output, one line a second; its standard error explains why no frame arrives."""
         with suppress(ValueError):
             figures = json.loads(line)
             session.figures = figures if figures["frames"] else None

@@ -25,16 +25,16 @@ from services.storage.faults import ConflictError, NotFoundError
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")  # no dots: nothing that ends like a suffix
 POSTER_EDGE = 640
 POSTER_QUALITY = 85
-LEFT_OVER_AFTER_S = 3600.0  # recovery writes all the time: an older file was left by a killed process
+LEFT_OVER_AFTER_S = 3600.0  # recovery writes continuously: an older file was left by a killed process
 
 Facts = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class StoredRecording:
-    """A recording on the disk; `facts` are those of `recording_info`, None if it cannot be read, as `detail` says.
+    """A recording on the disk; `facts` are those of `recording_info`, None if unreadable, as `detail` explains.
 
-    An `interrupted` recording was never ended, because its recorder was killed; it can be recovered.
+    An `interrupted` recording was never finished, because its recorder was killed; it can be recovered.
     """
 
     id: str
@@ -56,13 +56,13 @@ class RecordingStore:
     def __init__(self, folder: Path) -> None:
         self.folder = make_output_folder(folder)
         self._cache = make_output_folder(folder / ".cache")
-        self._reading = Lock()  # one recording is read at a time: it takes the disk
+        self._reading = Lock()  # recordings are read one at a time, because reading occupies the disk
         for path in folder.glob(f".*.tmp{SUFFIX}*"):
             if path.stat().st_mtime < time.time() - LEFT_OVER_AFTER_S:
                 path.unlink(missing_ok=True)
 
     def all(self, growing: Collection[str] = ()) -> list[StoredRecording]:
-        """Return all recordings, the newest first, except growing ones, which would be read whole each time."""
+        """Return all recordings, the newest first, except growing ones, which would be reread each time."""
         found = []
         for name in {path.name.split(".")[0] for path in self._paths()}.difference(growing):
             with suppress(NotFoundError):  # deleted meanwhile
@@ -94,7 +94,7 @@ class RecordingStore:
         return path
 
     def poster(self, name: str) -> Path:
-        """Return the JPEG file of a recording's first colour picture, made on first request.
+        """Return the JPEG file of a recording's first colour picture, created on first request.
 
         Raises:
             NotFoundError: there is no such recording.
@@ -108,7 +108,7 @@ class RecordingStore:
         return cached
 
     def recover(self, name: str) -> StoredRecording:
-        """Recover an interrupted recording; the result replaces what was left of it.
+        """Recover an interrupted recording; the result replaces its remains.
 
         Raises:
             NotFoundError: there is no such recording.
@@ -131,13 +131,13 @@ class RecordingStore:
             NotFoundError: there is none of this name.
         """
         path = self._path(name)
-        # An unfinished file may also lie beside the one that was just recovered from it.
+        # An unfinished file may also exist beside the one just recovered from it.
         unfinished = path.with_name(name + SUFFIX + ACTIVE_SUFFIX)
         for each in (path, unfinished, self._cache / f"{name}.jpg", self._cache / f"{name}.json"):
             each.unlink(missing_ok=True)
 
     def _paths(self) -> Iterator[Path]:
-        """All recordings, unfinished ones too."""
+        """Yield the paths of all recordings, unfinished ones too."""
         for suffix in (SUFFIX + ACTIVE_SUFFIX, SUFFIX):
             for path in self.folder.glob(f"*{suffix}"):
                 if NAME.fullmatch(path.name.removesuffix(suffix)):
@@ -157,7 +157,7 @@ class RecordingStore:
         return StoredRecording(name, path, state, status.st_size, status.st_mtime_ns, facts, detail)
 
     def _facts(self, path: Path, key: list[int]) -> tuple[Facts | None, str]:
-        """Return what a recording holds, or why it cannot be read; cached, because the whole file is read."""
+        """Return the facts of a recording, or why it cannot be read; cached, because the whole file is read."""
         cached = self._cache / f"{path.name.split('.')[0]}.json"
         known = _cached_facts(cached, key)
         if known is not None:
@@ -185,7 +185,7 @@ def _cached_facts(path: Path, key: list[int]) -> tuple[Facts | None, str] | None
         cached = json.loads(path.read_text())
         return (cached["facts"], cached["detail"]) if cached["key"] == key else None
     except (OSError, ValueError, KeyError, TypeError):
-        return None  # there is none yet, or one that a full disk cut short
+        return None  # there is none yet, or a full disk truncated it
 
 
 def _read_facts(path: Path) -> tuple[Facts | None, str]:
@@ -200,12 +200,12 @@ def _read_facts(path: Path) -> tuple[Facts | None, str]:
 
 @contextmanager
 def _naming(path: Path) -> Iterator[None]:
-    """Name recordings instead of paths in errors: clients know no paths."""
+    """Name recordings instead of paths in errors, because clients know no paths."""
     try:
         yield
     except NotFoundError:
         raise
-    except FileNotFoundError as fault:  # deleted while it was read
+    except FileNotFoundError as fault:  # deleted while being read
         raise _absent(path.name.split(".")[0]) from fault
     except DeltalightError as fault:
         raise DeltalightError(str(fault).replace(f"{path.parent}{os.sep}", "")) from fault

@@ -19,9 +19,9 @@ from services.storage.scenes import StoredScene
 from services.storage.store import Store
 
 LOOK_INTERVAL_S = 1.0
-ALIVE_TIMEOUT_S = 1.0  # the server's own thread answers this, whatever the renderer does
-COMMAND_TIMEOUT_S = 25.0  # the server gives up after 20 s itself
-MAX_COMMANDS = 8  # at once: each holds one of the 40 threads that answer requests
+ALIVE_TIMEOUT_S = 1.0  # a separate thread of the server answers this, whatever the renderer does
+COMMAND_TIMEOUT_S = 25.0  # the server itself times out after 20 s
+MAX_COMMANDS = 8  # at once: each occupies one of the 40 threads that handle requests
 
 log = structlog.get_logger()
 
@@ -29,7 +29,7 @@ log = structlog.get_logger()
 class FifoLock:
     """FIFO lock: threads acquire it in their order of arrival.
 
-    `threading.Lock` may be acquired again by the thread that has just released it, ahead of those that wait.
+    A thread that has just released a `threading.Lock` may acquire it again, ahead of those that wait.
     """
 
     def __init__(self) -> None:
@@ -38,7 +38,7 @@ class FifoLock:
         self._waiting: deque[threading.Lock] = deque()
 
     def __enter__(self) -> None:
-        """Wait until all who came before have released the lock."""
+        """Wait until all earlier threads have released the lock."""
         with self._lock:
             if not self._is_held:
                 self._is_held = True
@@ -49,7 +49,7 @@ class FifoLock:
         turn.acquire()
 
     def __exit__(self, *_fault: object) -> None:
-        """Hand over to the thread that has waited longest."""
+        """Hand the lock over to the thread that has waited longest."""
         with self._lock:
             if self._waiting:
                 self._waiting.popleft().release()
@@ -60,8 +60,8 @@ class FifoLock:
 class RenderLink:
     """Sends the active scene to the render server, immediately after a change and again after its restart.
 
-    One thread sends, always the newest revision: changes that come faster than the server takes them are skipped.
-    Commands run in between, each after the changes that were made before it.
+    One thread always sends the newest revision: it skips changes that come faster than the server takes them.
+    Commands run in between, each after the changes that preceded it.
     """
 
     def __init__(
@@ -75,14 +75,14 @@ class RenderLink:
         self._store = store
         self._on_delivery = on_delivery
         self._client = RequestClient(control, keys=keys)
-        self._asking = FifoLock()  # to ask the server; what is below changes while it is held
+        self._asking = FifoLock()  # held during requests to the server; guards the fields below
         self._commands = threading.BoundedSemaphore(MAX_COMMANDS)
         self._changed = threading.Event()
         self._deliveries = Deliveries()
         self._look_due_s = 0.0
         self._answers: bool | None = None  # not asked yet
-        self._instance: str | None = None  # of the server; another one has lost what was sent before
-        self._has_scene = False  # whether this instance took a scene from here
+        self._instance: str | None = None  # of the server; a different one has lost its scene
+        self._has_scene = False  # whether this instance received a scene from here
         self._source: list[str] | None = None
         self.on_source: Callable[[Sequence[str] | None], None] = lambda _endpoints: None
         self._stop = threading.Event()
@@ -98,13 +98,13 @@ class RenderLink:
         self._changed.set()
         if self._thread.is_alive():
             self._thread.join(timeout=ALIVE_TIMEOUT_S)
-        # Else it waits for a renderer that hangs: the process ends without it.
+        # Otherwise it waits for a renderer that hangs: the process ends without it.
         if not self._thread.is_alive():
             self._client.close()
 
     @property
     def is_reachable(self) -> bool:
-        """Whether the server answered when it was last asked; False before that."""
+        """Whether the server answered the last request; False before the first."""
         return self._answers is True
 
     @property
@@ -113,9 +113,9 @@ class RenderLink:
         return self._deliveries.newest
 
     def show(self, scene: StoredScene) -> DeliveryStatus:
-        """Send a stored revision of the active scene, and return its status as far as it is known soon.
+        """Send a stored revision of the active scene; return its status, or `pending` if that takes long.
 
-        Does not wait for a server that did not answer last.
+        Does not wait for a server that did not answer the last request.
         """
         change = _change(scene)
         outcome = self._deliveries.expect(change)
@@ -130,8 +130,8 @@ class RenderLink:
         """Execute a command at the render server, after those that wait, and return the payload of its reply.
 
         Raises:
-            UnansweredError: it does not answer, or too many commands wait.
-            DeltalightError: it refused the command.
+            UnansweredError: the server does not answer, or too many commands wait.
+            DeltalightError: the server refused the command.
         """
         self._refuse_where_silent()
         if not self._commands.acquire(blocking=False):
@@ -144,13 +144,13 @@ class RenderLink:
             self._commands.release()
 
     def use_source(self, endpoints: Sequence[str] | None) -> None:
-        """Make the server read frames from there, also after its restart; None = from its own nodes.
+        """Make the server read frames from these endpoints, also after its restart; None = from its own nodes.
 
         Calls `on_source` with the endpoints.
 
         Raises:
-            UnansweredError: it does not answer, and is told as soon as it does.
-            DeltalightError: it refused the endpoints.
+            UnansweredError: the server does not answer; it will be told once it does.
+            DeltalightError: the server refused the endpoints.
         """
         self._source = None if endpoints is None else list(endpoints)
         self.on_source(self._source)
@@ -161,7 +161,7 @@ class RenderLink:
         with self._asking:
             if self._changed.is_set():
                 self._send_newest()
-            self._refuse_where_silent()  # the first look may just have found nobody
+            self._refuse_where_silent()  # the first check may just have found no server
             self._require_alive()
             return self._ask(op, timeout_s, payload)
 
@@ -170,7 +170,7 @@ class RenderLink:
             raise UnansweredError("The render server does not answer; see that it runs, then try again.")
 
     def _require_alive(self) -> None:
-        """Detect a dead server within a second; how long its commands take, only the renderer knows."""
+        """Detect a dead server within a second; only the renderer knows how long its commands take."""
         try:
             self._ask(CLOCK_OP, ALIVE_TIMEOUT_S)
         except UnansweredError:
@@ -178,7 +178,7 @@ class RenderLink:
             self._refuse_where_silent()
 
     def _send_newest(self) -> None:
-        """Send the newest revision of the active scene unless the server has it (holding the lock)."""
+        """Send the newest revision of the active scene unless the server has it (while holding the lock)."""
         self._changed.clear()
         awaited = self._deliveries.awaited
         active = self._store.scenes.active()
@@ -209,7 +209,10 @@ class RenderLink:
         return DeliveryStatus("shown", active.head.id, revision)
 
     def _set_scene(self, active: StoredScene) -> None:
-        """Send the scene; the first without a revision, so that the server does not compare it with older ones."""
+        """Send the scene.
+
+        The first one without a revision, so that the server does not compare it with older ones.
+        """
         if self._instance is None:
             self._instance = self._server_instance()
         scene = self._store.assets.localised(active.document).model_dump(mode="json")
@@ -224,7 +227,7 @@ class RenderLink:
         return str(self._ask("ping", COMMAND_TIMEOUT_S)["instance"])
 
     def _run(self) -> None:
-        """Send changes; look at the server at first, and whenever it was not heard of for a second."""
+        """Send changes; check the server at first, and after each second of silence."""
         while not self._stop.is_set():
             try:
                 with self._asking:
@@ -243,14 +246,14 @@ class RenderLink:
             self._look_due_s = time.monotonic() + LOOK_INTERVAL_S
 
     def _look(self) -> None:
-        """Find out whether the server answers; one that came (back) gets source and scene."""
+        """Check whether the server answers; send source and scene to one that (re)started."""
         answered_before = self._answers
         try:
             self._ask(CLOCK_OP, ALIVE_TIMEOUT_S)
-            # It does, also while the renderer is busy, as with the shaders of its first picture.
+            # It answers even while the renderer is busy, e.g. compiling shaders for its first picture.
             self._note_reachable(True)
             instance = self._server_instance()
-            is_new = instance != self._instance  # it was started (again)
+            is_new = instance != self._instance  # it was (re)started
             if is_new or not answered_before:
                 self._restore_source()
         except UnansweredError:
@@ -261,12 +264,12 @@ class RenderLink:
             self._instance, self._has_scene = instance, False
 
     def _restore_source(self) -> None:
-        """Tell a server that came (back) where to read from; it may be left from a killed service."""
+        """Tell a (re)started server where to read from; its source may be left from a killed service."""
         try:
             self._ask("set_source", COMMAND_TIMEOUT_S, {"endpoints": self._source})
         except UnansweredError:
             raise
-        except DeltalightError as fault:  # pictures of elsewhere are better than no scene
+        except DeltalightError as fault:  # pictures of the wrong source are better than no scene
             log.warning("the render server keeps its source", fault=str(fault))
 
     def _note_reachable(self, reachable: bool) -> None:

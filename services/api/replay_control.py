@@ -21,10 +21,10 @@ from services.api.child_process import ChildProcess
 from services.api.render_link import RenderLink, UnansweredError
 from services.storage.faults import ConflictError
 
-# A child's imports and its first frame take two seconds on a slow machine, five with two busy cores.
+# A child takes two seconds for imports and its first frame on a slow machine, five with two busy cores.
 START_TIMEOUT_S = 20.0
 ASK_TIMEOUT_S, LOOK_PERIOD_S = 2.0, 0.5
-START_ASK_TIMEOUT_S = 0.5  # so soon it is seen that a child ended instead of answering
+START_ASK_TIMEOUT_S = 0.5  # short, to notice soon that a child ended instead of answering
 END_TIMEOUT_S = 3.0
 NODE = "replay"
 IPC = "ipc://"
@@ -34,7 +34,7 @@ log = structlog.get_logger()
 
 @dataclass(frozen=True)
 class Position:
-    """Where a replay is, in seconds from the recording's first frame."""
+    """Position of a replay, in seconds from the recording's first frame."""
 
     recording: str
     position_s: float
@@ -46,7 +46,7 @@ class Position:
 
 @dataclass(frozen=True)
 class ReplayOrder:
-    """Which recording to replay, from where and how."""
+    """Which recording to replay, and its initial position and state."""
 
     recording: str
     path: Path
@@ -58,7 +58,7 @@ class ReplayOrder:
 
 @dataclass(frozen=True)
 class ReplayEndpoints:
-    """Where one replay publishes and is controlled, so that the render server reaches it."""
+    """Endpoints of one replay's streams and control, reachable by the render server."""
 
     streams: str
     control: str
@@ -67,8 +67,8 @@ class ReplayEndpoints:
     def beside(cls, server: str) -> Self:
         """Choose endpoints that the render server reaches: sockets beside its own, else loopback ports.
 
-        Its sockets may lie in a folder shared with another container. The names are always the same, so that a replay
-        takes over what a killed service left.
+        Its sockets may be in a folder shared with another container. The names are constant, so that a replay takes
+        over what a killed service left.
 
         Args:
             server: endpoint of the render server's commands.
@@ -97,7 +97,7 @@ class ReplayControl:
     """Runs at most one replay, watched by a thread; when it ends for any reason the live nodes are shown again.
 
     `server` is the endpoint of the render server's commands. Calls `publish` with the position twice a second while
-    it moves and with None when live is back, and `notice` with sentences for people.
+    it moves and with None when live is back, and `notice` with sentences for the user.
     """
 
     def __init__(
@@ -115,16 +115,16 @@ class ReplayControl:
 
     @property
     def recording(self) -> str | None:
-        """The recording that is replayed; None = live."""
+        """The recording being replayed; None = live."""
         replay = self._replay
         return None if replay is None else replay.order.recording
 
     def position(self) -> Position | None:
-        """Return where the replay is; None = live."""
+        """Return the position of the replay; None = live."""
         replay = self._replay
         if replay is None:
             return None
-        with suppress(UnansweredError):  # it is slow, or ends just now
+        with suppress(UnansweredError):  # it is slow, or is just ending
             return replay.ask("position")
         return replay.last if self._replay is replay else None
 
@@ -144,7 +144,7 @@ class ReplayControl:
                 self._replay = replay
                 self._use((endpoints.streams,))
             except BaseException:
-                if self._replay is replay:  # a server that refused may have read from there before it did
+                if self._replay is replay:  # a server that refused may already have read from there
                     with suppress(DeltalightError):
                         self._use(None)
                 self._replay = None
@@ -202,7 +202,7 @@ class ReplayControl:
     def _use(self, endpoints: tuple[str, ...] | None) -> None:
         try:
             self._link.use_source(endpoints)
-        except UnansweredError:  # it is told when it answers
+        except UnansweredError:  # the server is told once it answers
             log.info("the render server reads from elsewhere as soon as it answers")
 
     def _ended(self, replay: "_Replay", sentence: str) -> None:
@@ -219,7 +219,7 @@ class ReplayControl:
         while self._replay is replay:
             try:
                 position = replay.ask("position")
-            except DeltalightError:  # it ends, or is slow; its end is told elsewhere
+            except DeltalightError:  # it is ending, or slow; its end is handled elsewhere
                 position = None
             if position is not None and position != last and self._replay is replay:
                 self._publish(position)
@@ -255,17 +255,17 @@ class _Replay:
         self._child = ChildProcess(*words, on_end=end)
 
     def first_position(self) -> Position:
-        """Wait until it runs, and return where it is.
+        """Wait until the child runs, and return its position.
 
         Raises:
-            DeltalightError: it ended, or does not answer.
+            DeltalightError: the child ended, or does not answer.
         """
         deadline_s = time.monotonic() + START_TIMEOUT_S
         while time.monotonic() < deadline_s and self._child.is_running:
             with suppress(UnansweredError):
                 position = self.ask("position", timeout_s=START_ASK_TIMEOUT_S)
                 self._has_answered = True
-                if self._child.is_running:  # else nobody would hear of its end
+                if self._child.is_running:  # otherwise nobody would notice its end
                     return position
         self._child.wait(START_ASK_TIMEOUT_S)  # for its last words
         sentence = self._child.last_sentence.replace(str(self.order.path), self.order.recording)

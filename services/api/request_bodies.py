@@ -1,7 +1,7 @@
 """Bodies of requests: described by the protocol's models, validated as part of the whole scene document.
 
 Every fault therefore has the same sentence as on the command line, with its place in the document and the nearest
-key. Whole documents may also be sent and downloaded as YAML.
+key. Whole documents can also be sent and downloaded as YAML.
 """
 
 import json
@@ -76,7 +76,7 @@ LightPatch = Annotated[dict[str, Any], Body(description=_PATCH_TEXT, examples=[{
 PartPatch = Annotated[dict[str, Any], Body(description=_PATCH_TEXT, examples=[{}])]
 
 JSON_TYPE, YAML_TYPE = "application/json", "application/yaml"
-_YAML_TYPES = (YAML_TYPE, "application/x-yaml", "text/yaml")  # before RFC 9512 there was no registered one
+_YAML_TYPES = (YAML_TYPE, "application/x-yaml", "text/yaml")  # none was registered before RFC 9512
 _REFERENCE = {"$ref": "#/components/schemas/SceneDocument"}
 DOCUMENT_BODY: dict[str, Any] = {
     "requestBody": {

@@ -1,4 +1,4 @@
-"""The REST API's process: its socket, its web server, and the scene that it starts with."""
+"""The REST API's process: its socket, its web server, and its initial scene."""
 
 import socket
 from pathlib import Path
@@ -10,6 +10,7 @@ from fastapi import FastAPI
 from protocol.errors import DeltalightError
 from protocol.keys import Keys
 from protocol.messages import ControlRequest
+from protocol.methods import PLUGINS
 from protocol.scene import SceneDocument, parse_scene
 from protocol.transport import RequestClient
 from services.api.app import create_app
@@ -27,10 +28,10 @@ log = structlog.get_logger()
 
 
 def run_api(settings: ApiSettings, keys: Keys | None = None, scene: Path | None = None) -> None:
-    """Serve until SIGINT or SIGTERM; `scene` is imported and activated first.
+    """Serve until SIGINT or SIGTERM; import and activate `scene` first.
 
-    Without any scene, it takes over that of the render server, or creates an empty one. If the address leaves the
-    host and there is no token yet, it creates one and prints it.
+    Without any scene, take over that of the render server, or create an empty one. If the address leaves the host and
+    there is no token yet, create one and print it.
 
     Raises:
         DeltalightError: the port is in use, the data folder cannot be used, or the scene is wrong.
@@ -44,13 +45,15 @@ def run_api(settings: ApiSettings, keys: Keys | None = None, scene: Path | None 
         make_first_scene(store, settings, keys)
         if settings.leaves_host:
             _announce_access(settings, store)
+        for fault in PLUGINS.faults.values():
+            log.warning(fault)
         server = http_server(create_app(settings, store, keys))
         log.info("web process runs", address=f"http://{settings.host}:{settings.port}")
         server.run(sockets=[listener])
 
 
 class _Server(uvicorn.Server):
-    """Ends the live streams before it waits for connections to close; they would not end by themselves."""
+    """Ends the live streams, which would not end by themselves, before it waits for connections to close."""
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Stop serving."""
@@ -66,11 +69,11 @@ def http_server(app: FastAPI) -> uvicorn.Server:
         log_level="warning",
         access_log=False,
         server_header=False,
-        proxy_headers=False,  # anybody could send them, and would choose the address that is counted
+        proxy_headers=False,  # anybody could send them, and so choose the address that is counted
         limit_concurrency=MAX_CONNECTIONS,
         timeout_graceful_shutdown=1,
         ws_max_size=LARGEST_SOCKET_MESSAGE,
-        ws_per_message_deflate=False,  # JPEG does not get smaller
+        ws_per_message_deflate=False,  # JPEG does not compress further
     )
     return _Server(config)
 
@@ -89,8 +92,8 @@ def listening(host: str, port: int) -> socket.socket:
             f"{host} port {port} cannot be listened on ({fault.strerror}); end the program that uses it, or choose "
             "others with --host and --port."
         ) from fault
-    # Connections inherit it. asyncio sets it for sockets of its own making only, and without it the body of each
-    # answer waits 40 ms for the acknowledgement of its head.
+    # Connections inherit it. asyncio sets it only on sockets that it creates, and without it the body of each
+    # response waits 40 ms for the acknowledgement of its head.
     listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     return listener
 

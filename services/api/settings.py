@@ -44,7 +44,7 @@ class ApiSettings(StrictModel):
     @classmethod
     def _check_host(cls, host: str) -> str:
         if host != "localhost":
-            ip_address(host)  # a name would be looked up, and could change what it means
+            ip_address(host)  # a name would be resolved, and could change its meaning
         return host
 
     @property

@@ -98,7 +98,7 @@ class SnapshotStore:
         hidden = self._folder / f".{name}.part"
         try:
             (self._folder / name).rename(hidden)
-        except FileNotFoundError as fault:  # somebody else was faster
+        except FileNotFoundError as fault:  # another request was faster
             raise _absent(name) from fault
         shutil.rmtree(hidden, ignore_errors=True)
 
@@ -140,7 +140,7 @@ def _absent(name: str) -> NotFoundError:
 
 
 def now() -> datetime:
-    """Return the time that a snapshot taken now carries."""
+    """Return the timestamp of a snapshot taken now."""
     return datetime.now(UTC)
 
 

@@ -8,10 +8,10 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 DASHBOARD = Path(__file__).parents[1] / "dashboard" / "dist"
-HASHED = "/assets/"  # Vite puts the hash of a file's content into the names here
+HASHED = "/assets/"  # Vite puts the hash of a file's content into these names
 API = "/api/"
 
-# Everything comes from here. three.js loads the textures of a GLB through blob: addresses.
+# Everything is served from here. three.js loads the textures of a GLB through blob: addresses.
 POLICY = "; ".join(
     (
         "default-src 'none'",
@@ -47,7 +47,7 @@ into <code>{escape("services/dashboard/dist")}</code> first. An installed packag
 
 
 class StaticPage:
-    """Serves all addresses without a route; `otherwise` answers unknown addresses of the API."""
+    """Serves all addresses without a route; `otherwise` handles unknown addresses of the API."""
 
     def __init__(self, otherwise: ASGIApp, folder: Path | None = None) -> None:
         folder = folder or DASHBOARD

@@ -1,4 +1,4 @@
-"""Subscribes to what nodes and render servers publish, and keeps their newest reports."""
+"""Subscriptions to nodes and render servers, and their newest reports."""
 
 import threading
 import time
@@ -24,7 +24,7 @@ log = structlog.get_logger()
 
 @dataclass(frozen=True)
 class Report:
-    """The newest report of a process, when it arrived (monotonic seconds) and how long it travelled."""
+    """The newest report of a process, its time of arrival (monotonic seconds) and its latency."""
 
     message: StatsMessage
     received_s: float
@@ -44,7 +44,7 @@ class ProcessWatch:
         self._lock = threading.Lock()
 
     def note(self, message: StatsMessage) -> Report:
-        """Keep a report that has just arrived."""
+        """Store a report that has just arrived."""
         sent_ns = message.capture_ns + message.clock_offset_ns
         report = Report(message, time.monotonic(), (time.time_ns() - sent_ns) / 1e6)
         with self._lock:
@@ -80,9 +80,9 @@ class Streams:
         self._thread.start()
 
     def use_source(self, endpoints: Sequence[str] | None) -> None:
-        """Subscribe also to what the render server reads from now on; None = its own nodes.
+        """Subscribe also to the source that the render server reads from now on; None = its own nodes.
 
-        While there is such a source, radiance comes from there only.
+        With such a source, radiance comes from there only.
         """
         with self._changing:
             before = self._source

@@ -1,1 +1,1 @@
-"""The commands of `deltalight`, one a file; heavy imports stand inside, so that --help is quick."""
+"""The commands of `deltalight`, one per file; heavy imports are inside functions, so that --help is fast."""

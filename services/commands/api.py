@@ -127,7 +127,7 @@ def revoke(
 
 
 def _subscriptions(subscribe: list[str] | None, node: str | None, keys: "KeySettings") -> list[str] | None:
-    """Endpoints that are named, and that of the node that is to be found beside the render server."""
+    """Return the given endpoints, or the one of the node to be found beside the render server."""
     if node is None:
         return subscribe or None
     from services.discovery import node_endpoint

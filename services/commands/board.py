@@ -29,7 +29,7 @@ class Paper(StrEnum):
 
 
 class _Defaults(NamedTuple):
-    """A board of a type that fills A4 well."""
+    """Sizes with which a board of a type fills A4 well."""
 
     dictionary: str
     rows: int

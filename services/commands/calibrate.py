@@ -96,7 +96,7 @@ def fisheye(
 
 
 class _LensJob(NamedTuple):
-    """What the options of `camera` and `fisheye` say."""
+    """The options of `camera` and `fisheye`."""
 
     source: str
     eye: "Eye"
@@ -185,7 +185,7 @@ def photometric(
 
 
 def _print_figures(figures: dict[str, Any], *, as_json: bool) -> None:
-    """As JSON, or a line for each figure."""
+    """Print figures as JSON, or one per line."""
     if as_json:
         typer.echo(json.dumps(figures, indent=2))
         return

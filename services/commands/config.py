@@ -1,4 +1,4 @@
-"""`deltalight config`: the settings as they are resolved, and where each comes from."""
+"""`deltalight config`: the resolved settings and their origins."""
 
 import json
 from collections.abc import Mapping
@@ -34,7 +34,7 @@ def config(
 
 
 def _models() -> "dict[str, type[BaseModel]]":
-    """The sections whose programs are installed here."""
+    """Return the sections whose programs are installed here."""
     from protocol.keys import KeySettings
     from sensor_node.node import NodeConfig
 
@@ -59,7 +59,7 @@ def _print_table(name: str, values: Mapping[str, Any], origins: Mapping[str, str
 
 
 def _toml(value: object) -> str:
-    """A value in TOML: JSON's text, numbers and lists are TOML's too."""
+    """Format a value as TOML: JSON's strings, numbers and lists are valid TOML."""
     if isinstance(value, dict):
         return (
             "{" + ", ".join(f"{key} = {_toml(each)}" for key, each in value.items() if each is not None) + "}"

@@ -28,7 +28,7 @@ def _print_table(checks: list[dict[str, str]]) -> None:
     marks = {"ok": "[green]ok[/]", "note": "[yellow]note[/]", "missing": "[red]missing[/]"}
     table = Table(box=None)
     for heading in ("", "What", "Found", "What to do"):
-        table.add_column(heading, overflow="fold")  # what is to be typed must not be cut
+        table.add_column(heading, overflow="fold")  # text to be typed must not be cut
     for check in checks:
         texts = (escape(check[key]) for key in ("name", "detail", "hint"))
         table.add_row(marks[check["state"]], *texts)

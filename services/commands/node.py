@@ -11,7 +11,7 @@ import typer
 from services.commands.options import ConfigFile
 
 if TYPE_CHECKING:
-    from sensor_node.cameras.discovery import Discovery
+    from sensor_node.cameras.driver import Discovery
 
 
 def node(

@@ -1,10 +1,13 @@
-"""Values that several commands take."""
+"""Values shared by several commands."""
 
+from difflib import get_close_matches
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from protocol.errors import DeltalightError
 
 
 class View(StrEnum):
@@ -29,6 +32,19 @@ class Method(StrEnum):
     AROOF = "aroof"
     DIFFERENTIAL = "differential"
     NONE = "none"
+
+
+def parse_method(name: str) -> Method:
+    """The method of that name.
+
+    Raises:
+        DeltalightError: there is none.
+    """
+    known = [method.value for method in Method]
+    if name in known:
+        return Method(name)
+    nearest = get_close_matches(name, known, 1, cutoff=0)[0]
+    raise DeltalightError(f"'{name}' is no method; the nearest is {nearest}, of {', '.join(known)}.")
 
 
 ConfigFile = Annotated[

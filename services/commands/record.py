@@ -77,7 +77,7 @@ def record(
 
 
 def _endpoints(subscribe: list[str] | None, node: str | None, settings: "KeySettings") -> list[str]:
-    """The endpoints that are named, or that of the node that is to be found."""
+    """Return the given endpoints, or the one of the node to be found."""
     from protocol.errors import DeltalightError
 
     if node is None:
@@ -121,7 +121,7 @@ def _progress_lines() -> "Iterator[Show]":
 
 
 def _run(recorder: "Recorder", progress: "AbstractContextManager[Show]", summarize: "Show") -> None:
-    """Record in a thread, which no signal interrupts in the middle of a frame, and show how far it is."""
+    """Record in a thread, which no signal interrupts in the middle of a frame, and show progress."""
     from concurrent.futures import ThreadPoolExecutor, wait
     from threading import Event
 
@@ -141,7 +141,7 @@ def _run(recorder: "Recorder", progress: "AbstractContextManager[Show]", summari
         status = running.result()
     summarize(status)
     if ended_by is not None and (isinstance(ended_by, Terminated) or not status.frames):
-        raise ended_by  # Ctrl-C is how a recording ends; without a frame there is none
+        raise ended_by  # Ctrl-C ends a recording normally; without a frame there is none
 
 
 def _line(status: "RecordStatus") -> Text:

@@ -1,4 +1,4 @@
-"""`deltalight recordings`: what is in a recording, mending one, dataset folders in and out."""
+"""`deltalight recordings`: contents of a recording, recovery, and conversion from and to dataset folders."""
 
 import json
 from collections.abc import Iterable

@@ -1,4 +1,4 @@
-"""`deltalight replay`: a recording or dataset folder, published as a sensor node does."""
+"""`deltalight replay`: publishes a recording or dataset folder like a sensor node."""
 
 from pathlib import Path
 from typing import Annotated

@@ -62,7 +62,7 @@ def server(
 
 
 def _subscriptions(subscribe: list[str] | None, node: str | None, keys: "KeySettings") -> list[str] | None:
-    """Endpoints that are named, and that of the node that is to be found."""
+    """Return the given endpoints, or the one of the node to be found."""
     if node is None:
         return subscribe or None
     from services.discovery import node_endpoint

@@ -82,7 +82,7 @@ def up(
 
 
 def _data_folder(data: Path | None, config_file: Path | None) -> Path:
-    """Where the web process keeps scenes: as the command line says, the configuration, or by default."""
+    """Return the web process's data folder: of the command line, the configuration, or the default."""
     from services.api.settings import ApiSettings
     from services.settings import load_configuration
     from services.storage.store import default_folder
@@ -91,7 +91,7 @@ def _data_folder(data: Path | None, config_file: Path | None) -> Path:
 
 
 def _configured_source(config_file: Path | None) -> str:
-    """The node's source of the configuration.
+    """Return the node's source of the configuration.
 
     Raises:
         DeltalightError: it names none.
@@ -108,8 +108,9 @@ def _configured_source(config_file: Path | None) -> str:
 
 
 def _recording(source: str | None) -> "Source | None":
-    """The recording that a source names, None where it is a camera, or another host's."""
+    """Return the recording that a source names, None if it is a camera, or another host's."""
     from protocol.source import open_source
-    from sensor_node.cameras.open import SYNTHETIC, is_live
+    from sensor_node.cameras.drivers import SYNTHETIC
+    from sensor_node.cameras.open import is_live
 
     return None if source is None or source == SYNTHETIC or is_live(source) else open_source(Path(source))

@@ -1,1 +1,1 @@
-"""What must survive: scenes with every revision, uploaded assets, tokens. `store.Store` is the way in."""
+"""Persistent data: scenes with every revision, uploaded assets, tokens. Use it through `store.Store`."""

@@ -1,4 +1,4 @@
-"""What is known of a mesh or a map once it is loaded (in the worker)."""
+"""Facts about a mesh or a map, found by loading it (in the worker)."""
 
 from pathlib import Path
 
@@ -13,12 +13,12 @@ def mesh_facts(path: Path) -> Facts:
     `clips` (`name`, `duration_s`) that it can play.
 
     Raises:
-        DeltalightError: what is wrong with it.
+        DeltalightError: the file is wrong; the sentence says how.
     """
     from render_server.scene.asset_check import check_mesh_file, read_gltf
 
     if check_mesh_file(path) == ".glb":
-        read_gltf(path)  # a file that lies is refused before the loader's second of imports
+        read_gltf(path)  # refuses a malformed file before the loader's second of imports
     import numpy as np
 
     from render_server.scene.mesh_loading import load_asset
@@ -39,7 +39,7 @@ def map_facts(path: Path) -> Facts:
     """Load an environment map and return its `width` and `height` in pixels.
 
     Raises:
-        DeltalightError: what is wrong with it.
+        DeltalightError: the file is wrong; the sentence says how.
     """
     from protocol.radiance_files import read_linear
 

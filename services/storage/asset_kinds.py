@@ -1,4 +1,4 @@
-"""Which file an upload is: by its first bytes, never by its name alone."""
+"""Formats of uploads, recognised by their first bytes, never by the name alone."""
 
 import re
 import struct
@@ -10,7 +10,7 @@ from typing import Any, Literal
 from services.storage.faults import RejectedAssetError
 
 AssetKind = Literal["mesh", "map"]
-Facts = dict[str, Any]  # what is known of a file once it is loaded, as JSON
+Facts = dict[str, Any]  # facts about a loaded file, as JSON
 HEAD_BYTES = 4096
 MAX_NAME_LENGTH = 200
 _STL_HEADER_BYTES, _STL_TRIANGLE_BYTES = 84, 50
@@ -21,7 +21,7 @@ _NOT_TEXT = re.compile(rb"[\x00-\x08\x0e-\x1f]")
 
 @dataclass(frozen=True)
 class AssetFormat:
-    """A file format that is taken; `media_type` is its registered or customary one."""
+    """A supported file format; `media_type` is its registered or customary one."""
 
     name: str
     kind: AssetKind
@@ -30,7 +30,7 @@ class AssetFormat:
 
     @property
     def suffix(self) -> str:
-        """The suffix by which loaders know the format."""
+        """The suffix by which loaders recognise the format."""
         return f".{self.name}"
 
 
@@ -43,7 +43,10 @@ def _is_ply(head: bytes, _size: int) -> bool:
 
 
 def _is_stl(head: bytes, size: int) -> bool:
-    """A binary file has as many bytes as its triangle count says; a text file begins with `solid` and has facets."""
+    """Whether it is an STL file.
+
+    A binary file has as many bytes as its triangle count says; a text file begins with `solid` and has facets.
+    """
     if len(head) >= _STL_HEADER_BYTES:
         (triangles,) = struct.unpack_from("<I", head, 80)
         if size == _STL_HEADER_BYTES + triangles * _STL_TRIANGLE_BYTES:
@@ -83,7 +86,7 @@ def recognise(head: bytes, size_bytes: int, name: str) -> AssetFormat:
     """Return the format of a file with this beginning.
 
     Raises:
-        RejectedAssetError: it is none that is taken, or its name says another.
+        RejectedAssetError: its format is not supported, or its name claims another one.
     """
     found = next((each for each in FORMATS if each.matches(head, size_bytes)), None)
     if found is None:
@@ -102,7 +105,7 @@ def _advice(head: bytes, name: str) -> str:
 
 
 def clean_name(name: str) -> str:
-    """Return the last part of a file name as people should see it, without what only terminals understand.
+    """Return the last part of a file name for display, without control characters.
 
     Raises:
         RejectedAssetError: nothing is left of it.

@@ -1,4 +1,4 @@
-"""Runs `asset_worker` on untrusted files, in a process with limits, before anything else may load them."""
+"""Runs `asset_worker` on untrusted files in a limited process, before anything else may load them."""
 
 import json
 import os
@@ -10,7 +10,7 @@ from typing import Literal
 from services.storage.asset_kinds import AssetKind, Facts
 from services.storage.faults import RejectedAssetError
 
-WORKER = "services.storage.asset_worker"  # by name: nothing here may import what it imports
+WORKER = "services.storage.asset_worker"  # by name: its imports must not happen here
 # An 8192 x 4096 map takes 1.6 GB while it is checked, a mesh of 10 M triangles 2 GB.
 MEMORY_LIMIT_BYTES = 3 << 30
 TIME_LIMIT_S = 60
@@ -27,12 +27,12 @@ def run_limited(
     memory_bytes: int = MEMORY_LIMIT_BYTES,
     output_bytes: int = 0,
 ) -> Facts:
-    """Run a task on a file in the worker and return its facts; `name` stands for the file in sentences.
+    """Run a task on a file in the worker and return its facts; `name` names the file in sentences.
 
-    A file that the task writes may have `output_bytes`.
+    `output_bytes` limits the size of the file that the task writes.
 
     Raises:
-        RejectedAssetError: the file is not what it must be, or the limits do not allow it.
+        RejectedAssetError: the file is invalid, or exceeds the limits.
     """
     limits = [str(memory_bytes), str(TIME_LIMIT_S), str(output_bytes)]
     try:
@@ -58,11 +58,11 @@ def run_limited(
 
 
 def probe(path: Path, kind: AssetKind, name: str, *, memory_bytes: int = MEMORY_LIMIT_BYTES) -> Facts:
-    """Load a file in the worker and return what is known of it then (`asset_facts`).
+    """Load a file in the worker and return its facts (`asset_facts`).
 
-    `name` stands for the file in sentences.
+    `name` names the file in sentences.
 
     Raises:
-        RejectedAssetError: it cannot be loaded, or not within the limits.
+        RejectedAssetError: the file cannot be loaded, or not within the limits.
     """
     return run_limited(kind, path, name, memory_bytes=memory_bytes)

@@ -1,4 +1,4 @@
-"""The process that works on an untrusted file within limits; `asset_sandbox` starts it.
+"""The process that handles an untrusted file within limits; started by `asset_sandbox`.
 
 Run as `python -m services.storage.asset_worker TASK PATH MEMORY_BYTES TIME_S OUTPUT_BYTES [ARGUMENT...]`; prints one
 JSON object.

@@ -1,6 +1,6 @@
-"""Uploaded files, kept under the hash of their content: ASSETS/<sha256>/asset.<format>.
+"""Uploaded files, stored by the hash of their content: ASSETS/<sha256>/asset.<format>.
 
-Each has a folder of its own, so that a file which names others finds none.
+Each has a folder of its own, so that a file that refers to others finds none.
 """
 
 import hashlib
@@ -37,16 +37,16 @@ from services.storage.faults import ConflictError, NotFoundError, StorageFaultEr
 from services.storage.tables import AssetNameRow, AssetRow, AssetUseRow, SceneRow
 
 Probe = Callable[[Path, AssetKind, str], Facts]
-LEFT_OVER_AFTER_S = 24 * 3600  # no upload takes a day: what is older, a killed process left
-CONCURRENT_CHILDREN = 2  # each may take up to the memory limit of a child
+LEFT_OVER_AFTER_S = 24 * 3600  # no upload takes a day: older files were left by a killed process
+CONCURRENT_CHILDREN = 2  # each may use memory up to the limit of a child
 THUMBNAIL = "thumbnail.png"
-THUMBNAIL_BYTES = 1 << 20  # more than 256 x 256 pixels take without any compression
+THUMBNAIL_BYTES = 1 << 20  # more than 256 x 256 pixels without any compression
 CHUNK_BYTES = 1 << 20
 
 
 @dataclass(frozen=True)
 class Asset:
-    """What is known of an uploaded file; `facts` are those of `asset_facts`."""
+    """An uploaded file; `facts` are those of `asset_facts`."""
 
     digest: str
     names: tuple[str, ...]
@@ -57,13 +57,13 @@ class Asset:
 
     @property
     def reference(self) -> str:
-        """How scene documents name it."""
+        """Its name in scene documents."""
         return DIGEST_PREFIX + self.digest
 
 
 @dataclass
 class Incoming:
-    """A file that is being received."""
+    """A file being received."""
 
     path: Path
     file: BinaryIO
@@ -73,10 +73,10 @@ class Incoming:
     digest: "hashlib._Hash" = field(default_factory=hashlib.sha256)
 
     def write(self, chunk: bytes) -> None:
-        """Take the next bytes.
+        """Append bytes.
 
         Raises:
-            TooLargeError: there are more than the limit.
+            TooLargeError: the file exceeds the limit.
             StorageFaultError: the disk is full.
         """
         self._note(chunk)
@@ -87,7 +87,7 @@ class Incoming:
         """Take what another process wrote to the file.
 
         Raises:
-            TooLargeError: it is more than the limit.
+            TooLargeError: the file exceeds the limit.
             StorageFaultError: the disk refuses.
         """
         with _disk(), self.path.open("rb") as file:
@@ -103,7 +103,7 @@ class Incoming:
 
 
 class AssetStore:
-    """The assets of a store; `probe` is replaced by tests that are about something else."""
+    """The assets of a store; tests about something else replace `probe`."""
 
     def __init__(self, database: Database, folder: Path, probe: Probe = probe) -> None:
         self._database = database
@@ -117,7 +117,7 @@ class AssetStore:
 
     @contextmanager
     def receiving(self, limit_bytes: int) -> Iterator[Incoming]:
-        """Give a place for an upload; it is gone at the end unless `keep` took it."""
+        """Yield a place for an upload; it is removed at the end unless `keep` took it."""
         path = self._incoming / uuid4().hex
         try:
             with _disk():
@@ -128,12 +128,12 @@ class AssetStore:
             path.unlink(missing_ok=True)
 
     def keep(self, incoming: Incoming, name: str) -> tuple[Asset, bool]:
-        """Check a received file and keep it; says whether it is new.
+        """Check a received file and store it; return the asset and whether it is new.
 
-        A .zip with one glTF and its files is kept as the .glb that it makes.
+        A .zip with one glTF and its files is stored as the .glb made of it.
 
         Raises:
-            RejectedAssetError: it is not what it must be.
+            RejectedAssetError: the file is invalid.
         """
         shown = clean_name(name)
         if not is_archive(incoming.head):
@@ -182,11 +182,11 @@ class AssetStore:
             return [_asset(session, row) for row in rows]
 
     def path(self, asset: Asset) -> Path:
-        """Where the file of an asset lies."""
+        """Return the path of an asset's file."""
         return self._path(asset.digest, asset.format.name)
 
     def thumbnail(self, digest: str) -> Path:
-        """Return the file of an asset's small picture; it is drawn when it is first asked for.
+        """Return the file of an asset's thumbnail, drawn on first request.
 
         Raises:
             NotFoundError: there is no asset of this digest.
@@ -211,7 +211,7 @@ class AssetStore:
             drawn.unlink(missing_ok=True)
 
     def remove(self, digest: str) -> None:
-        """Delete an asset that no scene names, now or in its past.
+        """Delete an asset that no scene uses, now or in an earlier revision.
 
         Raises:
             NotFoundError: there is none of this digest.
@@ -224,7 +224,7 @@ class AssetStore:
                 session.delete(each)
             session.flush()
             session.delete(row)
-        with self._database.writing() as session:  # the lock keeps off whoever uploads the same file just now
+        with self._database.writing() as session:  # the lock excludes simultaneous uploads of the same file
             if session.get(AssetRow, digest) is None:
                 shutil.rmtree(self._folder / digest, ignore_errors=True)
 
@@ -235,7 +235,7 @@ class AssetStore:
         )
 
     def without_paths(self, sentence: str) -> str:
-        """Return a sentence of the render server as clients may read it: digests in place of files."""
+        """Return a sentence of the render server for clients: digests in place of files."""
         return sentence.replace(f"{self._folder.absolute()}{os.sep}", DIGEST_PREFIX)
 
     def _path(self, digest: str, format_name: str) -> Path:
@@ -250,7 +250,7 @@ class AssetStore:
             return self._probe(path, found.kind, name)
 
     def _placed(self, checked: Path, row: AssetRow, name: str) -> tuple[Asset, bool]:
-        """Put the file in place, then its row: a row without a file never exists."""
+        """Move the file into place, then add its row: a row without a file never exists."""
         with self._database.writing() as session:
             known = session.get(AssetRow, row.digest)
             place = self._path(row.digest, row.format)
@@ -274,7 +274,7 @@ class AssetStore:
 
 
 class AssetNames:
-    """Turns what a document calls an asset into `sha256:<hex>`; asks the database once for each."""
+    """Resolves a document's names of assets to `sha256:<hex>`; queries the database once for each."""
 
     def __init__(self, session: Session) -> None:
         self._session = session
@@ -284,8 +284,7 @@ class AssetNames:
         """Return the reference of the asset that a document names at `place`, by digest or by uploaded name.
 
         Raises:
-            DeltalightError: there is no such asset, several have this name, or it is of another kind than `place`
-                needs.
+            DeltalightError: there is no such asset, several have this name, or its kind does not fit `place`.
         """
         if asset not in self._rows:
             self._rows[asset] = self._session.get(AssetRow, _digest_of(self._session, place, asset))

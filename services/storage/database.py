@@ -1,4 +1,4 @@
-"""The SQLite file: opened in WAL mode, written in whole transactions that are on the disk when they end."""
+"""The SQLite file: in WAL mode, written in transactions that are durable when they end."""
 
 import sqlite3
 from collections.abc import Iterator
@@ -21,10 +21,10 @@ _IMMEDIATE = "deltalight_immediate"
 class Database:
     """A database file, shared by any number of threads and processes.
 
-    Raises:
-        DeltalightError: it is of a newer version, or no database, or cannot be written.
+    A file of an older version is migrated in one transaction.
 
-    A file of an older version is brought to this one's, in one transaction.
+    Raises:
+        DeltalightError: the file is of a newer version, no database, or cannot be written.
     """
 
     def __init__(self, path: Path) -> None:
@@ -42,13 +42,13 @@ class Database:
 
     @contextmanager
     def reading(self) -> Iterator[Session]:
-        """A consistent view of the data."""
+        """Yield a session with a consistent view of the data."""
         with self._explained(), Session(self._engine) as session:
             yield session
 
     @contextmanager
     def writing(self) -> Iterator[Session]:
-        """The only writer, of all threads and processes; everything or (after an exception) nothing is kept."""
+        """Yield the session of the only writer, of all threads and processes; an exception rolls everything back."""
         with self._explained(), Session(self._writing) as session, session.begin():
             yield session
 
@@ -85,13 +85,13 @@ class Database:
 
 
 def _prepare(connection: sqlite3.Connection, _entry: ConnectionPoolEntry) -> None:
-    """Leave transactions to us, and have each on the disk when it ends (WAL alone outlives a kill, no power cut)."""
+    """Leave transactions to this class, and make each durable (WAL alone survives a kill, but no power cut)."""
     connection.isolation_level = None
     connection.execute("PRAGMA synchronous=FULL")
     connection.execute("PRAGMA foreign_keys=ON")
 
 
 def _begin(connection: Connection) -> None:
-    """A writer locks at once: what it has read stays true until it has written."""
+    """Lock at the start of a writer, so that what it reads stays true until it has written."""
     immediate = connection.get_execution_options().get(_IMMEDIATE, False)
     connection.exec_driver_sql("BEGIN IMMEDIATE" if immediate else "BEGIN")

@@ -38,9 +38,9 @@ def _merged(target: object, patch: object) -> object:
 
 
 def patch_document(patch: object) -> Edit:
-    """The edit that merges a patch into the whole document.
+    """Return an edit that merges a patch into the whole document.
 
-    A patch that names another method begins with that method's defaults, because the methods' keys differ.
+    A patch that names another method starts from that method's defaults, because the methods' keys differ.
     """
 
     def edit(document: Document) -> Any:  # noqa: ANN401 - JSON
@@ -56,22 +56,22 @@ def _prepared(document: Document, patch: object) -> Document:
 
 
 def patch_part(part: str, patch: object) -> Edit:
-    """The edit that merges a patch into one top-level part."""
+    """Return an edit that merges a patch into one top-level part."""
     return patch_document({part: patch})
 
 
 def replace_part(part: str, value: object) -> Edit:
-    """The edit that puts a top-level part in place of the old one."""
+    """Return an edit that replaces a top-level part."""
     return lambda document: {**document, part: value}
 
 
 def replace_document(value: object) -> Edit:
-    """The edit that puts another document in place of the old one."""
+    """Return an edit that replaces the document."""
     return lambda _document: value
 
 
 def add_object(value: object) -> Edit:
-    """The edit that adds an object; one without an id gets a free one."""
+    """Return an edit that adds an object; one without an id gets a free one."""
 
     def edit(document: Document) -> Document:
         added = {"id": _free_id(document), **value} if isinstance(value, Mapping) else value
@@ -86,12 +86,12 @@ def _free_id(document: Document) -> str:
 
 
 def replace_object(name: str, value: object) -> Edit:
-    """The edit that puts another object in place of one; without an id it keeps the old one."""
+    """Return an edit that replaces an object; without an id the new one keeps the old one's."""
     return _edit_object(name, lambda _old: {"id": name, **value} if isinstance(value, Mapping) else value)
 
 
 def patch_object(name: str, patch: object) -> Edit:
-    """The edit that merges a patch into one object."""
+    """Return an edit that merges a patch into one object."""
     return _edit_object(name, lambda old: merge_patch(old, patch))
 
 
@@ -106,7 +106,7 @@ def _edit_object(name: str, change: Callable[[Document], Any]) -> Edit:
 
 
 def remove_object(name: str) -> Edit:
-    """The edit that takes an object out."""
+    """Return an edit that removes an object."""
 
     def edit(document: Document) -> Document:
         index = _index(document, name)
@@ -123,24 +123,24 @@ def _index(document: Document, name: str) -> int:
 
 
 def add_light(value: object) -> Edit:
-    """The edit that adds a manual light after the others."""
+    """Return an edit that adds a manual light after the others."""
     return _edit_lights(lambda lights: [*lights, value])
 
 
 def replace_light(index: int, value: object) -> Edit:
-    """The edit that puts another manual light in place of one."""
+    """Return an edit that replaces a manual light."""
     return _edit_lights(lambda lights: _with_lights(lights, index, [value]))
 
 
 def patch_light(index: int, patch: object) -> Edit:
-    """The edit that merges a patch into one manual light."""
+    """Return an edit that merges a patch into one manual light."""
     return _edit_lights(
         lambda lights: _with_lights(lights, index, [merge_patch(light_at(lights, index), patch)])
     )
 
 
 def remove_light(index: int) -> Edit:
-    """The edit that takes a manual light out; those after it move up."""
+    """Return an edit that removes a manual light; those after it move up."""
     return _edit_lights(lambda lights: _with_lights(lights, index, []))
 
 
@@ -166,7 +166,7 @@ def _edit_lights(change: Callable[[list[Any]], list[Any]]) -> Edit:
 
 
 def _with_lights(lights: list[Any], index: int, values: list[Any]) -> list[Any]:
-    """Put any number of lights in place of one."""
+    """Replace one light by any number of lights."""
     light_at(lights, index)
     return [*lights[:index], *values, *lights[index + 1 :]]
 
@@ -185,7 +185,7 @@ def checked_document(document: object, revision: int) -> SceneDocument:
 
 
 def require_revision(expected: int | None, current: int) -> None:
-    """Refuse a change to an older revision; None = whatever is newest.
+    """Refuse a change to an older revision; None = whichever is newest.
 
     Raises:
         StaleRevisionError: `expected` is not the newest.

@@ -1,14 +1,14 @@
-"""Refusals of the storage that callers tell apart; each is a sentence for people."""
+"""Errors of the storage that callers distinguish; each is a sentence for the user."""
 
 from protocol.errors import DeltalightError
 
 
 class NotFoundError(DeltalightError):
-    """What was named is not there."""
+    """The named thing does not exist."""
 
 
 class ConflictError(DeltalightError):
-    """The change does not fit what is stored now."""
+    """The change conflicts with what is stored."""
 
 
 class StaleRevisionError(ConflictError):
@@ -20,11 +20,11 @@ class StaleRevisionError(ConflictError):
 
 
 class RejectedAssetError(DeltalightError):
-    """An uploaded file is not what it must be."""
+    """An uploaded file is invalid."""
 
 
 class TooLargeError(DeltalightError):
-    """More was sent than is taken."""
+    """The upload exceeds the limit."""
 
 
 class StorageFaultError(DeltalightError):

@@ -1,4 +1,4 @@
-"""A .zip with one glTF and its files, made one .glb (glTF 2.0, sections 3.6.1.2 and 4.4)."""
+"""Conversion of a .zip with one glTF and its files to one .glb (glTF 2.0, sections 3.6.1.2 and 4.4)."""
 
 import base64
 import binascii
@@ -23,10 +23,10 @@ _ENCRYPTED = 1  # general purpose flag, bit 0 (APPNOTE 4.4.4)
 def repack(path: Path, out: str, limit: str) -> Facts:
     """Write the glTF of an archive as one .glb file (in the worker); `limit` is its greatest size unpacked, bytes.
 
-    The same archive gives the same file to the bit.
+    The same archive always gives the same bytes.
 
     Raises:
-        DeltalightError: what is wrong with the archive.
+        DeltalightError: the archive is wrong; the sentence says how.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -38,7 +38,7 @@ def repack(path: Path, out: str, limit: str) -> Facts:
 
 
 class _Archive:
-    """The files of an archive by their paths; looked through before anything is unpacked."""
+    """The files of an archive by their paths; checked before anything is unpacked."""
 
     def __init__(self, archive: zipfile.ZipFile, path: Path, limit_bytes: int) -> None:
         self.path = path
@@ -75,7 +75,7 @@ class _Archive:
 
 
 def _is_litter(name: str) -> bool:
-    """What file managers add: it may even end in .gltf."""
+    """Whether a file manager added the file, which may even end in .gltf."""
     return name.startswith("__MACOSX/") or posixpath.basename(name).startswith(".")
 
 
@@ -98,7 +98,7 @@ def _repacked(archive: _Archive) -> bytes:
 
 
 def _joined(document: dict[str, Any], archive: _Archive, folder: str) -> tuple[dict[str, Any], bytes]:
-    """Put all buffers, then all pictures, into one; buffer views move along."""
+    """Join all buffers, then all pictures, into one; buffer views are shifted accordingly."""
     binary, starts = bytearray(), []
     for buffer in document.get("buffers", []):
         starts.append(_append(binary, _content(buffer["uri"], archive, folder)[: int(buffer["byteLength"])]))
@@ -120,7 +120,7 @@ def _joined(document: dict[str, Any], archive: _Archive, folder: str) -> tuple[d
 
 
 def _append(binary: bytearray, content: bytes) -> int:
-    """Add a piece and return where it begins; every accessor type is aligned to four bytes."""
+    """Append a piece and return its offset; every accessor type is aligned to four bytes."""
     start = len(binary)
     binary += content + bytes(-len(content) % 4)
     return start

@@ -1,4 +1,4 @@
-"""Taking over a scene document with the files that it names (the command line may; REST clients may not)."""
+"""Import of a scene document with the files that it names (for the command line, never for REST clients)."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ LIMIT_BYTES = 512 << 20
 
 
 def import_scene(store: Store, path: Path) -> str:
-    """Store a scene document and its assets; returns the id of the scene, of an old one where nothing differs.
+    """Store a scene document and its assets; return the id of the scene, an old one if nothing differs.
 
     Raises:
         DeltalightError: the document or one of its files is wrong.
@@ -19,7 +19,7 @@ def import_scene(store: Store, path: Path) -> str:
 
 
 def import_document(store: Store, document: SceneDocument, what: str = "imported") -> str:
-    """As `import_scene`, of a document whose assets are absolute paths."""
+    """Import a document whose assets are absolute paths, like `import_scene`."""
     kept = document.with_assets(lambda _place, asset: _keep(store, asset))
     for head in store.scenes.all():
         if _same(store.scenes.get(head.id).document, kept):

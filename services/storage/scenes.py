@@ -1,4 +1,4 @@
-"""Scenes: documents whose every change is a revision that stays."""
+"""Scenes: documents whose every change is a permanent revision."""
 
 import secrets
 import time
@@ -35,7 +35,7 @@ class SceneHead:
 
 @dataclass(frozen=True)
 class StoredScene:
-    """A scene at one revision (`document.revision`), and what its past allows."""
+    """A scene at one revision (`document.revision`), and whether it can be undone and redone."""
 
     head: SceneHead
     document: SceneDocument
@@ -46,7 +46,7 @@ class StoredScene:
 
 @dataclass(frozen=True)
 class Revision:
-    """One change: `what` names it for people."""
+    """One change; `what` names it for the user."""
 
     number: int
     at_ns: int
@@ -93,7 +93,7 @@ class SceneStore:
             return _stored(session, scene, row)
 
     def all(self) -> list[SceneHead]:
-        """Return all scenes, in the order in which they were made."""
+        """Return all scenes, in the order of their creation."""
         newest = select(RevisionRow.scene_id, func.max(RevisionRow.number).label("number"))
         heads = newest.group_by(RevisionRow.scene_id).subquery()
         query = (
@@ -127,9 +127,9 @@ class SceneStore:
     def change(
         self, scene_id: str, edit: Edit, what: str, expected: int | None = None, gesture: str | None = None
     ) -> StoredScene:
-        """Add a revision, made by `edit` from the newest one; an edit that changes nothing adds none.
+        """Add a revision that `edit` makes from the newest one; an edit that changes nothing adds none.
 
-        One undo takes back all changes in a row that carry the same `gesture`.
+        One undo takes back all consecutive changes with the same `gesture`.
 
         Raises:
             NotFoundError: there is no such scene.
@@ -150,7 +150,7 @@ class SceneStore:
             return _added(session, scene, _row(scene_id, changed, what, before, gesture), changed)
 
     def undo(self, scene_id: str, expected: int | None = None) -> StoredScene:
-        """Add a revision that shows what was before the last change.
+        """Add a revision that restores the state before the last change.
 
         Raises:
             ConflictError: there is nothing to undo; or as `change`.
@@ -167,7 +167,7 @@ class SceneStore:
         return self._step(scene_id, expected, step)
 
     def redo(self, scene_id: str, expected: int | None = None) -> StoredScene:
-        """Add a revision that shows again what the last undo took back.
+        """Add a revision that restores what the last undo took back.
 
         Raises:
             ConflictError: there is nothing to redo; or as `change`.
@@ -182,7 +182,7 @@ class SceneStore:
         return self._step(scene_id, expected, step)
 
     def duplicate(self, scene_id: str, name: str | None = None) -> StoredScene:
-        """Store a copy of the newest revision as a scene of its own.
+        """Store a copy of the newest revision as a new scene.
 
         Raises:
             NotFoundError: there is no such scene.
@@ -339,7 +339,7 @@ def _head(scene: SceneRow, row: RevisionRow, active: str | None) -> SceneHead:
 def _stored(
     session: Session, scene: SceneRow, row: RevisionRow, document: SceneDocument | None = None
 ) -> StoredScene:
-    """Describe a scene at a revision, whose document need not be read where it is at hand."""
+    """Describe a scene at a revision; pass its document if it is available, to avoid reading it."""
     return StoredScene(
         _head(scene, row, _active_id(session)),
         document or _document(session, row),

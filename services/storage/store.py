@@ -1,4 +1,4 @@
-"""The way into the storage: one folder with a database and a folder of assets."""
+"""Entry to the storage: one folder with a database and a folder of assets."""
 
 import os
 from pathlib import Path
@@ -15,10 +15,10 @@ from services.storage.tokens import TokenStore
 class Store:
     """Scenes, assets and tokens of one `folder`; usable by several threads and processes. A context manager.
 
-    What a call has stored is on the disk when it returns. `probe` loads an upload once, with limits.
+    What a call has stored is durable when it returns. `probe` loads an upload once, with limits.
 
     Raises:
-        DeltalightError: the folder cannot be written, or holds something else.
+        DeltalightError: the folder cannot be written, or has other contents.
     """
 
     def __init__(self, folder: Path, *, probe: Probe = probe_asset) -> None:
@@ -46,5 +46,5 @@ class Store:
 
 
 def default_folder() -> Path:
-    """Where the data lie unless a folder is named (XDG base directory specification)."""
+    """Return the default data folder (XDG base directory specification)."""
     return Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share") / "deltalight"

@@ -4,7 +4,7 @@ from sqlalchemy import ForeignKey, ForeignKeyConstraint
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
 SCHEMA_VERSION = 2
-# What turns a store of a version into one of the next.
+# Statements that migrate a store from a version to the next.
 MIGRATIONS = {1: ("ALTER TABLE revisions ADD COLUMN gesture VARCHAR",)}
 
 
@@ -25,9 +25,9 @@ class SceneRow(Base):
 class RevisionRow(Base):
     """One revision of a scene; rows are added, never changed.
 
-    `origin` is the revision whose document this one shows: itself, or for undo and redo (which then have no
-    document of their own) an earlier one. `before` is the origin that undo goes back to, `redo` the row that redo
-    shows again. Revisions of one `gesture` in a row go back to what was before the first of them.
+    `origin` is the revision whose document this one shows: itself, or for undo and redo (which then have no document
+    of their own) an earlier one. `before` is the origin that undo goes back to, `redo` the row that redo restores.
+    Consecutive revisions of one `gesture` go back to the state before the first of them.
     """
 
     __tablename__ = "revisions"
@@ -67,7 +67,7 @@ class AssetNameRow(Base):
 
 
 class AssetUseRow(Base):
-    """An asset that some revision of a scene names, first in revision `number`."""
+    """An asset that some revision of a scene uses, first in revision `number`."""
 
     __tablename__ = "asset_uses"
     __table_args__ = (
@@ -89,7 +89,7 @@ class ChoiceRow(Base):
 
 
 class TokenRow(Base):
-    """A token of the REST API: what is kept cannot be turned back into it."""
+    """A token of the REST API, stored irreversibly."""
 
     __tablename__ = "tokens"
 

@@ -18,14 +18,14 @@ from services.storage.asset_kinds import Facts
 SIZE = 256
 SAMPLES = 2  # rays along each edge of a pixel
 MARGIN = 1.06
-# Three-quarter view: from the front right and above, so far (in radii of the object) that lines hardly converge.
+# Three-quarter view: from the front right and above, so far away (in radii of the object) that lines hardly converge.
 AZIMUTH_DEG, ELEVATION_DEG, DISTANCE = -55.0, 25.0, 4.0
-# In camera axes (right, up, towards the camera): a key light from the upper left, a weaker one from the right,
-# and light from everywhere. White turned to the key light is just not clipped.
+# In camera axes (right, up, towards the camera): a key light from the upper left, a weaker one from the right, and
+# ambient light. White that faces the key light is just not clipped.
 KEY, FILL = np.array([-0.5, 0.7, 0.5], np.float32), np.array([0.9, 0.1, 0.4], np.float32)
 KEY_SHARE, FILL_SHARE, AMBIENT_SHARE = 0.65, 0.2, 0.15
-TEXTURE_EDGE = 2 * SIZE  # a texture seen whole is not finer than the rays
-MIDDLE_GREY = 0.18  # where the mean logarithm of a map's luminance lands (Reinhard et al. 2002)
+TEXTURE_EDGE = 2 * SIZE  # a texture in full view is not finer than the rays
+MIDDLE_GREY = 0.18  # target of the mean logarithm of a map's luminance (Reinhard et al. 2002)
 
 Pixels = Float32[np.ndarray, "h w 4"]
 
@@ -60,7 +60,7 @@ def draw_map(path: Path, out: str) -> Facts:
 
 
 class _Shot:
-    """Meshes before a camera, ready to be hit by rays; lengths are in radii of the whole."""
+    """Meshes in front of a camera, ready for ray casting; lengths are in radii of the whole."""
 
     def __init__(self, meshes: list[TriangleMesh], *, is_y_up: bool) -> None:
         self._meshes = meshes
@@ -76,7 +76,7 @@ class _Shot:
             self._places.append(placed[mesh.triangles.ravel()])
 
     def rays(self, size: int) -> Pixels:
-        """Cast size x size rays about what is seen; gives premultiplied linear colour and coverage."""
+        """Cast size x size rays around the meshes; return premultiplied linear colour and coverage."""
         used = np.concatenate(self._places)
         seen = used[:, :2] / -used[:, 2:]
         middle = (seen.min(axis=0) + seen.max(axis=0)) / 2
@@ -102,7 +102,7 @@ class _Shot:
         weights: Float32[np.ndarray, "n 3"],
         directions: Float32[np.ndarray, "n 3"],
     ) -> Float32[np.ndarray, "n 3"]:
-        """Radiance of Lambertian surfaces towards the camera; both sides of a triangle are lit."""
+        """Return the radiance of Lambertian surfaces towards the camera; both sides of a triangle are lit."""
         normals = _mixed(mesh.normals, corners, weights) @ self._camera_from_file.T
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
         normals *= np.where((normals * directions).sum(axis=1, keepdims=True) > 0, -1, 1)
@@ -121,7 +121,7 @@ _Z_FROM_Y = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], np.float32)
 
 
 def _camera_axes() -> Float32[np.ndarray, "3 3"]:
-    """Rotation from z-up axes to those of the camera: right, up, towards it."""
+    """Return the rotation from z-up axes to those of the camera: right, up, towards it."""
     azimuth, elevation = np.radians([AZIMUTH_DEG, ELEVATION_DEG])
     back = np.array(
         [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
@@ -137,7 +137,7 @@ def _mixed(
 
 
 def _texels(texture: np.ndarray, uv: Float32[np.ndarray, "n 2"]) -> Float32[np.ndarray, "n 3"]:
-    """Nearest texels of a repeated texture, made coarser first where it is finer than the picture."""
+    """Return the nearest texels of a repeated texture, downsampled first if it is finer than the picture."""
     rows, columns = (min(edge, TEXTURE_EDGE) for edge in texture.shape[:2])
     coarse = cv2.resize(texture.astype(np.float32), (columns, rows), interpolation=cv2.INTER_AREA)
     column, row = (np.floor(uv * [columns, rows]).astype(np.int64) % [columns, rows]).T

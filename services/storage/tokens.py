@@ -1,4 +1,4 @@
-"""Tokens of the REST API: shown once, kept as a salted scrypt hash (RFC 7914)."""
+"""Tokens of the REST API: shown once, stored as a salted scrypt hash (RFC 7914)."""
 
 import hashlib
 import hmac
@@ -21,13 +21,13 @@ PREFIX = "deltalight"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 _TOKEN = re.compile(PREFIX + r"-([0-9a-f]{12})-([A-Za-z0-9_-]{43})")
 _SALT_BYTES, _SECRET_BYTES = 16, 32
-# 16 MB and some 50 ms for one guess (RFC 7914, section 2: memory = 128 n r bytes).
+# 16 MB and some 50 ms per guess (RFC 7914, section 2: memory = 128 n r bytes).
 _COST = {"n": 1 << 14, "r": 8, "p": 1, "maxmem": 64 << 20}
 
 
 @dataclass(frozen=True)
 class Token:
-    """What is known of a token; the token itself is not."""
+    """Metadata of a token, without the token itself."""
 
     id: str
     name: str
@@ -44,7 +44,7 @@ class TokenStore:
         self._hashing = threading.Lock()  # one guess at a time: guesses must not fill the memory
 
     def create(self, name: str, role: Role) -> str:
-        """Make a token and return it; it cannot be shown again.
+        """Create a token and return it; it cannot be shown again.
 
         Raises:
             DeltalightError: the name is wrong or taken.
@@ -74,7 +74,7 @@ class TokenStore:
         return f"{PREFIX}-{token_id}-{secret}"
 
     def all(self) -> list[Token]:
-        """Return all tokens, in the order in which they were made."""
+        """Return all tokens, in the order of their creation."""
         with self._database.reading() as session:
             return [_token(row) for row in session.scalars(select(TokenRow).order_by(TokenRow.created_ns))]
 
@@ -85,7 +85,7 @@ class TokenStore:
             return session.scalars(select(func.count()).select_from(TokenRow)).one() == 0
 
     def revoke(self, name: str) -> None:
-        """End a token; it is refused from the next request on.
+        """Revoke a token; it is refused from the next request on.
 
         Raises:
             NotFoundError: there is no token of this name.
@@ -97,15 +97,15 @@ class TokenStore:
             session.delete(row)
 
     def knows(self, token_id: str) -> bool:
-        """Whether there still is a token of this id."""
+        """Whether a token of this id still exists."""
         with self._database.reading() as session:
             return session.get(TokenRow, token_id) is not None
 
     def verify(self, token: str) -> Token | None:
-        """Return what is known of a token, None where it is none of ours.
+        """Return the metadata of a token, None if it is not valid.
 
-        Its slow hash is computed once a process; later a fast hash of it is compared. Whether it was revoked is
-        looked up each time.
+        Its slow hash is computed once per process; later a fast hash of it is compared. Revocation is checked each
+        time.
         """
         match = _TOKEN.fullmatch(token)
         if match is None:

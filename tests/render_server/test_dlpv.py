@@ -69,7 +69,8 @@ def flux(graph: Graph, name: str) -> Float64[np.ndarray, "n n n 3"]:
     """Injected flux of each cell, W in the picture's units."""
     sums = np.frombuffer(graph[name].read(), np.int32).reshape(-1, 3, 4)
     edge = graph["volume"].placement.voxel_edge
-    return (sums[..., 0] / FIXED * np.pi / LOBE[0] * edge**2).reshape(CELLS, CELLS, CELLS, 3)
+    watts = sums[..., 0] / FIXED * np.pi / LOBE[0] * edge**2
+    return np.asarray(watts.reshape(CELLS, CELLS, CELLS, 3))
 
 
 def test_injected_is_the_flux_that_a_box_reflects_and_what_the_floor_lost(

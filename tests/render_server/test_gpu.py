@@ -16,7 +16,6 @@ from protocol.errors import DeltalightError
 from render_server.gpu import shader_source as shader_text
 from render_server.gpu.context import GpuContext, explain_context_failure, is_software_renderer
 from render_server.gpu.kernel import Kernel
-from render_server.gpu.memory import size_bytes
 from render_server.gpu.readback import AsyncReadback
 from render_server.gpu.textures import texture_2d
 from render_server.gpu.timers import PassTimers
@@ -168,13 +167,6 @@ def test_timers_sum_a_pass_by_name_and_begin_anew_each_frame(gpu: GpuContext) ->
     assert all(0 <= value < 1e4 for value in times.values())
     if gpu.is_software:
         assert timers.end_frame() == {}
-
-
-@pytest.mark.parametrize(("kind", "size"), [("f1", 1), ("u1", 1), ("f2", 2), ("i2", 2), ("f4", 4), ("u4", 4)])
-def test_memory_of_a_texture_is_counted_whatever_it_holds(gpu: GpuContext, kind: str, size: int) -> None:
-    texture = texture_2d(gpu, (7, 5), 2, kind)
-    assert size_bytes({"held": [texture, texture]}) == 7 * 5 * 2 * size
-    texture.release()
 
 
 # Context errors

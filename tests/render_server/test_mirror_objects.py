@@ -85,7 +85,7 @@ def reflection(gpu: GpuContext, document: SceneDocument, view: ViewFrame) -> np.
     return found
 
 
-def matte(gpu: GpuContext, document: SceneDocument, view: ViewFrame) -> np.ndarray:
+def object_coverage(gpu: GpuContext, document: SceneDocument, view: ViewFrame) -> np.ndarray:
     renderer = SceneRenderer(gpu, document)
     renderer.render(view)
     assert renderer.graph is not None
@@ -101,7 +101,7 @@ def test_mirror_shows_the_object_where_optics_says(gpu: GpuContext, stage: Stage
     view = over_floor(noise_m=noise_m)
     document = declared(glowing_ball(stage), 0.02)
     expected = mirrored_ball().astype(np.uint8)
-    beside = matte(gpu, document, view) == 0
+    beside = object_coverage(gpu, document, view) == 0
     seen = reflection(gpu, document, view)
     shown = (seen[..., 3] > 0.5).astype(np.uint8)
     assert not np.any(shown[beside] > cv2.dilate(expected, AROUND)[beside])
@@ -117,7 +117,7 @@ def test_bytes_are_the_cameras_where_the_mirror_shows_no_object(gpu: GpuContext,
     color = noisy()
     view = over_floor(color)
     document = declared(glowing_ball(stage), 0.02)
-    untouched = (matte(gpu, document, view) == 0) & (reflection(gpu, document, view)[..., 3] == 0)
+    untouched = (object_coverage(gpu, document, view) == 0) & (reflection(gpu, document, view)[..., 3] == 0)
     assert untouched[cv2.dilate(mirrored_ball().astype(np.uint8), AROUND, iterations=3) == 0].mean() > 0.9
     picture = composite(gpu, document, view)
     np.testing.assert_array_equal(picture[untouched], color[untouched])

@@ -10,13 +10,8 @@ import trimesh
 from protocol.scene import SceneDocument
 from protocol.scene_objects import Surface
 from render_server.gpu.context import GpuContext
-from render_server.lights.lights import (
-    MIRROR_ROUGHNESS,
-    DirectionalLight,
-    RectangleLight,
-    SphereLight,
-    mirror_lights,
-)
+from render_server.lights.lights import DirectionalLight, RectangleLight, SphereLight
+from render_server.lights.mirror_lights import MIRROR_ROUGHNESS, mirror_lights
 from render_server.renderer import SceneRenderer
 from render_server.scene.declared_surfaces import SurfaceTable, build_surface_table
 from tests.render_server.scenes import (

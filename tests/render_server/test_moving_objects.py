@@ -224,7 +224,7 @@ def test_several_objects_move_each_on_its_own(gpu: GpuContext, stage: Stage) -> 
 def test_reflections_of_a_moving_object_are_those_of_one_that_stands_there(
     gpu: GpuContext, stage: Stage
 ) -> None:
-    """The tree for rays is refitted, not built anew; only rays along edges may find another triangle."""
+    """The BVH is refitted, not built anew; only rays along edges may find another triangle."""
     item = placed(sliding_box(stage.folder), {})
     document = shown(stage, item)
     mirror = {"region": {"plane": {}}, "roughness": 0.05, "metallic": 1.0, "albedo": [0.9, 0.9, 0.9]}

@@ -5,8 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from sensor_node.cameras import discovery
-from sensor_node.cameras.discovery import FoundCamera, discover, list_cameras
+from sensor_node.cameras import oak_discovery
+from sensor_node.cameras.discovery import discover, list_cameras
+from sensor_node.cameras.driver import FoundCamera
 from sensor_node.cameras.oak_sdk import load_depthai, sdk_version
 from sensor_node.cameras.rgbd import has_backend
 
@@ -36,7 +37,7 @@ def add_usb(root: Path, port: str, vendor: str, product: str) -> None:
 @pytest.fixture
 def no_sdk(monkeypatch: pytest.MonkeyPatch) -> None:
     """As where the OAK SDK is not installed."""
-    monkeypatch.setattr(discovery, "sdk_version", lambda: None)
+    monkeypatch.setattr(oak_discovery, "sdk_version", lambda: None)
 
 
 @pytest.mark.usefixtures("no_sdk")
@@ -83,7 +84,7 @@ def test_usb_devices_of_known_makers_are_named_with_what_they_need(tmp_path: Pat
 
 
 def test_what_is_missing_is_said_for_each_kind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(discovery, "sdk_version", lambda: None)
+    monkeypatch.setattr(oak_discovery, "sdk_version", lambda: None)
     missing = {kind.kind: kind for kind in discover(tmp_path).missing}
     assert "does not list" in missing["uvc"].details
     assert missing["oak"].hint == "pip install 'deltalight[oak]'"
@@ -135,7 +136,7 @@ class TestWithTheSdk:
             dai.XLinkPlatform.X_LINK_MYRIAD_X,
             getattr(dai.XLinkError_t, status),
         )
-        found = discovery._oak_camera(info)
+        found = oak_discovery.describe_camera(info)
         assert found == FoundCamera(
             name="OAK 14442C10D13EABCE00",
             source="oak:14442C10D13EABCE00",

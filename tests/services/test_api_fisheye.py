@@ -10,7 +10,7 @@ from protocol.codecs import encode_array, encode_color
 from protocol.envelope import encode
 from protocol.messages import RadianceMessage
 from protocol.transport import Publisher
-from sensor_node.cameras.discovery import Discovery, FoundCamera, MissingSupport
+from sensor_node.cameras.driver import Discovery, FoundCamera, MissingSupport
 from services import ports
 from services.api import camera_finder
 from services.api.fisheye import lights_in_picture

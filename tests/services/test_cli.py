@@ -41,6 +41,7 @@ COMMANDS = {
     "keys trust",
     "config",
     "doctor",
+    "graph",
     "schema",
     "bench speed",
     "bench quality",

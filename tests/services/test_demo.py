@@ -177,14 +177,19 @@ def demo() -> Iterator[str]:
 @pytest.mark.slow
 def test_ctrl_c_ends_the_demo_without_orphans_and_it_starts_again() -> None:
     (page_port,) = ports.private_ports(1)
-    for _ in range(2):
-        command = [sys.executable, "-m", "services.cli", "demo", "--no-browser", "--port", str(page_port)]
-        demo = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-        wait_for_frames(f"{ports.LOOPBACK}:{page_port}", PATIENCE_S)
-        children = psutil.Process(demo.pid).children(recursive=True)
-        assert len(children) == 3
-        demo.send_signal(signal.SIGINT)
-        output, error = demo.communicate(timeout=20)
+    command = [sys.executable, "-m", "services.cli", "demo", "--no-browser", "--port", str(page_port)]
+    for method in ([], ["--method", "paper"]):
+        demo = subprocess.Popen(
+            [*command, *method], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        try:
+            wait_for_frames(f"{ports.LOOPBACK}:{page_port}", PATIENCE_S)
+            children = psutil.Process(demo.pid).children(recursive=True)
+            assert len(children) == 3
+            demo.send_signal(signal.SIGINT)
+            output, error = demo.communicate(timeout=20)
+        finally:
+            demo.kill()  # its children end with it
         assert demo.returncode == 130
         assert "Traceback" not in error
         assert f"http://127.0.0.1:{page_port}" in output

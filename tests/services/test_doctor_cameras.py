@@ -5,7 +5,7 @@ import json
 import pytest
 
 from sensor_node.cameras import discovery
-from sensor_node.cameras.discovery import Discovery, FoundCamera, MissingSupport
+from sensor_node.cameras.driver import Discovery, FoundCamera, MissingSupport
 from services import doctor
 from services.doctor import Check
 from tests.services.conftest import RunCli

@@ -1,4 +1,4 @@
-"""The benchmark's scenes, one a file."""
+"""The benchmark's scenes, one per file."""
 
 import difflib
 
@@ -32,7 +32,11 @@ SCENES: tuple[BenchmarkScene, ...] = (
 
 
 def scene_named(name: str) -> BenchmarkScene:
-    """Find a scene; DeltalightError names the known ones and the nearest."""
+    """Return a scene.
+
+    Raises:
+        DeltalightError: there is none; names the known ones and the nearest.
+    """
     known = {scene.name: scene for scene in SCENES}
     if name not in known:
         near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)

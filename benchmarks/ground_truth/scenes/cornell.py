@@ -1,8 +1,8 @@
-"""An open coloured Cornell box with a rabbit and a blue box in it, put onto lit ground.
+"""An open coloured Cornell box with a rabbit and a blue box in it, on lit ground.
 
-A reconstruction of the comparison in [D] 5.5, figure 5.19. As its discussion tells, box, bunny and blue box are all
-virtual: the left wall is reddish, the right one green, the shadow falls behind the box, and the ground is real. Their
-geometry, framing and light are not published, so those here are this project's own.
+A reconstruction of the comparison in [D] 5.5, figure 5.19. According to its discussion, box, bunny and blue box are
+all virtual: the left wall is reddish, the right one green, the shadow falls behind the box, and the ground is real.
+Their geometry, framing and light are not published, so those here are this project's own.
 """
 
 from typing import Any

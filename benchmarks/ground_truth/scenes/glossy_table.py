@@ -1,4 +1,4 @@
-"""Table of dark, glossy varnish: things and the virtual object mirror in it, blurred."""
+"""Table of dark, glossy varnish: it reflects things and the virtual object, blurred."""
 
 from typing import Any
 

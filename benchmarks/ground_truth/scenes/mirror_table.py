@@ -12,8 +12,10 @@ ROUGHNESS = 0.1
 STEEL: Triple = (0.62, 0.60, 0.57)
 TABLE_BACK_Y_M = 0.19
 LAMP = SphereLamp((0.62, -0.20, 0.95), 2.6, 0.20, (1.0, 0.95, 0.88))
-"""High above a table that ends before the wall: what the table throws back passes over all that the camera sees of
-the wall. Only a path that happens to end in the lamp finds such light, so it would be seen as noise."""
+"""High above a table that ends before the wall: the table's reflection passes over the visible part of the wall.
+
+Only a path that happens to end in the lamp finds such light, so it would show as noise.
+"""
 
 
 def _real(folder: MeshFolder) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Twelve frames: the camera swings around the table while one object slides and turns and another stands still."""
+"""Twelve frames: the camera swings around the table while one object slides and rotates and another stands still."""
 
 from typing import Any
 
@@ -31,7 +31,7 @@ def _real(folder: MeshFolder) -> dict[str, Any]:
 
 
 def _camera(frame: int) -> Matrix:
-    """A few millimetres a frame along an arc, rising slowly."""
+    """Return a pose some millimetres further per frame along an arc, rising slowly."""
     angle = np.radians(-90 + SWING_DEG * frame)
     x_m, y_m = TARGET_M[0] + DISTANCE_M * np.cos(angle), TARGET_M[1] + DISTANCE_M * np.sin(angle)
     return looking((float(x_m), float(y_m), HEIGHT_M + 0.001 * frame), TARGET_M)

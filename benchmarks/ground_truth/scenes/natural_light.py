@@ -23,7 +23,10 @@ ZENITH, HORIZON, GROUND = (
 
 
 def _sky() -> Float32[np.ndarray, "256 512 3"]:
-    """Sky that is whitest at the horizon and around the sun, over grass; rows from above, centre column +x."""
+    """Return a sky that is whitest at the horizon and around the sun, over grass.
+
+    Rows from above, centre column +x.
+    """
     azimuth = np.pi * (1 - 2 * (np.arange(512) + 0.5) / 512)
     elevation = np.pi * (0.5 - (np.arange(256) + 0.5) / 256)[:, None]
     parts = np.broadcast_arrays(
@@ -34,7 +37,7 @@ def _sky() -> Float32[np.ndarray, "256 512 3"]:
     angle = np.arccos(np.clip(np.stack(parts, axis=-1) @ to_sun, -1, 1))[..., None]
     glow = 0.9 * np.exp(-angle / 0.25) * np.array([1.0, 0.93, 0.80])
     sky = HORIZON + (ZENITH - HORIZON) * np.sqrt(height) + glow
-    disc = np.clip((SUN_RADIUS - angle) / np.radians(0.7) + 0.5, 0, 1)  # its rim falls within one pixel
+    disc = np.clip((SUN_RADIUS - angle) / np.radians(0.7) + 0.5, 0, 1)  # its rim falls off within one pixel
     grass = GROUND * np.exp(0.22 * smooth_noise(np.random.default_rng(2), 256, 512, 64, 128))[..., None]
     return np.where(parts[2][..., None] > 0, sky + disc * SUN_RADIANCE, grass).astype(np.float32)
 

@@ -1,4 +1,4 @@
-"""Where straight edges of objects throw the edges of their shadows."""
+"""Shadow edges cast by straight edges of objects."""
 
 import numpy as np
 from jaxtyping import Float
@@ -11,9 +11,9 @@ from benchmarks.ground_truth.parts import Triple
 def edge_of_shadow(
     lamp: SphereLamp, edge_m: tuple[Triple, Triple], inside_m: Triple, plane_z_m: float = TABLE_Z_M
 ) -> ShadowEdge:
-    """Way across the shadow that a straight edge of an object casts on a level plane.
+    """Return the path across the shadow that a straight edge of an object casts on a level plane.
 
-    `inside_m` is a point of the object whose shadow lies beside the edge's, on the dark side. The way crosses the
+    `inside_m` is a point of the object whose shadow lies beside the edge's, on the dark side. The path crosses the
     shadow of the edge's middle at a right angle and is twice as long as the penumbra is wide.
     """
     lamp_m, ends = np.array(lamp.position_m), np.array(edge_m)
@@ -32,7 +32,7 @@ def edge_of_shadow(
 def _shadow(
     lamp_m: Float[np.ndarray, "3"], point_m: Float[np.ndarray, "3"], plane_z_m: float
 ) -> Float[np.ndarray, "3"]:
-    """Where the ray from a lamp through a point meets the plane."""
+    """Return where the ray from a lamp through a point meets the plane."""
     reach = (lamp_m[2] - plane_z_m) / (lamp_m[2] - point_m[2])
     return np.asarray(lamp_m + reach * (point_m - lamp_m))
 
@@ -44,7 +44,7 @@ def _penumbra_m(
     shadow_m: Float[np.ndarray, "3"],
     across: Float[np.ndarray, "3"],
 ) -> float:
-    """Width of the penumbra along `across`: the lamp's disc through the edge, thrown slantwise onto the plane."""
+    """Return the width of the penumbra along `across`: the lamp's disc through the edge, projected onto the plane."""
     beam = (edge_m - lamp_m) / np.linalg.norm(edge_m - lamp_m)
     magnified = 2 * radius_m * np.linalg.norm(shadow_m - edge_m) / np.linalg.norm(edge_m - lamp_m)
     return float(magnified * np.hypot(1, np.dot(beam, across) / beam[2]))

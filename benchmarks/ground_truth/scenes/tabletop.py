@@ -1,4 +1,4 @@
-"""Corner of a wooden table with everyday things; a matte, a glossy and a metal object among them."""
+"""Corner of a wooden table with everyday things, and a matte, a glossy and a metal object among them."""
 
 from typing import Any
 

@@ -19,7 +19,7 @@ LEFT_EDGE_M: tuple[Triple, Triple] = (
     (_LEFT_X_M, _FRONT_Y_M, TABLE_Z_M + 0.02),
     (_LEFT_X_M, _FRONT_Y_M, TABLE_Z_M + 0.06),
 )
-"""Of the slab, upright: the part whose shadow falls onto free table."""
+"""Of the slab, upright: the part whose shadow falls onto the free table."""
 
 
 def _real(folder: MeshFolder) -> dict[str, Any]:

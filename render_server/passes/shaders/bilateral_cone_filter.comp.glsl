@@ -1,6 +1,6 @@
-// Four neighbouring texels looked along a quarter of the cones each (trace_cones): their mean looked along all of them.
-// A tent over 3 x 3 texels gives the four quarters the same weight; texels whose surface does not continue this one's
-// are left out.
+// Four neighbouring texels each trace a quarter of the cones (trace_cones); their mean covers all of them. A tent
+// over 3 x 3 texels weights the four quarters equally; texels whose surface does not continue this one's are left
+// out.
 #include "common/low_res_grid.glsl"
 #include "common/continuation.glsl"
 

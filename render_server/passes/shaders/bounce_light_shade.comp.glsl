@@ -1,5 +1,5 @@
-// Irradiance that one object's reflected light brings, added to that of the others, at 1/scale of the picture.
-// REAL: real surfaces; otherwise virtual ones, and what a mirror there shows of the objects.
+// Irradiance from one object's reflected light, added to that of the others, at 1/scale of the picture. REAL: real
+// surfaces; otherwise virtual ones, and what a mirror there shows of the objects.
 #include "common/harmonics.glsl"
 #include "common/object_field.glsl"
 #include "common/low_res_grid.glsl"
@@ -7,9 +7,9 @@
 layout(local_size_x = 8, local_size_y = 8) in;
 layout(rgba32f) uniform image2D bounce_irradiance;   // rgb irradiance
 layout(rgba32f) uniform image2D bounce_mirrored;     // rgb radiance
-uniform sampler3D bounce_light;                      // a slab a coefficient
+uniform sampler3D bounce_light;                      // a slab per coefficient
 #include "common/camera.glsl"
-uniform bool first;             // nothing lies in the images yet
+uniform bool first;             // the images are still empty
 
 const int LENGTH = 9;
 const float BANDS[3] = float[](3.14159265, 2.09439510, 0.78539816);

@@ -1,6 +1,6 @@
-// Beams of light that smooth virtual surfaces reflect: the flux of each block of a light's map of the objects is split
-// over a few rays, each followed to the first surface that it meets. WIDE: they sample the GGX lobe; otherwise all go in the
-// mirror direction.
+// Beams of light that smooth virtual surfaces reflect: the flux of each block of a light's map of the objects is
+// split over a few rays, each traced to the first surface that it hits. WIDE: they sample the GGX lobe; otherwise all
+// go in the mirror direction.
 #include "common/light_rays.glsl"
 #include "common/brdf.glsl"
 #include "common/geometry.glsl"
@@ -16,22 +16,22 @@ uniform sampler2D virtual_light_uv;
 uniform sampler2D virtual_light_normal;
 uniform int view_index;
 uniform int block_edge;        // texels
-uniform float least_alpha;     // materials of lobes from this width on,
-uniform float greatest_alpha;  // below that one
+uniform float least_alpha;     // for materials with lobes of at least this width,
+uniform float greatest_alpha;  // and below this one
 uniform float bias_real;       // m
 uniform float normal_offset;   // m: away from the object's own triangles
-uniform float reach;           // m: how far beams are followed
+uniform float reach;           // m: how far beams are traced
 #include "common/camera.glsl"
 
 #ifdef WIDE
-const float LOBE_FRACTION = 0.5;    // a ray stands for part of its lobe: that wide, so that all together are little wider
+const float LOBE_FRACTION = 0.5;    // a ray represents part of its lobe: this wide, so that together they are little wider
 #else
 const float LOBE_FRACTION = 1.0;    // all go in the mirror direction, and are as wide as the lobe
 #endif
 const float RAYS_APART = inversesqrt(float(RAY_COUNT));   // of a block's edge
-const float OVERLAP = 0.6;          // deviation, of the way to the next beam: their sum is even within a few percent
-// Deviation of the normal distribution that is as high as a GGX lobe cut off at 85 % of its energy; half-vectors turn
-// half as far as what they reflect.
+const float OVERLAP = 0.6;          // deviation / distance to the next beam: their sum is even within a few percent
+// Standard deviation of the normal distribution with the peak of a GGX lobe cut off at 85 % of its energy;
+// half-vectors turn half as far as the directions they reflect.
 const float LOBE_DEVIATION = 2.0 * 0.65;
 const float ALIKE = 0.5;            // cosine between normals of neighbours on one smooth surface
 const float MARCH_PIXELS = 2.0;     // a step of the march over the depth image
@@ -50,7 +50,7 @@ Spot spot_at(LightView view, ivec2 texel) {
     spot.point = ray_point(view, s, depth);
     spot.seen_from = normalize(ray_point(view, s, 2.0) - ray_point(view, s, 1.0));
     spot.normal = dot(normal.xyz, spot.seen_from) > 0.0 && materials[int(normal.w)].flags.x > 0.5 ? -normal.xyz : normal.xyz;
-    // Smooth normals lean beyond the horizon at silhouettes: there the surface is seen edge on.
+    // Smooth normals lean beyond the horizon at silhouettes, where the surface is seen edge on.
     float facing = dot(spot.normal, -spot.seen_from);
     spot.normal = normalize(spot.normal - max(1e-2 - facing, 0.0) * spot.seen_from);
     spot.material = int(normal.w);
@@ -65,7 +65,7 @@ bool is_wanted(int material) {
     return smooth_enough && (materials[material].base_color.a > 0.0 || has_interface(dielectric.rgb));
 }
 
-// How a mirror's ray moves from this texel to the next block along `axis`, at a distance t.
+// Drift of a mirror's ray from this texel to the next block along `axis`, at a distance t.
 struct Drift { vec3 start; vec3 turn; };
 
 Drift drift_along(LightView view, ivec2 texel, ivec2 axis, Spot here, float side) {
@@ -78,10 +78,10 @@ Drift drift_along(LightView view, ivec2 texel, ivec2 axis, Spot here, float side
         return Drift(blocks * (other.point - here.point), blocks * (reflect(other.seen_from, other.normal) - own));
     }
     vec3 across = transpose(mat3(view.view_from_world)) * vec3(vec2(axis), 0.0) * side * float(block_edge) * RAYS_APART;
-    return Drift(across, vec3(0.0));   // alone on its block: as if it were flat
+    return Drift(across, vec3(0.0));   // alone in its block: treated as flat
 }
 
-// Distance at which a ray meets what the camera sees of the real scene, 1e30 if it does not.
+// Distance at which a ray hits the visible real scene, 1e30 if it does not.
 float meets_real(vec3 from, vec3 direction, float limit) {
     float t = 0.0;
     for (int i = 0; i < MARCH_STEPS && t < limit; ++i) {
@@ -107,8 +107,8 @@ float unmasked(float n_dot_v, float n_dot_l, float alpha) {
     return (1.0 + lambda.x) / (1.0 + lambda.x + lambda.y);
 }
 
-// The footprint's variance has a part of the way to the next beams along both axes, and `round`, the deviation in all
-// directions that each beam has of its own.
+// The footprint's variance has a fraction of the distance to the next beams along both axes, and `round`, each beam's
+// own standard deviation in all directions.
 void set_footprint(inout Beam beam, Drift x, Drift y, float round) {
     mat3 basis = basis_around(beam.direction.xyz);
     vec2 a = OVERLAP * ((x.start + beam.from.w * x.turn) * basis).xy;
@@ -136,7 +136,7 @@ void send(Spot spot, vec3 direction, vec3 flux, float spread, Drift x, Drift y) 
     if (at < uint(beams.length())) beams[at] = beam;
 }
 
-// Ray j of a block: its texel is one of RAY_COUNT spread evenly over the block, which divide the block's flux.
+// Ray j of a block: its texel is one of RAY_COUNT spread evenly over the block, which share the block's flux.
 void reflect_ray(Light light, LightView view, ivec2 block, int j) {
     vec4 numbers = ray_numbers(block, j);
     ivec2 texel = ivec2(view.tile.xy) + ivec2((vec2(block) + numbers.zw) * float(block_edge));
@@ -160,7 +160,7 @@ void reflect_ray(Light light, LightView view, ivec2 block, int j) {
     float n_dot_l = dot(spot.normal, direction);
     if (n_dot_l <= 0.0) return;
     flux *= fresnel_schlick(m.f0, dot(v, h)) * unmasked(dot(spot.normal, v), n_dot_l, alpha);
-    float spread = length(vec2(LOBE_DEVIATION * alpha * LOBE_FRACTION, 0.5 * radius));   // a disc's deviation is half its radius
+    float spread = length(vec2(LOBE_DEVIATION * alpha * LOBE_FRACTION, 0.5 * radius));   // half a disc's radius
     float side = texel_side(view, (view.view_from_world * vec4(spot.point, 1.0)).z);
     Drift x = drift_along(view, texel, ivec2(1, 0), spot, side), y = drift_along(view, texel, ivec2(0, 1), spot, side);
     send(spot, direction, flux, spread, x, y);

@@ -1,5 +1,5 @@
-// Each beam's irradiance on the pixels around the point that it meets; a workgroup a beam. Sums are integers, so that
-// their order does not matter.
+// Adds each beam's irradiance to the pixels around its hit; a workgroup per beam. Sums are integers, so that their
+// order does not matter.
 #include "common/geometry.glsl"
 #include "common/basis.glsl"
 #include "common/beams.glsl"
@@ -13,8 +13,8 @@ uniform int scale;
 uniform ivec2 picture_pixels;
 
 const float LEAST_SLANT = 1.5;   // around corners too
-const float SMOOTH_TEXELS = 4.0;   // footprints of so many texels of the reduced grid and more lose nothing there
-const float LONGEST = 4.0;   // a slanting footprint is followed up to so many times the beam's radius
+const float SMOOTH_TEXELS = 4.0;   // footprints of this many texels of the reduced grid or more lose nothing there
+const float LONGEST = 4.0;   // limit of a slanted footprint, in radii of the beam
 
 vec3 position_on(int layer, ivec2 pixel, out vec3 normal) {
     ivec2 raster = raster_texel(pixel);
@@ -23,7 +23,7 @@ vec3 position_on(int layer, ivec2 pixel, out vec3 normal) {
     return (layer == REAL_LAYER ? real.w > 0.0 : object.w > 0.0) ? (layer == REAL_LAYER ? real.xyz : object.xyz) : vec3(1e9);
 }
 
-// `at`: where the pixel's sums are.
+// `at`: index of the pixel's sums.
 void add(Beam beam, mat3 basis, int layer, ivec2 pixel, int at) {
     vec3 normal;
     vec3 away = (position_on(layer, pixel, normal) - beam.from.xyz) * basis;
@@ -38,7 +38,7 @@ void add(Beam beam, mat3 basis, int layer, ivec2 pixel, int at) {
     }
 }
 
-// Steepness of the surface that the beam meets: how much longer than the beam is wide its footprint is.
+// Slant of the surface that the beam hits: length of the footprint relative to the beam's width.
 float slant_at(Beam beam, int layer, vec2 centre) {
     vec3 normal;
     position_on(layer, clamp(ivec2(round(centre)), ivec2(0), picture_pixels - 1), normal);

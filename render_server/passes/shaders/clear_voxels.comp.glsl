@@ -1,4 +1,4 @@
-// Empty the voxels that a set had touched: its grid cells, and their texels in all directions of a pyramid.
+// Empties the voxels that a set touched: its grid cells, and their texels in all directions of a mipmap.
 #include "common/volume.glsl"
 #define GRID_ACCESS
 #define TOUCHED_ACCESS readonly
@@ -6,7 +6,7 @@
 
 layout(local_size_x = 64) in;
 layout(rgba16f) writeonly uniform image3D pyramid;
-uniform bool free_slots;    // also give the slots back
+uniform bool free_slots;    // also release the slots
 
 void main() {
     for (uint i = gl_GlobalInvocationID.x; i < slot_count; i += gl_NumWorkGroups.x * 64u) {

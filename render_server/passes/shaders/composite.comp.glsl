@@ -1,5 +1,5 @@
-// Relit picture: real pixels by the ratio of irradiances or by addition, virtual pixels over them by the coverage,
-// camera response; where nothing changed the camera's own bytes (docs/method.md 3, composition).
+// Relit picture: real pixels by the ratio of irradiances or by addition, virtual pixels over them by coverage, camera
+// response; the camera's own bytes where nothing changed (docs/method.md 3, composition).
 #include "common/brdf.glsl"
 #include "common/geometry.glsl"
 #include "common/surfaces.glsl"
@@ -31,7 +31,7 @@ uniform float exposure_scale;
 uniform float sample_distance;   // m at 1 m depth
 #include "common/camera.glsl"
 uniform bool additive;
-uniform bool relights_real;      // method `none` shows objects and leaves the real scene as it is
+uniform bool relights_real;      // method `none` shows objects and keeps the real scene
 uniform bool filmic;             // ACES tone curve on the whole picture instead of the camera's response
 uniform bool specular_surfaces;
 uniform bool whole;              // compose every pixel, not only those near a change
@@ -81,7 +81,7 @@ Change change_at(ivec2 pixel, vec4 position, vec4 normal) {
         SurfaceEntry e = surfaces[int(normal.w)];
         float cosine = max(dot(normal.xyz, normalize(camera_position - position.xyz)), 1e-3);
         vec3 reflectance = specular_reflectance(e.f0.rgb, e.surface.x, cosine);
-        if (has_reflection && e.surface.x < RAY_ROUGHNESS) {   // rays tell what objects change there, cones do not
+        if (has_reflection && e.surface.x < RAY_ROUGHNESS) {   // rays give the objects' change there, cones do not
             vec4 seen = texelFetch(reflection, pixel, 0);
             c.gained = reflectance * seen.rgb;
             c.hidden = seen.a;
@@ -107,9 +107,9 @@ vec3 diffuse_fraction(ivec2 pixel, Change c, vec4 normal, vec3 b) {
     return (1.0 - e.f0.w) * diffuse / max(diffuse + c.s_mu, vec3(1e-6));
 }
 
-// What a specular surface shows more than before, of `glossy`, the picture's specular part. Predicted reflections that
-// the picture does not show (a wrong normal catches a light) cannot be taken away from it. What objects hide by rays
-// and the lights that they shadow overlap; which part of the picture is which cannot be told, so the larger counts.
+// What a specular surface shows in addition, of `glossy`, the picture's specular part. Predicted reflections that the
+// picture does not show (a wrong normal reflects a light) cannot be removed from it. Occlusion found by rays and
+// shadowed lights overlap; their parts of the picture are unknown, so the larger counts.
 vec3 specular_change(Change c, vec3 glossy) {
     vec3 shown = min(glossy / max(c.s_mu, vec3(1e-6)), vec3(1.0));
     vec3 lost = shown * max(c.s_mu - c.s_rho, vec3(0.0)), more = max(c.s_rho - c.s_mu, vec3(0.0));
@@ -128,10 +128,10 @@ vec3 relit(ivec2 pixel, Change c, vec4 normal, vec3 b) {
     return w * b * ratio + max(vec3(0.0), glossy + specular_change(c, glossy));
 }
 
-// Where depth is unknown the change of light continues from the surroundings of similar colour; 1 if there is none.
+// Where depth is unknown the change of light continues from surroundings of similar colour; 1 if there are none.
 vec3 surrounding_ratio(ivec2 pixel, vec3 b) {
     ivec2 centre = pixel / scale, last = textureSize(sample_pixels, 0) - 1;
-    float total = 1e-4;   // no change, should all be far or of another colour
+    float total = 1e-4;   // no change if all are far away or of another colour
     vec3 sum = vec3(total);
     for (int j = -FILL_RADIUS; j <= FILL_RADIUS; ++j)
         for (int i = -FILL_RADIUS; i <= FILL_RADIUS; ++i) {
@@ -148,7 +148,7 @@ vec3 surrounding_ratio(ivec2 pixel, vec3 b) {
     return sum / total;
 }
 
-// Camera code of each channel; the table is even in the square root, where codes are about equally far apart.
+// Camera code of each channel; the table is uniform in the square root, where codes are about evenly spaced.
 uvec3 encode(vec3 x) {
     int last = textureSize(inverse_response, 0).x - 1;
     ivec3 at = ivec3(round(sqrt(clamp(x, 0.0, 1.0)) * float(last)));
@@ -160,7 +160,7 @@ uvec3 encode(vec3 x) {
 // ACES tone curve (Narkowicz's fit, 2015).
 vec3 aces(vec3 x) { return clamp(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 0.0, 1.0); }
 
-// The pixel that shows the surface which a pixel shows: another one at the rims of real things before objects.
+// The pixel that represents a pixel's surface: another one at the rims of real things in front of objects.
 ivec2 surface_pixel(ivec2 pixel) {
     int code = int(texelFetch(edge_correction, pixel, 0).a) - 1, width = 2 * RIM_SIGHT + 1;
     return code < 0 ? pixel : pixel + ivec2(code % width, code / width) - RIM_SIGHT;
@@ -197,7 +197,7 @@ void compose(ivec2 pixel) {
     if (store_linear) imageStore(linear_out, pixel, vec4(result, 1.0));
 }
 
-// The pixels of the texels that change_ratio listed, or (`whole`) of all.
+// The pixels of the texels that change_ratio listed, or (`whole`) all pixels.
 void main() {
     ivec2 size = textureSize(picture, 0), grid = textureSize(sample_pixels, 0);
     uint block = uint(scale * scale);

@@ -1,5 +1,5 @@
-// What relighting changed. EFFECTS: objects and the change of light on mid grey. Otherwise the signed change alone:
-// gained light in its own colour, lost light as red, both enlarged; objects black.
+// The change due to relighting. EFFECTS: objects and the change of light on mid grey. Otherwise the signed change
+// alone: gained light in its own colour, lost light as red, both amplified; objects black.
 #include "common/srgb.glsl"
 
 layout(local_size_x = 8, local_size_y = 8) in;

@@ -18,7 +18,7 @@ layout(rgba16f) writeonly uniform image2D lobe_rho;
 #include "common/camera.glsl"
 uniform float noise_sigma;   // m at 1 m
 uniform bool specular_surfaces;
-uniform bool everywhere;       // also where the objects do not reach (photometric registration)
+uniform bool everywhere;       // also out of the objects' reach (photometric registration)
 
 #ifdef SHADOW_CONES
 bool shadow_may_reach(vec3 p, vec3 n, float bias) { return object_meets_cone(p, n); }
@@ -40,7 +40,7 @@ void main() {
     vec3 e_mu = vec3(0.0), e_rho = vec3(0.0), s_mu = vec3(0.0), s_rho = vec3(0.0);
     float unshadowed = 0.0;
     float bias = 3.0 * noise_sigma * position.w * position.w;
-    // Where neither cones nor shadows of the objects reach, the picture stays as it is.
+    // Where neither cones nor shadows of the objects reach, the picture stays unchanged.
     bool reached = position.w > 0.0
         && (everywhere || inside_volume(volume_coordinate(position.xyz))
             || shadow_may_reach(position.xyz, normal.xyz, bias));

@@ -1,8 +1,9 @@
-// The rims of real things before objects. A pixel there mixes the thing's colour F with that of the old background B,
-// and composition must show a F + (1 - a) object. F and B come from pixels around that surely show one of both, the
-// fraction a from the place of the pixel's colour on the line between them, in linear colour (Porter and Duff 1984;
-// Smith and Blinn 1996). It counts as far as F and B differ by more than they vary; what is left is depth's own answer.
-// Listed pixels get a new coverage, and in `edge_correction` what takes the old background out of their colour.
+// The rims of real things in front of objects. A pixel there mixes the thing's colour F with that of the old
+// background B, and composition must show a F + (1 - a) object. F and B come from pixels nearby that certainly show
+// one of them, the fraction a from the position of the pixel's colour on the line between them, in linear colour
+// (Porter and Duff 1984; Smith and Blinn 1996). It is weighted by how much more F and B differ than they vary; the
+// rest is the fraction by depth. Listed pixels get a new coverage, and in `edge_correction` what removes the old
+// background from their colour.
 #include "common/shown_object.glsl"
 #include "common/work_list.glsl"
 
@@ -13,21 +14,22 @@ layout(rgba16f) writeonly uniform image2D edge_correction;
 uniform sampler2D linear_picture;          // with linear sampling
 #include "common/camera.glsl"
 
-// pixels from an edge of depth in which it may be wrong, as the window of object_coverage.comp.glsl; in narrowed(), too
+// pixels from an edge of depth within which it may be wrong, as the window of object_coverage.comp.glsl; in
+// narrowed(), too
 const int REACH = 2;
-const int SIGHT = RIM_SIGHT;   // pixels within which sure ones are looked for
+const int SIGHT = RIM_SIGHT;   // pixels within which certain ones are searched
 const int SPAN = 2 * (SIGHT + REACH) + 1;
-const int LEAST_SAMPLES = 3;   // whose spread can be told
-const float NOISE = 9e-6;      // variance: 0.003 of sensor white, what rounding to 8 bits leaves and good sensors add
+const int LEAST_SAMPLES = 3;   // least number for a spread
+const float NOISE = 9e-6;      // variance: 0.003 of sensor white, from rounding to 8 bits and from good sensors
 const float UNKNOWN = 1.0 / 12.0;   // variance of a fraction that may be anything between 0 and 1
-const float BEND = 0.01;       // variance: along an edge with a radius of 5 pixels the kernel below shifts it by 0.1
-const int ALONG = 2;           // pixels each way along the edge whose mean has less noise
+const float BEND = 0.01;       // variance: along an edge with a radius of 5 pixels the kernel below shifts the fraction by 0.1
+const int ALONG = 2;           // pixels each way along the edge, averaged to reduce noise
 const float KERNEL[ALONG + 1] = float[](0.375, 0.25, 0.0625);
 const float KERNEL_NOISE = 0.2734375;   // sum of the kernel's squares
 
 struct Side { vec3 colour; mat3 squares; vec2 middle; float inverse_depth; float weight; int count; ivec2 nearest; };
 
-// 1 a real surface in front of depth z, 2 one that is not, 0 unknown.
+// 1 a real surface in front of depth z, 2 one behind it, 0 unknown.
 int class_of(ivec2 at, float z, ivec2 size) {
     if (any(lessThan(at, ivec2(0))) || any(greaterThanEqual(at, size))) return 0;
     if (texelFetch(real_surface_position, at, 0).w <= 0.0) return 0;
@@ -65,7 +67,7 @@ void finish(inout Side side) {
     side.inverse_depth /= side.weight;
 }
 
-// Sums over the pixels within SIGHT that have only their own class within REACH.
+// Sums over the pixels within SIGHT whose neighbours within REACH are all of their class.
 void look_around(ivec2 pixel, float z, out Side front, out Side back) {
     ivec2 size = textureSize(real_surface_position, 0);
     vec3 ray = mat3(world_from_camera) * vec3(texelFetch(picture_rays, pixel, 0).xy, 1.0);
@@ -91,7 +93,7 @@ void look_around(ivec2 pixel, float z, out Side front, out Side back) {
     finish(back);
 }
 
-// Whether both are there and do not continue each other at the pixel, as the floor does that an object stands on.
+// Whether both exist and do not continue each other at the pixel, as the floor under an object does.
 bool has_step(Side front, Side back, float z) {
     if (min(front.count, back.count) < LEAST_SAMPLES) return false;
     float least = 6.0 * noise_sigma + STEEPEST / (camera_pinhole.x * z);
@@ -108,8 +110,9 @@ vec3 mean_along(ivec2 pixel, vec2 edge) {
     return sum;
 }
 
-// The thing's fraction of the pixel by colour, and its variance: the pixel's own and that of the mean along the edge,
-// each as sure as it is. What lies within the spread of F or B is all of it; a colour beside the line is of neither.
+// The thing's fraction of the pixel by colour, and its variance: the pixel's own combined with the mean along the
+// edge, weighted by inverse variance. A colour within the spread of F or B is wholly that one; one beside the line is
+// neither.
 vec2 fraction_by_colour(ivec2 pixel, Side front, Side back) {
     vec3 d = front.colour - back.colour;
     float length2 = max(dot(d, d), 1e-9);
@@ -140,9 +143,9 @@ void unmix(ivec2 pixel) {
     float shown = (1.0 - a) * covered;
     imageStore(object_coverage, pixel, vec4(shown));
     if (shown >= 1.0) return;
-    // The pixel a F + (1 - a) B less the fraction `shown` of B, made whole again.
+    // The pixel a F + (1 - a) B minus the fraction `shown` of B, renormalised.
     vec3 correction = known * shown * a / (1.0 - shown) * (front.colour - back.colour);
-    bool own = 2.0 * a < 1.0 - shown;   // what is left is rather the old background
+    bool own = 2.0 * a < 1.0 - shown;   // the rest is mostly the old background
     ivec2 offset = front.nearest + SIGHT;
     imageStore(edge_correction, pixel, vec4(correction, own ? 0.0 : float(1 + offset.y * (2 * SIGHT + 1) + offset.x)));
 }

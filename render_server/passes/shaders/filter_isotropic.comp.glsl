@@ -1,10 +1,10 @@
-// One level of the isotropic pyramids of V_delta and V_rho: plain means of eight cells ([P1] 3.2).
+// Filters one level of the isotropic mipmaps of V_delta and V_rho: means of eight cells ([P1] 3.2).
 #include "common/volume.glsl"
 
 layout(local_size_x = 4, local_size_y = 4, local_size_z = 4) in;
 layout(rgba16f) uniform image3D delta;
 layout(rgba16f) uniform image3D rho;
-uniform int level;   // that is written; >= 1
+uniform int level;   // the level to write; >= 1
 
 void main() {
     ivec3 cell = ivec3(gl_GlobalInvocationID);

@@ -1,11 +1,11 @@
-// One level of the six one-sided pyramids (docs/method.md 4.4): two cells along k front to back, mean of the four
-// across.
-// Coverage of the two cells adds up to at most 1 (see trace_cones: pieces of one surface do not hide each other).
+// Filters one level of the six one-sided mipmaps (docs/method.md 4.4): two cells along k composited front to back,
+// mean of the four across. Coverage of the two cells adds up to at most 1 (see trace_cones: pieces of one surface do
+// not occlude each other).
 #include "common/volume.glsl"
 
 layout(local_size_x = 4, local_size_y = 4, local_size_z = 4) in;
 layout(rgba16f) uniform image3D pyramid;
-uniform int level;          // that is written; >= 1
+uniform int level;          // the level to write; >= 1
 
 vec4 fetch(ivec3 cell, int k) { return imageLoad(pyramid, level_base(level - 1, k) + cell); }
 

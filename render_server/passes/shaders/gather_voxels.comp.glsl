@@ -1,5 +1,5 @@
 // Irradiance of each group of surfels by a few cones through mu and rho (docs/method.md 4.3, further bounces): the
-// light of other surfaces, and the environment as far as nothing is before it.
+// light of other surfaces, and of the environment where nothing is in front of it.
 #include "common/march.glsl"
 #include "common/environment.glsl"
 #include "common/diffuse_cones.glsl"
@@ -15,20 +15,20 @@ const bool ONLY_RHO = false;
 #else
 const bool ONLY_RHO = true;
 #endif
-uniform bool only_unseen;    // groups that hold surfels which the camera does not see
+uniform bool only_unseen;    // groups with surfels that the camera does not see
 
-// Cones as wide as the solid angles of so few would look at cells as wide as the walls of a small room, and light would
+// Cones that fill the hemisphere with so few would sample cells as wide as the walls of a small room, and light would
 // leak past its edges: 2..10 % in a closed box, below 1 % at a third of the width. What single groups then miss
-// between their cones, others see, as each block turns them by another angle.
+// between their cones, others see, because each block rotates them by another angle.
 const float WIDTH = 0.35;
-const vec3 TURN_OF_BLOCK = vec3(0.8191725, 0.6710436, 0.5497005);   // of a full turn: spread evenly over neighbours
+const vec3 TURN_OF_BLOCK = vec3(0.8191725, 0.6710436, 0.5497005);   // of a full rotation: spread evenly over neighbours
 
 vec3 sums_at(int at) { return vec3(group_sums[at], group_sums[at + 1], group_sums[at + 2]); }
 
 void gather(int slot) {
     int at = slot * GROUP_SUMS;
     if (only_unseen && group_sums[at + GROUP_UNSEEN] == 0) return;
-    // Fixed-point sums of slivers may round to nothing: such a group reflects nothing either.
+    // Fixed-point sums of slivers may round to zero: such a group reflects nothing either.
     float area = max(float(group_sums[at + GROUP_AREA]), 1.0);
     vec3 sum = sums_at(at + GROUP_NORMAL);
     if (sum == vec3(0.0)) { group_light[2 * slot] = group_light[2 * slot + 1] = vec4(0.0); return; }

@@ -15,7 +15,7 @@ layout(location = 3) out vec4 out_tint;
 void main() {
     vec3 n = normalize(normal);
     vec3 view = camera_position - world;
-    // An interpolated normal may lean away at a silhouette: the triangle's own then serves.
+    // An interpolated normal may face away at a silhouette: then use the triangle's own.
     vec3 flat_normal = normalize(cross(dFdx(world), dFdy(world)));
     if (dot(flat_normal, view) < 0.0) flat_normal = -flat_normal;
     bool double_sided = materials[int(material)].flags.x > 0.5;

@@ -14,7 +14,7 @@
 layout(local_size_x = 64) in;
 
 #ifdef SUM
-uniform bool has_seen;    // SurfelLights tells which of them the camera looks at
+uniform bool has_seen;    // SurfelLights marks the surfels that the camera sees
 
 void add_to_group(Surfel s, uint surfel, int side, vec3 n) {
     uint entry = group_entry(floatBitsToUint(s.uv_voxel.z), n);

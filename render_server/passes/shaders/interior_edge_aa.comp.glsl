@@ -1,5 +1,5 @@
-// Where samples of a pixel show another surface of the objects than the one that was shaded, the light of that surface
-// is taken from the neighbour that shows it, by their fraction.
+// Where samples of a pixel show another surface of the objects than the shaded one, mixes in the light of that
+// surface from the neighbour that shows it, by the samples' fraction.
 layout(local_size_x = 8, local_size_y = 8) in;
 layout(rgba16f) writeonly uniform image2D radiance_out;
 uniform sampler2D radiance;
@@ -9,9 +9,9 @@ uniform sampler2D virtual_raster_position;
 uniform sampler2D virtual_raster_normal;
 uniform ivec4 rectangle;       // first pixel and size of the part of the picture that may show an object
 
-const float NEARNESS = 0.1;    // how much distance counts beside the distance from a neighbour's plane: it decides ties
+const float NEARNESS = 0.1;    // weight of the distance beside the distance from a neighbour's plane: it breaks ties
 
-// How far a place is from the surface of a neighbour, m; far where that shows no object.
+// Distance of a position from the surface of a neighbour, m; large where that shows no object.
 float away(ivec2 at, vec3 place) {
     if (texelFetch(sample_coverage, at, 0).r == 0.0) return 1e9;
     vec3 apart = place - texelFetch(virtual_raster_position, at, 0).xyz;

@@ -1,5 +1,5 @@
-// How objects change the light of the real surface at each texel of the reduced grid, lamps and natural light together:
-// E_rho / E_mu, before the objects' own reflected light.
+// Change of light of the real surface at each texel of the reduced grid due to the objects, lamps and natural light
+// together: E_rho / E_mu, before the objects' own reflected light.
 #include "common/lights.glsl"
 #include "common/low_res_grid.glsl"
 

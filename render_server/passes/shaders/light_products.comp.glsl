@@ -1,7 +1,7 @@
-// Products of light, transfer and harmonics ([D] 5.2.2): P_k(n) = integral of L(w) T(n, w) Y_k(w), T a clamped cosine in five
-// bands, L not band-limited. What an object with coefficients O_k hides of E(n) is then sum P_k O_k.
-// PAIRS: A_j integral of L Y_j Y_k for all j, k (tripling coefficients summed over the light). Otherwise: the table of normals,
-// octahedral, a layer a coefficient, E(n) in the last.
+// Products of light, transfer and harmonics ([D] 5.2.2): P_k(n) = integral of L(w) T(n, w) Y_k(w), T a clamped cosine
+// in five bands, L not band-limited. An object with coefficients O_k then occludes sum P_k O_k of E(n). PAIRS: A_j
+// integral of L Y_j Y_k for all j, k (tripling coefficients summed over the light). Otherwise: the table of normals,
+// octahedral, a layer per coefficient, E(n) in the last.
 #include "common/light_probe.glsl"
 
 #ifdef PAIRS

@@ -1,10 +1,10 @@
-// Sum each surfel's opacity and outgoing radiance into its voxel, per direction k (docs/method.md 4.3):
+// Sums each surfel's opacity and outgoing radiance into its voxel, per direction k (docs/method.md 4.3):
 //   a_k += A max(0, -n.k) / h^2,   c_k += L A max(0, -n.k) / h^2.
-// REAL: L_mu is what the camera measured (all bounces), or albedo / pi E_mu where it does not look;
+// REAL: L_mu is the measured radiance (all bounces), or albedo / pi E_mu where the camera does not look;
 //       REAL_DELTA sums L_rho - L_mu = L_mu (E_rho / E_mu - 1).
 // VIRTUAL: L_rho = albedo / pi E_rho + emission.
-// E is direct + ambient light at first; GATHERED: the direct light found then + what the surfel's group gathered;
-// REAL and VIRTUAL then add by how much L grows.
+// E is direct + ambient light at first; GATHERED: the direct light of that run + what the surfel's group gathered;
+// REAL and VIRTUAL then add the growth of L.
 // REAL_MU and REAL_RHO sum all of L, each under the maps of its own solution: L_mu as REAL,
 // L_rho = L_mu E_rho / E_mu where the camera measured L_mu, albedo / pi E_rho where it does not look.
 #define SURFELS_ACCESS readonly
@@ -27,9 +27,9 @@
 layout(local_size_x = 64) in;
 uniform float bias_real;      // m
 uniform float bias_virtual;   // m
-uniform bool keep_light;      // in SurfelLights, for what is summed later
-uniform bool has_caustics;    // beams carry what smooth virtual surfaces reflect of the lights
-const float WHITEST = 0.95;   // albedo of the brightest diffuse surfaces: no surface gives back more than it gets
+uniform bool keep_light;      // in SurfelLights, for later sums
+uniform bool has_caustics;    // beams carry the lights' reflections in smooth virtual surfaces
+const float WHITEST = 0.95;   // albedo of the brightest diffuse surfaces: no surface reflects more than it receives
 #if defined(REAL_MU) || defined(REAL_RHO)
 #define SOLUTION
 #endif
@@ -37,7 +37,7 @@ const float WHITEST = 0.95;   // albedo of the brightest diffuse surfaces: no su
 #include "common/real_radiance.glsl"
 #endif
 #ifdef REAL_DELTA
-layout(std430) buffer DeltaSums { int delta_sums[]; };   // 18 a slot
+layout(std430) buffer DeltaSums { int delta_sums[]; };   // 18 per slot
 layout(std430) buffer Support { int support[6]; };        // bounds of changed voxels: min xyz, -max xyz
 #endif
 
@@ -114,7 +114,7 @@ void add(uint voxel, vec3 n, float area, vec3 radiance) {
 }
 
 #if !defined(REAL_DELTA) && !defined(SOLUTION)
-// What the sums lack: all of it at first, what it gained when light was gathered. w: 1 where the camera measured it.
+// What the sums lack: everything at first, then the gain of gathered light. w: 1 where the camera measured it.
 vec3 unsummed(uint own, vec4 radiance) {
 #ifdef GATHERED
     vec3 summed = surfel_lights[own].radiance.rgb;
@@ -153,8 +153,8 @@ vec3 outgoing(Surfel s, vec3 n, uint own) {
 #endif
 
 #if defined(REAL_DELTA) || defined(REAL_RHO)
-// What a surface that gives back `back` of its irradiance sends out more under rho. A ratio is right whatever the
-// light's scale; gained light comes back by at most the greatest albedo.
+// Additional radiance under rho of a surface with reflectance `back`. A ratio is right whatever the light's scale;
+// gained light is reflected by at most the greatest albedo.
 vec3 change_of(vec3 back, vec3 mu, vec3 rho) {
     vec3 change = rho - mu;
     return change * mix(back, min(back, vec3(WHITEST / PI)), greaterThan(change, vec3(0.0)));
@@ -177,8 +177,8 @@ vec3 outgoing(Surfel s, vec3 n, uint own) {
 #endif
 
 #ifdef REAL_DELTA
-// Changes of gathered light below this fraction of it would not show in 8-bit pictures; mu and rho are then taken as
-// the same there, and need no two marches.
+// Relative changes of gathered light below this fraction are invisible in 8-bit pictures; mu and rho then count as
+// equal, and need no two marches.
 const float LEAST_CHANGE = 1.0 / 512.0;
 
 // L_rho - L_mu.

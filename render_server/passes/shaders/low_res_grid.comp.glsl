@@ -1,5 +1,5 @@
-// For each texel of the reduced resolution, the picture pixel nearest to its centre that shows a real surface with
-// depth, and the one that shows a virtual object. Where objects hide all real surfaces, one of these as -2 - pixel.
+// For each texel of the reduced grid, the picture pixel nearest to its centre that shows a real surface with depth,
+// and the one that shows a virtual object. Where objects hide all real surfaces, one of these as -2 - pixel.
 #include "common/geometry.glsl"
 #define APPENDS_TEXELS
 #include "common/work_list.glsl"

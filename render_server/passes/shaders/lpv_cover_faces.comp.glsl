@@ -8,7 +8,7 @@
 #include "common/light_cells.glsl"
 
 layout(local_size_x = 64) in;
-layout(std430) buffer Covered { int covered[]; };   // 6 a cell: its low faces on x, y, z; by surfaces that face -, +
+layout(std430) buffer Covered { int covered[]; };   // 6 per cell: its low faces on x, y, z; by surfaces that face -, +
 uniform int cells;
 uniform float cell_edge;   // m
 

@@ -1,7 +1,7 @@
-// Injection of reflective shadow maps ([P2] 4.3): the flux that each texel's surface reflects goes into its cell.
-// REAL walks a light's map of the real scene: all that it lights. VIRTUAL walks its map of the objects: what they reflect,
-// and, negative, what the same rays lit before on the real scene. DIRECT: the light itself that no longer gets there,
-// as negative lobes along its path ([P2] 4.3.2).
+// Injects reflective shadow maps ([P2] 4.3): the flux that each texel's surface reflects goes into its cell. REAL
+// walks a light's map of the real scene: all that it lights. VIRTUAL walks its map of the objects: what they reflect,
+// and, negative, what the same rays lit before on the real scene. DIRECT: the light itself that is now blocked, as
+// negative lobes along its path ([P2] 4.3.2).
 #include "common/light_rays.glsl"
 #ifndef REAL
 #include "common/materials.glsl"
@@ -16,8 +16,8 @@ uniform sampler2D real_light_normal;
 uniform sampler2D virtual_light_uv;
 uniform sampler2D virtual_light_normal;
 uniform int view_index;
-uniform float bias_real;   // m: how far behind the real map an object's surface may lie and still be lit
-uniform bool has_caustics; // beams carry what smooth virtual surfaces reflect of the lights
+uniform float bias_real;   // m: how far behind the real map an object's surface may be and still be lit
+uniform bool has_caustics; // beams carry the lights' reflections in smooth virtual surfaces
 
 vec3 direction_to_light(Light light, vec3 p) {
     vec3 to_light; float radius;
@@ -37,14 +37,14 @@ void inject_texel(Light light, LightView view, ivec2 texel, vec2 s, float depth,
 vec3 virtual_albedo(ivec2 texel) {
     vec4 uv = texelFetch(virtual_light_uv, texel, 0);
     Material m = material_of(int(texelFetch(virtual_light_normal, texel, 0).w), uv.xy, unpack_color(uv.z));
-    bool in_beams = has_caustics && m.roughness * m.roughness < GREATEST_ALPHA;   // those carry the rest
+    bool in_beams = has_caustics && m.roughness * m.roughness < GREATEST_ALPHA;   // beams carry these
     return m.diffuse + (in_beams ? vec3(0.0) : m.f0);
 }
 
 void inject_texel(Light light, LightView view, ivec2 texel, vec2 s, float depth, vec3 p) {
     vec3 arriving = texel_light(light, view, s);
     Hit real = first_hit(real_light_depth, light.views.x, light.views.y, p);
-    if (real.present && real.depth < real.ray_depth - bias_real) return;   // the real scene is before the object
+    if (real.present && real.depth < real.ray_depth - bias_real) return;   // the real scene is in front of the object
     vec3 to_light = direction_to_light(light, p);
 #ifndef DIRECT
     vec3 n = normalize(texelFetch(virtual_light_normal, texel, 0).xyz);
@@ -54,7 +54,7 @@ void inject_texel(Light light, LightView view, ivec2 texel, vec2 s, float depth,
     vec3 real_normal = normalize(texelFetch(real_light_normal, real.texel, 0).xyz);
     vec3 shadowed = hit_point(real, real_normal);
 #ifdef DIRECT
-    // The lobe points where the light travels; the cell lies half a cell before the surface, towards the light.
+    // The lobe points where the light travels; the cell is half a cell in front of the surface, towards the light.
     inject(shadowed + voxel_edge * to_light, -to_light, -arriving);
 #else
     inject(shadowed, lit_side(real_normal, to_light), -arriving * texelFetch(real_albedo, real.texel, 0).rgb);

@@ -1,6 +1,6 @@
-// FUSED steps of propagation: each cell gathers what its six neighbours send it through the faces between them, times
-// what the geometry volume lets through. A workgroup keeps a tile of one colour channel with a rim of FUSED cells in
-// shared memory. Beyond the volume nothing comes in.
+// FUSED steps of propagation: each cell gathers the light of its six neighbours through the faces between them, times
+// the transmittance of the geometry volume. A workgroup keeps a tile of one colour channel with a border of FUSED
+// cells in shared memory. No light enters from outside the volume.
 #include "common/light_cells.glsl"
 #include "common/light_step.glsl"
 
@@ -47,7 +47,7 @@ void main() {
     uint own_index = base + cell_index(low + own, cells);
     vec4 sum = total[own_index], mine = vec4(0.0);
     for (int done = 1; done <= FUSED; ++done) {
-        int edge = WIDE - 2 * done;   // the rim that is still right
+        int edge = WIDE - 2 * done;   // the part of the border that is still valid
         vec4 results[ROUNDS];
         for (int j = 0; j < ROUNDS; ++j) {
             int i = thread + j * THREADS;

@@ -1,4 +1,4 @@
-// One step of propagation as lpv_propagate.comp.glsl makes it, straight from memory: software has no faster one.
+// One step of propagation as in lpv_propagate.comp.glsl, directly from memory, which is fastest in software.
 #include "common/light_cells.glsl"
 #include "common/light_step.glsl"
 

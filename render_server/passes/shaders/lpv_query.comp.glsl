@@ -1,6 +1,6 @@
-// Irradiance of the light volumes at 1/scale of the picture (docs/method.md 5), on top of the environment R.
-// REAL: E_mu and E_rho of real surfaces; CHANGE: E_rho = E_mu + the one volume of the change. VIRTUAL otherwise: the light
-// on the objects, and what a mirror on them would see.
+// Irradiance from the light volumes at 1/scale of the picture (docs/method.md 5), in addition to the environment R.
+// REAL: E_mu and E_rho of real surfaces; CHANGE: E_rho = E_mu + the one volume of the change. VIRTUAL otherwise: the
+// light on the objects, and what a mirror on them would see.
 #include "common/environment.glsl"
 #include "common/brdf.glsl"
 #include "common/volume.glsl"
@@ -25,7 +25,7 @@ float border_fade(vec3 q) {
     return smoothstep(0.0, RIM, min(rim.x, min(rim.y, rim.z)));
 }
 
-// What a mirror at the point would show of the environment, were nothing in the volume.
+// What a mirror at the point would show of the environment if the volume were empty.
 vec3 mirrored(SurfacePoint s) {
     if (s.roughness < 0.0) return vec3(0.0);
     return environment(reflect(normalize(s.position - camera_position), s.normal), specular_half_angle(s.roughness));
@@ -46,7 +46,7 @@ void shade(ivec2 texel, SurfacePoint s) {
         e_rho += from_volume(true, q, s.normal);
 #else
         vec3 mu = from_volume(false, q, s.normal), rho = from_volume(true, q, s.normal);
-        e_rho = max(e_mu + fade * mu + (rho - mu), vec3(0.0));   // composition lets the change fade
+        e_rho = max(e_mu + fade * mu + (rho - mu), vec3(0.0));   // composition fades the change
         e_mu = max(e_mu + fade * mu, vec3(0.0));
 #endif
     }

@@ -1,5 +1,5 @@
-// What objects change at the start, for view `volume`: a cell that they bring light into in its colour, one that they take
-// light from in red, as radiance; opacity 0 where nothing was injected.
+// The objects' injected change, for view `volume`: a cell that gains light in its colour, one that loses light in
+// red, as radiance; opacity 0 where nothing was injected.
 #include "common/light_cells.glsl"
 
 layout(local_size_x = 8, local_size_y = 8) in;

@@ -1,4 +1,4 @@
-// Injected light -> state of a volume before the first step, and the total so far. A second set of sums may be added.
+// Injected light -> initial state of a volume, and the total so far. A second set of sums may be added.
 #include "common/light_cells.glsl"
 
 layout(local_size_x = 64) in;

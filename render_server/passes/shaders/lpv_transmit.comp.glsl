@@ -1,5 +1,5 @@
-// Covered faces -> fraction of light that gets into each cell from its six neighbours, of real surfaces alone (JOINT: of
-// real and virtual ones together), packed in 8 bits each: neighbours at -x, +x, -y, +y, and at -z, +z.
+// Covered faces -> fraction of light that enters each cell from its six neighbours, past real surfaces (JOINT: and
+// virtual ones), packed in 8 bits each: neighbours at -x, +x, -y, +y, and at -z, +z.
 #include "common/light_cells.glsl"
 
 layout(local_size_x = 64) in;
@@ -10,7 +10,7 @@ uniform int cells;
 
 const float FIXED_POINT_STEPS = 1048576.0;   // voxel_store.glsl's
 
-// Surfaces block from both sides: what is inside a body does not get out either.
+// Surfaces block from both sides: light inside a body does not leave it either.
 float open_fraction(int one_side, int other_side) {
     return 1.0 - clamp(float(max(one_side, other_side)) / FIXED_POINT_STEPS, 0.0, 1.0);
 }

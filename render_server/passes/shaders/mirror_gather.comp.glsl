@@ -1,5 +1,5 @@
-// Ambient and bounced light at the reflected points that mirror_hits listed, and how far real things hide them from the
-// surface that reflects them.
+// Ambient and bounced light at the reflected points that mirror_hits listed, and how much real things occlude them
+// from the reflecting surface.
 #include "common/march.glsl"
 #include "common/environment.glsl"
 #include "common/diffuse_cones.glsl"
@@ -9,7 +9,7 @@
 #include "common/work_list.glsl"
 
 layout(local_size_x = 64) in;
-layout(rgba16f) writeonly uniform image2D irradiance_out;   // rgb; a: fraction that no real thing hides
+layout(rgba16f) writeonly uniform image2D irradiance_out;   // rgb; a: fraction not occluded by real things
 layout(rgba16f) writeonly uniform image2D specular_out;     // rgb mean radiance of the specular cone
 uniform isampler2D sample_pixels;
 uniform sampler2D hit_position;
@@ -18,7 +18,7 @@ uniform sampler2D hit_normal;
 const ConeSet WHOLE = ConeSet(1, 0, 1.0, 0.0);   // cones as wide as their fractions
 const float OWN = 1.5;     // voxels from a surface that may be its own
 
-// Fraction of the way between two points (voxels) that real surfaces leave open; both ends are left out.
+// Unoccluded fraction of the segment between two points (voxels); both ends are left out.
 float open_fraction(vec3 from, vec3 to) {
     vec3 d = normalize(to - from);
     Walk w = walk_from(from + OWN * d, d);

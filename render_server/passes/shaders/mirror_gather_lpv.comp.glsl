@@ -1,5 +1,5 @@
 // Ambient and bounced light at the reflected points that mirror_hits listed, from the light volume, and whether real
-// things in the picture hide them from the surface that reflects them.
+// things in the picture occlude them from the reflecting surface.
 #include "common/volume.glsl"
 #include "common/environment.glsl"
 #include "common/lpv_light.glsl"
@@ -10,13 +10,13 @@
 #include "common/work_list.glsl"
 
 layout(local_size_x = 64) in;
-layout(rgba16f) writeonly uniform image2D irradiance_out;   // rgb; a: fraction that no real thing hides
+layout(rgba16f) writeonly uniform image2D irradiance_out;   // rgb; a: fraction not occluded by real things
 layout(rgba16f) writeonly uniform image2D specular_out;     // rgb mean radiance of the specular cone
 uniform isampler2D sample_pixels;
 uniform sampler2D hit_position;
 uniform sampler2D hit_normal;
 
-const float CLEAR = 1e-3;   // of the depth: how far off its own surface a ray starts, and how near its end it stops
+const float CLEAR = 1e-3;   // of the depth: distance of a ray's start from its own surface, and of its end from the hit
 
 float open_fraction(Mirror m, vec3 to) {
     vec3 from = m.point + (CLEAR * m.depth + 3.0 * noise_sigma * m.depth * m.depth) * m.normal;

@@ -1,10 +1,11 @@
-// For each texel of the reduced grid one point of the objects that its block of pixels reflects, listed where there is one.
+// For each texel of the reduced grid one point of the objects that its block of pixels reflects, listed if there is
+// one.
 #include "common/mirror_rays.glsl"
 #define APPENDS_TEXELS
 #include "common/work_list.glsl"
 
 layout(local_size_x = 8, local_size_y = 8) in;
-layout(rgba32f) writeonly uniform image2D position_out;   // world m; w: 1 where there is one
+layout(rgba32f) writeonly uniform image2D position_out;   // world m; w: 1 if there is one
 layout(rgba16f) writeonly uniform image2D normal_out;     // world; w: material
 uniform isampler2D sample_pixels;
 uniform int scale;

@@ -1,5 +1,5 @@
-// What the virtual objects add to the mirror image in smooth real surfaces: rays over each pixel and its lobe.
-// One invocation a ray; a pixel's rays lie side by side in a workgroup and are added up there.
+// The virtual objects in the mirror image of smooth real surfaces: rays over each pixel and its lobe. One invocation
+// per ray; a pixel's rays are adjacent in a workgroup and summed there.
 #include "common/lights.glsl"
 #include "common/brdf.glsl"
 #include "common/environment.glsl"
@@ -15,13 +15,14 @@ uniform sampler2D hit_position;
 uniform sampler2D hit_normal;
 uniform sampler2D hit_irradiance;
 uniform sampler2D hit_specular;
-uniform float sample_distance;   // m at 1 m: what a texel of the reduced resolution spans
+uniform float sample_distance;   // m at 1 m: size of a texel of the reduced grid
 
 shared vec4 of_ray[64];
 shared float counted[64];    // 1: the ray leaves the surface
 shared float distances[64];  // to an object, 0: none
 
-// Light from all around, from what was gathered near this point's mirror image; `open`: fraction not hidden by real things.
+// Ambient and bounced light, as gathered near this point's mirror image; `open`: fraction not occluded by real
+// things.
 Indirect gathered(ivec2 pixel, MeshSurface s, float seen_at, out float open) {
     Indirect sum = Indirect(vec3(0.0), vec3(0.0));
     float total = 0.0;
@@ -39,7 +40,7 @@ Indirect gathered(ivec2 pixel, MeshSurface s, float seen_at, out float open) {
         open += w * e.a;
         total += w;
     }
-    if (total == 0.0) {   // smaller than the reduced grid sees: what is ambient, unshadowed
+    if (total == 0.0) {   // too small for the reduced grid: ambient light, unshadowed
         open = 1.0;
         return Indirect(environment_irradiance(s.normal), vec3(0.0));
     }
@@ -47,7 +48,7 @@ Indirect gathered(ivec2 pixel, MeshSurface s, float seen_at, out float open) {
     return Indirect(sum.irradiance / total, sum.specular / total);
 }
 
-// rgb radiance, a: 1 if the ray meets an object, less where real things are before it.
+// rgb radiance, a: 1 if the ray hits an object, less if real things are in front of it.
 vec4 trace(ivec2 pixel, Ray ray, out float met_at) {
     MeshHit hit = closest_hit(ray);
     met_at = 0.0;

@@ -1,4 +1,4 @@
-// List the pixels of smooth real surfaces whose lobe can reach the virtual objects; the others reflect none.
+// Lists the pixels of smooth real surfaces whose lobe can reach the virtual objects; the others reflect none.
 #include "common/mirror.glsl"
 #define APPENDS_TEXELS
 #include "common/work_list.glsl"
@@ -11,14 +11,14 @@ uniform sampler2D object_coverage;
 uniform vec3 bounds_centre;
 uniform float bounds_radius;
 
-const float LOBE_FRACTION = 0.99;   // of its energy: how far out the lobe is followed
+const float LOBE_FRACTION = 0.99;   // of its energy: extent of the traced lobe
 
 bool reaches_objects(Mirror m) {
     vec3 mirrored = reflect(normalize(m.point - camera_position), m.normal);
     vec3 to = bounds_centre - m.point;
     float distance = length(to);
     if (distance <= bounds_radius) return true;
-    float lobe = 2.0 * atan(m.alpha * sqrt(LOBE_FRACTION / (1.0 - LOBE_FRACTION)));   // as specular_half_angle has it
+    float lobe = 2.0 * atan(m.alpha * sqrt(LOBE_FRACTION / (1.0 - LOBE_FRACTION)));   // as in specular_half_angle
     return acos(clamp(dot(to, mirrored) / distance, -1.0, 1.0)) < asin(bounds_radius / distance) + lobe;
 }
 

@@ -1,5 +1,5 @@
-// Rays of 3 x 3 pixels for each where the lobe is wider than that on the picture anyway: their pattern is made to be
-// even over 3 x 3, and does not show as grain.
+// Averages the rays of 3 x 3 pixels where the lobe is wider than that in the picture: their pattern is uniform over 3
+// x 3, and does not show as grain.
 #include "common/mirror.glsl"
 #include "common/work_list.glsl"
 
@@ -9,7 +9,7 @@ uniform sampler2D object_coverage;
 uniform sampler2D traced;
 uniform sampler2D hit_distance;   // m from the surface to the objects, 0 none
 
-// Radius on the picture of half of the lobe's energy, pixels; `d`: m to what it meets.
+// Radius in the picture of half of the lobe's energy, pixels; `d`: m to the hit.
 float lobe_pixels(Mirror m, float d) { return 2.0 * m.alpha * d / (m.depth + d) * camera_pinhole.x; }
 
 void smooth_pixel(ivec2 pixel) {

@@ -1,12 +1,12 @@
-// For each point of a smooth plane: what fraction of a light it mirrors, without and with the objects. None where it is
-// covered, or where the camera sees that it ends; where something hides it, it goes on.
+// For each point of a smooth plane: the fraction of a light that it mirrors, without and with the objects. None where
+// the plane is covered, or visibly ends; where something hides it, it is assumed to continue.
 #include "common/lights.glsl"
 #include "common/geometry.glsl"
 #include "common/surfaces.glsl"
 
 layout(local_size_x = 8, local_size_y = 8) in;
 layout(rg16f) writeonly uniform image2DArray visibility_out;
-uniform int first_image;       // number of the first light that is one
+uniform int first_image;       // index of the first light that is a mirror image
 #include "common/camera.glsl"
 uniform float bias_real;       // m
 uniform float noise_m;         // of depth, m

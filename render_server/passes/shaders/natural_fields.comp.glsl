@@ -1,5 +1,6 @@
-// What the objects leave of natural light and what they add -> the fields that cones fill elsewhere.
-// REAL: E_mu and E_rho of real surfaces, whose reflections stay. Otherwise the light on the objects and in their mirrors.
+// Natural light that the objects leave, and light that they add -> the fields that other methods trace by cones.
+// REAL: E_mu and E_rho of real surfaces, whose reflections stay. Otherwise the light on the objects and in their
+// mirrors.
 #include "common/environment.glsl"
 #include "common/brdf.glsl"
 #include "common/low_res_grid.glsl"

@@ -1,6 +1,6 @@
-// Light that an object reflects onto what is around it (radiance transfer field, [D] 5.2.4).
-// LIGHT: the light that falls on it, nine coefficients: its surroundings, and each lamp that real things leave visible
-// from the middles of its box's eighths. Otherwise: each sample's transfer times that light.
+// Light that an object reflects onto its surroundings (radiance transfer field, [D] 5.2.4). LIGHT: the incident
+// light, nine coefficients: its surroundings, and each lamp that is visible from the middles of its box's eighths.
+// Otherwise: each sample's transfer times that light.
 #include "common/light_probe.glsl"
 #include "common/object_field.glsl"
 #ifdef LIGHT
@@ -8,7 +8,7 @@
 #include "common/harmonics.glsl"
 #endif
 
-const int LENGTH = 9;   // coefficients of light, and of what is sent back
+const int LENGTH = 9;   // coefficients of incident and of reflected light
 #ifdef LIGHT
 layout(local_size_x = 16) in;
 uniform sampler2D probe;
@@ -38,7 +38,7 @@ void main() {
 }
 #else
 layout(local_size_x = 64) in;
-layout(rgba16f) writeonly uniform image3D bounce_light;            // a slab a coefficient
+layout(rgba16f) writeonly uniform image3D bounce_light;            // a slab per coefficient
 layout(std430) readonly buffer Transfer { uint transfer[]; };     // half floats: sample, sent, light, RGB
 layout(std430) readonly buffer Incident { vec4 incident[]; };
 uniform vec3 reflectance;

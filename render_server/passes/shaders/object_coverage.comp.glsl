@@ -1,6 +1,6 @@
-// Fraction of each pixel that the virtual objects cover: real surfaces hide them by depth, with an edge softened along
-// the picture's own edges. Unknown depth never hides; depth masks the object only, never its delta (docs/method.md 3).
-// Pixels at such an edge are listed: edge_unmixing.comp.glsl looks at them again.
+// Fraction of each pixel that the virtual objects cover: real surfaces occlude them by depth, with an edge softened
+// along the picture's own edges. Unknown depth never occludes; depth masks the object only, never its delta
+// (docs/method.md 3). Pixels at such an edge are listed for edge_unmixing.comp.glsl.
 #include "common/shown_object.glsl"
 #define APPENDS_TEXELS
 #include "common/work_list.glsl"
@@ -8,7 +8,7 @@
 layout(local_size_x = 8, local_size_y = 8) in;
 layout(r16f) writeonly uniform image2D object_coverage_out;
 uniform sampler2D linear_picture;
-uniform ivec2 first_pixel;     // of the rectangle that may show an object; the rest was emptied
+uniform ivec2 first_pixel;     // of the rectangle that may show an object; the rest was cleared
 
 const int WINDOW = 5;   // pixels
 
@@ -16,7 +16,7 @@ ivec2 neighbour(ivec2 pixel, int i, ivec2 size) {
     return clamp(pixel + ivec2(i % WINDOW, i / WINDOW) - WINDOW / 2, ivec2(0), size - 1);
 }
 
-// Fraction of the window that is in front, of the pixels that are near and of similar colour.
+// Fraction of the window in front, over the pixels that are near and of similar colour.
 float softened(ivec2 pixel, float z, ivec2 size) {
     vec3 colour = texelFetch(linear_picture, pixel, 0).rgb;
     float sum = 0.0, weight = 0.0;

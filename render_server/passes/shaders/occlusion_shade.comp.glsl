@@ -1,6 +1,6 @@
-// What one object hides of natural light, at 1/scale of the picture ([D] 5.2.3): its field at the point, times the product of
-// light and cosine for the normal. Objects follow each other; what they leave is multiplied: exact for one, and never
-// below nothing where they overlap. REAL: real surfaces; otherwise virtual ones, the object's own too.
+// Occlusion of natural light by one object, at 1/scale of the picture ([D] 5.2.3): its field at the point, times the
+// product of light and cosine for the normal. Objects are processed in turn; what they leave is multiplied: exact for
+// one, and never negative where they overlap. REAL: real surfaces; otherwise virtual ones, the object's own too.
 #include "common/brdf.glsl"
 #include "common/harmonics.glsl"
 #include "common/octahedral.glsl"
@@ -8,26 +8,26 @@
 #include "common/low_res_grid.glsl"
 
 layout(local_size_x = 8, local_size_y = 8) in;
-layout(rgba32f) uniform image2D unoccluded; // rgb: fraction of E that is left
+layout(rgba32f) uniform image2D unoccluded; // rgb: remaining fraction of E
 layout(rgba32f) uniform image2D natural;    // rgb: E of each object's surroundings times weight; a: weight
-layout(rgba32f) uniform image2D mirrored;   // rgb: mean radiance in the mirror direction times weight; a: fraction left
-uniform sampler3D occlusion;    // 4 coefficients a slab
+layout(rgba32f) uniform image2D mirrored;   // rgb: mean radiance in the mirror direction times weight; a: remaining fraction
+uniform sampler3D occlusion;    // 4 coefficients per slab
 uniform sampler3D products;     // light_products.comp.glsl
 uniform sampler2D probe;
 #include "common/camera.glsl"
-uniform bool has_field;         // it is still being computed where not
-uniform bool first;             // nothing lies in the images yet
+uniform bool has_field;         // if not, it is still being computed
+uniform bool first;             // the images are still empty
 
 const int GROUPS = (SH_LENGTH + 3) / 4;
 const int CONE_SAMPLES = 16;
 
-// Objects' surroundings count by how large the objects are seen from the point.
+// Objects' surroundings are weighted by the size of the objects as seen from the point.
 float nearness(vec3 q) {
     vec3 direction = (q - field_centre) / object_radius;
     return 1.0 / (0.1 + dot(direction, direction));
 }
 
-// Coefficients 4g to 4g + 3 at a place.
+// Coefficients 4g to 4g + 3 at a position.
 vec4 hidden(ShellPlace place, int g) { return field_sample(occlusion, place, GROUPS, g); }
 
 vec3 product(vec2 uv, int layer) {
@@ -55,7 +55,7 @@ void shade(ivec2 texel, SurfacePoint s) {
     vec3 mirror = turn_to_object(reflect(normalize(s.position - camera_position), s.normal));
 #ifndef REAL
     vec3 cell = 2.0 * shell_halves[0] / float(resolution - 1);
-    q += length(cell) * n;   // from its own surface samples on the same side are read
+    q += length(cell) * n;   // at the object's own surface, samples on the same side are read
     float basis[HARMONICS];
     harmonics(mirror, basis);
 #endif

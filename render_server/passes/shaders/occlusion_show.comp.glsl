@@ -1,15 +1,15 @@
-// One object's occlusion for view `volume`: cells from which it hides much of all directions, in red by how much.
+// One object's occlusion for view `volume`: cells from which it occludes many directions, in red by how many.
 #include "common/object_field.glsl"
 #include "common/volume.glsl"
 
 layout(local_size_x = 4, local_size_y = 4, local_size_z = 4) in;
 layout(rgba16f) uniform image3D shown;
 uniform sampler3D occlusion;
-uniform int slabs;            // a shell
+uniform int slabs;            // per shell
 uniform bool has_field;
-uniform bool first;           // nothing lies in the image yet
+uniform bool first;           // the image is still empty
 
-const float WHOLE = 0.28209479;     // Y_0: the first coefficient is Y_0 times the solid angle, so much of the sphere's
+const float WHOLE = 0.28209479;     // Y_0: the first coefficient is Y_0 times the solid angle, as a fraction of the sphere
 const float LEAST_FRACTION = 1.0 / 16.0;
 
 void main() {

@@ -1,6 +1,6 @@
-// The real surfaces around an object as light that comes from them: each texel of the reduced picture is a patch that
-// shines with the radiance which the camera measured, summed over the directions in which the object's middle sees it.
-// CHANGED: as it shines once the objects have changed its light.
+// The real surfaces around an object as a light source: each texel of the reduced picture is a patch with the
+// measured radiance, summed over the directions in which the object's middle sees it. CHANGED: with its light as
+// changed by the objects.
 #include "common/geometry.glsl"
 #include "common/light_probe.glsl"
 #include "common/object_field.glsl"
@@ -8,15 +8,15 @@
 layout(local_size_x = 8, local_size_y = 8) in;
 uniform isampler2D sample_pixels;
 uniform sampler2D linear_picture;
-layout(std430) buffer ProbeSums { int sums[]; };   // 4 a texel: radiance x solid angle, solid angle
+layout(std430) buffer ProbeSums { int sums[]; };   // 4 per texel: radiance x solid angle, solid angle
 #ifdef CHANGED
 uniform sampler2D changes;   // light_change.comp.glsl
 #endif
 #include "common/camera.glsl"
 uniform int scale;
 
-const float STEPS = 1048576.0;   // of the sums a sr and unit of radiance: 2000 units over a texel's 12 msr fit
-const float GRAZING = 0.1;       // cosine from which a patch seen at a grazing angle counts no larger
+const float STEPS = 1048576.0;   // per sr and unit of radiance: 2000 units over a texel's 12 msr fit
+const float GRAZING = 0.1;       // least cosine of a patch: one seen at a more grazing angle counts no larger
 
 void add(ivec2 at, vec4 value) {
     if (any(lessThan(at, ivec2(0))) || any(greaterThanEqual(at, ivec2(PROBE_SIZE)))) return;

@@ -1,4 +1,4 @@
-// Sums of measured light -> radiance of each direction: the environment fills what the patches leave open.
+// Sums of measured light -> radiance of each direction: the environment fills directions without patches.
 #include "common/environment.glsl"
 #include "common/light_probe.glsl"
 #include "common/object_field.glsl"

@@ -1,5 +1,5 @@
-// Albedo of the real surface at each texel of a light's map that has points in the volume, from the picture where the
-// camera looks at it: albedo = pi B_lin / E_mu ([P2] eq. 1, with visibility and ambient light).
+// Albedo of the real surface at each texel of a light's map with points in the volume, from the picture where the
+// camera sees it: albedo = pi B_lin / E_mu ([P2] eq. 1, with visibility and ambient light).
 #include "common/light_rays.glsl"
 #include "common/environment.glsl"
 #include "common/volume.glsl"
@@ -13,7 +13,7 @@ uniform float bias_real;   // m
 
 const vec2 ALBEDO_RANGE = vec2(0.02, 0.95);
 
-// Real direct and ambient light. The light whose map this is reaches its texels by what the map is.
+// Real direct and ambient light. The map's own light reaches its texels by definition.
 vec3 irradiance(vec3 p, vec3 n) {
     vec3 e = environment_irradiance(n);
     for (int i = 0; i < light_count; ++i) {
@@ -27,9 +27,9 @@ vec3 irradiance(vec3 p, vec3 n) {
     return e;
 }
 
-const float SNAP_REACH = 0.5;   // voxels: split_inject looks for a touched voxel so near (SNAP along each axis)
+const float SNAP_REACH = 0.5;   // voxels: split_inject searches a touched voxel this near (SNAP along each axis)
 
-// Whether light that meets a surface within `around` (m) of p may go into a voxel of the volume.
+// Whether light that hits a surface within `around` (m) of p may go into a voxel of the volume.
 bool reaches_volume(vec3 p, float around) {
     vec3 q = volume_coordinate(p);
     return distance(q, clamp(q, vec3(0.0), vec3(float(volume_size)))) <= around / voxel_edge + SNAP_REACH;

@@ -1,14 +1,14 @@
-// Real geometry buffer from a given model or the fused surface: its raster, looked up through the lens model.
+// Real geometry buffer from a given model or the fused surface: its raster, sampled through the lens model.
 #include "common/geometry.glsl"
 #include "common/surfaces.glsl"
 
 layout(local_size_x = 8, local_size_y = 8) in;
-uniform sampler2D model_raster_position;   // as the objects' raster (common/geometry.glsl)
+uniform sampler2D model_raster_position;   // like the objects' raster (common/geometry.glsl)
 uniform sampler2D model_raster_normal;
 layout(rgba32f) uniform image2D position_out;
 layout(rgba16f) writeonly uniform image2D normal_out;
-uniform bool keeps_depth;     // the frame's own depth is there already, and stays where it says something else
-uniform vec2 tolerance;       // up to which both say the same: m, and m at 1 m
+uniform bool keeps_depth;     // the frame's own depth is present, and stays where it differs
+uniform vec2 tolerance;       // up to which both agree: m, and m at 1 m
 
 void main() {
     ivec2 pixel = ivec2(gl_GlobalInvocationID.xy);

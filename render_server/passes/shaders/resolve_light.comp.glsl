@@ -10,7 +10,7 @@ layout(rgba16f) writeonly uniform image3D rho;
 layout(std430) readonly buffer Light { int light[]; };
 layout(std430) readonly buffer OtherGrid { uint other_grid[]; };
 layout(std430) readonly buffer OtherLight { int other_light[]; };
-uniform bool skip_shared;   // voxels that the other set touched too are written by its own walk
+uniform bool skip_shared;   // voxels that the other set touched too are written by its own pass
 
 void main() {
     for (uint i = gl_GlobalInvocationID.x; i < slot_count; i += gl_NumWorkGroups.x * 64u) {

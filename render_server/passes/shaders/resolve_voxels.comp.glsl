@@ -1,6 +1,6 @@
-// Fixed-point sums -> premultiplied (c_k, a_k) texels of level 0, only where the walked set touched a voxel.
-// MU walks the real set: (c_mu, a_real). RHO_REAL walks it too and adds the change of its light and the virtual set;
-// RHO_VIRTUAL walks the virtual set and writes the voxels that hold nothing real.
+// Fixed-point sums -> premultiplied (c_k, a_k) texels of level 0, only where the walked set touched a voxel. MU walks
+// the real set: (c_mu, a_real). RHO_REAL walks it too and adds the change of its light and the virtual set;
+// RHO_VIRTUAL walks the virtual set and writes the voxels without real geometry.
 #include "common/volume.glsl"
 #define TOUCHED_ACCESS readonly
 #define SUMS_ACCESS readonly
@@ -16,7 +16,7 @@ layout(std430) readonly buffer OtherSums { int other_sums[]; };
 layout(std430) readonly buffer OtherGrid { uint other_grid[]; };
 #endif
 
-// A voxel face cannot be covered more than once: layers beyond it hide each other, radiance keeps its mean.
+// A voxel face cannot be covered more than once: further layers occlude each other, radiance keeps its mean.
 vec4 at_most_covered(vec4 c) { return c.a > 1.0 ? c / c.a : c; }
 
 vec4 own_texel(int slot, int k) {

@@ -1,6 +1,6 @@
-// What smooth virtual surfaces reflect of the real scene that the camera sees, by cones across the picture ([D] 4.4.2):
-// the picture's radiance there, times how the objects change its light. What a cone does not find in the picture it meets
-// among the voxels (VOXELS), or that fraction of the lobe remains for others.
+// Reflections of the visible real scene in smooth virtual surfaces, by cones across the picture ([D] 4.4.2): the
+// picture's radiance there, times the objects' change of its light. What a cone does not find in the picture it looks
+// up in voxels (VOXELS), or that fraction of the lobe is left to other passes.
 #include "common/screen_march.glsl"
 #include "common/brdf.glsl"
 #include "common/ray_mesh.glsl"
@@ -22,7 +22,7 @@ uniform sampler2D cone_rho;
 #include "common/camera.glsl"
 
 const float LEAST_IRRADIANCE = 1e-4;
-const float CLEAR = 1e-3;   // of the depth: how far off its own surface a ray starts
+const float CLEAR = 1e-3;   // of the depth: distance of a ray's start from its own surface
 
 // E_rho / E_mu where a pixel sees a real surface, also behind objects.
 vec3 change_of_light(vec2 at) {
@@ -51,7 +51,7 @@ vec4 look_across(vec3 from, vec3 d, float spread) {
     return hit.fraction * vec4(screen_radiance(hit, spread) * change_of_light(hit.pixel), 1.0);
 }
 
-// The same through all that the cone may meet.
+// The same, through everything that the cone may hit.
 vec4 look(vec3 from, vec3 d, float spread) {
     vec4 seen = look_across(from, d, spread);
 #ifdef VOXELS
@@ -65,8 +65,8 @@ vec4 look(vec3 from, vec3 d, float spread) {
     return seen;
 }
 
-// How position and normal change from a pixel to the next along an axis; the lesser change of both sides, so that
-// no edge counts.
+// Change of position and normal from a pixel to the next along an axis; the smaller change of both sides, so that
+// edges do not count.
 struct Change { vec3 position; vec3 normal; };
 
 Change change_along(ivec2 pixel, ivec2 axis, vec4 position, vec4 normal) {
@@ -81,8 +81,8 @@ Change change_along(ivec2 pixel, ivec2 axis, vec4 position, vec4 normal) {
     return length(least.normal) < 1.0 ? least : Change(vec3(0.0), vec3(0.0));
 }
 
-// Diameter at distance 1 of what one cone stands for: its part of the lobe, and of how far a curved surface turns the
-// reflection from one border of the pixel to the other.
+// Diameter at distance 1 of what one cone represents: its part of the lobe, and the rotation of the reflection across
+// the pixel on a curved surface.
 float spread_of(float alpha, Change x, Change y) {
     vec2 turned = 2.0 * vec2(length(x.normal), length(y.normal));
     float fraction = 1.0 / float(CONE_COUNT);

@@ -1,5 +1,5 @@
-// List the texels of the reduced grid where cones are to be traced on real surfaces, and fill in those where they are
-// not: there the objects do not reach, and the environment is unchanged.
+// Lists the texels of the reduced grid where cones are to be traced on real surfaces, and fills in the others: there
+// the objects have no influence, and the environment is unchanged.
 #include "common/environment.glsl"
 #include "common/brdf.glsl"
 #include "common/volume.glsl"
@@ -14,7 +14,7 @@ layout(rgba16f) writeonly uniform image2D irradiance_rho;
 layout(rgba16f) writeonly uniform image2D specular_mu;
 layout(rgba16f) writeonly uniform image2D specular_rho;
 #include "common/camera.glsl"
-uniform bool everywhere;   // also where the objects do not reach (photometric registration)
+uniform bool everywhere;   // also out of the objects' reach (photometric registration)
 
 void leave(ivec2 texel, SurfacePoint s) {
     vec3 e = s.present ? environment_irradiance(s.normal) : vec3(0.0);

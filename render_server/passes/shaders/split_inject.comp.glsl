@@ -12,7 +12,7 @@
 #include "common/volume.glsl"
 
 layout(local_size_x = 8, local_size_y = 8) in;
-layout(std430) buffer RealLight { int real_light[]; };         // 6 a slot: V_delta, V_rho
+layout(std430) buffer RealLight { int real_light[]; };         // 6 per slot: V_delta, V_rho
 layout(std430) readonly buffer VirtualGrid { uint virtual_grid[]; };
 layout(std430) buffer VirtualLight { int virtual_light[]; };
 uniform sampler2D real_albedo;
@@ -20,18 +20,18 @@ uniform sampler2D real_light_normal;
 uniform sampler2D virtual_light_uv;
 uniform sampler2D virtual_light_normal;
 uniform int view_index;
-uniform float bias_real;   // m: how far behind the real map an object's surface may lie and still be lit
+uniform float bias_real;   // m: how far behind the real map an object's surface may be and still be lit
 
 const bool REAL_SET = true, VIRTUAL_SET = false;
 const int DELTA = 0, RHO = 3, LIGHT_SUMS = 6;
-const float SNAP = 0.25;   // voxels: a surface on the border of two voxels lies in the one that it touched
+const float SNAP = 0.25;   // voxels: a surface on the border of two voxels belongs to the one that it touched
 
 uint grid_at(bool real_set, ivec3 voxel) {
     uint i = voxel_index(voxel, volume_size);
     return real_set ? grid[i] : virtual_grid[i];
 }
 
-// Slot of the touched voxel at q or just beside it, -1 if there is none.
+// Slot of the touched voxel at q or next to it, -1 if there is none.
 int slot_near(bool real_set, vec3 q) {
     for (int j = -1; j < 8; ++j) {
         vec3 corner = j < 0 ? vec3(0.0) : vec3(j & 1, (j >> 1) & 1, j >> 2) * 2.0 - 1.0;

@@ -20,8 +20,8 @@ layout(rgba16f) writeonly uniform image2D specular_mu;      // rgb mean radiance
 layout(rgba16f) writeonly uniform image2D specular_rho;
 #include "common/camera.glsl"
 
-// Four texels next to each other divide four times as many directions between them, each cone half as wide as its
-// own solid angle; bilateral_cone_filter takes the mean.
+// Four adjacent texels share four times as many directions, each cone half as wide as its own solid angle;
+// bilateral_cone_filter takes the mean.
 ConeSet cones_of(ivec2 texel) { return ConeSet(4, (texel.x & 1) + 2 * (texel.y & 1), 0.5, 0.0); }
 
 void trace(ivec2 texel) {

@@ -1,6 +1,6 @@
-// Diffuse and specular cones of the paper's operator at 1/scale of the picture ([P1] eq. 6 and 8).
-// REAL: C_delta, the change of light on real surfaces. VIRTUAL: C_rho, the light of the volume on the objects, and the
-// environment where it is left of a cone.
+// Diffuse and specular cones of the paper's operator at 1/scale of the picture ([P1] eq. 6 and 8). REAL: C_delta, the
+// change of light on real surfaces. VIRTUAL: C_rho, the light of the volume on the objects, and of the environment in
+// the rest of a cone.
 #include "common/march_joint.glsl"
 #include "common/environment.glsl"
 #include "common/brdf.glsl"
@@ -22,7 +22,7 @@ layout(rgba16f) writeonly uniform image2D specular_rho;     // rgb mean radiance
 uniform sampler3D pyramid;   // V_delta for REAL, V_rho otherwise; a: V_eta
 #include "common/camera.glsl"
 
-const float START = 2.0;    // voxels along the normal, out of the surface's own voxels
+const float START = 2.0;    // voxels along the normal, to leave the surface's own voxels
 // Nine cones: the normal, four at 45 degrees, four on the diagonals between ((1,1,1) about the normal).
 const int CONES = 9;
 const float HALF_ANGLE = 0.4759;     // rad: a ninth of the hemisphere's solid angle each, cos = 8/9
@@ -31,7 +31,7 @@ const float DIAGONAL = 0.57735026919;
 const float RIGHT = 0.70710678119;
 const float COSINE_SUM = 1.0 + 4.0 * RIGHT + 4.0 * DIAGONAL;
 
-// Direction k about z; its z is the cosine that weighs it.
+// Direction k about z; its z is its cosine weight.
 vec3 cone_direction(int k) {
     if (k == 0) return vec3(0.0, 0.0, 1.0);
     float phi = float(k - 1) * PI / 4.0;
@@ -41,7 +41,7 @@ vec3 cone_direction(int k) {
 
 vec2 in_volume(vec3 q, vec3 d) { return box_interval(q, d, vec3(0.0), vec3(float(volume_size))); }
 
-// E of the nine cones; light that comes unhindered from all around would give pi L.
+// E of the nine cones; unoccluded uniform light would give pi L.
 vec3 diffuse(vec3 q, vec3 n, bool with_environment) {
     mat3 basis = basis_around(n);
     vec3 e = vec3(0.0);
@@ -63,7 +63,8 @@ void store_specular(ivec2 texel, vec3 mu, vec3 rho) {
 }
 
 #ifdef REAL
-// What the real mirror shows at the texel's pixel: the picture, on a metal; what it shows of the environment otherwise.
+// What the real mirror shows at the texel's pixel: the picture on a metal; otherwise its reflection of the
+// environment.
 vec3 mirrored(ivec2 texel, SurfacePoint s, vec3 v, vec3 d, float half_angle) {
     ivec2 pixel = texelFetch(sample_pixels, texel, 0).xy;
     SurfaceEntry e = surfaces[int(texelFetch(real_surface_normal, pixel, 0).w)];
@@ -72,7 +73,7 @@ vec3 mirrored(ivec2 texel, SurfacePoint s, vec3 v, vec3 d, float half_angle) {
     return texelFetch(linear_picture, pixel, 0).rgb / max(reflectance, vec3(1e-3));
 }
 
-// C_delta adds what the object's voxels send; their opacity takes away what was mirrored from there ([P1] 3.2).
+// C_delta adds the radiance of the object's voxels; their opacity removes what was mirrored from there ([P1] 3.2).
 void specular(ivec2 texel, SurfacePoint s, vec3 q) {
     vec3 v = normalize(camera_position - s.position);
     vec3 d = reflect(-v, s.normal);

@@ -1,5 +1,5 @@
-// The lit voxels as cubes, walked cell by cell along each pixel's ray (Amanatides & Woo 1987); beyond the volume the
-// picture at a quarter of its brightness.
+// The lit voxels as cubes, traversed cell by cell along each pixel's ray (Amanatides & Woo 1987); beyond the volume
+// the picture at a quarter of its brightness.
 #include "common/volume.glsl"
 #include "common/srgb.glsl"
 
@@ -12,7 +12,7 @@ uniform sampler3D voxels;
 
 const float VISIBLE_COVERAGE = 0.05;
 
-// Premultiplied texel of a voxel as seen along d: the mean of what its facing directions hold.
+// Premultiplied texel of a voxel as seen along d: the mean of its facing directions.
 vec4 facing_texel(ivec3 cell, vec3 d) {
     vec4 sum = vec4(0.0);
     for (int axis = 0; axis < (DIRECTIONS == 1 ? 1 : 3); ++axis) {

@@ -1,5 +1,5 @@
-// Voxelise triangles exactly: each is clipped against every voxel it may touch (Schwarz & Seidel 2010 find the same
-// voxels); area and centroid of each piece become a surfel. Thin, large and tiny triangles keep their area.
+// Voxelises triangles exactly: each is clipped against every voxel that it may touch (Schwarz & Seidel 2010 find the
+// same voxels); area and centroid of each piece become a surfel. Thin, large and tiny triangles keep their area.
 #include "common/volume.glsl"
 #define GRID_ACCESS
 #define TOUCHED_ACCESS
@@ -18,7 +18,7 @@ const int MAX_CORNERS = 10;
 vec3 polygon[MAX_CORNERS];
 int corners;
 
-// Keep the part of the polygon where side * (x[axis] - plane) >= 0 (Sutherland & Hodgman 1974).
+// Keeps the part of the polygon where side * (x[axis] - plane) >= 0 (Sutherland & Hodgman 1974).
 void clip(int axis, float plane, float side) {
     vec3 kept[MAX_CORNERS];
     int count = 0;
@@ -33,7 +33,7 @@ void clip(int axis, float plane, float side) {
     for (int i = 0; i < count; ++i) polygon[i] = kept[i];
 }
 
-// Clip against the six faces of a voxel, leaving out the slabs that hold the whole triangle.
+// Clips against the six faces of a voxel, skipping the slabs that contain the whole triangle.
 void clip_to_voxel(ivec3 voxel, bvec3 cut) {
     for (int face = 0; face < 6 && corners > 2; ++face) {
         int axis = face >> 1, upper = face & 1;
@@ -97,7 +97,7 @@ void main() {
     ivec3 low = ivec3(floor(min(a, min(b, c)))), high = ivec3(floor(max(a, max(b, c))));
     ivec3 first = max(low, ivec3(0)), last = min(high, ivec3(volume_size - 1));
     bvec3 cut = notEqual(low, high);
-    if (!any(cut)) {   // most triangles of a depth mesh lie within one voxel
+    if (!any(cut)) {   // most triangles of a depth mesh are within one voxel
         if (first == last) emit(t, vec4((a + b + c) / 3.0, 0.5 * length(n)), first, a, b, c, n);   // rounding may put it outside
         return;
     }

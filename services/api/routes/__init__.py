@@ -1,1 +1,1 @@
-"""The routes of the REST API: one module for each kind of resource, each with its `ROUTERS`."""
+"""The routes of the REST API: one module per kind of resource, each with its `ROUTERS`."""

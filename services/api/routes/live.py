@@ -1,4 +1,4 @@
-"""Routes of what arrives live: the composite, what a pixel of it shows, the fish-eye picture, events."""
+"""Routes of live data: the composite, picking, the fish-eye picture, events."""
 
 import asyncio
 from collections.abc import AsyncIterator, Coroutine
@@ -18,7 +18,7 @@ from services.api.live_hub import LiveFrame, LiveHub
 from services.api.problems import ProblemError, responses
 from services.storage.faults import NotFoundError
 
-WINDOW = 2  # frames on their way to one viewer before it has to acknowledge
+WINDOW = 2  # frames in flight to one viewer before it has to acknowledge
 PICK_TIMEOUT_S = 5.0  # some frames of the slowest renderer
 POLICY_VIOLATION, GOING_AWAY = 1008, 1001  # WebSocket close codes (RFC 6455, 7.4.1)
 BOUNDARY = "frame"
@@ -87,7 +87,7 @@ async def live(socket: WebSocket, shared: Shared) -> None:
     await _first_of(_send_frames(socket, shared.live, credits), _take_acknowledgements(socket, credits))
 
 
-@live_router.get("/live.mjpg", include_in_schema=False)  # it never ends, which its description could not say
+@live_router.get("/live.mjpg", include_in_schema=False)  # it never ends, which its description cannot express
 async def live_mjpeg(shared: Shared) -> StreamingResponse:
     """The newest frames as one endless multipart answer, for pictures in pages."""
     media_type = f"multipart/x-mixed-replace; boundary={BOUNDARY}"
@@ -171,7 +171,7 @@ async def _take_acknowledgements(socket: WebSocket, credits: asyncio.BoundedSema
             credits.release()
     except WebSocketDisconnect:
         return
-    except (ValueError, KeyError):  # it acknowledged what it never got, or sent bytes
+    except (ValueError, KeyError):  # it acknowledged a frame that it never got, or sent bytes
         await socket.close(POLICY_VIOLATION, "acknowledge each frame once")
 
 

@@ -283,7 +283,7 @@ def recording_event(
         return RecordingAnswer.growing(session).model_dump()
     try:
         ended = RecordingAnswer.stored(recordings.get(session.id))
-    except DeltalightError:  # no frame had come
+    except DeltalightError:  # no frame arrived
         return {**RecordingAnswer.growing(session).model_dump(), "deleted": True}
     return {**ended.model_dump(), "detail": session.detail or ended.detail}
 

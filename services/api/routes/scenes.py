@@ -57,7 +57,7 @@ ROUTERS = (scenes_router, objects_router, lights_router, parts_router)
 SceneId = Annotated[str, Path(description="The scene's `id`.", examples=["4f0c2a9be1d37785"])]
 # SQLite's integers have 64 bits.
 RevisionNumber = Annotated[int, Path(ge=1, lt=1 << 63)]
-# `path`: an id may hold slashes.
+# `path`: an id may contain slashes.
 ObjectId = Annotated[str, Path(description="The object's `id`.", examples=["knot"])]
 Index = Annotated[int, Path(ge=0, le=63, description="Place among the manual lights, from 0.")]
 CHANGE_PROBLEMS = responses(400, 404, 409, 422)

@@ -19,7 +19,7 @@ state_router = APIRouter(tags=["state"])
 nodes_router = APIRouter(tags=["nodes"])
 ROUTERS = (state_router, nodes_router)
 
-RENDER_SERVER = "render-server"  # its name unless its settings say another
+RENDER_SERVER = "render-server"  # its name unless its settings give another
 
 
 class StreamState(BaseModel):

@@ -1,6 +1,8 @@
 import { beforeEach, describe, expect, it, vi } from "vitest";
 import type { RevisionEntry, SceneAnswer, SceneDocument } from "../src/api/types";
 import { fieldOf, fieldsOf } from "../src/forms/fields";
+import { methods, methodText } from "../src/forms/methods";
+import { schemas } from "../src/forms/schemas";
 import { Gesture } from "../src/state/gesture";
 import { stepsOf } from "../src/state/history";
 import { scene, sceneDocument, takeScene } from "../src/state/scene";
@@ -115,6 +117,37 @@ describe("the history", () => {
       [2, 1],
       [1, 1],
     ]);
+  });
+});
+
+describe("methods", () => {
+  it("of plugins are read from the service's own schema", () => {
+    const ref = (name: string) => ({ $ref: `#/components/schemas/${name}` });
+    schemas.value = {
+      SceneDocument: { properties: { method: { oneOf: [ref("DvctMethod"), ref("DirectMethod")] } } },
+      DvctMethod: { properties: { name: { const: "dvct" } } },
+      DirectMethod: {
+        description: "Lamps and their shadows.",
+        properties: { name: { const: "direct_light" }, ambient: { type: "number" }, names: { type: "array" } },
+      },
+    };
+    expect(methods.value.map(({ name }) => name as string)).toEqual([
+      "dvct",
+      "dlpv",
+      "aroof",
+      "differential",
+      "none",
+      "direct_light",
+    ]);
+    expect(methodText("direct_light" as "dvct")).toEqual({
+      name: "direct_light",
+      title: "Direct light",
+      help: "Lamps and their shadows.",
+      schema: "DirectMethod",
+      main: ["ambient"],
+    });
+    schemas.value = {};
+    expect(methods.value).toHaveLength(5);
   });
 });
 

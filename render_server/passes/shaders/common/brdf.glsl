@@ -15,14 +15,15 @@ float smith_visibility(float n_dot_l, float n_dot_v, float alpha) {
     return 0.5 / max(lambda_v + lambda_l, 1e-6);
 }
 
-// Without reflection at normal incidence there is no interface, so none at grazing angles either: Lambert's surface.
+// Without reflection at normal incidence there is no interface, so none at grazing angles either: a Lambertian
+// surface.
 bool has_interface(vec3 f0) { return f0 != vec3(0.0); }
 
 vec3 fresnel_schlick(vec3 f0, float cosine) {
     return has_interface(f0) ? f0 + (1.0 - f0) * pow(clamp(1.0 - cosine, 0.0, 1.0), 5.0) : vec3(0.0);
 }
 
-// Directional albedo of the specular lobe for light from everywhere: scale and offset of f0 (Karis 2014, analytic fit).
+// Directional albedo of the specular lobe for uniform light: scale and offset of f0 (Karis 2014, analytic fit).
 vec3 specular_reflectance(vec3 f0, float roughness, float n_dot_v) {
     const vec4 c0 = vec4(-1.0, -0.0275, -0.572, 0.022);
     const vec4 c1 = vec4(1.0, 0.0425, 1.04, -0.04);
@@ -39,7 +40,7 @@ float burley(float n_dot_l, float n_dot_v, float l_dot_v, float roughness) {
     return (1.0 + grazing * pow(1.0 - n_dot_l, 5.0)) * (1.0 + grazing * pow(1.0 - n_dot_v, 5.0));
 }
 
-// The same for light from everywhere: mean of (1 - n.l)^5 over the cosine is 1/21, that of l.v is 2/3 n.v.
+// The same for uniform light: mean of (1 - n.l)^5 over the cosine is 1/21, that of l.v is 2/3 n.v.
 float burley_mean(float n_dot_v, float roughness) {
     float grazing = roughness * (1.0 + 2.0 / 3.0 * n_dot_v) - 0.5;
     return (1.0 + grazing / 21.0) * (1.0 + grazing * pow(1.0 - n_dot_v, 5.0));

@@ -1,11 +1,12 @@
-// Irradiance that beams bring to a pixel: what is sharp, and what is smooth from the reduced grid. Needs geometry.glsl.
+// Irradiance of caustic beams at a pixel: its sharp part, and the smooth part of the reduced grid. Needs
+// geometry.glsl.
 #include "common/caustic_sums.glsl"
 #include "common/upsample.glsl"
 
 uniform bool has_caustics;       // the sums are bound
-uniform float sample_distance;   // m at 1 m depth: what a texel of the reduced resolution spans
+uniform float sample_distance;   // m at 1 m depth: size of a texel of the reduced grid
 
-// `p`, `n`, `depth`: the surface of that layer which the pixel shows.
+// `p`, `n`, `depth`: the pixel's surface in that layer.
 vec3 caustic_irradiance(ivec2 pixel, ivec2 size, int layer, vec3 p, vec3 n, float depth) {
     if (!has_caustics) return vec3(0.0);
     vec3 smooth_part = vec3(0.0);

@@ -1,4 +1,4 @@
-// How well the plane (p, n) holds the point (sp, sn); `size`: distance at which a deviation counts, m.
+// Weight by how well the point (sp, sn) continues the plane (p, n); `size`: scale of deviations, m.
 float continuation(vec3 p, vec3 n, vec3 sp, vec3 sn, float size) {
     float off = abs(dot(sp - p, n)) / size;
     float turn = max(0.0, dot(n, sn));

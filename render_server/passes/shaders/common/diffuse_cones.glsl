@@ -2,11 +2,11 @@
 // Needs march.glsl, environment.glsl.
 uniform int cone_count;
 
-// Which cones are looked along: every `parts`-th of parts * cone_count directions, from the one numbered `part` on,
-// each `width` (0..1) of its own solid angle wide, all turned by `turn` (rad) about the normal.
+// Which cones are traced: every `parts`-th of parts * cone_count directions, starting with number `part`, each
+// `width` (0..1) of its own solid angle wide, all rotated by `turn` (rad) about the normal.
 struct ConeSet { int parts; int part; float width; float turn; };
 
-// Direction k about z, of equal shares of the projected solid angle (docs/method.md 4.5).
+// Direction k about z, stratified over the projected solid angle (docs/method.md 4.5).
 vec3 cone_direction(int k, ConeSet set) {
     float number = float(set.parts * k + set.part);
     float z = sqrt(1.0 - (number + 0.5) / float(set.parts * cone_count));
@@ -14,8 +14,8 @@ vec3 cone_direction(int k, ConeSet set) {
     return vec3(sqrt(1.0 - z * z) * vec2(cos(phi), sin(phi)), z);
 }
 
-// Without and with the objects, from `q` (voxels) on a surface about n: one-sided voxels do not meet their own surface.
-// `only_rho` leaves mu out.
+// Irradiance without and with the objects, from `q` (voxels) on a surface about n: one-sided voxels do not occlude
+// their own surface. `only_rho` skips mu.
 void diffuse(vec3 q, vec3 n, ConeSet set, bool only_rho, out vec3 e_mu, out vec3 e_rho) {
     // a solid angle of pi / K: diameter / distance = 2 tan(half-angle)
     float ratio = 1.5 * sqrt(2.0 / float(cone_count));

@@ -2,7 +2,7 @@
 #include "common/octahedral.glsl"
 #include "common/basis.glsl"
 
-uniform sampler2DArray environment_map;   // octahedral; a layer a cone
+uniform sampler2DArray environment_map;   // octahedral; a layer per cone size
 #include "common/lighting.glsl"
 
 vec3 environment(vec3 direction, float half_angle) {

@@ -1,5 +1,5 @@
 // Geometry buffers on the picture's pixel grid: the real scene's, and the virtual objects' raster (a slightly wider
-// pinhole, looked up through the lens model, so that the picture itself is never resampled).
+// pinhole, sampled through the lens model, so that the picture itself is never resampled).
 uniform sampler2D real_surface_position;   // world m; w: depth along the optical axis, 0 unknown
 uniform sampler2D real_surface_normal;     // world; w: entry of the surface table, -1 diffuse
 uniform sampler2D virtual_raster_position; // world m; w: depth along the optical axis, 0 nothing

@@ -1,5 +1,5 @@
-// Whether the objects' surface at depth z shows at a pixel: 1 in front of the real surface (within its noise), 0 behind it.
-// Unknown depth never hides.
+// Visibility of the objects' surface at depth z in a pixel: 1 in front of the real surface (within its noise), 0
+// behind it. Unknown depth never occludes.
 #include "common/geometry.glsl"
 uniform float noise_sigma;     // m at 1 m
 

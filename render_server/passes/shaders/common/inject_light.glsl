@@ -1,4 +1,4 @@
-// Adding a surface's reflected flux to the cell half a cell before it ([P2] 4.3.1). Needs volume.glsl.
+// Adds a surface's reflected flux to the cell half a cell in front of it ([P2] 4.3.1). Needs volume.glsl.
 #include "common/light_cells.glsl"
 
 layout(std430) buffer Injected { int injected[]; };

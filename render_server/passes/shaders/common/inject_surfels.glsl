@@ -1,4 +1,4 @@
-// Every surfel of a store, on each of its sides, sends `sent_out(surfel, normal)` (radiosity) into the volume. Needs
+// Injects `sent_out(surfel, normal)` (radiosity) from each side of every surfel of a store into the volume. Needs
 // voxel_store.glsl, inject_light.glsl and that function.
 
 void inject_side(Surfel s, vec3 n) {

@@ -2,7 +2,7 @@
 #include "common/octahedral.glsl"
 const int PROBE_SIZE = 32;
 const int PROBE_TEXELS = PROBE_SIZE * PROBE_SIZE;
-const int PROBE_ROW = 26;   // floats a direction in the table: its solid angle (sr), then 25 harmonics
+const int PROBE_ROW = 26;   // floats per direction in the table: its solid angle (sr), then 25 harmonics
 layout(std430) readonly buffer ProbeTable { float probe_table[]; };
 
 float texel_solid_angle(int texel) { return probe_table[texel * PROBE_ROW]; }

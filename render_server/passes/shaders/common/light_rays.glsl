@@ -1,4 +1,4 @@
-// Texels of reflective shadow maps as bundles of light rays: where they lie and how much light they hold (docs/method.md 4.1).
+// Texels of reflective shadow maps as bundles of light rays: their positions and their light (docs/method.md 4.1).
 #include "common/lights.glsl"
 
 // Index of the light that a view belongs to.
@@ -28,15 +28,15 @@ vec3 ray_point(LightView view, vec2 s, float depth) {
     return transpose(mat3(view.view_from_world)) * (v - view.view_from_world[3].xyz);
 }
 
-// Intensity towards a world direction of travel, relative to color. A rectangle's is that of its far field, L A cos,
-// as if all of it came from its centre: its flux is right, its spread over near surfaces is too narrow.
+// Intensity in a world direction of travel, relative to color. A rectangle's is that of its far field, L A cos, as if
+// emitted from its centre: its flux is right, its spread over near surfaces is too narrow.
 float intensity_towards(Light light, vec3 d) {
     vec3 normal_area = 4.0 * cross(light.axis_u.xyz, light.axis_v.xyz);
     return light.place.w == RECTANGLE ? max(dot(d, normal_area), 0.0) : spot_fraction(light, d);
 }
 
-// Light of a texel's rays before any reflection: I dW, or E_perp A (no cosine: a surface that leans away takes the
-// same rays on more area).
+// Light of a texel's rays before any reflection: I dW, or E_perp A (no cosine: a tilted surface receives the same
+// rays on a larger area).
 vec3 texel_light(Light light, LightView view, vec2 s) {
     float side = 2.0 * view.tile.w / view.tile.z;
     vec3 parallel_rays = light.color.rgb * side * side;
@@ -48,15 +48,15 @@ vec3 texel_light(Light light, LightView view, vec2 s) {
 
 struct Hit { bool present; ivec2 texel; LightView view; vec2 s; float depth; float ray_depth; };
 
-// What the light sees first along its ray through p: in the real map views.xy, in the virtual map views.zw.
-// `ray_depth` is the depth of p itself.
+// The first surface that the light sees along its ray through p: in the real map views.xy, in the virtual map
+// views.zw. `ray_depth` is the depth of p itself.
 Hit first_hit(sampler2D map, int first, int count, vec3 p) {
     Hit hit;
     hit.present = false;
     if (count == 0) return hit;
     hit.view = light_views[view_containing(first, count, p)];
     vec3 v = (hit.view.view_from_world * vec4(p, 1.0)).xyz;
-    if (v.z <= 0.0 && hit.view.range.z < 0.5) return hit;   // parallel rays come from before the view too
+    if (v.z <= 0.0 && hit.view.range.z < 0.5) return hit;   // parallel rays also come from in front of the view
     hit.ray_depth = v.z;
     hit.s = lateral(hit.view, v);
     vec2 t = tile_texel(hit.view, hit.s);
@@ -67,15 +67,16 @@ Hit first_hit(sampler2D map, int first, int count, vec3 p) {
     return hit;
 }
 
-const float HIT_REACH = 2.0;   // texels along the ray from the depth of a texel's centre: a normal across the ray says nothing
+const float HIT_REACH = 2.0;   // texels along the ray from a texel's centre; limits hit points where the normal is across the ray
 
-// How far the hit points of a texel lie from its centre at most, m: half its diagonal aside, HIT_REACH along the ray.
+// Bound on the distance of a texel's hit points from its centre, m: half its diagonal sideways, HIT_REACH along the
+// ray.
 float hit_spread(LightView view, vec2 s, float depth) {
     float slant = view.range.z > 0.5 ? 1.0 : length(vec3(s, 1.0));
     return (HIT_REACH + 1.0) * texel_side(view, depth) * slant;
 }
 
-// Where the ray itself meets the texel's surface: the plane through the texel's centre with its normal.
+// Intersection of the ray with the texel's surface: the plane through the texel's centre with its normal.
 vec3 hit_point(Hit hit, vec3 normal) {
     vec3 centre = ray_point(hit.view, texel_lateral(hit.view, hit.texel), hit.depth);
     vec3 a = ray_point(hit.view, hit.s, 0.0);

@@ -1,4 +1,4 @@
-// What goes on from a cell to its neighbour: a constant 4 x 4 matrix with six non-zeros a direction (docs/method.md 5).
+// Transfer from a cell to its neighbour: a constant 4 x 4 matrix with six non-zeros per direction (docs/method.md 5).
 uniform vec4 transfer;     // along the axis: (1 <- 1, 1 <- along, along <- 1, along <- along)
 uniform float sideways;    // across <- across
 

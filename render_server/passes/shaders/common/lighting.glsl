@@ -1,4 +1,4 @@
-// How many lights there are, and how the residual environment is layered (render_server/passes/lights.py).
+// The number of lights, and the layers of the residual environment (render_server/passes/lights.py).
 layout(std140) uniform Lighting {
     int light_count;
     int environment_layers;

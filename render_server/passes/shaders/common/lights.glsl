@@ -8,9 +8,9 @@ struct Light {
     vec4 shape;    // x: tan(angular radius) (directional), radius in m (sphere, spot); y - z angle: fraction of I (spot)
     vec4 axis_u;   // xyz: half an edge in m (rectangle) or direction of travel on the axis (spot)
     vec4 axis_v;   // xyz: half the other edge in m (rectangle)
-    vec4 plane;    // of a mirror image: the plane (world) before which it shines
-    vec4 mirror;   // of a mirror image: F0 rgb, layer of its map of fractions; layer -1: no image. color.w: m, how far from
-                   // the plane points still belong to it; shape.w: roughness; axis_u.w: entry of the surface table;
+    vec4 plane;    // of a mirror image: the plane (world) in front of which it shines
+    vec4 mirror;   // of a mirror image: F0 rgb, layer of its map of fractions; layer -1: no image. color.w: distance, m, up to
+                   // which points belong to the plane; shape.w: roughness; axis_u.w: entry of the surface table;
                    // axis_v.w: the light that it is an image of
     vec4 map_u;    // of a mirror image: its map's coordinates of a world point are dot(xyz, p) + w
     vec4 map_v;
@@ -22,7 +22,7 @@ struct LightView {
     mat4 view_from_world;   // light at the origin (unless directional), looking along +z
     vec4 tile;              // x, y, size in texels; half extent (m for directional, else tangent)
     vec4 range;             // near, far in m; 1 if orthographic; 0
-    vec4 front;             // plane (world) before which the light shines
+    vec4 front;             // plane (world) in front of which the light shines
 };
 
 layout(std430) readonly buffer Lights { Light lights[]; };
@@ -33,7 +33,7 @@ uniform sampler2DArray mirror_visibility;   // r, g: fraction of an image that a
 #include "common/lighting.glsl"
 uniform int shadow_samples;
 
-// Fraction of its intensity that a spot sends along d (unit, of travel); 1 for a sphere.
+// Fraction of its intensity that a spot emits along d (unit, of travel); 1 for a sphere.
 float spot_fraction(Light light, vec3 d) {
     float angle = 2.0 * asin(min(0.5 * distance(light.axis_u.xyz, d), 1.0));   // exact for small angles too
     return clamp(light.shape.y - light.shape.z * angle, 0.0, 1.0);
@@ -48,9 +48,9 @@ vec3 edge_term(vec3 a, vec3 b) {
 
 vec2 corner(int i) { return vec2(((i + 1) & 2) == 0 ? -1.0 : 1.0, (i & 2) == 0 ? -1.0 : 1.0); }
 
-// Vector irradiance of a rectangle of radiance 1 at p above the horizon of n: dot(result, n) is the irradiance (Lambert
-// 1760, photometry of polygons; exact). `edges` is 5, the last along the horizon, or 0 for another kind of light: on
-// llvmpipe a loop ends early and a branch does not.
+// Vector irradiance of a rectangle of radiance 1 at p above the horizon of n: dot(result, n) is the irradiance
+// (Lambert 1760, photometry of polygons; exact). `edges` is 5, the last along the horizon, or 0 for another kind of
+// light: llvmpipe leaves a loop early but executes both sides of a branch.
 vec3 rectangle_vector(Light light, int edges, vec3 p, vec3 n) {
     mat2x3 axes = mat2x3(light.axis_u.xyz, light.axis_v.xyz);
     vec3 centre = light.place.xyz - p, sum = vec3(0.0), leaves = vec3(0.0), enters = vec3(0.0);
@@ -68,12 +68,12 @@ vec3 rectangle_vector(Light light, int edges, vec3 p, vec3 n) {
         a = b;
     }
     bool before = dot(cross(axes[0], axes[1]), centre) < 0.0;
-    return before ? -sum : vec3(0.0);   // seen from before, the corners run clockwise
+    return before ? -sum : vec3(0.0);   // seen from the front, the corners run clockwise
 }
 
 // Irradiance across the beam at p of a surface with normal n, and the direction towards the light: the irradiance is
 // across * dot(n, to_light). A rectangle is one beam along its vector irradiance; its angular radius is that of the
-// disc with the same. Without a normal (0) no horizon cuts it.
+// disc with the same irradiance. Without a normal (0) no horizon clips it.
 vec3 unmirrored_light_at(Light light, vec3 p, vec3 n, out vec3 to_light, out float angular_radius) {
     vec3 d = light.place.xyz - p;
     float distance2 = max(dot(d, d), 1e-8);
@@ -110,7 +110,7 @@ vec2 mirror_fraction(Light light, vec3 p) {
     vec3 n = light.plane.xyz;
     bool distant = light.place.w == DIRECTIONAL;
     vec3 direction = distant ? -light.place.xyz : light.place.xyz - p;
-    float part = max(dot(n, p) + light.plane.w, 0.0) / max(-dot(n, direction), 1e-6);   // of the way, up to the plane
+    float part = max(dot(n, p) + light.plane.w, 0.0) / max(-dot(n, direction), 1e-6);   // fraction of the path up to the plane
     vec3 q = p + part * direction;
     float radius = light.place.w == RECTANGLE ? sqrt(length(light.axis_u.xyz) * length(light.axis_v.xyz)) : light.shape.x;
     float texels = 2.0 * radius * part * length(light.map_u.xyz) * float(textureSize(mirror_visibility, 0).x);
@@ -147,7 +147,7 @@ float first_depth(sampler2D map, LightView view, ivec2 texel) {
 // A receiver in a light's view: its plane, so that a tilted surface does not block its own surroundings.
 struct Receiver { vec2 s; float depth; vec3 normal; float plane; float bias; };
 
-const float DEPTH_ROUNDING = 1e-4;   // relative: no surface blocks itself by the rounding of its own depth
+const float DEPTH_ROUNDING = 1e-4;   // relative: prevents self-occlusion by rounding of a surface's own depth
 
 Receiver receiver_at(LightView view, vec3 p, vec3 n, float bias) {
     vec3 v = (view.view_from_world * vec4(p, 1.0)).xyz;
@@ -163,7 +163,7 @@ float plane_depth(LightView view, Receiver r, vec2 s) {
     return z > 0.0 ? z : r.depth;
 }
 
-// Bilinear comparison: fraction of the 2x2 texels around s that lie no nearer to the light than `depth`.
+// Bilinear comparison: fraction of the 2x2 texels around s that are no nearer to the light than `depth`.
 float lit_fraction(sampler2D map, LightView view, vec2 s, float depth) {
     vec2 t = tile_texel(view, s);
     if (t.x < 0.0) return 1.0;
@@ -176,11 +176,11 @@ float lit_fraction(sampler2D map, LightView view, vec2 s, float depth) {
     return mix(mix(lit.w, lit.z, f.x), mix(lit.x, lit.y, f.x), f.y);
 }
 
-// A light's area as a receiver finds it on the map. At a blocker's depth the ray from the sample at offset o (on the
+// A light's area as seen by a receiver on the map. At a blocker's depth the ray from the sample at offset o (on the
 // unit disc, or in the square -1..1 of a rectangle) is shifted laterally by gap (u o.x + v o.y) / (1 - dot(lean, o)).
 struct Spread { vec2 u; vec2 v; vec2 lean; float widest; bool square; };
 
-const float STEEPEST_LEAN = 0.9;   // samples as deep in the view as the receiver are taken as this deep
+const float STEEPEST_LEAN = 0.9;   // samples as deep in the view as the receiver count as this deep
 
 Spread spread_of(Light light, LightView view, vec2 s, float depth) {
     float size = light.shape.x;
@@ -198,7 +198,7 @@ Spread spread_of(Light light, LightView view, vec2 s, float depth) {
     return k;
 }
 
-// How far a ray drifts laterally between a blocker and the receiver, per unit of the light's area.
+// Lateral drift of a ray between a blocker and the receiver, per unit of the light's area.
 float drift(LightView view, float receiver, float blocker) {
     return view.range.z > 0.5 ? max(receiver - blocker, 0.0) : max(1.0 / blocker - 1.0 / receiver, 0.0);
 }
@@ -211,7 +211,8 @@ float norm_of(Spread k, vec2 o) { return k.square ? max(abs(o.x), abs(o.y)) : le
 
 float cross2(vec2 a, vec2 b) { return a.x * b.y - a.y * b.x; }
 
-// Whether a shift, `margin` less, lies within the light's area (shift_to solved for o by Cramer's rule, undivided).
+// Whether a shift, reduced by `margin`, is within the light's area (shift_to solved for o by Cramer's rule,
+// undivided).
 bool within(Spread k, float gap, vec2 shift, float margin) {
     if (!k.square) return length(shift) <= gap * k.widest + margin;
     shift *= max(1.0 - margin / max(length(shift), 1e-12), 0.0);
@@ -235,8 +236,8 @@ int view_containing(int first, int count, vec3 p) {
     return first + count - 1;
 }
 
-// Whatever walks over a light's samples does so twice, once for discs and once for squares with no round for the other:
-// llvmpipe leaves a loop early, but takes both sides of a branch.
+// Every loop over a light's samples appears twice, once for discs and once for squares, with no iterations for the
+// other kind: llvmpipe leaves a loop early, but executes both sides of a branch.
 
 struct Blocking { float sum; float hits; float deepest; };   // depths
 
@@ -255,13 +256,13 @@ void add_blockers(bool square, sampler2D map, Spread k, LightView view, Receiver
     }
 }
 
-// Mean and greatest depth of what blocks the light's area in one map; NOTHING if nothing does. Only what lies inside
-// the cone from the receiver to that area counts, so that a tilted or noisy surface does not block itself. Samples
-// crowd towards the axis, because what is near the receiver matters only there.
+// Mean and greatest depth of the blockers of the light's area in one map; NOTHING if there are none. Only blockers
+// inside the cone from the receiver to that area count, so that a tilted or noisy surface does not block itself.
+// Samples are denser near the axis, because blockers near the receiver matter only there.
 vec2 blockers(sampler2D map, Spread k, LightView view, Receiver r) {
     float widest = k.widest * drift(view, r.depth, view.range.x);
     float texel = 2.0 * view.tile.w / view.tile.z;
-    int count = widest < 0.5 * texel ? 1   // below half a texel: one look
+    int count = widest < 0.5 * texel ? 1   // below half a texel: one sample
         : widest > WIDE_TEXELS * texel ? 2 * shadow_samples : shadow_samples;
     Blocking found = Blocking(0.0, 0.0, 0.0);
     add_blockers(false, map, k, view, r, k.square ? 0 : count, found);
@@ -270,7 +271,7 @@ vec2 blockers(sampler2D map, Spread k, LightView view, Receiver r) {
     return vec2(found.sum / found.hits, found.deepest);
 }
 
-const float STEEPEST = 3.0;   // slope up to which a texel's rise is allowed for
+const float STEEPEST = 3.0;   // limit of the slope that a texel's rise is corrected for
 
 // `blocker`: mean and greatest depth; `gap`: the drift from there.
 struct Occluder { bool present; LightView view; Receiver receiver; Spread spread; vec2 blocker; vec2 gap; };
@@ -281,9 +282,9 @@ Occluder occluder(sampler2D map, Light light, int first, int count, vec3 p, vec3
     if (count == 0) return o;
     o.view = light_views[view_containing(first, count, p)];
     o.receiver = receiver_at(o.view, p, n, bias);
-    // What a tilted surface rises within a texel of the map must not block it either.
+    // The rise of a tilted surface within a texel of the map must not block it either.
     float texel = 2.0 * o.view.tile.w / o.view.tile.z * (o.view.range.z > 0.5 ? 1.0 : o.receiver.depth);
-    float slope = (abs(o.receiver.normal.x) + abs(o.receiver.normal.y)) / -o.receiver.normal.z;   // of texels askew too
+    float slope = (abs(o.receiver.normal.x) + abs(o.receiver.normal.y)) / -o.receiver.normal.z;   // for diagonal texels too
     o.receiver.bias += texel * min(slope, STEEPEST);
     if (o.receiver.depth - o.receiver.bias <= o.view.range.x) return o;
     o.spread = spread_of(light, o.view, o.receiver.s, o.receiver.depth);
@@ -295,9 +296,9 @@ Occluder occluder(sampler2D map, Light light, int first, int count, vec3 p, vec3
     return o;
 }
 
-// Whether the ray to one sample of the light gets through, bilinearly: at the mean blocker's depth, and for a rectangle
-// at the deepest one's too: near a large light what blocks is seldom flat. The receiver's plane may rise towards
-// the light there, but what stands a quarter of the way to the blockers above it does block.
+// Whether the ray to one sample of the light is unblocked, bilinearly: at the mean blocker's depth, and for a
+// rectangle at the deepest one's too, because blockers near a large light are seldom flat. The receiver's plane may
+// rise towards the light there, but things a quarter of the distance to the blockers above it do block.
 float passes(sampler2D map, Occluder o, vec2 offset) {
     float lit = 1.0;
     for (int i = 0; i < (o.spread.square ? 2 : 1); ++i) {
@@ -328,14 +329,14 @@ bool object_may_shadow(vec3 p, float bias) {
     return false;
 }
 
-// Where the penumbra is many texels wide, few samples would show as steps.
+// If the penumbra is many texels wide, few samples would show as steps.
 int samples_for(Occluder o) {
     if (!o.present) return 1;
     float texels = o.spread.widest * o.gap.x * o.view.tile.z / (2.0 * o.view.tile.w);
     return texels > WIDE_TEXELS ? 4 * shadow_samples : shadow_samples;
 }
 
-// What sample o of a rectangle adds to the irradiance, up to a factor; 1 for other lights, whose samples add the same.
+// Weight of sample o of a rectangle in the irradiance, up to a factor; 1 for other lights, whose samples are equal.
 float sample_weight(Light light, Spread k, vec3 p, vec3 n, vec2 o) {
     vec3 d = light.place.xyz + mat2x3(light.axis_u.xyz, light.axis_v.xyz) * o - p;
     float cosines = max(dot(d, n), 0.0) * max(-dot(d, cross(light.axis_u.xyz, light.axis_v.xyz)), 0.0);
@@ -375,8 +376,8 @@ float real_visibility(Light light, vec3 p, vec3 n, float bias) {
     return mirror_fraction(light, p).x * visible_fraction(light, real, none, p, n).x;
 }
 
-// (V_mu, V_rho) at p with normal n: averages over the same samples of the light; v_rho = v_mu v_obj (docs/method.md 3).
-// `bias_real`, `bias_virtual` (m) move the receiver towards the light.
+// (V_mu, V_rho) at p with normal n: averages over the same samples of the light; v_rho = v_mu v_obj (docs/method.md
+// 3). `bias_real`, `bias_virtual` (m) move the receiver towards the light.
 vec2 visibility(Light light, vec3 p, vec3 n, float bias_real, float bias_virtual) {
     Occluder real = occluder(real_light_depth, light, light.views.x, light.views.y, p, n, bias_real);
     Occluder object = occluder(virtual_light_depth, light, light.views.z, light.views.w, p, n, bias_virtual);

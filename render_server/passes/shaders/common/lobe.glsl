@@ -1,7 +1,7 @@
-// Ways of a GGX lobe.
+// Sampling of a GGX lobe.
 #include "common/basis.glsl"
 
-const float LEAST_ALPHA = 1e-4;   // a sharper lobe is narrower than any pixel
+const float LEAST_ALPHA = 1e-4;   // sharper lobes are narrower than any pixel
 
 // Half-vector about z of the lobe's visible normals, seen from v (Dupuy and Benyoub 2023).
 vec3 visible_normal(vec2 u, vec3 v, float alpha) {

@@ -1,4 +1,4 @@
-// Which picture pixel stands for each texel of the reduced resolution.
+// The picture pixel that represents each texel of the reduced grid.
 #include "common/geometry.glsl"
 
 uniform isampler2D sample_pixels;   // real x, y; virtual x, y; -1: none; below: hidden by objects
@@ -8,7 +8,7 @@ struct SurfacePoint { bool present; vec3 position; vec3 normal; float roughness;
 
 #ifdef REAL
 #include "common/surfaces.glsl"
-uniform bool hidden_too;   // virtual surfaces reflect what they hide
+uniform bool hidden_too;   // also grid texels whose real surfaces are hidden, because virtual surfaces reflect them
 
 SurfacePoint surface_point(ivec2 texel) {
     ivec2 pixel = texelFetch(sample_pixels, texel, 0).xy;

@@ -1,5 +1,5 @@
-// Irradiance of a surface from the light volumes (docs/method.md 5): E(n) = 2/3 <SH, lobe(-n)> (light is kept per cell
-// edge squared), trilinear about the point half a cell above the surface. Needs volume.glsl.
+// Irradiance of a surface from the light volumes (docs/method.md 5): E(n) = 2/3 <SH, lobe(-n)> (light is stored per
+// cell edge squared), trilinear about the point half a cell above the surface. Needs volume.glsl.
 #include "common/light_cells.glsl"
 
 layout(std430) readonly buffer WithoutObjects { vec4 light_mu[]; };   // channel by channel
@@ -13,7 +13,7 @@ struct Light12 { vec4 r; vec4 g; vec4 b; };
 
 uint cell_count() { return uint(volume_size * volume_size * volume_size); }
 
-// Intensity at q, from the cells whose centres lie before the plane (p, n) if `front_only`.
+// Intensity at q; with `front_only` from the cells whose centres are in front of the plane (p, n).
 Light12 intensity(bool with_objects, vec3 q, vec3 p, vec3 n, bool front_only) {
     ivec3 base = ivec3(floor(q - 0.5));
     vec3 f = q - 0.5 - vec3(base);
@@ -38,8 +38,8 @@ Light12 intensity(bool with_objects, vec3 q, vec3 p, vec3 n, bool front_only) {
 
 vec3 against(Light12 light, vec4 shape) { return vec3(dot(light.r, shape), dot(light.g, shape), dot(light.b, shape)); }
 
-// Where the light grows towards the back of the surface it leaked through it ([P2] 4.4): it is scaled down by how fast
-// it does so along the normal, relative to itself.
+// Light that increases towards the back of the surface has leaked through it ([P2] 4.4): it is scaled down by its
+// relative increase along the normal.
 vec3 damped(bool with_objects, vec3 q, vec3 n, vec3 e) {
     vec3 behind = vec3(0.0), before = vec3(0.0);
     for (int i = 0; i < (damping > 0.0 ? 1 : 0); ++i) {

@@ -1,10 +1,10 @@
-// Cone marching through the rho and the mu set (docs/method.md 3, exact operator): where a path does not lead through
-// the support of the delta, both are the same and one march serves.
+// Cone marching through the rho and the mu set (docs/method.md 3, exact operator): outside the support of the delta
+// both are equal, and one march is enough.
 //
-// A ray walks across the slices of cells along its main axis and looks where they touch, half into each, so that every
-// cell is met once, and none is missed where the level changes. The coverage that it meets is summed and a cone is
-// blocked when the sum is that of a wall. (Front-to-back products of a one-voxel shell let e^-2 of the light through at
-// any step: no furnace test could hold.)
+// A ray walks across the slices of cells along its main axis and samples at their faces, half into each, so that
+// every cell is counted once, and none is skipped where the level changes. The coverage met is summed, and a cone is
+// blocked when the sum reaches that of a wall. (Front-to-back products of a one-voxel shell let e^-2 of the light
+// through at any step size: no furnace test could hold.)
 #include "common/volume.glsl"
 
 uniform sampler3D pyramid_mu;
@@ -13,16 +13,16 @@ uniform sampler3D pyramid_far;   // real scene beyond the volume, coarse, the sa
 layout(std140) uniform FarVolume {
     vec3 far_origin;   // world position of its low corner, m
     float far_edge;    // of a voxel, m
-    int far_size;      // voxels an edge, 0: it is not used
+    int far_size;      // voxels per edge, 0: not used
     int far_levels;
 };
 layout(std430) readonly buffer Support { int support[6]; };   // voxels where mu and rho differ: min, -max
 
-// A wall's summed coverage scatters about 1 with its slant and place on the grid (2/3..4/3 at 45 degrees) and with
-// changes of level and other walls (down to 1/2). Below, the sum is the fraction of the cone that is covered.
+// A wall's summed coverage scatters about 1 with its slant and position on the grid (2/3..4/3 at 45 degrees) and with
+// changes of level and other walls (down to 1/2). Below, the sum is the covered fraction of the cone.
 #ifdef MULTIPLIED_COVERAGE
 const float PARTLY = 1.0;
-const float WALL = 0.97;   // what is left could not be seen in an 8-bit picture
+const float WALL = 0.97;   // the rest would be invisible in an 8-bit picture
 #else
 const float PARTLY = 0.4;
 const float WALL = 0.5;
@@ -51,9 +51,9 @@ struct Walk {
     vec3 from;       // cells of level 0
     float first;     // main coordinate of `from`
     vec3 slope;      // direction, 1 on the main axis
-    float stretch;   // distance a cell of the main axis
+    float stretch;   // distance per cell of the main axis
     ivec3 facing;    // slabs that the ray sees from the front
-    vec3 ahead;      // from the next look's face to its sample: half a cell at the start, where nothing behind counts
+    vec3 ahead;      // from the next face to its sample: half a cell at the start, so that nothing behind counts
     int plane;       // main coordinate of the face
     int level;
 };
@@ -74,8 +74,8 @@ vec3 sample_point(Walk w) { return w.from + (float(w.plane) - w.first) * w.slope
 
 float slice_fraction(Walk w) { return w.ahead == vec3(0.0) ? 1.0 : 0.5; }
 
-// Cells grow, at most twofold a slice, to half..all of the cone's diameter, where a slice begins that is whole on the
-// coarser level too. `before`: what the cone had travelled ahead of this walk, cells of level 0.
+// Cells grow, at most twofold per slice, to half..all of the cone's diameter, at the beginning of a slice that is
+// whole on the coarser level too. `before`: distance travelled before this walk, cells of level 0.
 void choose_level(inout Walk w, float ratio, float before, int levels) {
     int wide = 2 << w.level;
     bool whole = w.level + 1 < levels && (w.plane & (wide - 1)) == 0;
@@ -89,7 +89,7 @@ void advance(inout Walk w, float ratio, float before, int levels) {
 }
 
 #ifdef ISOTROPIC_VOXELS
-// One radiance and one opacity for all directions: what all six hold together, as opaque as from where it is most.
+// One radiance and one opacity for all directions: the sum of all six, with the opacity of the densest direction.
 vec4 directional_sample(sampler3D pyramid, int n, vec3 q, Walk w) {
     vec4 sum = vec4(0.0);
     float most = 0.0;
@@ -101,10 +101,10 @@ vec4 directional_sample(sampler3D pyramid, int n, vec3 q, Walk w) {
     return sum.a > 0.0 ? sum * (most / sum.a) : vec4(0.0);
 }
 #else
-// Coverage and radiance that the ray meets in one slice. Of all surfaces in a cell, f and b are known: their area
-// towards and away from the ray along each axis. The net area n.d is exact; what a closed lump adds to it on the
-// side that the ray sees is at most half of `round` (exact for a sphere) and of the pairs min(f, b) (exact, 0, for a
-// plane: no surface hides itself).
+// Coverage and radiance of one slice along the ray. Of all surfaces in a cell, f and b are known: their area towards
+// and away from the ray along each axis. The net area n.d is exact; a closed lump adds, on the side that the ray
+// sees, at most half of `round` (exact for a sphere) and of the pairs min(f, b) (exact, 0, for a plane: no surface
+// occludes itself).
 vec4 directional_sample(sampler3D pyramid, int n, vec3 q, Walk w) {
     vec4 x = volume_sample(pyramid, n, q, w.level, w.facing.x);
     vec4 y = volume_sample(pyramid, n, q, w.level, w.facing.y);
@@ -125,7 +125,7 @@ vec4 directional_sample(sampler3D pyramid, int n, vec3 q, Walk w) {
 #endif
 
 // Through the volume around the objects, from q (voxels), until a wall or the volume's end at distance t (voxels).
-// `differs`: the path led through cells where mu and rho are not the same.
+// `differs`: the path crossed cells where mu and rho differ.
 Crossed march_near(sampler3D pyramid, vec3 q, vec3 d, float ratio, out float t, out bool differs) {
     Crossed sum = Crossed(vec3(0.0), 0.0);
     Walk w = walk_from(q, d);
@@ -144,7 +144,7 @@ Crossed march_near(sampler3D pyramid, vec3 q, vec3 d, float ratio, out float t, 
     return sum;
 }
 
-// On through the coarse real scene, from q after a distance `before` (both in its voxels).
+// Continues through the coarse real scene, from q after a distance `before` (both in its voxels).
 void march_far(vec3 q, vec3 d, float before, float ratio, inout Crossed sum) {
     Walk w = walk_from(q, d);
     for (int i = 1; i < far_levels; ++i) choose_level(w, ratio, before, far_levels);
@@ -157,13 +157,13 @@ void march_far(vec3 q, vec3 d, float before, float ratio, inout Crossed sum) {
     }
 }
 
-// One march from q (voxels) along d, on into the coarse scene.
+// One march from q (voxels) along d, continued into the coarse scene.
 Crossed march_one(sampler3D pyramid, vec3 q, vec3 d, float ratio, out bool differs) {
     float t;
     Crossed sum = march_near(pyramid, q, d, ratio, t, differs);
     if (far_size > 0 && sum.coverage < WALL) {
         vec3 leave = (volume_origin + (q + t * d) * voxel_edge - far_origin) / far_edge;
-        // A surface that starts the march outside of the volume must not meet its own coarse voxels.
+        // A surface that starts the march outside of the volume must not hit its own coarse voxels.
         float skip = t > 0.0 ? 0.0 : 1.5;
         march_far(leave + skip * d, d, t * voxel_edge / far_edge + skip, ratio, sum);
     }

@@ -1,12 +1,11 @@
-// Cone marching of [P1] 3.2: front-to-back through one pyramid whose opacity is the joint one (V_eta),
+// Cone marching of [P1] 3.2: front-to-back through one mipmap whose opacity is the joint one (V_eta),
 //   c += (1 - a) c_v,  a += (1 - a) a_v        (c_v premultiplied; the factor a_0 before c_0 in eq. 5 is a slip).
-// A step is the edge of the cell sampled, as printed there, so that opacity needs no correction for it
-// (docs/method.md 4.5).
+// A step is the edge of the sampled cell, as in the paper, so opacity needs no correction for it (docs/method.md 4.5).
 #include "common/volume.glsl"
 
 const float OPAQUE = 0.99;   // opacity that ends a march
 
-// Premultiplied (c, a) as a cone along d meets it. One-sided pyramids are asked for both sides: a cone that starts
+// Premultiplied (c, a) seen by a cone along d. One-sided mipmaps are sampled for both sides: a cone that starts
 // inside an object is blocked by its far wall.
 vec4 cone_sample(sampler3D pyramid, vec3 q, int level, vec3 d) {
 #if DIRECTIONS == 1
@@ -26,8 +25,8 @@ vec2 box_interval(vec3 q, vec3 d, vec3 low, vec3 high) {
     return vec2(max(max(near.x, near.y), max(near.z, 0.0)), min(far.x, min(far.y, far.z)));
 }
 
-// One step further. Directional cells hold the fraction of their face that is covered, which adds up to 1 across a
-// surface however it lies between the samples (march.glsl); the marker of isotropic ones is composited as printed.
+// Takes one step. Directional cells hold the covered fraction of their face, which adds up to 1 across a surface
+// however it lies between the samples (march.glsl); the marker of isotropic ones is composited as in the paper.
 vec4 accumulated(vec4 sum, vec4 v) {
     float room = 1.0 - sum.a;
 #if DIRECTIONS == 1

@@ -5,7 +5,7 @@
 
 struct Mirror { bool present; vec3 point; vec3 normal; float depth; float alpha; };
 
-// The smooth surface that a pixel sees. A declared plane is flatter than its depth image: its own normal counts.
+// The smooth surface that a pixel sees. A declared plane is flatter than its depth image: its own normal applies.
 Mirror mirror_at(ivec2 pixel) {
     vec4 position = texelFetch(real_surface_position, pixel, 0);
     vec4 normal = texelFetch(real_surface_normal, pixel, 0);

@@ -1,11 +1,11 @@
-// Rays from smooth real surfaces, and the objects that they meet.
+// Rays from smooth real surfaces, and their hits on the objects.
 #include "common/mirror.glsl"
 #include "common/ray_mesh.glsl"
 #include "common/ray_pattern.glsl"
 
-const float DEPTH_RANGE = 1.5;   // change of depth within the rays' pixels; beyond, the surface's own point serves
+const float DEPTH_RANGE = 1.5;   // change of depth within the rays' pixels; beyond, all start at the surface's own point
 
-// A ray that the surface sends into its lobe towards the camera, reversed; `spread`: pixels that the rays start from.
+// A ray from the camera, reflected by a sample of the surface's lobe; `spread`: pixels that the rays start from.
 Ray lobe_ray(ivec2 pixel, Mirror m, vec4 numbers, float spread) {
     vec2 slope = texelFetch(picture_rays, pixel, 0).xy + spread * (numbers.zw - 0.5) / camera_pinhole.xy;
     vec3 seen = mat3(world_from_camera) * vec3(slope, 1.0);

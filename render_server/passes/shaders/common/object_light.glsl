@@ -1,4 +1,4 @@
-// Radiance that the surface of a virtual object sends towards v (docs/method.md 4.7). Needs lights.glsl and brdf.glsl.
+// Radiance of a virtual object's surface towards v (docs/method.md 4.7). Needs lights.glsl and brdf.glsl.
 #include "common/materials.glsl"
 
 uniform float noise_sigma;      // m at 1 m

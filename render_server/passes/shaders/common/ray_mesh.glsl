@@ -1,5 +1,5 @@
-// Closest hit of a ray with the objects' triangles, and what their surface is like there. The hierarchy
-// (render_server/scene/bvh.py) lies in depth-first order with skips, so that no stack is needed.
+// Closest hit of a ray on the objects' triangles, and the surface there. The hierarchy (render_server/scene/bvh.py)
+// is in depth-first order with skips, so that no stack is needed.
 #include "common/materials.glsl"
 
 struct Node { vec3 low; int leaf; vec3 high; int skip; };   // leaf: first triangle << 3 | count, or -1
@@ -8,7 +8,7 @@ layout(std430) readonly buffer Faces { vec4 faces[]; };           // 3 a triangl
 layout(std430) readonly buffer Vertices { float vertices[]; };    // VERTEX_FLOATS each (scene/triangle_mesh.py)
 
 const int VERTEX_FLOATS = 12;
-const float EDGE = 1e-5;   // barycentric: neighbours overlap by so much, so that no ray slips between them
+const float EDGE = 1e-5;   // barycentric: overlap of neighbours, so that no ray slips between them
 
 struct Ray { vec3 from; vec3 direction; };   // direction: unit length
 
@@ -65,7 +65,7 @@ vec3 vertex_vector(ivec3 rows, int column, vec3 weights) {
     return sum;
 }
 
-// The surface at a hit, its normal turned towards the ray's origin as the raster turns it to the camera.
+// The surface at a hit, its normal facing the ray's origin as the raster's faces the camera.
 MeshSurface surface_of(MeshHit hit, Ray ray) {
     int at = 3 * hit.triangle;
     ivec3 rows = floatBitsToInt(vec3(faces[at].w, faces[at + 1].w, faces[at + 2].w));

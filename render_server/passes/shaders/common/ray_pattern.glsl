@@ -1,11 +1,11 @@
-// Where the few rays of a pixel go: RAY_COUNT numbered samples of a lobe and of the pixel.
+// Sampling pattern of a pixel's few rays: RAY_COUNT numbered samples of a lobe and of the pixel.
 
-// Gradient noise of a pixel, even over any 3 x 3 of them (Jimenez 2014).
+// Gradient noise of a pixel, uniform over any 3 x 3 of them (Jimenez 2014).
 float pixel_noise(vec2 pixel) { return fract(52.9829189 * fract(dot(pixel, vec2(0.06711056, 0.00583715)))); }
 
-// Ray j of RAY_COUNT: xy over the lobe, zw within the pixel. Each stands for an equal fraction of the lobe's energy, at its
-// middle, so that no pixel has a longer tail than its neighbour; they are turned about from pixel to pixel, the same
-// each frame.
+// Ray j of RAY_COUNT: xy over the lobe, zw within the pixel. Each represents an equal fraction of the lobe's energy,
+// at its middle, so that no pixel has a longer tail than its neighbour; the pattern is rotated from pixel to pixel,
+// the same in each frame.
 vec4 ray_numbers(ivec2 pixel, int j) {
     vec3 even = float(j) * vec3(0.6180339887, 0.7548776662, 0.5698402910);   // golden ratio; Roberts 2018
     vec2 turn = vec2(pixel_noise(vec2(pixel)), pixel_noise(vec2(pixel.yx) + 47.0));

@@ -1,7 +1,7 @@
-// Radiance that a point of the real scene sends out, from the picture where the camera looks at it.
+// Radiance of a point of the real scene, from the picture where the camera sees it.
 #include "common/camera_image.glsl"
-uniform float depth_tolerance;      // relative to depth: how far a point may lie from what the camera sees
-uniform sampler3D albedo_volume;   // of real surfaces that the camera does not see now
+uniform float depth_tolerance;      // relative to depth: how far a point may be from the visible surface
+uniform sampler3D albedo_volume;   // of real surfaces that the camera does not see at present
 uniform vec4 albedo_cube;           // its lowest corner (world m) and 1 / edge (1/m)
 uniform float picture_lod;          // of the linear picture: one sample covers a triangle's pixels
 
@@ -14,7 +14,7 @@ bool camera_sees(vec3 p) {
     return seen > 0.0 && abs(seen - c.z) < depth_tolerance * c.z;
 }
 
-// The side about n of a surface at p.
+// The normal of the visible side of a surface at p.
 bool camera_sees(vec3 p, vec3 n) {
     vec3 c = (camera_from_world * vec4(p, 1.0)).xyz;
     return dot(mat3(camera_from_world) * n, c) < 0.0 && camera_sees(p);

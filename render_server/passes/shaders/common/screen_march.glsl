@@ -1,22 +1,22 @@
-// A ray followed across the camera's picture, pixel by pixel, until it meets a real surface that the camera sees
-// ([D] 4.4.2). What lies behind something in the picture is not known: the ray is lost there.
+// A ray marched across the camera's picture, pixel by pixel, until it hits a visible real surface ([D] 4.4.2). What
+// is behind something in the picture is unknown: the ray is lost there.
 #include "common/geometry.glsl"
 #include "common/camera_image.glsl"
 
 uniform bool lens_bends;      // picture_pixel is a pinhole's
 uniform float noise_sigma;    // m at 1 m
 
-const float NEAREST = 0.02;     // m before the camera
+const float NEAREST = 0.02;     // m in front of the camera
 const float FARTHEST = 20.0;    // m along the ray
 const int MOST_STEPS = 4096;    // longer than any picture's diagonal
 const float FADE_PIXELS = 4.0;  // at the picture's border, so that no seam shows
-// Sine of the angle below which a surface is met too flatly to be trusted: a pixel of it spans ten across.
+// Sine of the least angle of incidence for a reliable hit: a pixel of the surface then spans ten pixels across.
 const float FLATTEST = 0.1;
 
-// `point` on a real surface whose middle `pixel` shows; `fraction`: how far it can be trusted, 0 where the ray was lost.
+// `point` on a real surface whose middle `pixel` shows; `fraction`: its reliability, 0 where the ray was lost.
 struct ScreenHit { float distance; vec2 pixel; float depth; float fraction; };
 
-// Pixel (centres at .5) that shows a point before the camera: a pinhole's, moved by what the lens bends there.
+// Pixel (centres at .5) that shows a point in front of the camera: a pinhole's, displaced by the lens.
 vec2 seen_pixel(vec3 c) {
     vec2 pixel = picture_pixel(c), last = picture_size - 1.0;
     for (int i = 0; i < (lens_bends ? 2 : 0); ++i) {
@@ -29,7 +29,7 @@ vec2 seen_pixel(vec3 c) {
 
 bool in_picture(vec2 pixel) { return all(greaterThanEqual(pixel, vec2(0.0))) && all(lessThan(pixel, picture_size)); }
 
-// Fraction of the way from p to p + way (pixels) that lies in the picture; p does.
+// Fraction of the segment from p to p + way (pixels) that is inside the picture; p is.
 float way_in_picture(vec2 p, vec2 way) {
     vec2 safe = mix(way, vec2(1e-6), lessThan(abs(way), vec2(1e-6)));
     vec2 border = mix(vec2(0.0), picture_size, greaterThan(safe, vec2(0.0)));
@@ -37,7 +37,7 @@ float way_in_picture(vec2 p, vec2 way) {
     return clamp(min(leave.x, leave.y), 0.0, 1.0);
 }
 
-// From `from` (world) along d until something is met; `spread`: diameter of the cone at distance 1.
+// From `from` (world) along d until a hit; `spread`: diameter of the cone at distance 1.
 ScreenHit screen_hit(vec3 from, vec3 d, float spread) {
     ScreenHit hit = ScreenHit(FARTHEST, vec2(0.0), 1.0, 0.0);
     vec3 a = (camera_from_world * vec4(from, 1.0)).xyz, v = mat3(camera_from_world) * d;
@@ -51,7 +51,7 @@ ScreenHit screen_hit(vec3 from, vec3 d, float spread) {
     float before = 0.0;
     for (int i = 1; i <= steps; ++i) {
         float s = last * float(i) / float(steps);
-        float t = reach * s * near_b / mix(near_a, near_b, s);   // even in the picture is not even in the world
+        float t = reach * s * near_b / mix(near_a, near_b, s);   // uniform in the picture is not uniform in the world
         vec3 c = a + t * v;
         vec2 pixel = seen_pixel(c);
         if (!in_picture(pixel)) break;
@@ -68,7 +68,7 @@ ScreenHit screen_hit(vec3 from, vec3 d, float spread) {
         }
         before = t;
     }
-    if (hit.fraction > 0.0) {   // where on the surface: at most a pixel off
+    if (hit.fraction > 0.0) {   // refines the hit on the surface: at most a pixel off
         vec3 c = a + hit.distance * v;
         if (c.z > NEAREST) { hit.pixel = seen_pixel(c); hit.depth = c.z; }
         vec2 rim = min(hit.pixel, picture_size - hit.pixel);

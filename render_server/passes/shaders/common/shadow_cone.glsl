@@ -1,6 +1,6 @@
-// Shadow cones ([P1] eq. 4): C_s is the opacity that a cone as wide as the light meets on its way there.
-// It is marched where the objects are: only they take light away that the picture still has, and what the real scene
-// blocks is in V_mu. So T_delta = -C_s E V_mu cos, and a real shadow is not cast twice (docs/method.md 3, direct).
+// Shadow cones ([P1] eq. 4): C_s is the opacity along a cone as wide as the light. It is marched only near the
+// objects: only they remove light that is still in the picture, while occlusion by the real scene is in V_mu. So
+// T_delta = -C_s E V_mu cos, and a real shadow is not cast twice (docs/method.md 3, direct).
 #include "common/march_joint.glsl"
 #include "common/lights.glsl"
 
@@ -8,7 +8,7 @@ uniform sampler3D joint_pyramid;
 uniform vec3 object_low;     // voxels that hold the objects
 uniform vec3 object_high;
 
-const float SHADOW_START = 2.0;   // voxels along the normal, out of the receiver's own voxels
+const float SHADOW_START = 2.0;   // voxels along the normal, to leave the receiver's own voxels
 
 struct ShadowCone { vec3 start; vec3 d; float ratio; vec2 interval; };
 

@@ -1,13 +1,13 @@
-// What a pixel shows of the objects before real things are compared: its depth and the fraction of the pixel.
+// The objects in a pixel before comparison with real things: their depth and fraction of the pixel.
 #include "common/in_front.glsl"
 uniform sampler2D sample_coverage;   // of samples; r: in front of the real surface, g: behind it, b: g times mean depth
 uniform bool antialiased;
 #include "common/camera.glsl"
 
-const float STEEPEST = 10.0;   // tangent of the slant (84 degrees) up to which samples of one pixel are taken for one surface
+const float STEEPEST = 10.0;   // tangent of the slant (84 degrees) up to which samples of one pixel count as one surface
 
-// Fraction of the pixel's samples that show the surface at depth z, or lie in front. Hidden samples of the same surface
-// count: how it passes behind the real one is what the softened edge says.
+// Fraction of the pixel's samples that show the surface at depth z, or are in front. Hidden samples of the same
+// surface count: the softened edge decides how it passes behind the real one.
 float covered_fraction(ivec2 pixel, float z) {
     vec4 c = texelFetch(sample_coverage, pixel, 0);
     if (c.r == 0.0) return c.g;

@@ -6,8 +6,8 @@ const vec2 ALBEDO_RANGE = vec2(0.02, 0.95);
 #include "common/real_radiance.glsl"
 uniform float bias_real;   // m
 
-// As the picture shows it under the light that gets there ([P2] eq. 1), `indirect` of it by other surfaces and the
-// surroundings; or as remembered.
+// The albedo that the picture shows under the incident light ([P2] eq. 1), of which `indirect` comes from other
+// surfaces and the environment; or the remembered one.
 vec3 albedo_at(Surfel s, vec3 n, vec3 indirect) {
     vec3 p = s.position_area.xyz, e = indirect;
     if (!camera_sees(p, n)) return unseen_albedo(p);

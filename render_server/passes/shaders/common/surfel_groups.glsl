@@ -21,7 +21,7 @@ uint group_entry(uint voxel, vec3 n) {
     return voxel_index(block, volume_size / 2) * 6u + uint(main_axis(n));
 }
 
-// Low corner (voxels) of the block that an entry of the grid stands for.
+// Low corner (voxels) of the block of an entry of the grid.
 vec3 block_corner(uint entry) { return vec3(2 * voxel_of_index(entry / 6u, volume_size / 2)); }
 
 #ifdef GROUP_ENTRIES_ACCESS

@@ -1,5 +1,5 @@
-// Joint bilateral upsampling of what was computed at 1/scale of the picture: the 2 x 2 texels around a pixel, weighted
-// by nearness and by how well their surface continues this one's.
+// Joint bilateral upsampling from 1/scale of the picture: the 2 x 2 texels around a pixel, weighted by distance and
+// by how well their surface continues the pixel's.
 uniform isampler2D sample_pixels;
 uniform int scale;
 #include "common/continuation.glsl"

@@ -1,13 +1,13 @@
-// Voxel volume in world axes; its pyramid lies in one 3-D texture of n x n x (DIRECTIONS + ceil(DIRECTIONS / 2) / 2) n:
-// level 0 of direction k at z = k n; levels l >= 1 behind all of them, two directions side by side in x, at
-// y = n (1 - 2^(1-l)). Directions: 0:+x 1:-x 2:+y 3:-y 4:+z 5:-z, the direction in which a cone travels; isotropic sets have one.
+// Voxel volume in world axes; its mipmap is one 3-D texture of n x n x (DIRECTIONS + ceil(DIRECTIONS / 2) / 2) n:
+// level 0 of direction k at z = k n; levels l >= 1 behind all of them, two directions side by side in x, at y = n (1
+// - 2^(1-l)). Directions: 0:+x 1:-x 2:+y 3:-y 4:+z 5:-z, in which a cone travels; isotropic sets have one.
 #ifndef DIRECTIONS
 #define DIRECTIONS 6
 #endif
 layout(std140) uniform Volume {
     vec3 volume_origin;   // world position of the low corner, m
     float voxel_edge;     // h, m
-    int volume_size;      // n, voxels an edge
+    int volume_size;      // n, voxels per edge
     int volume_levels;
 };
 

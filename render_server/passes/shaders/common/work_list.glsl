@@ -14,7 +14,7 @@ uint listed_count() { return min(texel_count, uint(texels.length())); }
 
 ivec2 texel_of_index(uint index, int grid_width) { return ivec2(int(index) % grid_width, int(index) / grid_width); }
 
-// Pixel number `inside` of the block of scale x scale pixels that a texel stands for.
+// Pixel number `inside` of the block of scale x scale pixels that a texel represents.
 ivec2 pixel_in_block(ivec2 texel, int inside, int scale) {
     return texel * scale + ivec2(inside % scale, inside / scale);
 }

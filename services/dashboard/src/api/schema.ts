@@ -1033,7 +1033,7 @@ export interface components {
         };
         /**
          * AroofMethod
-         * @description Object occlusion fields (METHOD 6): what rigid objects hide of natural light is precomputed.
+         * @description Object occlusion fields (docs/method.md 6): what rigid objects hide of natural light is precomputed.
          */
         readonly AroofMethod: {
             /**
@@ -1257,7 +1257,7 @@ export interface components {
         };
         /**
          * DifferentialMethod
-         * @description Differential rendering: two full solutions, the reference (METHOD 6).
+         * @description Differential rendering: two full solutions, the reference (docs/method.md 6).
          */
         readonly DifferentialMethod: {
             /**
@@ -1417,7 +1417,7 @@ export interface components {
         };
         /**
          * DlpvMethod
-         * @description Delta light propagation volumes (METHOD 5).
+         * @description Delta light propagation volumes (docs/method.md 5).
          */
         readonly DlpvMethod: {
             /**
@@ -1523,7 +1523,7 @@ export interface components {
         };
         /**
          * DvctMethod
-         * @description Delta voxel cone tracing (METHOD 4).
+         * @description Delta voxel cone tracing (docs/method.md 4).
          */
         readonly DvctMethod: {
             /**
@@ -1587,7 +1587,7 @@ export interface components {
             readonly name: "dvct";
             /**
              * Operator
-             * @description Dual march (METHOD 3), or the operator as printed in the paper.
+             * @description Dual march (docs/method.md 3), or the operator as printed in the paper.
              * @default exact
              * @enum {string}
              */
@@ -1767,7 +1767,7 @@ export interface components {
         };
         /**
          * FisheyeLights
-         * @description How lights are taken from the fish-eye picture (METHOD 2); environment maps are split alike.
+         * @description How lights are taken from the fish-eye picture (docs/method.md 2); environment maps are split alike.
          */
         readonly FisheyeLights: {
             /**
@@ -2818,7 +2818,7 @@ export interface components {
         };
         /**
          * SceneDocument
-         * @description Everything that is to be seen beside the camera picture, and how (FORMATS 3).
+         * @description Everything that is to be seen beside the camera picture, and how (docs/formats.md 3).
          *
          *     World = the marker board's frame: origin at the top-left corner of its first marker, +x right, +y up the
          *     sheet, +z out of the paper; metres. Radiometry in camera units (1.0 = sensor white at the reference

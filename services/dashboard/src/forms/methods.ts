@@ -1,5 +1,9 @@
-// What each method is good and bad at (docs/methods.md), in a sentence.
+// What each method is good and bad at (docs/methods.md), in a sentence; methods of plugins speak for themselves.
+import { computed } from "@preact/signals";
 import type { MethodName } from "../api/types";
+import { labelOf } from "../math/units";
+import { fieldsOf } from "./fields";
+import { schemas, type JsonSchema } from "./schemas";
 
 interface MethodText {
   readonly name: MethodName;
@@ -10,7 +14,7 @@ interface MethodText {
   readonly main: readonly string[];
 }
 
-export const METHODS: readonly MethodText[] = [
+const OWN: readonly MethodText[] = [
   {
     name: "dvct",
     title: "Voxel cone tracing",
@@ -48,6 +52,20 @@ export const METHODS: readonly MethodText[] = [
   },
 ];
 
+/** Every method that the service knows: the project's own, then those of plugins. */
+export const methods = computed<readonly MethodText[]>(() => [...OWN, ...installed(schemas.value)]);
+
+function installed(known: Readonly<Record<string, JsonSchema>>): MethodText[] {
+  const models = known.SceneDocument?.properties?.method?.oneOf ?? [];
+  return models.flatMap(({ $ref }) => {
+    const schema = $ref?.split("/").at(-1) ?? "";
+    const name = known[schema]?.properties?.name?.const as MethodName | undefined;
+    if (name === undefined || OWN.some((each) => each.name === name)) return [];
+    const main = fieldsOf(known[schema]).map(({ key }) => key);
+    return [{ name, title: labelOf(name), help: known[schema]?.description ?? "", schema, main }];
+  });
+}
+
 export function methodText(name: MethodName): MethodText {
-  return METHODS.find((each) => each.name === name) ?? METHODS[0]!;
+  return methods.value.find((each) => each.name === name) ?? OWN[0]!;
 }

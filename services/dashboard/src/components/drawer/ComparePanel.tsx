@@ -1,8 +1,8 @@
-import { useSignal, type Signal } from "@preact/signals";
+import { computed, useSignal, type Signal } from "@preact/signals";
 import { API } from "../../api/http";
 import { role } from "../../api/session";
 import type { MethodName, Snapshot, WantedPicture } from "../../api/types";
-import { METHODS } from "../../forms/methods";
+import { methods } from "../../forms/methods";
 import { methodOf } from "../../state/actions";
 import { comparison, type Side } from "../../state/comparison";
 import { isTakingSnapshot, takeSnapshot } from "../../state/takes";
@@ -14,10 +14,10 @@ import { Select } from "../ui/Select";
 /** The camera's own picture, or the composite by a method. */
 type Choice = "camera" | MethodName;
 
-const CHOICES: readonly { readonly value: Choice; readonly label: string }[] = [
+const choices = computed<readonly { readonly value: Choice; readonly label: string }[]>(() => [
   { value: "camera", label: "Camera (before)" },
-  ...METHODS.map(({ name, title }) => ({ value: name, label: title })),
-];
+  ...methods.value.map(({ name, title }) => ({ value: name, label: title })),
+]);
 
 /** Renders one frame twice and lays both over the live picture, with a split to slide. */
 export function ComparePanel() {
@@ -54,7 +54,7 @@ function SideChoice({ label, choice }: { readonly label: string; readonly choice
       <Select
         label={label}
         value={choice.value}
-        choices={CHOICES}
+        choices={choices.value}
         onChange={(next) => (choice.value = next)}
         disabled={role.value !== "control"}
       />
@@ -75,5 +75,5 @@ function sideOf(taken: Snapshot, name: string, choice: Choice): Side | null {
 }
 
 function labelOf(choice: Choice): string {
-  return CHOICES.find((each) => each.value === choice)?.label ?? choice;
+  return choices.value.find((each) => each.value === choice)?.label ?? choice;
 }

@@ -1,7 +1,7 @@
 import { role } from "../../api/session";
 import type { MethodName } from "../../api/types";
 import { fieldsOf, type SchemaField } from "../../forms/fields";
-import { METHODS, methodText } from "../../forms/methods";
+import { methods, methodText } from "../../forms/methods";
 import { SchemaForm } from "../../forms/SchemaForm";
 import { schemas } from "../../forms/schemas";
 import { setMethod } from "../../state/actions";
@@ -56,7 +56,7 @@ export function MethodPanel() {
 function MethodChoice({ value, disabled }: { readonly value: MethodName; readonly disabled: boolean }) {
   return (
     <div class="choices" role="radiogroup" aria-label="Method">
-      {METHODS.map((each) => (
+      {methods.value.map((each) => (
         <label key={each.name} class="choice">
           <input
             type="radio"

@@ -1,6 +1,6 @@
 import { role } from "../../api/session";
 import type { MethodName, View } from "../../api/types";
-import { METHODS } from "../../forms/methods";
+import { methods } from "../../forms/methods";
 import { VIEWS } from "../../forms/views";
 import { setMethod, setView } from "../../state/actions";
 import { standsOnSurfaces } from "../../state/preferences";
@@ -61,7 +61,7 @@ export function StageBar() {
       <Select<MethodName>
         label="Method"
         value={document?.method.name ?? "dvct"}
-        choices={METHODS.map(({ name, title }) => ({ value: name, label: title }))}
+        choices={methods.value.map(({ name, title }) => ({ value: name, label: title }))}
         onChange={setMethod}
         disabled={isDisabled}
       />
