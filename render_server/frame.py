@@ -60,8 +60,8 @@ class Observation:
 class ObjectSurface:
     """The objects as the camera sees them: their geometry buffer and how much of each pixel they cover.
 
-    `samples` are the samples that an antialiased geometry buffer was resolved from; `rectangle` encloses the
-    objects; `edge_correction` unmixes the edges of real things in front of them.
+    `edge_correction` unmixes the edges of real things in front of the objects. `samples` are the samples that an
+    antialiased geometry buffer was resolved from; `rectangle` encloses the objects.
     """
 
     buffer: GeometryBuffer

@@ -17,7 +17,7 @@ import structlog
 from protocol.errors import DeltalightError
 from protocol.methods import InstalledMethod, load_methods
 from protocol.plugins import LoadedPlugins
-from protocol.scene_method import DvctMethod
+from protocol.scene_method import BUILT_IN_METHODS, DvctMethod, NoneMethod
 from render_server.methods import registry
 from render_server.methods.method import RelightingMethod
 from sensor_node.cameras.discovery import discover
@@ -126,7 +126,22 @@ for name, method in (("none", {"name": "none"}), ("direct", {"name": "direct"}),
     pictures[name] = renderer.render(frame).color
     renderer.release()
 np.savez(folder / "pictures.npz", **pictures)
+
+from render_server.gpu.kernel import Kernel
+from render_server.gpu.textures import texture_2d
+
+written = texture_2d(gpu, (2, 2), 4, "f4")
+Kernel(gpu, Path(sys.argv[2]) / "fog").run(written.size, fog_out=written)
+told["written"] = np.frombuffer(written.read(), np.float32).tolist()
 print(json.dumps(told))
+"""
+
+
+FOG_SHADER = """
+#include "common/basis.glsl"
+layout(local_size_x = 2, local_size_y = 2) in;
+layout(rgba32f) writeonly uniform image2D fog_out;
+void main() { imageStore(fog_out, ivec2(gl_GlobalInvocationID.xy), vec4(basis_around(vec3(0, 0, 1))[2], 4.0)); }
 """
 
 
@@ -136,8 +151,9 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     packages, folder = tmp_path_factory.mktemp("packages"), tmp_path_factory.mktemp("pictures")
     install_examples(packages)
     install_package(packages, "fog-method", "2.0", {"deltalight.methods": {"fog": "fog_method:method"}}, {})
+    (packages / "fog.comp.glsl").write_text(FOG_SHADER)
     done = subprocess.run(
-        [sys.executable, "-c", SCRIPT, str(folder)],
+        [sys.executable, "-c", SCRIPT, str(folder), str(packages)],
         cwd=ROOT,
         env={**os.environ, "PYTHONPATH": os.pathsep.join([str(packages), str(ROOT)])},
         capture_output=True,
@@ -159,6 +175,10 @@ def test_a_document_may_name_the_method_wherever_it_is_read(rendered: dict[str, 
     assert rendered["schema"]["required"] == ["name"]
     assert rendered["schema"]["properties"]["ambient"]["maximum"] == 10
     assert not rendered["opengl"]
+
+
+def test_a_plugin_has_kernels_of_its_own(rendered: dict[str, Any]) -> None:
+    assert rendered["written"] == [0, 0, 1, 4] * 4
 
 
 def test_the_method_draws_shadows_of_lamps_and_even_light(rendered: dict[str, Any]) -> None:
@@ -228,6 +248,28 @@ def test_a_broken_plugin_is_a_sentence_and_the_others_work(install: Install, nam
 
 
 GROUPS = ("deltalight.methods", "deltalight.cameras")
+
+
+def test_doctor_tells_of_methods(install: Install, monkeypatch: pytest.MonkeyPatch) -> None:
+    install("fog-method", "2.0", {"deltalight.methods": {"fog": "fog_method:method"}}, {})
+    monkeypatch.setattr("protocol.methods.PLUGINS", load_methods())
+    direct, fog = doctor._methods()
+    assert (direct.name, direct.state, direct.detail) == (
+        "method direct",
+        "ok",
+        "of package direct-light 1.0",
+    )
+    assert (fog.name, fog.state, fog.hint) == ("method fog", "note", "mend or uninstall the package")
+    assert "No module named 'fog_method'" in fog.detail
+
+
+def test_every_method_of_the_project_is_registered() -> None:
+    relighting = {method.settings for method in registry.BUILT_IN}
+    assert relighting == set(BUILT_IN_METHODS) - {NoneMethod}
+    for settings in BUILT_IN_METHODS:
+        choice = registry.choose_method(settings(), software=True)
+        assert choice.relights_real is (settings is not NoneMethod)
+        assert choice.plugin is None
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,6 @@ import math
 from collections.abc import Iterator, Sequence
 
 import moderngl
-import numpy as np
 
 from render_server.gpu.context import GpuContext
 
@@ -56,5 +55,5 @@ def _size(item: object) -> int:
     if isinstance(item, moderngl.Buffer):
         return int(item.size)
     assert isinstance(item, moderngl.Texture | moderngl.Texture3D | moderngl.TextureArray)
-    texels = math.prod(item.size)
-    return int(texels * item.components * np.dtype(item.dtype).itemsize)
+    component_bytes = int(item.dtype[-1])  # of moderngl's f1, f2, u4, ...
+    return math.prod(item.size) * int(item.components) * component_bytes

@@ -239,7 +239,7 @@ class FieldShading:
 def _occluded(
     shade: OcclusionShade, items: list[FieldObject], scene: Bindings, grid: LowResGrid
 ) -> OcclusionShade:
-    """What the objects leave of natural light."""
+    """Computes the natural light that the objects leave."""
     for number, item in enumerate(items):
         shade.run(grid, item.probe, item.textures, scene, item.place, first=number == 0)
     return shade

@@ -52,8 +52,8 @@ FAR_MARGIN = 1.05
 class VoxelSet:
     """The sparse voxels of one geometry: the placement that they were filled for, their surfels and groups.
 
-    `mipmaps` are filtered from them, and lose the texels of voxels that are replaced. `is_lit`: the sums hold light,
-    which must be cleared before relighting.
+    `mipmaps` are filtered from them; replaced voxels are cleared from them. `is_lit`: the sums hold light, which must
+    be cleared before relighting.
     """
 
     def __init__(self, gpu: GpuContext, size: int, mipmaps: Sequence[VoxelMipmap]) -> None:
@@ -271,7 +271,7 @@ class DeltaVoxels(DirectionalVoxels):
     def light_joint(
         self, real: VoxelSet, voxels: VoxelSet, objects: GeometryState, scene: Bindings
     ) -> LitVoxels:
-        """Lights the objects' surfels, and the change of real ones due to the objects' shadows."""
+        """Lights the objects' surfels, and changes the light of real ones by the objects' shadows."""
         voxels.forget_light()
         self._light.start_support(voxels.volume.placement.voxel_bounds(np.stack(objects.bounds)))
         self._light_rho(scene, gathered=False)

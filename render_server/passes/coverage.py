@@ -119,7 +119,7 @@ class EdgeUnmixing:
     """Unmixes pixels at the edge of a real thing in front of an object.
 
     Corrects the objects' coverage by the fraction of the pixel that the thing fills. `texture` (RGBA16F) removes the
-    old background from the pixel's radiance, and says which pixel shows the thing's surface.
+    old background from a pixel's radiance, and says which pixel shows the thing's surface.
     """
 
     def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:

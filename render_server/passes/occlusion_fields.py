@@ -193,9 +193,9 @@ def _direction_table() -> Float32[np.ndarray, "texels columns"]:
 class OcclusionShade:
     """Computes the natural light that objects leave on the reduced grid, one object after the other.
 
-    At the real surfaces (`real`) or at the objects'. RGBA32F each: `unoccluded` is the remaining fraction of the
-    irradiance; `natural` the weighted irradiance of each object's surroundings; `mirrored` the weighted radiance in
-    mirrors there, a: remaining fraction.
+    At the real surfaces (`real`), or at those of the objects. RGBA32F each: `unoccluded` is the remaining fraction of
+    the irradiance; `natural` the weighted irradiance of each object's surroundings; `mirrored` the weighted radiance
+    in mirrors there, a: remaining fraction.
     """
 
     def __init__(self, gpu: GpuContext, size: tuple[int, int], length: int, *, real: bool) -> None:
