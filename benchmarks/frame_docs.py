@@ -5,8 +5,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from render_server.graph import StageReport
-from render_server.graph_drawing import draw_graph
 from services.frame_account import FrameAccount, account_frame
+from services.graph_drawing import draw_graph
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "how-a-frame-is-made.md"

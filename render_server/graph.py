@@ -14,7 +14,7 @@ from typing import Any, Final, Generic, Literal, TypeVar, get_args
 
 from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Dispatch, watched
-from render_server.gpu.memory import gpu_objects, sizes_bytes
+from render_server.gpu.textures import gpu_objects, sizes_bytes
 from render_server.gpu.timers import PassTimers
 
 Clock = Literal["scene", "lights", "world", "objects", "view"]

@@ -17,7 +17,7 @@ from protocol.frames import DepthImage, ViewFrame
 from protocol.scene import SceneDocument
 from protocol.scene_method import Output
 from render_server.gpu.context import GpuContext
-from render_server.gpu.readback import AsyncReadback
+from render_server.gpu.textures import AsyncReadback
 from render_server.graph import Graph
 from render_server.live_scene import LiveScene, RelitFrame
 from render_server.picking import Pick, ShownFrame

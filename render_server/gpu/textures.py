@@ -1,6 +1,9 @@
-"""Textures with the sampling state that every pass uses; reading single texels; freeing GL objects."""
+"""Textures: made in one place, read back without stalling the GPU, and measured in bytes."""
 
-from typing import Protocol
+import math
+from collections import deque
+from collections.abc import Iterator, Sequence
+from typing import Any, Protocol
 
 import moderngl
 import numpy as np
@@ -55,3 +58,103 @@ def release_all(*items: Releasable | None) -> None:
     for item in items:
         if item is not None:
             item.release()
+
+
+GPU_KINDS = (moderngl.Texture, moderngl.Texture3D, moderngl.TextureArray, moderngl.Buffer)
+OWN_CODE = "render_server."
+DEEPEST = 4  # attributes of attributes; a pass holds fields, which hold textures
+
+
+def gpu_objects(value: object, depth: int = 0) -> Iterator[object]:
+    """Textures and buffers that `value` is or holds; one that is held twice comes twice.
+
+    What a context holds belongs to everybody, and so to nothing that knows the context.
+    """
+    if isinstance(value, GPU_KINDS):
+        yield value
+    elif depth < DEEPEST:
+        for item in _parts(value):
+            yield from gpu_objects(item, depth + 1)
+
+
+def _parts(value: object) -> Iterator[object]:
+    if isinstance(value, GpuContext):
+        return
+    if isinstance(value, tuple | list):
+        yield from value
+    elif isinstance(value, dict):
+        yield from value.values()
+    elif type(value).__module__.startswith(OWN_CODE) and hasattr(value, "__dict__"):
+        yield from vars(value).values()
+
+
+def sizes_bytes(values: Sequence[object]) -> list[int]:
+    """Bytes of the GPU's memory that each value takes, mip levels left out; nothing is counted twice.
+
+    What several hold counts for the one of them that holds the fewest things, the first of those.
+    """
+    held = [{id(item): item for item in gpu_objects(value)} for value in values]
+    owners: dict[int, int] = {}
+    for index in sorted(range(len(held)), key=lambda index: len(held[index])):
+        for key in held[index]:
+            owners.setdefault(key, index)
+    return [
+        sum(_size(item) for key, item in each.items() if owners[key] == index)
+        for index, each in enumerate(held)
+    ]
+
+
+def _size(item: object) -> int:
+    if isinstance(item, moderngl.Buffer):
+        return int(item.size)
+    assert isinstance(item, moderngl.Texture | moderngl.Texture3D | moderngl.TextureArray)
+    component_bytes = int(item.dtype[-1])  # of moderngl's f1, f2, u4, ...
+    return int(math.prod(item.size) * item.components) * component_bytes
+
+
+RING = 3
+
+
+class AsyncReadback:
+    """Copies textures into pixel buffers immediately and returns their bytes later, oldest first."""
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self._ctx = gpu.ctx
+        self._free: list[moderngl.Buffer] = []
+        self._waiting: deque[tuple[moderngl.Buffer, tuple[int, int, int], np.dtype[Any]]] = deque()
+
+    def __len__(self) -> int:
+        return len(self._waiting)
+
+    def push(self, texture: moderngl.Texture, dtype: str) -> None:
+        """Starts copying `texture` (level 0, as `dtype` elements)."""
+        width, height = texture.size
+        shape = (height, width, texture.components)
+        size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+        buffer = self._take(size)
+        texture.read_into(buffer, alignment=1)
+        self._waiting.append((buffer, shape, np.dtype(dtype)))
+
+    def pop(self) -> np.ndarray[Any, Any]:
+        """Returns the oldest pushed texture (h, w, components); waits only if the GPU has not finished it."""
+        buffer, shape, dtype = self._waiting.popleft()
+        size = int(np.prod(shape)) * dtype.itemsize
+        array = np.frombuffer(buffer.read(size), dtype=dtype).reshape(shape)
+        self._free.append(buffer)
+        return array
+
+    def _take(self, size: int) -> moderngl.Buffer:
+        """Returns an idle buffer of `size` bytes."""
+        for index, buffer in enumerate(self._free):
+            if buffer.size == size:
+                return self._free.pop(index)
+        while len(self._free) >= RING:
+            self._free.pop(0).release()
+        return self._ctx.buffer(reserve=size, dynamic=True)
+
+    def release(self) -> None:
+        """Frees all buffers."""
+        for buffer in [*self._free, *(entry[0] for entry in self._waiting)]:
+            buffer.release()
+        self._free.clear()
+        self._waiting.clear()

@@ -16,8 +16,7 @@ from render_server.gpu.textures import release_all
 from render_server.gpu_scene import GeometryState, PlacedObject
 from render_server.graph import Graph, Resource
 from render_server.methods.lighting import Layers, Shading, ShadingOptions, light_stages, shading_stages
-from render_server.methods.method import RelightingMethod
-from render_server.methods.settings import ResolvedSettings, Setup
+from render_server.methods.method import RelightingMethod, ResolvedSettings, Setup
 from render_server.occlusion_fields import OcclusionFields, require_rigid
 from render_server.passes.cones import ConeFields, LowResGrid
 from render_server.passes.occlusion_fields import (

@@ -12,13 +12,14 @@ import moderngl
 import numpy as np
 
 from protocol.scene_method import DifferentialMethod
-from render_server.frame import FrameResources
+from render_server.frame import FrameResources, Observation
 from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Binding, Bindings
 from render_server.gpu_scene import GeometryState
 from render_server.graph import Graph, Resource
 from render_server.lights.lights import LightSet
 from render_server.methods.lighting import (
+    SURFEL_SHADOW_SAMPLES,
     Layers,
     LitScene,
     Points,
@@ -27,15 +28,21 @@ from render_server.methods.lighting import (
     object_extent,
     shading_stages,
     shadow_receivers,
+    surfel_scene,
     volume_placement,
 )
-from render_server.methods.method import RelightingMethod
-from render_server.methods.settings import ResolvedSettings, Setup, march_defines, resolve_joint_maps
+from render_server.methods.method import (
+    RelightingMethod,
+    ResolvedSettings,
+    Setup,
+    march_defines,
+    resolve_joint_maps,
+)
 from render_server.methods.voxel_volumes import (
-    SolutionVoxels,
+    DirectionalVoxels,
+    VoxelSet,
     joint_voxels,
     placed_volume,
-    solution_stages,
 )
 from render_server.passes.caustics import Caustics
 from render_server.passes.cones import ConeFields, LowResGrid, TraceCones
@@ -43,7 +50,107 @@ from render_server.passes.gbuffer import MeshBuffers
 from render_server.passes.lights import LightBuffers
 from render_server.passes.shading import DirectLightPair
 from render_server.passes.shadow_maps import ShadowMaps
-from render_server.passes.voxels import DIRECTIONS, VoxelMipmap, memory_statement
+from render_server.passes.voxel_light import AlbedoTexture
+from render_server.passes.voxels import (
+    DIRECTIONS,
+    VolumePlacement,
+    VoxelMipmap,
+    memory_statement,
+)
+
+
+class SolutionVoxels(DirectionalVoxels):
+    """Voxels of two full solutions: the real scene alone (mu), real and virtual together (rho) (docs/method.md 6).
+
+    Each solution sums all its light and opacity under its own maps. Both share the pieces of the real triangles, the
+    camera's measurements on them (which give solution rho its reflectance), and the scene beyond the volume, which
+    objects do not change.
+    """
+
+    def voxelize_both(self, real: VoxelSet, objects: VoxelSet) -> tuple[VoxelSet, VoxelSet]:
+        """Groups the surfels of both sets after voxelisation."""
+        real.groups.reset(real.store)
+        if self._bounces > 0:
+            self._group.run(real.store, real.groups, real.volume.bindings, has_seen=False)
+        return real, objects
+
+    def mu_scene(
+        self,
+        seen: Observation,
+        albedo: AlbedoTexture,
+        _lights: LightSet,
+        lights: LightBuffers,
+        _environment: tuple[moderngl.TextureArray, ...],
+        voxels: VoxelSet,
+    ) -> dict[str, Binding]:
+        """Bindings of what lights the real scene's voxels under one solution's maps."""
+        seen.image.build_levels()
+        scene = surfel_scene(seen, lights, albedo, measured=self._measured)
+        return {**scene, **voxels.volume.bindings, "has_caustics": False}
+
+    def rho_scene(self, scene: Bindings, objects: GeometryState, lights: LightBuffers) -> dict[str, Binding]:
+        """Bindings of what lights the voxels of both."""
+        own = {**lights.bindings, "shadow_samples": SURFEL_SHADOW_SAMPLES}
+        return {**scene, **own, **objects.materials.bindings}
+
+    def light(
+        self, _voxels: tuple[VoxelSet, VoxelSet], _far: VoxelSet, mu: Bindings, rho: Bindings
+    ) -> "SolutionVoxels":
+        """Lights, resolves and filters mu, then rho."""
+        self._light_both(mu, rho, gathered=False)
+        return self
+
+    def bounce(self, _lit: "SolutionVoxels", mu: Bindings, rho: Bindings) -> "SolutionVoxels":
+        """Gathers light from each solution's own voxels, and relights them with it."""
+        for _ in range(self._bounces):
+            self.set_support(everywhere=True)
+            marching = {**mu, **self.march_bindings(1)}
+            self._gather.gather_real(self.real.store, self.real.groups, self.mu, self.rho, marching)
+            self._gather.gather_virtual(self.objects.store, self.objects.groups, self.rho, marching)
+            self._light_both(mu, rho, gathered=True)
+        return self
+
+    def _light_both(self, mu: Bindings, rho: Bindings, *, gathered: bool) -> None:
+        real, objects, light = self.real, self.objects, self._light
+        if not gathered:
+            objects.forget_light()
+        light.light_solution(real.store, mu, real.groups, with_objects=False, gathered=gathered)
+        self._resolve.resolve_mu(self.mu, real.store, real.volume)
+        light.light_solution(real.store, rho, real.groups, with_objects=True, gathered=gathered)
+        light.light_virtual(objects.store, rho, objects.groups, gathered=gathered)
+        real.store.delta_sums.clear()
+        self._resolve.resolve_rho(self.rho, real.store, objects.store, real.volume)
+        self._filter.run(self.mu, real.volume)
+        self._filter.run(self.rho, real.volume)
+
+    def set_support(self, *, everywhere: bool) -> None:
+        """Sets the bounds within which march.glsl distinguishes mu from rho: the whole volume or nothing."""
+        size = self.real.volume.placement.size
+        low, high = (0, size - 1) if everywhere else (size, -1)
+        # Unlike those of a delta, these bounds do not depend on the light.
+        self._light.reset_support(np.array([low, low, low, -high, -high, -high], np.int32))
+
+
+def solution_stages(
+    g: Graph,
+    s: FrameResources,
+    voxels: SolutionVoxels,
+    placement: Resource[VolumePlacement],
+    mu_maps: Resource[LightBuffers],
+    rho_maps: Resource[LightBuffers],
+    environment: Resource[tuple[moderngl.TextureArray, ...]],
+) -> Resource[SolutionVoxels]:
+    """Declares voxelisation of both geometries, then lighting and bounces in step."""
+    real = g.stage("voxelize real", voxels.voxelize_real, s.real, placement)
+    beyond = g.stage("voxelize far", voxels.far.voxelize, s.real)
+    objects = g.stage("voxelize objects", voxels.voxelize_objects, s.objects, placement)
+    both = g.stage("group surfels", voxels.voxelize_both, real, objects)
+    given = s.observation, s.albedo, s.lights, mu_maps, environment, real
+    mu = g.value("voxel scene mu", voxels.mu_scene, *given)
+    rho = g.value("voxel scene rho", voxels.rho_scene, mu, s.objects, rho_maps)
+    far = g.stage("light far voxels", voxels.far.light, beyond, mu)
+    lit = g.stage("light voxels", voxels.light, both, far, mu, rho)
+    return g.stage("bounces", voxels.bounce, lit, mu, rho)
 
 
 class SolutionLights:

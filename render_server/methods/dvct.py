@@ -1,31 +1,160 @@
 """Delta voxel cone tracing: the exact operator, and the one of the paper (docs/method.md 3 and 4)."""
 
+import moderngl
+
 from protocol.scene_method import DvctMethod
-from render_server.frame import FrameResources
+from render_server.frame import FrameResources, Observation
 from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Binding, Bindings
+from render_server.gpu.textures import release_all
+from render_server.gpu_scene import GeometryState
 from render_server.graph import Graph, Resource
+from render_server.lights.lights import LightSet
 from render_server.methods.lighting import (
     Layers,
+    LitScene,
     Shading,
     ShadingOptions,
     light_stages,
     shading_stages,
+    surfel_scene,
     volume_placement,
 )
-from render_server.methods.method import RelightingMethod
-from render_server.methods.settings import ResolvedSettings, Setup, march_defines, resolve_voxel_cones
+from render_server.methods.method import (
+    RelightingMethod,
+    ResolvedSettings,
+    Setup,
+    march_defines,
+    resolve_voxel_cones,
+)
 from render_server.methods.voxel_volumes import (
     DeltaVoxels,
-    InjectedVoxels,
+    VoxelSet,
     delta_voxel_stages,
-    injection_stages,
     joint_voxels,
     placed_volume,
 )
 from render_server.passes.cones import ConeFields, LowResGrid, TraceCones, TraceConesPaper
+from render_server.passes.lights import LightBuffers
 from render_server.passes.shading import DirectLight
-from render_server.passes.voxels import DIRECTIONS, VoxelMipmap, memory_statement
+from render_server.passes.split_injection import FilterIsotropic, RealAlbedo, ResolveInjection, SplitInjection
+from render_server.passes.voxel_light import AlbedoTexture
+from render_server.passes.voxels import (
+    DIRECTIONS,
+    VolumePlacement,
+    VoxelMipmap,
+    memory_statement,
+)
+
+
+class InjectedVoxels:
+    """V_delta and V_rho with the joint opacity of V_eta, filled by split injection ([P1] 3.2).
+
+    Two isotropic mipmaps: (V_delta, V_eta) with signed radiance, and (V_rho, V_eta).
+    """
+
+    directions = 1
+
+    def __init__(self, gpu: GpuContext, size: int) -> None:
+        self.delta, self.rho = (VoxelMipmap(gpu, size, self.directions) for _ in range(2))
+        self.real, self.objects = (VoxelSet(gpu, size, [self.delta, self.rho]) for _ in range(2))
+        self._albedo = RealAlbedo(gpu)
+        self._inject = SplitInjection(gpu)
+        self._resolve = ResolveInjection(gpu)
+        self._filter = FilterIsotropic(gpu)
+
+    def voxelize_real(self, real: GeometryState, placement: VolumePlacement) -> VoxelSet:
+        """Voxelises the real scene."""
+        self.real.fill(real.corners, placement)
+        return self.real
+
+    def voxelize_objects(self, objects: GeometryState, placement: VolumePlacement) -> VoxelSet:
+        """Voxelises the objects."""
+        self.objects.fill(objects.corners, placement)
+        return self.objects
+
+    def find_albedo(
+        self,
+        placed: VoxelSet,
+        seen: Observation,
+        albedo: AlbedoTexture,
+        _lights: LightSet,
+        lights: LightBuffers,
+        _environment: moderngl.TextureArray,
+    ) -> RealAlbedo:
+        """Computes the real scene's albedo as seen from the lights."""
+        seen.image.build_levels()
+        self._albedo.run(lights, {**surfel_scene(seen, lights, albedo), **placed.volume.bindings})
+        return self._albedo
+
+    def inject(
+        self,
+        real: VoxelSet,
+        objects: VoxelSet,
+        found: RealAlbedo,
+        geometry: GeometryState,
+        seen: Observation,
+        albedo: AlbedoTexture,
+        lights: LightBuffers,
+    ) -> tuple[VoxelSet, VoxelSet]:
+        """Injects the light of all maps."""
+        scene = {
+            **surfel_scene(seen, lights, albedo),
+            **geometry.materials.bindings,
+            **real.volume.bindings,
+        }
+        self._inject.run(real.store, objects.store, lights, found.atlas, scene)
+        return real, objects
+
+    def filter(self, injected: tuple[VoxelSet, VoxelSet]) -> "InjectedVoxels":
+        """Filters the sums into both mipmaps."""
+        real, objects = injected
+        self._resolve.run(self.delta, self.rho, real.store, objects.store, real.volume)
+        self._filter.run(self.delta, self.rho, real.volume)
+        return self
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        release_all(
+            self.delta,
+            self.rho,
+            self.real,
+            self.objects,
+            self._albedo,
+            self._inject,
+            self._resolve,
+            self._filter,
+        )
+
+
+def injection_stages(
+    g: Graph, s: FrameResources, lit: LitScene, voxels: InjectedVoxels, placement: Resource[VolumePlacement]
+) -> Resource[InjectedVoxels]:
+    """Declares voxelisation of both geometries, real albedo, injection and filtering."""
+    real = g.stage("voxelize real", voxels.voxelize_real, s.real, placement)
+    albedo = g.stage(
+        "real albedo",
+        voxels.find_albedo,
+        real,
+        s.observation,
+        s.albedo,
+        s.lights,
+        lit.real_maps,
+        lit.environment,
+    )
+    objects = g.stage("voxelize objects", voxels.voxelize_objects, s.objects, placement)
+    injected = g.stage(
+        "split inject",
+        voxels.inject,
+        real,
+        objects,
+        albedo,
+        s.objects,
+        s.observation,
+        s.albedo,
+        lit.object_maps,
+    )
+    return g.stage("filter", voxels.filter, injected)
 
 
 class ExactCones:

@@ -16,7 +16,7 @@ from render_server.gpu_scene import GeometryState
 from render_server.graph import Graph, Resource
 from render_server.lights.lights import LightSet
 from render_server.lights.mirror_lights import mirror_lights
-from render_server.methods.settings import ResolvedSettings
+from render_server.methods.method import ResolvedSettings
 from render_server.passes.caustics import GREATEST_ALPHA, Caustics
 from render_server.passes.composite import ChangeRatio
 from render_server.passes.cones import ConeFields, LowResGrid

@@ -24,8 +24,7 @@ from render_server.methods.lighting import (
     surfel_scene,
     volume_placement,
 )
-from render_server.methods.method import RelightingMethod
-from render_server.methods.settings import ResolvedSettings, Setup
+from render_server.methods.method import RelightingMethod, ResolvedSettings, Setup
 from render_server.passes.cones import ConeFields, LowResGrid
 from render_server.passes.lights import LightBuffers
 from render_server.passes.lpv import (

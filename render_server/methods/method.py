@@ -1,19 +1,74 @@
-"""A relighting method, as the registry and plugins know it (docs/plugins.md).
+"""A relighting method: its settings, resolved for this machine, and the declaration of its stages
+(docs/plugins.md).
 
 Light to import: processes that have no OpenGL load plugins too.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Generic
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Generic, TypeVar
 
+from protocol.scene_method import MethodSettings, VoxelConeSettings
 from protocol.scene_objects import SceneObject
-from render_server.methods.settings import ResolvedSettings, Settings, Setup
 
 if TYPE_CHECKING:
     from render_server.frame import FrameResources
     from render_server.graph import Graph
     from render_server.methods.lighting import Layers
+    from render_server.occlusion_fields import OcclusionFields
+
+Settings = TypeVar("Settings", bound=MethodSettings)
+
+
+@dataclass(frozen=True)
+class ResolvedSettings:
+    """The settings of a method whose defaults depend on the machine.
+
+    `volume_size` is in voxels or cells per edge. Cones and volumes are evaluated at 1/`cone_scale` of the picture.
+    """
+
+    volume_size: int
+    cone_scale: int
+    rsm_size: int
+    triangle_budget: int
+
+
+SOFTWARE_DEFAULTS = ResolvedSettings(volume_size=64, cone_scale=4, rsm_size=512, triangle_budget=40_000)
+GPU_DEFAULTS = ResolvedSettings(volume_size=256, cone_scale=2, rsm_size=1024, triangle_budget=400_000)
+
+
+@dataclass(frozen=True, eq=False)
+class Setup(Generic[Settings]):
+    """Arguments of a method's declaration: settings, picture size (width, height), precomputed data of objects."""
+
+    settings: Settings
+    resolved: ResolvedSettings
+    picture_size: tuple[int, int]
+    fields: "OcclusionFields"
+
+
+def resolve_voxel_cones(settings: VoxelConeSettings, defaults: ResolvedSettings) -> ResolvedSettings:
+    """Takes the document's values, or the machine's defaults where it says null."""
+    return ResolvedSettings(
+        settings.volume_size or defaults.volume_size,
+        settings.cone_scale or defaults.cone_scale,
+        settings.rsm_size or defaults.rsm_size,
+        settings.triangle_budget or defaults.triangle_budget,
+    )
+
+
+def resolve_joint_maps(settings: VoxelConeSettings, defaults: ResolvedSettings) -> ResolvedSettings:
+    """The same for methods whose shadow maps hold objects and room at once, and so resolve objects less."""
+    return resolve_voxel_cones(settings, replace(defaults, rsm_size=2 * defaults.rsm_size))
+
+
+def march_defines(settings: VoxelConeSettings) -> dict[str, int]:
+    """Returns the defines that march.glsl is compiled with."""
+    defines = {
+        "ISOTROPIC_VOXELS": settings.voxels == "isotropic",
+        "MULTIPLIED_COVERAGE": settings.coverage == "multiplied",
+    }
+    return {name: 1 for name, wanted in defines.items() if wanted}
 
 
 def keep_defaults(_settings: object, defaults: ResolvedSettings) -> ResolvedSettings:

@@ -16,8 +16,13 @@ from render_server.methods.differential import DIFFERENTIAL
 from render_server.methods.dvct import DVCT
 from render_server.methods.lighting import Layers
 from render_server.methods.lpv import DLPV
-from render_server.methods.method import RelightingMethod
-from render_server.methods.settings import GPU_DEFAULTS, SOFTWARE_DEFAULTS, ResolvedSettings, Setup
+from render_server.methods.method import (
+    GPU_DEFAULTS,
+    SOFTWARE_DEFAULTS,
+    RelightingMethod,
+    ResolvedSettings,
+    Setup,
+)
 from render_server.occlusion_fields import OcclusionFields
 
 BUILT_IN: tuple[RelightingMethod[Any], ...] = (DVCT, DLPV, AROOF, DIFFERENTIAL)

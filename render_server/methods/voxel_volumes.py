@@ -5,6 +5,7 @@ mu holds the real scene, rho real and virtual surfaces.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import moderngl
 import numpy as np
@@ -20,9 +21,8 @@ from render_server.gpu_scene import GeometryState
 from render_server.graph import Graph, Resource
 from render_server.lights.lights import LightSet
 from render_server.methods.lighting import SURFEL_SHADOW_SAMPLES, LitScene, casts_caustics, surfel_scene
-from render_server.methods.settings import march_defines
+from render_server.methods.method import march_defines
 from render_server.passes.lights import LightBuffers
-from render_server.passes.split_injection import FilterIsotropic, RealAlbedo, ResolveInjection, SplitInjection
 from render_server.passes.voxel_light import (
     AlbedoTexture,
     GatherVoxels,
@@ -337,215 +337,17 @@ def delta_voxel_stages(
     return mu, rho
 
 
-class SolutionVoxels(DirectionalVoxels):
-    """Voxels of two full solutions: the real scene alone (mu), real and virtual together (rho) (docs/method.md 6).
-
-    Each solution sums all its light and opacity under its own maps. Both share the pieces of the real triangles, the
-    camera's measurements on them (which give solution rho its reflectance), and the scene beyond the volume, which
-    objects do not change.
-    """
-
-    def voxelize_both(self, real: VoxelSet, objects: VoxelSet) -> tuple[VoxelSet, VoxelSet]:
-        """Groups the surfels of both sets after voxelisation."""
-        real.groups.reset(real.store)
-        if self._bounces > 0:
-            self._group.run(real.store, real.groups, real.volume.bindings, has_seen=False)
-        return real, objects
-
-    def mu_scene(
-        self,
-        seen: Observation,
-        albedo: AlbedoTexture,
-        _lights: LightSet,
-        lights: LightBuffers,
-        _environment: tuple[moderngl.TextureArray, ...],
-        voxels: VoxelSet,
-    ) -> dict[str, Binding]:
-        """Bindings of what lights the real scene's voxels under one solution's maps."""
-        seen.image.build_levels()
-        scene = surfel_scene(seen, lights, albedo, measured=self._measured)
-        return {**scene, **voxels.volume.bindings, "has_caustics": False}
-
-    def rho_scene(self, scene: Bindings, objects: GeometryState, lights: LightBuffers) -> dict[str, Binding]:
-        """Bindings of what lights the voxels of both."""
-        own = {**lights.bindings, "shadow_samples": SURFEL_SHADOW_SAMPLES}
-        return {**scene, **own, **objects.materials.bindings}
-
-    def light(
-        self, _voxels: tuple[VoxelSet, VoxelSet], _far: VoxelSet, mu: Bindings, rho: Bindings
-    ) -> "SolutionVoxels":
-        """Lights, resolves and filters mu, then rho."""
-        self._light_both(mu, rho, gathered=False)
-        return self
-
-    def bounce(self, _lit: "SolutionVoxels", mu: Bindings, rho: Bindings) -> "SolutionVoxels":
-        """Gathers light from each solution's own voxels, and relights them with it."""
-        for _ in range(self._bounces):
-            self.set_support(everywhere=True)
-            marching = {**mu, **self.march_bindings(1)}
-            self._gather.gather_real(self.real.store, self.real.groups, self.mu, self.rho, marching)
-            self._gather.gather_virtual(self.objects.store, self.objects.groups, self.rho, marching)
-            self._light_both(mu, rho, gathered=True)
-        return self
-
-    def _light_both(self, mu: Bindings, rho: Bindings, *, gathered: bool) -> None:
-        real, objects, light = self.real, self.objects, self._light
-        if not gathered:
-            objects.forget_light()
-        light.light_solution(real.store, mu, real.groups, with_objects=False, gathered=gathered)
-        self._resolve.resolve_mu(self.mu, real.store, real.volume)
-        light.light_solution(real.store, rho, real.groups, with_objects=True, gathered=gathered)
-        light.light_virtual(objects.store, rho, objects.groups, gathered=gathered)
-        real.store.delta_sums.clear()
-        self._resolve.resolve_rho(self.rho, real.store, objects.store, real.volume)
-        self._filter.run(self.mu, real.volume)
-        self._filter.run(self.rho, real.volume)
-
-    def set_support(self, *, everywhere: bool) -> None:
-        """Sets the bounds within which march.glsl distinguishes mu from rho: the whole volume or nothing."""
-        size = self.real.volume.placement.size
-        low, high = (0, size - 1) if everywhere else (size, -1)
-        # Unlike those of a delta, these bounds do not depend on the light.
-        self._light.reset_support(np.array([low, low, low, -high, -high, -high], np.int32))
-
-
-def solution_stages(
-    g: Graph,
-    s: FrameResources,
-    voxels: SolutionVoxels,
-    placement: Resource[VolumePlacement],
-    mu_maps: Resource[LightBuffers],
-    rho_maps: Resource[LightBuffers],
-    environment: Resource[tuple[moderngl.TextureArray, ...]],
-) -> Resource[SolutionVoxels]:
-    """Declares voxelisation of both geometries, then lighting and bounces in step."""
-    real = g.stage("voxelize real", voxels.voxelize_real, s.real, placement)
-    beyond = g.stage("voxelize far", voxels.far.voxelize, s.real)
-    objects = g.stage("voxelize objects", voxels.voxelize_objects, s.objects, placement)
-    both = g.stage("group surfels", voxels.voxelize_both, real, objects)
-    given = s.observation, s.albedo, s.lights, mu_maps, environment, real
-    mu = g.value("voxel scene mu", voxels.mu_scene, *given)
-    rho = g.value("voxel scene rho", voxels.rho_scene, mu, s.objects, rho_maps)
-    far = g.stage("light far voxels", voxels.far.light, beyond, mu)
-    lit = g.stage("light voxels", voxels.light, both, far, mu, rho)
-    return g.stage("bounces", voxels.bounce, lit, mu, rho)
-
-
 def placed_volume(voxels: VoxelSet) -> PlacedVolume:
     """Where the voxels lie."""
     return voxels.volume
 
 
-def joint_voxels(voxels: "InjectedVoxels | SolutionVoxels") -> VoxelMipmap:
+class JointVoxels(Protocol):
+    """Voxels that hold rho in a mipmap of its own."""
+
+    rho: VoxelMipmap
+
+
+def joint_voxels(voxels: JointVoxels) -> VoxelMipmap:
     """The voxels of real and virtual surfaces."""
     return voxels.rho
-
-
-class InjectedVoxels:
-    """V_delta and V_rho with the joint opacity of V_eta, filled by split injection ([P1] 3.2).
-
-    Two isotropic mipmaps: (V_delta, V_eta) with signed radiance, and (V_rho, V_eta).
-    """
-
-    directions = 1
-
-    def __init__(self, gpu: GpuContext, size: int) -> None:
-        self.delta, self.rho = (VoxelMipmap(gpu, size, self.directions) for _ in range(2))
-        self.real, self.objects = (VoxelSet(gpu, size, [self.delta, self.rho]) for _ in range(2))
-        self._albedo = RealAlbedo(gpu)
-        self._inject = SplitInjection(gpu)
-        self._resolve = ResolveInjection(gpu)
-        self._filter = FilterIsotropic(gpu)
-
-    def voxelize_real(self, real: GeometryState, placement: VolumePlacement) -> VoxelSet:
-        """Voxelises the real scene."""
-        self.real.fill(real.corners, placement)
-        return self.real
-
-    def voxelize_objects(self, objects: GeometryState, placement: VolumePlacement) -> VoxelSet:
-        """Voxelises the objects."""
-        self.objects.fill(objects.corners, placement)
-        return self.objects
-
-    def find_albedo(
-        self,
-        placed: VoxelSet,
-        seen: Observation,
-        albedo: AlbedoTexture,
-        _lights: LightSet,
-        lights: LightBuffers,
-        _environment: moderngl.TextureArray,
-    ) -> RealAlbedo:
-        """Computes the real scene's albedo as seen from the lights."""
-        seen.image.build_levels()
-        self._albedo.run(lights, {**surfel_scene(seen, lights, albedo), **placed.volume.bindings})
-        return self._albedo
-
-    def inject(
-        self,
-        real: VoxelSet,
-        objects: VoxelSet,
-        found: RealAlbedo,
-        geometry: GeometryState,
-        seen: Observation,
-        albedo: AlbedoTexture,
-        lights: LightBuffers,
-    ) -> tuple[VoxelSet, VoxelSet]:
-        """Injects the light of all maps."""
-        scene = {
-            **surfel_scene(seen, lights, albedo),
-            **geometry.materials.bindings,
-            **real.volume.bindings,
-        }
-        self._inject.run(real.store, objects.store, lights, found.atlas, scene)
-        return real, objects
-
-    def filter(self, injected: tuple[VoxelSet, VoxelSet]) -> "InjectedVoxels":
-        """Filters the sums into both mipmaps."""
-        real, objects = injected
-        self._resolve.run(self.delta, self.rho, real.store, objects.store, real.volume)
-        self._filter.run(self.delta, self.rho, real.volume)
-        return self
-
-    def release(self) -> None:
-        """Frees the GL objects."""
-        release_all(
-            self.delta,
-            self.rho,
-            self.real,
-            self.objects,
-            self._albedo,
-            self._inject,
-            self._resolve,
-            self._filter,
-        )
-
-
-def injection_stages(
-    g: Graph, s: FrameResources, lit: LitScene, voxels: InjectedVoxels, placement: Resource[VolumePlacement]
-) -> Resource[InjectedVoxels]:
-    """Declares voxelisation of both geometries, real albedo, injection and filtering."""
-    real = g.stage("voxelize real", voxels.voxelize_real, s.real, placement)
-    albedo = g.stage(
-        "real albedo",
-        voxels.find_albedo,
-        real,
-        s.observation,
-        s.albedo,
-        s.lights,
-        lit.real_maps,
-        lit.environment,
-    )
-    objects = g.stage("voxelize objects", voxels.voxelize_objects, s.objects, placement)
-    injected = g.stage(
-        "split inject",
-        voxels.inject,
-        real,
-        objects,
-        albedo,
-        s.objects,
-        s.observation,
-        s.albedo,
-        lit.object_maps,
-    )
-    return g.stage("filter", voxels.filter, injected)

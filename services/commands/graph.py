@@ -28,9 +28,9 @@ def graph(
     turned by a degree.
     """
     chosen = parse_method(method)
-    from render_server.graph_drawing import draw_graph
     from services.files import write_bytes
     from services.frame_account import account_frame
+    from services.graph_drawing import draw_graph
 
     with _progress() as watch:
         account = account_frame(chosen.value, watch)
@@ -57,7 +57,7 @@ def _print_table(account: "FrameAccount") -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from render_server.graph_drawing import format_ms
+    from services.graph_drawing import format_ms
 
     console = Console()
     if not console.is_terminal:

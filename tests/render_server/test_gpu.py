@@ -16,8 +16,7 @@ from protocol.errors import DeltalightError
 from render_server.gpu import shader_source as shader_text
 from render_server.gpu.context import GpuContext, explain_context_failure, is_software_renderer
 from render_server.gpu.kernel import Kernel
-from render_server.gpu.readback import AsyncReadback
-from render_server.gpu.textures import texture_2d
+from render_server.gpu.textures import AsyncReadback, texture_2d
 from render_server.gpu.timers import PassTimers
 from render_server.passes.voxels import (
     PlacedVolume,

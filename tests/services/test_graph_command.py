@@ -9,10 +9,10 @@ import pytest
 
 from benchmarks import frame_docs
 from render_server.graph import CLOCKS
-from render_server.graph_drawing import draw_graph
-from render_server.graph_layout import lay_out
 from services import frame_account
 from services.frame_account import FrameAccount, account_frame
+from services.graph_drawing import draw_graph
+from services.graph_layout import lay_out
 from tests.services.conftest import RunCli
 
 SVG = "{http://www.w3.org/2000/svg}"

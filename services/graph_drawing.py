@@ -6,7 +6,7 @@ from typing import Final
 from xml.etree import ElementTree
 
 from render_server.graph import CLOCKS, Clock, SourceReport, StageReport
-from render_server.graph_layout import Arrow, Box, Layout, lay_out
+from services.graph_layout import Arrow, Box, Layout, lay_out
 
 WIDTH = 1600
 MARGIN = 20
