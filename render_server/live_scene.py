@@ -69,7 +69,7 @@ class LiveScene:
         self._accumulated: ViewFrame | None = None  # last frame already accumulated
         self._plan = self._planned(scene)
         self.lighting = self._plan.lighting
-        self._take(self._plan)
+        self._apply(self._plan)
 
     def _planned(self, scene: SceneDocument) -> _Plan:
         """Checks everything that can fail before anything is replaced."""
@@ -88,7 +88,7 @@ class LiveScene:
 
     def set_scene(self, scene: SceneDocument) -> None:
         """Replaces the scene, or raises and changes nothing. Pictures do not wait for precomputation."""
-        self._take(self._planned(scene))
+        self._apply(self._planned(scene))
         self._fields.waits = False
 
     def _apply(self, plan: _Plan) -> None:
