@@ -38,8 +38,8 @@ def speed(
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
 ) -> None:
     """Time every pass of a frame on the demo's recording, and the frame rate from camera to viewer."""
-    from services.arguments import parse_size
-    from services.files import write_bytes
+    from protocol.files import write_bytes
+    from services.commands.options import parse_size
 
     chosen, size_px = _methods(methods), None if size is None else parse_size(size)
     from benchmarks.speed import measure_speed, print_report  # needs OpenGL's packages, unlike a wrong option
@@ -81,7 +81,7 @@ def quality(
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
 ) -> None:
     """Compare relit pictures with path-traced truth: figures, and a page with pictures of the errors."""
-    from services.arguments import parse_size
+    from services.commands.options import parse_size
 
     size_px = parse_size(size)
     try:
@@ -109,8 +109,8 @@ def rest(
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
 ) -> None:
     """Time the REST API with and without rendering, what 20 live viewers cost, and the dashboard's size."""
-    from services.arguments import parse_size
-    from services.files import write_bytes
+    from protocol.files import write_bytes
+    from services.commands.options import parse_size
 
     size_px = None if size is None else parse_size(size)
     from benchmarks.rest import measure_rest, print_report  # needs the api extra, unlike a wrong option

@@ -7,8 +7,7 @@ from jaxtyping import Float32
 
 from protocol.codecs import decode_array, decode_color, decode_raw
 from protocol.envelope import EnvelopeError
-from protocol.fisheye_lens import FisheyeCalibration
-from protocol.fisheye_parts import calibration_of
+from protocol.fisheye_lens import FisheyeCalibration, calibration_of
 from protocol.frames import FisheyePictures, LampPose, RadianceMap
 from protocol.messages import FisheyeMessage, LampsMessage, RadianceMessage
 

@@ -220,11 +220,11 @@ class FisheyeMessage(MessageBase):
 
 
 class RadianceMessage(MessageBase):
-    """The radiance that a fish-eye camera sees; it holds until the next and is repeated unchanged for who comes late.
+    """The radiance that a fish-eye camera sees; current until the next one, and repeated for late subscribers.
 
-    Parts: linear R G B on the `size` x `size` grid of the hemisphere (`protocol.hemisphere`), what was seen of it
-    (0 or 1), the picture for people (jpeg), then the response of the fish-eye camera if `has_response`. `camera` is
-    as in `FisheyeMessage`; the pose is that of the time of the map, `capture_ns`.
+    Parts: linear R G B on the `size` x `size` grid of the hemisphere (`protocol.hemisphere`), which of it was seen (0
+    or 1), the picture for display (jpeg), then the response of the fish-eye camera if `has_response`. `camera` is as
+    in `FisheyeMessage`; the pose is that of the time of the map, `capture_ns`.
     """
 
     stream: Literal["radiance"] = "radiance"
@@ -278,7 +278,7 @@ class LampEntry(BaseModel):
 
 
 class LampsMessage(MessageBase):
-    """Lamps whose markers the colour frame `frame_id` shows; those that it does not show are left out."""
+    """Lamps whose markers the colour frame `frame_id` shows; the others are left out."""
 
     stream: Literal["lamps"] = "lamps"
     lamps: Annotated[tuple[LampEntry, ...], Field(strict=False, max_length=MAX_LAMPS)]
@@ -287,9 +287,9 @@ class LampsMessage(MessageBase):
 class CompositeMessage(MessageBase):
     """The finished picture of the colour frame `frame_id` (sRGB, RGB order); one part.
 
-    `capture_ns` and the clock fields are those of that frame; `received_ns` and `rendered_ns` are by the
-    server's clock. `scene_id` and `scene_revision` are those of the request that set the scene which the frame was
-    begun with. `camera` (`CameraModel.to_dict()` at the picture's size) and pose are those that it was made with.
+    `capture_ns` and the clock fields are those of that frame; `received_ns` and `rendered_ns` are by the server's
+    clock. `scene_id` and `scene_revision` are those of the request that set the frame's scene. `camera`
+    (`CameraModel.to_dict()` at the picture's size) and pose are those that it was rendered with.
     """
 
     stream: Literal["composite"] = "composite"
@@ -319,7 +319,7 @@ class CompositeMessage(MessageBase):
 
 
 class StatsMessage(MessageBase):
-    """How a process is doing: rates in 1/s and drops by topic, a state, and a sentence for people."""
+    """State of a process: rates in 1/s and drops by topic, a state, and a sentence for display."""
 
     stream: Literal["stats"] = "stats"
     frame_id: Count = 0
@@ -330,7 +330,10 @@ class StatsMessage(MessageBase):
 
 
 class ControlMessage(MessageBase):
-    """What request and reply share; `payload_bytes`: the payload is not in the header but in a part (JSON text)."""
+    """Common fields of request and reply.
+
+    With `payload_bytes` the payload is a part (JSON text) instead of a field.
+    """
 
     frame_id: Count = 0
     capture_ns: Nanoseconds = 0
@@ -339,7 +342,7 @@ class ControlMessage(MessageBase):
     payload_bytes: Annotated[int, Field(ge=1, le=MAX_PAYLOAD_BYTES)] | None = None
 
     def part_rules(self) -> tuple[PartRule, ...]:
-        """The payload, where it is long."""
+        """The payload, if it is long."""
         return () if self.payload_bytes is None else (PartRule("payload", (self.payload_bytes,), "uint8"),)
 
     @model_validator(mode="after")
@@ -362,7 +365,7 @@ class ControlRequest(ControlMessage):
 
 
 class ControlReply(ControlMessage):
-    """The answer to the request of the same `id`; `error` is one sentence where `ok` is false."""
+    """The answer to the request of the same `id`; `error` is one sentence if `ok` is false."""
 
     stream: Literal["reply"] = "reply"
     ok: bool

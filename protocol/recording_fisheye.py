@@ -16,8 +16,7 @@ from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
 
 from protocol.equidistant_lens import EquidistantLens
 from protocol.errors import DeltalightError
-from protocol.fisheye_lens import FisheyeLens
-from protocol.fisheye_parts import calibration_of, describe_calibration
+from protocol.fisheye_lens import FisheyeLens, calibration_of, describe_calibration
 from protocol.frames import FisheyePictures
 from protocol.pictures import decode_rgb, encode_png
 from protocol.recording_format import (

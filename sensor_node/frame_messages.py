@@ -10,7 +10,7 @@ from jaxtyping import Float64
 from protocol.board import BoardSpec
 from protocol.codecs import encode_array, encode_color, encode_depth
 from protocol.envelope import EnvelopeError, encode
-from protocol.fisheye_parts import describe_calibration
+from protocol.fisheye_lens import describe_calibration
 from protocol.frames import BoardPose, DepthImage, FisheyePictures, LampPose, RadianceMap, SensorFrame
 from protocol.messages import (
     ColorMessage,

@@ -3,9 +3,10 @@
 import re
 import threading
 import time
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
-from typing import Literal
+from typing import Generic, Literal, TypeVar
 
 import structlog
 from pydantic import Field, field_serializer, field_validator
@@ -36,7 +37,6 @@ from sensor_node.frame_messages import (
 )
 from sensor_node.health import Health
 from sensor_node.pose_filter import PoseFilter, PoseFilterSettings
-from sensor_node.repeater import Repeater
 from sensor_node.view_frames import ViewFrameBuilder
 
 _log = structlog.get_logger(__name__)
@@ -45,6 +45,10 @@ MAX_SENTENCE = 2000  # of the wire (SPEC.md, section 3)
 STREAMS = ("fisheye", "depth", "radiance", "clean_depth", "lamps", "pose", "color", "stats")
 # Fish-eye pictures further than this from their frame are stamped by another clock (a loop restarted).
 LONGEST_HOLD_NS = 60_000_000_000
+# A late subscriber has the light after this time; at 1 MB per map it costs less than one stream of pictures.
+REPEAT_S = 2.0
+
+Item = TypeVar("Item")
 
 
 class NodeConfig(StrictModel):
@@ -137,6 +141,25 @@ def run_node(
         for note in camera.notes:
             _log.info(note)
         _Node(config, camera, publisher, clock).run(capture, stop)
+
+
+class Repeater(Generic[Item]):
+    """Sends one kind of message: when its object is new, and then unchanged every REPEAT_S."""
+
+    def __init__(self) -> None:
+        self._item: Item | None = None
+        self._multipart: list[bytes] = []
+        self._sent_s = 0.0
+
+    def send(self, item: Item, made: Callable[[], list[bytes]], send: Callable[[list[bytes]], None]) -> None:
+        """Send the message of `item`, created by `made`, if it is due."""
+        now_s = time.monotonic()
+        if item is not self._item:
+            self._item, self._multipart = item, made()
+        elif now_s - self._sent_s < REPEAT_S:
+            return
+        send(self._multipart)
+        self._sent_s = now_s
 
 
 class _Node:

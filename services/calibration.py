@@ -10,7 +10,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from rich.table import Table
 
 from protocol.errors import DeltalightError
-from services.files import make_output_folder, replacing, write_png
+from protocol.files import replacing, write_png
+from services.files import make_output_folder
 
 if TYPE_CHECKING:
     from protocol.camera_model import CameraModel
@@ -49,7 +50,7 @@ class Watch:
 
     def collect(self, series: "Series", target: "Target", enough: int) -> "ViewCollector":
         """Collect the views of a series."""
-        from sensor_node.calibration.collecting import collect_views
+        from sensor_node.calibration.picture_sources import collect_views
 
         if self.total is None:
             self.console.print(

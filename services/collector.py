@@ -15,12 +15,12 @@ from jaxtyping import UInt8
 from protocol.codecs import decode_color
 from protocol.envelope import decode
 from protocol.errors import DeltalightError
+from protocol.files import replacing, write_bytes, write_png
 from protocol.messages import CompositeMessage, ControlRequest
 from protocol.receiver import Receiver
 from protocol.request import RequestClient
 from protocol.subscriber import ReceivedMultipart
-from services.files import replacing, write_bytes, write_png
-from services.frame_age import age_ms
+from services.live_message import age_ms
 
 CONTROL_TIMEOUT_S = 10.0
 SHEET_PICTURES = 20

@@ -1,12 +1,15 @@
-"""Output folders of commands; files are written there atomically (protocol/files.py)."""
+"""Output folders of commands, and new recordings and folders that appear atomically and never replace anything."""
 
 import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from protocol.errors import DeltalightError
-from protocol.files import replacing, write_bytes, write_png
+from protocol.recording_format import ACTIVE_SUFFIX
 
-__all__ = ["make_output_folder", "replacing", "write_bytes", "write_png"]
+SUFFIX = ".mcap"
 
 
 def make_output_folder(folder: Path) -> Path:
@@ -27,3 +30,67 @@ def make_output_folder(folder: Path) -> Path:
             f"The output folder '{folder}' cannot be written ({fault.strerror}); choose another with --out."
         ) from fault
     return folder
+
+
+def require_new_recording(path: Path) -> None:
+    """Check the name of a recording to be written; create its folder if missing.
+
+    Raises:
+        DeltalightError: the name is taken or not `*.mcap`, or the folder cannot be written.
+    """
+    require_absent(path.with_name(path.name + ACTIVE_SUFFIX))
+    require_recording_name(path)
+
+
+def require_recording_name(path: Path) -> None:
+    """Check the name of a recording to appear; create its folder if missing.
+
+    Raises:
+        DeltalightError: the name is taken or not `*.mcap`, or the folder cannot be written.
+    """
+    if path.suffix != SUFFIX:
+        raise DeltalightError(f"{path} must end in {SUFFIX}; choose another name.")
+    require_absent(path)
+    make_output_folder(path.parent)
+
+
+def require_absent(path: Path) -> None:
+    """Refuse to replace anything.
+
+    Raises:
+        DeltalightError: the path exists.
+    """
+    if path.exists() or path.is_symlink():
+        raise DeltalightError(f"{path} already exists; choose another name or remove it.")
+
+
+@contextmanager
+def appearing(path: Path) -> Iterator[Path]:
+    """Yield a temporary path beside `path` for a file or folder.
+
+    Move it into place at the end, remove it on an error. A killed process leaves it behind, hidden. The suffix stays.
+
+    Raises:
+        DeltalightError: `path` exists already, or the disk refuses.
+    """
+    require_absent(path)
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
+    try:
+        yield temporary
+        require_absent(path)
+        temporary.rename(path)
+    except OSError as fault:
+        raise DeltalightError(
+            f"{path} cannot be written ({fault.strerror}); free some space or choose another name."
+        ) from fault
+    finally:
+        _remove(temporary)
+        _remove(temporary.with_name(temporary.name + ACTIVE_SUFFIX))
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with suppress(OSError):
+            path.unlink(missing_ok=True)

@@ -5,6 +5,7 @@ types are generated from the OpenAPI description, whose component `LiveHeader` t
 """
 
 import struct
+import time
 from typing import Any, Literal, Self
 
 from pydantic import BaseModel, Field, ValidationError
@@ -108,3 +109,8 @@ def unpack(message: bytes) -> tuple[LiveHeader, bytes]:
         return LiveHeader.model_validate_json(message[_LENGTH.size : end]), message[end:]
     except (struct.error, ValidationError) as fault:
         raise DeltalightError("The service sent a live picture without a valid header; update it.") from fault
+
+
+def age_ms(message: CompositeMessage) -> float:
+    """Return the time since the picture's capture, by this host's clock, ms."""
+    return (time.time_ns() - message.capture_ns - message.clock_offset_ns) / 1e6

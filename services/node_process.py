@@ -1,16 +1,22 @@
-"""A sensor node in this process, with the settings of a configuration file, for `node` and `replay`."""
+"""A sensor node in this process, for `node` and `replay`: configured by a file, and controlled during a replay."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from threading import Event
 
-from protocol.keys import KeySettings
+from protocol.documents import nearest
+from protocol.errors import DeltalightError
+from protocol.keys import Keys, KeySettings
+from protocol.messages import ControlRequest
+from protocol.request import ReplyServer
 from sensor_node.cameras.playback import PlaybackCamera
 from sensor_node.node import NodeConfig, run_node
-from services.replay_endpoint import playback_control
 from services.settings import load_configuration
+
+OPS = ("position", "play", "pause", "seek", "rate")  # of a replay's control endpoint (SPEC.md, section 6)
 
 
 def run_configured_node(
@@ -43,3 +49,43 @@ def run_configured_node(
             running.result()  # signals interrupt this wait, not the node's work
         finally:
             stop.set()
+
+
+@contextmanager
+def playback_control(camera: PlaybackCamera, endpoint: str, keys: Keys | None) -> Iterator[None]:
+    """Answer requests at a replay's control endpoint for the duration of the block.
+
+    Raises:
+        DeltalightError: the endpoint cannot be used.
+    """
+    server = ReplyServer(endpoint, lambda request: _execute(camera, request), node="replay", keys=keys)
+    try:
+        yield
+    finally:
+        server.close()
+
+
+def _execute(camera: PlaybackCamera, request: ControlRequest) -> dict[str, object]:
+    """Execute a request; every op answers with the position after it."""
+    match request.op:
+        case "position":
+            pass
+        case "play":
+            camera.play()
+        case "pause":
+            camera.pause()
+        case "seek":
+            camera.seek(_number(request.payload, "position_s"))
+        case "rate":
+            camera.set_rate(_number(request.payload, "rate"))
+        case unknown:
+            hint = nearest(unknown, OPS) or ", ".join(OPS)
+            raise DeltalightError(f"a replay knows no command '{unknown}'; did you mean {hint}?")
+    return asdict(camera.playback)
+
+
+def _number(payload: Mapping[str, object], key: str) -> float:
+    value = payload.get(key)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise DeltalightError(f"the command needs a number as `{key}` in its payload.")
+    return float(value)

@@ -2,6 +2,7 @@
 
 import shutil
 import time
+import uuid
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
@@ -15,13 +16,15 @@ from protocol.envelope import decode
 from protocol.errors import DeltalightError
 from protocol.frames import SensorFrame
 from protocol.keys import Keys
-from protocol.messages import Message, StatsMessage
+from protocol.messages import ControlRequest, Message, StatsMessage
 from protocol.recording_writer import RecordingWriter
-from protocol.scene import SceneDocument
-from services.new_files import require_new_recording
+from protocol.request import RequestClient
+from protocol.scene import SceneDocument, parse_scene
+from services.files import require_new_recording
 from services.raw_frames import RAW_STREAMS, RawFrameAssembler
 from services.stream_queue import StreamQueue
 
+SCENE_TIMEOUT_S = 5.0
 POLL_S = 0.1
 IDLE_POLLS = 3  # afterwards, frames whose partners are late are taken as they are
 SILENCE_S = 3.0
@@ -254,3 +257,23 @@ class Recorder:
 
 def _lacks_place(extrinsics: Extrinsics | None) -> bool:
     return extrinsics is None or extrinsics.depth_from_rgb is None
+
+
+def scene_of_server(endpoint: str, keys: Keys | None) -> SceneDocument:
+    """Request the scene document from the render server at a control endpoint.
+
+    Raises:
+        DeltalightError: it does not answer, or its answer is no scene document.
+    """
+    client = RequestClient(endpoint, keys=keys)
+    try:
+        request = ControlRequest(node="recorder", id=uuid.uuid4().hex, op="get_scene")
+        reply = client.request(request, SCENE_TIMEOUT_S)
+    finally:
+        client.close()
+    scene = reply.payload.get("scene")
+    if reply.error is not None or not isinstance(scene, dict):
+        raise DeltalightError(
+            f"{endpoint} gives no scene document ({reply.error}); name the control endpoint of a render server."
+        )
+    return parse_scene(scene, f"the scene of {endpoint}")

@@ -11,8 +11,7 @@ from protocol.recording_format import ACTIVE_SUFFIX
 from protocol.recording_reader import RecordingReader
 from protocol.recording_writer import RecordingWriter
 from protocol.scene import SceneDocument, load_scene
-from services.files import make_output_folder
-from services.new_files import appearing, require_absent, require_recording_name
+from services.files import appearing, make_output_folder, require_absent, require_recording_name
 from services.recording_info import RecordingScan, scan_recording
 
 SCENE_FILE = "scene.json"

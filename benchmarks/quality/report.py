@@ -14,7 +14,8 @@ from benchmarks.quality.report_data import REPORT_KIND, as_data
 from benchmarks.quality.report_html import ScenePictures, html_page, picture_name
 from benchmarks.quality.tables import COLUMNS, all_tables
 from protocol.errors import DeltalightError
-from services.files import make_output_folder, write_png
+from protocol.files import write_png
+from services.files import make_output_folder
 
 DATA_FILE = "quality.json"
 PICTURES = "pictures"

@@ -161,8 +161,8 @@ class LightTracker:
     """Tracks lights and residual (octahedral, world axes) through a low-pass filter; time constant in s, 0 = none.
 
     Lights and residual pass the same filter: what a fading light still lacks is still in the residual, so that their
-    sum follows that of the maps. The first map is taken as it is. A new map only sets the target; `advance` moves
-    towards it. If the clock is set back, lights stay until it goes on.
+    sum follows that of the maps. The first map is applied immediately. A new map only sets the target; `advance`
+    moves towards it. If the clock is set back, lights stay until it catches up.
     """
 
     def __init__(self, smoothing_s: float) -> None:
@@ -178,7 +178,7 @@ class LightTracker:
     def set_target(
         self, timestamp_ns: int, lights: tuple[RegionLight, ...], residual: Float32[np.ndarray, "n n 3"]
     ) -> None:
-        """Approaches the split of a new map from this time on."""
+        """Sets the split of a new map as the target from this time on."""
         self.advance(timestamp_ns, at_once=True)
         self._clock_ns = timestamp_ns
         self._target = self._identified(lights)

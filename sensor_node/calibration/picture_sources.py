@@ -1,9 +1,9 @@
-"""Pictures for a calibration: from files, a dataset folder, a recording, or a live camera."""
+"""Pictures for a calibration, from files, a dataset folder, a recording or a live camera, and the views in them."""
 
 import re
 import statistics
-from collections.abc import Generator, Iterable, Sequence
-from contextlib import closing
+from collections.abc import Callable, Generator, Iterable, Sequence
+from contextlib import closing, suppress
 from itertools import count, pairwise
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -16,12 +16,15 @@ from protocol.errors import DeltalightError
 from protocol.frames import SensorFrame
 from protocol.pictures import decode_rgb, read_bytes
 from protocol.source import RECORDING_SUFFIXES, open_source
-from sensor_node.calibration.views import Picture
+from sensor_node.calibration.targets import Target
+from sensor_node.calibration.views import Picture, ViewCollector
 
 Eye = Literal["rgb", "fisheye"]
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg")
 # Pictures in faster succession were filmed, slower ones were taken one by one.
 FILM_PERIOD_NS = 500_000_000
+# More views do not improve a lens; the time of a fit grows with their cube.
+MOST_VIEWS = 60
 
 
 class Series(NamedTuple):
@@ -133,3 +136,28 @@ def _live(source: str, eye: Eye) -> Generator[Picture]:
 def _natural(path: Path) -> list[tuple[int, str]]:
     """Return a sort key by which shot2 comes before shot10."""
     return [(int(word), "") if word.isdigit() else (-1, word) for word in re.split(r"(\d+)", path.name)]
+
+
+def collect_views(
+    series: Series, target: Target, *, enough: int, tell: Callable[[ViewCollector, bool], None]
+) -> ViewCollector:
+    """Examine all pictures of a series, or a live camera's until there are `enough` views or Ctrl-C.
+
+    Args:
+        series: the pictures.
+        target: what to look for.
+        enough: views at which a live series ends.
+        tell: called after each picture with the collector and whether the picture was taken as a view.
+    """
+    collector = ViewCollector(target, moving=series.moving)
+    live = series.total is None
+    # Closing releases a camera before the long fit begins.
+    with suppress(*(KeyboardInterrupt,) if live else ()), closing(series.pictures):
+        for picture in series.pictures:
+            tell(collector, collector.add(picture))
+            if live and len(collector.views) >= enough:
+                break
+    # Evenly over the series, so that none of its parts is lost.
+    step = -(-len(collector.views) // MOST_VIEWS)
+    collector.views = collector.views[:: max(step, 1)]
+    return collector

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float64
 from pydantic import BaseModel, Field
 
-from protocol.fisheye_parts import calibration_of
+from protocol.fisheye_lens import calibration_of
 from protocol.messages import Message, RadianceMessage
 
 if TYPE_CHECKING:

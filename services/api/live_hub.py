@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from protocol.messages import CompositeMessage
-from services.frame_age import age_ms
-from services.live_message import PictureHeader, ViewerHeader, pack
+from services.live_message import PictureHeader, ViewerHeader, age_ms, pack
 
 RATE_WINDOW_S = 3.0
 STALE_AFTER_S = 2.0

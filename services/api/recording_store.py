@@ -14,10 +14,10 @@ from typing import Any, Literal
 import cv2
 
 from protocol.errors import DeltalightError
+from protocol.files import write_bytes
 from protocol.recording_format import ACTIVE_SUFFIX
 from protocol.source import open_source
-from services.files import make_output_folder, write_bytes
-from services.new_files import SUFFIX
+from services.files import SUFFIX, make_output_folder
 from services.recording_copies import recover_recording
 from services.recording_info import describe_recording
 from services.storage.faults import ConflictError, NotFoundError

@@ -15,8 +15,7 @@ from protocol.request import RequestClient
 from protocol.scene import SceneDocument, parse_scene
 from services.api.app import create_app
 from services.api.settings import ApiSettings
-from services.host_store import FIRST_SCENE, activate_document
-from services.storage.scene_files import import_scene
+from services.host_store import FIRST_SCENE, activate_document, import_scene
 from services.storage.store import Store, default_folder
 
 FIRST_TOKEN = "first"

@@ -71,8 +71,9 @@ def board(
 ) -> None:
     """Write a marker board as true-scale PDF, with its board.yaml."""
     from protocol.board import save_board_yaml
+    from protocol.files import replacing
     from services.board_pdf import write_board_pdf
-    from services.files import make_output_folder, replacing
+    from services.files import make_output_folder
 
     described = out.with_suffix(".yaml")
     if out.suffix.lower() != ".pdf":

@@ -28,7 +28,7 @@ def graph(
     turned by a degree.
     """
     chosen = parse_method(method)
-    from services.files import write_bytes
+    from protocol.files import write_bytes
     from services.frame_account import account_frame
     from services.graph_drawing import draw_graph
 

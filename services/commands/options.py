@@ -1,5 +1,6 @@
 """Values shared by several commands."""
 
+import re
 from difflib import get_close_matches
 from enum import StrEnum
 from pathlib import Path
@@ -58,3 +59,41 @@ NodeName = Annotated[
     str | None,
     typer.Option("--node", help="Name of a node to find on the network; `auto` takes the only one there is."),
 ]
+SMALLEST_EDGE = 16
+LARGEST_EDGE = 8192
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """Parse `WxH` into width and height in pixels.
+
+    Raises:
+        DeltalightError: not two whole numbers within the range of the scene document.
+    """
+    found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text.strip().lower())
+    edges = [int(edge) for edge in found.groups()] if found else []
+    if not edges or min(edges) < SMALLEST_EDGE or max(edges) > LARGEST_EDGE:
+        raise DeltalightError(
+            f"'{text}' is no picture size; write WIDTHxHEIGHT such as 640x480, each from {SMALLEST_EDGE} to"
+            f" {LARGEST_EDGE}."
+        )
+    return edges[0], edges[1]
+
+
+def parse_frames(text: str | None, count: int) -> range:
+    """Parse the half-open `A:B` (either may be omitted) into frame numbers of a source of `count` frames.
+
+    Raises:
+        DeltalightError: not such a range, or it reaches outside the source or is empty.
+    """
+    found = re.fullmatch(r"(\d{0,9}):(\d{0,9})", (text or ":").strip())
+    if found is None:
+        raise DeltalightError(f"'{text}' is no range of frames; write A:B (B is not included), such as 0:10.")
+    first, end = (
+        int(group) if group else default for group, default in zip(found.groups(), (0, count), strict=True)
+    )
+    if not first < end <= count:
+        raise DeltalightError(
+            f"The frames {first}:{end} are not in the source, which has {count};"
+            f" choose A < B within 0:{count}."
+        )
+    return range(first, end)

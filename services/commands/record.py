@@ -92,7 +92,7 @@ def _endpoints(subscribe: list[str] | None, node: str | None, settings: "KeySett
 def _scene(path: Path | None, control: str | None, keys: "Keys | None") -> "SceneDocument | None":
     from protocol.errors import DeltalightError
     from protocol.scene import load_scene
-    from services.recorder_scene import scene_of_server
+    from services.recorder import scene_of_server
 
     if path is not None and control is not None:
         raise DeltalightError("--scene and --control both name a scene to attach; give one of them.")

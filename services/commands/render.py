@@ -37,7 +37,7 @@ def render(
 ) -> None:
     """Render a recording: OUT/<frame number>.png and OUT/frames.jsonl, a line a frame."""
     from protocol.source import open_source
-    from services.arguments import parse_frames, parse_size
+    from services.commands.options import parse_frames, parse_size
     from services.host import choose_scene
     from services.offline import RenderJob, run_job, with_output
 

@@ -11,8 +11,7 @@ from jaxtyping import UInt8
 from protocol.board import BoardSpec, save_board_yaml
 from protocol.camera_model import CameraModel
 from protocol.errors import DeltalightError
-from sensor_node.calibration.collecting import MOST_VIEWS, collect_views
-from sensor_node.calibration.picture_sources import Series, open_series
+from sensor_node.calibration.picture_sources import MOST_VIEWS, Series, collect_views, open_series
 from sensor_node.calibration.targets import Chessboard, MarkerBoard, Sighting, parse_target
 from sensor_node.calibration.views import Picture, ViewCollector
 from sensor_node.cameras.synthetic import SyntheticCamera

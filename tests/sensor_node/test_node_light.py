@@ -28,14 +28,13 @@ from protocol.messages import (
     StatsMessage,
 )
 from protocol.receiver import Receiver
-from sensor_node import repeater
+from sensor_node import node
 from sensor_node.cameras.base import Camera, StreamState
 from sensor_node.cameras.settings import CameraSettings, FisheyeSettings
 from sensor_node.cameras.synthetic import SyntheticCamera, default_board
 from sensor_node.health import Health
-from sensor_node.node import NodeConfig, run_node
+from sensor_node.node import NodeConfig, Repeater, run_node
 from sensor_node.pose_filter import PoseFilterSettings
-from sensor_node.repeater import Repeater
 from services import ports
 
 PERIOD_NS = 33_333_333
@@ -109,7 +108,7 @@ def endpoint(tmp_path: Path) -> str:
 def test_light_goes_out_when_it_is_new_and_again_for_whoever_comes_late(
     take: Path, endpoint: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(repeater, "REPEAT_S", 0.3)
+    monkeypatch.setattr(node, "REPEAT_S", 0.3)
     config = NodeConfig(source=str(take), endpoint=endpoint)
 
     def repeated(got: list[Message]) -> bool:
@@ -270,7 +269,7 @@ def test_a_repeater_makes_a_message_once_for_each_object(monkeypatch: pytest.Mon
     for item in (first, first, second, second, first):
         repeats.send(item, lambda item=item: made.append(item) or [bytes(item)], sent.append)  # type: ignore[misc]
     assert len(made) == len(sent) == 3
-    monkeypatch.setattr(repeater, "REPEAT_S", 0.0)
+    monkeypatch.setattr(node, "REPEAT_S", 0.0)
     repeats.send(first, lambda: [b"not made again"], sent.append)
     assert len(sent) == 4
     assert sent[-1] == sent[-2]
