@@ -56,4 +56,4 @@ def _size(item: object) -> int:
         return int(item.size)
     assert isinstance(item, moderngl.Texture | moderngl.Texture3D | moderngl.TextureArray)
     component_bytes = int(item.dtype[-1])  # of moderngl's f1, f2, u4, ...
-    return math.prod(item.size) * int(item.components) * component_bytes
+    return int(math.prod(item.size) * item.components) * component_bytes
