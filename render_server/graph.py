@@ -270,7 +270,7 @@ class Graph:
             for stage in self._stages:
                 self._place(stage, order, [])
             self._order = order
-            self._follow_clocks(order)
+            self._complete_clocks(order)
         return self._order
 
     def _place(self, stage: Stage, order: list[Stage], waiting: list[Stage]) -> None:
@@ -293,7 +293,7 @@ class Graph:
             )
         return self._resources[name]
 
-    def _follow_clocks(self, order: Sequence[Stage]) -> None:
+    def _complete_clocks(self, order: Sequence[Stage]) -> None:
         for stage in order:
             clocks = frozenset(clock for item in stage.inputs for clock in item.clocks)
             for output in stage.outputs:
