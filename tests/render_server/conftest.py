@@ -1,10 +1,17 @@
 """What the renderer's tests share: one GL context a module, and no GL error left behind."""
 
 from collections.abc import Iterator
+from pathlib import Path
 
+import moderngl
+import numpy as np
 import pytest
 
+from render_server.gpu import kernel as kernel_module
 from render_server.gpu.context import GpuContext, create_context
+from render_server.gpu.kernel import Kernel
+from render_server.gpu.textures import texture_2d
+from tests.render_server.tiny_kernel import OUT, MakeKernel
 
 
 @pytest.fixture(scope="module")
@@ -20,3 +27,38 @@ def clean_gl(gpu: GpuContext) -> Iterator[None]:
     assert gpu.ctx.error == "GL_NO_ERROR"
     yield
     assert gpu.ctx.error == "GL_NO_ERROR"
+
+
+@pytest.fixture
+def make(gpu: GpuContext, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[MakeKernel]:
+    """Makes kernel `tiny` of declarations and the statements of its main function."""
+    monkeypatch.setattr(kernel_module, "SHADERS", tmp_path)
+    made: list[Kernel] = []
+
+    def tiny(
+        declared: str, statements: str, local_size: str = "local_size_x = 1", **defines: float
+    ) -> Kernel:
+        text = f"layout({local_size}) in;\n{OUT}{declared}\nvoid main() {{ {statements} }}"
+        (tmp_path / "tiny.comp.glsl").write_text(text)
+        made.append(Kernel(gpu, "tiny", **defines))
+        return made[-1]
+
+    yield tiny
+    for item in made:
+        item.release()
+
+
+@pytest.fixture
+def out(gpu: GpuContext) -> Iterator[moderngl.Buffer]:
+    """What kernel `tiny` writes into: 64 floats."""
+    buffer = gpu.ctx.buffer(reserve=256)
+    yield buffer
+    buffer.release()
+
+
+@pytest.fixture
+def texture(gpu: GpuContext) -> Iterator[moderngl.Texture]:
+    """4 x 4, RGBA16F, of ones."""
+    item = texture_2d(gpu, (4, 4), 4, "f2", data=np.ones((4, 4, 4), np.float16).tobytes())
+    yield item
+    item.release()

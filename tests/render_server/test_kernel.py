@@ -1,11 +1,9 @@
-"""Kernels: textures, images, buffers, uniforms and blocks are bound by their names, or one sentence says why not."""
+"""Kernels: textures, images, buffers, uniforms and blocks are bound by their names."""
 
 import importlib
 import re
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
 
 import moderngl
 import numpy as np
@@ -13,8 +11,8 @@ import pytest
 
 from render_server.gpu import kernel as kernel_module
 from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import BindingError, Dispatch, Kernel, RasterKernel, watched
-from render_server.gpu.shader_source import SHADERS, declarations, preprocessed
+from render_server.gpu.kernel import BindingError, Dispatch, RasterKernel, watched
+from render_server.gpu.shader_source import SHADERS
 from render_server.gpu.textures import texture_2d
 from render_server.gpu.uniform_block import (
     STD140,
@@ -28,55 +26,14 @@ from render_server.gpu.uniform_block import (
     Vec3,
     Vec4,
 )
+from tests.render_server.tiny_kernel import CameraBlock, MakeKernel, floats
 
 pytestmark = pytest.mark.usefixtures("clean_gl")
-OUT = "layout(std430) buffer Out { float values[]; };\n"
-Make = Callable[..., Kernel]
-
-
-@pytest.fixture
-def make(gpu: GpuContext, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Make]:
-    """Makes kernel `tiny` of declarations and the statements of its main function."""
-    monkeypatch.setattr(kernel_module, "SHADERS", tmp_path)
-    made: list[Kernel] = []
-
-    def tiny(
-        declared: str, statements: str, local_size: str = "local_size_x = 1", **defines: float
-    ) -> Kernel:
-        text = f"layout({local_size}) in;\n{OUT}{declared}\nvoid main() {{ {statements} }}"
-        (tmp_path / "tiny.comp.glsl").write_text(text)
-        made.append(Kernel(gpu, "tiny", **defines))
-        return made[-1]
-
-    yield tiny
-    for item in made:
-        item.release()
-
-
-@pytest.fixture
-def out(gpu: GpuContext) -> Iterator[moderngl.Buffer]:
-    buffer = gpu.ctx.buffer(reserve=256)
-    yield buffer
-    buffer.release()
-
-
-def floats(buffer: moderngl.Buffer, count: int) -> list[float]:
-    return [float(value) for value in np.frombuffer(buffer.read(4 * count), np.float32)]
-
-
-@pytest.fixture
-def texture(gpu: GpuContext) -> Iterator[moderngl.Texture]:
-    """4 x 4, RGBA16F, of ones."""
-    item = texture_2d(gpu, (4, 4), 4, "f2", data=np.ones((4, 4, 4), np.float16).tobytes())
-    yield item
-    item.release()
-
-
 # By name
 
 
 def test_everything_is_bound_by_its_name(
-    gpu: GpuContext, make: Make, out: moderngl.Buffer, texture: moderngl.Texture
+    gpu: GpuContext, make: MakeKernel, out: moderngl.Buffer, texture: moderngl.Texture
 ) -> None:
     kernel = make(
         "layout(std430) readonly buffer First { float first[]; };\n"
@@ -114,20 +71,22 @@ def test_everything_is_bound_by_its_name(
 
 
 def test_own_bindings_come_before_shared_ones_and_shared_ones_in_their_order(
-    make: Make, out: moderngl.Buffer
+    make: MakeKernel, out: moderngl.Buffer
 ) -> None:
     kernel = make("uniform float a, b, c;", "values[0] = a; values[1] = b; values[2] = c;")
     kernel.run((1,), {"b": 2, "c": 2, "not mine": 0}, {"a": 3, "b": 3, "c": 3}, Out=out, c=1)
     assert floats(out, 3) == [3, 2, 1]
 
 
-def test_what_a_variant_leaves_out_may_be_given(make: Make, out: moderngl.Buffer) -> None:
+def test_what_a_variant_leaves_out_may_be_given(make: MakeKernel, out: moderngl.Buffer) -> None:
     kernel = make("#ifdef MORE\nuniform sampler2D extra;\n#endif\nuniform float unused;", "values[0] = 1.0;")
     kernel.run((1,), Out=out, extra=None, unused=2.0)
     assert floats(out, 1) == [1]
 
 
-def test_enough_workgroups_run_for_the_threads(gpu: GpuContext, make: Make, out: moderngl.Buffer) -> None:
+def test_enough_workgroups_run_for_the_threads(
+    gpu: GpuContext, make: MakeKernel, out: moderngl.Buffer
+) -> None:
     statement = "if (gl_GlobalInvocationID == uvec3(0)) values[0] = float(gl_NumWorkGroups.x * 100u"
     statement += " + gl_NumWorkGroups.y * 10u + gl_NumWorkGroups.z);"
     kernel = make("", statement, "local_size_x = 1, local_size_y = 2, local_size_z = 8")
@@ -141,7 +100,7 @@ def test_enough_workgroups_run_for_the_threads(gpu: GpuContext, make: Make, out:
     assert len(seen) == 3
 
 
-def test_labels_tell_variants_apart(gpu: GpuContext, make: Make) -> None:
+def test_labels_tell_variants_apart(gpu: GpuContext, make: MakeKernel) -> None:
     compiled: dict[str, str] = {}
     gpu.compile_watchers.append(lambda label, sources: compiled.update({label: sources["comp"]}))
     make("", "values[0] = SIZE;", REAL=1, SIZE=0.5)
@@ -151,7 +110,7 @@ def test_labels_tell_variants_apart(gpu: GpuContext, make: Make) -> None:
 
 
 def test_watchers_are_told_what_may_have_been_written(
-    gpu: GpuContext, make: Make, out: moderngl.Buffer, texture: moderngl.Texture
+    gpu: GpuContext, make: MakeKernel, out: moderngl.Buffer, texture: moderngl.Texture
 ) -> None:
     kernel = make(
         "layout(std430) readonly buffer From { float from[]; };\n"
@@ -171,7 +130,7 @@ def test_watchers_are_told_what_may_have_been_written(
 # None
 
 
-def test_none_is_empty(make: Make, out: moderngl.Buffer) -> None:
+def test_none_is_empty(make: MakeKernel, out: moderngl.Buffer) -> None:
     kernel = make(
         "uniform sampler2D a; uniform usampler2D b; uniform isampler2D c; uniform sampler3D d;\n"
         "uniform sampler2DArray e; layout(std430) readonly buffer From { float from[]; };",
@@ -184,7 +143,7 @@ def test_none_is_empty(make: Make, out: moderngl.Buffer) -> None:
     assert floats(out, 1) == [0]
 
 
-def test_what_is_written_to_none_is_lost(make: Make, out: moderngl.Buffer) -> None:
+def test_what_is_written_to_none_is_lost(make: MakeKernel, out: moderngl.Buffer) -> None:
     write = make("layout(std430) buffer To { float to[]; };", "to[0] = 3.0; values[0] = 1.0;")
     write.run((1,), To=None, Out=out)
     read = make("layout(std430) readonly buffer From { float from[]; };", "values[0] = from[0];")
@@ -195,7 +154,9 @@ def test_what_is_written_to_none_is_lost(make: Make, out: moderngl.Buffer) -> No
 # Images
 
 
-def test_several_3d_images_have_units_of_their_own(gpu: GpuContext, make: Make, out: moderngl.Buffer) -> None:
+def test_several_3d_images_have_units_of_their_own(
+    gpu: GpuContext, make: MakeKernel, out: moderngl.Buffer
+) -> None:
     kernel = make(
         "layout(r32f) writeonly uniform image3D one; layout(r32f) writeonly uniform image3D two;\n"
         "layout(r32f) uniform image3D three; uniform sampler3D sampled;",
@@ -212,191 +173,6 @@ def test_several_3d_images_have_units_of_their_own(gpu: GpuContext, make: Make, 
     assert found == {"one": 1, "two": 2, "three": 70, "sampled": 40}
     for item in textures.values():
         item.release()
-
-
-# Errors
-
-
-PARTS = (
-    "uniform sampler2D picture; uniform sampler3D voxels; layout(rgba16f) writeonly uniform image2D filled;\n"
-    "layout(std430) readonly buffer From { float from[]; };\n"
-    "layout(std140) uniform Camera { vec4 pinhole; float z; };\n"
-    "uniform vec3 tint; uniform int count; uniform mat4 turn; uniform usampler2D code;"
-)
-USES = (
-    "vec4 sum = texelFetch(picture, ivec2(0), 0) + texelFetch(voxels, ivec3(0), 0) + from[0] + pinhole * z;\n"
-    "sum += turn * vec4(tint, float(count)) + vec4(texelFetch(code, ivec2(0), 0));\n"
-    "imageStore(filled, ivec2(0), sum); values[0] = sum.x;"
-)
-
-
-@dataclass(frozen=True, eq=False)
-class CameraBlock(Block):
-    pinhole: Vec4
-    z: Float
-
-
-@dataclass(frozen=True, eq=False)
-class LongerBlock(Block):
-    pinhole: Vec4
-    z: Vec4
-    more: Float
-
-
-@pytest.fixture
-def given(gpu: GpuContext, out: moderngl.Buffer, texture: moderngl.Texture) -> Iterator[dict[str, Any]]:
-    """What kernel `tiny` of PARTS and USES needs."""
-    block = UniformBlock(gpu, CameraBlock((1, 2, 3, 4), 5.0))
-    filled = texture_2d(gpu, (4, 4), 4, "f2")
-    yield {
-        "picture": texture,
-        "voxels": None,
-        "filled": filled,
-        "From": None,
-        "Camera": block,
-        "tint": (0.0, 0.0, 0.0),
-        "count": 1,
-        "turn": np.eye(4),
-        "code": None,
-        "Out": out,
-    }
-    block.release()
-    filled.release()
-
-
-def test_what_all_errors_below_differ_from_runs(
-    make: Make, given: dict[str, Any], out: moderngl.Buffer
-) -> None:
-    make(PARTS, USES).run((1,), **given)
-    assert floats(out, 1) == [6]
-
-
-@pytest.mark.parametrize("name", ["picture", "filled", "From", "Out", "Camera", "tint"])
-def test_a_missing_name_is_told(make: Make, given: dict[str, Any], name: str) -> None:
-    kernel = make(PARTS, USES, REAL=1)
-    del given[name]
-    with pytest.raises(BindingError, match=f"Kernel tiny REAL needs `{name}`, which it was not given"):
-        kernel.run((1,), given)
-
-
-@pytest.mark.parametrize(("name", "nearest"), [("pictures", "picture"), ("from", "From"), ("tints", "tint")])
-def test_an_unknown_name_is_told_with_the_nearest(
-    make: Make, given: dict[str, Any], name: str, nearest: str
-) -> None:
-    kernel = make(PARTS, USES)
-    with pytest.raises(
-        BindingError, match=f"Kernel tiny declares no `{name}`; the nearest name is `{nearest}`"
-    ):
-        kernel.run((1,), given, **{name: None})
-
-
-def test_an_unknown_name_that_nothing_resembles_is_told(make: Make, given: dict[str, Any]) -> None:
-    with pytest.raises(BindingError, match=r"Kernel tiny declares no `xyzzy`\.$"):
-        make(PARTS, USES).run((1,), given, xyzzy=1)
-
-
-WRONG_KINDS = [
-    ("picture", lambda gpu: gpu.ctx.buffer(reserve=16), "a Texture that is sampled, not a Buffer"),
-    ("picture", lambda gpu: gpu.ctx.texture3d((1, 1, 1), 4), "a Texture that is sampled, not a Texture3D"),
-    ("voxels", lambda gpu: gpu.ctx.texture((1, 1), 4), "a Texture3D that is sampled, not a Texture"),
-    (
-        "voxels",
-        lambda gpu: gpu.ctx.texture_array((1, 1, 1), 4),
-        "a Texture3D that is sampled, not a TextureArray",
-    ),
-    ("voxels", lambda _: 3, "a Texture3D that is sampled, not a int"),
-    ("filled", lambda _: None, "a Texture that is written or read texel by texel, not a NoneType"),
-    ("filled", lambda gpu: gpu.ctx.texture3d((1, 1, 1), 4), "a Texture that is written .*, not a Texture3D"),
-    ("From", lambda gpu: gpu.ctx.texture((1, 1), 4), "a storage buffer, not a Texture"),
-    ("From", lambda _: np.zeros(4), "a storage buffer, not a ndarray"),
-    ("Camera", lambda gpu: gpu.ctx.buffer(reserve=32), "a uniform block, not a Buffer"),
-    ("Camera", lambda _: None, "a uniform block, not a NoneType"),
-    ("tint", lambda gpu: gpu.ctx.texture((1, 1), 4), "a uniform, not a Texture"),
-    ("tint", lambda _: None, "a uniform, not a NoneType"),
-    ("tint", lambda _: "red", "a uniform, not a str"),
-]
-
-
-@pytest.mark.parametrize("wrong", WRONG_KINDS)
-def test_a_wrong_kind_is_told(
-    gpu: GpuContext, make: Make, given: dict[str, Any], wrong: tuple[str, Callable[[GpuContext], Any], str]
-) -> None:
-    name, value, said = wrong
-    item = value(gpu)
-    kernel = make(PARTS, USES)
-    with pytest.raises(BindingError, match=f"Kernel tiny: `{name}` is {said}"):
-        kernel.run((1,), {**given, name: item})
-    if hasattr(item, "release"):
-        item.release()
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [("picture", "u1", "f"), ("code", "f1", "u"), ("code", "i4", "u")],
-    ids="-".join,
-)
-def test_texels_of_a_type_that_the_sampler_cannot_read_are_told(
-    gpu: GpuContext, make: Make, given: dict[str, Any], wrong: tuple[str, str, str]
-) -> None:
-    """OpenGL leaves undefined what such a look-up gives."""
-    name, dtype, texels = wrong
-    texture = texture_2d(gpu, (1, 1), 4, dtype)
-    with pytest.raises(
-        BindingError, match=f"Kernel tiny: `{name}` samples texels of type {texels}, not {dtype}"
-    ):
-        make(PARTS, USES).run((1,), {**given, name: texture})
-    texture.release()
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [(4, "f4", "rgba32f"), (1, "f2", "r16f"), (3, "f2", "no image format")],
-    ids=lambda wrong: wrong[2],
-)
-def test_a_wrong_image_format_is_told(
-    gpu: GpuContext, make: Make, given: dict[str, Any], wrong: tuple[int, str, str]
-) -> None:
-    components, dtype, found = wrong
-    texture = texture_2d(gpu, (4, 4), components, dtype)
-    with pytest.raises(
-        BindingError, match=f"Kernel tiny: `filled` is declared rgba16f, but the texture is {found}"
-    ):
-        make(PARTS, USES).run((1,), {**given, "filled": texture})
-    texture.release()
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("tint", (1.0, 2.0)),
-        ("tint", 1.0),
-        ("tint", np.zeros(2)),
-        ("tint", ("a", "b", "c")),
-        ("count", 1.5),
-        ("count", (1, 2)),
-        ("turn", np.eye(3)),
-    ],
-)
-def test_a_value_that_a_uniform_cannot_take_is_told(
-    make: Make, given: dict[str, Any], out: moderngl.Buffer, name: str, value: object
-) -> None:
-    kernel = make(PARTS, USES)
-    kernel.run((1,), given)
-    with pytest.raises(BindingError, match=f"Kernel tiny: `{name}` cannot take "):
-        kernel.run((1,), {**given, name: value})
-    kernel.run((1,), given)
-    assert floats(out, 1) == [6]
-
-
-def test_a_uniform_block_of_the_wrong_size_is_told(
-    gpu: GpuContext, make: Make, given: dict[str, Any]
-) -> None:
-    wrong = UniformBlock(gpu, LongerBlock((1, 2, 3, 4), (1, 1, 1, 1), 1.0))
-    with pytest.raises(
-        BindingError, match=r"Kernel tiny: block `Camera` takes (20|32) bytes, LongerBlock packs 48"
-    ):
-        make(PARTS, USES).run((1,), {**given, "Camera": wrong})
-    wrong.release()
 
 
 # Uniforms
@@ -429,7 +205,7 @@ SECOND = {
 }
 
 
-def test_uniforms_take_plain_and_numpy_values_and_change(make: Make, out: moderngl.Buffer) -> None:
+def test_uniforms_take_plain_and_numpy_values_and_change(make: MakeKernel, out: moderngl.Buffer) -> None:
     kernel = make(UNIFORMS, STORES)
     first, second = [0.5, -3, 1, 3, 8, 5, 6, 7], [1.5, 4, 0, 9, -2, 7, 8, 8]
     for given, expected in ((FIRST, first), (SECOND, second), (FIRST, first)):
@@ -438,7 +214,7 @@ def test_uniforms_take_plain_and_numpy_values_and_change(make: Make, out: modern
 
 
 def test_only_values_that_changed_are_written(
-    make: Make, out: moderngl.Buffer, monkeypatch: pytest.MonkeyPatch
+    make: MakeKernel, out: moderngl.Buffer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     kernel = make(UNIFORMS, STORES)
     written: list[str] = []
@@ -521,7 +297,7 @@ def reader_of(block: type[Block]) -> tuple[str, str, int]:
     return f"layout(std140) uniform Tested {{ {body} }};", "\n".join(lines), at
 
 
-def test_every_member_of_a_block_arrives(gpu: GpuContext, make: Make, out: moderngl.Buffer) -> None:
+def test_every_member_of_a_block_arrives(gpu: GpuContext, make: MakeKernel, out: moderngl.Buffer) -> None:
     assert {kind for _, kind in EveryTypeBlock.members()} == set(STD140)
     declared, statements, count = reader_of(EveryTypeBlock)
     kernel = make(declared, statements)
@@ -533,7 +309,7 @@ def test_every_member_of_a_block_arrives(gpu: GpuContext, make: Make, out: moder
 
 
 def test_a_block_is_rewritten_when_its_value_changes(
-    gpu: GpuContext, make: Make, out: moderngl.Buffer
+    gpu: GpuContext, make: MakeKernel, out: moderngl.Buffer
 ) -> None:
     kernel = make(
         "layout(std140) uniform Camera { vec4 pinhole; float z; };", "values[0] = pinhole.y; values[1] = z;"
@@ -627,70 +403,3 @@ def test_a_raster_kernel_binds_by_name_too(
     target.release()
     color.release()
     kernel.release()
-
-
-# What a text declares
-
-
-def test_declarations_are_those_that_the_defines_leave() -> None:
-    source = """
-#define SIZE 8
-#define GRID_ACCESS readonly
-#ifdef SIZE
-layout(local_size_x = SIZE, local_size_y = 4) in;
-layout(std430) GRID_ACCESS buffer Grid { uint grid[]; };
-#else
-layout(local_size_x = 1) in;
-layout(std430) buffer Grid { uint grid[]; };
-#endif
-#ifndef REAL
-layout(std430) buffer Sums { int sums[]; };  // layout(std430) buffer Comment { int comment[]; };
-/* uniform sampler2D commented; */
-layout(rgba16f) writeonly uniform image2D a, b;
-#else
-#ifdef SIZE
-layout(r32f) readonly uniform image2D a;
-#endif
-#endif
-#if SIZE == 9
-layout(std430) buffer Kept { int kept[]; };
-#endif
-uniform vec3 colors[4], tint;
-"""
-    virtual = declarations(source)
-    assert virtual.names == {"Grid", "Sums", "a", "b", "Kept", "colors", "tint"}
-    assert virtual.local_size == (8, 4, 1)
-    assert virtual.written == {"Sums", "a", "b", "Kept"}
-    assert virtual.formats == {"a": {"rgba16f"}, "b": {"rgba16f"}}
-    real = declarations("#define REAL 1\n" + source)
-    assert real.names == virtual.names
-    assert real.written == {"Kept"}
-    assert real.formats == {"a": {"r32f"}}
-
-
-def test_branches_nest_and_uncomputed_ones_stay() -> None:
-    text = "\n".join(
-        [
-            "#define A",
-            "#ifdef A",
-            "#ifdef B",
-            "1",
-            "#else",
-            "2",
-            "#define C 7",
-            "#endif",
-            "#else",
-            "#define C 8",
-            "3",
-            "#endif",
-            "#ifdef B",
-            "4",
-            "#elif defined(A)",
-            "5",
-            "#else",
-            "6",
-            "#endif",
-            "C",
-        ]
-    )
-    assert preprocessed(text).split() == ["2", "5", "6", "7"]

@@ -1,0 +1,67 @@
+"""What a shader's text declares, once its branches are resolved."""
+
+from render_server.gpu.shader_source import declarations, preprocessed
+
+
+def test_declarations_are_those_that_the_defines_leave() -> None:
+    source = """
+#define SIZE 8
+#define GRID_ACCESS readonly
+#ifdef SIZE
+layout(local_size_x = SIZE, local_size_y = 4) in;
+layout(std430) GRID_ACCESS buffer Grid { uint grid[]; };
+#else
+layout(local_size_x = 1) in;
+layout(std430) buffer Grid { uint grid[]; };
+#endif
+#ifndef REAL
+layout(std430) buffer Sums { int sums[]; };  // layout(std430) buffer Comment { int comment[]; };
+/* uniform sampler2D commented; */
+layout(rgba16f) writeonly uniform image2D a, b;
+#else
+#ifdef SIZE
+layout(r32f) readonly uniform image2D a;
+#endif
+#endif
+#if SIZE == 9
+layout(std430) buffer Kept { int kept[]; };
+#endif
+uniform vec3 colors[4], tint;
+"""
+    virtual = declarations(source)
+    assert virtual.names == {"Grid", "Sums", "a", "b", "Kept", "colors", "tint"}
+    assert virtual.local_size == (8, 4, 1)
+    assert virtual.written == {"Sums", "a", "b", "Kept"}
+    assert virtual.formats == {"a": {"rgba16f"}, "b": {"rgba16f"}}
+    real = declarations("#define REAL 1\n" + source)
+    assert real.names == virtual.names
+    assert real.written == {"Kept"}
+    assert real.formats == {"a": {"r32f"}}
+
+
+def test_branches_nest_and_uncomputed_ones_stay() -> None:
+    text = "\n".join(
+        [
+            "#define A",
+            "#ifdef A",
+            "#ifdef B",
+            "1",
+            "#else",
+            "2",
+            "#define C 7",
+            "#endif",
+            "#else",
+            "#define C 8",
+            "3",
+            "#endif",
+            "#ifdef B",
+            "4",
+            "#elif defined(A)",
+            "5",
+            "#else",
+            "6",
+            "#endif",
+            "C",
+        ]
+    )
+    assert preprocessed(text).split() == ["2", "5", "6", "7"]
