@@ -32,10 +32,18 @@ def _require_name(schema: dict[str, Any], model: type["MethodSettings"]) -> None
         schema["required"] = ["name", *schema.get("required", [])]
 
 
+Quality = Literal["live", "balanced", "best"]
+
+
 class MethodSettings(StrictModel):
     """Base of the settings of all methods; each has a field `name`, a literal with its name as default."""
 
     model_config = ConfigDict(json_schema_extra=_require_name)
+
+    quality: Quality = Field(
+        default="best",
+        description="What a moving picture may give up for speed (docs/speed.md): live, balanced, or best: nothing.",
+    )
 
     @classmethod
     def method_name(cls) -> str:

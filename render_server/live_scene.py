@@ -103,8 +103,9 @@ class LiveScene:
         budget = plan.method.resolved.triangle_budget
         if self._real is not None and not plan.method.relights_real:
             budget = self._real.budget  # `none` asks for none
-        if self._real is None or plan.scene.real != old.scene.real or budget != self._real.budget:
-            real = RealGeometry(self._gpu, plan.scene.real, budget)
+        key = plan.scene.real, budget, plan.method.keeps_world
+        if self._real is None or key != (old.scene.real, self._real.budget, old.method.keeps_world):
+            real = RealGeometry(self._gpu, plan.scene.real, budget, keeps_world=plan.method.keeps_world)
             if self._real is not None:
                 self._real.release()
             self._real = real
@@ -166,6 +167,7 @@ class LiveScene:
                 frame,
                 view.with_antialiasing if output.antialiasing else view,
                 self._real.scan,
+                self._real.measurement,
                 self._real.state,
                 objects,
                 self._surface_table(frame, moved=moved),

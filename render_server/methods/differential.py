@@ -145,7 +145,7 @@ def solution_stages(
     beyond = g.stage("voxelize far", voxels.far.voxelize, s.real)
     objects = g.stage("voxelize objects", voxels.voxelize_objects, s.objects, placement)
     both = g.stage("group surfels", voxels.voxelize_both, real, objects)
-    given = s.observation, s.albedo, s.lights, mu_maps, environment, real
+    given = s.measured, s.albedo, s.lights, mu_maps, environment, real
     mu = g.value("voxel scene mu", voxels.mu_scene, *given)
     rho = g.value("voxel scene rho", voxels.rho_scene, mu, s.objects, rho_maps)
     far = g.stage("light far voxels", voxels.far.light, beyond, mu)

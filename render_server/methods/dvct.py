@@ -136,7 +136,7 @@ def injection_stages(
         "real albedo",
         voxels.find_albedo,
         real,
-        s.observation,
+        s.measured,
         s.albedo,
         s.lights,
         lit.real_maps,
@@ -150,7 +150,7 @@ def injection_stages(
         objects,
         albedo,
         s.objects,
-        s.observation,
+        s.measured,
         s.albedo,
         lit.object_maps,
     )

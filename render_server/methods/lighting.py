@@ -135,7 +135,7 @@ def light_stages(
     object_maps = g.stage("shadow maps objects", stages.draw_objects, object_views, s.objects)
     mirrored = []
     if mirrors:
-        given = real_maps, object_maps, s.lights, extent, s.observation
+        given = real_maps, object_maps, s.lights, extent, s.measured
         mirrored = [g.stage("mirror visibility", stages.map_mirrors, *given, same=_both_none)]
     return LitScene(stages.buffers, environment, real_maps, object_maps, tuple(mirrored))
 

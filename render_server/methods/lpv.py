@@ -291,7 +291,7 @@ def lpv_stages(
     scene = g.value(
         "inject scene",
         volumes.real_scene,
-        s.observation,
+        s.measured,
         s.albedo,
         volume,
         s.lights,

@@ -45,6 +45,11 @@ class MethodChoice:
     plugin: Plugin | None = None
 
     @property
+    def keeps_world(self) -> bool:
+        """Whether the real scene is kept while it explains what a moving camera sees."""
+        return self.settings.quality != "best"
+
+    @property
     def composition(self) -> Literal["ratio", "additive"]:
         """How the change of light is composed with the picture."""
         return self.settings.resolved_composition

@@ -13,7 +13,7 @@ uniform int scale;
 uniform ivec2 picture_pixels;
 
 const float LEAST_SLANT = 1.5;   // around corners too
-const float SMOOTH_TEXELS = 4.0;   // footprints of this many texels of the reduced grid or more lose nothing there
+const float SMOOTH_TEXELS = 1.0;   // footprints with a radius of this many texels of the reduced grid go there
 const float LONGEST = 4.0;   // limit of a slanted footprint, in radii of the beam
 
 vec3 position_on(int layer, ivec2 pixel, out vec3 normal) {
