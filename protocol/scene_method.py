@@ -45,6 +45,11 @@ class MethodSettings(StrictModel):
         description="What a moving picture may give up for speed (docs/speed.md): live, balanced, or best: nothing.",
     )
 
+    @property
+    def is_quick(self) -> bool:
+        """Whether quality may be given up for speed."""
+        return self.quality != "best"
+
     @classmethod
     def method_name(cls) -> str:
         """What `method.name` of the scene document calls the method."""

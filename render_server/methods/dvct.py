@@ -165,7 +165,7 @@ class ExactCones:
     ) -> None:
         size = fields.mu.size
         self._voxels, self._fields, self._cone_count = voxels, fields, settings.cone_count
-        self._tracing = TraceCones(gpu, size, march_defines(settings))
+        self._tracing = TraceCones(gpu, size, march_defines(settings), reuses=settings.is_quick)
 
     def marching(self, _mu: VoxelMipmap, _rho: VoxelMipmap) -> dict[str, Binding]:
         """Returns the bindings that cones march with."""
@@ -203,8 +203,14 @@ def dvct_exact(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
         size,
         resolved,
         lit.buffers,
-        DirectLight(g.gpu, size, shadow_cones=DIRECTIONS if settings.resolved_shadow == "cone" else None),
+        DirectLight(
+            g.gpu,
+            size,
+            shadow_cones=DIRECTIONS if settings.resolved_shadow == "cone" else None,
+            reuses=settings.is_quick,
+        ),
         ShadingOptions(
+            reuses_light=settings.is_quick,
             caustics=settings.caustics,
             screen_space=settings.screen_space,
             mirror_gather="gather" if settings.reflections == "rays" else None,

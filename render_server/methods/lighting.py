@@ -23,7 +23,7 @@ from render_server.passes.cones import ConeFields, LowResGrid
 from render_server.passes.lights import LightBuffers, MirrorVisibility
 from render_server.passes.ray_tracing import ObjectBvh
 from render_server.passes.reflections import ROUGHEST, MirrorRays, ScreenCones
-from render_server.passes.shading import DirectLight, VirtualSurface
+from render_server.passes.shading import DirectLight, LightHistory, VirtualSurface
 from render_server.passes.shadow_maps import ShadowMaps
 from render_server.passes.voxel_light import AlbedoTexture
 from render_server.passes.voxels import PlacedVolume, VolumePlacement, VoxelMipmap, place_volume
@@ -207,11 +207,13 @@ def casts_caustics(objects: GeometryState) -> bool:
 class ShadingOptions:
     """Options of the shared shading.
 
+    `reuses_light`: light at real surfaces is that of the last frame, where only the camera has moved since.
     `mirror_gather` names the kernel that lights reflected points (`mirror_...`); None: no rays at smooth real
     surfaces. `march` are defines of march.glsl, with which smooth objects look up in voxels what the picture does not
     show.
     """
 
+    reuses_light: bool = False
     caustics: bool = False
     screen_space: bool = False
     mirror_gather: str | None = None
@@ -250,12 +252,16 @@ class Shading:
     ) -> None:
         self._gpu, self._options, self._lights, self._direct = gpu, options, lights, direct
         self._scale = resolved.cone_scale
+        self.reuses_light = options.reuses_light
         self._bvh = ObjectBvh(gpu)
         self.grid = LowResGrid(gpu, size, resolved.cone_scale)
-        self.cones = ConeFields(gpu, self.grid.size)
+        self.cones = ConeFields(gpu, self.grid.size, remembers=options.reuses_light)
+        self._history = LightHistory(gpu, self.grid, direct, self.cones) if options.reuses_light else None
         self._surface = VirtualSurface(gpu, size)
         self._change = ChangeRatio(gpu, self.grid.size)
-        self._caustics = Caustics(gpu, self.grid, self._bvh) if options.caustics else None
+        self._caustics = (
+            Caustics(gpu, self.grid, self._bvh, reuses=options.reuses_light) if options.caustics else None
+        )
         self._screen = ScreenCones(gpu, self.grid, options.march) if options.screen_space else None
         self._rays: MirrorRays | None = None
         self.normal_offset: Callable[[Points], float] = lights.virtual_texel_m
@@ -298,6 +304,12 @@ class Shading:
         """Selects the pixel that represents each block of the picture."""
         self.grid.run(scene)
         return self.grid
+
+    def reuse_light(self, scene: Bindings, _grid: LowResGrid, light: object, view: CameraView) -> Bindings:
+        """Fills in the last frame's light where it serves, and lists where light must be computed."""
+        assert self._history is not None
+        is_diffuse = not scene["specular_surfaces"]
+        return {**scene, **self._history.run(scene, light if is_diffuse else object(), view)}
 
     def cast_caustics(
         self, scene: Bindings, _grid: LowResGrid, _bvh: ObjectBvh, seen: Observation, volume: PlacedVolume
@@ -372,6 +384,7 @@ class Shading:
         held = (
             self._bvh,
             self.grid,
+            self._history,
             self.cones,
             self._direct,
             self._surface,
@@ -417,6 +430,12 @@ def shading_stages(
     )
     bvh = g.stage("object bvh", shading.set_objects, s.objects)
     grid = g.stage("low res grid", shading.choose_pixels, scene)
+    if shading.reuses_light:
+        # What light at real surfaces depends on, besides the camera: another value whenever any of it changes.
+        changing: tuple[Resource[Any], ...] = (s.objects, s.surfaces, volume, s.everywhere, s.lights)
+        changing += (*lit.all, shown, marching)
+        light = g.value("light state", _new_object, *changing)
+        scene = g.stage("light reuse", shading.reuse_light, scene, grid, light, s.view)
     cones = trace(scene, grid)
     caustics = g.stage("caustics", shading.cast_caustics, scene, grid, bvh, s.observation, volume)
     direct = g.stage("direct light", light_directly or shading.light_directly, scene, grid, caustics, shown)
@@ -425,6 +444,11 @@ def shading_stages(
     screen = g.stage("screen cones", shading.trace_screen, scene, direct, cones, bvh, s.observation, marching)
     radiance = g.stage("virtual surface", shading.shade_objects, scene, grid, cones, caustics, screen)
     return Layers(direct, cones, grid, change, radiance, reflection, shown, volume, lit.real_maps)
+
+
+def _new_object(*_: object) -> object:
+    """Returns a value that equals no other."""
+    return object()
 
 
 def shadow_receivers(real: GeometryState, extent: Points) -> Points:

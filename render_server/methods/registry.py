@@ -47,7 +47,7 @@ class MethodChoice:
     @property
     def keeps_world(self) -> bool:
         """Whether the real scene is kept while it explains what a moving camera sees."""
-        return self.settings.quality != "best"
+        return self.settings.is_quick
 
     @property
     def composition(self) -> Literal["ratio", "additive"]:

@@ -4,7 +4,7 @@ import math
 
 from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Binding, Bindings, Kernel, list_threads
-from render_server.passes.cones import LowResGrid
+from render_server.passes.cones import LowResGrid, reuse_define
 from render_server.passes.lights import LightBuffers
 from render_server.passes.ray_tracing import ObjectBvh
 
@@ -25,7 +25,9 @@ SUMS_BYTES = 6 * 4  # per pixel: three channels on its real surface, three on it
 class Caustics:
     """Renders caustics as fixed-point irradiance on real surfaces and objects (shaders/common/caustic_sums.glsl)."""
 
-    def __init__(self, gpu: GpuContext, grid: LowResGrid, objects: ObjectBvh) -> None:
+    def __init__(
+        self, gpu: GpuContext, grid: LowResGrid, objects: ObjectBvh, *, reuses: bool = False
+    ) -> None:
         self._threads, self._grid, self._objects = list_threads(gpu), grid, objects
         self._sums = gpu.ctx.buffer(
             reserve=SUMS_BYTES * (math.prod(grid.picture_size) + math.prod(grid.size))
@@ -33,7 +35,7 @@ class Caustics:
         self._beams = gpu.ctx.buffer(reserve=HEADER_BYTES + BEAM_BYTES)
         self._mirror_beams = Kernel(gpu, "caustic_beams", RAY_COUNT=RAYS)
         self._lobe_beams = Kernel(gpu, "caustic_beams", RAY_COUNT=RAYS, WIDE=1)
-        self._splat = Kernel(gpu, "caustic_splat")
+        self._splat = Kernel(gpu, "caustic_splat", **reuse_define(reuses))
 
     @property
     def bindings(self) -> dict[str, Binding]:

@@ -6,7 +6,7 @@ import moderngl
 
 from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Binding, Bindings, Kernel, list_threads
-from render_server.gpu.textures import texture_2d
+from render_server.gpu.textures import release_all, texture_2d
 from render_server.passes.voxels import VoxelMipmap
 
 
@@ -54,27 +54,52 @@ class LowResGrid:
 
 
 class ConeFields:
-    """Light gathered by cones at 1/scale of the picture: irradiance (diffuse) and mean radiance (specular cone)."""
+    """Light gathered by cones at 1/scale of the picture: irradiance (diffuse) and mean radiance (specular cone).
 
-    def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
+    With `remembers`, the irradiance of the last frame at real surfaces too.
+    """
+
+    def __init__(self, gpu: GpuContext, size: tuple[int, int], *, remembers: bool = False) -> None:
         self.mu = texture_2d(gpu, size, 4, "f2")
         self.rho = texture_2d(gpu, size, 4, "f2")
         self.specular_mu = texture_2d(gpu, size, 4, "f2")
         self.specular_rho = texture_2d(gpu, size, 4, "f2")
         self.virtual = texture_2d(gpu, size, 4, "f2")
         self.virtual_specular = texture_2d(gpu, size, 4, "f2")
+        self.last: tuple[moderngl.Texture, moderngl.Texture] | None = None
+        if remembers:
+            self.last = texture_2d(gpu, size, 4, "f2"), texture_2d(gpu, size, 4, "f2")
+
+    def remember(self) -> dict[str, Binding]:
+        """Makes the irradiance at real surfaces the last frame's, and returns its bindings."""
+        assert self.last is not None
+        self.last, (self.mu, self.rho) = (self.mu, self.rho), self.last
+        return {"last_cone_mu": self.last[0], "last_cone_rho": self.last[1]}
 
     def release(self) -> None:
         """Frees the textures."""
-        for texture in vars(self).values():
-            texture.release()
+        kept = self.last or ()
+        of_frame = (
+            self.mu,
+            self.rho,
+            self.specular_mu,
+            self.specular_rho,
+            self.virtual,
+            self.virtual_specular,
+        )
+        release_all(*of_frame, *kept)
+
+
+def reuse_define(reuses: bool) -> dict[str, int]:
+    """Returns the define of kernels that leave out what the last frame's light serves for."""
+    return {"REUSES": 1} if reuses else {}
 
 
 class BilateralConeFilter:
     """Averages neighbouring texels, whose cones point in different directions: a joint bilateral tent over 3 x 3."""
 
-    def __init__(self, gpu: GpuContext) -> None:
-        self._real = Kernel(gpu, "bilateral_cone_filter", REAL=1)
+    def __init__(self, gpu: GpuContext, *, reuses: bool = False) -> None:
+        self._real = Kernel(gpu, "bilateral_cone_filter", REAL=1, **reuse_define(reuses))
         self._virtual = Kernel(gpu, "bilateral_cone_filter")
 
     def filter_real(
@@ -110,16 +135,19 @@ class BilateralConeFilter:
 class TraceCones:
     """Traces the cones of the exact operator: both marches at real surfaces, rho's at virtual ones.
 
-    See docs/method.md 3 and 4.5. `size` is that of the reduced grid, `defines` are those of march.glsl.
+    See docs/method.md 3 and 4.5. `size` is that of the reduced grid, `defines` are those of march.glsl. With
+    `reuses`, only where the scene's `stale_texels` say so, or the last frame saw other surfaces.
     """
 
-    def __init__(self, gpu: GpuContext, size: tuple[int, int], defines: Mapping[str, int]) -> None:
+    def __init__(
+        self, gpu: GpuContext, size: tuple[int, int], defines: Mapping[str, int], *, reuses: bool = False
+    ) -> None:
         self._gpu = gpu
         self._mu, self._rho, self._irradiance = (texture_2d(gpu, size, 4, "f2") for _ in range(3))
-        self._filter = BilateralConeFilter(gpu)
+        self._filter = BilateralConeFilter(gpu, reuses=reuses)
         self._real = Kernel(gpu, "trace_cones", REAL=1, **defines)
         self._virtual = Kernel(gpu, "trace_cones", **defines)
-        self._select = Kernel(gpu, "select_cone_texels", REAL=1)
+        self._select = Kernel(gpu, "select_cone_texels", REAL=1, **reuse_define(reuses))
         self._texels = gpu.ctx.buffer(reserve=4)
 
     def trace_real(

@@ -11,6 +11,9 @@ uniform isampler2D sample_pixels;
 uniform int scale;
 #include "common/camera.glsl"
 uniform ivec2 picture_pixels;
+#ifdef REUSES
+uniform usampler2D stale_texels;   // 0: light there is the last frame's
+#endif
 
 const float LEAST_SLANT = 1.5;   // around corners too
 const float SMOOTH_TEXELS = 1.0;   // footprints with a radius of this many texels of the reduced grid go there
@@ -21,6 +24,15 @@ vec3 position_on(int layer, ivec2 pixel, out vec3 normal) {
     vec4 real = texelFetch(real_surface_position, pixel, 0), object = texelFetch(virtual_raster_position, raster, 0);
     normal = layer == REAL_LAYER ? texelFetch(real_surface_normal, pixel, 0).xyz : texelFetch(virtual_raster_normal, raster, 0).xyz;
     return (layer == REAL_LAYER ? real.w > 0.0 : object.w > 0.0) ? (layer == REAL_LAYER ? real.xyz : object.xyz) : vec3(1e9);
+}
+
+// Whether light on a real surface is computed at this texel of the reduced grid.
+bool is_wanted(int layer, ivec2 texel) {
+#ifdef REUSES
+    return layer != REAL_LAYER || texelFetch(stale_texels, texel, 0).r != 0u;
+#else
+    return true;
+#endif
 }
 
 // `at`: index of the pixel's sums.
@@ -62,6 +74,7 @@ void splat(Beam beam) {
     int width = high.x - low.x + 1, count = width * (high.y - low.y + 1);
     for (int i = int(gl_LocalInvocationIndex); i < count; i += 64) {
         ivec2 place = low + ivec2(i % width, i / width);
+        if (!is_wanted(layer, smooth_one ? place : place / scale)) continue;
         ivec4 pixels = smooth_one ? texelFetch(sample_pixels, place, 0) : place.xyxy;
         ivec2 pixel = layer == REAL_LAYER ? pixels.xy : pixels.zw;
         int at = smooth_one ? sums_of_texel(place, grid, picture_pixels) : sums_of_pixel(place, picture_pixels);
