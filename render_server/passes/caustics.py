@@ -4,6 +4,7 @@ import math
 
 from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Binding, Bindings, Kernel, list_threads
+from render_server.gpu.textures import release_all, texture_2d
 from render_server.passes.cones import LowResGrid, reuse_define
 from render_server.passes.lights import LightBuffers
 from render_server.passes.ray_tracing import ObjectBvh
@@ -19,6 +20,7 @@ WIDE_ALPHA = 1 / 32
 GREATEST_ALPHA = 0.174
 BEAM_BYTES = 64
 HEADER_BYTES = 16
+TILE = 8  # texels an edge
 SUMS_BYTES = 6 * 4  # per pixel: three channels on its real surface, three on its object
 
 
@@ -35,7 +37,10 @@ class Caustics:
         self._beams = gpu.ctx.buffer(reserve=HEADER_BYTES + BEAM_BYTES)
         self._mirror_beams = Kernel(gpu, "caustic_beams", RAY_COUNT=RAYS)
         self._lobe_beams = Kernel(gpu, "caustic_beams", RAY_COUNT=RAYS, WIDE=1)
-        self._splat = Kernel(gpu, "caustic_splat", **reuse_define(reuses))
+        self._tiles = texture_2d(gpu, (-(-grid.size[0] // TILE), -(-grid.size[1] // TILE)), 1, "u1")
+        self._find_tiles, self._splat = (
+            Kernel(gpu, f"caustic_{name}", **reuse_define(reuses)) for name in ("tiles", "splat")
+        )
 
     @property
     def bindings(self) -> dict[str, Binding]:
@@ -52,11 +57,16 @@ class Caustics:
         for view in range(len(lights.virtual_views)):
             self._trace_beams(lights, lights.first_virtual_view + view, scene, bias_m, reach_m)
         grid = self._grid
+        width, height = self._tiles.size
+        self._find_tiles.run(
+            (width * TILE**2, height), scene, tiles_out=self._tiles, sample_pixels=grid.pixels
+        )
         self._splat.run(
             (self._threads,),
             self.bindings,
             scene,
             Beams=self._beams,
+            tiles=self._tiles,
             sample_pixels=grid.pixels,
             picture_pixels=grid.picture_size,
             scale=grid.scale,
@@ -89,5 +99,12 @@ class Caustics:
 
     def release(self) -> None:
         """Frees the GL objects."""
-        for item in (self._sums, self._beams, self._mirror_beams, self._lobe_beams, self._splat):
-            item.release()
+        release_all(
+            self._sums,
+            self._beams,
+            self._tiles,
+            self._mirror_beams,
+            self._lobe_beams,
+            self._find_tiles,
+            self._splat,
+        )

@@ -6,8 +6,11 @@
 #define ADDS_CAUSTICS
 #include "common/caustic_sums.glsl"
 
+#include "common/caustic_tiles.glsl"
+
 layout(local_size_x = 64) in;
 uniform isampler2D sample_pixels;
+uniform usampler2D tiles;   // of texels of the reduced grid
 uniform int scale;
 #include "common/camera.glsl"
 uniform ivec2 picture_pixels;
@@ -71,9 +74,12 @@ void splat(Beam beam) {
     ivec2 high = min(ivec2(ceil((centre + extent) / float(unit))), last);
     if (any(greaterThan(low, high))) return;
     mat3 basis = basis_around(beam.direction.xyz);
-    int width = high.x - low.x + 1, count = width * (high.y - low.y + 1);
-    for (int i = int(gl_LocalInvocationIndex); i < count; i += 64) {
-        ivec2 place = low + ivec2(i % width, i / width);
+    ivec2 first = low / 8, count = high / 8 - first + 1;
+    for (int i = 0; i < count.x * count.y; ++i) {
+        ivec2 tile = first + ivec2(i % count.x, i / count.x);
+        if (smooth_one && (texelFetch(tiles, tile, 0).r & (layer == REAL_LAYER ? REAL_TILE : OBJECT_TILE)) == 0u) continue;
+        ivec2 place = place_in_tile(tile);
+        if (any(lessThan(place, low)) || any(greaterThan(place, high))) continue;
         if (!is_wanted(layer, smooth_one ? place : place / scale)) continue;
         ivec4 pixels = smooth_one ? texelFetch(sample_pixels, place, 0) : place.xyxy;
         ivec2 pixel = layer == REAL_LAYER ? pixels.xy : pixels.zw;
