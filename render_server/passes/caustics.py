@@ -31,9 +31,10 @@ class Caustics:
         self, gpu: GpuContext, grid: LowResGrid, objects: ObjectBvh, *, reuses: bool = False
     ) -> None:
         self._threads, self._grid, self._objects = list_threads(gpu), grid, objects
-        self._sums = gpu.ctx.buffer(
-            reserve=SUMS_BYTES * (math.prod(grid.picture_size) + math.prod(grid.size))
-        )
+        size_bytes = SUMS_BYTES * (math.prod(grid.picture_size) + math.prod(grid.size))
+        self._sums = gpu.ctx.buffer(reserve=size_bytes)
+        self._last_sums = gpu.ctx.buffer(reserve=size_bytes) if reuses else None
+        self._reuse = Kernel(gpu, "reuse_object_light", CAUSTICS=1) if reuses else None
         self._beams = gpu.ctx.buffer(reserve=HEADER_BYTES + BEAM_BYTES)
         self._mirror_beams = Kernel(gpu, "caustic_beams", RAY_COUNT=RAYS)
         self._lobe_beams = Kernel(gpu, "caustic_beams", RAY_COUNT=RAYS, WIDE=1)
@@ -52,11 +53,16 @@ class Caustics:
 
         `bias_m` offsets receivers of real shadows towards the light; beams are traced up to `reach_m`.
         """
+        if self._last_sums is not None:
+            self._sums, self._last_sums = self._last_sums, self._sums
         self._sums.clear()
         self._empty_beams(len(lights.virtual_views))
         for view in range(len(lights.virtual_views)):
             self._trace_beams(lights, lights.first_virtual_view + view, scene, bias_m, reach_m)
         grid = self._grid
+        if self._reuse is not None:
+            last: Bindings = {**grid.bindings, "Texels": grid.virtual_texels, "LastSums": self._last_sums}
+            self._reuse.run((self._threads,), self.bindings, last, scene)
         width, height = self._tiles.size
         self._find_tiles.run(
             (width * TILE**2, height), scene, tiles_out=self._tiles, sample_pixels=grid.pixels
@@ -101,6 +107,8 @@ class Caustics:
         """Frees the GL objects."""
         release_all(
             self._sums,
+            self._last_sums,
+            self._reuse,
             self._beams,
             self._tiles,
             self._mirror_beams,

@@ -56,7 +56,7 @@ class LowResGrid:
 class ConeFields:
     """Light gathered by cones at 1/scale of the picture: irradiance (diffuse) and mean radiance (specular cone).
 
-    With `remembers`, the irradiance of the last frame at real surfaces too.
+    With `remembers`, the irradiance of the last frame too.
     """
 
     def __init__(self, gpu: GpuContext, size: tuple[int, int], *, remembers: bool = False) -> None:
@@ -66,19 +66,18 @@ class ConeFields:
         self.specular_rho = texture_2d(gpu, size, 4, "f2")
         self.virtual = texture_2d(gpu, size, 4, "f2")
         self.virtual_specular = texture_2d(gpu, size, 4, "f2")
-        self.last: tuple[moderngl.Texture, moderngl.Texture] | None = None
+        self.last: tuple[moderngl.Texture, ...] = ()
         if remembers:
-            self.last = texture_2d(gpu, size, 4, "f2"), texture_2d(gpu, size, 4, "f2")
+            self.last = tuple(texture_2d(gpu, size, 4, "f2") for _ in range(3))
 
     def remember(self) -> dict[str, Binding]:
-        """Makes the irradiance at real surfaces the last frame's, and returns its bindings."""
-        assert self.last is not None
-        self.last, (self.mu, self.rho) = (self.mu, self.rho), self.last
-        return {"last_cone_mu": self.last[0], "last_cone_rho": self.last[1]}
+        """Makes the irradiance the last frame's, and returns its bindings."""
+        now = self.mu, self.rho, self.virtual
+        (self.mu, self.rho, self.virtual), self.last = self.last, now
+        return {"last_cone_mu": now[0], "last_cone_rho": now[1], "last_irradiance": now[2]}
 
     def release(self) -> None:
         """Frees the textures."""
-        kept = self.last or ()
         of_frame = (
             self.mu,
             self.rho,
@@ -87,7 +86,7 @@ class ConeFields:
             self.virtual,
             self.virtual_specular,
         )
-        release_all(*of_frame, *kept)
+        release_all(*of_frame, *self.last)
 
 
 def reuse_define(reuses: bool) -> dict[str, int]:
@@ -100,7 +99,7 @@ class BilateralConeFilter:
 
     def __init__(self, gpu: GpuContext, *, reuses: bool = False) -> None:
         self._real = Kernel(gpu, "bilateral_cone_filter", REAL=1, **reuse_define(reuses))
-        self._virtual = Kernel(gpu, "bilateral_cone_filter")
+        self._virtual = Kernel(gpu, "bilateral_cone_filter", **reuse_define(reuses))
 
     def filter_real(
         self,
@@ -146,7 +145,8 @@ class TraceCones:
         self._mu, self._rho, self._irradiance = (texture_2d(gpu, size, 4, "f2") for _ in range(3))
         self._filter = BilateralConeFilter(gpu, reuses=reuses)
         self._real = Kernel(gpu, "trace_cones", REAL=1, **defines)
-        self._virtual = Kernel(gpu, "trace_cones", **defines)
+        self._virtual = Kernel(gpu, "trace_cones", **reuse_define(reuses), **defines)
+        self._reuse = Kernel(gpu, "reuse_object_light") if reuses else None
         self._select = Kernel(gpu, "select_cone_texels", REAL=1, **reuse_define(reuses))
         self._texels = gpu.ctx.buffer(reserve=4)
 
@@ -172,13 +172,15 @@ class TraceCones:
     ) -> None:
         """Traces E_rho and the specular cone of virtual surfaces."""
         self._irradiance.write(bytes(8 * grid.texel_count))
+        listed: Bindings = {**grid.bindings, "Texels": grid.virtual_texels}
+        if self._reuse is not None:
+            self._reuse.run(self._threads(grid), listed, scene, irradiance=self._irradiance)
         self._virtual.run(
             self._threads(grid),
-            grid.bindings,
+            listed,
             scene,
             irradiance_rho=self._irradiance,
             specular_rho=fields.virtual_specular,
-            Texels=grid.virtual_texels,
             pyramid_mu=mu.texture,
             pyramid_rho=rho.texture,
         )
@@ -196,12 +198,8 @@ class TraceCones:
 
     def release(self) -> None:
         """Frees the GL objects."""
-        for texture in (self._mu, self._rho, self._irradiance):
-            texture.release()
-        for kernel in (self._real, self._virtual, self._select):
-            kernel.release()
-        self._filter.release()
-        self._texels.release()
+        release_all(self._mu, self._rho, self._irradiance, self._filter, self._texels)
+        release_all(self._real, self._virtual, self._reuse, self._select)
 
 
 class TraceConesPaper:

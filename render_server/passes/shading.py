@@ -76,7 +76,7 @@ class DirectLight:
 
 
 class LightHistory:
-    """Reuses the light of the last frame at real surfaces while only the camera moves.
+    """Reuses the light of the last frame while only the camera moves.
 
     Irradiance does not depend on where it is seen from: what the last frame computed is looked up where the surface
     was in its picture (reverse reprojection caching, Nehab et al. 2007). Pixels whose surface it did not show are
@@ -89,6 +89,7 @@ class LightHistory:
         self._last_direct = tuple(texture_2d(gpu, size, 4, "f2") for _ in range(2))
         self._positions = [texture_2d(gpu, size, 4, "f4") for _ in range(2)]
         self._samples = [texture_2d(gpu, grid.size, 4, "i2") for _ in range(2)]
+        self._objects = [texture_2d(gpu, grid.size, 4, "f4") for _ in range(2)]
         self._own_stale, self._stale = (texture_2d(gpu, grid.size, 1, "u1") for _ in range(2))
         self._texels = gpu.ctx.buffer(reserve=4 * (1 + grid.texel_count))
         self._reproject = Kernel(gpu, "reproject_light")
@@ -108,6 +109,7 @@ class LightHistory:
         self._turn = (self._turn + 1) % TURNS
         self._positions.reverse()
         self._samples.reverse()
+        self._objects.reverse()
         direct = self._direct
         self._last_direct, (direct.mu, direct.rho) = (direct.mu, direct.rho), self._last_direct
         found: dict[str, Binding] = {
@@ -115,6 +117,7 @@ class LightHistory:
             "last_camera_from_world": matrix,
             "last_position": self._positions[1],
             "last_sample_pixels": self._samples[1],
+            "last_object_position": self._objects[1],
             "pixel_size": 1.0 / view.camera.matrix[0, 0],
             "stale_texels": self._stale,
             "Texels": self._texels,
@@ -125,10 +128,10 @@ class LightHistory:
         return found
 
     def _fill(self, scene: Bindings, found: Bindings) -> None:
+        shared: Bindings = {**found, "scale": self._grid.scale, "turn": self._turn}
         self._reproject.run(
             self._grid.picture_size,
-            {"scale": self._grid.scale, "turn": self._turn},
-            found,
+            shared,
             scene,
             position_out=self._positions[0],
             direct_mu_out=self._direct.mu,
@@ -139,10 +142,13 @@ class LightHistory:
         )
         self._spread.run(
             self._grid.size,
-            stale_texels=self._own_stale,
+            shared,
+            scene,
+            own_stale=self._own_stale,
             sample_pixels=self._grid.pixels,
             stale_out=self._stale,
             sample_pixels_out=self._samples[0],
+            object_position_out=self._objects[0],
         )
 
     def release(self) -> None:
@@ -151,6 +157,7 @@ class LightHistory:
             *self._last_direct,
             *self._positions,
             *self._samples,
+            *self._objects,
             self._own_stale,
             self._stale,
             self._texels,

@@ -55,7 +55,12 @@ void main() {
     mu = texelFetch(traced_mu, texel, 0);
 #endif
 #ifdef REUSES
-    bool is_mean = texelFetch(stale_texels, texel, 0).r % 2u == 0u;
+#ifdef REAL
+    const uint fresh = 1u;
+#else
+    const uint fresh = 4u;
+#endif
+    bool is_mean = (texelFetch(stale_texels, texel, 0).r & fresh) == 0u;
 #else
     const bool is_mean = false;
 #endif

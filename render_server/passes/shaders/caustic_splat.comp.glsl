@@ -32,7 +32,7 @@ vec3 position_on(int layer, ivec2 pixel, out vec3 normal) {
 // Whether light on a real surface is computed at this texel of the reduced grid.
 bool is_wanted(int layer, ivec2 texel) {
 #ifdef REUSES
-    return layer != REAL_LAYER || texelFetch(stale_texels, texel, 0).r != 0u;
+    return (texelFetch(stale_texels, texel, 0).r & (layer == REAL_LAYER ? 3u : 4u)) != 0u;
 #else
     return true;
 #endif
@@ -80,7 +80,7 @@ void splat(Beam beam) {
         if (smooth_one && (texelFetch(tiles, tile, 0).r & (layer == REAL_LAYER ? REAL_TILE : OBJECT_TILE)) == 0u) continue;
         ivec2 place = place_in_tile(tile);
         if (any(lessThan(place, low)) || any(greaterThan(place, high))) continue;
-        if (!is_wanted(layer, smooth_one ? place : place / scale)) continue;
+        if ((smooth_one || layer == REAL_LAYER) && !is_wanted(layer, smooth_one ? place : place / scale)) continue;
         ivec4 pixels = smooth_one ? texelFetch(sample_pixels, place, 0) : place.xyxy;
         ivec2 pixel = layer == REAL_LAYER ? pixels.xy : pixels.zw;
         int at = smooth_one ? sums_of_texel(place, grid, picture_pixels) : sums_of_pixel(place, picture_pixels);

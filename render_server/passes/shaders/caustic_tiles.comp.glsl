@@ -16,11 +16,13 @@ void main() {
     ivec2 tile = ivec2(gl_WorkGroupID.xy), texel = place_in_tile(tile);
     if (all(lessThan(texel, textureSize(sample_pixels, 0)))) {
         ivec4 pixels = texelFetch(sample_pixels, texel, 0);
-        bool real = pixels.x >= 0;
+        bool real = pixels.x >= 0, object = pixels.z >= 0;
 #ifdef REUSES
-        real = real && texelFetch(stale_texels, texel, 0).r != 0u;
+        uint stale = texelFetch(stale_texels, texel, 0).r;
+        real = real && (stale & 3u) != 0u;
+        object = object && (stale & 4u) != 0u;
 #endif
-        uint shown = (real ? REAL_TILE : 0u) + (pixels.z >= 0 ? OBJECT_TILE : 0u);
+        uint shown = (real ? REAL_TILE : 0u) + (object ? OBJECT_TILE : 0u);
         if (shown != 0u) atomicOr(found, shown);
     }
     memoryBarrierShared();

@@ -28,7 +28,7 @@ uniform int scale;
 
 // Takes the light of the last frame's texels on this one's surface, if there are any and it is not this texel's turn.
 bool remembered(ivec2 texel, SurfacePoint s) {
-    if (!has_history || s.roughness >= 0.0 || (texelFetch(stale_texels, texel, 0).r & 1u) != 0u) return false;
+    if (!has_history || s.roughness >= 0.0 || (texelFetch(stale_texels, texel, 0).r & STALE_REAL) != 0u) return false;
     vec4 mu = vec4(0.0), rho = vec4(0.0), position = vec4(s.position, (camera_from_world * vec4(s.position, 1.0)).z);
     vec2 at = last_pixel(s.position) / float(scale) - 0.5;
     float total = 0.0;
