@@ -4,7 +4,7 @@ import math
 
 from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Binding, Bindings, Kernel, list_threads
-from render_server.gpu.textures import release_all, texture_2d
+from render_server.gpu.textures import release_all
 from render_server.passes.cones import LowResGrid, reuse_define
 from render_server.passes.lights import LightBuffers
 from render_server.passes.ray_tracing import ObjectBvh
@@ -19,8 +19,8 @@ WIDE_ALPHA = 1 / 32
 # A lobe with 85 % of its energy within 45 degrees or more is as good as diffuse: voxels carry its light.
 GREATEST_ALPHA = 0.174
 BEAM_BYTES = 64
+PLACE_BYTES = 32
 HEADER_BYTES = 16
-TILE = 8  # texels an edge
 SUMS_BYTES = 6 * 4  # per pixel: three channels on its real surface, three on its object
 
 
@@ -38,10 +38,10 @@ class Caustics:
         self._beams = gpu.ctx.buffer(reserve=HEADER_BYTES + BEAM_BYTES)
         self._mirror_beams = Kernel(gpu, "caustic_beams", RAY_COUNT=RAYS)
         self._lobe_beams = Kernel(gpu, "caustic_beams", RAY_COUNT=RAYS, WIDE=1)
-        self._tiles = texture_2d(gpu, (-(-grid.size[0] // TILE), -(-grid.size[1] // TILE)), 1, "u1")
-        self._find_tiles, self._splat = (
-            Kernel(gpu, f"caustic_{name}", **reuse_define(reuses)) for name in ("tiles", "splat")
-        )
+        self._places = gpu.ctx.buffer(reserve=PLACE_BYTES)
+        self._find_places = Kernel(gpu, "caustic_places")
+        self._gather = Kernel(gpu, "caustic_gather", **reuse_define(reuses))
+        self._splat = Kernel(gpu, "caustic_splat")
 
     @property
     def bindings(self) -> dict[str, Binding]:
@@ -63,26 +63,24 @@ class Caustics:
         if self._reuse is not None:
             last: Bindings = {**grid.bindings, "Texels": grid.virtual_texels, "LastSums": self._last_sums}
             self._reuse.run((self._threads,), self.bindings, last, scene)
-        width, height = self._tiles.size
-        self._find_tiles.run(
-            (width * TILE**2, height), scene, tiles_out=self._tiles, sample_pixels=grid.pixels
-        )
-        self._splat.run(
-            (self._threads,),
-            self.bindings,
-            scene,
-            Beams=self._beams,
-            tiles=self._tiles,
-            sample_pixels=grid.pixels,
-            picture_pixels=grid.picture_size,
-            scale=grid.scale,
-        )
+        shared: Bindings = {
+            **self.bindings,
+            "Beams": self._beams,
+            "BeamPlaces": self._places,
+            "sample_pixels": grid.pixels,
+            "picture_pixels": grid.picture_size,
+            "scale": grid.scale,
+        }
+        self._find_places.run((self._threads,), shared, scene)
+        self._gather.run(grid.size, shared, scene)
+        self._splat.run((self._threads,), shared, scene)
 
     def _empty_beams(self, views: int) -> None:
         """Allocates and clears the beams of that many views."""
-        needed = HEADER_BYTES + BEAM_BYTES * max(views * BLOCKS**2 * RAYS, 1)
-        if self._beams.size < needed:
-            self._beams.orphan(needed)
+        most = max(views * BLOCKS**2 * RAYS, 1)
+        if self._places.size < PLACE_BYTES * most:
+            self._beams.orphan(HEADER_BYTES + BEAM_BYTES * most)
+            self._places.orphan(PLACE_BYTES * most)
         self._beams.write(bytes(HEADER_BYTES))
 
     def _trace_beams(
@@ -110,9 +108,10 @@ class Caustics:
             self._last_sums,
             self._reuse,
             self._beams,
-            self._tiles,
+            self._places,
             self._mirror_beams,
             self._lobe_beams,
-            self._find_tiles,
+            self._find_places,
+            self._gather,
             self._splat,
         )
