@@ -34,7 +34,7 @@ class Caustics:
         size_bytes = SUMS_BYTES * (math.prod(grid.picture_size) + math.prod(grid.size))
         self._sums = gpu.ctx.buffer(reserve=size_bytes)
         self._last_sums = gpu.ctx.buffer(reserve=size_bytes) if reuses else None
-        self._reuse = Kernel(gpu, "reuse_object_light", CAUSTICS=1) if reuses else None
+        self._reuse = Kernel(gpu, "reuse_light", CAUSTICS=1) if reuses else None
         self._beams = gpu.ctx.buffer(reserve=HEADER_BYTES + BEAM_BYTES)
         self._mirror_beams = Kernel(gpu, "caustic_beams", RAY_COUNT=RAYS)
         self._lobe_beams = Kernel(gpu, "caustic_beams", RAY_COUNT=RAYS, WIDE=1)
@@ -61,8 +61,7 @@ class Caustics:
             self._trace_beams(lights, lights.first_virtual_view + view, scene, bias_m, reach_m)
         grid = self._grid
         if self._reuse is not None:
-            last: Bindings = {**grid.bindings, "Texels": grid.virtual_texels, "LastSums": self._last_sums}
-            self._reuse.run((self._threads,), self.bindings, last, scene)
+            self._reuse.run(grid.size, self.bindings, grid.bindings, scene, LastSums=self._last_sums)
         shared: Bindings = {
             **self.bindings,
             "Beams": self._beams,

@@ -146,7 +146,7 @@ class TraceCones:
         self._filter = BilateralConeFilter(gpu, reuses=reuses)
         self._real = Kernel(gpu, "trace_cones", REAL=1, **defines)
         self._virtual = Kernel(gpu, "trace_cones", **reuse_define(reuses), **defines)
-        self._reuse = Kernel(gpu, "reuse_object_light") if reuses else None
+        self._reuse = Kernel(gpu, "reuse_light") if reuses else None
         self._select = Kernel(gpu, "select_cone_texels", REAL=1, **reuse_define(reuses))
         self._texels = gpu.ctx.buffer(reserve=4)
 
@@ -174,7 +174,7 @@ class TraceCones:
         self._irradiance.write(bytes(8 * grid.texel_count))
         listed: Bindings = {**grid.bindings, "Texels": grid.virtual_texels}
         if self._reuse is not None:
-            self._reuse.run(self._threads(grid), listed, scene, irradiance=self._irradiance)
+            self._reuse.run(grid.size, listed, scene, irradiance=self._irradiance)
         self._virtual.run(
             self._threads(grid),
             listed,

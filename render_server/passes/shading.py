@@ -88,12 +88,13 @@ class LightHistory:
         size = grid.picture_size
         self._last_direct = tuple(texture_2d(gpu, size, 4, "f2") for _ in range(2))
         self._positions = [texture_2d(gpu, size, 4, "f4") for _ in range(2)]
-        self._samples = [texture_2d(gpu, grid.size, 4, "i2") for _ in range(2)]
-        self._objects = [texture_2d(gpu, grid.size, 4, "f4") for _ in range(2)]
-        self._own_stale, self._stale = (texture_2d(gpu, grid.size, 1, "u1") for _ in range(2))
+        self._real_texels, self._object_texels = (
+            [texture_2d(gpu, grid.size, 4, "f4") for _ in range(2)] for _ in range(2)
+        )
+        self._stale_pixels, self._stale = (texture_2d(gpu, grid.size, 1, "u1") for _ in range(2))
         self._texels = gpu.ctx.buffer(reserve=4 * (1 + grid.texel_count))
         self._reproject = Kernel(gpu, "reproject_light")
-        self._spread = Kernel(gpu, "spread_stale")
+        self._find_stale = Kernel(gpu, "stale_texels")
         self._seen: tuple[object, Float64[np.ndarray, "4 4"]] | None = None
         self._turn = 0
 
@@ -108,16 +109,16 @@ class LightHistory:
         matrix = view.camera_from_world if last is None else last[1]
         self._turn = (self._turn + 1) % TURNS
         self._positions.reverse()
-        self._samples.reverse()
-        self._objects.reverse()
+        self._real_texels.reverse()
+        self._object_texels.reverse()
         direct = self._direct
         self._last_direct, (direct.mu, direct.rho) = (direct.mu, direct.rho), self._last_direct
         found: dict[str, Binding] = {
             "has_history": has_history,
             "last_camera_from_world": matrix,
             "last_position": self._positions[1],
-            "last_sample_pixels": self._samples[1],
-            "last_object_position": self._objects[1],
+            "last_real_texels": self._real_texels[1],
+            "last_object_texels": self._object_texels[1],
             "pixel_size": 1.0 / view.camera.matrix[0, 0],
             "stale_texels": self._stale,
             "Texels": self._texels,
@@ -138,17 +139,17 @@ class LightHistory:
             direct_rho_out=self._direct.rho,
             last_direct_mu=self._last_direct[0],
             last_direct_rho=self._last_direct[1],
-            stale_out=self._own_stale,
+            stale_out=self._stale_pixels,
         )
-        self._spread.run(
+        self._find_stale.run(
             self._grid.size,
             shared,
             scene,
-            own_stale=self._own_stale,
+            stale_pixels=self._stale_pixels,
             sample_pixels=self._grid.pixels,
             stale_out=self._stale,
-            sample_pixels_out=self._samples[0],
-            object_position_out=self._objects[0],
+            real_texels_out=self._real_texels[0],
+            object_texels_out=self._object_texels[0],
         )
 
     def release(self) -> None:
@@ -156,13 +157,13 @@ class LightHistory:
         release_all(
             *self._last_direct,
             *self._positions,
-            *self._samples,
-            *self._objects,
-            self._own_stale,
+            *self._real_texels,
+            *self._object_texels,
+            self._stale_pixels,
             self._stale,
             self._texels,
             self._reproject,
-            self._spread,
+            self._find_stale,
         )
 
 

@@ -23,7 +23,7 @@ uint needs(ivec2 texel, ivec4 pixels) {
     uint found = (pixels.x >= 0 ? REAL : 0u) | (pixels.z >= 0 ? OBJECT : 0u);
 #ifdef REUSES
     uint stale = texelFetch(stale_texels, texel, 0).r;
-    found &= ((stale & 3u) != 0u ? REAL : 0u) | ((stale & 4u) != 0u ? OBJECT : 0u);
+    found &= ((stale & 2u) != 0u ? REAL : 0u) | ((stale & 4u) != 0u ? OBJECT : 0u);
 #endif
     return found;
 }

@@ -20,33 +20,26 @@ layout(rgba16f) writeonly uniform image2D specular_rho;
 uniform bool everywhere;   // also out of the objects' reach (photometric registration)
 
 #ifdef REUSES
+#include "common/last_texels.glsl"
 uniform usampler2D stale_texels;
-uniform isampler2D last_sample_pixels;
 uniform sampler2D last_cone_mu;
 uniform sampler2D last_cone_rho;
-uniform int scale;
 
-// Takes the light of the last frame's texels on this one's surface, if there are any and it is not this texel's turn.
+// Takes the light of the last frame's texels, if they know it all.
 bool remembered(ivec2 texel, SurfacePoint s) {
-    if (!has_history || s.roughness >= 0.0 || (texelFetch(stale_texels, texel, 0).r & STALE_REAL) != 0u) return false;
-    vec4 mu = vec4(0.0), rho = vec4(0.0), position = vec4(s.position, (camera_from_world * vec4(s.position, 1.0)).z);
-    vec2 at = last_pixel(s.position) / float(scale) - 0.5;
-    float total = 0.0;
+    if (s.roughness >= 0.0 || (texelFetch(stale_texels, texel, 0).r & STALE_REAL) != 0u) return false;
+    vec4 position = vec4(s.position, (camera_from_world * vec4(s.position, 1.0)).z), mu = vec4(0.0), rho = vec4(0.0);
+    LastTexels last = last_texels(position, s.normal, false);
     for (int j = 0; j < 4; ++j) {
-        ivec2 other = clamp(ivec2(floor(at)) + ivec2(j & 1, j >> 1), ivec2(0), low_resolution_size - 1);
-        ivec2 pixel = texelFetch(last_sample_pixels, other, 0).xy;
-        if (pixel.x < -1) pixel = -2 - pixel;
-        vec4 light = texelFetch(last_cone_mu, other, 0);
-        vec3 off = texelFetch(last_position, max(pixel, ivec2(0)), 0).xyz - s.position;
-        if (pixel.x < 0 || light.a <= 0.0 || abs(dot(off, s.normal)) > OFF_PLANE * pixel_size * position.w) continue;
-        float w = bilinear(at, j) + 1e-3;
-        total += w;
-        mu += w * light;
-        rho += w * texelFetch(last_cone_rho, other, 0);
+        if (last.weights[j] == 0.0) continue;
+        ivec2 from = last.base + ivec2(j & 1, j >> 1);
+        vec4 light = texelFetch(last_cone_mu, from, 0);
+        if (light.a < 1.0) return false;   // nothing was traced there
+        mu += last.weights[j] * light;
+        rho += last.weights[j] * texelFetch(last_cone_rho, from, 0);
     }
-    if (total < LEAST_WEIGHT) return false;
-    imageStore(irradiance_mu, texel, mu / total);
-    imageStore(irradiance_rho, texel, rho / total);
+    imageStore(irradiance_mu, texel, mu);
+    imageStore(irradiance_rho, texel, rho);
     imageStore(specular_mu, texel, vec4(0.0, 0.0, 0.0, 1.0));
     imageStore(specular_rho, texel, vec4(0.0, 0.0, 0.0, 1.0));
     return true;

@@ -9,7 +9,9 @@ const float APART = 8.0;                // or away from this pixel's point
 const float LEAST_WEIGHT = 0.25;
 const int TURNS = 8;
 const int TILE = 8;                     // texels
-const uint STALE_REAL = 1u, STALE_NEAR = 2u, STALE_OBJECT = 4u;   // of a texel: what light must be computed
+// What must be computed of a texel: direct light of its pixels and cones of its real surface, caustics there, light at
+// its object.
+const uint STALE_REAL = 1u, STALE_CAUSTICS = 2u, STALE_OBJECT = 4u;
 
 // Position in the last picture (pixel centres at .5), far outside it for what was behind the camera.
 vec2 last_pixel(vec3 p) {
