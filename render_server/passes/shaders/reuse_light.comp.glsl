@@ -32,7 +32,7 @@ void reuse(ivec2 texel, int layer, vec4 position, vec3 normal) {
     int to = sums_of_texel(texel, textureSize(sample_pixels, 0), ivec2(picture_size)) + layer;
     for (int i = 0; i < 3; ++i) caustic_sums[to + i] = int(round(sum[i]));
 #else
-    imageStore(irradiance, texel, sum);
+    imageStore(irradiance, texel, vec4(sum.rgb, 1.0));
 #endif
 }
 

@@ -34,11 +34,11 @@ bool remembered(ivec2 texel, SurfacePoint s) {
         if (last.weights[j] == 0.0) continue;
         ivec2 from = last.base + ivec2(j & 1, j >> 1);
         vec4 light = texelFetch(last_cone_mu, from, 0);
-        if (light.a < 1.0) return false;   // nothing was traced there
+        if (light.a < 0.5) return false;   // nothing was traced there
         mu += last.weights[j] * light;
         rho += last.weights[j] * texelFetch(last_cone_rho, from, 0);
     }
-    imageStore(irradiance_mu, texel, mu);
+    imageStore(irradiance_mu, texel, vec4(mu.rgb, 1.0));
     imageStore(irradiance_rho, texel, rho);
     imageStore(specular_mu, texel, vec4(0.0, 0.0, 0.0, 1.0));
     imageStore(specular_rho, texel, vec4(0.0, 0.0, 0.0, 1.0));
