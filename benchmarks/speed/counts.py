@@ -16,15 +16,15 @@ from benchmarks.speed.tables import figure_table
 from protocol.documents import StrictModel
 from render_server.renderer import SceneRenderer
 
-HEADINGS = {
+ROWS = {
     "dispatches": "dispatches",
     "draws": "draws",
-    "framebuffer_clears": "frame clears",
-    "buffer_clears": "CPU clears",
-    "buffer_clear_bytes": "CPU clears MB",
-    "uploaded_bytes": "uploads MB",
-    "reads": "reads",
-    "uniform_writes": "uniforms",
+    "framebuffer_clears": "framebuffer clears",
+    "buffer_clears": "buffer clears by the CPU",
+    "buffer_clear_bytes": "cleared by the CPU, MB",
+    "uploaded_bytes": "uploaded, MB",
+    "reads": "reads that wait for the GPU",
+    "uniform_writes": "uniform writes",
 }
 
 
@@ -91,22 +91,19 @@ def _per_frame(counts: GpuCounts, frames: int) -> dict[str, float]:
 
 
 def print_counts(report: CountsReport, console: Console) -> None:
-    """Print a table for each method, one row per motion."""
+    """Print a table for each method, one column per motion."""
     width, height = report.size
     console.print(f"{report.renderer}, {width}x{height}, means of {report.frames} frames")
     for method, motions in report.methods.items():
-        table = figure_table(method, ("Motion",), (*HEADINGS.values(), "Python ms", "p95"))
-        for motion, counts in motions.items():
-            table.add_row(motion, *_cells(counts))
+        table = figure_table(method, ("Per frame",), tuple(motions))
+        for field, name in ROWS.items():
+            table.add_row(name, *(_number(field, each.per_frame[field]) for each in motions.values()))
+        table.add_row("Python, median ms", *(f"{each.python_ms.median:.1f}" for each in motions.values()))
+        table.add_row("Python, p95 ms", *(f"{each.python_ms.p95:.1f}" for each in motions.values()))
         console.print(table)
 
 
-def _cells(counts: FrameCounts) -> list[str]:
-    shown = [_number(name, counts.per_frame[name]) for name in HEADINGS]
-    return [*shown, f"{counts.python_ms.median:.1f}", f"{counts.python_ms.p95:.1f}"]
-
-
-def _number(name: str, value: float) -> str:
-    if name.endswith("_bytes"):
-        return f"{value / 1e6:.1f}"
+def _number(field: str, value: float) -> str:
+    if field.endswith("_bytes"):
+        return f"{value / 1e6:.2f}"
     return f"{value:.0f}" if value.is_integer() else f"{value:.1f}"

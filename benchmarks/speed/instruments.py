@@ -75,7 +75,6 @@ class _Counter:
             *reads,
             *picture,
             (moderngl.Uniform, "write", _noting(self._write_uniform)),
-            (moderngl.Uniform, "value", self._noting_value),
         ]
 
     def _dispatch(self, *_: object) -> None:
@@ -110,10 +109,6 @@ class _Counter:
 
     def _write_uniform(self, *_: object) -> None:
         self.counts.uniform_writes += 1
-
-    def _noting_value(self, original: property) -> property:
-        assert original.fset is not None
-        return property(original.fget, _noting(self._write_uniform)(original.fset))
 
     def _excepting_reads(self, original: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(original)
@@ -172,8 +167,9 @@ class ReadBacks:
 
     def _remembering(self, original: Callable[..., bytes]) -> Callable[..., bytes]:
         @wraps(original)
-        def call(item: Any, *given: int) -> bytes:  # noqa: ANN401 (buffers and textures)
-            self._held[id(item), *given] = found = original(item, *given)
+        def call(item: Any, *given: int, **named: int) -> bytes:  # noqa: ANN401 (buffers and textures)
+            found = original(item, *given, **named)
+            self._held[id(item), given, *named.items()] = found
             return found
 
         return call
@@ -188,9 +184,9 @@ class ReadBacks:
 
     def _recalling(self, original: Callable[..., bytes]) -> Callable[..., bytes]:
         @wraps(original)
-        def call(item: Any, *given: int) -> bytes:  # noqa: ANN401 (buffers and textures)
+        def call(item: Any, *given: int, **named: int) -> bytes:  # noqa: ANN401 (buffers and textures)
             size = given[0] if given and isinstance(item, moderngl.Buffer) else sizes_bytes([item])[0]
-            held = self._held.get((id(item), *given), b"")
+            held = self._held.get((id(item), given, *named.items()), b"")
             return held if len(held) == size else bytes(size)
 
         return call

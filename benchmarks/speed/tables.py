@@ -29,7 +29,7 @@ def figure_table(title: str, names: Sequence[str], figures: Sequence[str]) -> Ta
     """Return an empty table that fits into a narrow terminal: names to the left, figures to the right."""
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for name in names:
-        table.add_column(name, overflow="fold")
+        table.add_column(name, overflow="fold", min_width=6)
     for heading in figures:
         table.add_column(heading, justify="right")
     return table
