@@ -2,13 +2,14 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal, Self
+from typing import Final, Literal, Self
 
 import numpy as np
 
 from protocol.documents import StrictModel, read_mapping, validate
 from protocol.errors import DeltalightError
 
+REPORT: Final = "deltalight bench speed"
 LEAST_FLOOR_MS = 0.0005
 
 
@@ -88,7 +89,7 @@ class Peaks(StrictModel):
 class SpeedReport(StrictModel):
     """A whole run; `size` in pixels, `frames` of each motion, `version` of Deltalight."""
 
-    report: Literal["deltalight bench speed"] = "deltalight bench speed"
+    report: Literal["deltalight bench speed"] = REPORT
     version: str
     renderer: str
     cpus: int
@@ -110,7 +111,9 @@ def read_report(path: Path) -> SpeedReport:
     Raises:
         DeltalightError: the file cannot be read, or is something else.
     """
-    try:
-        return validate(SpeedReport, read_mapping(path), str(path))
-    except DeltalightError as error:
-        raise DeltalightError(f"No report of this version's `bench speed`: {error}") from error
+    data = read_mapping(path)
+    if data.get("report") != REPORT:
+        raise DeltalightError(
+            f"{path} is no report of this version's `bench speed`; write one with `bench speed --out FILE`."
+        )
+    return validate(SpeedReport, data, str(path))
