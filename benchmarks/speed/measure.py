@@ -130,8 +130,10 @@ class _Run:
     def method(self, name: str, scene: SceneDocument) -> MethodFigures:
         """Measure one method, its motions by one renderer."""
         with rendering(self.gpu, scene) as renderer:
+            renderer.render(self.take.standing[0])
+            notices = list(renderer.notices)  # those of the demo itself; other lights bring further ones
             motions = {motion: self._motion(name, motion, scene, renderer) for motion in self.job.motions}
-            return MethodFigures(motions=motions, notices=renderer.notices)
+            return MethodFigures(motions=motions, notices=notices)
 
     def _motion(self, name: str, motion: str, scene: SceneDocument, renderer: SceneRenderer) -> MotionFigures:
         count = WARM_UP_FRAMES + self.job.frames

@@ -72,7 +72,7 @@ class EndToEnd(StrictModel):
 
 
 class MethodFigures(StrictModel):
-    """One method; `notices` are the renderer's sentences for the user, among them the memory of its volumes."""
+    """One method; `notices` are the renderer's sentences on the demo, among them the memory of its volumes."""
 
     motions: dict[str, MotionFigures]
     notices: list[str]

@@ -1,5 +1,6 @@
 """`bench speed` and `bench counts` on tiny pictures: what moves is what runs, figures hang together."""
 
+import json
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
@@ -9,7 +10,6 @@ import pytest
 from rich.progress import Progress
 
 from benchmarks.cli import DEFAULT_MOTIONS, TIMEABLE, TIMED_METHODS
-from benchmarks.speed import measure
 from benchmarks.speed.counts import count_motion
 from benchmarks.speed.measure import FrameTimes, motion_figures, time_step
 from benchmarks.speed.motions import (
@@ -24,7 +24,7 @@ from benchmarks.speed.motions import (
     steps_of,
 )
 from benchmarks.speed.peaks import measure_peaks, stage_bytes
-from benchmarks.speed.report import MotionFigures, Peaks
+from benchmarks.speed.report import MotionFigures, Peaks, read_report
 from benchmarks.variants import FIXED, parse_variants
 from protocol.errors import DeltalightError
 from protocol.scene import SceneDocument
@@ -32,6 +32,7 @@ from protocol.source import open_source
 from render_server.gpu.context import GpuContext, create_context
 from render_server.renderer import SceneRenderer, resized_frame
 from sensor_node.view_frames import ViewFrameBuilder
+from services.cli import run
 from services.demo import RECORDING, demo_scene
 
 pytestmark = pytest.mark.skipif(
@@ -63,10 +64,8 @@ def take() -> Take:
 @pytest.fixture(scope="module")
 def scene() -> SceneDocument:
     (paper,) = parse_variants("paper:volume_size=32,rsm_size=128")
-    return paper.applied(demo_scene("dvct").replaced(lights={"manual": LIGHTS, "surroundings": "none"}), None)
-
-
-LIGHTS = demo_scene("dvct").lights.manual if RECORDING.is_file() else ()
+    demo = demo_scene("dvct")
+    return paper.applied(demo.replaced(lights=demo.lights.replaced(surroundings="none")), None)
 
 
 @pytest.fixture(scope="module")
@@ -238,40 +237,29 @@ def test_counted_frames_agree_with_what_the_graph_ran(
     assert 0 < camera.python_ms.median <= camera.python_ms.p95
 
 
-# The command
+# The commands
+
+OPTIONS = ("--methods", "paper:cone_scale=4", "--motions", "still,camera", "--frames", "2", "--size", "64x48")
 
 
-def test_a_run_writes_its_report_and_prints_it(
-    take: Take,
-    scene: SceneDocument,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    from benchmarks.speed.report import read_report
-    from services.cli import run
+@pytest.fixture
+def prepared(monkeypatch: pytest.MonkeyPatch, take: Take, scene: SceneDocument) -> None:
+    """The commands take the small frames and the small scene; peaks are not measured."""
 
-    def prepared(_: Progress) -> Take:
+    def small(_: Progress) -> Take:
         return take
 
-    for module in ("measure", "counts"):
-        monkeypatch.setattr(f"benchmarks.speed.{module}.prepare_take", prepared)
-    monkeypatch.setattr(measure, "measure_peaks", lambda _: PEAKS)
-    monkeypatch.setattr(measure, "demo_scene", lambda _: scene)
+    monkeypatch.setattr("benchmarks.speed.measure.prepare_take", small)
+    monkeypatch.setattr("benchmarks.speed.counts.prepare_take", small)
+    monkeypatch.setattr("benchmarks.speed.measure.measure_peaks", lambda _: PEAKS)
+    monkeypatch.setattr("benchmarks.speed.measure.demo_scene", lambda _: scene)
+
+
+@pytest.mark.usefixtures("prepared")
+def test_a_run_writes_its_report_and_prints_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     report = tmp_path / "speed.json"
-    options = (
-        "--methods",
-        "paper:cone_scale=4",
-        "--motions",
-        "still,camera",
-        "--frames",
-        "2",
-        "--size",
-        "64x48",
-    )
-    assert (
-        run(["bench", "speed", *options, "--no-end-to-end", "--budget-ms", "0.1", "--out", str(report)]) == 0
-    )
+    more = ("--no-end-to-end", "--budget-ms", "0.1", "--out", str(report))
+    assert run(["bench", "speed", *OPTIONS, *more]) == 0
     shown = capsys.readouterr().out
     assert "2/2" in shown
     assert "real surface" in shown
@@ -280,5 +268,14 @@ def test_a_run_writes_its_report_and_prints_it(
     assert list(found.methods["paper:cone_scale=4"].motions) == ["still", "camera"]
     assert run(["bench", "speed", "--compare", str(report), str(report)]) == 0
     assert "0 of" in capsys.readouterr().out
-    assert run(["bench", "counts", *options]) == 0
-    assert "dispatches" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("prepared")
+def test_counts_are_printed_as_table_and_as_json(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    report = tmp_path / "counts.json"
+    assert run(["bench", "counts", *OPTIONS, "--out", str(report)]) == 0
+    assert "reads that wait for the GPU" in capsys.readouterr().out
+    counts = json.loads(report.read_text())["methods"]["paper:cone_scale=4"]
+    assert counts["still"]["per_frame"]["dispatches"] == 2
+    assert counts["camera"]["per_frame"]["draws"] >= 9
