@@ -1,4 +1,4 @@
-"""`deltalight bench`: measurements of this machine, not tests. The only module here that `services` imports."""
+"""`deltalight bench` and `gpu-check`: measurements of this machine. The only module here that `services` imports."""
 
 import json
 from pathlib import Path
@@ -122,6 +122,37 @@ def rest(
         typer.echo(json.dumps(report, indent=2))
     else:
         print_report(report)
+
+
+def gpu_check(
+    *,
+    out: Annotated[Path, typer.Option(help="Folder for the report and pictures that differ.")] = Path(
+        "gpu-check"
+    ),
+    steps: Annotated[
+        str | None,
+        typer.Option(
+            help="Steps, separated by commas: doctor, shaders, pictures, speed, memory, leaks, quality, tests; "
+            "default all."
+        ),
+    ] = None,
+) -> None:
+    """Check this machine's GPU and driver, eight minutes at most; exit code 1 if a step failed or ran out of time."""
+    from benchmarks.gpu_check.packages import missing_modules
+    from benchmarks.gpu_check.plan import choose_steps
+
+    chosen, missing = choose_steps(steps), missing_modules()
+    from benchmarks.gpu_check.check import check_gpu  # needs the first of those modules
+    from services.files import make_output_folder
+
+    def say(text: str) -> None:
+        typer.echo(f"gpu-check: {text}", err=True)
+
+    if missing:
+        say(f"these Python modules are not installed: {', '.join(missing)}")
+    report = check_gpu(make_output_folder(out), chosen, missing, say)
+    typer.echo(f"gpu-check: {report.sentence}")
+    raise typer.Exit(1 if report.bad_steps else 0)
 
 
 def _methods(text: str) -> list[str]:

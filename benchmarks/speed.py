@@ -11,6 +11,7 @@ from rich.table import Table
 
 from protocol.frames import ViewFrame
 from protocol.scene import SceneDocument
+from protocol.scene_method import VoxelConeSettings
 from protocol.source import open_source
 from render_server.gpu.context import create_context
 from render_server.renderer import SceneRenderer
@@ -23,14 +24,22 @@ WARM_UP_FRAMES = 3  # drivers compile and specialise shaders in the first frames
 
 
 def measure_speed(
-    methods: Sequence[str], frames: int, *, size: tuple[int, int] | None, device: int | None, end_to_end: bool
+    methods: Sequence[str],
+    frames: int,
+    *,
+    size: tuple[int, int] | None,
+    device: int | None,
+    end_to_end: bool,
+    volume: int | None = None,
 ) -> dict[str, Any]:
     """Measure every method; times in milliseconds, medians over `frames` frames.
+
+    `volume`: voxels an edge, default as the machine can; methods that have other cells keep theirs.
 
     Raises:
         DeltalightError: no OpenGL, missing demo files, or a process that died for good.
     """
-    scenes = {method: with_output(demo_scene(method), size, None) for method in methods}
+    scenes = {method: _with_volume(with_output(demo_scene(method), size, None), volume) for method in methods}
     source = open_source(RECORDING)
     builder = ViewFrameBuilder(source)
     views = [builder(source[index % len(source)]) for index in range(WARM_UP_FRAMES + frames)]
@@ -53,6 +62,12 @@ def measure_speed(
         for method, scene in scenes.items():
             report["methods"][method]["end_to_end"] = _measure_end_to_end(scene, frames)
     return report
+
+
+def _with_volume(scene: SceneDocument, volume: int | None) -> SceneDocument:
+    if volume is None or not isinstance(scene.method, VoxelConeSettings):
+        return scene
+    return scene.replaced(method=scene.method.replaced(volume_size=volume))
 
 
 def _measure(renderer: SceneRenderer, views: Sequence[ViewFrame]) -> dict[str, Any]:

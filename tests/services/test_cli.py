@@ -46,6 +46,7 @@ COMMANDS = {
     "bench speed",
     "bench quality",
     "bench rest",
+    "gpu-check",
 }
 
 
