@@ -67,7 +67,7 @@ def protected_pictures(gpu: "GpuContext", folder: Path) -> Iterator[ComparedPict
         except FileNotFoundError:
             yield ComparedPicture(str(case), picture, None, float("nan"), scenes.LEAST_PSNR_DB)
             continue
-        psnr_db = scenes.psnr_db(picture, golden)
+        psnr_db = _module("scenes").psnr_db(picture, golden)
         yield ComparedPicture(str(case), picture, golden, psnr_db, scenes.LEAST_PSNR_DB)
 
 
