@@ -138,18 +138,18 @@ def gpu_check(
     ] = None,
 ) -> None:
     """Check this machine's GPU and driver, eight minutes at most; exit code 1 if a step failed or ran out of time."""
-    from benchmarks.gpu_check.packages import missing_modules
+    from benchmarks.gpu_check.packages import missing_packages
     from benchmarks.gpu_check.plan import choose_steps
 
-    chosen, missing = choose_steps(steps), missing_modules()
-    from benchmarks.gpu_check.check import check_gpu  # needs the first of those modules
+    chosen, missing = choose_steps(steps), missing_packages()
+    from benchmarks.gpu_check.check import check_gpu  # needs some of those packages
     from services.files import make_output_folder
 
     def say(text: str) -> None:
         typer.echo(f"gpu-check: {text}", err=True)
 
     if missing:
-        say(f"these Python modules are not installed: {', '.join(missing)}")
+        say(f"these packages are not installed: {', '.join(missing)}")
     report = check_gpu(make_output_folder(out), chosen, missing, say)
     typer.echo(f"gpu-check: {report.sentence}")
     raise typer.Exit(1 if report.bad_steps else 0)

@@ -28,7 +28,7 @@ Say = Callable[[str], None]
 def check_gpu(out: Path, steps: Sequence[Step], missing: Sequence[str], say: Say) -> Report:
     """Take the steps and return the report, which is in the folder `out` too; `say` is told of progress.
 
-    `missing`: the Python modules that are not installed.
+    `missing`: the packages that are not installed.
 
     Raises:
         DeltalightError: the folder cannot be written.

@@ -6,26 +6,46 @@ from protocol.errors import DeltalightError
 
 FIRST = ("numpy", "cv2", "jaxtyping")
 """Modules without which no step can start."""
-MODULES = (
-    *FIRST,
-    *("pydantic", "pydantic_settings", "structlog", "rich", "yaml", "msgpack", "zmq", "zeroconf"),
-    *("blosc2", "zstandard", "mcap", "mcap_protobuf", "foxglove_schemas_protobuf", "google"),
-    *("moderngl", "trimesh", "scipy", "PIL", "OpenEXR", "embreex"),
-    *("pytest", "pytest_timeout", "xdist"),
-)
-"""What the steps import, with what the tests run faster with."""
+PACKAGES = {
+    "numpy": "numpy",
+    "cv2": "opencv-contrib-python-headless",
+    "jaxtyping": "jaxtyping",
+    "pydantic": "pydantic",
+    "pydantic_settings": "pydantic-settings",
+    "structlog": "structlog",
+    "rich": "rich",
+    "yaml": "pyyaml",
+    "msgpack": "msgpack",
+    "zmq": "pyzmq",
+    "zeroconf": "zeroconf",
+    "blosc2": "blosc2",
+    "zstandard": "zstandard",
+    "mcap": "mcap",
+    "mcap_protobuf": "mcap-protobuf-support",
+    "foxglove_schemas_protobuf": "foxglove-schemas-protobuf",
+    "google": "protobuf",
+    "moderngl": "moderngl",
+    "trimesh": "trimesh",
+    "scipy": "scipy",
+    "PIL": "pillow",
+    "OpenEXR": "OpenEXR",
+    "embreex": "embreex",
+    "pytest": "pytest",
+    "xdist": "pytest-xdist",
+}
+"""Modules that the steps import, or that the tests run faster with, and the packages that bring them."""
 
 
-def missing_modules() -> list[str]:
-    """Return those of MODULES that are not installed.
+def missing_packages() -> list[str]:
+    """Return the packages of PACKAGES that are not installed.
 
     Raises:
-        DeltalightError: one of FIRST is among them.
+        DeltalightError: one that brings a module of FIRST is among them.
     """
-    missing = [name for name in MODULES if find_spec(name) is None]
-    needed = [name for name in missing if name in FIRST]
+    missing = {module: package for module, package in PACKAGES.items() if find_spec(module) is None}
+    needed = [missing[module] for module in FIRST if module in missing]
     if needed:
         raise DeltalightError(
-            f"gpu-check needs the Python modules {', '.join(needed)}; install them, or put them into PYTHONPATH."
+            f"gpu-check cannot start without {', '.join(needed)}; install them, or put them into PYTHONPATH."
         )
-    return missing
+    return list(missing.values())

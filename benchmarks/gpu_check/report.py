@@ -70,7 +70,7 @@ class Report:
 
     def _write(self) -> None:
         steps = {name: record.as_dict() for name, record in self.records.items()}
-        whole = {**self.about, **self.machine, "missing_modules": self.missing}
+        whole = {**self.about, **self.machine, "missing_packages": self.missing}
         whole |= {"finished": self.is_finished, "steps": steps}
         write_bytes(self.out / JSON_FILE, json.dumps(whole, indent=1).encode())
         write_bytes(self.out / MARKDOWN_FILE, self._markdown().encode())
@@ -84,7 +84,7 @@ class Report:
     def _facts(self) -> str:
         facts = {**self.about, **self.machine}
         lines = [f"* {name.replace('_', ' ')}: {value}" for name, value in facts.items()]
-        return "\n".join([*lines, f"* modules that are not installed: {', '.join(self.missing) or 'none'}"])
+        return "\n".join([*lines, f"* packages that are not installed: {', '.join(self.missing) or 'none'}"])
 
     def _steps(self) -> str:
         rows = [

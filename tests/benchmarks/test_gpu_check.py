@@ -5,6 +5,7 @@ import os
 import shutil
 import subprocess
 import sys
+from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -83,17 +84,20 @@ def test_an_unknown_step_is_one_sentence(capsys: pytest.CaptureFixture[str], tmp
     assert not (tmp_path / "out").exists()
 
 
-def test_every_module_that_is_asked_for_has_its_right_name() -> None:
-    assert packages.missing_modules() == []
+def test_every_package_that_is_asked_for_has_its_right_name() -> None:
+    assert packages.missing_packages() == []
+    assert all(version(package) for package in packages.PACKAGES.values())
     assert set(BUDGETS_S) == {step.name for step in STEPS}
 
 
-def test_a_module_without_which_nothing_starts_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_package_without_which_nothing_starts_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         packages, "find_spec", lambda name: None if name in ("cv2", "xdist") else find_spec(name)
     )
-    with pytest.raises(DeltalightError, match=r"gpu-check needs the Python modules cv2; install"):
-        packages.missing_modules()
+    with pytest.raises(
+        DeltalightError, match=r"cannot start without opencv-contrib-python-headless; install"
+    ):
+        packages.missing_packages()
 
 
 @pytest.mark.slow
@@ -127,7 +131,7 @@ def test_a_step_that_crashes_hangs_or_fails_ends_itself_alone(tmp_path: Path) ->
     about = written(tmp_path)
     assert about["finished"]
     assert about["is_software"]
-    assert about["missing_modules"] == ["xdist"]
+    assert about["missing_packages"] == ["xdist"]
     assert {"gpu", "driver", "gl_version", "date", "commit", "python"} <= set(about)
     markdown = (tmp_path / "report.md").read_text()
     assert "| crash | failed |" in markdown
@@ -291,7 +295,7 @@ def test_a_report_is_there_before_the_last_step_ends(tmp_path: Path) -> None:
     assert not written(tmp_path)["finished"]
     markdown = (tmp_path / "report.md").read_text()
     assert "**Not finished**" in markdown
-    assert "modules that are not installed: pytest" in markdown
+    assert "packages that are not installed: pytest" in markdown
     assert report.bad_steps == ["shaders did not end"]
 
 
