@@ -132,8 +132,8 @@ def gpu_check(
     steps: Annotated[
         str | None,
         typer.Option(
-            help="Steps, separated by commas: doctor, shaders, pictures, speed, memory, leaks, quality, tests; "
-            "default all."
+            help="Steps, separated by commas: doctor, shaders, pictures, speed, memory, leaks, quality, tests, "
+            "slow-tests; default all."
         ),
     ] = None,
 ) -> None:

@@ -1,7 +1,7 @@
 """What lies beside the project's tests: every shader variant, the protected pictures and their goldens."""
 
 import importlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -52,23 +52,26 @@ def shader_parts() -> "dict[str, Callable[[GpuContext, Path], None]]":
     return parts
 
 
-def protected_pictures(gpu: "GpuContext", folder: Path) -> Iterator[ComparedPicture]:
-    """Render the protected scenes one by one and compare each with its golden.
+def protected_cases() -> list[Any]:
+    """Return the protected scenes; their names are their strings.
 
     Raises:
         Skipped: the tests are not here.
     """
+    return list(_module("protected_scenes").cases())
+
+
+def compare_picture(gpu: "GpuContext", case: Any, folder: Path) -> ComparedPicture:  # noqa: ANN401 (see _module)
+    """Render a protected scene, with its assets in `folder`, and compare its picture with the golden."""
     scenes = _module("protected_scenes")
-    for case in scenes.cases():
-        pictures, _ = scenes.pictures_of(gpu, case, folder)
-        picture = pictures[scenes.SHOWN]
-        try:
-            golden = scenes.golden_of(case)
-        except FileNotFoundError:
-            yield ComparedPicture(str(case), picture, None, float("nan"), scenes.LEAST_PSNR_DB)
-            continue
-        psnr_db = _module("scenes").psnr_db(picture, golden)
-        yield ComparedPicture(str(case), picture, golden, psnr_db, scenes.LEAST_PSNR_DB)
+    pictures, _ = scenes.pictures_of(gpu, case, folder)
+    picture = pictures[scenes.SHOWN]
+    try:
+        golden = scenes.golden_of(case)
+    except FileNotFoundError:
+        return ComparedPicture(str(case), picture, None, float("nan"), scenes.LEAST_PSNR_DB)
+    psnr_db = _module("scenes").psnr_db(picture, golden)
+    return ComparedPicture(str(case), picture, golden, psnr_db, scenes.LEAST_PSNR_DB)
 
 
 def _module(name: str) -> Any:  # noqa: ANN401 (of the tests, which mypy does not check)

@@ -1,7 +1,6 @@
 """The renderer's tests as a step of `deltalight gpu-check`, by pytest."""
 
 import os
-from collections.abc import Generator
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -15,19 +14,11 @@ MOST_WORKERS = 8
 
 
 class Recorder:
-    """Counts outcomes as they come; in time that may run out, the tests that one waits for are first."""
+    """Counts outcomes as they come, because time may run out."""
 
     def __init__(self, findings: Findings) -> None:
         self._findings = findings
         self.counts = {"passed": 0, "failed": 0, "skipped": 0}
-        self.total = 0
-
-    @pytest.hookimpl(wrapper=True)
-    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> Generator[None]:
-        """Put slow tests last."""
-        yield
-        items.sort(key=lambda item: item.get_closest_marker("slow") is not None)
-        self.total = len(items)
 
     def pytest_runtest_logstart(self, nodeid: str) -> None:
         """Keep which test runs: a driver may end the process."""
@@ -48,20 +39,14 @@ class Recorder:
             self._findings.fault(f"{report.nodeid}: {report.longreprtext.splitlines()[-1]}")
 
 
-def run_tests(findings: Findings, tests: Path = TESTS) -> str:
-    """Run the tests below `tests`, spread over the cores where pytest-xdist is installed."""
+def run_tests(findings: Findings, marked: str, tests: Path = TESTS) -> str:
+    """Run the tests below `tests` that the marker expression takes; pytest-xdist, if installed, spreads them."""
     recorder = Recorder(findings)
-    options = [
-        "--all",
-        "-q",
-        "-p",
-        "no:cacheprovider",
-        f"--rootdir={ROOT}",
-        f"--basetemp={findings.scratch / 'tests'}",
-    ]
+    options = ["-q", "-p", "no:cacheprovider", f"--rootdir={ROOT}", "-m", marked]
+    options += ["--basetemp", str(findings.scratch / "tests"), f"--ignore={tests / OTHER_STEPS}"]
     if find_spec("xdist") is not None:
         options += ["-n", str(min(os.cpu_count() or 1, MOST_WORKERS)), "--dist", "worksteal"]
-    ended = pytest.main([*options, f"--ignore={tests / OTHER_STEPS}", str(tests)], plugins=[recorder])
+    ended = pytest.main([*options, str(tests)], plugins=[recorder])
     if ended not in (pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED):
         findings.fault(f"pytest ended with {ended!r}")
     return ", ".join(f"{count} {outcome}" for outcome, count in recorder.counts.items())

@@ -27,9 +27,12 @@ BUDGETS_S = {
     "memory": 25,
     "leaks": 35,
     "quality": 5,
-    "tests": 95,
+    "tests": 65,
+    "slow-tests": 30,
 }
-STEPS = [Step(name, f"{STEPS_MODULE}:{name}", budget_s) for name, budget_s in BUDGETS_S.items()]
+STEPS = [
+    Step(name, f"{STEPS_MODULE}:{name.replace('-', '_')}", budget_s) for name, budget_s in BUDGETS_S.items()
+]
 
 
 def choose_steps(text: str | None) -> list[Step]:

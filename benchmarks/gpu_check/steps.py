@@ -1,9 +1,12 @@
 """The steps of `deltalight gpu-check`; each runs in a process of its own and keeps what it finds as it goes along."""
 
-from collections.abc import Iterator
+import traceback
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
+from functools import partial
 from importlib.util import find_spec
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,6 +35,17 @@ def _context() -> "Iterator[GpuContext]":
         yield gpu
     finally:
         gpu.release()
+
+
+@contextmanager
+def _noting(findings: Findings, what: str | Callable[[], str]) -> Iterator[None]:
+    """Note what is raised inside, so that the step goes on with the next thing; `what` names this one."""
+    try:
+        yield
+    except Exception as fault:  # moderngl raises its own Error, with the driver's words
+        traceback.print_exc()
+        kind = "" if isinstance(fault, DeltalightError) else f"{type(fault).__name__}, "
+        findings.fault(f"{what if isinstance(what, str) else what()}: {kind}{fault}")
 
 
 def machine(findings: Findings) -> str:
@@ -69,91 +83,108 @@ def shaders(findings: Findings) -> str:
     with _context() as gpu:
         gpu.compile_watchers.append(lambda label, _sources: labels.append(label))
         for name, compile_part in parts.items():
-            try:
+            with _noting(findings, partial(_latest, name, labels)):
                 compile_part(gpu, findings.scratch)
-            except Exception as refusal:  # moderngl raises its own Error, with the driver's words
-                findings.fault(f"{name}, {labels[-1] if labels else 'before the first shader'}: {refusal}")
             variants = sorted(set(labels))
             findings.keep(f"{len(variants)} shader variants so far", variants=variants)
-    return f"{len(variants)} shader variants compiled by the driver"
+    return f"{len(variants)} shader variants given to the driver"
+
+
+def _latest(name: str, labels: list[str]) -> str:
+    """What is being compiled: the scene, and the variant that came last."""
+    return ", ".join([name, *labels[-1:]])
 
 
 def pictures(findings: Findings) -> str:
     """Compare the protected pictures with their goldens; those that differ go into `failed_pictures.png`."""
-    from benchmarks.gpu_check.beside_tests import protected_pictures
+    from benchmarks.gpu_check.beside_tests import compare_picture, protected_cases
     from benchmarks.gpu_check.failed_pictures import FailedPictures
 
-    shown, found = FailedPictures(findings.out), dict[str, float | None]()
+    cases, shown, psnr_db = protected_cases(), FailedPictures(findings.out), dict[str, float]()
     with _context() as gpu:
-        for one in protected_pictures(gpu, findings.scratch):
-            found[one.name] = None if one.psnr_db == float("inf") else one.psnr_db
-            if not one.is_alike:
-                shown.add(one)
-                findings.fault(f"{one.name}: {one.complaint}")
-            findings.keep(f"{len(found)} pictures compared so far", psnr_db=found)
-    alike = len(found) - len(findings.record.faults)
-    return f"{alike} of {len(found)} pictures agree with their goldens"
+        for count, case in enumerate(cases, start=1):
+            with _noting(findings, str(case)):
+                one = compare_picture(gpu, case, findings.scratch)
+                if isfinite(one.psnr_db):  # neither the same to the bit nor without a golden
+                    psnr_db[one.name] = round(one.psnr_db, 2)
+                if not one.is_alike:
+                    shown.add(one)
+                    findings.fault(f"{one.name}: {one.complaint}")
+            findings.keep(f"{count} pictures compared so far", compared=count, psnr_db=psnr_db)
+    return f"{len(cases) - len(findings.record.faults)} of {len(cases)} pictures agree with their goldens"
 
 
 def speed(findings: Findings) -> str:
     """Time every method at each of SIZES, with its stages, in milliseconds."""
     from benchmarks.gpu_check.timing import time_method
 
-    timed: dict[str, dict[str, Any]] = {}
+    timed: dict[str, dict[str, Any]] = {title: {} for title in SIZES}
     for title, (size, volume) in SIZES.items():
         for method in METHODS:
-            try:
-                timing = time_method(method, SPEED_FRAMES, size, volume)
-            except DeltalightError as fault:
-                findings.fault(f"{method} at {title}: {fault}")
-                continue
-            timed.setdefault(title, {})[method] = asdict(timing)
-            findings.keep(f"{method} at {title} was the last", timed=timed)
+            with _noting(findings, f"{method} at {title}"):
+                timed[title][method] = asdict(time_method(method, SPEED_FRAMES, size, volume))
+                findings.keep(f"{method} at {title} was the last", timed=timed)
     return f"{sum(map(len, timed.values()))} measurements"
 
 
 def memory(findings: Findings) -> str:
     """Say what each method's frame holds: bytes of each source and stage (`deltalight graph`), and GL objects."""
-    from benchmarks.gpu_check.gl_objects import count_gl_objects
-
     held: dict[str, dict[str, Any]] = {}
     with _context() as gpu:
         for method in METHODS:
-            before = sum(count_gl_objects().values())
-            renderer = _rendered(gpu, method, findings.scratch)
-            graph = renderer.graph
-            assert graph is not None
-            sizes = {source.name: source.size_bytes for source in graph.report_sources()}
-            sizes |= {stage.name: stage.size_bytes for stage in graph.report()}
-            objects = sum(count_gl_objects().values()) - before
-            held[method] = {"total_bytes": sum(sizes.values()), "gl_objects": objects, "bytes": sizes}
-            renderer.release()
-            findings.keep(f"{method} was the last", held=held)
+            with _noting(findings, method):
+                held[method] = _held(gpu, method, findings.scratch)
+                findings.keep(f"{method} was the last", held=held)
     return f"memory of {len(held)} methods"
+
+
+def _held(gpu: "GpuContext", method: str, folder: Path) -> dict[str, Any]:
+    from benchmarks.gpu_check.gl_objects import count_gl_objects
+
+    before = sum(count_gl_objects().values())
+    renderer = _rendered(gpu, method, folder)
+    graph = renderer.graph
+    assert graph is not None
+    sizes = {source.name: source.size_bytes for source in graph.report_sources()}
+    sizes |= {stage.name: stage.size_bytes for stage in graph.report()}
+    objects = sum(count_gl_objects().values()) - before
+    renderer.release()
+    return {"total_bytes": sum(sizes.values()), "gl_objects": objects, "bytes": sizes}
 
 
 def leaks(findings: Findings) -> str:
     """Create, use and release a renderer of each method again and again: the number of GL objects stays the same."""
-    from benchmarks.gpu_check.gl_objects import count_gl_objects
-
     counts: dict[str, list[dict[str, int]]] = {}
     with _context() as gpu:
         for method in METHODS:
-            rounds = counts.setdefault(method, [])
-            for _ in range(LEAK_ROUNDS):
-                _rendered(gpu, method, findings.scratch).release()
-                rounds.append(count_gl_objects())
-            findings.keep(f"{method} was the last", counts=counts)
-            # The first round also makes what the context keeps for everybody.
-            if any(each != rounds[0] for each in rounds[1:]):
-                findings.fault(
-                    f"{method}: {_grown(rounds[0], rounds[-1])} after {LEAK_ROUNDS - 1} more renderers"
-                )
+            with _noting(findings, method):
+                counts[method] = list(_counts(gpu, method, findings.scratch))
+                findings.keep(f"{method} was the last", counts=counts)
+                first, *later = counts[method]  # the first also makes what the context keeps for everybody
+                if any(each != first for each in later):
+                    findings.fault(f"{method}: {_grown(first, later[-1])} after {len(later)} more renderers")
     return f"{LEAK_ROUNDS} renderers of each of {len(counts)} methods released"
 
 
+def _counts(gpu: "GpuContext", method: str, folder: Path) -> Iterator[dict[str, int]]:
+    from benchmarks.gpu_check.gl_objects import count_gl_objects
+
+    for _ in range(LEAK_ROUNDS):
+        _rendered(gpu, method, folder).release()
+        yield count_gl_objects()
+
+
 def tests(findings: Findings) -> str:
-    """Run the renderer's tests, slow ones last, where pytest is installed."""
+    """Run the renderer's tests where pytest is installed, but for those marked `slow`."""
+    return _tests(findings, "not slow")
+
+
+def slow_tests(findings: Findings) -> str:
+    """Run those of the renderer's tests that are marked `slow`."""
+    return _tests(findings, "slow")
+
+
+def _tests(findings: Findings, marked: str) -> str:
     from benchmarks.gpu_check.beside_tests import require_tests
 
     require_tests()
@@ -161,7 +192,7 @@ def tests(findings: Findings) -> str:
         raise Skipped("pytest is not installed")
     from benchmarks.gpu_check.gpu_tests import run_tests
 
-    return run_tests(findings)
+    return run_tests(findings, marked)
 
 
 def quality(findings: Findings) -> str:  # noqa: ARG001

@@ -23,14 +23,14 @@ from benchmarks.gpu_check.plan import BUDGETS_S, MACHINE, STEPS, Step, choose_st
 from benchmarks.gpu_check.record import Findings, Record, State
 from benchmarks.gpu_check.report import Report
 from protocol.errors import DeltalightError
+from render_server.gpu.context import GpuContext
 from services.cli import run
-from tests.render_server import protected_scenes
+from tests.render_server import protected_scenes, shader_variants
 from tests.render_server.protected_scenes import Case
 
 ROOT = Path(__file__).resolve().parents[2]
 SAMPLES = "tests.benchmarks.gpu_check_samples"
 MOST_S = 8 * 60
-CONFTEST = "def pytest_addoption(parser): parser.addoption('--all', action='store_true')"
 CASE = Case("paper", "model", "plain")
 
 
@@ -198,6 +198,34 @@ def test_a_changed_golden_fails_with_a_picture(tmp_path: Path, own_goldens: Path
     assert shown.shape == (72, 240 + 3 * 96, 3)
 
 
+def test_one_picture_that_cannot_be_rendered_leaves_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(protected_scenes, "cases", lambda: iter([Case("paper", "model", "no kind"), CASE]))
+    step = findings(tmp_path)
+    take_step("benchmarks.gpu_check.steps:pictures", step)
+    assert step.record.faults == ["paper-model-no kind: KeyError, 'no kind'"]
+    assert step.record.sentence == "1 of 2 pictures agree with their goldens"
+
+
+def test_a_shader_that_the_driver_refuses_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(gpu: GpuContext, folder: Path) -> None:
+        del folder
+        gpu.compiled("odd ODD=1", {})
+        gpu.ctx.compute_shader("#version 430 core\nlayout(local_size_x = 1) in;\nvoid main() { odd(); }")
+
+    def taken(gpu: GpuContext, folder: Path) -> None:
+        del folder
+        gpu.compiled("even", {})
+
+    monkeypatch.setattr(shader_variants, "PARTS", {"first": refused, "second": taken})
+    step = findings(tmp_path)
+    take_step("benchmarks.gpu_check.steps:shaders", step)
+    assert step.record.state is State.FAILED
+    assert step.record.faults[0].startswith("first, odd ODD=1: Error, GLSL Compiler failed")
+    assert step.record.figures["variants"] == ["even", "odd ODD=1"]
+
+
 @pytest.mark.usefixtures("one_picture", "own_goldens")
 def test_a_missing_golden_fails(tmp_path: Path) -> None:
     step = findings(tmp_path)
@@ -206,7 +234,7 @@ def test_a_missing_golden_fails(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "record.json").read_text())["state"] == "failed"
 
 
-@pytest.mark.parametrize("name", ["shaders", "pictures", "tests"])
+@pytest.mark.parametrize("name", ["shaders", "pictures", "tests", "slow_tests"])
 def test_an_installed_package_has_no_tests(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
@@ -228,13 +256,18 @@ def test_without_pytest_the_tests_are_left_out(tmp_path: Path, monkeypatch: pyte
 def test_tests_are_counted_and_what_fails_is_named(tmp_path: Path) -> None:
     """In a process of its own, as the step has it: pytest runs in a process once."""
     (tmp_path / "some").mkdir()
-    lines = ["def test_good(): pass", "def test_bad(): assert 1 == 2", "def test_skipped(): pytest.skip()"]
+    lines = [
+        "def test_good(): pass",
+        "def test_bad(): assert 1 == 2",
+        "def test_skipped(): pytest.skip()",
+        "@pytest.mark.slow",
+        "def test_slow(): pass",
+    ]
     (tmp_path / "some" / "test_some.py").write_text("\n".join(["import pytest", *lines]))
-    (tmp_path / "some" / "conftest.py").write_text(CONFTEST)
     code = (
         "import sys; from pathlib import Path; from benchmarks.gpu_check.gpu_tests import run_tests;"
         "from benchmarks.gpu_check.record import Findings; here = Path(sys.argv[1]);"
-        "print('said:', run_tests(Findings(here / 'record.json', here, here), here / 'some'))"
+        "print('said:', run_tests(Findings(here / 'record.json', here, here), 'not slow', here / 'some'))"
     )
     done = subprocess.run(
         [sys.executable, "-c", code, str(tmp_path)],
