@@ -30,7 +30,9 @@ PACKAGES = {
     "PIL": "pillow",
     "OpenEXR": "OpenEXR",
     "embreex": "embreex",
+    "httpx": "httpx",  # blosc2 imports it
     "pytest": "pytest",
+    "hypothesis": "hypothesis",
     "xdist": "pytest-xdist",
 }
 """Modules that the steps import, or that the tests run faster with, and the packages that bring them."""

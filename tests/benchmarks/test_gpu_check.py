@@ -263,6 +263,7 @@ def test_tests_are_counted_and_what_fails_is_named(tmp_path: Path) -> None:
         "@pytest.mark.slow",
         "def test_slow(): pass",
     ]
+    (tmp_path / "some" / "test_other.py").write_text("import no_such_package")
     (tmp_path / "some" / "test_some.py").write_text("\n".join(["import pytest", *lines]))
     code = (
         "import sys; from pathlib import Path; from benchmarks.gpu_check.gpu_tests import run_tests;"
@@ -277,7 +278,9 @@ def test_tests_are_counted_and_what_fails_is_named(tmp_path: Path) -> None:
         timeout=120,
         check=False,
     )
-    assert "said: 1 passed, 1 failed, 1 skipped" in done.stdout, done.stdout + done.stderr
+    assert "said: 1 passed, 1 failed, 1 skipped, 1 files left out for want of a package" in done.stdout, (
+        done.stdout + done.stderr
+    )
     (fault,) = json.loads((tmp_path / "record.json").read_text())["faults"]
     assert "test_some.py::test_bad: " in fault
     assert "assert 1 == 2" in fault
