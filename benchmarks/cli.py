@@ -1,4 +1,4 @@
-"""`deltalight bench`: measurements of this machine, not tests. The only module here that `services` imports."""
+"""`deltalight bench` and `gpu-check`: measurements of this machine. The only module here that `services` imports."""
 
 import json
 from pathlib import Path
@@ -163,3 +163,34 @@ def _speed_job(methods: str, motions: str, frames: int, size: str | None, device
     from benchmarks.speed.motions import parse_motions
 
     return SpeedJob(variants, parse_motions(motions), frames, size_px, device)
+
+
+def gpu_check(
+    *,
+    out: Annotated[Path, typer.Option(help="Folder for the report and pictures that differ.")] = Path(
+        "gpu-check"
+    ),
+    steps: Annotated[
+        str | None,
+        typer.Option(
+            help="Steps, separated by commas: doctor, shaders, pictures, speed, memory, leaks, quality, tests, "
+            "slow-tests; default all."
+        ),
+    ] = None,
+) -> None:
+    """Check this machine's GPU and driver, eight minutes at most; exit code 1 if a step failed or ran out of time."""
+    from benchmarks.gpu_check.packages import missing_packages
+    from benchmarks.gpu_check.plan import choose_steps
+
+    chosen, missing = choose_steps(steps), missing_packages()
+    from benchmarks.gpu_check.check import check_gpu  # needs some of those packages
+    from services.files import make_output_folder
+
+    def say(text: str) -> None:
+        typer.echo(f"gpu-check: {text}", err=True)
+
+    if missing:
+        say(f"these packages are not installed: {', '.join(missing)}")
+    report = check_gpu(make_output_folder(out), chosen, missing, say)
+    typer.echo(f"gpu-check: {report.sentence}")
+    raise typer.Exit(1 if report.bad_steps else 0)

@@ -47,6 +47,7 @@ COMMANDS = {
     "bench counts",
     "bench quality",
     "bench rest",
+    "gpu-check",
 }
 
 
