@@ -66,7 +66,7 @@ class GpuContext:
 
     @cached_property
     def common(self) -> dict[str, object]:
-        """What is made once and used by all, by name: the kernels that clear (gpu/kernel.py)."""
+        """What is made once and used by all, by name: the kernels that clear and count (gpu/kernel.py)."""
         return {}
 
     @cached_property

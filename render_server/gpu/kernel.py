@@ -429,7 +429,7 @@ class ListGroups:
     def __init__(self, gpu: GpuContext, per_group: int) -> None:
         self._per_group = per_group
         self._groups = gpu.ctx.buffer(reserve=3 * WORD_BYTES)
-        self._kernel = Kernel(gpu, "count_groups")
+        self._kernel = _common_kernel(gpu, "count_groups")
 
     def count(self, texels: moderngl.Buffer) -> moderngl.Buffer:
         """Returns the workgroups (x, y, z) that `per_group` items each need; valid until the next call."""
@@ -437,9 +437,8 @@ class ListGroups:
         return self._groups
 
     def release(self) -> None:
-        """Frees the GL objects."""
+        """Frees the buffer."""
         self._groups.release()
-        self._kernel.release()
 
 
 @contextmanager
