@@ -3,7 +3,7 @@
 import math
 
 from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import Binding, Bindings, Kernel, list_threads
+from render_server.gpu.kernel import Binding, Bindings, Kernel, clear_buffer, list_threads
 from render_server.passes.cones import LowResGrid
 from render_server.passes.lights import LightBuffers
 from render_server.passes.ray_tracing import ObjectBvh
@@ -26,10 +26,9 @@ class Caustics:
     """Renders caustics as fixed-point irradiance on real surfaces and objects (shaders/common/caustic_sums.glsl)."""
 
     def __init__(self, gpu: GpuContext, grid: LowResGrid, objects: ObjectBvh) -> None:
-        self._threads, self._grid, self._objects = list_threads(gpu), grid, objects
-        self._sums = gpu.ctx.buffer(
-            reserve=SUMS_BYTES * (math.prod(grid.picture_size) + math.prod(grid.size))
-        )
+        self._gpu, self._threads, self._grid, self._objects = gpu, list_threads(gpu), grid, objects
+        pixels = math.prod(grid.picture_size) + math.prod(grid.size)
+        self._sums = gpu.storage_buffer(SUMS_BYTES * pixels, "output.width and output.height")
         self._beams = gpu.ctx.buffer(reserve=HEADER_BYTES + BEAM_BYTES)
         self._mirror_beams = Kernel(gpu, "caustic_beams", RAY_COUNT=RAYS)
         self._lobe_beams = Kernel(gpu, "caustic_beams", RAY_COUNT=RAYS, WIDE=1)
@@ -45,7 +44,7 @@ class Caustics:
 
         `bias_m` offsets receivers of real shadows towards the light; beams are traced up to `reach_m`.
         """
-        self._sums.clear()
+        clear_buffer(self._gpu, self._sums)
         self._empty_beams(len(lights.virtual_views))
         for view in range(len(lights.virtual_views)):
             self._trace_beams(lights, lights.first_virtual_view + view, scene, bias_m, reach_m)

@@ -10,6 +10,7 @@ from typing import Any
 
 from protocol.scene import SceneDocument, parse_scene
 from render_server.gpu.context import GpuContext
+from render_server.gpu.kernel import Kernel
 from render_server.passes.lpv import LpvPropagate
 from render_server.renderer import SceneRenderer
 from tests.render_server.protected_scenes import Case, frames_of, scene_of
@@ -53,13 +54,14 @@ def changed(scene: SceneDocument, part: str, changes: dict[str, Any]) -> SceneDo
     return parse_scene(document)
 
 
-def propagate(gpu: GpuContext, folder: Path) -> None:  # noqa: ARG001
-    """Compiles light propagation as software and as a GPU has it, wherever this runs."""
+def by_device(gpu: GpuContext, folder: Path) -> None:  # noqa: ARG001
+    """Compiles what software and GPUs do differently, both ways wherever this runs."""
     for tiled in (False, True):
         LpvPropagate(gpu, tiled=tiled).release()
+    Kernel(gpu, "clear_buffer").release()
 
 
 PARTS: dict[str, Callable[[GpuContext, Path], None]] = {
     **{str(case): partial(render, case, changes) for case, changes in CASES.items()},
-    "propagation": propagate,
+    "by device": by_device,
 }

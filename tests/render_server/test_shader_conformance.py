@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from render_server.gpu.context import create_context
+from render_server.gpu.context import NEEDED, create_context
 from render_server.gpu.kernel import IMAGES, SAMPLERS
 from render_server.gpu.shader_source import SHADERS
 from tests.render_server.shader_variants import PARTS
@@ -35,6 +35,14 @@ GUARANTEED: Mapping[str, Mapping[str, int]] = {
         "shared bytes": 32768,
         "invocations": 1024,
     },
+}
+REFUSED_BELOW = {  # what a device without is refused
+    "storage blocks": "GL_MAX_COMPUTE_SHADER_STORAGE_BLOCKS",
+    "samplers": "GL_MAX_COMPUTE_TEXTURE_IMAGE_UNITS",
+    "images": "GL_MAX_COMPUTE_IMAGE_UNIFORMS",
+    "uniform blocks": "GL_MAX_COMPUTE_UNIFORM_BLOCKS",
+    "shared bytes": "GL_MAX_COMPUTE_SHARED_MEMORY_SIZE",
+    "invocations": "GL_MAX_COMPUTE_WORK_GROUP_INVOCATIONS",
 }
 ELEMENT_BYTES = {"float": 4, "int": 4, "uint": 4, "bool": 4, "vec2": 8, "vec3": 16, "vec4": 16}
 BLOCK = re.compile(r"\b(buffer|uniform)\s+\w+\s*\{")
@@ -112,6 +120,7 @@ def test_no_variant_needs_more_than_opengl_guarantees(programs: Programs) -> Non
     }
     assert {name: kinds for name, kinds in beyond.items() if kinds} == {}
     assert max(needed["storage blocks"] for needed in needs.values()) == 8
+    assert GUARANTEED["comp"] == {kind: NEEDED[name] for kind, name in REFUSED_BELOW.items()}
     assert max(needed.get("shared bytes", 0) for needed in needs.values()) > 16384
 
 
