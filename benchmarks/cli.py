@@ -1,16 +1,34 @@
-"""`deltalight bench`: measurements of this machine, not tests. The only module here that `services` imports."""
+"""`deltalight bench` and `gpu-check`: measurements of this machine. The only module here that `services` imports."""
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from protocol.errors import DeltalightError
-from services.commands.options import parse_method
+
+if TYPE_CHECKING:
+    from benchmarks.speed.measure import SpeedJob
 
 # The methods that `bench quality` compares by default.
 DEFAULT_METHODS = "camera,none,paper,exact,path"
+
+# Those of `bench speed` and `bench counts`, and all that these take.
+TIMED_METHODS = "none,exact,paper,dlpv"
+TIMEABLE = ("dvct", "none", "exact", "paper", "dlpv", "dlpv-paper", "aroof", "differential")
+DEFAULT_MOTIONS = "camera,object,arm,lamps,still"
+
+Size = Annotated[str | None, typer.Option(metavar="WxH", help="Size of the pictures; default the demo's.")]
+Device = Annotated[int | None, typer.Option(min=0, help="EGL device; `deltalight doctor` lists them.")]
+ReportFile = Annotated[Path | None, typer.Option(help="File for the report as JSON.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the report as JSON.")]
+
+METHODS_HELP = (
+    "dvct (the scene's own), none (objects without relighting), exact, paper, dlpv, dlpv-paper, aroof, differential; "
+    "or exact:KEY=VALUE[,KEY=VALUE], likewise for the others but none."
+)
+MOTIONS_HELP = "What moves: camera, object, arm, lamps, still; separated by commas."
 
 bench = typer.Typer(
     no_args_is_help=True, help="Measure speed on this machine, and agreement with ground truth."
@@ -20,37 +38,55 @@ bench = typer.Typer(
 @bench.command()
 def speed(
     *,
-    size: Annotated[
-        str | None, typer.Option(metavar="WxH", help="Size of the pictures; default the demo's.")
-    ] = None,
-    methods: Annotated[
-        str, typer.Option(help="Methods, separated by commas, as for `demo --method`.")
-    ] = "exact,paper,dlpv",
+    size: Size = None,
+    methods: Annotated[str, typer.Option(help=METHODS_HELP)] = TIMED_METHODS,
+    motions: Annotated[str, typer.Option(help=MOTIONS_HELP)] = DEFAULT_MOTIONS,
     frames: Annotated[int, typer.Option(min=1, max=10_000, help="Frames of each measurement.")] = 30,
-    device: Annotated[
-        int | None, typer.Option(min=0, help="EGL device; `deltalight doctor` lists them.")
-    ] = None,
+    budget_ms: Annotated[
+        float, typer.Option(min=0.1, help="Frames that take longer are counted as late, ms.")
+    ] = 100.0,
+    device: Device = None,
     end_to_end: Annotated[
         bool,
         typer.Option("--end-to-end/--no-end-to-end", help="Measure node, server and viewer processes too."),
     ] = True,
-    out: Annotated[Path | None, typer.Option(help="File for the report as JSON.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
+    compare: Annotated[
+        tuple[Path, Path] | None,
+        typer.Option(metavar="A B", help="Compare two reports instead of measuring: B against A."),
+    ] = None,
+    out: ReportFile = None,
+    as_json: AsJson = False,
 ) -> None:
-    """Time every pass of a frame on the demo's recording, and the frame rate from camera to viewer."""
-    from protocol.files import write_bytes
-    from services.commands.options import parse_size
+    """Time every stage of a frame while camera, object, real scene or light moves, and camera to viewer."""
+    if compare is not None:
+        from benchmarks.speed.command import run_comparison
 
-    chosen, size_px = _methods(methods), None if size is None else parse_size(size)
-    from benchmarks.speed import measure_speed, print_report  # needs OpenGL's packages, unlike a wrong option
+        run_comparison(*compare, as_json=as_json)
+        return
+    job = _speed_job(methods, motions, frames, size, device)
+    from benchmarks.speed.command import run_speed
 
-    report = measure_speed(chosen, frames, size=size_px, device=device, end_to_end=end_to_end)
-    if out is not None:
-        write_bytes(out, json.dumps(report, indent=2).encode())
-    if as_json:
-        typer.echo(json.dumps(report, indent=2))
-    else:
-        print_report(report)
+    run_speed(job, budget_ms, end_to_end=end_to_end, out=out, as_json=as_json)
+
+
+@bench.command()
+def counts(
+    *,
+    size: Size = None,
+    methods: Annotated[str, typer.Option(help=METHODS_HELP)] = TIMED_METHODS,
+    motions: Annotated[str, typer.Option(help=MOTIONS_HELP)] = DEFAULT_MOTIONS,
+    frames: Annotated[
+        int, typer.Option(min=1, max=1000, help="Frames that are counted, and as many timed without the GPU.")
+    ] = 8,
+    device: Device = None,
+    out: ReportFile = None,
+    as_json: AsJson = False,
+) -> None:
+    """Count what a frame asks of the GPU, and time what Python takes for it while the GPU is left out."""
+    job = _speed_job(methods, motions, frames, size, device)
+    from benchmarks.speed.command import run_counts
+
+    run_counts(job, out=out, as_json=as_json)
 
 
 @bench.command()
@@ -62,8 +98,8 @@ def quality(
     methods: Annotated[
         str,
         typer.Option(
-            help="camera, none, paper, exact, fisheye (exact with the lights of the fish-eye picture), dlpv, "
-            "dlpv-paper, path; or exact:KEY=VALUE[,KEY=VALUE], likewise for paper, dlpv, dlpv-paper."
+            help="camera, dvct (the scene's own), none, paper, exact, fisheye (exact with the lights of the fish-eye "
+            "picture), dlpv, dlpv-paper, path; or exact:KEY=VALUE[,KEY=VALUE], likewise for the others that render."
         ),
     ] = DEFAULT_METHODS,
     ablation: Annotated[
@@ -75,10 +111,8 @@ def quality(
     ] = None,
     spp: Annotated[int, typer.Option(min=1, help="Light paths a pixel of the truth; a multiple of 8.")] = 512,
     out: Annotated[Path, typer.Option(help="Folder for the report.")] = Path("quality"),
-    device: Annotated[
-        int | None, typer.Option(min=0, help="EGL device; `deltalight doctor` lists them.")
-    ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
+    device: Device = None,
+    as_json: AsJson = False,
 ) -> None:
     """Compare relit pictures with path-traced truth: figures, and a page with pictures of the errors."""
     from services.commands.options import parse_size
@@ -99,14 +133,10 @@ def quality(
 def rest(
     *,
     seconds: Annotated[float, typer.Option(min=0.2, max=3600, help="Length of each measurement.")] = 20.0,
-    size: Annotated[
-        str | None, typer.Option(metavar="WxH", help="Size of the pictures; default the demo's.")
-    ] = None,
-    device: Annotated[
-        int | None, typer.Option(min=0, help="EGL device; `deltalight doctor` lists them.")
-    ] = None,
-    out: Annotated[Path | None, typer.Option(help="File for the report as JSON.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
+    size: Size = None,
+    device: Device = None,
+    out: ReportFile = None,
+    as_json: AsJson = False,
 ) -> None:
     """Time the REST API with and without rendering, what 20 live viewers cost, and the dashboard's size."""
     from protocol.files import write_bytes
@@ -124,5 +154,43 @@ def rest(
         print_report(report)
 
 
-def _methods(text: str) -> list[str]:
-    return [parse_method(name.strip()).value for name in text.split(",")]
+def _speed_job(methods: str, motions: str, frames: int, size: str | None, device: int | None) -> "SpeedJob":
+    from benchmarks.variants import parse_variants
+    from services.commands.options import parse_size
+
+    variants, size_px = parse_variants(methods, TIMEABLE), None if size is None else parse_size(size)
+    from benchmarks.speed.measure import SpeedJob  # needs OpenGL's packages, unlike a wrong option
+    from benchmarks.speed.motions import parse_motions
+
+    return SpeedJob(variants, parse_motions(motions), frames, size_px, device)
+
+
+def gpu_check(
+    *,
+    out: Annotated[Path, typer.Option(help="Folder for the report and pictures that differ.")] = Path(
+        "gpu-check"
+    ),
+    steps: Annotated[
+        str | None,
+        typer.Option(
+            help="Steps, separated by commas: doctor, shaders, pictures, speed, memory, leaks, quality, tests, "
+            "slow-tests; default all."
+        ),
+    ] = None,
+) -> None:
+    """Check this machine's GPU and driver, eight minutes at most; exit code 1 if a step failed or ran out of time."""
+    from benchmarks.gpu_check.packages import missing_packages
+    from benchmarks.gpu_check.plan import choose_steps
+
+    chosen, missing = choose_steps(steps), missing_packages()
+    from benchmarks.gpu_check.check import check_gpu  # needs some of those packages
+    from services.files import make_output_folder
+
+    def say(text: str) -> None:
+        typer.echo(f"gpu-check: {text}", err=True)
+
+    if missing:
+        say(f"these packages are not installed: {', '.join(missing)}")
+    report = check_gpu(make_output_folder(out), chosen, missing, say)
+    typer.echo(f"gpu-check: {report.sentence}")
+    raise typer.Exit(1 if report.bad_steps else 0)

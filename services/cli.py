@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from benchmarks.cli import bench
+from benchmarks.cli import bench, gpu_check
 from protocol.errors import DeltalightError
 from services.commands.api import api
 from services.commands.board import board
@@ -49,6 +49,7 @@ app.add_typer(recordings, name="recordings")
 app.add_typer(calibrate, name="calibrate")
 app.add_typer(keys, name="keys")
 app.add_typer(bench, name="bench")
+app.command()(gpu_check)
 
 
 def _show_version(wanted: bool) -> None:

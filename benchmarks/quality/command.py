@@ -8,11 +8,12 @@ from rich.console import Console
 from rich.progress import Progress
 
 from benchmarks.ground_truth.scenes import SCENES, scene_named
+from benchmarks.quality.ablation import ablation_chain
 from benchmarks.quality.evaluate import QualityJob, measure_quality
 from benchmarks.quality.report import require_replaceable, write_report
 from benchmarks.quality.report_data import as_data
 from benchmarks.quality.tables import all_tables
-from benchmarks.quality.variants import Variant, ablation_chain, parse_variants
+from benchmarks.variants import Variant, parse_variants
 from protocol.errors import DeltalightError
 
 

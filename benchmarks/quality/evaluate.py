@@ -14,7 +14,7 @@ from benchmarks.quality.figures import Figures, mean_figures, scene_figures
 from benchmarks.quality.metrics import Picture
 from benchmarks.quality.path_tracing import trace_in_time
 from benchmarks.quality.renders import Rendered, render_variant
-from benchmarks.quality.variants import TIMED_VARIANT, Variant
+from benchmarks.variants import TIMED_VARIANT, Variant
 from render_server.gpu.context import GpuContext, create_context
 
 CEILING = Variant(

@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.quality.case import SceneCase
 from benchmarks.quality.metrics import Picture
-from benchmarks.quality.variants import Variant
+from benchmarks.variants import Variant
 from protocol.frames import BoardPose, ViewFrame
 from protocol.scene import SceneDocument
 from render_server.gpu.context import GpuContext

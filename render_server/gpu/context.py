@@ -1,9 +1,10 @@
 """The OpenGL context of a process (EGL, headless)."""
 
+import ctypes
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, Final
 
 import moderngl
 
@@ -20,6 +21,25 @@ HINTS = {
     "eglCreateContext failed": "the driver offers less than OpenGL 4.3: update the graphics driver",
     "found 0 devices": "EGL sees no device: in a container, pass the GPU with its graphics capability",
     "requested device": "there is no such GPU: leave --device out, or see `deltalight doctor` for the list",
+}
+
+# What the assembled shaders and the buffers of a small scene need of a device, by OpenGL's name. Devices that conform
+# to OpenGL 4.3 have it; tests/render_server/test_shader_conformance.py holds the shaders to it.
+NEEDED: Final[Mapping[str, int]] = {
+    "GL_MAX_COMPUTE_SHADER_STORAGE_BLOCKS": 8,
+    "GL_MAX_SHADER_STORAGE_BUFFER_BINDINGS": 8,
+    "GL_MAX_SHADER_STORAGE_BLOCK_SIZE": 2**24,
+    "GL_MAX_COMPUTE_TEXTURE_IMAGE_UNITS": 16,
+    "GL_MAX_TEXTURE_IMAGE_UNITS": 16,
+    "GL_MAX_COMPUTE_IMAGE_UNIFORMS": 8,
+    "GL_MAX_COMPUTE_UNIFORM_BLOCKS": 12,
+    "GL_MAX_COMPUTE_SHARED_MEMORY_SIZE": 32768,
+    "GL_MAX_COMPUTE_WORK_GROUP_INVOCATIONS": 1024,
+    "GL_MAX_3D_TEXTURE_SIZE": 1024,
+}
+UNLISTED: Final = {  # limits that moderngl does not list
+    "GL_MAX_COMPUTE_IMAGE_UNIFORMS": 0x91BD,
+    "GL_MAX_COMPUTE_SHARED_MEMORY_SIZE": 0x8262,
 }
 
 
@@ -43,6 +63,11 @@ class GpuContext:
         """Tells the compile watchers about a program."""
         for watch in self.compile_watchers:
             watch(label, sources)
+
+    @cached_property
+    def common(self) -> dict[str, object]:
+        """What is made once and used by all, by name: the kernels that clear and count (gpu/kernel.py)."""
+        return {}
 
     @cached_property
     def _empty_textures(self) -> dict[tuple[type, str], Any]:
@@ -72,6 +97,26 @@ class GpuContext:
         """The buffer that stands where a kernel may write to none."""
         return self.ctx.buffer(bytes(256))
 
+    def storage_buffer(self, size: int, lower: str) -> moderngl.Buffer:
+        """Reserves `size` bytes that shaders read or write; `lower` is as in `check_storage`."""
+        self.check_storage(size, lower)
+        return self.ctx.buffer(reserve=size)
+
+    def check_storage(self, size: int, lower: str) -> None:
+        """Refuses a buffer beyond what shaders reach of one: what they write there would be lost without a word.
+
+        `lower` names the settings of the scene document that make it smaller.
+
+        Raises:
+            DeltalightError: `size` (bytes) is beyond the limit.
+        """
+        limit = self.ctx.info["GL_MAX_SHADER_STORAGE_BLOCK_SIZE"]
+        if size > limit:
+            raise DeltalightError(
+                f"A buffer of {size / 1e6:.0f} MB is needed, and shaders of this GPU reach {limit / 1e6:.0f} MB "
+                f"of one: lower {lower}."
+            )
+
     def release(self) -> None:
         """Frees the context; nothing made from it may be used afterwards."""
         self.ctx.release()
@@ -90,12 +135,38 @@ def explain_context_failure(text: str) -> str:
     return f"No OpenGL context ({text}): run `deltalight doctor` to see what is missing."
 
 
+def check_limits(renderer: str, limits: Mapping[str, int]) -> None:
+    """Refuses a device that has less of anything than NEEDED.
+
+    Raises:
+        DeltalightError: names the limit, what the device has and what is needed.
+    """
+    for name, needed in NEEDED.items():
+        if limits[name] < needed:
+            raise DeltalightError(
+                f"{renderer} has {name} {limits[name]}, and {needed} is needed: "
+                "update the graphics driver, or choose another GPU."
+            )
+
+
+def limits_of(ctx: moderngl.Context) -> dict[str, int]:
+    """Returns the limits of the current device that NEEDED names."""
+    address = ctx.mglo._context.load("glGetIntegerv")
+    read = ctypes.CFUNCTYPE(None, ctypes.c_uint, ctypes.POINTER(ctypes.c_int))(address)
+    limits = {name: int(ctx.info[name]) for name in NEEDED if name not in UNLISTED}
+    for name, number in UNLISTED.items():
+        value = ctypes.c_int()
+        read(number, ctypes.byref(value))
+        limits[name] = value.value
+    return limits
+
+
 def create_context(device: int | None = None, *, allow_software: bool = True) -> GpuContext:
     """Creates the process's context on EGL device `device` (default: the driver's first).
 
     Raises:
-        DeltalightError: there is no driver, no such device, or only a software renderer although none is
-            allowed.
+        DeltalightError: there is no driver, no such device, one that has too little of something, or only a
+            software renderer although none is allowed.
     """
     options: dict[str, Any] = {"standalone": True, "backend": "egl", "require": 430}
     if device is not None:
@@ -112,4 +183,9 @@ def create_context(device: int | None = None, *, allow_software: bool = True) ->
             f"Only the software renderer {name} was found: "
             "install a GPU driver, or add --allow-software to accept slow frames."
         )
+    try:
+        check_limits(name, limits_of(ctx))
+    except DeltalightError:
+        ctx.release()
+        raise
     return GpuContext(ctx, name, str(ctx.info["GL_VERSION"]), software)

@@ -26,6 +26,8 @@ LIST_WALKERS = 16384
 BLOCK_ALIGNMENT = (
     16  # bytes that std140 blocks are padded to; drivers may leave the padding out of their size
 )
+CLEARING_GROUPS = 4096  # of workgroups at most; they stride over larger buffers
+WORD_BYTES = 4
 GL_INT = 0x1404
 CLIP_DISTANCE0 = 0x3000  # GL_CLIP_DISTANCE0, which moderngl does not name
 
@@ -76,7 +78,10 @@ class Drawable(Protocol):
 
 @dataclass(frozen=True)
 class Dispatch:
-    """One run of a kernel: workgroups (x, y, z) or triangles drawn, and what it wrote, by name."""
+    """One run of a kernel: workgroups (x, y, z) or triangles drawn, and what it wrote, by name.
+
+    `size` is empty where the GPU counted the workgroups itself.
+    """
 
     kernel: str
     size: tuple[int, ...]
@@ -275,7 +280,7 @@ class Kernel:
         self.label = _label(name, defines)
         gpu.compiled(self.label, {"comp": source})
         self._program = _Program(gpu, self.label, gpu.ctx.compute_shader(source), declared)
-        self._local = declared.local_size
+        self.local_size = declared.local_size
 
     def run(self, threads: Sequence[int], *shared: Bindings, **own: Binding) -> None:
         """Runs at least `threads` (x[, y[, z]]) invocations; later work sees their writes.
@@ -288,12 +293,26 @@ class Kernel:
         """
         written = self._program.bind(shared, own)
         counts = [*threads, 1, 1][:3]
-        groups = tuple(max(1, -(-count // size)) for count, size in zip(counts, self._local, strict=True))
-        program = self._program.program
-        assert isinstance(program, moderngl.ComputeShader)
-        program.run(*groups)
+        groups = tuple(max(1, -(-count // size)) for count, size in zip(counts, self.local_size, strict=True))
+        self._compute.run(*groups)
         self._ctx.memory_barrier()
         self._program.report(groups, written)
+
+    def run_counted(self, groups: moderngl.Buffer, *shared: Bindings, **own: Binding) -> None:
+        """Runs as many workgroups (x, y, z; three uint32) as `groups` holds on the GPU, perhaps none; else as `run`.
+
+        Nothing is read back, so the CPU does not wait until the GPU has counted.
+        """
+        written = self._program.bind(shared, own)
+        self._compute.run_indirect(groups)
+        self._ctx.memory_barrier()
+        self._program.report((), written)
+
+    @property
+    def _compute(self) -> moderngl.ComputeShader:
+        program = self._program.program
+        assert isinstance(program, moderngl.ComputeShader)
+        return program
 
     def resources(self) -> dict[str, list[str]]:
         """Returns the names of the linked program's bindings, by kind."""
@@ -372,6 +391,54 @@ def list_threads(gpu: GpuContext, longest: int = LIST_WALKERS) -> int:
     if not gpu.is_software:
         return longest
     return min(longest, max(SOFTWARE_WALKERS, -(-longest // SOFTWARE_DIVISOR)))
+
+
+def _common_kernel(gpu: GpuContext, name: str) -> Kernel:
+    """The kernel that all share, compiled on first use; it ends with the context."""
+    if name not in gpu.common:
+        gpu.common[name] = Kernel(gpu, name)
+    kernel = gpu.common[name]
+    assert isinstance(kernel, Kernel)
+    return kernel
+
+
+def clear_buffer(gpu: GpuContext, buffer: moderngl.Buffer, size: int | None = None) -> None:
+    """Sets the first `size` bytes (a multiple of 4; default: all) of a buffer to zero.
+
+    By a kernel, because `Buffer.clear` maps the buffer: it waits for the GPU and sends the zeros over the bus. In
+    software that is no more than a memset, 15 to 50 times as fast as a kernel (measured from 4 to 64 MB).
+    """
+    size = buffer.size if size is None else size
+    if gpu.is_software:
+        buffer.clear(size)
+        return
+    kernel = _common_kernel(gpu, "clear_buffer")
+    words = size // WORD_BYTES
+    threads = min(words, CLEARING_GROUPS * kernel.local_size[0])
+    kernel.run((threads,), Cleared=buffer, word_count=words)
+
+
+def clear_volume(gpu: GpuContext, texture: moderngl.Texture3D) -> None:
+    """Sets all texels to zero, without a copy of them on the CPU."""
+    _common_kernel(gpu, "clear_volume").run(texture.size, cleared=texture)
+
+
+class ListGroups:
+    """Counts the workgroups that walk a list of shaders/common/work_list.glsl, for `Kernel.run_counted`."""
+
+    def __init__(self, gpu: GpuContext, per_group: int) -> None:
+        self._per_group = per_group
+        self._groups = gpu.ctx.buffer(reserve=3 * WORD_BYTES)
+        self._kernel = _common_kernel(gpu, "count_groups")
+
+    def count(self, texels: moderngl.Buffer) -> moderngl.Buffer:
+        """Returns the workgroups (x, y, z) that `per_group` items each need; valid until the next call."""
+        self._kernel.run((1,), Texels=texels, Groups=self._groups, per_group=self._per_group)
+        return self._groups
+
+    def release(self) -> None:
+        """Frees the buffer."""
+        self._groups.release()
 
 
 @contextmanager

@@ -14,7 +14,7 @@ import numpy as np
 from protocol.scene_method import DifferentialMethod
 from render_server.frame import FrameResources, Observation
 from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import Binding, Bindings
+from render_server.gpu.kernel import Binding, Bindings, clear_buffer
 from render_server.gpu_scene import GeometryState
 from render_server.graph import Graph, Resource
 from render_server.lights.lights import LightSet
@@ -39,6 +39,7 @@ from render_server.methods.method import (
     resolve_joint_maps,
 )
 from render_server.methods.voxel_volumes import (
+    FAR_SIZE,
     DirectionalVoxels,
     VoxelSet,
     joint_voxels,
@@ -118,7 +119,7 @@ class SolutionVoxels(DirectionalVoxels):
         self._resolve.resolve_mu(self.mu, real.store, real.volume)
         light.light_solution(real.store, rho, real.groups, with_objects=True, gathered=gathered)
         light.light_virtual(objects.store, rho, objects.groups, gathered=gathered)
-        real.store.delta_sums.clear()
+        clear_buffer(self._gpu, real.store.delta_sums)
         self._resolve.resolve_rho(self.rho, real.store, objects.store, real.volume)
         self._filter.run(self.mu, real.volume)
         self._filter.run(self.rho, real.volume)
@@ -289,7 +290,7 @@ def state_memory(settings: DifferentialMethod, resolved: ResolvedSettings) -> st
     Raises:
         DeltalightError: it is beyond the budget.
     """
-    return memory_statement(resolved.volume_size, DIRECTIONS, settings.memory_budget_mb)
+    return memory_statement(resolved.volume_size, DIRECTIONS, settings.memory_budget_mb, FAR_SIZE)
 
 
 DIFFERENTIAL = RelightingMethod(DifferentialMethod, differential, resolve_joint_maps, state_memory)

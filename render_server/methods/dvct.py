@@ -28,6 +28,7 @@ from render_server.methods.method import (
     resolve_voxel_cones,
 )
 from render_server.methods.voxel_volumes import (
+    FAR_SIZE,
     DeltaVoxels,
     VoxelSet,
     delta_voxel_stages,
@@ -282,8 +283,10 @@ def state_memory(settings: DvctMethod, resolved: ResolvedSettings) -> str:
     Raises:
         DeltalightError: it is beyond the budget.
     """
-    directions = DIRECTIONS if settings.operator == "exact" else 1
-    return memory_statement(resolved.volume_size, directions, settings.memory_budget_mb)
+    size, budget_mb = resolved.volume_size, settings.memory_budget_mb
+    if settings.operator == "paper":
+        return memory_statement(size, 1, budget_mb)
+    return memory_statement(size, DIRECTIONS, budget_mb, FAR_SIZE)
 
 
 DVCT = RelightingMethod(DvctMethod, dvct, resolve_voxel_cones, state_memory)

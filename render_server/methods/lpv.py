@@ -7,7 +7,7 @@ from jaxtyping import Float32
 from protocol.scene_method import DlpvMethod
 from render_server.frame import FrameResources, Observation
 from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import Binding, Bindings
+from render_server.gpu.kernel import Binding, Bindings, clear_buffer
 from render_server.gpu.textures import release_all
 from render_server.gpu_scene import GeometryState
 from render_server.graph import Graph, Resource
@@ -63,7 +63,7 @@ class LpvVolumes:
     """
 
     def __init__(self, gpu: GpuContext, settings: DlpvMethod, cells: int) -> None:
-        self._settings, self._steps = settings, settings.steps or cells
+        self._gpu, self._settings, self._steps = gpu, settings, settings.steps or cells
         is_paper = settings.operator == "paper"
         has_moments = settings.resolved_propagation == "moments"
         self._weights = moment_weights(cells) if has_moments else lobe_weights()
@@ -125,7 +125,7 @@ class LpvVolumes:
 
     def _surfels(self, store: VoxelStore, corners: Float32[np.ndarray, "m 3 10"]) -> None:
         """Voxelises at half a cell; only the store's surfels are used."""
-        store.grid.clear()
+        clear_buffer(self._gpu, store.grid)
         self._voxelize.run(store, corners, self._half_cells)
 
     def real_scene(
@@ -145,7 +145,7 @@ class LpvVolumes:
     def inject_real(self, real: VoxelStore, scene: Bindings, lights: LightBuffers) -> moderngl.Buffer:
         """Injects the real scene's light without objects."""
         self._albedo.run(lights, scene)
-        self._real_light.clear()
+        clear_buffer(self._gpu, self._real_light)
         self._maps.add_real(self._real_light, lights, self._albedo.atlas, scene)
         if self._blocks_environment:
             self._surfaces.add_real(self._real_light, real, scene)
@@ -182,7 +182,7 @@ class LpvVolumes:
         self, objects: VoxelStore, scene: Bindings, lights: LightBuffers, _real: moderngl.Buffer
     ) -> moderngl.Buffer:
         """Injects the change due to the objects."""
-        self._change_light.clear()
+        clear_buffer(self._gpu, self._change_light)
         self._maps.add_change(self._change_light, lights, self._albedo.atlas, scene)
         self._surfaces.add_virtual(self._change_light, objects, scene)
         return self._change_light
@@ -217,7 +217,7 @@ class LpvVolumes:
         """Propagates V_rho again, with the light that surfaces reflect of the previous pass."""
         for _ in range(0 if mu is None else self._settings.resolved_bounces):
             assert mu is not None
-            self._bounced_light.clear()
+            clear_buffer(self._gpu, self._bounced_light)
             own = {**scene, **self.query_bindings}
             self._bounce.run(self._bounced_light, (self.real, self.objects), (mu, rho), own)
             self._start.run(rho, self._real_light, self._change_light, self._bounced_light)
@@ -227,7 +227,7 @@ class LpvVolumes:
     def inject_shadow(self, scene: Bindings, lights: LightBuffers, _real: moderngl.Buffer) -> moderngl.Buffer:
         """Negative lobes of the direct light that objects keep off the real scene; nothing where maps shadow it."""
         if self._settings.resolved_shadow == "lobe":
-            self._shadow_light.clear()
+            clear_buffer(self._gpu, self._shadow_light)
             self._maps.add_shadow(self._shadow_light, lights, self._albedo.atlas, scene)
         return self._shadow_light
 
@@ -250,7 +250,8 @@ class LpvVolumes:
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_all(*(item for item in vars(self).values() if hasattr(item, "release")))
+        own = (item for item in vars(self).values() if item is not self._gpu)
+        release_all(*(item for item in own if hasattr(item, "release")))
 
 
 class LpvFields:

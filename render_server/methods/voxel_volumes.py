@@ -14,7 +14,7 @@ from jaxtyping import Float32
 from protocol.scene_method import DvctMethod, VoxelConeSettings
 from render_server.frame import FrameResources, Observation
 from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import Binding, Bindings
+from render_server.gpu.kernel import Binding, Bindings, clear_buffer
 from render_server.gpu.textures import release_all
 from render_server.gpu.uniform_block import UniformBlock
 from render_server.gpu_scene import GeometryState
@@ -57,6 +57,7 @@ class VoxelSet:
     """
 
     def __init__(self, gpu: GpuContext, size: int, mipmaps: Sequence[VoxelMipmap]) -> None:
+        self._gpu = gpu
         self.store = VoxelStore(gpu, size)
         self.volume = PlacedVolume(gpu, VolumePlacement((0.0, 0.0, 0.0), 1.0, size))
         self.groups = SurfelGroups(gpu, size)
@@ -75,12 +76,8 @@ class VoxelSet:
     def forget_light(self) -> None:
         """Clears the sums if they hold light."""
         if self.is_lit:
-            self.store.sums.clear()
+            clear_buffer(self._gpu, self.store.sums)
         self.is_lit = True
-
-    def counts(self) -> tuple[int, int]:
-        """Returns the numbers of touched voxels and surfels; waits for the GPU."""
-        return self.store.counts()
 
     def release(self) -> None:
         """Frees the GL objects."""
@@ -136,7 +133,7 @@ class DirectionalVoxels:
     """Voxel data of both marches: two anisotropic mipmaps, two voxel sets, and the scene beyond."""
 
     def __init__(self, gpu: GpuContext, settings: VoxelConeSettings, size: int) -> None:
-        self._bounces = settings.bounces
+        self._gpu, self._bounces = gpu, settings.bounces
         self._measured = settings.radiance == "measured"
         self.mu, self.rho = (VoxelMipmap(gpu, size, DIRECTIONS) for _ in range(2))
         self.real = VoxelSet(gpu, size, [self.mu, self.rho])
@@ -248,8 +245,7 @@ class DeltaVoxels(DirectionalVoxels):
             return self.mu, voxels
         own, store, groups = {**scene, **voxels.volume.bindings}, voxels.store, voxels.groups
         self._group.run(store, groups, own, has_seen=True)
-        _, unseen = groups.counts()
-        for _ in range(self._bounces if unseen else 0):
+        for _ in range(self._bounces):
             self._gather.gather_unseen(store, groups, self.mu, {**own, **self.march_bindings(1)})
             self._light.light_real(store, own, groups, gathered=True)
             self._filter_mu()

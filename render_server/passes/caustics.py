@@ -3,7 +3,7 @@
 import math
 
 from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import Binding, Bindings, Kernel, list_threads
+from render_server.gpu.kernel import Binding, Bindings, Kernel, clear_buffer, list_threads
 from render_server.gpu.textures import release_all
 from render_server.passes.cones import LowResGrid, reuse_define
 from render_server.passes.lights import LightBuffers
@@ -30,10 +30,11 @@ class Caustics:
     def __init__(
         self, gpu: GpuContext, grid: LowResGrid, objects: ObjectBvh, *, reuses: bool = False
     ) -> None:
-        self._threads, self._grid, self._objects = list_threads(gpu), grid, objects
-        size_bytes = SUMS_BYTES * (math.prod(grid.picture_size) + math.prod(grid.size))
-        self._sums = gpu.ctx.buffer(reserve=size_bytes)
-        self._last_sums = gpu.ctx.buffer(reserve=size_bytes) if reuses else None
+        self._gpu, self._threads, self._grid, self._objects = gpu, list_threads(gpu), grid, objects
+        size = SUMS_BYTES * (math.prod(grid.picture_size) + math.prod(grid.size))
+        lower = "output.width and output.height"
+        self._sums = gpu.storage_buffer(size, lower)
+        self._last_sums = gpu.storage_buffer(size, lower) if reuses else None
         self._reuse = Kernel(gpu, "reuse_light", CAUSTICS=1) if reuses else None
         self._beams = gpu.ctx.buffer(reserve=HEADER_BYTES + BEAM_BYTES)
         self._mirror_beams = Kernel(gpu, "caustic_beams", RAY_COUNT=RAYS)
@@ -55,7 +56,7 @@ class Caustics:
         """
         if self._last_sums is not None:
             self._sums, self._last_sums = self._last_sums, self._sums
-        self._sums.clear()
+        clear_buffer(self._gpu, self._sums)
         self._empty_beams(len(lights.virtual_views))
         for view in range(len(lights.virtual_views)):
             self._trace_beams(lights, lights.first_virtual_view + view, scene, bias_m, reach_m)

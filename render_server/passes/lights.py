@@ -231,6 +231,7 @@ class MirrorVisibility:
             (MIRROR_MAP_TEXELS, MIRROR_MAP_TEXELS, count),
             scene,
             visibility_out=lights.mirror_visibility,
+            mirror_visibility=None,  # of the lights that are no images, which alone are asked for
             first_image=len(lights.lights) - count,
             bias_real=noise_m,
             noise_m=noise_m,

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import Bindings, Kernel, list_threads
-from render_server.passes.voxels import VolumePlacement, VoxelMipmap, VoxelStore
+from render_server.gpu.kernel import Bindings, Kernel, clear_buffer, list_threads
+from render_server.passes.voxels import LOWER_VOLUME, VolumePlacement, VoxelMipmap, VoxelStore
 
 COEFFICIENT_BYTES = 16  # per cell and channel: 4 floats
 INJECTED_SUMS = 12  # per cell: 4 coefficients x 3 channels
@@ -87,7 +87,7 @@ class LightVolume:
     def __init__(self, gpu: GpuContext, cells: int) -> None:
         self.cells = cells
         size = 3 * cells**3 * COEFFICIENT_BYTES
-        self.state, self.next_state, self.total = (gpu.ctx.buffer(reserve=size) for _ in range(3))
+        self.state, self.next_state, self.total = (gpu.storage_buffer(size, LOWER_VOLUME) for _ in range(3))
 
     def swap(self) -> None:
         """Makes the last output the current state."""
@@ -115,8 +115,8 @@ def transmitted_fractions(gpu: GpuContext, cells: int) -> moderngl.Buffer:
 
 
 def _zeros(gpu: GpuContext, size: int) -> moderngl.Buffer:
-    buffer = gpu.ctx.buffer(reserve=size)
-    buffer.clear()
+    buffer = gpu.storage_buffer(size, LOWER_VOLUME)
+    clear_buffer(gpu, buffer)
     return buffer
 
 
@@ -169,7 +169,7 @@ class LpvCoverFaces:
     """
 
     def __init__(self, gpu: GpuContext) -> None:
-        self._threads = list_threads(gpu)
+        self._gpu, self._threads = gpu, list_threads(gpu)
         self._kernel = Kernel(gpu, "lpv_cover_faces")
 
     def run(self, covered: moderngl.Buffer, store: VoxelStore, cells: VolumePlacement) -> None:
@@ -177,7 +177,7 @@ class LpvCoverFaces:
 
         `cells` is the placement of the cells; `store` was voxelised at half a cell per edge.
         """
-        covered.clear()
+        clear_buffer(self._gpu, covered)
         self._kernel.run(
             (self._threads,), store.bindings, Covered=covered, cells=cells.size, cell_edge=cells.voxel_edge
         )

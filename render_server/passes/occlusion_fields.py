@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float16, Float32, Float64
 
 from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import Binding, Bindings, Kernel
+from render_server.gpu.kernel import Binding, Bindings, Kernel, clear_buffer
 from render_server.gpu.textures import texture_2d
 from render_server.lights.octahedral import MAX_ORDER, harmonics, octahedral_grid, texel_solid_angles
 from render_server.passes.cones import ConeFields, LowResGrid
@@ -123,7 +123,7 @@ class LightProbeCapture:
     """Captures probes one after the other; `length` is the number of harmonics of an occlusion field."""
 
     def __init__(self, gpu: GpuContext, length: int) -> None:
-        self._length = length
+        self._gpu, self._length = gpu, length
         self._table = gpu.ctx.buffer(_direction_table().tobytes())
         self._sums = gpu.ctx.buffer(reserve=PROBE_TEXELS * 16)
         self._pairs = gpu.ctx.buffer(reserve=MAX_ORDER**2 * length * 16)
@@ -145,7 +145,7 @@ class LightProbeCapture:
 
         `changes` is the factor by which objects change the light at each texel of the grid, applied to the sum.
         """
-        self._sums.clear()
+        clear_buffer(self._gpu, self._sums)
         kernel = self._gather if changes is None else self._gather_changed
         kernel.run(
             grid.size,
@@ -159,7 +159,7 @@ class LightProbeCapture:
 
     def forget(self) -> None:
         """Drops what was gathered, so that only the environment is left."""
-        self._sums.clear()
+        clear_buffer(self._gpu, self._sums)
 
     def resolve(self, probe: LightProbe, scene: Bindings, place: Bindings) -> None:
         """Computes radiance from the gathered sums and the environment, and its products."""

@@ -3,10 +3,9 @@
 from collections.abc import Mapping
 
 import moderngl
-import numpy as np
 
 from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import Bindings, Kernel, list_threads
+from render_server.gpu.kernel import Bindings, Kernel, ListGroups, list_threads
 from render_server.gpu.textures import texture_2d
 from render_server.passes.caustics import GREATEST_ALPHA
 from render_server.passes.cones import ConeFields, LowResGrid
@@ -18,8 +17,7 @@ from render_server.passes.shading import DirectLight
 RAY_COUNT = 16
 # Of surfaces; rougher ones use cones. These span many voxels there, and so few rays would show as grain.
 RAY_ROUGHNESS = 0.3
-GROUP = 64  # invocations of a workgroup, one per ray
-ROW = 256  # workgroups per row: OpenGL guarantees at most 65535
+GROUP = 64  # invocations of a workgroup: one per texel of a list, or per ray
 
 # A lobe with 85 % of its energy within 45 degrees or more is as good as diffuse: the wider cones serve.
 ROUGHEST = GREATEST_ALPHA**0.5
@@ -55,6 +53,8 @@ class MirrorRays:
         self._specular = texture_2d(gpu, grid.size, 4, "f2")
         self._pixels = gpu.ctx.buffer(reserve=4 + 4 * grid.picture_size[0] * grid.picture_size[1])
         self._texels = gpu.ctx.buffer(reserve=4 + 4 * grid.size[0] * grid.size[1])
+        self._pixel_groups, self._texel_groups = (ListGroups(gpu, GROUP) for _ in range(2))
+        self._ray_groups = ListGroups(gpu, GROUP // RAY_COUNT)
         self._select, self._hits, self._gather, self._trace, self._smooth = (
             Kernel(gpu, f"mirror_{name}", RAY_ROUGHNESS=RAY_ROUGHNESS, RAY_COUNT=RAY_COUNT, **defines)
             for name in ("select", "hits", gather, "objects", "smooth")
@@ -63,15 +63,13 @@ class MirrorRays:
     def run(self, light: Bindings, scene: Bindings) -> None:
         """Fills `reflection`; `light` holds what the gathering kernel reads besides the scene.
 
-        Waits for the GPU to count the pixels that need rays; builds and traces nothing if there are none.
+        The GPU counts the pixels that need rays, and traces nothing if there are none.
         """
-        count = self._list_pixels(scene)
-        if not count:
-            return
+        self._list_pixels(scene)
         self._gather_light(light, scene)
-        self._trace_rays(count, scene)
-        self._smooth.run(
-            (count,),
+        self._trace_rays(scene)
+        self._smooth.run_counted(
+            self._pixel_groups.count(self._pixels),
             scene,
             Texels=self._pixels,
             reflection=self.reflection,
@@ -79,8 +77,8 @@ class MirrorRays:
             hit_distance=self._hit_distance,
         )
 
-    def _list_pixels(self, scene: Bindings) -> int:
-        """Lists the pixels that need rays and returns their number; the others reflect nothing."""
+    def _list_pixels(self, scene: Bindings) -> None:
+        """Lists the pixels that need rays; the others reflect nothing."""
         _clear_list(self._pixels)
         self._select.run(
             self._grid.picture_size,
@@ -92,7 +90,6 @@ class MirrorRays:
             bounds_centre=tuple(self._objects.centre),
             bounds_radius=self._objects.radius,
         )
-        return _list_length(self._pixels)
 
     def _gather_light(self, light: Bindings, scene: Bindings) -> None:
         """Computes the light at reflected points, at the resolution of the cones."""
@@ -108,8 +105,8 @@ class MirrorRays:
             sample_pixels=grid.pixels,
             scale=grid.scale,
         )
-        self._gather.run(
-            (_list_length(self._texels),),
+        self._gather.run_counted(
+            self._texel_groups.count(self._texels),
             light,
             scene,
             Texels=self._texels,
@@ -120,10 +117,9 @@ class MirrorRays:
             specular_out=self._specular,
         )
 
-    def _trace_rays(self, count: int, scene: Bindings) -> None:
-        groups = -(-count * RAY_COUNT // GROUP)
-        self._trace.run(
-            (GROUP * min(groups, ROW), -(-groups // ROW)),
+    def _trace_rays(self, scene: Bindings) -> None:
+        self._trace.run_counted(
+            self._ray_groups.count(self._pixels),
             self._objects.bindings,
             scene,
             Texels=self._pixels,
@@ -186,8 +182,3 @@ class ScreenCones:
 def _clear_list(texels: moderngl.Buffer) -> None:
     """Clears a list of shaders/common/work_list.glsl."""
     texels.write(bytes(4))
-
-
-def _list_length(texels: moderngl.Buffer) -> int:
-    """Returns the length of a list of texels; waits for the GPU."""
-    return int(np.frombuffer(texels.read(4), np.uint32)[0])

@@ -175,14 +175,14 @@ class DirectLightPair(DirectLight):
 
     def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
         super().__init__(gpu, size, objects_shadow=False)
-        self._unused = texture_2d(gpu, size, 4, "f2")
+        self._unused = [texture_2d(gpu, size, 4, "f2") for _ in range(2)]
 
     def run_both(self, mu: LightBuffers, rho: LightBuffers, grid: LowResGrid, scene: Bindings) -> None:
         """Shades every pixel in both solutions."""
         self.run(grid, {**scene, **mu.bindings})
         self._kernel.run(
             self._size,
-            {**self.bindings, "direct_mu": self._unused, "lobe_mu": self._unused},
+            {**self.bindings, "direct_mu": self._unused[0], "lobe_mu": self._unused[1]},
             _caustics_on(grid, None),
             rho.bindings,
             scene,
@@ -190,7 +190,7 @@ class DirectLightPair(DirectLight):
 
     def release(self) -> None:
         """Frees the GL objects."""
-        self._unused.release()
+        release_all(*self._unused)
         super().release()
 
 

@@ -3,7 +3,7 @@
 import moderngl
 
 from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import Bindings, Kernel, list_threads
+from render_server.gpu.kernel import Bindings, Kernel, clear_buffer, list_threads
 from render_server.gpu.textures import texture_2d
 from render_server.passes.lights import LightBuffers
 from render_server.passes.voxels import PlacedVolume, VoxelMipmap, VoxelStore
@@ -41,6 +41,7 @@ class SplitInjection:
     """Sums into `delta_sums` of both stores, in fixed point, so that the order of threads does not matter."""
 
     def __init__(self, gpu: GpuContext) -> None:
+        self._gpu = gpu
         self._real = Kernel(gpu, "split_inject")
         self._virtual = Kernel(gpu, "split_inject", VIRTUAL=1)
 
@@ -54,7 +55,7 @@ class SplitInjection:
     ) -> None:
         """Injects all lights; `scene` brings the objects' materials."""
         for store in (real, virtual):
-            store.delta_sums.clear(size=store.slot_capacity * LIGHT_SUMS * 4)
+            clear_buffer(self._gpu, store.delta_sums, store.slot_capacity * LIGHT_SUMS * 4)
         sums: Bindings = {
             **real.bindings,
             "RealLight": real.delta_sums,

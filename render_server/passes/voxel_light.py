@@ -11,9 +11,15 @@ import numpy as np
 from jaxtyping import Float32
 
 from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import Binding, Bindings, Kernel, list_threads
+from render_server.gpu.kernel import Binding, Bindings, Kernel, clear_buffer, list_threads
 from render_server.passes.caustics import GREATEST_ALPHA
-from render_server.passes.voxels import VoxelMipmap, VoxelStore
+from render_server.passes.voxels import (
+    LOWER_SURFELS,
+    LOWER_VOLUME,
+    VoxelMipmap,
+    VoxelStore,
+    group_grid_bytes,
+)
 from render_server.scene.albedo_volume import MEAN_ALBEDO, AlbedoVolume
 
 SUPPORT_BYTES = 24
@@ -21,7 +27,7 @@ SUPPORT_BYTES = 24
 SURFEL_LIGHT_BYTES = 2 * 48  # front and back
 GROUP_SUMS_BYTES = 32
 GROUP_LIGHT_BYTES = 32
-HEADER_BYTES = 8
+HEADER_BYTES = 4
 NO_GROUPS: Final[Bindings] = {"SurfelLights": None}
 
 GATHER_CONES = 4  # as good as 16 in pictures: cones that see gathered light average over many groups
@@ -38,8 +44,8 @@ class SurfelGroups:
     """
 
     def __init__(self, gpu: GpuContext, volume_size: int) -> None:
-        self._ctx = gpu.ctx
-        self._grid = gpu.ctx.buffer(reserve=6 * (volume_size // 2) ** 3 * 4)
+        self._gpu = gpu
+        self._grid = gpu.storage_buffer(group_grid_bytes(volume_size), LOWER_VOLUME)
         self._allocate(0)
 
     @property
@@ -58,25 +64,26 @@ class SurfelGroups:
         if store.surfel_capacity != self._room:
             self._release_growing()
             self._allocate(store.surfel_capacity)
-        self._grid.clear()
+        clear_buffer(self._gpu, self._grid)
         self._entries.write(bytes(HEADER_BYTES))
 
     def _allocate(self, surfels: int) -> None:
         """Allocates the buffers that grow, with room for `surfels` surfels."""
         self._room = surfels
-        self.lights = self._ctx.buffer(reserve=max(surfels, 1) * SURFEL_LIGHT_BYTES)
-        self._entries = self._ctx.buffer(reserve=HEADER_BYTES + surfels * 4)
-        self._sums = self._ctx.buffer(reserve=max(surfels, 1) * GROUP_SUMS_BYTES)
-        self._light = self._ctx.buffer(reserve=max(surfels, 1) * GROUP_LIGHT_BYTES)
+        room = max(surfels, 1)
+        sizes = (
+            room * SURFEL_LIGHT_BYTES,
+            HEADER_BYTES + surfels * 4,
+            room * GROUP_SUMS_BYTES,
+            room * GROUP_LIGHT_BYTES,
+        )
+        self.lights, self._entries, self._sums, self._light = (
+            self._gpu.storage_buffer(size, LOWER_SURFELS) for size in sizes
+        )
 
     def _release_growing(self) -> None:
         for buffer in (self.lights, self._entries, self._sums, self._light):
             buffer.release()
-
-    def counts(self) -> tuple[int, int]:
-        """Returns the number of groups, and of those with surfels that the camera does not see; waits for the GPU."""
-        groups, unseen = np.frombuffer(self._entries.read(HEADER_BYTES), np.uint32)
-        return int(groups), int(unseen)
 
     def release(self) -> None:
         """Frees all buffers."""
@@ -96,7 +103,7 @@ class LightVoxels:
         self._gpu = gpu
         self._threads = list_threads(gpu)
         self._kernels: dict[tuple[str, bool], Kernel] = {}
-        self.support = gpu.ctx.buffer(reserve=SUPPORT_BYTES, dynamic=True)
+        self.support = gpu.ctx.buffer(reserve=SUPPORT_BYTES)
 
     @property
     def bindings(self) -> dict[str, Binding]:
@@ -118,7 +125,7 @@ class LightVoxels:
         self, store: VoxelStore, scene: Bindings, groups: SurfelGroups, *, gathered: bool = False
     ) -> None:
         """Sums c_rho - c_mu of real surfaces, whose L_mu `groups` hold; extends the support."""
-        store.delta_sums.clear()
+        clear_buffer(self._gpu, store.delta_sums)
         self._run("REAL_DELTA", store, groups, scene, gathered=gathered)
 
     def light_virtual(
@@ -145,7 +152,7 @@ class LightVoxels:
 
         Run it without objects first, so that `groups` hold E_mu for the other solution.
         """
-        store.sums.clear()
+        clear_buffer(self._gpu, store.sums)
         self._run("REAL_RHO" if with_objects else "REAL_MU", store, groups, scene, gathered=gathered)
 
     def _run(

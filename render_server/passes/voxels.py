@@ -11,7 +11,7 @@ from jaxtyping import Float32, Float64
 
 from protocol.errors import DeltalightError
 from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import Binding, Kernel, list_threads
+from render_server.gpu.kernel import Binding, Kernel, clear_buffer, clear_volume, list_threads
 from render_server.gpu.uniform_block import Block, Float, Int, UniformBlock, Vec3
 from render_server.scene.triangle_mesh import split_triangles
 
@@ -24,6 +24,10 @@ DELTA_SUMS_PER_SLOT = 18
 SURFELS_HEADER_BYTES = 16  # their number, padded
 TOUCHED_HEADER_BYTES = 4
 LEAST_SURFELS = 1024
+LARGEST_ITEM_BYTES = (
+    96  # of what is kept a surfel or slot: SUMS_PER_SLOT, SURFEL_LIGHT_BYTES (voxel_light.py)
+)
+LOWER_VOLUME, LOWER_SURFELS = "method.volume_size", "method.volume_size or method.triangle_budget"
 
 LONGEST_EDGE_VOXELS = 8.0  # longer ones are split before: balances the threads, bounds each one's loops
 
@@ -127,17 +131,25 @@ def mipmap_shape(size: int, directions: int) -> tuple[int, int, int]:
 
 
 def volume_memory_bytes(size: int, directions: int) -> int:
-    """Returns the bytes of a volume set: two RGBA16F mipmaps and two slot grids."""
-    return 2 * math.prod(mipmap_shape(size, directions)) * 8 + 2 * size**3 * 4
+    """Returns the bytes of an RGBA16F mipmap and of the grids of one voxel set: its slots, and its groups."""
+    return math.prod(mipmap_shape(size, directions)) * 8 + size**3 * 4 + group_grid_bytes(size)
 
 
-def memory_statement(size: int, directions: int, budget_mb: int) -> str:
-    """Returns a sentence that states the memory of the volume set.
+def group_grid_bytes(size: int) -> int:
+    """Returns the bytes of the grid of groups: an entry for each block of 2^3 voxels and main axis."""
+    return DIRECTIONS * (size // 2) ** 3 * 4
+
+
+def memory_statement(size: int, directions: int, budget_mb: int, far_size: int = 0) -> str:
+    """Returns a sentence that states the memory of a volume set: two mipmaps and two voxel sets.
+
+    `far_size`: of the coarse volume beyond, which has one of each. Surfels come on top, as many as there are.
 
     Raises:
         DeltalightError: it exceeds the budget.
     """
-    needed = math.ceil(volume_memory_bytes(size, directions) / MEGABYTE)
+    size_bytes = 2 * volume_memory_bytes(size, directions) + volume_memory_bytes(far_size, DIRECTIONS)
+    needed = math.ceil(size_bytes / MEGABYTE)
     if needed > budget_mb:
         raise DeltalightError(
             f"A volume set of {size}^3 voxels takes {needed} MB, beyond the budget of {budget_mb} MB: "
@@ -161,7 +173,7 @@ class VoxelMipmap:
         self.texture = gpu.ctx.texture3d(shape, 4, dtype="f2")
         self.texture.filter = (moderngl.LINEAR, moderngl.LINEAR)
         self.texture.repeat_x = self.texture.repeat_y = self.texture.repeat_z = False
-        self.texture.write(bytes(math.prod(shape) * 8))
+        clear_volume(gpu, self.texture)
 
     def release(self) -> None:
         """Frees the texture."""
@@ -175,10 +187,10 @@ class VoxelStore:
     """
 
     def __init__(self, gpu: GpuContext, volume_size: int) -> None:
-        self._ctx = gpu.ctx
+        self._gpu = gpu
         self.volume_size = volume_size
-        self.grid = gpu.ctx.buffer(reserve=volume_size**3 * 4)
-        self.grid.clear()
+        self.grid = gpu.storage_buffer(volume_size**3 * 4, LOWER_VOLUME)
+        clear_buffer(gpu, self.grid)
         self._allocate(LEAST_SURFELS)
         self.reset(0)
 
@@ -200,22 +212,38 @@ class VoxelStore:
     def _allocate(self, surfels: int) -> None:
         """Allocates the buffers that grow, with room for `surfels` surfels."""
         self.surfel_capacity = surfels
-        self.surfels = self._ctx.buffer(reserve=SURFELS_HEADER_BYTES + surfels * SURFEL_BYTES)
-        self.touched = self._ctx.buffer(reserve=TOUCHED_HEADER_BYTES + self.slot_capacity * 4)
-        self.sums = self._ctx.buffer(reserve=self.slot_capacity * SUMS_PER_SLOT * 4)
-        self.delta_sums = self._ctx.buffer(reserve=self.slot_capacity * DELTA_SUMS_PER_SLOT * 4)
+        slots = self.slot_capacity
+        sizes = (
+            SURFELS_HEADER_BYTES + surfels * SURFEL_BYTES,
+            TOUCHED_HEADER_BYTES + slots * 4,
+            slots * SUMS_PER_SLOT * 4,
+            slots * DELTA_SUMS_PER_SLOT * 4,
+        )
+        self.surfels, self.touched, self.sums, self.delta_sums = (
+            self._gpu.storage_buffer(size, LOWER_SURFELS) for size in sizes
+        )
 
     def _release_growing(self) -> None:
         for buffer in (self.surfels, self.touched, self.sums, self.delta_sums):
             buffer.release()
 
     def reset(self, surfel_bound: int) -> None:
-        """Begins a new voxelisation of at most `surfel_bound` surfels; the old voxels must have been cleared."""
+        """Begins a new voxelisation of at most `surfel_bound` surfels; the old voxels must have been cleared.
+
+        Raises:
+            DeltalightError: buffers cannot hold so many; the store is as it was.
+        """
         if surfel_bound > self.surfel_capacity:
+            self._gpu.check_storage(surfel_bound * LARGEST_ITEM_BYTES, LOWER_SURFELS)
             self._release_growing()
-            self._allocate(int(surfel_bound * 1.25) + LEAST_SURFELS)
+            self._allocate(self._room_for(surfel_bound))
         self.surfels.write(bytes(SURFELS_HEADER_BYTES))
         self.touched.write(bytes(TOUCHED_HEADER_BYTES))
+
+    def _room_for(self, surfels: int) -> int:
+        """Room to grow, up to what a buffer can hold."""
+        most = int(self._gpu.ctx.info["GL_MAX_SHADER_STORAGE_BLOCK_SIZE"]) // LARGEST_ITEM_BYTES
+        return max(surfels, min(int(surfels * 1.25) + LEAST_SURFELS, most - 1))
 
     def counts(self) -> tuple[int, int]:
         """Returns the numbers of touched voxels and surfels; waits for the GPU (tests and reports only)."""
@@ -232,6 +260,7 @@ class Voxelize:
     """Clips triangles against the voxels they touch: surfels and touched voxels (docs/method.md 4.2)."""
 
     def __init__(self, gpu: GpuContext) -> None:
+        self._gpu = gpu
         self._kernel = Kernel(gpu, "voxelize")
         self._triangles = gpu.ctx.buffer(reserve=64)
 
@@ -241,6 +270,7 @@ class Voxelize:
         store.reset(bound)
         if not len(pieces):
             return
+        self._gpu.check_storage(pieces.nbytes, LOWER_SURFELS)
         self._triangles.orphan(pieces.nbytes)
         self._triangles.write(pieces.tobytes())
         self._kernel.run(

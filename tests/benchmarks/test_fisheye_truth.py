@@ -10,7 +10,7 @@ from benchmarks.ground_truth.scenes import scene_named
 from benchmarks.ground_truth.truth import Truth, ensure_truth
 from benchmarks.quality.case import SceneCase
 from benchmarks.quality.metrics import Comparison
-from benchmarks.quality.variants import FIXED, parse_variants
+from benchmarks.variants import FIXED, parse_variants
 from protocol.frames import ViewFrame
 from protocol.scene_lights import Lights
 from protocol.scene_lights import SphereLight as GivenSphere

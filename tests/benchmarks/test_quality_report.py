@@ -12,7 +12,7 @@ from benchmarks.quality import report
 from benchmarks.quality.evaluate import CEILING, QualityJob, QualityResult, SceneResult, VariantResult
 from benchmarks.quality.report import require_replaceable, write_report
 from benchmarks.quality.tables import COLUMNS
-from benchmarks.quality.variants import parse_variants
+from benchmarks.variants import parse_variants
 from protocol.errors import DeltalightError
 
 

@@ -1,39 +1,281 @@
-"""`bench speed` takes each kind of method: its frames are told into still and moving ones, its passes are named."""
+"""`bench speed` and `bench counts` on tiny pictures: what moves is what runs, figures hang together."""
 
+import json
+from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
+from rich.progress import Progress
 
-from benchmarks.speed import WARM_UP_FRAMES, _measure
-from render_server.gpu.context import create_context
-from render_server.renderer import SceneRenderer
-from services.commands.options import Method
-from services.demo import with_method
-from tests.render_server.scenes import Stage, everyday, frame, look_at
+from benchmarks.cli import DEFAULT_MOTIONS, TIMEABLE, TIMED_METHODS
+from benchmarks.speed.counts import count_motion
+from benchmarks.speed.measure import FrameTimes, motion_figures, time_step
+from benchmarks.speed.motions import (
+    ARM_STEPS,
+    DRAG_STEPS,
+    LAMP_SHARES,
+    MOTIONS,
+    STANDING,
+    SWING,
+    Take,
+    parse_motions,
+    steps_of,
+)
+from benchmarks.speed.peaks import measure_peaks, stage_bytes
+from benchmarks.speed.report import MotionFigures, Peaks, read_report
+from benchmarks.variants import FIXED, parse_variants
+from protocol.errors import DeltalightError
+from protocol.scene import SceneDocument
+from protocol.source import open_source
+from render_server.gpu.context import GpuContext, create_context
+from render_server.renderer import SceneRenderer, resized_frame
+from sensor_node.view_frames import ViewFrameBuilder
+from services.cli import run
+from services.demo import RECORDING, demo_scene
+
+pytestmark = pytest.mark.skipif(
+    not RECORDING.is_file(), reason="the demo's recording is not in this checkout"
+)
+SIZE = (64, 48)
+PEAKS = Peaks(bytes_per_s=1e9, flops_per_s=1e9)
+
+
+@pytest.fixture(scope="module")
+def gpu() -> Iterator[GpuContext]:
+    context = create_context()
+    yield context
+    context.release()
+
+
+@pytest.fixture(scope="module")
+def take() -> Take:
+    """Two frames of the demo at rest and all of its swing, small."""
+    source = open_source(RECORDING)
+    builder = ViewFrameBuilder(source)
+    standing, swing = (
+        [resized_frame(builder(source[number]), *SIZE) for number in numbers]
+        for numbers in (STANDING[:2], SWING)
+    )
+    return Take(standing, swing)
+
+
+@pytest.fixture(scope="module")
+def scene() -> SceneDocument:
+    (paper,) = parse_variants("paper:volume_size=32,rsm_size=128")
+    demo = demo_scene("dvct")
+    return paper.applied(demo.replaced(lights=demo.lights.replaced(surroundings="none")), None)
+
+
+@pytest.fixture(scope="module")
+def renderer(gpu: GpuContext, scene: SceneDocument) -> Iterator[SceneRenderer]:
+    made = SceneRenderer(gpu, scene)
+    yield made
+    made.release()
+
+
+def measured(renderer: SceneRenderer, motion: str, take: Take, scene: SceneDocument) -> MotionFigures:
+    times = [time_step(renderer, step) for step in steps_of(motion, take, scene, 4)][1:]
+    assert renderer.graph is not None
+    return motion_figures(times, stage_bytes(renderer.graph), PEAKS, 1e9)
+
+
+# Motions
+
+
+def test_the_camera_never_shows_two_equal_frames_after_another(take: Take, scene: SceneDocument) -> None:
+    frames = [step.frame for step in steps_of("camera", take, scene, 3 * len(SWING))]
+    assert all(frame.pose is not None and frame.depth is not None for frame in frames)
+    for before, after in pairwise(frames):
+        assert before.pose is not None
+        assert after.pose is not None
+        moved = after.pose.world_from_camera[:3, 3] - before.pose.world_from_camera[:3, 3]
+        assert np.linalg.norm(moved) > 0.005
+
+
+def test_an_arm_reaches_further_into_colour_and_depth_and_back(take: Take, scene: SceneDocument) -> None:
+    steps = list(steps_of("arm", take, scene, ARM_STEPS + 1))
+    covered = []
+    for step in steps:
+        assert step.scene is scene
+        depth = step.frame.depth
+        assert depth is not None
+        arm = depth.valid & (depth.depth_m > 0) & (depth.depth_m < 0.43)
+        assert depth.depth_m[arm].min() > 0.25
+        red, _, blue = step.frame.color[arm].mean(axis=0)
+        assert red > 1.3 * blue
+        covered.append(arm.mean())
+    half = ARM_STEPS // 2
+    assert all(more > less for less, more in pairwise(covered[: half + 1]))
+    assert all(less < more for more, less in pairwise(covered[half:]))
+
+
+def test_an_object_is_dragged_and_a_lamp_dimmed_every_frame(take: Take, scene: SceneDocument) -> None:
+    dragged = [step.scene for step in steps_of("object", take, scene, DRAG_STEPS + 2)]
+    places = [each.objects[0].pose.translation_m for each in dragged]
+    assert all(before != after for before, after in pairwise(places))
+    assert all(each.lights == scene.lights for each in dragged)
+    dimmed = [step.scene for step in steps_of("lamps", take, scene, len(LAMP_SHARES) + 1)]
+    strengths = [each.lights.manual[0].intensity for each in dimmed]
+    assert all(before != after for before, after in pairwise(strengths))
+    assert min(strengths) == 0
+    assert all(each.objects == scene.objects for each in dimmed)
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_frames_of_a_motion_are_new_and_the_same_every_time(
+    motion: str, take: Take, scene: SceneDocument
+) -> None:
+    first, again = (list(steps_of(motion, take, scene, 5)) for _ in range(2))
+    assert len({id(step.frame) for step in first}) == 5
+    times = [step.frame.timestamp_ns for step in first]
+    assert times == sorted(set(times))
+    for one, other in zip(first, again, strict=True):
+        assert np.array_equal(one.frame.color, other.frame.color)
+        assert one.scene == other.scene
+
+
+def test_names_of_motions_and_methods() -> None:
+    assert parse_motions(DEFAULT_MOTIONS) == list(MOTIONS)
+    assert parse_motions("still, arm") == ["still", "arm"]
+    for text, sentence in (("stil", "nearest is still"), ("", "camera"), ("arm,arm", "twice")):
+        with pytest.raises(DeltalightError, match=sentence):
+            parse_motions(text)
+    assert [each.name for each in parse_variants(TIMED_METHODS, TIMEABLE)] == TIMED_METHODS.split(",")
+    assert set(TIMEABLE) < set(FIXED)
+    for name in ("camera", "path", "fisheye"):
+        with pytest.raises(DeltalightError, match=f"'{name}' is no method"):
+            parse_variants(name, TIMEABLE)
+
+
+# Figures
 
 
 @pytest.mark.slow
-def test_each_kind_of_method_has_still_and_moving_frames(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_what_moves_is_what_runs(renderer: SceneRenderer, take: Take, scene: SceneDocument) -> None:
+    found = {motion: measured(renderer, motion, take, scene) for motion in MOTIONS}
+    shared = {"upload", "composite", "readback"}
+    assert found["still"].stages.keys() == shared
+    for motion in ("camera", "arm"):
+        assert {"real surface", "object surface", "voxelize real"} | shared <= found[motion].stages.keys()
+        assert found[motion].stages["real surface"].runs == 1
+    assert "real surface" not in found["object"].stages
+    assert found["object"].stages["voxelize objects"].runs == 1
+    assert not {"real surface", "object surface", "voxelize real"} & found["lamps"].stages.keys()
+    assert found["lamps"].stages["environment"].runs == 1
+    for figures in found.values():
+        assert figures.stages["upload"].moved_bytes is None
+        assert figures.stages["composite"].moved_bytes > 4 * SIZE[0] * SIZE[1]
+        assert figures.late == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "method",
+    [
+        "none",
+        "dlpv-paper:volume_size=16",
+        "differential:volume_size=32,rsm_size=128",
+        "aroof:resolution=12,rays=64,shells=2",
+    ],
+)
+def test_each_kind_of_method_is_measured_and_counted(method: str, gpu: GpuContext, take: Take) -> None:
+    (variant,) = parse_variants(method, TIMEABLE)
+    scene = variant.applied(demo_scene("dvct"), None)
+    renderer = SceneRenderer(gpu, scene)
+    camera, still = (measured(renderer, motion, take, scene) for motion in ("camera", "still"))
+    counts = count_motion(renderer, list(steps_of("camera", take, scene, 3)), 1)
+    renderer.release()
+    assert {"direct light", "composite"} <= camera.stages.keys()
+    assert "direct light" not in still.stages
+    assert counts.per_frame["dispatches"] > 10
+
+
+def test_figures_are_of_the_frames_in_which_a_stage_ran() -> None:
+    times = [
+        FrameTimes(10, 9, 5, {"a": 1.0, "b": 4.0}),
+        FrameTimes(20, 19, 6, {"a": 3.0}),
+        FrameTimes(30, 28, 7, {"a": 2.0}),
+    ]
+    found = motion_figures(times, {"a": 4_000_000}, PEAKS, 15)
+    assert (found.frame_ms.median, found.picture_ms.median, found.submit_ms.median) == (20, 19, 6)
+    assert found.frame_ms.p95 == pytest.approx(29)
+    assert (found.stages_ms.median, found.outside_ms.median) == (3, 17)
+    assert found.late == 2
+    a, b = found.stages["a"], found.stages["b"]
+    assert (a.ms.median, a.runs, a.moved_bytes, a.floor_ms, a.times_floor) == (2, 1, 4_000_000, 4, 0.5)
+    assert (b.ms.median, b.runs, b.floor_ms, b.times_floor) == (4, 1 / 3, None, None)
+
+
+def test_peaks_are_measured(gpu: GpuContext, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("benchmarks.speed.peaks.COPIED_BYTES", 1 << 20)
+    monkeypatch.setattr("benchmarks.speed.peaks.SOFTWARE_THREADS", 256)
+    found = measure_peaks(gpu)
+    assert min(found.bytes_per_s, found.flops_per_s) > 0
+    assert gpu.ctx.error == "GL_NO_ERROR"
+
+
+@pytest.mark.slow
+def test_counted_frames_agree_with_what_the_graph_ran(
+    renderer: SceneRenderer, take: Take, scene: SceneDocument
 ) -> None:
-    monkeypatch.setenv("DELTALIGHT_CACHE", str(tmp_path / "cache"))
-    gpu = create_context()
-    document = everyday(Stage(tmp_path))
-    still, moved = frame(), frame(pose=look_at((0.4, -0.8, 0.6)))
-    views = [*[still] * WARM_UP_FRAMES, still, moved]
-    try:
-        for method in (Method.EXACT, Method.DLPV_PAPER, Method.DIFFERENTIAL, Method.AROOF):
-            changed = with_method(document, method)
-            if method is Method.AROOF:  # precomputes the least that it can
-                changed = changed.replaced(
-                    method={"name": "aroof", "resolution": 12, "rays": 64, "shells": 2}
-                )
-            renderer = SceneRenderer(gpu, changed)
-            found = _measure(renderer, views)
-            renderer.release()
-            assert found["still_frame_ms"] is not None, method
-            assert found["moving_frame_ms"] is not None, method
-            assert {"composite", "direct light"} <= set(found["passes"]), method
-            assert found["passes"]["direct light"]["runs"] == 0.5, method
-    finally:
-        gpu.release()
+    still = count_motion(renderer, list(steps_of("still", take, scene, 7)), 2)
+    assert still.per_frame == {
+        "dispatches": 2,  # linearize and composite
+        "draws": 0,
+        "framebuffer_clears": 0,
+        "buffer_clears": 0,
+        "buffer_clear_bytes": 0,
+        "uploaded_bytes": 2 * 4 * SIZE[0] * SIZE[1],  # to be linearised, and to be composed over
+        "reads": 0,
+        "uniform_writes": 0,
+    }
+    camera = count_motion(renderer, list(steps_of("camera", take, scene, 6)), 2)
+    assert camera.per_frame["draws"] >= 9  # eight samples of the objects, and a shadow map
+    assert camera.per_frame["dispatches"] > 10
+    assert 0 < camera.python_ms.median <= camera.python_ms.p95
+
+
+# The commands
+
+OPTIONS = ("--methods", "paper:cone_scale=4", "--motions", "still,camera", "--frames", "2", "--size", "64x48")
+
+
+@pytest.fixture
+def prepared(monkeypatch: pytest.MonkeyPatch, take: Take, scene: SceneDocument) -> None:
+    """The commands take the small frames and the small scene; peaks are not measured."""
+
+    def small(_: Progress) -> Take:
+        return take
+
+    monkeypatch.setattr("benchmarks.speed.measure.prepare_take", small)
+    monkeypatch.setattr("benchmarks.speed.counts.prepare_take", small)
+    monkeypatch.setattr("benchmarks.speed.measure.measure_peaks", lambda _: PEAKS)
+    monkeypatch.setattr("benchmarks.speed.measure.demo_scene", lambda _: scene)
+
+
+@pytest.mark.usefixtures("prepared")
+def test_a_run_writes_its_report_and_prints_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    report = tmp_path / "speed.json"
+    more = ("--no-end-to-end", "--budget-ms", "0.1", "--out", str(report))
+    assert run(["bench", "speed", *OPTIONS, *more]) == 0
+    shown = capsys.readouterr().out
+    assert "2/2" in shown
+    assert "real surface" in shown
+    found = read_report(report)
+    assert (found.size, found.frames) == (SIZE, 2)
+    assert list(found.methods["paper:cone_scale=4"].motions) == ["still", "camera"]
+    assert run(["bench", "speed", "--compare", str(report), str(report)]) == 0
+    assert "0 of" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("prepared")
+def test_counts_are_printed_as_table_and_as_json(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    report = tmp_path / "counts.json"
+    assert run(["bench", "counts", *OPTIONS, "--out", str(report)]) == 0
+    assert "reads that wait for the GPU" in capsys.readouterr().out
+    counts = json.loads(report.read_text())["methods"]["paper:cone_scale=4"]
+    assert counts["still"]["per_frame"]["dispatches"] == 2
+    assert counts["camera"]["per_frame"]["draws"] >= 9

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from protocol.board import BoardSpec
@@ -34,6 +35,10 @@ from tests.render_server.scenes import (
     look_at,
     sphere_light,
 )
+
+FOLDER = Path(__file__).with_name("goldens")
+LEAST_PSNR_DB = 60.0  # of pictures by another machine than the one that recorded them
+SHOWN = 1  # the frame that the sheets of goldens show: the turned one
 
 PICTURE = {"width": 96, "height": 72}
 LATER_NS = 50_000_000
@@ -231,3 +236,24 @@ def pictures_of(
     finally:
         renderer.release()
     return pictures, dispatches
+
+
+def sheet_path(method: str) -> Path:
+    return FOLDER / f"protected_{method}.png"
+
+
+def tile(case: Case) -> tuple[slice, slice]:
+    """Where a sheet shows the case."""
+    row, column = GEOMETRIES.index(case.geometry), list(KINDS).index(case.kind)
+    width, height = PICTURE["width"], PICTURE["height"]
+    return np.s_[row * height : (row + 1) * height, column * width : (column + 1) * width]
+
+
+def golden_of(case: Case) -> np.ndarray:
+    """The recorded picture (72, 96, 3; uint8) of the case's frame SHOWN.
+
+    Raises:
+        FileNotFoundError: the method's sheet is missing.
+    """
+    encoded = np.fromfile(sheet_path(case.method), np.uint8)
+    return np.asarray(cv2.imdecode(encoded, cv2.IMREAD_COLOR)[..., ::-1][tile(case)])

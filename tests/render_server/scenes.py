@@ -245,3 +245,9 @@ def composite(gpu: GpuContext, document: SceneDocument, view: ViewFrame | None =
     color = renderer.render(frame() if view is None else view).color
     renderer.release()
     return color
+
+
+def psnr_db(a: np.ndarray, b: np.ndarray) -> float:
+    """Of two pictures of codes; infinite if they are the same."""
+    error = np.mean((a.astype(float) - b.astype(float)) ** 2)
+    return float("inf") if error == 0 else float(10 * np.log10(255**2 / error))

@@ -30,6 +30,7 @@ from tests.render_server.scenes import (
     frame,
     look_at,
     plain,
+    psnr_db,
 )
 
 pytestmark = pytest.mark.usefixtures("clean_gl")
@@ -60,11 +61,6 @@ SCENES: dict[str, Callable[[Stage], tuple[SceneDocument, ViewFrame]]] = {
     "given_model": on_given_model,
     "depth": on_depth,
 }
-
-
-def psnr_db(a: np.ndarray, b: np.ndarray) -> float:
-    error = np.mean((a.astype(float) - b.astype(float)) ** 2)
-    return float("inf") if error == 0 else float(10 * np.log10(255**2 / error))
 
 
 @pytest.mark.parametrize("name", SCENES)

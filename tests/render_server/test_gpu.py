@@ -5,6 +5,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import moderngl
 import numpy as np
@@ -13,15 +14,29 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from protocol.errors import DeltalightError
+from protocol.scene_method import DifferentialMethod, DvctMethod
 from render_server.gpu import shader_source as shader_text
-from render_server.gpu.context import GpuContext, explain_context_failure, is_software_renderer
+from render_server.gpu.context import (
+    NEEDED,
+    GpuContext,
+    check_limits,
+    explain_context_failure,
+    is_software_renderer,
+    limits_of,
+)
 from render_server.gpu.kernel import Kernel
-from render_server.gpu.textures import AsyncReadback, texture_2d
+from render_server.gpu.textures import AsyncReadback, gpu_objects, sizes_bytes, texture_2d
 from render_server.gpu.timers import PassTimers
+from render_server.methods.differential import SolutionVoxels
+from render_server.methods.dvct import InjectedVoxels
+from render_server.methods.voxel_volumes import DeltaVoxels
 from render_server.passes.voxels import (
+    LARGEST_ITEM_BYTES,
+    LEAST_SURFELS,
     PlacedVolume,
     VolumePlacement,
     VoxelMipmap,
+    VoxelStore,
     memory_statement,
     mipmap_shape,
     place_volume,
@@ -204,6 +219,7 @@ def test_software_renderers_are_known_by_name(name: str, software: bool) -> None
 
 CHILD = """
 from protocol.errors import DeltalightError
+from protocol.scene_method import DifferentialMethod, DvctMethod
 from render_server.gpu.context import create_context
 try:
     create_context(device=99)
@@ -231,12 +247,87 @@ def test_unusable_contexts_are_refused() -> None:
     assert "--allow-software" in no_gpu
 
 
+# Limits
+
+
+def test_this_device_has_what_is_needed(gpu: GpuContext) -> None:
+    limits = limits_of(gpu.ctx)
+    assert set(limits) == set(NEEDED)
+    check_limits(gpu.renderer_name, limits)
+
+
+@pytest.mark.parametrize("name", NEEDED)
+def test_a_device_that_lacks_something_is_refused_by_name_and_numbers(name: str) -> None:
+    less = {**NEEDED, name: NEEDED[name] - 1}
+    with pytest.raises(
+        DeltalightError, match=rf"Old GPU has {name} {less[name]}, and {NEEDED[name]} is needed"
+    ):
+        check_limits("Old GPU", less)
+
+
+def test_a_buffer_beyond_what_shaders_reach_is_refused(gpu: GpuContext) -> None:
+    limit = gpu.ctx.info["GL_MAX_SHADER_STORAGE_BLOCK_SIZE"]
+    gpu.check_storage(limit, "nothing")
+    with pytest.raises(
+        DeltalightError, match=rf"200 MB .* reach {limit / 1e6:.0f} MB .* lower method.volume_size"
+    ):
+        gpu.storage_buffer(max(200_000_000, limit + 1), "method.volume_size")
+
+
+def test_a_store_grows_up_to_what_a_buffer_holds_and_is_kept_where_that_is_too_little(
+    gpu: GpuContext, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(gpu.ctx.info, "GL_MAX_SHADER_STORAGE_BLOCK_SIZE", 10_000 * LARGEST_ITEM_BYTES)
+    store = VoxelStore(gpu, 32)
+    store.reset(9_000)
+    assert 9_000 <= store.surfel_capacity < 10_000
+    with pytest.raises(DeltalightError, match="triangle_budget"):
+        store.reset(10_001)
+    assert store.counts() == (0, 0)
+    store.release()
+
+
 # Volumes
 
 
+VOXELS = [
+    (DeltaVoxels, DvctMethod(), 6, 32),
+    (SolutionVoxels, DifferentialMethod(), 6, 32),
+    (InjectedVoxels, None, 1, 0),
+]
+
+
+@pytest.mark.parametrize(("make", "settings", "directions", "far_size"), VOXELS)
+def test_the_stated_memory_is_what_is_allocated(
+    gpu: GpuContext,
+    make: Any,  # noqa: ANN401
+    settings: Any,  # noqa: ANN401
+    directions: int,
+    far_size: int,
+) -> None:
+    """But for surfels, of which there are none yet, and uniform blocks and the like."""
+    size = 64
+    voxels = make(gpu, size) if settings is None else make(gpu, settings, size)
+    large = [item for item in set(gpu_objects(voxels)) if isinstance(item, moderngl.Texture3D)]
+    sets = [voxels.real, voxels.objects, *([voxels.far._set] if far_size else [])]
+    grids = [grid for each in sets for grid in (each.store.grid, each.groups._grid)]
+    stated = 2 * volume_memory_bytes(size, directions) + volume_memory_bytes(far_size, 6)
+    assert sum(sizes_bytes([*large, *grids])) == stated
+    assert f"{math.ceil(stated / 1e6)} MB" in memory_statement(size, directions, 4096, far_size)
+    surfels = 3 * LEAST_SURFELS * 400  # bytes a surfel, with its slot, light and group
+    assert sizes_bytes([voxels])[0] - stated < surfels
+    voxels.release()
+
+
+def test_a_volume_begins_empty(gpu: GpuContext) -> None:
+    mipmap = VoxelMipmap(gpu, 40, 6)
+    assert not np.frombuffer(mipmap.texture.read(), np.float16).any()
+    mipmap.release()
+
+
 def test_memory_beyond_the_budget_is_refused_with_both_numbers() -> None:
-    needed = math.ceil((2 * 512 * 512 * (6 * 512 + 3 * 256) * 8 + 2 * 512**3 * 4) / 1e6)
-    assert volume_memory_bytes(512, 6) == pytest.approx(needed * 1e6, rel=1e-4)
+    grids = 512**3 * 4 + 6 * 256**3 * 4
+    needed = math.ceil(2 * (512 * 512 * (6 * 512 + 3 * 256) * 8 + grids) / 1e6)
     with pytest.raises(DeltalightError, match=rf"{needed} MB.*2048 MB.*volume_size"):
         memory_statement(512, 6, 2048)
     assert f"{needed} MB" in memory_statement(512, 6, needed)

@@ -9,18 +9,13 @@ import subprocess
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from protocol.scene import SceneDocument, parse_scene
-from render_server.gpu.context import GpuContext, create_context
+from render_server.gpu.context import NEEDED, create_context
 from render_server.gpu.kernel import IMAGES, SAMPLERS
 from render_server.gpu.shader_source import SHADERS
-from render_server.passes.lpv import LpvPropagate
-from render_server.renderer import SceneRenderer
-from tests.render_server.protected_scenes import Case, frames_of, scene_of
-from tests.render_server.scenes import Stage
+from tests.render_server.shader_variants import PARTS
 
 VALIDATOR = shutil.which("glslangValidator")
 pytestmark = [
@@ -28,24 +23,6 @@ pytestmark = [
     pytest.mark.skipif(VALIDATOR is None, reason="glslangValidator (package glslang-tools) is not installed"),
 ]
 
-CASES: dict[Case, dict[str, Any]] = {  # with changes of the method
-    Case("exact", "depth", "mirror"): {},
-    Case("exact", "fused", "antialiased"): {
-        "voxels": "isotropic",
-        "coverage": "multiplied",
-        "shadow": "cone",
-        "volume_size": 40,
-    },
-    Case("paper", "depth", "mirror"): {},
-    Case("differential", "depth", "mirror"): {},
-    Case("dlpv", "model", "mirror"): {},
-    Case("dlpv-paper", "depth", "plain"): {},
-    Case("aroof", "depth", "mirror"): {},
-}
-VIEWS = {
-    Case("exact", "depth", "mirror"): ("effects", "delta", "volume", "rsm"),
-    Case("paper", "depth", "mirror"): ("volume",),
-}
 # What every implementation of OpenGL 4.3 has at least, for a shader of each stage.
 GUARANTEED: Mapping[str, Mapping[str, int]] = {
     "vert": {"storage blocks": 0, "samplers": 16, "images": 0, "uniform blocks": 12},
@@ -58,6 +35,14 @@ GUARANTEED: Mapping[str, Mapping[str, int]] = {
         "shared bytes": 32768,
         "invocations": 1024,
     },
+}
+REFUSED_BELOW = {  # what a device without is refused
+    "storage blocks": "GL_MAX_COMPUTE_SHADER_STORAGE_BLOCKS",
+    "samplers": "GL_MAX_COMPUTE_TEXTURE_IMAGE_UNITS",
+    "images": "GL_MAX_COMPUTE_IMAGE_UNIFORMS",
+    "uniform blocks": "GL_MAX_COMPUTE_UNIFORM_BLOCKS",
+    "shared bytes": "GL_MAX_COMPUTE_SHARED_MEMORY_SIZE",
+    "invocations": "GL_MAX_COMPUTE_WORK_GROUP_INVOCATIONS",
 }
 ELEMENT_BYTES = {"float": 4, "int": 4, "uint": 4, "bool": 4, "vec2": 8, "vec3": 16, "vec4": 16}
 BLOCK = re.compile(r"\b(buffer|uniform)\s+\w+\s*\{")
@@ -101,28 +86,10 @@ def programs(tmp_path_factory: pytest.TempPathFactory) -> Programs:
 
     gpu = create_context()
     gpu.compile_watchers.append(keep)
-    for case, changes in CASES.items():
-        render(gpu, case, changes, tmp_path_factory.mktemp("scene"))
-    for tiled in (False, True):
-        LpvPropagate(gpu, tiled=tiled).release()
+    for compile_part in PARTS.values():
+        compile_part(gpu, tmp_path_factory.mktemp("scene"))
     gpu.release()
     return found
-
-
-def render(gpu: GpuContext, case: Case, changes: dict[str, Any], folder: Path) -> None:
-    """Renders the case's first frame, in each debug view too that VIEWS names."""
-    scene = changed(scene_of(case, Stage(folder)), "method", changes)
-    renderer = SceneRenderer(gpu, scene)
-    for view in ("composite", *VIEWS.get(case, ())):
-        renderer.set_scene(changed(scene, "output", {"view": view}))
-        renderer.render(frames_of(case)[0])
-    renderer.release()
-
-
-def changed(scene: SceneDocument, part: str, changes: dict[str, Any]) -> SceneDocument:
-    document = scene.model_dump(mode="json", exclude_unset=True)
-    document[part] = {**document[part], **changes}
-    return parse_scene(document)
 
 
 def shaders_of(programs: Programs) -> Iterator[tuple[str, Shader]]:
@@ -153,6 +120,7 @@ def test_no_variant_needs_more_than_opengl_guarantees(programs: Programs) -> Non
     }
     assert {name: kinds for name, kinds in beyond.items() if kinds} == {}
     assert max(needed["storage blocks"] for needed in needs.values()) == 8
+    assert GUARANTEED["comp"] == {kind: NEEDED[name] for kind, name in REFUSED_BELOW.items()}
     assert max(needed.get("shared bytes", 0) for needed in needs.values()) > 16384
 
 

@@ -44,8 +44,10 @@ COMMANDS = {
     "graph",
     "schema",
     "bench speed",
+    "bench counts",
     "bench quality",
     "bench rest",
+    "gpu-check",
 }
 
 
@@ -141,6 +143,8 @@ def test_server_and_up_refuse_wrong_input_in_a_sentence(cli: RunCli, tmp_path: o
         (("up", "--source", "synthetic", "--scene", f"{tmp_path}/absent.json"), "absent.json"),
         (("--log-level", "loud", "doctor"), "log level"),
         (("bench", "speed", "--methods", "guess"), "exact"),
+        (("bench", "speed", "--motions", "stil"), "still"),
+        (("bench", "counts", "--methods", "path"), "exact"),
         (("bench", "quality", "--methods", "exact:cone_cont=9"), "cone_count"),
         (("bench", "quality", "--scenes", "tabletopp"), "tabletop"),
         (("bench", "quality", "--spp", 3, "--scenes", "tabletop", "--out", f"{tmp_path}/quality"), "even"),

@@ -13,11 +13,12 @@ layout(location = 2) out vec2 out_uv;
 layout(location = 3) out vec4 out_tint;
 
 void main() {
-    vec3 n = normalize(normal);
     vec3 view = camera_position - world;
-    // An interpolated normal may face away at a silhouette: then use the triangle's own.
-    vec3 flat_normal = normalize(cross(dFdx(world), dFdy(world)));
+    // An interpolated normal may vanish in a fold, or face away at a silhouette: then use the triangle's own.
+    vec3 across = cross(dFdx(world), dFdy(world));
+    vec3 flat_normal = normalize(across == vec3(0.0) ? view : across);
     if (dot(flat_normal, view) < 0.0) flat_normal = -flat_normal;
+    vec3 n = normal == vec3(0.0) ? flat_normal : normalize(normal);
     bool double_sided = materials[int(material)].flags.x > 0.5;
     if (dot(n, view) < 0.0) n = double_sided ? -n : flat_normal;
     out_position = vec4(world, depth);

@@ -29,7 +29,7 @@ void add_to_group(Surfel s, uint surfel, int side, vec3 n) {
         atomicAdd(group_sums[at + GROUP_PLACE + j], fixed_point(weight * place[j]));
     }
     if (!has_seen || surfel_lights[2u * surfel + uint(side)].radiance.w > 0.5) return;
-    if (atomicAdd(group_sums[at + GROUP_UNSEEN], 1) == 0) atomicAdd(unseen_count, 1u);
+    atomicAdd(group_sums[at + GROUP_UNSEEN], 1);
 }
 #else
 void add_to_group(Surfel s, uint surfel, int side, vec3 n) {
@@ -38,7 +38,7 @@ void add_to_group(Surfel s, uint surfel, int side, vec3 n) {
     uint slot = atomicAdd(group_count, 1u);
     if (slot >= uint(group_entries.length())) return;
     group_entries[slot] = entry;
-    group_grid[entry] = slot + 1u;
+    atomicExchange(group_grid[entry], slot + 1u);   // others compare and swap it
     for (int i = 0; i < GROUP_SUMS; ++i) group_sums[int(slot) * GROUP_SUMS + i] = 0;
 }
 #endif

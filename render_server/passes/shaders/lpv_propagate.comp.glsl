@@ -42,6 +42,7 @@ void main() {
         ivec3 cell = low + in_cube(i, WIDE) - FUSED;
         tile[i] = in_grid(cell, cells) ? state[base + cell_index(cell, cells)] : vec4(0.0);
     }
+    memoryBarrierShared();
     barrier();
     ivec3 own = ivec3(gl_LocalInvocationID);
     uint own_index = base + cell_index(low + own, cells);
@@ -56,11 +57,13 @@ void main() {
             uvec2 open = has_geometry && inside ? transmitted[cell_index(cell, cells)] : uvec2(0xffffffffu);
             results[j] = inside ? gathered(c, open) : vec4(0.0);
         }
+        memoryBarrierShared();
         barrier();
         for (int j = 0; j < ROUNDS; ++j) {
             int i = thread + j * THREADS;
             if (i < edge * edge * edge) tile[tile_index(in_cube(i, edge) + done)] = results[j];
         }
+        memoryBarrierShared();
         barrier();
         mine = tile[tile_index(own + FUSED)];
         sum += mine;

@@ -48,6 +48,6 @@ void gather(ivec2 texel) {
 }
 
 void main() {
-    uint i = gl_GlobalInvocationID.x;
+    uint i = counted_group() * 64u + gl_LocalInvocationIndex;
     if (i < listed_count()) gather(texel_of_index(texels[i], textureSize(sample_pixels, 0).x));
 }

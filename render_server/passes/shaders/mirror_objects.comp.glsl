@@ -64,8 +64,7 @@ vec4 trace(ivec2 pixel, Ray ray, out float met_at) {
 
 void main() {
     uint inside = gl_LocalInvocationIndex;
-    uint group = gl_WorkGroupID.y * gl_NumWorkGroups.x + gl_WorkGroupID.x;
-    uint i = group * (64u / uint(RAY_COUNT)) + inside / uint(RAY_COUNT);
+    uint i = counted_group() * (64u / uint(RAY_COUNT)) + inside / uint(RAY_COUNT);
     int j = int(inside % uint(RAY_COUNT));
     of_ray[inside] = vec4(0.0);
     counted[inside] = distances[inside] = 0.0;
@@ -79,6 +78,7 @@ void main() {
             of_ray[inside] = trace(pixel, ray, distances[inside]);
         }
     }
+    memoryBarrierShared();
     barrier();
     if (j != 0 || pixel.x < 0) return;
     vec4 sum = vec4(0.0);

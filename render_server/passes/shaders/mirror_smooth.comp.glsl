@@ -29,6 +29,6 @@ void smooth_pixel(ivec2 pixel) {
 }
 
 void main() {
-    uint i = gl_GlobalInvocationID.x;
+    uint i = counted_group() * 64u + gl_LocalInvocationIndex;
     if (i < listed_count()) smooth_pixel(texel_of_index(texels[i], textureSize(traced, 0).x));
 }

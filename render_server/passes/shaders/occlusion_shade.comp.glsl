@@ -40,7 +40,7 @@ vec3 cone_radiance(vec3 d, float half_angle) {
     vec3 sum = vec3(0.0);
     for (int i = 0; i < CONE_SAMPLES; ++i) {
         float z = mix(1.0, cos(half_angle), (float(i) + 0.5) / float(CONE_SAMPLES)), turn = float(i) * GOLDEN_ANGLE;
-        vec3 direction = basis * vec3(sqrt(1.0 - z * z) * vec2(cos(turn), sin(turn)), z);
+        vec3 direction = basis * vec3(sqrt(max(1.0 - z * z, 0.0)) * vec2(cos(turn), sin(turn)), z);
         sum += textureLod(probe, octahedral_uv(direction), 0.0).rgb;
     }
     return sum / float(CONE_SAMPLES);

@@ -57,7 +57,7 @@ void touch(uint voxel) {
     if (atomicCompSwap(grid[voxel], 0u, 0xffffffffu) != 0u) return;
     uint slot = atomicAdd(slot_count, 1u);
     touched[slot] = voxel;
-    grid[voxel] = slot + 1u;
+    atomicExchange(grid[voxel], slot + 1u);   // others compare and swap it
     for (int i = 0; i < SUMS_PER_SLOT; ++i) sums[int(slot) * SUMS_PER_SLOT + i] = 0;
 }
 

@@ -1,5 +1,12 @@
 // GGX microfacet BRDF with the height-correlated Smith term (Walter et al. 2007, Heitz 2014) and Schlick's Fresnel.
+// Rounding to half floats makes every other normal longer than 1, so cosines may exceed 1.
 #include "common/basis.glsl"
+
+// (1 - cosine)^5 of Schlick's and Burley's terms; pow of a negative number is NaN.
+float grazing_weight(float cosine) {
+    float x = clamp(1.0 - cosine, 0.0, 1.0);
+    return x * x * x * x * x;
+}
 
 float ggx_distribution(float n_dot_h, float alpha) {
     float a2 = alpha * alpha;
@@ -20,7 +27,7 @@ float smith_visibility(float n_dot_l, float n_dot_v, float alpha) {
 bool has_interface(vec3 f0) { return f0 != vec3(0.0); }
 
 vec3 fresnel_schlick(vec3 f0, float cosine) {
-    return has_interface(f0) ? f0 + (1.0 - f0) * pow(clamp(1.0 - cosine, 0.0, 1.0), 5.0) : vec3(0.0);
+    return has_interface(f0) ? f0 + (1.0 - f0) * grazing_weight(cosine) : vec3(0.0);
 }
 
 // Directional albedo of the specular lobe for uniform light: scale and offset of f0 (Karis 2014, analytic fit).
@@ -37,13 +44,13 @@ vec3 specular_reflectance(vec3 f0, float roughness, float n_dot_v) {
 // (f0 = 0) it is Lambert's.
 float burley(float n_dot_l, float n_dot_v, float l_dot_v, float roughness) {
     float grazing = roughness * (1.0 + l_dot_v) - 0.5;   // F_D90 - 1; 2 cos^2 of the difference angle is 1 + l.v
-    return (1.0 + grazing * pow(1.0 - n_dot_l, 5.0)) * (1.0 + grazing * pow(1.0 - n_dot_v, 5.0));
+    return (1.0 + grazing * grazing_weight(n_dot_l)) * (1.0 + grazing * grazing_weight(n_dot_v));
 }
 
 // The same for uniform light: mean of (1 - n.l)^5 over the cosine is 1/21, that of l.v is 2/3 n.v.
 float burley_mean(float n_dot_v, float roughness) {
     float grazing = roughness * (1.0 + 2.0 / 3.0 * n_dot_v) - 0.5;
-    return (1.0 + grazing / 21.0) * (1.0 + grazing * pow(1.0 - n_dot_v, 5.0));
+    return (1.0 + grazing / 21.0) * (1.0 + grazing * grazing_weight(n_dot_v));
 }
 
 // Specular BRDF times cosine for a light seen under half-angle `radius` (rad). Averaging the lobe's peak over the
@@ -54,8 +61,9 @@ vec3 specular_times_cosine(vec3 n, vec3 v, vec3 l, vec3 f0, float roughness, flo
     float wide = min(sqrt(alpha * alpha + 0.25 * radius * radius), 1.0);
     float n_dot_l = max(dot(n, l), 0.0);
     float n_dot_v = max(dot(n, v), 1e-3);
-    vec3 h = normalize(l + v);
-    return fresnel_schlick(f0, max(dot(l, h), 0.0)) * (ggx_distribution(max(dot(n, h), 0.0), wide)
+    vec3 h = l + v;
+    h *= inversesqrt(max(dot(h, h), 1e-12));   // l = -v has no half-vector
+    return fresnel_schlick(f0, max(dot(l, h), 0.0)) * (ggx_distribution(clamp(dot(n, h), 0.0, 1.0), wide)
         * smith_visibility(n_dot_l, n_dot_v, alpha) * n_dot_l);
 }
 

@@ -73,8 +73,8 @@ MeshSurface surface_of(MeshHit hit, Ray ray) {
     int material = int(vertices[rows.x * VERTEX_FLOATS + 11]);
     vec3 corner = vertex_vector(rows, 0, vec3(1.0, 0.0, 0.0));
     vec3 face = cross(vertex_vector(rows, 0, vec3(0.0, 1.0, 0.0)) - corner, vertex_vector(rows, 0, vec3(0.0, 0.0, 1.0)) - corner);
-    vec3 normal = normalize(vertex_vector(rows, 3, weights));
     if (dot(face, ray.direction) > 0.0) face = -face;
+    vec3 mean = vertex_vector(rows, 3, weights), normal = normalize(mean == vec3(0.0) ? face : mean);
     bool double_sided = materials[material].flags.x > 0.5;
     if (dot(normal, ray.direction) > 0.0) normal = double_sided ? -normal : normalize(face);
     vec2 uv = vertex_vector(rows, 6, weights).xy;

@@ -25,7 +25,7 @@ uint group_entry(uint voxel, vec3 n) {
 vec3 block_corner(uint entry) { return vec3(2 * voxel_of_index(entry / 6u, volume_size / 2)); }
 
 #ifdef GROUP_ENTRIES_ACCESS
-layout(std430) GROUP_ENTRIES_ACCESS buffer GroupEntries { uint group_count; uint unseen_count; uint group_entries[]; };
+layout(std430) GROUP_ENTRIES_ACCESS buffer GroupEntries { uint group_count; uint group_entries[]; };
 
 uint groups_held() { return min(group_count, uint(group_entries.length())); }
 #endif

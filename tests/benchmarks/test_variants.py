@@ -5,7 +5,8 @@ from itertools import pairwise
 import pytest
 
 from benchmarks.cli import DEFAULT_METHODS
-from benchmarks.quality.variants import ABLATION_STEPS, ablation_chain, parse_variants
+from benchmarks.quality.ablation import ABLATION_STEPS, ablation_chain
+from benchmarks.variants import parse_variants
 from protocol.errors import DeltalightError
 from protocol.scene import parse_scene
 from protocol.scene_method import DvctMethod, NoneMethod

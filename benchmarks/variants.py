@@ -1,10 +1,10 @@
-"""What is compared: pictures without relighting, the renderer with chosen settings, path tracing in equal time."""
+"""Names and settings of `--methods`: the renderer with chosen settings, and what `bench quality` compares it with."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from protocol.documents import parse_mapping, validate
+from protocol.documents import nearest, parse_mapping, validate
 from protocol.errors import DeltalightError
 from protocol.scene import SceneDocument
 from protocol.scene_method import AroofMethod, DifferentialMethod, DlpvMethod, DvctMethod, NoneMethod
@@ -18,6 +18,7 @@ METHODS: dict[str, type[DvctMethod | DlpvMethod | AroofMethod | DifferentialMeth
 }
 """Kinds that the renderer makes with settings."""
 ADJUSTABLE: dict[str, tuple[Kind, dict[str, Any]]] = {
+    "dvct": ("dvct", {}),
     "exact": ("dvct", {"operator": "exact"}),
     "paper": ("dvct", {"operator": "paper"}),
     "differential": ("differential", {}),
@@ -61,6 +62,7 @@ FIXED: dict[str, Variant] = {
     variant.name: variant
     for variant in (
         Variant("camera", "the camera's picture: no object, no relighting", "camera"),
+        Variant("dvct", "voxel cone tracing as the scene says", "dvct"),
         Variant("none", "objects drawn, the real scene left as it was", "none"),
         Variant("paper", "the operator as printed in [P1]", "dvct", {"operator": "paper"}),
         Variant("exact", "the exact operator, machine's defaults", "dvct", {"operator": "exact"}),
@@ -78,70 +80,9 @@ FIXED: dict[str, Variant] = {
     )
 }
 
-PAPER_IN_SOFTWARE: dict[str, Any] = {
-    "operator": "paper",
-    "shadow": "cone",
-    "composition": "additive",
-    "cone_scale": 4,
-    "volume_size": 64,
-    "lights.surroundings": "none",
-    "output.antialiasing": False,
-}
-"""Everything that a later row switches, so that a chain means the same on every machine."""
-BARE_EXACT: dict[str, Any] = {
-    "operator": "exact",
-    "cone_count": 9,
-    "voxels": "isotropic",
-    "coverage": "multiplied",
-    "radiance": "predicted",
-    "far_volume": False,
-    "bounces": 0,
-    "reflections": "cones",
-    "mirrored_lights": False,
-    "caustics": False,
-    "screen_space": False,
-}
-"""Two sets of voxels marched, everything else as far as possible as in the paper."""
 
-ABLATION_STEPS: tuple[tuple[str, str, dict[str, Any]], ...] = (
-    # name, sentence, change against the previous row
-    (
-        "paper",
-        "the operator as printed in [P1], 64 voxels an edge, cones at every 4th pixel",
-        PAPER_IN_SOFTWARE,
-    ),
-    ("+ shadow maps", "shadows from maps in place of shadow cones", {"shadow": "map"}),
-    ("+ ratio", "the change multiplies the picture in place of being added", {"composition": "ratio"}),
-    ("+ two sets", "voxels without and with objects, both marched", BARE_EXACT),
-    ("+ one-sided voxels", "six directions a voxel in place of one", {"voxels": "directional"}),
-    ("+ summed coverage", "a shell of voxels is a wall", {"coverage": "summed"}),
-    ("+ 16 cones", "16 equal cones in place of 9", {"cone_count": 16}),
-    ("+ measured radiance", "real surfaces shine as the camera sees them", {"radiance": "measured"}),
-    ("+ far volume", "the real scene beyond the volume, coarse", {"far_volume": True}),
-    ("+ surroundings", "light of what is out of sight", {"lights.surroundings": "auto"}),
-    ("+ bounce", "light gathered once more from voxel to voxel", {"bounces": 1}),
-    ("+ rays", "objects in smooth real surfaces by rays", {"reflections": "rays"}),
-    ("+ mirrored lights", "smooth declared planes throw the lights back", {"mirrored_lights": True}),
-    ("+ caustics", "smooth objects throw the lights on as beams", {"caustics": True}),
-    ("+ screen space", "smooth objects reflect the picture", {"screen_space": True}),
-    ("+ antialiasing", "coverage of pixels at the objects' edges", {"output.antialiasing": True}),
-    ("+ every pixel", "cones traced at every pixel", {"cone_scale": 1}),
-    ("+ finer voxels", "128 voxels an edge", {"volume_size": 128}),
-)
-
-
-def ablation_chain() -> list[Variant]:
-    """Return the chain from the paper's operator to the exact one and beyond, one switch per row."""
-    chain: list[Variant] = []
-    settings: dict[str, Any] = {}
-    for name, sentence, changes in ABLATION_STEPS:
-        settings = settings | changes
-        chain.append(Variant(name, sentence, "dvct", settings))
-    return chain
-
-
-def parse_variants(text: str) -> list[Variant]:
-    """Parse `camera,paper,exact:cone_count=32,cone_scale=1`: names with settings, separated by commas.
+def parse_variants(text: str, known: Collection[str] = FIXED) -> list[Variant]:
+    """Parse `camera,paper,exact:cone_count=32,cone_scale=1`: names among `known` with settings, separated by commas.
 
     Raises:
         DeltalightError: an unknown name, or a setting that the method does not have or allow.
@@ -154,7 +95,7 @@ def parse_variants(text: str) -> list[Variant]:
             written.append(piece)
     if len(set(written)) < len(written):
         raise DeltalightError(f"--methods '{text}' names one thing twice; write each once.")
-    variants = [_parse(one) for one in written]
+    variants = [_parse(one, known) for one in written]
     if "path" in written and TIMED_VARIANT not in written:
         raise DeltalightError(
             f"`path` takes the time of `{TIMED_VARIANT}`; add {TIMED_VARIANT} to --methods."
@@ -162,13 +103,16 @@ def parse_variants(text: str) -> list[Variant]:
     return variants
 
 
-def _parse(text: str) -> Variant:
+def _parse(text: str, known: Collection[str]) -> Variant:
     name, _, changes = text.partition(":")
-    if not changes and name in FIXED:
+    if not changes and name in known:
         return FIXED[name]
     if not changes or name not in ADJUSTABLE:
-        known, adjustable = ", ".join(FIXED), " or ".join(f"{one}:KEY=VALUE" for one in ADJUSTABLE)
-        raise DeltalightError(f"'{text}' is no method to compare; use {known}, or {adjustable}.")
+        close, adjustable = nearest(name, known), " or ".join(f"{one}:KEY=VALUE" for one in ADJUSTABLE)
+        hint = "" if close is None or changes else f"; the nearest is {close}"
+        raise DeltalightError(
+            f"'{text}' is no method to compare{hint}; use {', '.join(known)}, or {adjustable}."
+        )
     kind, own = ADJUSTABLE[name]
     settings = dict(own)
     for pair in changes.split(","):

@@ -1,0 +1,216 @@
+"""The steps of `deltalight gpu-check`; each runs in a process of its own and keeps what it finds as it goes along."""
+
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from functools import partial
+from importlib.util import find_spec
+from math import isfinite
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from benchmarks.gpu_check.record import Findings, Skipped
+from protocol.errors import DeltalightError
+
+if TYPE_CHECKING:
+    from render_server.gpu.context import GpuContext
+    from render_server.renderer import SceneRenderer
+
+METHODS = ("exact", "paper", "dlpv", "differential", "dlpv-paper", "none", "aroof")
+"""As for `demo --method`; the one that computes longest before its first frame comes last."""
+NEEDLESS_CHECKS = ("packages [api]",)  # of doctor: what rendering does without
+SIZES = {"640x480, 64^3": ((640, 480), 64), "1280x720, 256^3": ((1280, 720), 256)}
+SPEED_FRAMES = 30  # the demo's recording; its camera moves in the last ten
+LEAK_ROUNDS = 3
+LEAK_FRAMES = 4
+
+
+@contextmanager
+def _context() -> "Iterator[GpuContext]":
+    from render_server.gpu.context import create_context
+
+    gpu = create_context()
+    try:
+        yield gpu
+    finally:
+        gpu.release()
+
+
+@contextmanager
+def _noting(findings: Findings, what: str | Callable[[], str]) -> Iterator[None]:
+    """Note what is raised inside, so that the step goes on with the next thing; `what` names this one."""
+    try:
+        yield
+    except Exception as fault:  # moderngl raises its own Error, with the driver's words
+        traceback.print_exc()
+        kind = "" if isinstance(fault, DeltalightError) else f"{type(fault).__name__}, "
+        findings.fault(f"{what if isinstance(what, str) else what()}: {kind}{fault}")
+
+
+def machine(findings: Findings) -> str:
+    """Say what renders here: GL_RENDERER, GL_VENDOR, and GL_VERSION, which names the driver after the first space."""
+    with _context() as gpu:
+        version, _, driver = gpu.version.partition(" ")
+        findings.keep(
+            gpu=gpu.renderer_name,
+            vendor=str(gpu.ctx.info["GL_VENDOR"]),
+            gl_version=version,
+            driver=driver,
+            is_software=gpu.is_software,
+        )
+    return f"{gpu.renderer_name}, OpenGL {gpu.version}"
+
+
+def doctor(findings: Findings) -> str:
+    """Examine the machine as `deltalight doctor` does."""
+    from services.doctor import examine
+
+    checks: list[dict[str, str]] = []
+    for check in examine():
+        checks.append(check.as_dict())
+        findings.keep(checks=checks)
+        if check.state == "missing" and check.name not in NEEDLESS_CHECKS:
+            findings.fault(f"{check.name}: {check.detail}")
+    return f"{len(checks)} checks"
+
+
+def shaders(findings: Findings) -> str:
+    """Let the driver compile every variant of every shader; a refusal leaves out the rest of that scene."""
+    from benchmarks.gpu_check.beside_tests import shader_parts
+
+    parts, labels = shader_parts(), list[str]()
+    with _context() as gpu:
+        gpu.compile_watchers.append(lambda label, _sources: labels.append(label))
+        for name, compile_part in parts.items():
+            with _noting(findings, partial(_latest, name, labels)):
+                compile_part(gpu, findings.scratch)
+            variants = sorted(set(labels))
+            findings.keep(f"{len(variants)} shader variants so far", variants=variants)
+    return f"{len(variants)} shader variants given to the driver"
+
+
+def _latest(name: str, labels: list[str]) -> str:
+    """What is being compiled: the scene, and the variant that came last."""
+    return ", ".join([name, *labels[-1:]])
+
+
+def pictures(findings: Findings) -> str:
+    """Compare the protected pictures with their goldens; those that differ go into `failed_pictures.png`."""
+    from benchmarks.gpu_check.beside_tests import compare_picture, protected_cases
+    from benchmarks.gpu_check.failed_pictures import FailedPictures
+
+    cases, shown, psnr_db = protected_cases(), FailedPictures(findings.out), dict[str, float]()
+    with _context() as gpu:
+        for count, case in enumerate(cases, start=1):
+            with _noting(findings, str(case)):
+                one = compare_picture(gpu, case, findings.scratch)
+                if isfinite(one.psnr_db):  # neither the same to the bit nor without a golden
+                    psnr_db[one.name] = round(one.psnr_db, 2)
+                if not one.is_alike:
+                    shown.add(one)
+                    findings.fault(f"{one.name}: {one.complaint}")
+            findings.keep(f"{count} pictures compared so far", compared=count, psnr_db=psnr_db)
+    return f"{len(cases) - len(findings.record.faults)} of {len(cases)} pictures agree with their goldens"
+
+
+def speed(findings: Findings) -> str:
+    """Time every method at each of SIZES, with its stages, in milliseconds."""
+    from benchmarks.gpu_check.timing import time_method
+
+    timed: dict[str, dict[str, Any]] = {title: {} for title in SIZES}
+    for title, (size, volume) in SIZES.items():
+        for method in METHODS:
+            with _noting(findings, f"{method} at {title}"):
+                timed[title][method] = asdict(time_method(method, SPEED_FRAMES, size, volume))
+                findings.keep(f"{method} at {title} was the last", timed=timed)
+    return f"{sum(map(len, timed.values()))} measurements"
+
+
+def memory(findings: Findings) -> str:
+    """Say what each method's frame holds: bytes of each source and stage (`deltalight graph`), and GL objects."""
+    held: dict[str, dict[str, Any]] = {}
+    with _context() as gpu:
+        for method in METHODS:
+            with _noting(findings, method):
+                held[method] = _held(gpu, method, findings.scratch)
+                findings.keep(f"{method} was the last", held=held)
+    return f"memory of {len(held)} methods"
+
+
+def _held(gpu: "GpuContext", method: str, folder: Path) -> dict[str, Any]:
+    from benchmarks.gpu_check.gl_objects import count_gl_objects
+
+    before = sum(count_gl_objects().values())
+    renderer = _rendered(gpu, method, folder)
+    graph = renderer.graph
+    assert graph is not None
+    sizes = {source.name: source.size_bytes for source in graph.report_sources()}
+    sizes |= {stage.name: stage.size_bytes for stage in graph.report()}
+    objects = sum(count_gl_objects().values()) - before
+    renderer.release()
+    return {"total_bytes": sum(sizes.values()), "gl_objects": objects, "bytes": sizes}
+
+
+def leaks(findings: Findings) -> str:
+    """Create, use and release a renderer of each method again and again: the number of GL objects stays the same."""
+    counts: dict[str, list[dict[str, int]]] = {}
+    with _context() as gpu:
+        for method in METHODS:
+            with _noting(findings, method):
+                counts[method] = list(_counts(gpu, method, findings.scratch))
+                findings.keep(f"{method} was the last", counts=counts)
+                first, *later = counts[method]  # the first also makes what the context keeps for everybody
+                if any(each != first for each in later):
+                    findings.fault(f"{method}: {_grown(first, later[-1])} after {len(later)} more renderers")
+    return f"{LEAK_ROUNDS} renderers of each of {len(counts)} methods released"
+
+
+def _counts(gpu: "GpuContext", method: str, folder: Path) -> Iterator[dict[str, int]]:
+    from benchmarks.gpu_check.gl_objects import count_gl_objects
+
+    for _ in range(LEAK_ROUNDS):
+        _rendered(gpu, method, folder).release()
+        yield count_gl_objects()
+
+
+def tests(findings: Findings) -> str:
+    """Run the renderer's tests where pytest is installed, but for those marked `slow`."""
+    return _tests(findings, "not slow")
+
+
+def slow_tests(findings: Findings) -> str:
+    """Run those of the renderer's tests that are marked `slow`."""
+    return _tests(findings, "slow")
+
+
+def _tests(findings: Findings, marked: str) -> str:
+    from benchmarks.gpu_check.beside_tests import require_tests
+
+    require_tests()
+    if find_spec("pytest") is None:
+        raise Skipped("pytest is not installed")
+    from benchmarks.gpu_check.gpu_tests import run_tests
+
+    return run_tests(findings, marked)
+
+
+def quality(findings: Findings) -> str:  # noqa: ARG001
+    """Leave the comparison with truth to machines that can render truth: none is part of the project."""
+    raise Skipped("no truth beside this machine; `deltalight bench quality` renders it with Mitsuba")
+
+
+def _rendered(gpu: "GpuContext", method: str, folder: Path) -> "SceneRenderer":
+    """Return a renderer after some frames of a given model, during which the camera turns."""
+    from render_server.renderer import SceneRenderer
+    from services.frame_account import room_scene, turned_frame
+
+    renderer = SceneRenderer(gpu, room_scene(method, folder))
+    for number in range(LEAK_FRAMES):
+        renderer.render(turned_frame(number, float(number % 2)))
+    return renderer
+
+
+def _grown(first: dict[str, int], last: dict[str, int]) -> str:
+    changes = {kind: last[kind] - first[kind] for kind in first}
+    return ", ".join(f"{change:+d} {kind}" for kind, change in changes.items() if change)

@@ -1,0 +1,36 @@
+"""Times of one method's frames: the one place that knows what `measure_speed` returns."""
+
+from dataclasses import dataclass, replace
+
+BUDGET_MS = 100.0
+MOTIONS = ("camera", "object", "still")
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Medians in milliseconds: of frames by motion, and of the stages while the camera moves by name."""
+
+    frames_ms: dict[str, float]
+    stages_ms: dict[str, float]
+
+
+def time_method(method: str, frames: int, size: tuple[int, int], volume: int) -> Timing:
+    """Time a method on the demo; `size` in pixels, `volume` in voxels an edge where the method has voxels.
+
+    Raises:
+        DeltalightError: no OpenGL, missing demo files, or a volume beyond the memory budget.
+    """
+    from rich.progress import Progress
+
+    from benchmarks.speed.measure import SpeedJob, measure_speed
+    from benchmarks.variants import parse_variants
+
+    (variant,) = parse_variants(method)
+    if variant.kind in ("dvct", "differential"):
+        variant = replace(variant, settings={**variant.settings, "volume_size": volume})
+    job = SpeedJob([variant], MOTIONS, frames, size)
+    found = measure_speed(job, BUDGET_MS, Progress(disable=True), end_to_end=False).methods[method]
+    return Timing(
+        {motion: figures.frame_ms.median for motion, figures in found.motions.items()},
+        {name: stage.ms.median for name, stage in found.motions["camera"].stages.items()},
+    )

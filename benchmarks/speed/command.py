@@ -1,0 +1,58 @@
+"""`deltalight bench speed` and `bench counts` with parsed options."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from json import dumps
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import Progress
+
+from benchmarks.speed.compare import compare_reports, print_comparison
+from benchmarks.speed.counts import count_frames, print_counts
+from benchmarks.speed.measure import SpeedJob, measure_speed
+from benchmarks.speed.tables import print_report
+from protocol.files import write_bytes
+
+
+def run_speed(job: SpeedJob, budget_ms: float, *, end_to_end: bool, out: Path | None, as_json: bool) -> None:
+    """Measure, write the report to `out` if given, and print it."""
+    with _progress() as progress:
+        report = measure_speed(job, budget_ms, progress, end_to_end=end_to_end)
+    text = report.model_dump_json(indent=2)
+    if out is not None:
+        write_bytes(out, text.encode())
+    if as_json:
+        print(text)
+    else:
+        print_report(report, Console())
+
+
+def run_counts(job: SpeedJob, *, out: Path | None, as_json: bool) -> None:
+    """Count, write the report to `out` if given, and print it."""
+    with _progress() as progress:
+        report = count_frames(job, progress)
+    text = report.model_dump_json(indent=2)
+    if out is not None:
+        write_bytes(out, text.encode())
+    if as_json:
+        print(text)
+    else:
+        print_counts(report, Console())
+
+
+def run_comparison(before: Path, after: Path, *, as_json: bool) -> None:
+    """Compare two reports and print the comparison."""
+    rows = compare_reports(before, after)
+    if as_json:
+        print(dumps([{**asdict(row), "ratio": row.ratio, "slower": row.is_slower} for row in rows], indent=2))
+    else:
+        print_comparison(rows, Console())
+
+
+@contextmanager
+def _progress() -> Iterator[Progress]:
+    """Shows progress on stderr, seldom redrawn: that takes time from what is measured."""
+    with Progress(console=Console(stderr=True), transient=True, refresh_per_second=1) as progress:
+        yield progress

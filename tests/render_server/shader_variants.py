@@ -1,0 +1,67 @@
+"""What compiles every variant of every shader: scenes that together need all of them.
+
+A context's `compile_watchers` are told of each, with its defines.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from protocol.scene import SceneDocument, parse_scene
+from render_server.gpu.context import GpuContext
+from render_server.gpu.kernel import Kernel
+from render_server.passes.lpv import LpvPropagate
+from render_server.renderer import SceneRenderer
+from tests.render_server.protected_scenes import Case, frames_of, scene_of
+from tests.render_server.scenes import Stage
+
+CASES: dict[Case, dict[str, Any]] = {  # with changes of the method
+    Case("exact", "depth", "mirror"): {},
+    Case("exact", "fused", "antialiased"): {
+        "voxels": "isotropic",
+        "coverage": "multiplied",
+        "shadow": "cone",
+        "volume_size": 40,
+    },
+    Case("paper", "depth", "mirror"): {},
+    Case("differential", "depth", "mirror"): {},
+    Case("dlpv", "model", "mirror"): {},
+    Case("dlpv-paper", "depth", "plain"): {},
+    Case("aroof", "depth", "mirror"): {},
+}
+VIEWS = {
+    Case("exact", "depth", "mirror"): ("effects", "delta", "volume", "rsm"),
+    Case("paper", "depth", "mirror"): ("volume",),
+}
+
+
+def render(case: Case, changes: dict[str, Any], gpu: GpuContext, folder: Path) -> None:
+    """Renders the case's first frame, in each debug view too that VIEWS names; assets go into the folder."""
+    scene = changed(scene_of(case, Stage(folder)), "method", changes)
+    renderer = SceneRenderer(gpu, scene)
+    try:
+        for view in ("composite", *VIEWS.get(case, ())):
+            renderer.set_scene(changed(scene, "output", {"view": view}))
+            renderer.render(frames_of(case)[0])
+    finally:
+        renderer.release()
+
+
+def changed(scene: SceneDocument, part: str, changes: dict[str, Any]) -> SceneDocument:
+    document = scene.model_dump(mode="json", exclude_unset=True)
+    document[part] = {**document[part], **changes}
+    return parse_scene(document)
+
+
+def by_device(gpu: GpuContext, folder: Path) -> None:  # noqa: ARG001
+    """Compiles what software and GPUs do differently, both ways wherever this runs."""
+    for tiled in (False, True):
+        LpvPropagate(gpu, tiled=tiled).release()
+    Kernel(gpu, "clear_buffer").release()
+
+
+PARTS: dict[str, Callable[[GpuContext, Path], None]] = {
+    **{str(case): partial(render, case, changes) for case, changes in CASES.items()},
+    "by device": by_device,
+}

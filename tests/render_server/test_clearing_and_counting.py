@@ -1,0 +1,116 @@
+"""Buffers are cleared on the GPU, and lists are walked by as many workgroups as the GPU counted."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import moderngl
+import numpy as np
+import pytest
+
+from render_server.gpu.context import GpuContext
+from render_server.gpu.kernel import (
+    CLEARING_GROUPS,
+    BindingError,
+    Dispatch,
+    ListGroups,
+    clear_buffer,
+    watched,
+)
+from tests.render_server.tiny_kernel import MakeKernel, floats
+
+pytestmark = pytest.mark.usefixtures("clean_gl")
+FULL = 0xFFFFFFFF
+WORDS = 256 * CLEARING_GROUPS + 77  # more than the workgroups clear in one stride, and no multiple of four
+WALK = """
+#include "common/work_list.glsl"
+"""
+
+
+@pytest.fixture(params=["software", "hardware"])
+def either(gpu: GpuContext, request: pytest.FixtureRequest) -> GpuContext:
+    """The context as it is, and as that of a GPU."""
+    return replace(gpu, is_software=request.param == "software")
+
+
+@pytest.fixture
+def full(gpu: GpuContext) -> Iterator[moderngl.Buffer]:
+    buffer = gpu.ctx.buffer(np.full(WORDS, FULL, np.uint32).tobytes())
+    yield buffer
+    buffer.release()
+
+
+@pytest.fixture
+def groups(gpu: GpuContext) -> Iterator[ListGroups]:
+    counted = ListGroups(gpu, 4)
+    yield counted
+    counted.release()
+
+
+def words(buffer: moderngl.Buffer) -> np.ndarray:
+    return np.frombuffer(buffer.read(), np.uint32)
+
+
+def test_a_buffer_is_cleared_whole(either: GpuContext, full: moderngl.Buffer) -> None:
+    clear_buffer(either, full)
+    assert not words(full).any()
+
+
+@pytest.mark.parametrize("count", [1, 300])
+def test_the_first_bytes_of_a_buffer_are_cleared(
+    either: GpuContext, full: moderngl.Buffer, count: int
+) -> None:
+    clear_buffer(either, full, 4 * count)
+    assert not words(full)[:count].any()
+    assert (words(full)[count:] == FULL).all()
+
+
+def test_on_a_gpu_no_buffer_is_mapped_to_be_cleared(
+    gpu: GpuContext, full: moderngl.Buffer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def clear(*_args: object, **_more: object) -> None:
+        raise AssertionError("it is mapped")
+
+    monkeypatch.setattr(moderngl.Buffer, "clear", clear)
+    seen: list[Dispatch] = []
+    hardware = replace(gpu, is_software=False)
+    with watched(hardware, seen.append):
+        clear_buffer(hardware, full)
+        clear_buffer(hardware, full, 400)
+    assert [(one.kernel, one.size) for one in seen] == [
+        ("clear_buffer", (CLEARING_GROUPS, 1, 1)),
+        ("clear_buffer", (1, 1, 1)),
+    ]
+    assert seen[0].written == {"Cleared": full}
+
+
+@pytest.mark.parametrize("length", [0, 1, 4, 5, 1023, 1024, 1025, 5000])
+def test_every_item_of_a_list_is_met_once(
+    gpu: GpuContext, groups: ListGroups, make: MakeKernel, length: int
+) -> None:
+    """In one row of workgroups or several, the last of them not full."""
+    listed = gpu.ctx.buffer(np.array([length, *range(length)], np.uint32).tobytes())
+    met = gpu.ctx.buffer(np.zeros(6000, np.uint32).tobytes())
+    kernel = make(
+        WALK + "layout(std430) buffer Met { uint met[]; };",
+        "uint i = counted_group() * 4u + gl_LocalInvocationIndex;\n"
+        "if (i < listed_count()) atomicAdd(met[texels[i]], 1u);",
+        "local_size_x = 4",
+    )
+    seen: list[Dispatch] = []
+    with watched(gpu, seen.append):
+        kernel.run_counted(groups.count(listed), Texels=listed, Met=met, Out=None)
+    assert words(met).tolist() == [1] * length + [0] * (6000 - length)
+    assert [(one.kernel, one.size) for one in seen] == [("count_groups", (1, 1, 1)), ("tiny", ())]
+    assert seen[1].written == {"Met": met}
+    for item in (listed, met):
+        item.release()
+
+
+def test_a_counted_run_checks_its_names_too(gpu: GpuContext, make: MakeKernel, out: moderngl.Buffer) -> None:
+    kernel = make("uniform float a;", "values[0] = a;")
+    groups = gpu.ctx.buffer(np.array([1, 1, 1], np.uint32).tobytes())
+    kernel.run_counted(groups, Out=out, a=3.0)
+    assert floats(out, 1) == [3.0]
+    with pytest.raises(BindingError, match="declares no `b`"):
+        kernel.run_counted(groups, Out=out, b=1.0)
+    groups.release()
