@@ -6,6 +6,7 @@ import moderngl
 import numpy as np
 
 from protocol.frames import DepthImage, ViewFrame
+from protocol.scene_method import QualityTier
 from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Binding, Bindings
 from render_server.gpu.textures import release_all
@@ -156,15 +157,15 @@ class ObservationBuffers:
 class PictureBuffers:
     """Textures and kernels of one picture size that every method shares.
 
-    `keeps_world`: what lights the real scene is a measurement of its own, which outlives the camera's motion.
+    `measured`: of a tier that keeps the real scene, what lights it: a measurement that outlives the camera's motion.
     """
 
-    def __init__(self, gpu: GpuContext, view: CameraView, *, keeps_world: bool = False) -> None:
+    def __init__(self, gpu: GpuContext, view: CameraView, tier: QualityTier) -> None:
         size, raster_size = view.size, view.raster[1]
         self.key = (size, raster_size)
-        self._gpu = gpu
+        self._gpu, self._tier = gpu, tier
         self._observed = ObservationBuffers(gpu, view)
-        self.measured = ObservationBuffers(gpu, view) if keeps_world else None
+        self.measured = ObservationBuffers(gpu, view) if tier.refresh_tiles else None
         self.coverage = ObjectCoverage(gpu, size)
         self._raster = GeometryBuffer(gpu, raster_size)
         self._samples: SampleCoverage | None = None
@@ -221,7 +222,7 @@ class PictureBuffers:
     ) -> SampleCoverage:
         """Draws several samples per pixel and resolves them into one surface."""
         if self._samples is None:
-            self._samples = SampleCoverage(self._gpu, view.size)
+            self._samples = SampleCoverage(self._gpu, view.size, self._tier.edge_samples)
         plain = view.without_antialiasing
         self._samples.run(
             self._geometry,

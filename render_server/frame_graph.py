@@ -153,7 +153,7 @@ class FrameGraph:
         checks: bool = False,
     ) -> None:
         self.method = method
-        self.buffers = PictureBuffers(gpu, view, keeps_world=method.keeps_world)
+        self.buffers = PictureBuffers(gpu, view, method.settings.tier)
         self.graph = Graph(gpu, timers, checks=checks)
         self.graph.own(self.buffers)
         self.resources: FrameResources = declare_frame(self.graph, self.buffers)

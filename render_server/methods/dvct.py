@@ -166,7 +166,7 @@ class ExactCones:
     ) -> None:
         size = fields.mu.size
         self._voxels, self._fields, self._cone_count = voxels, fields, settings.cone_count
-        self._tracing = TraceCones(gpu, size, march_defines(settings), reuses=settings.is_quick)
+        self._tracing = TraceCones(gpu, size, march_defines(settings), reuses=settings.tier.refresh_tiles > 0)
 
     def marching(self, _mu: VoxelMipmap, _rho: VoxelMipmap) -> dict[str, Binding]:
         """Returns the bindings that cones march with."""
@@ -208,10 +208,10 @@ def dvct_exact(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
             g.gpu,
             size,
             shadow_cones=DIRECTIONS if settings.resolved_shadow == "cone" else None,
-            reuses=settings.is_quick,
+            reuses=settings.tier.refresh_tiles > 0,
         ),
         ShadingOptions(
-            reuses_light=settings.is_quick,
+            tier=settings.tier,
             caustics=settings.caustics,
             screen_space=settings.screen_space,
             mirror_gather="gather" if settings.reflections == "rays" else None,
@@ -259,8 +259,9 @@ def dvct_paper(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
     voxels = InjectedVoxels(g.gpu, resolved.volume_size)
     injected = injection_stages(g, s, lit, voxels, placement)
     shadow_cones = voxels.directions if settings.resolved_shadow == "cone" else None
-    direct = DirectLight(g.gpu, size, shadow_cones=shadow_cones)
-    shading = Shading(g.gpu, size, resolved, lit.buffers, direct, ShadingOptions())
+    tier = settings.tier
+    direct = DirectLight(g.gpu, size, shadow_cones=shadow_cones, reuses=tier.refresh_tiles > 0)
+    shading = Shading(g.gpu, size, resolved, lit.buffers, direct, ShadingOptions(tier))
     cones = PaperCones(g.gpu, shading.cones)
 
     def trace(scene: Resource[Bindings], grid: Resource[LowResGrid]) -> Resource[ConeFields]:

@@ -1,7 +1,7 @@
 """Stages that methods share: the lights' depth maps, and shading of the visible surfaces (docs/method.md 3)."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from operator import eq
 from typing import Any
 
@@ -9,6 +9,7 @@ import moderngl
 import numpy as np
 from jaxtyping import Float64
 
+from protocol.scene_method import QualityTier
 from render_server.frame import FrameResources, Observation
 from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Binding, Bindings
@@ -207,13 +208,12 @@ def casts_caustics(objects: GeometryState) -> bool:
 class ShadingOptions:
     """Options of the shared shading.
 
-    `reuses_light`: light at real surfaces is that of the last frame, where only the camera has moved since.
     `mirror_gather` names the kernel that lights reflected points (`mirror_...`); None: no rays at smooth real
     surfaces. `march` are defines of march.glsl, with which smooth objects look up in voxels what the picture does not
     show.
     """
 
-    reuses_light: bool = False
+    tier: QualityTier = field(default_factory=QualityTier)
     caustics: bool = False
     screen_space: bool = False
     mirror_gather: str | None = None
@@ -252,17 +252,21 @@ class Shading:
     ) -> None:
         self._gpu, self._options, self._lights, self._direct = gpu, options, lights, direct
         self._scale = resolved.cone_scale
-        self.reuses_light = options.reuses_light
+        self.reuses_light = options.tier.refresh_tiles > 0
         self._bvh = ObjectBvh(gpu)
         self.grid = LowResGrid(gpu, size, resolved.cone_scale)
-        self.cones = ConeFields(gpu, self.grid.size, remembers=options.reuses_light)
-        self._history = LightHistory(gpu, self.grid, direct, self.cones) if options.reuses_light else None
+        self.cones = ConeFields(gpu, self.grid.size, remembers=self.reuses_light)
+        self._history: LightHistory | None = None
+        if self.reuses_light:
+            self._history = LightHistory(gpu, self.grid, direct, self.cones, options.tier.refresh_tiles)
         self._surface = VirtualSurface(gpu, size)
         self._change = ChangeRatio(gpu, self.grid.size)
-        self._caustics = (
-            Caustics(gpu, self.grid, self._bvh, reuses=options.reuses_light) if options.caustics else None
-        )
-        self._screen = ScreenCones(gpu, self.grid, options.march) if options.screen_space else None
+        self._caustics: Caustics | None = None
+        if options.caustics:
+            self._caustics = Caustics(gpu, self.grid, self._bvh, reuses=self.reuses_light)
+        self._screen: ScreenCones | None = None
+        if options.screen_space:
+            self._screen = ScreenCones(gpu, self.grid, options.march, options.tier.reflection_cones)
         self._rays: MirrorRays | None = None
         self.normal_offset: Callable[[Points], float] = lights.virtual_texel_m
         self.is_everywhere = False  # nothing is skipped because objects seem not to reach it

@@ -324,11 +324,13 @@ def dlpv(g: Graph, s: FrameResources, setup: Setup[DlpvMethod]) -> Layers:
     mu, rho, delta = lpv_stages(g, s, lit, volumes, volume)
     shown = g.stage("shown cells", volumes.show, "inject change", "inject shadow", volume)
     options = ShadingOptions(
+        tier=settings.tier,
         caustics=settings.resolved_caustics,
         screen_space=settings.resolved_screen_space,
         mirror_gather="gather_lpv" if settings.resolved_reflections == "rays" else None,
     )
-    direct = DirectLight(g.gpu, size, objects_shadow=settings.resolved_shadow == "map")
+    reuses = settings.tier.refresh_tiles > 0
+    direct = DirectLight(g.gpu, size, objects_shadow=settings.resolved_shadow == "map", reuses=reuses)
     shading = Shading(g.gpu, size, resolved, lit.buffers, direct, options)
     fields = LpvFields(g.gpu, volumes, shading.cones)
     marching = g.value("marching", fields.marching, rho)

@@ -47,7 +47,7 @@ class MethodChoice:
     @property
     def keeps_world(self) -> bool:
         """Whether the real scene is kept while it explains what a moving camera sees."""
-        return self.settings.is_quick
+        return self.settings.tier.refresh_tiles > 0
 
     @property
     def composition(self) -> Literal["ratio", "additive"]:
@@ -91,7 +91,7 @@ def choose_method(document: MethodSettings, *, software: bool) -> MethodChoice:
     with _blamed(plugin):
         resolved = method.resolve(document, SOFTWARE_DEFAULTS if software else GPU_DEFAULTS)
         remark = None if method.state_memory is None else method.state_memory(document, resolved)
-    return MethodChoice(method, document, resolved, remark, plugin=plugin)
+    return MethodChoice(method, document.limited(), resolved, remark, plugin=plugin)
 
 
 def _registered(settings: MethodSettings) -> tuple[RelightingMethod[Any], Plugin | None]:

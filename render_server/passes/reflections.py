@@ -21,10 +21,9 @@ GROUP = 64  # invocations of a workgroup: one per texel of a list, or per ray
 
 # A lobe with 85 % of its energy within 45 degrees or more is as good as diffuse: the wider cones serve.
 ROUGHEST = GREATEST_ALPHA**0.5
-CONE_COUNT = 4
 # A uniform disc with the median of the GGX lobe has this multiple of alpha as its half-angle (rad): half of the lobe
-# lies within 2 alpha, half of a disc within 1 / sqrt(2) of its radius. The cones share the disc.
-MEDIAN_DISC = 2.0 * 2.0**0.5 / CONE_COUNT**0.5
+# lies within 2 alpha, half of a disc within 1 / sqrt(2) of its radius.
+MEDIAN_DISC = 2.0 * 2.0**0.5
 
 
 class MirrorRays:
@@ -148,13 +147,20 @@ class ScreenCones:
     fraction is then 1. None: that fraction of the lobe is left to other passes.
     """
 
-    def __init__(self, gpu: GpuContext, grid: LowResGrid, march: Mapping[str, float | str] | None) -> None:
+    def __init__(
+        self, gpu: GpuContext, grid: LowResGrid, march: Mapping[str, float | str] | None, cone_count: int
+    ) -> None:
         self._grid = grid
         self._threads = list_threads(gpu, grid.picture_size[0] * grid.picture_size[1])
         self.reflected = texture_2d(gpu, grid.picture_size, 4, "f2")
         voxels = {} if march is None else {"VOXELS": 1, **march}
         self._kernel = Kernel(
-            gpu, "screen_cones", ROUGHEST=ROUGHEST, CONE_COUNT=CONE_COUNT, MEDIAN_DISC=MEDIAN_DISC, **voxels
+            gpu,
+            "screen_cones",
+            ROUGHEST=ROUGHEST,
+            CONE_COUNT=cone_count,
+            MEDIAN_DISC=MEDIAN_DISC / cone_count**0.5,  # the cones share the disc
+            **voxels,
         )
 
     def run(self, direct: DirectLight, cones: ConeFields, objects: ObjectBvh, scene: Bindings) -> None:

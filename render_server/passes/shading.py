@@ -14,8 +14,6 @@ from render_server.passes.cones import ConeFields, LowResGrid
 from render_server.passes.lights import LightBuffers
 from render_server.view import CameraView
 
-TURNS = 8  # reprojection.glsl
-
 
 class DirectLight:
     """E_mu and E_rho of the lights (RGBA16F), and their lobes on declared specular surfaces.
@@ -80,11 +78,13 @@ class LightHistory:
 
     Irradiance does not depend on where it is seen from: what the last frame computed is looked up where the surface
     was in its picture (reverse reprojection caching, Nehab et al. 2007). Pixels whose surface it did not show are
-    computed, and in turn one tile in eight.
+    computed, and in turn one tile in `turns`.
     """
 
-    def __init__(self, gpu: GpuContext, grid: LowResGrid, direct: DirectLight, cones: ConeFields) -> None:
-        self._grid, self._direct, self._cones = grid, direct, cones
+    def __init__(
+        self, gpu: GpuContext, grid: LowResGrid, direct: DirectLight, cones: ConeFields, turns: int
+    ) -> None:
+        self._grid, self._direct, self._cones, self._turns = grid, direct, cones, turns
         size = grid.picture_size
         self._last_direct = tuple(texture_2d(gpu, size, 4, "f2") for _ in range(2))
         self._positions = [texture_2d(gpu, size, 4, "f4") for _ in range(2)]
@@ -107,7 +107,7 @@ class LightHistory:
         last, self._seen = self._seen, (light, view.camera_from_world)
         has_history = last is not None and last[0] is light
         matrix = view.camera_from_world if last is None else last[1]
-        self._turn = (self._turn + 1) % TURNS
+        self._turn = (self._turn + 1) % self._turns
         self._positions.reverse()
         self._real_texels.reverse()
         self._object_texels.reverse()
@@ -129,7 +129,7 @@ class LightHistory:
         return found
 
     def _fill(self, scene: Bindings, found: Bindings) -> None:
-        shared: Bindings = {**found, "scale": self._grid.scale, "turn": self._turn}
+        shared: Bindings = {**found, "scale": self._grid.scale, "turns": self._turns, "turn": self._turn}
         self._reproject.run(
             self._grid.picture_size,
             shared,

@@ -1,5 +1,5 @@
 // Direct light of the last frame at the pixels that see the same surfaces as then, and which texels of the reduced grid
-// need it anew: those with a pixel that sees another surface, and, in turn, one in TURNS tiles, so that errors of
+// need it anew: those with a pixel that sees another surface, and, in turn, one tile in `turns`, so that errors of
 // resampling do not add up.
 #include "common/geometry.glsl"
 #define APPENDS_TEXELS
@@ -14,7 +14,6 @@ layout(r8ui) writeonly uniform uimage2D stale_out;   // by texel
 uniform sampler2D last_direct_mu;
 uniform sampler2D last_direct_rho;
 uniform int scale;
-uniform int turn;
 
 shared uint stale[64];
 
@@ -59,7 +58,7 @@ void main() {
     bool first = all(equal(ivec2(gl_LocalInvocationID.xy), inside * scale));
     ivec2 texel = pixel / scale, grid = (size + scale - 1) / scale;
     if (!first || any(greaterThanEqual(texel, grid))) return;
-    bool chosen = stale[slot] != 0u || is_due(texel, turn);
+    bool chosen = stale[slot] != 0u || is_due(texel);
     imageStore(stale_out, texel, uvec4(chosen ? 1u : 0u));
     if (chosen) append_texel(texel, grid.x);
 }

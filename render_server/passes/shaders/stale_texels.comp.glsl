@@ -6,7 +6,6 @@
 layout(local_size_x = 8, local_size_y = 8) in;
 uniform usampler2D stale_pixels;   // 1 where direct light of some of the texel's pixels must be computed
 uniform isampler2D sample_pixels;
-uniform int turn;
 layout(r8ui) writeonly uniform uimage2D stale_out;
 layout(rgba32f) writeonly uniform image2D real_texels_out;
 layout(rgba32f) writeonly uniform image2D object_texels_out;
@@ -31,7 +30,7 @@ void main() {
         object = texelFetch(virtual_raster_position, raster, 0);
         object_normal = texelFetch(virtual_raster_normal, raster, 0).xyz;
     }
-    bool due = is_due(texel, turn), unknown = is_unknown(real, real_normal, false);
+    bool due = is_due(texel), unknown = is_unknown(real, real_normal, false);
     uint stale = unknown || due || texelFetch(stale_pixels, texel, 0).r != 0u ? STALE_REAL : 0u;
     if (unknown || due) stale |= STALE_CAUSTICS;
     if (object.w > 0.0 && (due || is_unknown(object, object_normal, true))) stale |= STALE_OBJECT;

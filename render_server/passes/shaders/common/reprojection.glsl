@@ -3,11 +3,12 @@ uniform sampler2D last_position;        // world m; w: depth, 0 unknown
 uniform mat4 last_camera_from_world;
 uniform bool has_history;
 uniform float pixel_size;               // m at 1 m depth
+uniform int turns;
+uniform int turn;
 
 const float OFF_PLANE = 4.0;            // pixels at the surface's depth that it may lie off this pixel's plane,
 const float APART = 8.0;                // or away from this pixel's point
 const float LEAST_WEIGHT = 0.25;
-const int TURNS = 8;
 const int TILE = 8;                     // texels
 // What must be computed of a texel: direct light of its pixels and cones of its real surface, caustics there, light at
 // its object.
@@ -41,7 +42,8 @@ float same_surface(ivec2 pixel, vec4 position, vec3 normal) {
     return same ? 1.0 : 0.0;
 }
 
-bool is_due(ivec2 texel, int turn) {
+// Whether it is the turn of a texel's tile, one in `turns`.
+bool is_due(ivec2 texel) {
     ivec2 tile = texel / TILE;
-    return (tile.x + 3 * tile.y) % TURNS == turn;
+    return (tile.x + 3 * tile.y) % turns == turn;
 }
