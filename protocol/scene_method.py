@@ -41,9 +41,9 @@ class QualityTier:
     """What a quality gives up while something moves.
 
     `cone_count` and `shadow_samples` limit the settings of that name. `reflection_cones` look up what a pixel of a
-    smooth object reflects, `edge_samples` smooth an object's edges. One tile of the picture in `refresh_tiles` gets new
-    light in each frame in which only the camera moves, the others keep that of the frame before; 0: all get new light,
-    and the real scene is built anew whenever the camera moves.
+    smooth object reflects, `edge_samples` smooth an object's edges. One tile of the picture in `refresh_tiles` gets
+    new light in each frame in which only the camera moves, the others keep that of the frame before; 0: all get new
+    light, and the real scene is built anew whenever the camera moves.
     """
 
     cone_count: int = 64

@@ -290,7 +290,7 @@ class Shading:
             **geometry,
             **self._lights.bindings,
             **volume.bindings,
-            "normal_offset": SELF_SHADOW_TEXELS * self.normal_offset((low + high) / 2),
+            "normal_offset": self._normal_offset(objects),
             "sample_distance": 1.5 * self._scale / view.camera.matrix[0, 0],
             "object_low": tuple(bounds[:3]),
             "object_high": tuple(1.0 - bounds[3:]),
@@ -298,6 +298,10 @@ class Shading:
             "has_caustics": self._caustics is not None and casts_caustics(objects),
             "hidden_too": self._screen is not None and reflects_screen(objects),
         }
+
+    def _normal_offset(self, objects: GeometryState) -> float:
+        low, high = objects.bounds
+        return SELF_SHADOW_TEXELS * self.normal_offset((low + high) / 2)
 
     def set_objects(self, objects: GeometryState) -> ObjectBvh:
         """Sets the objects' triangles; their hierarchy is built when rays are traced."""
@@ -315,15 +319,29 @@ class Shading:
         is_diffuse = not scene["specular_surfaces"]
         return {**scene, **self._history.run(scene, light if is_diffuse else object(), view)}
 
-    def cast_caustics(
-        self, scene: Bindings, _grid: LowResGrid, _bvh: ObjectBvh, seen: Observation, volume: PlacedVolume
+    def trace_beams(
+        self,
+        objects: GeometryState,
+        _bvh: ObjectBvh,
+        seen: Observation,
+        volume: PlacedVolume,
+        _lights: LightSet,
+        *_maps: object,
     ) -> Caustics | None:
-        """Renders caustics if any object is smooth enough."""
-        if self._caustics is None or not scene["has_caustics"]:
+        """Traces the beams that smooth objects cast; None if none is smooth enough."""
+        if self._caustics is None or not casts_caustics(objects):
             return None
         reach = volume.placement.size * volume.placement.voxel_edge
-        self._caustics.run(self._lights, scene, bias_m=seen.scan.bias_m, reach_m=reach)
+        own = {"normal_offset": self._normal_offset(objects)}
+        scene = {**seen.bindings, **objects.materials.bindings, **self._lights.bindings, **own}
+        self._caustics.trace(self._lights, scene, bias_m=seen.scan.bias_m, reach_m=reach)
         return self._caustics
+
+    def cast_caustics(self, scene: Bindings, _grid: LowResGrid, beams: Caustics | None) -> Caustics | None:
+        """Renders the light of the beams where they end."""
+        if beams is not None:
+            beams.run(scene)
+        return beams
 
     def light_directly(
         self, scene: Bindings, grid: LowResGrid, caustics: Caustics | None, voxels: VoxelMipmap | None
@@ -433,6 +451,9 @@ def shading_stages(
         s.lights,
     )
     bvh = g.stage("object bvh", shading.set_objects, s.objects)
+    beams = g.stage(
+        "caustic beams", shading.trace_beams, s.objects, bvh, s.measured, volume, s.lights, *lit.all
+    )
     grid = g.stage("low res grid", shading.choose_pixels, scene)
     if shading.reuses_light:
         # What light at real surfaces depends on, besides the camera: another value whenever any of it changes.
@@ -441,7 +462,7 @@ def shading_stages(
         light = g.value("light state", _new_object, *changing)
         scene = g.stage("light reuse", shading.reuse_light, scene, grid, light, s.view)
     cones = trace(scene, grid)
-    caustics = g.stage("caustics", shading.cast_caustics, scene, grid, bvh, s.observation, volume)
+    caustics = g.stage("caustics", shading.cast_caustics, scene, grid, beams)
     direct = g.stage("direct light", light_directly or shading.light_directly, scene, grid, caustics, shown)
     reflection = g.stage("reflections", shading.reflect_objects, scene, grid, bvh, marching)
     change = g.stage("change of light", shading.compare, grid, direct, cones, reflection)

@@ -49,17 +49,20 @@ class Caustics:
         """The sums, for passes that shade."""
         return {"CausticSums": self._sums}
 
-    def run(self, lights: LightBuffers, scene: Bindings, *, bias_m: float, reach_m: float) -> None:
-        """Fills the sums.
+    def trace(self, lights: LightBuffers, scene: Bindings, *, bias_m: float, reach_m: float) -> None:
+        """Traces the beams.
 
         `bias_m` offsets receivers of real shadows towards the light; beams are traced up to `reach_m`.
         """
-        if self._last_sums is not None:
-            self._sums, self._last_sums = self._last_sums, self._sums
-        clear_buffer(self._gpu, self._sums)
         self._empty_beams(len(lights.virtual_views))
         for view in range(len(lights.virtual_views)):
             self._trace_beams(lights, lights.first_virtual_view + view, scene, bias_m, reach_m)
+
+    def run(self, scene: Bindings) -> None:
+        """Fills the sums with the light of the beams where they end."""
+        if self._last_sums is not None:
+            self._sums, self._last_sums = self._last_sums, self._sums
+        clear_buffer(self._gpu, self._sums)
         grid = self._grid
         if self._reuse is not None:
             self._reuse.run(grid.size, self.bindings, grid.bindings, scene, LastSums=self._last_sums)
