@@ -41,14 +41,16 @@ class QualityTier:
     """What a quality gives up while something moves.
 
     `cone_count` and `shadow_samples` limit the settings of that name. `reflection_cones` look up what a pixel of a
-    smooth object reflects, `edge_samples` smooth an object's edges. One tile of the picture in `refresh_tiles` gets
-    new light in each frame in which only the camera moves, the others keep that of the frame before; 0: all get new
-    light, and the real scene is built anew whenever the camera moves.
+    smooth object reflects, in one of `reflection_step` x `reflection_step` pixels. `edge_samples` smooth an object's
+    edges. One tile of the picture in `refresh_tiles` gets new light in each frame in which only the camera moves, the
+    others keep that of the frame before; 0: all get new light, and the real scene is built anew whenever the camera
+    moves.
     """
 
     cone_count: int = 64
     shadow_samples: int = 64
     reflection_cones: Literal[2, 4] = 4
+    reflection_step: Literal[1, 2] = 1
     edge_samples: Literal[4, 8] = 8
     refresh_tiles: int = 0
 
@@ -56,7 +58,14 @@ class QualityTier:
 TIERS: dict[Quality, QualityTier] = {
     "best": QualityTier(),
     "balanced": QualityTier(refresh_tiles=8),
-    "live": QualityTier(cone_count=8, shadow_samples=8, reflection_cones=2, edge_samples=4, refresh_tiles=16),
+    "live": QualityTier(
+        cone_count=8,
+        shadow_samples=8,
+        reflection_cones=2,
+        reflection_step=2,
+        edge_samples=4,
+        refresh_tiles=16,
+    ),
 }
 
 

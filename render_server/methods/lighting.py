@@ -266,7 +266,7 @@ class Shading:
             self._caustics = Caustics(gpu, self.grid, self._bvh, reuses=self.reuses_light)
         self._screen: ScreenCones | None = None
         if options.screen_space:
-            self._screen = ScreenCones(gpu, self.grid, options.march, options.tier.reflection_cones)
+            self._screen = ScreenCones(gpu, self.grid, options.march, options.tier)
         self._rays: MirrorRays | None = None
         self.normal_offset: Callable[[Points], float] = lights.virtual_texel_m
         self.is_everywhere = False  # nothing is skipped because objects seem not to reach it
@@ -291,6 +291,7 @@ class Shading:
             **self._lights.bindings,
             **volume.bindings,
             "normal_offset": self._normal_offset(objects),
+            "pixel_size": 1.0 / view.camera.matrix[0, 0],
             "sample_distance": 1.5 * self._scale / view.camera.matrix[0, 0],
             "object_low": tuple(bounds[:3]),
             "object_high": tuple(1.0 - bounds[3:]),

@@ -119,7 +119,6 @@ class LightHistory:
             "last_position": self._positions[1],
             "last_real_texels": self._real_texels[1],
             "last_object_texels": self._object_texels[1],
-            "pixel_size": 1.0 / view.camera.matrix[0, 0],
             "stale_texels": self._stale,
             "Texels": self._texels,
             **self._cones.remember(),
