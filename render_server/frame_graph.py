@@ -254,6 +254,11 @@ class FrameGraph:
         self.graph.run(layers.direct, layers.cones, layers.grid)
         return Fields(layers.direct.value, layers.cones.value, layers.grid.value)
 
+    def advance(self, options: CompositeOptions, until_s: float) -> bool:
+        """Works on the frame until then (time.monotonic()); returns whether it is ready to render at once."""
+        self._options.write(options, eq)
+        return self.graph.run(until_s=until_s)
+
     def render(self, options: CompositeOptions) -> Composite:
         """Composes the frame."""
         self._options.write(options, eq)

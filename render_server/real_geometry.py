@@ -88,6 +88,11 @@ class RealGeometry:
         return self._measurement
 
     @property
+    def is_settled(self) -> bool:
+        """Whether a kept world was built from the frame in which everything came to rest."""
+        return self._kept is not None and self._kept.built_from is self._last
+
+    @property
     def scan(self) -> Scan:
         """The camera's measurement from when something last moved."""
         if self._scan is None:

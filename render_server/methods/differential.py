@@ -251,7 +251,7 @@ def differential(g: Graph, s: FrameResources, setup: Setup[DifferentialMethod]) 
     mu_maps = g.stage("shadow maps mu", lights.draw_mu, views, s.real)
     rho_maps = g.stage("shadow maps rho", lights.draw_rho, views, s.real, s.objects)
     g.section("voxels")
-    placement = volume_placement(g, s, resolved.volume_size, settings.volume_edge_m)
+    placement = volume_placement(g, s, resolved.volume_size, settings.volume_edge_m, settings.tier)
     voxels = SolutionVoxels(g.gpu, settings, resolved.volume_size)
     lit_voxels = solution_stages(g, s, voxels, placement, mu_maps, rho_maps, environment)
     options = ShadingOptions(

@@ -194,9 +194,11 @@ class ExactCones:
 def dvct_exact(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
     """Marches both solutions at once through one-sided directional voxels."""
     settings, resolved, size = setup.settings, setup.resolved, setup.picture_size
-    lit = light_stages(g, s, resolved, settings.shadow_samples, mirrors=settings.mirrored_lights)
+    lit = light_stages(
+        g, s, resolved, settings.shadow_samples, settings.tier, mirrors=settings.mirrored_lights
+    )
     g.section("voxels")
-    placement = volume_placement(g, s, resolved.volume_size, settings.volume_edge_m)
+    placement = volume_placement(g, s, resolved.volume_size, settings.volume_edge_m, settings.tier)
     voxels = DeltaVoxels(g.gpu, settings, resolved.volume_size)
     mu, rho = delta_voxel_stages(g, s, lit, voxels, placement)
     shading = Shading(
@@ -253,9 +255,9 @@ def dvct_paper(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
     Split injection fills V_delta and V_rho; the joint V_eta gives visibility.
     """
     settings, resolved, size = setup.settings, setup.resolved, setup.picture_size
-    lit = light_stages(g, s, resolved, settings.shadow_samples)
+    lit = light_stages(g, s, resolved, settings.shadow_samples, settings.tier)
     g.section("voxels")
-    placement = volume_placement(g, s, resolved.volume_size, settings.volume_edge_m)
+    placement = volume_placement(g, s, resolved.volume_size, settings.volume_edge_m, settings.tier)
     voxels = InjectedVoxels(g.gpu, resolved.volume_size)
     injected = injection_stages(g, s, lit, voxels, placement)
     shadow_cones = voxels.directions if settings.resolved_shadow == "cone" else None

@@ -27,7 +27,13 @@ from render_server.passes.reflections import ROUGHEST, MirrorRays, ScreenCones
 from render_server.passes.shading import DirectLight, LightHistory, VirtualSurface
 from render_server.passes.shadow_maps import ShadowMaps
 from render_server.passes.voxel_light import AlbedoTexture
-from render_server.passes.voxels import PlacedVolume, VolumePlacement, VoxelMipmap, place_volume
+from render_server.passes.voxels import (
+    PlacedVolume,
+    VolumePlacement,
+    VoxelMipmap,
+    keep_placement,
+    place_volume,
+)
 from render_server.scene.declared_surfaces import SurfaceTable
 from render_server.view import CameraView
 
@@ -62,11 +68,21 @@ class LitScene:
 
 
 class LightStages:
-    """Fits the lights' views to their casters and receivers, and draws their depth maps."""
+    """Fits the lights' views to their casters and receivers, and draws their depth maps.
+
+    With `keeps_views`, the views of real shadows stay while objects move a little.
+    """
 
     def __init__(
-        self, gpu: GpuContext, tile_size: int, shadow_samples: int, *, mirrors: bool = False
+        self,
+        gpu: GpuContext,
+        tile_size: int,
+        shadow_samples: int,
+        *,
+        mirrors: bool = False,
+        keeps_views: bool = False,
     ) -> None:
+        self._keeps_views = keeps_views
         self.buffers = LightBuffers(gpu, tile_size, shadow_samples)
         self._mirrors = mirrors
         self._maps = ShadowMaps(gpu)
@@ -83,7 +99,8 @@ class LightStages:
 
         Returns the records of both, which tell whether their maps are still those of the views.
         """
-        receivers = real.points if everywhere else shadow_receivers(real, extent)
+        around = _snapped(extent) if self._keeps_views else extent
+        receivers = real.points if everywhere else shadow_receivers(real, around)
         shining = list(lights.lights)
         mirrors = mirror_lights(shining, surfaces, np.mean(extent, axis=0)) if self._mirrors else []
         self.buffers.place(shining, real.points, receivers, extent, mirrors)
@@ -122,11 +139,19 @@ class LightStages:
 
 
 def light_stages(
-    g: Graph, s: FrameResources, resolved: ResolvedSettings, shadow_samples: int, *, mirrors: bool = False
+    g: Graph,
+    s: FrameResources,
+    resolved: ResolvedSettings,
+    shadow_samples: int,
+    tier: QualityTier,
+    *,
+    mirrors: bool = False,
 ) -> LitScene:
     """Declares environment, light views, depth maps of both geometries, and mirror images of the lights."""
     g.section("lights")
-    stages = LightStages(g.gpu, resolved.rsm_size, shadow_samples, mirrors=mirrors)
+    stages = LightStages(
+        g.gpu, resolved.rsm_size, shadow_samples, mirrors=mirrors, keeps_views=tier.refresh_tiles > 0
+    )
     extent = object_extent(g, s)
     environment = g.stage("environment", stages.set_environment, s.lights)
     fitted = s.lights, s.real, extent, s.surfaces, s.everywhere
@@ -158,13 +183,19 @@ def _lasting_points(objects: GeometryState) -> Points:
 
 
 def volume_placement(
-    g: Graph, s: FrameResources, size: int, edge_m: float | None
+    g: Graph, s: FrameResources, size: int, edge_m: float | None, tier: QualityTier
 ) -> Resource[VolumePlacement]:
-    """Declares the cube of voxels or cells around the objects."""
+    """Declares the cube of voxels or cells around the objects; a quick tier moves it only when it must."""
+    placed: VolumePlacement | None = None
 
     def place(extent: Points) -> VolumePlacement:
         """Places a cube around the objects, snapped to its cells."""
-        return place_volume(extent.min(axis=0), extent.max(axis=0), size, edge_m)
+        nonlocal placed
+        low, high = extent.min(axis=0), extent.max(axis=0)
+        wanted = place_volume(low, high, size, edge_m)
+        if placed is None or not tier.refresh_tiles or not keep_placement(placed, low, high, wanted):
+            placed = wanted
+        return placed
 
     return g.value("volume placement", place, object_extent(g, s), same=eq)
 
@@ -475,6 +506,14 @@ def shading_stages(
 def _new_object(*_: object) -> object:
     """Returns a value that equals no other."""
     return object()
+
+
+def _snapped(extent: Points) -> Points:
+    """Returns the corners of a box around points, snapped to half of their longest edge."""
+    low, high = extent.min(axis=0), extent.max(axis=0)
+    step = max(float(np.max(high - low)) / 2, 1e-6)
+    step = 2.0 ** np.ceil(np.log2(step))  # an object that turns keeps it
+    return np.stack([np.floor(low / step) * step, np.ceil(high / step) * step])
 
 
 def shadow_receivers(real: GeometryState, extent: Points) -> Points:

@@ -316,9 +316,9 @@ def lpv_stages(
 def dlpv(g: Graph, s: FrameResources, setup: Setup[DlpvMethod]) -> Layers:
     """Subtracts V_mu from V_rho, or uses the paper's single volume of the change."""
     settings, resolved, size = setup.settings, setup.resolved, setup.picture_size
-    lit = light_stages(g, s, resolved, settings.shadow_samples)
+    lit = light_stages(g, s, resolved, settings.shadow_samples, settings.tier)
     g.section("propagation volumes")
-    placement = volume_placement(g, s, resolved.volume_size, settings.volume_edge_m)
+    placement = volume_placement(g, s, resolved.volume_size, settings.volume_edge_m, settings.tier)
     volumes = LpvVolumes(g.gpu, settings, resolved.volume_size)
     volume = g.value("volume", volumes.place, placement)
     mu, rho, delta = lpv_stages(g, s, lit, volumes, volume)

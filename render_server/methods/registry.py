@@ -33,11 +33,13 @@ _BY_SETTINGS = {method.settings: method for method in BUILT_IN}
 class MethodChoice:
     """A method whose settings and memory were checked.
 
-    `remark`: a sentence for the user, or none. `relights_real`: the real scene changes too.
-    `plugin`: what the method comes from, unless it is the project's own.
+    `settings` are those of the `document` within the limits of its quality. `remark`: a sentence for the user, or
+    none. `relights_real`: the real scene changes too. `plugin`: what the method comes from, unless it is the
+    project's own.
     """
 
     method: RelightingMethod[Any]
+    document: MethodSettings
     settings: MethodSettings
     resolved: ResolvedSettings
     remark: str | None = None
@@ -48,6 +50,10 @@ class MethodChoice:
     def keeps_world(self) -> bool:
         """Whether the real scene is kept while it explains what a moving camera sees."""
         return self.settings.tier.refresh_tiles > 0
+
+    def in_best_quality(self, *, software: bool) -> "MethodChoice":
+        """Returns the same method as it is when nothing moves."""
+        return choose_method(self.document.replaced(quality="best"), software=software)
 
     @property
     def composition(self) -> Literal["ratio", "additive"]:
@@ -91,7 +97,7 @@ def choose_method(document: MethodSettings, *, software: bool) -> MethodChoice:
     with _blamed(plugin):
         resolved = method.resolve(document, SOFTWARE_DEFAULTS if software else GPU_DEFAULTS)
         remark = None if method.state_memory is None else method.state_memory(document, resolved)
-    return MethodChoice(method, document.limited(), resolved, remark, plugin=plugin)
+    return MethodChoice(method, document, document.limited(), resolved, remark, plugin=plugin)
 
 
 def _registered(settings: MethodSettings) -> tuple[RelightingMethod[Any], Plugin | None]:

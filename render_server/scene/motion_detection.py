@@ -22,7 +22,7 @@ class MotionThresholds:
     `depth_sigmas`: a depth sample has moved beyond this many standard deviations of a difference;
     `depth_fraction`: fraction of the samples that may (0..1). `color_noise`: standard deviation of linear colour at
     1.0, falling with its square root (shot noise; camera units); `color_sigmas`, `color_fraction` as for depth.
-    `unexplained_fraction`: fraction of a moving camera's samples that a kept scene need not explain (0..1).
+    `unseen_fraction`: fraction of a moving camera's samples that a kept scene need not hold (0..1).
     """
 
     image_motion_px: float = 0.5
@@ -31,7 +31,7 @@ class MotionThresholds:
     color_noise: float = 0.02
     color_sigmas: float = 4.0
     color_fraction: float = 0.005
-    unexplained_fraction: float = 0.1
+    unseen_fraction: float = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +46,16 @@ class FrameSamples:
     def of(frame: ViewFrame) -> "FrameSamples":
         """Samples a frame."""
         return FrameSamples(frame, _downsampled_color(frame), _subsampled_inverse_depth(frame.depth))
+
+    @cached_property
+    def depth_range(self) -> tuple[Float32[np.ndarray, "gh gw"], Float32[np.ndarray, "gh gw"]]:
+        """Least and greatest known inverse depth of each sample and its eight neighbours; 0 where none is known."""
+        assert self.inverse_depth is not None
+        kernel, known = np.ones((3, 3), np.uint8), self.inverse_depth > 0
+        far = cv2.erode(np.where(known, self.inverse_depth, np.float32(np.inf)), kernel)
+        return np.where(np.isfinite(far), far, np.float32(0)), np.asarray(
+            cv2.dilate(self.inverse_depth, kernel)
+        )
 
     @cached_property
     def color_range(self) -> tuple[Float32[np.ndarray, "gh gw 3"], Float32[np.ndarray, "gh gw 3"]]:
@@ -67,47 +77,55 @@ class MotionDetector:
 
     def update(self, current: FrameSamples) -> bool:
         """Returns whether anything moved; if so, the frame becomes the reference."""
-        if self._reference is not None and not self._changed(self._reference, current):
+        if self._reference is not None and not _has_changed(self._reference, current, self._thresholds):
             return False
         self._reference = current
         return True
 
-    def _changed(self, old: FrameSamples, new: FrameSamples) -> bool:
-        before, after = old.frame, new.frame
-        return (
-            before.camera != after.camera
-            or (before.depth is None) != (after.depth is None)
-            or _image_motion(before, after, old.inverse_depth) > self._thresholds.image_motion_px
-            or self._moved_fraction(old, new) > self._thresholds.depth_fraction
-            or self._recolored_fraction(old, new) > self._thresholds.color_fraction
-        )
 
-    def _moved_fraction(self, old: FrameSamples, new: FrameSamples) -> float:
-        """Returns the fraction of common samples whose inverse depth differs by more than noise explains."""
-        before, after, depth = old.inverse_depth, new.inverse_depth, new.frame.depth
-        if before is None or after is None or depth is None:
-            return 0.0
-        if before.shape != after.shape:
-            return 1.0
-        both = (before > 0) & (after > 0)
-        limit = self._thresholds.depth_sigmas * np.sqrt(2) * noise_sigma(depth)
-        moved = both & (np.abs(after - before) > limit)
-        return float(np.count_nonzero(moved)) / max(int(np.count_nonzero(both)), 1)
+def _has_changed(old: FrameSamples, new: FrameSamples, thresholds: MotionThresholds) -> bool:
+    """Returns whether two frames differ by more than noise."""
+    before, after = old.frame, new.frame
+    return (
+        before.camera != after.camera
+        or (before.depth is None) != (after.depth is None)
+        or _image_motion(before, after, old.inverse_depth) > thresholds.image_motion_px
+        or _moved_fraction(old, new, thresholds) > thresholds.depth_fraction
+        or _recolored_fraction(old, new, thresholds) > thresholds.color_fraction
+    )
 
-    def _recolored_fraction(self, old: FrameSamples, new: FrameSamples) -> float:
-        """Returns the fraction of block means whose linear colour differs in any channel by more than noise explains.
 
-        A block's mean has the noise of a pixel divided by the block's edge; codecs leave some more.
-        """
-        limit = _color_limit(old.color, self._thresholds)
-        return float((np.abs(new.color - old.color) > limit).any(axis=-1).mean())
+def _moved_fraction(old: FrameSamples, new: FrameSamples, thresholds: MotionThresholds) -> float:
+    """Returns the fraction of common samples whose inverse depth differs by more than noise explains."""
+    before, after, depth = old.inverse_depth, new.inverse_depth, new.frame.depth
+    if before is None or after is None or depth is None:
+        return 0.0
+    if before.shape != after.shape:
+        return 1.0
+    both = (before > 0) & (after > 0)
+    moved = both & (np.abs(after - before) > _depth_limit(depth, thresholds))
+    return float(np.count_nonzero(moved)) / max(int(np.count_nonzero(both)), 1)
+
+
+def _depth_limit(depth: DepthImage, thresholds: MotionThresholds) -> float:
+    """Returns the difference of inverse depths that noise explains."""
+    return thresholds.depth_sigmas * float(np.sqrt(2)) * noise_sigma(depth)
+
+
+def _recolored_fraction(old: FrameSamples, new: FrameSamples, thresholds: MotionThresholds) -> float:
+    """Returns the fraction of block means whose linear colour differs in any channel by more than noise explains.
+
+    A block's mean has the noise of a pixel divided by the block's edge; codecs leave some more.
+    """
+    limit = _color_limit(old.color, thresholds)
+    return float((np.abs(new.color - old.color) > limit).any(axis=-1).mean())
 
 
 class KeptWorld:
     """Tells whether the real scene, as built from an earlier frame, still explains what the camera sees.
 
-    The samples of a new frame are looked up in the frame that the scene was built from. One is explained if that
-    frame shows it, at its depth, in a colour that its surroundings have there.
+    Seen from the same place, a frame may differ by no more than noise (MotionThresholds). Seen from elsewhere, its
+    samples are looked up in the frame that the scene was built from.
     """
 
     def __init__(self, thresholds: MotionThresholds | None = None) -> None:
@@ -115,29 +133,41 @@ class KeptWorld:
         self.built_from: FrameSamples | None = None
 
     def explains(self, new: FrameSamples) -> bool:
-        """Returns whether at most `unexplained_fraction` of the samples with depth are unexplained.
-
-        Without depth, whether the picture has moved by at most that fraction of its width.
-        """
-        old = self.built_from
+        """Returns whether the scene need not be rebuilt; without depth, while the picture has moved little."""
+        old, thresholds = self.built_from, self._thresholds
         if old is None or old.frame.camera != new.frame.camera:
             return False
-        return self._unexplained_fraction(old, new) <= self._thresholds.unexplained_fraction
-
-    def _unexplained_fraction(self, old: FrameSamples, new: FrameSamples) -> float:
         motion_px = _image_motion(old.frame, new.frame, old.inverse_depth)
-        if old.inverse_depth is None or new.inverse_depth is None or new.frame.depth is None:
-            return motion_px / new.frame.camera.width if motion_px > self._thresholds.image_motion_px else 1.0
-        cells, inverse, known = _reprojected(old, new)
-        before = old.inverse_depth[cells]
-        tilt = np.tan(np.radians(MAX_SLOPE_DEG)) * GRID_STEP_PX / new.frame.camera.matrix[0, 0]
-        limit = self._thresholds.depth_sigmas * np.sqrt(2) * noise_sigma(new.frame.depth) + tilt * inverse
-        same_place = (before > 0) & (np.abs(before - inverse) <= limit)
-        low, high = (edge[cells] for edge in old.color_range)
-        color, spare = new.color[known], _color_limit(old.color[cells], self._thresholds)
-        same_color = ((color >= low - spare) & (color <= high + spare)).all(axis=-1)
-        total = int(np.count_nonzero(new.inverse_depth))
-        return 1 - float(np.count_nonzero(same_place & same_color)) / max(total, 1)
+        if motion_px <= thresholds.image_motion_px:
+            return not _has_changed(old, new, thresholds)
+        if old.inverse_depth is None or new.inverse_depth is None:
+            return motion_px <= thresholds.unseen_fraction * new.frame.camera.width
+        appeared, unseen = _compared(old, new, thresholds)
+        return appeared <= thresholds.depth_fraction and unseen <= thresholds.unseen_fraction
+
+
+def _compared(old: FrameSamples, new: FrameSamples, thresholds: MotionThresholds) -> tuple[float, float]:
+    """Returns fractions of the samples with depth, seen from another place than the old frame's.
+
+    The first: what has appeared before the old surface, or has another colour than anything around it had. The
+    second: what the old frame did not show, or showed something else before it.
+    """
+    assert old.inverse_depth is not None
+    assert new.inverse_depth is not None
+    assert new.frame.depth is not None
+    cells, inverse, known = _reprojected(old, new)
+    tilt = np.tan(np.radians(MAX_SLOPE_DEG)) * GRID_STEP_PX / new.frame.camera.matrix[0, 0]
+    limit = _depth_limit(new.frame.depth, thresholds) + tilt * inverse
+    farthest, nearest = (edge[cells] for edge in old.depth_range)
+    low, high = (edge[cells] for edge in old.color_range)
+    seen = old.inverse_depth[cells] > 0
+    same_place = seen & (inverse >= farthest - limit) & (inverse <= nearest + limit)
+    color, spare = new.color[known], _color_limit(old.color[cells], thresholds)
+    recolored = ((color < low - spare) | (color > high + spare)).any(axis=-1)
+    appeared = (seen & (inverse > nearest + limit)) | (same_place & recolored)
+    total = max(int(np.count_nonzero(new.inverse_depth)), 1)
+    unseen = total - int(np.count_nonzero(same_place | appeared))
+    return float(np.count_nonzero(appeared)) / total, unseen / total
 
 
 def _color_limit(
