@@ -92,7 +92,9 @@ def choose_method(document: MethodSettings, *, software: bool) -> MethodChoice:
         DeltalightError: more memory than its budget, or a plugin that cannot be used.
     """
     if isinstance(document, NoneMethod):
-        return replace(choose_method(DvctMethod(), software=software), relights_real=False)
+        return replace(
+            choose_method(DvctMethod(quality=document.quality), software=software), relights_real=False
+        )
     method, plugin = _registered(document)
     with _blamed(plugin):
         resolved = method.resolve(document, SOFTWARE_DEFAULTS if software else GPU_DEFAULTS)

@@ -91,7 +91,7 @@ class LightHistory:
         self._real_texels, self._object_texels = (
             [texture_2d(gpu, grid.size, 4, "f4") for _ in range(2)] for _ in range(2)
         )
-        self._stale_pixels, self._stale = (texture_2d(gpu, grid.size, 1, "u1") for _ in range(2))
+        self._stale = texture_2d(gpu, grid.size, 1, "u1")
         self._texels = gpu.ctx.buffer(reserve=4 * (1 + grid.texel_count))
         self._reproject = Kernel(gpu, "reproject_light")
         self._find_stale = Kernel(gpu, "stale_texels")
@@ -138,13 +138,11 @@ class LightHistory:
             direct_rho_out=self._direct.rho,
             last_direct_mu=self._last_direct[0],
             last_direct_rho=self._last_direct[1],
-            stale_out=self._stale_pixels,
         )
         self._find_stale.run(
             self._grid.size,
             shared,
             scene,
-            stale_pixels=self._stale_pixels,
             sample_pixels=self._grid.pixels,
             stale_out=self._stale,
             real_texels_out=self._real_texels[0],
@@ -158,7 +156,6 @@ class LightHistory:
             *self._positions,
             *self._real_texels,
             *self._object_texels,
-            self._stale_pixels,
             self._stale,
             self._texels,
             self._reproject,

@@ -58,7 +58,7 @@ void main() {
 #ifdef REAL
     const uint fresh = 1u;
 #else
-    const uint fresh = 4u;
+    const uint fresh = 2u;
 #endif
     bool is_mean = (texelFetch(stale_texels, texel, 0).r & fresh) == 0u;
 #else

@@ -9,7 +9,7 @@ layout(local_size_x = 8, local_size_y = 8) in;
 uniform isampler2D sample_pixels;
 uniform ivec2 picture_pixels;
 #ifdef REUSES
-uniform usampler2D stale_texels;   // where light must be computed (reprojection.glsl)
+uniform usampler2D stale_texels;   // REAL and OBJECT where light must be computed
 #endif
 
 const uint REAL = 1u, OBJECT = 2u;
@@ -22,8 +22,7 @@ shared uint picked[64];
 uint needs(ivec2 texel, ivec4 pixels) {
     uint found = (pixels.x >= 0 ? REAL : 0u) | (pixels.z >= 0 ? OBJECT : 0u);
 #ifdef REUSES
-    uint stale = texelFetch(stale_texels, texel, 0).r;
-    found &= ((stale & 2u) != 0u ? REAL : 0u) | ((stale & 4u) != 0u ? OBJECT : 0u);
+    found &= texelFetch(stale_texels, texel, 0).r;
 #endif
     return found;
 }

@@ -42,7 +42,7 @@ void main() {
     ivec4 pixels = texelFetch(sample_pixels, texel, 0);
     uint stale = texelFetch(stale_texels, texel, 0).r;
 #ifdef CAUSTICS
-    if (pixels.x >= 0 && (stale & STALE_CAUSTICS) == 0u)
+    if (pixels.x >= 0 && (stale & STALE_REAL) == 0u)
         reuse(texel, REAL_LAYER, texelFetch(real_surface_position, pixels.xy, 0), texelFetch(real_surface_normal, pixels.xy, 0).xyz);
 #endif
     ivec2 raster = raster_texel(max(pixels.zw, ivec2(0)));

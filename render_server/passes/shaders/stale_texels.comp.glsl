@@ -1,10 +1,9 @@
-// What must be computed of each texel of the reduced grid. Keeps the points that the next frame looks up.
+// Where light must be computed at each texel of the reduced grid: cones and caustics. Keeps the points that the next frame looks up.
 #include "common/geometry.glsl"
 #include "common/reprojection.glsl"
 #include "common/last_texels.glsl"
 
 layout(local_size_x = 8, local_size_y = 8) in;
-uniform usampler2D stale_pixels;   // 1 where direct light of some of the texel's pixels must be computed
 uniform isampler2D sample_pixels;
 layout(r8ui) writeonly uniform uimage2D stale_out;
 layout(rgba32f) writeonly uniform image2D real_texels_out;
@@ -30,9 +29,8 @@ void main() {
         object = texelFetch(virtual_raster_position, raster, 0);
         object_normal = texelFetch(virtual_raster_normal, raster, 0).xyz;
     }
-    bool due = is_due(texel), unknown = is_unknown(real, real_normal, false);
-    uint stale = unknown || due || texelFetch(stale_pixels, texel, 0).r != 0u ? STALE_REAL : 0u;
-    if (unknown || due) stale |= STALE_CAUSTICS;
+    bool due = is_due(texel);
+    uint stale = due || is_unknown(real, real_normal, false) ? STALE_REAL : 0u;
     if (object.w > 0.0 && (due || is_unknown(object, object_normal, true))) stale |= STALE_OBJECT;
     imageStore(stale_out, texel, uvec4(stale));
     imageStore(real_texels_out, texel, real);

@@ -27,7 +27,7 @@ ConeSet cones_of(ivec2 texel) { return ConeSet(4, (texel.x & 1) + 2 * (texel.y &
 #ifdef REUSES
 uniform usampler2D stale_texels;
 // Whether the last frame does not know the irradiance.
-bool is_fresh(ivec2 texel) { return (texelFetch(stale_texels, texel, 0).r & 4u) != 0u; }
+bool is_fresh(ivec2 texel) { return (texelFetch(stale_texels, texel, 0).r & 2u) != 0u; }
 #else
 bool is_fresh(ivec2 texel) { return true; }
 #endif

@@ -10,9 +10,7 @@ const float OFF_PLANE = 4.0;            // pixels at the surface's depth that it
 const float APART = 8.0;                // or away from this pixel's point
 const float LEAST_WEIGHT = 0.25;
 const int TILE = 8;                     // texels
-// What must be computed of a texel: direct light of its pixels and cones of its real surface, caustics there, light at
-// its object.
-const uint STALE_REAL = 1u, STALE_CAUSTICS = 2u, STALE_OBJECT = 4u;
+const uint STALE_REAL = 1u, STALE_OBJECT = 2u;   // of a texel: where light must be computed
 
 // Position in the last picture (pixel centres at .5), far outside it for what was behind the camera.
 vec2 last_pixel(vec3 p) {
