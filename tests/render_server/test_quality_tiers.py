@@ -146,7 +146,7 @@ def test_what_reaches_in_hides_at_once_and_is_relit_half_a_second_later(players:
 def test_light_of_before_a_change_is_not_reused(
     players: dict[str, Player], scene: SceneDocument, gpu: GpuContext, change: str
 ) -> None:
-    """The first picture after it is the one that a renderer makes that knows nothing else."""
+    """The first picture after it is that of a renderer which never knew anything else."""
     player, (ball, box) = players["balanced"], scene.objects
     for aside in (0.0, *ASIDE[:3]):
         player.show(aside)
@@ -159,7 +159,7 @@ def test_light_of_before_a_change_is_not_reused(
     player.change(scene)
     shown = player.show(ASIDE[2])
     fresh = Player(gpu, scene, "balanced")
-    for aside in (0.0, ASIDE[2]):  # the same room was built from
+    for aside in (0.0, *ASIDE[:3], ASIDE[2]):
         expected = fresh.show(aside)
     assert psnr_db(shown, expected) > 45  # the volume stays where it is
     fresh.renderer.release()
