@@ -20,6 +20,7 @@ WIDE_ALPHA = 1 / 32
 GREATEST_ALPHA = 0.174
 BEAM_BYTES = 64
 PLACE_BYTES = 32
+TILE = 8  # texels an edge, of what caustic_gather fills at once
 HEADER_BYTES = 16
 SUMS_BYTES = 6 * 4  # per pixel: three channels on its real surface, three on its object
 
@@ -75,7 +76,8 @@ class Caustics:
             "scale": grid.scale,
         }
         self._find_places.run((self._threads,), shared, scene)
-        self._gather.run(grid.size, shared, scene)
+        tiles = tuple(-(-edge // TILE) for edge in grid.size)
+        self._gather.run((8 * tiles[0], 4 * tiles[1]), shared, scene)
         self._splat.run((self._threads,), shared, scene)
 
     def _empty_beams(self, views: int) -> None:

@@ -1,11 +1,11 @@
-// Irradiance of the wide beams at each texel of the reduced grid; a workgroup per tile of 8 x 8 texels. It picks the beams
-// that may reach the tile 64 at a time. Sums are integers, so that the order of the beams does not matter.
+// Irradiance of the wide beams at each texel of the reduced grid; a workgroup per tile of 8 x 8 texels, two of them
+// for each invocation. It picks the beams that may reach the tile 32 at a time. Sums are integers, so that the order of the beams does not matter.
 #include "common/geometry.glsl"
 #define ADDS_CAUSTICS
 #include "common/beam_footprint.glsl"
 #include "common/camera.glsl"
 
-layout(local_size_x = 8, local_size_y = 8) in;
+layout(local_size_x = 8, local_size_y = 4) in;
 uniform isampler2D sample_pixels;
 uniform ivec2 picture_pixels;
 #ifdef REUSES
@@ -16,7 +16,7 @@ const uint REAL = 1u, OBJECT = 2u;
 
 shared uint wanted;                // of the tile's texels
 shared uint picked_count;
-shared uint picked[64];
+shared uint picked[32];
 
 // What light this texel needs.
 uint needs(ivec2 texel, ivec4 pixels) {
@@ -40,24 +40,44 @@ void store(ivec2 texel, int layer, ivec3 sum) {
     for (int j = 0; j < 3; ++j) caustic_sums[at + j] = sum[j];
 }
 
+// What a texel has gathered, at its real surface and at its object.
+struct Texel { ivec2 place; uint needed; vec3 p[2]; vec3 normal[2]; ivec3 sum[2]; };
+
+Texel texel_at(ivec2 place) {
+    Texel t;
+    t.place = place;
+    bool inside = all(lessThan(place, textureSize(sample_pixels, 0)));
+    ivec4 pixels = inside ? texelFetch(sample_pixels, place, 0) : ivec4(-1);
+    t.needed = inside ? needs(place, pixels) : 0u;
+    t.p[0] = position_on(REAL_LAYER, max(pixels.xy, ivec2(0)), t.normal[0]);
+    t.p[1] = position_on(OBJECT_LAYER, max(pixels.zw, ivec2(0)), t.normal[1]);
+    t.sum[0] = t.sum[1] = ivec3(0);
+    return t;
+}
+
+void gather(inout Texel t, Beam beam, BeamPlace at, mat3 basis) {
+    int k = at.layer == REAL_LAYER ? 0 : 1;
+    bool reached = all(greaterThanEqual(t.place, at.low)) && all(lessThanEqual(t.place, at.high));
+    if (reached && (t.needed & (1u << k)) != 0u) t.sum[k] += caustic_part(beam, basis, t.p[k], t.normal[k]);
+}
+
+void store_all(Texel t) {
+    if ((t.needed & REAL) != 0u) store(t.place, REAL_LAYER, t.sum[0]);
+    if ((t.needed & OBJECT) != 0u) store(t.place, OBJECT_LAYER, t.sum[1]);
+}
+
 void main() {
-    ivec2 texel = ivec2(gl_GlobalInvocationID.xy), tile = 8 * ivec2(gl_WorkGroupID.xy);
-    bool inside = all(lessThan(texel, textureSize(sample_pixels, 0)));
-    ivec4 pixels = inside ? texelFetch(sample_pixels, texel, 0) : ivec4(-1);
-    uint needed = inside ? needs(texel, pixels) : 0u;
+    ivec2 tile = 8 * ivec2(gl_WorkGroupID.xy), place = tile + ivec2(gl_LocalInvocationID.xy);
+    Texel one = texel_at(place), other = texel_at(place + ivec2(0, 4));
     if (gl_LocalInvocationIndex == 0u) wanted = 0u;
     memoryBarrierShared();
     barrier();
-    if (needed != 0u) atomicOr(wanted, needed);
+    if ((one.needed | other.needed) != 0u) atomicOr(wanted, one.needed | other.needed);
     memoryBarrierShared();
     barrier();
     if (wanted == 0u) return;
-    vec3 normal[2], p[2];
-    p[0] = position_on(REAL_LAYER, max(pixels.xy, ivec2(0)), normal[0]);
-    p[1] = position_on(OBJECT_LAYER, max(pixels.zw, ivec2(0)), normal[1]);
-    ivec3 sum[2] = ivec3[2](ivec3(0), ivec3(0));
     uint count = min(beam_count, uint(beams.length()));
-    for (uint first = 0u; first < count; first += 64u) {
+    for (uint first = 0u; first < count; first += 32u) {
         if (gl_LocalInvocationIndex == 0u) picked_count = 0u;
         memoryBarrierShared();
         barrier();
@@ -67,12 +87,12 @@ void main() {
         for (uint j = 0u; j < picked_count; ++j) {
             Beam beam = beams[picked[j]];
             BeamPlace at = places[picked[j]];
-            int k = at.layer == REAL_LAYER ? 0 : 1;
-            if ((needed & (1u << k)) == 0u || any(lessThan(texel, at.low)) || any(greaterThan(texel, at.high))) continue;
-            sum[k] += caustic_part(beam, basis_around(beam.direction.xyz), p[k], normal[k]);
+            mat3 basis = basis_around(beam.direction.xyz);
+            gather(one, beam, at, basis);
+            gather(other, beam, at, basis);
         }
         barrier();
     }
-    if ((needed & REAL) != 0u) store(texel, REAL_LAYER, sum[0]);
-    if ((needed & OBJECT) != 0u) store(texel, OBJECT_LAYER, sum[1]);
+    store_all(one);
+    store_all(other);
 }
