@@ -1,6 +1,7 @@
 """How the scene document's picture is computed and shown: `method`, `shading`, `output` (docs/formats.md 3)."""
 
-from typing import Annotated, Any, Literal, TypeVar, get_args
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal, Self, TypeVar, get_args
 
 from pydantic import ConfigDict, Field, model_validator
 
@@ -32,10 +33,63 @@ def _require_name(schema: dict[str, Any], model: type["MethodSettings"]) -> None
         schema["required"] = ["name", *schema.get("required", [])]
 
 
+Quality = Literal["live", "balanced", "best"]
+
+
+@dataclass(frozen=True)
+class QualityTier:
+    """What a quality gives up while something moves.
+
+    `cone_count` and `shadow_samples` limit the settings of that name. `reflection_cones` look up what a pixel of a
+    smooth object reflects, in one of `reflection_step` x `reflection_step` pixels. `edge_samples` smooth an object's
+    edges. One tile of the picture in `refresh_tiles` gets new light in each frame in which only the camera moves, the
+    others keep that of the frame before; 0: all get new light, and the real scene is built anew whenever the camera
+    moves.
+    """
+
+    cone_count: int = 64
+    shadow_samples: int = 64
+    reflection_cones: Literal[2, 4] = 4
+    reflection_step: Literal[1, 2] = 1
+    edge_samples: Literal[4, 8] = 8
+    refresh_tiles: int = 0
+
+
+TIERS: dict[Quality, QualityTier] = {
+    "best": QualityTier(),
+    "balanced": QualityTier(refresh_tiles=8),
+    "live": QualityTier(
+        cone_count=8,
+        shadow_samples=8,
+        reflection_cones=2,
+        reflection_step=2,
+        edge_samples=4,
+        refresh_tiles=16,
+    ),
+}
+
+
 class MethodSettings(StrictModel):
     """Base of the settings of all methods; each has a field `name`, a literal with its name as default."""
 
     model_config = ConfigDict(json_schema_extra=_require_name)
+
+    quality: Quality = Field(
+        default="best",
+        description="What a moving picture may give up for speed (docs/speed.md): live, balanced, or best: nothing.",
+    )
+
+    @property
+    def tier(self) -> QualityTier:
+        """What the quality gives up."""
+        return TIERS[self.quality]
+
+    def limited(self) -> Self:
+        """Return the settings within the limits of their tier."""
+        given = {
+            name: getattr(self, name) for name in ("cone_count", "shadow_samples") if hasattr(self, name)
+        }
+        return self.replaced(**{name: min(value, getattr(self.tier, name)) for name, value in given.items()})
 
     @classmethod
     def method_name(cls) -> str:

@@ -1,13 +1,12 @@
 """The resources of one frame that all methods share, and the stages that compute them."""
 
 from dataclasses import dataclass
-from operator import is_
-from typing import Any
 
 import moderngl
 import numpy as np
 
 from protocol.frames import DepthImage, ViewFrame
+from protocol.scene_method import QualityTier
 from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Binding, Bindings
 from render_server.gpu.textures import release_all
@@ -57,6 +56,15 @@ class Observation:
 
 
 @dataclass(frozen=True, eq=False)
+class Measurement:
+    """What the camera saw when the real scene's geometry was last built from it."""
+
+    frame: ViewFrame
+    view: CameraView
+    scan: Scan
+
+
+@dataclass(frozen=True, eq=False)
 class ObjectSurface:
     """The objects as the camera sees them: their geometry buffer and how much of each pixel they cover.
 
@@ -76,13 +84,15 @@ class FrameResources:
     """Resources that every method's stages read. The renderer sets the sources.
 
     This module's stages compute the rest. `observation` changes only when something moved, so a new picture of a
-    scene at rest relights nothing. `geometry` holds the bindings of both surfaces; `everywhere` requests light at
-    every pixel (for estimation).
+    scene at rest relights nothing. `measured` is the observation that lights the real scene's voxels and maps: the
+    same, or, where the world is kept while the camera moves, that of `measurement`. `geometry` holds the bindings of
+    both surfaces; `everywhere` requests light at every pixel (for estimation).
     """
 
     image: Resource[CameraImage]
     view: Resource[CameraView]
     scan: Resource[Scan]
+    measurement: Resource[Measurement] | None
     real: Resource[GeometryState]
     objects: Resource[GeometryState]
     surfaces: Resource[SurfaceTable]
@@ -90,28 +100,84 @@ class FrameResources:
     everywhere: Resource[bool]
     albedo: Resource[AlbedoTexture]
     observation: Resource[Observation]
+    measured: Resource[Observation]
     object_surface: Resource[ObjectSurface]
     geometry: Resource[dict[str, Binding]]
 
 
-class PictureBuffers:
-    """Textures and kernels of one picture size that every method shares."""
+class ObservationBuffers:
+    """The camera's picture and the real surfaces that it shows, in textures of one picture size."""
 
     def __init__(self, gpu: GpuContext, view: CameraView) -> None:
+        self._gpu = gpu
+        self.image = CameraImage(gpu, view.size)
+        self.real_surface = RealSurface(gpu, view.size)
+        self._model_raster: GeometryBuffer | None = None
+        self.raster_camera, self.camera = (UniformBlock[CameraBlock](gpu, view.block()) for _ in range(2))
+
+    def set_camera(self, view: CameraView) -> CameraView:
+        """Writes the camera blocks: for rasters through the lens, and for reading the objects' geometry."""
+        self.raster_camera.write(view.without_antialiasing.block())
+        self.camera.write(view.block())
+        return view
+
+    def observe(
+        self,
+        geometry: RasterGeometry,
+        scan: Scan,
+        real: GeometryState,
+        view: CameraView,
+        declared: Bindings,
+    ) -> Observation:
+        """Fills the real geometry buffer from depth, from the given model, or from both if depth is fused."""
+        raster_scene = {"Camera": self.raster_camera, **self.image.bindings, **declared}
+        if scan.depth is not None and scan.surface is not None:
+            self.real_surface.from_depth(scan.depth, scan.surface.normals, raster_scene)
+        if scan.depth is None or scan.tolerance is not None:
+            if self._model_raster is None:
+                self._model_raster = GeometryBuffer(self._gpu, view.raster[1])
+            own = {**raster_scene, **real.materials.bindings}
+            geometry.run(self._model_raster, real.buffers, view.without_antialiasing, own)
+            self.real_surface.from_model(self._model_raster, raster_scene, tolerance=scan.tolerance)
+        bindings: dict[str, Binding] = {
+            "Camera": self.camera,
+            **self.image.bindings,
+            **self.real_surface.bindings,
+            **declared,
+            "noise_sigma": scan.noise_sigma,
+            "lens_bends": view.camera.has_distortion,
+        }
+        return Observation(self.image, self.real_surface, scan, bindings)
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        release_all(self.image, self.real_surface, self._model_raster, self.raster_camera, self.camera)
+
+
+class PictureBuffers:
+    """Textures and kernels of one picture size that every method shares.
+
+    `measured`: of a tier that keeps the real scene, what lights it: a measurement that outlives the camera's motion.
+    """
+
+    def __init__(self, gpu: GpuContext, view: CameraView, tier: QualityTier) -> None:
         size, raster_size = view.size, view.raster[1]
         self.key = (size, raster_size)
-        self._gpu = gpu
-        self.image = CameraImage(gpu, size)
-        self.real_surface = RealSurface(gpu, size)
+        self._gpu, self._tier = gpu, tier
+        self._observed = ObservationBuffers(gpu, view)
+        self.measured = ObservationBuffers(gpu, view) if tier.refresh_tiles else None
         self.coverage = ObjectCoverage(gpu, size)
         self._raster = GeometryBuffer(gpu, raster_size)
-        self._model_raster: GeometryBuffer | None = None
         self._samples: SampleCoverage | None = None
         self._interior_edges: InteriorEdgeAA | None = None
         self._unmixing = EdgeUnmixing(gpu, size)
         self._geometry = RasterGeometry(gpu)
-        self._raster_camera, self._camera = (UniformBlock[CameraBlock](gpu, view.block()) for _ in range(2))
         self._surfaces = gpu.ctx.buffer(reserve=MAX_SURFACES * 80 + 80)
+
+    @property
+    def image(self) -> CameraImage:
+        """The newest picture."""
+        return self._observed.image
 
     def declare_surfaces(self, table: SurfaceTable) -> dict[str, Binding]:
         """Uploads the declared surfaces of the real scene; returns what shaders read of them."""
@@ -122,30 +188,18 @@ class PictureBuffers:
 
     def set_camera(self, view: CameraView) -> CameraView:
         """Writes the camera blocks: for rasters through the lens, and for reading the objects' geometry."""
-        self._raster_camera.write(view.without_antialiasing.block())
-        self._camera.write(view.block())
-        return view
+        return self._observed.set_camera(view)
 
     def observe(self, scan: Scan, real: GeometryState, view: CameraView, declared: Bindings) -> Observation:
         """Fills the real geometry buffer from depth, from the given model, or from both if depth is fused."""
-        raster_scene = {"Camera": self._raster_camera, **self.image.bindings, **declared}
-        if scan.depth is not None and scan.surface is not None:
-            self.real_surface.from_depth(scan.depth, scan.surface.normals, raster_scene)
-        if scan.depth is None or scan.tolerance is not None:
-            if self._model_raster is None:
-                self._model_raster = GeometryBuffer(self._gpu, self._raster.size)
-            own = {**raster_scene, **real.materials.bindings}
-            self._geometry.run(self._model_raster, real.buffers, view.without_antialiasing, own)
-            self.real_surface.from_model(self._model_raster, raster_scene, tolerance=scan.tolerance)
-        bindings: dict[str, Binding] = {
-            "Camera": self._camera,
-            **self.image.bindings,
-            **self.real_surface.bindings,
-            **declared,
-            "noise_sigma": scan.noise_sigma,
-            "lens_bends": view.camera.has_distortion,
-        }
-        return Observation(self.image, self.real_surface, scan, bindings)
+        return self._observed.observe(self._geometry, scan, real, view, declared)
+
+    def measure(self, taken: Measurement, real: GeometryState, declared: Bindings) -> Observation:
+        """Fills the buffers of the measurement that lights the real scene."""
+        assert self.measured is not None
+        self.measured.image.upload(taken.frame)
+        self.measured.set_camera(taken.view)
+        return self.measured.observe(self._geometry, taken.scan, real, taken.view, declared)
 
     def draw_objects(self, objects: GeometryState, seen: Observation, view: CameraView) -> ObjectSurface:
         """Rasters the objects, computes their coverage of pixels, and unmixes the edges of real things."""
@@ -168,7 +222,7 @@ class PictureBuffers:
     ) -> SampleCoverage:
         """Draws several samples per pixel and resolves them into one surface."""
         if self._samples is None:
-            self._samples = SampleCoverage(self._gpu, view.size)
+            self._samples = SampleCoverage(self._gpu, view.size, self._tier.edge_samples)
         plain = view.without_antialiasing
         self._samples.run(
             self._geometry,
@@ -176,7 +230,7 @@ class PictureBuffers:
             objects.buffers,
             view=plain,
             rectangles=(rectangle, plain.raster_rectangle_around(objects.points)),
-            scene={**seen.bindings, **objects.materials.bindings, "Camera": self._raster_camera},
+            scene={**seen.bindings, **objects.materials.bindings, "Camera": self._observed.raster_camera},
         )
         return self._samples
 
@@ -193,16 +247,13 @@ class PictureBuffers:
         """Frees the GL objects."""
         release_all(
             self._unmixing,
-            self.image,
-            self.real_surface,
+            self._observed,
+            self.measured,
             self.coverage,
             self._raster,
-            self._model_raster,
             self._samples,
             self._interior_edges,
             self._geometry,
-            self._raster_camera,
-            self._camera,
             self._surfaces,
         )
 
@@ -222,10 +273,27 @@ def declare_frame(graph: Graph, buffers: PictureBuffers) -> FrameResources:
     declared = graph.value("declared surfaces", buffers.declare_surfaces, surfaces)
     camera = graph.value("camera", buffers.set_camera, view)
     observation = graph.stage("real surface", buffers.observe, scan, real, camera, declared)
+    measurement, measured = None, observation
+    if buffers.measured is not None:
+        measurement = graph.source("measurement", "world")
+        measured = graph.stage("measured surface", buffers.measure, measurement, real, declared)
     surface = graph.stage("object surface", buffers.draw_objects, objects, observation, camera)
     geometry = graph.value("geometry", _geometry_bindings, observation, surface, objects)
     return FrameResources(
-        image, view, scan, real, objects, surfaces, lights, everywhere, albedo, observation, surface, geometry
+        image,
+        view,
+        scan,
+        measurement,
+        real,
+        objects,
+        surfaces,
+        lights,
+        everywhere,
+        albedo,
+        observation,
+        measured,
+        surface,
+        geometry,
     )
 
 
@@ -240,14 +308,3 @@ def _geometry_bindings(
         "object_coverage": surface.coverage.texture,
         "edge_correction": surface.edge_correction,
     }
-
-
-def set_source(resource: Resource[Any], value: object) -> None:
-    """Sets a source; setting the same object again is not a change."""
-    resource.write(value, is_)
-
-
-def upload_image(resource: Resource[CameraImage], image: CameraImage, frame: ViewFrame) -> None:
-    """Uploads a frame's picture, which always counts as a change."""
-    image.upload(frame)
-    resource.write(image)

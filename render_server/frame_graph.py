@@ -8,7 +8,14 @@ import moderngl
 
 from protocol.frames import ViewFrame
 from protocol.scene_method import Output
-from render_server.frame import FrameResources, Observation, PictureBuffers, Scan, declare_frame
+from render_server.frame import (
+    FrameResources,
+    Measurement,
+    Observation,
+    PictureBuffers,
+    Scan,
+    declare_frame,
+)
 from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Bindings
 from render_server.gpu.timers import PassTimers
@@ -55,11 +62,15 @@ class CompositeOptions:
 
 @dataclass(frozen=True, eq=False)
 class FrameInputs:
-    """Everything that one frame is rendered from. Passing the same object again is not a change."""
+    """Everything that one frame is rendered from. Passing the same object again is not a change.
+
+    `measurement`: what `real` was built from; only a graph that keeps the world reads it.
+    """
 
     frame: ViewFrame
     view: CameraView
     scan: Scan
+    measurement: Measurement
     real: GeometryState
     objects: GeometryState
     surfaces: SurfaceTable
@@ -142,7 +153,7 @@ class FrameGraph:
         checks: bool = False,
     ) -> None:
         self.method = method
-        self.buffers = PictureBuffers(gpu, view)
+        self.buffers = PictureBuffers(gpu, view, method.settings.tier)
         self.graph = Graph(gpu, timers, checks=checks)
         self.graph.own(self.buffers)
         self.resources: FrameResources = declare_frame(self.graph, self.buffers)
@@ -188,6 +199,8 @@ class FrameGraph:
         s = self.resources
         s.view.write(inputs.view, eq)
         s.scan.write(inputs.scan, is_)
+        if s.measurement is not None:
+            s.measurement.write(inputs.measurement, is_)
         s.real.write(inputs.real, is_)
         s.objects.write(inputs.objects, is_)
         s.surfaces.write(inputs.surfaces, is_)
@@ -240,6 +253,11 @@ class FrameGraph:
         s.everywhere.write(True, eq)
         self.graph.run(layers.direct, layers.cones, layers.grid)
         return Fields(layers.direct.value, layers.cones.value, layers.grid.value)
+
+    def advance(self, options: CompositeOptions, until_s: float) -> bool:
+        """Works on the frame until then (time.monotonic()); returns whether it is ready to render at once."""
+        self._options.write(options, eq)
+        return self.graph.run(until_s=until_s)
 
     def render(self, options: CompositeOptions) -> Composite:
         """Composes the frame."""

@@ -6,6 +6,7 @@ drawn.
 """
 
 import inspect
+import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -242,10 +243,11 @@ class Graph:
     def __contains__(self, name: str) -> bool:
         return name in self._resources
 
-    def run(self, *targets: Resource[Any]) -> None:
-        """Brings the `targets` (all resources if none is named) up to date.
+    def run(self, *targets: Resource[Any], until_s: float | None = None) -> bool:
+        """Brings the `targets` (all resources if none is named) up to date; returns whether they are.
 
-        What a stage raises is raised here; the stage and those that read it run again the next time.
+        No stage is begun after `until_s` (time.monotonic()): the next run goes on from there. What a stage raises is
+        raised here; the stage and those that read it run again the next time.
 
         Raises:
             GraphError: stages read each other in a circle, read what nobody writes, or write what they did not
@@ -259,7 +261,10 @@ class Graph:
                 resource.write(ask(), same)
         for stage in order:
             if not needed.isdisjoint(stage.outputs):
+                if until_s is not None and time.monotonic() >= until_s:
+                    return False
                 self._update(stage)
+        return True
 
     def _sorted(self) -> list[Stage]:
         """Returns the stages in topological order; declaration order breaks ties."""

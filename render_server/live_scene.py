@@ -1,7 +1,8 @@
 """One scene across frames: geometry, lights and estimates that outlive a frame, and the frame graph."""
 
+import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from protocol.frames import ViewFrame
@@ -12,6 +13,7 @@ from render_server.estimation.albedo import AlbedoEstimator
 from render_server.estimation.lighting import LightEstimator
 from render_server.frame_graph import CompositeOptions, FrameGraph, FrameInputs, ShownBuffers
 from render_server.gpu.context import GpuContext
+from render_server.gpu.textures import release_all
 from render_server.gpu.timers import PassTimers
 from render_server.methods.registry import MethodChoice, choose_method
 from render_server.occlusion_fields import OcclusionFields
@@ -21,6 +23,10 @@ from render_server.scene.declared_surfaces import SurfaceTable, build_surface_ta
 from render_server.scene.triangle_mesh import TriangleMesh
 from render_server.view import CameraView
 from render_server.virtual_objects import VirtualObjects
+
+# Work on a frame at rest, until its picture has the best quality; a stage that was begun is finished.
+REFINE_S = 0.05
+REST_NS = 300_000_000  # without any change, after which a picture is refined
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +78,11 @@ class LiveScene:
         self._surfaces: SurfaceTable | None = None
         self._albedo = AlbedoEstimator(gpu)
         self.graph: FrameGraph | None = None
+        self._best: FrameGraph | None = None
+        self._changing: tuple[
+            object, ...
+        ] = ()  # what the newest picture was made from, camera and room left out,
+        self._changed_ns = 0  # and when that or anything else last changed
         self._fields = OcclusionFields(self._notify, waits=waits)
         self._accumulated: ViewFrame | None = None  # last frame already accumulated
         self._plan = self._planned(scene)
@@ -103,8 +114,9 @@ class LiveScene:
         budget = plan.method.resolved.triangle_budget
         if self._real is not None and not plan.method.relights_real:
             budget = self._real.budget  # `none` asks for none
-        if self._real is None or plan.scene.real != old.scene.real or budget != self._real.budget:
-            real = RealGeometry(self._gpu, plan.scene.real, budget)
+        key = plan.scene.real, budget, plan.method.keeps_world
+        if self._real is None or key != (old.scene.real, self._real.budget, old.method.keeps_world):
+            real = RealGeometry(self._gpu, plan.scene.real, budget, keeps_world=plan.method.keeps_world)
             if self._real is not None:
                 self._real.release()
             self._real = real
@@ -118,9 +130,8 @@ class LiveScene:
         self._plan = plan
 
     def _drop_graph(self) -> None:
-        if self.graph is not None:
-            self.graph.release()
-        self.graph = None
+        release_all(self.graph, self._best)
+        self.graph = self._best = None
 
     def forget_frames(self) -> None:
         """Forgets all observations and estimates: another camera shows another room."""
@@ -161,24 +172,42 @@ class LiveScene:
             return None
         output = self._plan.scene.output
         assert self.lighting.lights is not None
-        graph.set_inputs(
-            FrameInputs(
-                frame,
-                view.with_antialiasing if output.antialiasing else view,
-                self._real.scan,
-                self._real.state,
-                objects,
-                self._surface_table(frame, moved=moved),
-                self.lighting.lights,
-                self._albedo.texture,
-            )
+        inputs = FrameInputs(
+            frame,
+            view.with_antialiasing if output.antialiasing else view,
+            self._real.scan,
+            self._real.measurement,
+            self._real.state,
+            objects,
+            self._surface_table(frame, moved=moved),
+            self.lighting.lights,
+            self._albedo.texture,
         )
+        graph.set_inputs(inputs)
         graph.set_lights(self.lighting.estimate(graph, moved=moved))
         if moved and self._real.has_unseen and self._albedo.observe(graph, self.lighting.lights):
             graph.renew_albedo()
             graph.set_lights(self.lighting.lights)
         self._accumulated = frame
+        changing = (objects, self.lighting.lights, self._plan)
+        if moved or not _same_objects(changing, self._changing):
+            self._changing, self._changed_ns = changing, frame.timestamp_ns
+        if self._real.is_settled and frame.timestamp_ns - self._changed_ns >= REST_NS:
+            graph = self._refined(graph, frame, replace(inputs, lights=self.lighting.lights))
         return RelitFrame(graph, self._options(output))
+
+    def _refined(self, graph: FrameGraph, frame: ViewFrame, inputs: FrameInputs) -> FrameGraph:
+        """Works on the frame in the best quality for REFINE_S; returns its graph once it is ready, else `graph`."""
+        if self._best is None:
+            best = self._plan.method.in_best_quality(software=self._gpu.is_software)
+            self._best = FrameGraph(
+                self._gpu, inputs.view, best, self._fields, self.timers, checks=self._checks
+            )
+        self._best.upload(frame)
+        self._best.set_inputs(inputs)
+        options = self._options(self._plan.scene.output)
+        ready = self._best.advance(options, time.monotonic() + REFINE_S)
+        return self._best if ready else graph
 
     def _options(self, output: Output) -> CompositeOptions:
         method = self._plan.method
@@ -214,9 +243,11 @@ class LiveScene:
 
     def release(self) -> None:
         """Frees all GL objects."""
-        for item in (self._objects, self._real, self.graph, self._albedo, self._fields):
-            if item is not None:
-                item.release()
+        release_all(self._objects, self._real, self.graph, self._best, self._albedo, self._fields)
+
+
+def _same_objects(some: Sequence[object], others: Sequence[object]) -> bool:
+    return len(some) == len(others) and all(one is other for one, other in zip(some, others, strict=True))
 
 
 def unsupported_requests(scene: SceneDocument) -> list[str]:

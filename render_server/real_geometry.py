@@ -8,14 +8,14 @@ from jaxtyping import Float32, Float64, UInt8
 from protocol.errors import DeltalightError
 from protocol.frames import DepthImage, ViewFrame
 from protocol.scene_objects import ModelGeometry, RealScene
-from render_server.frame import Scan
+from render_server.frame import Measurement, Scan
 from render_server.gpu.context import GpuContext
 from render_server.gpu_scene import GeometryState
 from render_server.passes.gbuffer import MaterialTable, MeshBuffers, triangle_corners
 from render_server.scene.depth_mesh import depth_mesh
 from render_server.scene.depth_surface import DepthSurface, depth_surface, grazing_depth_fill, noise_sigma
 from render_server.scene.mesh_loading import load_mesh
-from render_server.scene.motion_detection import MotionDetector
+from render_server.scene.motion_detection import FrameSamples, KeptWorld, MotionDetector
 from render_server.scene.triangle_mesh import TriangleMesh, merge_for_gpu
 from render_server.scene.tsdf_mesh import TsdfScene
 from render_server.view import CameraView
@@ -29,17 +29,27 @@ STILL_FRAMES = 16
 ROUNDED_VOXELS = 0.35
 
 
+# A kept world is renewed no more often than this while something moves in it, and at the latest this long after all
+# has come to rest.
+RENEWAL_NS = 400_000_000
+
+
 class RealGeometry:
     """Holds the real scene, and rebuilds it when it moves (MotionDetector).
 
-    `state` is a new object whenever the triangles change, `scan` whenever anything moved, the camera
-    included.
+    With `keeps_world`, only when what was built no longer explains what the camera sees (KeptWorld), and once more
+    from the frame in which everything comes to rest. `state` is a new object whenever the triangles change, `scan`
+    whenever anything moved, the camera included. `measurement` is what `state` was built from.
     """
 
-    def __init__(self, gpu: GpuContext, real: RealScene, triangle_budget: int) -> None:
+    def __init__(
+        self, gpu: GpuContext, real: RealScene, triangle_budget: int, *, keeps_world: bool = False
+    ) -> None:
         self._gpu = gpu
         self.budget = triangle_budget
         self._motion = MotionDetector()
+        self._kept = KeptWorld() if keeps_world else None
+        self._last: FrameSamples | None = None  # in which anything moved
         self._buffers = MeshBuffers(gpu)
         self._materials: MaterialTable | None = None
         self.state: GeometryState | None = None
@@ -49,6 +59,7 @@ class RealGeometry:
         self.view: CameraView | None = None
         self.surface: DepthSurface | None = None
         self._scan: Scan | None = None
+        self._measurement: Measurement | None = None
         self._world_from_tsdf = np.eye(4)
         self._tsdf_meshes: tuple[list[TriangleMesh], list[TriangleMesh]] = [], []
         self._tsdf = TsdfScene() if real.geometry == "fused" else None
@@ -66,6 +77,20 @@ class RealGeometry:
     def has_unseen(self) -> bool:
         """Whether surfaces exist that the camera may not see: those of a model or of earlier frames."""
         return self.is_model or self._tsdf is not None
+
+    @property
+    def measurement(self) -> Measurement:
+        """The frame that the real scene was last built from."""
+        if self._measurement is None:
+            assert self.frame is not None
+            assert self.view is not None
+            self._measurement = Measurement(self.frame, self.view, self.scan)
+        return self._measurement
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether a kept world was built from the frame in which everything came to rest."""
+        return self._kept is not None and self._kept.built_from is self._last
 
     @property
     def scan(self) -> Scan:
@@ -100,9 +125,36 @@ class RealGeometry:
             raise DeltalightError(
                 "The source has no depth: record depth, or give the scene a model (`real: {geometry: {model: ...}}`)."
             )
-        moved = self._motion.update(frame)
+        samples = FrameSamples.of(frame)
+        moved = self._motion.update(samples)
         if moved:
-            self.frame, self.view = frame, view
+            self._last, self.frame, self.view, self._scan = samples, frame, view, None
+        if self._kept is not None and not self._is_due(self._kept, samples, moved=moved):
+            if moved and frame.depth is not None and not self.is_model:
+                self.surface = depth_surface(frame.depth, view.camera)
+            return moved
+        return self._rebuild(frame, view, moved=moved)
+
+    def _is_due(self, kept: KeptWorld, samples: FrameSamples, *, moved: bool) -> bool:
+        """Returns whether a kept world must be rebuilt: it explains the frame no longer, or all came to rest."""
+        built, last = kept.built_from, self._last
+        if built is None or self.state is None:
+            return True
+        if moved:
+            too_soon = abs(samples.frame.timestamp_ns - built.frame.timestamp_ns) < RENEWAL_NS
+            return not too_soon and not kept.explains(samples)
+        if built is last:
+            return self._tsdf is not None  # which averages some more frames
+        assert last is not None
+        return samples.frame.timestamp_ns - last.frame.timestamp_ns >= RENEWAL_NS
+
+    def _rebuild(self, frame: ViewFrame, view: CameraView, *, moved: bool) -> bool:
+        """Builds the real scene from the frame in which anything last moved; returns whether it changed."""
+        if self._kept is not None and self._kept.built_from is not self._last:
+            assert self.frame is not None
+            assert self.view is not None
+            frame, view, moved = self.frame, self.view, True
+            self._kept.built_from = self._last
         if self._tsdf is not None:
             changed = self._integrate(self._tsdf, frame, view, moved)
         else:
@@ -112,7 +164,7 @@ class RealGeometry:
             elif moved and frame.depth is not None and not self.is_model:
                 self._build_from_depth(frame.depth, frame.color, view)
         if changed:
-            self._scan = None
+            self._scan = self._measurement = None
         return changed
 
     def _integrate(self, tsdf: TsdfScene, frame: ViewFrame, view: CameraView, moved: bool) -> bool:

@@ -1,7 +1,7 @@
 """The camera of one picture: matrices and lens, as the passes need them."""
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from jaxtyping import Float64
@@ -85,9 +85,9 @@ class CameraView:
         own = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])
         if not self.camera.has_distortion:
             return own, self.size
-        rays = self.camera.rays().reshape(-1, 2)
-        low = np.floor(rays.min(axis=0) * own[:2] + own[2:]) - 1
-        high = np.ceil(rays.max(axis=0) * own[:2] + own[2:]) + 1
+        least, greatest = _ray_extremes(self.camera)
+        low = np.floor(least * own[:2] + own[2:]) - 1
+        high = np.ceil(greatest * own[:2] + own[2:]) + 1
         width, height = (int(v) + 1 for v in high - low)
         return np.array([*own[:2], *(own[2:] - low)]), (width, height)
 
@@ -120,15 +120,9 @@ class CameraView:
         if seen is None:
             return _rectangle(None, self.size)
         # Far outside the picture a lens model may fold back into it.
-        low, high = self._ray_bounds
+        low, high = _ray_bounds(self.camera)
         rays = np.clip(seen[:, :2] / seen[:, 2:], low, high)
         return _rectangle(self.camera.project(np.column_stack([rays, np.ones(len(rays))])), self.size)
-
-    @cached_property
-    def _ray_bounds(self) -> tuple[Float64[np.ndarray, "2"], Float64[np.ndarray, "2"]]:
-        """Least and greatest (x/z, y/z) that the picture shows, two pixels wider."""
-        rays, margin = self.camera.rays().reshape(-1, 2), 2 / self.camera.matrix[[0, 1], [0, 1]]
-        return rays.min(axis=0) - margin, rays.max(axis=0) + margin
 
     def raster_rectangle_around(self, points: Float64[np.ndarray, "n 3"]) -> Rectangle:
         """Like `rectangle_around`, for the raster's texels."""
@@ -154,6 +148,19 @@ class CameraView:
             lens_distortion=self.camera.has_distortion and not self.antialiased,
             picture_size=self.size,
         )
+
+
+@lru_cache(maxsize=4)
+def _ray_extremes(camera: CameraModel) -> tuple[Float64[np.ndarray, "2"], Float64[np.ndarray, "2"]]:
+    """Returns the least and greatest (x/z, y/z) of the pixels' centres."""
+    rays = camera.rays().reshape(-1, 2)
+    return rays.min(axis=0), rays.max(axis=0)
+
+
+def _ray_bounds(camera: CameraModel) -> tuple[Float64[np.ndarray, "2"], Float64[np.ndarray, "2"]]:
+    """Returns the least and greatest (x/z, y/z) that the picture shows, two pixels wider."""
+    (low, high), margin = _ray_extremes(camera), 2 / camera.matrix[[0, 1], [0, 1]]
+    return low - margin, high + margin
 
 
 def _rectangle(places: Float64[np.ndarray, "n 2"] | None, size: tuple[int, int]) -> Rectangle:

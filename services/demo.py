@@ -78,7 +78,9 @@ def run_live(method: str, *, port: int, with_browser: bool) -> None:
 def _kept(method: str, data: Path) -> Iterator[Path]:
     """Yield the session file of the demo's scene; a data folder stores the scene too, as the active one."""
     with Store(data) as store:
-        scene = activate_document(store, demo_scene(method).replaced(name=NAME))
+        scene = demo_scene(method)
+        live = scene.replaced(name=NAME, method=scene.method.replaced(quality="live"))
+        scene = activate_document(store, live)
     with session_file(scene) as session:
         yield session
 

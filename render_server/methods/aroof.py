@@ -252,7 +252,7 @@ def _with_hidden(scene: Bindings) -> dict[str, Binding]:
 def aroof(g: Graph, s: FrameResources, setup: Setup[AroofMethod]) -> Layers:
     """Lamps by shadow maps, natural light by occlusion fields; the volume exists only for its debug view."""
     settings, resolved, size = setup.settings, setup.resolved, setup.picture_size
-    lit = light_stages(g, s, resolved, settings.shadow_samples)
+    lit = light_stages(g, s, resolved, settings.shadow_samples, settings.tier)
     options = ShadingOptions(caustics=settings.caustics, screen_space=settings.screen_space)
     shading = Shading(g.gpu, size, resolved, lit.buffers, DirectLight(g.gpu, size), options)
     own = FieldShading(g.gpu, settings, resolved.volume_size, shading.cones)

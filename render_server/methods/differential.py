@@ -146,7 +146,7 @@ def solution_stages(
     beyond = g.stage("voxelize far", voxels.far.voxelize, s.real)
     objects = g.stage("voxelize objects", voxels.voxelize_objects, s.objects, placement)
     both = g.stage("group surfels", voxels.voxelize_both, real, objects)
-    given = s.observation, s.albedo, s.lights, mu_maps, environment, real
+    given = s.measured, s.albedo, s.lights, mu_maps, environment, real
     mu = g.value("voxel scene mu", voxels.mu_scene, *given)
     rho = g.value("voxel scene rho", voxels.rho_scene, mu, s.objects, rho_maps)
     far = g.stage("light far voxels", voxels.far.light, beyond, mu)
@@ -251,7 +251,7 @@ def differential(g: Graph, s: FrameResources, setup: Setup[DifferentialMethod]) 
     mu_maps = g.stage("shadow maps mu", lights.draw_mu, views, s.real)
     rho_maps = g.stage("shadow maps rho", lights.draw_rho, views, s.real, s.objects)
     g.section("voxels")
-    placement = volume_placement(g, s, resolved.volume_size, settings.volume_edge_m)
+    placement = volume_placement(g, s, resolved.volume_size, settings.volume_edge_m, settings.tier)
     voxels = SolutionVoxels(g.gpu, settings, resolved.volume_size)
     lit_voxels = solution_stages(g, s, voxels, placement, mu_maps, rho_maps, environment)
     options = ShadingOptions(

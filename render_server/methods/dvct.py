@@ -137,7 +137,7 @@ def injection_stages(
         "real albedo",
         voxels.find_albedo,
         real,
-        s.observation,
+        s.measured,
         s.albedo,
         s.lights,
         lit.real_maps,
@@ -151,7 +151,7 @@ def injection_stages(
         objects,
         albedo,
         s.objects,
-        s.observation,
+        s.measured,
         s.albedo,
         lit.object_maps,
     )
@@ -166,7 +166,7 @@ class ExactCones:
     ) -> None:
         size = fields.mu.size
         self._voxels, self._fields, self._cone_count = voxels, fields, settings.cone_count
-        self._tracing = TraceCones(gpu, size, march_defines(settings))
+        self._tracing = TraceCones(gpu, size, march_defines(settings), reuses=settings.tier.refresh_tiles > 0)
 
     def marching(self, _mu: VoxelMipmap, _rho: VoxelMipmap) -> dict[str, Binding]:
         """Returns the bindings that cones march with."""
@@ -194,9 +194,11 @@ class ExactCones:
 def dvct_exact(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
     """Marches both solutions at once through one-sided directional voxels."""
     settings, resolved, size = setup.settings, setup.resolved, setup.picture_size
-    lit = light_stages(g, s, resolved, settings.shadow_samples, mirrors=settings.mirrored_lights)
+    lit = light_stages(
+        g, s, resolved, settings.shadow_samples, settings.tier, mirrors=settings.mirrored_lights
+    )
     g.section("voxels")
-    placement = volume_placement(g, s, resolved.volume_size, settings.volume_edge_m)
+    placement = volume_placement(g, s, resolved.volume_size, settings.volume_edge_m, settings.tier)
     voxels = DeltaVoxels(g.gpu, settings, resolved.volume_size)
     mu, rho = delta_voxel_stages(g, s, lit, voxels, placement)
     shading = Shading(
@@ -204,8 +206,14 @@ def dvct_exact(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
         size,
         resolved,
         lit.buffers,
-        DirectLight(g.gpu, size, shadow_cones=DIRECTIONS if settings.resolved_shadow == "cone" else None),
+        DirectLight(
+            g.gpu,
+            size,
+            shadow_cones=DIRECTIONS if settings.resolved_shadow == "cone" else None,
+            reuses=settings.tier.refresh_tiles > 0,
+        ),
         ShadingOptions(
+            tier=settings.tier,
             caustics=settings.caustics,
             screen_space=settings.screen_space,
             mirror_gather="gather" if settings.reflections == "rays" else None,
@@ -247,14 +255,15 @@ def dvct_paper(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
     Split injection fills V_delta and V_rho; the joint V_eta gives visibility.
     """
     settings, resolved, size = setup.settings, setup.resolved, setup.picture_size
-    lit = light_stages(g, s, resolved, settings.shadow_samples)
+    lit = light_stages(g, s, resolved, settings.shadow_samples, settings.tier)
     g.section("voxels")
-    placement = volume_placement(g, s, resolved.volume_size, settings.volume_edge_m)
+    placement = volume_placement(g, s, resolved.volume_size, settings.volume_edge_m, settings.tier)
     voxels = InjectedVoxels(g.gpu, resolved.volume_size)
     injected = injection_stages(g, s, lit, voxels, placement)
     shadow_cones = voxels.directions if settings.resolved_shadow == "cone" else None
-    direct = DirectLight(g.gpu, size, shadow_cones=shadow_cones)
-    shading = Shading(g.gpu, size, resolved, lit.buffers, direct, ShadingOptions())
+    tier = settings.tier
+    direct = DirectLight(g.gpu, size, shadow_cones=shadow_cones, reuses=tier.refresh_tiles > 0)
+    shading = Shading(g.gpu, size, resolved, lit.buffers, direct, ShadingOptions(tier))
     cones = PaperCones(g.gpu, shading.cones)
 
     def trace(scene: Resource[Bindings], grid: Resource[LowResGrid]) -> Resource[ConeFields]:

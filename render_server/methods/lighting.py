@@ -1,7 +1,7 @@
 """Stages that methods share: the lights' depth maps, and shading of the visible surfaces (docs/method.md 3)."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from operator import eq
 from typing import Any
 
@@ -9,6 +9,7 @@ import moderngl
 import numpy as np
 from jaxtyping import Float64
 
+from protocol.scene_method import QualityTier
 from render_server.frame import FrameResources, Observation
 from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Binding, Bindings
@@ -23,10 +24,16 @@ from render_server.passes.cones import ConeFields, LowResGrid
 from render_server.passes.lights import LightBuffers, MirrorVisibility
 from render_server.passes.ray_tracing import ObjectBvh
 from render_server.passes.reflections import ROUGHEST, MirrorRays, ScreenCones
-from render_server.passes.shading import DirectLight, VirtualSurface
+from render_server.passes.shading import DirectLight, LightHistory, VirtualSurface
 from render_server.passes.shadow_maps import ShadowMaps
 from render_server.passes.voxel_light import AlbedoTexture
-from render_server.passes.voxels import PlacedVolume, VolumePlacement, VoxelMipmap, place_volume
+from render_server.passes.voxels import (
+    PlacedVolume,
+    VolumePlacement,
+    VoxelMipmap,
+    keep_placement,
+    place_volume,
+)
 from render_server.scene.declared_surfaces import SurfaceTable
 from render_server.view import CameraView
 
@@ -61,11 +68,21 @@ class LitScene:
 
 
 class LightStages:
-    """Fits the lights' views to their casters and receivers, and draws their depth maps."""
+    """Fits the lights' views to their casters and receivers, and draws their depth maps.
+
+    With `keeps_views`, the views of real shadows stay while objects move a little.
+    """
 
     def __init__(
-        self, gpu: GpuContext, tile_size: int, shadow_samples: int, *, mirrors: bool = False
+        self,
+        gpu: GpuContext,
+        tile_size: int,
+        shadow_samples: int,
+        *,
+        mirrors: bool = False,
+        keeps_views: bool = False,
     ) -> None:
+        self._keeps_views = keeps_views
         self.buffers = LightBuffers(gpu, tile_size, shadow_samples)
         self._mirrors = mirrors
         self._maps = ShadowMaps(gpu)
@@ -82,7 +99,8 @@ class LightStages:
 
         Returns the records of both, which tell whether their maps are still those of the views.
         """
-        receivers = real.points if everywhere else shadow_receivers(real, extent)
+        around = _snapped(extent) if self._keeps_views else extent
+        receivers = real.points if everywhere else shadow_receivers(real, around)
         shining = list(lights.lights)
         mirrors = mirror_lights(shining, surfaces, np.mean(extent, axis=0)) if self._mirrors else []
         self.buffers.place(shining, real.points, receivers, extent, mirrors)
@@ -121,11 +139,19 @@ class LightStages:
 
 
 def light_stages(
-    g: Graph, s: FrameResources, resolved: ResolvedSettings, shadow_samples: int, *, mirrors: bool = False
+    g: Graph,
+    s: FrameResources,
+    resolved: ResolvedSettings,
+    shadow_samples: int,
+    tier: QualityTier,
+    *,
+    mirrors: bool = False,
 ) -> LitScene:
     """Declares environment, light views, depth maps of both geometries, and mirror images of the lights."""
     g.section("lights")
-    stages = LightStages(g.gpu, resolved.rsm_size, shadow_samples, mirrors=mirrors)
+    stages = LightStages(
+        g.gpu, resolved.rsm_size, shadow_samples, mirrors=mirrors, keeps_views=tier.refresh_tiles > 0
+    )
     extent = object_extent(g, s)
     environment = g.stage("environment", stages.set_environment, s.lights)
     fitted = s.lights, s.real, extent, s.surfaces, s.everywhere
@@ -135,7 +161,7 @@ def light_stages(
     object_maps = g.stage("shadow maps objects", stages.draw_objects, object_views, s.objects)
     mirrored = []
     if mirrors:
-        given = real_maps, object_maps, s.lights, extent, s.observation
+        given = real_maps, object_maps, s.lights, extent, s.measured
         mirrored = [g.stage("mirror visibility", stages.map_mirrors, *given, same=_both_none)]
     return LitScene(stages.buffers, environment, real_maps, object_maps, tuple(mirrored))
 
@@ -157,13 +183,19 @@ def _lasting_points(objects: GeometryState) -> Points:
 
 
 def volume_placement(
-    g: Graph, s: FrameResources, size: int, edge_m: float | None
+    g: Graph, s: FrameResources, size: int, edge_m: float | None, tier: QualityTier
 ) -> Resource[VolumePlacement]:
-    """Declares the cube of voxels or cells around the objects."""
+    """Declares the cube of voxels or cells around the objects; a quick tier moves it only when it must."""
+    placed: VolumePlacement | None = None
 
     def place(extent: Points) -> VolumePlacement:
         """Places a cube around the objects, snapped to its cells."""
-        return place_volume(extent.min(axis=0), extent.max(axis=0), size, edge_m)
+        nonlocal placed
+        low, high = extent.min(axis=0), extent.max(axis=0)
+        wanted = place_volume(low, high, size, edge_m)
+        if placed is None or not tier.refresh_tiles or not keep_placement(placed, low, high, wanted):
+            placed = wanted
+        return placed
 
     return g.value("volume placement", place, object_extent(g, s), same=eq)
 
@@ -212,6 +244,7 @@ class ShadingOptions:
     show.
     """
 
+    tier: QualityTier = field(default_factory=QualityTier)
     caustics: bool = False
     screen_space: bool = False
     mirror_gather: str | None = None
@@ -250,13 +283,21 @@ class Shading:
     ) -> None:
         self._gpu, self._options, self._lights, self._direct = gpu, options, lights, direct
         self._scale = resolved.cone_scale
+        self.reuses_light = options.tier.refresh_tiles > 0
         self._bvh = ObjectBvh(gpu)
         self.grid = LowResGrid(gpu, size, resolved.cone_scale)
-        self.cones = ConeFields(gpu, self.grid.size)
+        self.cones = ConeFields(gpu, self.grid.size, remembers=self.reuses_light)
+        self._history: LightHistory | None = None
+        if self.reuses_light:
+            self._history = LightHistory(gpu, self.grid, direct, self.cones, options.tier.refresh_tiles)
         self._surface = VirtualSurface(gpu, size)
         self._change = ChangeRatio(gpu, self.grid.size)
-        self._caustics = Caustics(gpu, self.grid, self._bvh) if options.caustics else None
-        self._screen = ScreenCones(gpu, self.grid, options.march) if options.screen_space else None
+        self._caustics: Caustics | None = None
+        if options.caustics:
+            self._caustics = Caustics(gpu, self.grid, self._bvh, reuses=self.reuses_light)
+        self._screen: ScreenCones | None = None
+        if options.screen_space:
+            self._screen = ScreenCones(gpu, self.grid, options.march, options.tier)
         self._rays: MirrorRays | None = None
         self.normal_offset: Callable[[Points], float] = lights.virtual_texel_m
         self.is_everywhere = False  # nothing is skipped because objects seem not to reach it
@@ -280,7 +321,8 @@ class Shading:
             **geometry,
             **self._lights.bindings,
             **volume.bindings,
-            "normal_offset": SELF_SHADOW_TEXELS * self.normal_offset((low + high) / 2),
+            "normal_offset": self._normal_offset(objects),
+            "pixel_size": 1.0 / view.camera.matrix[0, 0],
             "sample_distance": 1.5 * self._scale / view.camera.matrix[0, 0],
             "object_low": tuple(bounds[:3]),
             "object_high": tuple(1.0 - bounds[3:]),
@@ -288,6 +330,10 @@ class Shading:
             "has_caustics": self._caustics is not None and casts_caustics(objects),
             "hidden_too": self._screen is not None and reflects_screen(objects),
         }
+
+    def _normal_offset(self, objects: GeometryState) -> float:
+        low, high = objects.bounds
+        return SELF_SHADOW_TEXELS * self.normal_offset((low + high) / 2)
 
     def set_objects(self, objects: GeometryState) -> ObjectBvh:
         """Sets the objects' triangles; their hierarchy is built when rays are traced."""
@@ -299,15 +345,35 @@ class Shading:
         self.grid.run(scene)
         return self.grid
 
-    def cast_caustics(
-        self, scene: Bindings, _grid: LowResGrid, _bvh: ObjectBvh, seen: Observation, volume: PlacedVolume
+    def reuse_light(self, scene: Bindings, _grid: LowResGrid, light: object, view: CameraView) -> Bindings:
+        """Fills in the last frame's light where it serves, and lists where light must be computed."""
+        assert self._history is not None
+        is_diffuse = not scene["specular_surfaces"]
+        return {**scene, **self._history.run(scene, light if is_diffuse else object(), view)}
+
+    def trace_beams(
+        self,
+        objects: GeometryState,
+        _bvh: ObjectBvh,
+        seen: Observation,
+        volume: PlacedVolume,
+        _lights: LightSet,
+        *_maps: object,
     ) -> Caustics | None:
-        """Renders caustics if any object is smooth enough."""
-        if self._caustics is None or not scene["has_caustics"]:
+        """Traces the beams that smooth objects cast; None if none is smooth enough."""
+        if self._caustics is None or not casts_caustics(objects):
             return None
         reach = volume.placement.size * volume.placement.voxel_edge
-        self._caustics.run(self._lights, scene, bias_m=seen.scan.bias_m, reach_m=reach)
+        own = {"normal_offset": self._normal_offset(objects)}
+        scene = {**seen.bindings, **objects.materials.bindings, **self._lights.bindings, **own}
+        self._caustics.trace(self._lights, scene, bias_m=seen.scan.bias_m, reach_m=reach)
         return self._caustics
+
+    def cast_caustics(self, scene: Bindings, _grid: LowResGrid, beams: Caustics | None) -> Caustics | None:
+        """Renders the light of the beams where they end."""
+        if beams is not None:
+            beams.run(scene)
+        return beams
 
     def light_directly(
         self, scene: Bindings, grid: LowResGrid, caustics: Caustics | None, voxels: VoxelMipmap | None
@@ -372,6 +438,7 @@ class Shading:
         held = (
             self._bvh,
             self.grid,
+            self._history,
             self.cones,
             self._direct,
             self._surface,
@@ -416,15 +483,37 @@ def shading_stages(
         s.lights,
     )
     bvh = g.stage("object bvh", shading.set_objects, s.objects)
+    beams = g.stage(
+        "caustic beams", shading.trace_beams, s.objects, bvh, s.measured, volume, s.lights, *lit.all
+    )
     grid = g.stage("low res grid", shading.choose_pixels, scene)
+    if shading.reuses_light:
+        # What light at real surfaces depends on, besides the camera: another value whenever any of it changes.
+        changing: tuple[Resource[Any], ...] = (s.objects, s.surfaces, volume, s.everywhere, s.lights)
+        changing += (*lit.all, shown, marching)
+        light = g.value("light state", _new_object, *changing)
+        scene = g.stage("light reuse", shading.reuse_light, scene, grid, light, s.view)
     cones = trace(scene, grid)
-    caustics = g.stage("caustics", shading.cast_caustics, scene, grid, bvh, s.observation, volume)
+    caustics = g.stage("caustics", shading.cast_caustics, scene, grid, beams)
     direct = g.stage("direct light", light_directly or shading.light_directly, scene, grid, caustics, shown)
     reflection = g.stage("reflections", shading.reflect_objects, scene, grid, bvh, marching)
     change = g.stage("change of light", shading.compare, grid, direct, cones, reflection)
     screen = g.stage("screen cones", shading.trace_screen, scene, direct, cones, bvh, s.observation, marching)
     radiance = g.stage("virtual surface", shading.shade_objects, scene, grid, cones, caustics, screen)
     return Layers(direct, cones, grid, change, radiance, reflection, shown, volume, lit.real_maps)
+
+
+def _new_object(*_: object) -> object:
+    """Returns a value that equals no other."""
+    return object()
+
+
+def _snapped(extent: Points) -> Points:
+    """Returns the corners of a box around points, snapped to half of their longest edge."""
+    low, high = extent.min(axis=0), extent.max(axis=0)
+    step = max(float(np.max(high - low)) / 2, 1e-6)
+    step = 2.0 ** np.ceil(np.log2(step))  # an object that turns keeps it
+    return np.stack([np.floor(low / step) * step, np.ceil(high / step) * step])
 
 
 def shadow_receivers(real: GeometryState, extent: Points) -> Points:

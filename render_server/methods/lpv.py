@@ -292,7 +292,7 @@ def lpv_stages(
     scene = g.value(
         "inject scene",
         volumes.real_scene,
-        s.observation,
+        s.measured,
         s.albedo,
         volume,
         s.lights,
@@ -316,19 +316,21 @@ def lpv_stages(
 def dlpv(g: Graph, s: FrameResources, setup: Setup[DlpvMethod]) -> Layers:
     """Subtracts V_mu from V_rho, or uses the paper's single volume of the change."""
     settings, resolved, size = setup.settings, setup.resolved, setup.picture_size
-    lit = light_stages(g, s, resolved, settings.shadow_samples)
+    lit = light_stages(g, s, resolved, settings.shadow_samples, settings.tier)
     g.section("propagation volumes")
-    placement = volume_placement(g, s, resolved.volume_size, settings.volume_edge_m)
+    placement = volume_placement(g, s, resolved.volume_size, settings.volume_edge_m, settings.tier)
     volumes = LpvVolumes(g.gpu, settings, resolved.volume_size)
     volume = g.value("volume", volumes.place, placement)
     mu, rho, delta = lpv_stages(g, s, lit, volumes, volume)
     shown = g.stage("shown cells", volumes.show, "inject change", "inject shadow", volume)
     options = ShadingOptions(
+        tier=settings.tier,
         caustics=settings.resolved_caustics,
         screen_space=settings.resolved_screen_space,
         mirror_gather="gather_lpv" if settings.resolved_reflections == "rays" else None,
     )
-    direct = DirectLight(g.gpu, size, objects_shadow=settings.resolved_shadow == "map")
+    reuses = settings.tier.refresh_tiles > 0
+    direct = DirectLight(g.gpu, size, objects_shadow=settings.resolved_shadow == "map", reuses=reuses)
     shading = Shading(g.gpu, size, resolved, lit.buffers, direct, options)
     fields = LpvFields(g.gpu, volumes, shading.cones)
     marching = g.value("marching", fields.marching, rho)

@@ -33,16 +33,27 @@ _BY_SETTINGS = {method.settings: method for method in BUILT_IN}
 class MethodChoice:
     """A method whose settings and memory were checked.
 
-    `remark`: a sentence for the user, or none. `relights_real`: the real scene changes too.
-    `plugin`: what the method comes from, unless it is the project's own.
+    `settings` are those of the `document` within the limits of its quality. `remark`: a sentence for the user, or
+    none. `relights_real`: the real scene changes too. `plugin`: what the method comes from, unless it is the
+    project's own.
     """
 
     method: RelightingMethod[Any]
+    document: MethodSettings
     settings: MethodSettings
     resolved: ResolvedSettings
     remark: str | None = None
     relights_real: bool = field(default=True, compare=False)
     plugin: Plugin | None = None
+
+    @property
+    def keeps_world(self) -> bool:
+        """Whether the real scene is kept while it explains what a moving camera sees."""
+        return self.settings.tier.refresh_tiles > 0
+
+    def in_best_quality(self, *, software: bool) -> "MethodChoice":
+        """Returns the same method as it is when nothing moves."""
+        return choose_method(self.document.replaced(quality="best"), software=software)
 
     @property
     def composition(self) -> Literal["ratio", "additive"]:
@@ -81,12 +92,14 @@ def choose_method(document: MethodSettings, *, software: bool) -> MethodChoice:
         DeltalightError: more memory than its budget, or a plugin that cannot be used.
     """
     if isinstance(document, NoneMethod):
-        return replace(choose_method(DvctMethod(), software=software), relights_real=False)
+        return replace(
+            choose_method(DvctMethod(quality=document.quality), software=software), relights_real=False
+        )
     method, plugin = _registered(document)
     with _blamed(plugin):
         resolved = method.resolve(document, SOFTWARE_DEFAULTS if software else GPU_DEFAULTS)
         remark = None if method.state_memory is None else method.state_memory(document, resolved)
-    return MethodChoice(method, document, resolved, remark, plugin=plugin)
+    return MethodChoice(method, document, document.limited(), resolved, remark, plugin=plugin)
 
 
 def _registered(settings: MethodSettings) -> tuple[RelightingMethod[Any], Plugin | None]:

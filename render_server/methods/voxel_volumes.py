@@ -304,7 +304,7 @@ def delta_voxel_stages(
     scene = g.value(
         "real voxel scene",
         voxels.real_scene,
-        s.observation,
+        s.measured,
         s.albedo,
         s.lights,
         lit.real_maps,

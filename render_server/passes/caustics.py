@@ -4,7 +4,8 @@ import math
 
 from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Binding, Bindings, Kernel, clear_buffer, list_threads
-from render_server.passes.cones import LowResGrid
+from render_server.gpu.textures import release_all
+from render_server.passes.cones import LowResGrid, reuse_define
 from render_server.passes.lights import LightBuffers
 from render_server.passes.ray_tracing import ObjectBvh
 
@@ -18,6 +19,8 @@ WIDE_ALPHA = 1 / 32
 # A lobe with 85 % of its energy within 45 degrees or more is as good as diffuse: voxels carry its light.
 GREATEST_ALPHA = 0.174
 BEAM_BYTES = 64
+PLACE_BYTES = 32
+TILE = 8  # texels an edge, of what caustic_gather fills at once
 HEADER_BYTES = 16
 SUMS_BYTES = 6 * 4  # per pixel: three channels on its real surface, three on its object
 
@@ -25,13 +28,21 @@ SUMS_BYTES = 6 * 4  # per pixel: three channels on its real surface, three on it
 class Caustics:
     """Renders caustics as fixed-point irradiance on real surfaces and objects (shaders/common/caustic_sums.glsl)."""
 
-    def __init__(self, gpu: GpuContext, grid: LowResGrid, objects: ObjectBvh) -> None:
+    def __init__(
+        self, gpu: GpuContext, grid: LowResGrid, objects: ObjectBvh, *, reuses: bool = False
+    ) -> None:
         self._gpu, self._threads, self._grid, self._objects = gpu, list_threads(gpu), grid, objects
-        pixels = math.prod(grid.picture_size) + math.prod(grid.size)
-        self._sums = gpu.storage_buffer(SUMS_BYTES * pixels, "output.width and output.height")
+        size = SUMS_BYTES * (math.prod(grid.picture_size) + math.prod(grid.size))
+        lower = "output.width and output.height"
+        self._sums = gpu.storage_buffer(size, lower)
+        self._last_sums = gpu.storage_buffer(size, lower) if reuses else None
+        self._reuse = Kernel(gpu, "reuse_light", CAUSTICS=1) if reuses else None
         self._beams = gpu.ctx.buffer(reserve=HEADER_BYTES + BEAM_BYTES)
         self._mirror_beams = Kernel(gpu, "caustic_beams", RAY_COUNT=RAYS)
         self._lobe_beams = Kernel(gpu, "caustic_beams", RAY_COUNT=RAYS, WIDE=1)
+        self._places = gpu.ctx.buffer(reserve=PLACE_BYTES)
+        self._find_places = Kernel(gpu, "caustic_places")
+        self._gather = Kernel(gpu, "caustic_gather", **reuse_define(reuses))
         self._splat = Kernel(gpu, "caustic_splat")
 
     @property
@@ -39,31 +50,42 @@ class Caustics:
         """The sums, for passes that shade."""
         return {"CausticSums": self._sums}
 
-    def run(self, lights: LightBuffers, scene: Bindings, *, bias_m: float, reach_m: float) -> None:
-        """Fills the sums.
+    def trace(self, lights: LightBuffers, scene: Bindings, *, bias_m: float, reach_m: float) -> None:
+        """Traces the beams.
 
         `bias_m` offsets receivers of real shadows towards the light; beams are traced up to `reach_m`.
         """
-        clear_buffer(self._gpu, self._sums)
         self._empty_beams(len(lights.virtual_views))
         for view in range(len(lights.virtual_views)):
             self._trace_beams(lights, lights.first_virtual_view + view, scene, bias_m, reach_m)
+
+    def run(self, scene: Bindings) -> None:
+        """Fills the sums with the light of the beams where they end."""
+        if self._last_sums is not None:
+            self._sums, self._last_sums = self._last_sums, self._sums
+        clear_buffer(self._gpu, self._sums)
         grid = self._grid
-        self._splat.run(
-            (self._threads,),
-            self.bindings,
-            scene,
-            Beams=self._beams,
-            sample_pixels=grid.pixels,
-            picture_pixels=grid.picture_size,
-            scale=grid.scale,
-        )
+        if self._reuse is not None:
+            self._reuse.run(grid.size, self.bindings, grid.bindings, scene, LastSums=self._last_sums)
+        shared: Bindings = {
+            **self.bindings,
+            "Beams": self._beams,
+            "BeamPlaces": self._places,
+            "sample_pixels": grid.pixels,
+            "picture_pixels": grid.picture_size,
+            "scale": grid.scale,
+        }
+        self._find_places.run((self._threads,), shared, scene)
+        tiles = tuple(-(-edge // TILE) for edge in grid.size)
+        self._gather.run((8 * tiles[0], 4 * tiles[1]), shared, scene)
+        self._splat.run((self._threads,), shared, scene)
 
     def _empty_beams(self, views: int) -> None:
         """Allocates and clears the beams of that many views."""
-        needed = HEADER_BYTES + BEAM_BYTES * max(views * BLOCKS**2 * RAYS, 1)
-        if self._beams.size < needed:
-            self._beams.orphan(needed)
+        most = max(views * BLOCKS**2 * RAYS, 1)
+        if self._places.size < PLACE_BYTES * most:
+            self._beams.orphan(HEADER_BYTES + BEAM_BYTES * most)
+            self._places.orphan(PLACE_BYTES * most)
         self._beams.write(bytes(HEADER_BYTES))
 
     def _trace_beams(
@@ -86,5 +108,15 @@ class Caustics:
 
     def release(self) -> None:
         """Frees the GL objects."""
-        for item in (self._sums, self._beams, self._mirror_beams, self._lobe_beams, self._splat):
-            item.release()
+        release_all(
+            self._sums,
+            self._last_sums,
+            self._reuse,
+            self._beams,
+            self._places,
+            self._mirror_beams,
+            self._lobe_beams,
+            self._find_places,
+            self._gather,
+            self._splat,
+        )

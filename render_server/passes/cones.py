@@ -6,7 +6,7 @@ import moderngl
 
 from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Binding, Bindings, Kernel, list_threads
-from render_server.gpu.textures import texture_2d
+from render_server.gpu.textures import release_all, texture_2d
 from render_server.passes.voxels import VoxelMipmap
 
 
@@ -54,28 +54,52 @@ class LowResGrid:
 
 
 class ConeFields:
-    """Light gathered by cones at 1/scale of the picture: irradiance (diffuse) and mean radiance (specular cone)."""
+    """Light gathered by cones at 1/scale of the picture: irradiance (diffuse) and mean radiance (specular cone).
 
-    def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
+    With `remembers`, the irradiance of the last frame too.
+    """
+
+    def __init__(self, gpu: GpuContext, size: tuple[int, int], *, remembers: bool = False) -> None:
         self.mu = texture_2d(gpu, size, 4, "f2")
         self.rho = texture_2d(gpu, size, 4, "f2")
         self.specular_mu = texture_2d(gpu, size, 4, "f2")
         self.specular_rho = texture_2d(gpu, size, 4, "f2")
         self.virtual = texture_2d(gpu, size, 4, "f2")
         self.virtual_specular = texture_2d(gpu, size, 4, "f2")
+        self.last: tuple[moderngl.Texture, ...] = ()
+        if remembers:
+            self.last = tuple(texture_2d(gpu, size, 4, "f2") for _ in range(3))
+
+    def remember(self) -> dict[str, Binding]:
+        """Makes the irradiance the last frame's, and returns its bindings."""
+        now = self.mu, self.rho, self.virtual
+        (self.mu, self.rho, self.virtual), self.last = self.last, now
+        return {"last_cone_mu": now[0], "last_cone_rho": now[1], "last_irradiance": now[2]}
 
     def release(self) -> None:
         """Frees the textures."""
-        for texture in vars(self).values():
-            texture.release()
+        of_frame = (
+            self.mu,
+            self.rho,
+            self.specular_mu,
+            self.specular_rho,
+            self.virtual,
+            self.virtual_specular,
+        )
+        release_all(*of_frame, *self.last)
+
+
+def reuse_define(reuses: bool) -> dict[str, int]:
+    """Returns the define of kernels that leave out what the last frame's light serves for."""
+    return {"REUSES": 1} if reuses else {}
 
 
 class BilateralConeFilter:
     """Averages neighbouring texels, whose cones point in different directions: a joint bilateral tent over 3 x 3."""
 
-    def __init__(self, gpu: GpuContext) -> None:
-        self._real = Kernel(gpu, "bilateral_cone_filter", REAL=1)
-        self._virtual = Kernel(gpu, "bilateral_cone_filter")
+    def __init__(self, gpu: GpuContext, *, reuses: bool = False) -> None:
+        self._real = Kernel(gpu, "bilateral_cone_filter", REAL=1, **reuse_define(reuses))
+        self._virtual = Kernel(gpu, "bilateral_cone_filter", **reuse_define(reuses))
 
     def filter_real(
         self,
@@ -110,16 +134,20 @@ class BilateralConeFilter:
 class TraceCones:
     """Traces the cones of the exact operator: both marches at real surfaces, rho's at virtual ones.
 
-    See docs/method.md 3 and 4.5. `size` is that of the reduced grid, `defines` are those of march.glsl.
+    See docs/method.md 3 and 4.5. `size` is that of the reduced grid, `defines` are those of march.glsl. With
+    `reuses`, only where the scene's `stale_texels` say so, or the last frame saw other surfaces.
     """
 
-    def __init__(self, gpu: GpuContext, size: tuple[int, int], defines: Mapping[str, int]) -> None:
+    def __init__(
+        self, gpu: GpuContext, size: tuple[int, int], defines: Mapping[str, int], *, reuses: bool = False
+    ) -> None:
         self._gpu = gpu
         self._mu, self._rho, self._irradiance = (texture_2d(gpu, size, 4, "f2") for _ in range(3))
-        self._filter = BilateralConeFilter(gpu)
+        self._filter = BilateralConeFilter(gpu, reuses=reuses)
         self._real = Kernel(gpu, "trace_cones", REAL=1, **defines)
-        self._virtual = Kernel(gpu, "trace_cones", **defines)
-        self._select = Kernel(gpu, "select_cone_texels", REAL=1)
+        self._virtual = Kernel(gpu, "trace_cones", **reuse_define(reuses), **defines)
+        self._reuse = Kernel(gpu, "reuse_light") if reuses else None
+        self._select = Kernel(gpu, "select_cone_texels", REAL=1, **reuse_define(reuses))
         self._texels = gpu.ctx.buffer(reserve=4)
 
     def trace_real(
@@ -144,13 +172,15 @@ class TraceCones:
     ) -> None:
         """Traces E_rho and the specular cone of virtual surfaces."""
         self._irradiance.write(bytes(8 * grid.texel_count))
+        listed: Bindings = {**grid.bindings, "Texels": grid.virtual_texels}
+        if self._reuse is not None:
+            self._reuse.run(grid.size, listed, scene, irradiance=self._irradiance)
         self._virtual.run(
             self._threads(grid),
-            grid.bindings,
+            listed,
             scene,
             irradiance_rho=self._irradiance,
             specular_rho=fields.virtual_specular,
-            Texels=grid.virtual_texels,
             pyramid_mu=mu.texture,
             pyramid_rho=rho.texture,
         )
@@ -168,12 +198,8 @@ class TraceCones:
 
     def release(self) -> None:
         """Frees the GL objects."""
-        for texture in (self._mu, self._rho, self._irradiance):
-            texture.release()
-        for kernel in (self._real, self._virtual, self._select):
-            kernel.release()
-        self._filter.release()
-        self._texels.release()
+        release_all(self._mu, self._rho, self._irradiance, self._filter, self._texels)
+        release_all(self._real, self._virtual, self._reuse, self._select)
 
 
 class TraceConesPaper:

@@ -4,9 +4,10 @@ from collections.abc import Mapping
 
 import moderngl
 
+from protocol.scene_method import QualityTier
 from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Bindings, Kernel, ListGroups, list_threads
-from render_server.gpu.textures import texture_2d
+from render_server.gpu.textures import release_all, texture_2d
 from render_server.passes.caustics import GREATEST_ALPHA
 from render_server.passes.cones import ConeFields, LowResGrid
 from render_server.passes.ray_tracing import ObjectBvh
@@ -21,10 +22,9 @@ GROUP = 64  # invocations of a workgroup: one per texel of a list, or per ray
 
 # A lobe with 85 % of its energy within 45 degrees or more is as good as diffuse: the wider cones serve.
 ROUGHEST = GREATEST_ALPHA**0.5
-CONE_COUNT = 4
 # A uniform disc with the median of the GGX lobe has this multiple of alpha as its half-angle (rad): half of the lobe
-# lies within 2 alpha, half of a disc within 1 / sqrt(2) of its radius. The cones share the disc.
-MEDIAN_DISC = 2.0 * 2.0**0.5 / CONE_COUNT**0.5
+# lies within 2 alpha, half of a disc within 1 / sqrt(2) of its radius.
+MEDIAN_DISC = 2.0 * 2.0**0.5
 
 
 class MirrorRays:
@@ -145,38 +145,57 @@ class ScreenCones:
 
     `reflected` (RGBA16F): radiance times fraction of the specular lobe, and that fraction, on the picture's grid.
     `march` are defines of march.glsl to look up in voxels and environment what the picture does not show; the
-    fraction is then 1. None: that fraction of the lobe is left to other passes.
+    fraction is then 1. None: that fraction of the lobe is left to other passes. `tier` says how finely.
     """
 
-    def __init__(self, gpu: GpuContext, grid: LowResGrid, march: Mapping[str, float | str] | None) -> None:
+    def __init__(
+        self,
+        gpu: GpuContext,
+        grid: LowResGrid,
+        march: Mapping[str, float | str] | None,
+        tier: QualityTier,
+    ) -> None:
         self._grid = grid
         self._threads = list_threads(gpu, grid.picture_size[0] * grid.picture_size[1])
         self.reflected = texture_2d(gpu, grid.picture_size, 4, "f2")
         voxels = {} if march is None else {"VOXELS": 1, **march}
+        if tier.reflection_step == 2:
+            voxels["QUADS"] = 1
         self._kernel = Kernel(
-            gpu, "screen_cones", ROUGHEST=ROUGHEST, CONE_COUNT=CONE_COUNT, MEDIAN_DISC=MEDIAN_DISC, **voxels
+            gpu,
+            "screen_cones",
+            ROUGHEST=ROUGHEST,
+            CONE_COUNT=tier.reflection_cones,
+            MEDIAN_DISC=MEDIAN_DISC / tier.reflection_cones**0.5,  # the cones share the disc
+            **voxels,
         )
+        self._traced: moderngl.Texture | None = None
+        self._fill: Kernel | None = None
+        if tier.reflection_step == 2:
+            self._traced = texture_2d(gpu, grid.picture_size, 4, "f2")
+            self._fill = Kernel(gpu, "fill_reflections")
 
     def run(self, direct: DirectLight, cones: ConeFields, objects: ObjectBvh, scene: Bindings) -> None:
         """Fills `reflected`; the picture needs its mip levels (`CameraImage.build_levels`)."""
+        texels: Bindings = {"Texels": self._grid.virtual_texels, "scale": self._grid.scale}
         self._kernel.run(
             (self._threads,),
             objects.bindings,
+            texels,
             scene,
-            reflected=self.reflected,
-            Texels=self._grid.virtual_texels,
+            reflected=self.reflected if self._traced is None else self._traced,
             sample_pixels=self._grid.pixels,
-            scale=self._grid.scale,
             direct_mu=direct.mu,
             direct_rho=direct.rho,
             cone_mu=cones.mu,
             cone_rho=cones.rho,
         )
+        if self._fill is not None:
+            self._fill.run((self._threads,), texels, scene, traced=self._traced, reflected=self.reflected)
 
     def release(self) -> None:
         """Frees the GL objects."""
-        self.reflected.release()
-        self._kernel.release()
+        release_all(self.reflected, self._traced, self._kernel, self._fill)
 
 
 def _clear_list(texels: moderngl.Buffer) -> None:

@@ -1,6 +1,10 @@
 """Full-resolution shading: direct light on the real surfaces, and radiance of the virtual ones."""
 
+import math
+
 import moderngl
+import numpy as np
+from jaxtyping import Float64
 
 from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Binding, Bindings, Kernel, list_threads
@@ -8,13 +12,15 @@ from render_server.gpu.textures import release_all, texture_2d
 from render_server.passes.caustics import Caustics
 from render_server.passes.cones import ConeFields, LowResGrid
 from render_server.passes.lights import LightBuffers
+from render_server.view import CameraView
 
 
 class DirectLight:
     """E_mu and E_rho of the lights (RGBA16F), and their lobes on declared specular surfaces.
 
     With `shadow_cones`, that many cones through voxels give the objects' shadows ([P1] eq. 4); without, shadow maps
-    do. Without `objects_shadow` other passes do, and E_rho is E_mu.
+    do. Without `objects_shadow` other passes do, and E_rho is E_mu. With `reuses`, only the texels that the scene
+    lists are shaded.
     """
 
     def __init__(
@@ -24,8 +30,9 @@ class DirectLight:
         *,
         shadow_cones: int | None = None,
         objects_shadow: bool = True,
+        reuses: bool = False,
     ) -> None:
-        self._size = size
+        self._gpu, self._size, self._reuses = gpu, size, reuses
         self.mu = texture_2d(gpu, size, 4, "f2")
         self.rho = texture_2d(gpu, size, 4, "f2")
         self.lobe_mu = texture_2d(gpu, size, 4, "f2")
@@ -33,6 +40,8 @@ class DirectLight:
         defines = {} if shadow_cones is None else {"SHADOW_CONES": 1, "DIRECTIONS": shadow_cones}
         if not objects_shadow:
             defines = {"REAL_SHADOWS": 1}
+        if reuses:
+            defines = {**defines, "LISTED": 1}
         self._kernel = Kernel(gpu, "direct_light", **defines)
 
     @property
@@ -53,14 +62,105 @@ class DirectLight:
         joint: moderngl.Texture3D | None = None,
         caustics: Caustics | None = None,
     ) -> None:
-        """Shades every pixel. `joint`: the voxels that shadow cones march through; `caustics`: added to E_rho."""
+        """Shades the pixels. `joint`: the voxels that shadow cones march through; `caustics`: added to E_rho."""
         voxels: dict[str, Binding] = {} if joint is None else {"joint_pyramid": joint}
-        self._kernel.run(self._size, self.bindings, voxels, _caustics_on(grid, caustics), scene)
+        threads = (list_threads(self._gpu, math.prod(self._size)),) if self._reuses else self._size
+        self._kernel.run(threads, self.bindings, voxels, _caustics_on(grid, caustics), scene)
 
     def release(self) -> None:
         """Frees the GL objects."""
         for item in (self.mu, self.rho, self.lobe_mu, self.lobe_rho, self._kernel):
             item.release()
+
+
+class LightHistory:
+    """Reuses the light of the last frame while only the camera moves.
+
+    Irradiance does not depend on where it is seen from: what the last frame computed is looked up where the surface
+    was in its picture (reverse reprojection caching, Nehab et al. 2007). Pixels whose surface it did not show are
+    computed, and in turn one tile in `turns`.
+    """
+
+    def __init__(
+        self, gpu: GpuContext, grid: LowResGrid, direct: DirectLight, cones: ConeFields, turns: int
+    ) -> None:
+        self._grid, self._direct, self._cones, self._turns = grid, direct, cones, turns
+        size = grid.picture_size
+        self._last_direct = tuple(texture_2d(gpu, size, 4, "f2") for _ in range(2))
+        self._positions = [texture_2d(gpu, size, 4, "f4") for _ in range(2)]
+        self._real_texels, self._object_texels = (
+            [texture_2d(gpu, grid.size, 4, "f4") for _ in range(2)] for _ in range(2)
+        )
+        self._stale = texture_2d(gpu, grid.size, 1, "u1")
+        self._texels = gpu.ctx.buffer(reserve=4 * (1 + grid.texel_count))
+        self._reproject = Kernel(gpu, "reproject_light")
+        self._find_stale = Kernel(gpu, "stale_texels")
+        self._seen: tuple[object, Float64[np.ndarray, "4 4"]] | None = None
+        self._turn = 0
+
+    def run(self, scene: Bindings, light: object, view: CameraView) -> dict[str, Binding]:
+        """Fills in the light that the last frame knows, and lists the rest.
+
+        `light` is the same object as in the last frame if nothing but the camera has changed since. Returns the
+        bindings of the passes that compute the rest.
+        """
+        last, self._seen = self._seen, (light, view.camera_from_world)
+        has_history = last is not None and last[0] is light
+        matrix = view.camera_from_world if last is None else last[1]
+        self._turn = (self._turn + 1) % self._turns
+        self._positions.reverse()
+        self._real_texels.reverse()
+        self._object_texels.reverse()
+        direct = self._direct
+        self._last_direct, (direct.mu, direct.rho) = (direct.mu, direct.rho), self._last_direct
+        found: dict[str, Binding] = {
+            "has_history": has_history,
+            "last_camera_from_world": matrix,
+            "last_position": self._positions[1],
+            "last_real_texels": self._real_texels[1],
+            "last_object_texels": self._object_texels[1],
+            "stale_texels": self._stale,
+            "Texels": self._texels,
+            **self._cones.remember(),
+        }
+        self._texels.write(bytes(4))
+        self._fill(scene, found)
+        return found
+
+    def _fill(self, scene: Bindings, found: Bindings) -> None:
+        shared: Bindings = {**found, "scale": self._grid.scale, "turns": self._turns, "turn": self._turn}
+        self._reproject.run(
+            self._grid.picture_size,
+            shared,
+            scene,
+            position_out=self._positions[0],
+            direct_mu_out=self._direct.mu,
+            direct_rho_out=self._direct.rho,
+            last_direct_mu=self._last_direct[0],
+            last_direct_rho=self._last_direct[1],
+        )
+        self._find_stale.run(
+            self._grid.size,
+            shared,
+            scene,
+            sample_pixels=self._grid.pixels,
+            stale_out=self._stale,
+            real_texels_out=self._real_texels[0],
+            object_texels_out=self._object_texels[0],
+        )
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        release_all(
+            *self._last_direct,
+            *self._positions,
+            *self._real_texels,
+            *self._object_texels,
+            self._stale,
+            self._texels,
+            self._reproject,
+            self._find_stale,
+        )
 
 
 class DirectLightPair(DirectLight):

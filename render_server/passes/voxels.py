@@ -29,6 +29,10 @@ LARGEST_ITEM_BYTES = (
 )
 LOWER_VOLUME, LOWER_SURFELS = "method.volume_size", "method.volume_size or method.triangle_budget"
 
+SPARE_EDGE = (
+    0.125  # of a volume that stays while its objects move: the light around them changes that far at least
+)
+
 LONGEST_EDGE_VOXELS = 8.0  # longer ones are split before: balances the threads, bounds each one's loops
 
 
@@ -95,6 +99,22 @@ def place_volume(
     voxel = edge / size
     origin = np.floor(((low + high) / 2 - edge / 2) / voxel) * voxel
     return VolumePlacement((float(origin[0]), float(origin[1]), float(origin[2])), voxel, size)
+
+
+def keep_placement(
+    old: VolumePlacement,
+    low: Float64[np.ndarray, "3"],
+    high: Float64[np.ndarray, "3"],
+    wanted: VolumePlacement,
+) -> bool:
+    """Returns whether objects that move may stay in the volume that was placed around them before.
+
+    They must keep away from its border by SPARE_EDGE of its edge, and its voxels must be of about the `wanted` size.
+    """
+    edge = old.size * old.voxel_edge
+    origin, spare = np.array(old.origin), SPARE_EDGE * edge
+    fits = bool((low >= origin + spare).all() and (high <= origin + edge - spare).all())
+    return fits and old.size == wanted.size and 0.8 < wanted.voxel_edge / old.voxel_edge < 1.25
 
 
 class PlacedVolume:

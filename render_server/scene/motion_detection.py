@@ -1,13 +1,15 @@
-"""Detects when the real scene has changed since the renderer last built geometry and light from it."""
+"""Detects when the real scene or the camera has moved, and when a kept real scene no longer explains a frame."""
 
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Bool, Float32, Float64
 
+from protocol.camera_model import CameraModel
 from protocol.frames import DepthImage, ViewFrame, decode_lut
-from render_server.scene.depth_surface import noise_sigma
+from render_server.scene.depth_surface import MAX_SLOPE_DEG, noise_sigma
 
 GRID_STEP_PX = 4
 
@@ -20,6 +22,7 @@ class MotionThresholds:
     `depth_sigmas`: a depth sample has moved beyond this many standard deviations of a difference;
     `depth_fraction`: fraction of the samples that may (0..1). `color_noise`: standard deviation of linear colour at
     1.0, falling with its square root (shot noise; camera units); `color_sigmas`, `color_fraction` as for depth.
+    `unseen_fraction`: fraction of a moving camera's samples that a kept scene need not hold (0..1).
     """
 
     image_motion_px: float = 0.5
@@ -28,15 +31,37 @@ class MotionThresholds:
     color_noise: float = 0.02
     color_sigmas: float = 4.0
     color_fraction: float = 0.005
+    unseen_fraction: float = 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class _Reference:
-    """The frame that the scene was last built from, subsampled."""
+class FrameSamples:
+    """A frame on a grid of GRID_STEP_PX pixels: mean linear colour, and inverse depth (0 = unknown)."""
 
     frame: ViewFrame
     color: Float32[np.ndarray, "gh gw 3"]
     inverse_depth: Float32[np.ndarray, "gh gw"] | None
+
+    @staticmethod
+    def of(frame: ViewFrame) -> "FrameSamples":
+        """Samples a frame."""
+        return FrameSamples(frame, _downsampled_color(frame), _subsampled_inverse_depth(frame.depth))
+
+    @cached_property
+    def depth_range(self) -> tuple[Float32[np.ndarray, "gh gw"], Float32[np.ndarray, "gh gw"]]:
+        """Least and greatest known inverse depth of each sample and its eight neighbours; 0 where none is known."""
+        assert self.inverse_depth is not None
+        kernel, known = np.ones((3, 3), np.uint8), self.inverse_depth > 0
+        far = cv2.erode(np.where(known, self.inverse_depth, np.float32(np.inf)), kernel)
+        return np.where(np.isfinite(far), far, np.float32(0)), np.asarray(
+            cv2.dilate(self.inverse_depth, kernel)
+        )
+
+    @cached_property
+    def color_range(self) -> tuple[Float32[np.ndarray, "gh gw 3"], Float32[np.ndarray, "gh gw 3"]]:
+        """Least and greatest colour of each sample and its eight neighbours."""
+        kernel = np.ones((3, 3), np.uint8)
+        return np.asarray(cv2.erode(self.color, kernel)), np.asarray(cv2.dilate(self.color, kernel))
 
 
 class MotionDetector:
@@ -48,46 +73,146 @@ class MotionDetector:
 
     def __init__(self, thresholds: MotionThresholds | None = None) -> None:
         self._thresholds = thresholds or MotionThresholds()
-        self._reference: _Reference | None = None
+        self._reference: FrameSamples | None = None
 
-    def update(self, frame: ViewFrame) -> bool:
-        """Returns whether the real scene must be rebuilt; if so, `frame` becomes the reference."""
-        current = _Reference(frame, _downsampled_color(frame), _subsampled_inverse_depth(frame.depth))
-        if self._reference is not None and not self._changed(self._reference, current):
+    def update(self, current: FrameSamples) -> bool:
+        """Returns whether anything moved; if so, the frame becomes the reference."""
+        if self._reference is not None and not _has_changed(self._reference, current, self._thresholds):
             return False
         self._reference = current
         return True
 
-    def _changed(self, old: _Reference, new: _Reference) -> bool:
-        before, after = old.frame, new.frame
-        return (
-            before.camera != after.camera
-            or (before.depth is None) != (after.depth is None)
-            or _image_motion(before, after, old.inverse_depth) > self._thresholds.image_motion_px
-            or self._moved_fraction(old, new) > self._thresholds.depth_fraction
-            or self._recolored_fraction(old, new) > self._thresholds.color_fraction
-        )
 
-    def _moved_fraction(self, old: _Reference, new: _Reference) -> float:
-        """Returns the fraction of common samples whose inverse depth differs by more than noise explains."""
-        before, after, depth = old.inverse_depth, new.inverse_depth, new.frame.depth
-        if before is None or after is None or depth is None:
-            return 0.0
-        if before.shape != after.shape:
-            return 1.0
-        both = (before > 0) & (after > 0)
-        limit = self._thresholds.depth_sigmas * np.sqrt(2) * noise_sigma(depth)
-        moved = both & (np.abs(after - before) > limit)
-        return float(np.count_nonzero(moved)) / max(int(np.count_nonzero(both)), 1)
+def _has_changed(old: FrameSamples, new: FrameSamples, thresholds: MotionThresholds) -> bool:
+    """Returns whether two frames differ by more than noise."""
+    before, after = old.frame, new.frame
+    return (
+        before.camera != after.camera
+        or (before.depth is None) != (after.depth is None)
+        or _image_motion(before, after, old.inverse_depth) > thresholds.image_motion_px
+        or _moved_fraction(old, new, thresholds) > thresholds.depth_fraction
+        or _recolored_fraction(old, new, thresholds) > thresholds.color_fraction
+    )
 
-    def _recolored_fraction(self, old: _Reference, new: _Reference) -> float:
-        """Returns the fraction of block means whose linear colour differs in any channel by more than noise explains.
 
-        A block's mean has the noise of a pixel divided by the block's edge; codecs leave some more.
-        """
-        sigma = self._thresholds.color_noise * np.sqrt(np.maximum(old.color, 0.01)) / 2
-        limit = self._thresholds.color_sigmas * np.sqrt(2) * sigma
-        return float((np.abs(new.color - old.color) > limit).any(axis=-1).mean())
+def _moved_fraction(old: FrameSamples, new: FrameSamples, thresholds: MotionThresholds) -> float:
+    """Returns the fraction of common samples whose inverse depth differs by more than noise explains."""
+    before, after, depth = old.inverse_depth, new.inverse_depth, new.frame.depth
+    if before is None or after is None or depth is None:
+        return 0.0
+    if before.shape != after.shape:
+        return 1.0
+    both = (before > 0) & (after > 0)
+    moved = both & (np.abs(after - before) > _depth_limit(depth, thresholds))
+    return float(np.count_nonzero(moved)) / max(int(np.count_nonzero(both)), 1)
+
+
+def _depth_limit(depth: DepthImage, thresholds: MotionThresholds) -> float:
+    """Returns the difference of inverse depths that noise explains."""
+    return thresholds.depth_sigmas * float(np.sqrt(2)) * noise_sigma(depth)
+
+
+def _recolored_fraction(old: FrameSamples, new: FrameSamples, thresholds: MotionThresholds) -> float:
+    """Returns the fraction of block means whose linear colour differs in any channel by more than noise explains.
+
+    A block's mean has the noise of a pixel divided by the block's edge; codecs leave some more.
+    """
+    limit = _color_limit(old.color, thresholds)
+    return float((np.abs(new.color - old.color) > limit).any(axis=-1).mean())
+
+
+class KeptWorld:
+    """Tells whether the real scene, as built from an earlier frame, still explains what the camera sees.
+
+    Seen from the same place, a frame may differ by no more than noise (MotionThresholds). Seen from elsewhere, its
+    samples are looked up in the frame that the scene was built from.
+    """
+
+    def __init__(self, thresholds: MotionThresholds | None = None) -> None:
+        self._thresholds = thresholds or MotionThresholds()
+        self.built_from: FrameSamples | None = None
+
+    def explains(self, new: FrameSamples) -> bool:
+        """Returns whether the scene need not be rebuilt; without depth, while the picture has moved little."""
+        old, thresholds = self.built_from, self._thresholds
+        if old is None or old.frame.camera != new.frame.camera:
+            return False
+        motion_px = _image_motion(old.frame, new.frame, old.inverse_depth)
+        if motion_px <= thresholds.image_motion_px:
+            return not _has_changed(old, new, thresholds)
+        if old.inverse_depth is None or new.inverse_depth is None:
+            return motion_px <= thresholds.unseen_fraction * new.frame.camera.width
+        appeared, unseen = _compared(old, new, thresholds)
+        return appeared <= thresholds.depth_fraction and unseen <= thresholds.unseen_fraction
+
+
+def _compared(old: FrameSamples, new: FrameSamples, thresholds: MotionThresholds) -> tuple[float, float]:
+    """Returns fractions of the samples with depth, seen from another place than the old frame's.
+
+    The first: what has appeared before the old surface, or has another colour than anything around it had. The
+    second: what the old frame did not show, or showed something else before it.
+    """
+    assert old.inverse_depth is not None
+    assert new.inverse_depth is not None
+    assert new.frame.depth is not None
+    cells, inverse, known = _reprojected(old, new)
+    tilt = np.tan(np.radians(MAX_SLOPE_DEG)) * GRID_STEP_PX / new.frame.camera.matrix[0, 0]
+    limit = _depth_limit(new.frame.depth, thresholds) + tilt * inverse
+    farthest, nearest = (edge[cells] for edge in old.depth_range)
+    low, high = (edge[cells] for edge in old.color_range)
+    seen = old.inverse_depth[cells] > 0
+    same_place = seen & (inverse >= farthest - limit) & (inverse <= nearest + limit)
+    color, spare = new.color[known], _color_limit(old.color[cells], thresholds)
+    recolored = ((color < low - spare) | (color > high + spare)).any(axis=-1)
+    appeared = (seen & (inverse > nearest + limit)) | (same_place & recolored)
+    total = max(int(np.count_nonzero(new.inverse_depth)), 1)
+    unseen = total - int(np.count_nonzero(same_place | appeared))
+    return float(np.count_nonzero(appeared)) / total, unseen / total
+
+
+def _color_limit(
+    color: Float32[np.ndarray, "*n 3"], thresholds: MotionThresholds
+) -> Float32[np.ndarray, "*n 3"]:
+    """Returns the difference of block means that noise explains: of half the deviation of a pixel's."""
+    sigma = thresholds.color_noise * np.sqrt(np.maximum(color, 0.01)) / 2
+    return np.asarray(thresholds.color_sigmas * np.sqrt(2) * sigma)
+
+
+def _reprojected(
+    old: FrameSamples, new: FrameSamples
+) -> tuple[tuple[np.ndarray, np.ndarray], Float64[np.ndarray, " n"], Bool[np.ndarray, "gh gw"]]:
+    """Places the samples of `new` with depth in the picture of `old`.
+
+    Returns the cells (row, column) and inverse depths of those that it shows, and which samples they are.
+    """
+    assert new.inverse_depth is not None
+    assert old.frame.pose is not None
+    assert new.frame.pose is not None
+    camera, inverse = new.frame.camera, new.inverse_depth
+    known = inverse > 0
+    points = _sample_rays(camera, inverse.shape)[known] / inverse[known][:, None]
+    old_from_new = np.linalg.inv(old.frame.pose.world_from_camera) @ new.frame.pose.world_from_camera
+    moved = np.einsum("ni,ji->nj", points, old_from_new[:3, :3]) + old_from_new[:3, 3]
+    ahead = np.maximum(moved[:, 2], 1e-6)
+    fx, fy, cx, cy = camera.matrix[[0, 1, 0, 1], [0, 1, 2, 2]]
+    column = np.floor((moved[:, 0] / ahead * fx + cx) / GRID_STEP_PX).astype(int)
+    row = np.floor((moved[:, 1] / ahead * fy + cy) / GRID_STEP_PX).astype(int)
+    shown = (
+        (moved[:, 2] > 0) & (row >= 0) & (row < len(inverse)) & (column >= 0) & (column < inverse.shape[1])
+    )
+    chosen = np.zeros_like(known)
+    chosen[known] = shown
+    return (row[shown], column[shown]), 1 / ahead[shown], chosen
+
+
+@lru_cache(maxsize=2)
+def _sample_rays(camera: CameraModel, shape: tuple[int, int]) -> Float64[np.ndarray, "gh gw 3"]:
+    """Returns (x/z, y/z, 1) of the grid's pixels, of which every fourth has its depth."""
+    first = GRID_STEP_PX // 2
+    columns, rows = (first + GRID_STEP_PX * np.arange(count) for count in shape[::-1])
+    pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2).astype(float)
+    rays = camera.unproject(pixels)
+    return np.column_stack([rays, np.ones(len(rays))]).reshape(*shape, 3)
 
 
 def _downsampled_color(frame: ViewFrame) -> Float32[np.ndarray, "gh gw 3"]:

@@ -22,6 +22,14 @@ class View(StrEnum):
     LIGHTS = "lights"
 
 
+class Quality(StrEnum):
+    """What a moving picture may give up for speed (`method.quality` of the scene document)."""
+
+    LIVE = "live"
+    BALANCED = "balanced"
+    BEST = "best"
+
+
 class Method(StrEnum):
     """A relighting method: dvct as the scene says, or with one of its operators, or another one with its defaults."""
 

@@ -8,7 +8,7 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from services.commands.options import View
+from services.commands.options import Quality, View
 
 if TYPE_CHECKING:
     from services.offline import RenderSummary
@@ -29,6 +29,9 @@ def render(
         int | None, typer.Option(min=0, help="EGL device; `deltalight doctor` lists them.")
     ] = None,
     view: Annotated[View | None, typer.Option(help="What to show; default: as the scene says.")] = None,
+    quality: Annotated[
+        Quality, typer.Option(help="What moving pictures may give up for speed; files need not.")
+    ] = Quality.BEST,
     exr: Annotated[bool, typer.Option("--exr", help="Write linear OpenEXR files too.")] = False,
     allow_software: Annotated[
         bool, typer.Option("--allow-software", help="Do not warn where there is no GPU.")
@@ -44,6 +47,7 @@ def render(
     size_px = None if size is None else parse_size(size)
     recording = open_source(source)
     document = with_output(choose_scene(recording, scene), size_px, view and view.value)
+    document = document.replaced(method=document.method.replaced(quality=quality.value))
     job = RenderJob(recording, document, parse_frames(frames, len(recording)), out, device, with_exr=exr)
     for note in recording.notes:
         typer.echo(note, err=True)

@@ -12,7 +12,7 @@ from protocol.frames import ViewFrame, decode_lut
 from protocol.scene import SceneDocument
 from protocol.scene_method import NoneMethod
 from render_server.gpu.context import GpuContext
-from render_server.passes.coverage import PATTERN, STEPS
+from render_server.passes.coverage import PATTERN_8, STEPS
 from render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (
     FOCAL,
@@ -82,8 +82,8 @@ def area_shares(normal: np.ndarray, shift: float, steps: int = 32) -> np.ndarray
 
 
 def test_the_pattern_holds_one_sample_in_each_row_and_column() -> None:
-    pattern = np.array(PATTERN)
-    places = np.arange(1 - len(PATTERN), len(PATTERN), STEPS // len(PATTERN))
+    pattern = np.array(PATTERN_8)
+    places = np.arange(1 - len(PATTERN_8), len(PATTERN_8), STEPS // len(PATTERN_8))
     assert np.array_equal(np.sort(pattern[:, 0]), places)
     assert np.array_equal(np.sort(pattern[:, 1]), places)
     assert np.all(np.diff((pattern**2).sum(axis=1)) >= 0)

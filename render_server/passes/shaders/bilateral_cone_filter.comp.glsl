@@ -11,6 +11,9 @@ layout(rgba16f) writeonly uniform image2D irradiance_rho;
 uniform sampler2D traced_mu;                        // a: 1 where traced
 layout(rgba16f) writeonly uniform image2D irradiance_mu;
 #endif
+#ifdef REUSES
+uniform usampler2D stale_texels;   // the others hold means already
+#endif
 #include "common/camera.glsl"
 uniform float sample_distance;
 
@@ -51,7 +54,17 @@ void main() {
 #ifdef REAL
     mu = texelFetch(traced_mu, texel, 0);
 #endif
-    if (traced(texel)) average(texel, mu.rgb, rho.rgb);
+#ifdef REUSES
+#ifdef REAL
+    const uint fresh = 1u;
+#else
+    const uint fresh = 2u;
+#endif
+    bool is_mean = (texelFetch(stale_texels, texel, 0).r & fresh) == 0u;
+#else
+    const bool is_mean = false;
+#endif
+    if (traced(texel) && !is_mean) average(texel, mu.rgb, rho.rgb);
     imageStore(irradiance_rho, texel, rho);
 #ifdef REAL
     imageStore(irradiance_mu, texel, mu);

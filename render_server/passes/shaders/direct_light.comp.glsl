@@ -10,7 +10,12 @@
 #include "common/shadow_cone.glsl"
 #endif
 
+#ifdef LISTED
+#include "common/work_list.glsl"
+layout(local_size_x = 64) in;
+#else
 layout(local_size_x = 8, local_size_y = 8) in;
+#endif
 layout(rgba16f) writeonly uniform image2D direct_mu;    // rgb E_mu; a: unshadowed E, mean of channels
 layout(rgba16f) writeonly uniform image2D direct_rho;   // rgb E_rho
 layout(rgba16f) writeonly uniform image2D lobe_mu;      // rgb radiance of light lobes
@@ -31,10 +36,7 @@ bool shadow_may_reach(vec3 p, vec3 n, float bias) { return object_may_shadow(p, 
 vec2 light_visibility(Light light, vec3 p, vec3 n, float bias) { return visibility(light, p, n, bias, bias); }
 #endif
 
-void main() {
-    ivec2 pixel = ivec2(gl_GlobalInvocationID.xy);
-    ivec2 size = textureSize(real_surface_position, 0);
-    if (any(greaterThanEqual(pixel, size))) return;
+void light(ivec2 pixel, ivec2 size) {
     vec4 position = texelFetch(real_surface_position, pixel, 0);
     vec4 normal = texelFetch(real_surface_normal, pixel, 0);
     vec3 e_mu = vec3(0.0), e_rho = vec3(0.0), s_mu = vec3(0.0), s_rho = vec3(0.0);
@@ -72,4 +74,19 @@ void main() {
         imageStore(lobe_mu, pixel, vec4(s_mu, 0.0));
         imageStore(lobe_rho, pixel, vec4(s_rho, 0.0));
     }
+}
+
+void main() {
+    ivec2 size = textureSize(real_surface_position, 0);
+#ifdef LISTED
+    int grid_width = (size.x + scale - 1) / scale;
+    uint block = uint(scale * scale);
+    for (uint i = gl_GlobalInvocationID.x; i < listed_count() * block; i += gl_NumWorkGroups.x * 64u) {
+        ivec2 pixel = pixel_in_block(texel_of_index(texels[i / block], grid_width), int(i % block), scale);
+        if (all(lessThan(pixel, size))) light(pixel, size);
+    }
+#else
+    ivec2 pixel = ivec2(gl_GlobalInvocationID.xy);
+    if (all(lessThan(pixel, size))) light(pixel, size);
+#endif
 }

@@ -120,6 +120,20 @@ vec4 reflection(ivec2 pixel) {
     return sum / max(count, 1.0);
 }
 
+#ifdef QUADS
+#include "common/quads.glsl"
+
+// One pixel of each quad in the texels that show an object.
+void main() {
+    int grid_width = textureSize(sample_pixels, 0).x, edge = (scale + 1) / 2;
+    uint quads = uint(edge * edge);
+    for (uint i = gl_GlobalInvocationID.x; i < listed_count() * quads; i += gl_NumWorkGroups.x * 64u) {
+        ivec2 first = pixel_in_block(texel_of_index(texels[i / quads], grid_width), 0, scale);
+        ivec2 quad = first / 2 + ivec2(int(i % quads) % edge, int(i % quads) / edge), pixel = first_of_quad(quad);
+        if (pixel.x >= 0) imageStore(reflected, pixel, reflection(pixel));
+    }
+}
+#else
 // The pixels of the texels that show an object.
 void main() {
     ivec2 size = textureSize(object_coverage, 0);
@@ -131,3 +145,4 @@ void main() {
         imageStore(reflected, pixel, reflection(pixel));
     }
 }
+#endif

@@ -7,6 +7,9 @@
 #include "common/low_res_grid.glsl"
 #define APPENDS_TEXELS
 #include "common/work_list.glsl"
+#ifdef REUSES
+#include "common/reprojection.glsl"
+#endif
 
 layout(local_size_x = 8, local_size_y = 8) in;
 layout(rgba16f) writeonly uniform image2D irradiance_mu;
@@ -15,6 +18,35 @@ layout(rgba16f) writeonly uniform image2D specular_mu;
 layout(rgba16f) writeonly uniform image2D specular_rho;
 #include "common/camera.glsl"
 uniform bool everywhere;   // also out of the objects' reach (photometric registration)
+
+#ifdef REUSES
+#include "common/last_texels.glsl"
+uniform usampler2D stale_texels;
+uniform sampler2D last_cone_mu;
+uniform sampler2D last_cone_rho;
+
+// Takes the light of the last frame's texels, if they know it all.
+bool remembered(ivec2 texel, SurfacePoint s) {
+    if (s.roughness >= 0.0 || (texelFetch(stale_texels, texel, 0).r & STALE_REAL) != 0u) return false;
+    vec4 position = vec4(s.position, (camera_from_world * vec4(s.position, 1.0)).z), mu = vec4(0.0), rho = vec4(0.0);
+    LastTexels last = last_texels(position, s.normal, false);
+    for (int j = 0; j < 4; ++j) {
+        if (last.weights[j] == 0.0) continue;
+        ivec2 from = last.base + ivec2(j & 1, j >> 1);
+        vec4 light = texelFetch(last_cone_mu, from, 0);
+        if (light.a < 0.5) return false;   // nothing was traced there
+        mu += last.weights[j] * light;
+        rho += last.weights[j] * texelFetch(last_cone_rho, from, 0);
+    }
+    imageStore(irradiance_mu, texel, vec4(mu.rgb, 1.0));
+    imageStore(irradiance_rho, texel, rho);
+    imageStore(specular_mu, texel, vec4(0.0, 0.0, 0.0, 1.0));
+    imageStore(specular_rho, texel, vec4(0.0, 0.0, 0.0, 1.0));
+    return true;
+}
+#else
+bool remembered(ivec2 texel, SurfacePoint s) { return false; }
+#endif
 
 void leave(ivec2 texel, SurfacePoint s) {
     vec3 e = s.present ? environment_irradiance(s.normal) : vec3(0.0);
@@ -33,5 +65,6 @@ void main() {
     SurfacePoint s = surface_point(texel);
     bool reached = s.present && (everywhere || volume_fade(volume_coordinate(s.position)) > 0.0
         || object_may_shadow(s.position, 0.0));
-    if (reached) append_texel(texel, low_resolution_size.x); else leave(texel, s);
+    if (!reached) leave(texel, s);
+    else if (!remembered(texel, s)) append_texel(texel, low_resolution_size.x);
 }

@@ -24,6 +24,14 @@ layout(rgba16f) writeonly uniform image2D specular_rho;
 // bilateral_cone_filter takes the mean.
 ConeSet cones_of(ivec2 texel) { return ConeSet(4, (texel.x & 1) + 2 * (texel.y & 1), 0.5, 0.0); }
 
+#ifdef REUSES
+uniform usampler2D stale_texels;
+// Whether the last frame does not know the irradiance.
+bool is_fresh(ivec2 texel) { return (texelFetch(stale_texels, texel, 0).r & 2u) != 0u; }
+#else
+bool is_fresh(ivec2 texel) { return true; }
+#endif
+
 void trace(ivec2 texel) {
     SurfacePoint s = surface_point(texel);
     vec3 q = volume_coordinate(s.position);
@@ -31,7 +39,7 @@ void trace(ivec2 texel) {
 #ifdef REAL
     diffuse(q, s.normal, cones_of(texel), false, e_mu, e_rho);
 #else
-    diffuse(q, s.normal, cones_of(texel), true, e_mu, e_rho);
+    if (is_fresh(texel)) diffuse(q, s.normal, cones_of(texel), true, e_mu, e_rho);
 #endif
     if (s.roughness >= 0.0) {
         vec3 v = normalize(camera_position - s.position);
@@ -47,7 +55,7 @@ void trace(ivec2 texel) {
     imageStore(irradiance_rho, texel, vec4(e_rho, volume_fade(q)));
     imageStore(specular_mu, texel, vec4(c_mu, 1.0));
 #else
-    imageStore(irradiance_rho, texel, vec4(e_rho, 1.0));
+    if (is_fresh(texel)) imageStore(irradiance_rho, texel, vec4(e_rho, 1.0));
 #endif
     imageStore(specular_rho, texel, vec4(c_rho, 1.0));
 }

@@ -1,5 +1,5 @@
-// Voxelises triangles exactly: each is clipped against every voxel that it may touch (Schwarz & Seidel 2010 find the
-// same voxels); area and centroid of each piece become a surfel. Thin, large and tiny triangles keep their area.
+// Voxelises triangles exactly: each is clipped to the layers of voxels along x, each part along y, then along z (Schwarz &
+// Seidel 2010 find the same voxels); area and centroid of each piece become a surfel. Thin, large and tiny triangles keep their area.
 #include "common/volume.glsl"
 #define GRID_ACCESS
 #define TOUCHED_ACCESS
@@ -15,42 +15,50 @@ layout(std430) readonly buffer Triangles { Triangle triangles[]; };
 uniform int triangle_count;
 
 const int MAX_CORNERS = 10;
-vec3 polygon[MAX_CORNERS];
-int corners;
+struct Polygon { int corners; vec3 p[MAX_CORNERS]; };
 
-// Keeps the part of the polygon where side * (x[axis] - plane) >= 0 (Sutherland & Hodgman 1974).
-void clip(int axis, float plane, float side) {
-    vec3 kept[MAX_CORNERS];
-    int count = 0;
-    for (int i = 0; i < corners; ++i) {
-        vec3 a = polygon[i], b = polygon[i + 1 == corners ? 0 : i + 1];
+// The part of a polygon where side * (x[axis] - plane) >= 0 (Sutherland & Hodgman 1974).
+Polygon clip(Polygon given, int axis, float plane, float side) {
+    Polygon kept;
+    kept.corners = 0;
+    for (int i = 0; i < given.corners; ++i) {
+        vec3 a = given.p[i], b = given.p[i + 1 == given.corners ? 0 : i + 1];
         float da = side * (a[axis] - plane), db = side * (b[axis] - plane);
-        if (da >= 0.0 && count < MAX_CORNERS) kept[count++] = a;
+        if (da >= 0.0 && kept.corners < MAX_CORNERS) kept.p[kept.corners++] = a;
         if ((da > 0.0 && db < 0.0) || (da < 0.0 && db > 0.0))
-            if (count < MAX_CORNERS) kept[count++] = mix(a, b, da / (da - db));
+            if (kept.corners < MAX_CORNERS) kept.p[kept.corners++] = mix(a, b, da / (da - db));
     }
-    corners = count;
-    for (int i = 0; i < count; ++i) polygon[i] = kept[i];
+    return kept;
 }
 
-// Clips against the six faces of a voxel, skipping the slabs that contain the whole triangle.
-void clip_to_voxel(ivec3 voxel, bvec3 cut) {
-    for (int face = 0; face < 6 && corners > 2; ++face) {
-        int axis = face >> 1, upper = face & 1;
-        if (cut[axis]) clip(axis, float(voxel[axis] + upper), upper == 0 ? 1.0 : -1.0);
+// The part in one layer of voxels; a triangle that lies `within` one is not cut.
+Polygon clip_to_layer(Polygon given, int axis, int layer, bool within) {
+    if (within) return given;
+    Polygon above = clip(given, axis, float(layer), 1.0);
+    if (above.corners < 3) return above;
+    return clip(above, axis, float(layer + 1), -1.0);
+}
+
+// First and last layer that a polygon may touch, among `limits`.
+ivec2 layers_of(Polygon given, int axis, ivec2 limits) {
+    float low = 1e9, high = -1e9;
+    for (int i = 0; i < given.corners; ++i) {
+        low = min(low, given.p[i][axis]);
+        high = max(high, given.p[i][axis]);
     }
+    return ivec2(max(int(floor(low)), limits.x), min(int(floor(high)), limits.y));
 }
 
 // Area-weighted centroid and area of the polygon (voxel units).
-vec4 centroid_area() {
+vec4 centroid_area(Polygon given) {
     vec3 centre = vec3(0.0);
     float area = 0.0;
-    for (int i = 1; i + 1 < corners; ++i) {
-        float a = 0.5 * length(cross(polygon[i] - polygon[0], polygon[i + 1] - polygon[0]));
-        centre += a * (polygon[0] + polygon[i] + polygon[i + 1]) / 3.0;
+    for (int i = 1; i + 1 < given.corners; ++i) {
+        float a = 0.5 * length(cross(given.p[i] - given.p[0], given.p[i + 1] - given.p[0]));
+        centre += a * (given.p[0] + given.p[i] + given.p[i + 1]) / 3.0;
         area += a;
     }
-    return vec4(area > 0.0 ? centre / area : polygon[0], area);
+    return vec4(area > 0.0 ? centre / area : given.p[0], area);
 }
 
 void touch(uint voxel) {
@@ -101,12 +109,19 @@ void main() {
         if (first == last) emit(t, vec4((a + b + c) / 3.0, 0.5 * length(n)), first, a, b, c, n);   // rounding may put it outside
         return;
     }
-    for (int x = first.x; x <= last.x; ++x)
-        for (int y = first.y; y <= last.y; ++y)
-            for (int z = first.z; z <= last.z; ++z) {
-                polygon[0] = a; polygon[1] = b; polygon[2] = c;
-                corners = 3;
-                clip_to_voxel(ivec3(x, y, z), cut);
-                if (corners > 2) emit(t, centroid_area(), ivec3(x, y, z), a, b, c, n);
+    Polygon whole;
+    whole.corners = 3;
+    whole.p[0] = a; whole.p[1] = b; whole.p[2] = c;
+    for (int x = first.x; x <= last.x; ++x) {
+        Polygon in_x = clip_to_layer(whole, 0, x, !cut.x);
+        ivec2 ys = layers_of(in_x, 1, ivec2(first.y, last.y));
+        for (int y = ys.x; in_x.corners > 2 && y <= ys.y; ++y) {
+            Polygon in_xy = clip_to_layer(in_x, 1, y, !cut.y);
+            ivec2 zs = layers_of(in_xy, 2, ivec2(first.z, last.z));
+            for (int z = zs.x; in_xy.corners > 2 && z <= zs.y; ++z) {
+                Polygon piece = clip_to_layer(in_xy, 2, z, !cut.z);
+                if (piece.corners > 2) emit(t, centroid_area(piece), ivec3(x, y, z), a, b, c, n);
             }
+        }
+    }
 }

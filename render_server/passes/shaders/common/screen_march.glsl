@@ -1,5 +1,6 @@
-// A ray marched across the camera's picture, pixel by pixel, until it hits a visible real surface ([D] 4.4.2). What
-// is behind something in the picture is unknown: the ray is lost there.
+// A ray marched across the camera's picture until it hits a visible real surface ([D] 4.4.2). What is behind something
+// in the picture is unknown: the ray is lost there. It strides over STRIDE pixels, and goes pixel by pixel only through
+// the stride at whose end it is behind the picture's surface.
 #include "common/geometry.glsl"
 #include "common/camera_image.glsl"
 
@@ -8,7 +9,8 @@ uniform float noise_sigma;    // m at 1 m
 
 const float NEAREST = 0.02;     // m in front of the camera
 const float FARTHEST = 20.0;    // m along the ray
-const int MOST_STEPS = 4096;    // longer than any picture's diagonal
+const int MOST_STEPS = 4096;    // pixels: longer than any picture's diagonal
+const int STRIDE = 8;           // pixels
 const float FADE_PIXELS = 4.0;  // at the picture's border, so that no seam shows
 // Sine of the least angle of incidence for a reliable hit: a pixel of the surface then spans ten pixels across.
 const float FLATTEST = 0.1;
@@ -49,14 +51,18 @@ ScreenHit screen_hit(vec3 from, vec3 d, float spread) {
     float last = fraction_in_picture(first, path);
     int steps = min(int(ceil(max(abs(path.x), abs(path.y)) * last)), MOST_STEPS);
     float before = 0.0;
-    for (int i = 1; i <= steps; ++i) {
-        float s = last * float(i) / float(steps);
+    for (int i = 0, fine_until = 0; i < steps;) {
+        int next = i < fine_until ? i + 1 : min(i + STRIDE, steps);
+        float s = last * float(next) / float(steps);
         float t = reach * s * near_b / mix(near_a, near_b, s);   // uniform in the picture is not uniform in the world
         vec3 c = a + t * v;
         vec2 pixel = seen_pixel(c);
-        if (!in_picture(pixel)) break;
-        vec4 seen = texelFetch(real_surface_position, ivec2(pixel), 0);
-        if (seen.w > 0.0 && c.z > seen.w) {
+        bool inside = in_picture(pixel);
+        vec4 seen = inside ? texelFetch(real_surface_position, ivec2(pixel), 0) : vec4(0.0);
+        bool behind = seen.w > 0.0 && c.z > seen.w;
+        if ((behind || !inside) && next > i + 1) { fine_until = next; continue; }
+        if (!inside) break;
+        if (behind) {
             vec3 n = texelFetch(real_surface_normal, ivec2(pixel), 0).xyz;
             float tolerance = 3.0 * noise_sigma * seen.w * seen.w, towards = -dot(n, d);
             float at = dot(n, from - seen.xyz) / max(towards, 1e-6);
@@ -67,6 +73,7 @@ ScreenHit screen_hit(vec3 from, vec3 d, float spread) {
             if (c.z > seen.w + tolerance) break;
         }
         before = t;
+        i = next;
     }
     if (hit.fraction > 0.0) {   // refines the hit on the surface: at most a pixel off
         vec3 c = a + hit.distance * v;

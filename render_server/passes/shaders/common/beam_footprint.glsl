@@ -1,0 +1,34 @@
+// Footprints of beams in the picture, and the sums of their light. Needs geometry.glsl.
+#include "common/basis.glsl"
+#include "common/beams.glsl"
+#include "common/caustic_sums.glsl"
+
+// Where a beam may light the picture: the first and last column and row, of pixels if `sharp`, else of texels of the
+// reduced grid. `layer`: REAL_LAYER or OBJECT_LAYER, -1 nowhere.
+struct BeamPlace { ivec2 low; ivec2 high; int layer; int sharp; ivec2 unused; };
+
+#ifdef FINDS_PLACES
+layout(std430) writeonly buffer BeamPlaces { BeamPlace places[]; };
+#else
+layout(std430) readonly buffer BeamPlaces { BeamPlace places[]; };
+#endif
+
+const float LONGEST = 4.0;   // limit of a slanted footprint, in radii of the beam
+
+vec3 position_on(int layer, ivec2 pixel, out vec3 normal) {
+    ivec2 raster = raster_texel(pixel);
+    vec4 real = texelFetch(real_surface_position, pixel, 0), object = texelFetch(virtual_raster_position, raster, 0);
+    normal = layer == REAL_LAYER ? texelFetch(real_surface_normal, pixel, 0).xyz : texelFetch(virtual_raster_normal, raster, 0).xyz;
+    return (layer == REAL_LAYER ? real.w > 0.0 : object.w > 0.0) ? (layer == REAL_LAYER ? real.xyz : object.xyz) : vec3(1e9);
+}
+
+// Irradiance at (p, normal) in CAUSTIC_STEPS.
+ivec3 caustic_part(Beam beam, mat3 basis, vec3 p, vec3 normal) {
+    vec3 away = (p - beam.from.xyz) * basis;
+    if (abs(away.z - beam.from.w) > LONGEST * beam.direction.w || away.z <= 0.0) return ivec3(0);
+    float cosine = -dot(normal, beam.direction.xyz);
+    float x2 = beam.across.x * away.x * away.x + 2.0 * beam.across.y * away.x * away.y + beam.across.z * away.y * away.y;
+    if (cosine <= 0.0 || x2 > FOOTPRINT_CUT * FOOTPRINT_CUT) return ivec3(0);
+    vec3 irradiance = beam.flux.rgb * (cosine * beam.across.w * exp(-0.5 * x2));
+    return ivec3(round(irradiance * CAUSTIC_STEPS));
+}

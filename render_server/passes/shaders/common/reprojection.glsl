@@ -1,0 +1,47 @@
+// What the last frame saw of a surface that this frame sees. Needs geometry.glsl.
+uniform sampler2D last_position;        // world m; w: depth, 0 unknown
+uniform mat4 last_camera_from_world;
+uniform bool has_history;
+uniform float pixel_size;               // m at 1 m depth
+uniform int turns;
+uniform int turn;
+
+const float OFF_PLANE = 4.0;            // pixels at the surface's depth that it may lie off this pixel's plane,
+const float APART = 8.0;                // or away from this pixel's point
+const float LEAST_WEIGHT = 0.25;
+const int TILE = 8;                     // texels
+const uint STALE_REAL = 1u, STALE_OBJECT = 2u;   // of a texel: where light must be computed
+
+// Position in the last picture (pixel centres at .5), far outside it for what was behind the camera.
+vec2 last_pixel(vec3 p) {
+    vec3 c = (last_camera_from_world * vec4(p, 1.0)).xyz;
+    if (c.z <= 0.0) return vec2(-1e4);
+    vec2 pixel = camera_pinhole.xy * c.xy / c.z + camera_pinhole.zw + 0.5;
+    ivec2 last = textureSize(picture_rays, 0) - 1;
+    for (int i = 0; i < 2; ++i) {   // displaced by the lens
+        ivec2 at = clamp(ivec2(pixel), ivec2(0), last);
+        pixel = vec2(at) + 0.5 + camera_pinhole.xy * (c.xy / c.z - texelFetch(picture_rays, at, 0).xy);
+    }
+    return pixel;
+}
+
+float bilinear(vec2 at, int j) {
+    vec2 f = fract(at);
+    return ((j & 1) == 1 ? f.x : 1.0 - f.x) * ((j >> 1) == 1 ? f.y : 1.0 - f.y);
+}
+
+// 1 if the pixel of the last picture saw the plane of (position, normal) near that point, else 0.
+float same_surface(ivec2 pixel, vec4 position, vec3 normal) {
+    if (any(lessThan(pixel, ivec2(0))) || any(greaterThanEqual(pixel, textureSize(last_position, 0)))) return 0.0;
+    vec4 seen = texelFetch(last_position, pixel, 0);
+    vec3 away = seen.xyz - position.xyz;
+    float size = pixel_size * position.w;
+    bool same = seen.w > 0.0 && abs(dot(away, normal)) < OFF_PLANE * size && dot(away, away) < APART * APART * size * size;
+    return same ? 1.0 : 0.0;
+}
+
+// Whether it is the turn of a texel's tile, one in `turns`.
+bool is_due(ivec2 texel) {
+    ivec2 tile = texel / TILE;
+    return (tile.x + 3 * tile.y) % turns == turn;
+}

@@ -1,0 +1,38 @@
+// Where light must be computed at each texel of the reduced grid: cones and caustics. Keeps the points that the next frame looks up.
+#include "common/geometry.glsl"
+#include "common/reprojection.glsl"
+#include "common/last_texels.glsl"
+
+layout(local_size_x = 8, local_size_y = 8) in;
+uniform isampler2D sample_pixels;
+layout(r8ui) writeonly uniform uimage2D stale_out;
+layout(rgba32f) writeonly uniform image2D real_texels_out;
+layout(rgba32f) writeonly uniform image2D object_texels_out;
+
+bool is_unknown(vec4 position, vec3 normal, bool object) {
+    return position.w > 0.0 && (!has_history || last_texels(position, normal, object).total < LEAST_WEIGHT);
+}
+
+void main() {
+    ivec2 texel = ivec2(gl_GlobalInvocationID.xy);
+    if (any(greaterThanEqual(texel, textureSize(sample_pixels, 0)))) return;
+    ivec4 pixels = texelFetch(sample_pixels, texel, 0);
+    if (pixels.x < -1) pixels.xy = -2 - pixels.xy;
+    vec4 real = vec4(0.0), object = vec4(0.0);
+    vec3 real_normal = vec3(0.0), object_normal = vec3(0.0);
+    if (pixels.x >= 0) {
+        real = texelFetch(real_surface_position, pixels.xy, 0);
+        real_normal = texelFetch(real_surface_normal, pixels.xy, 0).xyz;
+    }
+    if (pixels.z >= 0) {
+        ivec2 raster = raster_texel(pixels.zw);
+        object = texelFetch(virtual_raster_position, raster, 0);
+        object_normal = texelFetch(virtual_raster_normal, raster, 0).xyz;
+    }
+    bool due = is_due(texel);
+    uint stale = due || is_unknown(real, real_normal, false) ? STALE_REAL : 0u;
+    if (object.w > 0.0 && (due || is_unknown(object, object_normal, true))) stale |= STALE_OBJECT;
+    imageStore(stale_out, texel, uvec4(stale));
+    imageStore(real_texels_out, texel, real);
+    imageStore(object_texels_out, texel, object);
+}
