@@ -3,11 +3,13 @@
 import os
 import signal
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
 import structlog
 
+from render_server.gpu import kernel
 from services import ports
 
 # A shell starts what it puts into the background with SIGINT ignored, and children inherit that: no test of Ctrl-C
@@ -62,6 +64,14 @@ def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """What is kept between runs is not the user's: tests neither meet it nor leave anything there."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("DELTALIGHT_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _shaders_parsed_once() -> Iterator[None]:
+    """Hundreds of renderers are made of the same shaders' texts; what a text declares does not change."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(kernel, "declarations", cache(kernel.declarations))
         yield
 
 

@@ -12,8 +12,9 @@ from scipy.ndimage import binary_erosion
 from protocol.camera_model import CameraModel
 from protocol.frames import BoardPose, DepthImage, ViewFrame
 from protocol.scene import SceneDocument, parse_scene
+from protocol.scene_method import NoneMethod
 from render_server.gpu.context import GpuContext
-from render_server.renderer import SceneRenderer
+from render_server.renderer import CompositeFrame, SceneRenderer
 
 WIDTH, HEIGHT = 160, 120
 FOCAL = 150.0
@@ -245,3 +246,41 @@ def composite(gpu: GpuContext, document: SceneDocument, view: ViewFrame | None =
     color = renderer.render(frame() if view is None else view).color
     renderer.release()
     return color
+
+
+def unlit(document: SceneDocument) -> SceneDocument:
+    """Objects are drawn, and nothing else about the picture changes."""
+    return document.replaced(method=NoneMethod())
+
+
+class ObjectsRenderer:
+    """Draws the objects of one `unlit` scene after the other: kernels are compiled once for all.
+
+    Each picture is the first of its real scene, whose mesh is coarse: nothing but voxels is made of it.
+    """
+
+    def __init__(self, gpu: GpuContext, stage: Stage) -> None:
+        document = stage.document([stage.virtual(cube())], [ambient(0.2)], triangle_budget=1000)
+        self.renderer = SceneRenderer(gpu, document, with_linear=True)  # `none` keeps its budget
+
+    def draw(self, document: SceneDocument, view: ViewFrame) -> CompositeFrame:
+        assert isinstance(document.method, NoneMethod)
+        another = document.replaced(real=document.real.replaced(unseen_albedo=0.25))
+        self.renderer.set_scene(another)  # forgets what was seen
+        self.renderer.set_scene(document)
+        return self.renderer.render(view)
+
+    def linear(self, document: SceneDocument, view: ViewFrame) -> np.ndarray:
+        linear = self.draw(document, view).linear
+        assert linear is not None
+        return linear
+
+    def matte(self, document: SceneDocument, view: ViewFrame) -> np.ndarray:
+        """Share of each pixel that objects cover."""
+        self.draw(document, view)
+        return self.newest_matte()
+
+    def newest_matte(self) -> np.ndarray:
+        graph = self.renderer.graph
+        assert graph is not None
+        return array_of(graph["object surface"].coverage.texture)[..., 0]
