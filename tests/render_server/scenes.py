@@ -1,6 +1,6 @@
 """Small scenes for the renderer's tests: models, cameras, pictures, documents, and the fields computed from them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -130,11 +130,16 @@ def ambient(radiance: float) -> dict[str, Any]:
     return {"type": "ambient", "radiance": radiance}
 
 
+COARSE: dict[str, object] = {"cone_scale": 4, "cone_count": 4, "triangle_budget": 4000}
+"""For tests of something else than the light of cones, which takes most of a picture's time."""
+
+
 @dataclass
 class Stage:
-    """Writes assets into a folder and makes documents of them."""
+    """Writes assets into a folder and makes documents of them; `settings` of the method are those of all."""
 
     folder: Path
+    settings: dict[str, object] = field(default_factory=dict)
     count: int = 0
 
     def asset(self, mesh: trimesh.Trimesh) -> str:
@@ -160,13 +165,13 @@ class Stage:
     ) -> SceneDocument:
         """`real`: the given model; None: the depth of each frame. Only the lights shine, nothing is learnt."""
         geometry: Any = "depth" if real is None else {"model": self.asset(real)}
-        settings = {"volume_size": 32, "volume_edge_m": 0.6, "cone_scale": 1, "rsm_size": 256, **method}
+        usual = {"volume_size": 32, "volume_edge_m": 0.6, "cone_scale": 1, "rsm_size": 256}
         return parse_scene(
             {
                 "real": {"geometry": geometry, "unseen_albedo": 0.5},
                 "objects": objects,
                 "lights": {"manual": lights, "surroundings": "none"},
-                "method": settings,
+                "method": {**usual, **self.settings, **method},
             }
         )
 

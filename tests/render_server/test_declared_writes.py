@@ -157,8 +157,9 @@ def test_reading_what_another_stage_made_is_no_offence(gpu: GpuContext, copy: Ke
     assert content(second) == [1, 2, 3, 4]
 
 
-def test_without_checks_nothing_is_watched(gpu: GpuContext, graph: Graph, copy: Kernel) -> None:
+def test_without_checks_nothing_is_watched(gpu: GpuContext, copy: Kernel) -> None:
     first, second = buffers(gpu, 2)
+    graph = Graph(gpu)
     graph.stage("made", lambda: first)
 
     def spoil(made: moderngl.Buffer) -> int:

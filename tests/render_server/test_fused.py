@@ -11,6 +11,7 @@ from render_server.gpu.context import GpuContext
 from render_server.real_geometry import STILL_FRAMES
 from render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (
+    COARSE,
     HEIGHT,
     WIDTH,
     Stage,
@@ -32,7 +33,7 @@ HOLE = np.s_[50:90, 40:80]
 
 @pytest.fixture
 def stage(tmp_path: Path) -> Stage:
-    return Stage(tmp_path)
+    return Stage(tmp_path, {**COARSE, "triangle_budget": 40000})
 
 
 def document(stage: Stage) -> SceneDocument:
