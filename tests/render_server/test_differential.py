@@ -43,7 +43,7 @@ pytestmark = pytest.mark.usefixtures("clean_gl")
 
 @pytest.fixture
 def stage(tmp_path: Path) -> Stage:
-    return Stage(tmp_path)
+    return Stage(tmp_path, {"cone_count": 6})
 
 
 def differential(document: SceneDocument) -> SceneDocument:
