@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 SHADERS = Path(__file__).resolve().parents[1] / "passes" / "shaders"
@@ -63,6 +64,9 @@ def _expand(path: Path, seen: list[Path]) -> str:
     return "\n".join(lines)
 
 
+@lru_cache(
+    maxsize=512
+)  # every shader of the project, in all its variants: renderers are made again and again
 def declarations(source: str) -> Declarations:
     """What the text of a shader, with its defines, declares."""
     text = _COMMENT.sub(" ", source)

@@ -11,6 +11,7 @@ from render_server.gpu import kernel as kernel_module
 from render_server.gpu.context import GpuContext, create_context
 from render_server.gpu.kernel import Kernel
 from render_server.gpu.textures import texture_2d
+from tests.render_server.scenes import ObjectsRenderer, Stage
 from tests.render_server.tiny_kernel import OUT, MakeKernel
 
 
@@ -19,6 +20,13 @@ def gpu() -> Iterator[GpuContext]:
     context = create_context()
     yield context
     context.release()
+
+
+@pytest.fixture(scope="module")
+def objects(gpu: GpuContext, tmp_path_factory: pytest.TempPathFactory) -> Iterator[ObjectsRenderer]:
+    shared = ObjectsRenderer(gpu, Stage(tmp_path_factory.mktemp("objects")))
+    yield shared
+    shared.renderer.release()
 
 
 @pytest.fixture

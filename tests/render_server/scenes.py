@@ -1,6 +1,6 @@
 """Small scenes for the renderer's tests: models, cameras, pictures, documents, and the fields computed from them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +12,9 @@ from scipy.ndimage import binary_erosion
 from protocol.camera_model import CameraModel
 from protocol.frames import BoardPose, DepthImage, ViewFrame
 from protocol.scene import SceneDocument, parse_scene
+from protocol.scene_method import NoneMethod
 from render_server.gpu.context import GpuContext
-from render_server.renderer import SceneRenderer
+from render_server.renderer import CompositeFrame, SceneRenderer
 
 WIDTH, HEIGHT = 160, 120
 FOCAL = 150.0
@@ -129,11 +130,16 @@ def ambient(radiance: float) -> dict[str, Any]:
     return {"type": "ambient", "radiance": radiance}
 
 
+COARSE: dict[str, object] = {"cone_scale": 4, "cone_count": 4, "triangle_budget": 4000}
+"""For tests of something else than the light of cones, which takes most of a picture's time."""
+
+
 @dataclass
 class Stage:
-    """Writes assets into a folder and makes documents of them."""
+    """Writes assets into a folder and makes documents of them; `settings` of the method are those of all."""
 
     folder: Path
+    settings: dict[str, object] = field(default_factory=dict)
     count: int = 0
 
     def asset(self, mesh: trimesh.Trimesh) -> str:
@@ -159,13 +165,13 @@ class Stage:
     ) -> SceneDocument:
         """`real`: the given model; None: the depth of each frame. Only the lights shine, nothing is learnt."""
         geometry: Any = "depth" if real is None else {"model": self.asset(real)}
-        settings = {"volume_size": 32, "volume_edge_m": 0.6, "cone_scale": 1, "rsm_size": 256, **method}
+        usual = {"volume_size": 32, "volume_edge_m": 0.6, "cone_scale": 1, "rsm_size": 256}
         return parse_scene(
             {
                 "real": {"geometry": geometry, "unseen_albedo": 0.5},
                 "objects": objects,
                 "lights": {"manual": lights, "surroundings": "none"},
-                "method": settings,
+                "method": {**usual, **self.settings, **method},
             }
         )
 
@@ -251,3 +257,41 @@ def psnr_db(a: np.ndarray, b: np.ndarray) -> float:
     """Of two pictures of codes; infinite if they are the same."""
     error = np.mean((a.astype(float) - b.astype(float)) ** 2)
     return float("inf") if error == 0 else float(10 * np.log10(255**2 / error))
+
+
+def unlit(document: SceneDocument) -> SceneDocument:
+    """Objects are drawn, and nothing else about the picture changes."""
+    return document.replaced(method=NoneMethod())
+
+
+class ObjectsRenderer:
+    """Draws the objects of one `unlit` scene after the other: kernels are compiled once for all.
+
+    Each picture is the first of its real scene, whose mesh is coarse: nothing but voxels is made of it.
+    """
+
+    def __init__(self, gpu: GpuContext, stage: Stage) -> None:
+        document = stage.document([stage.virtual(cube())], [ambient(0.2)], triangle_budget=1000)
+        self.renderer = SceneRenderer(gpu, document, with_linear=True)  # `none` keeps its budget
+
+    def draw(self, document: SceneDocument, view: ViewFrame) -> CompositeFrame:
+        assert isinstance(document.method, NoneMethod)
+        another = document.replaced(real=document.real.replaced(unseen_albedo=0.25))
+        self.renderer.set_scene(another)  # forgets what was seen
+        self.renderer.set_scene(document)
+        return self.renderer.render(view)
+
+    def linear(self, document: SceneDocument, view: ViewFrame) -> np.ndarray:
+        linear = self.draw(document, view).linear
+        assert linear is not None
+        return linear
+
+    def coverage(self, document: SceneDocument, view: ViewFrame) -> np.ndarray:
+        """Share of each pixel that objects cover."""
+        self.draw(document, view)
+        return self.newest_coverage()
+
+    def newest_coverage(self) -> np.ndarray:
+        graph = self.renderer.graph
+        assert graph is not None
+        return array_of(graph["object surface"].coverage.texture)[..., 0]

@@ -10,7 +10,6 @@ import trimesh
 from protocol.camera_model import CameraModel
 from protocol.frames import ViewFrame, decode_lut
 from protocol.scene import SceneDocument
-from protocol.scene_method import NoneMethod
 from render_server.gpu.context import GpuContext
 from render_server.passes.coverage import PATTERN_8, STEPS
 from render_server.renderer import SceneRenderer
@@ -18,6 +17,7 @@ from tests.render_server.scenes import (
     FOCAL,
     HEIGHT,
     WIDTH,
+    ObjectsRenderer,
     Stage,
     ambient,
     ball,
@@ -27,12 +27,11 @@ from tests.render_server.scenes import (
     depth_image,
     directional,
     everyday,
-    fields_of,
     frame,
     look_at,
     noisy,
     shifted,
-    solve,
+    unlit,
 )
 
 pytestmark = pytest.mark.usefixtures("clean_gl")
@@ -53,8 +52,7 @@ def antialiased(document: SceneDocument, wanted: bool = True) -> SceneDocument:
 def glowing(stage: Stage, mesh: trimesh.Trimesh) -> SceneDocument:
     """An object of one radiance; nothing else about the picture changes."""
     material = {"base_color": (0, 0, 0), "specular": 0, "emission": (GLOW, GLOW, GLOW)}
-    document = stage.document([{"asset": stage.asset(mesh), "material": material}], [ambient(0.2)])
-    return document.replaced(method=NoneMethod())
+    return unlit(stage.document([{"asset": stage.asset(mesh), "material": material}], [ambient(0.2)]))
 
 
 def seen_from_above(depth_m: float = 3.0, model: CameraModel | None = None) -> ViewFrame:
@@ -75,10 +73,14 @@ def sheet(
 
 def area_shares(normal: np.ndarray, shift: float, steps: int = 32) -> np.ndarray:
     """Share of each pixel on the near side of a line: normal . x < shift, in pixels from the optical centre."""
-    fine = (np.arange(WIDTH * steps) + 0.5) / steps - WIDTH / 2
-    x, y = np.meshgrid(fine, -fine[: HEIGHT * steps] - (WIDTH - HEIGHT) / 2)  # picture rows run down
-    inside = normal[0] * x + normal[1] * y < shift
-    return np.asarray(inside.reshape(HEIGHT, steps, WIDTH, steps).mean(axis=(1, 3)))
+    across, down = np.arange(WIDTH) + 0.5 - WIDTH / 2, np.arange(HEIGHT) + 0.5 - HEIGHT / 2
+    x, y = np.meshgrid(across, -down)
+    inside = shift - normal[0] * x - normal[1] * y
+    shares = (inside > 0).astype(float)
+    cut = np.abs(inside) < 1
+    u, v = np.meshgrid(*[(np.arange(steps) + 0.5) / steps - 0.5] * 2)
+    shares[cut] = (normal[0] * u + normal[1] * v < inside[cut, None, None]).mean(axis=(1, 2))
+    return shares
 
 
 def test_the_pattern_holds_one_sample_in_each_row_and_column() -> None:
@@ -92,14 +94,14 @@ def test_the_pattern_holds_one_sample_in_each_row_and_column() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("turn_deg", [0.0, 90.0, 180.0, 17.0, 45.0])
 @pytest.mark.parametrize("shift", [0.1, 0.37, 0.8])
-def test_share_of_a_half_plane(gpu: GpuContext, stage: Stage, turn_deg: float, shift: float) -> None:
+def test_share_of_a_half_plane(objects: ObjectsRenderer, stage: Stage, turn_deg: float, shift: float) -> None:
     half_plane = sheet(400, 800, shift - 200, 0, turn_deg)
-    found = solve(gpu, antialiased(glowing(stage, half_plane)), seen_from_above())
+    found = objects.coverage(antialiased(glowing(stage, half_plane)), seen_from_above())
     angle = np.radians(turn_deg)
     expected = area_shares(np.array([np.cos(angle), np.sin(angle)]), shift)
     assert 0.1 < expected.mean() < 0.9
     upright = turn_deg % 90 == 0
-    assert np.abs(found.matte - expected).max() <= (1 / 16 + 1e-3 if upright else 1 / 8)
+    assert np.abs(found - expected).max() <= (1 / 16 + 1e-3 if upright else 1 / 8)
 
 
 def area_through(lens: CameraModel, radius_m: float, x: float, y: float, corners: int = 256) -> float:
@@ -116,75 +118,67 @@ def disc_in_the_middle(radius_px: float) -> trimesh.Trimesh:
 
 
 @pytest.mark.parametrize("distortion", [0.0, -0.3])
-def test_area_of_a_small_disc(gpu: GpuContext, stage: Stage, distortion: float) -> None:
+def test_area_of_a_small_disc(objects: ObjectsRenderer, stage: Stage, distortion: float) -> None:
     lens = camera(distortion=(distortion, 0.0, 0.0, 0.0, 0.0))
     document = antialiased(glowing(stage, disc_in_the_middle(9.3)))
-    found = solve(gpu, document, seen_from_above(model=lens))
+    found = objects.coverage(document, seen_from_above(model=lens))
     expected = area_through(lens, 9.3 * PIXEL, 0.3 * PIXEL, 0.1 * PIXEL)
-    assert found.matte.sum() == pytest.approx(expected, rel=0.01)
+    assert found.sum() == pytest.approx(expected, rel=0.01)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("distortion", [0.0, -0.3, 0.2])
 @pytest.mark.parametrize("middle", [(0.0, 0.0), (0.5, 0.5), (0.3, -0.2)])
-@pytest.mark.parametrize("radius_px", [8.14, 50.0])
 def test_area_of_a_disc_is_that_of_its_picture(
-    gpu: GpuContext, stage: Stage, distortion: float, middle: tuple[float, float], radius_px: float
+    objects: ObjectsRenderer, stage: Stage, distortion: float, middle: tuple[float, float]
 ) -> None:
     """Wherever between pixels the optical axis passes, with antialiasing or without: no row is skipped or doubled."""
     matrix = camera().matrix.copy()
     matrix[:2, 2] += middle
     lens = replace(camera(distortion=(distortion, 0.0, 0.0, 0.0, 0.0)), matrix=matrix)
-    document = glowing(stage, disc_in_the_middle(radius_px))
-    areas = [
-        solve(gpu, antialiased(document, wanted), seen_from_above(model=lens)).matte.sum()
-        for wanted in (False, True)
-    ]
-    expected = area_through(lens, radius_px * PIXEL, 0.3 * PIXEL, 0.1 * PIXEL)
-    assert areas == pytest.approx([expected, expected], rel=0.01)
-    assert areas[0] == pytest.approx(areas[1], rel=0.01)
+    for radius_px in (8.14, 50.0):
+        document = glowing(stage, disc_in_the_middle(radius_px))
+        areas = [
+            objects.coverage(antialiased(document, wanted), seen_from_above(model=lens)).sum()
+            for wanted in (False, True)
+        ]
+        expected = area_through(lens, radius_px * PIXEL, 0.3 * PIXEL, 0.1 * PIXEL)
+        assert areas == pytest.approx([expected, expected], rel=0.01)
+        assert areas[0] == pytest.approx(areas[1], rel=0.01)
 
 
 @pytest.mark.parametrize("x", [0.03, 0.28, 0.405, 0.655, 0.905])
-def test_thin_bar_is_neither_lost_nor_doubled(gpu: GpuContext, stage: Stage, x: float) -> None:
+def test_thin_bar_is_neither_lost_nor_doubled(objects: ObjectsRenderer, stage: Stage, x: float) -> None:
     """Half a pixel wide: on each row its shares add up to its width, and the light it brings to its radiance."""
     document = antialiased(glowing(stage, sheet(0.5, 40, x, 0.0)))
     view = seen_from_above()
-    renderer = SceneRenderer(gpu, document, with_linear=True)
-    linear = renderer.render(view).linear
-    fields = fields_of(renderer)
-    renderer.release()
-    assert linear is not None
+    linear, matte = objects.linear(document, view), objects.newest_coverage()
     before = decode_lut(None)[view.color, np.arange(3)]
     rows = slice(HEIGHT // 2 - 15, HEIGHT // 2 + 15)
-    shares = fields.matte[rows]
+    shares = matte[rows]
     assert shares.sum(axis=1) == pytest.approx(0.5, abs=1 / 8)
     mixed = (1 - shares[..., None]) * before[rows] + shares[..., None] * GLOW
     assert linear[rows] == pytest.approx(mixed, abs=2e-3)
 
 
-def test_an_inclined_thin_bar_has_no_gap(gpu: GpuContext, stage: Stage) -> None:
-    found = solve(gpu, antialiased(glowing(stage, sheet(0.5, 80, 0.2, 0.0, 13.0))), seen_from_above())
-    rows = found.matte[HEIGHT // 2 - 30 : HEIGHT // 2 + 30]
+def test_an_inclined_thin_bar_has_no_gap(objects: ObjectsRenderer, stage: Stage) -> None:
+    found = objects.coverage(antialiased(glowing(stage, sheet(0.5, 80, 0.2, 0.0, 13.0))), seen_from_above())
+    rows = found[HEIGHT // 2 - 30 : HEIGHT // 2 + 30]
     assert (rows.sum(axis=1) > 0.2).all()
     assert rows.sum() == pytest.approx(60 * 0.5 / np.cos(np.radians(13)), rel=0.05)
 
 
-def test_without_the_wish_pixels_are_covered_or_not(gpu: GpuContext, stage: Stage) -> None:
+def test_without_the_wish_pixels_are_covered_or_not(objects: ObjectsRenderer, stage: Stage) -> None:
     document = glowing(stage, ball(8.4 * PIXEL, (0, 0, 0)))
-    found = solve(gpu, document, seen_from_above())
-    assert set(np.unique(found.matte)) == {0.0, 1.0}
+    assert set(np.unique(objects.coverage(document, seen_from_above()))) == {0.0, 1.0}
 
 
-def test_real_pixels_beside_the_object_are_the_cameras(gpu: GpuContext, stage: Stage) -> None:
+def test_real_pixels_beside_the_object_are_the_cameras(objects: ObjectsRenderer, stage: Stage) -> None:
     document = antialiased(glowing(stage, ball(8.4 * PIXEL, (0, 0, 0))))
-    renderer = SceneRenderer(gpu, document)
-    picture = renderer.render(seen_from_above()).color
-    fields = fields_of(renderer)
-    renderer.release()
-    assert not any("antialiasing" in line for line in renderer.notices)
-    assert np.array_equal(picture[fields.matte == 0], noisy()[fields.matte == 0])
-    partly = (fields.matte > 0) & (fields.matte < 1)
+    picture, matte = objects.draw(document, seen_from_above()).color, objects.newest_coverage()
+    assert not any("antialiasing" in line for line in objects.renderer.notices)
+    assert np.array_equal(picture[matte == 0], noisy()[matte == 0])
+    partly = (matte > 0) & (matte < 1)
     assert np.count_nonzero(partly) > 30
 
 
@@ -203,13 +197,15 @@ def test_asking_for_it_and_taking_it_back_leaves_no_trace(gpu: GpuContext, stage
     assert np.array_equal(pictures[1], composite(gpu, smooth, frame(noisy())))
 
 
-def test_real_surface_still_hides_the_object_and_softens_its_edge(gpu: GpuContext, stage: Stage) -> None:
+def test_real_surface_still_hides_the_object_and_softens_its_edge(
+    objects: ObjectsRenderer, stage: Stage
+) -> None:
     """Where an object fills its pixels, the share is what it is without antialiasing."""
     document = glowing(stage, cube(60 * PIXEL, (0, 0, -60 * PIXEL)))
     depth = np.full((HEIGHT, WIDTH), 3.0, np.float32)
     depth[:, : WIDTH // 2] = 0.5
     view = frame(noisy(), pose=ABOVE, depth=depth_image(depth))
-    hard, smooth = (solve(gpu, antialiased(document, wanted), view).matte for wanted in (False, True))
+    hard, smooth = (objects.coverage(antialiased(document, wanted), view) for wanted in (False, True))
     assert smooth[:, : WIDTH // 2 - 3].max() == 0
     filled = np.s_[HEIGHT // 2 - 28 : HEIGHT // 2 + 28, : WIDTH // 2 + 28]
     assert np.array_equal(hard[filled], smooth[filled])
@@ -219,46 +215,43 @@ def test_real_surface_still_hides_the_object_and_softens_its_edge(gpu: GpuContex
 def two_sheets(stage: Stage, near: trimesh.Trimesh) -> SceneDocument:
     """A small sheet, and a large dimmer one 1 m below it."""
     far = shifted(sheet(400, 400), 0, 0, -1.0)
-    objects = [
+    sheets = [
         {
             "asset": stage.asset(mesh),
             "material": {"base_color": (0, 0, 0), "specular": 0, "emission": (glow,) * 3},
         }
         for mesh, glow in ((near, GLOW), (far, DIM))
     ]
-    return stage.document(objects, [ambient(0.2)]).replaced(method=NoneMethod())
+    return unlit(stage.document(sheets, [ambient(0.2)]))
 
 
-def test_what_is_hidden_lends_nothing_to_the_outline_before_it(gpu: GpuContext, stage: Stage) -> None:
+def test_what_is_hidden_lends_nothing_to_the_outline_before_it(
+    objects: ObjectsRenderer, stage: Stage
+) -> None:
     document = antialiased(two_sheets(stage, sheet(20, 20, 0.3, 0.3)))
-    assert solve(gpu, document, seen_from_above(1.5)).matte.sum() == pytest.approx(400, rel=0.02)
+    assert objects.coverage(document, seen_from_above(1.5)).sum() == pytest.approx(400, rel=0.02)
 
 
 @pytest.mark.parametrize("turn_deg", [0.0, 45.0])
-def test_edges_of_objects_before_each_other_are_mixed(gpu: GpuContext, stage: Stage, turn_deg: float) -> None:
+def test_edges_of_objects_before_each_other_are_mixed(
+    objects: ObjectsRenderer, stage: Stage, turn_deg: float
+) -> None:
     document = antialiased(two_sheets(stage, sheet(400, 800, 0.37 - 200, 0, turn_deg)))
-    renderer = SceneRenderer(gpu, document, with_linear=True)
-    linear = renderer.render(seen_from_above()).linear
-    matte = fields_of(renderer).matte
-    renderer.release()
-    assert linear is not None
+    linear, matte = objects.linear(document, seen_from_above()), objects.newest_coverage()
     angle = np.radians(turn_deg)
     shares = area_shares(np.array([np.cos(angle), np.sin(angle)]), 0.37)[..., None]
     assert matte.min() == 1
     assert np.abs(linear - (shares * GLOW + (1 - shares) * DIM)).max() <= (GLOW - DIM) / 8
 
 
-def test_creases_of_an_object_are_mixed(gpu: GpuContext, stage: Stage) -> None:
+def test_creases_of_an_object_are_mixed(objects: ObjectsRenderer, stage: Stage) -> None:
     """Faces of unlike light meet along a roof's ridge: on each row the bright part adds up to its width."""
     roof = trimesh.creation.box((40 * PIXEL, 40 * PIXEL, 40 * PIXEL))
     roof.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 4, (0, 1, 0)))
     ridge = 0.3
     roof.apply_translation((ridge * PIXEL, 0, -20 * PIXEL * np.sqrt(2)))
     document = stage.document([stage.virtual(roof)], [directional((1.0, 0.0, -1.0), 2.0)])
-    renderer = SceneRenderer(gpu, antialiased(document.replaced(method=NoneMethod())), with_linear=True)
-    linear = renderer.render(seen_from_above()).linear
-    renderer.release()
-    assert linear is not None
+    linear = objects.linear(antialiased(unlit(document)), seen_from_above())
     row = linear[HEIGHT // 2, :, 0]
     left, right = WIDTH // 2 - 10, WIDTH // 2 + 10
     bright, dark = row[left], row[right]

@@ -15,6 +15,7 @@ from render_server.lights.lights import RectangleLight, SpotLight, build_lights
 from render_server.passes.shadow_maps import light_views
 from render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (
+    COARSE,
     Fields,
     Stage,
     Vector,
@@ -36,7 +37,7 @@ ABOVE = look_at((-0.4, 0.0, 0.5), (0.0, 0.0, 0.0))
 
 @pytest.fixture
 def stage(tmp_path: Path) -> Stage:
-    return Stage(tmp_path)
+    return Stage(tmp_path, COARSE)
 
 
 def spot(**changes: object) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from render_server.gpu.context import GpuContext
 from render_server.passes.caustics import GREATEST_ALPHA
 from render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (
+    COARSE,
     EYE,
     HEIGHT,
     WIDTH,
@@ -35,7 +36,7 @@ DOWN = {"base_color": (SILVER,) * 3, "metallic": 1.0, "roughness": 0.02}
 
 @pytest.fixture
 def stage(tmp_path: Path) -> Stage:
-    return Stage(tmp_path)
+    return Stage(tmp_path, {**COARSE, "cone_scale": 1})
 
 
 def fields(gpu: GpuContext, document: SceneDocument) -> Fields:

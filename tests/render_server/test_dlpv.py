@@ -164,14 +164,16 @@ def test_a_moved_object_leaves_the_real_scenes_volume_alone(gpu: GpuContext, sta
 
 def test_methods_switch_while_running(gpu: GpuContext, stage: Stage) -> None:
     cones = everyday(stage)
-    volumes = dlpv(cones)
-    renderer = run(gpu, cones, frame(noisy()))
-    for document in (volumes, cones, volumes):
-        renderer.set_scene(document)
-        switched = renderer.render(frame(noisy())).color
+    documents = [dlpv(cones), cones]
+    alone = []
+    for document in documents:
         fresh = run(gpu, document, frame(noisy()))
-        assert np.array_equal(switched, fresh.render(frame(noisy())).color)
+        alone.append(fresh.render(frame(noisy())).color)
         fresh.release()
+    renderer = run(gpu, cones, frame(noisy()))
+    for document, expected in zip(documents * 2, alone * 2, strict=True):
+        renderer.set_scene(document)
+        assert np.array_equal(renderer.render(frame(noisy())).color, expected)
     renderer.release()
 
 

@@ -10,13 +10,13 @@ import pytest
 from protocol.camera_model import CameraModel
 from protocol.frames import ViewFrame, decode_lut
 from protocol.scene import SceneDocument
-from protocol.scene_method import NoneMethod
 from protocol.scene_objects import Pose
 from render_server.gpu.context import GpuContext
 from render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (
     HEIGHT,
     WIDTH,
+    ObjectsRenderer,
     Stage,
     ambient,
     array_of,
@@ -26,12 +26,12 @@ from tests.render_server.scenes import (
     cube,
     depth_image,
     directional,
-    fields_of,
     floor_depth,
     frame,
     look_at,
     noisy,
     plain,
+    unlit,
 )
 from tests.render_server.test_antialiasing import ABOVE, GLOW, antialiased, area_shares, sheet
 
@@ -51,10 +51,6 @@ def glowing(stage: Stage, *lights: dict[str, Any], size: float = 400) -> SceneDo
     material = {"base_color": (0, 0, 0), "specular": 0, "emission": (GLOW, GLOW, GLOW)}
     sheets = [{"asset": stage.asset(sheet(size, size)), "material": material}]
     return stage.document(sheets, [*lights, ambient(0.2)])
-
-
-def unlit(document: SceneDocument) -> SceneDocument:
-    return document.replaced(method=NoneMethod())
 
 
 def coded(linear: np.ndarray) -> np.ndarray:
@@ -79,7 +75,7 @@ def seen(a: np.ndarray, color: np.ndarray, least: float = 0.5, model: CameraMode
     return frame(color, pose=ABOVE, depth=depth, **({} if model is None else {"camera": model}))
 
 
-def linear_picture(gpu: GpuContext, document: SceneDocument, view: ViewFrame) -> np.ndarray:
+def lit_picture(gpu: GpuContext, document: SceneDocument, view: ViewFrame) -> np.ndarray:
     renderer = SceneRenderer(gpu, document, with_linear=True)
     linear = renderer.render(view).linear
     renderer.release()
@@ -92,31 +88,31 @@ def linear_picture(gpu: GpuContext, document: SceneDocument, view: ViewFrame) ->
     [(0.0, 0.5, False), (23.0, 0.02, False), (45.0, 0.98, False), (90.0, 0.98, True), (23.0, 0.5, True)],
 )
 def test_edge_shows_the_thing_and_the_object_only(
-    gpu: GpuContext, stage: Stage, turn_deg: float, least: float, smooth: bool
+    objects: ObjectsRenderer, stage: Stage, turn_deg: float, least: float, smooth: bool
 ) -> None:
     """Whichever surface depth gives the mixed pixels to."""
     a = shares(turn_deg)
-    found = linear_picture(gpu, antialiased(unlit(glowing(stage)), smooth), seen(a, coded(mixed(a)), least))
+    found = objects.linear(antialiased(unlit(glowing(stage)), smooth), seen(a, coded(mixed(a)), least))
     expected = mixed(a, back=np.full(3, GLOW))
     assert np.abs(found - expected)[INSIDE].max() < 0.03
 
 
 @pytest.mark.parametrize("distortion", [-0.3, 0.2])
-def test_through_a_lens(gpu: GpuContext, stage: Stage, distortion: float) -> None:
+def test_through_a_lens(objects: ObjectsRenderer, stage: Stage, distortion: float) -> None:
     lens = camera(distortion=(distortion, 0.0, 0.0, 0.0, 0.0))
     a = shares(23.0)
-    found = linear_picture(gpu, unlit(glowing(stage, size=250)), seen(a, coded(mixed(a)), model=lens))
+    found = objects.linear(unlit(glowing(stage, size=250)), seen(a, coded(mixed(a)), model=lens))
     assert np.abs(found - mixed(a, back=np.full(3, GLOW)))[INSIDE].max() < 0.03
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("back", "tolerance"), [(BACK, 0.02), (0.6 * FRONT, 0.05)])
-def test_in_noise(gpu: GpuContext, stage: Stage, back: np.ndarray, tolerance: float) -> None:
+def test_in_noise(objects: ObjectsRenderer, stage: Stage, back: np.ndarray, tolerance: float) -> None:
     """A tenth of the contrast or less of the colours: the whole edge is right within `tolerance`, r.m.s."""
     a = shares(23.0)
     noise = 0.015 * np.random.default_rng(0).standard_normal((HEIGHT, WIDTH, 3))
     color = coded(np.clip(mixed(a, back=back) + noise, 0, 1))
-    found = linear_picture(gpu, unlit(glowing(stage)), seen(a, color, least=0.98))
+    found = objects.linear(unlit(glowing(stage)), seen(a, color, least=0.98))
     error = (found - mixed(a, back=np.full(3, GLOW)))[INSIDE]
     edge = ((a > 0.01) & (a < 0.99))[INSIDE]
     assert np.sqrt(np.mean(error[edge] ** 2)) < tolerance
@@ -124,11 +120,11 @@ def test_in_noise(gpu: GpuContext, stage: Stage, back: np.ndarray, tolerance: fl
 
 @pytest.mark.slow
 @pytest.mark.parametrize("off_px", [-1, 1])
-def test_depth_that_is_off_by_a_pixel(gpu: GpuContext, stage: Stage, off_px: int) -> None:
+def test_depth_that_is_off_by_a_pixel(objects: ObjectsRenderer, stage: Stage, off_px: int) -> None:
     a = shares(0.0)
     view = seen(a, coded(mixed(a)))
     depth = np.roll(view.depth.depth_m, off_px, axis=1)  # type: ignore[union-attr]
-    found = linear_picture(gpu, unlit(glowing(stage)), replace(view, depth=depth_image(depth)))
+    found = objects.linear(unlit(glowing(stage)), replace(view, depth=depth_image(depth)))
     assert np.abs(found - mixed(a, back=np.full(3, GLOW)))[INSIDE].max() < 0.03
 
 
@@ -136,13 +132,13 @@ def test_edge_is_lit_like_the_thing_and_not_like_the_shaded_background(gpu: GpuC
     """The object shades all of the background, and depth gives the edge's pixels to that."""
     a = shares(0.0)
     document = glowing(stage, directional((0.0, 0.0, -1.0), 2.0))
-    found = linear_picture(gpu, document, seen(a, coded(mixed(a)), least=0.98))
+    found = lit_picture(gpu, document, seen(a, coded(mixed(a)), least=0.98))
     assert np.abs(found - mixed(a, back=np.full(3, GLOW)))[INSIDE].max() < 0.03
 
 
-def test_equal_colours_leave_the_choice_to_depth(gpu: GpuContext, stage: Stage) -> None:
+def test_equal_colours_leave_the_choice_to_depth(objects: ObjectsRenderer, stage: Stage) -> None:
     a = shares(0.0, 0.0)
-    found = linear_picture(gpu, unlit(glowing(stage)), seen(a, plain()))
+    found = objects.linear(unlit(glowing(stage)), seen(a, plain()))
     assert np.isfinite(found).all()
     thing = float(decode_lut(None)[plain()[0, 0, 0], 0])
     middle = found[INSIDE][:, :, 0]
@@ -154,18 +150,15 @@ def test_equal_colours_leave_the_choice_to_depth(gpu: GpuContext, stage: Stage) 
 
 @pytest.mark.parametrize("smooth", [False, True])
 def test_no_negative_pixel_and_the_cameras_bytes_where_no_object_lies_behind(
-    gpu: GpuContext, stage: Stage, smooth: bool
+    objects: ObjectsRenderer, stage: Stage, smooth: bool
 ) -> None:
     """The edge goes on beyond the object."""
     document = antialiased(unlit(glowing(stage, size=60)), smooth)
     view = seen(shares(23.0), noisy())
-    renderer = SceneRenderer(gpu, document, with_linear=True)
-    result = renderer.render(view)
-    matte = fields_of(renderer).matte
+    result, matte = objects.draw(document, view), objects.newest_coverage()
     drawn = (
         np.abs(np.indices((HEIGHT, WIDTH)) - np.reshape([HEIGHT / 2, WIDTH / 2], (2, 1, 1))).max(axis=0) < 33
     )
-    renderer.release()
     assert result.linear is not None
     assert np.isfinite(result.linear).all()
     assert result.linear.min() >= 0
@@ -174,40 +167,43 @@ def test_no_negative_pixel_and_the_cameras_bytes_where_no_object_lies_behind(
 
 
 def test_a_third_colour_along_the_edge_belongs_to_the_thing_as_depth_says(
-    gpu: GpuContext, stage: Stage
+    objects: ObjectsRenderer, stage: Stage
 ) -> None:
     """A green line that is neither the thing's red nor the background's blue."""
     column = np.arange(WIDTH) - WIDTH // 2
     a = np.broadcast_to((column < 0).astype(float), (HEIGHT, WIDTH))
     color = mixed(a)
     color[:, (column < 0) & (column >= -2)] = (0.10, 0.60, 0.15)
-    found = linear_picture(gpu, unlit(glowing(stage)), seen(a, coded(color)))
+    found = objects.linear(unlit(glowing(stage)), seen(a, coded(color)))
     expected = np.where(a[..., None] > 0.5, color, GLOW)
     assert np.abs(found - expected)[INSIDE].max() < 0.05
 
 
-def corrections(gpu: GpuContext, document: SceneDocument, view: ViewFrame) -> np.ndarray:
-    renderer = SceneRenderer(gpu, document)
-    renderer.render(view)
-    assert renderer.graph is not None
-    found = array_of(renderer.graph["object surface"].edge_correction)
-    renderer.release()
-    return found
+def corrections(objects: ObjectsRenderer) -> np.ndarray:
+    """Of the picture that was drawn last."""
+    graph = objects.renderer.graph
+    assert graph is not None
+    return array_of(graph["object surface"].edge_correction)
 
 
-def test_the_floor_is_not_unmixed_where_an_object_stands_on_it(gpu: GpuContext, stage: Stage) -> None:
+def test_the_floor_is_not_unmixed_where_an_object_stands_on_it(
+    objects: ObjectsRenderer, stage: Stage
+) -> None:
     document = unlit(
         stage.document([stage.virtual(cube()), stage.virtual(ball(at=(0.1, 0, 0.03)))], [ambient(0.2)])
     )
     view = frame(noisy(), depth=depth_image(floor_depth(look_at())))
-    assert not corrections(gpu, document, view).any()
+    objects.draw(document, view)
+    assert not corrections(objects).any()
 
 
-def test_what_is_too_thin_to_tell_its_colour_keeps_the_share_by_depth(gpu: GpuContext, stage: Stage) -> None:
+def test_what_is_too_thin_to_tell_its_colour_keeps_the_share_by_depth(
+    objects: ObjectsRenderer, stage: Stage
+) -> None:
     bar = np.abs(np.arange(WIDTH) - WIDTH // 2) < 2
     a = np.broadcast_to(bar.astype(float), (HEIGHT, WIDTH))
-    assert not corrections(gpu, unlit(glowing(stage)), seen(a, coded(mixed(a)))).any()
-    found = linear_picture(gpu, unlit(glowing(stage)), seen(a, coded(mixed(a))))
+    found = objects.linear(unlit(glowing(stage)), seen(a, coded(mixed(a))))
+    assert not corrections(objects).any()
     assert np.abs(found - mixed(a, back=np.full(3, GLOW)))[INSIDE].max() < 0.03
 
 

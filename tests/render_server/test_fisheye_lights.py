@@ -21,6 +21,7 @@ from render_server.lights.octahedral import octahedral_grid, sample_octahedral
 from render_server.lights.sources import FisheyeSource, TrackedSource
 from render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (
+    COARSE,
     Stage,
     camera,
     cube,
@@ -283,7 +284,7 @@ def test_fisheye_light_is_registered_on_paper_and_moves_without_registering_agai
 ) -> None:
     """The picture was taken with half the light that the fish-eye camera's units say: factor 0.5."""
     view = paper_under_a_lamp(1.5)
-    renderer = SceneRenderer(gpu, document(Stage(tmp_path), documents.Lights(mode="fisheye")))
+    renderer = SceneRenderer(gpu, document(Stage(tmp_path, COARSE), documents.Lights(mode="fisheye")))
     untouched = renderer.render(replace(view, radiance_map=None))
     assert np.array_equal(untouched.color, view.color)
     first = renderer.render(view)
@@ -306,7 +307,7 @@ def test_fisheye_light_is_registered_on_paper_and_moves_without_registering_agai
 
 @pytest.mark.usefixtures("clean_gl")
 def test_lamp_that_appears_lights_the_scene_from_then_on(gpu: GpuContext, tmp_path: Path) -> None:
-    renderer = SceneRenderer(gpu, document(Stage(tmp_path), tracked(surroundings="none")))
+    renderer = SceneRenderer(gpu, document(Stage(tmp_path, COARSE), tracked(surroundings="none")))
     dark = renderer.render(frame())
     lit = renderer.render(frame(lamps=(lamp_pose(0.5),)))
     kept = renderer.render(frame())
@@ -321,7 +322,9 @@ def test_lamp_that_appears_lights_the_scene_from_then_on(gpu: GpuContext, tmp_pa
 @pytest.mark.usefixtures("clean_gl")
 def test_view_of_the_lights_shows_where_they_are(gpu: GpuContext, tmp_path: Path) -> None:
     view = paper_under_a_lamp(None)
-    renderer = SceneRenderer(gpu, document(Stage(tmp_path), documents.Lights(mode="fisheye"), "lights"))
+    renderer = SceneRenderer(
+        gpu, document(Stage(tmp_path, COARSE), documents.Lights(mode="fisheye"), "lights")
+    )
     shown = renderer.render(view)
     assert shown.color.shape == view.color.shape
     assert shown.lights[0]["type"] == "directional"
@@ -343,7 +346,9 @@ def test_view_of_the_lights_without_fisheye_is_drawn_on_the_cameras_picture(
     gpu: GpuContext, tmp_path: Path
 ) -> None:
     lamp = documents.SphereLight(position_m=(0.0, 0.0, 0.1), intensity=1.0, radius_m=0.02)
-    renderer = SceneRenderer(gpu, document(Stage(tmp_path), documents.Lights(manual=(lamp,)), "lights"))
+    renderer = SceneRenderer(
+        gpu, document(Stage(tmp_path, COARSE), documents.Lights(manual=(lamp,)), "lights")
+    )
     shown = renderer.render(frame(plain())).color
     renderer.release()
     changed = (shown != plain()).any(axis=-1)

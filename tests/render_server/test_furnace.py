@@ -83,8 +83,7 @@ def test_radiance_and_transmittance_share_the_light(lab: VoxelLab) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("start", [0.5, 1.5])
-def test_open_plane_does_not_hide_itself(lab: VoxelLab, start: float) -> None:
+def test_open_plane_does_not_hide_itself(lab: VoxelLab) -> None:
     rng = np.random.default_rng(5)
     for normal in (*np.eye(3), (1, 0, 1), (1, 1, 1), *rng.normal(size=(5, 3))):
         n = np.array(normal) / np.linalg.norm(normal)
@@ -95,11 +94,12 @@ def test_open_plane_does_not_hide_itself(lab: VoxelLab, start: float) -> None:
         plane = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
         voxels = lab.fill(gpu_mesh(plane))
         spread = rng.uniform(-8, 8, (COUNT, 2))
-        starts = centre + spread[:, :1] * x + spread[:, 1:] * y + start * n
-        found = lab.trace(voxels, starts, cosine_directions(COUNT, n, rng), DIFFUSE)
-        blocked = lab.trace(voxels, starts + (2 - start) * n, cosine_directions(COUNT, -n, rng), DIFFUSE)
+        places = centre + spread[:, :1] * x + spread[:, 1:] * y
+        for start in (0.5, 1.5):
+            found = lab.trace(voxels, places + start * n, cosine_directions(COUNT, n, rng), DIFFUSE)
+            assert found[:, 3].min() > 0.999
+        blocked = lab.trace(voxels, places + 2 * n, cosine_directions(COUNT, -n, rng), DIFFUSE)
         voxels.release()
-        assert found[:, 3].min() > 0.999
         assert blocked[:, 3].mean() < 0.03  # grazing ones leave the volume first
 
 

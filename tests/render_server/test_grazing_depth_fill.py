@@ -13,7 +13,7 @@ from render_server.gpu.context import GpuContext
 from render_server.scene.depth_mesh import depth_mesh
 from render_server.scene.depth_surface import grazing_depth_fill
 from sensor_node.view_frames import ViewFrameBuilder
-from tests.render_server.scenes import Stage, camera, cube, directional, frame, look_at, solve
+from tests.render_server.scenes import COARSE, Stage, camera, cube, directional, frame, look_at, solve
 
 CAMERA = camera(320, 240, 300)
 TOP, FRONT, WALL, SIDE = 0.3, -0.1, 0.3, 0.2  # of a shelf on a wall, over a floor; m
@@ -109,7 +109,7 @@ def top_of_a_cube_under_the_lid(gpu: GpuContext, stage: Stage, color: UInt8[np.n
 @pytest.mark.slow
 @pytest.mark.usefixtures("clean_gl")
 def test_the_lid_throws_its_shadow(gpu: GpuContext, tmp_path: Path) -> None:
-    stage, (_, shown) = Stage(tmp_path), shelf(ALONG)
+    stage, (_, shown) = Stage(tmp_path, COARSE), shelf(ALONG)
     bright = top_of_a_cube_under_the_lid(
         gpu, stage, colored(shown, tuple(COLORS[BEHIND]))
     )  # the lid is unknown

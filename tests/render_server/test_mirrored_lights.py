@@ -15,6 +15,7 @@ from render_server.lights.mirror_lights import MIRROR_ROUGHNESS, mirror_lights
 from render_server.renderer import SceneRenderer
 from render_server.scene.declared_surfaces import SurfaceTable, build_surface_table
 from tests.render_server.scenes import (
+    COARSE,
     Fields,
     Stage,
     ball,
@@ -36,7 +37,7 @@ OVER = np.array([0.0, 0.0, 0.1])
 
 @pytest.fixture
 def stage(tmp_path: Path) -> Stage:
-    return Stage(tmp_path)
+    return Stage(tmp_path, COARSE)
 
 
 def mirror(roughness: float = 0.02, **more: Any) -> Surface:  # noqa: ANN401

@@ -26,6 +26,7 @@ from tests.render_server.gltf_samples import (
     moved_box,
 )
 from tests.render_server.scenes import (
+    COARSE,
     GREY,
     Stage,
     ambient,
@@ -45,7 +46,7 @@ SECOND = 1_000_000_000
 
 @pytest.fixture
 def stage(tmp_path: Path) -> Stage:
-    return Stage(tmp_path)
+    return Stage(tmp_path, COARSE)
 
 
 def at(time_s: float) -> ViewFrame:

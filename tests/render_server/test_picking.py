@@ -15,6 +15,7 @@ from render_server.picking import Pick
 from render_server.renderer import SceneRenderer
 from render_server.scene.bvh import first_hit
 from tests.render_server.scenes import (
+    COARSE,
     HEIGHT,
     WIDTH,
     Stage,
@@ -40,7 +41,7 @@ BENT = (-0.2, 0.05, 0.001, 0.001, 0.0)
 
 @pytest.fixture
 def stage(tmp_path: Path) -> Stage:
-    return Stage(tmp_path)
+    return Stage(tmp_path, COARSE)
 
 
 def pixel_of(view: ViewFrame, point: np.ndarray, scale: float = 1.0) -> tuple[float, float]:

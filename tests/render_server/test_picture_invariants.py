@@ -15,6 +15,7 @@ from protocol.scene_objects import Pose
 from render_server.gpu.context import GpuContext
 from render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (
+    COARSE,
     HEIGHT,
     WIDTH,
     Stage,
@@ -45,7 +46,7 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.fixture
 def stage(tmp_path: Path) -> Stage:
-    return Stage(tmp_path)
+    return Stage(tmp_path, COARSE)
 
 
 def test_no_object_gives_the_cameras_bytes(gpu: GpuContext, stage: Stage) -> None:
@@ -85,9 +86,9 @@ def test_same_input_gives_the_same_bytes(gpu: GpuContext, stage: Stage) -> None:
 CHILD = """
 import hashlib, sys, tempfile, pathlib
 from render_server.gpu.context import create_context
-from tests.render_server.scenes import Stage, composite, everyday, frame, noisy
+from tests.render_server.scenes import COARSE, Stage, composite, everyday, frame, noisy
 folder = tempfile.TemporaryDirectory()
-picture = composite(create_context(), everyday(Stage(pathlib.Path(folder.name))), frame(noisy()))
+picture = composite(create_context(), everyday(Stage(pathlib.Path(folder.name), COARSE)), frame(noisy()))
 print(hashlib.sha256(picture.tobytes()).hexdigest())
 """
 
@@ -95,14 +96,10 @@ print(hashlib.sha256(picture.tobytes()).hexdigest())
 @pytest.mark.slow
 def test_two_processes_give_the_same_bytes(gpu: GpuContext, stage: Stage) -> None:
     command = [sys.executable, "-c", CHILD]
-    children = [
-        subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-        for _ in range(2)
-    ]
-    outputs = [child.communicate(timeout=120) for child in children]
-    assert [child.returncode for child in children] == [0, 0], outputs
+    child = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
+    assert child.returncode == 0, child.stderr
     own = hashlib.sha256(composite(gpu, everyday(stage), frame(noisy())).tobytes()).hexdigest()
-    assert [out.strip() for out, _ in outputs] == [own, own]
+    assert child.stdout.strip() == own
 
 
 @pytest.mark.parametrize("composition", ["ratio", "additive"])
@@ -121,7 +118,7 @@ def test_no_shadow_where_the_real_scene_is_in_shadow(gpu: GpuContext, stage: Sta
     sun = directional((-1.0, 0.0, -0.5), 2.0)
     objects = [stage.virtual(cube(0.1))]
     open_floor = solve(gpu, stage.document(objects, [sun], floor()))
-    walled = stage.document(objects, [sun], wall + floor())
+    walled = stage.document(objects, [sun], wall + floor(), cone_scale=1)
     renderer = SceneRenderer(gpu, walled)
     picture = renderer.render(frame(noisy())).color
     shaded = fields_of(renderer)
@@ -272,7 +269,7 @@ def test_textures_are_read_back_whole(gpu: GpuContext) -> None:
 def test_method_none_shows_objects_and_leaves_every_real_pixel_as_it_was(
     gpu: GpuContext, tmp_path: Path
 ) -> None:
-    document = everyday(Stage(tmp_path))
+    document = everyday(Stage(tmp_path, COARSE))
     picture = checkered()
     relit = (composite(gpu, document, frame(picture)) != picture).any(axis=-1)
     renderer = SceneRenderer(gpu, document.replaced(method=NoneMethod()))
@@ -285,7 +282,7 @@ def test_method_none_shows_objects_and_leaves_every_real_pixel_as_it_was(
 
 @pytest.mark.slow
 def test_another_real_model_gives_what_a_fresh_renderer_gives(gpu: GpuContext, tmp_path: Path) -> None:
-    stage = Stage(tmp_path)
+    stage = Stage(tmp_path, COARSE)
     document = everyday(stage)
     lower = document.real.geometry.model_copy(
         update={"pose": Pose(translation_m=(0.0, 0.0, -0.05))}  # type: ignore[union-attr]

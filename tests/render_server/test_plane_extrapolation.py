@@ -22,7 +22,7 @@ from render_server.gpu.context import GpuContext
 from render_server.lights.lights import Light, SphereLight
 from render_server.lights.octahedral import octahedral_grid, sample_octahedral
 from render_server.renderer import SceneRenderer
-from tests.render_server.scenes import Stage, ambient, cube, floor, frame, look_at, plain, shifted
+from tests.render_server.scenes import COARSE, Stage, ambient, cube, floor, frame, look_at, plain, shifted
 
 SIZE = 32
 DIRECTIONS = octahedral_grid(SIZE).reshape(-1, 3)
@@ -207,14 +207,14 @@ def test_the_wall_in_the_picture_goes_on_beside_it_unless_nothing_is_to_be_found
     radiance = float(decode_lut(None)[120, 0])
     directions = np.array([[(0.9, 0.6, 0.1), (-0.9, 0.6, 0.1), (0.1, -0.5, 0.9)]])
     directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
-    found, picture = environment(gpu, corner(Stage(tmp_path), "auto"))
+    found, picture = environment(gpu, corner(Stage(tmp_path, COARSE), "auto"))
     *beside, above = sample_octahedral(found, directions)[0]
     assert radiance < 0.25 * ROOM
     assert (np.array(beside) < 0.6 * ROOM).all()
     assert (np.array(beside) > 0.95 * radiance).all()
     assert above == pytest.approx(ROOM, rel=1e-3)
-    again, same = environment(gpu, corner(Stage(tmp_path), "auto"))
+    again, same = environment(gpu, corner(Stage(tmp_path, COARSE), "auto"))
     np.testing.assert_array_equal(found, again)
     assert picture == same
-    given, _ = environment(gpu, corner(Stage(tmp_path), "none"))
+    given, _ = environment(gpu, corner(Stage(tmp_path, COARSE), "none"))
     assert given == pytest.approx(ROOM, rel=1e-6)

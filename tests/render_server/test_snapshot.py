@@ -69,7 +69,7 @@ def with_method(document: SceneDocument, method: dict[str, object]) -> SceneDocu
 def test_each_picture_is_what_that_view_and_method_alone_would_show(
     gpu: GpuContext, stage: Stage, folder: Path
 ) -> None:
-    document = everyday(stage)
+    document = everyday(stage, cone_scale=2, cone_count=8)
     document = document.replaced(output=document.output.replaced(width=80))
     view = frame(checkered())
     pictures = [
@@ -147,8 +147,11 @@ def noisy_view(number: int) -> ViewFrame:
 def learning(stage: Stage) -> SceneDocument:
     """A scene in which all is found from the frames and averaged over them: surface, albedo, factor of the lights."""
     objects = [stage.virtual(ball(), (0.8, 0.2, 0.1)), stage.virtual(cube(0.08, (0.12, 0.08, 0)))]
-    document = stage.document(objects, [directional(), ambient(0.2)], triangle_budget=20000)
+    document = stage.document(
+        objects, [directional(), ambient(0.2)], triangle_budget=2000, cone_scale=4, cone_count=4
+    )
     return document.replaced(
+        output=document.output.replaced(width=80),
         real=document.real.replaced(geometry="fused", unseen_albedo=None),
         lights=document.lights.replaced(registration="auto"),
     )

@@ -18,7 +18,8 @@ EYES = ((0.25, -0.9, 0.65), (0.3, -0.9, 0.63))
 
 @pytest.fixture
 def document(tmp_path: Path) -> SceneDocument:
-    return everyday(Stage(tmp_path))
+    document = everyday(Stage(tmp_path))
+    return document.replaced(output=document.output.replaced(width=80))
 
 
 @pytest.mark.slow

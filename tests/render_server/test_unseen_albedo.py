@@ -25,6 +25,7 @@ from tests.render_server.scenes import (
     shifted,
 )
 
+FAST: dict[str, object] = {"cone_scale": 4, "cone_count": 8, "shadow_samples": 1}
 FRONT = -0.29  # x of the wall's lit side
 BESIDE = look_at((-0.33, -0.3, 0.9), (-0.12, 0, 0))  # sees the wall's back and top, not its front
 
@@ -33,7 +34,7 @@ def room(stage: Stage) -> SceneDocument:
     wall = shifted(trimesh.creation.box((0.02, 1.2, 0.5)), FRONT - 0.01, 0, 0.25)
     white = stage.virtual(cube(0.1, (-0.12, 0, 0)), (0.8, 0.8, 0.8))
     document = stage.document(
-        [white], [directional((-0.9, 0.1, -0.5))], trimesh.util.concatenate([floor(1.0), wall])
+        [white], [directional((-0.9, 0.1, -0.5))], trimesh.util.concatenate([floor(1.0), wall]), **FAST
     )
     return document.replaced(real=document.real.model_copy(update={"unseen_albedo": None}))
 
@@ -105,7 +106,7 @@ def test_the_interval_grows_and_survives_a_clock_that_is_set_back() -> None:
 def test_registration_is_averaged_over_moved_frames_only(gpu: GpuContext, tmp_path: Path) -> None:
     stage = Stage(tmp_path)
     document = stage.document(
-        [stage.virtual(cube(0.05, (-0.2, 0.15, 0)))], [directional((0, 0, -1), 1.0)], floor()
+        [stage.virtual(cube(0.05, (-0.2, 0.15, 0)))], [directional((0, 0, -1), 1.0)], floor(), **FAST
     )
     scene = document.replaced(lights=document.lights.model_copy(update={"registration": "auto"}))
     renderer = SceneRenderer(gpu, scene)

@@ -11,7 +11,7 @@ from protocol.scene import SceneDocument
 from render_server.estimation.registration import unseen_radiance_from_patch
 from render_server.gpu.context import GpuContext
 from render_server.renderer import SceneRenderer
-from tests.render_server.scenes import Stage, ambient, cube, directional, floor, frame, plain
+from tests.render_server.scenes import COARSE, Stage, ambient, cube, directional, floor, frame, plain
 
 ALBEDO = 0.7
 KNOWN, OUT_OF_SIGHT, SUN = 0.05, 0.12, 0.9
@@ -53,7 +53,7 @@ def sky_light(gpu: GpuContext, scene: SceneDocument, view: ViewFrame) -> np.ndar
 @pytest.mark.usefixtures("clean_gl")
 def test_what_lights_do_not_explain_comes_from_above(gpu: GpuContext, tmp_path: Path) -> None:
     color = picture(SUN + np.pi * (KNOWN + OUT_OF_SIGHT))
-    found = sky_light(gpu, document(Stage(tmp_path)), frame(color, board=BOARD))
+    found = sky_light(gpu, document(Stage(tmp_path, COARSE)), frame(color, board=BOARD))
     assert found == pytest.approx(KNOWN + OUT_OF_SIGHT, rel=0.03)  # one code is 1 % of the paper's radiance
 
 
@@ -63,13 +63,13 @@ def test_what_lights_do_not_explain_comes_from_above(gpu: GpuContext, tmp_path: 
 def test_given_sky_stays_where_nothing_can_be_found(gpu: GpuContext, tmp_path: Path, case: str) -> None:
     board = BOARD.model_copy(update={"white_albedo": None}) if case == "paper unknown" else BOARD
     color = picture(0.8 * SUN if case == "darker than the lights" else SUN + np.pi * (KNOWN + OUT_OF_SIGHT))
-    found = sky_light(gpu, document(Stage(tmp_path)), frame(color, board=board))
+    found = sky_light(gpu, document(Stage(tmp_path, COARSE)), frame(color, board=board))
     assert found == pytest.approx(KNOWN, abs=0.002)
 
 
 @pytest.mark.usefixtures("clean_gl")
 def test_without_surroundings_only_the_lights_shine(gpu: GpuContext, tmp_path: Path) -> None:
-    renderer = SceneRenderer(gpu, document(Stage(tmp_path), "none"))
+    renderer = SceneRenderer(gpu, document(Stage(tmp_path, COARSE), "none"))
     view = frame(picture(SUN + np.pi * (KNOWN + OUT_OF_SIGHT)), board=BOARD)
     found = renderer.render(view).lights[-1]["mean_radiance"]
     renderer.release()

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 
 import pytest
-from playwright.sync_api import Locator, Page, expect, sync_playwright
+from playwright.sync_api import Browser, Locator, Page, expect, sync_playwright
 
 from services.api.static_page import DASHBOARD
 from tests.services.dashboard_samples import AXE, PATIENCE_S, SIZE, find_chromium, photograph
@@ -44,16 +44,22 @@ def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveApi]:
         yield running
 
 
-@pytest.fixture
-def page(guarded: LiveApi) -> Iterator[Page]:
-    expect.set_options(timeout=PATIENCE_S * 1000)
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        page = browser.new_context(viewport=SIZE, color_scheme="dark").new_page()  # type: ignore[arg-type]
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def page(guarded: LiveApi, browser: Browser) -> Iterator[Page]:
+    expect.set_options(timeout=PATIENCE_S * 1000)
+    with browser.new_context(viewport=SIZE, color_scheme="dark") as context:  # type: ignore[arg-type]
+        page = context.new_page()
         page.set_default_timeout(PATIENCE_S * 1000)
         page.goto(f"http://{guarded.address}/")
         yield page
-        browser.close()
 
 
 def sign_in(page: Page, token: str) -> None:

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -32,23 +33,33 @@ pytestmark = pytest.mark.skipif(
     not (RECORDING.is_file() and SCENE.is_file()), reason="the demo's recording is not in this checkout"
 )
 PATIENCE_S = 90
+SMALL = {"width": 160, "height": 120}
+CHEAP = {
+    "volume_size": 32,
+    "cone_count": 4,
+    "cone_scale": 4,
+    "rsm_size": 256,
+    "triangle_budget": 4000,
+    "bounces": 0,
+}
+PLAIN = {"caustics": False, "screen_space": False, "far_volume": False, "shadow_samples": 1}
 
 
 @pytest.mark.slow
 def test_headless_demo_writes_composites_sheet_and_video(cli_process: RunCli, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    options = ("--headless", "--frames", 4, "--out", out, "--method", "paper", "--json")
+    options = ("--headless", "--frames", 3, "--out", out, "--method", "paper", "--json")
     done = cli_process("demo", *options, timeout_s=PATIENCE_S)
     assert done.returncode == 0, done.stderr
-    assert len(list(out.glob("??????.jpg"))) == 4
+    assert len(list(out.glob("??????.jpg"))) == 3
     sheet, first = cv2.imread(str(out / "contact_sheet.png")), cv2.imread(str(out / "000000.jpg"))
     assert sheet is not None
     assert first is not None
-    assert sheet.shape[1] == 4 * 256
+    assert sheet.shape[1] == 3 * 256
     video = cv2.VideoCapture(str(out / "demo.mp4"))
-    assert int(video.get(cv2.CAP_PROP_FRAME_COUNT)) == 4
+    assert int(video.get(cv2.CAP_PROP_FRAME_COUNT)) == 3
     summary = json.loads(done.stdout)
-    assert summary["composites"] == 4
+    assert summary["composites"] == 3
     assert summary["without_pose"] == 0
     assert summary["renderer"]
     assert summary["pass_times_ms"]
@@ -67,7 +78,7 @@ def test_headless_demo_needs_a_folder(cli: RunCli) -> None:
 
 @pytest.mark.slow
 def test_picture_returns_after_node_and_server_are_killed() -> None:
-    with session_file(demo_scene("paper")) as session:
+    with session_file(demo_scene("paper").replaced(output=SMALL)) as session:
         plan = demo_plan(session)
         lines: list[str] = []
         with Supervisor(plan.specs(), forward=lines.append) as supervisor:
@@ -121,35 +132,6 @@ def current_view(plan: HostPlan) -> str:
     return str(scene["output"]["view"])
 
 
-@pytest.mark.slow
-def test_a_change_by_rest_is_in_the_next_picture_that_is_begun(demo: str) -> None:
-    """Of all frames that were captured after the answer, each shows the new revision."""
-    client = httpx.Client(base_url=f"http://{demo}/api/v1", timeout=30)
-    scene = client.get("/active-scene").json()
-    assert scene["document"]["name"] == "Demo"
-    path, knot = f"/scenes/{scene['id']}", scene["document"]["objects"][0]["id"]
-    changes: list[tuple[str, object]] = [
-        (f"{path}/objects/{knot}", {"pose": {"translation_m": [0.2, -0.1, 0.02]}}),
-        (f"{path}/output", {"view": "delta"}),
-        (f"{path}/method", {"name": "dvct", "operator": "exact"}),
-    ]
-    with live_socket(demo) as socket:
-        for address, patch in changes:
-            answer = client.patch(address, json=patch).json()
-            wait_until_shown(client, answer)
-            answered_ns, expected = time.time_ns(), {"id": scene["id"], "revision": answer["revision"]}
-            header = read_frame(socket, PATIENCE_S)
-            while header["capture_ns"] <= answered_ns:
-                assert header["status"] == "ok"
-                socket.send("ack")
-                header = read_frame(socket, PATIENCE_S)
-            assert header["scene"] == expected
-            socket.send("ack")
-    assert header["camera"]["width"] == 640
-    assert header["renderer"]
-    assert client.post(f"{path}/undo").json()["document"]["output"]["view"] == "delta"
-
-
 def wait_until_shown(client: httpx.Client, answer: dict[str, Any]) -> None:
     """Where a busy machine's renderer took the change after its answer."""
     deadline_s = time.monotonic() + PATIENCE_S
@@ -161,41 +143,67 @@ def wait_until_shown(client: httpx.Client, answer: dict[str, Any]) -> None:
         answer = client.get("/active-scene").json()
 
 
-@pytest.fixture
-def demo() -> Iterator[str]:
-    """A demo that shows frames; its address is host:port."""
-    (port,) = ports.private_ports(1)
-    command = [sys.executable, "-m", "services.cli", "demo", "--no-browser", "--method", "paper"]
-    process = subprocess.Popen([*command, "--port", str(port)], cwd=ROOT)
+@contextmanager
+def demo(page_port: int, *options: str) -> Iterator[str]:
+    """A demo that shows frames, at host:port; Ctrl-C ends it and leaves nothing."""
+    command = [sys.executable, "-m", "services.cli", "demo", "--no-browser", "--port", str(page_port)]
+    demo = subprocess.Popen(
+        [*command, *options], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
     try:
-        wait_for_frames(f"{ports.LOOPBACK}:{port}", PATIENCE_S)
-        yield f"{ports.LOOPBACK}:{port}"
+        wait_for_frames(f"{ports.LOOPBACK}:{page_port}", PATIENCE_S)
+        children = psutil.Process(demo.pid).children(recursive=True)
+        assert len(children) == 3
+        yield f"{ports.LOOPBACK}:{page_port}"
+        demo.send_signal(signal.SIGINT)
+        output, error = demo.communicate(timeout=20)
     finally:
-        process.send_signal(signal.SIGINT)
-        process.wait(timeout=20)
+        demo.kill()  # its children end with it
+    assert demo.returncode == 130
+    assert "Traceback" not in error
+    assert f"http://127.0.0.1:{page_port}" in output
+    assert psutil.wait_procs(children, timeout=1)[1] == []
+    assert ports.is_free(page_port)
 
 
 @pytest.mark.slow
 def test_ctrl_c_ends_the_demo_without_orphans_and_it_starts_again() -> None:
+    """The first as people start it; in the second, a change by REST is in the next picture that is begun."""
     (page_port,) = ports.private_ports(1)
-    command = [sys.executable, "-m", "services.cli", "demo", "--no-browser", "--port", str(page_port)]
-    for method in ([], ["--method", "paper"]):
-        demo = subprocess.Popen(
-            [*command, *method], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        )
-        try:
-            wait_for_frames(f"{ports.LOOPBACK}:{page_port}", PATIENCE_S)
-            children = psutil.Process(demo.pid).children(recursive=True)
-            assert len(children) == 3
-            demo.send_signal(signal.SIGINT)
-            output, error = demo.communicate(timeout=20)
-        finally:
-            demo.kill()  # its children end with it
-        assert demo.returncode == 130
-        assert "Traceback" not in error
-        assert f"http://127.0.0.1:{page_port}" in output
-        assert psutil.wait_procs(children, timeout=1)[1] == []
-        assert ports.is_free(page_port)
+    with demo(page_port):
+        pass
+    with demo(page_port, "--method", "paper") as address:
+        check_changes(address)
+
+
+def check_changes(address: str) -> None:
+    """Of all frames that were captured after the answer, each shows the new revision."""
+    client = httpx.Client(base_url=f"http://{address}/api/v1", timeout=30)
+    scene = client.get("/active-scene").json()
+    assert scene["document"]["name"] == "Demo"
+    path, knot = f"/scenes/{scene['id']}", scene["document"]["objects"][0]["id"]
+    changes: list[tuple[str, object]] = [
+        (f"{path}/output", {"view": "delta", **SMALL}),
+        (f"{path}/objects/{knot}", {"pose": {"translation_m": [0.2, -0.1, 0.02]}}),
+        (f"{path}/method", {"name": "dvct", "operator": "exact", **CHEAP, **PLAIN}),
+    ]
+    with live_socket(address) as socket:
+        assert read_frame(socket, PATIENCE_S)["camera"]["width"] == 640
+        socket.send("ack")
+        for route, patch in changes:
+            answer = client.patch(route, json=patch).json()
+            wait_until_shown(client, answer)
+            answered_ns, expected = time.time_ns(), {"id": scene["id"], "revision": answer["revision"]}
+            header = read_frame(socket, PATIENCE_S)
+            while header["capture_ns"] <= answered_ns:
+                assert header["status"] == "ok"
+                socket.send("ack")
+                header = read_frame(socket, PATIENCE_S)
+            assert header["scene"] == expected
+            socket.send("ack")
+    assert header["camera"]["width"] == SMALL["width"]
+    assert header["renderer"]
+    assert client.post(f"{path}/undo").json()["document"]["method"]["operator"] == "paper"
 
 
 def test_page_port_in_use_is_a_sentence(cli: RunCli) -> None:

@@ -85,19 +85,14 @@ def test_gltf_is_y_up_and_textured(tmp_path: Path) -> None:
     assert solid[:, :2].max() < 30
 
 
-@pytest.mark.parametrize("suffix", [".hdr", ".exr"])
-def test_a_map_is_shown_whole_whatever_its_brightness(tmp_path: Path, suffix: str) -> None:
+def test_a_map_is_shown_whole_whatever_its_kind_and_brightness(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     radiance = rng.uniform(0.5, 1.5, (64, 128, 3)).astype(np.float32)
     radiance[:32, :, 2] *= 3  # the sky is blue
-    shown = []
-    for factor in (1e-3, 1e3):
-        path = tmp_path / f"source{suffix}"
-        if suffix == ".hdr":
-            cv2.imwrite(str(path), radiance[..., ::-1] * factor)
-        else:
-            write_exr(path, radiance * np.float32(factor))
-        shown.append(drawn(tmp_path, f"map{suffix}", path.read_bytes()))
+    hdr, exr = tmp_path / "dark.hdr", tmp_path / "bright.exr"
+    cv2.imwrite(str(hdr), radiance[..., ::-1] * np.float32(1e-3))
+    write_exr(exr, radiance * np.float32(1e3))
+    shown = [drawn(tmp_path, f"map{path.suffix}", path.read_bytes()) for path in (hdr, exr)]
     dark, bright = (picture[SIZE // 4 : 3 * SIZE // 4].astype(int) for picture in shown)
     assert (shown[0][: SIZE // 4, :, 3] == 0).all()
     assert (dark[..., 3] == 255).all()
