@@ -188,6 +188,8 @@ class LiveScene:
         if moved and self._real.has_unseen and self._albedo.observe(graph, self.lighting.lights):
             graph.renew_albedo()
             graph.set_lights(self.lighting.lights)
+            if self._best is not None:
+                self._best.renew_albedo()
         self._accumulated = frame
         changing = (objects, self.lighting.lights, self._plan)
         if moved or not _same_objects(changing, self._changing):

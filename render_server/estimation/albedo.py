@@ -5,7 +5,7 @@ from render_server.frame_graph import FrameGraph
 from render_server.gpu.context import GpuContext
 from render_server.lights.lights import LightSet
 from render_server.passes.voxel_light import AlbedoTexture
-from render_server.scene.albedo_volume import MEAN_ALBEDO, AlbedoVolume
+from render_server.scene.albedo import MEAN_ALBEDO, AlbedoVolume
 
 
 class AlbedoEstimator:

@@ -10,7 +10,7 @@ from render_server.estimation.samples import bounced_light, sample_light
 from render_server.frame_graph import FrameGraph
 from render_server.lights.environment import LUMINANCE
 from render_server.lights.lights import LightSet
-from render_server.scene.board_albedo import MIN_PIXELS
+from render_server.scene.albedo import MIN_PIXELS
 
 OUTLIER_DEVIATIONS = 3.0
 MIN_IRRADIANCE = 1e-4

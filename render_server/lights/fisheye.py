@@ -20,7 +20,7 @@ from render_server.lights.environment import LUMINANCE, SkyGrid
 from render_server.lights.median_cut import RegionLight
 from render_server.lights.octahedral import octahedral_grid, sample_octahedral, texel_weights
 from render_server.lights.octahedral import texel_solid_angles as octahedral_solid_angles
-from render_server.scene.board_albedo import MIN_PIXELS, known_albedo, unclipped
+from render_server.scene.albedo import MIN_PIXELS, known_albedo, unclipped
 
 COARSE_SIZE = 32
 # Power of the cosine that weights visible directions for an unseen one: half at 24 degrees, about the size of parts

@@ -15,7 +15,8 @@ from render_server.gpu.kernel import Binding, Bindings
 from render_server.gpu.textures import release_all
 from render_server.gpu_scene import GeometryState, PlacedObject
 from render_server.graph import Graph, Resource
-from render_server.methods.lighting import Layers, Shading, ShadingOptions, light_stages, shading_stages
+from render_server.methods.light_maps import light_stages
+from render_server.methods.lighting import Layers, Shading, ShadingOptions, shading_stages
 from render_server.methods.method import RelightingMethod, ResolvedSettings, Setup
 from render_server.occlusion_fields import OcclusionFields, require_rigid
 from render_server.passes.cones import ConeFields, LowResGrid

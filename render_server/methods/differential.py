@@ -18,16 +18,13 @@ from render_server.gpu.kernel import Binding, Bindings, clear_buffer
 from render_server.gpu_scene import GeometryState
 from render_server.graph import Graph, Resource
 from render_server.lights.lights import LightSet
+from render_server.methods.light_maps import LitScene, Points, object_extent, shadow_receivers
 from render_server.methods.lighting import (
     SURFEL_SHADOW_SAMPLES,
     Layers,
-    LitScene,
-    Points,
     Shading,
     ShadingOptions,
-    object_extent,
     shading_stages,
-    shadow_receivers,
     surfel_scene,
     volume_placement,
 )

@@ -10,12 +10,11 @@ from render_server.gpu.textures import release_all
 from render_server.gpu_scene import GeometryState
 from render_server.graph import Graph, Resource
 from render_server.lights.lights import LightSet
+from render_server.methods.light_maps import LitScene, light_stages
 from render_server.methods.lighting import (
     Layers,
-    LitScene,
     Shading,
     ShadingOptions,
-    light_stages,
     shading_stages,
     surfel_scene,
     volume_placement,

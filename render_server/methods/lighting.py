@@ -1,4 +1,4 @@
-"""Stages that methods share: the lights' depth maps, and shading of the visible surfaces (docs/method.md 3)."""
+"""Stages that methods share: volumes around the objects, and shading of the visible surfaces (docs/method.md 3)."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -7,7 +7,6 @@ from typing import Any
 
 import moderngl
 import numpy as np
-from jaxtyping import Float64
 
 from protocol.scene_method import QualityTier
 from render_server.frame import FrameResources, Observation
@@ -16,16 +15,15 @@ from render_server.gpu.kernel import Binding, Bindings
 from render_server.gpu_scene import GeometryState
 from render_server.graph import Graph, Resource
 from render_server.lights.lights import LightSet
-from render_server.lights.mirror_lights import mirror_lights
+from render_server.methods.light_maps import LitScene, Points, object_extent
 from render_server.methods.method import ResolvedSettings
 from render_server.passes.caustics import GREATEST_ALPHA, Caustics
 from render_server.passes.composite import ChangeRatio
 from render_server.passes.cones import ConeFields, LowResGrid
-from render_server.passes.lights import LightBuffers, MirrorVisibility
+from render_server.passes.lights import LightBuffers
 from render_server.passes.ray_tracing import ObjectBvh
 from render_server.passes.reflections import ROUGHEST, MirrorRays, ScreenCones
 from render_server.passes.shading import DirectLight, LightHistory, VirtualSurface
-from render_server.passes.shadow_maps import ShadowMaps
 from render_server.passes.voxel_light import AlbedoTexture
 from render_server.passes.voxels import (
     PlacedVolume,
@@ -34,152 +32,12 @@ from render_server.passes.voxels import (
     keep_placement,
     place_volume,
 )
-from render_server.scene.declared_surfaces import SurfaceTable
 from render_server.view import CameraView
 
-SHADOW_REACH = 4.0  # in longest edges of the objects' bounds: how far around them real shadows are resolved
-LARGE_TRIANGLE = 0.1  # of that reach: from here on a triangle's own extent matters, not only its corners
 SELF_SHADOW_TEXELS = 1.5  # a virtual receiver is lifted by so many texels of the depth map
 SURFEL_SHADOW_SAMPLES = 4  # of a light's area: a voxel averages many surfels
 DEPTH_TOLERANCE = 0.02  # a surfel this near (relative) to what the camera sees is what it sees
 SURFEL_PICTURE_LOD = 2.0  # of the linear picture: one sample covers a surfel's pixels
-
-Points = Float64[np.ndarray, "n 3"]
-
-
-@dataclass(frozen=True, eq=False)
-class LitScene:
-    """The lights' buffers and the resources that follow them.
-
-    `real_maps` and `object_maps`: depth maps of the real scene and of the objects; `mirrored`: where smooth planes
-    mirror the lights, if the method heeds that. All of them fill a part of `buffers`.
-    """
-
-    buffers: LightBuffers
-    environment: Resource[Any]
-    real_maps: Resource[LightBuffers]
-    object_maps: Resource[LightBuffers]
-    mirrored: tuple[Resource[moderngl.TextureArray | None], ...] = ()
-
-    @property
-    def all(self) -> tuple[Resource[Any], ...]:
-        """Everything that shading under these lights depends on."""
-        return self.environment, self.real_maps, self.object_maps, *self.mirrored
-
-
-class LightStages:
-    """Fits the lights' views to their casters and receivers, and draws their depth maps.
-
-    With `keeps_views`, the views of real shadows stay while objects move a little.
-    """
-
-    def __init__(
-        self,
-        gpu: GpuContext,
-        tile_size: int,
-        shadow_samples: int,
-        *,
-        mirrors: bool = False,
-        keeps_views: bool = False,
-    ) -> None:
-        self._keeps_views = keeps_views
-        self.buffers = LightBuffers(gpu, tile_size, shadow_samples)
-        self._mirrors = mirrors
-        self._maps = ShadowMaps(gpu)
-        self._visibility = MirrorVisibility(gpu)
-
-    def set_environment(self, lights: LightSet) -> moderngl.TextureArray:
-        """Uploads the residual environment."""
-        return self.buffers.set_environment(lights.environment)
-
-    def fit_views(
-        self, lights: LightSet, real: GeometryState, extent: Points, surfaces: SurfaceTable, everywhere: bool
-    ) -> tuple[bytes, bytes]:
-        """Fits the views: of real shadows around the objects (or `everywhere`), and closely around the objects.
-
-        Returns the records of both, which tell whether their maps are still those of the views.
-        """
-        around = _snapped(extent) if self._keeps_views else extent
-        receivers = real.points if everywhere else shadow_receivers(real, around)
-        shining = list(lights.lights)
-        mirrors = mirror_lights(shining, surfaces, np.mean(extent, axis=0)) if self._mirrors else []
-        self.buffers.place(shining, real.points, receivers, extent, mirrors)
-        return self.buffers.real_records, self.buffers.virtual_records
-
-    def draw_real(self, _views: bytes, real: GeometryState) -> LightBuffers:
-        """Draws the real scene as seen from the lights."""
-        buffers = self.buffers
-        self._maps.run(buffers.real_atlas, [real.buffers], buffers.real_views)
-        return buffers
-
-    def draw_objects(self, _views: bytes, objects: GeometryState) -> LightBuffers:
-        """Draws the objects as seen from the lights."""
-        buffers = self.buffers
-        self._maps.run(buffers.virtual_atlas, [objects.buffers], buffers.virtual_views)
-        return buffers
-
-    def map_mirrors(
-        self,
-        _real: LightBuffers,
-        _objects: LightBuffers,
-        _lights: LightSet,
-        _extent: Points,
-        seen: Observation,
-    ) -> moderngl.TextureArray | None:
-        """Maps where smooth planes show the lights; None where no plane does."""
-        if not self.buffers.mirrors:
-            return None
-        self._visibility.run(self.buffers, seen.scan.bias_m, {**seen.bindings, **self.buffers.bindings})
-        return self.buffers.mirror_visibility
-
-    def release(self) -> None:
-        """Frees the GL objects."""
-        for item in (self.buffers, self._maps, self._visibility):
-            item.release()
-
-
-def light_stages(
-    g: Graph,
-    s: FrameResources,
-    resolved: ResolvedSettings,
-    shadow_samples: int,
-    tier: QualityTier,
-    *,
-    mirrors: bool = False,
-) -> LitScene:
-    """Declares environment, light views, depth maps of both geometries, and mirror images of the lights."""
-    g.section("lights")
-    stages = LightStages(
-        g.gpu, resolved.rsm_size, shadow_samples, mirrors=mirrors, keeps_views=tier.refresh_tiles > 0
-    )
-    extent = object_extent(g, s)
-    environment = g.stage("environment", stages.set_environment, s.lights)
-    fitted = s.lights, s.real, extent, s.surfaces, s.everywhere
-    views = "light views real", "light views objects"
-    real_views, object_views = g.stages("light views", stages.fit_views, *fitted, outputs=views, same=eq)
-    real_maps = g.stage("shadow maps real", stages.draw_real, real_views, s.real)
-    object_maps = g.stage("shadow maps objects", stages.draw_objects, object_views, s.objects)
-    mirrored = []
-    if mirrors:
-        given = real_maps, object_maps, s.lights, extent, s.measured
-        mirrored = [g.stage("mirror visibility", stages.map_mirrors, *given, same=_both_none)]
-    return LitScene(stages.buffers, environment, real_maps, object_maps, tuple(mirrored))
-
-
-def _both_none(old: object, new: object) -> bool:
-    return old is None and new is None
-
-
-def object_extent(g: Graph, s: FrameResources) -> Resource[Points]:
-    """Declares the points that enclose the objects throughout their animations, for fitting volumes and views."""
-    if "object extent" in g:
-        return g.resource("object extent")
-    return g.value("object extent", _lasting_points, s.objects, same=np.array_equal)
-
-
-def _lasting_points(objects: GeometryState) -> Points:
-    """Points that enclose the objects at all times of their animations."""
-    return objects.lasting_points
 
 
 def volume_placement(
@@ -506,28 +364,3 @@ def shading_stages(
 def _new_object(*_: object) -> object:
     """Returns a value that equals no other."""
     return object()
-
-
-def _snapped(extent: Points) -> Points:
-    """Returns the corners of a box around points, snapped to half of their longest edge."""
-    low, high = extent.min(axis=0), extent.max(axis=0)
-    step = max(float(np.max(high - low)) / 2, 1e-6)
-    step = 2.0 ** np.ceil(np.log2(step))  # an object that turns keeps it
-    return np.stack([np.floor(low / step) * step, np.ceil(high / step) * step])
-
-
-def shadow_receivers(real: GeometryState, extent: Points) -> Points:
-    """Returns the real points around the objects, or all of them if none is near.
-
-    These are the vertices within reach and, for triangles too large to have a vertex there, their part of that cube.
-    """
-    low, high = extent.min(axis=0), extent.max(axis=0)
-    centre, reach = (low + high) / 2, SHADOW_REACH * float(np.max(high - low))
-    points = real.points
-    near = points[np.linalg.norm(points - centre, axis=1) <= reach]
-    corners = real.corners[..., :3].astype(np.float64)
-    first, last = corners.min(axis=1), corners.max(axis=1)
-    meets = np.all((first <= centre + reach) & (last >= centre - reach), axis=1)
-    large = meets & (np.max(last - first, axis=1) > LARGE_TRIANGLE * reach)
-    clipped = np.clip(corners[large].reshape(-1, 3), centre - reach, centre + reach)
-    return np.concatenate([near, clipped]) if len(near) or len(clipped) else points

@@ -12,14 +12,13 @@ from render_server.gpu.textures import release_all
 from render_server.gpu_scene import GeometryState
 from render_server.graph import Graph, Resource
 from render_server.lights.lights import LightSet
+from render_server.methods.light_maps import LitScene, light_stages
 from render_server.methods.lighting import (
     SURFEL_SHADOW_SAMPLES,
     Layers,
-    LitScene,
     Shading,
     ShadingOptions,
     casts_caustics,
-    light_stages,
     shading_stages,
     surfel_scene,
     volume_placement,

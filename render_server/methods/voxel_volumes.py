@@ -20,7 +20,8 @@ from render_server.gpu.uniform_block import UniformBlock
 from render_server.gpu_scene import GeometryState
 from render_server.graph import Graph, Resource
 from render_server.lights.lights import LightSet
-from render_server.methods.lighting import SURFEL_SHADOW_SAMPLES, LitScene, casts_caustics, surfel_scene
+from render_server.methods.light_maps import LitScene
+from render_server.methods.lighting import SURFEL_SHADOW_SAMPLES, casts_caustics, surfel_scene
 from render_server.methods.method import march_defines
 from render_server.passes.lights import LightBuffers
 from render_server.passes.voxel_light import (

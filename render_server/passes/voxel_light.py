@@ -20,7 +20,7 @@ from render_server.passes.voxels import (
     VoxelStore,
     group_grid_bytes,
 )
-from render_server.scene.albedo_volume import MEAN_ALBEDO, AlbedoVolume
+from render_server.scene.albedo import MEAN_ALBEDO, AlbedoVolume
 
 SUPPORT_BYTES = 24
 

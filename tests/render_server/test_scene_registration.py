@@ -10,7 +10,7 @@ from render_server.estimation.registration import (
     registration_from_albedo_percentile,
     registration_from_patch,
 )
-from render_server.scene.board_albedo import known_albedo, paper_pixels, unclipped
+from render_server.scene.albedo import known_albedo, paper_pixels, unclipped
 
 FACTOR = np.array([2.0, 1.5, 0.75])
 BOARD = BoardSpec(
