@@ -55,8 +55,9 @@ class QualityTier:
     refresh_tiles: int = 0
 
 
+BEST = QualityTier()
 TIERS: dict[Quality, QualityTier] = {
-    "best": QualityTier(),
+    "best": BEST,
     "balanced": QualityTier(refresh_tiles=8),
     "live": QualityTier(
         cone_count=8,

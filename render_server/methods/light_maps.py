@@ -8,7 +8,7 @@ import moderngl
 import numpy as np
 from jaxtyping import Float64
 
-from protocol.scene_method import QualityTier
+from protocol.scene_method import BEST, QualityTier
 from render_server.frame import FrameResources, Observation
 from render_server.gpu.context import GpuContext
 from render_server.gpu_scene import GeometryState
@@ -122,7 +122,7 @@ def light_stages(
     s: FrameResources,
     resolved: ResolvedSettings,
     shadow_samples: int,
-    tier: QualityTier,
+    tier: QualityTier = BEST,
     *,
     mirrors: bool = False,
 ) -> LitScene:

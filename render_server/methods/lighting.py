@@ -1,14 +1,14 @@
 """Stages that methods share: volumes around the objects, and shading of the visible surfaces (docs/method.md 3)."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from operator import eq
 from typing import Any
 
 import moderngl
 import numpy as np
 
-from protocol.scene_method import QualityTier
+from protocol.scene_method import BEST, QualityTier
 from render_server.frame import FrameResources, Observation
 from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Binding, Bindings
@@ -41,7 +41,7 @@ SURFEL_PICTURE_LOD = 2.0  # of the linear picture: one sample covers a surfel's 
 
 
 def volume_placement(
-    g: Graph, s: FrameResources, size: int, edge_m: float | None, tier: QualityTier
+    g: Graph, s: FrameResources, size: int, edge_m: float | None, tier: QualityTier = BEST
 ) -> Resource[VolumePlacement]:
     """Declares the cube of voxels or cells around the objects; a quick tier moves it only when it must."""
     placed: VolumePlacement | None = None
@@ -102,7 +102,7 @@ class ShadingOptions:
     show.
     """
 
-    tier: QualityTier = field(default_factory=QualityTier)
+    tier: QualityTier = BEST
     caustics: bool = False
     screen_space: bool = False
     mirror_gather: str | None = None
