@@ -28,6 +28,7 @@ SHEET_COLUMNS = 5
 SHEET_WIDTH = 256
 VIDEO_CODEC = "mp4v"  # in every OpenCV wheel, which contains FFmpeg
 FALLBACK_RATE = 10.0
+VIDEO_RATES = (1.0, 60.0)  # frames a second; encoders refuse that of pictures a millisecond apart
 
 
 class CompositeCollector:
@@ -71,7 +72,7 @@ class CompositeCollector:
         """Rate of arrival, None below two composites."""
         if self.count < 2:
             return None
-        return (self.count - 1) / (self.arrivals_s[-1] - self.arrivals_s[0])
+        return (self.count - 1) / max(self.arrivals_s[-1] - self.arrivals_s[0], 1e-3)
 
     def write_overview(self) -> None:
         """Write contact_sheet.png and the video from the pictures in the folder."""
@@ -124,8 +125,9 @@ class CompositeCollector:
         assert self._out is not None
         height, width = self.messages[0].shape[:2]
         codec = cv2.VideoWriter.fourcc(*VIDEO_CODEC)
+        rate = round(float(np.clip(self.frames_per_s() or FALLBACK_RATE, *VIDEO_RATES)), 2)
         with replacing(self._out / "demo.mp4") as path:
-            video = cv2.VideoWriter(str(path), codec, self.frames_per_s() or FALLBACK_RATE, (width, height))
+            video = cv2.VideoWriter(str(path), codec, rate, (width, height))
             if not video.isOpened():
                 raise DeltalightError(
                     "This OpenCV cannot write mp4; reinstall the package opencv-contrib-python-headless."
