@@ -229,18 +229,3 @@ def test_up_without_a_gpu_refuses_in_a_sentence(cli: RunCli, cli_process: RunCli
     last_line = done.stderr.strip().splitlines()[-1]
     assert "--allow-software" in last_line
     assert "started again" not in done.stderr
-
-
-@pytest.mark.slow
-def test_bench_speed_reports_every_pass(cli: RunCli, tmp_path: Path) -> None:
-    report = tmp_path / "speed.json"
-    options = ("--methods", "paper", "--frames", 1, "--size", "160x120", "--no-end-to-end", "--json")
-    done = cli("bench", "speed", *options, "--out", report)
-    assert done.returncode == 0, done.stderr
-    figures = json.loads(done.stdout)
-    assert figures == json.loads(report.read_text())
-    assert figures["size"] == [160, 120]
-    paper = figures["methods"]["paper"]
-    assert paper["passes"]
-    assert paper["frames_per_s"] > 0
-    assert any("MB" in notice for notice in paper["notices"])
