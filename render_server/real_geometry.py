@@ -29,9 +29,10 @@ STILL_FRAMES = 16
 ROUNDED_VOXELS = 0.35
 
 
-# A kept world is renewed no more often than this while something moves in it, and at the latest this long after all
-# has come to rest.
+# A kept world is renewed no more often than this while something moves in it,
 RENEWAL_NS = 400_000_000
+# and once all has been at rest for so long: a camera that only pauses must not wait for it.
+SETTLING_NS = 1_500_000_000
 
 
 class RealGeometry:
@@ -146,7 +147,7 @@ class RealGeometry:
         if built is last:
             return self._tsdf is not None  # which averages some more frames
         assert last is not None
-        return samples.frame.timestamp_ns - last.frame.timestamp_ns >= RENEWAL_NS
+        return samples.frame.timestamp_ns - last.frame.timestamp_ns >= SETTLING_NS
 
     def _rebuild(self, frame: ViewFrame, view: CameraView, *, moved: bool) -> bool:
         """Builds the real scene from the frame in which anything last moved; returns whether it changed."""
