@@ -29,9 +29,9 @@ STILL_FRAMES = 16
 ROUNDED_VOXELS = 0.35
 
 
-# A kept world is renewed no more often than this while something moves in it,
+# A kept world that explains the picture no longer is renewed no more often than this,
 RENEWAL_NS = 400_000_000
-# and once all has been at rest for so long: a camera that only pauses must not wait for it.
+# one that does once all has been at rest for so long: a camera that only pauses must not wait for it.
 SETTLING_NS = 1_500_000_000
 
 
@@ -147,7 +147,8 @@ class RealGeometry:
         if built is last:
             return self._tsdf is not None  # which averages some more frames
         assert last is not None
-        return samples.frame.timestamp_ns - last.frame.timestamp_ns >= SETTLING_NS
+        wait_ns = SETTLING_NS if kept.explains(last) else RENEWAL_NS
+        return samples.frame.timestamp_ns - last.frame.timestamp_ns >= wait_ns
 
     def _rebuild(self, frame: ViewFrame, view: CameraView, *, moved: bool) -> bool:
         """Builds the real scene from the frame in which anything last moved; returns whether it changed."""
