@@ -11,7 +11,8 @@ from jaxtyping import Float32, Float64
 
 from protocol.errors import DeltalightError
 from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import Binding, Kernel, clear_buffer, clear_volume, list_threads
+from render_server.gpu.kernel import Binding, Bindings, Kernel, clear_buffer, clear_volume, list_threads
+from render_server.gpu.textures import release_all
 from render_server.gpu.uniform_block import Block, Float, Int, UniformBlock, Vec3
 from render_server.scene.triangle_mesh import split_triangles
 
@@ -23,6 +24,7 @@ SUMS_PER_SLOT = 24
 DELTA_SUMS_PER_SLOT = 18
 SURFELS_HEADER_BYTES = 16  # their number, padded
 TOUCHED_HEADER_BYTES = 4
+PAIR_BYTES = PAIRS_HEADER_BYTES = 8  # of a triangle and a voxel (shaders/common/voxel_pairs.glsl)
 LEAST_SURFELS = 1024
 LARGEST_ITEM_BYTES = (
     96  # of what is kept a surfel or slot: SUMS_PER_SLOT, SURFEL_LIGHT_BYTES (voxel_light.py)
@@ -281,8 +283,10 @@ class Voxelize:
 
     def __init__(self, gpu: GpuContext) -> None:
         self._gpu = gpu
-        self._kernel = Kernel(gpu, "voxelize")
+        self._find_pairs = Kernel(gpu, "voxel_pairs")
+        self._clip = Kernel(gpu, "voxelize")
         self._triangles = gpu.ctx.buffer(reserve=64)
+        self._pairs = gpu.ctx.buffer(reserve=PAIRS_HEADER_BYTES + PAIR_BYTES)
 
     def run(self, store: VoxelStore, corners: Float32[np.ndarray, "m 3 10"], volume: PlacedVolume) -> None:
         """Fills the empty `store` with the surfels of the triangles inside the volume."""
@@ -290,21 +294,25 @@ class Voxelize:
         store.reset(bound)
         if not len(pieces):
             return
+        self._write(pieces, bound)
+        shared: Bindings = {**volume.bindings, "Triangles": self._triangles, "Pairs": self._pairs}
+        self._find_pairs.run((len(pieces),), shared, triangle_count=len(pieces))
+        self._clip.run((list_threads(self._gpu, bound),), shared, store.bindings)
+
+    def _write(self, pieces: Float32[np.ndarray, "k 3 10"], bound: int) -> None:
+        """Uploads the triangles, and makes room for `bound` pairs."""
         self._gpu.check_storage(pieces.nbytes, LOWER_SURFELS)
         self._triangles.orphan(pieces.nbytes)
         self._triangles.write(pieces.tobytes())
-        self._kernel.run(
-            (len(pieces),),
-            store.bindings,
-            volume.bindings,
-            Triangles=self._triangles,
-            triangle_count=len(pieces),
-        )
+        needed = PAIRS_HEADER_BYTES + PAIR_BYTES * bound
+        if self._pairs.size < needed:
+            self._gpu.check_storage(needed, LOWER_SURFELS)
+            self._pairs.orphan(needed)
+        self._pairs.write(bytes(PAIRS_HEADER_BYTES))
 
     def release(self) -> None:
         """Frees the GL objects."""
-        self._kernel.release()
-        self._triangles.release()
+        release_all(self._find_pairs, self._clip, self._triangles, self._pairs)
 
 
 def pieces_in_volume(

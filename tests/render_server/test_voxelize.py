@@ -49,6 +49,8 @@ def test_area_is_kept(lab: VoxelLab, kind: str) -> None:
     assert np.isfinite(normals).all()
     assert areas.min() > 0
     assert areas.sum(dtype=np.float64) == pytest.approx(mesh.area, rel=1e-3)
+    centre = np.average(positions.astype(np.float64), axis=0, weights=areas)
+    assert np.abs(centre - np.average(mesh.triangles_center, axis=0, weights=mesh.area_faces)).max() < 2e-3
     assert np.abs(np.linalg.norm(normals, axis=1) - 1).max() < 1e-5
     assert (positions > voxels - 1e-4).all()
     assert (positions < voxels + 1 + 1e-4).all()
@@ -82,6 +84,34 @@ def test_aligned_plane_covers_its_voxels_once(lab: VoxelLab, height: float) -> N
     assert np.abs(seen_from_above[int(height)] - 1).max() < 2e-3
     assert np.count_nonzero(texels[..., 3]) == SIZE**2
     assert np.abs(texels[5, int(height), ..., 0] - 1).max() < 2e-3
+
+
+TILTED = {
+    "through edges of voxels": (0.0, 1.0, 0.0),
+    "through corners of voxels": (1.0, 1.0, 0.0),
+    "through edges, but for rounding": (1e-7, 1.0 - 1e-7, 0.3e-6),
+    "all but level, on the border": (1e-7, -1e-7, 20.0),
+    "all but level, across the border": (3e-6, -2e-6, 19.99998),
+}
+
+
+@pytest.mark.parametrize("name", TILTED)
+def test_planes_through_edges_of_voxels_count_once(lab: VoxelLab, name: str) -> None:
+    """Where outlines of pieces coincide with borders of voxels, exactly or almost."""
+    across_x, across_y, height = TILTED[name]
+    low, high = 2.0, 26.0
+    corners = np.array(
+        [(x, y, height + across_x * x + across_y * y) for x in (low, high) for y in (low, high)]
+    )
+    plane = trimesh.Trimesh(corners, [[0, 2, 3], [0, 3, 1]])
+    positions, areas, _, voxels = lab.surfels(gpu_mesh(plane))
+    assert areas.sum(dtype=np.float64) == pytest.approx(plane.area, rel=1e-4)
+    columns, each = np.unique(voxels[:, :2], axis=0, return_inverse=True)
+    assert len(columns) == (high - low) ** 2
+    in_columns = np.bincount(each.ravel(), weights=areas)
+    assert np.abs(in_columns / np.hypot(1.0, np.hypot(across_x, across_y)) - 1).max() < 0.02
+    off_plane = positions[:, 2] - height - positions[:, :2] @ (across_x, across_y)
+    assert (np.abs(off_plane) * areas).max() < 1e-5  # where a sliver lies does not matter
 
 
 CLOSED = {

@@ -1,64 +1,85 @@
-// Voxelises triangles exactly: each is clipped to the layers of voxels along x, each part along y, then along z (Schwarz &
-// Seidel 2010 find the same voxels); area and centroid of each piece become a surfel. Thin, large and tiny triangles keep their area.
+// Voxelises triangles exactly (Schwarz & Seidel 2010 find the same voxels): each is clipped to the voxels that it may meet, which
+// voxel_pairs lists; area and centroid of each piece become a surfel. Thin, large and tiny triangles keep their area.
 #include "common/volume.glsl"
 #define GRID_ACCESS
 #define TOUCHED_ACCESS
 #define SURFELS_ACCESS
 #define SUMS_ACCESS
 #include "common/voxel_store.glsl"
+#define PAIRS_ACCESS readonly
+#include "common/voxel_pairs.glsl"
 
 layout(local_size_x = 64) in;
 
-struct Corner { float p[3]; float uv[2]; float tint[3]; float material; float double_sided; };
-struct Triangle { Corner corners[3]; };
-layout(std430) readonly buffer Triangles { Triangle triangles[]; };
-uniform int triangle_count;
+// A half plane of the piece's plane, seen along the axis nearest to its normal: dot(xy, p) + z >= 0, xy of length 1.
+const int LINES = 9;                           // three edges, and six faces of the voxel
+const vec3 EVERYWHERE = vec3(1.0, 0.0, 1e3), NOWHERE = vec3(1.0, 0.0, -1e3);   // near the voxel
+const float PARALLEL = 1e-6;                   // sine: over a voxel's edge, less than what is measured
+const float LEAST_AREA = 1e-7;                 // of a part: below, rounding
 
-const int MAX_CORNERS = 10;
-struct Polygon { int corners; vec3 p[MAX_CORNERS]; };
+// Where both lines cross. Each of them is cut at this very point, so that the outline stays closed under rounding.
+vec2 crossing(vec3 one, vec3 other) { return cross(one, other).xy / cross(one, other).z; }
 
-// The part of a polygon where side * (x[axis] - plane) >= 0 (Sutherland & Hodgman 1974).
-Polygon clip(Polygon given, int axis, float plane, float side) {
-    Polygon kept;
-    kept.corners = 0;
-    for (int i = 0; i < given.corners; ++i) {
-        vec3 a = given.p[i], b = given.p[i + 1 == given.corners ? 0 : i + 1];
-        float da = side * (a[axis] - plane), db = side * (b[axis] - plane);
-        if (da >= 0.0 && kept.corners < MAX_CORNERS) kept.p[kept.corners++] = a;
-        if ((da > 0.0 && db < 0.0) || (da < 0.0 && db > 0.0))
-            if (kept.corners < MAX_CORNERS) kept.p[kept.corners++] = mix(a, b, da / (da - db));
+// Cuts the stretch `kept` of line i (running along `along` from `base`) by half plane j (Cyrus & Beck 1978). Of two lines that
+// coincide, the first counts.
+void cut(inout vec2 kept, vec3 line, vec3 other, bool first, vec2 base, vec2 along) {
+    float turn = cross(line, other).z;
+    if (abs(turn) < PARALLEL) {
+        float gap = dot(line.xy, other.xy) > 0.0 ? other.z - line.z : other.z + line.z;
+        if (gap < 0.0 || (gap == 0.0 && !first && dot(line.xy, other.xy) > 0.0)) kept.y = kept.x;
+        return;
     }
-    return kept;
+    float at = dot((first ? crossing(line, other) : crossing(other, line)) - base, along);
+    if (turn < 0.0) kept.x = max(kept.x, at);
+    else kept.y = min(kept.y, at);
 }
 
-// The part in one layer of voxels; a triangle that lies `within` one is not cut.
-Polygon clip_to_layer(Polygon given, int axis, int layer, bool within) {
-    if (within) return given;
-    Polygon above = clip(given, axis, float(layer), 1.0);
-    if (above.corners < 3) return above;
-    return clip(above, axis, float(layer + 1), -1.0);
+vec3 line_through(vec2 a, vec2 b, float side) {
+    vec2 n = side * normalize(vec2(a.y - b.y, b.x - a.x));
+    return vec3(n, -dot(n, a));
 }
 
-// First and last layer that a polygon may touch, among `limits`.
-ivec2 layers_of(Polygon given, int axis, ivec2 limits) {
-    float low = 1e9, high = -1e9;
-    for (int i = 0; i < given.corners; ++i) {
-        low = min(low, given.p[i][axis]);
-        high = max(high, given.p[i][axis]);
-    }
-    return ivec2(max(int(floor(low)), limits.x), min(int(floor(high)), limits.y));
+// The voxel's faces at 0 and 1 across a plane coordinate dot(slope.xy, p) + slope.z; none if the triangle lies `within`.
+void face_lines(inout vec3 lines[LINES], int at, vec3 slope, bool within) {
+    float size = length(slope.xy);
+    bool level = size < PARALLEL, between = slope.z >= 0.0 && slope.z < 1.0;
+    vec3 whole = within || between ? EVERYWHERE : NOWHERE;
+    lines[at] = within || level ? whole : slope / size;
+    lines[at + 1] = within || level ? whole : vec3(-slope.xy, 1.0 - slope.z) / size;
 }
 
-// Area-weighted centroid and area of the polygon (voxel units).
-vec4 centroid_area(Polygon given) {
-    vec3 centre = vec3(0.0);
-    float area = 0.0;
-    for (int i = 1; i + 1 < given.corners; ++i) {
-        float a = 0.5 * length(cross(given.p[i] - given.p[0], given.p[i + 1] - given.p[0]));
-        centre += a * (given.p[0] + given.p[i] + given.p[i + 1]) / 3.0;
-        area += a;
+// Area-weighted centroid and area of the part of a triangle in the voxel at the origin (voxel units): integrals along its
+// outline (Green's theorem), without a list of corners, which software renderers keep in memory.
+vec4 centroid_area(vec3 a, vec3 b, vec3 c, vec3 n, bvec3 within) {
+    vec3 size = abs(n);
+    int w = size.x > size.y ? (size.x > size.z ? 0 : 2) : (size.y > size.z ? 1 : 2), u = (w + 1) % 3, v = (w + 2) % 3;
+    vec2 pa = vec2(a[u], a[v]), pb = vec2(b[u], b[v]), pc = vec2(c[u], c[v]);
+    vec2 slope = -vec2(n[u], n[v]) / n[w];
+    vec3 height = vec3(slope, a[w] - dot(slope, pa));   // the coordinate along w at a point
+    vec3 lines[LINES];
+    lines[0] = line_through(pa, pb, sign(n[w]));
+    lines[1] = line_through(pb, pc, sign(n[w]));
+    lines[2] = line_through(pc, pa, sign(n[w]));
+    face_lines(lines, 3, vec3(1.0, 0.0, 0.0), within[u]);
+    face_lines(lines, 5, vec3(0.0, 1.0, 0.0), within[v]);
+    face_lines(lines, 7, height, within[w]);
+    vec3 sum = vec3(0.0);
+    for (int i = 0; i < LINES; ++i) {
+        vec2 along = vec2(lines[i].y, -lines[i].x), base = -lines[i].z * lines[i].xy, kept = vec2(-1e4, 1e4);
+        for (int j = 0; j < LINES; ++j)
+            if (j != i) cut(kept, lines[i], lines[j], i < j, base, along);
+        if (kept.x >= kept.y) continue;
+        vec2 p = base + kept.x * along, q = base + kept.y * along;
+        float part = 0.5 * (p.x * q.y - p.y * q.x);
+        sum += part * vec3((p + q) / 3.0, 1.0);
     }
-    return vec4(area > 0.0 ? centre / area : given.p[0], area);
+    if (sum.z < LEAST_AREA) return vec4(0.0);
+    vec2 centre = clamp(sum.xy / sum.z, vec2(0.0), vec2(1.0));
+    vec3 found;
+    found[u] = centre.x;
+    found[v] = centre.y;
+    found[w] = clamp(dot(height, vec3(centre, 1.0)), 0.0, 1.0);
+    return vec4(found, sum.z * length(n) / size[w]);
 }
 
 void touch(uint voxel) {
@@ -69,7 +90,6 @@ void touch(uint voxel) {
     for (int i = 0; i < SUMS_PER_SLOT; ++i) sums[int(slot) * SUMS_PER_SLOT + i] = 0;
 }
 
-vec3 corner_position(Corner c) { return vec3(c.p[0], c.p[1], c.p[2]); }
 vec2 corner_uv(Corner c) { return vec2(c.uv[0], c.uv[1]); }
 vec3 corner_tint(Corner c) { return vec3(c.tint[0], c.tint[1], c.tint[2]); }
 
@@ -93,35 +113,24 @@ void emit(Triangle t, vec4 piece, ivec3 voxel, vec3 a, vec3 b, vec3 c, vec3 n) {
         vec4((corner_tint(t.corners[0]) + corner_tint(t.corners[1]) + corner_tint(t.corners[2])) / 3.0, 1.0);
 }
 
-void main() {
-    int i = int(gl_GlobalInvocationID.x);
-    if (i >= triangle_count) return;
-    Triangle t = triangles[i];
+void clip_to_voxel(uvec2 pair) {
+    Triangle t = triangles[pair.x];
+    ivec3 voxel = voxel_of_pair(pair);
     vec3 a = volume_coordinate(corner_position(t.corners[0]));
     vec3 b = volume_coordinate(corner_position(t.corners[1]));
     vec3 c = volume_coordinate(corner_position(t.corners[2]));
     vec3 n = cross(b - a, c - a);
-    if (dot(n, n) == 0.0) return;
-    ivec3 low = ivec3(floor(min(a, min(b, c)))), high = ivec3(floor(max(a, max(b, c))));
-    ivec3 first = max(low, ivec3(0)), last = min(high, ivec3(volume_size - 1));
-    bvec3 cut = notEqual(low, high);
-    if (!any(cut)) {   // most triangles of a depth mesh are within one voxel
-        if (first == last) emit(t, vec4((a + b + c) / 3.0, 0.5 * length(n)), first, a, b, c, n);   // rounding may put it outside
+    bvec3 within = equal(ivec3(floor(min(a, min(b, c)))), ivec3(floor(max(a, max(b, c)))));
+    if (all(within)) {   // most triangles of a depth mesh
+        emit(t, vec4((a + b + c) / 3.0, 0.5 * length(n)), voxel, a, b, c, n);
         return;
     }
-    Polygon whole;
-    whole.corners = 3;
-    whole.p[0] = a; whole.p[1] = b; whole.p[2] = c;
-    for (int x = first.x; x <= last.x; ++x) {
-        Polygon in_x = clip_to_layer(whole, 0, x, !cut.x);
-        ivec2 ys = layers_of(in_x, 1, ivec2(first.y, last.y));
-        for (int y = ys.x; in_x.corners > 2 && y <= ys.y; ++y) {
-            Polygon in_xy = clip_to_layer(in_x, 1, y, !cut.y);
-            ivec2 zs = layers_of(in_xy, 2, ivec2(first.z, last.z));
-            for (int z = zs.x; in_xy.corners > 2 && z <= zs.y; ++z) {
-                Polygon piece = clip_to_layer(in_xy, 2, z, !cut.z);
-                if (piece.corners > 2) emit(t, centroid_area(piece), ivec3(x, y, z), a, b, c, n);
-            }
-        }
-    }
+    vec3 corner = vec3(voxel);
+    vec4 piece = centroid_area(a - corner, b - corner, c - corner, n, within);
+    emit(t, vec4(piece.xyz + corner, piece.w), voxel, a, b, c, n);
+}
+
+void main() {
+    uint count = min(pair_count, uint(pairs.length()));
+    for (uint i = gl_GlobalInvocationID.x; i < count; i += gl_NumWorkGroups.x * 64u) clip_to_voxel(pairs[i]);
 }
