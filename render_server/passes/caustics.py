@@ -42,7 +42,11 @@ class Caustics:
         self._lobe_beams = Kernel(gpu, "caustic_beams", RAY_COUNT=RAYS, WIDE=1)
         self._places = gpu.ctx.buffer(reserve=PLACE_BYTES)
         self._find_places = Kernel(gpu, "caustic_places")
-        self._gather = Kernel(gpu, "caustic_gather", **reuse_define(reuses))
+        # Software renderers pass barriers slowly, and read a beam once for each of few threads.
+        rows = 8 if gpu.is_software else 2
+        self._gather = Kernel(
+            gpu, "caustic_gather", ROWS=rows, GROUP_ROWS=TILE // rows, **reuse_define(reuses)
+        )
         self._splat = Kernel(gpu, "caustic_splat")
 
     @property
@@ -77,7 +81,7 @@ class Caustics:
         }
         self._find_places.run((self._threads,), shared, scene)
         tiles = tuple(-(-edge // TILE) for edge in grid.size)
-        self._gather.run((8 * tiles[0], 4 * tiles[1]), shared, scene)
+        self._gather.run((TILE * tiles[0], self._gather.local_size[1] * tiles[1]), shared, scene)
         self._splat.run((self._threads,), shared, scene)
 
     def _empty_beams(self, views: int) -> None:
