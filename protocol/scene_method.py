@@ -451,6 +451,13 @@ class Output(StrictModel):
     tone: Literal["camera", "aces"] = Field(
         default="camera", description="The camera's own response, or ACES."
     )
+    frame_budget_ms: float | None = Field(
+        default=None,
+        ge=5,
+        le=5000,
+        description="What a frame may take while something moves, ms: quality, then the size at which it is rendered "
+        "give way (docs/speed.md); null = no limit.",
+    )
     antialiasing: bool = Field(default=False, description="Smooth the edges of virtual objects.")
     camera_artifacts: bool = Field(
         default=False, description="Put the camera's noise and blur on the virtual part."

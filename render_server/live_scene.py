@@ -11,17 +11,19 @@ from protocol.scene_method import Output
 from protocol.scene_objects import Material
 from render_server.estimation.albedo import AlbedoEstimator
 from render_server.estimation.lighting import LightEstimator
+from render_server.frame_budget import FrameBudget, Level
 from render_server.frame_graph import CompositeOptions, FrameGraph, FrameInputs, ShownBuffers
 from render_server.gpu.context import GpuContext
 from render_server.gpu.textures import release_all
 from render_server.gpu.timers import PassTimers
+from render_server.gpu_scene import GeometryState
 from render_server.methods.registry import MethodChoice, choose_method
 from render_server.occlusion_fields import OcclusionFields
-from render_server.passes.composite import Composite
+from render_server.passes.composite import Composite, Enlarge
 from render_server.real_geometry import RealGeometry
 from render_server.scene.declared_surfaces import SurfaceTable, build_surface_table
 from render_server.scene.triangle_mesh import TriangleMesh
-from render_server.view import CameraView
+from render_server.view import CameraView, PosedFrame
 from render_server.virtual_objects import VirtualObjects
 
 # Work on a frame at rest, until its picture has the best quality; a stage that was begun is finished.
@@ -31,17 +33,28 @@ REST_NS = 300_000_000  # without any change, after which a picture is refined
 
 @dataclass(frozen=True, eq=False)
 class RelitFrame:
-    """A frame that `graph` can compose."""
+    """A frame that `graph` can compose, at `level`; `enlarge` brings it to the camera's size.
 
+    `moves`: something in it does.
+    """
+
+    frame: ViewFrame
     graph: FrameGraph
     options: CompositeOptions
+    level: Level
+    moves: bool
+    enlarge: Enlarge | None
 
-    def compose(self, *, with_linear: bool) -> Composite:
-        """Renders the picture, and its linear radiance if `with_linear`."""
+    def compose(self, *, with_linear: bool) -> Composite | Enlarge:
+        """Renders the picture (its `code`), and its linear radiance if `with_linear`, unless it is enlarged."""
         options = self.options
-        return self.graph.render(
+        composite = self.graph.render(
             CompositeOptions(options.output, options.additive, options.relights_real, with_linear)
         )
+        if self.enlarge is None:
+            return composite
+        self.enlarge.run(self.frame.color, self.graph.buffers.image, composite, self.shown().object_coverage)
+        return self.enlarge
 
     def shown(self) -> ShownBuffers:
         """Returns the geometry buffers."""
@@ -58,7 +71,10 @@ class _Plan:
 
 
 class LiveScene:
-    """Holds everything that lives longer than a frame. `checks` is `Graph`'s."""
+    """Holds everything that lives longer than a frame. `checks` is `Graph`'s.
+
+    `is_paced`: frames in which something moves heed the document's budget (FrameBudget).
+    """
 
     def __init__(
         self,
@@ -67,9 +83,11 @@ class LiveScene:
         notices: list[str],
         *,
         waits: bool = True,
+        is_paced: bool = True,
         checks: bool = False,
     ) -> None:
         self._gpu = gpu
+        self._is_paced = is_paced
         self._checks = checks
         self._notices = notices
         self.timers = PassTimers(gpu)
@@ -79,19 +97,22 @@ class LiveScene:
         self._albedo = AlbedoEstimator(gpu)
         self.graph: FrameGraph | None = None
         self._best: FrameGraph | None = None
+        self._enlarge: Enlarge | None = None
         self._changing: tuple[
             object, ...
         ] = ()  # what the newest picture was made from, camera and room left out,
         self._changed_ns = 0  # and when that or anything else last changed
         self._fields = OcclusionFields(self._notify, waits=waits)
         self._accumulated: ViewFrame | None = None  # last frame already accumulated
+        self._budget = self._new_budget(scene)
         self._plan = self._planned(scene)
         self.lighting = self._plan.lighting
         self._apply(self._plan)
 
     def _planned(self, scene: SceneDocument) -> _Plan:
         """Checks everything that can fail before anything is replaced."""
-        method = choose_method(scene.method, software=self._gpu.is_software)
+        document = scene.method.replaced(quality=self._budget.level.quality)
+        method = choose_method(document, software=self._gpu.is_software)
         if method.remark is not None:
             self._notify(method.remark)
         method.require(scene.objects)
@@ -106,8 +127,27 @@ class LiveScene:
 
     def set_scene(self, scene: SceneDocument) -> None:
         """Replaces the scene, or raises and changes nothing. Pictures do not wait for precomputation."""
-        self._apply(self._planned(scene))
+        before, old = self._budget, self._plan.scene
+        if (scene.method, scene.output.frame_budget_ms) != (old.method, old.output.frame_budget_ms):
+            self._budget = self._new_budget(scene)
+        try:
+            self._apply(self._planned(scene))
+        except BaseException:
+            self._budget = before
+            raise
         self._fields.waits = False
+
+    def _new_budget(self, scene: SceneDocument) -> FrameBudget:
+        budget_ms = scene.output.frame_budget_ms if self._is_paced else None
+        return FrameBudget(budget_ms, scene.method.quality)
+
+    def account(self, relit: RelitFrame, frame_ms: float) -> None:
+        """Takes how long a frame took; the next ones may be rendered at another level."""
+        if not relit.moves or relit.level != self._budget.level:
+            return
+        self._budget.add(frame_ms)
+        if self._budget.remark is not None:
+            self._notify(self._budget.remark)
 
     def _apply(self, plan: _Plan) -> None:
         old = self._plan
@@ -148,41 +188,35 @@ class LiveScene:
         """The real scene's meshes, if a model is given."""
         return () if self._real is None else self._real.model
 
-    def relight(self, frame: ViewFrame, view: CameraView) -> RelitFrame | None:
+    def relight(self, frame: ViewFrame, view: CameraView, *, whole: bool = False) -> RelitFrame | None:
         """Prepares a frame for composition; returns None if no object is visible or there is no light yet.
+
+        `whole`: at the camera's size, whatever the budget.
 
         Relighting the same frame again, in another view or by another method, adds nothing to averages over
         frames.
         """
+        if self._plan.method.document.quality != self._budget.level.quality:
+            self._apply(self._planned(self._plan.scene))
         again, self._accumulated = frame is self._accumulated, None
         lit = again or self.lighting.update(frame)
         objects = self._objects.update(self._plan.scene.objects, frame.board, frame.timestamp_ns)
         if objects is None or self._real is None or not lit:
             return None
-        graph = self._graph_for(view)
+        taken, level = PosedFrame(frame, view), self._level(whole=whole)
+        size = _scaled(view.size, level.scale)
+        graph = self._graph_for(taken.at(size).view)
         with self.timers.measure("upload"):
-            graph.upload(frame)
-        moved = not again and self._real.update(frame, view)
-        assert self._real.view is not None
-        view = self._real.view  # while nothing moves, the pose's own jitter must not shake the picture
+            graph.upload(taken.at(size).frame)
+        moved = not again and self._real.update(taken)
         if self._real.state is None:
             self._notify(
                 "Depth showed no surface in some frames; they are passed through as the camera saw them."
             )
             return None
-        output = self._plan.scene.output
         assert self.lighting.lights is not None
-        inputs = FrameInputs(
-            frame,
-            view.with_antialiasing if output.antialiasing else view,
-            self._real.scan,
-            self._real.measurement,
-            self._real.state,
-            objects,
-            self._surface_table(frame, moved=moved),
-            self.lighting.lights,
-            self._albedo.texture,
-        )
+        surfaces = self._surface_table(frame, moved=moved)
+        inputs = self._inputs(self._real, taken, size, objects, surfaces)
         graph.set_inputs(inputs)
         graph.set_lights(self.lighting.estimate(graph, moved=moved))
         if moved and self._real.has_unseen and self._albedo.observe(graph, self.lighting.lights):
@@ -192,24 +226,64 @@ class LiveScene:
                 self._best.renew_albedo()
         self._accumulated = frame
         changing = (objects, self.lighting.lights, self._plan)
-        if moved or not _same_objects(changing, self._changing):
+        changed = moved or not _same_objects(changing, self._changing)
+        if changed:
             self._changing, self._changed_ns = changing, frame.timestamp_ns
+        options = self._options(self._plan.scene.output)
         if self._real.is_settled and frame.timestamp_ns - self._changed_ns >= REST_NS:
-            graph = self._refined(graph, frame, replace(inputs, lights=self.lighting.lights))
-        return RelitFrame(graph, self._options(output))
+            best = self._refined(self._inputs(self._real, taken, view.size, objects, surfaces))
+            if best is not None:
+                return RelitFrame(frame, best, options, Level("best"), moves=False, enlarge=None)
+        enlarge = None if size == view.size else self._enlarged_to(view.size)
+        return RelitFrame(frame, graph, options, level, changed, enlarge)
 
-    def _refined(self, graph: FrameGraph, frame: ViewFrame, inputs: FrameInputs) -> FrameGraph:
-        """Works on the frame in the best quality for REFINE_S; returns its graph once it is ready, else `graph`."""
-        if self._best is None:
-            best = self._plan.method.in_best_quality(software=self._gpu.is_software)
-            self._best = FrameGraph(
-                self._gpu, inputs.view, best, self._fields, self.timers, checks=self._checks
-            )
-        self._best.upload(frame)
+    def _level(self, *, whole: bool) -> Level:
+        """Returns what the next frame is rendered at; views of the inside are never enlarged."""
+        level = self._budget.level
+        whole = whole or self._plan.scene.output.view != "composite"
+        return replace(level, scale=1.0) if whole else level
+
+    def _inputs(
+        self,
+        real: RealGeometry,
+        taken: PosedFrame,
+        size: tuple[int, int],
+        objects: GeometryState,
+        surfaces: SurfaceTable,
+    ) -> FrameInputs:
+        """Returns what a graph of this picture size renders the frame from."""
+        assert real.seen is not None
+        assert real.state is not None
+        assert self.lighting.lights is not None
+        view = real.seen.at(
+            size
+        ).view  # while nothing moves, the pose's own jitter must not shake the picture
+        return FrameInputs(
+            taken.at(size).frame,
+            view.with_antialiasing if self._plan.scene.output.antialiasing else view,
+            real.scan(size),
+            real.measurement(size),
+            real.state,
+            objects,
+            surfaces,
+            self.lighting.lights,
+            self._albedo.texture,
+        )
+
+    def _refined(self, inputs: FrameInputs) -> FrameGraph | None:
+        """Works on the frame in the best quality for REFINE_S; returns its graph once it is ready."""
+        best = self._plan.method.in_best_quality(software=self._gpu.is_software)
+        self._best = self._fitting(self._best, inputs.view, best)
+        self._best.upload(inputs.frame)
         self._best.set_inputs(inputs)
         options = self._options(self._plan.scene.output)
-        ready = self._best.advance(options, time.monotonic() + REFINE_S)
-        return self._best if ready else graph
+        return self._best if self._best.advance(options, time.monotonic() + REFINE_S) else None
+
+    def _enlarged_to(self, size: tuple[int, int]) -> Enlarge:
+        if self._enlarge is None or self._enlarge.size != size:
+            release_all(self._enlarge)
+            self._enlarge = Enlarge(self._gpu, size)
+        return self._enlarge
 
     def _options(self, output: Output) -> CompositeOptions:
         method = self._plan.method
@@ -229,15 +303,15 @@ class LiveScene:
         return self._surfaces
 
     def _graph_for(self, view: CameraView) -> FrameGraph:
-        """Returns the graph for the picture's size; a new one if lens or size changed."""
-        key = (view.size, view.raster[1])
-        if self.graph is not None and self.graph.buffers.key != key:
-            self._drop_graph()
-        if self.graph is None:
-            self.graph = FrameGraph(
-                self._gpu, view, self._plan.method, self._fields, self.timers, checks=self._checks
-            )
+        """Returns the graph for this picture size; a new one if lens or size changed."""
+        self.graph = self._fitting(self.graph, view, self._plan.method)
         return self.graph
+
+    def _fitting(self, graph: FrameGraph | None, view: CameraView, method: MethodChoice) -> FrameGraph:
+        if graph is not None and graph.buffers.key == (view.size, view.raster[1]):
+            return graph
+        release_all(graph)
+        return FrameGraph(self._gpu, view, method, self._fields, self.timers, checks=self._checks)
 
     def describe_lights(self) -> list[dict[str, Any]]:
         """Returns the lights as plain values, registration included."""
@@ -245,7 +319,20 @@ class LiveScene:
 
     def release(self) -> None:
         """Frees all GL objects."""
-        release_all(self._objects, self._real, self.graph, self._best, self._albedo, self._fields)
+        release_all(
+            self._objects,
+            self._real,
+            self.graph,
+            self._best,
+            self._enlarge,
+            self._albedo,
+            self._fields,
+        )
+
+
+def _scaled(size: tuple[int, int], scale: float) -> tuple[int, int]:
+    """Returns a picture size at that scale."""
+    return max(round(size[0] * scale), 1), max(round(size[1] * scale), 1)
 
 
 def _same_objects(some: Sequence[object], others: Sequence[object]) -> bool:

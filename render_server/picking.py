@@ -56,7 +56,8 @@ class ShownFrame:
     """The last rendered frame, at the picture's size.
 
     `view` holds its camera and pose; None without a pose, or if the picture is not the camera's. `buffers`
-    are its geometry buffers; None if the scene shows no object. `model` is the real scene's, if given.
+    are its geometry buffers, of an enlarged picture smaller ones; None if the scene shows no object. `model` is the
+    real scene's, if given.
     """
 
     frame: ViewFrame
@@ -103,6 +104,8 @@ class ShownFrame:
         """Returns the id of the object in front, if it counts, and the surface there."""
         if self.buffers is None:
             return None, self._in_frame(view, pixel)
+        whole, held = (self.frame.camera.width, self.frame.camera.height), self.buffers.view.size
+        pixel = pixel[0] * held[0] // whole[0], pixel[1] * held[1] // whole[1]
         owner = _object_in_front(self.buffers, pixel)
         if owner == ignore:
             owner = None

@@ -3,10 +3,9 @@
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Float64, UInt8
+from jaxtyping import Float32, Float64
 
 from protocol.errors import DeltalightError
-from protocol.frames import DepthImage, ViewFrame
 from protocol.scene_objects import ModelGeometry, RealScene
 from render_server.frame import Measurement, Scan
 from render_server.gpu.context import GpuContext
@@ -18,7 +17,7 @@ from render_server.scene.mesh_loading import load_mesh
 from render_server.scene.motion_detection import FrameSamples, KeptWorld, MotionDetector
 from render_server.scene.triangle_mesh import TriangleMesh, merge_for_gpu
 from render_server.scene.tsdf_mesh import TsdfScene
-from render_server.view import CameraView
+from render_server.view import CameraView, PosedFrame
 
 COARSE_DIVISOR = 8  # of the triangles, for the coarse volume: its voxels are several times larger
 BOUND_POINTS = 4000  # sampled from a mesh for fitting light views
@@ -39,8 +38,8 @@ class RealGeometry:
     """Holds the real scene, and rebuilds it when it moves (MotionDetector).
 
     With `keeps_world`, only when what was built no longer explains what the camera sees (KeptWorld), and once more
-    from the frame in which everything comes to rest. `state` is a new object whenever the triangles change, `scan`
-    whenever anything moved, the camera included. `measurement` is what `state` was built from.
+    from the frame in which everything comes to rest. `state` is a new object whenever the triangles change, `seen`
+    (the frame) whenever anything moved, the camera included.
     """
 
     def __init__(
@@ -56,11 +55,11 @@ class RealGeometry:
         self.state: GeometryState | None = None
         self.material_names: tuple[str, ...] = ()
         self.is_model = isinstance(real.geometry, ModelGeometry)
-        self.frame: ViewFrame | None = None
-        self.view: CameraView | None = None
-        self.surface: DepthSurface | None = None
-        self._scan: Scan | None = None
-        self._measurement: Measurement | None = None
+        self.seen: PosedFrame | None = None
+        self._built_from: PosedFrame | None = None
+        self._surfaces: dict[PosedFrame, DepthSurface] = {}
+        self._scans: dict[PosedFrame, Scan] = {}
+        self._measurements: dict[tuple[int, int], Measurement] = {}
         self._world_from_tsdf = np.eye(4)
         self._tsdf_meshes: tuple[list[TriangleMesh], list[TriangleMesh]] = [], []
         self._tsdf = TsdfScene() if real.geometry == "fused" else None
@@ -79,33 +78,35 @@ class RealGeometry:
         """Whether surfaces exist that the camera may not see: those of a model or of earlier frames."""
         return self.is_model or self._tsdf is not None
 
-    @property
-    def measurement(self) -> Measurement:
-        """The frame that the real scene was last built from."""
-        if self._measurement is None:
-            assert self.frame is not None
-            assert self.view is not None
-            self._measurement = Measurement(self.frame, self.view, self.scan)
-        return self._measurement
+    def measurement(self, size: tuple[int, int]) -> Measurement:
+        """Returns the frame that the real scene was last built from, at a picture's size, always the same object."""
+        if size not in self._measurements:
+            assert self._built_from is not None
+            taken = self._built_from.at(size)
+            self._measurements[size] = Measurement(taken.frame, taken.view, self._scan_of(taken))
+        return self._measurements[size]
 
     @property
     def is_settled(self) -> bool:
         """Whether a kept world was built from the frame in which everything came to rest."""
         return self._kept is not None and self._kept.built_from is self._last
 
-    @property
-    def scan(self) -> Scan:
-        """The camera's measurement from when something last moved."""
-        if self._scan is None:
-            self._scan = self._scanned()
-        return self._scan
+    def scan(self, size: tuple[int, int]) -> Scan:
+        """Returns the camera's measurement from when something last moved, at a picture's size."""
+        assert self.seen is not None
+        return self._scan_of(self.seen.at(size))
 
-    def _scanned(self) -> Scan:
+    def _scan_of(self, taken: PosedFrame) -> Scan:
+        if taken not in self._scans:
+            self._scans[taken] = self._scanned(taken)
+        return self._scans[taken]
+
+    def _scanned(self, taken: PosedFrame) -> Scan:
         """Collects depth, its noise, and the tolerance of the fused surface. A model has no noise.
 
         Three standard deviations of the noise cover at least what voxels round off.
         """
-        depth = None if self.is_model or self.frame is None else self.frame.depth
+        depth = None if self.is_model else taken.frame.depth
         if depth is None:
             return Scan(None, None, 0.0, 1.0, None)
         known = depth.depth_m[depth.valid]
@@ -114,27 +115,34 @@ class RealGeometry:
         sigma = max(noise_sigma(depth), rounded_m / (3 * typical_depth**2))
         # The fused surface agrees with depth up to half a voxel, and three standard deviations of the depth's noise.
         tolerance = None if self._tsdf is None else (0.5 * self._tsdf.voxel_m, 3 * sigma)
-        return Scan(depth, self.surface, sigma, typical_depth, tolerance)
+        return Scan(depth, self._surface_of(taken), sigma, typical_depth, tolerance)
 
-    def update(self, frame: ViewFrame, view: CameraView) -> bool:
+    def _surface_of(self, taken: PosedFrame) -> DepthSurface:
+        """Returns the surface fitted to a frame's depth."""
+        if taken not in self._surfaces:
+            assert taken.frame.depth is not None
+            self._surfaces[taken] = depth_surface(taken.frame.depth, taken.view.camera)
+        return self._surfaces[taken]
+
+    def update(self, taken: PosedFrame) -> bool:
         """Updates the geometry from the frame if something moved; returns whether it did.
 
         Raises:
             DeltalightError: the scene requires depth and the frame has none.
         """
-        if not self.is_model and frame.depth is None:
+        if not self.is_model and taken.frame.depth is None:
             raise DeltalightError(
                 "The source has no depth: record depth, or give the scene a model (`real: {geometry: {model: ...}}`)."
             )
-        samples = FrameSamples.of(frame)
+        samples = FrameSamples.of(taken.frame)
         moved = self._motion.update(samples)
         if moved:
-            self._last, self.frame, self.view, self._scan = samples, frame, view, None
+            self._last, self.seen = samples, taken
+            self._surfaces.clear()
+            self._scans.clear()
         if self._kept is not None and not self._is_due(self._kept, samples, moved=moved):
-            if moved and frame.depth is not None and not self.is_model:
-                self.surface = depth_surface(frame.depth, view.camera)
             return moved
-        return self._rebuild(frame, view, moved=moved)
+        return self._rebuild(taken, moved=moved)
 
     def _is_due(self, kept: KeptWorld, samples: FrameSamples, *, moved: bool) -> bool:
         """Returns whether a kept world must be rebuilt: it explains the frame no longer, or all came to rest."""
@@ -150,45 +158,44 @@ class RealGeometry:
         wait_ns = SETTLING_NS if kept.explains(last) else RENEWAL_NS
         return samples.frame.timestamp_ns - last.frame.timestamp_ns >= wait_ns
 
-    def _rebuild(self, frame: ViewFrame, view: CameraView, *, moved: bool) -> bool:
+    def _rebuild(self, taken: PosedFrame, *, moved: bool) -> bool:
         """Builds the real scene from the frame in which anything last moved; returns whether it changed."""
         if self._kept is not None and self._kept.built_from is not self._last:
-            assert self.frame is not None
-            assert self.view is not None
-            frame, view, moved = self.frame, self.view, True
+            assert self.seen is not None
+            taken, moved = self.seen, True
             self._kept.built_from = self._last
         if self._tsdf is not None:
-            changed = self._integrate(self._tsdf, frame, view, moved)
+            changed = self._integrate(self._tsdf, taken, moved)
         else:
             changed = moved
             if moved and self.is_model and self.state is None:
                 self._build(self.model, None)
-            elif moved and frame.depth is not None and not self.is_model:
-                self._build_from_depth(frame.depth, frame.color, view)
+            elif moved and not self.is_model:
+                self._build_from_depth(taken)
         if changed:
-            self._scan = self._measurement = None
+            self._built_from = self.seen
+            self._scans.clear()
+            self._measurements.clear()
         return changed
 
-    def _integrate(self, tsdf: TsdfScene, frame: ViewFrame, view: CameraView, moved: bool) -> bool:
+    def _integrate(self, tsdf: TsdfScene, taken: PosedFrame, moved: bool) -> bool:
         """Integrates a frame unless the scene has been at rest for long; returns whether anything changed."""
         self._still_frames = 0 if moved else self._still_frames + 1
         if self._still_frames > STILL_FRAMES:
             return False
-        assert frame.depth is not None
-        surface = depth_surface(frame.depth, view.camera)
+        pose, depth = taken.frame.pose, taken.frame.depth
+        assert depth is not None
         renewed = tsdf.add(
-            surface,
-            view,
-            noise_sigma(frame.depth),
-            align=frame.pose is not None and frame.pose.reprojection_error_px is not None,
+            self._surface_of(taken),
+            taken.view,
+            noise_sigma(depth),
+            align=pose is not None and pose.reprojection_error_px is not None,
             settle=self._still_frames == STILL_FRAMES,
         )
         if renewed:
             fine, coarse = tsdf.meshes(self.budget, self.budget // COARSE_DIVISOR)
             self._tsdf_meshes = fine, coarse
-        displaced = moved and self._realign(tsdf, view)
-        if moved:
-            self.surface = surface
+        displaced = moved and self._realign(tsdf, taken.view)
         if renewed or displaced:
             self._build_from_tsdf()
         return moved or renewed
@@ -214,19 +221,19 @@ class RealGeometry:
             return
         self._build(fine, triangle_corners(merge_for_gpu(coarse)))
 
-    def _build_from_depth(
-        self, depth: DepthImage, color: UInt8[np.ndarray, "h w 3"], view: CameraView
-    ) -> None:
+    def _build_from_depth(self, taken: PosedFrame) -> None:
         """Meshes the depth image, and a second time with few triangles for geometry far from the objects."""
-        self.surface = depth_surface(depth, view.camera)
-        grazing = grazing_depth_fill(depth, color, view.camera)
-        place = view.world_from_camera
-        fine = depth_mesh(depth, view.camera, place, self.budget, self.surface, grazing=grazing)
+        depth, camera, place = taken.frame.depth, taken.view.camera, taken.view.world_from_camera
+        assert depth is not None
+        surface = self._surface_of(taken)
+        grazing = grazing_depth_fill(depth, taken.frame.color, camera)
+        fine, coarse = (
+            depth_mesh(depth, camera, place, budget, surface, grazing=grazing)
+            for budget in (self.budget, self.budget // COARSE_DIVISOR)
+        )
         if not len(fine.triangles):
             self.state = None
             return
-        budget = self.budget // COARSE_DIVISOR
-        coarse = depth_mesh(depth, view.camera, place, budget, self.surface, grazing=grazing)
         self._build([fine], triangle_corners(merge_for_gpu([coarse])), is_open=True)
 
     def _build(

@@ -1,27 +1,28 @@
 """SceneRenderer: (frame, scene) -> composite. GPU only.
 
-No sockets, no clock, no files except the scene's assets.
+No sockets, no files except the scene's assets.
 """
 
+import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
-import cv2
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
 from protocol.camera_model import CameraModel
 from protocol.errors import DeltalightError
-from protocol.frames import DepthImage, ViewFrame
+from protocol.frames import ViewFrame
 from protocol.scene import SceneDocument
-from protocol.scene_method import Output
+from render_server.frame_budget import Level
 from render_server.gpu.context import GpuContext
 from render_server.gpu.textures import AsyncReadback
 from render_server.graph import Graph
 from render_server.live_scene import LiveScene, RelitFrame
+from render_server.passes.composite import Composite
 from render_server.picking import Pick, ShownFrame
-from render_server.view import CameraView
+from render_server.view import CameraView, output_size, resized_frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +44,7 @@ class CompositeFrame:
     world_from_camera: Float64[np.ndarray, "4 4"] | None
     pass_times_ms: dict[str, float] = field(default_factory=dict)
     lights: list[dict[str, Any]] = field(default_factory=list)
+    level: Level | None = None
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,8 @@ class SceneRenderer:
 
     `with_linear`: composites carry the linear picture too (for files). `notices` collects sentences that a user
     should read (registration, memory), each once. `waits`: the first picture waits for what a method precomputes of
-    objects; pictures after `set_scene` never do. `checks` is `Graph`'s.
+    objects; pictures after `set_scene` never do. `checks` is `Graph`'s. `with_linear` leaves the document's budget
+    aside.
     """
 
     def __init__(
@@ -75,7 +78,7 @@ class SceneRenderer:
     ) -> None:
         self._gpu = gpu
         self.notices: list[str] = []
-        self._live = LiveScene(gpu, scene, self.notices, waits=waits, checks=checks)
+        self._live = LiveScene(gpu, scene, self.notices, waits=waits, is_paced=not with_linear, checks=checks)
         self._readback = AsyncReadback(gpu)
         self._with_linear = with_linear
         self._sized: tuple[ViewFrame, ViewFrame] | None = None
@@ -102,12 +105,13 @@ class SceneRenderer:
 
     def submit(self, frame: ViewFrame, *, with_linear: bool = False) -> PendingComposite:
         """Starts a frame on the GPU; reading its picture back does not stall later frames."""
+        started_s = time.perf_counter()
         frame, self._shown = self.sized(frame), None
         if frame.pose is None:
             self._shown = ShownFrame(frame, None, None)
             return _at_once(self._shown, frame.color)
         view = CameraView(frame.camera, frame.pose.world_from_camera)
-        relit = self._live.relight(frame, view)
+        relit = self._live.relight(frame, view, whole=with_linear)
         lights = self._live.describe_lights()
         name = self.scene.output.view
         shows_lights = name == "lights" and bool(lights)
@@ -121,7 +125,9 @@ class SceneRenderer:
             return _at_once(shown, self._live.lighting.picture(frame), times, lights)
         if relit is None:
             return _at_once(shown, frame.color)
-        return self._composed(shown, relit, lights, with_linear=with_linear or self._with_linear)
+        return self._composed(
+            shown, relit, lights, with_linear=with_linear or self._with_linear, started_s=started_s
+        )
 
     @property
     def graph(self) -> Graph | None:
@@ -151,20 +157,37 @@ class SceneRenderer:
         return self._shown.pick(x, y, ignore)
 
     def _composed(
-        self, shown: ShownFrame, relit: RelitFrame, lights: list[dict[str, Any]], *, with_linear: bool
+        self,
+        shown: ShownFrame,
+        relit: RelitFrame,
+        lights: list[dict[str, Any]],
+        *,
+        with_linear: bool,
+        started_s: float,
     ) -> PendingComposite:
         composite, timers = relit.compose(with_linear=with_linear), self._live.timers
         with timers.measure("readback"):
             self._readback.push(composite.code, "u1")
-            if with_linear:
+            if isinstance(composite, Composite) and with_linear:
                 self._readback.push(composite.linear, "f2")
         times, frame, pose = dict(timers.end_frame()), shown.frame, shown.world_from_camera
+        submitted_ms = 1e3 * (time.perf_counter() - started_s)
 
         def finish() -> CompositeFrame:
             color = np.ascontiguousarray(self._readback.pop()[..., :3])
             linear = self._readback.pop()[..., :3].astype(np.float32) if with_linear else None
+            self._live.account(relit, max(submitted_ms, sum(times.values())))
             return CompositeFrame(
-                frame.frame_id, frame.timestamp_ns, color, linear, "ok", frame.camera, pose, times, lights
+                frame.frame_id,
+                frame.timestamp_ns,
+                color,
+                linear,
+                "ok",
+                frame.camera,
+                pose,
+                times,
+                lights,
+                relit.level,
             )
 
         return PendingComposite(finish, self._gpu.is_software)
@@ -189,28 +212,3 @@ def _at_once(
         frame.frame_id, frame.timestamp_ns, color, None, status, frame.camera, pose, times or {}, lights or []
     )
     return PendingComposite(lambda: composite, immediate=True)
-
-
-def output_size(frame: ViewFrame, output: Output) -> tuple[int, int]:
-    """Returns width and height of the composite; a missing one follows from the camera's aspect ratio."""
-    camera = frame.camera
-    if output.width is None and output.height is None:
-        return camera.width, camera.height
-    width = output.width or round(camera.width * (output.height or 0) / camera.height)
-    return width, output.height or round(camera.height * width / camera.width)
-
-
-def resized_frame(frame: ViewFrame, width: int, height: int) -> ViewFrame:
-    """Resizes a frame: colour averaged over areas, depth from the nearest pixel."""
-    size = (width, height)
-    camera = frame.camera.resized(width, height)
-    depth = frame.depth
-    if depth is not None:
-        depth = DepthImage(
-            cv2.resize(depth.depth_m, size, interpolation=cv2.INTER_NEAREST),
-            cv2.resize(depth.valid.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST).astype(bool),
-            camera,
-            depth.noise_sigma_m,
-        )
-    color = cv2.resize(frame.color, size, interpolation=cv2.INTER_AREA)
-    return replace(frame, color=color, camera=camera, depth=depth)

@@ -1,12 +1,15 @@
-"""The camera of one picture: matrices and lens, as the passes need them."""
+"""The camera of one picture: matrices and lens, as the passes need them; frames at other sizes."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 
+import cv2
 import numpy as np
 from jaxtyping import Float64
 
 from protocol.camera_model import CameraModel
+from protocol.frames import DepthImage, ViewFrame
+from protocol.scene_method import Output
 from render_server.gpu.uniform_block import Block, Bool, Mat4, Vec2, Vec3, Vec4
 
 NEAR_M = 0.02
@@ -148,6 +151,49 @@ class CameraView:
             lens_distortion=self.camera.has_distortion and not self.antialiased,
             picture_size=self.size,
         )
+
+
+@dataclass(frozen=True, eq=False)
+class PosedFrame:
+    """A frame and the view that it was taken from."""
+
+    frame: ViewFrame
+    view: CameraView
+    _sizes: dict[tuple[int, int], "PosedFrame"] = field(default_factory=dict, repr=False)
+
+    def at(self, size: tuple[int, int]) -> "PosedFrame":
+        """Returns the same at another size (width, height); the same object each time."""
+        if size == self.view.size:
+            return self
+        if size not in self._sizes:
+            frame = resized_frame(self.frame, *size)
+            self._sizes[size] = PosedFrame(frame, replace(self.view, camera=frame.camera))
+        return self._sizes[size]
+
+
+def output_size(frame: ViewFrame, output: Output) -> tuple[int, int]:
+    """Returns width and height of the composite; a missing one follows from the camera's aspect ratio."""
+    camera = frame.camera
+    if output.width is None and output.height is None:
+        return camera.width, camera.height
+    width = output.width or round(camera.width * (output.height or 0) / camera.height)
+    return width, output.height or round(camera.height * width / camera.width)
+
+
+def resized_frame(frame: ViewFrame, width: int, height: int) -> ViewFrame:
+    """Resizes a frame: colour averaged over areas, depth from the nearest pixel."""
+    size = (width, height)
+    camera = frame.camera.resized(width, height)
+    depth = frame.depth
+    if depth is not None:
+        depth = DepthImage(
+            cv2.resize(depth.depth_m, size, interpolation=cv2.INTER_NEAREST),
+            cv2.resize(depth.valid.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST).astype(bool),
+            camera,
+            depth.noise_sigma_m,
+        )
+    color = cv2.resize(frame.color, size, interpolation=cv2.INTER_AREA)
+    return replace(frame, color=color, camera=camera, depth=depth)
 
 
 @lru_cache(maxsize=4)

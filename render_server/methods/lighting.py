@@ -20,8 +20,8 @@ from render_server.methods.method import ResolvedSettings
 from render_server.passes.caustics import GREATEST_ALPHA, Caustics
 from render_server.passes.composite import ChangeRatio
 from render_server.passes.cones import ConeFields, LowResGrid
+from render_server.passes.gbuffer import ObjectBvh
 from render_server.passes.lights import LightBuffers
-from render_server.passes.ray_tracing import ObjectBvh
 from render_server.passes.reflections import ROUGHEST, MirrorRays, ScreenCones
 from render_server.passes.shading import DirectLight, LightHistory, VirtualSurface
 from render_server.passes.voxel_light import AlbedoTexture

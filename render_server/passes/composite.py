@@ -3,13 +3,15 @@
 from dataclasses import dataclass
 
 import moderngl
+import numpy as np
+from jaxtyping import UInt8
 
 from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Binding, Bindings, Kernel, list_threads
 from render_server.gpu.textures import release_all, texture_2d
 from render_server.passes.cones import ConeFields, LowResGrid
 from render_server.passes.coverage import RIM_SIGHT
-from render_server.passes.gbuffer import CameraImage
+from render_server.passes.gbuffer import CameraImage, rgba_bytes
 from render_server.passes.lights import LightBuffers
 from render_server.passes.reflections import RAY_ROUGHNESS
 from render_server.passes.shading import DirectLight
@@ -128,6 +130,37 @@ class Composite:
     def release(self) -> None:
         """Frees the GL objects."""
         release_all(self.code, self.linear, self._kernel)
+
+
+class Enlarge:
+    """Enlarges a relit picture to the camera's size, with the camera's own detail; `code` is RGBA8UI."""
+
+    def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
+        self.size = size
+        self._picture, self.code = (texture_2d(gpu, size, 4, "u1") for _ in range(2))
+        self._kernel = Kernel(gpu, "enlarge")
+
+    def run(
+        self,
+        color: UInt8[np.ndarray, "h w 3"],
+        image: CameraImage,
+        small: Composite,
+        coverage: moderngl.Texture,
+    ) -> None:
+        """Enlarges the composite `small` of `image`; `color` is the camera's picture at this size."""
+        self._picture.write(rgba_bytes(color), alignment=1)
+        self._kernel.run(
+            self.size,
+            picture=self._picture,
+            small_picture=image.code,
+            small_composite=small.code,
+            object_coverage=coverage,
+            code_out=self.code,
+        )
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        release_all(self._picture, self.code, self._kernel)
 
 
 class DebugViews:

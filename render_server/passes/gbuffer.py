@@ -1,14 +1,15 @@
-"""The camera's image, the meshes, and the geometry buffers of the real and the virtual scene."""
+"""The camera's image, the meshes and their hierarchy, and the geometry buffers of the real and the virtual scene."""
 
 import cv2
 import moderngl
 import numpy as np
-from jaxtyping import Float16, Float32, Int32
+from jaxtyping import Float16, Float32, Float64, Int32, UInt8
 
 from protocol.frames import DepthImage, ViewFrame, decode_lut
 from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Binding, Bindings, Kernel, RasterKernel
 from render_server.gpu.textures import release_all, release_target, texture_2d
+from render_server.scene.bvh import Bvh, build_bvh
 from render_server.scene.triangle_mesh import VERTEX_ATTRIBUTES, VERTEX_LAYOUT, GpuMesh
 from render_server.view import CameraView, Rectangle
 
@@ -20,6 +21,10 @@ METALLIC, REFLECTANCE, ROUGHNESS = (
     slice(4, 7),
     7,
 )  # columns of the material table, as materials.glsl has them
+
+# Refitting costs a tenth of building (9 000 triangles: 5 against 51 ms; 78 000: 53 against 806), so rays through a
+# hierarchy may become half as expensive again before it is rebuilt.
+WORN = 1.5
 
 
 class CameraImage:
@@ -46,11 +51,7 @@ class CameraImage:
 
     def upload(self, frame: ViewFrame) -> None:
         """Uploads a frame's picture and linearises it."""
-        height, width, _ = frame.color.shape
-        rgba = np.empty((height, width, 4), np.uint8)
-        rgba[..., :3] = frame.color
-        rgba[..., 3] = 255
-        self.bytes = rgba.tobytes()
+        self.bytes = rgba_bytes(frame.color)
         self.code.write(self.bytes, alignment=1)
         self._write_response(decode_lut(frame.response))
         if self._rays_of != frame.camera:
@@ -83,6 +84,15 @@ class CameraImage:
     def release(self) -> None:
         """Frees the GL objects."""
         release_all(self.code, self.linear, self.response, self.inverse_response, self.rays, self._linearize)
+
+
+def rgba_bytes(color: UInt8[np.ndarray, "h w 3"]) -> bytes:
+    """Returns a picture as the bytes of an opaque RGBA texture."""
+    height, width, _ = color.shape
+    rgba = np.empty((height, width, 4), np.uint8)
+    rgba[..., :3] = color
+    rgba[..., 3] = 255
+    return rgba.tobytes()
 
 
 def inverse_response(decode: Float32[np.ndarray, "256 3"]) -> Float32[np.ndarray, "n 4"]:
@@ -158,6 +168,61 @@ def triangle_corners(mesh: GpuMesh) -> Float32[np.ndarray, "m 3 10"]:
     flags = double_sided[vertices[:, MATERIAL].astype(int)][:, None]
     columns = [vertices[:, :3], vertices[:, UV], vertices[:, COLOR], vertices[:, MATERIAL:], flags]
     return np.asarray(np.concatenate(columns, axis=1)[mesh.triangles], np.float32)
+
+
+class ObjectBvh:
+    """Bounding volume hierarchy of the objects; updated only when they moved and rays are traced."""
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self._ctx = gpu.ctx
+        self._nodes = gpu.ctx.buffer(reserve=4)
+        self._faces = gpu.ctx.buffer(reserve=4)
+        self._corners = self._built = np.zeros((0, 3, 3), np.float32)
+        self._mesh: MeshBuffers | None = None
+        self._bvh: Bvh | None = None
+        self._fresh_cost = 0.0
+        self.centre = np.zeros(3)
+        self.radius = 0.0
+
+    def set_triangles(
+        self,
+        corners: Float32[np.ndarray, "m 3 10"],
+        bounds: tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]],
+        mesh: MeshBuffers,
+    ) -> None:
+        """Sets triangles (positions first), their bounds (m) and vertices; a changed array is a changed shape."""
+        low, high = bounds
+        self.centre, self.radius = (low + high) / 2, float(np.linalg.norm(high - low) / 2)
+        self._corners, self._mesh = corners, mesh
+
+    @property
+    def bindings(self) -> dict[str, Binding]:
+        """The bindings of shaders/common/ray_mesh.glsl; brings the hierarchy up to date first."""
+        assert self._mesh is not None
+        if self._corners is not self._built:
+            self._built = self._corners
+            positions = self._corners[..., :3]
+            bvh = self._renewed(positions)
+            self.release()
+            self._nodes = self._ctx.buffer(bvh.packed())
+            self._faces = self._ctx.buffer(bvh.packed_triangles(positions, self._mesh.triangles))
+        return {"Nodes": self._nodes, "Faces": self._faces, **self._mesh.storage}
+
+    def _renewed(self, positions: Float32[np.ndarray, "m 3 3"]) -> Bvh:
+        """Returns the hierarchy of the current triangles: the old one refitted, as long as it is good enough."""
+        bvh = self._bvh
+        if bvh is not None and len(bvh.order) == len(positions):
+            bvh = bvh.refitted(positions)
+            if bvh.cost <= WORN * self._fresh_cost:
+                return bvh
+        self._bvh = build_bvh(positions)
+        self._fresh_cost = self._bvh.cost
+        return self._bvh
+
+    def release(self) -> None:
+        """Frees the buffers."""
+        self._nodes.release()
+        self._faces.release()
 
 
 class MaterialTable:

@@ -10,7 +10,7 @@ from render_server.gpu.kernel import Bindings, Kernel, ListGroups, list_threads
 from render_server.gpu.textures import release_all, texture_2d
 from render_server.passes.caustics import GREATEST_ALPHA
 from render_server.passes.cones import ConeFields, LowResGrid
-from render_server.passes.ray_tracing import ObjectBvh
+from render_server.passes.gbuffer import ObjectBvh
 from render_server.passes.shading import DirectLight
 
 # Of equal energy each: up to RAY_ROUGHNESS they are closer together than voxels. There the cone of the lobe is 48

@@ -30,7 +30,8 @@ from protocol.errors import DeltalightError
 from protocol.scene import SceneDocument
 from protocol.source import open_source
 from render_server.gpu.context import GpuContext, create_context
-from render_server.renderer import SceneRenderer, resized_frame
+from render_server.renderer import SceneRenderer
+from render_server.view import resized_frame
 from sensor_node.view_frames import ViewFrameBuilder
 from services.cli import run
 from services.demo import RECORDING, demo_scene

@@ -9,8 +9,7 @@ import trimesh
 
 from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Bindings, Kernel
-from render_server.passes.gbuffer import MeshBuffers
-from render_server.passes.ray_tracing import ObjectBvh
+from render_server.passes.gbuffer import MeshBuffers, ObjectBvh
 from render_server.scene.bvh import LEAF_SIZE, Bvh, build_bvh
 
 pytestmark = pytest.mark.usefixtures("clean_gl")

@@ -1,0 +1,94 @@
+"""What a moving frame gives up so that it is finished in the time that the scene document grants."""
+
+import statistics
+from collections import deque
+from dataclasses import dataclass
+from typing import get_args
+
+from protocol.scene_method import Quality
+
+WARM_UP = 2  # frames after a change of level: they compile, allocate and build
+WINDOW = 5  # frames: the median tells
+TOLERANCE = 1.1  # of the budget: what a level may take before a lower one is chosen
+ROOM = 0.8  # of the budget: what the level above must be expected to take before it is chosen
+PATIENCE = 30  # frames with that much room; twice as many after each try that failed
+
+
+@dataclass(frozen=True)
+class Level:
+    """A quality, and the scale of the picture's width and height that is rendered and then enlarged."""
+
+    quality: Quality
+    scale: float = 1.0
+
+
+# From the most costly to the cheapest, each with what a frame took relative to the first (`bench speed`, llvmpipe).
+LEVELS = {
+    Level("best"): 1.0,
+    Level("balanced"): 0.4,
+    Level("live"): 0.2,
+    Level("live", 0.75): 0.13,
+    Level("live", 0.5): 0.07,
+}
+
+
+class FrameBudget:
+    """Chooses the level of frames in which something moves, from how long earlier ones took.
+
+    `best` is the highest quality that it may choose; without a budget (ms), it chooses that and nothing else.
+    """
+
+    def __init__(self, budget_ms: float | None, best: Quality) -> None:
+        allowed = get_args(Quality)[: get_args(Quality).index(best) + 1]
+        self._budget_ms = budget_ms
+        self._levels = [level for level in LEVELS if level.quality in allowed]
+        self._at = 0
+        self._times_ms: deque[float] = deque(maxlen=WINDOW)
+        self._ignored = WARM_UP
+        self._frames_with_room = 0
+        self._patience = PATIENCE
+        self._is_trying = False  # the level was chosen because there was room
+        self.remark: str | None = None
+
+    @property
+    def level(self) -> Level:
+        """What the next frame is to be rendered at."""
+        return self._levels[self._at]
+
+    def add(self, frame_ms: float) -> None:
+        """Takes the time of a frame at the current level in which something moved."""
+        if self._budget_ms is None:
+            return
+        if self._ignored:
+            self._ignored -= 1
+            return
+        self._times_ms.append(frame_ms)
+        if len(self._times_ms) == WINDOW:
+            self._judge(statistics.median(self._times_ms), self._budget_ms)
+
+    def _judge(self, median_ms: float, budget_ms: float) -> None:
+        """Goes down to the first level that should hold the budget, or up by one when that has long had room."""
+        cost = LEVELS[self.level]
+        expected = [median_ms * LEVELS[level] / cost for level in self._levels]
+        last = len(self._levels) - 1
+        if median_ms > TOLERANCE * budget_ms:
+            lower = [at for at in range(self._at + 1, len(self._levels)) if expected[at] <= budget_ms]
+            if self._at == last and self.remark is None:
+                self.remark = (
+                    f"A frame takes {median_ms:.0f} ms at the lowest quality, so output.frame_budget_ms "
+                    f"({budget_ms:g}) cannot be held here: expect {1000 / median_ms:.1f} frames/s, or lower "
+                    "output.width."
+                )
+            self._patience *= 2 if self._is_trying else 1
+            self._change_to(lower[0] if lower else last, is_trying=False)
+            return
+        has_room = self._at > 0 and expected[self._at - 1] <= ROOM * budget_ms
+        self._frames_with_room = self._frames_with_room + 1 if has_room else 0
+        if self._frames_with_room >= self._patience:
+            self._change_to(self._at - 1, is_trying=True)
+
+    def _change_to(self, at: int, *, is_trying: bool) -> None:
+        if at != self._at:
+            self._at, self._ignored, self._is_trying = at, WARM_UP, is_trying
+        self._times_ms.clear()
+        self._frames_with_room = 0

@@ -1,0 +1,200 @@
+"""A budget for frames in which something moves: what gives way, what comes back, and what smaller pictures show."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from protocol.errors import DeltalightError
+from protocol.scene import SceneDocument, parse_scene
+from render_server.frame_budget import PATIENCE, WARM_UP, WINDOW, FrameBudget, Level
+from render_server.gpu.context import GpuContext
+from render_server.renderer import CompositeFrame, SceneRenderer
+from tests.render_server.protected_scenes import Case, scene_of
+from tests.render_server.scenes import Stage, psnr_db
+from tests.render_server.test_quality_tiers import seen
+
+pytestmark = pytest.mark.usefixtures("clean_gl")
+LIVE, HALF = Level("live"), Level("live", 0.5)
+
+
+def spend(budget: FrameBudget, frame_ms: float, frames: int = WARM_UP + WINDOW) -> Level:
+    for _ in range(frames):
+        budget.add(frame_ms)
+    return budget.level
+
+
+def test_without_a_budget_nothing_gives_way() -> None:
+    assert spend(FrameBudget(None, "balanced"), 1e6) == Level("balanced")
+
+
+def test_a_budget_that_is_held_changes_nothing() -> None:
+    assert spend(FrameBudget(100, "best"), 104, 100) == Level("best")
+
+
+def test_the_level_follows_from_how_much_too_long_a_frame_takes() -> None:
+    assert spend(FrameBudget(100, "best"), 200) == Level("balanced")
+    assert spend(FrameBudget(100, "best"), 490) == LIVE
+    assert spend(FrameBudget(100, "best"), 5000) == HALF
+
+
+def test_quality_never_exceeds_that_of_the_document() -> None:
+    budget = FrameBudget(100, "live")
+    assert budget.level == LIVE
+    assert spend(budget, 1, 10 * PATIENCE) == LIVE
+
+
+def test_single_long_frames_do_not_count() -> None:
+    """A new graph compiles and builds; the real scene is built anew now and then."""
+    budget = FrameBudget(100, "live")
+    spend(budget, 5000, WARM_UP)
+    for _ in range(10):
+        spend(budget, 400, 1)
+        assert spend(budget, 90, 4) == LIVE
+
+
+def test_what_gave_way_comes_back_when_there_has_long_been_room() -> None:
+    budget = FrameBudget(100, "live")
+    assert spend(budget, 150) == Level("live", 0.75)
+    assert spend(budget, 40, WARM_UP + WINDOW - 1 + PATIENCE - 1) == Level("live", 0.75)
+    assert spend(budget, 40, 1) == LIVE
+
+
+def test_levels_that_were_too_slow_are_not_tried_again_and_again() -> None:
+    """A frame takes 150 ms at full size and 50 at three quarters: by how much less it shows, there would be room."""
+    budget, changes = FrameBudget(100, "live"), 0
+    for _ in range(100 * PATIENCE):
+        before = budget.level
+        budget.add(150 if before == LIVE else 50)
+        changes += budget.level != before
+    assert budget.level == Level("live", 0.75)
+    assert changes < 15
+
+
+def test_a_budget_that_cannot_be_held_is_said_once() -> None:
+    budget = FrameBudget(20, "live")
+    spend(budget, 300)
+    assert budget.remark is None
+    spend(budget, 80)
+    said = budget.remark
+    assert said is not None
+    assert "12.5 frames/s" in said
+    spend(budget, 95, 100)
+    assert budget.remark == said
+
+
+@pytest.mark.parametrize("budget_ms", [0, 4, 5001, "fast"])
+def test_impossible_budgets_are_refused(tmp_path: Path, budget_ms: object) -> None:
+    document = scene_of(Case("exact", "depth", "plain"), Stage(tmp_path)).model_dump(mode="json")
+    document["output"]["frame_budget_ms"] = budget_ms
+    with pytest.raises(DeltalightError, match="frame_budget_ms"):
+        parse_scene(document)
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> SceneDocument:
+    plain = scene_of(Case("exact", "depth", "plain"), Stage(tmp_path))
+    return plain.replaced(method=plain.method.replaced(quality="live"))
+
+
+class Walker:
+    """Shows frames by a camera that moves to and fro, or stands."""
+
+    def __init__(self, gpu: GpuContext, scene: SceneDocument) -> None:
+        self.renderer = SceneRenderer(gpu, scene)
+        self.count = 0
+
+    def show(self, aside: float | None = None) -> CompositeFrame:
+        self.count += 1
+        moving = 0.004 * (self.count % 8)
+        return self.renderer.render(seen(moving if aside is None else aside, self.count))
+
+
+@pytest.fixture
+def hurried(gpu: GpuContext, scene: SceneDocument, monkeypatch: pytest.MonkeyPatch) -> Iterator[Walker]:
+    """A renderer that was always too slow: at its smallest pictures."""
+    add = FrameBudget.add
+    monkeypatch.setattr(FrameBudget, "add", lambda self, _ms: add(self, 1e4))
+    walker = Walker(gpu, scene.replaced(output=scene.output.replaced(frame_budget_ms=50)))
+    assert walker.show().level == LIVE
+    levels = [walker.show().level for _ in range(2 * (WARM_UP + WINDOW))]
+    assert levels[-1] == HALF
+    yield walker
+    walker.renderer.release()
+
+
+@pytest.fixture
+def whole(gpu: GpuContext, scene: SceneDocument, hurried: Walker) -> Iterator[Walker]:
+    """The same without a budget."""
+    walker = Walker(gpu, scene)
+    while walker.count < hurried.count:
+        walker.show()
+    yield walker
+    walker.renderer.release()
+
+
+def camera_picture(walker: Walker) -> np.ndarray:
+    return cv2.resize(seen(0.004 * (walker.count % 8), 0).color, (96, 72), interpolation=cv2.INTER_AREA)
+
+
+def test_smaller_pictures_are_enlarged_with_the_cameras_detail(hurried: Walker, whole: Walker) -> None:
+    small, full = hurried.show(), whole.show()
+    plain = camera_picture(whole)
+    assert (small.level, full.level) == (HALF, LIVE)
+    assert small.color.shape == full.color.shape == plain.shape
+    assert small.camera == full.camera
+    assert psnr_db(small.color, full.color) > 30
+    assert psnr_db(small.color, full.color) > psnr_db(plain, full.color) + 6
+    untouched = cv2.erode((small.color == plain).all(axis=-1).astype(np.uint8), np.ones((3, 3))) > 0
+    assert untouched.mean() > 0.1  # the camera's own bytes
+    assert (full.color[untouched] == plain[untouched]).mean() > 0.9
+
+
+def test_picking_finds_the_same_things_in_smaller_pictures(hurried: Walker, whole: Walker) -> None:
+    hurried.show()
+    whole.show()
+    owners = []
+    for y in range(4, 72, 8):
+        for x in range(4, 96, 8):
+            small, full = hurried.renderer.pick(x, y), whole.renderer.pick(x, y)
+            owners.append((small.object_id, full.object_id))
+            if small.object_id == full.object_id and small.point_m is not None and full.point_m is not None:
+                assert np.linalg.norm(small.point_m - full.point_m) < 0.03
+    assert {full for _, full in owners} >= {None, "ball"}
+    assert np.mean([small == full for small, full in owners]) > 0.95
+
+
+def test_views_of_the_inside_are_not_enlarged(hurried: Walker, whole: Walker) -> None:
+    for walker in (hurried, whole):
+        scene = walker.renderer.scene
+        walker.renderer.set_scene(scene.replaced(output=scene.output.replaced(view="effects")))
+    assert hurried.show().level == LIVE
+    whole.show()
+    assert psnr_db(hurried.show().color, whole.show().color) > 40
+
+
+def test_at_rest_a_smaller_picture_becomes_the_best(
+    gpu: GpuContext, scene: SceneDocument, hurried: Walker
+) -> None:
+    best = Walker(gpu, scene.replaced(method=scene.method.replaced(quality="best")))
+    while best.count < hurried.count:
+        wanted = best.show().color
+    best.renderer.release()
+    aside = 0.004 * (hurried.count % 8)
+    shown = hurried.show(aside)
+    while shown.level != Level("best") and hurried.count < 200:
+        shown = hurried.show(aside)
+    assert shown.level == Level("best")
+    assert psnr_db(shown.color, wanted) > 55
+    assert hurried.show().level == HALF
+
+
+def test_files_leave_the_budget_aside(gpu: GpuContext, hurried: Walker) -> None:
+    frame = seen(0.0, 1000)
+    assert hurried.renderer.render(frame, with_linear=True).level == LIVE
+    renderer = SceneRenderer(gpu, hurried.renderer.scene, with_linear=True)
+    levels = {renderer.render(seen(0.004 * (number % 8), number)).level for number in range(9)}
+    renderer.release()
+    assert levels == {LIVE}
