@@ -12,7 +12,9 @@ from typing import Annotated, Final, Literal, Self, get_args
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints, model_validator
 
-SCHEMA_VERSION: Final = 4
+from protocol.scene_method import Quality
+
+SCHEMA_VERSION: Final = 5
 MAX_HEADER_BYTES = 64 * 1024
 MAX_PART_BYTES = 64 * 1024 * 1024
 MAX_PAYLOAD_BYTES = 4 * 1024 * 1024
@@ -120,7 +122,7 @@ class MessageBase(BaseModel):
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
-    schema_version: Literal[4] = SCHEMA_VERSION
+    schema_version: Literal[5] = SCHEMA_VERSION
     node: Name
     stream: Stream
     frame_id: Count
@@ -289,7 +291,8 @@ class CompositeMessage(MessageBase):
 
     `capture_ns` and the clock fields are those of that frame; `received_ns` and `rendered_ns` are by the server's
     clock. `scene_id` and `scene_revision` are those of the request that set the frame's scene. `camera`
-    (`CameraModel.to_dict()` at the picture's size) and pose are those that it was rendered with.
+    (`CameraModel.to_dict()` at the picture's size) and pose are those that it was rendered with. `quality` is that of
+    `method.quality` (None if nothing was rendered); `scale` the part of its width that was, before it was enlarged.
     """
 
     stream: Literal["composite"] = "composite"
@@ -306,6 +309,8 @@ class CompositeMessage(MessageBase):
     pass_times_ms: Durations = Field(default_factory=dict)
     lights: LightList = ()
     drops: Counts = Field(default_factory=dict)
+    quality: Quality | None = None
+    scale: Annotated[float, Field(gt=0, le=1)] = 1.0
 
     def part_rules(self) -> tuple[PartRule, ...]:
         """The picture."""

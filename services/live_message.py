@@ -14,6 +14,7 @@ from protocol.camera_model import DistortionModel
 from protocol.documents import validate
 from protocol.errors import DeltalightError
 from protocol.messages import CompositeMessage
+from protocol.scene_method import Quality
 
 _LENGTH = struct.Struct("<I")
 
@@ -52,6 +53,10 @@ class PictureHeader(BaseModel):
     world_from_camera: tuple[Row, Row, Row, Row] | None = Field(description="null without a pose.")
     scene: ShownScene | None = Field(description="null where another program set the server's scene.")
     renderer: str
+    quality: Quality | None = Field(
+        description="The quality that it was rendered in; null: nothing was rendered."
+    )
+    scale: float = Field(description="Fraction of its width and height that was rendered, and then enlarged.")
 
     @classmethod
     def of(

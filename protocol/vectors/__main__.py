@@ -144,6 +144,8 @@ def _picture_examples() -> Iterator[Example]:
             pass_times_ms={"voxelize": 1.25, "cones": 20.5},
             lights=(LAMP,),
             drops={"color.desk": 3},
+            quality="live",
+            scale=0.5,
         ),
         [pixels.tobytes()],
         [pixels.ravel().tolist()],

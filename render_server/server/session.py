@@ -23,6 +23,7 @@ from protocol.frames import ViewFrame
 from protocol.messages import CompositeMessage, ControlRequest, StatsMessage
 from protocol.scene import SceneDocument, parse_scene
 from protocol.subscriber import ReceivedMultipart
+from render_server.frame_budget import Level
 from render_server.server.frames import AssembledFrame, FrameAssembler, SourceOrder
 from render_server.server.snapshot import SnapshotOrder, take_snapshot
 
@@ -59,6 +60,10 @@ class Composite(Protocol):
     @property
     def lights(self) -> Sequence[dict[str, Any]]:
         """The lights that the picture was rendered with."""
+
+    @property
+    def level(self) -> Level | None:
+        """The quality and scale that it was rendered at; None if nothing was."""
 
     @property
     def linear(self) -> Float32[np.ndarray, "h w 3"] | None:
@@ -350,6 +355,8 @@ class RenderSession:
             pass_times_ms=composite.pass_times_ms,
             lights=tuple(composite.lights),
             drops=self.drops(),
+            quality=None if composite.level is None else composite.level.quality,
+            scale=1.0 if composite.level is None else composite.level.scale,
         )
         return RenderedFrame(message, composite.color)
 

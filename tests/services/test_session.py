@@ -13,6 +13,7 @@ from protocol.errors import DeltalightError
 from protocol.frames import ViewFrame
 from protocol.messages import ControlRequest
 from protocol.scene import SceneDocument
+from render_server.frame_budget import Level
 from render_server.server.frames import FrameAssembler
 from render_server.server.session import MAXIMUM_FAULTS_IN_A_ROW, RenderSession, SourceInUse
 from tests.services.conftest import IDENTITY, camera, color, depth, pose, received
@@ -29,6 +30,7 @@ class Picture:
     pass_times_ms: dict[str, float] = field(default_factory=lambda: {"linearize": 1.5})
     lights: list[dict[str, Any]] = field(default_factory=list)
     linear: np.ndarray | None = None
+    level: Level | None = field(default_factory=lambda: Level("live", 0.5))
 
 
 @dataclass
@@ -139,6 +141,7 @@ def test_composite_carries_its_own_frames_header(session: RenderSession) -> None
     assert (rendered.message.frame_id, rendered.message.capture_ns) == (5, START + 5)
     assert rendered.message.status == "ok"
     assert rendered.message.pass_times_ms == {"linearize": 1.5}
+    assert (rendered.message.quality, rendered.message.scale) == ("live", 0.5)
     assert rendered.message.drops["color.cam"] == 4
     assert np.all(rendered.pixels == 250)
     assert session.step() is None
