@@ -103,8 +103,9 @@ class SolutionVoxels(DirectionalVoxels):
         for _ in range(self._bounces):
             self.set_support(everywhere=True)
             marching = {**mu, **self.march_bindings(1)}
-            self._gather.gather_real(self.real.store, self.real.groups, self.mu, self.rho, marching)
-            self._gather.gather_virtual(self.objects.store, self.objects.groups, self.rho, marching)
+            self._gather.gather(self.real.store, self.real.groups, self.mu, marching)
+            self._gather.gather(self.real.store, self.real.groups, self.rho, marching, keeps_mu=True)
+            self._gather.gather(self.objects.store, self.objects.groups, self.rho, marching)
             self._light_both(mu, rho, gathered=True)
         return self
 

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from render_server.occlusion_fields import OcclusionFields
 
 Settings = TypeVar("Settings", bound=MethodSettings)
+LEAST_VOLUME = 32  # voxels an edge
+VOLUME_STEP = 8  # whose multiples have enough mip levels
 
 
 @dataclass(frozen=True)
@@ -48,9 +50,10 @@ class Setup(Generic[Settings]):
 
 
 def resolve_voxel_cones(settings: VoxelConeSettings, defaults: ResolvedSettings) -> ResolvedSettings:
-    """Takes the document's values, or the machine's defaults where it says null."""
+    """Takes the document's values, or the machine's defaults where it says null, within the limits of the quality."""
+    size = settings.volume_size or defaults.volume_size
     return ResolvedSettings(
-        settings.volume_size or defaults.volume_size,
+        max(int(settings.tier.volume_share * size / VOLUME_STEP) * VOLUME_STEP, min(size, LEAST_VOLUME)),
         settings.cone_scale or defaults.cone_scale,
         settings.rsm_size or defaults.rsm_size,
         settings.triangle_budget or defaults.triangle_budget,

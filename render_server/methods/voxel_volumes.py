@@ -241,15 +241,16 @@ class DeltaVoxels(DirectionalVoxels):
     def bounce_real(
         self, voxels: VoxelSet, _mu: VoxelMipmap, _far: VoxelSet, scene: Bindings
     ) -> tuple[VoxelMipmap, VoxelSet]:
-        """Replaces the ambient light of unseen real surfaces by what they gather from mu."""
+        """Replaces the ambient light of unseen real surfaces by what they gather from mu; gathers E_mu of all."""
         if self._bounces == 0:
             return self.mu, voxels
         own, store, groups = {**scene, **voxels.volume.bindings}, voxels.store, voxels.groups
         self._group.run(store, groups, own, has_seen=True)
         for _ in range(self._bounces):
-            self._gather.gather_unseen(store, groups, self.mu, {**own, **self.march_bindings(1)})
+            self._gather.gather(store, groups, self.mu, {**own, **self.march_bindings(1)}, only_unseen=True)
             self._light.light_real(store, own, groups, gathered=True)
             self._filter_mu()
+        self._gather.gather(store, groups, self.mu, {**own, **self.march_bindings(1)})
         return self.mu, voxels
 
     def joint_scene(
@@ -286,11 +287,11 @@ class DeltaVoxels(DirectionalVoxels):
     def bounce_joint(
         self, lit: LitVoxels, _rho: VoxelMipmap, scene: Bindings
     ) -> tuple[VoxelMipmap, LitVoxels]:
-        """Gathers light from mu and rho, and relights the objects and the change of real surfaces with it."""
+        """Gathers light from rho, and relights the objects and the change of real surfaces with it."""
         for _ in range(self._bounces):
             marching = {**scene, **self.march_bindings(1)}
-            self._gather.gather_real(self.real.store, self.real.groups, self.mu, self.rho, marching)
-            self._gather.gather_virtual(self.objects.store, self.objects.groups, self.rho, marching)
+            self._gather.gather_change(self.real.store, self.real.groups, self.mu, self.rho, marching)
+            self._gather.gather(self.objects.store, self.objects.groups, self.rho, marching)
             self._light_rho(scene, gathered=True)
             self._filter_rho()
         return self.rho, lit

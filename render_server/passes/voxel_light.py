@@ -12,6 +12,7 @@ from jaxtyping import Float32
 
 from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Binding, Bindings, Kernel, clear_buffer, list_threads
+from render_server.gpu.textures import release_all
 from render_server.passes.caustics import GREATEST_ALPHA
 from render_server.passes.voxels import (
     LOWER_SURFELS,
@@ -210,26 +211,32 @@ class GatherVoxels:
 
     def __init__(self, gpu: GpuContext, defines: Mapping[str, int]) -> None:
         self._gpu = gpu
-        self._one = Kernel(gpu, "gather_voxels", **defines)
-        self._dual = Kernel(gpu, "gather_voxels", DUAL=1, **defines)
+        self._whole = Kernel(gpu, "gather_voxels", **defines)
+        self._change = Kernel(gpu, "gather_voxels", CHANGE=1, **defines)
 
-    def gather_unseen(
-        self, store: VoxelStore, groups: SurfelGroups, mu: VoxelMipmap, scene: Bindings
+    def gather(
+        self,
+        store: VoxelStore,
+        groups: SurfelGroups,
+        mipmap: VoxelMipmap,
+        scene: Bindings,
+        *,
+        only_unseen: bool = False,
+        keeps_mu: bool = False,
     ) -> None:
-        """Gathers E_mu of the groups with surfels that the camera does not see."""
-        self._run(self._one, store, groups, (mu, mu), scene, only_unseen=True)
+        """Gathers E_mu and E_rho of every group from one mipmap.
 
-    def gather_real(
+        `only_unseen`: of those with surfels that the camera does not see; `keeps_mu`: E_rho alone.
+        """
+        own = {"only_unseen": only_unseen, "keeps_mu": keeps_mu}
+        self._run(self._whole, store, groups, (mipmap, mipmap), {**scene, **own})
+
+    def gather_change(
         self, store: VoxelStore, groups: SurfelGroups, mu: VoxelMipmap, rho: VoxelMipmap, scene: Bindings
     ) -> None:
-        """Gathers E_mu and E_rho of every group."""
-        self._run(self._dual, store, groups, (mu, rho), scene, only_unseen=False)
-
-    def gather_virtual(
-        self, store: VoxelStore, groups: SurfelGroups, rho: VoxelMipmap, scene: Bindings
-    ) -> None:
-        """Gathers E_rho of every group."""
-        self._run(self._one, store, groups, (rho, rho), scene, only_unseen=False)
+        """Gathers E_rho of every group: its E_mu, and what the objects change."""
+        own = {"only_unseen": False, "keeps_mu": True}
+        self._run(self._change, store, groups, (mu, rho), {**scene, **own})
 
     def _run(
         self,
@@ -238,8 +245,6 @@ class GatherVoxels:
         groups: SurfelGroups,
         mipmaps: tuple[VoxelMipmap, VoxelMipmap],
         scene: Bindings,
-        *,
-        only_unseen: bool,
     ) -> None:
         kernel.run(
             (self._threads(store),),
@@ -249,7 +254,6 @@ class GatherVoxels:
             pyramid_mu=mipmaps[0].texture,
             pyramid_rho=mipmaps[1].texture,
             cone_count=GATHER_CONES,
-            only_unseen=only_unseen,
         )
 
     def _threads(self, store: VoxelStore) -> int:
@@ -260,8 +264,7 @@ class GatherVoxels:
 
     def release(self) -> None:
         """Frees the programs."""
-        self._one.release()
-        self._dual.release()
+        release_all(self._whole, self._change)
 
 
 class AlbedoTexture:

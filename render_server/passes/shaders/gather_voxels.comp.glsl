@@ -1,5 +1,6 @@
-// Irradiance of each group of surfels by a few cones through mu and rho (docs/method.md 4.3, further bounces): the
-// light of other surfaces, and of the environment where nothing is in front of it.
+// Irradiance of each group of surfels by a few cones through one mipmap (docs/method.md 4.3, further bounces): the light of
+// other surfaces, and of the environment where nothing is in front of it. CHANGE: E_rho from E_mu, by the cones that may meet the
+// objects' changes.
 #include "common/march.glsl"
 #include "common/environment.glsl"
 #include "common/diffuse_cones.glsl"
@@ -10,12 +11,8 @@
 #include "common/surfel_groups.glsl"
 
 layout(local_size_x = 64) in;
-#ifdef DUAL
-const bool ONLY_RHO = false;
-#else
-const bool ONLY_RHO = true;
-#endif
 uniform bool only_unseen;    // groups with surfels that the camera does not see
+uniform bool keeps_mu;       // writes E_rho alone
 
 // Cones that fill the hemisphere with so few would sample cells as wide as the walls of a small room, and light would
 // leak past its edges: 2..10 % in a closed box, below 1 % at a third of the width. What single groups then miss
@@ -31,14 +28,23 @@ void gather(int slot) {
     // Fixed-point sums of slivers may round to zero: such a group reflects nothing either.
     float area = max(float(group_sums[at + GROUP_AREA]), 1.0);
     vec3 sum = sums_at(at + GROUP_NORMAL);
-    if (sum == vec3(0.0)) { group_light[2 * slot] = group_light[2 * slot + 1] = vec4(0.0); return; }
+    if (sum == vec3(0.0)) {
+        if (!keeps_mu) group_light[2 * slot] = vec4(0.0);
+        group_light[2 * slot + 1] = vec4(0.0);
+        return;
+    }
     vec3 n = normalize(sum);
     vec3 corner = block_corner(group_entries[slot]);
     vec3 q = corner + sums_at(at + GROUP_PLACE) / area;
     float turn = 2.0 * PI * fract(dot(0.5 * corner, TURN_OF_BLOCK));
+    ConeSet cones = ConeSet(1, 0, WIDTH, turn);
+#ifdef CHANGE
+    vec3 e_rho = group_light[2 * slot].rgb + diffuse_change(q, n, cones);
+#else
     vec3 e_mu, e_rho;
-    diffuse(q, n, ConeSet(1, 0, WIDTH, turn), ONLY_RHO, e_mu, e_rho);
-    group_light[2 * slot] = vec4(e_mu, 0.0);
+    diffuse(q, n, cones, true, e_mu, e_rho);
+    if (!keeps_mu) group_light[2 * slot] = vec4(e_mu, 0.0);
+#endif
     group_light[2 * slot + 1] = vec4(e_rho, 0.0);
 }
 

@@ -14,11 +14,48 @@ vec3 cone_direction(int k, ConeSet set) {
     return vec3(sqrt(1.0 - z * z) * vec2(cos(phi), sin(phi)), z);
 }
 
+float cone_ratio() { return 1.5 * sqrt(2.0 / float(cone_count)); }   // diameter / distance of a solid angle of pi / K
+
+// Whether a cone from q may cross cells where mu and rho differ: those within 1.5 cells of the support, whose size follows the
+// cone's (march.glsl). `ball`: around the support.
+bool may_differ(vec3 q, vec3 d, float ratio, vec4 ball) {
+    float along = dot(ball.xyz - q, d), slope = 1.5 * ratio, across = length(ball.xyz - q - along * d);
+    if (slope >= 1.0) return true;
+    // Least of sqrt(across^2 + (t - along)^2) - slope t over t >= 0.
+    float t = max(along + across * slope * inversesqrt(1.0 - slope * slope), 0.0);
+    return length(vec2(across, t - along)) - slope * t <= ball.w;
+}
+
+vec4 ball_around_support() {
+    vec3 low = vec3(support[0], support[1], support[2]), high = vec3(-support[3], -support[4], -support[5]) + 1.0;
+    return vec4(0.5 * (low + high), 0.5 * length(high - low) + 3.0);   // the first samples lie a cell off the axis
+}
+
+// Change of the irradiance by the objects. Lanes of a processor walk through their own lists of cones that meet any.
+vec3 diffuse_change(vec3 q, vec3 n, ConeSet set) {
+    float ratio = set.width * cone_ratio(), half_angle = atan(0.5 * cone_ratio());
+    vec4 ball = ball_around_support();
+    mat3 basis = basis_around(n);
+    vec3 change = vec3(0.0);
+    for (int first = 0; first < cone_count; first += 32) {
+        uint met = 0u;
+        for (int k = first; k < min(first + 32, cone_count); ++k)
+            if (may_differ(q, basis * cone_direction(k, set), ratio, ball)) met |= 1u << (k - first);
+        while (met != 0u) {
+            int k = findLSB(met);
+            met &= met - 1u;
+            vec3 d = basis * cone_direction(first + k, set);
+            March m = march(q, d, ratio, false);
+            change += m.c_rho - m.c_mu + (m.t_rho - m.t_mu) * environment(d, half_angle);
+        }
+    }
+    return change * PI / float(cone_count);
+}
+
 // Irradiance without and with the objects, from `q` (voxels) on a surface about n: one-sided voxels do not occlude
 // their own surface. `only_rho` skips mu.
 void diffuse(vec3 q, vec3 n, ConeSet set, bool only_rho, out vec3 e_mu, out vec3 e_rho) {
-    // a solid angle of pi / K: diameter / distance = 2 tan(half-angle)
-    float ratio = 1.5 * sqrt(2.0 / float(cone_count));
+    float ratio = cone_ratio();
     float half_angle = atan(0.5 * ratio);
     mat3 basis = basis_around(n);
     e_mu = vec3(0.0);
