@@ -40,7 +40,7 @@ Quality = Literal["live", "balanced", "best"]
 class QualityTier:
     """What a quality gives up while something moves.
 
-    `cone_count` and `shadow_samples` limit the settings of that name, and a volume has `volume_share` of its voxels an
+    `cone_count` and `shadow_samples` limit the settings of that name; a volume has `volume_share` of its voxels an
     edge. `reflection_cones` look up what a pixel of a smooth object reflects, in one of `reflection_step` x
     `reflection_step` pixels. `edge_samples` smooth an object's edges. One tile of the picture in `refresh_tiles` gets
     new light in each frame in which only the camera moves, the others keep that of the frame before; 0: all get new
