@@ -14,9 +14,8 @@ if TYPE_CHECKING:
 # The methods that `bench quality` compares by default.
 DEFAULT_METHODS = "camera,none,paper,exact,path"
 
-# Those of `bench speed` and `bench counts`, and all that these take.
-TIMED_METHODS = "none,exact,paper,dlpv"
-TIMEABLE = ("dvct", "none", "exact", "paper", "dlpv", "dlpv-paper", "aroof", "differential")
+# Those of `bench speed` and `bench counts`.
+TIMED_METHODS = "raster,none,exact,paper,dlpv"
 DEFAULT_MOTIONS = "camera,object,arm,lamps,still"
 
 Size = Annotated[str | None, typer.Option(metavar="WxH", help="Size of the pictures; default the demo's.")]
@@ -25,8 +24,9 @@ ReportFile = Annotated[Path | None, typer.Option(help="File for the report as JS
 AsJson = Annotated[bool, typer.Option("--json", help="Print the report as JSON.")]
 
 METHODS_HELP = (
-    "dvct (the scene's own), none (objects without relighting), exact, paper, dlpv, dlpv-paper, aroof, differential; "
-    "or exact:KEY=VALUE[,KEY=VALUE], likewise for the others but none."
+    "dvct (the scene's own), raster (objects without shadows: a floor), none (objects without relighting), exact, "
+    "paper, dlpv, dlpv-paper, aroof, differential, a plugin's; or exact:KEY=VALUE[,KEY=VALUE], likewise for the "
+    "others but none."
 )
 MOTIONS_HELP = "What moves: camera, object, arm, lamps, still; separated by commas."
 
@@ -99,7 +99,8 @@ def quality(
         str,
         typer.Option(
             help="camera, dvct (the scene's own), none, paper, exact, fisheye (exact with the lights of the fish-eye "
-            "picture), dlpv, dlpv-paper, path; or exact:KEY=VALUE[,KEY=VALUE], likewise for the others that render."
+            "picture), dlpv, dlpv-paper, aroof, differential, raster, path, path+oidn (denoised), a plugin's; or "
+            "exact:KEY=VALUE[,KEY=VALUE], likewise for the others that render."
         ),
     ] = DEFAULT_METHODS,
     ablation: Annotated[
@@ -155,10 +156,10 @@ def rest(
 
 
 def _speed_job(methods: str, motions: str, frames: int, size: str | None, device: int | None) -> "SpeedJob":
-    from benchmarks.variants import parse_variants
+    from benchmarks.variants import RENDERED, parse_variants
     from services.commands.options import parse_size
 
-    variants, size_px = parse_variants(methods, TIMEABLE), None if size is None else parse_size(size)
+    variants, size_px = parse_variants(methods, RENDERED), None if size is None else parse_size(size)
     from benchmarks.speed.measure import SpeedJob  # needs OpenGL's packages, unlike a wrong option
     from benchmarks.speed.motions import parse_motions
 
