@@ -142,6 +142,7 @@ def test_server_and_up_refuse_wrong_input_in_a_sentence(cli: RunCli, tmp_path: o
         (("up", "--source", f"{tmp_path}/absent.mcap"), "absent.mcap"),
         (("up", "--source", "synthetic", "--scene", f"{tmp_path}/absent.json"), "absent.json"),
         (("--log-level", "loud", "doctor"), "log level"),
+        (("demo", "--method", "exakt"), "the nearest is exact"),
         (("bench", "speed", "--methods", "guess"), "exact"),
         (("bench", "speed", "--motions", "stil"), "still"),
         (("bench", "counts", "--methods", "path"), "exact"),
