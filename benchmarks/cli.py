@@ -131,6 +131,30 @@ def quality(
 
 
 @bench.command()
+def plot(
+    *,
+    speed: Annotated[
+        list[Path],
+        typer.Option(
+            help="Report of `bench speed`; may be given again: of a method in several the first counts."
+        ),
+    ],
+    quality: Annotated[Path, typer.Option(help="quality.json in a report folder of `bench quality`.")],
+    out: Annotated[Path, typer.Option(metavar="FILE.svg", help="File for the picture.")],
+    motion: Annotated[str, typer.Option(help="What moves while frames are timed.")] = "camera",
+) -> None:
+    """Draw speed against quality: every method that both reports hold is a point."""
+    from benchmarks.plot import draw_plot, read_plot
+    from protocol.files import write_bytes
+
+    found = read_plot(speed, quality, motion)
+    write_bytes(out, draw_plot(found).encode())
+    if found.left_out:
+        typer.echo(f"Left out, in one kind of report only: {', '.join(found.left_out)}.", err=True)
+    typer.echo(f"The picture is in {out}.", err=True)
+
+
+@bench.command()
 def rest(
     *,
     seconds: Annotated[float, typer.Option(min=0.2, max=3600, help="Length of each measurement.")] = 20.0,
