@@ -45,6 +45,7 @@ COMMANDS = {
     "schema",
     "bench speed",
     "bench counts",
+    "bench plot",
     "bench quality",
     "bench rest",
     "gpu-check",
