@@ -14,9 +14,8 @@ if TYPE_CHECKING:
 # The methods that `bench quality` compares by default.
 DEFAULT_METHODS = "camera,none,paper,exact,path"
 
-# Those of `bench speed` and `bench counts`, and all that these take.
-TIMED_METHODS = "none,exact,paper,dlpv"
-TIMEABLE = ("dvct", "none", "exact", "paper", "dlpv", "dlpv-paper", "aroof", "differential")
+# Those of `bench speed` and `bench counts`.
+TIMED_METHODS = "raster,none,exact,paper,dlpv"
 DEFAULT_MOTIONS = "camera,object,arm,lamps,still"
 
 Size = Annotated[str | None, typer.Option(metavar="WxH", help="Size of the pictures; default the demo's.")]
@@ -25,8 +24,9 @@ ReportFile = Annotated[Path | None, typer.Option(help="File for the report as JS
 AsJson = Annotated[bool, typer.Option("--json", help="Print the report as JSON.")]
 
 METHODS_HELP = (
-    "dvct (the scene's own), none (objects without relighting), exact, paper, dlpv, dlpv-paper, aroof, differential; "
-    "or exact:KEY=VALUE[,KEY=VALUE], likewise for the others but none."
+    "dvct (the scene's own), raster (objects without shadows: a floor), none (objects without relighting), exact, "
+    "paper, dlpv, dlpv-paper, aroof, differential, a plugin's; or exact:KEY=VALUE[,KEY=VALUE], likewise for the "
+    "others but none."
 )
 MOTIONS_HELP = "What moves: camera, object, arm, lamps, still; separated by commas."
 
@@ -99,7 +99,8 @@ def quality(
         str,
         typer.Option(
             help="camera, dvct (the scene's own), none, paper, exact, fisheye (exact with the lights of the fish-eye "
-            "picture), dlpv, dlpv-paper, path; or exact:KEY=VALUE[,KEY=VALUE], likewise for the others that render."
+            "picture), dlpv, dlpv-paper, aroof, differential, raster, path, path+oidn (denoised), a plugin's; or "
+            "exact:KEY=VALUE[,KEY=VALUE], likewise for the others that render."
         ),
     ] = DEFAULT_METHODS,
     ablation: Annotated[
@@ -130,6 +131,30 @@ def quality(
 
 
 @bench.command()
+def plot(
+    *,
+    speed: Annotated[
+        list[Path],
+        typer.Option(
+            help="Report of `bench speed`; may be given again: of a method in several the first counts."
+        ),
+    ],
+    quality: Annotated[Path, typer.Option(help="quality.json in a report folder of `bench quality`.")],
+    out: Annotated[Path, typer.Option(metavar="FILE.svg", help="File for the picture.")],
+    motion: Annotated[str, typer.Option(help="What moves while frames are timed.")] = "camera",
+) -> None:
+    """Draw speed against quality: every method that both reports hold is a point."""
+    from benchmarks.plot import draw_plot, read_plot
+    from protocol.files import write_bytes
+
+    found = read_plot(speed, quality, motion)
+    write_bytes(out, draw_plot(found).encode())
+    if found.left_out:
+        typer.echo(f"Left out, in one kind of report only: {', '.join(found.left_out)}.", err=True)
+    typer.echo(f"The picture is in {out}.", err=True)
+
+
+@bench.command()
 def rest(
     *,
     seconds: Annotated[float, typer.Option(min=0.2, max=3600, help="Length of each measurement.")] = 20.0,
@@ -155,10 +180,10 @@ def rest(
 
 
 def _speed_job(methods: str, motions: str, frames: int, size: str | None, device: int | None) -> "SpeedJob":
-    from benchmarks.variants import parse_variants
+    from benchmarks.variants import RENDERED, parse_variants
     from services.commands.options import parse_size
 
-    variants, size_px = parse_variants(methods, TIMEABLE), None if size is None else parse_size(size)
+    variants, size_px = parse_variants(methods, RENDERED), None if size is None else parse_size(size)
     from benchmarks.speed.measure import SpeedJob  # needs OpenGL's packages, unlike a wrong option
     from benchmarks.speed.motions import parse_motions
 

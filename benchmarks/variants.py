@@ -2,22 +2,22 @@
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
+from benchmarks.raster import RasterMethod, register_raster
 from protocol.documents import nearest, parse_mapping, validate
 from protocol.errors import DeltalightError
+from protocol.methods import PLUGINS, SETTINGS
 from protocol.scene import SceneDocument
-from protocol.scene_method import AroofMethod, DifferentialMethod, DlpvMethod, DvctMethod, NoneMethod
+from protocol.scene_method import MethodSettings, NoneMethod
 
-Kind = Literal["camera", "none", "dvct", "dlpv", "aroof", "differential", "path"]
-METHODS: dict[str, type[DvctMethod | DlpvMethod | AroofMethod | DifferentialMethod]] = {
-    "dvct": DvctMethod,
-    "dlpv": DlpvMethod,
-    "aroof": AroofMethod,
-    "differential": DifferentialMethod,
-}
-"""Kinds that the renderer makes with settings."""
-ADJUSTABLE: dict[str, tuple[Kind, dict[str, Any]]] = {
+RASTER = RasterMethod.method_name()
+MODELS: dict[str, type[MethodSettings]] = {**SETTINGS, RASTER: RasterMethod}
+"""Kinds that the renderer makes, by the names of their methods."""
+SIZED_BY_CELLS = ("dlpv", "aroof")
+"""Kinds whose `volume_size` is not in voxels."""
+ADJUSTABLE: dict[str, tuple[str, dict[str, Any]]] = {
+    **{name: (name, {}) for name in PLUGINS.values},
     "dvct": ("dvct", {}),
     "exact": ("dvct", {"operator": "exact"}),
     "paper": ("dvct", {"operator": "paper"}),
@@ -25,42 +25,64 @@ ADJUSTABLE: dict[str, tuple[Kind, dict[str, Any]]] = {
     "dlpv": ("dlpv", {"operator": "difference"}),
     "dlpv-paper": ("dlpv", {"operator": "paper"}),
     "aroof": ("aroof", {}),
+    RASTER: (RASTER, {}),
 }
-"""Variants that take settings: their kind and what they set themselves."""
+"""Variants that take settings: their kind and what they set themselves. Installed plugins are among them."""
 TIMED_VARIANT = "exact"
-"""`path` takes the time of this one's frame."""
+"""The kinds of path tracing take the time of this one's frame."""
 
 
 @dataclass(frozen=True)
 class Variant:
-    """One way to make the picture; `settings` are changes of the scene document (kinds in METHODS).
+    """One way to make the picture; `settings` are changes of the scene document (kinds in MODELS).
 
     A key names a setting of `method`, or one of `lights` or `output` with that before a dot.
     """
 
     name: str
     sentence: str
-    kind: Kind
+    kind: str
     settings: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def is_traced(self) -> bool:
+        """Whether a path tracer makes it, in the time of TIMED_VARIANT's frame."""
+        return self.kind in ("path", "denoised path")
+
+    @property
+    def runs_in_processes(self) -> bool:
+        """Whether other processes know its method too."""
+        return self.kind in SETTINGS
 
     def applied(self, document: SceneDocument, volume_size: int | None) -> SceneDocument:
         """Return the document with this variant's method; `volume_size` applies if no setting names one."""
         if self.kind == "none":
             return document.replaced(method=NoneMethod())
-        if self.kind in METHODS and not isinstance(document.method, METHODS[self.kind]):
-            document = document.replaced(method=METHODS[self.kind]())
-        size = {} if volume_size is None or self.kind in ("dlpv", "aroof") else {"volume_size": volume_size}
-        parts: dict[str, dict[str, Any]] = {"method": size, "lights": {}, "output": {}}
+        if (
+            self.kind == RASTER
+        ):  # a method that `SceneDocument.replaced` does not know, and that finds no light
+            register_raster()
+            document = document.replaced(lights=document.lights.replaced(surroundings="none"))
+        model = MODELS.get(self.kind)
+        if model is not None and not isinstance(document.method, model):
+            document = document.model_copy(update={"method": model()})
+        parts: dict[str, dict[str, Any]] = {"method": {}, "lights": {}, "output": {}}
+        if volume_size is not None and self._has_voxels(document.method):
+            parts["method"]["volume_size"] = volume_size
         for key, value in self.settings.items():
             part, _, name = key.rpartition(".")
             parts[part or "method"][name] = value
         changed = {part: getattr(document, part).replaced(**changes) for part, changes in parts.items()}
-        return document.replaced(**changed)
+        return document.model_copy(update=changed)
+
+    def _has_voxels(self, method: MethodSettings) -> bool:
+        return self.kind not in SIZED_BY_CELLS and "volume_size" in type(method).model_fields
 
 
 FIXED: dict[str, Variant] = {
     variant.name: variant
     for variant in (
+        *(Variant(name, f"of package {one.plugin.package}", name) for name, one in PLUGINS.values.items()),
         Variant("camera", "the camera's picture: no object, no relighting", "camera"),
         Variant("dvct", "voxel cone tracing as the scene says", "dvct"),
         Variant("none", "objects drawn, the real scene left as it was", "none"),
@@ -76,9 +98,25 @@ FIXED: dict[str, Variant] = {
         Variant("differential", "two full solutions, subtracted, machine's defaults", "differential"),
         Variant("dlpv", "light propagation volumes, machine's defaults", "dlpv", {"operator": "difference"}),
         Variant("dlpv-paper", "the volume as printed in [P2]", "dlpv", {"operator": "paper"}),
+        Variant(
+            RASTER,
+            "objects rasterised over the picture: no shadows, no light of the room; a floor of cost",
+            RASTER,
+        ),
         Variant("path", "path tracing with and without objects, in the time of an `exact` frame", "path"),
+        Variant(
+            "path+oidn",
+            "the same with fewer light paths and both pictures denoised (Intel Open Image Denoise)",
+            "denoised path",
+        ),
     )
 }
+RENDERED = tuple(
+    name
+    for name, variant in FIXED.items()
+    if variant.kind in MODELS and "lights.mode" not in variant.settings
+)
+"""Variants that `bench speed` times: all that the renderer makes with the scene's own lights."""
 
 
 def parse_variants(text: str, known: Collection[str] = FIXED) -> list[Variant]:
@@ -96,15 +134,19 @@ def parse_variants(text: str, known: Collection[str] = FIXED) -> list[Variant]:
     if len(set(written)) < len(written):
         raise DeltalightError(f"--methods '{text}' names one thing twice; write each once.")
     variants = [_parse(one, known) for one in written]
-    if "path" in written and TIMED_VARIANT not in written:
+    traced = next((one for one in variants if one.is_traced), None)
+    if traced is not None and TIMED_VARIANT not in written[: written.index(traced.name)]:
         raise DeltalightError(
-            f"`path` takes the time of `{TIMED_VARIANT}`; add {TIMED_VARIANT} to --methods."
+            f"`{traced.name}` takes the time of `{TIMED_VARIANT}`; add {TIMED_VARIANT} to --methods before it."
         )
     return variants
 
 
 def _parse(text: str, known: Collection[str]) -> Variant:
     name, _, changes = text.partition(":")
+    fault = PLUGINS.fault(name)
+    if fault is not None and name not in known:
+        raise DeltalightError(fault)
     if not changes and name in known:
         return FIXED[name]
     if not changes or name not in ADJUSTABLE:
@@ -117,7 +159,7 @@ def _parse(text: str, known: Collection[str]) -> Variant:
     settings = dict(own)
     for pair in changes.split(","):
         settings |= _setting(pair, text)
-    validate(METHODS[kind], settings, f"--methods {text}")
+    validate(MODELS[kind], settings, f"--methods {text}")
     return Variant(text, f"{name} with {changes.replace(',', ', ')}", kind, settings)
 
 

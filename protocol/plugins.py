@@ -42,8 +42,10 @@ class Plugin:
             raise self.fault(f"{type(error).__name__}: {error}") from error
 
     @contextmanager
-    def blamed(self) -> Iterator[None]:
+    def blamed(self, doing: str = "") -> Iterator[None]:
         """Turns what a package's code raises into a sentence that names it; sentences stay as they are.
+
+        `doing` says where in the package's code, where that is known.
 
         Raises:
             DeltalightError: in place of any other exception.
@@ -55,7 +57,8 @@ class Plugin:
         except Exception as error:  # as above
             if self.entry_point.dist is None:
                 raise
-            raise self.fault(f"{type(error).__name__}: {error}") from error
+            where = f"{doing}, " if doing else ""
+            raise self.fault(f"{where}{type(error).__name__}: {error}") from error
 
     def fault(self, reason: str) -> DeltalightError:
         """The sentence for people on why the plugin cannot be used."""

@@ -7,12 +7,13 @@ drawn.
 
 import inspect
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from typing import Any, Final, Generic, Literal, TypeVar, get_args
 
+from protocol.plugins import Plugin
 from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Dispatch, watched
 from render_server.gpu.textures import gpu_objects, sizes_bytes
@@ -62,13 +63,14 @@ class Resource(Generic[T]):
 
 @dataclass(eq=False)
 class Stage:
-    """A function of resources. `ran`: whether the last run of the graph called it."""
+    """A function of resources. `ran`: whether the last run of the graph called it; `plugin`: whose stage it is."""
 
     name: str
     function: Callable[..., Any]
     inputs: tuple[Resource[Any], ...]
     outputs: tuple[Resource[Any], ...]
     same: Same | None
+    plugin: Plugin | None = None
     seen: tuple[int, ...] | None = None
     ran: bool = False
 
@@ -130,6 +132,7 @@ class Graph:
         self._order: list[Stage] | None = None
         self._polled: list[tuple[Resource[Any], Callable[[], Any], Same]] = []
         self._owned: list[Any] = []
+        self._plugin: Plugin | None = None
 
     def source(self, name: str, clock: Clock) -> Resource[Any]:
         """Declares a resource that is set from outside (`Resource.write`)."""
@@ -168,6 +171,15 @@ class Graph:
         """Begins a section of the frame, for who reads the graph: what is declared from here on belongs to it."""
         self._sections.append((len(self._stages), name))
 
+    @contextmanager
+    def of_plugin(self, plugin: Plugin | None) -> Iterator[None]:
+        """What is declared in here is a plugin's, which is named when a stage fails."""
+        self._plugin = plugin
+        try:
+            yield
+        finally:
+            self._plugin = None
+
     def stages(
         self,
         name: str,
@@ -194,7 +206,7 @@ class Graph:
         for item in inputs:
             if isinstance(item, Resource) and item is not self._resources.get(item.name):
                 raise GraphError(f"Stage `{name}` reads `{item.name}` of another graph.")
-        stage = Stage(name, function, (), (), same)
+        stage = Stage(name, function, (), (), same, self._plugin)
         stage.outputs = self._declare(outputs, stage)
         self._stages.append(stage)
         self._named[stage] = [item if isinstance(item, str) else item.name for item in inputs]
@@ -332,6 +344,8 @@ class Graph:
         dispatches: list[Dispatch] = []
         try:
             with ExitStack() as around:
+                if stage.plugin is not None:
+                    around.enter_context(stage.plugin.blamed(f"stage `{stage.name}`"))
                 if self.timers is not None and stage.name not in self._values:
                     around.enter_context(self.timers.measure(stage.name))
                 if self._checks:

@@ -13,6 +13,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from protocol.errors import DeltalightError
+from protocol.methods import PLUGINS
 from protocol.scene import SceneDocument, load_scene
 from services import ports
 from services.collector import CompositeCollector, summarize
@@ -32,7 +33,7 @@ BETWEEN_FRAMES_TIMEOUT_S = 60.0
 
 
 def demo_scene(method: str) -> SceneDocument:
-    """Return the demo's scene with a method of `services.commands.options.Method`.
+    """Return the demo's scene with a method of `services.commands.options.require_method`.
 
     Raises:
         DeltalightError: the demo's files are missing.
@@ -46,13 +47,13 @@ def demo_scene(method: str) -> SceneDocument:
 def with_method(scene: SceneDocument, method: str) -> SceneDocument:
     """Return the scene with another method.
 
-    `dvct` (as it is), its operator `exact` or `paper`, or NAME[-OPERATOR].
+    `dvct` (as it is), its operator `exact` or `paper`, an installed plugin's, or NAME[-OPERATOR].
     """
     if method == "dvct":
         return scene
     if method in ("exact", "paper"):
         return scene.replaced(method=scene.method.replaced(operator=method))
-    name, _, operator = method.partition("-")
+    name, _, operator = (method, "", "") if method in PLUGINS.values else method.partition("-")
     return scene.replaced(method={"name": name, **({"operator": operator} if operator else {})})
 
 

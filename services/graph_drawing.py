@@ -7,6 +7,7 @@ from xml.etree import ElementTree
 
 from render_server.graph import CLOCKS, Clock, SourceReport, StageReport
 from services.graph_layout import Arrow, Box, Layout, lay_out
+from services.svg import BOLD_LETTER, FAINT, GREY, INK, LETTER, PANEL, Point, as_text, new_svg, rect, text
 
 WIDTH = 1600
 MARGIN = 20
@@ -21,10 +22,6 @@ CARD_HEIGHT = 68  # of a clock in the legend
 TEXT_LEFT = 14  # in a box
 RADIUS = 8  # of an arrow's corners
 LEAST_BYTES = 50_000  # that a box tells of
-LETTER, BOLD_LETTER = 0.57, 0.70  # mean widths, of the font's size
-INK, GREY, FAINT, PANEL = "#1c2430", "#5d6673", "#9aa3af", "#f4f6f8"
-Point = tuple[float, float]
-STYLE = "text { font-family: system-ui, 'Segoe UI', 'DejaVu Sans', sans-serif; }"
 
 COLORS: Final[dict[Clock, str]] = {
     "scene": "#6b7280",
@@ -72,26 +69,14 @@ def draw_graph(title: str, sources: Sequence[SourceReport], stages: Sequence[Sta
     """The picture as text of an SVG file. Stages that did not run are faded; colours are the fastest clocks'."""
     layout = lay_out(stages)
     metrics = _measure(layout)
-    svg = ElementTree.Element(
-        "svg",
-        {
-            "xmlns": "http://www.w3.org/2000/svg",
-            "viewBox": f"0 0 {WIDTH} {metrics.height:.0f}",
-            "width": str(WIDTH),
-            "height": f"{metrics.height:.0f}",
-        },
-    )
-    ElementTree.SubElement(svg, "title").text = title
-    ElementTree.SubElement(svg, "style").text = STYLE
-    _rect(svg, (0, 0, WIDTH, metrics.height), fill="white")
-    _text(svg, (MARGIN, 34), title, 20, INK, bold=True)
+    svg = new_svg(title, (WIDTH, metrics.height))
+    text(svg, (MARGIN, 34), title, 20, INK, bold=True)
     _draw_legend(svg, sources)
     _draw_sections(svg, metrics)
     _draw_arrows(svg, metrics)
     for box in layout.boxes:
         _draw_box(svg, metrics, box)
-    ElementTree.indent(svg)
-    return ElementTree.tostring(svg, encoding="unicode") + "\n"
+    return as_text(svg)
 
 
 def _measure(layout: Layout) -> _Metrics:
@@ -113,16 +98,16 @@ def _draw_legend(svg: ElementTree.Element, sources: Sequence[SourceReport]) -> N
     width = (WIDTH - 2 * MARGIN + 10) / len(CLOCKS)
     for index, clock in enumerate(CLOCKS):
         x = MARGIN + index * width
-        _rect(svg, (x, LEGEND_TOP, width - 10, CARD_HEIGHT), fill="white", stroke=COLORS[clock], rx="5")
-        _rect(svg, (x, LEGEND_TOP, 6, CARD_HEIGHT), fill=COLORS[clock])
-        _text(svg, (x + 18, LEGEND_TOP + 21), clock, 15, COLORS[clock], bold=True)
-        _text(svg, (x + 18, LEGEND_TOP + 39), MEANINGS[clock], 12, GREY)
+        rect(svg, (x, LEGEND_TOP, width - 10, CARD_HEIGHT), fill="white", stroke=COLORS[clock], rx="5")
+        rect(svg, (x, LEGEND_TOP, 6, CARD_HEIGHT), fill=COLORS[clock])
+        text(svg, (x + 18, LEGEND_TOP + 21), clock, 15, COLORS[clock], bold=True)
+        text(svg, (x + 18, LEGEND_TOP + 39), MEANINGS[clock], 12, GREY)
         own = [source for source in sources if source.clock == clock]
-        line = _text(svg, (x + 18, LEGEND_TOP + 57), "", 12, GREY)
+        line = text(svg, (x + 18, LEGEND_TOP + 57), "", 12, GREY)
         for source in own:
             name = ElementTree.SubElement(line, "tspan", {"fill": INK if source.changed else FAINT})
             name.text = source.name + ("" if source is own[-1] else ", ")
-    _text(svg, (MARGIN, LEGEND_TOP + CARD_HEIGHT + 22), NOTE, 12.5, GREY)
+    text(svg, (MARGIN, LEGEND_TOP + CARD_HEIGHT + 22), NOTE, 12.5, GREY)
 
 
 def _draw_sections(svg: ElementTree.Element, metrics: _Metrics) -> None:
@@ -132,8 +117,8 @@ def _draw_sections(svg: ElementTree.Element, metrics: _Metrics) -> None:
         height = TITLE + rows * (metrics.box_heights[section.band] + ROW_GAP) + 2
         width = section.columns * (metrics.box_width + metrics.gap) - 8
         y = metrics.tops[section.band]
-        _rect(svg, (x, y, width, height), fill=PANEL, rx="8")
-        _text(svg, (x + 12, y + 21), section.name, 15, GREY, bold=True)
+        rect(svg, (x, y, width, height), fill=PANEL, rx="8")
+        text(svg, (x + 12, y + 21), section.name, 15, GREY, bold=True)
 
 
 def _draw_arrows(svg: ElementTree.Element, metrics: _Metrics) -> None:
@@ -228,15 +213,15 @@ def _draw_box(svg: ElementTree.Element, metrics: _Metrics, box: Box) -> None:
         if stage.ran
         else {"stroke": FAINT, "stroke-dasharray": "4 3"}
     )
-    _rect(group, (x, y, width, height), fill=_tint(color) if stage.ran else "white", rx="5", **line)
-    _rect(group, (x, y, 5, height), fill=color, **({} if stage.ran else {"fill-opacity": "0.4"}))
+    rect(group, (x, y, width, height), fill=_tint(color) if stage.ran else "white", rx="5", **line)
+    rect(group, (x, y, 5, height), fill=color, **({} if stage.ran else {"fill-opacity": "0.4"}))
     for index, clock in enumerate(CLOCKS):
         fill = COLORS[clock] if clock in stage.clocks else "#e3e6ea"
         place = {"cx": f"{x + TEXT_LEFT + 4 + 11 * index:.1f}", "cy": f"{y + height - 11:.1f}", "r": "3.5"}
         ElementTree.SubElement(group, "circle", {**place, "fill": fill})
-    for number, (text, size, bold) in enumerate(_lines(box, width)):
+    for number, (words, size, bold) in enumerate(_lines(box, width)):
         ink = (INK if size > 12 else GREY) if stage.ran else FAINT if size < 12 else GREY
-        _text(group, (x + TEXT_LEFT, y + 20 + LINE * number), text, size, ink, bold=bold)
+        text(group, (x + TEXT_LEFT, y + 20 + LINE * number), words, size, ink, bold=bold)
 
 
 def _lines(box: Box, width: float) -> list[tuple[str, float, bool]]:
@@ -285,25 +270,3 @@ def _tint(color: str) -> str:
     """The colour mixed with nine parts of white."""
     channels = (int(color[at : at + 2], 16) for at in (1, 3, 5))
     return "#" + "".join(f"{round(255 - (255 - channel) / 10):02x}" for channel in channels)
-
-
-def _rect(parent: ElementTree.Element, box: tuple[float, float, float, float], **style: str) -> None:
-    names = ("x", "y", "width", "height")
-    place = {name: f"{value:.1f}" for name, value in zip(names, box, strict=True)}
-    ElementTree.SubElement(parent, "rect", {**place, **style})
-
-
-def _text(
-    parent: ElementTree.Element, place: Point, text: str, size: float, color: str, *, bold: bool = False
-) -> ElementTree.Element:
-    weight = {"font-weight": "600"} if bold else {}
-    given = {
-        "x": f"{place[0]:.1f}",
-        "y": f"{place[1]:.1f}",
-        "font-size": f"{size:g}",
-        "fill": color,
-        **weight,
-    }
-    element = ElementTree.SubElement(parent, "text", given)
-    element.text = text
-    return element

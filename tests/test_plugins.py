@@ -18,6 +18,7 @@ from protocol.errors import DeltalightError
 from protocol.methods import InstalledMethod, load_methods
 from protocol.plugins import LoadedPlugins
 from protocol.scene_method import BUILT_IN_METHODS, DvctMethod, NoneMethod
+from render_server.graph import Graph
 from render_server.methods import registry
 from render_server.methods.method import RelightingMethod
 from sensor_node.cameras.discovery import discover
@@ -132,6 +133,20 @@ from render_server.gpu.textures import texture_2d
 
 written = texture_2d(gpu, (2, 2), 4, "f4")
 Kernel(gpu, Path(sys.argv[2]) / "fog").run(written.size, fog_out=written)
+from benchmarks.variants import RENDERED, parse_variants
+from services.commands.options import require_method
+from services.demo import with_method
+
+(variant,) = parse_variants("direct:ambient=4", RENDERED)
+chosen = variant.applied(document, 64), with_method(document, "direct")
+told["chosen"] = [each.method.model_dump() for each in chosen]
+for choose in (require_method, parse_variants):
+    choose("direct")
+    for name in ("fog", "dirct"):
+        try:
+            choose(name)
+        except DeltalightError as error:
+            told["faults"].append(str(error))
 told["written"] = np.frombuffer(written.read(), np.float32).tolist()
 print(json.dumps(told))
 """
@@ -166,7 +181,7 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 
 def test_a_document_may_name_the_method_wherever_it_is_read(rendered: dict[str, Any]) -> None:
-    misspelt, unknown_key, out_of_range, broken = rendered["faults"]
+    misspelt, unknown_key, out_of_range, broken = rendered["faults"][:4]
     assert "the nearest is `direct`" in misspelt
     assert "`method.ambiant`; the nearest known key is `ambient`" in unknown_key
     assert "`method.ambient` is wrong" in out_of_range
@@ -175,6 +190,15 @@ def test_a_document_may_name_the_method_wherever_it_is_read(rendered: dict[str, 
     assert rendered["schema"]["required"] == ["name"]
     assert rendered["schema"]["properties"]["ambient"]["maximum"] == 10
     assert not rendered["opengl"]
+
+
+def test_commands_take_the_method_by_its_name(rendered: dict[str, Any]) -> None:
+    adjusted, plain = rendered["chosen"]
+    assert (adjusted["name"], adjusted["ambient"]) == ("direct", 4)
+    assert (plain["name"], plain["ambient"]) == ("direct", 1)
+    for broken, misspelt in (rendered["faults"][4:6], rendered["faults"][6:]):
+        assert "plugin `fog` of package fog-method 2.0" in broken
+        assert "the nearest is direct" in misspelt
 
 
 def test_a_plugin_has_kernels_of_its_own(rendered: dict[str, Any]) -> None:
@@ -343,8 +367,37 @@ def test_a_method_that_cannot_declare_its_stages_is_named(
     assert choice.resolved == registry.SOFTWARE_DEFAULTS
     nothing = cast(Any, None)
     with pytest.raises(DeltalightError, match=r"`direct` of package direct-light 1\.0 .*no module of mine"):
-        choice.declare(nothing, nothing, nothing)
+        choice.declare(Graph(nothing), nothing, nothing)
     light = InstalledMethod(direct.plugin, direct.settings, DvctMethod)
     monkeypatch.setattr(registry, "PLUGINS", LoadedPlugins({"direct": light}, {}))
     with pytest.raises(DeltalightError, match="it names no RelightingMethod"):
         registry.choose_method(direct.settings(), software=True)
+
+
+def test_a_stage_that_fails_is_named_with_its_plugin(
+    install: Install, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    del install
+    (direct,) = load_methods().values.values()
+
+    def fail() -> None:
+        raise ValueError("too thin")
+
+    def declare(graph: Graph, *_: object) -> Any:  # noqa: ANN401
+        return graph.stage("fog", fail)
+
+    weak = InstalledMethod(direct.plugin, direct.settings, RelightingMethod(direct.settings, declare))
+    monkeypatch.setattr(registry, "PLUGINS", LoadedPlugins({"direct": weak}, {}))
+    choice = registry.choose_method(direct.settings(), software=True)
+    nothing = cast(Any, None)
+    graph = Graph(nothing)
+    choice.declare(graph, nothing, nothing)
+    with pytest.raises(
+        DeltalightError,
+        match=r"`direct` of package direct-light 1\.0 .*\(stage `fog`, ValueError: too thin\)",
+    ):
+        graph.run()
+    own = Graph(nothing)
+    own.stage("fog", fail)
+    with pytest.raises(ValueError, match="too thin"):
+        own.run()

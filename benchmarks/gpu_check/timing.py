@@ -29,7 +29,9 @@ def time_method(method: str, frames: int, size: tuple[int, int], volume: int) ->
     if variant.kind in ("dvct", "differential"):
         variant = replace(variant, settings={**variant.settings, "volume_size": volume})
     job = SpeedJob([variant], MOTIONS, frames, size)
-    found = measure_speed(job, BUDGET_MS, Progress(disable=True), end_to_end=False).methods[method]
+    progress = Progress(disable=True)
+    report = measure_speed(job, BUDGET_MS, progress, lambda _: None, end_to_end=False)
+    found = report.methods[method]
     return Timing(
         {motion: figures.frame_ms.median for motion, figures in found.motions.items()},
         {name: stage.ms.median for name, stage in found.motions["camera"].stages.items()},

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cache
 from typing import Any, Literal
 
@@ -35,6 +36,12 @@ INTEGRATORS: dict[str, dict[str, Any]] = {
     "cover": {"type": "path", "max_depth": 1},  # directly visible light only
     "distance": {"type": "aov", "aovs": "distance:depth"},
 }
+GUIDED: dict[str, Any] = {
+    "type": "aov",
+    "aovs": "albedo:albedo,normal:sh_normal",
+    "path": INTEGRATORS["color"],
+}
+"""Not among INTEGRATORS: truth, which is found again by a hash of those, is made without it."""
 SUBPIXELS = 2
 """Supersampling of colour per axis, filtered here.
 
@@ -92,6 +99,15 @@ def passes(spp: int, pixels: int) -> tuple[int, ...]:
     return tuple(taken)
 
 
+@dataclass(frozen=True, eq=False)
+class GuidedPicture:
+    """Linear radiance in camera units, with what guides a denoiser: albedo 0..1 and unit normals in the world."""
+
+    color: Float32[np.ndarray, "h w 3"]
+    albedo: Float32[np.ndarray, "h w 3"]
+    normal: Float32[np.ndarray, "h w 3"]
+
+
 def _ignore() -> None:
     """Do nothing: nobody counts the passes."""
 
@@ -108,13 +124,22 @@ class RoomRenderer:
         self._camera = camera
         self._fine = camera.resized(SUBPIXELS * camera.width, SUBPIXELS * camera.height)
         self._scene = mi.load_dict(scene)
-        self._integrators = {name: mi.load_dict(what) for name, what in INTEGRATORS.items()}
+        known = {**INTEGRATORS, "guided": GUIDED}
+        self._integrators = {name: mi.load_dict(what) for name, what in known.items()}
 
     def color(
         self, world_from_camera: Matrix, *, spp: int, seed: int, advance: Callable[[], None] = _ignore
     ) -> Float32[np.ndarray, "h w 3"]:
         """Render linear radiance in camera units; call `advance` after each of the `passes`."""
         return self._mean("color", world_from_camera, spp, seed, advance)
+
+    def guided(self, world_from_camera: Matrix, *, spp: int, seed: int) -> GuidedPicture:
+        """Render with any number of samples a pixel, each in its own pixel, which denoisers expect.
+
+        What `color` has of the lens's blur is missing: `softened` adds it.
+        """
+        channels = self._render("guided", _sensor(self._camera, world_from_camera, "independent"), spp, seed)
+        return GuidedPicture(channels[..., :3], channels[..., 3:6], channels[..., 6:9])
 
     def cover(
         self, world_from_camera: Matrix, *, spp: int, seed: int, advance: Callable[[], None] = _ignore
@@ -184,6 +209,13 @@ def filtered(fine: Float32[np.ndarray, "hs ws 3"]) -> Float32[np.ndarray, "h w 3
         return np.asarray(soft[::SUBPIXELS, ::SUBPIXELS])
 
     return np.asarray(blurred(fine) / blurred(np.ones_like(fine)))
+
+
+def softened(picture: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
+    """Blur a picture of whole pixels by the lens: by the variance that their own area does not have."""
+    side = (SOFTNESS_PX**2 - 1 / 12) / 2
+    kernel = np.array([side, 1 - 2 * side, side], np.float32)
+    return np.asarray(cv2.sepFilter2D(picture, -1, kernel, kernel, borderType=cv2.BORDER_REPLICATE))
 
 
 def _sensor(camera: CameraModel, world_from_camera: Matrix, sampler: str) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from benchmarks.ground_truth.benchmark_scene import BenchmarkScene
 from benchmarks.ground_truth.truth import ensure_truth
 from benchmarks.quality.case import SceneCase
 from benchmarks.quality.ceiling import ideal_composite
+from benchmarks.quality.denoising import require_denoiser
 from benchmarks.quality.figures import Figures, mean_figures, scene_figures
 from benchmarks.quality.metrics import Picture
 from benchmarks.quality.path_tracing import trace_in_time
@@ -84,6 +85,8 @@ def measure_quality(job: QualityJob, progress: Progress) -> QualityResult:
     Raises:
         DeltalightError: no OpenGL, truth is missing and cannot be rendered, or a variant cannot be used.
     """
+    if any(variant.kind == "denoised path" for variant in job.variants):
+        require_denoiser()
     gpu = create_context(job.device)
     try:
         result = QualityResult(job, gpu.renderer_name)
@@ -113,8 +116,9 @@ def _measure(
     match variant.kind:
         case "camera":
             rendered = Rendered([frame.sensor_without for frame in case.frames])
-        case "path":
-            rendered = trace_in_time(case, before[TIMED_VARIANT].figures["frame_ms"])
+        case "path" | "denoised path" as kind:
+            frame_ms = before[TIMED_VARIANT].figures["frame_ms"]
+            rendered = trace_in_time(case, frame_ms, is_denoised=kind == "denoised path")
         case _:
             rendered = render_variant(gpu, case, variant, volume_size)
     return _result(case, rendered)

@@ -7,10 +7,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from benchmarks.quality import REPORT_KIND
 from benchmarks.quality.error_view import error_view
 from benchmarks.quality.evaluate import QualityResult, SceneResult
 from benchmarks.quality.metrics import Picture
-from benchmarks.quality.report_data import REPORT_KIND, as_data
+from benchmarks.quality.report_data import as_data
 from benchmarks.quality.report_html import ScenePictures, html_page, picture_name
 from benchmarks.quality.tables import COLUMNS, all_tables
 from protocol.errors import DeltalightError

@@ -5,11 +5,10 @@ import os
 from dataclasses import asdict
 from typing import Any
 
+from benchmarks.quality import REPORT_KIND
 from benchmarks.quality.evaluate import QualityResult, SceneResult
 from benchmarks.quality.figures import Figures
 from benchmarks.quality.tables import COLUMNS
-
-REPORT_KIND = "deltalight quality report"
 
 
 def as_data(result: QualityResult) -> dict[str, Any]:

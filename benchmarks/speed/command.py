@@ -12,19 +12,36 @@ from rich.progress import Progress
 from benchmarks.speed.compare import compare_reports, print_comparison
 from benchmarks.speed.counts import count_frames, print_counts
 from benchmarks.speed.measure import SpeedJob, measure_speed
+from benchmarks.speed.report import SpeedReport
 from benchmarks.speed.tables import print_report
 from protocol.files import write_bytes
 
 
 def run_speed(job: SpeedJob, budget_ms: float, *, end_to_end: bool, out: Path | None, as_json: bool) -> None:
-    """Measure, write the report to `out` if given, and print it."""
-    with _progress() as progress:
-        report = measure_speed(job, budget_ms, progress, end_to_end=end_to_end)
-    text = report.model_dump_json(indent=2)
-    if out is not None:
-        write_bytes(out, text.encode())
+    """Measure, write the report to `out` if given after every motion, and print it, also if it is stopped before."""
+    newest: SpeedReport | None = None
+
+    def keep(report: SpeedReport) -> None:
+        nonlocal newest
+        newest = report
+        if out is not None:
+            write_bytes(out, _as_text(report).encode())
+
+    try:
+        with _progress() as progress:
+            measure_speed(job, budget_ms, progress, keep, end_to_end=end_to_end)
+    finally:  # Ctrl-C, or a method that fails after others were measured
+        if newest is not None:
+            _print_speed(newest, as_json=as_json)
+
+
+def _as_text(report: SpeedReport) -> str:
+    return report.model_dump_json(indent=2)
+
+
+def _print_speed(report: SpeedReport, *, as_json: bool) -> None:
     if as_json:
-        print(text)
+        print(_as_text(report))
     else:
         print_report(report, Console())
 

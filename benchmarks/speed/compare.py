@@ -42,14 +42,19 @@ def compare_reports(before: Path, after: Path) -> list[Row]:
         DeltalightError: a file is no report, or the two are of different machines or sizes, or share no motion.
     """
     old, new = read_report(before), read_report(after)
-    _require_alike(old, new)
+    require_alike(old, new)
     rows = list(_rows(old, new))
     if not rows:
         raise DeltalightError(f"{before} and {after} have no motion of the same method in common.")
     return rows
 
 
-def _require_alike(old: SpeedReport, new: SpeedReport) -> None:
+def require_alike(old: SpeedReport, new: SpeedReport) -> None:
+    """Check that times of two reports may stand beside each other.
+
+    Raises:
+        DeltalightError: they are of different machines or picture sizes.
+    """
     sizes = ["x".join(map(str, each.size)) for each in (old, new)]
     for kind, first, second in (("machines", old.machine, new.machine), ("picture sizes", *sizes)):
         if first != second:

@@ -2,7 +2,7 @@
 
 import os
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -27,6 +27,8 @@ from render_server.graph import Graph
 from render_server.renderer import SceneRenderer
 from services.demo import collect_composites, demo_scene
 from services.offline import with_output
+
+Keep = Callable[[SpeedReport], None]
 
 WARM_UP_FRAMES = 3  # drivers compile and specialise shaders in the first frames
 
@@ -69,31 +71,37 @@ class FrameTimes:
         return sum(self.stages_ms.values())
 
 
-def measure_speed(job: SpeedJob, budget_ms: float, progress: Progress, *, end_to_end: bool) -> SpeedReport:
+def measure_speed(
+    job: SpeedJob, budget_ms: float, progress: Progress, keep: Keep, *, end_to_end: bool
+) -> SpeedReport:
     """Measure every motion by every method; frames that take longer than `budget_ms` are late.
+
+    `keep` is given the report so far after every motion, so that nothing is lost where a run is stopped.
 
     Raises:
         DeltalightError: no OpenGL, missing demo files, or a process that died for good.
     """
     scenes, take = job.scenes(), prepare_take(progress)
     with opened(job.device) as gpu:
-        run = _Run(gpu, job, take, measure_peaks(gpu), budget_ms, progress)
-        methods = {name: run.method(name, scene) for name, scene in scenes.items()}
+        frame = take.standing[0].camera
+        report = SpeedReport(
+            version=version("deltalight"),
+            renderer=gpu.renderer_name,
+            cpus=os.cpu_count() or 1,
+            size=job.size or (frame.width, frame.height),
+            frames=job.frames,
+            budget_ms=budget_ms,
+            peaks=measure_peaks(gpu),
+            methods={},
+        )
+        run = _Run(gpu, job, take, report, _Shown(progress, job), keep)
+        for name, scene in scenes.items():
+            run.measure(name, scene)
     if end_to_end:
-        for method in progress.track(methods, description="camera to viewer"):
-            through = _measure_end_to_end(scenes[method], job.frames)
-            methods[method] = methods[method].replaced(end_to_end=through)
-    frame = take.standing[0].camera
-    return SpeedReport(
-        version=version("deltalight"),
-        renderer=gpu.renderer_name,
-        cpus=os.cpu_count() or 1,
-        size=job.size or (frame.width, frame.height),
-        frames=job.frames,
-        budget_ms=budget_ms,
-        peaks=run.peaks,
-        methods=methods,
-    )
+        through = [method.name for method in job.methods if method.runs_in_processes]
+        for name in progress.track(through, description="camera to viewer"):
+            run.add(name, end_to_end=_measure_end_to_end(scenes[name], job.frames))
+    return report
 
 
 @contextmanager
@@ -116,32 +124,63 @@ def rendering(gpu: GpuContext, scene: SceneDocument) -> Iterator[SceneRenderer]:
         renderer.release()
 
 
+class _Shown:
+    """Tells how far a run is: one bar, and a line for each motion that is done."""
+
+    def __init__(self, progress: Progress, job: SpeedJob) -> None:
+        self._progress, self._frames = progress, job.frames
+        self._motions, self._done = len(job.methods) * len(job.motions), 0
+        self._task = progress.add_task("", total=self._motions * (WARM_UP_FRAMES + job.frames))
+
+    def frame(self, name: str, motion: str, number: int) -> None:
+        """Another frame begins, counted from 0."""
+        measured = number - WARM_UP_FRAMES + 1
+        which = "warming up" if measured < 1 else f"frame {measured} of {self._frames}"
+        place = f"motion {self._done + 1} of {self._motions}"
+        self._progress.update(self._task, description=f"{name}: {motion} ({place}), {which}", advance=1)
+
+    def motion(self, name: str, motion: str, found: MotionFigures) -> None:
+        """A motion is done."""
+        self._done += 1
+        line = f"{name}: {motion}, {found.frame_ms.median:.1f} ms a frame ({self._done} of {self._motions} motions)"
+        self._progress.console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+
 @dataclass(frozen=True)
 class _Run:
-    """What all measurements of a run share."""
+    """What all measurements of a run share; `report` grows."""
 
     gpu: GpuContext
     job: SpeedJob
     take: Take
-    peaks: Peaks
-    budget_ms: float
-    progress: Progress
+    report: SpeedReport
+    shown: _Shown
+    keep: Keep
 
-    def method(self, name: str, scene: SceneDocument) -> MethodFigures:
+    def measure(self, name: str, scene: SceneDocument) -> None:
         """Measure one method, its motions by one renderer."""
         with rendering(self.gpu, scene) as renderer:
             renderer.render(self.take.standing[0])
             notices = list(renderer.notices)  # those of the demo itself; other lights bring further ones
-            motions = {motion: self._motion(name, motion, scene, renderer) for motion in self.job.motions}
-            return MethodFigures(motions=motions, notices=notices)
+            motions: dict[str, MotionFigures] = {}
+            for motion in self.job.motions:
+                motions[motion] = self._motion(name, motion, scene, renderer)
+                self.add(name, motions=dict(motions), notices=notices)
+                self.shown.motion(name, motion, motions[motion])
+
+    def add(self, name: str, **figures: object) -> None:
+        """Put figures of a method into the report, and hand that on."""
+        known = dict(self.report.methods[name]) if name in self.report.methods else {}
+        self.report.methods[name] = MethodFigures.model_validate({**known, **figures})
+        self.keep(self.report)
 
     def _motion(self, name: str, motion: str, scene: SceneDocument, renderer: SceneRenderer) -> MotionFigures:
-        count = WARM_UP_FRAMES + self.job.frames
-        steps = steps_of(motion, self.take, scene, count)
-        shown = self.progress.track(steps, count, description=f"{name}: {motion}")
-        times = [time_step(renderer, step) for step in shown][WARM_UP_FRAMES:]
+        times: list[FrameTimes] = []
+        for number, step in enumerate(steps_of(motion, self.take, scene, WARM_UP_FRAMES + self.job.frames)):
+            self.shown.frame(name, motion, number)
+            times.append(time_step(renderer, step))
         moved = {} if renderer.graph is None else stage_bytes(renderer.graph)
-        return motion_figures(times, moved, self.peaks, self.budget_ms)
+        return motion_figures(times[WARM_UP_FRAMES:], moved, self.report.peaks, self.report.budget_ms)
 
 
 def time_step(renderer: SceneRenderer, step: Step) -> FrameTimes:

@@ -106,7 +106,7 @@ def object_is_dragged(take: Take, scene: SceneDocument) -> Iterator[Step]:
     first, *others = scene.objects
     for number, frame in zip(count(), cycle(take.standing)):
         moved = _dragged(first, 2 * math.pi * (number % DRAG_STEPS) / DRAG_STEPS)
-        yield Step(frame, scene.replaced(objects=[moved, *others]))
+        yield Step(frame, scene.model_copy(update={"objects": (moved, *others)}))
 
 
 def _dragged(item: SceneObject, angle: float) -> SceneObject:
@@ -161,7 +161,7 @@ def lamp_is_dimmed(take: Take, scene: SceneDocument) -> Iterator[Step]:
     first, *others = scene.lights.manual
     for frame, share in zip(cycle(take.standing), cycle(LAMP_SHARES)):
         lights = scene.lights.replaced(manual=[_dimmed(first, share), *others])
-        yield Step(frame, scene.replaced(lights=lights))
+        yield Step(frame, scene.model_copy(update={"lights": lights}))
 
 
 def _dimmed(light: ManualLight, share: float) -> ManualLight:

@@ -81,7 +81,7 @@ class MethodChoice:
         Raises:
             DeltalightError: a plugin cannot.
         """
-        with _blamed(self.plugin):
+        with _blamed(self.plugin), graph.of_plugin(self.plugin):
             return self.method.declare(graph, resources, setup)
 
 

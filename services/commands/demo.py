@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from protocol.errors import DeltalightError
-from services.commands.options import Method
+from services.commands.options import MethodName, require_method
 from services.ports import PAGE_PORT
 
 
@@ -20,19 +20,18 @@ def demo(
     ] = False,
     frames: Annotated[int, typer.Option(min=1, max=100_000, help="Composites of a headless demo.")] = 30,
     out: Annotated[Path | None, typer.Option(help="Folder of a headless demo.")] = None,
-    method: Annotated[
-        Method, typer.Option(help="Relighting method; dvct is as the demo's scene says.")
-    ] = Method.DVCT,
+    method: MethodName = "dvct",
     no_browser: Annotated[bool, typer.Option("--no-browser", help="Do not open a browser.")] = False,
     port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the dashboard.")] = PAGE_PORT,
     as_json: Annotated[bool, typer.Option("--json", help="Print a headless demo's summary as JSON.")] = False,
 ) -> None:
     """Play the shipped recording through node, render server and web process, and open the dashboard."""
+    method = require_method(method)
     from services.demo import run_headless, run_live
 
     if not headless:
-        run_live(method.value, port=port, with_browser=not no_browser)
+        run_live(method, port=port, with_browser=not no_browser)
         return
     if out is None:
         raise DeltalightError("A headless demo writes files; name their folder with --out.")
-    run_headless(method.value, frames, out, as_json=as_json)
+    run_headless(method, frames, out, as_json=as_json)

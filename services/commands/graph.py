@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from services.commands.options import parse_method
+from services.commands.options import MethodName, require_method
 
 if TYPE_CHECKING:
     from services.frame_account import FrameAccount
@@ -18,7 +18,7 @@ NARROWEST = 150  # columns of a table that no terminal shows
 
 def graph(
     *,
-    method: Annotated[str, typer.Option(help="Relighting method, as for `demo`.")] = "dvct",
+    method: MethodName = "dvct",
     svg: Annotated[Path | None, typer.Option(metavar="FILE", help="Draw the graph into an SVG file.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the graph as JSON.")] = False,
 ) -> None:
@@ -27,13 +27,13 @@ def graph(
     Renders a small scene of its own whose real geometry is given; the frame that is shown comes after the camera has
     turned by a degree.
     """
-    chosen = parse_method(method)
+    method = require_method(method)
     from protocol.files import write_bytes
     from services.frame_account import account_frame
     from services.graph_drawing import draw_graph
 
     with _progress() as watch:
-        account = account_frame(chosen.value, watch)
+        account = account_frame(method, watch)
     if svg is not None:
         write_bytes(svg, draw_graph(account.title, account.sources, account.stages).encode())
         typer.echo(f"The picture is in {svg}.", err=True)

@@ -30,28 +30,31 @@ class Quality(StrEnum):
     BEST = "best"
 
 
-class Method(StrEnum):
-    """A relighting method: dvct as the scene says, or with one of its operators, or another one with its defaults."""
-
-    DVCT = "dvct"
-    EXACT = "exact"
-    PAPER = "paper"
-    DLPV = "dlpv"
-    DLPV_PAPER = "dlpv-paper"
-    AROOF = "aroof"
-    DIFFERENTIAL = "differential"
-    NONE = "none"
+METHODS = ("dvct", "exact", "paper", "dlpv", "dlpv-paper", "aroof", "differential", "none")
+"""The project's relighting methods: dvct as the scene says, or one of its operators, or another one's defaults."""
+MethodName = Annotated[
+    str,
+    typer.Option(
+        "--method",
+        help=f"Relighting method: {', '.join(METHODS)}, or a plugin's; dvct is as the demo's scene says.",
+    ),
+]
 
 
-def parse_method(name: str) -> Method:
-    """The method of that name.
+def require_method(name: str) -> str:
+    """Return the name if there is such a method, the project's or an installed plugin's.
 
     Raises:
-        DeltalightError: there is none.
+        DeltalightError: there is none, or it comes from a plugin that cannot be used.
     """
-    known = [method.value for method in Method]
+    from protocol.methods import PLUGINS
+
+    known = [*METHODS, *PLUGINS.values]
     if name in known:
-        return Method(name)
+        return name
+    fault = PLUGINS.fault(name)
+    if fault is not None:
+        raise DeltalightError(fault)
     nearest = get_close_matches(name, known, 1, cutoff=0)[0]
     raise DeltalightError(f"'{name}' is no method; the nearest is {nearest}, of {', '.join(known)}.")
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from rich.progress import Progress
 
-from benchmarks.cli import DEFAULT_MOTIONS, TIMEABLE, TIMED_METHODS
+from benchmarks.cli import DEFAULT_MOTIONS, TIMED_METHODS
 from benchmarks.speed.counts import count_motion
-from benchmarks.speed.measure import FrameTimes, motion_figures, time_step
+from benchmarks.speed.measure import WARM_UP_FRAMES, FrameTimes, motion_figures, time_step
 from benchmarks.speed.motions import (
     ARM_STEPS,
     DRAG_STEPS,
@@ -19,13 +19,14 @@ from benchmarks.speed.motions import (
     MOTIONS,
     STANDING,
     SWING,
+    Step,
     Take,
     parse_motions,
     steps_of,
 )
 from benchmarks.speed.peaks import measure_peaks, stage_bytes
 from benchmarks.speed.report import MotionFigures, Peaks, read_report
-from benchmarks.variants import FIXED, parse_variants
+from benchmarks.variants import FIXED, RENDERED, parse_variants
 from protocol.errors import DeltalightError
 from protocol.scene import SceneDocument
 from protocol.source import open_source
@@ -143,11 +144,11 @@ def test_names_of_motions_and_methods() -> None:
     for text, sentence in (("stil", "nearest is still"), ("", "camera"), ("arm,arm", "twice")):
         with pytest.raises(DeltalightError, match=sentence):
             parse_motions(text)
-    assert [each.name for each in parse_variants(TIMED_METHODS, TIMEABLE)] == TIMED_METHODS.split(",")
-    assert set(TIMEABLE) < set(FIXED)
+    assert [each.name for each in parse_variants(TIMED_METHODS, RENDERED)] == TIMED_METHODS.split(",")
+    assert set(RENDERED) < set(FIXED)
     for name in ("camera", "path", "fisheye"):
         with pytest.raises(DeltalightError, match=f"'{name}' is no method"):
-            parse_variants(name, TIMEABLE)
+            parse_variants(name, RENDERED)
 
 
 # Figures
@@ -182,7 +183,7 @@ def test_what_moves_is_what_runs(renderer: SceneRenderer, take: Take, scene: Sce
     ],
 )
 def test_each_kind_of_method_is_measured_and_counted(method: str, gpu: GpuContext, take: Take) -> None:
-    (variant,) = parse_variants(method, TIMEABLE)
+    (variant,) = parse_variants(method, RENDERED)
     scene = variant.applied(demo_scene("dvct"), None)
     renderer = SceneRenderer(gpu, scene)
     camera, still = (measured(renderer, motion, take, scene) for motion in ("camera", "still"))
@@ -269,6 +270,48 @@ def test_a_run_writes_its_report_and_prints_it(tmp_path: Path, capsys: pytest.Ca
     assert list(found.methods["paper:cone_scale=4"].motions) == ["still", "camera"]
     assert run(["bench", "speed", "--compare", str(report), str(report)]) == 0
     assert "0 of" in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("prepared")
+def test_a_run_that_is_stopped_loses_nothing_and_has_told_what_it_did(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    taken: list[Step] = []
+
+    def until_ctrl_c(renderer: SceneRenderer, step: Step) -> FrameTimes:
+        taken.append(step)
+        if len(taken) > WARM_UP_FRAMES + 2:
+            assert list(read_report(report).methods["paper:cone_scale=4"].motions) == ["still"]
+            raise KeyboardInterrupt
+        return time_step(renderer, step)
+
+    monkeypatch.setattr("benchmarks.speed.measure.time_step", until_ctrl_c)
+    report = tmp_path / "speed.json"
+    assert run(["bench", "speed", *OPTIONS, "--out", str(report)]) == 130
+    out, err = capsys.readouterr()
+    assert "still" in out
+    assert "camera" not in out
+    assert "paper:cone_scale=4: still, " in err
+    assert "(1 of 2 motions)" in err
+    assert list(read_report(report).methods["paper:cone_scale=4"].motions) == ["still"]
+
+
+def test_the_floor_draws_the_object_and_leaves_all_else(gpu: GpuContext, take: Take) -> None:
+    (raster,) = parse_variants("raster", RENDERED)
+    renderer = SceneRenderer(gpu, raster.applied(demo_scene("dvct"), None), checks=True)
+    frame = take.standing[0]
+    shown = renderer.render(frame).color
+    assert renderer.graph is not None
+    coverage = renderer.graph["object surface"].coverage.texture
+    covered = np.frombuffer(coverage.read(), np.float16).reshape(SIZE[1], SIZE[0], -1)[..., 0] > 0
+    moved = measured(renderer, "camera", take, renderer.scene)
+    dimmed = measured(renderer, "lamps", take, renderer.scene)
+    renderer.release()
+    assert 0.02 < covered.mean() < 0.2
+    assert (shown[~covered] == frame.color[~covered]).all()
+    assert (np.abs(shown[covered].astype(int) - frame.color[covered]).max(axis=1) > 8).mean() > 0.9
+    assert not any("shadow" in name or "voxel" in name for name in moved.stages)
+    assert {"lamps", "virtual surface"} <= dimmed.stages.keys()
 
 
 @pytest.mark.slow

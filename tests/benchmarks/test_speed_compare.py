@@ -1,9 +1,14 @@
-"""Two reports of `bench speed` side by side."""
+"""Two reports of `bench speed` side by side, and reports of speed and quality in one picture."""
 
+import json
+import math
+from itertools import combinations
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 
+from benchmarks.plot import BOTTOM, LEFT, RIGHT, TOP, place_labels
 from benchmarks.speed.compare import Row, compare_reports
 from benchmarks.speed.report import MethodFigures, MotionFigures, Peaks, SpeedReport, Spread, StageFigures
 from services.cli import run
@@ -78,5 +83,81 @@ def test_what_cannot_be_compared_is_refused_in_a_sentence(
         (write(tmp_path / "method.json", "paper"), "in common"),
     ):
         assert run(["bench", "speed", "--compare", str(good), str(other)]) == 2
+        (line,) = capsys.readouterr().err.strip().splitlines()
+        assert sentence in line
+
+
+def write_quality(file: Path, **db: float | None) -> Path:
+    means = {name: {"changed_psnr_db": value, "frame_ms": 1.0} for name, value in db.items()}
+    scenes = {"tabletop": {}, "cornell": {}}
+    about = {"kind": "deltalight quality report", "size": [16, 12], "spp": 8, "cpus": 2}
+    file.write_text(json.dumps({**about, "means": means, "scenes": scenes}))
+    return file
+
+
+def drawn(path: Path) -> dict[str, tuple[float, float]]:
+    """Where the picture's round markers lie, by the label of their group."""
+    svg = "{http://www.w3.org/2000/svg}"
+    found = {}
+    for group in ElementTree.parse(path).getroot().iter(f"{svg}g"):
+        circle, label = group.find(f"{svg}circle"), group.findtext(f"{svg}text")
+        if circle is not None:
+            found[str(label)] = float(circle.attrib["cx"]), float(circle.attrib["cy"])
+    return found
+
+
+def test_a_picture_has_a_point_for_each_method_of_both_kinds_of_reports(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    times_ms = {"fast": 10, "middle": 100, "slow": 1000}
+    reports = [
+        write(tmp_path / f"{name}.json", name, motions={"arm": motion(ms)}) for name, ms in times_ms.items()
+    ]
+    reports.append(write(tmp_path / "again.json", "slow", motions={"arm": motion(3)}))
+    quality = write_quality(tmp_path / "quality.json", slow=35, middle=30, fast=25, path=20, undefined=None)
+    speed = [option for report in reports for option in ("--speed", str(report))]
+    options = ("--quality", str(quality), "--motion", "arm", "--out", str(tmp_path / "plot.svg"))
+    assert run(["bench", "plot", *speed, *options]) == 0
+    assert "path, undefined" in capsys.readouterr().err
+    places = drawn(tmp_path / "plot.svg")
+    (fast, high), (middle, between), (slow, low) = (places[name] for name in times_ms)
+    assert middle - fast == pytest.approx(slow - middle, abs=0.2)  # a logarithmic axis: times ten, twice
+    assert fast < slow
+    assert high - between == pytest.approx(between - low, abs=0.2)
+    assert high > low  # better is further up
+    text = (tmp_path / "plot.svg").read_text()
+    assert "tabletop, cornell" in text
+    assert "motion `arm`" in text
+
+
+def test_labels_lie_beside_their_points_and_on_nothing_else() -> None:
+    points = [(LEFT + 300 + 14 * (number % 4), TOP + 200 + 9 * (number // 4)) for number in range(12)]
+    points += [(RIGHT - 3, BOTTOM - 3), (LEFT + 3, TOP + 3)]
+    line = (points[0], points[11])
+    boxes = place_labels(points, [f"exact balanced {number}" for number in range(14)], [line])
+    for one, other in combinations(boxes, 2):
+        assert one[2] <= other[0] or other[2] <= one[0] or one[3] <= other[1] or other[3] <= one[1]
+    for left, top, right, bottom in boxes:
+        assert LEFT < left < right < RIGHT
+        assert TOP < top < bottom < BOTTOM
+        assert not any(left <= x <= right and top <= y <= bottom for x, y in points)
+    lone = place_labels([(500.0, 300.0)], ["exact"])[0]
+    assert math.dist((lone[0], (lone[1] + lone[3]) / 2), (500, 300)) < 15
+
+
+def test_what_cannot_be_drawn_is_refused_in_a_sentence(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    speed = write(tmp_path / "a.json", "exact")
+    quality = write_quality(tmp_path / "quality.json", paper=30)
+    other = write(tmp_path / "machine.json", "paper", cpus=4)
+    for options, sentence in (
+        (("--speed", speed, "--quality", quality), "same --methods"),
+        (("--speed", speed, "--speed", other, "--quality", quality), "different machines"),
+        (("--speed", other, "--quality", quality), "moving as in `camera`"),
+        (("--speed", speed, "--quality", speed), "no report of `bench quality`"),
+        (("--speed", quality, "--quality", quality), "no report of this version's `bench speed`"),
+    ):
+        assert run(["bench", "plot", *map(str, options), "--out", str(tmp_path / "plot.svg")]) == 2
         (line,) = capsys.readouterr().err.strip().splitlines()
         assert sentence in line

@@ -6,10 +6,11 @@ import pytest
 
 from benchmarks.cli import DEFAULT_METHODS
 from benchmarks.quality.ablation import ABLATION_STEPS, ablation_chain
-from benchmarks.variants import parse_variants
+from benchmarks.variants import RENDERED, parse_variants
 from protocol.errors import DeltalightError
 from protocol.scene import parse_scene
 from protocol.scene_method import DvctMethod, NoneMethod
+from render_server.methods.registry import choose_method
 
 SCENE = parse_scene({"method": {"name": "dvct", "volume_edge_m": 0.7}})
 
@@ -34,6 +35,15 @@ def test_variant_changes_its_settings_only() -> None:
     assert isinstance(parse_variants("none")[0].applied(SCENE, None).method, NoneMethod)
 
 
+def test_the_floor_is_a_method_that_no_document_may_name() -> None:
+    (raster,) = parse_variants("raster:quality=live", RENDERED)
+    document = raster.applied(SCENE, 64)
+    assert (document.method.name, document.method.quality) == ("raster", "live")
+    assert choose_method(document.method, software=True).resolved.triangle_budget < 40_000
+    with pytest.raises(DeltalightError, match="raster"):
+        parse_scene({"method": {"name": "raster"}})
+
+
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
@@ -45,7 +55,10 @@ def test_variant_changes_its_settings_only() -> None:
         ("exact:cone_count=[", "YAML"),
         ("exact:cone_count", "KEY=VALUE"),
         ("exact,exact", "twice"),
-        ("camera,path", "add exact"),
+        ("camera,path", "`path` .*add exact"),
+        ("camera,path+oidn", r"`path\+oidn` .*add exact"),
+        ("path,exact", "add exact to --methods before it"),
+        ("raster:volume_size=64", "volume_size"),
     ],
 )
 def test_wrong_methods_are_refused_in_a_sentence(text: str, sentence: str) -> None:

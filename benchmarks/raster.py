@@ -1,0 +1,94 @@
+"""A method for measurements alone, as cheap as a picture with objects gets: rasterised and composited.
+
+Lamps light the objects without shadows, the mean of all other light lights them evenly. Nothing real changes, and the
+real scene is neither voxelised nor lit. It is written as a plugin's method is (docs/plugins.md), but known in the
+measuring process only: no scene document may name it.
+"""
+
+from importlib.metadata import EntryPoint
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from protocol.methods import GROUP, PLUGINS, InstalledMethod
+from protocol.plugins import Plugin
+from protocol.scene_method import MethodSettings
+from render_server.methods.method import RelightingMethod, ResolvedSettings
+
+if TYPE_CHECKING:
+    from render_server.frame import FrameResources
+    from render_server.gpu.kernel import Bindings
+    from render_server.graph import Graph, Resource
+    from render_server.lights.lights import LightSet
+    from render_server.methods.lighting import Layers
+    from render_server.methods.method import Setup
+    from render_server.passes.cones import ConeFields, LowResGrid
+    from render_server.passes.lights import LightBuffers
+
+LEAST = ResolvedSettings(volume_size=32, cone_scale=4, rsm_size=16, triangle_budget=1000)
+"""Nothing reads the volume, the shadow maps or the real triangles."""
+
+
+class RasterMethod(MethodSettings):
+    """Objects rasterised over the picture, under lamps without shadows."""
+
+    name: Literal["raster"] = "raster"
+
+
+def declare(g: "Graph", s: "FrameResources", setup: "Setup[RasterMethod]") -> "Layers":
+    """Declares lamps without views, even light instead of cones, and no change of light."""
+    from render_server.methods import lighting
+    from render_server.methods.light_maps import LitScene
+    from render_server.passes.lights import LightBuffers
+    from render_server.passes.shading import DirectLight
+    from render_server.passes.voxels import PlacedVolume, VolumePlacement
+
+    size = setup.picture_size
+    buffers, direct = LightBuffers(g.gpu, LEAST.rsm_size, 1), DirectLight(g.gpu, size)
+    for texture in (direct.mu, direct.rho, direct.lobe_mu, direct.lobe_rho):
+        texture.write(bytes(8 * size[0] * size[1]))  # no light without objects, and none with them
+    shading = lighting.Shading(g.gpu, size, setup.resolved, buffers, direct, lighting.ShadingOptions())
+
+    def place(lights: "LightSet") -> "LightBuffers":
+        """Gives the lamps to the shaders; without points to shine on they get no shadow maps."""
+        nowhere = np.zeros((0, 3))
+        buffers.set_environment(lights.environment)
+        buffers.place(list(lights.lights), nowhere, nowhere, nowhere)
+        return buffers
+
+    def fill(lights: "LightSet") -> "ConeFields":
+        """Writes the mean of the environment in place of what cones gather."""
+        width, height = shading.grid.size
+        even = np.ones((height, width, 4), np.float16)
+        even[..., :3] = lights.environment.mean(axis=(0, 1))
+        fields = shading.cones
+        for radiance in (fields.specular_mu, fields.specular_rho, fields.virtual_specular):
+            radiance.write(even)
+        even[..., :3] *= np.pi
+        for irradiance in (fields.mu, fields.rho, fields.virtual):
+            irradiance.write(even)
+        return fields
+
+    def gather(_scene: "Resource[Bindings]", _grid: "Resource[LowResGrid]") -> "Resource[ConeFields]":
+        return g.stage("even light", fill, s.lights)
+
+    g.own(buffers)
+    lamps = g.stage("lamps", place, s.lights)
+    volume = PlacedVolume(g.gpu, VolumePlacement((0.0, 0.0, 0.0), 1.0, LEAST.volume_size))
+    placed = g.value("volume", lambda _: volume, s.surfaces)
+    g.own(volume)
+    lit = LitScene(buffers, lamps, lamps, lamps)
+    return lighting.shading_stages(g, s, shading, lit, placed, gather, light_directly=lambda *_: direct)
+
+
+def _resolve(_settings: RasterMethod, _defaults: ResolvedSettings) -> ResolvedSettings:
+    return LEAST
+
+
+def register_raster() -> None:
+    """Makes the renderer of this process know the method."""
+    plugin = Plugin(EntryPoint(RasterMethod.method_name(), "benchmarks.raster:METHOD", GROUP))
+    PLUGINS.values.setdefault(plugin.name, InstalledMethod(plugin, RasterMethod, METHOD))
+
+
+METHOD = RelightingMethod(RasterMethod, declare, _resolve)
