@@ -9,7 +9,7 @@ from protocol.documents import nearest, parse_mapping, validate
 from protocol.errors import DeltalightError
 from protocol.methods import PLUGINS, SETTINGS
 from protocol.scene import SceneDocument
-from protocol.scene_method import MethodSettings, NoneMethod
+from protocol.scene_method import MethodSettings, NoneMethod, Output
 
 RASTER = RasterMethod.method_name()
 MODELS: dict[str, type[MethodSettings]] = {**SETTINGS, RASTER: RasterMethod}
@@ -28,6 +28,7 @@ ADJUSTABLE: dict[str, tuple[str, dict[str, Any]]] = {
     RASTER: (RASTER, {}),
 }
 """Variants that take settings: their kind and what they set themselves. Installed plugins are among them."""
+OUTPUT = "output."
 TIMED_VARIANT = "exact"
 """The kinds of path tracing take the time of this one's frame."""
 
@@ -120,7 +121,9 @@ RENDERED = tuple(
 
 
 def parse_variants(text: str, known: Collection[str] = FIXED) -> list[Variant]:
-    """Parse `camera,paper,exact:cone_count=32,cone_scale=1`: names among `known` with settings, separated by commas.
+    """Parse `camera,paper,exact:cone_count=32,output.antialiasing=true`: names among `known`, separated by commas.
+
+    Settings are the method's, or the document's `output`.
 
     Raises:
         DeltalightError: an unknown name, or a setting that the method does not have or allow.
@@ -159,7 +162,13 @@ def _parse(text: str, known: Collection[str]) -> Variant:
     settings = dict(own)
     for pair in changes.split(","):
         settings |= _setting(pair, text)
-    validate(MODELS[kind], settings, f"--methods {text}")
+    where = f"--methods {text}"
+    validate(MODELS[kind], {key: value for key, value in settings.items() if "." not in key}, where)
+    output = {key.removeprefix(OUTPUT): value for key, value in settings.items() if key.startswith(OUTPUT)}
+    others = [key for key in settings if "." in key and not key.startswith(OUTPUT)]
+    if others:
+        raise DeltalightError(f"`{others[0]}` in '{text}' is no setting; write one of the method, or output.KEY.")
+    validate(Output, output, where)
     return Variant(text, f"{name} with {changes.replace(',', ', ')}", kind, settings)
 
 

@@ -32,6 +32,8 @@ def test_variant_changes_its_settings_only() -> None:
     assert method == DvctMethod(operator="exact", cone_count=32, volume_edge_m=0.7, volume_size=128)
     (own_size,) = parse_variants("exact:volume_size=64")
     assert own_size.applied(SCENE, 128).method.volume_size == 64
+    (hurried,) = parse_variants("exact:output.frame_budget_ms=125")
+    assert hurried.applied(SCENE, None).output.frame_budget_ms == 125
     assert isinstance(parse_variants("none")[0].applied(SCENE, None).method, NoneMethod)
 
 
@@ -53,6 +55,8 @@ def test_the_floor_is_a_method_that_no_document_may_name() -> None:
         ("exact:cone_cont=3", "cone_count"),
         ("exact:cone_count=1000", "64"),
         ("exact:cone_count=[", "YAML"),
+        ("exact:output.frame_budget=9", "frame_budget_ms"),
+        ("exact:lights.mode=fisheye", "output.KEY"),
         ("exact:cone_count", "KEY=VALUE"),
         ("exact,exact", "twice"),
         ("camera,path", "`path` .*add exact"),
