@@ -1069,6 +1069,13 @@ export interface components {
              */
             readonly near_light: "measured" | "none";
             /**
+             * Quality
+             * @description What a moving picture may give up for speed (docs/speed.md): live, balanced, or best: nothing.
+             * @default best
+             * @enum {string}
+             */
+            readonly quality: "live" | "balanced" | "best";
+            /**
              * Rays
              * @description Rays from each sample over the whole sphere; more take longer once.
              * @default 256
@@ -1310,6 +1317,13 @@ export interface components {
              */
             readonly name: "differential";
             /**
+             * Quality
+             * @description What a moving picture may give up for speed (docs/speed.md): live, balanced, or best: nothing.
+             * @default best
+             * @enum {string}
+             */
+            readonly quality: "live" | "balanced" | "best";
+            /**
              * Radiance
              * @description Of the exact operator: real surfaces shine as the camera sees them, or as lights predict.
              * @default measured
@@ -1469,6 +1483,13 @@ export interface components {
              */
             readonly propagation?: ("moments" | "lobes") | null;
             /**
+             * Quality
+             * @description What a moving picture may give up for speed (docs/speed.md): live, balanced, or best: nothing.
+             * @default best
+             * @enum {string}
+             */
+            readonly quality: "live" | "balanced" | "best";
+            /**
              * Query Scale
              * @description The volume is read at 1/scale of the picture; null = 2 on a GPU, 4 in software.
              */
@@ -1592,6 +1613,13 @@ export interface components {
              * @enum {string}
              */
             readonly operator: "exact" | "paper";
+            /**
+             * Quality
+             * @description What a moving picture may give up for speed (docs/speed.md): live, balanced, or best: nothing.
+             * @default best
+             * @enum {string}
+             */
+            readonly quality: "live" | "balanced" | "best";
             /**
              * Radiance
              * @description Of the exact operator: real surfaces shine as the camera sees them, or as lights predict.
@@ -1939,6 +1967,11 @@ export interface components {
             readonly pass_times_ms: {
                 readonly [key: string]: number;
             };
+            /**
+             * Render Ms
+             * @description From the frame's arrival at the renderer to its picture, waiting included.
+             */
+            readonly render_ms: number;
             /** Renderer */
             readonly renderer: string;
             /** @description null where another program set the server's scene. */
@@ -2246,6 +2279,13 @@ export interface components {
              * @constant
              */
             readonly name: "none";
+            /**
+             * Quality
+             * @description What a moving picture may give up for speed (docs/speed.md): live, balanced, or best: nothing.
+             * @default best
+             * @enum {string}
+             */
+            readonly quality: "live" | "balanced" | "best";
         };
         /**
          * Output
@@ -3173,6 +3213,11 @@ export interface components {
          * @description How the render server and the nodes are doing.
          */
         readonly State: {
+            /**
+             * Has Fisheye
+             * @description Whether light of a fish-eye camera has come.
+             */
+            readonly has_fisheye: boolean;
             /** @description What became of the active scene's newest revision. */
             readonly picture: components["schemas"]["PictureState"] | null;
             /**

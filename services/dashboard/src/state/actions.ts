@@ -10,14 +10,16 @@ import type {
   PickAnswer,
   Pose,
   SceneAnswer,
+  Vector,
   View,
 } from "../api/types";
-import { boundsOf, longestEdge, sensibleScale, standOn } from "../math/bounds";
+import { boundsOf, longestEdge, restOn, sensibleScale, standOn, type Bounds } from "../math/bounds";
 import { meetPlane, type Pixel } from "../math/camera";
 import { UP } from "../math/vector";
 import { size, trimmed } from "../math/units";
 import { pictureSize, view } from "../live/picture";
 import { assetName, boundsByObject } from "./assets";
+import { footprintOf, freePlace, standable } from "./freeSpace";
 import { edit } from "./gesture";
 import { rounded } from "./handle";
 import { change, lights, objects, readScene, readScenes, sceneDocument, takeScene } from "./scene";
@@ -32,32 +34,55 @@ export async function pick(pixel: Pixel): Promise<PickAnswer | undefined> {
   return attempt(() => lookAt(pixel));
 }
 
-/** Where something new is put: on what the picture shows at a pixel, else on the board's plane there. */
-async function placeAt(pixel: Pixel): Promise<Pick<PickAnswer, "point_m" | "normal">> {
-  const found = await pick(pixel);
-  if (found?.point_m) return found;
-  const point_m = view.value ? meetPlane(view.value, pixel, [0, 0, 0], UP) : null;
-  if (point_m) toast("No surface was seen there; the object stands on the board's plane.");
-  return { point_m: point_m ?? [0, 0, 0], normal: UP };
-}
-
-/** Add an object of an asset at a pixel, named as a file; it stands on the surface there. */
-export async function addObject(asset: AssetAnswer, pixel: Pixel = centre(), name = assetName(asset)): Promise<void> {
+/** Add an object of an asset, named as a file: at a pixel, or where the middle of the picture has room for it. */
+export async function addObject(
+  asset: AssetAnswer,
+  pixel: Pixel | null = null,
+  name = assetName(asset),
+): Promise<void> {
   if (!(await ensureScene())) return;
-  const { point_m, normal } = await placeAt(pixel);
   const bounds = boundsOf(asset, null);
   const scale = bounds ? sensibleScale(bounds) : 1;
-  const pose = standOn({ ...UPRIGHT, scale }, bounds, point_m ?? [0, 0, 0], normal ?? UP);
+  const pose: Pose = { ...UPRIGHT, scale };
+  const point = pixel ? await pointAt(pixel) : await roomFor(pose, bounds);
   const id = freeId(name);
-  if (!(await change("POST", "/objects", { id, asset: asset.asset, pose: rounded(pose) }))) return;
+  const body = { id, asset: asset.asset, pose: rounded(restOn(pose, bounds, point, UP)) };
+  if (!(await change("POST", "/objects", body))) return;
   selectObject(id);
-  announce(`${id} was added.`);
+  announce(`${id} added.`);
   if (bounds && scale !== 1) {
     const edge = longestEdge(bounds);
-    toast(
-      `${id} is ${size(edge)} long in its file; it was added at scale ${trimmed(scale, 9)}. Change it under Scale.`,
-    );
+    toast(`${id} is ${size(edge)} long in its file, so it was added at scale ${trimmed(scale, 9)}.`);
   }
+}
+
+/** Where something new stands at a pixel: on the surface seen there, or on what is behind a virtual object. */
+async function pointAt(pixel: Pixel): Promise<Vector> {
+  const first = await pick(pixel);
+  const found = first?.kind === "object" && first.object ? await attempt(() => lookAt(pixel, first.object!)) : first;
+  const point = standable(found);
+  if (point) return point;
+  toast("There is no level surface there, so the object stands on the plane of the board.");
+  return onBoard(pixel, found?.point_m ?? null);
+}
+
+/** The place on the board's plane at a pixel; below what is seen there, where that is in front of the plane's. */
+function onBoard(pixel: Pixel, seen: Vector | null): Vector {
+  if (seen) return [seen[0], seen[1], 0];
+  return (view.value && meetPlane(view.value, pixel, [0, 0, 0], UP)) ?? [0, 0, 0];
+}
+
+/** The free place nearest to the picture's middle. */
+async function roomFor(pose: Pose, bounds: Bounds | null): Promise<Vector> {
+  if (!view.value) return [0, 0, 0];
+  const taken = objects.value.flatMap((item) =>
+    item.frame === "world" ? footprintOf(item.pose, boundsByObject.value.get(item.id) ?? null) : [],
+  );
+  const wanted = { view: view.value, pixel: centre(), pose, bounds, taken };
+  const found = await freePlace(wanted, (at) => attempt(() => lookAt(at)));
+  if (found) return found;
+  toast("No free place was found, so the object stands in the middle of the picture. Drag it where you want it.");
+  return onBoard(centre(), null);
 }
 
 function centre(): Pixel {

@@ -5,7 +5,9 @@ import { lights } from "../../state/scene";
 import { partTarget } from "../../state/targets";
 import { toast } from "../../state/toasts";
 import { assets } from "../../state/assets";
+import { hasFisheye } from "../../state/processes";
 import { Segments, type Segment } from "../ui/Segments";
+import { useStateWatch } from "../ui/useStateWatch";
 import { EnvironmentSection } from "./EnvironmentSection";
 import { FisheyeSection } from "./FisheyeSection";
 import { LightSection } from "./LightSection";
@@ -29,8 +31,11 @@ const HELP: Readonly<Record<Mode, string>> = {
   environment: "A given panorama of the surroundings (HDR or EXR).",
 };
 
+const NO_FISHEYE = "Fish-eye light needs a fish-eye camera, and none is sending.";
+
 export function LightsPanel() {
   const found = lights.value;
+  useStateWatch();
   if (!found) return null;
   const disabled = role.value !== "control";
   return (
@@ -38,12 +43,13 @@ export function LightsPanel() {
       <Section title="Light comes from">
         <Segments
           label="Light mode"
-          segments={MODES}
+          segments={MODES.map((each) => ({ ...each, reason: reasonAgainst(each.value, found) }))}
           value={found.mode}
           onChange={(mode) => setMode(found, mode)}
           disabled={disabled}
         />
         <p class="quiet small">{HELP[found.mode]}</p>
+        {hasFisheye.value === false && <p class="quiet small">{NO_FISHEYE}</p>}
       </Section>
       {found.mode === "manual" && <ManualList lights={found} disabled={disabled} />}
       {found.mode === "manual" && <LightSection lights={found} disabled={disabled} />}
@@ -55,6 +61,11 @@ export function LightsPanel() {
       <RegistrationSection lights={found} disabled={disabled} />
     </>
   );
+}
+
+/** Why a mode cannot be chosen. */
+function reasonAgainst(mode: Mode, current: Lights): string | undefined {
+  return mode === "fisheye" && current.mode !== mode && hasFisheye.value === false ? NO_FISHEYE : undefined;
 }
 
 /** Some modes need something to begin with. */

@@ -4,6 +4,7 @@ import { Drawer } from "../drawer/Drawer";
 import { Inspector } from "../inspector/Inspector";
 import { Stage } from "../stage/Stage";
 import { SidePanel } from "../tree/SidePanel";
+import { Boundary } from "../ui/Boundary";
 import { KeysDialog } from "./KeysDialog";
 import { listenToKeys } from "./shortcuts";
 import { TopBar } from "./TopBar";
@@ -15,9 +16,17 @@ export function Workspace() {
       <a class="skip" href="#stage">
         To the picture
       </a>
-      <TopBar />
-      {isTreeOpen.value && <SidePanel />}
-      <Stage />
+      <Boundary name="The top bar">
+        <TopBar />
+      </Boundary>
+      {isTreeOpen.value && (
+        <Boundary name="The scene list">
+          <SidePanel />
+        </Boundary>
+      )}
+      <Boundary name="The picture">
+        <Stage />
+      </Boundary>
       {isInspectorOpen.value && <Inspector />}
       <Drawer />
       <KeysDialog />

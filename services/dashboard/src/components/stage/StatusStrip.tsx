@@ -1,7 +1,7 @@
-import { frame, view } from "../../live/picture";
+import { frame, rate, view } from "../../live/picture";
 import { droppedFrames } from "../../live/message";
 import { lensDeviation } from "../../math/camera";
-import { milliseconds } from "../../math/units";
+import { milliseconds, rateText } from "../../math/units";
 import { uploads } from "../../state/assets";
 
 // Beyond this share of the picture's width lines that should be straight are visibly bent.
@@ -22,7 +22,7 @@ export function StatusStrip() {
             tip="Of the scene that this frame shows"
           />
           <Figure name="Delay" value={milliseconds(header.age_ms)} />
-          <Figure name="Rate" value={header.frames_per_s === null ? "–" : `${header.frames_per_s.toFixed(1)} fps`} />
+          <Figure name="Rate" value={rateText(rate.value)} />
           <Figure name="Dropped" value={String(droppedFrames(header.drops))} tip={dropText(header.drops)} />
           <Figure name="Skipped" value={String(header.skipped)} tip="Frames that this browser was too slow for" />
         </dl>
