@@ -45,16 +45,13 @@ def demo_scene(method: str) -> SceneDocument:
 
 
 def with_method(scene: SceneDocument, method: str) -> SceneDocument:
-    """Return the scene with another method.
+    """Return the scene with a method: `exact` or `paper` (operators of dvct), or NAME[-OPERATOR].
 
-    `dvct` (as it is), its operator `exact` or `paper`, or NAME[-OPERATOR].
+    A method that the scene has keeps its settings.
     """
-    if method == "dvct":
-        return scene
-    if method in ("exact", "paper"):
-        return scene.replaced(method=scene.method.replaced(operator=method))
-    name, _, operator = method.partition("-")
-    return scene.replaced(method={"name": name, **({"operator": operator} if operator else {})})
+    name, _, operator = ("dvct", "", method) if method in ("exact", "paper") else method.partition("-")
+    chosen = scene if scene.method.name == name else scene.replaced(method={"name": name})
+    return chosen.replaced(method=chosen.method.replaced(operator=operator)) if operator else chosen
 
 
 def run_live(method: str, *, port: int, with_browser: bool) -> None:
