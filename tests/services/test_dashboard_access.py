@@ -37,7 +37,7 @@ DRAWER = ("Performance", "Nodes", "Recordings", "Snapshots", "Compare", "History
 LOOKING = {
     *INSPECTOR,
     *DRAWER,
-    *("Scene and assets", "Inspector", "Scenes: Gallery", "Keys and help", "Light appearance", "Sign out"),
+    *("Scene and assets", "Inspector", "Scenes: Gallery", "Keyboard shortcuts", "Light appearance", "Sign out"),
     *("Outlines and lamps", "Close the drawer", "Lamp 1"),
 }
 

@@ -24,7 +24,7 @@ import { edit } from "./gesture";
 import { rounded } from "./handle";
 import { change, lights, objects, readScene, readScenes, sceneDocument, takeScene } from "./scene";
 import { selectLight, selectObject } from "./selection";
-import { objectTarget, partTarget } from "./targets";
+import { documentTarget, objectTarget, partTarget } from "./targets";
 import { announce, attempt, toast } from "./toasts";
 import { tool } from "./tools";
 
@@ -100,12 +100,16 @@ function freeId(fileName: string): string {
 }
 
 async function ensureScene(): Promise<boolean> {
-  return sceneDocument.value !== null || (await newScene("my scene")) !== undefined;
+  return sceneDocument.value !== null || (await newScene("My scene")) !== undefined;
 }
 
 export async function newScene(name: string): Promise<SceneAnswer | undefined> {
   const made = await attempt(() => request<SceneAnswer>("POST", `${API}/scenes`, { body: { name } }));
   return made && activateScene(made.id);
+}
+
+export function renameScene(name: string): Promise<number | null> {
+  return edit(documentTarget, { name });
 }
 
 export async function activateScene(id: string): Promise<SceneAnswer | undefined> {
@@ -130,7 +134,7 @@ export async function deleteScene(id: string): Promise<void> {
 
 export async function removeObject(id: string): Promise<void> {
   const removed = await change("DELETE", `/objects/${encodeURIComponent(id)}`);
-  if (removed) announce(`${id} was removed; undo brings it back.`);
+  if (removed) announce(`${id} removed. Undo brings it back.`);
 }
 
 export async function duplicateObject(id: string): Promise<void> {
@@ -153,8 +157,8 @@ export async function placeObject(id: string, pixel: Pixel): Promise<void> {
   if (!found.point_m || found.object === id) {
     toast(
       found.object === id
-        ? "Click beside the object, where it is to stand."
-        : "No surface was seen there; click elsewhere.",
+        ? "Click next to the object, where it should stand."
+        : "No surface was found there. Click somewhere else.",
     );
     return;
   }
@@ -175,7 +179,7 @@ export async function replaceLight(index: number, light: Partial<ManualLight>): 
 export async function removeLight(index: number): Promise<void> {
   if (await change("DELETE", `/lights/manual/${index}`, undefined, { strict: true })) {
     selectLight(null);
-    announce("The light was removed; undo brings it back.");
+    announce("Light removed. Undo brings it back.");
   }
 }
 

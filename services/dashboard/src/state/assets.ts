@@ -42,7 +42,7 @@ export async function upload(file: File): Promise<AssetAnswer | undefined> {
   const asset = await attempt(() => uploadAsset(file, progress));
   uploads.value = uploads.value.filter((each) => each.id !== id);
   if (asset) {
-    announce(`${file.name} is uploaded.`);
+    announce(`${file.name} uploaded.`);
     await readAssets();
   }
   return asset;

@@ -1,4 +1,5 @@
 // Events of the service, which keep every browser in step.
+import { signal } from "@preact/signals";
 import { API } from "../api/http";
 import { role, version } from "../api/session";
 import type { PictureState, ProcessAnswer, Recording, Replay } from "../api/types";
@@ -14,6 +15,9 @@ interface Event {
   readonly type: string;
   readonly [key: string]: unknown;
 }
+
+/** Whether everything was read once: before, nothing can be said to be missing. */
+export const isRead = signal(false);
 
 const socket = new ReconnectingSocket(`${API}/events`, (message) => {
   if (typeof message.data === "string") void take(JSON.parse(message.data) as Event);
@@ -39,6 +43,7 @@ export async function readAll(): Promise<void> {
     readSnapshots(),
   ]);
   await readRevisions();
+  isRead.value = true;
 }
 
 async function take(event: Event): Promise<void> {

@@ -94,5 +94,8 @@ async function tellChange(fault: unknown): Promise<void> {
   }
   await readScene();
   const what = served.value ? ` (${served.value.what}, revision ${served.value.revision})` : "";
-  toast(`Somebody else was faster${what}. The scene was read again; look, and repeat your change.`, "error");
+  toast(
+    `Somebody else changed the scene first${what}. It has been reloaded; check it, then repeat your change.`,
+    "error",
+  );
 }

@@ -26,7 +26,7 @@ export function ProcessCard({ seen }: { readonly seen: Seen }) {
           />
         ))}
         {drops.map(([name, count]) => (
-          <Row key={name} name={`lost: ${name}`} value={String(count)} />
+          <Row key={name} name={`dropped: ${name}`} value={String(count)} />
         ))}
         <Row
           name="clock error"

@@ -25,10 +25,10 @@ const MODES: readonly Segment<Mode>[] = [
   { value: "environment", label: "Map" },
 ];
 const HELP: Readonly<Record<Mode, string>> = {
-  manual: "Lamps that you set by hand.",
+  manual: "Lamps you set by hand.",
   fisheye: "What a fish-eye camera beside the objects sees, live.",
-  tracked: "Lamps that carry a marker and may be moved about.",
-  environment: "A given panorama of the surroundings (HDR or EXR).",
+  tracked: "Lamps with markers on them, which can be moved around.",
+  environment: "A panorama of the surroundings (HDR or EXR).",
 };
 
 const NO_FISHEYE = "Fish-eye light needs a fish-eye camera, and none is sending.";
@@ -40,7 +40,7 @@ export function LightsPanel() {
   const disabled = role.value !== "control";
   return (
     <>
-      <Section title="Light comes from">
+      <Section title="Light source">
         <Segments
           label="Light mode"
           segments={MODES.map((each) => ({ ...each, reason: reasonAgainst(each.value, found) }))}
@@ -74,7 +74,7 @@ async function setMode(current: Lights, mode: Mode): Promise<void> {
   if (mode === "environment" && current.environment.map == null) {
     const map = assets.value.find((each) => each.kind === "map");
     if (!map) {
-      toast("Upload an environment map first: drop an .hdr or .exr file on the assets.");
+      toast("Upload an environment map first: drop an .hdr or .exr file onto Assets.");
       return;
     }
     await edit(target, { mode, environment: { map: map.asset } });

@@ -7,6 +7,7 @@ import { SidePanel } from "../tree/SidePanel";
 import { Boundary } from "../ui/Boundary";
 import { KeysDialog } from "./KeysDialog";
 import { listenToKeys } from "./shortcuts";
+import { NameDialog } from "./NameDialog";
 import { TopBar } from "./TopBar";
 
 export function Workspace() {
@@ -14,7 +15,7 @@ export function Workspace() {
   return (
     <div class="app">
       <a class="skip" href="#stage">
-        To the picture
+        Skip to the picture
       </a>
       <Boundary name="The top bar">
         <TopBar />
@@ -30,6 +31,7 @@ export function Workspace() {
       {isInspectorOpen.value && <Inspector />}
       <Drawer />
       <KeysDialog />
+      <NameDialog />
     </div>
   );
 }

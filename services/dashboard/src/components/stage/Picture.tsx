@@ -79,7 +79,7 @@ export function Picture() {
         />
         <CompareSlider />
         <PictureNotice />
-        {isDropping.value && <p class="drop-hint">Let go where the object is to stand</p>}
+        {isDropping.value && <p class="drop-hint">Drop it where the object should stand</p>}
       </div>
     </div>
   );

@@ -19,6 +19,9 @@ const TOOLS: readonly Segment<Tool>[] = [
   { value: "place", label: "Place on a surface", icon: "place", hint: "P" },
 ];
 
+// Shown until the scene is read.
+const NOTHING = { value: "" as never, label: "–" };
+
 /** Tools over the picture, and what it shows. */
 export function StageBar() {
   const document = sceneDocument.value;
@@ -36,7 +39,7 @@ export function StageBar() {
       <IconButton
         icon="stand"
         label="Stand on surfaces"
-        hint="F: what is dragged stands on what the camera sees"
+        hint="F: dragged objects stand on what the camera sees"
         pressed={standsOnSurfaces.value}
         disabled={isDisabled}
         onClick={() => (standsOnSurfaces.value = !standsOnSurfaces.value)}
@@ -60,15 +63,15 @@ export function StageBar() {
       <span class="grow" />
       <Select<MethodName>
         label="Method"
-        value={document?.method.name ?? "dvct"}
-        choices={methods.value.map(({ name, title }) => ({ value: name, label: title }))}
+        value={document?.method.name ?? NOTHING.value}
+        choices={document ? methods.value.map(({ name, title }) => ({ value: name, label: title })) : [NOTHING]}
         onChange={setMethod}
         disabled={isDisabled}
       />
       <Select<View>
         label="View"
-        value={document?.output.view ?? "composite"}
-        choices={VIEWS}
+        value={document?.output.view ?? NOTHING.value}
+        choices={document ? VIEWS : [NOTHING]}
         onChange={setView}
         disabled={isDisabled}
       />
