@@ -50,7 +50,7 @@ def with_method(scene: SceneDocument, method: str) -> SceneDocument:
     A method that the scene has keeps its settings.
     """
     name, _, operator = ("dvct", "", method) if method in ("exact", "paper") else method.partition("-")
-    chosen = scene if scene.method.name == name else scene.replaced(method={"name": name})
+    chosen = scene if scene.method.method_name() == name else scene.replaced(method={"name": name})
     return chosen.replaced(method=chosen.method.replaced(operator=operator)) if operator else chosen
 
 

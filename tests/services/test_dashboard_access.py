@@ -37,7 +37,14 @@ DRAWER = ("Performance", "Nodes", "Recordings", "Snapshots", "Compare", "History
 LOOKING = {
     *INSPECTOR,
     *DRAWER,
-    *("Scene and assets", "Inspector", "Scenes: Gallery", "Keyboard shortcuts", "Light appearance", "Sign out"),
+    *(
+        "Scene and assets",
+        "Inspector",
+        "Scenes: Gallery",
+        "Keyboard shortcuts",
+        "Light appearance",
+        "Sign out",
+    ),
     *("Outlines and lamps", "Close the drawer", "Lamp 1"),
 }
 

@@ -117,7 +117,11 @@ def test_fisheye_light_cannot_be_chosen_without_a_fisheye_camera(stack: Stack, p
 
 def test_nothing_false_is_said_while_the_page_connects(stack: Stack, page: Desk) -> None:
     answered: list[Route] = []
-    page.page.route("**/api/v1/active-scene", lambda route: answered.append(route))
+
+    def hold(route: Route) -> None:
+        answered.append(route)
+
+    page.page.route("**/api/v1/active-scene", hold)
     page.page.goto(f"http://{stack.address}/")
     page.until(lambda: answered, "the question for the scene")
     expect(page.page.locator(".skeleton").first).to_be_visible()
@@ -131,6 +135,21 @@ def test_nothing_false_is_said_while_the_page_connects(stack: Stack, page: Desk)
     page.shows_newest()
     expect(page.page.locator(".skeleton")).to_have_count(0)
     expect(page.named("treeitem", "Lamp 1")).to_be_visible()
+
+
+def test_a_view_is_neither_in_the_scene_nor_in_its_history(live: LiveApi, stack: Stack, page: Desk) -> None:
+    page.open()
+    view = page.page.get_by_role("toolbar").get_by_label("View")
+    view.select_option("delta")
+    page.until(lambda: live.server.session.scene.output.view == "delta", "the view")
+    page.page.keyboard.press("Escape")
+    page.page.locator("#stage").press("2")
+    page.until(lambda: live.server.session.scene.output.view == "effects", "the view of a key")
+    expect(view).to_have_value("effects")
+    expect(page.named("button", "Undo")).to_be_disabled()
+    assert (stack.scene()["revision"], stack.document()["output"]["view"]) == (1, "composite")
+    stack.client.patch(f"{stack.path}/output", json={"view": "volume"}).raise_for_status()
+    expect(view).to_have_value("volume")
 
 
 def test_a_name_is_kept_as_it_is_typed_while_the_scene_changes(stack: Stack, page: Desk) -> None:

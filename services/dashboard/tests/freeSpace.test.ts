@@ -3,7 +3,7 @@ import type { PickAnswer, Pose, Vector } from "../src/api/types";
 import type { Bounds } from "../src/math/bounds";
 import { meetPlane, type Pixel, type View } from "../src/math/camera";
 import { UP } from "../src/math/vector";
-import { footprintOf, freePlace, isFree, standable, type Wanted } from "../src/state/freeSpace";
+import { beforeWall, footprintOf, freePlace, isFree, standable, type Wanted } from "../src/state/freeSpace";
 
 const BOX: Bounds = { minimum: [-0.1, -0.1, 0], maximum: [0.1, 0.1, 0.2] };
 const UPRIGHT: Pose = { translation_m: [0, 0, 0], rotation_wxyz: [1, 0, 0, 0], scale: 1 };
@@ -67,6 +67,14 @@ describe("room for a new object", () => {
       ),
     ).toBeNull();
     expect(await freePlace(wanted(), () => Promise.resolve(undefined))).toBeNull();
+  });
+});
+
+describe("what is dropped on a wall", () => {
+  it("stands on the board's plane, before the wall", () => {
+    expect(beforeWall([1, 2, 0.5], [-1, 0, 0], 0.25)).toEqual([0.75, 2, 0]);
+    expect(beforeWall([1, 2, 0.5], [0, 0.6, 0.8], 0.25)).toEqual([1, 2.25, 0]);
+    expect(beforeWall([1, 2, 0.5], null, 0.25)).toEqual([1, 2, 0]);
   });
 });
 

@@ -78,6 +78,8 @@ describe("the rate", () => {
     expect(meter.rate(0)).toBeNull();
     meter.note(1, 0);
     expect(meter.rate(500)).toBeNull();
+    meter.note(2, 5);
+    expect(meter.rate(5)).toBeNull(); // it had waited
     meter.note(3, 1000);
     expect(meter.rate(1000)).toBeCloseTo(2, 9);
     expect(meter.rate(4000)).toBeCloseTo(0.5, 9); // nothing came since

@@ -11,7 +11,6 @@ import type {
   Pose,
   SceneAnswer,
   Vector,
-  View,
 } from "../api/types";
 import { boundsOf, longestEdge, restOn, sensibleScale, standOn, type Bounds } from "../math/bounds";
 import { meetPlane, type Pixel } from "../math/camera";
@@ -19,7 +18,7 @@ import { UP } from "../math/vector";
 import { size, trimmed } from "../math/units";
 import { pictureSize, view } from "../live/picture";
 import { assetName, boundsByObject } from "./assets";
-import { footprintOf, freePlace, standable } from "./freeSpace";
+import { beforeWall, footprintOf, freePlace, standable } from "./freeSpace";
 import { edit } from "./gesture";
 import { rounded } from "./handle";
 import { change, lights, objects, readScene, readScenes, sceneDocument, takeScene } from "./scene";
@@ -44,7 +43,7 @@ export async function addObject(
   const bounds = boundsOf(asset, null);
   const scale = bounds ? sensibleScale(bounds) : 1;
   const pose: Pose = { ...UPRIGHT, scale };
-  const point = pixel ? await pointAt(pixel) : await roomFor(pose, bounds);
+  const point = pixel ? await pointAt(pixel, footprintOf(pose, bounds).radius) : await roomFor(pose, bounds);
   const id = freeId(name);
   const body = { id, asset: asset.asset, pose: rounded(restOn(pose, bounds, point, UP)) };
   if (!(await change("POST", "/objects", body))) return;
@@ -57,18 +56,16 @@ export async function addObject(
 }
 
 /** Where something new stands at a pixel: on the surface seen there, or on what is behind a virtual object. */
-async function pointAt(pixel: Pixel): Promise<Vector> {
+async function pointAt(pixel: Pixel, radius: number): Promise<Vector> {
   const first = await pick(pixel);
   const found = first?.kind === "object" && first.object ? await attempt(() => lookAt(pixel, first.object!)) : first;
   const point = standable(found);
   if (point) return point;
   toast("There is no level surface there, so the object stands on the plane of the board.");
-  return onBoard(pixel, found?.point_m ?? null);
+  return found?.point_m ? beforeWall(found.point_m, found.normal, radius) : onBoard(pixel);
 }
 
-/** The place on the board's plane at a pixel; below what is seen there, where that is in front of the plane's. */
-function onBoard(pixel: Pixel, seen: Vector | null): Vector {
-  if (seen) return [seen[0], seen[1], 0];
+function onBoard(pixel: Pixel): Vector {
   return (view.value && meetPlane(view.value, pixel, [0, 0, 0], UP)) ?? [0, 0, 0];
 }
 
@@ -82,7 +79,7 @@ async function roomFor(pose: Pose, bounds: Bounds | null): Promise<Vector> {
   const found = await freePlace(wanted, (at) => attempt(() => lookAt(at)));
   if (found) return found;
   toast("No free place was found, so the object stands in the middle of the picture. Drag it where you want it.");
-  return onBoard(centre(), null);
+  return onBoard(centre());
 }
 
 function centre(): Pixel {
@@ -185,10 +182,6 @@ export async function removeLight(index: number): Promise<void> {
 
 export function setMethod(name: MethodName): Promise<number | null> {
   return edit(partTarget("method"), { name });
-}
-
-export function setView(name: View): Promise<number | null> {
-  return edit(partTarget("output"), { view: name });
 }
 
 export function methodOf(name: MethodName): Method | { name: MethodName } {

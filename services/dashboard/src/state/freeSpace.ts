@@ -127,3 +127,10 @@ export function standable(found: PickAnswer | undefined): Vector | null {
   if (found?.kind !== "real" || !found.point_m || (found.normal && isSteep(found.normal))) return null;
   return found.point_m;
 }
+
+/** The place on the board's plane before a wall that was seen, with room for a radius between them. */
+export function beforeWall([x, y]: Vector, normal: Vector | null, radius: number): Vector {
+  const away = Math.hypot(normal?.[0] ?? 0, normal?.[1] ?? 0);
+  if (!normal || away === 0) return [x, y, 0];
+  return [x + (normal[0] / away) * radius, y + (normal[1] / away) * radius, 0];
+}

@@ -2,9 +2,9 @@ import { role } from "../../api/session";
 import type { MethodName, View } from "../../api/types";
 import { methods } from "../../forms/methods";
 import { VIEWS } from "../../forms/views";
-import { setMethod, setView } from "../../state/actions";
+import { setMethod } from "../../state/actions";
 import { standsOnSurfaces } from "../../state/preferences";
-import { sceneDocument } from "../../state/scene";
+import { sceneDocument, setView, shownView } from "../../state/scene";
 import { areOutlinesShown, isSnapping, tool, type Tool } from "../../state/tools";
 import { IconButton } from "../ui/IconButton";
 import { Segments, type Segment } from "../ui/Segments";
@@ -70,7 +70,7 @@ export function StageBar() {
       />
       <Select<View>
         label="View"
-        value={document?.output.view ?? NOTHING.value}
+        value={shownView.value ?? NOTHING.value}
         choices={document ? VIEWS : [NOTHING]}
         onChange={setView}
         disabled={isDisabled}
