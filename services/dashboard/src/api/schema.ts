@@ -2834,7 +2834,7 @@ export interface components {
             /**
              * What
              * @description What was changed.
-             * @example object knot changed
+             * @example knot: pose changed
              */
             readonly what: string;
         };
