@@ -10,6 +10,8 @@ export interface Seen {
 
 /** Its name among the processes. */
 export const RENDER_SERVER = "render-server";
+/** That of the node that replays a recording. */
+export const REPLAY = "replay";
 // Processes report once a second; so many misses are no accident.
 const SILENT_MS = 5000;
 

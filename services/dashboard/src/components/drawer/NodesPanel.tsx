@@ -1,5 +1,6 @@
 import { useEffect } from "preact/hooks";
-import { hasFisheye, processes, readFisheye } from "../../state/processes";
+import { hasFisheye, isSilent, processes, readFisheye, REPLAY, type Seen } from "../../state/processes";
+import { replay } from "../../state/takes";
 import { Empty } from "../ui/Empty";
 import { Skeleton } from "../ui/Skeleton";
 import { FisheyePicture } from "./FisheyePicture";
@@ -15,7 +16,7 @@ export function NodesPanel() {
     return () => clearInterval(timer);
   }, []);
   if (hasFisheye.value === null) return <Skeleton lines={4} />;
-  const known = [...processes.value.values()];
+  const known = [...processes.value.values()].filter((seen) => !isEndedReplay(seen));
   return (
     <div class="cards">
       {known.length === 0 && (
@@ -31,4 +32,9 @@ export function NodesPanel() {
       <FisheyePicture />
     </div>
   );
+}
+
+/** A replay that is over is no process that fell silent. */
+function isEndedReplay(seen: Seen): boolean {
+  return seen.report.name === REPLAY && isSilent(seen) && replay.value?.recording == null;
 }

@@ -1,7 +1,7 @@
 import type uPlot from "uplot";
-import { frame } from "../../live/picture";
+import { frame, rate } from "../../live/picture";
 import { leadingPasses, OTHERS, samples, stacked, timeOf, type Sample } from "../../live/telemetry";
-import { milliseconds } from "../../math/units";
+import { milliseconds, rateText } from "../../math/units";
 import { Empty } from "../ui/Empty";
 import { Plot, type Series } from "./Plot";
 
@@ -45,7 +45,7 @@ export function PerformancePanel() {
       </figure>
       <figure class="plot-box">
         <figcaption>
-          Frames per second <b>{last.rate === null ? "–" : last.rate.toFixed(1)}</b>
+          Rate <b>{rateText(rate.value)}</b>
         </figcaption>
         <Plot label="Frames per second" series={line("rate", "#5b9df0")} data={[times, all.map((each) => each.rate)]} />
       </figure>
