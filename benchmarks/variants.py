@@ -167,7 +167,9 @@ def _parse(text: str, known: Collection[str]) -> Variant:
     output = {key.removeprefix(OUTPUT): value for key, value in settings.items() if key.startswith(OUTPUT)}
     others = [key for key in settings if "." in key and not key.startswith(OUTPUT)]
     if others:
-        raise DeltalightError(f"`{others[0]}` in '{text}' is no setting; write one of the method, or output.KEY.")
+        raise DeltalightError(
+            f"`{others[0]}` in '{text}' is no setting; write one of the method, or output.KEY."
+        )
     validate(Output, output, where)
     return Variant(text, f"{name} with {changes.replace(',', ', ')}", kind, settings)
 

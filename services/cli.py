@@ -18,6 +18,7 @@ from services.commands.calibrate import calibrate
 from services.commands.config import config
 from services.commands.demo import demo
 from services.commands.doctor import doctor
+from services.commands.examples import examples_of
 from services.commands.graph import graph
 from services.commands.keys import keys
 from services.commands.node import node
@@ -37,13 +38,13 @@ DEBUG_FLAG = "--debug"
 
 app = typer.Typer(
     no_args_is_help=True,
-    add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
-    help="Mixed-reality relighting: virtual objects in a camera picture, with light that agrees both ways.",
+    help="Mixed-reality relighting: virtual objects in a camera picture, with light that acts both ways.",
 )
 for command in (render, demo, node, server, up, record, replay, config, doctor, graph, schema, board, ping):
-    app.command()(command)
+    app.command(epilog=examples_of(command.__name__))(command)
 app.add_typer(api, name="api")
 app.add_typer(recordings, name="recordings")
 app.add_typer(calibrate, name="calibrate")
@@ -63,13 +64,14 @@ def _show_version(wanted: bool) -> None:
 @app.callback()
 def _global_options(
     debug: Annotated[  # read by run(), so that it may appear anywhere
-        bool, typer.Option(DEBUG_FLAG, help="Show the traceback of a fault instead of one sentence.")
+        bool, typer.Option(DEBUG_FLAG, help="Show the full traceback of an error instead of one sentence.")
     ] = False,
     log_level: Annotated[
-        str, typer.Option(help="Least level of log lines: debug, info, warning, error.")
+        str, typer.Option(help="Lowest level of messages to log: debug, info, warning or error.")
     ] = "info",
     version: Annotated[
-        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version.")
+        bool,
+        typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit."),
     ] = False,
 ) -> None:
     del debug, version

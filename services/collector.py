@@ -5,6 +5,8 @@ import math
 import statistics
 import time
 import uuid
+from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import IO, Any
 
@@ -12,17 +14,19 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from protocol.clock import CLOCK_OP
 from protocol.codecs import decode_color
 from protocol.envelope import decode
 from protocol.errors import DeltalightError
 from protocol.files import replacing, write_bytes, write_png
-from protocol.messages import CompositeMessage, ControlRequest
+from protocol.messages import CompositeMessage, ControlRequest, StatsMessage
 from protocol.receiver import Receiver
 from protocol.request import RequestClient
-from protocol.subscriber import ReceivedMultipart
 from services.live_message import age_ms
 
 CONTROL_TIMEOUT_S = 10.0
+ALIVE_TIMEOUT_S = 1.0  # a separate thread of the render server answers, whatever the renderer does
+REPORT_INTERVAL_S = 3.0  # it reports each second, but not while it renders
 SHEET_PICTURES = 20
 SHEET_COLUMNS = 5
 SHEET_WIDTH = 256
@@ -39,7 +43,10 @@ class CompositeCollector:
         self.ages_ms: list[float] = []
         self.arrivals_s: list[float] = []
         self._out = out
-        self._receiver = Receiver([composite_endpoint], ["composite"])
+        self._report: StatsMessage | None = None
+        self._reported_s = -math.inf
+        self._began_s = time.monotonic()
+        self._receiver = Receiver([composite_endpoint], ["composite", "stats"])
         self._client = RequestClient(control_endpoint)
         self._index: IO[str] | None = (
             None if out is None else (out / "frames.jsonl").open("w", encoding="utf-8")
@@ -50,23 +57,45 @@ class CompositeCollector:
         """Number of composites so far."""
         return len(self.messages)
 
+    @property
+    def slowest_s(self) -> float:
+        """The longest wait for a composite so far, the first one's included; 0 before it."""
+        times_s = [self._began_s, *self.arrivals_s]
+        return max((after - before for before, after in pairwise(times_s)), default=0.0)
+
     def take(self, timeout_s: float, limit: int) -> bool:
         """Take what arrived within `timeout_s`, up to `limit` composites in total; return whether there was any."""
-        newest = self._receiver.latest(timeout_s) or {}
-        for multipart in list(newest.values())[: limit - self.count]:
-            self._add(multipart)
-        return bool(newest)
+        before = self.count
+        for multipart in (self._receiver.latest(timeout_s) or {}).values():
+            message, parts = decode(multipart)
+            if isinstance(message, StatsMessage):
+                self._report, self._reported_s = message, time.monotonic()
+            elif isinstance(message, CompositeMessage) and self.count < limit:
+                self._add(message, parts)
+        return self.count > before
 
-    def server_stats(self) -> dict[str, Any]:
-        """Return the render server's own statistics.
+    def is_rendering(self) -> bool:
+        """Whether the render server is at work on a frame: it answers, and does not report meanwhile."""
+        if time.monotonic() - self._reported_s < REPORT_INTERVAL_S:
+            return False
+        return self._ask(CLOCK_OP, ALIVE_TIMEOUT_S) is not None
 
-        Raises:
-            DeltalightError: it does not answer.
-        """
-        request = ControlRequest(node="collector", id=uuid.uuid4().hex, op="stats")
-        reply = self._client.request(request, CONTROL_TIMEOUT_S)
-        stats = reply.payload.get("stats")
-        return stats if isinstance(stats, dict) else {}
+    def renderer_name(self) -> str:
+        """The OpenGL renderer, as the render server reported it, or that it does not answer."""
+        if self._report is not None:
+            return self._report.detail
+        stats = (self._ask("stats", max(CONTROL_TIMEOUT_S, 2 * self.slowest_s)) or {}).get("stats")
+        detail = stats.get("detail") if isinstance(stats, dict) else None
+        return str(detail or "unknown: the render server did not answer")
+
+    def _ask(self, op: str, timeout_s: float) -> dict[str, Any] | None:
+        """Return the payload of the render server's reply; None if it does not answer in time."""
+        try:
+            return self._client.request(
+                ControlRequest(node="collector", id=uuid.uuid4().hex, op=op), timeout_s
+            ).payload
+        except DeltalightError:
+            return None
 
     def frames_per_s(self) -> float | None:
         """Rate of arrival, None below two composites."""
@@ -90,10 +119,7 @@ class CompositeCollector:
         if self._index is not None:
             self._index.close()
 
-    def _add(self, multipart: ReceivedMultipart) -> None:
-        message, parts = decode(multipart)
-        if not isinstance(message, CompositeMessage):
-            return
+    def _add(self, message: CompositeMessage, parts: Sequence[memoryview]) -> None:
         number = self.count
         self.messages.append(message)
         self.ages_ms.append(age_ms(message))
@@ -150,13 +176,13 @@ def contact_sheet(pictures: list[UInt8[np.ndarray, "h w 3"]]) -> UInt8[np.ndarra
 
 
 def summarize(collector: CompositeCollector, restarts: dict[str, int]) -> dict[str, Any]:
-    """Return the figures of a finished run, while the render server still answers."""
+    """Return the figures of a finished run; a render server that does not answer only lacks its name."""
     passes: dict[str, list[float]] = {}
     for message in collector.messages:
         for name, milliseconds in message.pass_times_ms.items():
             passes.setdefault(name, []).append(milliseconds)
     return {
-        "renderer": collector.server_stats().get("detail", ""),
+        "renderer": collector.renderer_name(),
         "composites": collector.count,
         "without_pose": sum(message.status == "no_pose" for message in collector.messages),
         "frames_per_s": collector.frames_per_s(),

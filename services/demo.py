@@ -30,6 +30,8 @@ NAME = "Demo"
 FRAME_BUDGET_MS = 125.0  # of what a viewer calls live: eight pictures a second
 FIRST_FRAME_TIMEOUT_S = 120.0  # a cold shader cache on a slow machine takes a while
 BETWEEN_FRAMES_TIMEOUT_S = 60.0
+SLOWER = 3.0  # than the slowest frame before may the next one be
+LONGEST_FRAME_S = 1800.0  # after it a renderer that still answers hangs
 
 
 def demo_scene(method: str) -> SceneDocument:
@@ -45,16 +47,16 @@ def demo_scene(method: str) -> SceneDocument:
 
 
 def with_method(scene: SceneDocument, method: str) -> SceneDocument:
-    """Return the scene with another method.
+    """Return the scene with a method: `exact` or `paper` (operators of dvct), or NAME[-OPERATOR].
 
-    `dvct` (as it is), its operator `exact` or `paper`, an installed plugin's, or NAME[-OPERATOR].
+    An installed plugin's, too. A method that the scene has keeps its settings.
     """
-    if method == "dvct":
-        return scene
     if method in ("exact", "paper"):
-        return scene.replaced(method=scene.method.replaced(operator=method))
-    name, _, operator = (method, "", "") if method in PLUGINS.values else method.partition("-")
-    return scene.replaced(method={"name": name, **({"operator": operator} if operator else {})})
+        name, operator = "dvct", method
+    else:
+        name, _, operator = (method, "", "") if method in PLUGINS.values else method.partition("-")
+    chosen = scene if scene.method.method_name() == name else scene.replaced(method={"name": name})
+    return chosen.replaced(method=chosen.method.replaced(operator=operator)) if operator else chosen
 
 
 def run_live(method: str, *, port: int, with_browser: bool) -> None:
@@ -129,16 +131,25 @@ def collect_composites(scene: SceneDocument, frames: int, out: Path | None) -> d
 
 
 def _collect(collector: CompositeCollector, supervisor: Supervisor, frames: int) -> None:
-    deadline_s = time.monotonic() + FIRST_FRAME_TIMEOUT_S
+    """Take composites until there are `frames`; wait for as long as the renderer is at work on the next one."""
+    waiting_since_s = time.monotonic()
     while collector.count < frames:
         supervisor.poll()
         if collector.take(POLL_INTERVAL_S, frames):
-            deadline_s = time.monotonic() + BETWEEN_FRAMES_TIMEOUT_S
-        if time.monotonic() > deadline_s:
+            waiting_since_s = time.monotonic()
+        waited_s = time.monotonic() - waiting_since_s
+        if waited_s > _patience_s(collector) and (waited_s > LONGEST_FRAME_S or not collector.is_rendering()):
             raise DeltalightError(
-                f"Only {collector.count} of {frames} composites arrived before they stopped;"
+                f"Only {collector.count} of {frames} composites arrived, and none in the last {waited_s:.0f} s;"
                 " see the lines above."
             )
+
+
+def _patience_s(collector: CompositeCollector) -> float:
+    """Return how long the next composite may take before the renderer is asked whether it is at work."""
+    if collector.count == 0:
+        return FIRST_FRAME_TIMEOUT_S
+    return max(BETWEEN_FRAMES_TIMEOUT_S, SLOWER * collector.slowest_s)
 
 
 def demo_plan(session: Path) -> HostPlan:

@@ -46,6 +46,9 @@ class PictureHeader(BaseModel):
     capture_ns: int = Field(description="When it was captured, ns since 1970 by the node's clock.")
     frames_per_s: float | None = Field(description="Rate at which pictures come; null before the second.")
     status: Literal["ok", "no_pose"] = Field(description="`no_pose`: the camera's picture as it is.")
+    render_ms: float = Field(
+        description="From the frame's arrival at the renderer to its picture, waiting included."
+    )
     drops: dict[str, int] = Field(description="What was lost before, by cause.")
     pass_times_ms: dict[str, float] = Field(description="Where its time went.")
     lights: list[dict[str, Any]] = Field(description="What it was lit with.")
@@ -77,6 +80,7 @@ class PictureHeader(BaseModel):
             "number": number,
             "frames_per_s": frames_per_s,
             "scene": None if message.scene_id is None else scene,
+            "render_ms": (message.rendered_ns - message.received_ns) / 1e6,
             "renderer": renderer,
         }
         return validate(cls, {**dict(message), **own}, "the composite")

@@ -14,6 +14,7 @@ from protocol.radiance_files import require_openexr, write_exr
 from protocol.scene import SceneDocument
 from protocol.source import Source
 from services.files import make_output_folder
+from services.object_sizes import size_warnings
 
 if TYPE_CHECKING:
     from render_server.renderer import CompositeFrame, SceneRenderer
@@ -101,6 +102,8 @@ def run_job(job: RenderJob, progress: Progress) -> RenderSummary:
         progress.renderer(gpu.renderer_name, is_software=gpu.is_software)
         renderer = SceneRenderer(gpu, job.scene, with_linear=job.with_exr)
         try:
+            for sentence in size_warnings(job.scene):
+                progress.notice(sentence)
             return _render_frames(job, renderer, RenderSummary(gpu.renderer_name, job.out), progress)
         finally:
             renderer.release()

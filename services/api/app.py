@@ -30,6 +30,7 @@ from services.api.render_link import RenderLink
 from services.api.replay_control import ReplayControl
 from services.api.routes import assets, live, recordings, scenes, snapshots, state
 from services.api.settings import ApiSettings
+from services.api.shown_view import ShownView
 from services.api.snapshot_store import SnapshotStore
 from services.api.static_page import StaticPage
 from services.api.streams import ProcessWatch, Sink, Streams
@@ -151,7 +152,11 @@ def create_app(settings: ApiSettings, store: Store, keys: Keys | None = None) ->
 def _context(settings: ApiSettings, store: Store, keys: Keys | None) -> Context:
     events, watch, live_hub, problems = EventHub(), ProcessWatch(), LiveHub(), Problems()
     link = RenderLink(
-        store, settings.control, keys, on_delivery=lambda status: events.publish("picture", asdict(status))
+        store,
+        settings.control,
+        keys,
+        on_delivery=lambda status: events.publish("picture", asdict(status)),
+        view=ShownView(lambda view: events.publish("view", {"view": view})),
     )
     recording_store = RecordingStore(store.folder / "recordings")
 

@@ -13,7 +13,17 @@ from pydantic_core import to_json
 QUEUE_EVENTS = 256  # how far a client may lag: a minute of reports from four processes
 
 EventType = Literal[
-    "hello", "scene", "asset", "picture", "process", "recording", "replay", "snapshot", "notice", "lost"
+    "hello",
+    "scene",
+    "asset",
+    "picture",
+    "process",
+    "recording",
+    "replay",
+    "snapshot",
+    "view",
+    "notice",
+    "lost",
 ]
 
 

@@ -138,12 +138,13 @@ class LiveHub:
             return self._rate()
 
     def _rate(self) -> float | None:
-        oldest_s = time.monotonic() - RATE_WINDOW_S
+        now_s = time.monotonic()
+        oldest_s = now_s - RATE_WINDOW_S
         while len(self._arrivals_s) > 2 and self._arrivals_s[0] < oldest_s:
             self._arrivals_s.popleft()
         if len(self._arrivals_s) < 2:
             return None
-        span_s = self._arrivals_s[-1] - self._arrivals_s[0]
+        span_s = now_s - self._arrivals_s[0]  # up to now: the rate falls while frames stay away
         return (len(self._arrivals_s) - 1) / span_s if span_s > 0 else None
 
     def _wake_soon(self) -> None:

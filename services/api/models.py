@@ -89,7 +89,7 @@ class RevisionEntry(BaseModel):
 
     revision: int
     at: datetime
-    what: str = Field(description="What was changed.", examples=["object knot changed"])
+    what: str = Field(description="What was changed.", examples=["knot: pose changed"])
     name: str = Field(description="Title of the scene then.")
     gesture: str | None = Field(description="Changes in a row with the same one are undone together.")
 

@@ -15,6 +15,7 @@ from protocol.keys import Keys
 from protocol.messages import ControlRequest
 from protocol.request import RequestClient
 from services.api.delivery import SILENT, Change, Deliveries, DeliveryStatus, pending
+from services.api.shown_view import ShownView, View
 from services.storage.scenes import StoredScene
 from services.storage.store import Store
 
@@ -71,13 +72,16 @@ class RenderLink:
         keys: Keys | None = None,
         *,
         on_delivery: Callable[[DeliveryStatus], None] = lambda _status: None,
+        view: ShownView | None = None,
     ) -> None:
         self._store = store
         self._on_delivery = on_delivery
+        self._view = view or ShownView()
         self._client = RequestClient(control, keys=keys)
         self._asking = FifoLock()  # held during requests to the server; guards the fields below
         self._commands = threading.BoundedSemaphore(MAX_COMMANDS)
         self._changed = threading.Event()
+        self._view_changed = threading.Event()
         self._deliveries = Deliveries()
         self._look_due_s = 0.0
         self._answers: bool | None = None  # not asked yet
@@ -143,6 +147,17 @@ class RenderLink:
         finally:
             self._commands.release()
 
+    @property
+    def view(self) -> View | None:
+        """The view that is shown in place of the document's own, if any."""
+        return self._view.chosen
+
+    def use_view(self, view: View | None) -> None:
+        """Show a view as soon as the server takes it; None = the document's. Neither scene nor revision change."""
+        self._view.choose(view, self._store.scenes.active())
+        self._view_changed.set()
+        self._changed.set()
+
     def use_source(self, endpoints: Sequence[str] | None) -> None:
         """Make the server read frames from these endpoints, also after its restart; None = from its own nodes.
 
@@ -180,6 +195,10 @@ class RenderLink:
     def _send_newest(self) -> None:
         """Send the newest revision of the active scene unless the server has it (while holding the lock)."""
         self._changed.clear()
+        if self._view_changed.is_set():
+            self._view_changed.clear()
+            self._has_scene = False  # the same revision again, which the server is not to compare
+            self._deliveries.forget()
         awaited = self._deliveries.awaited
         active = self._store.scenes.active()
         if active is None:
@@ -215,7 +234,7 @@ class RenderLink:
         """
         if self._instance is None:
             self._instance = self._server_instance()
-        scene = self._store.assets.localised(active.document).model_dump(mode="json")
+        scene = self._store.assets.localised(self._view.applied(active)).model_dump(mode="json")
         revision = active.document.revision if self._has_scene else None
         self._request(
             "set_scene", COMMAND_TIMEOUT_S, {"scene": scene}, scene_id=active.head.id, revision=revision

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from services.storage.store import Store
 
 api = typer.Typer(
-    invoke_without_command=True, help="Serve dashboard, REST API and live video, or manage their tokens."
+    invoke_without_command=True, help="Serve the dashboard, REST API and live video, or manage access tokens."
 )
 Data = Annotated[
     Path | None, typer.Option(help="Folder of scenes and assets; default: the user's data folder.")
@@ -36,15 +36,18 @@ def serve(
     *,
     host: Annotated[
         str | None,
-        typer.Option(help="Address to listen on; others than loopback need tokens. Default: 127.0.0.1."),
+        typer.Option(
+            help="Address to listen on; any other than loopback requires tokens. Default: 127.0.0.1."
+        ),
     ] = None,
     port: Annotated[int | None, typer.Option(min=1, max=65535, help="Port. Default: 8000.")] = None,
     data: Data = None,
     scene: Annotated[
-        Path | None, typer.Option(help="Scene document to import with its files, and to render.")
+        Path | None, typer.Option(help="Scene document to import, with its files, and show.")
     ] = None,
     token_file: Annotated[
-        Path | None, typer.Option(help="File with one more token, of role control: a container's secret.")
+        Path | None,
+        typer.Option(help="File with an additional token of role control, such as a container's secret."),
     ] = None,
     control: Annotated[
         str | None,
@@ -53,7 +56,7 @@ def serve(
     subscribe: Annotated[
         list[str] | None,
         typer.Option(
-            help="Endpoint of pictures and reports; may be given several times. Default: 5602 and 5601."
+            help="Endpoint of pictures and reports; may be given more than once. Default: ports 5602 and 5601."
         ),
     ] = None,
     node: NodeName = None,
@@ -85,11 +88,11 @@ def serve(
 def token(
     name: Annotated[str, typer.Argument(help="Name of the token, for example of its user.")],
     role: Annotated[
-        TokenRole, typer.Option(help="view = look only, control = change everything.")
+        TokenRole, typer.Option(help="view: look only; control: change everything.")
     ] = TokenRole.VIEW,
     data: Data = None,
 ) -> None:
-    """Make a token and print it; it cannot be shown again."""
+    """Create a token and print it; it cannot be shown again."""
     with _store(data) as store:
         typer.echo(store.tokens.create(name, role.value))
 
@@ -99,7 +102,7 @@ def tokens(
     data: Data = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the list as JSON.")] = False,
 ) -> None:
-    """List the tokens by name, role and day."""
+    """List the tokens with their roles and dates."""
     with _store(data) as store:
         found = store.tokens.all()
     days = [datetime.fromtimestamp(each.created_ns / 1e9, UTC).date().isoformat() for each in found]
@@ -118,9 +121,9 @@ def tokens(
 
 @api.command()
 def revoke(
-    name: Annotated[str, typer.Argument(help="Name of the token that is to end.")], data: Data = None
+    name: Annotated[str, typer.Argument(help="Name of the token to revoke.")], data: Data = None
 ) -> None:
-    """End a token; it is refused from the next request on, without a restart."""
+    """Revoke a token; it is refused from the next request on, without a restart."""
     with _store(data) as store:
         store.tokens.revoke(name)
     typer.echo(f"The token `{name}` is no longer taken.")

@@ -47,15 +47,20 @@ DEFAULTS = {
 
 def board(
     *,
-    out: Annotated[Path, typer.Option(help="PDF file; board.yaml is written beside it, of the same name.")],
+    out: Annotated[
+        Path,
+        typer.Option("--out", "-o", help="PDF file; a .yaml file of the same name is written beside it."),
+    ],
     kind: Annotated[BoardType, typer.Option("--type", help="Kind of board.")] = BoardType.ARUCO_GRID,
     paper: Annotated[
-        Paper, typer.Option(help="Paper; it is turned where the board fits only so.")
+        Paper, typer.Option(help="Paper size; it is turned if the board only fits that way.")
     ] = Paper.A4,
     rows: Annotated[
-        int | None, typer.Option(min=1, max=100, help="Rows of markers (charuco: of squares).")
+        int | None, typer.Option(min=1, max=100, help="Rows of markers (for charuco: of squares).")
     ] = None,
-    columns: Annotated[int | None, typer.Option(min=1, max=100, help="Columns, likewise.")] = None,
+    columns: Annotated[
+        int | None, typer.Option(min=1, max=100, help="Columns of markers (for charuco: of squares).")
+    ] = None,
     marker_mm: Annotated[float | None, typer.Option(help="Outer edge of a marker, mm.")] = None,
     separation_mm: Annotated[
         float | None, typer.Option(help="White gap between markers, mm (charuco: square less marker).")

@@ -14,25 +14,26 @@ if TYPE_CHECKING:
     from sensor_node.calibration.picture_sources import Eye
 
 calibrate = typer.Typer(
-    no_args_is_help=True, help="Calibrate lenses, the place of sensors, the camera's response, the paper."
+    no_args_is_help=True,
+    help="Calibrate lenses, sensor positions, the camera's response and the board's paper.",
 )
 
 Source = Annotated[
     str,
     typer.Argument(
-        help="Folder of pictures, pattern (shots/*.jpg), dataset folder, .mcap, or a camera (uvc:0)."
+        help="Folder of pictures, pattern (shots/*.jpg), dataset folder, .mcap recording or camera (uvc:0)."
     ),
 ]
 RecordedSource = Annotated[Path, typer.Argument(help="Dataset folder or .mcap recording.")]
-Out = Annotated[Path, typer.Option(help="Folder that gets calibration/*.yaml; created where missing.")]
+Out = Annotated[Path, typer.Option("--out", "-o", help="Folder for calibration/*.yaml; created if missing.")]
 TargetOption = Annotated[
     str | None,
     typer.Option(
         help="board.yaml, or chessboard:COLUMNSxROWS:SQUARE (inner corners, metres); default: the source's board."
     ),
 ]
-Views = Annotated[int, typer.Option(min=8, max=200, help="Views at which a live camera's series ends.")]
-Force = Annotated[bool, typer.Option("--force", help="Write over an older result.")]
+Views = Annotated[int, typer.Option(min=8, max=200, help="Number of views to take with a live camera.")]
+Force = Annotated[bool, typer.Option("--force", help="Overwrite an older result.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")]
 
 
@@ -144,7 +145,7 @@ def extrinsics(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Find where a sensor is: writes one transform into OUT/calibration/extrinsics.yaml."""
+    """Find where a sensor is: writes a transform to OUT/calibration/extrinsics.yaml."""
     from services.calibration_extrinsics import ExtrinsicsJob, find_transform
 
     figures = find_transform(ExtrinsicsJob(source, what.value, out, target), force=force)
@@ -158,7 +159,7 @@ def photometric(
     ],
     *,
     out: Out,
-    eye: Annotated[EyeOption, typer.Option(help="Whose bracket it is.")] = EyeOption.RGB,
+    eye: Annotated[EyeOption, typer.Option(help="Which camera took the bracket.")] = EyeOption.RGB,
     card: Annotated[
         str | None,
         typer.Option(

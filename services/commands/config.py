@@ -14,9 +14,11 @@ if TYPE_CHECKING:
 
 def config(
     config_file: ConfigFile = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print values and origins as JSON.")] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print the values and where they come from as JSON.")
+    ] = False,
 ) -> None:
-    """Print the settings of node, server, API and keys as a configuration file, with the origin of each value."""
+    """Print the settings of node, server, API and keys as a configuration file, and where each comes from."""
     from services.settings import load_configuration
 
     configuration = load_configuration(config_file)

@@ -15,11 +15,13 @@ def demo(
     headless: Annotated[
         bool,
         typer.Option(
-            "--headless", help="No dashboard: write composites, a contact sheet and a video to --out."
+            "--headless", help="Without the dashboard: write pictures, a contact sheet and a video to --out."
         ),
     ] = False,
-    frames: Annotated[int, typer.Option(min=1, max=100_000, help="Composites of a headless demo.")] = 30,
-    out: Annotated[Path | None, typer.Option(help="Folder of a headless demo.")] = None,
+    frames: Annotated[
+        int, typer.Option(min=1, max=100_000, help="Number of pictures of a headless demo.")
+    ] = 30,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Output folder of a headless demo.")] = None,
     method: MethodName = "dvct",
     no_browser: Annotated[bool, typer.Option("--no-browser", help="Do not open a browser.")] = False,
     port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the dashboard.")] = PAGE_PORT,
@@ -33,5 +35,5 @@ def demo(
         run_live(method, port=port, with_browser=not no_browser)
         return
     if out is None:
-        raise DeltalightError("A headless demo writes files; name their folder with --out.")
+        raise DeltalightError("A headless demo writes files; give a folder for them with --out.")
     run_headless(method, frames, out, as_json=as_json)

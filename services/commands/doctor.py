@@ -9,7 +9,7 @@ import typer
 def doctor(
     as_json: Annotated[bool, typer.Option("--json", help="Print the checks as JSON.")] = False,
 ) -> None:
-    """Say what this machine has and what is missing; exit code 1 if something needed is missing."""
+    """Check what this machine has and what is missing; exit code 1 if something required is missing."""
     from services.doctor import examine
 
     checks = list(examine())

@@ -19,13 +19,13 @@ NARROWEST = 150  # columns of a table that no terminal shows
 def graph(
     *,
     method: MethodName = "dvct",
-    svg: Annotated[Path | None, typer.Option(metavar="FILE", help="Draw the graph into an SVG file.")] = None,
+    svg: Annotated[Path | None, typer.Option(metavar="FILE", help="Write the graph to an SVG file.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the graph as JSON.")] = False,
 ) -> None:
-    """Show the stages of a frame: what each reads, writes, follows, takes and holds, and what is kept between frames.
+    """Show the stages of a frame: what each reads and writes, how long it takes, and what is kept between frames.
 
-    Renders a small scene of its own whose real geometry is given; the frame that is shown comes after the camera has
-    turned by a degree.
+    Renders a small built-in scene with given real geometry, and shows the frame after the camera has turned by one
+    degree.
     """
     method = require_method(method)
     from protocol.files import write_bytes

@@ -6,10 +6,10 @@ from typing import Annotated
 
 import typer
 
-keys = typer.Typer(no_args_is_help=True, help="Keys for connections that leave this host.")
+keys = typer.Typer(no_args_is_help=True, help="Manage keys for connections to other machines.")
 
 Folder = Annotated[
-    Path | None, typer.Option(help="Folder of the keys; default: as [keys] of the configuration says.")
+    Path | None, typer.Option(help="Folder of the keys; default: from [keys] in the configuration.")
 ]
 
 
@@ -18,7 +18,7 @@ def create(
     name: Annotated[str, typer.Argument(help="Name of the key pair, for example this host's.")],
     folder: Folder = None,
 ) -> None:
-    """Make a key pair; the public file is for other hosts, the secret one stays here."""
+    """Create a key pair; the public file is for other machines, the secret one stays here."""
     from protocol.keys import create_keys
 
     public, secret = create_keys(name, _folder(folder))
@@ -32,7 +32,7 @@ def list_keys(
     folder: Folder = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the keys as JSON.")] = False,
 ) -> None:
-    """List this host's key pairs and the keys that it trusts."""
+    """List this machine's key pairs and the keys it trusts."""
     from protocol.keys import load_keys, own_keys, trusted_keys
 
     place = _folder(folder)
@@ -52,10 +52,12 @@ def list_keys(
 @keys.command()
 def trust(
     file: Annotated[Path, typer.Argument(help="Public key of the other host, NAME.key.")],
-    name: Annotated[str | None, typer.Option(help="Name to keep it by; default: that of the file.")] = None,
+    name: Annotated[
+        str | None, typer.Option(help="Name to store it under; default: the name of the file.")
+    ] = None,
     folder: Folder = None,
 ) -> None:
-    """Let the host with this public key connect, and connect to it; holds at once, without a restart."""
+    """Trust the machine with this public key; takes effect at once, without a restart."""
     from protocol.keys import trust as keep
 
     kept = keep(file, _folder(folder), name)

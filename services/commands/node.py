@@ -19,41 +19,42 @@ def node(
     source: Annotated[
         str | None,
         typer.Option(
-            help="Camera (`uvc:0`, `oak`), dataset folder, .mcap recording, or `synthetic`, the default."
+            help="Camera (`uvc:0`, `oak`), dataset folder, .mcap recording, or `synthetic` (default)."
         ),
     ] = None,
-    name: Annotated[
-        str | None, typer.Option(help="Name of the node; topics end with it. Default: camera.")
-    ] = None,
+    name: Annotated[str | None, typer.Option(help="Name of the node. Default: camera.")] = None,
     publish: Annotated[
         str | None, typer.Option(help="Endpoint for the streams. Default: tcp://127.0.0.1:5601.")
     ] = None,
     clock: Annotated[
-        str | None, typer.Option(help="Control endpoint of the render server whose clock stamps refer to.")
+        str | None,
+        typer.Option(help="Control endpoint of the render server whose clock the timestamps follow."),
     ] = None,
     fisheye: Annotated[
-        str | None, typer.Option(help="Camera that sees the light, as --source; default: the source's own.")
+        str | None,
+        typer.Option(help="Fish-eye camera that sees the light, as for --source; default: the source's own."),
     ] = None,
     calibration: Annotated[
         Path | None, typer.Option(help="Calibration folder of a live camera (rgb.yaml, board.yaml, ...).")
     ] = None,
     loop: Annotated[
-        bool | None, typer.Option("--loop/--no-loop", help="Start again at the end of the source.")
+        bool | None, typer.Option("--loop/--no-loop", help="Start again when the source ends.")
     ] = None,
     fast: Annotated[
-        bool | None, typer.Option("--fast", help="Do not wait for the source's own times between frames.")
+        bool | None,
+        typer.Option("--fast", help="Send frames as fast as possible instead of at their recorded times."),
     ] = None,
     config_file: ConfigFile = None,
     list_cameras: Annotated[
-        bool, typer.Option("--list", help="List the cameras of this machine and end.")
+        bool, typer.Option("--list", help="List the cameras of this machine and exit.")
     ] = False,
     discover: Annotated[
         bool,
-        typer.Option("--discover", help="List the nodes that announce themselves on the network and end."),
+        typer.Option("--discover", help="List the nodes found on the network and exit."),
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print a list as JSON.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the list as JSON.")] = False,
 ) -> None:
-    """Publish colour, depth, light and pose of a camera or a recording, until Ctrl-C or its end."""
+    """Publish colour, depth, light and pose from a camera or a recording, until it ends or Ctrl-C."""
     if list_cameras or discover:
         _print_lists(cameras=list_cameras, nodes=discover, as_json=as_json)
         return

@@ -68,7 +68,7 @@ ConfigFile = Annotated[
 ]
 NodeName = Annotated[
     str | None,
-    typer.Option("--node", help="Name of a node to find on the network; `auto` takes the only one there is."),
+    typer.Option("--node", help="Name of a node to find on the network; `auto` uses the only one found."),
 ]
 SMALLEST_EDGE = 16
 LARGEST_EDGE = 8192
@@ -84,7 +84,7 @@ def parse_size(text: str) -> tuple[int, int]:
     edges = [int(edge) for edge in found.groups()] if found else []
     if not edges or min(edges) < SMALLEST_EDGE or max(edges) > LARGEST_EDGE:
         raise DeltalightError(
-            f"'{text}' is no picture size; write WIDTHxHEIGHT such as 640x480, each from {SMALLEST_EDGE} to"
+            f"'{text}' is not a picture size; write WIDTHxHEIGHT such as 640x480, each from {SMALLEST_EDGE} to"
             f" {LARGEST_EDGE}."
         )
     return edges[0], edges[1]
@@ -98,7 +98,9 @@ def parse_frames(text: str | None, count: int) -> range:
     """
     found = re.fullmatch(r"(\d{0,9}):(\d{0,9})", (text or ":").strip())
     if found is None:
-        raise DeltalightError(f"'{text}' is no range of frames; write A:B (B is not included), such as 0:10.")
+        raise DeltalightError(
+            f"'{text}' is not a range of frames; write A:B (B is not included), such as 0:10."
+        )
     first, end = (
         int(group) if group else default for group, default in zip(found.groups(), (0, count), strict=True)
     )

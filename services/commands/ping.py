@@ -14,11 +14,12 @@ def ping(
     ],
     *,
     streams: Annotated[
-        bool, typer.Option("--streams", help="The endpoint publishes: wait for a report of its process.")
+        bool,
+        typer.Option("--streams", help="The endpoint publishes streams: wait for a report from its process."),
     ] = False,
     timeout: Annotated[float, typer.Option(min=0.1, max=60, help="Seconds to wait.")] = 5.0,
 ) -> None:
-    """Ask a process whether it works; exit code 0 = yes, 1 = no."""
+    """Check whether a process responds; exit code 0 = yes, 1 = no."""
     from services.health_check import check_health
 
     fault = check_health(address, streams=streams, timeout_s=timeout)

@@ -27,15 +27,17 @@ Show = Callable[["RecordStatus"], None]
 
 def record(
     *,
-    out: Annotated[Path, typer.Option(help="Recording to write, NAME.mcap; it must not exist.")],
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Recording to write, NAME.mcap; it must not exist.")
+    ],
     subscribe: Annotated[
         list[str] | None,
         typer.Option(
-            help="Endpoint of the node's streams; may be given several times. Default: tcp://127.0.0.1:5601."
+            help="Endpoint of the node's streams; may be given more than once. Default: tcp://127.0.0.1:5601."
         ),
     ] = None,
     node: NodeName = None,
-    name: Annotated[str | None, typer.Option(help="Name of the node, where several publish there.")] = None,
+    name: Annotated[str | None, typer.Option(help="Name of the node, if several publish there.")] = None,
     scene: Annotated[Path | None, typer.Option(help="Scene document to attach.")] = None,
     control: Annotated[
         str | None, typer.Option(help="Control endpoint of the render server whose scene is attached.")
@@ -43,15 +45,15 @@ def record(
     extrinsics: Annotated[
         Path | None, typer.Option(help="calibration/extrinsics.yaml: transforms between the sensors.")
     ] = None,
-    duration: Annotated[float | None, typer.Option(min=0.1, help="Seconds from the first frame.")] = None,
-    frames: Annotated[int | None, typer.Option(min=1, help="Frames to record.")] = None,
+    duration: Annotated[float | None, typer.Option(min=0.1, help="Stop after this many seconds.")] = None,
+    frames: Annotated[int | None, typer.Option(min=1, help="Stop after this many frames.")] = None,
     config_file: ConfigFile = None,
     progress: Annotated[
-        bool, typer.Option("--progress", help="Print how far it is as a line of JSON, once a second.")
+        bool, typer.Option("--progress", help="Print the progress as a line of JSON once a second.")
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
-    """Record every raw frame of a node until Ctrl-C, --duration or --frames."""
+    """Record every raw frame of a node until Ctrl-C, or for --duration or --frames."""
     from protocol.calibration import load_extrinsics_yaml
     from protocol.keys import KeySettings
     from services.recorder import Recorder, RecordJob

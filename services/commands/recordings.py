@@ -14,19 +14,17 @@ if TYPE_CHECKING:
 
     from services.recording_copies import Copied, Track
 
-recordings = typer.Typer(
-    no_args_is_help=True, help="Look into recordings, mend them, convert dataset folders."
-)
+recordings = typer.Typer(no_args_is_help=True, help="Inspect, repair and convert recordings.")
 
-FILE = Annotated[Path, typer.Argument(help="Recording: .mcap, or .mcap.active where it was not finished.")]
+FILE = Annotated[Path, typer.Argument(help="Recording: .mcap, or .mcap.active if it was not finished.")]
 AS_JSON = Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")]
 
 
 @recordings.command()
 def info(
-    file: FILE, *, as_json: Annotated[bool, typer.Option("--json", help="Print it as JSON.")] = False
+    file: FILE, *, as_json: Annotated[bool, typer.Option("--json", help="Print the facts as JSON.")] = False
 ) -> None:
-    """Show what a recording holds: frames, rates, sizes, cameras, what is missing."""
+    """Show what a recording contains: frames, rates, sizes, cameras, and what is missing."""
     from services.recording_info import describe_recording
 
     with _progress("reading", show_count=False) as progress:
@@ -49,12 +47,14 @@ def recover(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Mended recording; default NAME.mcap of NAME.mcap.active, else NAME-recovered.mcap."
+            "--out",
+            "-o",
+            help="Repaired recording; default: NAME.mcap for NAME.mcap.active, else NAME-recovered.mcap.",
         ),
     ] = None,
     as_json: AS_JSON = False,
 ) -> None:
-    """Mend a recording that was cut or damaged: a new, finished .mcap; the old file is only read."""
+    """Repair a recording that was cut off or damaged; writes a new .mcap and leaves the old file as it is."""
     from services.recording_copies import recover_recording, recovered_name
 
     copied = recover_recording(file, out or recovered_name(file), _track("recovering"))
@@ -68,13 +68,15 @@ def recover(
 def import_(
     folder: Annotated[Path, typer.Argument(help="Dataset folder with rgb.txt.")],
     *,
-    out: Annotated[Path, typer.Option(help="Recording to write, NAME.mcap; it must not exist.")],
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Recording to write, NAME.mcap; it must not exist.")
+    ],
     scene: Annotated[
-        Path | None, typer.Option(help="Scene document to attach; default FOLDER/scene.json if it is there.")
+        Path | None, typer.Option(help="Scene document to attach; default: FOLDER/scene.json if it exists.")
     ] = None,
     as_json: AS_JSON = False,
 ) -> None:
-    """Make a recording of a dataset folder."""
+    """Convert a dataset folder to a recording."""
     from services.recording_copies import import_folder
 
     _print_copied(import_folder(folder, out, scene, _track("importing")), as_json=as_json)
@@ -84,10 +86,10 @@ def import_(
 def export(
     file: FILE,
     *,
-    out: Annotated[Path, typer.Option(help="Dataset folder to write; it must not exist.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Dataset folder to write; it must not exist.")],
     as_json: AS_JSON = False,
 ) -> None:
-    """Make a dataset folder of a recording."""
+    """Convert a recording to a dataset folder."""
     from services.recording_copies import export_recording
 
     _print_copied(export_recording(file, out, _track("exporting")), as_json=as_json)

@@ -8,7 +8,7 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from services.commands.options import Quality, View
+from services.commands.options import Quality, View, require_method
 
 if TYPE_CHECKING:
     from services.offline import RenderSummary
@@ -17,37 +17,52 @@ if TYPE_CHECKING:
 def render(
     source: Annotated[Path, typer.Argument(help="Dataset folder or .mcap recording.")],
     *,
-    out: Annotated[Path, typer.Option(help="Folder for the pictures; created where missing.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the pictures; created if missing.")],
     scene: Annotated[
-        Path | None, typer.Option(help="Scene document; default: the one that the recording carries.")
+        Path | None, typer.Option(help="Scene document; default: the one in the recording.")
     ] = None,
     frames: Annotated[
-        str | None, typer.Option(metavar="A:B", help="Frame numbers, B not included; default all.")
+        str | None,
+        typer.Option(metavar="A:B", help="Frame numbers from A up to but not including B; default: all."),
     ] = None,
-    size: Annotated[str | None, typer.Option(metavar="WxH", help="Size of the pictures.")] = None,
+    size: Annotated[
+        str | None,
+        typer.Option(
+            metavar="WxH", help="Size of the pictures, such as 640x480; default: as the scene says."
+        ),
+    ] = None,
     device: Annotated[
         int | None, typer.Option(min=0, help="EGL device; `deltalight doctor` lists them.")
     ] = None,
-    view: Annotated[View | None, typer.Option(help="What to show; default: as the scene says.")] = None,
+    view: Annotated[View | None, typer.Option(help="View to render; default: as the scene says.")] = None,
+    method: Annotated[
+        str | None,
+        typer.Option(help="Relighting method, as for `demo`, or a plugin's; default: as the scene says."),
+    ] = None,
     quality: Annotated[
-        Quality, typer.Option(help="What moving pictures may give up for speed; files need not.")
+        Quality, typer.Option(help="What may be given up for speed while something moves.")
     ] = Quality.BEST,
-    exr: Annotated[bool, typer.Option("--exr", help="Write linear OpenEXR files too.")] = False,
+    exr: Annotated[bool, typer.Option("--exr", help="Also write linear OpenEXR files.")] = False,
     allow_software: Annotated[
-        bool, typer.Option("--allow-software", help="Do not warn where there is no GPU.")
+        bool, typer.Option("--allow-software", help="Do not warn about a missing GPU.")
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
-    """Render a recording: OUT/<frame number>.png and OUT/frames.jsonl, a line a frame."""
+    """Render a recording to pictures: OUT/000000.png and so on, with one line per frame in OUT/frames.jsonl."""
     from protocol.source import open_source
     from services.commands.options import parse_frames, parse_size
+    from services.demo import with_method
     from services.host import choose_scene
     from services.offline import RenderJob, run_job, with_output
 
     size_px = None if size is None else parse_size(size)
     recording = open_source(source)
     document = with_output(choose_scene(recording, scene), size_px, view and view.value)
-    document = document.replaced(method=document.method.replaced(quality=quality.value))
+    document = document if method is None else with_method(document, require_method(method))
+    document = document.replaced(
+        method=document.method.replaced(quality=quality.value),
+        output=document.output.replaced(frame_budget_ms=None),
+    )
     job = RenderJob(recording, document, parse_frames(frames, len(recording)), out, device, with_exr=exr)
     for note in recording.notes:
         typer.echo(note, err=True)
@@ -83,6 +98,6 @@ def _print_summary(summary: "RenderSummary", *, as_json: bool) -> None:
         typer.echo(json.dumps(figures))
         return
     typer.echo(
-        f"{figures['frames']} frames, {figures['no_pose']} without a pose, {figures['mean_ms']:.1f} ms a"
+        f"{figures['frames']} frames, {figures['no_pose']} without a pose, {figures['mean_ms']:.1f} ms per"
         f" frame, {figures['renderer']}, written to {figures['out']}"
     )

@@ -14,28 +14,30 @@ def replay(
     publish: Annotated[
         str | None, typer.Option(help="Endpoint for the streams. Default: tcp://127.0.0.1:5601.")
     ] = None,
-    name: Annotated[
-        str | None, typer.Option(help="Name of the node; topics end with it. Default: camera.")
-    ] = None,
+    name: Annotated[str | None, typer.Option(help="Name of the node. Default: camera.")] = None,
     clock: Annotated[
-        str | None, typer.Option(help="Control endpoint of the render server whose clock stamps refer to.")
+        str | None,
+        typer.Option(help="Control endpoint of the render server whose clock the timestamps follow."),
     ] = None,
-    loop: Annotated[bool, typer.Option("--loop", help="Start again at the end.")] = False,
-    rate: Annotated[float | None, typer.Option(help="Recorded seconds a second. Default: 1.")] = None,
+    loop: Annotated[bool, typer.Option("--loop", help="Start again when the recording ends.")] = False,
+    rate: Annotated[float | None, typer.Option(help="Speed, as a factor. Default: 1.")] = None,
     start: Annotated[
-        float | None, typer.Option(min=0, help="Where to begin, seconds from the first frame.")
+        float | None, typer.Option(min=0, help="Where to start, in seconds from the first frame.")
     ] = None,
-    paused: Annotated[bool, typer.Option("--paused", help="Begin paused; needs --control.")] = False,
+    paused: Annotated[bool, typer.Option("--paused", help="Start paused; needs --control.")] = False,
     control: Annotated[
         str | None,
-        typer.Option(help="Endpoint for pause, seek and rate; the replay then waits at its end."),
+        typer.Option(
+            help="Endpoint for pause, seek and speed; the replay then waits at its end instead of exiting."
+        ),
     ] = None,
     fast: Annotated[
-        bool, typer.Option("--fast", help="As fast as frames can be made ready, not at the recorded times.")
+        bool,
+        typer.Option("--fast", help="Send frames as fast as possible instead of at their recorded times."),
     ] = False,
     config_file: ConfigFile = None,
 ) -> None:
-    """Publish a recording or dataset folder as its node did, until its end or Ctrl-C."""
+    """Publish a recording or dataset folder as its node did, until it ends or Ctrl-C."""
     from protocol.errors import DeltalightError
     from protocol.source import open_source
     from sensor_node.cameras.playback import PlaybackCamera

@@ -16,12 +16,12 @@ def server(
     scene: Annotated[Path | None, typer.Option(help="Scene document to start with.")] = None,
     session: Annotated[
         Path | None,
-        typer.Option(help="File that keeps the current scene, so that a restart goes on with it."),
+        typer.Option(help="File that keeps the current scene, so that a restart continues with it."),
     ] = None,
     subscribe: Annotated[
         list[str] | None,
         typer.Option(
-            help="Endpoint of a sensor node; may be given several times. Default: tcp://127.0.0.1:5601."
+            help="Endpoint of a sensor node; may be given more than once. Default: tcp://127.0.0.1:5601."
         ),
     ] = None,
     node: NodeName = None,
@@ -35,11 +35,11 @@ def server(
         int | None, typer.Option(min=0, help="EGL device; `deltalight doctor` lists them.")
     ] = None,
     allow_software: Annotated[
-        bool | None, typer.Option("--allow-software", help="Accept a renderer without a GPU.")
+        bool | None, typer.Option("--allow-software", help="Render without a GPU if there is none.")
     ] = None,
     config_file: ConfigFile = None,
 ) -> None:
-    """Render what sensor nodes send and publish the composites, until Ctrl-C."""
+    """Render the frames of sensor nodes and publish the pictures, until Ctrl-C."""
     from protocol.keys import KeySettings
     from render_server.server.process import ServerSettings, run_server
     from services.settings import load_configuration

@@ -18,14 +18,14 @@ def up(
     source: Annotated[
         str | None,
         typer.Option(
-            help="Camera, dataset folder, .mcap recording, or `synthetic`; default: as the configuration says."
+            help="Camera, dataset folder, .mcap recording or `synthetic`; default: from the configuration."
         ),
     ] = None,
     node: NodeName = None,
     scene: Annotated[
         Path | None,
         typer.Option(
-            help="Scene document to import and show; default: the scene shown last, else the recording's."
+            help="Scene document to import and show; default: the last one shown, else the recording's."
         ),
     ] = None,
     data: Annotated[
@@ -41,13 +41,13 @@ def up(
         int | None, typer.Option(min=0, help="EGL device; `deltalight doctor` lists them.")
     ] = None,
     allow_software: Annotated[
-        bool, typer.Option("--allow-software", help="Accept a renderer without a GPU.")
+        bool, typer.Option("--allow-software", help="Render without a GPU if there is none.")
     ] = False,
     config_file: ConfigFile = None,
 ) -> None:
-    """Run node, render server and web process on this host and restart what dies, until Ctrl-C.
+    """Run node, render server and dashboard on this machine until Ctrl-C, and restart what fails.
 
-    With --node no node is started: the server takes the streams of one that is found on the network.
+    With --node, no node is started: the render server uses one that is found on the network.
     """
     from services.host import HostPlan
     from services.host_store import scene_to_show, session_file
@@ -57,7 +57,9 @@ def up(
     if node is None:
         source = source or _configured_source(config_file)
     elif source is not None:
-        raise DeltalightError("--source starts a node here and --node names one elsewhere; give one of them.")
+        raise DeltalightError(
+            "--source starts a node here and --node uses one elsewhere; give only one of them."
+        )
     folder = _data_folder(data, config_file)
     with Store(folder) as store:
         shown = scene_to_show(store, _recording(source), scene)

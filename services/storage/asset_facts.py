@@ -1,16 +1,21 @@
 """Facts about a mesh or a map, found by loading it (in the worker)."""
 
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from protocol.errors import DeltalightError
 from services.storage.asset_kinds import Facts
+
+if TYPE_CHECKING:
+    from render_server.scene.triangle_mesh import TriangleMesh
 
 
 def mesh_facts(path: Path) -> Facts:
     """Load a mesh and return its facts.
 
-    They are `triangles`, `vertices`, `minimum` and `maximum` (in the file's own units and axes, at rest), and the
-    `clips` (`name`, `duration_s`) that it can play.
+    They are `triangles`, `vertices`, `minimum` and `maximum` (in the file's own units and axes, at rest), the
+    `clips` (`name`, `duration_s`) that it can play, and the `material` of most of it, as scene documents write one.
 
     Raises:
         DeltalightError: the file is wrong; the sentence says how.
@@ -32,7 +37,33 @@ def mesh_facts(path: Path) -> Facts:
         "minimum": bounds[:, 0].min(axis=0).tolist(),
         "maximum": bounds[:, 1].max(axis=0).tolist(),
         "clips": [{"name": clip.name, "duration_s": clip.duration_s} for clip in clips],
+        "material": _material_facts(meshes),
     }
+
+
+def _material_facts(meshes: Sequence["TriangleMesh"]) -> Facts:
+    """Return the material of the mesh with the most triangles; textures and vertex colours by their mean."""
+    import numpy as np
+
+    mesh = max(meshes, key=lambda each: len(each.triangles))
+    material, color = mesh.material, np.asarray(mesh.material.base_color, np.float64)
+    if material.base_color_texture is not None:
+        color = color * material.base_color_texture.mean(axis=(0, 1), dtype=np.float64)
+    if mesh.colors is not None:
+        color = color * mesh.colors.mean(axis=0)
+    return {
+        "base_color": _rounded(np.clip(color, 0, 1)),
+        "metallic": round(float(material.metallic), 4),
+        "roughness": round(float(material.roughness), 4),
+        "specular": round(float(material.specular), 4),
+        "ior": None if material.ior is None else round(float(material.ior), 4),
+        "emission": _rounded(material.emission),
+        "transmission": round(float(material.transmission), 4),
+    }
+
+
+def _rounded(color: Iterable[float]) -> list[float]:
+    return [round(float(value), 4) for value in color]
 
 
 def map_facts(path: Path) -> Facts:

@@ -5,7 +5,7 @@ import os
 import shutil
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -118,21 +118,35 @@ def _kept_alive(supervisor: Supervisor) -> Iterator[None]:
         thread.join()
 
 
+def complaints_of(page: Page, *, expected: Sequence[str] = ()) -> list[str]:
+    """What the browser will complain of from now on: faults of the page, and errors in its console.
+
+    Every test of the dashboard asserts that the list is empty at its end. `expected` are parts of those that the test
+    brings about itself, such as "status of 401".
+    """
+    complaints: list[str] = []
+
+    def hear(text: str) -> None:
+        if not any(part in text for part in expected):
+            complaints.append(text)
+
+    def hear_console(message: ConsoleMessage) -> None:
+        if message.type == "error":
+            hear(f"{message.text} ({message.location['url']})")
+
+    page.on("pageerror", lambda fault: hear(str(fault)))
+    page.on("console", hear_console)
+    return complaints
+
+
 class Desk:
     """A page of the dashboard as a person uses it, beside the REST API of the same stack."""
 
     def __init__(self, stack: Stack, page: Page) -> None:
         self.stack = stack
         self.page = page
-        self.complaints: list[str] = []
-        page.on("console", self._hear)
-        page.on("pageerror", lambda fault: self.complaints.append(str(fault)))
+        self.complaints = complaints_of(page)
         page.set_default_timeout(PATIENCE_S * 1000)
-
-    def _hear(self, message: ConsoleMessage) -> None:
-        has_no_fisheye = message.location["url"].endswith("/fisheye")  # the browser notes each 404
-        if message.type == "error" and not has_no_fisheye:
-            self.complaints.append(message.text)
 
     def open(self) -> None:
         """Load the page and wait until it shows a picture of the newest revision."""

@@ -30,11 +30,17 @@ AROUND = {"type": "environment", "mean_radiance": [0.1, 0.1, 0.1]}
 
 
 class StandInStream:
-    """Publishes a composite every 20 ms, each tenth time a report too; `scene` = id and revision of what it shows."""
+    """Publishes a composite every 20 ms, each tenth time a report too; `scene` = id and revision of what it shows.
+
+    While `is_busy` it does neither, as a renderer that is at work on a slow frame; a camera that sends `camera_fps`
+    frames a second reports meanwhile.
+    """
 
     def __init__(self, port: int) -> None:
         self.sent = 0
         self.scene: tuple[str | None, int | None] = (None, None)
+        self.is_busy = False
+        self.camera_fps: float | None = None
         self._stop = threading.Event()
         self.publisher = Publisher(ports.endpoint(port))
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -50,6 +56,10 @@ class StandInStream:
         for number in itertools.count(1):
             if self._stop.wait(PERIOD_S):
                 return
+            if number % 10 == 0 and self.camera_fps is not None:
+                self.publisher.send(encode(report("camera", rates={"fps": self.camera_fps})))
+            if self.is_busy:
+                continue
             self.publisher.send(encode(composite(number, *self.scene), [jpeg]))
             if number % 10 == 0:
                 self.publisher.send(encode(report("render-server", "stand-in renderer")))

@@ -36,7 +36,7 @@ def test_a_client_is_greeted_and_hears_every_change_of_scenes(live: LiveApi) -> 
         assert next_event(socket, "scene")["active"] is True
         client.patch(f"/scenes/{scene_id}/output", json={"view": "delta"})
         changed = next_event(socket, "scene")
-        assert (changed["revision"], changed["what"]) == (2, "output changed")
+        assert (changed["revision"], changed["what"]) == (2, "output: view changed")
         picture = next_event(socket, "picture")
         while picture["revision"] < 2:
             picture = next_event(socket, "picture")

@@ -156,7 +156,7 @@ def test_manual_lights_one_by_one(client: httpx.Client) -> None:
     address = f"/scenes/{scene['id']}/lights/manual"
     lamp = {"type": "sphere", "position_m": [0, 0, 1], "intensity": 2}
     added = client.post(address, json=lamp)
-    assert (added.status_code, added.json()["what"]) == (201, "light added")
+    assert (added.status_code, added.json()["what"]) == (201, "sphere light added")
     assert [light["type"] for light in client.get(address).json()] == ["ambient", "sphere"]
     stale = client.patch(f"{address}/1", json={"intensity": 3}, headers={"If-Match": '"1"'})
     assert "revision 2" in sentence(stale, 409)
@@ -193,9 +193,10 @@ def test_objects_by_id(client: httpx.Client) -> None:
     address = f"/scenes/{make(client)['id']}/objects"
     added = client.post(address, json={"asset": "t.obj", "id": "shelf/left cup"})
     assert (added.status_code, added.json()["revision"]) == (201, 2)
+    assert added.json()["what"] == "shelf/left cup added"
     cup = f"{address}/shelf%2Fleft%20cup"
     moved = client.patch(cup, json={"pose": {"translation_m": [0, 0, 0.1]}}, headers={"If-Match": '"2"'})
-    assert moved.json()["what"] == "object shelf/left cup changed"
+    assert moved.json()["what"] == "shelf/left cup: pose changed"
     coloured = client.patch(cup, json={"material": {"roughness": 0.2}})
     assert coloured.json()["document"]["objects"][0]["pose"]["translation_m"] == [0, 0, 0.1]
     assert client.get(cup).json()["material"]["roughness"] == 0.2

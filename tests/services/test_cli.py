@@ -6,12 +6,14 @@ import sys
 from collections.abc import Iterator
 
 import pytest
+from typer.core import TyperGroup
 from typer.main import get_command
 from typer.testing import CliRunner
 
 from services import doctor, ports
 from services.api.serve import listening
 from services.cli import app
+from services.commands.examples import EXAMPLES
 from tests.services.conftest import ROOT, RunCli
 
 COMMANDS = {
@@ -67,6 +69,30 @@ def test_every_command_is_there_and_has_help() -> None:
         done = CliRunner().invoke(app, [*command.split(), "--help"], prog_name="deltalight")
         assert done.exit_code == 0, done.output
         assert f"Usage: deltalight {command} " in " ".join(done.output.split())
+
+
+def test_help_has_a_short_form_and_ends_with_examples_that_can_be_run() -> None:
+    root = get_command(app)
+    assert isinstance(root, TyperGroup)
+    for name, lines in EXAMPLES.items():
+        done = CliRunner().invoke(app, [name, "-h"], prog_name="deltalight", terminal_width=200)
+        assert done.exit_code == 0, done.output
+        shown = " ".join(done.output.split())
+        for line in lines:
+            assert line in shown
+            program, command, *arguments = line.split()
+            assert (program, command) == ("deltalight", name)
+            root.commands[name].make_context(name, arguments)
+
+
+def test_a_shell_completes_commands_and_options(cli: RunCli, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("_DELTALIGHT_COMPLETE", "complete_bash")
+    monkeypatch.setenv("COMP_CWORD", "1")
+    monkeypatch.setenv("COMP_WORDS", "deltalight re")
+    assert cli().stdout.split() == ["render", "record", "replay", "recordings"]
+    monkeypatch.setenv("COMP_CWORD", "2")
+    monkeypatch.setenv("COMP_WORDS", "deltalight render --met")
+    assert cli().stdout.split() == ["--method"]
 
 
 def test_overview_lists_the_commands(cli: RunCli) -> None:

@@ -20,6 +20,7 @@ from protocol.camera_model import CameraModel
 from protocol.dataset_writer import DatasetWriter
 from protocol.recording_writer import RecordingWriter
 from sensor_node.cameras.synthetic import SyntheticCamera
+from services.object_sizes import likely_factor
 from tests.services.conftest import ROOT, RunCli
 
 FRAMES = 3
@@ -139,6 +140,35 @@ def test_size_exr_and_json(cli: RunCli, take: Path, tmp_path: Path) -> None:
     assert read_rgb(tmp_path / "000000.png").shape == (120, 160, 3)
     assert (tmp_path / "000000.exr").read_bytes()[:4] == struct.pack("<I", 20000630)
     assert "no GPU" not in done.stderr
+
+
+def test_another_method_by_the_short_form_of_out(cli: RunCli, take: Path, tmp_path: Path) -> None:
+    common = ("render", take / "take", "--scene", take / "scene.json", "--frames", "0:1", "--allow-software")
+    for method in ("dlpv", "dvct"):
+        done = cli(*common, "-o", tmp_path / method, "--method", method)
+        assert done.returncode == 0, done.stderr
+    passes = [records(tmp_path / method)[0]["pass_times_ms"] for method in ("dlpv", "dvct")]
+    assert [any("propagate" in name for name in of_one) for of_one in passes] == [True, False]
+
+
+def test_a_file_in_another_unit_is_told_with_the_scale_that_helps(
+    cli: RunCli, take: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "mug.obj").write_text(triangles([[0, 0, 0], [12, 0, 0], [0, 9, 0]]))
+    mugs = [{"id": "mug", "asset": "mug.obj"}, {"id": "small", "asset": "mug.obj", "pose": {"scale": 0.01}}]
+    scene = write_scene(tmp_path / "scene.json", objects=mugs, method={"name": "none"})
+    done = cli("render", take / "take", "--scene", scene, "-o", tmp_path / "out", "--frames", "0:1")
+    assert done.returncode == 0, done.stderr
+    told = [line for line in done.stderr.splitlines() if "object `" in line]
+    assert len(told) == 1
+    assert 'object `mug` is 12 m long. If its file is in centimetres, write "scale": 0.01' in told[0]
+
+
+@pytest.mark.parametrize(
+    ("edge_m", "factor"), [(30, 0.01), (12, 0.01), (1.5, 0.01), (120, 0.001), (800, 0.001), (0.002, 100)]
+)
+def test_the_likely_unit_of_a_file(edge_m: float, factor: float) -> None:
+    assert likely_factor(edge_m) == pytest.approx(factor)
 
 
 @pytest.mark.parametrize(

@@ -94,7 +94,7 @@ def test_an_object_walks_in_a_circle(service: Service, client: Client) -> None:
     assert after.revision == before.revision + 24
     assert after.document.replaced(revision=before.revision) == before.document
     history = client.request("GET", f"/scenes/{after.id}/revisions", params={"limit": 24})
-    assert [each["what"] for each in history] == ["undo"] * 12 + ["object knot changed"] * 12
+    assert [each["what"] for each in history] == ["undo"] * 12 + ["knot: pose changed"] * 12
     way = [
         client.request("GET", f"/scenes/{after.id}/revisions/{each['revision']}")["document"]["objects"][0]
         for each in history[12:]

@@ -1,13 +1,22 @@
 """What a viewer writes of the composites that it receives."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 
-from services import ports
-from services.collector import CompositeCollector
-from tests.services.live_samples import StandInStream
+from protocol.codecs import encode_color
+from protocol.envelope import encode
+from protocol.errors import DeltalightError
+from protocol.publisher import Publisher
+from services import collector as collector_module
+from services import demo, ports
+from services.collector import CompositeCollector, summarize
+from tests.services.api_samples import RenderServer
+from tests.services.conftest import HEIGHT, WIDTH
+from tests.services.live_samples import StandInStream, composite, report
 
 
 @pytest.mark.parametrize("apart_s", [0.0, 1e-6, 0.001, 30.0])
@@ -27,3 +36,85 @@ def test_a_video_is_written_however_fast_or_slow_pictures_came(tmp_path: Path, a
     video = cv2.VideoCapture(str(tmp_path / "demo.mp4"))
     assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 2
     video.release()
+
+
+class Rig:
+    """A collector of a stand-in that publishes when it is told, beside a render server that may answer."""
+
+    def __init__(self, out: Path | None) -> None:
+        published, self.control = ports.private_ports(2)
+        self.publisher = Publisher(ports.endpoint(published))
+        self.collector = CompositeCollector(ports.endpoint(published), ports.endpoint(self.control), out)
+
+    def send(self, message: object, *parts: bytes) -> None:
+        self.publisher.send(encode(message, list(parts)))  # type: ignore[arg-type]
+
+    def send_composites(self, number: int) -> None:
+        jpeg = encode_color(np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+        while self.collector.count < number:  # a subscription takes a moment
+            self.send(composite(self.collector.count + 1), jpeg)
+            self.collector.take(0.02, number)
+
+    def close(self) -> None:
+        self.collector.close()
+        self.publisher.close()
+
+
+@pytest.fixture
+def rig(monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
+    monkeypatch.setattr(collector_module, "CONTROL_TIMEOUT_S", 0.05)
+    monkeypatch.setattr(collector_module, "ALIVE_TIMEOUT_S", 0.2)
+    made = Rig(None)
+    yield made
+    made.close()
+
+
+class NoSupervisor:
+    def poll(self) -> None:
+        """Nothing runs that could die."""
+
+
+def test_a_finished_run_does_not_need_the_servers_answer(rig: Rig) -> None:
+    rig.send_composites(2)
+    rig.collector.arrivals_s = [rig.collector._began_s, rig.collector._began_s + 0.01]
+    figures = summarize(rig.collector, {})
+    assert figures["composites"] == 2
+    assert "did not answer" in figures["renderer"]
+    while rig.collector.renderer_name() != "llvmpipe":
+        rig.send(report("render-server", "llvmpipe"))
+        rig.collector.take(0.02, 2)
+    assert summarize(rig.collector, {})["renderer"] == "llvmpipe"
+
+
+def test_a_frame_may_take_as_long_as_the_renderer_is_at_work(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(demo, "FIRST_FRAME_TIMEOUT_S", 0.05)
+    with pytest.raises(DeltalightError, match="Only 0 of 1 composites"):
+        demo._collect(rig.collector, NoSupervisor(), 1)  # type: ignore[arg-type]
+    server = RenderServer(rig.control)
+    try:
+        asked = 0
+        answer = rig.collector.is_rendering
+
+        def at_work() -> bool:
+            nonlocal asked
+            asked += 1
+            assert answer(), "it answers"
+            if asked == 3:
+                rig.send_composites(1)
+            return True
+
+        monkeypatch.setattr(rig.collector, "is_rendering", at_work)
+        demo._collect(rig.collector, NoSupervisor(), 1)  # type: ignore[arg-type]
+        assert asked == 3
+    finally:
+        server.close()
+
+
+def test_patience_grows_with_the_slowest_frame(rig: Rig) -> None:
+    rig.send_composites(1)
+    rig.collector._began_s = 0.0
+    rig.collector.arrivals_s = [120.0, 130.0]
+    assert rig.collector.slowest_s == 120
+    assert demo._patience_s(rig.collector) == 360

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from playwright.sync_api import Browser, sync_playwright
+from playwright.sync_api import Browser, Route, sync_playwright
 
 from protocol.camera_model import CameraModel
 from services.api.static_page import DASHBOARD
@@ -129,6 +129,59 @@ def test_a_glb_that_is_dropped_stands_where_it_was_let_go(stack: Stack, page: De
     page.shows_newest()
     page.until(lambda: magenta(page.pixels()) > 100, "the box in the picture")
     page.photograph("drop")
+
+
+def test_an_object_that_is_added_finds_room_beside_the_first(stack: Stack, page: Desk) -> None:
+    for name in ("crate", "crate 2"):
+        page.named("button", "Add object").click()
+        if name == "crate":
+            with page.page.expect_file_chooser() as chosen:
+                page.page.get_by_role("menuitem", name="From a file").click()
+            chosen.value.set_files({"name": "crate.glb", "mimeType": "", "buffer": box_glb()})
+        else:
+            page.named("menuitem", "crate.glb").click()
+        page.named("treeitem", name).wait_for()
+    places = [np.array(stack.object(name)["pose"]["translation_m"]) for name in ("knot", "crate", "crate 2")]
+    for index, place in enumerate(places[1:], 1):
+        assert stack.object(f"crate{' 2' * (index - 1)}")["pose"]["rotation_wxyz"] == [1, 0, 0, 0], "upright"
+        assert -0.02 < place[2] - 0.06 < 0.2, "on the table or on a thing that stands on it"
+        assert all(np.linalg.norm((place - other)[:2]) > 0.12 for other in places[:index]), (
+            "beside the others"
+        )
+    page.named("tab", "History").click()
+    assert page.page.get_by_role("listitem").filter(has_text="crate 2 added").count() == 1
+    page.shows_newest()
+    page.photograph("added")
+
+
+def test_an_override_of_the_material_begins_with_the_files_own(stack: Stack, page: Desk) -> None:
+    page.named("treeitem", "knot").click()
+    page.named("switch", "Override material").click()
+    page.named("slider", "Roughness, slider").wait_for()
+    page.named("spinbutton", "Emission red").wait_for()
+    page.until(lambda: stack.object("knot")["material"], "the material")
+    red, green, _ = stack.object("knot")["material"]["base_color"]
+    assert green > 2 * red, "the file's own green"
+    page.named("switch", "Override material").click()
+    page.until(lambda: stack.object("knot")["material"] is None, "the file's material")
+
+
+def test_a_fault_of_one_panel_leaves_the_others(page: Desk) -> None:
+    def spoil(route: Route) -> None:
+        answer = route.fetch()
+        scene = answer.json()
+        scene["document"]["objects"][0]["material"] = {"base_color": [1, 1, 1]}
+        route.fulfill(response=answer, json=scene)
+
+    page.page.route("**/active-scene", spoil)
+    page.page.reload()
+    page.named("treeitem", "knot").click()
+    page.page.get_by_role("alert").filter(has_text="The inspector failed").wait_for()
+    assert page.complaints != [], "the fixture hears of it"
+    page.complaints.clear()
+    page.named("tab", "Lights").click()
+    page.named("button", "Add light").first.wait_for()
+    assert page.complaints == []
 
 
 def arrow_place(page: Desk, from_m: np.ndarray) -> tuple[tuple[float, float], float]:

@@ -6,7 +6,14 @@ import pytest
 from playwright.sync_api import Browser, Locator, Page, expect, sync_playwright
 
 from services.api.static_page import DASHBOARD
-from tests.services.dashboard_samples import AXE, PATIENCE_S, SIZE, find_chromium, photograph
+from tests.services.dashboard_samples import (
+    AXE,
+    PATIENCE_S,
+    SIZE,
+    complaints_of,
+    find_chromium,
+    photograph,
+)
 from tests.services.live_samples import LiveApi, live_api
 
 CHROMIUM = find_chromium()
@@ -30,7 +37,14 @@ DRAWER = ("Performance", "Nodes", "Recordings", "Snapshots", "Compare", "History
 LOOKING = {
     *INSPECTOR,
     *DRAWER,
-    *("Scene and assets", "Inspector", "Scenes: Gallery", "Keys and help", "Light appearance", "Sign out"),
+    *(
+        "Scene and assets",
+        "Inspector",
+        "Scenes: Gallery",
+        "Keyboard shortcuts",
+        "Light appearance",
+        "Sign out",
+    ),
     *("Outlines and lamps", "Close the drawer", "Lamp 1"),
 }
 
@@ -57,9 +71,11 @@ def page(guarded: LiveApi, browser: Browser) -> Iterator[Page]:
     expect.set_options(timeout=PATIENCE_S * 1000)
     with browser.new_context(viewport=SIZE, color_scheme="dark") as context:  # type: ignore[arg-type]
         page = context.new_page()
+        complaints = complaints_of(page, expected=("status of 401",))
         page.set_default_timeout(PATIENCE_S * 1000)
         page.goto(f"http://{guarded.address}/")
         yield page
+        assert complaints == []
 
 
 def sign_in(page: Page, token: str) -> None:

@@ -107,6 +107,28 @@ def test_the_newest_of_many_changes_is_sent_and_all_are_answered(shown: Shown) -
     assert shown.client.get("/state").json()["picture"] == last["picture"]
 
 
+def test_a_view_is_no_change_of_the_scene_and_ends_with_a_change_of_its_own(shown: Shown) -> None:
+    def sent() -> list[object]:
+        return [order["scene"]["output"]["view"] for order in shown.server.payloads("set_scene")]  # type: ignore[index]
+
+    before = shown.client.get(f"/scenes/{shown.id}").json()
+    assert shown.client.get("/view").json() == {"view": None}
+    shown.client.put("/view", json={"view": "delta"}).raise_for_status()
+    wait_for(lambda: sent() == ["composite", "delta"])
+    wait_for(lambda: shown.client.get(f"/scenes/{shown.id}").json() == before)
+    assert not before["can_undo"]
+    assert shown.rename("other")["revision"] == 2
+    assert sent() == ["composite", "delta", "delta"]
+    shown.client.patch(f"/scenes/{shown.id}/output", json={"view": "volume"}).raise_for_status()
+    assert sent()[-1] == "volume", "the document's newer wish"
+    assert shown.client.get("/view").json() == {"view": None}
+    shown.client.put("/view", json={"view": "rsm"}).raise_for_status()
+    wait_for(lambda: sent()[-1] == "rsm")
+    shown.client.put("/view", json={"view": None}).raise_for_status()
+    wait_for(lambda: sent()[-1] == "volume")
+    assert "view" in sentence(shown.client.put("/view", json={"view": "sideways"}), 422)
+
+
 def test_who_waits_for_the_same_revision_holds_a_few_threads_only(shown: Shown) -> None:
     held = shown.hold_up()
     others = [shown.at_once(shown.activate) for _ in range(MANY - 1)]

@@ -16,6 +16,7 @@ from services.api.events import EventQueue, packed
 from services.api.fisheye import FisheyeLight, lights_in_picture
 from services.api.live_hub import LiveFrame, LiveHub
 from services.api.problems import ProblemError, responses
+from services.api.shown_view import View
 from services.storage.faults import NotFoundError
 
 WINDOW = 2  # frames in flight to one viewer before it has to acknowledge
@@ -60,6 +61,14 @@ class Pixel(BaseModel):
         max_length=200,
         description="Id of an object to look through, at the real scene behind it: one that is being dragged.",
     )
+
+
+class ViewAnswer(BaseModel):
+    """The view that the live picture shows."""
+
+    model_config = ConfigDict(strict=True, extra="forbid")
+
+    view: View | None = Field(description="null: the one of the scene's document, `output.view`.")
 
 
 class FisheyeAnswer(BaseModel):
@@ -124,6 +133,22 @@ def fisheye(shared: Shared) -> FisheyeAnswer:
         clipped_share=message.clipped_share,
         lights=lights_in_picture(message, () if frame is None else frame.message.lights),
     )
+
+
+@live_router.get("/view")
+def get_view(shared: Shared) -> ViewAnswer:
+    """Return the view that the live picture shows."""
+    return ViewAnswer(view=shared.link.view)
+
+
+@live_router.put("/view", responses=responses(400, 422))
+def put_view(shared: Shared, wanted: Annotated[ViewAnswer, Body(examples=[{"view": "delta"}])]) -> ViewAnswer:
+    """Show everybody another view; the scene and its history stay as they are.
+
+    It ends when another scene is shown, or when the `output.view` of the scene changes.
+    """
+    shared.link.use_view(wanted.view)
+    return wanted
 
 
 @live_router.get("/fisheye.jpg", response_class=Response, responses={**responses(404), **JPEG_ANSWER})

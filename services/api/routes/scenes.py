@@ -1,5 +1,6 @@
 """Routes of scenes: their revisions, objects, manual lights and the parts of the document."""
 
+from collections.abc import Mapping
 from enum import Enum
 from typing import Annotated, Any, Literal
 
@@ -62,6 +63,20 @@ ObjectId = Annotated[str, Path(description="The object's `id`.", examples=["knot
 Index = Annotated[int, Path(ge=0, le=63, description="Place among the manual lights, from 0.")]
 CHANGE_PROBLEMS = responses(400, 404, 409, 422)
 MAX_ENTRIES = 200
+LONGEST_WHAT = 200  # characters of what a revision says of itself
+
+
+def _named(body: object, key: str, otherwise: str) -> str:
+    """Return a name from a body that is not validated yet."""
+    name = body.get(key) if isinstance(body, Mapping) else None
+    return name[: LONGEST_WHAT // 2] if isinstance(name, str) and name else otherwise
+
+
+def _changed(name: str, patch: Mapping[str, Any]) -> str:
+    """Say for people what a patch changes, such as `knot: pose changed`."""
+    keys = [key.replace("_", " ") for key in sorted(patch)]
+    place = f"{name}: " if name else ""
+    return f"{place}{', '.join(keys) or 'nothing'} changed"[:LONGEST_WHAT]
 
 
 @scenes_router.get("/scenes")
@@ -109,7 +124,7 @@ def patch_scene(
     shared: Shared, scene_id: SceneId, patch: ScenePatch, response: Response, precondition: IfUnchanged
 ) -> SceneAnswer:
     """Change keys of a scene's document; a `revision` in the patch counts as If-Match."""
-    what = f"{', '.join(sorted(set(patch) - {'revision'})) or 'nothing'} changed"[:200]
+    what = _changed("", {key: value for key, value in patch.items() if key != "revision"})
     return shared.change(
         scene_id, patch_document(patch), what, with_revision_of(patch, precondition), response
     )
@@ -205,7 +220,9 @@ def create_object(
     shared: Shared, scene_id: SceneId, item: ObjectBody, response: Response, precondition: IfUnchanged
 ) -> SceneAnswer:
     """Add an object; without an `id` it gets a free one."""
-    return shared.change(scene_id, add_object(item), "object added", precondition, response)
+    return shared.change(
+        scene_id, add_object(item), f"{_named(item, 'id', 'object')} added", precondition, response
+    )
 
 
 @objects_router.get("/{object_id:path}", responses=responses(404))
@@ -231,7 +248,9 @@ def put_object(
 ) -> SceneAnswer:
     """Put another object in place of one."""
     edit = replace_object(object_id, item)
-    return shared.change(scene_id, edit, f"object {object_id} replaced", precondition, response)
+    name = _named(item, "id", object_id)
+    what = f"{object_id} replaced" if name == object_id else f"{object_id} renamed to {name}"
+    return shared.change(scene_id, edit, what[:LONGEST_WHAT], precondition, response)
 
 
 @objects_router.patch("/{object_id:path}", responses=CHANGE_PROBLEMS)
@@ -246,7 +265,7 @@ def change_object(
 ) -> SceneAnswer:
     """Change keys of an object: its pose, its material, whether it is seen."""
     edit = patch_object(object_id, patch)
-    return shared.change(scene_id, edit, f"object {object_id} changed", precondition, response)
+    return shared.change(scene_id, edit, _changed(object_id, patch), precondition, response)
 
 
 @objects_router.delete("/{object_id:path}", responses=CHANGE_PROBLEMS)
@@ -255,7 +274,7 @@ def delete_object(
 ) -> SceneAnswer:
     """Take an object out of the scene; undo brings it back."""
     edit = remove_object(object_id)
-    return shared.change(scene_id, edit, f"object {object_id} removed", precondition, response)
+    return shared.change(scene_id, edit, f"{object_id} removed", precondition, response)
 
 
 @lights_router.get("", responses=responses(404))
@@ -269,7 +288,8 @@ def create_light(
     shared: Shared, scene_id: SceneId, light: LightBody, response: Response, precondition: IfUnchanged
 ) -> SceneAnswer:
     """Add a manual light after the others; it shines in mode `manual`."""
-    return shared.change(scene_id, add_light(light), "light added", precondition, response)
+    what = f"{_named(light, 'type', 'a')} light added"
+    return shared.change(scene_id, add_light(light), what, precondition, response)
 
 
 @lights_router.get("/{index}", responses=responses(404))
@@ -292,7 +312,7 @@ def put_light(
 ) -> SceneAnswer:
     """Put another manual light in place of one."""
     return shared.change(
-        scene_id, replace_light(index, light), f"light {index} replaced", precondition, response
+        scene_id, replace_light(index, light), f"light {index + 1} replaced", precondition, response
     )
 
 
@@ -308,7 +328,7 @@ def change_light(
 ) -> SceneAnswer:
     """Change keys of a manual light; for another `type` put a whole one in its place."""
     return shared.change(
-        scene_id, patch_light(index, patch), f"light {index} changed", precondition, response
+        scene_id, patch_light(index, patch), _changed(f"light {index + 1}", patch), precondition, response
     )
 
 
@@ -317,7 +337,7 @@ def delete_light(
     shared: Shared, scene_id: SceneId, index: Index, response: Response, precondition: IfUnchanged
 ) -> SceneAnswer:
     """Take a manual light out; those after it move up, and undo brings it back."""
-    return shared.change(scene_id, remove_light(index), f"light {index} removed", precondition, response)
+    return shared.change(scene_id, remove_light(index), f"light {index + 1} removed", precondition, response)
 
 
 def _add_part(part: str, model: Any, body: Any, text: str) -> None:  # noqa: ANN401 - types for the description
@@ -337,7 +357,7 @@ def _add_part(part: str, model: Any, body: Any, text: str) -> None:  # noqa: ANN
     def patch(
         shared: Shared, scene_id: SceneId, value: PartPatch, response: Response, precondition: IfUnchanged
     ) -> SceneAnswer:
-        return shared.change(scene_id, patch_part(part, value), f"{part} changed", precondition, response)
+        return shared.change(scene_id, patch_part(part, value), _changed(part, value), precondition, response)
 
     tags: list[str | Enum] = [part if part in ("lights", "method", "output") else "scenes"]
     parts_router.add_api_route(

@@ -47,6 +47,7 @@ class State(BaseModel):
 
     render_server: Literal["answers", "silent"]
     picture: PictureState | None = Field(description="What became of the active scene's newest revision.")
+    has_fisheye: bool = Field(description="Whether light of a fish-eye camera has come.")
     processes: list[ProcessAnswer] = Field(description="Nodes and render server, as they report each second.")
     refused: dict[str, int] = Field(description="Requests refused since the start, by kind of problem.")
 
@@ -90,6 +91,7 @@ def state(shared: Shared) -> State:
     return State(
         render_server=_server(shared),
         picture=None if delivery is None else PictureState.of(delivery),
+        has_fisheye=shared.fisheye.newest is not None,
         processes=[ProcessAnswer.of(report) for report in shared.watch.reports()],
         refused=dict(shared.problems.counts),
     )

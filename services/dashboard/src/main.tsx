@@ -11,12 +11,14 @@ import "./styles/drawer.css";
 import { App } from "./components/shell/App";
 import { followScene } from "./state/selection";
 import { begin, followSession } from "./state/begin";
+import { followChanges } from "./state/liveState";
 import { followFrames } from "./state/tools";
 import { applyTheme } from "./state/theme";
 
 applyTheme();
 followScene();
 followFrames();
+followChanges();
 followSession();
 void begin();
 const root = document.getElementById("app");

@@ -1,7 +1,10 @@
 import { describe, expect, it } from "vitest";
 import { droppedFrames, parseLiveMessage } from "../src/live/message";
+import { lateBy } from "../src/live/picture";
+import { RateMeter } from "../src/live/rate";
 import { backoff } from "../src/live/socket";
 import { leadingPasses, OTHERS, stacked, timeOf, withKept, type Sample } from "../src/live/telemetry";
+import { awaitedChange } from "../src/state/liveState";
 
 function message(header: object, jpeg: readonly number[]): ArrayBuffer {
   const text = new TextEncoder().encode(JSON.stringify(header));
@@ -13,7 +16,7 @@ function message(header: object, jpeg: readonly number[]): ArrayBuffer {
 }
 
 function sample(at: number, passes: Record<string, number>): Sample {
-  return { at, age: 10, rate: 30, passes, kept: new Set(), shows: "a 1" };
+  return { at, age: 10, rate: 30, took: 20, passes, kept: new Set(), shows: "a 1" };
 }
 
 describe("a message of the live picture", () => {
@@ -66,5 +69,55 @@ describe("the plots", () => {
       [7, 7],
       [9, 8],
     ]);
+  });
+});
+
+describe("the rate", () => {
+  it("counts pictures up to now, those that this browser skipped too", () => {
+    const meter = new RateMeter();
+    expect(meter.rate(0)).toBeNull();
+    meter.note(1, 0);
+    expect(meter.rate(500)).toBeNull();
+    meter.note(2, 5);
+    expect(meter.rate(5)).toBeNull(); // it had waited
+    meter.note(3, 1000);
+    expect(meter.rate(1000)).toBeCloseTo(2, 9);
+    expect(meter.rate(4000)).toBeCloseTo(0.5, 9); // nothing came since
+  });
+
+  it("forgets what is longer ago than three seconds, and a service that began anew", () => {
+    const meter = new RateMeter();
+    for (let number = 1; number <= 11; number++) meter.note(number, 1000 * number);
+    expect(meter.rate(11_000)).toBeCloseTo(1, 9);
+    meter.note(1, 12_000);
+    expect(meter.rate(12_500)).toBeNull();
+  });
+});
+
+describe("a late frame", () => {
+  it("is later than three of the slowest frames, and than a second and a half", () => {
+    expect(lateBy(1400, 20)).toBe(0);
+    expect(lateBy(1600, 20)).toBe(1600);
+    expect(lateBy(5000, 2000)).toBe(0);
+    expect(lateBy(7000, 2000)).toBe(7000);
+    expect(lateBy(11_000, 60_000)).toBe(11_000);
+  });
+});
+
+describe("a change that is rendered", () => {
+  const at = (revision: number, id = "a") => ({ id, revision });
+
+  it("is waited for since the oldest one that the picture lacks", () => {
+    const first = awaitedChange(null, at(1), at(2), 100);
+    expect(first).toEqual({ revision: 2, sinceMs: 100 });
+    expect(awaitedChange(first, at(1), at(5), 200)).toEqual(first);
+    expect(awaitedChange(first, at(2), at(5), 300)).toEqual({ revision: 5, sinceMs: 300 });
+    expect(awaitedChange(first, at(5), at(5), 400)).toBeNull();
+  });
+
+  it("may be another scene, and is nothing where another program set the scene", () => {
+    expect(awaitedChange(null, at(9, "b"), at(2), 100)).toEqual({ revision: 2, sinceMs: 100 });
+    expect(awaitedChange(null, null, at(2), 100)).toBeNull();
+    expect(awaitedChange(null, at(2), null, 100)).toBeNull();
   });
 });

@@ -6,7 +6,7 @@ import { anglesFromDirection, directionFromAngles } from "../src/math/direction"
 import { convexHull, isInside } from "../src/math/hull";
 import { anglesFromQuaternion, quaternionFromAngles, rotate, turnBetween } from "../src/math/rotation";
 import { snap } from "../src/math/snap";
-import { bytes, clock, labelOf, milliseconds, size, trimmed, unitOf } from "../src/math/units";
+import { bytes, clock, labelOf, milliseconds, size, sizesText, trimmed, unitOf } from "../src/math/units";
 
 const UPRIGHT: Pose = { translation_m: [0, 0, 0], rotation_wxyz: [1, 0, 0, 0], scale: 1 };
 
@@ -114,6 +114,12 @@ describe("small things", () => {
       "4.2 mm",
       "14.5 cm",
     ]);
+  });
+
+  it("gives the sizes of a thing in one unit", () => {
+    expect(sizesText([0.145, 0.076])).toBe("14.5 × 7.6 cm");
+    expect(sizesText([1.2, 0.5, 0.25])).toBe("1.2 × 0.5 × 0.25 m");
+    expect(sizesText([0.0042, 0.001])).toBe("4.2 × 1 mm");
   });
 
   it("keeps colours through the picker, brighter ones in their own strength", () => {

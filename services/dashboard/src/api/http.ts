@@ -49,7 +49,11 @@ async function send(method: string, path: string, options: RequestOptions): Prom
   try {
     return await fetch(path, init);
   } catch {
-    throw new ProblemError(0, "unreachable", "The service does not answer; see whether `deltalight api` still runs.");
+    throw new ProblemError(
+      0,
+      "unreachable",
+      "The server does not respond. Check that `deltalight api` is still running.",
+    );
   }
 }
 
@@ -79,11 +83,13 @@ export function refusal(status: number, text: string): ProblemError {
   } catch {
     // whoever stands between answered: a proxy's page says nothing that people could use
   }
-  const sentence = sentenceOf(problem.detail ?? `The service answered with status ${status}.`);
+  const sentence = sentenceOf(problem.detail ?? `The server answered with status ${status}.`);
   if (status === 401) tokenRefused(sentence);
   return new ProblemError(status, (problem.type ?? "").replace(PROBLEM_PREFIX, ""), sentence, problem.revision ?? null);
 }
 
+/** A capital at the beginning, unless that is a name: a file's, a key's or an id's stays as it was typed. */
 export function sentenceOf(detail: string): string {
-  return detail.charAt(0).toUpperCase() + detail.slice(1);
+  const isWord = /^[a-z]+[ ,]/.test(detail);
+  return isWord ? detail.charAt(0).toUpperCase() + detail.slice(1) : detail;
 }

@@ -966,6 +966,32 @@ export interface paths {
         readonly patch?: never;
         readonly trace?: never;
     };
+    readonly "/api/v1/view": {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        /**
+         * Get View
+         * @description Return the view that the live picture shows.
+         */
+        readonly get: operations["get_view"];
+        /**
+         * Put View
+         * @description Show everybody another view; the scene and its history stay as they are.
+         *
+         *     It ends when another scene is shown, or when the `output.view` of the scene changes.
+         */
+        readonly put: operations["put_view"];
+        readonly post?: never;
+        readonly delete?: never;
+        readonly options?: never;
+        readonly head?: never;
+        readonly patch?: never;
+        readonly trace?: never;
+    };
 }
 export type webhooks = Record<string, never>;
 export interface components {
@@ -1068,6 +1094,13 @@ export interface components {
              * @enum {string}
              */
             readonly near_light: "measured" | "none";
+            /**
+             * Quality
+             * @description What a moving picture may give up for speed (docs/speed.md): live, balanced, or best: nothing.
+             * @default best
+             * @enum {string}
+             */
+            readonly quality: "live" | "balanced" | "best";
             /**
              * Rays
              * @description Rays from each sample over the whole sphere; more take longer once.
@@ -1310,6 +1343,13 @@ export interface components {
              */
             readonly name: "differential";
             /**
+             * Quality
+             * @description What a moving picture may give up for speed (docs/speed.md): live, balanced, or best: nothing.
+             * @default best
+             * @enum {string}
+             */
+            readonly quality: "live" | "balanced" | "best";
+            /**
              * Radiance
              * @description Of the exact operator: real surfaces shine as the camera sees them, or as lights predict.
              * @default measured
@@ -1469,6 +1509,13 @@ export interface components {
              */
             readonly propagation?: ("moments" | "lobes") | null;
             /**
+             * Quality
+             * @description What a moving picture may give up for speed (docs/speed.md): live, balanced, or best: nothing.
+             * @default best
+             * @enum {string}
+             */
+            readonly quality: "live" | "balanced" | "best";
+            /**
              * Query Scale
              * @description The volume is read at 1/scale of the picture; null = 2 on a GPU, 4 in software.
              */
@@ -1592,6 +1639,13 @@ export interface components {
              * @enum {string}
              */
             readonly operator: "exact" | "paper";
+            /**
+             * Quality
+             * @description What a moving picture may give up for speed (docs/speed.md): live, balanced, or best: nothing.
+             * @default best
+             * @enum {string}
+             */
+            readonly quality: "live" | "balanced" | "best";
             /**
              * Radiance
              * @description Of the exact operator: real surfaces shine as the camera sees them, or as lights predict.
@@ -1939,6 +1993,11 @@ export interface components {
             readonly pass_times_ms: {
                 readonly [key: string]: number;
             };
+            /**
+             * Render Ms
+             * @description From the frame's arrival at the renderer to its picture, waiting included.
+             */
+            readonly render_ms: number;
             /** Renderer */
             readonly renderer: string;
             /** @description null where another program set the server's scene. */
@@ -2246,6 +2305,13 @@ export interface components {
              * @constant
              */
             readonly name: "none";
+            /**
+             * Quality
+             * @description What a moving picture may give up for speed (docs/speed.md): live, balanced, or best: nothing.
+             * @default best
+             * @enum {string}
+             */
+            readonly quality: "live" | "balanced" | "best";
         };
         /**
          * Output
@@ -2768,7 +2834,7 @@ export interface components {
             /**
              * What
              * @description What was changed.
-             * @example object knot changed
+             * @example knot: pose changed
              */
             readonly what: string;
         };
@@ -3173,6 +3239,11 @@ export interface components {
          * @description How the render server and the nodes are doing.
          */
         readonly State: {
+            /**
+             * Has Fisheye
+             * @description Whether light of a fish-eye camera has come.
+             */
+            readonly has_fisheye: boolean;
             /** @description What became of the active scene's newest revision. */
             readonly picture: components["schemas"]["PictureState"] | null;
             /**
@@ -3333,6 +3404,17 @@ export interface components {
             readonly radius_m: number;
         };
         /**
+         * ViewAnswer
+         * @description The view that the live picture shows.
+         */
+        readonly ViewAnswer: {
+            /**
+             * View
+             * @description null: the one of the scene's document, `output.view`.
+             */
+            readonly view: ("composite" | "effects" | "delta" | "volume" | "rsm" | "lights") | null;
+        };
+        /**
          * WantedPicture
          * @description A picture to take.
          */
@@ -3421,6 +3503,7 @@ export type StreamState = components['schemas']['StreamState'];
 export type Surface = components['schemas']['Surface'];
 export type TicketAnswer = components['schemas']['TicketAnswer'];
 export type TrackedLamp = components['schemas']['TrackedLamp'];
+export type ViewAnswer = components['schemas']['ViewAnswer'];
 export type WantedPicture = components['schemas']['WantedPicture'];
 export type $defs = Record<string, never>;
 export interface operations {
@@ -10840,6 +10923,176 @@ export interface operations {
                 };
                 content: {
                     readonly "application/json": components["schemas"]["TicketAnswer"];
+                };
+            };
+            /** @description Bad Request */
+            readonly 400: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Unauthorized */
+            readonly 401: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Forbidden */
+            readonly 403: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Request Entity Too Large */
+            readonly 413: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Unprocessable Entity */
+            readonly 422: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too Many Requests */
+            readonly 429: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Service Unavailable */
+            readonly 503: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    readonly get_view: {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        readonly requestBody?: never;
+        readonly responses: {
+            /** @description Successful Response */
+            readonly 200: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/json": components["schemas"]["ViewAnswer"];
+                };
+            };
+            /** @description Bad Request */
+            readonly 400: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Unauthorized */
+            readonly 401: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Forbidden */
+            readonly 403: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Request Entity Too Large */
+            readonly 413: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Unprocessable Entity */
+            readonly 422: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too Many Requests */
+            readonly 429: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Service Unavailable */
+            readonly 503: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    readonly put_view: {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        readonly requestBody: {
+            readonly content: {
+                readonly "application/json": components["schemas"]["ViewAnswer"];
+            };
+        };
+        readonly responses: {
+            /** @description Successful Response */
+            readonly 200: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/json": components["schemas"]["ViewAnswer"];
                 };
             };
             /** @description Bad Request */

@@ -8,8 +8,8 @@ export type Phase = "starting" | "sign-in" | "ready" | "unreachable";
 export const phase = signal<Phase>("starting");
 export const token = signal<string | null>(sessionStorage.getItem(TOKEN_KEY));
 export const signInProblem = signal<string>("");
-/** "view" may only look; told by the service when its events begin. */
-export const role = signal<"view" | "control">("control");
+/** "view" may only look; null until the service tells, when its events begin. */
+export const role = signal<"view" | "control" | null>(null);
 export const version = signal<string>("");
 
 export function keepToken(value: string | null): void {

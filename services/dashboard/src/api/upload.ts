@@ -14,7 +14,8 @@ export function uploadAsset(file: File, onProgress: (share: number) => void): Pr
     sending.upload.onprogress = (event) => {
       if (event.lengthComputable) onProgress(event.loaded / event.total);
     };
-    sending.onerror = () => reject(new ProblemError(0, "unreachable", `${file.name} was not sent; try again.`));
+    sending.onerror = () =>
+      reject(new ProblemError(0, "unreachable", `${file.name} could not be uploaded; try again.`));
     sending.onload = () => {
       if (sending.status < 300) resolve(JSON.parse(sending.responseText) as AssetAnswer);
       else reject(refusal(sending.status, sending.responseText));

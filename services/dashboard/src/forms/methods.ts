@@ -39,7 +39,7 @@ const OWN: readonly MethodText[] = [
   {
     name: "differential",
     title: "Differential rendering",
-    help: "Two full solutions subtracted: the yardstick for the others, and the slowest.",
+    help: "Two full solutions, subtracted. The reference for the others, and the slowest.",
     schema: "DifferentialMethod",
     main: ["volume_size", "bounces"],
   },

@@ -12,9 +12,13 @@ export const VIEWS: readonly ViewText[] = [
   {
     value: "delta",
     label: "Change of light",
-    help: "Light gained in its colour, light lost in red, four times enlarged.",
+    help: "Light gained in its own colour, light lost in red, amplified four times.",
   },
   { value: "volume", label: "Volume", help: "The lit voxels or cells." },
-  { value: "rsm", label: "Light's view", help: "What the first lamp sees: the real scene left, objects right." },
-  { value: "lights", label: "Lights", help: "The lights that were found, over the fish-eye picture." },
+  {
+    value: "rsm",
+    label: "Light's view",
+    help: "What the first lamp sees: the real scene on the left, objects on the right.",
+  },
+  { value: "lights", label: "Lights", help: "The lights found in the fish-eye picture." },
 ];

@@ -1,29 +1,30 @@
 // The live picture: newest frame drawn and acknowledged, its header shared with everything that goes over it.
-import { computed, signal } from "@preact/signals";
+import { computed, signal, type ReadonlySignal } from "@preact/signals";
 import { API } from "../api/http";
 import type { LiveHeader } from "../api/types";
 import { lensOf, type View } from "../math/camera";
-import { note } from "./telemetry";
+import { RateMeter } from "./rate";
+import { note, slowestMs } from "./telemetry";
 import { parseLiveMessage } from "./message";
-import { ReconnectingSocket } from "./socket";
+import { ReconnectingSocket, type Connection } from "./socket";
 
-// A picture is stale when three frames are missing, within these bounds.
-const STALE_MS = { least: 1500, most: 10_000 };
+// A frame is late when three of the slowest of the last minute would have fitted in, within these bounds.
+const LATE_FRAMES = 3;
+const LATE_MS = { least: 1500, most: 10_000 };
+const TICK_MS = 500;
 
 export const frame = signal<LiveHeader | null>(null);
 export const pictureSize = signal<{ readonly width: number; readonly height: number } | null>(null);
-const isStale = signal(false);
+/** Pictures a second. */
+export const rate = signal<number | null>(null);
+/** How long the next frame has kept this page waiting, ms; 0 until it is late. */
+export const lateMs = signal(0);
+const meter = new RateMeter();
 let lastArrival = 0;
 let canvas: HTMLCanvasElement | null = null;
 
 const socket = new ReconnectingSocket(`${API}/live`, (event) => void receive(event));
-
-export const liveState = computed<"connecting" | "reconnecting" | "waiting" | "stale" | "no-board" | "live">(() => {
-  if (socket.state.value !== "open") return frame.value === null ? "connecting" : "reconnecting";
-  if (frame.value === null) return "waiting";
-  if (isStale.value) return "stale";
-  return frame.value.status === "ok" ? "live" : "no-board";
-});
+export const connection = socket.state as ReadonlySignal<Connection>;
 
 /** The newest frame's camera in the world; null without a pose. */
 export const view = computed<View | null>(() => {
@@ -41,14 +42,19 @@ let watch: ReturnType<typeof setInterval> | undefined;
 export function startPicture(): void {
   socket.start();
   clearInterval(watch);
-  watch = setInterval(
-    () => (isStale.value = performance.now() - lastArrival > staleAfterMs(frame.value?.frames_per_s)),
-    500,
-  );
+  watch = setInterval(tick, TICK_MS);
 }
 
-function staleAfterMs(framesPerS: number | null | undefined): number {
-  return Math.max(STALE_MS.least, Math.min(STALE_MS.most, 3000 / (framesPerS ?? 1)));
+function tick(): void {
+  const now = performance.now();
+  rate.value = meter.rate(now);
+  lateMs.value = frame.value === null ? 0 : lateBy(now - lastArrival, slowestMs());
+}
+
+/** How long a frame has been waited for, where that is longer than frames took; else 0. */
+export function lateBy(sinceMs: number, frameMs: number): number {
+  const patienceMs = Math.max(LATE_MS.least, Math.min(LATE_MS.most, LATE_FRAMES * frameMs));
+  return sinceMs > patienceMs ? sinceMs : 0;
 }
 
 export function stopPicture(): void {
@@ -79,7 +85,9 @@ function draw(bitmap: ImageBitmap, header: LiveHeader): void {
     canvas.getContext("2d")?.drawImage(bitmap, 0, 0);
   }
   lastArrival = performance.now();
-  isStale.value = false;
+  lateMs.value = 0;
+  meter.note(header.number, lastArrival);
+  rate.value = meter.rate(lastArrival);
   frame.value = header;
-  note(header, lastArrival);
+  note(header, lastArrival, rate.value);
 }

@@ -7,6 +7,8 @@ export interface Sample {
   readonly at: number;
   readonly age: number | null;
   readonly rate: number | null;
+  /** What the renderer took for the frame, ms. */
+  readonly took: number;
   readonly passes: Passes;
   /** Names of the passes whose results this frame used again: their times are those of when they ran. */
   readonly kept: ReadonlySet<string>;
@@ -21,13 +23,18 @@ export const OTHERS = "others";
 
 export const samples = signal<readonly Sample[]>([]);
 
-export function note(header: LiveHeader, nowMs: number): void {
+export function note(header: LiveHeader, nowMs: number, rate: number | null): void {
   const at = nowMs / 1000;
   const shows = header.scene && `${header.scene.id} ${header.scene.revision}`;
   const passes = withKept(samples.value.at(-1), header.pass_times_ms, shows);
-  const sample: Sample = { at, age: header.age_ms, rate: header.frames_per_s, shows, ...passes };
+  const sample: Sample = { at, age: header.age_ms, rate, took: header.render_ms, shows, ...passes };
   const kept = samples.value.filter((each) => each.at > at - KEPT_S);
   samples.value = [...kept, sample];
+}
+
+/** What the slowest frame of the last minute took the renderer, ms. */
+export function slowestMs(): number {
+  return samples.value.reduce((most, each) => Math.max(most, each.took), 0);
 }
 
 /**

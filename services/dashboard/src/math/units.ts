@@ -48,7 +48,23 @@ export function milliseconds(value: number): string {
   return value >= 1000 ? `${trimmed(value / 1000, 2)} s` : `${trimmed(value, value < 10 ? 1 : 0)} ms`;
 }
 
+/** Pictures a second; slow ones with a digit more. */
+export function rateText(perSecond: number | null): string {
+  return perSecond === null ? "–" : `${perSecond.toFixed(perSecond < 1 ? 2 : 1)} fps`;
+}
+
 export function size(metres: number): string {
-  if (metres < 0.1) return `${trimmed(metres * 1000, metres < 0.01 ? 1 : 0)} mm`;
-  return metres < 1 ? `${trimmed(metres * 100, 1)} cm` : `${trimmed(metres, 2)} m`;
+  return sizesText([metres]);
+}
+
+/** Lengths in the unit that suits the longest: "14.5 × 7.6 cm". */
+export function sizesText(metres: readonly number[]): string {
+  const longest = Math.max(...metres);
+  const [unit, factor, decimals] =
+    longest < 0.1
+      ? (["mm", 1000, longest < 0.01 ? 1 : 0] as const)
+      : longest < 1
+        ? (["cm", 100, 1] as const)
+        : (["m", 1, 2] as const);
+  return `${metres.map((each) => trimmed(each * factor, decimals)).join(" × ")} ${unit}`;
 }

@@ -10,19 +10,20 @@ import type {
   PickAnswer,
   Pose,
   SceneAnswer,
-  View,
+  Vector,
 } from "../api/types";
-import { boundsOf, longestEdge, sensibleScale, standOn } from "../math/bounds";
+import { boundsOf, longestEdge, restOn, sensibleScale, standOn, type Bounds } from "../math/bounds";
 import { meetPlane, type Pixel } from "../math/camera";
 import { UP } from "../math/vector";
 import { size, trimmed } from "../math/units";
 import { pictureSize, view } from "../live/picture";
 import { assetName, boundsByObject } from "./assets";
+import { beforeWall, footprintOf, freePlace, standable } from "./freeSpace";
 import { edit } from "./gesture";
 import { rounded } from "./handle";
 import { change, lights, objects, readScene, readScenes, sceneDocument, takeScene } from "./scene";
 import { selectLight, selectObject } from "./selection";
-import { objectTarget, partTarget } from "./targets";
+import { documentTarget, objectTarget, partTarget } from "./targets";
 import { announce, attempt, toast } from "./toasts";
 import { tool } from "./tools";
 
@@ -32,32 +33,53 @@ export async function pick(pixel: Pixel): Promise<PickAnswer | undefined> {
   return attempt(() => lookAt(pixel));
 }
 
-/** Where something new is put: on what the picture shows at a pixel, else on the board's plane there. */
-async function placeAt(pixel: Pixel): Promise<Pick<PickAnswer, "point_m" | "normal">> {
-  const found = await pick(pixel);
-  if (found?.point_m) return found;
-  const point_m = view.value ? meetPlane(view.value, pixel, [0, 0, 0], UP) : null;
-  if (point_m) toast("No surface was seen there; the object stands on the board's plane.");
-  return { point_m: point_m ?? [0, 0, 0], normal: UP };
-}
-
-/** Add an object of an asset at a pixel, named as a file; it stands on the surface there. */
-export async function addObject(asset: AssetAnswer, pixel: Pixel = centre(), name = assetName(asset)): Promise<void> {
+/** Add an object of an asset, named as a file: at a pixel, or where the middle of the picture has room for it. */
+export async function addObject(
+  asset: AssetAnswer,
+  pixel: Pixel | null = null,
+  name = assetName(asset),
+): Promise<void> {
   if (!(await ensureScene())) return;
-  const { point_m, normal } = await placeAt(pixel);
   const bounds = boundsOf(asset, null);
   const scale = bounds ? sensibleScale(bounds) : 1;
-  const pose = standOn({ ...UPRIGHT, scale }, bounds, point_m ?? [0, 0, 0], normal ?? UP);
+  const pose: Pose = { ...UPRIGHT, scale };
+  const point = pixel ? await pointAt(pixel, footprintOf(pose, bounds).radius) : await roomFor(pose, bounds);
   const id = freeId(name);
-  if (!(await change("POST", "/objects", { id, asset: asset.asset, pose: rounded(pose) }))) return;
+  const body = { id, asset: asset.asset, pose: rounded(restOn(pose, bounds, point, UP)) };
+  if (!(await change("POST", "/objects", body))) return;
   selectObject(id);
-  announce(`${id} was added.`);
+  announce(`${id} added.`);
   if (bounds && scale !== 1) {
     const edge = longestEdge(bounds);
-    toast(
-      `${id} is ${size(edge)} long in its file; it was added at scale ${trimmed(scale, 9)}. Change it under Scale.`,
-    );
+    toast(`${id} is ${size(edge)} long in its file, so it was added at scale ${trimmed(scale, 9)}.`);
   }
+}
+
+/** Where something new stands at a pixel: on the surface seen there, or on what is behind a virtual object. */
+async function pointAt(pixel: Pixel, radius: number): Promise<Vector> {
+  const first = await pick(pixel);
+  const found = first?.kind === "object" && first.object ? await attempt(() => lookAt(pixel, first.object!)) : first;
+  const point = standable(found);
+  if (point) return point;
+  toast("There is no level surface there, so the object stands on the plane of the board.");
+  return found?.point_m ? beforeWall(found.point_m, found.normal, radius) : onBoard(pixel);
+}
+
+function onBoard(pixel: Pixel): Vector {
+  return (view.value && meetPlane(view.value, pixel, [0, 0, 0], UP)) ?? [0, 0, 0];
+}
+
+/** The free place nearest to the picture's middle. */
+async function roomFor(pose: Pose, bounds: Bounds | null): Promise<Vector> {
+  if (!view.value) return [0, 0, 0];
+  const taken = objects.value.flatMap((item) =>
+    item.frame === "world" ? footprintOf(item.pose, boundsByObject.value.get(item.id) ?? null) : [],
+  );
+  const wanted = { view: view.value, pixel: centre(), pose, bounds, taken };
+  const found = await freePlace(wanted, (at) => attempt(() => lookAt(at)));
+  if (found) return found;
+  toast("No free place was found, so the object stands in the middle of the picture. Drag it where you want it.");
+  return onBoard(centre());
 }
 
 function centre(): Pixel {
@@ -75,12 +97,16 @@ function freeId(fileName: string): string {
 }
 
 async function ensureScene(): Promise<boolean> {
-  return sceneDocument.value !== null || (await newScene("my scene")) !== undefined;
+  return sceneDocument.value !== null || (await newScene("My scene")) !== undefined;
 }
 
 export async function newScene(name: string): Promise<SceneAnswer | undefined> {
   const made = await attempt(() => request<SceneAnswer>("POST", `${API}/scenes`, { body: { name } }));
   return made && activateScene(made.id);
+}
+
+export function renameScene(name: string): Promise<number | null> {
+  return edit(documentTarget, { name });
 }
 
 export async function activateScene(id: string): Promise<SceneAnswer | undefined> {
@@ -105,7 +131,7 @@ export async function deleteScene(id: string): Promise<void> {
 
 export async function removeObject(id: string): Promise<void> {
   const removed = await change("DELETE", `/objects/${encodeURIComponent(id)}`);
-  if (removed) announce(`${id} was removed; undo brings it back.`);
+  if (removed) announce(`${id} removed. Undo brings it back.`);
 }
 
 export async function duplicateObject(id: string): Promise<void> {
@@ -128,8 +154,8 @@ export async function placeObject(id: string, pixel: Pixel): Promise<void> {
   if (!found.point_m || found.object === id) {
     toast(
       found.object === id
-        ? "Click beside the object, where it is to stand."
-        : "No surface was seen there; click elsewhere.",
+        ? "Click next to the object, where it should stand."
+        : "No surface was found there. Click somewhere else.",
     );
     return;
   }
@@ -150,16 +176,12 @@ export async function replaceLight(index: number, light: Partial<ManualLight>): 
 export async function removeLight(index: number): Promise<void> {
   if (await change("DELETE", `/lights/manual/${index}`, undefined, { strict: true })) {
     selectLight(null);
-    announce("The light was removed; undo brings it back.");
+    announce("Light removed. Undo brings it back.");
   }
 }
 
 export function setMethod(name: MethodName): Promise<number | null> {
   return edit(partTarget("method"), { name });
-}
-
-export function setView(name: View): Promise<number | null> {
-  return edit(partTarget("output"), { view: name });
 }
 
 export function methodOf(name: MethodName): Method | { name: MethodName } {

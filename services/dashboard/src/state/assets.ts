@@ -1,7 +1,7 @@
 // Uploaded files, and those on their way.
 import { computed, signal } from "@preact/signals";
 import { API, request } from "../api/http";
-import type { AssetAnswer } from "../api/types";
+import type { AssetAnswer, Material, SceneObject } from "../api/types";
 import { uploadAsset } from "../api/upload";
 import { boundsOfObject, type Bounds } from "../math/bounds";
 import { objects } from "./scene";
@@ -42,7 +42,7 @@ export async function upload(file: File): Promise<AssetAnswer | undefined> {
   const asset = await attempt(() => uploadAsset(file, progress));
   uploads.value = uploads.value.filter((each) => each.id !== id);
   if (asset) {
-    announce(`${file.name} is uploaded.`);
+    announce(`${file.name} uploaded.`);
     await readAssets();
   }
   return asset;
@@ -51,6 +51,23 @@ export async function upload(file: File): Promise<AssetAnswer | undefined> {
 export async function removeAsset(asset: AssetAnswer): Promise<void> {
   await attempt(() => request("DELETE", `${API}/assets/${asset.asset}`));
   await readAssets();
+}
+
+// Of files that were uploaded before the service read their material.
+const PLAIN: Material = {
+  base_color: [0.8, 0.8, 0.8],
+  metallic: 0,
+  roughness: 0.5,
+  specular: 0.5,
+  ior: null,
+  emission: [0, 0, 0],
+  transmission: 0,
+};
+
+/** The material that an object's file gives it, to begin an override with. */
+export function materialOfFile(item: SceneObject, known: readonly AssetAnswer[]): Material {
+  const asset = known.find((each) => each.asset === item.asset);
+  return { ...PLAIN, ...(asset?.facts.material as Partial<Material> | undefined) };
 }
 
 export function assetName(asset: AssetAnswer): string {

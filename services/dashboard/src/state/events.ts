@@ -1,12 +1,13 @@
 // Events of the service, which keep every browser in step.
+import { signal } from "@preact/signals";
 import { API } from "../api/http";
 import { role, version } from "../api/session";
-import type { PictureState, ProcessAnswer, Recording, Replay } from "../api/types";
+import type { PictureState, ProcessAnswer, Recording, Replay, View } from "../api/types";
 import { ReconnectingSocket } from "../live/socket";
 import { readAssets } from "./assets";
 import { readRevisions } from "./history";
 import { readState, takeReport } from "./processes";
-import { readScene, readScenes, scene, takePicture } from "./scene";
+import { chosenView, readScene, readScenes, readView, scene, takePicture } from "./scene";
 import { readRecordings, readReplay, readSnapshots, replay } from "./takes";
 import { toast } from "./toasts";
 
@@ -14,6 +15,9 @@ interface Event {
   readonly type: string;
   readonly [key: string]: unknown;
 }
+
+/** Whether everything was read once: before, nothing can be said to be missing. */
+export const isRead = signal(false);
 
 const socket = new ReconnectingSocket(`${API}/events`, (message) => {
   if (typeof message.data === "string") void take(JSON.parse(message.data) as Event);
@@ -32,6 +36,7 @@ export async function readAll(): Promise<void> {
   await Promise.all([
     readScene(),
     readScenes(),
+    readView(),
     readAssets(),
     readState(),
     readRecordings(),
@@ -39,6 +44,7 @@ export async function readAll(): Promise<void> {
     readSnapshots(),
   ]);
   await readRevisions();
+  isRead.value = true;
 }
 
 async function take(event: Event): Promise<void> {
@@ -64,6 +70,10 @@ async function take(event: Event): Promise<void> {
       return readSnapshots();
     case "picture": {
       takePictureEvent(event as unknown as PictureEvent);
+      return;
+    }
+    case "view": {
+      chosenView.value = (event as unknown as { readonly view: View | null }).view;
       return;
     }
     case "notice": {

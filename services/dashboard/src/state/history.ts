@@ -46,7 +46,7 @@ export function undo(): Promise<void> {
   last = last.then(async () => {
     await settled();
     if (scene.value?.can_undo !== true) return;
-    if (await change("POST", "/undo", undefined, { strict: true })) announce("The last change was taken back.");
+    if (await change("POST", "/undo", undefined, { strict: true })) announce("Undone.");
   });
   return last;
 }
@@ -55,7 +55,7 @@ export function redo(): Promise<void> {
   last = last.then(async () => {
     await settled();
     if (scene.value?.can_redo !== true) return;
-    if (await change("POST", "/redo", undefined, { strict: true })) announce("The change was made again.");
+    if (await change("POST", "/redo", undefined, { strict: true })) announce("Redone.");
   });
   return last;
 }
@@ -65,5 +65,5 @@ export async function restore(revision: number): Promise<void> {
   const then = await attempt(() => request<SceneAnswer>("GET", scenePath(`/revisions/${revision}`)));
   if (!then) return;
   const body = { ...then.document, revision: scene.value?.revision };
-  if (await change("PUT", "", body, { strict: true })) announce(`The scene is as it was at revision ${revision}.`);
+  if (await change("PUT", "", body, { strict: true })) announce(`Revision ${revision} restored.`);
 }

@@ -1,7 +1,7 @@
 // The scene that is rendered: as the service has it, with this browser's changes on their way laid over it.
 import { computed, signal } from "@preact/signals";
 import { API, ProblemError, request } from "../api/http";
-import type { PictureState, SceneAnswer, SceneDocument, SceneSummary } from "../api/types";
+import type { PictureState, SceneAnswer, SceneDocument, SceneSummary, View } from "../api/types";
 import { settled } from "./pending";
 import { attempt, tell, toast } from "./toasts";
 
@@ -18,6 +18,9 @@ export const sceneDocument = computed<SceneDocument | null>(() => {
   return [...overlays.value.values()].reduce((document, overlay) => overlay(document), served.value.document);
 });
 export const objects = computed(() => sceneDocument.value?.objects ?? []);
+/** The view in place of the document's own; null without. */
+export const chosenView = signal<View | null>(null);
+export const shownView = computed<View | null>(() => chosenView.value ?? sceneDocument.value?.output.view ?? null);
 export const lights = computed(() => sceneDocument.value?.lights ?? null);
 
 export function overlay(key: object, change: Overlay | null): void {
@@ -54,6 +57,19 @@ export async function readScene(): Promise<void> {
     else tell(fault);
   }
   isSceneRead.value = true;
+}
+
+export async function readView(): Promise<void> {
+  const found = await attempt(() => request<{ readonly view: View | null }>("GET", `${API}/view`));
+  if (found) chosenView.value = found.view;
+}
+
+/** Look at the scene in another way; that is no change of the scene. */
+export async function setView(view: View): Promise<void> {
+  const before = chosenView.value;
+  chosenView.value = view;
+  const shown = await attempt(() => request<unknown>("PUT", `${API}/view`, { body: { view } }));
+  if (shown === undefined) chosenView.value = before;
 }
 
 export async function readScenes(): Promise<void> {
@@ -94,5 +110,8 @@ async function tellChange(fault: unknown): Promise<void> {
   }
   await readScene();
   const what = served.value ? ` (${served.value.what}, revision ${served.value.revision})` : "";
-  toast(`Somebody else was faster${what}. The scene was read again; look, and repeat your change.`, "error");
+  toast(
+    `Somebody else changed the scene first${what}. It has been reloaded; check it, then repeat your change.`,
+    "error",
+  );
 }

@@ -1,4 +1,4 @@
-// Sentences that stay until they are dismissed, and short ones for screen readers.
+// Sentences that leave by themselves once they were read, and short ones for screen readers.
 import { signal } from "@preact/signals";
 import { ProblemError } from "../api/http";
 
@@ -9,7 +9,11 @@ export interface Toast {
 }
 
 const MOST = 4;
+// Time to notice one, and to read it at 15 letters a second; refusals want a second look.
+const STAYS_MS = { notice: 5000, error: 10_000 };
+const LETTER_MS = 1000 / 15;
 let count = 0;
+const leaving = new Map<number, ReturnType<typeof setTimeout>>();
 
 export const toasts = signal<readonly Toast[]>([]);
 /** Read out by screen readers; not shown. */
@@ -17,10 +21,30 @@ export const announcement = signal("");
 
 export function toast(text: string, kind: Toast["kind"] = "notice"): void {
   const others = toasts.value.filter((each) => each.text !== text);
-  toasts.value = [...others, { id: ++count, kind, text }].slice(-MOST);
+  const made: Toast = { id: ++count, kind, text };
+  toasts.value = [...others, made].slice(-MOST);
+  release(made);
+}
+
+/** Keep one for as long as somebody points at it. */
+export function hold({ id }: Toast): void {
+  clearTimeout(leaving.get(id));
+  leaving.delete(id);
+}
+
+/** Let one leave after its time. */
+export function release(shown: Toast): void {
+  hold(shown);
+  const stays = STAYS_MS[shown.kind] + LETTER_MS * shown.text.length;
+  leaving.set(
+    shown.id,
+    setTimeout(() => dismiss(shown.id), stays),
+  );
 }
 
 export function dismiss(id: number): void {
+  clearTimeout(leaving.get(id));
+  leaving.delete(id);
   toasts.value = toasts.value.filter((each) => each.id !== id);
 }
 
@@ -34,7 +58,7 @@ export function tell(fault: unknown): void {
     if (fault.status !== 401) toast(fault.message, "error");
     return;
   }
-  toast("Something in this page went wrong; load it again if it does not behave.", "error");
+  toast("Something went wrong in this page. Reload it if it misbehaves.", "error");
   console.error(fault);
 }
 

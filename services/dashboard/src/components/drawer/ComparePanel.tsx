@@ -41,8 +41,8 @@ export function ComparePanel() {
         {comparison.value && <Button onClick={() => (comparison.value = null)}>Back to live</Button>}
       </div>
       <p class="quiet small">
-        One and the same frame is rendered for both sides. Drag the split over the picture, or focus it and use the
-        arrow keys. The two pictures are kept under Snapshots.
+        Both sides show the same frame. Drag the split across the picture, or focus it and use the arrow keys. Both
+        pictures are kept under Snapshots.
       </p>
     </div>
   );

@@ -1,4 +1,5 @@
 import { drawerTab, isDrawerOpen, openDrawer, type DrawerTab } from "../../state/preferences";
+import { Boundary } from "../ui/Boundary";
 import { IconButton } from "../ui/IconButton";
 import { Tabs, type Tab } from "../ui/Tabs";
 import { ComparePanel } from "./ComparePanel";
@@ -40,7 +41,9 @@ export function Drawer() {
       </div>
       {isOpen && (
         <div class="drawer-body" role="tabpanel" tabIndex={0} id={PANEL_ID} aria-labelledby={`${PANEL_ID}-${tab}`}>
-          <Panel tab={tab} />
+          <Boundary key={tab} name="This panel">
+            <Panel tab={tab} />
+          </Boundary>
         </div>
       )}
     </section>

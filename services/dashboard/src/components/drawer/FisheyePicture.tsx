@@ -16,7 +16,9 @@ export function FisheyePicture() {
     return (
       <article class="card fisheye-none" aria-label="Fish-eye camera">
         <Icon name="eye" />
-        <p class="quiet small">No fish-eye camera sends. With one, lights of the room are found by themselves.</p>
+        <p class="quiet small">
+          No fish-eye camera is sending. With one, the lights of the room are found automatically.
+        </p>
       </article>
     );
   }
@@ -44,7 +46,7 @@ export function FisheyePicture() {
       <div class="small">
         <b>Fish-eye camera</b>
         <p class="quiet">{found} found</p>
-        <ol title="What each gives a surface that faces it; 1 = what the camera shows white">
+        <ol title="What each gives a surface that faces it; 1 is what the camera shows as white">
           {seen.lights.map((light, index) => (
             <li key={index}>
               {index + 1}
@@ -53,7 +55,7 @@ export function FisheyePicture() {
             </li>
           ))}
         </ol>
-        {seen.clipped_share > SOME && <p class="quiet">{trimmed(100 * seen.clipped_share, 1)} % is too bright</p>}
+        {seen.clipped_share > SOME && <p class="quiet">{trimmed(100 * seen.clipped_share, 1)} % is overexposed</p>}
       </div>
     </article>
   );

@@ -1,6 +1,8 @@
 import { role } from "../../api/session";
 import { redo, restore, steps, undo, type Step } from "../../state/history";
 import { scene } from "../../state/scene";
+import { isRead } from "../../state/events";
+import { Skeleton } from "../ui/Skeleton";
 import { Button } from "../ui/Button";
 import { Empty } from "../ui/Empty";
 
@@ -9,10 +11,11 @@ const MOST = 100;
 /** Every change of the scene; any of them can be gone back to, and that is a change too. */
 export function HistoryPanel() {
   const current = scene.value;
+  if (!isRead.value) return <Skeleton lines={4} />;
   if (!current || steps.value.length === 0) {
     return (
       <Empty icon="history" title="No changes yet">
-        <p>Each change of the scene is kept here and can be taken back.</p>
+        <p>Every change to the scene is listed here and can be undone.</p>
       </Empty>
     );
   }
@@ -63,7 +66,7 @@ function Entry({ step: { entry, count }, isCurrent, mayChange }: EntryProps) {
         <span class="badge">shown</span>
       ) : (
         <Button kind="plain" disabled={!mayChange} onClick={() => restore(entry.revision)}>
-          Go back to this
+          Restore
         </Button>
       )}
     </li>

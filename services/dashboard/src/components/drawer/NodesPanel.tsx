@@ -1,25 +1,28 @@
 import { useEffect } from "preact/hooks";
-import { processes, readFisheye } from "../../state/processes";
+import { hasFisheye, isSilent, processes, readFisheye, REPLAY, type Seen } from "../../state/processes";
+import { replay } from "../../state/takes";
 import { Empty } from "../ui/Empty";
+import { Skeleton } from "../ui/Skeleton";
 import { FisheyePicture } from "./FisheyePicture";
 import { ProcessCard } from "./ProcessCard";
 
-const FISHEYE_INTERVAL_MS = 2000;
+const INTERVAL_MS = 2000;
 
 /** What runs, how it is doing, and what the fish-eye camera sees. */
 export function NodesPanel() {
   useEffect(() => {
     void readFisheye();
-    const timer = setInterval(() => void readFisheye(), FISHEYE_INTERVAL_MS);
+    const timer = setInterval(() => void readFisheye(), INTERVAL_MS);
     return () => clearInterval(timer);
   }, []);
-  const known = [...processes.value.values()];
+  if (hasFisheye.value === null) return <Skeleton lines={4} />;
+  const known = [...processes.value.values()].filter((seen) => !isEndedReplay(seen));
   return (
     <div class="cards">
       {known.length === 0 && (
-        <Empty icon="node" title="Nothing reports">
+        <Empty icon="node" title="Nothing is running">
           <p>
-            Start a camera node and the render server: <code>deltalight up --source CAMERA</code>
+            Start a camera and the render server: <code>deltalight up --source CAMERA</code>
           </p>
         </Empty>
       )}
@@ -29,4 +32,9 @@ export function NodesPanel() {
       <FisheyePicture />
     </div>
   );
+}
+
+/** A replay that is over is no process that fell silent. */
+function isEndedReplay(seen: Seen): boolean {
+  return seen.report.name === REPLAY && isSilent(seen) && replay.value?.recording == null;
 }

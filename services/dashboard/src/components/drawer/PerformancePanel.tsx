@@ -1,7 +1,7 @@
 import type uPlot from "uplot";
-import { frame } from "../../live/picture";
+import { frame, rate } from "../../live/picture";
 import { leadingPasses, OTHERS, samples, stacked, timeOf, type Sample } from "../../live/telemetry";
-import { milliseconds } from "../../math/units";
+import { milliseconds, rateText } from "../../math/units";
 import { Empty } from "../ui/Empty";
 import { Plot, type Series } from "./Plot";
 
@@ -25,7 +25,7 @@ export function PerformancePanel() {
   return (
     <div class="performance">
       <figure class="plot-box wide">
-        <figcaption>Passes of the renderer, ms</figcaption>
+        <figcaption>Renderer passes, ms</figcaption>
         <Plot
           label="Time of each pass, stacked, milliseconds"
           series={areas(names)}
@@ -45,9 +45,9 @@ export function PerformancePanel() {
       </figure>
       <figure class="plot-box">
         <figcaption>
-          Frames a second <b>{last.rate === null ? "–" : last.rate.toFixed(1)}</b>
+          Rate <b>{rateText(rate.value)}</b>
         </figcaption>
-        <Plot label="Frames a second" series={line("rate", "#5b9df0")} data={[times, all.map((each) => each.rate)]} />
+        <Plot label="Frames per second" series={line("rate", "#5b9df0")} data={[times, all.map((each) => each.rate)]} />
       </figure>
     </div>
   );
@@ -89,7 +89,7 @@ function PassLegend({ sample, names }: { readonly sample: Sample; readonly names
       {sample.kept.size > 0 && (
         <tfoot>
           <tr>
-            <td colSpan={2}>Nothing moves: pale ones are used again, with their last times.</td>
+            <td colSpan={2}>Nothing is moving: pale passes are reused, and show the times of their last run.</td>
           </tr>
         </tfoot>
       )}

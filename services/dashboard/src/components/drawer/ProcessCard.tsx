@@ -1,31 +1,36 @@
-import { trimmed } from "../../math/units";
-import type { Seen } from "../../state/processes";
+import { rate } from "../../live/picture";
+import { rateText, trimmed } from "../../math/units";
+import { isSilent, RENDER_SERVER, type Seen } from "../../state/processes";
 
-// Processes report once a second; so many misses are no accident.
-const SILENT_MS = 5000;
+const RATE_NAMES: Readonly<Record<string, string>> = { fps: "frames", without_board: "frames without the board" };
 
 export function ProcessCard({ seen }: { readonly seen: Seen }) {
-  const { report, arrivedMs } = seen;
-  const isSilent = performance.now() - arrivedMs > SILENT_MS;
-  const rates = Object.entries(report.rates);
+  const { report } = seen;
+  // The page's own rate of pictures stands for the renderer's, so that there is one number.
+  const rates = Object.entries(report.rates).filter(([name]) => name !== "frames_per_s");
   const drops = Object.entries(report.drops).filter(([, count]) => count > 0);
   return (
     <article class="card process" aria-label={report.name} tabIndex={0}>
       <header class="spread">
         <h3>{report.name}</h3>
-        <span class={`badge ${isSilent ? "bad" : report.state}`}>{isSilent ? "silent" : report.state}</span>
+        <span class={`badge ${isSilent(seen) ? "bad" : report.state}`}>{isSilent(seen) ? "silent" : report.state}</span>
       </header>
       {report.detail && <p class="quiet small">{report.detail}</p>}
       <dl>
-        {rates.map(([name, rate]) => (
-          <Row key={name} name={name} value={`${trimmed(rate, 1)}/s`} />
+        {report.name === RENDER_SERVER && <Row name="frames" value={rateText(rate.value)} />}
+        {rates.map(([name, each]) => (
+          <Row
+            key={name}
+            name={RATE_NAMES[name] ?? name}
+            value={name in RATE_NAMES ? rateText(each) : `${trimmed(each, 1)}/s`}
+          />
         ))}
         {drops.map(([name, count]) => (
-          <Row key={name} name={`lost: ${name}`} value={String(count)} />
+          <Row key={name} name={`dropped: ${name}`} value={String(count)} />
         ))}
         <Row
-          name="clock within"
-          value={report.clock_bound_ms == null ? "not compared" : `${trimmed(report.clock_bound_ms, 2)} ms`}
+          name="clock error"
+          value={report.clock_bound_ms == null ? "unknown" : `at most ${trimmed(report.clock_bound_ms, 2)} ms`}
         />
       </dl>
     </article>

@@ -21,7 +21,7 @@ export function RecordingCard({ recording }: { readonly recording: Recording }) 
   return (
     <article class={`card take ${isShown ? "current" : ""}`} aria-label={recording.id}>
       {isRunning ? (
-        <div class="poster running">{recording.state === "waiting" ? "Waiting for a frame" : "Recording"}</div>
+        <div class="poster running">{recording.state === "waiting" ? "Waiting for the next frame" : "Recording"}</div>
       ) : (
         <SecureImage className="poster" path={`${path}/poster.jpg`} alt="" />
       )}

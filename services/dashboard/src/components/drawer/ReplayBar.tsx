@@ -37,7 +37,7 @@ export function ReplayBar() {
       <Timeline shown={shown} disabled={disabled} />
       <IconButton icon="loop" label="Loop" pressed={shown.loop === true} disabled={disabled} onClick={loop} />
       <Select
-        label="Rate"
+        label="Speed"
         value={String(shown.rate ?? 1)}
         choices={RATES}
         onChange={(rate) => changeReplay({ rate: Number(rate) })}

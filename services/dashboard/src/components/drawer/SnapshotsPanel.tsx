@@ -1,6 +1,8 @@
 import { useSignal } from "@preact/signals";
 import { role } from "../../api/session";
 import { isTakingSnapshot, snapshots, takeSnapshot } from "../../state/takes";
+import { isRead } from "../../state/events";
+import { Skeleton } from "../ui/Skeleton";
 import { Button } from "../ui/Button";
 import { Empty } from "../ui/Empty";
 import { Switch } from "../ui/Switch";
@@ -21,16 +23,17 @@ export function SnapshotsPanel() {
           {isBusy ? "Rendering…" : "Take a snapshot"}
         </Button>
         <Switch
-          label="Linear EXR too"
+          label="Also as linear EXR"
           checked={withExr.value}
           onChange={(on) => (withExr.value = on)}
           disabled={role.value !== "control"}
         />
         <p class="quiet small">One frame in every view, as PNG.</p>
       </div>
-      {snapshots.value.length === 0 && (
+      {!isRead.value && <Skeleton />}
+      {isRead.value && snapshots.value.length === 0 && (
         <Empty icon="camera" title="No snapshots yet">
-          <p>They are kept on the service until they are deleted.</p>
+          <p>Snapshots are kept on the server until you delete them.</p>
         </Empty>
       )}
       {snapshots.value.map((each) => (

@@ -43,7 +43,7 @@ export function AnimationSection({ item, disabled }: AnimationSectionProps) {
           label="Clip"
           value={animation ? String(indexOf(animation, clips)) : AT_REST}
           choices={[
-            { value: AT_REST, label: "at rest" },
+            { value: AT_REST, label: "None" },
             ...clips.map((clip, index) => ({
               value: String(index),
               label: `${clip.name || index} (${trimmed(clip.duration_s, 1)} s)`,

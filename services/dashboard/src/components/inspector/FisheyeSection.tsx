@@ -21,7 +21,7 @@ export function FisheyeSection({ lights, disabled }: FisheyeSectionProps) {
   const distance = lights.fisheye.distance_m;
   const isMetres = typeof distance === "number";
   return (
-    <Section title={lights.mode === "fisheye" ? "Lights of the fish-eye picture" : "Lights cut out of the map"}>
+    <Section title={lights.mode === "fisheye" ? "Lights found in the fish-eye picture" : "Lights found in the map"}>
       <SchemaForm
         fields={fieldsOf(schemas.value.FisheyeLights)}
         values={lights.fisheye}
@@ -35,9 +35,9 @@ export function FisheyeSection({ lights, disabled }: FisheyeSectionProps) {
             label="Distance"
             value={isMetres ? "metres" : distance}
             choices={[
-              { value: "auto", label: "measured" },
-              { value: "far", label: "far away" },
-              { value: "metres", label: "given" },
+              { value: "auto", label: "Measured" },
+              { value: "far", label: "Far away" },
+              { value: "metres", label: "Given" },
             ]}
             onChange={(choice) => push("distance_m", choice === "metres" ? 2 : choice)}
             disabled={disabled}

@@ -18,16 +18,16 @@ export function FrameSection({ item, disabled }: FrameSectionProps) {
   return (
     <Section title="Placement">
       <Field
-        label="Stands on"
-        help="The board stays; an object on a marker moves with it, and is placed by numbers only."
+        label="Anchor"
+        help="The board stays put. An object anchored to a marker moves with it, and is placed by numbers only."
         inline
       >
         <Select
-          label="Stands on"
+          label="Anchor"
           value={marker === null ? "world" : "marker"}
           choices={[
-            { value: "world", label: "the board" },
-            { value: "marker", label: "a marker" },
+            { value: "world", label: "Board" },
+            { value: "marker", label: "Marker" },
           ]}
           onChange={(frame) => edit(target, { frame: frame === "world" ? "world" : "marker:0" })}
           disabled={disabled}
@@ -46,14 +46,14 @@ export function FrameSection({ item, disabled }: FrameSectionProps) {
           />
         </Field>
       )}
-      <Field label="Up in its file" help="glTF files are y up; others are taken as z up." inline>
+      <Field label="Up axis" help="glTF files are y-up; other formats are taken as z-up." inline>
         <Select
-          label="Up in its file"
+          label="Up axis"
           value={item.up_axis ?? "auto"}
           choices={[
-            { value: "auto", label: "as usual for its format" },
-            { value: "y", label: "y" },
-            { value: "z", label: "z" },
+            { value: "auto", label: "Default for the format" },
+            { value: "y", label: "Y" },
+            { value: "z", label: "Z" },
           ]}
           onChange={(axis) => edit(target, { up_axis: axis === "auto" ? null : axis })}
           disabled={disabled}

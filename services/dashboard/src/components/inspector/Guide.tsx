@@ -23,20 +23,20 @@ export function Guide() {
           <span>Click it, then drag it or its arrows. Shadow and colour follow.</span>
         </li>
         <li>
-          <b>Drop a .glb on the picture</b>
+          <b>Drop a .glb onto the picture</b>
           <span>It stands where you let go.</span>
         </li>
         <li>
           <button type="button" onClick={() => (inspectorTab.value = "lights")}>
             Change the light
           </button>
-          <span>Colour, strength and place of each lamp.</span>
+          <span>Colour, strength and position of each lamp.</span>
         </li>
         <li>
           <button type="button" onClick={() => openDrawer("compare")}>
             Compare methods
           </button>
-          <span>One frame, two pictures, a split to slide.</span>
+          <span>One frame, two methods, and a split to drag.</span>
         </li>
       </ol>
     </section>

@@ -1,4 +1,5 @@
-import { inspectorTab, type InspectorTab } from "../../state/selection";
+import { inspectorTab, selectedObjectId, type InspectorTab } from "../../state/selection";
+import { Boundary } from "../ui/Boundary";
 import { Tabs, type Tab } from "../ui/Tabs";
 import { Guide } from "./Guide";
 import { LightsPanel } from "./LightsPanel";
@@ -28,7 +29,9 @@ export function Inspector() {
         panelId={PANEL_ID}
       />
       <div class="scroll" role="tabpanel" tabIndex={0} id={PANEL_ID} aria-labelledby={`${PANEL_ID}-${tab}`}>
-        <Panel tab={tab} />
+        <Boundary key={`${tab} ${selectedObjectId.value ?? ""}`} name="The inspector">
+          <Panel tab={tab} />
+        </Boundary>
       </div>
       <Guide />
     </aside>

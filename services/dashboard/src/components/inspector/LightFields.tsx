@@ -29,7 +29,7 @@ const STRENGTHS: readonly Strength[] = [
     max: 20,
     help: "Camera units times square metres: a surface at distance d gets intensity / d².",
   },
-  { key: "irradiance", label: "Irradiance", unit: "", max: 10, help: "Camera units, across the beam." },
+  { key: "irradiance", label: "Irradiance", unit: "", max: 10, help: "Camera units, perpendicular to the beam." },
   {
     key: "radiance",
     label: "Radiance",
@@ -80,7 +80,7 @@ export function LightFields({ light, onChange, onEnd, disabled }: LightFieldsPro
           <VectorInput
             label="Second edge"
             unit="m"
-            help="It shines to the side of first edge × second edge."
+            help="It shines in the direction of first edge × second edge."
             value={light.axis_v_m}
             onChange={(axis_v_m) => onChange({ axis_v_m })}
             {...common}
@@ -88,7 +88,7 @@ export function LightFields({ light, onChange, onEnd, disabled }: LightFieldsPro
         </>
       )}
       {"radius_m" in light && (
-        <Field label="Radius" help="A larger lamp throws softer shadows." inline>
+        <Field label="Radius" help="A larger lamp casts softer shadows." inline>
           <NumberInput
             label="Radius"
             unit="m"
@@ -103,7 +103,7 @@ export function LightFields({ light, onChange, onEnd, disabled }: LightFieldsPro
       {"angle_deg" in light && (
         <>
           <SliderField
-            label="Opening"
+            label="Cone angle"
             unit="°"
             value={light.angle_deg}
             onChange={(angle_deg) => onChange({ angle_deg })}
@@ -153,9 +153,9 @@ function DirectionFields({
   return (
     <>
       <SliderField
-        label="Comes from"
+        label="Direction"
         unit="°"
-        help="Bearing over the board: 0° from its right, 90° from its upper edge."
+        help="Where the light comes from, as a bearing on the board: 0° is the right, 90° the top edge."
         value={bearing}
         onChange={(next) => onChange({ direction: directionFromAngles(next, height) })}
         min={-180}
@@ -165,9 +165,9 @@ function DirectionFields({
         disabled={disabled}
       />
       <SliderField
-        label="Height"
+        label="Elevation"
         unit="°"
-        help="Over the board's plane; 90° is straight from above."
+        help="Above the plane of the board; 90° is straight from above."
         value={height}
         onChange={(next) => onChange({ direction: directionFromAngles(bearing, next) })}
         min={-90}

@@ -5,7 +5,9 @@ import { lights } from "../../state/scene";
 import { partTarget } from "../../state/targets";
 import { toast } from "../../state/toasts";
 import { assets } from "../../state/assets";
+import { hasFisheye } from "../../state/processes";
 import { Segments, type Segment } from "../ui/Segments";
+import { useStateWatch } from "../ui/useStateWatch";
 import { EnvironmentSection } from "./EnvironmentSection";
 import { FisheyeSection } from "./FisheyeSection";
 import { LightSection } from "./LightSection";
@@ -23,27 +25,31 @@ const MODES: readonly Segment<Mode>[] = [
   { value: "environment", label: "Map" },
 ];
 const HELP: Readonly<Record<Mode, string>> = {
-  manual: "Lamps that you set by hand.",
+  manual: "Lamps you set by hand.",
   fisheye: "What a fish-eye camera beside the objects sees, live.",
-  tracked: "Lamps that carry a marker and may be moved about.",
-  environment: "A given panorama of the surroundings (HDR or EXR).",
+  tracked: "Lamps with markers on them, which can be moved around.",
+  environment: "A panorama of the surroundings (HDR or EXR).",
 };
+
+const NO_FISHEYE = "Fish-eye light needs a fish-eye camera, and none is sending.";
 
 export function LightsPanel() {
   const found = lights.value;
+  useStateWatch();
   if (!found) return null;
   const disabled = role.value !== "control";
   return (
     <>
-      <Section title="Light comes from">
+      <Section title="Light source">
         <Segments
           label="Light mode"
-          segments={MODES}
+          segments={MODES.map((each) => ({ ...each, reason: reasonAgainst(each.value, found) }))}
           value={found.mode}
           onChange={(mode) => setMode(found, mode)}
           disabled={disabled}
         />
         <p class="quiet small">{HELP[found.mode]}</p>
+        {hasFisheye.value === false && <p class="quiet small">{NO_FISHEYE}</p>}
       </Section>
       {found.mode === "manual" && <ManualList lights={found} disabled={disabled} />}
       {found.mode === "manual" && <LightSection lights={found} disabled={disabled} />}
@@ -57,13 +63,18 @@ export function LightsPanel() {
   );
 }
 
+/** Why a mode cannot be chosen. */
+function reasonAgainst(mode: Mode, current: Lights): string | undefined {
+  return mode === "fisheye" && current.mode !== mode && hasFisheye.value === false ? NO_FISHEYE : undefined;
+}
+
 /** Some modes need something to begin with. */
 async function setMode(current: Lights, mode: Mode): Promise<void> {
   const target = partTarget("lights");
   if (mode === "environment" && current.environment.map == null) {
     const map = assets.value.find((each) => each.kind === "map");
     if (!map) {
-      toast("Upload an environment map first: drop an .hdr or .exr file on the assets.");
+      toast("Upload an environment map first: drop an .hdr or .exr file onto Assets.");
       return;
     }
     await edit(target, { mode, environment: { map: map.asset } });

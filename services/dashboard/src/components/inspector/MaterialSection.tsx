@@ -1,5 +1,6 @@
 import type { Material, SceneObject } from "../../api/types";
 import { schemas } from "../../forms/schemas";
+import { assets, materialOfFile } from "../../state/assets";
 import { edit } from "../../state/gesture";
 import { objectTarget } from "../../state/targets";
 import { ColorField } from "../ui/ColorField";
@@ -13,9 +14,7 @@ interface MaterialSectionProps {
   readonly disabled: boolean;
 }
 
-const INITIAL = { base_color: [0.8, 0.8, 0.8], metallic: 0, roughness: 0.5, specular: 0.5 } as const;
-
-/** The object's own material, or the file's. */
+/** The material of the scene, in place of the file's. */
 export function MaterialSection({ item, disabled }: MaterialSectionProps) {
   const material = item.material ?? null;
   const target = objectTarget(item.id);
@@ -23,10 +22,10 @@ export function MaterialSection({ item, disabled }: MaterialSectionProps) {
   return (
     <Section title="Material">
       <Switch
-        label="Own material instead of the file's"
+        label="Override material"
         checked={isOwn}
         disabled={disabled}
-        onChange={(own) => edit(target, { material: own ? INITIAL : null })}
+        onChange={(own) => edit(target, { material: own ? materialOfFile(item, assets.value) : null })}
       />
       {isOwn && <MaterialFields item={item} material={material} disabled={disabled} />}
     </Section>

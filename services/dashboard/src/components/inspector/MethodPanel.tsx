@@ -45,7 +45,7 @@ export function MethodPanel() {
             </details>
           )}
           <Button onClick={defaults} disabled={disabled}>
-            Back to defaults
+            Reset to defaults
           </Button>
         </Section>
       )}

@@ -1,13 +1,15 @@
 import { role } from "../../api/session";
 import type { SceneObject } from "../../api/types";
 import { size } from "../../math/bounds";
-import { size as lengthText } from "../../math/units";
+import { sizesText } from "../../math/units";
 import { duplicateObject, removeObject, setVisible } from "../../state/actions";
 import { assetName, assets, boundsByObject } from "../../state/assets";
+import { isSceneRead } from "../../state/scene";
 import { selectedObject } from "../../state/selection";
 import { tool } from "../../state/tools";
 import { Button } from "../ui/Button";
 import { Empty } from "../ui/Empty";
+import { Skeleton } from "../ui/Skeleton";
 import { IconButton } from "../ui/IconButton";
 import { AnimationSection } from "./AnimationSection";
 import { MaterialSection } from "./MaterialSection";
@@ -17,10 +19,11 @@ import { FrameSection } from "./FrameSection";
 
 export function ObjectPanel() {
   const item = selectedObject.value;
+  if (!isSceneRead.value) return <Skeleton lines={4} />;
   if (!item) {
     return (
-      <Empty icon="cursor" title="No object is selected">
-        <p>Click an object in the picture or in the list. To add one, drop a .glb file on the picture.</p>
+      <Empty icon="cursor" title="No object selected">
+        <p>Click an object in the picture or in the list. To add one, drop a .glb file onto the picture.</p>
       </Empty>
     );
   }
@@ -39,11 +42,7 @@ export function ObjectPanel() {
 function ObjectHead({ item, mayChange }: { readonly item: SceneObject; readonly mayChange: boolean }) {
   const asset = assets.value.find((each) => each.asset === item.asset);
   const bounds = boundsByObject.value.get(item.id);
-  const measures = bounds
-    ? size(bounds)
-        .map((edge) => lengthText(edge * item.pose.scale))
-        .join(" × ")
-    : "";
+  const measures = bounds ? sizesText(size(bounds).map((edge) => edge * item.pose.scale)) : "";
   return (
     <section class="section head" aria-label="Object">
       <div class="row">
@@ -72,11 +71,11 @@ function ObjectHead({ item, mayChange }: { readonly item: SceneObject; readonly 
         />
       </div>
       <p class="quiet small">
-        {asset ? assetName(asset) : "The asset is gone"}
+        {asset ? assetName(asset) : "Its file is missing"}
         {measures && `, ${measures}`}
       </p>
       <Button icon="place" disabled={!mayChange} onClick={() => (tool.value = "place")}>
-        {tool.value === "place" ? "Click in the picture where it is to stand" : "Place on a surface"}
+        {tool.value === "place" ? "Click in the picture to place it" : "Place on a surface"}
       </Button>
     </section>
   );

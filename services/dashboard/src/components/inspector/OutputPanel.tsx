@@ -3,8 +3,7 @@ import { fieldsOf } from "../../forms/fields";
 import { SchemaForm } from "../../forms/SchemaForm";
 import { schemas } from "../../forms/schemas";
 import { VIEWS } from "../../forms/views";
-import { setView } from "../../state/actions";
-import { sceneDocument } from "../../state/scene";
+import { sceneDocument, setView, shownView } from "../../state/scene";
 import { partTarget } from "../../state/targets";
 import { useGesture } from "../ui/useGesture";
 import { Section } from "./Section";
@@ -25,7 +24,7 @@ export function OutputPanel() {
                 type="radio"
                 name="view"
                 aria-label={each.label}
-                checked={each.value === output.view}
+                checked={each.value === shownView.value}
                 disabled={disabled}
                 onChange={() => void setView(each.value)}
               />

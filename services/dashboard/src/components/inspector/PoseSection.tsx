@@ -48,7 +48,7 @@ export function PoseSection({ item, disabled }: PoseSectionProps) {
       <VectorInput
         label="Rotation"
         unit="°"
-        help="First about x, then y, then z; z is up."
+        help="Applied about x first, then y, then z; z is up."
         value={anglesFromQuaternion(pose.rotation_wxyz)}
         onChange={(angles) => push({ rotation_wxyz: quaternionFromAngles(angles) })}
         onEnd={gesture.end}
@@ -58,7 +58,7 @@ export function PoseSection({ item, disabled }: PoseSectionProps) {
       />
       <Field
         label="Lean with surfaces"
-        help="While it is dragged over the picture, its up follows slopes and walls. Else it stays turned as it is, and stands on what is not too steep."
+        help="While you drag it over the picture, the object tilts with slopes and walls. Otherwise it keeps its rotation, and stands only on surfaces that are not too steep."
         inline
       >
         <Switch

@@ -25,11 +25,11 @@ export function RealPanel() {
     edit(target, { surfaces: surfaces.flatMap((each, at) => (at === index ? (surface ?? []) : each)) });
   return (
     <>
-      <Section title="Shape of the real scene">
+      <Section title="Real geometry">
         <GeometryField geometry={real.geometry} disabled={disabled} />
         <Field
           label="Unseen albedo"
-          help="Of surfaces that the camera does not see now; automatic remembers what it saw."
+          help="Albedo of surfaces that the camera does not see right now; automatic remembers what it saw."
           inline
         >
           <NumberInput
@@ -54,7 +54,7 @@ export function RealPanel() {
       ))}
       <div class="section">
         <p class="quiet small">
-          Real surfaces are taken as matte. Declare those that are not, such as a polished table.
+          Real surfaces are assumed to be matte. Declare those that are not, such as a polished table.
         </p>
         <Button icon="add" onClick={add} disabled={disabled || surfaces.length >= MOST_SURFACES}>
           Declare a surface
@@ -68,9 +68,9 @@ function GeometryField({ geometry, disabled }: { readonly geometry: unknown; rea
   const meshes = assets.value.filter((each) => each.kind === "mesh");
   const model = typeof geometry === "object" && geometry !== null ? (geometry as { model: string }).model : null;
   const choices = [
-    { value: "depth", label: "depth of each frame" },
-    { value: "fused", label: "depth of all frames" },
-    ...meshes.map((each) => ({ value: each.asset, label: `model ${assetName(each)}` })),
+    { value: "depth", label: "Depth of each frame" },
+    { value: "fused", label: "Depth of all frames" },
+    ...meshes.map((each) => ({ value: each.asset, label: `Model: ${assetName(each)}` })),
   ];
   const choose = (value: string) =>
     edit(partTarget("real"), { geometry: value === "depth" || value === "fused" ? value : { model: value } });

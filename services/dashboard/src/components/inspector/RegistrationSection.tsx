@@ -21,15 +21,15 @@ export function RegistrationSection({ lights, disabled }: RegistrationSectionPro
   const choose = (choice: Choice) =>
     edit(partTarget("lights"), { registration: { default: null, auto: "auto", given: [1, 1, 1] }[choice] });
   return (
-    <Section title="Match with the camera">
+    <Section title="Match to the camera">
       <Field label="Strength" help={help("registration")} inline>
         <Select
           label="Strength"
           value={value}
           choices={[
-            { value: "default", label: "as usual for the mode" },
-            { value: "auto", label: "from the picture" },
-            { value: "given", label: "as given" },
+            { value: "default", label: "Default for the source" },
+            { value: "auto", label: "From the picture" },
+            { value: "given", label: "As given" },
           ]}
           onChange={choose}
           disabled={disabled}
@@ -41,8 +41,8 @@ export function RegistrationSection({ lights, disabled }: RegistrationSectionPro
             label="Surroundings"
             value={lights.surroundings}
             choices={[
-              { value: "auto", label: "estimated" },
-              { value: "none", label: "dark" },
+              { value: "auto", label: "Estimated" },
+              { value: "none", label: "Dark" },
             ]}
             onChange={(surroundings) => edit(partTarget("lights"), { surroundings })}
             disabled={disabled}

@@ -36,7 +36,7 @@ export function SurfaceSection({ index, surface, onChange, disabled }: SurfaceSe
       {plane && (
         <>
           <VectorInput
-            label="Plane through"
+            label="Point on the plane"
             unit="m"
             value={plane.point_m}
             onChange={(point_m) => setPlane({ point_m })}

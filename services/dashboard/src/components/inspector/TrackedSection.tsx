@@ -52,7 +52,7 @@ export function TrackedSection({ lights, disabled }: TrackedSectionProps) {
       ))}
       <div class="section">
         <Button icon="add" onClick={add} disabled={disabled || lamps.length >= 16}>
-          Add a lamp
+          Add lamp
         </Button>
       </div>
     </>
@@ -70,7 +70,7 @@ function LampFields({ lamp, onChange, onEnd, disabled }: LampFieldsProps) {
   const common = { onEnd, disabled };
   return (
     <>
-      <Field label="Marker" help="One of the lamp markers of board.yaml." inline>
+      <Field label="Marker" help="One of the lamp markers in board.yaml." inline>
         <NumberInput
           label="Marker"
           value={lamp.marker}

@@ -14,18 +14,18 @@ const GROUPS: readonly { readonly title: string; readonly keys: readonly (readon
       ["G or W", "move"],
       ["R or E", "rotate"],
       ["S", "scale"],
-      ["P", "place on a surface: click where"],
+      ["P", "place on a surface: click the spot"],
       ["F", "stand on surfaces while dragging, or keep the height"],
       ["Shift", "snap to 1 cm, 15°, 0.1 while dragging"],
-      ["Esc", "cancel the drag; else select nothing"],
+      ["Esc", "cancel the drag, or clear the selection"],
     ],
   },
   {
     title: "With the picture focused",
     keys: [
-      ["Arrows", "move the selection 1 cm"],
-      ["Page Up / Down", "higher, lower"],
-      ["Shift / Alt", "with arrows: ten times, a tenth"],
+      ["Arrows", "move the selection by 1 cm"],
+      ["Page Up / Down", "move it up, down"],
+      ["Shift / Alt", "with arrows: 10 cm, 1 mm"],
       ["[ and ]", "turn by 15°"],
       ["Tab", "next object or light"],
     ],
@@ -57,7 +57,7 @@ export function KeysDialog() {
     areKeysShown.value = false;
   };
   return (
-    <Dialog title="Keys" onClose={() => (areKeysShown.value = false)}>
+    <Dialog title="Keyboard shortcuts" onClose={() => (areKeysShown.value = false)}>
       <div class="keys">
         {GROUPS.map((group) => (
           <section key={group.title}>

@@ -29,7 +29,7 @@ export function RecordButton() {
       onClick={toggle}
     >
       <span class="dot" />
-      {current ? clock(seconds) : "Record"}
+      {current ? clock(seconds) : <span class="wide-label">Record</span>}
     </button>
   );
 }

@@ -2,9 +2,10 @@ import { useRef } from "preact/hooks";
 import { API, request } from "../../api/http";
 import { role } from "../../api/session";
 import type { SceneAnswer } from "../../api/types";
-import { activateScene, deleteScene, duplicateScene, newScene } from "../../state/actions";
-import { scene, sceneDocument, scenes } from "../../state/scene";
+import { activateScene, deleteScene, duplicateScene, newScene, renameScene } from "../../state/actions";
+import { isSceneRead, scene, sceneDocument, scenes } from "../../state/scene";
 import { attempt } from "../../state/toasts";
+import { askName } from "./NameDialog";
 import { download } from "../ui/download";
 import { Icon } from "../ui/Icon";
 import { Menu, type MenuEntry } from "../ui/Menu";
@@ -14,7 +15,7 @@ export function SceneMenu() {
   const file = useRef<HTMLInputElement>(null);
   const current = scene.value;
   const name = sceneDocument.value?.name ?? "";
-  const shown = current ? name || "untitled" : "No scene";
+  const shown = current ? name || "untitled" : isSceneRead.value ? "No scene" : "…";
   const mayChange = role.value === "control";
   const others = scenes.value.map((each): MenuEntry => ({
     label: each.name || "untitled",
@@ -25,14 +26,26 @@ export function SceneMenu() {
   }));
   const entries: MenuEntry[] = [
     ...others,
-    { label: "New scene", icon: "add", begins: true, disabled: !mayChange, onClick: () => newScene("untitled") },
+    {
+      label: "New scene…",
+      icon: "add",
+      begins: true,
+      disabled: !mayChange,
+      onClick: () => askName({ title: "New scene", initial: "My scene", onName: newScene }),
+    },
+    {
+      label: "Rename this scene…",
+      icon: "frame",
+      disabled: !mayChange || !current,
+      onClick: () => askName({ title: "Rename the scene", initial: name, onName: renameScene }),
+    },
     {
       label: "Duplicate this scene",
       icon: "copy",
       disabled: !mayChange || !current,
       onClick: () => current && duplicateScene(current.id),
     },
-    { label: "Import a document", icon: "upload", disabled: !mayChange, onClick: () => file.current?.click() },
+    { label: "Import a scene…", icon: "upload", disabled: !mayChange, onClick: () => file.current?.click() },
     {
       label: "Export as JSON",
       icon: "download",

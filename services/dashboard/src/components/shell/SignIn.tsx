@@ -21,7 +21,7 @@ export function SignIn() {
         <Mark />
         <div>
           <h1>Deltalight</h1>
-          <p class="quiet">This service is open to other hosts, so it asks for a token.</p>
+          <p class="quiet">This server accepts connections from other machines, so it asks for a token.</p>
         </div>
         {signInProblem.value && (
           <p role="alert">
@@ -43,7 +43,7 @@ export function SignIn() {
           Sign in
         </Button>
         <p class="quiet small">
-          Make one with <code>deltalight api token NAME --role control</code>. It is kept until this tab is closed.
+          Create one with <code>deltalight api token NAME --role control</code>. It is kept until you close this tab.
         </p>
       </form>
     </main>

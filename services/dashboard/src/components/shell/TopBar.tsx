@@ -44,12 +44,12 @@ export function TopBar() {
         onClick={redo}
       />
       <span class="grow" />
-      {!mayChange && <span class="badge">view only</span>}
+      {role.value === "view" && <span class="badge">view only</span>}
       <LiveState />
       <SnapshotButton />
       <RecordButton />
       <span class="rule" />
-      <IconButton icon="keyboard" label="Keys and help" hint="?" onClick={() => (areKeysShown.value = true)} />
+      <IconButton icon="keyboard" label="Keyboard shortcuts" hint="?" onClick={() => (areKeysShown.value = true)} />
       <IconButton
         icon={isDark ? "sun" : "moon"}
         label={isDark ? "Light appearance" : "Dark appearance"}

@@ -7,9 +7,9 @@ export function Unreachable() {
       <form>
         <Mark />
         <div role="status">
-          <h1>The service does not answer</h1>
+          <h1>The server does not respond</h1>
           <p class="quiet">
-            See whether <code>deltalight up</code> or <code>deltalight api</code> still runs. This page tries again
+            Check that <code>deltalight up</code> or <code>deltalight api</code> is still running. This page retries
             every three seconds.
           </p>
         </div>

@@ -4,8 +4,10 @@ import { Drawer } from "../drawer/Drawer";
 import { Inspector } from "../inspector/Inspector";
 import { Stage } from "../stage/Stage";
 import { SidePanel } from "../tree/SidePanel";
+import { Boundary } from "../ui/Boundary";
 import { KeysDialog } from "./KeysDialog";
 import { listenToKeys } from "./shortcuts";
+import { NameDialog } from "./NameDialog";
 import { TopBar } from "./TopBar";
 
 export function Workspace() {
@@ -13,14 +15,23 @@ export function Workspace() {
   return (
     <div class="app">
       <a class="skip" href="#stage">
-        To the picture
+        Skip to the picture
       </a>
-      <TopBar />
-      {isTreeOpen.value && <SidePanel />}
-      <Stage />
+      <Boundary name="The top bar">
+        <TopBar />
+      </Boundary>
+      {isTreeOpen.value && (
+        <Boundary name="The scene list">
+          <SidePanel />
+        </Boundary>
+      )}
+      <Boundary name="The picture">
+        <Stage />
+      </Boundary>
       {isInspectorOpen.value && <Inspector />}
       <Drawer />
       <KeysDialog />
+      <NameDialog />
     </div>
   );
 }

@@ -1,9 +1,10 @@
 // Keys that hold everywhere but in fields.
 import { role } from "../../api/session";
 import { VIEWS } from "../../forms/views";
-import { duplicateObject, removeLight, removeObject, setView } from "../../state/actions";
+import { duplicateObject, removeLight, removeObject } from "../../state/actions";
 import { redo, undo } from "../../state/history";
 import { endNudge } from "../../state/nudge";
+import { setView } from "../../state/scene";
 import { standsOnSurfaces } from "../../state/preferences";
 import { selectLight, selectedLight, selectedObjectId, selectObject } from "../../state/selection";
 import { areOutlinesShown, tool, type Tool } from "../../state/tools";

@@ -7,7 +7,7 @@ import { Menu, type MenuEntry } from "../ui/Menu";
 
 export const MESH_TYPES = ".glb,.gltf,.zip,.obj,.ply,.stl";
 
-/** Adds an object at the picture's centre: of an asset that is there, or of a file. */
+/** Adds an object where the picture has room: of an asset that is there, or of a file. */
 export function AddObjectButton() {
   const file = useRef<HTMLInputElement>(null);
   const meshes = assets.value.filter((each) => each.kind === "mesh");
@@ -25,7 +25,7 @@ export function AddObjectButton() {
     input.value = "";
     if (!chosen) return;
     const asset = await upload(chosen);
-    if (asset?.kind === "mesh") await addObject(asset, undefined, chosen.name);
+    if (asset?.kind === "mesh") await addObject(asset, null, chosen.name);
   };
   return (
     <>

@@ -1,10 +1,11 @@
 import { useSignal } from "@preact/signals";
 import { useEffect, useRef } from "preact/hooks";
 import { role } from "../../api/session";
-import { liveState, showPictureOn } from "../../live/picture";
+import { showPictureOn } from "../../live/picture";
 import { ASSET_DRAG, droppedAsset } from "../../state/drag";
 import { addObject } from "../../state/actions";
 import { upload } from "../../state/assets";
+import { isOutdated } from "../../state/liveState";
 import { nudge } from "../../state/nudge";
 import { selectedObjectId } from "../../state/selection";
 import { tool } from "../../state/tools";
@@ -50,7 +51,7 @@ export function Picture() {
   return (
     <div class="picture-area" ref={area}>
       <div
-        class={`picture ${isDropping.value ? "dropping" : ""} ${liveState.value === "live" ? "" : "not-live"}`}
+        class={`picture ${isDropping.value ? "dropping" : ""} ${isOutdated.value ? "not-live" : ""}`}
         style={style}
         onDragOver={(event) => {
           event.preventDefault();
@@ -78,7 +79,7 @@ export function Picture() {
         />
         <CompareSlider />
         <PictureNotice />
-        {isDropping.value && <p class="drop-hint">Let go where the object is to stand</p>}
+        {isDropping.value && <p class="drop-hint">Drop it where the object should stand</p>}
       </div>
     </div>
   );

@@ -1,73 +1,79 @@
-import { useSignal } from "@preact/signals";
-import { useEffect } from "preact/hooks";
-import { isSceneRead, scene } from "../../state/scene";
-import { frame, liveState, retryPicture } from "../../live/picture";
-import { processes } from "../../state/processes";
+import { lateMs, retryPicture } from "../../live/picture";
+import { changeMs, isSending, liveState } from "../../state/liveState";
+import { hasFisheye, renderServer } from "../../state/processes";
+import { isSceneRead, lights, scene } from "../../state/scene";
 import { isTakingSnapshot } from "../../state/takes";
 import { Button } from "../ui/Button";
-import { Sentence } from "../ui/Sentence";
 import { Icon } from "../ui/Icon";
+import { Sentence } from "../ui/Sentence";
+import { useStateWatch } from "../ui/useStateWatch";
 
 /** Says why there is no picture, or why it stands still, and what to do. */
 export function PictureNotice() {
   switch (liveState.value) {
     case "connecting":
-      return <Full title="Connecting to the live picture" text="The service is asked for the newest frame." />;
+      return <Full title="Connecting to the live picture" text="Asking the service for the newest frame." />;
     case "waiting":
-      return <Full title="No picture yet" text={isSomethingRunning() ? PREPARING : NOTHING_SENDS} />;
+      return <Full title="No picture yet" text={waitingText()} />;
     case "reconnecting":
       return (
         <p class="picture-banner">
-          <Icon name="alert" /> The connection is lost; this is the last picture.
+          <Icon name="alert" /> Connection lost. This is the last picture.
           <Button kind="plain" onClick={retryPicture}>
             Try now
           </Button>
         </p>
       );
     case "stale":
-      return <Banner text={staleText()} />;
+      return <Banner text={renderServer.value === "silent" ? SILENT : STOPPED} />;
+    case "rendering":
+      return <Working text={workText()} />;
     case "no-board":
       return <Banner text="The marker board is not in view, so objects cannot be placed. Point the camera at it." />;
     case "live":
-      return isSceneRead.value && scene.value === null ? (
-        <Banner text="No scene is shown; add an object, or choose one under Scenes." />
-      ) : (
-        <Pending />
-      );
+      return <SceneNotice />;
   }
 }
 
 const NOTHING_SENDS =
-  "Neither a camera nor a recording sends frames. Start one with `deltalight up --source CAMERA`, or replay a recording below.";
+  "Neither a camera nor a recording is sending frames. Start one with `deltalight up --source CAMERA`, or replay a recording below.";
 const PREPARING =
-  "Frames arrive, and the renderer prepares its first picture. The first start on a machine can take a minute: its shaders are compiled.";
+  "Frames are arriving, and the renderer is preparing its first picture. The first start on a machine can take a minute while shaders compile.";
+const SILENT = "The render server does not answer. Your changes are kept, and shown as soon as it does.";
+const STOPPED = "No new frames are coming from the camera. See Nodes below for what has stopped.";
+const NO_FISHEYE =
+  "This scene is lit by a fish-eye camera, and none is sending. Objects appear once one does; or choose another light under Lights.";
 
-function isSomethingRunning(): boolean {
-  return [...processes.value.values()].some((seen) => seen.report.state === "running");
+function waitingText(): string {
+  if (renderServer.value === null) return "Asking the service what is running.";
+  return isSending() ? PREPARING : NOTHING_SENDS;
 }
 
-// A slow renderer takes a change that late; while it takes others, nothing is wrong.
-const TAKEN_MS = 5000;
-const PENDING = "The render server does not answer; it gets this scene as soon as it does.";
-
-function staleText(): string {
-  if (isTakingSnapshot.value) return "The renderer takes the snapshot; the live picture goes on after it.";
-  if (scene.value?.picture?.state === "pending") return PENDING;
-  return "No new picture comes. See Nodes below for what stands still.";
+function workText(): string {
+  const seconds = (ms: number): string => `${Math.round(ms / 1000)} s`;
+  if (isTakingSnapshot.value) return "Taking the snapshot. The live picture continues afterwards.";
+  if (changeMs.value > 0) return `Rendering your change… ${seconds(changeMs.value)}`;
+  return `Waiting for the next frame… ${seconds(lateMs.value)}`;
 }
 
-function Pending() {
+/** What the scene lacks to be seen. */
+function SceneNotice() {
+  const needsFisheye = lights.value?.mode === "fisheye";
+  useStateWatch(needsFisheye);
+  if (isSceneRead.value && scene.value === null)
+    return <Banner text="No scene is open. Add an object, or choose a scene under Scenes." />;
   const state = scene.value?.picture;
-  const isPending = state?.state === "pending";
-  const isLong = useSignal(false);
-  useEffect(() => {
-    isLong.value = false;
-    const timer = setTimeout(() => (isLong.value = true), TAKEN_MS);
-    return () => clearTimeout(timer);
-  }, [isPending, frame.value?.scene?.revision]);
-  if (isPending) return isLong.value ? <Banner text={PENDING} /> : null;
   if (state?.state === "refused") return <Banner text={state.detail} />;
-  return null;
+  if (state?.state === "pending" && renderServer.value === "silent") return <Banner text={SILENT} />;
+  return needsFisheye && hasFisheye.value === false ? <Banner text={NO_FISHEYE} /> : null;
+}
+
+function Working({ text }: { readonly text: string }) {
+  return (
+    <p class="picture-banner working">
+      <i aria-hidden="true" /> {text}
+    </p>
+  );
 }
 
 function Banner({ text }: { readonly text: string }) {

@@ -2,9 +2,9 @@ import { role } from "../../api/session";
 import type { MethodName, View } from "../../api/types";
 import { methods } from "../../forms/methods";
 import { VIEWS } from "../../forms/views";
-import { setMethod, setView } from "../../state/actions";
+import { setMethod } from "../../state/actions";
 import { standsOnSurfaces } from "../../state/preferences";
-import { sceneDocument } from "../../state/scene";
+import { sceneDocument, setView, shownView } from "../../state/scene";
 import { areOutlinesShown, isSnapping, tool, type Tool } from "../../state/tools";
 import { IconButton } from "../ui/IconButton";
 import { Segments, type Segment } from "../ui/Segments";
@@ -18,6 +18,9 @@ const TOOLS: readonly Segment<Tool>[] = [
   { value: "scale", label: "Scale", icon: "scale", hint: "S" },
   { value: "place", label: "Place on a surface", icon: "place", hint: "P" },
 ];
+
+// Shown until the scene is read.
+const NOTHING = { value: "" as never, label: "–" };
 
 /** Tools over the picture, and what it shows. */
 export function StageBar() {
@@ -36,7 +39,7 @@ export function StageBar() {
       <IconButton
         icon="stand"
         label="Stand on surfaces"
-        hint="F: what is dragged stands on what the camera sees"
+        hint="F: dragged objects stand on what the camera sees"
         pressed={standsOnSurfaces.value}
         disabled={isDisabled}
         onClick={() => (standsOnSurfaces.value = !standsOnSurfaces.value)}
@@ -60,15 +63,15 @@ export function StageBar() {
       <span class="grow" />
       <Select<MethodName>
         label="Method"
-        value={document?.method.name ?? "dvct"}
-        choices={methods.value.map(({ name, title }) => ({ value: name, label: title }))}
+        value={document?.method.name ?? NOTHING.value}
+        choices={document ? methods.value.map(({ name, title }) => ({ value: name, label: title })) : [NOTHING]}
         onChange={setMethod}
         disabled={isDisabled}
       />
       <Select<View>
         label="View"
-        value={document?.output.view ?? "composite"}
-        choices={VIEWS}
+        value={shownView.value ?? NOTHING.value}
+        choices={document ? VIEWS : [NOTHING]}
         onChange={setView}
         disabled={isDisabled}
       />

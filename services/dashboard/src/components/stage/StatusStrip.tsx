@@ -1,7 +1,7 @@
-import { frame, view } from "../../live/picture";
+import { frame, rate, view } from "../../live/picture";
 import { droppedFrames } from "../../live/message";
 import { lensDeviation } from "../../math/camera";
-import { milliseconds } from "../../math/units";
+import { milliseconds, rateText } from "../../math/units";
 import { uploads } from "../../state/assets";
 
 // Beyond this share of the picture's width lines that should be straight are visibly bent.
@@ -19,15 +19,15 @@ export function StatusStrip() {
           <Figure
             name="Revision"
             value={String(header.scene?.revision ?? "–")}
-            tip="Of the scene that this frame shows"
+            tip="Revision of the scene that this frame shows"
           />
           <Figure name="Delay" value={milliseconds(header.age_ms)} />
-          <Figure name="Rate" value={header.frames_per_s === null ? "–" : `${header.frames_per_s.toFixed(1)} fps`} />
+          <Figure name="Rate" value={rateText(rate.value)} />
           <Figure name="Dropped" value={String(droppedFrames(header.drops))} tip={dropText(header.drops)} />
-          <Figure name="Skipped" value={String(header.skipped)} tip="Frames that this browser was too slow for" />
+          <Figure name="Skipped" value={String(header.skipped)} tip="Frames this browser was too slow to show" />
         </dl>
       )}
-      {deviation > STRONG && <span class="quiet">Wide lens: handles are exact at their centre</span>}
+      {deviation > STRONG && <span class="quiet">Wide lens: handles are exact only at their centre</span>}
       <span class="grow" />
       {uploads.value.map((each) => (
         <label class="upload" key={each.id}>
@@ -50,5 +50,5 @@ function Figure({ name, value, tip }: { readonly name: string; readonly value: s
 
 function dropText(drops: Readonly<Record<string, number>>): string {
   const lines = Object.entries(drops).filter(([, count]) => count > 0);
-  return lines.map(([cause, count]) => `${cause}: ${count}`).join("\n") || "Nothing was lost";
+  return lines.map(([cause, count]) => `${cause}: ${count}`).join("\n") || "Nothing was dropped";
 }

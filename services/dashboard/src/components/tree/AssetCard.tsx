@@ -1,7 +1,7 @@
 import { API } from "../../api/http";
 import type { AssetAnswer } from "../../api/types";
 import { boundsOf, size } from "../../math/bounds";
-import { bytes, size as lengthText } from "../../math/units";
+import { bytes, sizesText } from "../../math/units";
 import { addObject } from "../../state/actions";
 import { assetName, removeAsset } from "../../state/assets";
 import { ASSET_DRAG } from "../../state/drag";
@@ -68,7 +68,7 @@ function factsText(asset: AssetAnswer): string {
     asset.format.toUpperCase(),
     bytes(asset.size_bytes),
     ...(typeof triangles === "number" ? [`${triangles.toLocaleString("en")} triangles`] : []),
-    ...(bounds ? [size(bounds).map(lengthText).join(" × ")] : []),
+    ...(bounds ? [sizesText(size(bounds))] : []),
     ...(typeof width === "number" && typeof height === "number" ? [`${width} × ${height}`] : []),
   ];
   return facts.join(", ");

@@ -2,6 +2,8 @@ import { useRef } from "preact/hooks";
 import { useSignal } from "@preact/signals";
 import { role } from "../../api/session";
 import { assets, upload } from "../../state/assets";
+import { isRead } from "../../state/events";
+import { Skeleton } from "../ui/Skeleton";
 import { IconButton } from "../ui/IconButton";
 import { MESH_TYPES } from "../stage/AddObjectButton";
 import { AssetCard } from "./AssetCard";
@@ -53,7 +55,8 @@ export function AssetList() {
           <AssetCard key={asset.asset} asset={asset} mayChange={mayChange} />
         ))}
       </ul>
-      {assets.value.length === 0 && (
+      {!isRead.value && <Skeleton />}
+      {isRead.value && assets.value.length === 0 && (
         <p class="tree-empty">{mayChange ? "Drop GLB, OBJ, PLY, STL, HDR or EXR files here." : "None yet."}</p>
       )}
     </section>

@@ -2,7 +2,7 @@ import { role } from "../../api/session";
 import type { Surface } from "../../api/types";
 import { LIGHT_TYPES } from "../../forms/lights";
 import { removeLight, removeObject, setVisible } from "../../state/actions";
-import { lights, objects, sceneDocument } from "../../state/scene";
+import { isSceneRead, lights, objects, sceneDocument } from "../../state/scene";
 import {
   inspectorTab,
   selectedLight,
@@ -11,6 +11,7 @@ import {
   selectObject,
   selectReal,
 } from "../../state/selection";
+import { Skeleton } from "../ui/Skeleton";
 import { IconButton } from "../ui/IconButton";
 import { TreeGroup } from "./TreeGroup";
 import { TreeItem } from "./TreeItem";
@@ -18,7 +19,7 @@ import { AddLightButton } from "./AddLightButton";
 
 const MODES = {
   manual: "",
-  fisheye: "From the fish-eye camera",
+  fisheye: "Fish-eye camera",
   tracked: "Tracked lamps",
   environment: "Environment map",
 } as const;
@@ -26,6 +27,7 @@ const MODES = {
 /** Objects, lights and real surfaces; arrow keys walk through all of them. */
 export function SceneTree() {
   const document = sceneDocument.value;
+  if (!isSceneRead.value) return <Skeleton lines={6} />;
   return (
     <div class="scroll" onKeyDown={walk}>
       <TreeGroup title="Objects" empty={objects.value.length > 0 ? null : noObjects()}>
@@ -33,14 +35,10 @@ export function SceneTree() {
           <ObjectItem key={item.id} id={item.id} visible={item.visible} />
         ))}
       </TreeGroup>
-      <TreeGroup
-        title="Lights"
-        action={<AddLightButton />}
-        empty={hasLights() ? null : "No lamps: only the surroundings shine."}
-      >
+      <TreeGroup title="Lights" action={<AddLightButton />} empty={hasLights() ? null : "No lamps."}>
         <LightItems />
       </TreeGroup>
-      <TreeGroup title="Real scene">
+      <TreeGroup title="Real scene" empty={document ? null : "Belongs to a scene."}>
         <TreeItem
           icon="room"
           label={geometryText(document?.real.geometry)}
@@ -62,7 +60,7 @@ export function SceneTree() {
 }
 
 function noObjects(): string {
-  return role.value === "control" ? "None yet. Drop a .glb on the picture." : "None yet.";
+  return role.value === "control" ? "None yet. Drop a .glb onto the picture." : "None yet.";
 }
 
 function ObjectItem({ id, visible }: { readonly id: string; readonly visible: boolean }) {

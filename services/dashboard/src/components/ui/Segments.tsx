@@ -6,6 +6,8 @@ export interface Segment<T extends string> {
   readonly label: string;
   readonly icon?: IconName;
   readonly hint?: string;
+  /** Why it cannot be chosen. */
+  readonly reason?: string | undefined;
 }
 
 interface SegmentsProps<T extends string> {
@@ -25,13 +27,13 @@ export function Segments<T extends string>(props: SegmentsProps<T>) {
   return (
     <div class="segments" role="radiogroup" aria-label={label}>
       {segments.map((segment) => (
-        <label key={segment.value} title={segment.hint ? `${segment.label} (${segment.hint})` : segment.label}>
+        <label key={segment.value} title={tipOf(segment)}>
           <input
             type="radio"
             name={name}
             aria-label={segment.label}
             checked={segment.value === value}
-            disabled={disabled}
+            disabled={disabled || segment.reason !== undefined}
             onChange={() => onChange(segment.value)}
           />
           {segment.icon && <Icon name={segment.icon} />}
@@ -40,4 +42,8 @@ export function Segments<T extends string>(props: SegmentsProps<T>) {
       ))}
     </div>
   );
+}
+
+function tipOf({ label, hint, reason }: Segment<string>): string {
+  return reason ?? (hint ? `${label} (${hint})` : label);
 }

@@ -41,6 +41,8 @@ export function Tabs<T extends string>({ label, tabs, value, onChange, panelId }
           class="tab"
           role="tab"
           id={`${panelId}-${tab.value}`}
+          aria-label={tab.label}
+          title={tab.icon && tab.label}
           aria-selected={tab.value === value}
           aria-controls={panelId}
           tabIndex={tab.value === value || (value === null && index === 0) ? 0 : -1}
@@ -48,7 +50,7 @@ export function Tabs<T extends string>({ label, tabs, value, onChange, panelId }
           onKeyDown={(event) => onKeyDown(event, index)}
         >
           {tab.icon && <Icon name={tab.icon} />}
-          {tab.label}
+          <span class="tab-label">{tab.label}</span>
         </button>
       ))}
     </div>

@@ -1,4 +1,4 @@
-import { announcement, dismiss, toasts } from "../../state/toasts";
+import { announcement, dismiss, hold, release, toasts } from "../../state/toasts";
 import { Icon } from "./Icon";
 import { IconButton } from "./IconButton";
 import { Sentence } from "./Sentence";
@@ -9,7 +9,15 @@ export function Toasts() {
     <>
       <div class="toasts" role="region" aria-label="Messages">
         {toasts.value.map((each) => (
-          <div key={each.id} class={`toast ${each.kind}`} role={each.kind === "error" ? "alert" : "status"}>
+          <div
+            key={each.id}
+            class={`toast ${each.kind}`}
+            role={each.kind === "error" ? "alert" : "status"}
+            onPointerEnter={() => hold(each)}
+            onPointerLeave={() => release(each)}
+            onFocusIn={() => hold(each)}
+            onFocusOut={() => release(each)}
+          >
             <Icon name={each.kind === "error" ? "alert" : "info"} />
             <p>
               <Sentence text={each.text} />

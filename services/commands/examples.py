@@ -1,0 +1,25 @@
+"""Examples that the help of a command ends with."""
+
+EXAMPLES = {
+    "render": (
+        "deltalight render take.mcap -o pictures",
+        "deltalight render take.mcap -o pictures --scene scene.json --method dlpv --frames 0:30",
+    ),
+    "demo": ("deltalight demo", "deltalight demo --headless --frames 30 -o pictures"),
+    "node": ("deltalight node --source synthetic", "deltalight node --source take.mcap"),
+    "server": ("deltalight server --scene scene.json",),
+    "up": ("deltalight up --source synthetic", "deltalight up --source take.mcap --scene scene.json"),
+    "record": ("deltalight record -o take.mcap --duration 10",),
+    "replay": ("deltalight replay take.mcap",),
+    "config": ("deltalight config",),
+    "doctor": ("deltalight doctor",),
+    "graph": ("deltalight graph", "deltalight graph --method dlpv"),
+    "schema": ("deltalight schema scene",),
+    "board": ("deltalight board -o board.pdf",),
+    "ping": ("deltalight ping tcp://127.0.0.1:5603",),
+}
+
+
+def examples_of(command: str) -> str:
+    """Return the examples of a command as the end of its help; blank lines keep them apart."""
+    return "\n\n".join(["[bold]Examples[/bold]", *(f"  {line}" for line in EXAMPLES[command])])

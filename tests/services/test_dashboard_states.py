@@ -1,0 +1,195 @@
+"""What the dashboard says of slow frames, of what is missing and while it connects, and how it fits a phone.
+
+Node and renderer are stand-ins.
+"""
+
+import re
+from collections.abc import Iterator
+
+import pytest
+from playwright.sync_api import Browser, Route, expect, sync_playwright
+
+from services.api.static_page import DASHBOARD
+from tests.services.dashboard_samples import PATIENCE_S, SIZE, Desk, Stack, find_chromium
+from tests.services.live_samples import LiveApi, live_api
+
+CHROMIUM = find_chromium()
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(
+        CHROMIUM is None, reason="no Chromium is installed (Debian: apt-get install chromium)"
+    ),
+    pytest.mark.skipif(
+        not (DASHBOARD / "index.html").is_file(),
+        reason="the dashboard is not built; `./run test --all` builds it",
+    ),
+]
+LAMP = {"type": "sphere", "position_m": [1, 0, 1], "intensity": 5}
+SCENE = {"name": "Gallery", "lights": {"mode": "manual", "manual": [LAMP]}}
+PHONE = {"width": 390, "height": 844}
+TABS = ("Performance", "Nodes", "Recordings", "Snapshots", "Compare", "History")
+PANELS = ("Object", "Lights", "Real", "Method", "Output")
+
+
+@pytest.fixture(scope="module")
+def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveApi]:
+    with live_api(tmp_path_factory.mktemp("data")) as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def stack(live: LiveApi) -> Stack:
+    """A scene of its own for each test; the stand-in claims to show its first revision."""
+    store = live.api.store
+    scene = store.scenes.activate(store.scenes.create(SCENE).head.id)
+    live.stream.scene, live.stream.is_busy, live.stream.camera_fps = (scene.head.id, 1), False, 15.0
+    return Stack(live.address, live.client, f"/scenes/{scene.head.id}")
+
+
+def seat(stack: Stack, browser: Browser, **options: object) -> Iterator[Desk]:
+    expect.set_options(timeout=PATIENCE_S * 1000)
+    with browser.new_context(color_scheme="dark", **options) as context:  # type: ignore[arg-type]
+        desk = Desk(stack, context.new_page())
+        yield desk
+        assert desk.complaints == []
+
+
+@pytest.fixture
+def page(stack: Stack, browser: Browser) -> Iterator[Desk]:
+    yield from seat(stack, browser, viewport=SIZE)
+
+
+@pytest.fixture
+def phone(stack: Stack, browser: Browser) -> Iterator[Desk]:
+    yield from seat(stack, browser, viewport=PHONE, has_touch=True, is_mobile=True)
+
+
+def says(page: Desk, word: str) -> None:
+    """Wait until the top bar tells that of the picture."""
+    expect(page.page.locator(".live-state [role=status]")).to_have_text(word)
+
+
+def test_a_slow_frame_is_told_as_work_and_not_as_a_fault(live: LiveApi, stack: Stack, page: Desk) -> None:
+    page.open()
+    says(page, "Live")
+    live.stream.is_busy = True
+    stack.client.patch(f"{stack.path}/output", json={"antialiasing": True}).raise_for_status()
+    banner = page.page.locator(".picture-banner")
+    expect(banner).to_have_text(re.compile(r"Rendering your change… [2-9] s"))
+    says(page, "Rendering")
+    expect(page.page.locator(".picture.not-live")).to_have_count(0)
+    page.photograph("rendering")
+    live.stream.scene, live.stream.is_busy = (stack.path.rpartition("/")[2], 2), False
+    says(page, "Live")
+    expect(banner).to_have_count(0)
+    live.stream.is_busy = True
+    expect(banner).to_have_text(re.compile(r"Waiting for the next frame… \d+ s"))
+    live.stream.is_busy = False
+    says(page, "Live")
+
+
+def test_frames_that_stay_away_are_told_with_where_to_look(live: LiveApi, page: Desk) -> None:
+    page.open()
+    live.stream.is_busy, live.stream.camera_fps = True, 0.0
+    says(page, "No new frames")
+    expect(page.page.locator(".picture-banner")).to_contain_text("See Nodes below")
+    expect(page.page.locator(".picture.not-live")).to_have_count(1)
+
+
+def test_fisheye_light_cannot_be_chosen_without_a_fisheye_camera(stack: Stack, page: Desk) -> None:
+    page.open()
+    page.named("tab", "Lights").click()
+    expect(page.named("radio", "Fish-eye")).to_be_disabled()
+    expect(page.named("radio", "Manual")).to_be_enabled()
+    expect(page.page.get_by_text("none is sending")).to_be_visible()
+    page.photograph("no_fisheye")
+    stack.client.patch(f"{stack.path}/lights", json={"mode": "fisheye"}).raise_for_status()
+    expect(page.page.locator(".picture-banner")).to_contain_text("lit by a fish-eye camera")
+
+
+def test_nothing_false_is_said_while_the_page_connects(stack: Stack, page: Desk) -> None:
+    answered: list[Route] = []
+
+    def hold(route: Route) -> None:
+        answered.append(route)
+
+    page.page.route("**/api/v1/active-scene", hold)
+    page.page.goto(f"http://{stack.address}/")
+    page.until(lambda: answered, "the question for the scene")
+    expect(page.page.locator(".skeleton").first).to_be_visible()
+    page.photograph("connecting")
+    shown = page.page.locator("body").inner_text()
+    for false in ("None yet", "No scene", "No lamps", "Given model", "No object", "Voxel cone", "view only"):
+        assert false not in shown, false
+    for route in answered:
+        route.continue_()
+    page.page.unroute("**/api/v1/active-scene")
+    page.shows_newest()
+    expect(page.page.locator(".skeleton")).to_have_count(0)
+    expect(page.named("treeitem", "Lamp 1")).to_be_visible()
+
+
+def test_a_view_is_neither_in_the_scene_nor_in_its_history(live: LiveApi, stack: Stack, page: Desk) -> None:
+    page.open()
+    view = page.page.get_by_role("toolbar").get_by_label("View")
+    view.select_option("delta")
+    page.until(lambda: live.server.session.scene.output.view == "delta", "the view")
+    page.page.keyboard.press("Escape")
+    page.page.locator("#stage").press("2")
+    page.until(lambda: live.server.session.scene.output.view == "effects", "the view of a key")
+    expect(view).to_have_value("effects")
+    expect(page.named("button", "Undo")).to_be_disabled()
+    assert (stack.scene()["revision"], stack.document()["output"]["view"]) == (1, "composite")
+    stack.client.patch(f"{stack.path}/output", json={"view": "volume"}).raise_for_status()
+    expect(view).to_have_value("volume")
+
+
+def test_a_name_is_kept_as_it_is_typed_while_the_scene_changes(stack: Stack, page: Desk) -> None:
+    page.open()
+    page.named("button", "Scenes: Gallery").click()
+    page.page.get_by_role("menuitem", name="Rename this scene").click()
+    name = page.named("textbox", "Name")
+    name.fill("mY room #2")
+    stack.client.patch(f"{stack.path}/output", json={"antialiasing": True}).raise_for_status()
+    page.until(lambda: page.page.get_by_text("output: antialiasing").count() == 0, "the event")
+    expect(name).to_have_value("mY room #2")
+    name.press("Enter")
+    expect(page.named("button", "Scenes: mY room #2")).to_be_visible()
+    assert stack.document()["name"] == "mY room #2"
+
+
+def test_everything_can_be_reached_on_a_phone(phone: Desk) -> None:
+    phone.open()
+    phone.photograph("phone")
+    assert phone.beyond_the_edge() == []
+    picture = phone.page.locator(".picture").bounding_box()
+    assert picture is not None
+    assert picture["width"] > 0.8 * PHONE["width"], "the picture is as wide as the phone"
+    for panel in PANELS:
+        phone.named("tab", panel).tap()
+        assert phone.beyond_the_edge() == [], panel
+    phone.photograph("phone_output")
+    for tab in TABS:
+        phone.named("tab", tab).tap()
+        expect(phone.page.locator(".drawer-body")).to_be_visible()
+        assert phone.beyond_the_edge() == [], tab
+        phone.photograph(f"phone_{tab.lower()}")
+    phone.named("button", "Close the drawer").tap()
+    phone.named("button", "Add object").tap()
+    assert phone.beyond_the_edge() == [], "the menu"
+    phone.page.keyboard.press("Escape")
+    phone.named("button", "Scene and assets").tap()
+    phone.named("treeitem", "Lamp 1").tap()
+    phone.photograph("phone_tree")
+    phone.named("button", "Scene and assets").tap()
+    phone.named("spinbutton", "Intensity").wait_for()
+    assert phone.beyond_the_edge() == []
+    phone.photograph("phone_lamp")
