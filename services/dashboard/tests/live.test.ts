@@ -1,5 +1,5 @@
 import { describe, expect, it } from "vitest";
-import { droppedFrames, parseLiveMessage } from "../src/live/message";
+import { droppedFrames, parseLiveMessage, qualityText } from "../src/live/message";
 import { lateBy } from "../src/live/picture";
 import { RateMeter } from "../src/live/rate";
 import { backoff } from "../src/live/socket";
@@ -34,6 +34,14 @@ describe("a message of the live picture", () => {
 
   it("counts a lost frame once, though depth and pose went with it", () => {
     expect(droppedFrames({ "color.camera": 3, "clean_depth.camera": 3, "pose.camera": 2 })).toBe(3);
+  });
+});
+
+describe("the quality of a picture", () => {
+  it("is named with the share of its size that was rendered", () => {
+    expect(qualityText({ quality: "best", scale: 1 })).toBe("best");
+    expect(qualityText({ quality: "live", scale: 0.75 })).toBe("live, 75 %");
+    expect(qualityText({ quality: null, scale: 1 })).toBe("–");
   });
 });
 

@@ -1994,12 +1994,22 @@ export interface components {
                 readonly [key: string]: number;
             };
             /**
+             * Quality
+             * @description The quality that it was rendered in; null: nothing was rendered.
+             */
+            readonly quality: ("live" | "balanced" | "best") | null;
+            /**
              * Render Ms
              * @description From the frame's arrival at the renderer to its picture, waiting included.
              */
             readonly render_ms: number;
             /** Renderer */
             readonly renderer: string;
+            /**
+             * Scale
+             * @description Fraction of its width and height that was rendered, and then enlarged.
+             */
+            readonly scale: number;
             /** @description null where another program set the server's scene. */
             readonly scene: components["schemas"]["ShownScene"] | null;
             /**
@@ -2330,6 +2340,11 @@ export interface components {
              * @default false
              */
             readonly camera_artifacts: boolean;
+            /**
+             * Frame Budget Ms
+             * @description What a frame may take while something moves, ms: quality, then the size at which it is rendered give way (docs/speed.md); null = no limit.
+             */
+            readonly frame_budget_ms?: number | null;
             /**
              * Height
              * @description Height, pixels; null = the camera's.

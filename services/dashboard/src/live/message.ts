@@ -18,6 +18,12 @@ export function parseLiveMessage(data: ArrayBuffer): LiveMessage {
   };
 }
 
+/** The quality that a picture was rendered in; with the scale where it was rendered smaller and enlarged: "live, 50 %". */
+export function qualityText({ quality, scale }: Pick<LiveHeader, "quality" | "scale">): string {
+  if (quality === null) return "–";
+  return scale < 1 ? `${quality}, ${Math.round(100 * scale)} %` : quality;
+}
+
 /** Frames that were lost on their way; depth and pose go with their colour frame and are not counted again. */
 export function droppedFrames(drops: LiveHeader["drops"]): number {
   return Object.entries(drops)

@@ -1,8 +1,9 @@
 import { frame, rate, view } from "../../live/picture";
-import { droppedFrames } from "../../live/message";
+import { droppedFrames, qualityText } from "../../live/message";
 import { lensDeviation } from "../../math/camera";
 import { milliseconds, rateText } from "../../math/units";
 import { uploads } from "../../state/assets";
+import { sceneDocument } from "../../state/scene";
 
 // Beyond this share of the picture's width lines that should be straight are visibly bent.
 const STRONG = 0.02;
@@ -23,6 +24,11 @@ export function StatusStrip() {
           />
           <Figure name="Delay" value={milliseconds(header.age_ms)} />
           <Figure name="Rate" value={rateText(rate.value)} />
+          <Figure
+            name="Quality"
+            value={qualityText(header)}
+            tip={budgetText(sceneDocument.value?.output.frame_budget_ms)}
+          />
           <Figure name="Dropped" value={String(droppedFrames(header.drops))} tip={dropText(header.drops)} />
           <Figure name="Skipped" value={String(header.skipped)} tip="Frames this browser was too slow to show" />
         </dl>
@@ -46,6 +52,12 @@ function Figure({ name, value, tip }: { readonly name: string; readonly value: s
       <dd>{value}</dd>
     </div>
   );
+}
+
+function budgetText(budget: number | null | undefined): string {
+  return budget == null
+    ? "While something moves, quality gives way as the method's setting says"
+    : `While something moves, quality and then size give way, to take ${milliseconds(budget)} a frame; at rest the picture becomes the best`;
 }
 
 function dropText(drops: Readonly<Record<string, number>>): string {
