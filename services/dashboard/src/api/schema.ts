@@ -1069,6 +1069,13 @@ export interface components {
              */
             readonly near_light: "measured" | "none";
             /**
+             * Quality
+             * @description What a moving picture may give up for speed (docs/speed.md): live, balanced, or best: nothing.
+             * @default best
+             * @enum {string}
+             */
+            readonly quality: "live" | "balanced" | "best";
+            /**
              * Rays
              * @description Rays from each sample over the whole sphere; more take longer once.
              * @default 256
@@ -1310,6 +1317,13 @@ export interface components {
              */
             readonly name: "differential";
             /**
+             * Quality
+             * @description What a moving picture may give up for speed (docs/speed.md): live, balanced, or best: nothing.
+             * @default best
+             * @enum {string}
+             */
+            readonly quality: "live" | "balanced" | "best";
+            /**
              * Radiance
              * @description Of the exact operator: real surfaces shine as the camera sees them, or as lights predict.
              * @default measured
@@ -1446,6 +1460,21 @@ export interface components {
              */
             readonly damping?: number | null;
             /**
+             * Direct Filter
+             * @description Of shadow lobe: direct light is averaged over cubes that reach so many cells to each side, which softens shadows and makes them lighter; null = 0.
+             */
+            readonly direct_filter?: number | null;
+            /**
+             * Direct Steps
+             * @description Of shadow lobe: steps of direct light after injection; they soften shadows. null = 0.
+             */
+            readonly direct_steps?: number | null;
+            /**
+             * Direct Volume Size
+             * @description Of shadow lobe: cells an edge of the volume of direct light; null = volume_size.
+             */
+            readonly direct_volume_size?: number | null;
+            /**
              * Geometry Volume
              * @description Surfaces block light between cells; null = yes, no for paper.
              */
@@ -1456,6 +1485,16 @@ export interface components {
              * @constant
              */
             readonly name: "dlpv";
+            /**
+             * Objects Steps
+             * @description Of operator paper: steps in the volume that lights the objects; null = as steps.
+             */
+            readonly objects_steps?: number | null;
+            /**
+             * Objects Volume Size
+             * @description Of operator paper: cells an edge of the volume that lights the objects; null = volume_size.
+             */
+            readonly objects_volume_size?: number | null;
             /**
              * Operator
              * @description Two volumes, with and without objects, subtracted; or one volume of the change, as printed in the paper. Settings that are null follow it.
@@ -1468,6 +1507,13 @@ export interface components {
              * @description What a cell keeps of light that enters it: its direction, or lobes about the faces that it reaches; null = moments, lobes for paper.
              */
             readonly propagation?: ("moments" | "lobes") | null;
+            /**
+             * Quality
+             * @description What a moving picture may give up for speed (docs/speed.md): live, balanced, or best: nothing.
+             * @default best
+             * @enum {string}
+             */
+            readonly quality: "live" | "balanced" | "best";
             /**
              * Query Scale
              * @description The volume is read at 1/scale of the picture; null = 2 on a GPU, 4 in software.
@@ -1592,6 +1638,13 @@ export interface components {
              * @enum {string}
              */
             readonly operator: "exact" | "paper";
+            /**
+             * Quality
+             * @description What a moving picture may give up for speed (docs/speed.md): live, balanced, or best: nothing.
+             * @default best
+             * @enum {string}
+             */
+            readonly quality: "live" | "balanced" | "best";
             /**
              * Radiance
              * @description Of the exact operator: real surfaces shine as the camera sees them, or as lights predict.
@@ -2246,6 +2299,13 @@ export interface components {
              * @constant
              */
             readonly name: "none";
+            /**
+             * Quality
+             * @description What a moving picture may give up for speed (docs/speed.md): live, balanced, or best: nothing.
+             * @default best
+             * @enum {string}
+             */
+            readonly quality: "live" | "balanced" | "best";
         };
         /**
          * Output
