@@ -118,6 +118,58 @@ def test_the_delta_holds_the_flux_that_the_box_reflects_and_what_the_floor_lost(
     assert lost == pytest.approx(np.full(3, -albedo * IRRADIANCE * EDGE**2), rel=0.02)
 
 
+@pytest.mark.parametrize("lights", [(DOWN,), (DOWN, OBLIQUE)], ids=["a light", "two lights"])
+@pytest.mark.parametrize("normal", [(0, 0, 1), (0, -1, 1), (1, -1, 1)])
+def test_voxels_of_a_plate_hold_its_radiance_however_it_is_turned(
+    gpu: GpuContext,
+    assets: Path,
+    tmp_path: Path,
+    normal: tuple[int, ...],
+    lights: tuple[tuple[float, ...], ...],
+) -> None:
+    """albedo / pi times the irradiance of all lights: Phi / (pi A), with the area that the plate has in the voxel."""
+    direction = np.array(normal) / np.linalg.norm(normal)
+    plate = trimesh.creation.box((0.3, 0.3, 0.01), trimesh.geometry.align_vectors((0, 0, 1), direction))
+    plate.apply_translation((0, 0, 0.3))
+    plate.export(tmp_path / "plate.ply")
+    document = scene(assets)
+    plates = document.objects[0].model_copy(update={"asset": str(tmp_path / "plate.ply")})
+    manual = [{"type": "directional", "direction": each, "irradiance": IRRADIANCE} for each in lights]
+    given = parse_scene({"lights": {"manual": manual, "surroundings": "none"}}).lights
+    with rendered(gpu, document.replaced(objects=(plates,), lights=given)) as graph:
+        rho, low = level_0(graph["filter"].rho), np.array(graph["volume"].placement.origin)
+    irradiance = sum(-IRRADIANCE * float(np.dot(direction, each)) for each in lights)
+    centres = low + VOXEL_M * (np.moveaxis(np.indices((VOXELS,) * 3), 0, -1)[..., ::-1] + 0.5)
+    inner = (rho[..., 0] > 0) & (
+        np.linalg.norm(centres - (0, 0, 0.3), axis=-1) < 0.12
+    )  # without the plate's rim
+    relative = rho[inner] / (BASE_COLOR / np.pi * irradiance)
+    assert len(relative) > 60
+    assert relative == pytest.approx(1.0, abs=0.02)
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.5])
+def test_the_floor_loses_the_radiance_that_it_had(
+    gpu: GpuContext, assets: Path, tmp_path: Path, tilt: float
+) -> None:
+    """Where the box takes all of a light, V_delta is the negative of what the camera saw less ambient light."""
+    turn = trimesh.transformations.rotation_matrix(tilt, (1, 0, 0))
+    cuboid((2, 2, 0.02), -0.01).apply_transform(turn).export(tmp_path / "floor.ply")
+    box = cuboid((EDGE, EDGE, EDGE), 0.35)
+    box.export(tmp_path / "box.ply")
+    document = scene(assets)
+    floating = document.objects[0].model_copy(update={"asset": str(tmp_path / "box.ply")})
+    real = parse_scene({"real": {"geometry": {"model": str(tmp_path / "floor.ply")}}}).real
+    with rendered(gpu, document.replaced(objects=(floating,), real=real)) as graph:
+        delta = level_0(graph["filter"].delta)[..., 0]
+    direct = IRRADIANCE * np.cos(tilt)
+    lost = camera_radiance() * direct / (direct + np.pi * AMBIENT)
+    relative = -delta[delta < 0] / lost
+    assert len(relative) > 30
+    assert np.median(relative) == pytest.approx(1.0, abs=0.02)
+    assert relative.max() < 1.02
+
+
 def test_where_the_real_scene_keeps_the_light_off_nothing_changes(gpu: GpuContext, assets: Path) -> None:
     with rendered(gpu, scene(assets, real="roofed")) as graph:
         mu, rho = texels(graph["direct light"].mu), texels(graph["direct light"].rho)

@@ -19,12 +19,6 @@ uniform int view_index;
 uniform float bias_real;   // m: how far behind the real map an object's surface may be and still be lit
 uniform bool has_caustics; // beams carry the lights' reflections in smooth virtual surfaces
 
-vec3 direction_to_light(Light light, vec3 p) {
-    vec3 to_light; float radius;
-    light_at(light, p, to_light, radius);
-    return to_light;
-}
-
 // What a light sees faces it.
 vec3 lit_side(vec3 n, vec3 to_light) { return dot(n, to_light) < 0.0 ? -n : n; }
 
