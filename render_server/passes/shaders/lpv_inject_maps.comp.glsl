@@ -32,7 +32,8 @@ vec3 virtual_albedo(ivec2 texel) {
     vec4 uv = texelFetch(virtual_light_uv, texel, 0);
     Material m = material_of(int(texelFetch(virtual_light_normal, texel, 0).w), uv.xy, unpack_color(uv.z));
     bool in_beams = has_caustics && m.roughness * m.roughness < GREATEST_ALPHA;   // beams carry these
-    return m.diffuse + (in_beams ? vec3(0.0) : m.f0);
+    vec3 lobe = in_beams ? vec3(0.0) : mean_specular_reflectance(m.f0, m.roughness);
+    return mean_diffuse_reflectance(m.diffuse, m.f0, m.roughness) + lobe;
 }
 
 // A lobe that points where the light travels, in the cell half a cell in front of the surface, towards the light.
