@@ -197,7 +197,7 @@ class LpvShow:
 
 def _cells_of(sums: moderngl.Buffer) -> int:
     """Cells an edge of injected sums."""
-    return round((sums.size / (INJECTED_SUMS * 4)) ** (1 / 3))
+    return round(math.cbrt(sums.size / (INJECTED_SUMS * 4)))
 
 
 class LpvCoverFaces:

@@ -262,3 +262,42 @@ def test_the_shadow_lies_where_geometry_puts_it(
     assert np.median(linear[umbra]) == pytest.approx(ambient, abs=0.08)
     assert np.mean(linear[umbra] < 0.5) > 0.95
     assert np.mean(np.abs(linear[lit] - 1) < 0.1) > 0.98
+
+
+def gathered(graph: Graph, cells: bytes) -> Float64[np.ndarray, "h w 3"]:
+    """E of the nine cones at real surfaces, through a volume in place of V_delta."""
+    filtered = graph.resource("filter")
+    filtered.value.delta.texture.write(cells)
+    filtered.write(filtered.value)
+    graph.run()
+    cones = graph["cones"]
+    return np.asarray((texels(cones.rho) - texels(cones.mu))[..., :3])
+
+
+def test_the_error_of_the_delta_is_the_indirect_light_that_the_box_blocks(
+    gpu: GpuContext, assets: Path, tmp_path: Path
+) -> None:
+    """[P1] eq. 9, E = C_rho - (C_mu + C_delta), with C_mu through the scene without the box: what V_delta holds takes
+    nothing away that passes between two real surfaces. So E is never positive, and not small beside the box."""
+    wall = trimesh.creation.box((1.0, 0.02, 0.6), trimesh.transformations.translation_matrix((0, 0.2, 0.3)))
+    trimesh.util.concatenate([cuboid((2, 2, 0.02), -0.01), wall]).export(tmp_path / "room.ply")
+    corners = [trimesh.creation.box((0.002,) * 3) for _ in range(2)]  # as far apart as the box's
+    for corner, side in zip(corners, (-1, 1), strict=True):
+        corner.apply_translation(side * np.array([EDGE / 2] * 3) + (0, 0, EDGE / 2))
+    trimesh.util.concatenate(corners).export(tmp_path / "speck.ply")
+    real = parse_scene({"real": {"geometry": {"model": str(tmp_path / "room.ply")}}}).real
+    document = scene(assets, direction=(0.0, 0.6, -0.8)).replaced(real=real)
+    speck = document.objects[0].model_copy(update={"asset": str(tmp_path / "speck.ply")})
+    with rendered(gpu, document) as graph:
+        volumes = graph["filter"]
+        held = [each.texture.read() for each in (volumes.rho, volumes.delta)]
+        rho, delta = (gathered(graph, cells) for cells in held)
+        hidden = texels(graph["cones"].virtual)[..., 3] > 0
+    with rendered(gpu, document.replaced(objects=(speck,))) as graph:
+        mu = gathered(graph, graph["filter"].rho.texture.read())
+    error = (rho - mu - delta)[~hidden].mean(axis=-1)
+    print(
+        f"E: {error.sum() / mu[~hidden].mean(axis=-1).sum():.3f} of C_mu, {error.min():.3f} .. {error.max():.3f}"
+    )
+    assert error.min() < -0.05
+    assert error.max() < 0.01
