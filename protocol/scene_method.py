@@ -199,6 +199,9 @@ class DvctMethod(VoxelConeSettings):
         return self.composition or ("ratio" if self.operator == "exact" else "additive")
 
 
+PrintedCells = Annotated[int | None, Field(ge=16, le=64, multiple_of=8)]
+
+
 class DlpvMethod(MethodSettings):
     """Delta light propagation volumes (docs/method.md 5)."""
 
@@ -221,6 +224,34 @@ class DlpvMethod(MethodSettings):
         ge=1,
         le=256,
         description="Steps of propagation, a cell each; null = cells per edge. The result depends on their number.",
+    )
+    objects_volume_size: PrintedCells = Field(
+        default=None,
+        description="Of operator paper: cells an edge of the volume that lights the objects; "
+        "null = volume_size.",
+    )
+    objects_steps: int | None = Field(
+        default=None,
+        ge=1,
+        le=256,
+        description="Of operator paper: steps in the volume that lights the objects; null = as steps.",
+    )
+    direct_volume_size: PrintedCells = Field(
+        default=None,
+        description="Of shadow lobe: cells an edge of the volume of direct light; null = volume_size.",
+    )
+    direct_steps: int | None = Field(
+        default=None,
+        ge=0,
+        le=256,
+        description="Of shadow lobe: steps of direct light after injection; they soften shadows. null = 0.",
+    )
+    direct_filter: int | None = Field(
+        default=None,
+        ge=0,
+        le=4,
+        description="Of shadow lobe: direct light is averaged over cubes that reach so many cells to each side, "
+        "which softens shadows and makes them lighter; null = 0.",
     )
     propagation: Literal["moments", "lobes"] | None = Field(
         default=None,
@@ -286,6 +317,15 @@ class DlpvMethod(MethodSettings):
         if self.bounces and self.operator == "paper":
             raise ValueError(
                 "`bounces` need operator `difference`: leave them out, or use operator difference"
+            )
+        given = [name for name in ("objects_volume_size", "objects_steps") if getattr(self, name) is not None]
+        if given and self.operator != "paper":
+            raise ValueError(f"`{given[0]}` is part of operator `paper`: leave it out, or use operator paper")
+        direct = ("direct_volume_size", "direct_steps", "direct_filter")
+        given = [name for name in direct if getattr(self, name) is not None]
+        if given and self.resolved_shadow != "lobe":
+            raise ValueError(
+                f"`{given[0]}` needs shadow `lobe`: leave it out, or use operator paper with shadow lobe"
             )
         return self
 

@@ -1,5 +1,8 @@
 """Delta light propagation volumes ([P2], docs/method.md 5)."""
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
 import moderngl
 import numpy as np
 from jaxtyping import Float32
@@ -28,6 +31,7 @@ from render_server.passes.cones import ConeFields, LowResGrid
 from render_server.passes.lights import LightBuffers
 from render_server.passes.lpv import (
     LightVolume,
+    LpvBoxFilter,
     LpvCoverFaces,
     LpvPropagate,
     LpvShow,
@@ -52,42 +56,26 @@ from render_server.passes.voxel_light import AlbedoTexture
 from render_server.passes.voxels import PlacedVolume, VolumePlacement, Voxelize, VoxelMipmap, VoxelStore
 
 
-class LpvVolumes:
-    """V_rho with V_mu (`mu`), or the paper's V_delta (`change`).
+class LpvCells:
+    """Cells of one size: the surfels of both geometries, what these block, and the light injected from them and maps.
 
-    Two sums are injected: the real scene's light without objects, and the change due to the objects. V_mu starts from
-    the first, V_rho from both, the paper's V_delta from the second and the negative lobes of direct light. Each
-    bounce propagates V_rho again with the light that surfaces reflect of it. `shown` is the injected change, for
-    debug view `volume`.
+    Two sums are injected: the real scene's light without objects, and the change due to the objects.
     """
 
-    def __init__(self, gpu: GpuContext, settings: DlpvMethod, cells: int) -> None:
-        self._gpu, self._settings, self._steps = gpu, settings, settings.steps or cells
-        is_paper = settings.operator == "paper"
-        has_moments = settings.resolved_propagation == "moments"
-        self._weights = moment_weights(cells) if has_moments else lobe_weights()
-        nowhere = VolumePlacement((0.0, 0.0, 0.0), 1.0, cells)
+    def __init__(self, gpu: GpuContext, settings: DlpvMethod, size: int) -> None:
+        self._gpu, self._settings, self.size = gpu, settings, size
+        nowhere = VolumePlacement((0.0, 0.0, 0.0), 1.0, size)
         self.volume, self._half_cells = PlacedVolume(gpu, nowhere), PlacedVolume(gpu, nowhere)
-        self.rho = LightVolume(gpu, cells)
-        self.mu = None if is_paper else LightVolume(gpu, cells)
-        self.change = LightVolume(gpu, cells) if is_paper else None
-        self.shown = VoxelMipmap(gpu, cells, 1)
-        self._real_light, self._change_light, self._bounced_light, self._shadow_light = (
-            injected_sums(gpu, cells) for _ in range(4)
-        )
-        self._real_covered, self._virtual_covered = (covered_sums(gpu, cells) for _ in range(2))
-        self._through_real, self._through_joint = (transmitted_fractions(gpu, cells) for _ in range(2))
-        self.real, self.objects = (VoxelStore(gpu, 2 * cells) for _ in range(2))
+        self._real_light, self._change_light = (injected_sums(gpu, size) for _ in range(2))
+        self._real_covered, self._virtual_covered = (covered_sums(gpu, size) for _ in range(2))
+        self._through_real, self._through_joint = (transmitted_fractions(gpu, size) for _ in range(2))
+        self.real, self.objects = (VoxelStore(gpu, 2 * size) for _ in range(2))
         self._voxelize = Voxelize(gpu)
         self._albedo = RealAlbedo(gpu)
         self._maps = LpvInjectMaps(gpu)
         self._surfaces = LpvInjectSurfaces(gpu)
         self._cover = LpvCoverFaces(gpu)
         self._transmit = LpvTransmit(gpu)
-        self._start = LpvStart(gpu)
-        self._propagate = LpvPropagate(gpu)
-        self._bounce = LpvBounce(gpu)
-        self._show = LpvShow(gpu)
 
     @property
     def _has_geometry(self) -> bool:
@@ -98,17 +86,11 @@ class LpvVolumes:
     def _blocks_environment(self) -> bool:
         return self._settings.resolved_ambient == "blocked"
 
-    @property
-    def query_bindings(self) -> dict[str, Binding]:
-        """Returns the bindings for reading light from the volumes (shaders/common/lpv_light.glsl)."""
-        return {"has_geometry": self._has_geometry, "damping": self._settings.resolved_damping}
-
-    def place(self, placement: VolumePlacement) -> PlacedVolume:
-        """Places the cells, and the half-size cells for surfels."""
-        self.volume.place(placement)
-        self._half_cells.place(
-            VolumePlacement(placement.origin, placement.voxel_edge / 2, 2 * placement.size)
-        )
+    def place(self, cube: VolumePlacement) -> PlacedVolume:
+        """Fills the cube with the cells, and the half-size cells for surfels."""
+        edge = cube.voxel_edge * cube.size / self.size
+        self.volume.place(VolumePlacement(cube.origin, edge, self.size))
+        self._half_cells.place(VolumePlacement(cube.origin, edge / 2, 2 * self.size))
         return self.volume
 
     def voxelize_real(self, real: GeometryState, volume: PlacedVolume) -> VoxelStore:
@@ -155,15 +137,8 @@ class LpvVolumes:
         if not self._has_geometry:
             return None
         self._cover.run(self._real_covered, real, volume.placement)
-        self._transmit.run(self._through_real, volume.placement.size, self._real_covered)
+        self._transmit.run(self._through_real, self.size, self._real_covered)
         return self._through_real
-
-    def propagate_mu(self, injected: moderngl.Buffer, through: moderngl.Buffer | None) -> LightVolume | None:
-        """Propagates V_mu; None with the paper's operator."""
-        if self.mu is not None:
-            self._start.run(self.mu, injected)
-            self._propagate.run(self.mu, self._weights, self._steps, through)
-        return self.mu
 
     def joint_scene(
         self, scene: Bindings, objects: GeometryState, lights: LightBuffers
@@ -193,89 +168,224 @@ class LpvVolumes:
         if not self._has_geometry:
             return None
         self._cover.run(self._virtual_covered, objects, volume.placement)
-        self._transmit.run(
-            self._through_joint, volume.placement.size, self._real_covered, self._virtual_covered
-        )
+        self._transmit.run(self._through_joint, self.size, self._real_covered, self._virtual_covered)
         return self._through_joint
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        _release_all(self)
+
+
+def _release_all(owner: object) -> None:
+    release_all(*(item for name, item in vars(owner).items() if name != "_gpu" and hasattr(item, "release")))
+
+
+@dataclass(frozen=True, eq=False)
+class CellStages:
+    """The resources of cells of one size (`cell_stages`); `through` is what lets light pass between them."""
+
+    volume: Resource[PlacedVolume]
+    joint: Resource[dict[str, Binding]]
+    real_light: Resource[moderngl.Buffer]
+    change: Resource[moderngl.Buffer]
+    through: Resource[moderngl.Buffer | None]
+
+
+def cell_stages(
+    g: Graph,
+    s: FrameResources,
+    lit: LitScene,
+    cells: LpvCells,
+    cube: Resource[VolumePlacement],
+    suffix: str = "",
+) -> CellStages:
+    """Declares placement, injection and blocking of cells that fill the `cube`; `suffix` tells sizes apart."""
+    volume = g.value(f"volume{suffix}", cells.place, cube)
+    real = g.stage(f"voxelize real{suffix}", cells.voxelize_real, s.real, volume)
+    inputs = (s.measured, s.albedo, volume, s.lights, lit.environment, lit.real_maps)
+    scene = g.value(f"inject scene{suffix}", cells.real_scene, *inputs)
+    real_light = g.stage(f"inject real{suffix}", cells.inject_real, real, scene, lit.real_maps)
+    through_real = g.stage(f"geometry volume real{suffix}", cells.cover_real, real, volume)
+    objects = g.stage(f"voxelize objects{suffix}", cells.voxelize_objects, s.objects, volume)
+    joint = g.value(f"inject scene joint{suffix}", cells.joint_scene, scene, s.objects, lit.object_maps)
+    change = g.stage(
+        f"inject change{suffix}", cells.inject_change, objects, joint, lit.object_maps, real_light
+    )
+    through = g.stage(f"geometry volume{suffix}", cells.cover_joint, objects, volume, through_real)
+    return CellStages(volume, joint, real_light, change, through)
+
+
+class Propagated:
+    """A light volume and its steps."""
+
+    def __init__(self, gpu: GpuContext, settings: DlpvMethod, cells: int, steps: int) -> None:
+        has_moments = settings.resolved_propagation == "moments"
+        self._weights, self._steps = moment_weights(cells) if has_moments else lobe_weights(), steps
+        self.light = LightVolume(gpu, cells)
+        self._start = LpvStart(gpu)
+        self._propagate = LpvPropagate(gpu)
+
+    def run(self, through: moderngl.Buffer | None, *injected: moderngl.Buffer) -> LightVolume:
+        """Propagates the light of one to three injected sums, added up; without `through` nothing blocks it."""
+        self._start.run(self.light, *injected)
+        self._propagate.run(self.light, self._weights, self._steps, through)
+        return self.light
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        _release_all(self)
+
+
+def query_bindings(settings: DlpvMethod) -> dict[str, Binding]:
+    """Returns the bindings for reading light from volumes (shaders/common/lpv_light.glsl)."""
+    return {"has_geometry": settings.resolved_geometry_volume, "damping": settings.resolved_damping}
+
+
+class DifferenceVolumes:
+    """V_rho and V_mu.
+
+    V_mu starts from the real scene's light without objects, V_rho from that and the change due to them. Each bounce
+    propagates V_rho again with the light that surfaces reflect of it. `shown` is the injected change, for debug view
+    `volume`.
+    """
+
+    def __init__(self, gpu: GpuContext, settings: DlpvMethod, cells: LpvCells) -> None:
+        self._gpu, self._settings, self._cells = gpu, settings, cells
+        steps = settings.steps or cells.size
+        self._mu, self._rho = (Propagated(gpu, settings, cells.size, steps) for _ in range(2))
+        self._bounced_light = injected_sums(gpu, cells.size)
+        self._bounce = LpvBounce(gpu)
+        self._shown = VoxelMipmap(gpu, cells.size, 1)
+        self._show = LpvShow(gpu)
+
+    def propagate_mu(self, injected: moderngl.Buffer, through: moderngl.Buffer | None) -> LightVolume:
+        """Propagates V_mu."""
+        return self._mu.run(through, injected)
 
     def propagate_rho(
         self, real: moderngl.Buffer, change: moderngl.Buffer, through: moderngl.Buffer | None
     ) -> LightVolume:
         """Propagates V_rho."""
-        self._start.run(self.rho, real, change)
-        self._propagate.run(self.rho, self._weights, self._steps, through)
-        return self.rho
+        return self._rho.run(through, real, change)
 
     def bounce(
         self,
         rho: LightVolume,
-        mu: LightVolume | None,
+        mu: LightVolume,
+        injected: moderngl.Buffer,
+        change: moderngl.Buffer,
         scene: Bindings,
         through: moderngl.Buffer | None,
     ) -> LightVolume:
         """Propagates V_rho again, with the light that surfaces reflect of the previous pass."""
-        for _ in range(0 if mu is None else self._settings.resolved_bounces):
-            assert mu is not None
+        for _ in range(self._settings.resolved_bounces):
             clear_buffer(self._gpu, self._bounced_light)
-            own = {**scene, **self.query_bindings}
-            self._bounce.run(self._bounced_light, (self.real, self.objects), (mu, rho), own)
-            self._start.run(rho, self._real_light, self._change_light, self._bounced_light)
-            self._propagate.run(rho, self._weights, self._steps, through)
+            own = {**scene, **query_bindings(self._settings)}
+            self._bounce.run(self._bounced_light, (self._cells.real, self._cells.objects), (mu, rho), own)
+            self._rho.run(through, injected, change, self._bounced_light)
         return rho
 
-    def inject_shadow(self, scene: Bindings, lights: LightBuffers, _real: moderngl.Buffer) -> moderngl.Buffer:
-        """Negative lobes of the direct light that objects keep off the real scene; nothing where maps shadow it."""
-        if self._settings.resolved_shadow == "lobe":
-            clear_buffer(self._gpu, self._shadow_light)
-            self._maps.add_shadow(self._shadow_light, lights, self._albedo.atlas, scene)
-        return self._shadow_light
-
-    def propagate_change(
-        self, change: moderngl.Buffer, shadow: moderngl.Buffer, through: moderngl.Buffer | None
-    ) -> LightVolume | None:
-        """Propagates the paper's V_delta: a single volume of the difference ([P2] 4.3).
-
-        None with the other operator.
-        """
-        if self.change is not None:
-            self._start.run(self.change, change, shadow)
-            self._propagate.run(self.change, self._weights, self._steps, through)
-        return self.change
-
-    def show(self, change: moderngl.Buffer, shadow: moderngl.Buffer, volume: PlacedVolume) -> VoxelMipmap:
+    def show(self, change: moderngl.Buffer) -> VoxelMipmap:
         """Draws the injected change into cells."""
-        self._show.run(self.shown, volume.placement.size, change, shadow)
-        return self.shown
+        self._show.run(self._shown, change)
+        return self._shown
 
     def release(self) -> None:
         """Frees the GL objects."""
-        own = (item for item in vars(self).values() if item is not self._gpu)
-        release_all(*(item for item in own if hasattr(item, "release")))
+        _release_all(self)
+
+
+class PrintedVolumes:
+    """The volumes of [P2] 4.3: V_rho for the objects, V_delta of the indirect change, and one of the direct change.
+
+    The direct change is injected apart from the indirect one, so that it can have steps of its own (none as printed
+    in 4.3.2, "n" in section 7). `shown` is what was injected of both, for debug view `volume`.
+    """
+
+    def __init__(self, gpu: GpuContext, settings: DlpvMethod, sizes: "PrintedSizes") -> None:
+        self._gpu, self._settings = gpu, settings
+        steps, own_steps = settings.steps, settings.objects_steps or settings.steps
+        self._rho = Propagated(gpu, settings, sizes.objects, own_steps or sizes.objects)
+        self._delta = Propagated(gpu, settings, sizes.indirect, steps or sizes.indirect)
+        self._direct: Propagated | None = None
+        if settings.resolved_shadow == "lobe":
+            self._direct = Propagated(gpu, settings, sizes.direct, settings.direct_steps or 0)
+        self._maps = LpvInjectMaps(gpu)
+        self._direct_light = injected_sums(gpu, sizes.direct)
+        self._filter = LpvBoxFilter(gpu)
+        self._shown = VoxelMipmap(gpu, sizes.indirect, 1)
+        self._show = LpvShow(gpu)
+
+    def propagate_rho(
+        self, real: moderngl.Buffer, change: moderngl.Buffer, through: moderngl.Buffer | None
+    ) -> LightVolume:
+        """Propagates V_rho."""
+        return self._rho.run(through, real, change)
+
+    def propagate_delta(self, change: moderngl.Buffer, through: moderngl.Buffer | None) -> LightVolume:
+        """Propagates the indirect change ([P2] 4.3.1)."""
+        return self._delta.run(through, change)
+
+    def inject_direct(self, scene: Bindings, lights: LightBuffers) -> moderngl.Buffer:
+        """Injects the direct change ([P2] 4.3.2); nothing where shadow maps bring it."""
+        if self._direct is not None:
+            clear_buffer(self._gpu, self._direct_light)
+            self._maps.add_direct(self._direct_light, lights, scene)
+        return self._direct_light
+
+    def propagate_direct(
+        self, injected: moderngl.Buffer, through: moderngl.Buffer | None
+    ) -> LightVolume | None:
+        """Propagates and filters the direct change; None where shadow maps bring it."""
+        if self._direct is None:
+            return None
+        light = self._direct.run(through, injected)
+        self._filter.run(light, self._settings.direct_filter or 0)
+        return light
+
+    def show(self, change: moderngl.Buffer, direct: moderngl.Buffer) -> VoxelMipmap:
+        """Draws the injected change into cells."""
+        self._show.run(self._shown, change, direct)
+        return self._shown
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        _release_all(self)
 
 
 class LpvFields:
     """Reads from the volumes what other methods trace by cones."""
 
-    def __init__(self, gpu: GpuContext, volumes: LpvVolumes, fields: ConeFields) -> None:
-        self._volumes, self._fields = volumes, fields
+    def __init__(self, gpu: GpuContext, settings: DlpvMethod, fields: ConeFields) -> None:
+        self._fields, self._bindings = fields, query_bindings(settings)
         self._query = LpvQuery(gpu)
 
-    def marching(self, rho: LightVolume) -> dict[str, Binding]:
-        """Returns the bindings for lighting reflected points."""
-        return {**light_volume_bindings(rho, rho), **self._volumes.query_bindings}
+    def marching(self, rho: LightVolume, volume: PlacedVolume) -> dict[str, Binding]:
+        """Returns the bindings for lighting reflected points from V_rho, which fills the `volume`."""
+        return {**light_volume_bindings(rho, rho), **volume.bindings, **self._bindings}
 
-    def read(
+    def read_difference(
+        self, scene: Bindings, grid: LowResGrid, mu: LightVolume, rho: LightVolume
+    ) -> ConeFields:
+        """Reads the irradiance at real surfaces and at the objects."""
+        own = {**scene, **self._bindings}
+        self._query.read_real(self._fields, grid, mu, rho, own)
+        self._query.read_virtual(self._fields, grid, rho, own)
+        return self._fields
+
+    def read_printed(
         self,
         scene: Bindings,
         grid: LowResGrid,
-        mu: LightVolume | None,
+        delta: LightVolume,
+        direct: LightVolume | None,
         rho: LightVolume,
-        change: LightVolume | None,
+        rho_volume: PlacedVolume,
     ) -> ConeFields:
-        """Reads the irradiance at real surfaces and at the objects."""
-        own = {**scene, **self._volumes.query_bindings}
-        self._query.read_real(self._fields, grid, mu, rho if change is None else change, own)
-        self._query.read_virtual(self._fields, grid, rho, own)
+        """Reads the change of irradiance at real surfaces, and the irradiance at the objects."""
+        own = {**scene, **self._bindings}
+        self._query.read_change(self._fields, grid, delta, direct, own)
+        self._query.read_virtual(self._fields, grid, rho, {**own, **rho_volume.bindings})
         return self._fields
 
     def release(self) -> None:
@@ -283,45 +393,80 @@ class LpvFields:
         self._query.release()
 
 
-def lpv_stages(
-    g: Graph, s: FrameResources, lit: LitScene, volumes: LpvVolumes, volume: Resource[PlacedVolume]
-) -> tuple[Resource[LightVolume | None], Resource[LightVolume], Resource[LightVolume | None]]:
-    """Declares injection, blocking and propagation: V_mu, V_rho, and the paper's V_delta."""
-    real = g.stage("voxelize real", volumes.voxelize_real, s.real, volume)
-    scene = g.value(
-        "inject scene",
-        volumes.real_scene,
-        s.measured,
-        s.albedo,
-        volume,
-        s.lights,
-        lit.environment,
-        lit.real_maps,
-    )
-    real_light = g.stage("inject real", volumes.inject_real, real, scene, lit.real_maps)
-    through_real = g.stage("geometry volume real", volumes.cover_real, real, volume)
-    mu = g.stage("propagate mu", volumes.propagate_mu, real_light, through_real)
-    objects = g.stage("voxelize objects", volumes.voxelize_objects, s.objects, volume)
-    joint = g.value("inject scene joint", volumes.joint_scene, scene, s.objects, lit.object_maps)
-    change = g.stage("inject change", volumes.inject_change, objects, joint, lit.object_maps, real_light)
-    through = g.stage("geometry volume", volumes.cover_joint, objects, volume, through_real)
-    first = g.stage("propagate rho", volumes.propagate_rho, real_light, change, through)
-    rho = g.stage("bounces", volumes.bounce, first, mu, joint, through)
-    shadow = g.stage("inject shadow", volumes.inject_shadow, joint, lit.object_maps, real_light)
-    delta = g.stage("propagate delta", volumes.propagate_change, change, shadow, through)
-    return mu, rho, delta
+@dataclass(frozen=True, eq=False)
+class LitCells:
+    """What a form of the method hands to shading: a reader of fields, V_rho and its volume, that of the change."""
+
+    read: Callable[[LpvFields, Resource[Bindings], Resource[LowResGrid]], Resource[ConeFields]]
+    rho: Resource[LightVolume]
+    rho_volume: Resource[PlacedVolume]
+    volume: Resource[PlacedVolume]
+    shown: Resource[VoxelMipmap]
+
+
+def difference_stages(
+    g: Graph, s: FrameResources, lit: LitScene, settings: DlpvMethod, cube: Resource[VolumePlacement]
+) -> LitCells:
+    """V_mu is subtracted from V_rho."""
+    cells = LpvCells(g.gpu, settings, settings.volume_size)
+    volumes = DifferenceVolumes(g.gpu, settings, cells)
+    mu = g.stage("propagate mu", volumes.propagate_mu, "inject real", "geometry volume real")
+    c = cell_stages(g, s, lit, cells, cube)
+    first = g.stage("propagate rho", volumes.propagate_rho, c.real_light, c.change, c.through)
+    rho = g.stage("bounces", volumes.bounce, first, mu, c.real_light, c.change, c.joint, c.through)
+    shown = g.stage("shown cells", volumes.show, c.change)
+
+    def read(
+        fields: LpvFields, scene: Resource[Bindings], grid: Resource[LowResGrid]
+    ) -> Resource[ConeFields]:
+        return g.stage("cones", fields.read_difference, scene, grid, mu, rho)
+
+    return LitCells(read, rho, c.volume, c.volume, shown)
+
+
+@dataclass(frozen=True)
+class PrintedSizes:
+    """Cells an edge of V_rho, of V_delta, and of the direct change."""
+
+    objects: int
+    indirect: int
+    direct: int
+
+
+def printed_stages(
+    g: Graph, s: FrameResources, lit: LitScene, settings: DlpvMethod, cube: Resource[VolumePlacement]
+) -> LitCells:
+    """The change alone is propagated, direct light after and apart from the indirect one ([P2] 4.3)."""
+    size = settings.volume_size
+    sizes = PrintedSizes(settings.objects_volume_size or size, size, settings.direct_volume_size or size)
+    volumes = PrintedVolumes(g.gpu, settings, sizes)
+    stages = {
+        n: cell_stages(g, s, lit, LpvCells(g.gpu, settings, n), cube, "" if n == size else f" {n}")
+        for n in sorted({sizes.objects, sizes.indirect, sizes.direct})
+    }
+    own, indirect, direct = stages[sizes.objects], stages[sizes.indirect], stages[sizes.direct]
+    rho = g.stage("propagate rho", volumes.propagate_rho, own.real_light, own.change, own.through)
+    delta = g.stage("propagate delta", volumes.propagate_delta, indirect.change, indirect.through)
+    injected = g.stage("inject direct", volumes.inject_direct, direct.joint, lit.object_maps)
+    after = g.stage("propagate direct", volumes.propagate_direct, injected, direct.through)
+    shown = g.stage("shown cells", volumes.show, indirect.change, injected)
+
+    def read(
+        fields: LpvFields, scene: Resource[Bindings], grid: Resource[LowResGrid]
+    ) -> Resource[ConeFields]:
+        return g.stage("cones", fields.read_printed, scene, grid, delta, after, rho, own.volume)
+
+    return LitCells(read, rho, own.volume, indirect.volume, shown)
 
 
 def dlpv(g: Graph, s: FrameResources, setup: Setup[DlpvMethod]) -> Layers:
-    """Subtracts V_mu from V_rho, or uses the paper's single volume of the change."""
+    """Subtracts V_mu from V_rho, or uses the paper's volume of the change."""
     settings, resolved, size = setup.settings, setup.resolved, setup.picture_size
     lit = light_stages(g, s, resolved, settings.shadow_samples, settings.tier)
     g.section("propagation volumes")
-    placement = volume_placement(g, s, resolved.volume_size, settings.volume_edge_m, settings.tier)
-    volumes = LpvVolumes(g.gpu, settings, resolved.volume_size)
-    volume = g.value("volume", volumes.place, placement)
-    mu, rho, delta = lpv_stages(g, s, lit, volumes, volume)
-    shown = g.stage("shown cells", volumes.show, "inject change", "inject shadow", volume)
+    cube = volume_placement(g, s, resolved.volume_size, settings.volume_edge_m, settings.tier)
+    declare = printed_stages if settings.operator == "paper" else difference_stages
+    cells = declare(g, s, lit, settings, cube)
     options = ShadingOptions(
         tier=settings.tier,
         caustics=settings.resolved_caustics,
@@ -331,13 +476,13 @@ def dlpv(g: Graph, s: FrameResources, setup: Setup[DlpvMethod]) -> Layers:
     reuses = settings.tier.refresh_tiles > 0
     direct = DirectLight(g.gpu, size, objects_shadow=settings.resolved_shadow == "map", reuses=reuses)
     shading = Shading(g.gpu, size, resolved, lit.buffers, direct, options)
-    fields = LpvFields(g.gpu, volumes, shading.cones)
-    marching = g.value("marching", fields.marching, rho)
+    fields = LpvFields(g.gpu, settings, shading.cones)
+    marching = g.value("marching", fields.marching, cells.rho, cells.rho_volume)
 
     def read(scene: Resource[Bindings], grid: Resource[LowResGrid]) -> Resource[ConeFields]:
-        return g.stage("cones", fields.read, scene, grid, mu, rho, delta)
+        return cells.read(fields, scene, grid)
 
-    return shading_stages(g, s, shading, lit, volume, read, voxels=shown, marching=marching)
+    return shading_stages(g, s, shading, lit, cells.volume, read, voxels=cells.shown, marching=marching)
 
 
 def resolve(settings: DlpvMethod, defaults: ResolvedSettings) -> ResolvedSettings:

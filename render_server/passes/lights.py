@@ -56,6 +56,7 @@ class LightBuffers:
         self.mirror_visibility = gpu.ctx.texture_array((1, 1, 1), 2, dtype="f2")
         self.real_views: list[LightView] = []
         self.virtual_views: list[LightView] = []
+        self.views_of_lights: list[tuple[range, range]] = []
         # Records of the views as shaders read them: they change when these do.
         self.real_records = self.virtual_records = b""
         self.real_atlas = ShadowMapAtlas(gpu, 1, tile_size)
@@ -155,6 +156,7 @@ class LightBuffers:
     ) -> None:
         """Writes the records of all lights and views; the real views come first."""
         records = b""
+        self.views_of_lights = []
         first_real, first_virtual = 0, len(self.real_views)
         first_mirror = len(self.lights) - len(self.mirrors)
         for index, (light, real_part, virtual_part) in enumerate(
@@ -167,6 +169,7 @@ class LightBuffers:
                 records += _pack_mirror(self.mirrors[index], index, axes[index], ranges)
             first_real += len(real_part)
             first_virtual += len(virtual_part)
+            self.views_of_lights.append((range(ranges[0], first_real), range(ranges[2], first_virtual)))
         self.real_records = self._packed(self.real_views)
         self.virtual_records = self._packed(self.virtual_views)
         packed = self.real_records + self.virtual_records

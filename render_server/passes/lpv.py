@@ -145,21 +145,59 @@ class LpvStart:
         self._kernel.release()
 
 
+class LpvBoxFilter:
+    """Averages light over cubes of cells ([P2] 7: softens the jagged edges of shadows)."""
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self._kernel = Kernel(gpu, "lpv_box_filter")
+
+    def run(self, volume: LightVolume, radius: int) -> None:
+        """Replaces the total by its mean over cubes of 2 `radius` + 1 cells an edge; overwrites the next state.
+
+        Beyond the border there is no light.
+        """
+        if radius == 0:
+            return
+        threads = (volume.cells, volume.cells, 3 * volume.cells)
+        self._kernel.run(
+            threads, Total=volume.total, Filtered=volume.next_state, cells=volume.cells, radius=radius
+        )
+        volume.total, volume.next_state = volume.next_state, volume.total
+
+    def release(self) -> None:
+        """Frees the GL object."""
+        self._kernel.release()
+
+
 class LpvShow:
     """Draws the injected change into cells for debug view `volume`."""
 
     def __init__(self, gpu: GpuContext) -> None:
         self._kernel = Kernel(gpu, "lpv_show")
 
-    def run(self, shown: VoxelMipmap, cells: int, change: moderngl.Buffer, shadow: moderngl.Buffer) -> None:
-        """Writes the sum of both buffers into level 0 of `shown`, which has one direction."""
+    def run(self, shown: VoxelMipmap, change: moderngl.Buffer, direct: moderngl.Buffer | None = None) -> None:
+        """Writes `change`, and what `direct` has in its cells, into level 0 of `shown`, which has one direction.
+
+        Cells of `direct` may be larger or smaller than those of `change`; both fill the same cube.
+        """
+        cells = _cells_of(change)
         self._kernel.run(
-            (cells, cells, cells), shown=shown.texture, Change=change, Shadow=shadow, cells=cells
+            (cells, cells, cells),
+            shown=shown.texture,
+            Change=change,
+            Direct=change if direct is None else direct,
+            cells=cells,
+            direct_cells=0 if direct is None else _cells_of(direct),
         )
 
     def release(self) -> None:
         """Frees the GL object."""
         self._kernel.release()
+
+
+def _cells_of(sums: moderngl.Buffer) -> int:
+    """Cells an edge of injected sums."""
+    return round(math.cbrt(sums.size / (INJECTED_SUMS * 4)))
 
 
 class LpvCoverFaces:

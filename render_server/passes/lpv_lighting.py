@@ -38,12 +38,9 @@ class LpvInjectMaps:
         views = _virtual_views(lights)
         _inject_views(self._change, views, lights, scene, Injected=sums, real_albedo=real_albedo)
 
-    def add_shadow(
-        self, sums: moderngl.Buffer, lights: LightBuffers, real_albedo: moderngl.Texture, scene: Bindings
-    ) -> None:
-        """Subtracts the direct light that the objects block from the real scene."""
-        views = _virtual_views(lights)
-        _inject_views(self._direct, views, lights, scene, Injected=sums, real_albedo=real_albedo)
+    def add_direct(self, sums: moderngl.Buffer, lights: LightBuffers, scene: Bindings) -> None:
+        """Adds the direct light that meets the objects, and subtracts what it lit before ([P2] 4.3.2)."""
+        _inject_views(self._direct, _virtual_views(lights), lights, scene, Injected=sums)
 
     def release(self) -> None:
         """Frees the GL objects."""
@@ -120,19 +117,31 @@ class LpvQuery:
         self._virtual = Kernel(gpu, "lpv_query")
 
     def read_real(
+        self, fields: ConeFields, grid: LowResGrid, mu: LightVolume, rho: LightVolume, scene: Bindings
+    ) -> None:
+        """Writes E_mu and E_rho of real surfaces."""
+        self._run_real(self._real, fields, grid, light_volume_bindings(mu, rho), scene)
+
+    def read_change(
         self,
         fields: ConeFields,
         grid: LowResGrid,
-        mu: LightVolume | None,
-        rho: LightVolume,
+        delta: LightVolume,
+        direct: LightVolume | None,
         scene: Bindings,
     ) -> None:
-        """Writes E_mu and E_rho of real surfaces; without `mu`, `rho` is the change itself."""
-        kernel = self._change if mu is None else self._real
+        """Writes E_mu of real surfaces without the volumes, and E_rho with `delta` and `direct` added."""
+        volumes = light_volume_bindings(direct or delta, delta)
+        own: dict[str, Binding] = {"direct_size": 0 if direct is None else direct.cells}
+        self._run_real(self._change, fields, grid, {**volumes, **own}, scene)
+
+    def _run_real(
+        self, kernel: Kernel, fields: ConeFields, grid: LowResGrid, volumes: Bindings, scene: Bindings
+    ) -> None:
         kernel.run(
             grid.size,
             grid.bindings,
-            light_volume_bindings(rho if mu is None else mu, rho),
+            volumes,
             scene,
             irradiance_mu=fields.mu,
             irradiance_rho=fields.rho,

@@ -8,7 +8,7 @@ from render_server.gpu.textures import texture_2d
 from render_server.passes.lights import LightBuffers
 from render_server.passes.voxels import PlacedVolume, VoxelMipmap, VoxelStore
 
-LIGHT_SUMS = 6  # per slot: V_delta and V_rho, three channels each
+LIGHT_SUMS = 14  # per slot: shaders/common/split_sums.glsl
 
 
 class RealAlbedo:
@@ -44,6 +44,7 @@ class SplitInjection:
         self._gpu = gpu
         self._real = Kernel(gpu, "split_inject")
         self._virtual = Kernel(gpu, "split_inject", VIRTUAL=1)
+        self._divide, self._threads = Kernel(gpu, "split_radiance"), list_threads(gpu)
 
     def run(
         self,
@@ -64,19 +65,22 @@ class SplitInjection:
             "real_albedo": real_albedo,
         }
         threads = (lights.tile_size, lights.tile_size)
-        for view in range(len(lights.real_views)):
-            self._real.run(threads, sums, scene, view_index=view)
-        for view in range(len(lights.virtual_views)):
-            self._virtual.run(threads, sums, scene, view_index=lights.first_virtual_view + view)
+        for real_views, virtual_views in lights.views_of_lights:
+            for view in real_views:
+                self._real.run(threads, sums, scene, view_index=view)
+            for view in virtual_views:
+                self._virtual.run(threads, sums, scene, view_index=view)
+            for store in (real, virtual):
+                self._divide.run((self._threads,), store.bindings, Light=store.delta_sums)
 
     def release(self) -> None:
         """Frees the programs."""
-        self._real.release()
-        self._virtual.release()
+        for kernel in (self._real, self._virtual, self._divide):
+            kernel.release()
 
 
 class ResolveInjection:
-    """Writes the sums to level 0 of V_delta and V_rho, with the marker of V_eta.
+    """Writes the radiance to level 0 of V_delta and V_rho, with the marker of V_eta.
 
     Processes the real set, then what only the virtual set touched.
     """

@@ -29,7 +29,7 @@ CASES: dict[Case, dict[str, Any]] = {  # with changes of the method
     Case("paper", "depth", "antialiased"): {"quality": "live"},
     Case("differential", "depth", "mirror"): {},
     Case("dlpv", "model", "mirror"): {},
-    Case("dlpv-paper", "depth", "plain"): {},
+    Case("dlpv-paper", "depth", "plain"): {"direct_filter": 1},
     Case("aroof", "depth", "mirror"): {},
 }
 VIEWS = {

@@ -16,7 +16,7 @@ from protocol.scene_objects import Pose
 from render_server.estimation.albedo import AlbedoEstimator
 from render_server.gpu.context import GpuContext
 from render_server.graph import Graph
-from render_server.passes.lpv import CONSTANT, LOBE
+from render_server.passes.lpv import CONSTANT, LOBE, LightVolume, LpvPropagate, lobe_weights
 from render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (
     GREY,
@@ -81,7 +81,7 @@ def test_injected_is_the_flux_that_a_box_reflects_and_what_the_floor_lost(
     document = dlpv(document, operator="paper", volume_edge_m=0.5)
     renderer = run(gpu, document)
     graph = graph_of(renderer)
-    change, shadow = (flux(graph, name) for name in ("inject change", "inject shadow"))
+    change, direct = (flux(graph, name) for name in ("inject change", "inject direct"))
     linear = array_of(graph["camera image"].linear)[0, 0, :3]
     renderer.release()
     albedo = np.pi * linear / 2.0
@@ -90,7 +90,9 @@ def test_injected_is_the_flux_that_a_box_reflects_and_what_the_floor_lost(
         np.array(color) * 2.0 * area, rel=0.03
     )
     assert np.clip(change, None, 0).sum(axis=(0, 1, 2)) == pytest.approx(-albedo * 2.0 * area, rel=0.03)
-    assert shadow.sum(axis=(0, 1, 2)) == pytest.approx(np.full(3, -2.0 * area), rel=0.03)
+    for sign in (1, -1):  # what now meets the box, and what the floor lost
+        one_sided = np.clip(sign * direct, 0, None).sum(axis=(0, 1, 2))
+        assert one_sided == pytest.approx(np.full(3, 2.0 * area), rel=0.03)
 
 
 def test_a_query_in_an_even_field_is_exact(gpu: GpuContext, stage: Stage) -> None:
@@ -126,7 +128,8 @@ def test_an_object_behind_a_wall_changes_nothing(gpu: GpuContext, stage: Stage, 
 def test_same_input_gives_the_same_bytes(gpu: GpuContext, stage: Stage, operator: str) -> None:
     document = dlpv(everyday(stage), operator=operator)
     first, second = (run(gpu, document, frame(noisy())) for _ in range(2))
-    for name in ("bounces", "propagate delta" if operator == "paper" else "propagate mu"):
+    volumes = {"paper": ("propagate rho", "propagate delta", "propagate direct")}
+    for name in volumes.get(operator, ("bounces", "propagate mu")):
         totals = [graph_of(renderer)[name].total.read() for renderer in (first, second)]
         assert totals[0] == totals[1]
     pictures = [renderer.render(frame(noisy())).color for renderer in (first, first, second)]
@@ -287,11 +290,72 @@ def test_no_negative_pixel(gpu: GpuContext, stage: Stage, operator: str, composi
     assert linear.min() >= 0.0
 
 
-def test_the_papers_shadow_comes_from_the_volume(gpu: GpuContext, stage: Stage) -> None:
-    document = stage.document([stage.virtual(cube())], [directional((0.5, 0.0, -1.0))], floor())
-    found = solve(gpu, dlpv(document, operator="paper"))
-    assert np.array_equal(found.direct_mu, found.direct_rho)
-    assert (found.cones_rho - found.cones_mu).min() < -0.5
+def under_a_plate(gpu: GpuContext, stage: Stage, **settings: object) -> Fields:
+    """A wide black plate over the floor, in light from above; the floor is a border of cells."""
+    plate = stage.virtual(shifted(trimesh.creation.box((0.4, 0.4, 0.01)), 0, 0, 0.2), (0.0, 0.0, 0.0))
+    document = stage.document([plate], [directional((0.0, 0.0, -1.0), irradiance=2.0)], floor())
+    return solve(gpu, dlpv(document, operator="paper", **settings))
+
+
+def test_printed_direct_light_is_injected_after_propagation(gpu: GpuContext, stage: Stage) -> None:
+    """One layer of lobes: E = 2/3 <lobe, lobe> / pi = 7/18 of the light that arrived, however far the indirect change
+    is propagated ([P2] 4.3.2)."""
+    for steps in (1, CELLS):
+        lobes, maps = (under_a_plate(gpu, stage, steps=steps, shadow=kind) for kind in ("lobe", "map"))
+        assert np.array_equal(lobes.direct_mu, lobes.direct_rho)
+        middle = (np.abs(lobes.position[..., :2]).max(axis=-1) < 0.1) & (lobes.position[..., 3] > 0)
+        middle &= (lobes.position[..., 2] < 0.01) & (lobes.matte == 0)
+        assert middle.sum() > 100
+        direct = (lobes.cones_rho - maps.cones_rho)[middle]
+        assert direct.mean() == pytest.approx(-7 / 18 * 2.0, rel=0.01)
+
+
+def test_steps_of_direct_light_are_its_own(gpu: GpuContext, stage: Stage) -> None:
+    """What was injected, propagated by that number of steps."""
+    document = stage.document([stage.virtual(cube())], [directional((0.0, 0.0, -1.0))], floor())
+    totals = []
+    for steps in (0, 2):
+        renderer = run(gpu, dlpv(document, operator="paper", steps=1, direct_steps=steps))
+        totals.append(graph_of(renderer)["propagate direct"].total.read())
+        renderer.release()
+    volume, propagate = LightVolume(gpu, CELLS), LpvPropagate(gpu)
+    for buffer in (volume.state, volume.total):
+        buffer.write(totals[0])
+    propagate.run(volume, lobe_weights(), 2, None)
+    assert volume.total.read() == totals[1] != totals[0]
+    for item in (volume, propagate):
+        item.release()
+
+
+def test_printed_volumes_have_sizes_of_their_own(gpu: GpuContext, stage: Stage) -> None:
+    """In one cube: each volume is the one that it is with all others of its size."""
+    document = stage.document([stage.virtual(cube(0.125))], [directional((0.3, 0.2, -1.0))], floor())
+    sizes = {"volume_size": 16, "objects_volume_size": 24, "direct_volume_size": 32}
+    names = ("propagate delta", "propagate rho", "propagate direct")
+
+    def totals(**settings: object) -> list[bytes]:
+        renderer = run(gpu, dlpv(document, operator="paper", volume_edge_m=0.5, **settings))
+        found = [graph_of(renderer)[name].total.read() for name in names]
+        renderer.release()
+        return found
+
+    mixed = totals(**sizes)
+    for i, size in enumerate(sizes.values()):
+        assert totals(volume_size=size)[i] == mixed[i], names[i]
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"objects_volume_size": 32}, "operator paper"),
+        ({"objects_steps": 4}, "operator paper"),
+        ({"direct_steps": 5}, "shadow lobe"),
+        ({"operator": "paper", "shadow": "map", "direct_filter": 1}, "shadow lobe"),
+    ],
+)
+def test_settings_of_the_printed_volumes_need_them(settings: dict[str, Any], words: str) -> None:
+    with pytest.raises(DeltalightError, match=words):
+        parse_scene({"method": {"name": "dlpv", **settings}})
 
 
 def test_lobes_of_direct_light_need_the_papers_operator() -> None:
@@ -299,12 +363,17 @@ def test_lobes_of_direct_light_need_the_papers_operator() -> None:
         parse_scene({"method": {"name": "dlpv", "shadow": "lobe"}})
 
 
-def test_view_of_the_volume_shows_cells(gpu: GpuContext, stage: Stage) -> None:
-    document = dlpv(everyday(stage))
+@pytest.mark.parametrize(
+    ("settings", "least"), [({}, 50), ({"operator": "paper", "direct_volume_size": 24}, 10)]
+)
+def test_view_of_the_volume_shows_cells(
+    gpu: GpuContext, stage: Stage, settings: dict[str, Any], least: int
+) -> None:
+    document = dlpv(everyday(stage), **settings)
     output = document.output.model_copy(update={"view": "volume"})
     renderer = SceneRenderer(gpu, document.replaced(output=output))
     picture = renderer.render(frame(plain(200))).color.astype(int)
     renderer.release()
     red, green, blue = picture[..., 0], picture[..., 1], picture[..., 2]
-    assert ((red > 60) & (green == 0) & (blue == 0)).sum() > 50  # light that objects take away
-    assert ((green > 60) & (green > red)).sum() > 50  # what the green box reflects
+    assert ((red > 60) & (green == 0) & (blue == 0)).sum() > least  # light that objects take away
+    assert ((green > 60) & (green > red)).sum() > least  # what the green box reflects

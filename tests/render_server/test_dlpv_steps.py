@@ -3,11 +3,13 @@
 import numpy as np
 import pytest
 from jaxtyping import Float32
+from scipy.ndimage import uniform_filter
 
 from render_server.gpu.context import GpuContext
 from render_server.passes.lpv import (
     LOBE,
     LightVolume,
+    LpvBoxFilter,
     LpvPropagate,
     StepWeights,
     lobe_weights,
@@ -114,3 +116,17 @@ def test_directions_are_kept_where_lobes_lose_them(gpu: GpuContext) -> None:
         own[name] = 2 / 3 * up.mean()
     assert abs(own["moments"]) < 0.1
     assert own["lobes"] > 0.4
+
+
+@pytest.mark.parametrize("radius", [1, 2])
+def test_box_filter_is_the_mean_over_cubes(gpu: GpuContext, radius: int) -> None:
+    """It keeps the light of what lies inside; nothing comes from beyond the border."""
+    light = np.random.default_rng(3).uniform(-1, 2, (3, CELLS, CELLS, CELLS, 4)).astype(np.float32)
+    volume, box = LightVolume(gpu, CELLS), LpvBoxFilter(gpu)
+    volume.total.write(light.tobytes())
+    box.run(volume, radius)
+    found = cells_of(volume, "total").copy()
+    for item in (volume, box):
+        item.release()
+    expected = uniform_filter(light.astype(float), 2 * radius + 1, mode="constant", axes=(1, 2, 3))
+    assert found == pytest.approx(expected, abs=1e-5)

@@ -118,6 +118,58 @@ def test_the_delta_holds_the_flux_that_the_box_reflects_and_what_the_floor_lost(
     assert lost == pytest.approx(np.full(3, -albedo * IRRADIANCE * EDGE**2), rel=0.02)
 
 
+@pytest.mark.parametrize("lights", [(DOWN,), (DOWN, OBLIQUE)], ids=["a light", "two lights"])
+@pytest.mark.parametrize("normal", [(0, 0, 1), (0, -1, 1), (1, -1, 1)])
+def test_voxels_of_a_plate_hold_its_radiance_however_it_is_turned(
+    gpu: GpuContext,
+    assets: Path,
+    tmp_path: Path,
+    normal: tuple[int, ...],
+    lights: tuple[tuple[float, ...], ...],
+) -> None:
+    """albedo / pi times the irradiance of all lights: Phi / (pi A), with the area that the plate has in the voxel."""
+    direction = np.array(normal) / np.linalg.norm(normal)
+    plate = trimesh.creation.box((0.3, 0.3, 0.01), trimesh.geometry.align_vectors((0, 0, 1), direction))
+    plate.apply_translation((0, 0, 0.3))
+    plate.export(tmp_path / "plate.ply")
+    document = scene(assets)
+    plates = document.objects[0].model_copy(update={"asset": str(tmp_path / "plate.ply")})
+    manual = [{"type": "directional", "direction": each, "irradiance": IRRADIANCE} for each in lights]
+    given = parse_scene({"lights": {"manual": manual, "surroundings": "none"}}).lights
+    with rendered(gpu, document.replaced(objects=(plates,), lights=given)) as graph:
+        rho, low = level_0(graph["filter"].rho), np.array(graph["volume"].placement.origin)
+    irradiance = sum(-IRRADIANCE * float(np.dot(direction, each)) for each in lights)
+    centres = low + VOXEL_M * (np.moveaxis(np.indices((VOXELS,) * 3), 0, -1)[..., ::-1] + 0.5)
+    inner = (rho[..., 0] > 0) & (
+        np.linalg.norm(centres - (0, 0, 0.3), axis=-1) < 0.12
+    )  # without the plate's rim
+    relative = rho[inner] / (BASE_COLOR / np.pi * irradiance)
+    assert len(relative) > 60
+    assert relative == pytest.approx(1.0, abs=0.02)
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.5])
+def test_the_floor_loses_the_radiance_that_it_had(
+    gpu: GpuContext, assets: Path, tmp_path: Path, tilt: float
+) -> None:
+    """Where the box takes all of a light, V_delta is the negative of what the camera saw less ambient light."""
+    turn = trimesh.transformations.rotation_matrix(tilt, (1, 0, 0))
+    cuboid((2, 2, 0.02), -0.01).apply_transform(turn).export(tmp_path / "floor.ply")
+    box = cuboid((EDGE, EDGE, EDGE), 0.35)
+    box.export(tmp_path / "box.ply")
+    document = scene(assets)
+    floating = document.objects[0].model_copy(update={"asset": str(tmp_path / "box.ply")})
+    real = parse_scene({"real": {"geometry": {"model": str(tmp_path / "floor.ply")}}}).real
+    with rendered(gpu, document.replaced(objects=(floating,), real=real)) as graph:
+        delta = level_0(graph["filter"].delta)[..., 0]
+    direct = IRRADIANCE * np.cos(tilt)
+    lost = camera_radiance() * direct / (direct + np.pi * AMBIENT)
+    relative = -delta[delta < 0] / lost
+    assert len(relative) > 30
+    assert np.median(relative) == pytest.approx(1.0, abs=0.02)
+    assert relative.max() < 1.02
+
+
 def test_where_the_real_scene_keeps_the_light_off_nothing_changes(gpu: GpuContext, assets: Path) -> None:
     with rendered(gpu, scene(assets, real="roofed")) as graph:
         mu, rho = texels(graph["direct light"].mu), texels(graph["direct light"].rho)
@@ -210,3 +262,42 @@ def test_the_shadow_lies_where_geometry_puts_it(
     assert np.median(linear[umbra]) == pytest.approx(ambient, abs=0.08)
     assert np.mean(linear[umbra] < 0.5) > 0.95
     assert np.mean(np.abs(linear[lit] - 1) < 0.1) > 0.98
+
+
+def gathered(graph: Graph, cells: bytes) -> Float64[np.ndarray, "h w 3"]:
+    """E of the nine cones at real surfaces, through a volume in place of V_delta."""
+    filtered = graph.resource("filter")
+    filtered.value.delta.texture.write(cells)
+    filtered.write(filtered.value)
+    graph.run()
+    cones = graph["cones"]
+    return np.asarray((texels(cones.rho) - texels(cones.mu))[..., :3])
+
+
+def test_the_error_of_the_delta_is_the_indirect_light_that_the_box_blocks(
+    gpu: GpuContext, assets: Path, tmp_path: Path
+) -> None:
+    """[P1] eq. 9, E = C_rho - (C_mu + C_delta), with C_mu through the scene without the box: what V_delta holds takes
+    nothing away that passes between two real surfaces. So E is never positive, and not small beside the box."""
+    wall = trimesh.creation.box((1.0, 0.02, 0.6), trimesh.transformations.translation_matrix((0, 0.2, 0.3)))
+    trimesh.util.concatenate([cuboid((2, 2, 0.02), -0.01), wall]).export(tmp_path / "room.ply")
+    corners = [trimesh.creation.box((0.002,) * 3) for _ in range(2)]  # as far apart as the box's
+    for corner, side in zip(corners, (-1, 1), strict=True):
+        corner.apply_translation(side * np.array([EDGE / 2] * 3) + (0, 0, EDGE / 2))
+    trimesh.util.concatenate(corners).export(tmp_path / "speck.ply")
+    real = parse_scene({"real": {"geometry": {"model": str(tmp_path / "room.ply")}}}).real
+    document = scene(assets, direction=(0.0, 0.6, -0.8)).replaced(real=real)
+    speck = document.objects[0].model_copy(update={"asset": str(tmp_path / "speck.ply")})
+    with rendered(gpu, document) as graph:
+        volumes = graph["filter"]
+        held = [each.texture.read() for each in (volumes.rho, volumes.delta)]
+        rho, delta = (gathered(graph, cells) for cells in held)
+        hidden = texels(graph["cones"].virtual)[..., 3] > 0
+    with rendered(gpu, document.replaced(objects=(speck,))) as graph:
+        mu = gathered(graph, graph["filter"].rho.texture.read())
+    error = (rho - mu - delta)[~hidden].mean(axis=-1)
+    print(
+        f"E: {error.sum() / mu[~hidden].mean(axis=-1).sum():.3f} of C_mu, {error.min():.3f} .. {error.max():.3f}"
+    )
+    assert error.min() < -0.05
+    assert error.max() < 0.01

@@ -159,7 +159,8 @@ void reflect_ray(Light light, LightView view, ivec2 block, int j) {
     vec3 direction = reflect(-v, h);
     float n_dot_l = dot(spot.normal, direction);
     if (n_dot_l <= 0.0) return;
-    flux *= fresnel_schlick(m.f0, dot(v, h)) * unmasked(dot(spot.normal, v), n_dot_l, alpha);
+    flux *= fresnel_schlick(m.f0, dot(v, h)) * unmasked(dot(spot.normal, v), n_dot_l, alpha)
+        * further_reflections(m.f0, lobe_albedo(m.roughness, dot(spot.normal, v)).x);
     float spread = length(vec2(LOBE_DEVIATION * alpha * LOBE_FRACTION, 0.5 * radius));   // half a disc's radius
     float side = texel_side(view, (view.view_from_world * vec4(spot.point, 1.0)).z);
     Drift x = drift_along(view, texel, ivec2(1, 0), spot, side), y = drift_along(view, texel, ivec2(0, 1), spot, side);

@@ -17,6 +17,7 @@
 #include "common/voxel_store.glsl"
 #include "common/surfel_light.glsl"
 #include "common/environment.glsl"
+#include "common/brdf.glsl"
 #ifndef GATHERED
 #include "common/lights.glsl"
 #endif
@@ -131,9 +132,10 @@ vec3 outgoing(Surfel s, vec3 n, uint own) {
     vec3 mu, rho;
     irradiances(s, n, own, mu, rho);
     Material m = material_of(int(s.normal_material.w), s.uv_voxel.xy, s.tint.rgb);
-    vec3 albedo = min(m.diffuse + m.f0, vec3(WHITEST));
+    vec3 diffuse = mean_diffuse_reflectance(m.diffuse, m.f0, m.roughness);
+    vec3 albedo = min(diffuse + mean_specular_reflectance(m.f0, m.roughness), vec3(WHITEST));
     bool in_beams = has_caustics && keep_light && m.roughness * m.roughness < GREATEST_ALPHA;
-    vec3 carried = in_beams ? (albedo - min(m.diffuse, albedo)) * surfel_lights[own].direct_rho.rgb : vec3(0.0);
+    vec3 carried = in_beams ? (albedo - min(diffuse, albedo)) * surfel_lights[own].direct_rho.rgb : vec3(0.0);
     return unsummed(own, vec4((albedo * rho - carried) / PI + m.emission, 0.0));
 }
 #endif

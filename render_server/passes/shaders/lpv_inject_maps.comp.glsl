@@ -1,7 +1,7 @@
 // Injects reflective shadow maps ([P2] 4.3): the flux that each texel's surface reflects goes into its cell. REAL
 // walks a light's map of the real scene: all that it lights. VIRTUAL walks its map of the objects: what they reflect,
-// and, negative, what the same rays lit before on the real scene. DIRECT: the light itself that is now blocked, as
-// negative lobes along its path ([P2] 4.3.2).
+// and, negative, what the same rays lit before on the real scene. DIRECT: the light itself, as lobes along its path:
+// what now meets the objects, and, negative, what met the real scene before ([P2] 4.3.2).
 #include "common/light_rays.glsl"
 #ifndef REAL
 #include "common/materials.glsl"
@@ -19,12 +19,6 @@ uniform int view_index;
 uniform float bias_real;   // m: how far behind the real map an object's surface may be and still be lit
 uniform bool has_caustics; // beams carry the lights' reflections in smooth virtual surfaces
 
-vec3 direction_to_light(Light light, vec3 p) {
-    vec3 to_light; float radius;
-    light_at(light, p, to_light, radius);
-    return to_light;
-}
-
 // What a light sees faces it.
 vec3 lit_side(vec3 n, vec3 to_light) { return dot(n, to_light) < 0.0 ? -n : n; }
 
@@ -38,15 +32,21 @@ vec3 virtual_albedo(ivec2 texel) {
     vec4 uv = texelFetch(virtual_light_uv, texel, 0);
     Material m = material_of(int(texelFetch(virtual_light_normal, texel, 0).w), uv.xy, unpack_color(uv.z));
     bool in_beams = has_caustics && m.roughness * m.roughness < GREATEST_ALPHA;   // beams carry these
-    return m.diffuse + (in_beams ? vec3(0.0) : m.f0);
+    vec3 lobe = in_beams ? vec3(0.0) : mean_specular_reflectance(m.f0, m.roughness);
+    return mean_diffuse_reflectance(m.diffuse, m.f0, m.roughness) + lobe;
 }
+
+// A lobe that points where the light travels, in the cell half a cell in front of the surface, towards the light.
+void inject_along(vec3 p, vec3 to_light, vec3 flux) { inject(p + voxel_edge * to_light, -to_light, flux); }
 
 void inject_texel(Light light, LightView view, ivec2 texel, vec2 s, float depth, vec3 p) {
     vec3 arriving = texel_light(light, view, s);
     Hit real = first_hit(real_light_depth, light.views.x, light.views.y, p);
     if (real.present && real.depth < real.ray_depth - bias_real) return;   // the real scene is in front of the object
     vec3 to_light = direction_to_light(light, p);
-#ifndef DIRECT
+#ifdef DIRECT
+    inject_along(p, to_light, arriving);
+#else
     vec3 n = normalize(texelFetch(virtual_light_normal, texel, 0).xyz);
     inject(p, lit_side(n, to_light), arriving * virtual_albedo(texel));
 #endif
@@ -54,8 +54,7 @@ void inject_texel(Light light, LightView view, ivec2 texel, vec2 s, float depth,
     vec3 real_normal = normalize(texelFetch(real_light_normal, real.texel, 0).xyz);
     vec3 shadowed = hit_point(real, real_normal);
 #ifdef DIRECT
-    // The lobe points where the light travels; the cell is half a cell in front of the surface, towards the light.
-    inject(shadowed + voxel_edge * to_light, -to_light, -arriving);
+    inject_along(shadowed, to_light, -arriving);
 #else
     inject(shadowed, lit_side(real_normal, to_light), -arriving * texelFetch(real_albedo, real.texel, 0).rgb);
 #endif

@@ -1,5 +1,5 @@
 // Irradiance from the light volumes at 1/scale of the picture (docs/method.md 5), in addition to the environment R.
-// REAL: E_mu and E_rho of real surfaces; CHANGE: E_rho = E_mu + the one volume of the change. VIRTUAL otherwise: the
+// REAL: E_mu and E_rho of real surfaces; CHANGE: E_rho = E_mu + the volumes of the change, indirect and direct. VIRTUAL otherwise: the
 // light on the objects, and what a mirror on them would see.
 #include "common/environment.glsl"
 #include "common/brdf.glsl"
@@ -12,6 +12,9 @@ layout(local_size_x = 8, local_size_y = 8) in;
 layout(rgba16f) writeonly uniform image2D irradiance_mu;    // rgb E_mu, a: 1 where known
 layout(rgba16f) writeonly uniform image2D irradiance_rho;   // rgb E_rho, a: volume fade
 layout(rgba16f) writeonly uniform image2D specular_mu;
+#ifdef CHANGE
+uniform int direct_size;   // cells an edge of the direct change, in place of the light without objects; 0: none
+#endif
 #else
 layout(rgba16f) writeonly uniform image2D irradiance_rho;   // rgb E_rho, a: 1 where known
 #endif
@@ -44,6 +47,7 @@ void shade(ivec2 texel, SurfacePoint s) {
     if (fade > 0.0) {
 #ifdef CHANGE
         e_rho += from_volume(true, q, s.normal);
+        if (direct_size > 0) e_rho += irradiance_in(false, direct_size, q * float(direct_size) / float(volume_size), s.normal);
 #else
         vec3 mu = from_volume(false, q, s.normal), rho = from_volume(true, q, s.normal);
         e_rho = max(e_mu + fade * mu + (rho - mu), vec3(0.0));   // composition fades the change

@@ -1,8 +1,9 @@
-// Fixed-point sums of split-inject -> level 0 of V_delta and V_rho. The marker of V_eta goes with both: opacity 1 in
+// Radiance of split-inject -> level 0 of V_delta and V_rho: of what a voxel holds of both sets, by area. The marker of V_eta goes with both: opacity 1 in
 // every voxel that real or virtual geometry touches ([P1] 3.2), so that one fetch gives radiance and opacity.
 #include "common/volume.glsl"
 #define TOUCHED_ACCESS readonly
 #include "common/voxel_store.glsl"
+#include "common/split_sums.glsl"
 
 layout(local_size_x = 64) in;
 layout(rgba16f) writeonly uniform image3D delta;
@@ -17,13 +18,17 @@ void main() {
         uint voxel = touched[i];
         uint other = other_grid[voxel];
         if (skip_shared && other != 0u) continue;
-        int sums[6];
-        for (uint j = 0u; j < 6u; ++j) {
-            sums[j] = light[i * 6u + j];
-            if (other != 0u) sums[j] += other_light[(other - 1u) * 6u + j];
+        float own_area = float(light[i * uint(LIGHT_SUMS) + uint(ALL_AREA)]);
+        uint j = (other - 1u) * uint(LIGHT_SUMS);
+        float other_area = other == 0u ? 0.0 : float(other_light[j + uint(ALL_AREA)]);
+        float share = other_area / max(own_area + other_area, 1.0);
+        float found[AREA];
+        for (int k = 0; k < AREA; ++k) {
+            float own = float(light[i * uint(LIGHT_SUMS) + uint(ALL_DELTA + k)]);
+            found[k] = (share > 0.0 ? mix(own, float(other_light[j + uint(ALL_DELTA + k)]), share) : own) / FIXED_POINT;
         }
         ivec3 v = voxel_of_index(voxel, volume_size);
-        imageStore(delta, v, vec4(vec3(sums[0], sums[1], sums[2]) / FIXED_POINT, 1.0));
-        imageStore(rho, v, vec4(vec3(sums[3], sums[4], sums[5]) / FIXED_POINT, 1.0));
+        imageStore(delta, v, vec4(found[0], found[1], found[2], 1.0));
+        imageStore(rho, v, vec4(found[3], found[4], found[5], 1.0));
     }
 }

@@ -1,7 +1,7 @@
-// Split-inject ([P1] 3.2): the reflected flux of every texel of a light's map goes into its voxel, as radiance
-// Phi / (pi h^2). VIRTUAL walks the objects' map: +Phi_rho where the light meets the object (V_delta and V_rho), and
-// -Phi_mu where the same rays met the real scene before (V_delta). REAL walks the real map: +Phi of what the objects
-// leave lit (V_rho).
+// Split-inject ([P1] 3.2): the reflected flux of every texel of a light's map goes into its voxel, and the area of the
+// surface that its rays light; split_radiance divides one by the other (docs/method.md 4.3). VIRTUAL walks the objects'
+// map: +Phi_rho where the light meets the object (V_delta and V_rho). REAL walks the real map: -Phi_mu of what the
+// objects keep the light off (V_delta), +Phi of what they leave lit (V_rho).
 #define GRID_ACCESS readonly
 #include "common/voxel_store.glsl"
 #include "common/light_rays.glsl"
@@ -10,9 +10,10 @@
 #endif
 #include "common/packing.glsl"
 #include "common/volume.glsl"
+#include "common/split_sums.glsl"
 
 layout(local_size_x = 8, local_size_y = 8) in;
-layout(std430) buffer RealLight { int real_light[]; };         // 6 per slot: V_delta, V_rho
+layout(std430) buffer RealLight { int real_light[]; };         // per slot, below
 layout(std430) readonly buffer VirtualGrid { uint virtual_grid[]; };
 layout(std430) buffer VirtualLight { int virtual_light[]; };
 uniform sampler2D real_albedo;
@@ -23,7 +24,6 @@ uniform int view_index;
 uniform float bias_real;   // m: how far behind the real map an object's surface may be and still be lit
 
 const bool REAL_SET = true, VIRTUAL_SET = false;
-const int DELTA = 0, RHO = 3, LIGHT_SUMS = 6;
 const float SNAP = 0.25;   // voxels: a surface on the border of two voxels belongs to the one that it touched
 
 uint grid_at(bool real_set, ivec3 voxel) {
@@ -43,32 +43,26 @@ int slot_near(bool real_set, vec3 q) {
     return -1;
 }
 
-void add(bool real_set, int at, vec3 radiance) {
-    for (int j = 0; j < 3; ++j) {
-        int part = fixed_point(radiance[j]);
-        if (real_set) atomicAdd(real_light[at + j], part); else atomicAdd(virtual_light[at + j], part);
-    }
+void add(bool real_set, int at, float amount) {
+    int part = fixed_point(amount);
+    if (real_set) atomicAdd(real_light[at], part); else atomicAdd(virtual_light[at], part);
 }
 
-vec3 voxel_radiance(vec3 flux) { return flux / (PI * voxel_edge * voxel_edge); }
-
-void inject_real(vec3 p, vec3 flux, int volume) {
-    int slot = slot_near(REAL_SET, volume_coordinate(p));
-    if (slot >= 0) add(REAL_SET, slot * LIGHT_SUMS + volume, voxel_radiance(flux));
+// Flux and area per voxel face, so that fixed point serves every scale.
+void add_flux(bool real_set, int slot, int volume, vec3 flux) {
+    for (int j = 0; j < 3; ++j)
+        add(real_set, slot * LIGHT_SUMS + volume + j, flux[j] / (PI * voxel_edge * voxel_edge));
 }
 
-void inject_virtual(vec3 p, vec3 flux) {
-    int slot = slot_near(VIRTUAL_SET, volume_coordinate(p));
-    if (slot < 0) return;
-    add(VIRTUAL_SET, slot * LIGHT_SUMS + DELTA, voxel_radiance(flux));
-    add(VIRTUAL_SET, slot * LIGHT_SUMS + RHO, voxel_radiance(flux));
+void add_area(bool real_set, int slot, float area) {
+    add(real_set, slot * LIGHT_SUMS + AREA, area / (voxel_edge * voxel_edge));
 }
 
 #ifdef VIRTUAL
 vec3 virtual_albedo(ivec2 texel) {
     vec4 uv = texelFetch(virtual_light_uv, texel, 0);
     Material m = material_of(int(texelFetch(virtual_light_normal, texel, 0).w), uv.xy, unpack_color(uv.z));
-    return m.diffuse + m.f0;
+    return mean_diffuse_reflectance(m.diffuse, m.f0, m.roughness) + mean_specular_reflectance(m.f0, m.roughness);
 }
 
 void split(Light light, LightView view, ivec2 texel) {
@@ -76,13 +70,15 @@ void split(Light light, LightView view, ivec2 texel) {
     if (depth == NOTHING) return;
     vec2 s = texel_lateral(view, texel);
     vec3 p = ray_point(view, s, depth);
-    vec3 arriving = texel_light(light, view, s);
     Hit real = first_hit(real_light_depth, light.views.x, light.views.y, p);
     if (real.present && real.depth < real.ray_depth - bias_real) return;
-    inject_virtual(p, arriving * virtual_albedo(texel));
-    if (!real.present) return;
-    vec3 shadowed = hit_point(real, texelFetch(real_light_normal, real.texel, 0).xyz);
-    inject_real(shadowed, -arriving * texelFetch(real_albedo, real.texel, 0).rgb, DELTA);
+    int slot = slot_near(VIRTUAL_SET, volume_coordinate(p));
+    if (slot < 0) return;
+    vec3 flux = texel_light(light, view, s) * virtual_albedo(texel);
+    add_flux(VIRTUAL_SET, slot, DELTA, flux);
+    add_flux(VIRTUAL_SET, slot, RHO, flux);
+    vec3 n = normalize(texelFetch(virtual_light_normal, texel, 0).xyz);
+    add_area(VIRTUAL_SET, slot, lit_area(light, view, s, p, n));
 }
 #else
 void split(Light light, LightView view, ivec2 texel) {
@@ -91,9 +87,14 @@ void split(Light light, LightView view, ivec2 texel) {
     vec2 s = texel_lateral(view, texel);
     vec3 p = ray_point(view, s, depth);
     if (!inside_volume(volume_coordinate(p))) return;
+    int slot = slot_near(REAL_SET, volume_coordinate(p));
+    if (slot < 0) return;
     Hit object = first_hit(virtual_light_depth, light.views.z, light.views.w, p);
-    if (object.present && object.depth <= object.ray_depth + bias_real) return;
-    inject_real(p, texel_light(light, view, s) * texelFetch(real_albedo, texel, 0).rgb, RHO);
+    bool shadowed = object.present && object.depth <= object.ray_depth + bias_real;
+    vec3 flux = texel_light(light, view, s) * texelFetch(real_albedo, texel, 0).rgb;
+    add_flux(REAL_SET, slot, shadowed ? DELTA : RHO, shadowed ? -flux : flux);
+    vec3 n = normalize(texelFetch(real_light_normal, texel, 0).xyz);
+    add_area(REAL_SET, slot, lit_area(light, view, s, p, n));
 }
 #endif
 

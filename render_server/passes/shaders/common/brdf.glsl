@@ -1,8 +1,9 @@
-// GGX microfacet BRDF with the height-correlated Smith term (Walter et al. 2007, Heitz 2014) and Schlick's Fresnel.
+// GGX microfacet BRDF with the height-correlated Smith term (Walter et al. 2007, Heitz 2014) and Schlick's Fresnel, over a
+// diffuse base that gets what the lobe leaves: in even light a white surface shows just that light (docs/method.md 4.7).
 // Rounding to half floats makes every other normal longer than 1, so cosines may exceed 1.
 #include "common/basis.glsl"
 
-// (1 - cosine)^5 of Schlick's and Burley's terms; pow of a negative number is NaN.
+// (1 - cosine)^5 of Schlick's term; pow of a negative number is NaN.
 float grazing_weight(float cosine) {
     float x = clamp(1.0 - cosine, 0.0, 1.0);
     return x * x * x * x * x;
@@ -30,27 +31,55 @@ vec3 fresnel_schlick(vec3 f0, float cosine) {
     return has_interface(f0) ? f0 + (1.0 - f0) * grazing_weight(cosine) : vec3(0.0);
 }
 
-// Directional albedo of the specular lobe for uniform light: scale and offset of f0 (Karis 2014, analytic fit).
+// Directional albedo of the lobe as if every microfacet reflected all light (x) or (1 - cosine)^5 of it (y): rational fits
+// in the roots of the cosine and of alpha to the integrals, within 0.012 from cosine 0.05 on.
+vec2 lobe_albedo(float roughness, float n_dot_v) {
+    float x = sqrt(clamp(n_dot_v, 1e-3, 1.0)), r = roughness;
+    float lost = (0.6373 + r * (-1.962 + 1.3035 * r) + x * (-0.0104 + 2.3882 * r - 0.8464 * x))
+        / (r * (0.6235 + r * (4.7755 - 1.6819 * r))
+            + x * (-0.1492 + r * (-9.6169 + 5.0022 * r) + x * (5.7903 - 0.4948 * r - 2.0802 * x)));
+    float grazing = (0.9591 + r * (-1.0615 + r * (0.7896 - 0.3781 * r))
+            + x * (-1.0906 + r * (1.5887 - 0.367 * r) + x * (-1.098 - 0.6203 * r + 1.2425 * x)))
+        / (1.0 + r * (0.3065 + 9.8252 * r) + x * (-1.5368 - 6.7215 * r + 4.1183 * x));
+    float whole = min(1.0 - r * r * lost, 1.0);
+    return vec2(whole, clamp(grazing, 0.0, whole));
+}
+
+// The means of both over light from everywhere.
+vec2 mean_lobe_albedo(float roughness) {
+    float r = roughness;
+    return vec2(0.9993 + r * (0.0054 + r * (0.2549 + r * (-2.0969 + 1.2481 * r))),
+        0.0469 + r * (0.0424 + r * (-0.419 + r * (0.5563 - 0.2242 * r))));
+}
+
+// Light that microfacets throw at each other leaves the surface after all: a gain of the lobe that single reflection lacks
+// (Turquin 2019). `whole`: lobe_albedo's x.
+vec3 further_reflections(vec3 f0, float whole) { return 1.0 + f0 * (1.0 / whole - 1.0); }
+
+vec3 reflectance_of(vec3 f0, vec2 lobe) {
+    vec3 all = (f0 * (lobe.x - lobe.y) + lobe.y) * further_reflections(f0, lobe.x);
+    return has_interface(f0) ? min(all, vec3(1.0)) : vec3(0.0);
+}
+
+// Directional albedo of the specular lobe for uniform light.
 vec3 specular_reflectance(vec3 f0, float roughness, float n_dot_v) {
-    const vec4 c0 = vec4(-1.0, -0.0275, -0.572, 0.022);
-    const vec4 c1 = vec4(1.0, 0.0425, 1.04, -0.04);
-    vec4 r = roughness * c0 + c1;
-    float a004 = min(r.x * r.x, exp2(-9.28 * n_dot_v)) * r.x + r.y;
-    vec2 ab = vec2(-1.04, 1.04) * a004 + r.zw;
-    return has_interface(f0) ? f0 * ab.x + ab.y : vec3(0.0);
+    return reflectance_of(f0, lobe_albedo(roughness, n_dot_v));
 }
 
-// Diffuse reflection relative to Lambert's, under a rough dielectric interface (Burley 2012). Without an interface
-// (f0 = 0) it is Lambert's.
-float burley(float n_dot_l, float n_dot_v, float l_dot_v, float roughness) {
-    float grazing = roughness * (1.0 + l_dot_v) - 0.5;   // F_D90 - 1; 2 cos^2 of the difference angle is 1 + l.v
-    return (1.0 + grazing * grazing_weight(n_dot_l)) * (1.0 + grazing * grazing_weight(n_dot_v));
+// Its mean: the lobe's part of what a surface reflects of light from everywhere, in all directions.
+vec3 mean_specular_reflectance(vec3 f0, float roughness) { return reflectance_of(f0, mean_lobe_albedo(roughness)); }
+
+// Of all light, the part that the diffuse base reflects, of albedo `diffuse`.
+vec3 mean_diffuse_reflectance(vec3 diffuse, vec3 f0, float roughness) {
+    return diffuse * (1.0 - mean_specular_reflectance(f0, roughness));
 }
 
-// The same for uniform light: mean of (1 - n.l)^5 over the cosine is 1/21, that of l.v is 2/3 n.v.
-float burley_mean(float n_dot_v, float roughness) {
-    float grazing = roughness * (1.0 + 2.0 / 3.0 * n_dot_v) - 0.5;
-    return (1.0 + grazing / 21.0) * (1.0 + grazing * grazing_weight(n_dot_v));
+// Diffuse reflection relative to Lambert's: what the lobe leaves of the light on its way in and out (Kelemen and
+// Szirmay-Kalos 2001). For light from everywhere it is 1 - specular_reflectance towards the viewer.
+vec3 diffuse_under_lobe(vec3 f0, float roughness, float n_dot_l, float n_dot_v) {
+    vec3 in_and_out = (1.0 - specular_reflectance(f0, roughness, n_dot_l))
+        * (1.0 - specular_reflectance(f0, roughness, n_dot_v));
+    return in_and_out / max(1.0 - mean_specular_reflectance(f0, roughness), vec3(1e-3));
 }
 
 // Specular BRDF times cosine for a light seen under half-angle `radius` (rad). Averaging the lobe's peak over the
@@ -63,7 +92,8 @@ vec3 specular_times_cosine(vec3 n, vec3 v, vec3 l, vec3 f0, float roughness, flo
     float n_dot_v = max(dot(n, v), 1e-3);
     vec3 h = l + v;
     h *= inversesqrt(max(dot(h, h), 1e-12));   // l = -v has no half-vector
-    return fresnel_schlick(f0, max(dot(l, h), 0.0)) * (ggx_distribution(clamp(dot(n, h), 0.0, 1.0), wide)
+    vec3 reflected = fresnel_schlick(f0, max(dot(l, h), 0.0)) * further_reflections(f0, lobe_albedo(roughness, n_dot_v).x);
+    return reflected * (ggx_distribution(clamp(dot(n, h), 0.0, 1.0), wide)
         * smith_visibility(n_dot_l, n_dot_v, alpha) * n_dot_l);
 }
 

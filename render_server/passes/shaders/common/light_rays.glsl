@@ -46,6 +46,24 @@ vec3 texel_light(Light light, LightView view, vec2 s) {
     return parallel_rays * pow(slant2, -1.5) * intensity_towards(light, d);
 }
 
+vec3 direction_to_light(Light light, vec3 p) {
+    vec3 to_light; float radius;
+    light_at(light, p, to_light, radius);
+    return to_light;
+}
+
+const float LEAST_COSINE = 0.01;   // bounds the area of a surface that the light grazes
+
+// Area of the surface at p, of normal n, that the rays of a texel light, m^2.
+float lit_area(Light light, LightView view, vec2 s, vec3 p, vec3 n) {
+    float side = 2.0 * view.tile.w / view.tile.z, across = side * side;
+    if (view.range.z < 0.5) {
+        vec3 way = p - ray_point(view, s, 0.0);
+        across *= dot(way, way) * pow(1.0 + dot(s, s), -1.5);
+    }
+    return across / max(abs(dot(n, direction_to_light(light, p))), LEAST_COSINE);
+}
+
 struct Hit { bool present; ivec2 texel; LightView view; vec2 s; float depth; float ray_depth; };
 
 // The first surface that the light sees along its ray through p: in the real map views.xy, in the virtual map

@@ -2,8 +2,8 @@
 // cell edge squared), trilinear about the point half a cell above the surface. Needs volume.glsl.
 #include "common/light_cells.glsl"
 
-layout(std430) readonly buffer WithoutObjects { vec4 light_mu[]; };   // channel by channel
-layout(std430) readonly buffer WithObjects { vec4 light_rho[]; };     // or the change itself
+layout(std430) readonly buffer WithoutObjects { vec4 light_mu[]; };   // channel by channel; or the direct change
+layout(std430) readonly buffer WithObjects { vec4 light_rho[]; };     // or the change itself, indirect
 uniform bool has_geometry;   // cells behind the surface are dark and must not be read
 uniform float damping;
 
@@ -11,10 +11,8 @@ const float PER_FACE = 2.0 / 3.0;   // of 1 / edge^2: a uniform field's intensit
 
 struct Light12 { vec4 r; vec4 g; vec4 b; };
 
-uint cell_count() { return uint(volume_size * volume_size * volume_size); }
-
-// Intensity at q; with `front_only` from the cells whose centres are in front of the plane (p, n).
-Light12 intensity(bool with_objects, vec3 q, vec3 p, vec3 n, bool front_only) {
+// Intensity at q of a volume of `size` cells an edge; with `front_only` from the cells whose centres are in front of the plane (p, n).
+Light12 intensity(bool with_objects, int size, vec3 q, vec3 p, vec3 n, bool front_only) {
     ivec3 base = ivec3(floor(q - 0.5));
     vec3 f = q - 0.5 - vec3(base);
     Light12 sum = Light12(vec4(0.0), vec4(0.0), vec4(0.0));
@@ -23,8 +21,8 @@ Light12 intensity(bool with_objects, vec3 q, vec3 p, vec3 n, bool front_only) {
         ivec3 o = ivec3(i & 1, (i >> 1) & 1, i >> 2), cell = base + o;
         vec3 fraction = mix(1.0 - f, f, vec3(o));
         float w = fraction.x * fraction.y * fraction.z * (front_only ? max(dot(vec3(cell) + 0.5 - p, n), 0.0) : 1.0);
-        if (w <= 0.0 || !in_grid(cell, volume_size)) continue;
-        uint at = cell_index(cell, volume_size), channel = cell_count();
+        if (w <= 0.0 || !in_grid(cell, size)) continue;
+        uint at = cell_index(cell, size), channel = uint(size * size * size);
         if (with_objects) {
             sum.r += w * light_rho[at]; sum.g += w * light_rho[at + channel]; sum.b += w * light_rho[at + 2u * channel];
         } else {
@@ -43,15 +41,19 @@ vec3 against(Light12 light, vec4 shape) { return vec3(dot(light.r, shape), dot(l
 vec3 damped(bool with_objects, vec3 q, vec3 n, vec3 e) {
     vec3 behind = vec3(0.0), before = vec3(0.0);
     for (int i = 0; i < (damping > 0.0 ? 1 : 0); ++i) {
-        behind = PER_FACE * against(intensity(with_objects, q, q, n, false), lobe(-n));
-        before = PER_FACE * against(intensity(with_objects, q + n, q, n, false), lobe(-n));
+        behind = PER_FACE * against(intensity(with_objects, volume_size, q, q, n, false), lobe(-n));
+        before = PER_FACE * against(intensity(with_objects, volume_size, q + n, q, n, false), lobe(-n));
     }
     vec3 opposing = max((behind - before) * sign(e), vec3(0.0));
     return e / (1.0 + damping * opposing / max(abs(e), vec3(1e-6)));
 }
 
-// Irradiance from the volume at a surface point q (cells) with normal n.
+// Irradiance at a surface point q (cells) with normal n, from a volume of `size` cells an edge.
+vec3 irradiance_in(bool with_objects, int size, vec3 q, vec3 n) {
+    return PER_FACE * against(intensity(with_objects, size, q + 0.5 * n, q, n, has_geometry), lobe(-n));
+}
+
+// The same of the volume that the block describes, damped.
 vec3 from_volume(bool with_objects, vec3 q, vec3 n) {
-    vec3 e = PER_FACE * against(intensity(with_objects, q + 0.5 * n, q, n, has_geometry), lobe(-n));
-    return damped(with_objects, q, n, e);
+    return damped(with_objects, q, n, irradiance_in(with_objects, volume_size, q, n));
 }

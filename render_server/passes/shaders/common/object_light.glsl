@@ -14,8 +14,8 @@ vec3 direct_radiance(vec3 p, float depth, vec3 n, vec3 v, Material m) {
         float cosine = dot(n, l);
         if (cosine <= 0.0) continue;
         float seen = visibility(lights[i], p + normal_offset * n, n, 3.0 * noise_sigma * depth * depth, 0.0).y;
-        float rough = has_interface(m.f0) ? burley(cosine, max(dot(n, v), 0.0), dot(l, v), m.roughness) : 1.0;
-        vec3 response = m.diffuse / PI * rough * cosine + specular_times_cosine(n, v, l, m.f0, m.roughness, radius);
+        vec3 base = m.diffuse / PI * diffuse_under_lobe(m.f0, m.roughness, cosine, dot(n, v));
+        vec3 response = base * cosine + specular_times_cosine(n, v, l, m.f0, m.roughness, radius);
         sum += across * seen * response;
     }
     return sum;
@@ -23,7 +23,7 @@ vec3 direct_radiance(vec3 p, float depth, vec3 n, vec3 v, Material m) {
 
 vec3 object_radiance(vec3 p, float depth, vec3 n, vec3 v, Material m, Indirect indirect) {
     float n_dot_v = max(dot(n, v), 1e-3);
-    float rough = has_interface(m.f0) ? burley_mean(n_dot_v, m.roughness) : 1.0;
-    return m.emission + direct_radiance(p, depth, n, v, m) + m.diffuse / PI * rough * indirect.irradiance
-        + specular_reflectance(m.f0, m.roughness, n_dot_v) * indirect.specular;
+    vec3 reflectance = specular_reflectance(m.f0, m.roughness, n_dot_v);
+    return m.emission + direct_radiance(p, depth, n, v, m)
+        + m.diffuse / PI * (1.0 - reflectance) * indirect.irradiance + reflectance * indirect.specular;
 }

@@ -1,4 +1,6 @@
 // Albedo of surfels. Needs voxel_store.glsl, environment.glsl.
+#include "common/brdf.glsl"
+
 const vec2 ALBEDO_RANGE = vec2(0.02, 0.95);
 
 #ifdef REAL
@@ -24,6 +26,6 @@ vec3 albedo_at(Surfel s, vec3 n, vec3 indirect) {
 
 vec3 virtual_albedo(Surfel s) {
     Material m = material_of(int(s.normal_material.w), s.uv_voxel.xy, s.tint.rgb);
-    return min(m.diffuse + m.f0, vec3(ALBEDO_RANGE.y));
+    return min(mean_diffuse_reflectance(m.diffuse, m.f0, m.roughness) + mean_specular_reflectance(m.f0, m.roughness), vec3(ALBEDO_RANGE.y));
 }
 #endif

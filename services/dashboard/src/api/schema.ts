@@ -1486,6 +1486,21 @@ export interface components {
              */
             readonly damping?: number | null;
             /**
+             * Direct Filter
+             * @description Of shadow lobe: direct light is averaged over cubes that reach so many cells to each side, which softens shadows and makes them lighter; null = 0.
+             */
+            readonly direct_filter?: number | null;
+            /**
+             * Direct Steps
+             * @description Of shadow lobe: steps of direct light after injection; they soften shadows. null = 0.
+             */
+            readonly direct_steps?: number | null;
+            /**
+             * Direct Volume Size
+             * @description Of shadow lobe: cells an edge of the volume of direct light; null = volume_size.
+             */
+            readonly direct_volume_size?: number | null;
+            /**
              * Geometry Volume
              * @description Surfaces block light between cells; null = yes, no for paper.
              */
@@ -1496,6 +1511,16 @@ export interface components {
              * @constant
              */
             readonly name: "dlpv";
+            /**
+             * Objects Steps
+             * @description Of operator paper: steps in the volume that lights the objects; null = as steps.
+             */
+            readonly objects_steps?: number | null;
+            /**
+             * Objects Volume Size
+             * @description Of operator paper: cells an edge of the volume that lights the objects; null = volume_size.
+             */
+            readonly objects_volume_size?: number | null;
             /**
              * Operator
              * @description Two volumes, with and without objects, subtracted; or one volume of the change, as printed in the paper. Settings that are null follow it.
