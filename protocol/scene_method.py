@@ -244,7 +244,8 @@ class DlpvMethod(MethodSettings):
         default=None,
         ge=0,
         le=256,
-        description="Of shadow lobe: steps of direct light after injection; they soften shadows. null = 0.",
+        description="Of shadow lobe: steps of direct light after injection; they soften and "
+        "deepen shadows. null = 5 ([P2] fig. 7); 0 = none.",
     )
     direct_filter: int | None = Field(
         default=None,

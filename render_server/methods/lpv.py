@@ -55,6 +55,8 @@ from render_server.passes.split_injection import RealAlbedo
 from render_server.passes.voxel_light import AlbedoTexture
 from render_server.passes.voxels import PlacedVolume, VolumePlacement, Voxelize, VoxelMipmap, VoxelStore
 
+PRINTED_DIRECT_STEPS = 5  # of direct light: [P2] fig. 7
+
 
 class LpvCells:
     """Cells of one size: the surfels of both geometries, what these block, and the light injected from them and maps.
@@ -298,8 +300,8 @@ class DifferenceVolumes:
 class PrintedVolumes:
     """The volumes of [P2] 4.3: V_rho for the objects, V_delta of the indirect change, and one of the direct change.
 
-    The direct change is injected apart from the indirect one, so that it can have steps of its own (none as printed
-    in 4.3.2, "n" in section 7). `shown` is what was injected of both, for debug view `volume`.
+    The direct change is injected apart from the indirect one, so that it can have steps of its own (none in 4.3.2,
+    "n" in section 7, five in fig. 7). `shown` is what was injected of both, for debug view `volume`.
     """
 
     def __init__(self, gpu: GpuContext, settings: DlpvMethod, sizes: "PrintedSizes") -> None:
@@ -309,7 +311,10 @@ class PrintedVolumes:
         self._delta = Propagated(gpu, settings, sizes.indirect, steps or sizes.indirect)
         self._direct: Propagated | None = None
         if settings.resolved_shadow == "lobe":
-            self._direct = Propagated(gpu, settings, sizes.direct, settings.direct_steps or 0)
+            given = settings.direct_steps
+            self._direct = Propagated(
+                gpu, settings, sizes.direct, PRINTED_DIRECT_STEPS if given is None else given
+            )
         self._maps = LpvInjectMaps(gpu)
         self._direct_light = injected_sums(gpu, sizes.direct)
         self._filter = LpvBoxFilter(gpu)

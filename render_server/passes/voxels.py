@@ -35,6 +35,7 @@ SPARE_EDGE = (
     0.125  # of a volume that stays while its objects move: the light around them changes that far at least
 )
 
+BORDER_VOXELS = 1e-3  # of rounding: this near, a triangle counts on both sides of a border
 LONGEST_EDGE_VOXELS = 8.0  # longer ones are split before: balances the threads, bounds each one's loops
 
 
@@ -333,9 +334,13 @@ def pieces_in_volume(
 def _voxel_extents(
     corners: Float32[np.ndarray, "m 3 10"], placement: VolumePlacement
 ) -> tuple[Float64[np.ndarray, "m 3"], Float64[np.ndarray, "m 3"]]:
-    """Returns the lowest and highest voxel coordinates of each triangle."""
-    a, b, c = (np.floor((corners[:, i, :3] - placement.origin) / placement.voxel_edge) for i in range(3))
-    return np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
+    """Returns the lowest and highest voxel coordinates of each triangle, on borders those of both sides.
+
+    The shaders' arithmetic rounds in another way, so these are at least the voxels that they find.
+    """
+    a, b, c = ((corners[:, i, :3] - placement.origin) / placement.voxel_edge for i in range(3))
+    low, high = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
+    return np.floor(low - BORDER_VOXELS), np.floor(high + BORDER_VOXELS)
 
 
 def _voxels_in(

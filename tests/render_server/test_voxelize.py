@@ -9,6 +9,15 @@ import trimesh
 from scipy import ndimage
 
 from render_server.gpu.context import GpuContext
+from render_server.passes.gbuffer import triangle_corners
+from render_server.passes.voxels import (
+    SURFEL_BYTES,
+    SURFELS_HEADER_BYTES,
+    PlacedVolume,
+    Voxelize,
+    VoxelStore,
+    place_volume,
+)
 from tests.render_server.voxel_lab import VoxelLab, gpu_mesh
 
 pytestmark = pytest.mark.usefixtures("clean_gl")
@@ -84,6 +93,21 @@ def test_aligned_plane_covers_its_voxels_once(lab: VoxelLab, height: float) -> N
     assert np.abs(seen_from_above[int(height)] - 1).max() < 2e-3
     assert np.count_nonzero(texels[..., 3]) == SIZE**2
     assert np.abs(texels[5, int(height), ..., 0] - 1).max() < 2e-3
+
+
+@pytest.mark.parametrize("edge", [0.12, 0.07, 0.3])
+def test_faces_on_borders_of_voxels_keep_their_area(gpu: GpuContext, edge: float) -> None:
+    """But for rounding, which differs between the CPU, which makes room, and shaders."""
+    box = trimesh.creation.box((edge,) * 3)
+    placement = place_volume(*box.bounds, SIZE, None)
+    store, volume, voxelize = VoxelStore(gpu, SIZE), PlacedVolume(gpu, placement), Voxelize(gpu)
+    voxelize.run(store, triangle_corners(gpu_mesh(box)), volume)
+    _, count = store.counts()
+    content = store.surfels.read(count * SURFEL_BYTES, offset=SURFELS_HEADER_BYTES)
+    areas = np.frombuffer(content, np.float32).reshape(-1, SURFEL_BYTES // 4)[:, 3]
+    assert areas.sum(dtype=np.float64) == pytest.approx(box.area, rel=1e-5)
+    for item in (store, volume, voxelize):
+        item.release()
 
 
 TILTED = {

@@ -1492,7 +1492,7 @@ export interface components {
             readonly direct_filter?: number | null;
             /**
              * Direct Steps
-             * @description Of shadow lobe: steps of direct light after injection; they soften shadows. null = 0.
+             * @description Of shadow lobe: steps of direct light after injection; they soften and deepen shadows. null = 5 ([P2] fig. 7); 0 = none.
              */
             readonly direct_steps?: number | null;
             /**
