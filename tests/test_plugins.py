@@ -180,6 +180,7 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
         return {**json.loads(done.stdout), "pictures": dict(pictures)}
 
 
+@pytest.mark.slow
 def test_a_document_may_name_the_method_wherever_it_is_read(rendered: dict[str, Any]) -> None:
     misspelt, unknown_key, out_of_range, broken = rendered["faults"][:4]
     assert "the nearest is `direct`" in misspelt
@@ -192,6 +193,7 @@ def test_a_document_may_name_the_method_wherever_it_is_read(rendered: dict[str, 
     assert not rendered["opengl"]
 
 
+@pytest.mark.slow
 def test_commands_take_the_method_by_its_name(rendered: dict[str, Any]) -> None:
     adjusted, plain = rendered["chosen"]
     assert (adjusted["name"], adjusted["ambient"]) == ("direct", 4)
@@ -201,10 +203,12 @@ def test_commands_take_the_method_by_its_name(rendered: dict[str, Any]) -> None:
         assert "the nearest is direct" in misspelt
 
 
+@pytest.mark.slow
 def test_a_plugin_has_kernels_of_its_own(rendered: dict[str, Any]) -> None:
     assert rendered["written"] == [0, 0, 1, 4] * 4
 
 
+@pytest.mark.slow
 def test_the_method_draws_shadows_of_lamps_and_even_light(rendered: dict[str, Any]) -> None:
     plain, direct, bright = (rendered["pictures"][name].astype(int) for name in ("none", "direct", "bright"))
     shadow = np.s_[46:50, 74:80]  # the lamp shines towards +x, so the shadow lies right of the cube

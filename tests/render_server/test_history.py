@@ -132,7 +132,7 @@ def test_an_object_that_moves_leaves_nothing(gpu: GpuContext, stage: Stage, by: 
     assert differing_pixels(found, fresh(gpu, end, seen(HERE))) == 0
 
 
-@pytest.mark.parametrize("operator", ["exact", "paper"])
+@pytest.mark.parametrize("operator", [pytest.param("exact", marks=pytest.mark.slow), "paper"])
 def test_an_object_that_moves_less_than_a_voxel(gpu: GpuContext, stage: Stage, operator: str) -> None:
     """The volume stays where it is, but not what may receive the objects' shadows, nor the light maps around it."""
     start = room(stage, has_model=True, operator=operator, volume_edge_m=0.5)

@@ -45,8 +45,8 @@ uniform float roughness;
 #include "common/brdf.glsl"
 """
 RESPONSES = """
-values[0] = burley(dot(n, l), dot(n, v), dot(l, v), roughness);
-values[1] = burley_mean(dot(n, v), roughness);
+values[0] = diffuse_under_lobe(vec3(0.04), roughness, dot(n, l), dot(n, v)).g;
+values[1] = specular_reflectance(vec3(0.04), roughness, dot(n, v)).g;
 vec3 specular = specular_times_cosine(n, v, l, vec3(0.04), roughness, 0.0);
 values[2] = specular.g;
 values[3] = fresnel_schlick(vec3(0.04), dot(n, v)).g;

@@ -126,6 +126,7 @@ def test_wrong_wishes_are_one_sentence(client: httpx.Client, body: object, expec
     assert not recorders()
 
 
+@pytest.mark.slow
 def test_without_frames_it_says_why_and_leaves_nothing(tmp_path: Path) -> None:
     (nobody,) = ports.private_ports(1)
     with running_api(tmp_path, subscribe=[ports.endpoint(nobody)]) as api:

@@ -118,6 +118,7 @@ def test_frame_without_pose_is_the_camera_picture_bit_for_bit(
     assert not (tmp_path / "000000.png").exists()
 
 
+@pytest.mark.slow
 def test_second_run_overwrites_and_is_bit_identical(
     cli: RunCli, cli_process: RunCli, take: Path, tmp_path: Path
 ) -> None:

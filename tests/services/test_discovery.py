@@ -21,6 +21,7 @@ def keys(tmp_path: Path) -> Keys:
     return load_keys(None, tmp_path / "node")
 
 
+@pytest.mark.slow
 def test_a_node_is_found_with_all_it_says_and_is_trusted_by_its_key(keys: Keys, tmp_path: Path) -> None:
     with announced("desk", "tcp://127.0.0.1:5999", STREAMS, keys, interfaces=LOOPBACK):
         found = find_nodes(name="desk", patience_s=10, interfaces=LOOPBACK)
