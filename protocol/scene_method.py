@@ -316,9 +316,7 @@ class DlpvMethod(MethodSettings):
         if self.shadow == "lobe" and self.operator != "paper":
             raise ValueError("shadow `lobe` is part of operator `paper`: use shadow map, or operator paper")
         if self.bounces and self.operator == "paper":
-            raise ValueError(
-                "`bounces` need operator `difference`: leave them out, or use operator difference"
-            )
+            raise ValueError("`bounces` need operator `difference`: leave them out, or use that operator")
         given = [name for name in ("objects_volume_size", "objects_steps") if getattr(self, name) is not None]
         if given and self.operator != "paper":
             raise ValueError(f"`{given[0]}` is part of operator `paper`: leave it out, or use operator paper")
@@ -326,7 +324,7 @@ class DlpvMethod(MethodSettings):
         given = [name for name in direct if getattr(self, name) is not None]
         if given and self.resolved_shadow != "lobe":
             raise ValueError(
-                f"`{given[0]}` needs shadow `lobe`: leave it out, or use operator paper with shadow lobe"
+                f"`{given[0]}` needs operator paper with shadow `lobe`: leave it out, or use those"
             )
         return self
 
@@ -334,6 +332,11 @@ class DlpvMethod(MethodSettings):
         if value is not None:
             return value
         return printed if self.operator == "paper" else default
+
+    @property
+    def resolved_direct_steps(self) -> int:
+        """Steps of direct light as given, or five, as in [P2] fig. 7."""
+        return 5 if self.direct_steps is None else self.direct_steps
 
     @property
     def resolved_propagation(self) -> Literal["moments", "lobes"]:

@@ -55,8 +55,6 @@ from render_server.passes.split_injection import RealAlbedo
 from render_server.passes.voxel_light import AlbedoTexture
 from render_server.passes.voxels import PlacedVolume, VolumePlacement, Voxelize, VoxelMipmap, VoxelStore
 
-PRINTED_DIRECT_STEPS = 5  # of direct light: [P2] fig. 7
-
 
 class LpvCells:
     """Cells of one size: the surfels of both geometries, what these block, and the light injected from them and maps.
@@ -311,10 +309,7 @@ class PrintedVolumes:
         self._delta = Propagated(gpu, settings, sizes.indirect, steps or sizes.indirect)
         self._direct: Propagated | None = None
         if settings.resolved_shadow == "lobe":
-            given = settings.direct_steps
-            self._direct = Propagated(
-                gpu, settings, sizes.direct, PRINTED_DIRECT_STEPS if given is None else given
-            )
+            self._direct = Propagated(gpu, settings, sizes.direct, settings.resolved_direct_steps)
         self._maps = LpvInjectMaps(gpu)
         self._direct_light = injected_sums(gpu, sizes.direct)
         self._filter = LpvBoxFilter(gpu)
