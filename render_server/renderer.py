@@ -103,15 +103,18 @@ class SceneRenderer:
         """Renders one frame; without a pose or visible object, returns the camera's picture byte for byte."""
         return self.submit(frame, with_linear=with_linear).finish()
 
-    def submit(self, frame: ViewFrame, *, with_linear: bool = False) -> PendingComposite:
-        """Starts a frame on the GPU; reading its picture back does not stall later frames."""
+    def submit(self, frame: ViewFrame, *, with_linear: bool = False, whole: bool = False) -> PendingComposite:
+        """Starts a frame on the GPU; reading its picture back does not stall later frames.
+
+        `whole`: at full size whatever the budget, as `with_linear` always is.
+        """
         started_s = time.perf_counter()
         frame, self._shown = self.sized(frame), None
         if frame.pose is None:
             self._shown = ShownFrame(frame, None, None)
             return _at_once(self._shown, frame.color)
         view = CameraView(frame.camera, frame.pose.world_from_camera)
-        relit = self._live.relight(frame, view, whole=with_linear)
+        relit = self._live.relight(frame, view, whole=whole or with_linear)
         lights = self._live.describe_lights()
         name = self.scene.output.view
         shows_lights = name == "lights" and bool(lights)

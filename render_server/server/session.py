@@ -96,8 +96,8 @@ class Renderer(Protocol):
     def notices(self) -> Sequence[str]:
         """Sentences for the user; the list only grows."""
 
-    def submit(self, frame: ViewFrame, *, with_linear: bool = False) -> Pending:
-        """Starts the composite of one frame; frames finish in the order in which they were started."""
+    def submit(self, frame: ViewFrame, *, with_linear: bool = False, whole: bool = False) -> Pending:
+        """Starts the composite of one frame, at full size if `whole`; frames finish in the order of their starts."""
 
     def sized(self, frame: ViewFrame) -> ViewFrame:
         """Returns the frame at the composite's size."""

@@ -75,8 +75,8 @@ class SnapshotRenderer(Protocol):
     def sized(self, frame: ViewFrame) -> ViewFrame:
         """Returns the frame at the composite's size."""
 
-    def submit(self, frame: ViewFrame, *, with_linear: bool = False) -> StartedPicture:
-        """Starts a composite."""
+    def submit(self, frame: ViewFrame, *, with_linear: bool = False, whole: bool = False) -> StartedPicture:
+        """Starts a composite, at full size if `whole`."""
 
 
 @dataclass
@@ -134,7 +134,7 @@ def _picture(
     if picture.view == CAMERA_VIEW:
         return renderer.sized(frame).color
     renderer.set_scene(_variant(scene, picture.view, picture.method))
-    return renderer.submit(frame).finish().color
+    return renderer.submit(frame, whole=True).finish().color
 
 
 def _linear(

@@ -12,6 +12,7 @@ from protocol.scene import SceneDocument, parse_scene
 from render_server.frame_budget import PATIENCE, WARM_UP, WINDOW, FrameBudget, Level
 from render_server.gpu.context import GpuContext
 from render_server.renderer import CompositeFrame, SceneRenderer
+from render_server.server.snapshot import SnapshotOrder, SnapshotPicture, take_snapshot
 from tests.render_server.protected_scenes import Case, scene_of
 from tests.render_server.scenes import Stage, psnr_db
 from tests.render_server.test_quality_tiers import seen
@@ -189,6 +190,16 @@ def test_at_rest_a_smaller_picture_becomes_the_best(
     assert shown.level == Level("best")
     assert psnr_db(shown.color, wanted) > 55
     assert hurried.show(aside + 0.02).level == HALF
+
+
+def test_snapshots_are_full_size(hurried: Walker, whole: Walker, tmp_path: Path) -> None:
+    aside = 0.004 * (hurried.count % 8)
+    order = SnapshotOrder(folder=tmp_path, pictures=(SnapshotPicture(name="now"),))
+    taken = take_snapshot(hurried.renderer, hurried.renderer.scene, seen(aside, hurried.count), order)
+    assert taken.files == ["now.png"]
+    shown = cv2.cvtColor(cv2.imread(str(tmp_path / "now.png")), cv2.COLOR_BGR2RGB)
+    assert psnr_db(shown, whole.show(aside).color) > 36
+    assert hurried.show().level == HALF
 
 
 def test_files_leave_the_budget_aside(gpu: GpuContext, hurried: Walker) -> None:
