@@ -61,7 +61,7 @@ class InvertingRenderer:
         self.ignored: str | None = None
         self.unfinished: list[int] = []
 
-    def submit(self, frame: ViewFrame, *, with_linear: bool = False, whole: bool = False) -> Started:  # noqa: ARG002 (always whole)
+    def submit(self, frame: ViewFrame, *, with_linear: bool = False, whole: bool = False) -> Started:  # noqa: ARG002
         self.newest = frame
         if frame.frame_id in self.fails_at:
             raise RuntimeError("the volume fell over")
