@@ -11,6 +11,9 @@ from typing import Any
 from protocol.scene import SceneDocument, parse_scene
 from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Kernel
+from render_server.passes.caustics import TILE
+from render_server.passes.composite import Enlarge
+from render_server.passes.cones import reuse_define
 from render_server.passes.lpv import LpvPropagate
 from render_server.renderer import SceneRenderer
 from tests.render_server.protected_scenes import Case, frames_of, scene_of
@@ -57,10 +60,16 @@ def changed(scene: SceneDocument, part: str, changes: dict[str, Any]) -> SceneDo
 
 
 def by_device(gpu: GpuContext, folder: Path) -> None:  # noqa: ARG001
-    """Compiles what software and GPUs do differently, both ways wherever this runs."""
+    """Compiles what software and GPUs do differently, both ways wherever this runs, and what a budget brings."""
     for tiled in (False, True):
         LpvPropagate(gpu, tiled=tiled).release()
     Kernel(gpu, "clear_buffer").release()
+    for rows in (2, 8):
+        for reuses in (False, True):
+            Kernel(
+                gpu, "caustic_gather", ROWS=rows, GROUP_ROWS=TILE // rows, **reuse_define(reuses)
+            ).release()
+    Enlarge(gpu, (16, 16)).release()
 
 
 PARTS: dict[str, Callable[[GpuContext, Path], None]] = {
