@@ -316,7 +316,9 @@ class DlpvMethod(MethodSettings):
         if self.shadow == "lobe" and self.operator != "paper":
             raise ValueError("shadow `lobe` is part of operator `paper`: use shadow map, or operator paper")
         if self.bounces and self.operator == "paper":
-            raise ValueError("`bounces` need operator `difference`: leave them out, or use that operator")
+            raise ValueError(
+                "`bounces` are not in operator `paper`: leave them out, or use operator difference"
+            )
         given = [name for name in ("objects_volume_size", "objects_steps") if getattr(self, name) is not None]
         if given and self.operator != "paper":
             raise ValueError(f"`{given[0]}` is part of operator `paper`: leave it out, or use operator paper")
@@ -324,7 +326,7 @@ class DlpvMethod(MethodSettings):
         given = [name for name in direct if getattr(self, name) is not None]
         if given and self.resolved_shadow != "lobe":
             raise ValueError(
-                f"`{given[0]}` needs operator paper with shadow `lobe`: leave it out, or use those"
+                f"`{given[0]}` is for operator paper with shadow lobe: leave it out, or use these"
             )
         return self
 
