@@ -12,7 +12,7 @@ from typing import Annotated, Final, Literal, Self, get_args
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints, model_validator
 
-from protocol.scene_method import Quality
+from protocol.quality import Quality
 
 SCHEMA_VERSION: Final = 5
 MAX_HEADER_BYTES = 64 * 1024

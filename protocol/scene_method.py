@@ -1,11 +1,11 @@
 """How the scene document's picture is computed and shown: `method`, `shading`, `output` (docs/formats.md 3)."""
 
-from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Self, TypeVar, get_args
 
 from pydantic import ConfigDict, Field, model_validator
 
 from protocol.documents import StrictModel
+from protocol.quality import TIERS, Quality, QualityTier
 
 DEFAULT_METHOD = "dvct"
 T = TypeVar("T")
@@ -31,45 +31,6 @@ def _require_name(schema: dict[str, Any], model: type["MethodSettings"]) -> None
     """Without `name` the method is dvct, so the others need the key for a document to match one method only."""
     if model.method_name() != DEFAULT_METHOD:
         schema["required"] = ["name", *schema.get("required", [])]
-
-
-Quality = Literal["live", "balanced", "best"]
-
-
-@dataclass(frozen=True)
-class QualityTier:
-    """What a quality gives up while something moves.
-
-    `cone_count` and `shadow_samples` limit the settings of that name; a volume has `volume_share` of its voxels an
-    edge. `reflection_cones` look up what a pixel of a smooth object reflects, in one of `reflection_step` x
-    `reflection_step` pixels. `edge_samples` smooth an object's edges. One tile of the picture in `refresh_tiles` gets
-    new light in each frame in which only the camera moves, the others keep that of the frame before; 0: all get new
-    light, and the real scene is built anew whenever the camera moves.
-    """
-
-    cone_count: int = 64
-    shadow_samples: int = 64
-    volume_share: float = 1.0
-    reflection_cones: Literal[2, 4] = 4
-    reflection_step: Literal[1, 2] = 1
-    edge_samples: Literal[4, 8] = 8
-    refresh_tiles: int = 0
-
-
-BEST = QualityTier()
-TIERS: dict[Quality, QualityTier] = {
-    "best": BEST,
-    "balanced": QualityTier(refresh_tiles=8),
-    "live": QualityTier(
-        cone_count=8,
-        shadow_samples=8,
-        volume_share=0.75,
-        reflection_cones=2,
-        reflection_step=2,
-        edge_samples=4,
-        refresh_tiles=16,
-    ),
-}
 
 
 class MethodSettings(StrictModel):

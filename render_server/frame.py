@@ -6,7 +6,7 @@ import moderngl
 import numpy as np
 
 from protocol.frames import DepthImage, ViewFrame
-from protocol.scene_method import QualityTier
+from protocol.quality import QualityTier
 from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Binding, Bindings
 from render_server.gpu.textures import release_all

@@ -14,7 +14,7 @@ from protocol.camera_model import DistortionModel
 from protocol.documents import validate
 from protocol.errors import DeltalightError
 from protocol.messages import CompositeMessage
-from protocol.scene_method import Quality
+from protocol.quality import Quality
 
 _LENGTH = struct.Struct("<I")
 

@@ -8,7 +8,7 @@ import moderngl
 import numpy as np
 from jaxtyping import Float64
 
-from protocol.scene_method import BEST, QualityTier
+from protocol.quality import BEST, QualityTier
 from render_server.frame import FrameResources, Observation
 from render_server.gpu.context import GpuContext
 from render_server.gpu_scene import GeometryState

@@ -8,7 +8,7 @@ from typing import Any
 import moderngl
 import numpy as np
 
-from protocol.scene_method import BEST, QualityTier
+from protocol.quality import BEST, QualityTier
 from render_server.frame import FrameResources, Observation
 from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Binding, Bindings

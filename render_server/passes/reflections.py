@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import moderngl
 
-from protocol.scene_method import QualityTier
+from protocol.quality import QualityTier
 from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Bindings, Kernel, ListGroups, list_threads
 from render_server.gpu.textures import release_all, texture_2d

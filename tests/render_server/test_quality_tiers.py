@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from protocol.frames import ViewFrame
+from protocol.quality import TIERS
 from protocol.scene import SceneDocument
-from protocol.scene_method import TIERS, DvctMethod
+from protocol.scene_method import DvctMethod
 from render_server.gpu.context import GpuContext
 from render_server.renderer import SceneRenderer
 from tests.render_server.protected_scenes import EYE, METHODS, Case, scene_of

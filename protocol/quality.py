@@ -1,0 +1,42 @@
+"""Qualities of a moving picture: what each gives up for speed (docs/speed.md, quality and speed)."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+Quality = Literal["live", "balanced", "best"]
+
+
+@dataclass(frozen=True)
+class QualityTier:
+    """What a quality gives up while something moves.
+
+    `cone_count` and `shadow_samples` limit the settings of that name; a volume has `volume_share` of its voxels an
+    edge. `reflection_cones` look up what a pixel of a smooth object reflects, in one of `reflection_step` x
+    `reflection_step` pixels. `edge_samples` smooth an object's edges. One tile of the picture in `refresh_tiles` gets
+    new light in each frame in which only the camera moves, the others keep that of the frame before; 0: all get new
+    light, and the real scene is built anew whenever the camera moves.
+    """
+
+    cone_count: int = 64
+    shadow_samples: int = 64
+    volume_share: float = 1.0
+    reflection_cones: Literal[2, 4] = 4
+    reflection_step: Literal[1, 2] = 1
+    edge_samples: Literal[4, 8] = 8
+    refresh_tiles: int = 0
+
+
+BEST = QualityTier()
+TIERS: dict[Quality, QualityTier] = {
+    "best": BEST,
+    "balanced": QualityTier(refresh_tiles=8),
+    "live": QualityTier(
+        cone_count=8,
+        shadow_samples=8,
+        volume_share=0.75,
+        reflection_cones=2,
+        reflection_step=2,
+        edge_samples=4,
+        refresh_tiles=16,
+    ),
+}
