@@ -323,7 +323,7 @@ def test_undo_and_redo_by_keys_and_buttons(stack: Stack, page: Desk) -> None:
     page.photograph("history")
     page.page.keyboard.press("Delete")
     page.named("treeitem", "knot").wait_for(state="detached")
-    assert stack.document()["objects"] == []
+    page.until(lambda: stack.document()["objects"] == [], "the document without the knot")
     page.page.keyboard.press("Control+z")
     page.named("treeitem", "knot").wait_for()
     assert list(knot_m(stack)) == list(raised_m)

@@ -163,7 +163,7 @@ def test_a_name_is_kept_as_it_is_typed_while_the_scene_changes(stack: Stack, pag
     expect(name).to_have_value("mY room #2")
     name.press("Enter")
     expect(page.named("button", "Scenes: mY room #2")).to_be_visible()
-    assert stack.document()["name"] == "mY room #2"
+    page.until(lambda: stack.document()["name"] == "mY room #2", "the name in the document")
 
 
 def test_everything_can_be_reached_on_a_phone(phone: Desk) -> None:
