@@ -247,7 +247,7 @@ class RealGeometry:
         merged = merge_for_gpu(meshes)
         self._buffers.write(merged)
         if self._materials is None:
-            self._materials = MaterialTable(self._gpu, merged)
+            self._materials = MaterialTable(self._gpu, merged, draws_maps=False)
         self.state = GeometryState(
             self._buffers,
             triangle_corners(merged),

@@ -142,11 +142,13 @@ class VirtualObjects:
         if not np.ptp(np.vstack(swept), axis=0).any():
             return None
         self._buffers.write(merged)
+        materials = self._material_table(merged)
+        self._buffers.cutouts = materials.bindings
         return GeometryState(
             self._buffers,
             triangle_corners(merged),
             np.vstack(points),
-            self._material_table(merged),
+            materials,
             objects=tuple(objects),
             swept_points=np.vstack(swept) if any(item.moves for item in objects) else None,
         )

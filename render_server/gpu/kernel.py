@@ -156,21 +156,26 @@ class _Program:
         sources = (own, *shared)
         written: dict[str, object] = {}
         for slot in self._samplers:
-            self._bind_sampler(slot, self._find(slot.name, sources))
+            self._bind_sampler(slot, self.find(slot.name, sources))
         for slot in self._images:
-            written[slot.name] = self._bind_image(slot, self._find(slot.name, sources))
+            written[slot.name] = self._bind_image(slot, self.find(slot.name, sources))
         for slot in self._storage:
-            value = self._find(slot.name, sources)
+            value = self.find(slot.name, sources)
             self._bind_storage(slot, value)
             if value is not None:
                 written[slot.name] = value
         for slot in self._blocks:
-            self._bind_block(slot, self._find(slot.name, sources))
+            self._bind_block(slot, self.find(slot.name, sources))
         for slot in self._uniforms:
-            self._write(slot, self._find(slot.name, sources))
+            self._write(slot, self.find(slot.name, sources))
         return {name: item for name, item in written.items() if name in self._declared.written}
 
-    def _find(self, name: str, sources: Sequence[Bindings]) -> Binding:
+    def find(self, name: str, sources: Sequence[Bindings]) -> Binding:
+        """Returns what the first of the sources that knows it binds to a name.
+
+        Raises:
+            BindingError: none does.
+        """
         for source in sources:
             if name in source:
                 return source[name]
@@ -251,6 +256,22 @@ class _Program:
             ) from error
         self._last[slot.name] = data
 
+    @property
+    def switches(self) -> tuple[str, ...]:
+        """Names of the defines that bindings turn on."""
+        return self._declared.switches
+
+    @property
+    def local_size(self) -> tuple[int, int, int]:
+        """Invocations of a workgroup."""
+        return self._declared.local_size
+
+    @property
+    def compute(self) -> moderngl.ComputeShader:
+        """The program as one that is dispatched."""
+        assert isinstance(self.program, moderngl.ComputeShader)
+        return self.program
+
     def resources(self) -> dict[str, list[str]]:
         """Names of the active samplers, images, storage blocks and uniform blocks."""
         return {
@@ -266,7 +287,41 @@ class _Program:
             watch(Dispatch(self.label, size, written))
 
 
-class Kernel:
+class _Shader:
+    """The programs of one shader: with each set of its switches (`#pragma switch NAME`) that bindings turn on.
+
+    All but the one without any are compiled when first run: what a scene lacks costs nothing.
+    """
+
+    def __init__(self, gpu: GpuContext, name: str | Path, defines: Mapping[str, float | str]) -> None:
+        self._gpu, self._ctx, self._name, self._defines = gpu, gpu.ctx, name, defines
+        self._plain = self._compiled(defines)
+        self._switched: dict[tuple[str, ...], _Program] = {}
+        self.label, self.local_size = self._plain.label, self._plain.local_size
+
+    def _compiled(self, defines: Mapping[str, float | str]) -> _Program:
+        raise NotImplementedError
+
+    def _program(self, *sources: Bindings) -> _Program:
+        """Returns the program that the bindings choose."""
+        on = tuple(name for name in self._plain.switches if self._plain.find(name, sources))
+        if not on:
+            return self._plain
+        if on not in self._switched:
+            self._switched[on] = self._compiled({**self._defines, **dict.fromkeys(on, 1)})
+        return self._switched[on]
+
+    def resources(self) -> dict[str, list[str]]:
+        """Returns the names of the plain program's bindings, by kind."""
+        return self._plain.resources()
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        for each in (self._plain, *self._switched.values()):
+            each.program.release()
+
+
+class Kernel(_Shader):
     """A compute shader with its defines: `name`.comp.glsl of the shaders' folder, or of another one if it is a path.
 
     The one place where work is dispatched, so that the memory barrier is never forgotten: a missing barrier does not
@@ -274,13 +329,13 @@ class Kernel:
     """
 
     def __init__(self, gpu: GpuContext, name: str | Path, **defines: float | str) -> None:
-        self._ctx = gpu.ctx
-        source = shader_source(SHADERS / f"{name}.comp.glsl", defines)
-        declared = declarations(source)
-        self.label = _label(name, defines)
-        gpu.compiled(self.label, {"comp": source})
-        self._program = _Program(gpu, self.label, gpu.ctx.compute_shader(source), declared)
-        self.local_size = declared.local_size
+        super().__init__(gpu, name, defines)
+
+    def _compiled(self, defines: Mapping[str, float | str]) -> _Program:
+        source = shader_source(SHADERS / f"{self._name}.comp.glsl", defines)
+        label = _label(self._name, defines)
+        self._gpu.compiled(label, {"comp": source})
+        return _Program(self._gpu, label, self._ctx.compute_shader(source), declarations(source))
 
     def run(self, threads: Sequence[int], *shared: Bindings, **own: Binding) -> None:
         """Runs at least `threads` (x[, y[, z]]) invocations; later work sees their writes.
@@ -291,50 +346,40 @@ class Kernel:
         Raises:
             BindingError: a name is undeclared or missing, or its value is of the wrong kind or format.
         """
-        written = self._program.bind(shared, own)
+        program = self._program(own, *shared)
+        written = program.bind(shared, own)
         counts = [*threads, 1, 1][:3]
         groups = tuple(max(1, -(-count // size)) for count, size in zip(counts, self.local_size, strict=True))
-        self._compute.run(*groups)
+        program.compute.run(*groups)
         self._ctx.memory_barrier()
-        self._program.report(groups, written)
+        program.report(groups, written)
 
     def run_counted(self, groups: moderngl.Buffer, *shared: Bindings, **own: Binding) -> None:
         """Runs as many workgroups (x, y, z; three uint32) as `groups` holds on the GPU, perhaps none; else as `run`.
 
         Nothing is read back, so the CPU does not wait until the GPU has counted.
         """
-        written = self._program.bind(shared, own)
-        self._compute.run_indirect(groups)
+        program = self._program(own, *shared)
+        written = program.bind(shared, own)
+        program.compute.run_indirect(groups)
         self._ctx.memory_barrier()
-        self._program.report((), written)
-
-    @property
-    def _compute(self) -> moderngl.ComputeShader:
-        program = self._program.program
-        assert isinstance(program, moderngl.ComputeShader)
-        return program
-
-    def resources(self) -> dict[str, list[str]]:
-        """Returns the names of the linked program's bindings, by kind."""
-        return self._program.resources()
-
-    def release(self) -> None:
-        """Frees the GL object."""
-        self._program.program.release()
+        program.report((), written)
 
 
-class RasterKernel:
+class RasterKernel(_Shader):
     """A vertex and a fragment shader of one name; draws with depth test into a framebuffer."""
 
     def __init__(self, gpu: GpuContext, name: str, **defines: float | str) -> None:
-        self._ctx = gpu.ctx
+        super().__init__(gpu, name, defines)
+
+    def _compiled(self, defines: Mapping[str, float | str]) -> _Program:
         vertex, fragment = (
-            shader_source(SHADERS / f"{name}.{stage}.glsl", defines) for stage in ("vert", "frag")
+            shader_source(SHADERS / f"{self._name}.{stage}.glsl", defines) for stage in ("vert", "frag")
         )
-        self.label = _label(name, defines)
-        gpu.compiled(self.label, {"vert": vertex, "frag": fragment})
-        program = gpu.ctx.program(vertex_shader=vertex, fragment_shader=fragment)
-        self._program = _Program(gpu, self.label, program, declarations(vertex + "\n" + fragment))
+        label = _label(self._name, defines)
+        self._gpu.compiled(label, {"vert": vertex, "frag": fragment})
+        program = self._ctx.program(vertex_shader=vertex, fragment_shader=fragment)
+        return _Program(self._gpu, label, program, declarations(vertex + "\n" + fragment))
 
     def draw(
         self,
@@ -350,30 +395,22 @@ class RasterKernel:
         Raises:
             BindingError: as `Kernel.run`.
         """
-        self._program.bind(shared, own)
+        linked = self._program(own, *shared)
+        linked.bind(shared, own)
         target.use()
         target.viewport = box or (0, 0, *target.size)
         target.scissor = box  # type: ignore[assignment]  # None lifts it, which the stubs do not know
         self._ctx.enable_only(moderngl.DEPTH_TEST)
         if clips:
             self._ctx.enable_direct(CLIP_DISTANCE0)
-        program = self._program.program
-        assert isinstance(program, moderngl.Program)
-        mesh.draw(program)
+        assert isinstance(linked.program, moderngl.Program)
+        mesh.draw(linked.program)
         if clips:
             self._ctx.disable_direct(CLIP_DISTANCE0)
         target.scissor = None  # type: ignore[assignment]  # or it would cut what is cleared next
         attachments = [*target.color_attachments, target.depth_attachment]
         written = {f"attachment {number}": item for number, item in enumerate(attachments)}
-        self._program.report((mesh.triangle_count,), written)
-
-    def resources(self) -> dict[str, list[str]]:
-        """Returns the names of the linked program's bindings, by kind."""
-        return self._program.resources()
-
-    def release(self) -> None:
-        """Frees the GL object."""
-        self._program.program.release()
+        linked.report((mesh.triangle_count,), written)
 
 
 def _label(name: str | Path, defines: Mapping[str, float | str]) -> str:

@@ -18,6 +18,7 @@ _VARIABLE = re.compile(
 _BLOCK = re.compile(
     r"((?:(?:readonly|writeonly|coherent|volatile|restrict)\s+)*)\b(buffer|uniform)\s+(\w+)\s*\{"
 )
+_SWITCH = re.compile(r"^\s*#\s*pragma\s+switch\s+(\w+)\s*$", re.MULTILINE)
 _LOCAL_SIZE = re.compile(r"\blocal_size_([xyz])\s*=\s*(\d+)")
 _WORD = re.compile(r"\b[A-Za-z_]\w*")
 _DIRECTIVE = re.compile(r"\s*#\s*(define|ifdef|ifndef|if|elif|else|endif)\b\s*(\w*)(?:[ \t]+(.*))?")
@@ -29,12 +30,13 @@ class Declarations:
 
     `names` are those of all variants; the rest is of the one that the defines leave: `formats` of images (layout
     qualifiers; none where it is written only and has no format), `written` images and storage blocks (all that are
-    not `readonly`).
+    not `readonly`), and `switches`: defines that the bindings of a run turn on (`#pragma switch NAME`).
     """
 
     names: frozenset[str]
     formats: Mapping[str, frozenset[str]]
     written: frozenset[str]
+    switches: tuple[str, ...]
     local_size: tuple[int, int, int]
 
 
@@ -82,7 +84,8 @@ def declarations(source: str) -> Declarations:
         written |= {name} if kind == "buffer" and "readonly" not in access else set()
     sizes = {axis: int(size) for axis, size in _LOCAL_SIZE.findall(text)}
     local_size = (sizes.get("x", 1), sizes.get("y", 1), sizes.get("z", 1))
-    return Declarations(frozenset(names), formats, frozenset(written), local_size)
+    switches = tuple(dict.fromkeys(_SWITCH.findall(text)))
+    return Declarations(frozenset(names), formats, frozenset(written), switches, local_size)
 
 
 def _variables(text: str) -> Iterator[tuple[str, str, str, str]]:

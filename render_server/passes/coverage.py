@@ -58,9 +58,9 @@ class SampleCoverage:
         self.surface.clear()
         self._sums.use()
         self._sums.clear()
-        for x, y in self._pattern:
-            offset = (x / STEPS, y / STEPS)
-            geometry.run(raster, mesh, view, scene, offset=offset, rectangle=in_raster)
+        for number, (x, y) in enumerate(self._pattern):
+            offset, blended = (x / STEPS, y / STEPS), number / len(self._pattern)
+            geometry.run(raster, mesh, view, scene, offset=offset, rectangle=in_raster, sample=blended)
             self._kernel.run(
                 in_picture[2:],
                 raster.bindings,

@@ -1,20 +1,25 @@
 """The camera's image, the meshes and their hierarchy, and the geometry buffers of the real and the virtual scene."""
 
-import cv2
+from collections.abc import Sequence
+from typing import Any
+
 import moderngl
 import numpy as np
-from jaxtyping import Float16, Float32, Float64, Int32, UInt8
+from jaxtyping import Float32, Float64, Int32, UInt8
 
+from protocol.errors import DeltalightError
 from protocol.frames import DepthImage, ViewFrame, decode_lut
 from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Binding, Bindings, Kernel, RasterKernel
 from render_server.gpu.textures import release_all, release_target, texture_2d
 from render_server.scene.bvh import Bvh, build_bvh
+from render_server.scene.materials import TextureMap, map_edge, map_table, resampled
 from render_server.scene.triangle_mesh import VERTEX_ATTRIBUTES, VERTEX_LAYOUT, GpuMesh
 from render_server.view import CameraView, Rectangle
 
 INVERSE_SIZE = 8192  # steps of the inverse response: a code is at least 16 of them wide
-TEXTURE_SIZE = 1024  # texels an edge of a base-colour texture
+ANISOTROPY = 8.0  # samples along the longer side of a pixel's footprint
+SECOND_UV = "in_second_uv"  # of the vertices of meshes that have one, in a buffer of its own
 UV, COLOR, MATERIAL = slice(6, 8), slice(8, 11), 11  # columns of a vertex
 METALLIC, REFLECTANCE, ROUGHNESS = (
     3,
@@ -105,15 +110,23 @@ def inverse_response(decode: Float32[np.ndarray, "256 3"]) -> Float32[np.ndarray
     return table
 
 
+NO_CUTOUTS: Bindings = {"CUTOUTS": False}
+
+
 class MeshBuffers:
-    """Vertex and index buffers that are rewritten when the mesh changes."""
+    """Vertex and index buffers that are rewritten when the mesh changes.
+
+    `cutouts` binds what tells where the mesh is not there (`MaterialTable`).
+    """
 
     def __init__(self, gpu: GpuContext) -> None:
         self._ctx = gpu.ctx
         self._vertices = gpu.ctx.buffer(reserve=4)
         self._indices = gpu.ctx.buffer(reserve=4)
+        self._second_uv: moderngl.Buffer | None = None
         self._arrays: dict[int, moderngl.VertexArray] = {}
         self.triangles: Int32[np.ndarray, "m 3"] = np.zeros((0, 3), np.int32)
+        self.cutouts = NO_CUTOUTS
 
     @property
     def triangle_count(self) -> int:
@@ -137,20 +150,31 @@ class MeshBuffers:
         if self.triangle_count:
             self._vertices.write(vertices)
             self._indices.write(indices)
+        self._write_second_uv(mesh.second_uv)
+
+    def _write_second_uv(self, uv: Float32[np.ndarray, "n 2"] | None) -> None:
+        if uv is None and self._second_uv is None:
+            return
+        release_all(*self._arrays.values(), self._second_uv)
+        self._arrays.clear()
+        self._second_uv = None if uv is None else self._ctx.buffer(np.ascontiguousarray(uv, np.float32))
 
     def draw(self, program: moderngl.Program) -> None:
         """Draws all triangles with `program`."""
         if not self.triangle_count:
             return
         if program.glo not in self._arrays:
-            layout = [(self._vertices, *_layout_of(program))]
+            layout: list[tuple[Any, ...]] = [(self._vertices, *_layout_of(program))]
+            if self._second_uv is not None and program.get(SECOND_UV, None) is not None:
+                layout.append((self._second_uv, "2f", SECOND_UV))
             self._arrays[program.glo] = self._ctx.vertex_array(program, layout, self._indices)
         self._arrays[program.glo].render(moderngl.TRIANGLES, vertices=3 * self.triangle_count)
 
     def release(self) -> None:
         """Frees all buffers."""
-        release_all(*self._arrays.values(), self._vertices, self._indices)
+        release_all(*self._arrays.values(), self._vertices, self._indices, self._second_uv)
         self._arrays.clear()
+        self._second_uv = None
 
 
 def _layout_of(program: moderngl.Program) -> tuple[str, ...]:
@@ -226,45 +250,96 @@ class ObjectBvh:
 
 
 class MaterialTable:
-    """Materials in a storage buffer, their base-colour textures in one array (common/materials.glsl).
+    """Materials in a storage buffer; if any has maps or alpha, their textures in two arrays (common/materials.glsl).
 
-    `smoothest` is the least roughness of those that reflect specularly, 1 if none does.
+    `smoothest` is the least roughness of those that reflect specularly, 1 if none does. `draws_maps`: false for the
+    real scene, of which the camera tells how it looks.
     """
 
-    def __init__(self, gpu: GpuContext, mesh: GpuMesh) -> None:
+    def __init__(self, gpu: GpuContext, mesh: GpuMesh, *, draws_maps: bool = True) -> None:
+        maps = [each for material in mesh.materials for each in material.maps if each is not None]
+        self._has_cutouts = draws_maps and any(material.alpha_mode for material in mesh.materials)
+        self._has_maps = draws_maps and (self._has_cutouts or bool(maps))
         self.smoothest = _smoothest(mesh)
-        self._buffer = gpu.ctx.buffer(np.ascontiguousarray(mesh.material_table, np.float32).tobytes())
-        size = TEXTURE_SIZE if mesh.textures else 1
-        self._textures = gpu.ctx.texture_array((size, size, max(len(mesh.textures), 1)), 4, dtype="f2")
-        for index, texture in enumerate(mesh.textures):
-            self._textures.write(_resampled(texture, size), viewport=(0, 0, index, size, size, 1))
-        self._textures.filter = (moderngl.LINEAR, moderngl.LINEAR)
+        self._colors = self._data = None
+        table = mesh.material_table
+        if self._has_maps:
+            self._colors = MapArray(gpu, [each for each in maps if each.is_color], "f2")
+            self._data = MapArray(gpu, [each for each in maps if not each.is_color], "f1")
+            table = np.hstack([table, map_table(mesh.materials, mesh.repeats_per_m(), self._layer)])
+        self._buffer = gpu.ctx.buffer(np.ascontiguousarray(table, np.float32).tobytes())
+
+    def _layer(self, each: TextureMap) -> int:
+        array = self._colors if each.is_color else self._data
+        assert array is not None
+        return array.layer(each)
 
     @property
     def bindings(self) -> dict[str, Binding]:
-        """Table and textures by GLSL name."""
-        return {"Materials": self._buffer, "base_color_textures": self._textures}
+        """Table and textures by GLSL name, and which of their features are used."""
+        return {
+            "Materials": self._buffer,
+            "color_maps": None if self._colors is None else self._colors.texture,
+            "data_maps": None if self._data is None else self._data.texture,
+            "MATERIAL_MAPS": self._has_maps,
+            "CUTOUTS": self._has_cutouts,
+        }
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_all(self._buffer, self._textures)
+        release_all(self._buffer, self._colors, self._data)
+
+
+class MapArray:
+    """Textures of one kind as layers of one array, with mip levels; each texture once.
+
+    All layers have the size of the largest texture, a power of 2, less if they would take too much
+    (`map_edge`).
+    """
+
+    def __init__(self, gpu: GpuContext, maps: Sequence[TextureMap], dtype: str) -> None:
+        unique = {(id(each.texels), each.is_nearest): each for each in maps}
+        self._layers = {key: layer for layer, key in enumerate(unique)}
+        limit = int(gpu.ctx.info["GL_MAX_ARRAY_TEXTURE_LAYERS"])
+        if len(unique) > limit:
+            raise DeltalightError(
+                f"the objects have {len(unique)} textures of one kind, and this GPU takes {limit}: use fewer."
+            )
+        size = map_edge(list(unique.values()), 4 * int(dtype[1]))
+        self.texture = gpu.ctx.texture_array((size, size, max(len(unique), 1)), 4, dtype=dtype)
+        for layer, each in enumerate(unique.values()):
+            data = resampled(each, size)
+            self.texture.write(data.tobytes(), viewport=(0, 0, layer, size, size, 1))
+        self.texture.build_mipmaps()
+        self.texture.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
+        if gpu.ctx.max_anisotropy > 1:
+            self.texture.anisotropy = min(ANISOTROPY, gpu.ctx.max_anisotropy)
+
+    def layer(self, each: TextureMap) -> int:
+        """Returns the layer of one of the maps."""
+        return self._layers[id(each.texels), each.is_nearest]
+
+    def release(self) -> None:
+        """Frees the texture."""
+        self.texture.release()
 
 
 def _smoothest(mesh: GpuMesh) -> float:
     table = mesh.material_table
     reflects = (table[:, METALLIC] > 0) | (table[:, REFLECTANCE] > 0).any(axis=1)
-    return float(min(table[reflects, ROUGHNESS], default=1.0))
+    darkest = np.array([_least_green(material.metallic_roughness_map) for material in mesh.materials])
+    return float(min((table[:, ROUGHNESS] * darkest)[reflects], default=1.0))
 
 
-def _resampled(texture: Float16[np.ndarray, "h w 3"], size: int) -> bytes:
-    """Returns the RGBA float16 bytes of a linear texture, area-averaged to size x size."""
-    resized = cv2.resize(texture.astype(np.float32), (size, size), interpolation=cv2.INTER_AREA)
-    rgba = np.dstack([resized, np.ones((size, size), np.float32)])
-    return rgba.astype(np.float16).tobytes()
+def _least_green(each: TextureMap | None) -> float:
+    return 1.0 if each is None else float(each.texels[..., 1].min()) / 255
 
 
 class GeometryBuffer:
-    """World position + depth (RGBA32F, w = 0: nothing), normal + material (RGBA16F), uv, vertex colour."""
+    """World position + depth (RGBA32F, w = 0: nothing), normal + material (RGBA16F), uv, vertex colour.
+
+    Of materials with maps, what these give stands in place of uv and vertex colour (common/shown_maps.glsl).
+    """
 
     def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
         self.size = size
@@ -311,14 +386,21 @@ class RasterGeometry:
         *,
         offset: tuple[float, float] = (0.0, 0.0),
         rectangle: Rectangle | None = None,
+        sample: float = 0.0,
     ) -> None:
         """Draws `mesh` as `view` sees it, sampled `offset` pixels from the texels' centres.
 
         `scene` brings the view's camera and the mesh's own materials. `rectangle` limits drawing to the texels that
-        can show the mesh; the others keep their contents.
+        can show the mesh; the others keep their contents. `sample`: which part 0..1 of what is blended shows here.
         """
         target.clear(rectangle)
-        self._kernel.draw(target.framebuffer, mesh, scene, clip_from_camera=view.clip_from_camera_at(offset))
+        self._kernel.draw(
+            target.framebuffer,
+            mesh,
+            scene,
+            clip_from_camera=view.clip_from_camera_at(offset),
+            blend_sample=sample,
+        )
 
     def release(self) -> None:
         """Frees the program."""

@@ -95,6 +95,7 @@ class ShadowMaps:
                 self._kernel.draw(
                     atlas.target,
                     mesh,
+                    mesh.cutouts,
                     box=atlas.box(tile),
                     clips=view.front is not None,
                     view_from_world=view.view_from_world,

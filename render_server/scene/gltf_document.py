@@ -2,6 +2,7 @@
 
 import base64
 import io
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from PIL import Image
 
 COMPONENT_TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+IMAGE_TYPES = {"image/png": "PNG", "image/jpeg": "JPEG", "image/webp": "WEBP"}
 COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 
 
@@ -93,23 +95,37 @@ class GltfDocument:
         replaced[places] = self._rows(sparse["values"], sparse["count"], rows.shape[1], rows.dtype)
         return replaced
 
-    def texture(self, index: int) -> "Image.Image | None":
-        """Opens the image of a texture without decoding it; None for unsupported kinds.
+    def image_of(self, texture: int) -> int | None:
+        """Returns the image of a texture; None for unsupported kinds."""
+        entry = self.root["textures"][texture]
+        webp = entry.get("extensions", {}).get("EXT_texture_webp", {})
+        source = webp.get("source", entry.get("source"))
+        return None if source is None else int(source)
+
+    def sampler(self, texture: int) -> dict[str, Any]:
+        """Returns the sampler of a texture; an empty one if it names none."""
+        index = self.root["textures"][texture].get("sampler")
+        return {} if index is None else dict(self.root["samplers"][index])
+
+    def image(self, index: int) -> "Image.Image":
+        """Opens an image without decoding it.
 
         Raises:
-            GltfFaultError: it is missing or no picture.
+            GltfFaultError: it is missing, no picture, or another kind of picture than it says.
         """
         from PIL import Image
 
-        texture = self.root["textures"][index]
-        webp = texture.get("extensions", {}).get("EXT_texture_webp", {})
-        source = webp.get("source", texture.get("source"))
-        if source is None:
-            return None
+        entry = self.root["images"][index]
         try:
-            return Image.open(io.BytesIO(self._image_bytes(self.root["images"][source])))
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # MAX_TEXTURE_PIXELS is lower
+                image = Image.open(io.BytesIO(self._image_bytes(entry)), formats=tuple(IMAGE_TYPES.values()))
         except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-            raise GltfFaultError(f"its image {source} cannot be read ({error})") from error
+            raise GltfFaultError(f"its image {index} cannot be read ({error})") from error
+        said = entry.get("mimeType")
+        if said is not None and IMAGE_TYPES.get(said) != image.format:
+            raise GltfFaultError(f"its image {index} is called {said} and holds {image.format}")
+        return image
 
     def _image_bytes(self, image: dict[str, Any]) -> bytes:
         if "uri" in image:

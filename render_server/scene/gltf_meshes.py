@@ -14,7 +14,7 @@ from protocol.errors import DeltalightError
 from render_server.scene.asset_check import read_gltf
 from render_server.scene.gltf_animation import Clip, read_clips
 from render_server.scene.gltf_document import GltfDocument, GltfFaultError, NodeTree, faults_named, read_nodes
-from render_server.scene.materials import Material
+from render_server.scene.materials import Material, TextureReader
 from render_server.scene.triangle_mesh import (
     MAX_COORDINATE_M,
     ConvertedMesh,
@@ -86,6 +86,7 @@ class PartReader:
     def __init__(self, gltf: GltfDocument, nodes: NodeTree) -> None:
         self._gltf = gltf
         self._nodes = nodes
+        self._textures = TextureReader(gltf)
         self._materials: dict[int | None, Material] = {}
         self._primitives: dict[tuple[int, int], ConvertedMesh | None] = {}
 
@@ -122,7 +123,7 @@ class PartReader:
         key = mesh, number
         if key not in self._primitives:
             material = self._material(primitive.get("material"))
-            given = _geometry(self._gltf, primitive)
+            given = _geometry(self._gltf, primitive, second_uv=material.has_second_uv)
             # What has no area in the mesh itself may have one when it is morphed.
             keeps = "targets" in primitive
             self._primitives[key] = (
@@ -132,8 +133,13 @@ class PartReader:
 
     def _material(self, index: int | None) -> Material:
         if index not in self._materials:
-            self._materials[index] = _material(self._gltf, index).checked(str(self._gltf.path))
+            self._materials[index] = self._read_material(index).checked(str(self._gltf.path))
         return self._materials[index]
+
+    def _read_material(self, index: int | None) -> Material:
+        if index is None:
+            return Material(base_color=np.ones(3, np.float32), name="default")
+        return Material.from_gltf(self._gltf.root["materials"][index], self._textures)
 
     def _skin(self, skin: dict[str, Any], primitive: dict[str, Any], made: ConvertedMesh) -> Skin:
         joints = np.array(skin["joints"], np.int64)
@@ -149,16 +155,8 @@ class PartReader:
         return Skin(joints, joint_from_mesh, weights)
 
 
-def _material(gltf: GltfDocument, index: int | None) -> Material:
-    if index is None:
-        return Material(base_color=np.ones(3, np.float32), name="default")
-    description = gltf.root["materials"][index]
-    texture = description.get("pbrMetallicRoughness", {}).get("baseColorTexture")
-    return Material.from_gltf(description, None if texture is None else gltf.texture(texture["index"]))
-
-
-def _geometry(gltf: GltfDocument, primitive: dict[str, Any]) -> FileGeometry | None:
-    """Returns the geometry of a primitive; None for points and lines."""
+def _geometry(gltf: GltfDocument, primitive: dict[str, Any], *, second_uv: bool) -> FileGeometry | None:
+    """Returns the geometry of a primitive; None for points and lines. `second_uv`: with that set too."""
     mode = primitive.get("mode", _TRIANGLES)
     if mode not in (_TRIANGLES, _STRIP, _FAN):
         return None
@@ -169,8 +167,9 @@ def _geometry(gltf: GltfDocument, primitive: dict[str, Any]) -> FileGeometry | N
         positions,
         _triangles(gltf, primitive, mode, count),
         _attribute(gltf, attributes, "NORMAL", count, 3),
-        _uv(gltf, attributes, count),
+        _uv(gltf, attributes, "TEXCOORD_0", count),
         _attribute(gltf, attributes, "COLOR_0", count, 3),
+        _uv(gltf, attributes, "TEXCOORD_1", count) if second_uv else None,
     )
 
 
@@ -205,8 +204,10 @@ def _attribute(
     return (rows[:, :columns] / np.float32(scale)).astype(np.float32)
 
 
-def _uv(gltf: GltfDocument, attributes: dict[str, int], count: int) -> Float32[np.ndarray, "n 2"] | None:
-    uv = _attribute(gltf, attributes, "TEXCOORD_0", count, 2)
+def _uv(
+    gltf: GltfDocument, attributes: dict[str, int], name: str, count: int
+) -> Float32[np.ndarray, "n 2"] | None:
+    uv = _attribute(gltf, attributes, name, count, 2)
     return uv if uv is not None and np.isfinite(uv).all() else None
 
 

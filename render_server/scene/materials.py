@@ -1,28 +1,79 @@
-"""Surface materials of virtual and modelled real objects, from scene documents and asset files."""
+"""Surface materials of virtual and modelled real objects, and their textures, from scenes and asset files."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from enum import IntEnum
 from typing import Any, Self
 
+import cv2
 import numpy as np
-from jaxtyping import Float16, Float32
+from jaxtyping import Float16, Float32, Shaped, UInt8
 from PIL import Image
 
 from protocol.errors import DeltalightError
 from protocol.frames import decode_lut
 from protocol.scene_objects import Material as MaterialDocument
+from render_server.scene.gltf_document import GltfDocument, GltfFaultError
 
 MAX_TEXTURE_PIXELS = 64_000_000
+MAX_FILE_PIXELS = 512_000_000  # of all pictures of a file that are decoded
+MAX_TEXTURE_EDGE = 1024  # texels that are kept of a picture's longer edge
+MAP_BYTES = 512 << 20  # of all texels of one kind, mip levels left out; beyond, textures lose resolution
 MATERIAL_FLOATS = 16
+_DECODED_ROWS = 1 << 20  # pixels that are made linear at a time
+_MASK_SLOPE = 8.0  # of the coverage that an alpha mask becomes, over alpha
+
+
+class Wrap(IntEnum):
+    """What is beyond a texture's edge."""
+
+    REPEAT = 0
+    CLAMP = 1
+    MIRROR = 2
+
+
+class AlphaMode(IntEnum):
+    """What alpha means (glTF 2.0, section 3.9.4)."""
+
+    OPAQUE = 0
+    MASK = 1
+    BLEND = 2
+
+
+_WRAPS = {10497: Wrap.REPEAT, 33071: Wrap.CLAMP, 33648: Wrap.MIRROR}
+_NEAREST = 9728
+
+
+@dataclass(frozen=True, eq=False)
+class TextureMap:
+    """A texture and how it lies on a surface (glTF 2.0, sections 3.8.2 and 5.29; KHR_texture_transform).
+
+    `texels`: linear R G B or R G B A of a colour (float16), or R G B of data (bytes); row 0 is the top, uv (0, 0) its
+    top-left corner. `from_uv` maps (u, v, 1) of the vertices' set `uv_set` to the texture's own coordinates.
+    `strength` scales a normal's tilt, or weighs occlusion.
+    """
+
+    texels: Shaped[np.ndarray, "h w c"]
+    uv_set: int = 0
+    from_uv: Float32[np.ndarray, "2 3"] = field(default_factory=lambda: np.eye(2, 3, dtype=np.float32))
+    wraps: tuple[Wrap, Wrap] = (Wrap.REPEAT, Wrap.REPEAT)
+    is_nearest: bool = False
+    strength: float = 1.0
+
+    @property
+    def is_color(self) -> bool:
+        """Whether it holds colours, not data."""
+        return self.texels.dtype == np.float16
 
 
 @dataclass(frozen=True, eq=False)
 class Material:
     """Metallic/roughness surface of the Disney BRDF with GGX microfacets; reflectances are linear.
 
-    `specular`: F0 = 0.08 specular, which `ior` overrides. `emission` is a radiance in camera units.
-    `base_color_texture` is linear, row 0 at the top (uv (0, 0) is its top-left corner), and multiplies
-    `base_color`. `roughness` is perceptual (alpha = roughness squared).
+    `specular`: F0 = 0.08 specular, which `ior` overrides; `f0_tint` multiplies either. `emission` is a radiance in
+    camera units. `roughness` is perceptual (alpha = roughness squared). Maps multiply the values that they are named
+    after: roughness by green, metallic by blue. `alpha` multiplies that of the base colour's map.
     """
 
     base_color: Float32[np.ndarray, "3"] = field(default_factory=lambda: np.full(3, 0.8, np.float32))
@@ -30,16 +81,45 @@ class Material:
     roughness: float = 0.5
     specular: float = 0.5
     ior: float | None = None
+    f0_tint: Float32[np.ndarray, "3"] = field(default_factory=lambda: np.ones(3, np.float32))
     emission: Float32[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3, np.float32))
     transmission: float = 0.0
     double_sided: bool = False
-    base_color_texture: Float16[np.ndarray, "h w 3"] | None = None
+    alpha_mode: AlphaMode = AlphaMode.OPAQUE
+    alpha: float = 1.0
+    base_color_map: TextureMap | None = None
+    metallic_roughness_map: TextureMap | None = None
+    normal_map: TextureMap | None = None
+    occlusion_map: TextureMap | None = None
+    emissive_map: TextureMap | None = None
     name: str = ""
 
     @property
-    def dielectric_f0(self) -> float:
+    def maps(self) -> tuple[TextureMap | None, ...]:
+        """Its maps, in the order of the shaders' table."""
+        return (
+            self.base_color_map,
+            self.metallic_roughness_map,
+            self.normal_map,
+            self.occlusion_map,
+            self.emissive_map,
+        )
+
+    @property
+    def has_second_uv(self) -> bool:
+        """Whether any of its maps lies on the second set of texture coordinates."""
+        return any(each is not None and each.uv_set == 1 for each in self.maps)
+
+    @property
+    def base_color_texture(self) -> Float16[np.ndarray, "h w 3"] | None:
+        """The linear colours of the base colour's map."""
+        return None if self.base_color_map is None else self.base_color_map.texels[..., :3]
+
+    @property
+    def dielectric_f0(self) -> Float32[np.ndarray, "3"]:
         """Reflectance at normal incidence of the dielectric part."""
-        return 0.08 * self.specular if self.ior is None else ((self.ior - 1) / (self.ior + 1)) ** 2
+        plain = 0.08 * self.specular if self.ior is None else ((self.ior - 1) / (self.ior + 1)) ** 2
+        return np.minimum(plain * self.f0_tint, 1.0).astype(np.float32)
 
     @property
     def f0(self) -> Float32[np.ndarray, "3"]:
@@ -61,27 +141,64 @@ class Material:
         )
 
     @classmethod
-    def from_gltf(cls, description: dict[str, Any], base_color: Image.Image | None) -> Self:
-        """Makes a material from an entry of a glTF document's `materials` and its decoded texture.
+    def from_gltf(cls, description: dict[str, Any], textures: "TextureReader") -> Self:
+        """Makes a material from an entry of a glTF document's `materials`.
 
-        Roughness and metallic textures are left out: their factors alone count.
+        Raises:
+            GltfFaultError: a texture cannot be used.
         """
         pbr = description.get("pbrMetallicRoughness", {})
         extensions = description.get("extensions", {})
         strength = extensions.get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0)
-        specular = extensions.get("KHR_materials_specular", {}).get("specularFactor", 1.0)
+        specular = extensions.get("KHR_materials_specular", {})
         transmission = extensions.get("KHR_materials_transmission", {}).get("transmissionFactor", 0.0)
-        return cls(
-            base_color=np.array(pbr.get("baseColorFactor", [1, 1, 1, 1])[:3], np.float32),
+        color = np.array(pbr.get("baseColorFactor", [1, 1, 1, 1]), np.float32)
+        material = cls(
+            base_color=color[:3],
             metallic=float(pbr.get("metallicFactor", 1.0)),
             roughness=float(pbr.get("roughnessFactor", 1.0)),
-            specular=0.5 * float(specular),
             ior=extensions.get("KHR_materials_ior", {}).get("ior"),
+            f0_tint=_f0_tint(specular),
             emission=np.array(description.get("emissiveFactor", [0, 0, 0]), np.float32) * float(strength),
             transmission=float(transmission),
             double_sided=bool(description.get("doubleSided", False)),
-            base_color_texture=None if base_color is None else linear_texture(base_color),
+            metallic_roughness_map=textures.data(pbr.get("metallicRoughnessTexture")),
+            normal_map=textures.data(description.get("normalTexture"), "scale"),
+            occlusion_map=textures.data(description.get("occlusionTexture"), "strength"),
+            emissive_map=textures.color(description.get("emissiveTexture")),
             name=str(description.get("name", "")),
+        )
+        mode = AlphaMode[description.get("alphaMode", "OPAQUE")]
+        base_map = textures.color(pbr.get("baseColorTexture"), with_alpha=mode != AlphaMode.OPAQUE)
+        material = replace(material, base_color_map=base_map)
+        material = material._with_alpha(mode, float(color[3]), float(description.get("alphaCutoff", 0.5)))
+        return material._unlit() if "KHR_materials_unlit" in extensions else material
+
+    def _with_alpha(self, mode: AlphaMode, factor: float, cutoff: float) -> Self:
+        """Returns the material with its alpha; a mask becomes coverage, one half at the cutoff.
+
+        So the map's mip levels hold the fraction of the surface that is there.
+        """
+        if mode != AlphaMode.MASK or self.base_color_map is None:
+            is_there = mode != AlphaMode.MASK or factor >= cutoff
+            return replace(self, alpha_mode=mode, alpha=min(factor, 1.0) * is_there if mode else 1.0)
+        texels = self.base_color_map.texels.copy()
+        texels[..., 3] = np.clip(0.5 + (texels[..., 3] * factor - cutoff) * _MASK_SLOPE, 0, 1)
+        return replace(self, alpha_mode=mode, base_color_map=replace(self.base_color_map, texels=texels))
+
+    def _unlit(self) -> Self:
+        """Returns the material that glows with its base colour instead of being lit (KHR_materials_unlit)."""
+        return replace(
+            self,
+            base_color=np.zeros(3, np.float32),
+            metallic=0.0,
+            roughness=1.0,
+            f0_tint=np.zeros(3, np.float32),
+            emission=self.base_color,
+            emissive_map=self.base_color_map,
+            metallic_roughness_map=None,
+            normal_map=None,
+            occlusion_map=None,
         )
 
     @classmethod
@@ -98,7 +215,7 @@ class Material:
             roughness=float(np.sqrt(np.sqrt(2 / (exponent + 2)))),
             specular=0.5 if shiny else 0.0,
             emission=np.array(_floats(keys.get("ke"), (0.0, 0.0, 0.0)), np.float32),
-            base_color_texture=None if image is None else linear_texture(image),
+            base_color_map=None if image is None else TextureMap(linear_texture(image)),
             name=name,
         )
 
@@ -108,8 +225,9 @@ class Material:
         Raises:
             DeltalightError: a value is not finite or negative; `place` names the file.
         """
-        numbers = np.array([*self.base_color, *self.emission, self.metallic, self.roughness, self.ior or 1.0])
-        if numbers.shape != (9,) or not np.isfinite(numbers).all() or (numbers < 0).any():
+        scalars = self.metallic, self.roughness, 1.0 if self.ior is None else self.ior, self.alpha
+        numbers = np.array([*self.base_color, *self.emission, *self.f0_tint, *scalars])
+        if numbers.shape != (13,) or not np.isfinite(numbers).all() or (numbers < 0).any():
             raise DeltalightError(
                 f"{place}: the material `{self.name}` has a value below 0 or not finite; correct it."
             )
@@ -119,6 +237,12 @@ class Material:
             metallic=min(self.metallic, 1.0),
             roughness=min(self.roughness, 1.0),
         )
+
+
+def _f0_tint(specular: dict[str, Any]) -> Float32[np.ndarray, "3"]:
+    """Returns what KHR_materials_specular makes of the reflectance at normal incidence."""
+    color = np.array(specular.get("specularColorFactor", [1, 1, 1]), np.float32)
+    return np.asarray(color * np.float32(specular.get("specularFactor", 1.0)))
 
 
 def _floats(value: Any, default: tuple[float, ...]) -> tuple[float, ...]:  # noqa: ANN401 - as in the file
@@ -133,34 +257,204 @@ def _first(value: Any, default: float) -> float:  # noqa: ANN401 - as in the fil
     return default if value is None else float(np.atleast_1d(value)[0])
 
 
-def linear_texture(image: Image.Image) -> Float16[np.ndarray, "h w 3"]:
-    """Decodes an sRGB picture to linear R G B.
+def linear_texture(image: Image.Image, *, with_alpha: bool = False) -> Float16[np.ndarray, "h w c"]:
+    """Decodes an sRGB picture to linear R G B [A], of at most MAX_TEXTURE_EDGE texels an edge.
 
     Raises:
-        DeltalightError: it has more than 64 million pixels or cannot be decoded.
+        ValueError: it has more than 64 million pixels or cannot be decoded.
     """
+    decode = decode_lut(None)[:, 0]
+    codes = _codes(image, "RGBA" if with_alpha else "RGB")
+
+    def linear(part: UInt8[np.ndarray, "h w c"]) -> Float32[np.ndarray, "h w c"]:
+        values = decode[part]
+        values[..., 3:] = part[..., 3:] / np.float32(255)
+        return values
+
+    return _reduced(codes, linear).astype(np.float16)
+
+
+def data_texture(image: Image.Image) -> UInt8[np.ndarray, "h w 3"]:
+    """Decodes a picture of numbers to bytes R G B, of at most MAX_TEXTURE_EDGE texels an edge.
+
+    Raises:
+        ValueError: as `linear_texture`.
+    """
+    mean = _reduced(_codes(image, "RGB"), lambda part: part.astype(np.float32))
+    return np.asarray(np.round(mean), np.uint8)
+
+
+def _codes(image: Image.Image, mode: str) -> UInt8[np.ndarray, "h w c"]:
     if image.width * image.height > MAX_TEXTURE_PIXELS:
-        raise DeltalightError(f"a texture of {image.width}x{image.height} pixels is too large; reduce it.")
+        raise ValueError(f"a texture of {image.width}x{image.height} pixels is too large")
     try:
-        codes = np.asarray(image.convert("RGB"))
+        return np.asarray(image.convert(mode))
     except (OSError, SyntaxError, ValueError) as error:
-        raise DeltalightError(f"a texture cannot be decoded ({error}); export the mesh again.") from error
-    return np.asarray(decode_lut(None)[:, 0].astype(np.float16)[codes])
+        raise ValueError(f"a texture cannot be decoded: {error}") from error
+
+
+def _reduced(
+    codes: UInt8[np.ndarray, "h w c"], linear: Callable[[np.ndarray], Float32[np.ndarray, "h w c"]]
+) -> Float32[np.ndarray, "k l c"]:
+    """Averages the `linear` values of a large picture; first by whole pixels, some rows at a time."""
+    height, width, channels = codes.shape
+    by = max(1, max(height, width) // MAX_TEXTURE_EDGE)
+    by = min(by, height, width)
+    rows = max(1, _DECODED_ROWS // (by * width))
+    parts = []
+    for first in range(0, height // by, rows):
+        part = codes[first * by : min(first + rows, height // by) * by, : width // by * by]
+        blocks = linear(part).reshape(-1, by, width // by, by, channels)
+        parts.append(blocks.mean(axis=(1, 3)) if by > 1 else blocks[:, 0, :, 0])
+    values = np.concatenate(parts)
+    scale = MAX_TEXTURE_EDGE / max(values.shape[:2])
+    if scale >= 1:
+        return values
+    size = max(1, round(values.shape[1] * scale)), max(1, round(values.shape[0] * scale))
+    return np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_AREA)).reshape(*size[::-1], channels)
+
+
+class TextureReader:
+    """Decodes the pictures of a glTF document, each once for a use; their pixels are counted."""
+
+    def __init__(self, gltf: GltfDocument) -> None:
+        self._gltf = gltf
+        self._pixels = 0
+        self._decoded: dict[tuple[int, str], Shaped[np.ndarray, "h w c"] | None] = {}
+
+    def color(self, info: dict[str, Any] | None, *, with_alpha: bool = False) -> TextureMap | None:
+        """Returns the map that a `textureInfo` describes, of colours; None if there is none that can be read.
+
+        Raises:
+            GltfFaultError: its picture is damaged or too large, or its place on the surface unknown.
+        """
+        kind = "color and alpha" if with_alpha else "color"
+        return self._map(info, kind, lambda image: linear_texture(image, with_alpha=with_alpha))
+
+    def data(self, info: dict[str, Any] | None, strength: str = "") -> TextureMap | None:
+        """Returns the map that a `textureInfo` describes, of data; `strength` is the key of its weight.
+
+        Raises:
+            GltfFaultError: as `color`.
+        """
+        found = self._map(info, "data", data_texture)
+        if found is None or info is None:
+            return found
+        weight = float(info.get(strength, 1.0))
+        if not math.isfinite(weight):
+            raise GltfFaultError(f"a texture has the {strength} {weight}")
+        return replace(found, strength=weight)
+
+    def _map(
+        self,
+        info: dict[str, Any] | None,
+        kind: str,
+        decode: Callable[[Image.Image], Shaped[np.ndarray, "h w c"]],
+    ) -> TextureMap | None:
+        if info is None:
+            return None
+        texels = self._texels(info["index"], kind, decode)
+        if texels is None:
+            return None
+        transform = info.get("extensions", {}).get("KHR_texture_transform", {})
+        uv_set = transform.get("texCoord", info.get("texCoord", 0))
+        if uv_set not in (0, 1):
+            raise GltfFaultError(f"a texture lies on texture coordinates {uv_set}, and only 0 and 1 are read")
+        sampler = self._gltf.sampler(info["index"])
+        wraps = tuple(_WRAPS[sampler.get(key, 10497)] for key in ("wrapS", "wrapT"))
+        is_nearest = sampler.get("magFilter") == _NEAREST
+        return TextureMap(texels, uv_set, _uv_matrix(transform), (wraps[0], wraps[1]), is_nearest)
+
+    def _texels(
+        self, texture: int, kind: str, decode: Callable[[Image.Image], Shaped[np.ndarray, "h w c"]]
+    ) -> Shaped[np.ndarray, "h w c"] | None:
+        source = self._gltf.image_of(texture)
+        if source is None:
+            return None
+        key = source, kind
+        if key not in self._decoded:
+            image = self._gltf.image(source)
+            self._pixels += image.width * image.height
+            if self._pixels > MAX_FILE_PIXELS:
+                raise GltfFaultError(f"its textures have more than {MAX_FILE_PIXELS // 10**6} million pixels")
+            try:
+                self._decoded[key] = decode(image)
+            except ValueError as error:
+                raise GltfFaultError(f"image {source}: {error}") from error
+        return self._decoded[key]
+
+
+def _uv_matrix(transform: dict[str, Any]) -> Float32[np.ndarray, "2 3"]:
+    """Returns offset * rotation * scale of KHR_texture_transform.
+
+    Rotation is counter-clockwise where v points down, as the extension says in words and all viewers have it; its
+    GLSL sample turns the other way (KhronosGroup/glTF issue 1563).
+    """
+    x, y = transform.get("scale", (1.0, 1.0))
+    cosine, sine = math.cos(transform.get("rotation", 0.0)), math.sin(transform.get("rotation", 0.0))
+    u, v = transform.get("offset", (0.0, 0.0))
+    matrix = np.array([[cosine * x, sine * y, u], [-sine * x, cosine * y, v]], np.float32)
+    if not np.isfinite(matrix).all():
+        raise GltfFaultError("a KHR_texture_transform is not finite")
+    return matrix
 
 
 def material_table(materials: Sequence[Material]) -> Float32[np.ndarray, "k 16"]:
     """Packs materials for a shader, four vectors each.
 
-    (base color, metallic), (dielectric F0 three times, roughness), (emission, transmission),
-    (double sided 0/1, index of the texture among those that have one or -1, 0, 0).
+    (base color, metallic), (dielectric F0, roughness), (emission, transmission), (double sided 0/1, 0, 0, 0).
     """
     table = np.zeros((len(materials), MATERIAL_FLOATS), np.float32)
-    textures = 0
     for row, material in zip(table, materials, strict=True):
-        has_texture = material.base_color_texture is not None
         row[0:4] = *material.base_color, material.metallic
-        row[4:8] = *([material.dielectric_f0] * 3), material.roughness
+        row[4:8] = *material.dielectric_f0, material.roughness
         row[8:12] = *material.emission, material.transmission
-        row[12:14] = material.double_sided, textures if has_texture else -1
-        textures += has_texture
+        row[12] = material.double_sided
     return table
+
+
+def map_table(
+    materials: Sequence[Material],
+    repeats_per_m: Float32[np.ndarray, " k"],
+    layer_of: Callable[[TextureMap], int],
+) -> Float32[np.ndarray, "k 64"]:
+    """Packs alpha and maps for a shader, sixteen vectors each, behind the rows of `material_table`.
+
+    (alpha mode, alpha, repeats of the base colour's map a metre, 0); for each map (row of u, layer or -1),
+    (row of v, set of coordinates), (wraps, across + 3 down; columns and rows of an unfiltered texture, else 0;
+    strength).
+    """
+    table = np.zeros((len(materials), 4 + 12 * len(Material().maps)), np.float32)
+    table[:, 7::12] = -1
+    for row, material, repeats in zip(table, materials, repeats_per_m, strict=True):
+        row[:3] = material.alpha_mode, material.alpha, repeats
+        for place, each in enumerate(material.maps):
+            if each is not None:
+                row[4 + 12 * place :][:12] = _map_entry(each, layer_of(each))
+    return table
+
+
+def _map_entry(each: TextureMap, layer: int) -> tuple[float, ...]:
+    height, width = each.texels.shape[:2] if each.is_nearest else (0, 0)
+    wraps = float(each.wraps[0] + 3 * each.wraps[1])
+    return (*each.from_uv[0], layer, *each.from_uv[1], each.uv_set, wraps, width, height, each.strength)
+
+
+def map_edge(maps: Sequence[TextureMap], texel_bytes: int) -> int:
+    """Returns the edge of the layers that hold the maps, texels."""
+    longest = max((max(each.texels.shape[:2]) for each in maps), default=1)
+    edge = min(1 << (longest - 1).bit_length(), MAX_TEXTURE_EDGE)
+    while len(maps) * edge * edge * texel_bytes > MAP_BYTES:
+        edge //= 2
+    return edge
+
+
+def resampled(each: TextureMap, size: int) -> Shaped[np.ndarray, "n n 4"]:
+    """Returns a map's texels at size x size: averaged over areas, or interpolated, unless it is unfiltered."""
+    texels = each.texels.astype(np.float32)
+    grows = size > min(texels.shape[:2])
+    enlarging = cv2.INTER_NEAREST if each.is_nearest else cv2.INTER_LINEAR
+    resized = cv2.resize(texels, (size, size), interpolation=enlarging if grows else cv2.INTER_AREA)
+    rgba = np.full((size, size, 4), 1.0 if each.is_color else 255.0, np.float32)
+    rgba[..., : texels.shape[2]] = resized.reshape(size, size, -1)
+    return rgba.astype(np.float16) if each.is_color else np.round(rgba).astype(np.uint8)

@@ -147,7 +147,7 @@ class TriangleMesh:
     """Triangles of one material, counter-clockwise seen from outside.
 
     `normals` are unit vectors. `uv` (0, 0) is the top-left corner of the texture array. `colors` are linear
-    R G B that multiply the material's base colour.
+    R G B that multiply the material's base colour. `second_uv` is what maps of set 1 lie on.
     """
 
     positions: Float32[np.ndarray, "n 3"]
@@ -156,6 +156,7 @@ class TriangleMesh:
     uv: Float32[np.ndarray, "n 2"] | None
     material: Material
     colors: Float32[np.ndarray, "n 3"] | None = None
+    second_uv: Float32[np.ndarray, "n 2"] | None = None
 
     def bounds(self) -> Float32[np.ndarray, "2 3"]:
         """Returns the least and greatest coordinates of the vertices that triangles use."""
@@ -186,6 +187,7 @@ class FileGeometry:
     normals: Float32[np.ndarray, "n 3"] | None = None
     uv: Float32[np.ndarray, "n 2"] | None = None
     colors: Float32[np.ndarray, "n 3"] | None = None
+    second_uv: Float32[np.ndarray, "n 2"] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,6 +230,7 @@ def converted(
         None if given.uv is None else given.uv[source],
         material,
         None if given.colors is None else given.colors[source],
+        None if given.second_uv is None else given.second_uv[source],
     )
     return ConvertedMesh(mesh, source, smoothing)
 
@@ -267,6 +270,7 @@ def joined(parts: Sequence[TriangleMesh]) -> TriangleMesh:
         _joined_attribute([part.uv for part in parts], parts, 0.0),
         parts[0].material,
         _joined_attribute([part.colors for part in parts], parts, 1.0),
+        _joined_attribute([part.second_uv for part in parts], parts, 0.0),
     )
 
 
@@ -303,15 +307,32 @@ class GpuMesh:
     """Several meshes in one vertex buffer.
 
     A row of `vertices` is position 3, normal 3, uv 2, colour 3, material index 1 (`VERTEX_LAYOUT`).
-    For `material_table` see `materials.material_table`; `textures` are the base-colour textures in the order of its
-    texture indices.
+    For `material_table` see `materials.material_table`. `second_uv` is None if no vertex has one.
     """
 
     vertices: Float32[np.ndarray, "n 12"]
     triangles: Int32[np.ndarray, "m 3"]
     materials: tuple[Material, ...]
     material_table: Float32[np.ndarray, "k 16"]
-    textures: tuple[np.ndarray, ...]
+    second_uv: Float32[np.ndarray, "n 2"] | None
+
+    def repeats_per_m(self) -> Float32[np.ndarray, " k"]:
+        """Returns how often the base colour's map repeats over a metre of each material's triangles, on average."""
+        corners = self.vertices[self.triangles].astype(np.float64)
+        edges, turns = (corners[:, 1:, part] - corners[:, :1, part] for part in (slice(0, 3), slice(6, 8)))
+        material = corners[:, 0, 11].astype(int)
+        area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+        sums = [
+            np.bincount(material, each, len(self.materials)) for each in (np.abs(np.linalg.det(turns)), area)
+        ]
+        scale = np.array([_map_area(each) for each in self.materials])
+        return np.sqrt(scale * sums[0] / np.maximum(sums[1], 1e-30)).astype(np.float32)
+
+
+def _map_area(material: Material) -> float:
+    """Returns the area of the base colour's map that a unit of texture coordinates covers."""
+    placed = material.base_color_map
+    return 1.0 if placed is None else abs(float(np.linalg.det(placed.from_uv[:, :2])))
 
 
 def merge_for_gpu(meshes: Sequence[TriangleMesh]) -> GpuMesh:
@@ -323,13 +344,12 @@ def merge_for_gpu(meshes: Sequence[TriangleMesh]) -> GpuMesh:
     if not meshes:
         raise DeltalightError("there is no mesh to draw; give the scene an object.")
     materials = tuple(mesh.material for mesh in meshes)
-    textures = [material.base_color_texture for material in materials]
     return GpuMesh(
         np.concatenate([_interleaved(mesh, index) for index, mesh in enumerate(meshes)]),
         joined_triangles([mesh.triangles for mesh in meshes], [len(mesh.positions) for mesh in meshes]),
         materials,
         material_table(materials),
-        tuple(texture for texture in textures if texture is not None),
+        _joined_attribute([mesh.second_uv for mesh in meshes], meshes, 0.0),
     )
 
 

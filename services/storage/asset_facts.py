@@ -49,15 +49,20 @@ def _material_facts(meshes: Sequence["TriangleMesh"]) -> Facts:
     material, color = mesh.material, np.asarray(mesh.material.base_color, np.float64)
     if material.base_color_texture is not None:
         color = color * material.base_color_texture.mean(axis=(0, 1), dtype=np.float64)
+    rough_metal, emission = np.ones(2), np.asarray(material.emission, np.float64)
+    if material.metallic_roughness_map is not None:
+        rough_metal = material.metallic_roughness_map.texels[..., 1:].mean(axis=(0, 1)) / 255
+    if material.emissive_map is not None:
+        emission = emission * material.emissive_map.texels[..., :3].mean(axis=(0, 1), dtype=np.float64)
     if mesh.colors is not None:
         color = color * mesh.colors.mean(axis=0)
     return {
         "base_color": _rounded(np.clip(color, 0, 1)),
-        "metallic": round(float(material.metallic), 4),
-        "roughness": round(float(material.roughness), 4),
-        "specular": round(float(material.specular), 4),
+        "metallic": round(float(material.metallic * rough_metal[1]), 4),
+        "roughness": round(float(material.roughness * rough_metal[0]), 4),
+        "specular": round(float(material.specular * material.f0_tint.mean()), 4),
         "ior": None if material.ior is None else round(float(material.ior), 4),
-        "emission": _rounded(material.emission),
+        "emission": _rounded(emission),
         "transmission": round(float(material.transmission), 4),
     }
 

@@ -114,7 +114,11 @@ class _Shot:
             color = color * _mixed(mesh.colors, corners, weights)
         if mesh.uv is not None and mesh.material.base_color_texture is not None:
             color = color * _texels(mesh.material.base_color_texture, _mixed(mesh.uv, corners, weights))
-        return np.asarray(color * light + mesh.material.emission, np.float32)
+        glow = np.broadcast_to(mesh.material.emission, normals.shape)
+        if mesh.uv is not None and mesh.material.emissive_map is not None:
+            texels = mesh.material.emissive_map.texels[..., :3]
+            glow = glow * _texels(texels, _mixed(mesh.uv, corners, weights))
+        return np.asarray(color * light + glow, np.float32)
 
 
 _Z_FROM_Y = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], np.float32)

@@ -9,7 +9,7 @@ from PIL import Image
 
 from protocol.errors import DeltalightError
 from protocol.scene_objects import Material as MaterialDocument
-from render_server.scene.materials import Material
+from render_server.scene.materials import Material, TextureMap
 from render_server.scene.mesh_loading import load_mesh
 from render_server.scene.triangle_mesh import TriangleMesh, merge_for_gpu, split_triangles
 
@@ -130,7 +130,7 @@ def test_gltf_nodes_are_placed_and_mirrored_without_turning_inside_out(tmp_path:
     assert (material.metallic, material.roughness, material.name) == (0.25, 0.75, "painted")
     assert material.emission == pytest.approx([4, 2, 8])
     assert material.transmission == 0.5
-    assert material.dielectric_f0 == pytest.approx(1 / 9)
+    assert material.dielectric_f0 == pytest.approx(np.full(3, 1 / 9))
     assert material.f0 == pytest.approx(np.full(3, 0.75 / 9 + 0.25))
 
 
@@ -270,7 +270,7 @@ def test_material_of_the_document_replaces_all() -> None:
 def test_merging_keeps_every_triangle_and_its_material() -> None:
     texture = np.ones((2, 2, 3), np.float16)
     textured = Material(
-        base_color=np.array([1, 0, 0], np.float32), base_color_texture=texture, double_sided=True
+        base_color=np.array([1, 0, 0], np.float32), base_color_map=TextureMap(texture), double_sided=True
     )
     merged = merge_for_gpu([triangle(), triangle(material=textured, uv=np.full((3, 2), 0.25, np.float32))])
     assert merged.vertices.shape == (6, 12)
@@ -278,10 +278,9 @@ def test_merging_keeps_every_triangle_and_its_material() -> None:
     assert merged.vertices[:, 11].tolist() == [0, 0, 0, 1, 1, 1]
     assert merged.vertices[3:, 6:8].min() == 0.25
     assert merged.vertices[:, 8:11].min() == 1
-    assert merged.material_table[:, 13].tolist() == [-1, 0]
     assert merged.material_table[1, :3].tolist() == [1, 0, 0]
     assert merged.material_table[:, 12].tolist() == [0, 1]
-    assert len(merged.textures) == 1
+    assert merged.second_uv is None
 
 
 def area(corners: np.ndarray) -> float:

@@ -58,12 +58,21 @@ Spot spot_at(LightView view, ivec2 texel) {
     return spot;
 }
 
-bool is_wanted(int material) {
+#ifdef MATERIAL_MAPS
+bool is_wanted(ivec2 texel, int material) {
+    vec4 uv = texelFetch(virtual_light_uv, texel, 0);
+    Material m = material_of(material, uv.xy, unpack_color(uv.z), 0.0);
+    float alpha = m.roughness * m.roughness;
+    return alpha >= least_alpha && alpha < greatest_alpha && has_interface(m.f0);
+}
+#else
+bool is_wanted(ivec2 texel, int material) {
     vec4 dielectric = materials[material].dielectric;
     float alpha = dielectric.a * dielectric.a;
     bool smooth_enough = alpha >= least_alpha && alpha < greatest_alpha;
     return smooth_enough && (materials[material].base_color.a > 0.0 || has_interface(dielectric.rgb));
 }
+#endif
 
 // Drift of a mirror's ray from this texel to the next block along `axis`, at a distance t.
 struct Drift { vec3 start; vec3 turn; };
@@ -141,7 +150,7 @@ void reflect_ray(Light light, LightView view, ivec2 block, int j) {
     vec4 numbers = ray_numbers(block, j);
     ivec2 texel = ivec2(view.tile.xy) + ivec2((vec2(block) + numbers.zw) * float(block_edge));
     Spot spot = spot_at(view, texel);
-    if (!spot.present || !is_wanted(spot.material)) return;
+    if (!spot.present || !is_wanted(texel, spot.material)) return;
     vec3 to_light; float radius;
     light_at(light, spot.point, spot.normal, to_light, radius);
     float fraction = float(block_edge * block_edge) / float(RAY_COUNT);
@@ -149,7 +158,7 @@ void reflect_ray(Light light, LightView view, ivec2 block, int j) {
     if (flux == vec3(0.0)) return;
     flux *= real_visibility(light, spot.point, spot.normal, bias_real);
     vec4 uv = texelFetch(virtual_light_uv, texel, 0);
-    Material m = material_of(spot.material, uv.xy, unpack_color(uv.z));
+    Material m = material_of(spot.material, uv.xy, unpack_color(uv.z), 0.0);
     float alpha = max(m.roughness * m.roughness, LEAST_ALPHA);
     vec3 v = -spot.seen_from, h = spot.normal;
 #ifdef WIDE

@@ -1,6 +1,8 @@
-// World position + depth along the optical axis, normal + material, texture coordinate.
-#include "common/materials.glsl"
+// World position + depth along the optical axis, normal + material, texture coordinate, vertex colour; with MATERIAL_MAPS
+// what the maps give in place of the last two. CUTOUTS: some materials have alpha.
+#include "common/shown_maps.glsl"
 #include "common/camera.glsl"
+#pragma switch CUTOUTS
 in vec3 world;
 in vec3 normal;
 in vec2 uv;
@@ -11,6 +13,20 @@ layout(location = 0) out vec4 out_position;
 layout(location = 1) out vec4 out_normal;
 layout(location = 2) out vec2 out_uv;
 layout(location = 3) out vec4 out_tint;
+#ifdef MATERIAL_MAPS
+in vec2 second_uv;
+#include "common/fragment_maps.glsl"
+#endif
+#ifdef CUTOUTS
+uniform float blend_sample;   // 0..1: samples of one pixel show different parts of what is blended
+
+bool is_left_out() {
+    int index = int(material);
+    float layer = 2.0 * material + float(gl_FrontFacing);
+    float even = fract(even_noise(gl_FragCoord.xy + APART * layer) + blend_sample);
+    return is_cut_out(index, fragment_opacity(index), even);
+}
+#endif
 
 void main() {
     vec3 view = camera_position - world;
@@ -21,8 +37,17 @@ void main() {
     vec3 n = normal == vec3(0.0) ? flat_normal : normalize(normal);
     bool double_sided = materials[int(material)].flags.x > 0.5;
     if (dot(n, view) < 0.0) n = double_sided ? -n : flat_normal;
-    out_position = vec4(world, depth);
-    out_normal = vec4(n, material);
+#ifdef MATERIAL_MAPS
+    find_slopes();
+    n = bent_normal(materials[int(material)].maps[NORMAL], n, normalize(view));
+    pack_maps(fragment_maps(int(material), tint), out_uv, out_tint);
+#else
     out_uv = uv;
     out_tint = vec4(tint, 1.0);
+#endif
+#ifdef CUTOUTS
+    if (is_left_out()) discard;
+#endif
+    out_position = vec4(world, depth);
+    out_normal = vec4(n, material);
 }

@@ -6,6 +6,12 @@ in vec3 in_normal;
 in vec2 in_uv;
 in vec3 in_color;
 in float in_material;
+#ifndef MATERIAL_MAPS
+#pragma switch MATERIAL_MAPS
+#else
+in vec2 in_second_uv;   // zero for meshes without
+out vec2 second_uv;
+#endif
 out vec3 world;
 out vec3 normal;
 out vec2 uv;
@@ -21,5 +27,8 @@ void main() {
     tint = in_color;
     depth = camera.z;
     material = in_material;
+#ifdef MATERIAL_MAPS
+    second_uv = in_second_uv;
+#endif
     gl_Position = clip_from_camera * camera;
 }

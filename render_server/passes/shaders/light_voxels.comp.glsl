@@ -131,7 +131,7 @@ vec3 unsummed(uint own, vec4 radiance) {
 vec3 outgoing(Surfel s, vec3 n, uint own) {
     vec3 mu, rho;
     irradiances(s, n, own, mu, rho);
-    Material m = material_of(int(s.normal_material.w), s.uv_voxel.xy, s.tint.rgb);
+    Material m = material_of(int(s.normal_material.w), s.uv_voxel.xy, s.tint.rgb, sqrt(s.position_area.w));
     vec3 diffuse = mean_diffuse_reflectance(m.diffuse, m.f0, m.roughness);
     vec3 albedo = min(diffuse + mean_specular_reflectance(m.f0, m.roughness), vec3(WHITEST));
     bool in_beams = has_caustics && keep_light && m.roughness * m.roughness < GREATEST_ALPHA;
@@ -204,7 +204,11 @@ void light(Surfel s, uint own, vec3 n) {
     ivec3 v = voxel_of_index(voxel, volume_size);
     for (int j = 0; j < 3; ++j) { atomicMin(support[j], v[j]); atomicMin(support[3 + j], -v[j]); }
 #endif
-    add(voxel, n, s.position_area.w, radiance);
+    float area = s.position_area.w;
+#if defined(VIRTUAL) && defined(MATERIAL_MAPS)
+    area *= opacity_of(int(s.normal_material.w), s.uv_voxel.xy, sqrt(area));
+#endif
+    add(voxel, n, area, radiance);
 }
 
 void main() {

@@ -17,7 +17,7 @@ vec3 reflectance(Surfel s, vec3 n) { return albedo_at(s, n, environment_irradian
 vec3 emission_of(Surfel s) { return vec3(0.0); }
 #else
 vec3 reflectance(Surfel s, vec3 n) { return virtual_albedo(s); }
-vec3 emission_of(Surfel s) { return materials[int(s.normal_material.w)].emission.rgb; }
+vec3 emission_of(Surfel s) { return virtual_material(s).emission; }
 #endif
 
 vec3 sent_out(Surfel s, vec3 n) {

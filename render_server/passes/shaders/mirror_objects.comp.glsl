@@ -57,7 +57,7 @@ vec4 trace(ivec2 pixel, Ray ray, out float met_at) {
     MeshSurface s = surface_of(hit, ray);
     float open;
     Indirect indirect = gathered(pixel, s, distance(camera_position, ray.from) + hit.distance, open);
-    Material material = material_of(s.material, s.uv, s.tint);
+    Material material = material_of(s.material, s.uv, s.tint, 0.0);
     vec3 radiance = object_radiance(s.position, distance(camera_position, s.position), s.normal, -ray.direction, material, indirect);
     return open * vec4(radiance, 1.0);
 }

@@ -4,6 +4,7 @@
 #include "common/screen_march.glsl"
 #include "common/brdf.glsl"
 #include "common/ray_mesh.glsl"
+#include "common/shown_maps.glsl"
 #include "common/lobe.glsl"
 #include "common/upsample.glsl"
 #include "common/work_list.glsl"
@@ -97,8 +98,9 @@ vec4 reflection(ivec2 pixel) {
     vec4 normal = texelFetch(virtual_raster_normal, raster, 0);
     MaterialEntry m = materials[int(normal.w)];
     bool shines = m.dielectric.rgb != vec3(0.0) || m.base_color.a > 0.0;
-    if (!shines || m.dielectric.a >= ROUGHEST) return vec4(0.0);
-    float alpha = max(m.dielectric.a * m.dielectric.a, LEAST_ALPHA);
+    float roughness = roughness_at(raster, int(normal.w));
+    if (!shines || roughness >= ROUGHEST) return vec4(0.0);
+    float alpha = max(roughness * roughness, LEAST_ALPHA);
     Change x = change_along(pixel, ivec2(1, 0), position, normal);
     Change y = change_along(pixel, ivec2(0, 1), position, normal);
     float spread = spread_of(alpha, x, y);

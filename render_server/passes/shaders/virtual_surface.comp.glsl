@@ -4,6 +4,7 @@
 #include "common/brdf.glsl"
 #include "common/geometry.glsl"
 #include "common/object_light.glsl"
+#include "common/shown_maps.glsl"
 #include "common/work_list.glsl"
 #include "common/caustics.glsl"
 
@@ -12,7 +13,6 @@ layout(rgba16f) writeonly uniform image2D radiance_out;
 uniform sampler2D object_coverage;
 uniform sampler2D cone_irradiance;
 uniform sampler2D cone_specular;
-uniform sampler2D virtual_raster_uv;
 uniform sampler2D virtual_raster_tint;
 uniform sampler2D screen_reflection;   // rgb radiance times fraction; a: fraction of the specular lobe
 uniform bool has_screen_reflection;
@@ -42,8 +42,7 @@ void shade(ivec2 pixel) {
     ivec2 raster = raster_texel(pixel);
     vec4 position = texelFetch(virtual_raster_position, raster, 0);
     vec4 normal = texelFetch(virtual_raster_normal, raster, 0);
-    Material m = material_of(
-        int(normal.w), texelFetch(virtual_raster_uv, raster, 0).xy, texelFetch(virtual_raster_tint, raster, 0).rgb);
+    Material m = material_at(raster, int(normal.w), texelFetch(virtual_raster_tint, raster, 0));
     vec3 v = normalize(camera_position - position.xyz);
     Indirect indirect = indirect_at(pixel, position, normal.xyz);
     if (has_screen_reflection) {

@@ -19,7 +19,7 @@ SurfacePoint surface_point(ivec2 texel) {
     return SurfacePoint(true, texelFetch(real_surface_position, pixel, 0).xyz, normal.xyz, roughness);
 }
 #else
-#include "common/materials.glsl"
+#include "common/shown_maps.glsl"
 
 SurfacePoint surface_point(ivec2 texel) {
     ivec2 pixel = texelFetch(sample_pixels, texel, 0).zw;
@@ -27,6 +27,6 @@ SurfacePoint surface_point(ivec2 texel) {
     pixel = raster_texel(pixel);
     vec4 normal = texelFetch(virtual_raster_normal, pixel, 0);
     vec3 position = texelFetch(virtual_raster_position, pixel, 0).xyz;
-    return SurfacePoint(true, position, normal.xyz, materials[int(normal.w)].dielectric.a);
+    return SurfacePoint(true, position, normal.xyz, roughness_at(pixel, int(normal.w)));
 }
 #endif

@@ -1,20 +1,106 @@
-// Materials of meshes: a table, with base colour from one texture atlas layer where the mesh has one.
+// Materials of meshes. MATERIAL_MAPS: some have maps or alpha (scene/materials.py): two arrays of textures with mip levels.
+#ifndef MATERIAL_MAPS
+#pragma switch MATERIAL_MAPS
+#else
+struct MapEntry {
+    vec4 u;          // texture coordinate: dot(u.xyz, (uv, 1)); layer, -1 without a map
+    vec4 v;          // the same; set of the vertices' coordinates
+    vec4 sampling;   // wraps (across + 3 down); columns, rows of an unfiltered texture, else 0; strength
+};
+#endif
 struct MaterialEntry {
     vec4 base_color;   // rgb linear; metallic
     vec4 dielectric;   // F0 rgb; roughness
     vec4 emission;     // rgb radiance, camera units; transmission
-    vec4 flags;        // double-sided, texture layer or -1
+    vec4 flags;        // double-sided
+#ifdef MATERIAL_MAPS
+    vec4 alpha;        // mode, alpha, repeats of the base colour's map per m
+    MapEntry maps[5];
+#endif
 };
 layout(std430) readonly buffer Materials { MaterialEntry materials[]; };
-uniform sampler2DArray base_color_textures;
 
+#ifdef MATERIAL_MAPS
+uniform sampler2DArray color_maps;   // linear; a: alpha, of a mask the fraction that is there
+uniform sampler2DArray data_maps;
+
+const int BASE_COLOR = 0, METALLIC_ROUGHNESS = 1, NORMAL = 2, OCCLUSION = 3, EMISSIVE = 4;
+const int CLAMPED = 1, MIRRORED = 2;   // wraps; 0 repeats
+const float MASKED = 1.0, BLENDED = 2.0;   // modes of alpha
+const float APART = 5.588238;              // of the noise of materials and sides: what lies behind is left out elsewhere
+const float COARSEST = 32.0;   // mip level: a texture's mean
+
+struct Material { vec3 diffuse; vec3 f0; float roughness; vec3 emission; float occlusion; };
+
+Material mapped(MaterialEntry e, vec3 base, float metallic, float roughness, float occlusion, vec3 glow) {
+    metallic *= e.base_color.a;
+    vec3 f0 = mix(e.dielectric.rgb, base, metallic);
+    return Material(base * (1.0 - metallic), f0, e.dielectric.a * roughness, e.emission.rgb * glow, occlusion);
+}
+
+bool has_map(MapEntry m) { return m.u.w >= 0.0; }
+
+vec2 place_on(MapEntry m, vec2 uv) { return vec2(dot(m.u.xyz, vec3(uv, 1.0)), dot(m.v.xyz, vec3(uv, 1.0))); }
+
+// A coordinate within the texture; `margin`: half a texel, within which filters would reach over the edge.
+float wrapped(float x, int wrap, float margin) {
+    if (wrap == MIRRORED) x = 1.0 - abs(mod(x, 2.0) - 1.0);
+    return wrap == 0 ? x : clamp(x, margin, 1.0 - margin);
+}
+
+vec3 layer_place(MapEntry m, vec2 place, float margin) {
+    int wraps = int(m.sampling.x);
+    vec2 at = vec2(wrapped(place.x, wraps % 3, margin), wrapped(place.y, wraps / 3, margin));
+    if (m.sampling.y > 0.0) at = (floor(at * m.sampling.yz) + 0.5) / m.sampling.yz;
+    return vec3(at, m.u.w);
+}
+
+// Where there is no picture to tell the footprint: the texels of a mip level. What lies on the second set of coordinates, which
+// rays and voxels do not know, is its mean.
+vec4 map_level(sampler2DArray maps, MapEntry m, vec2 uv, float level) {
+    if (!has_map(m)) return vec4(1.0);
+    vec3 at = layer_place(m, place_on(m, uv), 0.5 / float(textureSize(maps, 0).x));
+    return textureLod(maps, at, m.v.w > 0.5 ? COARSEST : level);
+}
+
+// Mip level at which a texel is as large as `size` (m).
+float level_of(MaterialEntry e, sampler2DArray maps, float size) {
+    return log2(max(size * e.alpha.z * float(textureSize(maps, 0).x), 1.0));
+}
+
+// `tint`: the vertex colour, which multiplies the base colour. `size`: of the footprint, m.
+Material material_of(int index, vec2 uv, vec3 tint, float size) {
+    MaterialEntry e = materials[index];
+    float level = level_of(e, color_maps, size);
+    vec3 base = e.base_color.rgb * tint * map_level(color_maps, e.maps[BASE_COLOR], uv, level).rgb;
+    vec2 rough_metal = map_level(data_maps, e.maps[METALLIC_ROUGHNESS], uv, level_of(e, data_maps, size)).gb;
+    vec3 glow = map_level(color_maps, e.maps[EMISSIVE], uv, level).rgb;
+    return mapped(e, base, rough_metal.y, rough_metal.x, 1.0, glow);
+}
+
+// Fraction of a footprint that is there.
+float opacity_of(int index, vec2 uv, float size) {
+    MaterialEntry e = materials[index];
+    if (e.alpha.x == 0.0) return 1.0;
+    return e.alpha.y * map_level(color_maps, e.maps[BASE_COLOR], uv, level_of(e, color_maps, size)).a;
+}
+
+// Whether a place of that opacity is left out: below a mask's half; where blended, below `even`, which takes all values 0..1.
+bool is_cut_out(int index, float opacity, float even) {
+    float mode = materials[index].alpha.x;
+    return mode != 0.0 && (mode == MASKED ? opacity < 0.5 : opacity <= even);
+}
+
+// Evenly distributed 0..1 over any few neighbours on the integer grid (Jimenez 2014, interleaved gradient noise).
+float even_noise(vec2 place) { return fract(52.9829189 * fract(dot(place, vec2(0.06711056, 0.00583715)))); }
+
+#else
 struct Material { vec3 diffuse; vec3 f0; float roughness; vec3 emission; };
 
-// `tint`: the vertex colour, which multiplies the base colour.
-Material material_of(int index, vec2 uv, vec3 tint) {
+// `tint`: the vertex colour, which multiplies the base colour. `size` (of a footprint, m) and `uv` are for maps.
+Material material_of(int index, vec2 uv, vec3 tint, float size) {
     MaterialEntry e = materials[index];
     vec3 base = e.base_color.rgb * tint;
-    if (e.flags.y >= 0.0) base *= textureLod(base_color_textures, vec3(uv, e.flags.y), 0.0).rgb;
     Material m;
     m.diffuse = base * (1.0 - e.base_color.a);
     m.f0 = mix(e.dielectric.rgb, base, e.base_color.a);
@@ -22,3 +108,4 @@ Material material_of(int index, vec2 uv, vec3 tint) {
     m.emission = e.emission.rgb;
     return m;
 }
+#endif

@@ -24,6 +24,10 @@ vec3 direct_radiance(vec3 p, float depth, vec3 n, vec3 v, Material m) {
 vec3 object_radiance(vec3 p, float depth, vec3 n, vec3 v, Material m, Indirect indirect) {
     float n_dot_v = max(dot(n, v), 1e-3);
     vec3 reflectance = specular_reflectance(m.f0, m.roughness, n_dot_v);
+#ifdef MATERIAL_MAPS
+    indirect.irradiance *= m.occlusion;
+    indirect.specular *= m.occlusion;
+#endif
     return m.emission + direct_radiance(p, depth, n, v, m)
         + m.diffuse / PI * (1.0 - reflectance) * indirect.irradiance + reflectance * indirect.specular;
 }

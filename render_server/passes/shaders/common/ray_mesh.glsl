@@ -1,6 +1,7 @@
 // Closest hit of a ray on the objects' triangles, and the surface there. The hierarchy (render_server/scene/bvh.py)
 // is in depth-first order with skips, so that no stack is needed.
 #include "common/materials.glsl"
+#pragma switch CUTOUTS
 
 struct Node { vec3 low; int leaf; vec3 high; int skip; };   // leaf: first triangle << 3 | count, or -1
 layout(std430) readonly buffer Nodes { Node nodes[]; };
@@ -9,6 +10,8 @@ layout(std430) readonly buffer Vertices { float vertices[]; };    // VERTEX_FLOA
 
 const int VERTEX_FLOATS = 12;
 const float EDGE = 1e-5;   // barycentric: overlap of neighbours, so that no ray slips between them
+
+const float PLACES = 4096.0;   // of a blended triangle's edge, each there or not
 
 struct Ray { vec3 from; vec3 direction; };   // direction: unit length
 
@@ -23,6 +26,18 @@ bool meets_box(vec3 low, vec3 high, vec3 from, vec3 inverse, float limit) {
     return enter <= min(min(far.x, far.y), min(far.z, limit));
 }
 
+#ifdef CUTOUTS
+// Whether a triangle's material is not there, at the barycentric place of corners 1 and 2.
+bool is_open_at(int at, vec2 place) {
+    ivec3 rows = VERTEX_FLOATS * floatBitsToInt(vec3(faces[3 * at].w, faces[3 * at + 1].w, faces[3 * at + 2].w));
+    vec3 weights = vec3(1.0 - place.x - place.y, place);
+    vec2 uv = vec2(0.0);
+    for (int k = 0; k < 3; ++k) uv += weights[k] * vec2(vertices[rows[k] + 6], vertices[rows[k] + 7]);
+    int material = int(vertices[rows.x + 11]);
+    return is_cut_out(material, opacity_of(material, uv, 0.0), even_noise(PLACES * place));
+}
+#endif
+
 // Moeller and Trumbore 1997, both sides.
 void meet_triangle(int at, Ray ray, inout MeshHit hit) {
     vec3 corner = faces[3 * at].xyz;
@@ -36,6 +51,9 @@ void meet_triangle(int at, Ray ray, inout MeshHit hit) {
     float v = dot(ray.direction, q) / det;
     float t = dot(e2, q) / det;
     if (u < -EDGE || v < -EDGE || u + v > 1.0 + EDGE || t <= 0.0 || t >= hit.distance) return;
+#ifdef CUTOUTS
+    if (is_open_at(at, vec2(u, v))) return;
+#endif
     hit = MeshHit(t, at, vec2(u, v));
 }
 

@@ -24,8 +24,12 @@ vec3 albedo_at(Surfel s, vec3 n, vec3 indirect) {
 #else
 #include "common/materials.glsl"
 
+Material virtual_material(Surfel s) {
+    return material_of(int(s.normal_material.w), s.uv_voxel.xy, s.tint.rgb, sqrt(s.position_area.w));
+}
+
 vec3 virtual_albedo(Surfel s) {
-    Material m = material_of(int(s.normal_material.w), s.uv_voxel.xy, s.tint.rgb);
+    Material m = virtual_material(s);
     return min(mean_diffuse_reflectance(m.diffuse, m.f0, m.roughness) + mean_specular_reflectance(m.f0, m.roughness), vec3(ALBEDO_RANGE.y));
 }
 #endif

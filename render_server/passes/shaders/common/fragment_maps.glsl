@@ -1,0 +1,54 @@
+// The maps of a fragment, filtered over its footprint. Needs materials.glsl, shown_maps.glsl and the inputs `world`, `uv`, `second_uv`.
+
+struct Slopes { vec4 uv; vec4 second_uv; vec3 right; vec3 down; };   // per pixel: to the right (xy), down (zw); of the place
+Slopes slopes;
+
+void find_slopes() {
+    slopes = Slopes(vec4(dFdx(uv), dFdy(uv)), vec4(dFdx(second_uv), dFdy(second_uv)), dFdx(world), dFdy(world));
+}
+
+vec2 uv_of(MapEntry m) { return m.v.w > 0.5 ? second_uv : uv; }
+
+// Slopes of a map's own coordinate.
+vec4 slopes_of(MapEntry m) {
+    vec4 s = m.v.w > 0.5 ? slopes.second_uv : slopes.uv;
+    return vec4(dot(m.u.xy, s.xy), dot(m.v.xy, s.xy), dot(m.u.xy, s.zw), dot(m.v.xy, s.zw));
+}
+
+vec4 map_here(sampler2DArray maps, MapEntry m) {
+    if (!has_map(m)) return vec4(1.0);
+    vec4 s = slopes_of(m);
+    vec3 at = layer_place(m, place_on(m, uv_of(m)), 0.5 / float(textureSize(maps, 0).x));
+    return textureGrad(maps, at, s.xy, s.zw);
+}
+
+ShownMaps fragment_maps(int index, vec3 tint) {
+    MaterialEntry e = materials[index];
+    vec2 rough_metal = map_here(data_maps, e.maps[METALLIC_ROUGHNESS]).gb;
+    float occlusion = 1.0 + e.maps[OCCLUSION].sampling.w * (map_here(data_maps, e.maps[OCCLUSION]).r - 1.0);
+    vec3 base = tint * map_here(color_maps, e.maps[BASE_COLOR]).rgb;
+    return ShownMaps(base, rough_metal.y, rough_metal.x, occlusion, map_here(color_maps, e.maps[EMISSIVE]).rgb);
+}
+
+float fragment_opacity(int index) {
+    MaterialEntry e = materials[index];
+    return e.alpha.y * map_here(color_maps, e.maps[BASE_COLOR]).a;
+}
+
+// The normal `n` with a normal map's tilt. Tangents are those of the triangle's texture coordinates, turned into the plane across
+// n; the map's y points against v (glTF 2.0, section 3.9.3). Towards the viewer `v` at least.
+vec3 bent_normal(MapEntry m, vec3 n, vec3 v) {
+    vec4 s = slopes_of(m);
+    float turn = s.x * s.w - s.y * s.z;
+    vec3 tangent = (slopes.right * s.w - slopes.down * s.y) * sign(turn);
+    vec3 upwards = (slopes.right * s.z - slopes.down * s.x) * sign(turn);
+    tangent -= n * dot(n, tangent);
+    if (!has_map(m) || dot(tangent, tangent) == 0.0) return n;
+    tangent = normalize(tangent);
+    vec3 across = cross(n, tangent);
+    if (dot(across, upwards) < 0.0) across = -across;
+    vec3 tilt = map_here(data_maps, m).rgb * 2.0 - 1.0;
+    vec3 bent = tilt.x * m.sampling.w * tangent + tilt.y * m.sampling.w * across + tilt.z * n;
+    bent = normalize(dot(bent, bent) == 0.0 ? n : bent);
+    return normalize(bent + max(1e-2 - dot(bent, v), 0.0) * v);
+}

@@ -1,0 +1,40 @@
+// What maps give at a pixel, packed by the geometry buffer in place of texture coordinate and vertex colour: all maps are sampled
+// there, once, with the footprint that the picture has. Values are relative to the material's own.
+#include "common/materials.glsl"
+#include "common/packing.glsl"
+
+#ifdef MATERIAL_MAPS
+struct ShownMaps { vec3 base; float metallic; float roughness; float occlusion; vec3 glow; };
+
+const float STEPS = 4095.0;   // of roughness and of occlusion: both fit a float exactly
+
+// Roots of colours: even steps to the eye.
+void pack_maps(ShownMaps s, out vec2 uv, out vec4 tint) {
+    uv = vec2(round(s.roughness * STEPS) + (STEPS + 1.0) * round(s.occlusion * STEPS), pack_color(sqrt(s.glow)));
+    tint = vec4(sqrt(s.base), s.metallic);
+}
+
+ShownMaps unpack_maps(vec2 uv, vec4 tint) {
+    float occlusion = floor(uv.x / (STEPS + 1.0));
+    vec3 glow = unpack_color(uv.y);
+    return ShownMaps(tint.rgb * tint.rgb, tint.a, (uv.x - (STEPS + 1.0) * occlusion) / STEPS, occlusion / STEPS, glow * glow);
+}
+
+uniform sampler2D virtual_raster_uv;
+
+ShownMaps maps_at(ivec2 raster, vec4 tint) { return unpack_maps(texelFetch(virtual_raster_uv, raster, 0).xy, tint); }
+
+float roughness_at(ivec2 raster, int material) {
+    return materials[material].dielectric.a * maps_at(raster, vec4(0.0)).roughness;
+}
+
+Material material_at(ivec2 raster, int material, vec4 tint) {
+    ShownMaps s = maps_at(raster, tint);
+    MaterialEntry e = materials[material];
+    return mapped(e, e.base_color.rgb * s.base, s.metallic, s.roughness, s.occlusion, s.glow);
+}
+#else
+float roughness_at(ivec2 raster, int material) { return materials[material].dielectric.a; }
+
+Material material_at(ivec2 raster, int material, vec4 tint) { return material_of(material, vec2(0.0), tint.rgb, 0.0); }
+#endif
