@@ -117,7 +117,7 @@ class LiveScene:
             self._notify(method.remark)
         method.require(scene.objects)
         self._objects.load(scene.objects)
-        for sentence in unsupported_requests(scene):
+        for sentence in (*unsupported_requests(scene), *self._objects.left_out(scene.objects)):
             self._notify(sentence)
         return _Plan(scene, method, LightEstimator(scene.lights, self._notify))
 

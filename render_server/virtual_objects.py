@@ -107,6 +107,11 @@ class VirtualObjects:
                     f"object `{item.id}`: precomputed materials arrive with a later release; give base_color instead."
                 )
 
+    def left_out(self, objects: Sequence[SceneObject]) -> list[str]:
+        """Returns a sentence for each loaded asset of which something is not shown."""
+        loaded = [self._assets[item.asset] for item in objects if item.asset in self._assets]
+        return [asset.left_out for asset in loaded if asset.left_out is not None]
+
     def _animated(self, item: SceneObject) -> AnimatedObject | None:
         """Returns the object animated by its clip; None if it plays none."""
         asset = self._assets[item.asset].animated

@@ -18,7 +18,6 @@ from render_server.scene.triangle_mesh import VERTEX_ATTRIBUTES, VERTEX_LAYOUT, 
 from render_server.view import CameraView, Rectangle
 
 INVERSE_SIZE = 8192  # steps of the inverse response: a code is at least 16 of them wide
-ANISOTROPY = 8.0  # samples along the longer side of a pixel's footprint
 SECOND_UV = "in_second_uv"  # of the vertices of meshes that have one, in a buffer of its own
 UV, COLOR, MATERIAL = slice(6, 8), slice(8, 11), 11  # columns of a vertex
 METALLIC, REFLECTANCE, ROUGHNESS = (
@@ -312,8 +311,6 @@ class MapArray:
             self.texture.write(data.tobytes(), viewport=(0, 0, layer, size, size, 1))
         self.texture.build_mipmaps()
         self.texture.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
-        if gpu.ctx.max_anisotropy > 1:
-            self.texture.anisotropy = min(ANISOTROPY, gpu.ctx.max_anisotropy)
 
     def layer(self, each: TextureMap) -> int:
         """Returns the layer of one of the maps."""

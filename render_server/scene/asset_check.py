@@ -23,9 +23,31 @@ MAX_TRIANGLES = 20_000_000
 _GLB_MAGIC, _JSON_CHUNK, _BIN_CHUNK = b"glTF", 0x4E4F534A, 0x004E4942
 _COMPONENT_BYTES = {kind: int(name[-1]) for kind, name in COMPONENT_TYPES.items()}
 _INDEX_TYPES = (5121, 5123, 5125)
-# Extensions that a file may call required although only part of them (or none) changes what is loaded.
-_HARMLESS_EXTENSIONS = re.compile(
-    r"KHR_materials_\w+|KHR_lights_punctual|EXT_texture_webp|KHR_mesh_quantization"
+DRAWN_EXTENSIONS = frozenset(
+    {
+        "EXT_texture_webp",
+        "KHR_materials_emissive_strength",
+        "KHR_materials_ior",
+        "KHR_materials_specular",
+        "KHR_materials_unlit",
+        "KHR_mesh_quantization",
+        "KHR_texture_transform",
+    }
+)
+# What a file may require although it is left out: the object's shape, place and texture do not depend on it.
+LEFT_OUT_EXTENSIONS = frozenset(
+    {
+        "KHR_lights_punctual",
+        "KHR_materials_anisotropy",
+        "KHR_materials_clearcoat",
+        "KHR_materials_diffuse_transmission",
+        "KHR_materials_dispersion",
+        "KHR_materials_iridescence",
+        "KHR_materials_sheen",
+        "KHR_materials_transmission",
+        "KHR_materials_variants",
+        "KHR_materials_volume",
+    }
 )
 
 
@@ -71,6 +93,17 @@ def read_gltf(path: Path) -> GltfDocument:
         return _checked(path, document, binary)
 
 
+def left_out(gltf: GltfDocument) -> str | None:
+    """Returns a sentence about what a document uses and no picture shows; None if that is nothing."""
+    names = [str(name) for name in gltf.root.get("extensionsUsed", []) if name not in DRAWN_EXTENSIONS]
+    specular = [
+        each.get("extensions", {}).get("KHR_materials_specular", {}) for each in gltf.entries("materials")
+    ]
+    if any("specularTexture" in each or "specularColorTexture" in each for each in specular):
+        names.append("the textures of KHR_materials_specular")
+    return f"{gltf.path} is shown without {', '.join(dict.fromkeys(names))}." if names else None
+
+
 def _json(data: bytes) -> dict[str, Any]:
     document = json.loads(data.decode("utf-8-sig"))
     if not isinstance(document, dict):
@@ -101,7 +134,7 @@ def _checked(path: Path, document: dict[str, Any], binary: bytes | None) -> Gltf
     if not version.startswith("2."):
         raise GltfFaultError(f"glTF {version} is not supported, only 2.x")
     for name in document.get("extensionsRequired", []):
-        if not _HARMLESS_EXTENSIONS.fullmatch(str(name)):
+        if name not in DRAWN_EXTENSIONS | LEFT_OUT_EXTENSIONS:
             raise GltfFaultError(f"the extension {name} that it requires is not supported")
     _check_uris(document.get("images", []), path.parent)
     buffers = [_buffer(buffer, binary, path.parent) for buffer in document.get("buffers", [])]

@@ -11,7 +11,7 @@ from jaxtyping import Float32, Float64, Int64
 from scipy.sparse import csr_array
 
 from protocol.errors import DeltalightError
-from render_server.scene.asset_check import read_gltf
+from render_server.scene.asset_check import left_out, read_gltf
 from render_server.scene.gltf_animation import Clip, read_clips
 from render_server.scene.gltf_document import GltfDocument, GltfFaultError, NodeTree, faults_named, read_nodes
 from render_server.scene.materials import Material, TextureReader
@@ -276,12 +276,20 @@ class Pose:
 
 
 class GltfAsset:
-    """Meshes of a document, one per material, in any pose of its clips, in the file's axes and units."""
+    """Meshes of a document, one per material, in any pose of its clips, in the file's axes and units.
+
+    `left_out` says what of the document is not shown.
+    """
 
     def __init__(
-        self, path: Path, nodes: NodeTree, parts: list[list[GltfPart]], clips: tuple[Clip, ...]
+        self,
+        path: Path,
+        nodes: NodeTree,
+        parts: list[list[GltfPart]],
+        clips: tuple[Clip, ...],
+        left_out: str | None = None,
     ) -> None:
-        self.clips = clips
+        self.clips, self.left_out = clips, left_out
         self._path = path
         self._nodes = nodes
         self._parts = parts
@@ -345,7 +353,7 @@ def load_gltf(path: Path) -> GltfAsset:
             together[material].append(part)
         if not together:
             raise DeltalightError(f"{path} has no triangle with an area; export a triangle mesh.")
-        return GltfAsset(path, nodes, list(together.values()), read_clips(gltf, nodes))
+        return GltfAsset(path, nodes, list(together.values()), read_clips(gltf, nodes), left_out(gltf))
 
 
 def _sweep_times(clip: Clip) -> Float64[np.ndarray, " k"]:

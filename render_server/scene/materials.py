@@ -267,11 +267,11 @@ def linear_texture(image: Image.Image, *, with_alpha: bool = False) -> Float16[n
     codes = _codes(image, "RGBA" if with_alpha else "RGB")
 
     def linear(part: UInt8[np.ndarray, "h w c"]) -> Float32[np.ndarray, "h w c"]:
-        values = decode[part]
+        values: Float32[np.ndarray, "h w c"] = decode[part]
         values[..., 3:] = part[..., 3:] / np.float32(255)
         return values
 
-    return _reduced(codes, linear).astype(np.float16)
+    return np.asarray(_reduced(codes, linear), np.float16)
 
 
 def data_texture(image: Image.Image) -> UInt8[np.ndarray, "h w 3"]:

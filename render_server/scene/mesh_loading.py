@@ -24,10 +24,14 @@ from render_server.scene.triangle_mesh import (
 
 @dataclass(frozen=True, eq=False)
 class Asset:
-    """The meshes of a file in their rest pose, and the glTF asset that animates them if the file has clips."""
+    """The meshes of a file in their rest pose, and the glTF asset that animates them if the file has clips.
+
+    `left_out` says what of the file is not shown.
+    """
 
     meshes: list[TriangleMesh]
     animated: GltfAsset | None
+    left_out: str | None = None
 
 
 def load_mesh(path: Path) -> list[TriangleMesh]:
@@ -52,7 +56,7 @@ def load_asset(path: Path) -> Asset:
     """
     if check_mesh_file(path) in GLTF_SUFFIXES:
         gltf = load_gltf(path)
-        return Asset(gltf.meshes(gltf.pose(None, 0.0)), gltf if gltf.clips else None)
+        return Asset(gltf.meshes(gltf.pose(None, 0.0)), gltf if gltf.clips else None, gltf.left_out)
     together: dict[int, list[TriangleMesh]] = defaultdict(list)
     for key, part in _parts(_open_scene(path), path):
         together[key].append(part)

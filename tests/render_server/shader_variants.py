@@ -16,6 +16,7 @@ from render_server.passes.composite import Enlarge
 from render_server.passes.cones import reuse_define
 from render_server.passes.lpv import LpvPropagate
 from render_server.renderer import SceneRenderer
+from tests.render_server.gltf_samples import Plate, even
 from tests.render_server.protected_scenes import Case, frames_of, scene_of
 from tests.render_server.scenes import Stage
 
@@ -35,6 +36,14 @@ CASES: dict[Case, dict[str, Any]] = {  # with changes of the method
     Case("dlpv-paper", "depth", "plain"): {"direct_filter": 1},
     Case("aroof", "depth", "mirror"): {},
 }
+TEXTURED: dict[Case, dict[str, Any]] = {
+    Case("exact", "depth", "mirror"): {},
+    Case("exact", "depth", "antialiased"): {"quality": "live"},
+    Case("paper", "depth", "mirror"): {},
+    Case("dlpv", "model", "mirror"): {},
+    Case("dlpv-paper", "depth", "plain"): {"direct_filter": 1},
+    Case("aroof", "depth", "mirror"): {},
+}
 VIEWS = {
     Case("exact", "depth", "mirror"): ("effects", "delta", "volume", "rsm"),
     Case("paper", "depth", "mirror"): ("volume",),
@@ -49,6 +58,31 @@ def render(case: Case, changes: dict[str, Any], gpu: GpuContext, folder: Path) -
         for view in ("composite", *VIEWS.get(case, ())):
             renderer.set_scene(changed(scene, "output", {"view": view}))
             renderer.render(frames_of(case)[0])
+    finally:
+        renderer.release()
+
+
+def render_textured(case: Case, changes: dict[str, Any], gpu: GpuContext, folder: Path) -> None:
+    """Renders the case's first frame with a smooth object more that has maps and holes."""
+    plate = Plate(0.1, 0.1)
+    plate.material |= {
+        "alphaMode": "MASK",
+        "normalTexture": plate.texture(even(128, 128, 255)),
+        "pbrMetallicRoughness": {
+            "baseColorTexture": plate.texture(even(255, 255, 255, 255)),
+            "metallicRoughnessTexture": plate.texture(even(0, 20, 255)),
+        },
+    }
+    asset = {
+        "id": "plate",
+        "asset": str(plate.write(folder / "plate.glb")),
+        "pose": {"translation_m": [0, 0, 0.2]},
+    }
+    document = scene_of(case, Stage(folder)).model_dump(mode="json", exclude_unset=True)
+    document["objects"].append(asset)
+    renderer = SceneRenderer(gpu, changed(parse_scene(document), "method", changes))
+    try:
+        renderer.render(frames_of(case)[0])
     finally:
         renderer.release()
 
@@ -74,5 +108,6 @@ def by_device(gpu: GpuContext, folder: Path) -> None:  # noqa: ARG001
 
 PARTS: dict[str, Callable[[GpuContext, Path], None]] = {
     **{str(case): partial(render, case, changes) for case, changes in CASES.items()},
+    **{f"{case} textured": partial(render_textured, case, changes) for case, changes in TEXTURED.items()},
     "by device": by_device,
 }

@@ -15,7 +15,12 @@ from render_server.scene.bvh import LEAF_SIZE, Bvh, build_bvh
 pytestmark = pytest.mark.usefixtures("clean_gl")
 RAYS = 2048
 SHADER = Path(__file__).with_name("rays")
-UNREAD: Bindings = {"Vertices": None, "Materials": None, "MATERIAL_MAPS": False, "CUTOUTS": False}  # what the surface at a hit is like
+UNREAD: Bindings = {
+    "Vertices": None,
+    "Materials": None,
+    "MATERIAL_MAPS": False,
+    "CUTOUTS": False,
+}  # what the surface at a hit is like
 
 
 def soup(count: int, seed: int = 0, size: float = 0.1) -> np.ndarray:

@@ -15,11 +15,25 @@ vec4 slopes_of(MapEntry m) {
     return vec4(dot(m.u.xy, s.xy), dot(m.v.xy, s.xy), dot(m.u.xy, s.zw), dot(m.v.xy, s.zw));
 }
 
+// The mean over a pixel's footprint, long and narrow where a surface is seen at a grazing angle: up to PROBES samples along its
+// length, of the mip level of its width. Samplers' own anisotropic filters differ between drivers; Mesa's blurs what is enlarged.
+const float PROBES = 8.0;
+
 vec4 map_here(sampler2DArray maps, MapEntry m) {
     if (!has_map(m)) return vec4(1.0);
-    vec4 s = slopes_of(m);
-    vec3 at = layer_place(m, place_on(m, uv_of(m)), 0.5 / float(textureSize(maps, 0).x));
-    return textureGrad(maps, at, s.xy, s.zw);
+    float edge = float(textureSize(maps, 0).x);
+    vec4 s = slopes_of(m) * edge;
+    vec2 along = dot(s.xy, s.xy) > dot(s.zw, s.zw) ? s.xy : s.zw;
+    float major = length(along), minor = max(abs(s.x * s.w - s.y * s.z) / max(major, 1e-12), max(major / PROBES, 1.0));
+    int count = int(clamp(ceil(major / minor), 1.0, PROBES));
+    vec2 place = place_on(m, uv_of(m));
+    float margin = 0.5 * minor / edge;
+    vec4 sum = vec4(0.0);
+    for (int i = 0; i < count; ++i) {
+        vec2 shift = ((float(i) + 0.5) / float(count) - 0.5) * along / edge;
+        sum += textureLod(maps, layer_place(m, place + shift, margin), log2(minor));
+    }
+    return sum / float(count);
 }
 
 ShownMaps fragment_maps(int index, vec3 tint) {

@@ -20,9 +20,10 @@ ShownMaps unpack_maps(vec2 uv, vec4 tint) {
     return ShownMaps(tint.rgb * tint.rgb, tint.a, (uv.x - (STEPS + 1.0) * occlusion) / STEPS, occlusion / STEPS, glow * glow);
 }
 
-uniform sampler2D virtual_raster_uv;
+// An image, because OpenGL guarantees no more than sixteen samplers.
+layout(rg32f) readonly uniform image2D virtual_raster_uv;
 
-ShownMaps maps_at(ivec2 raster, vec4 tint) { return unpack_maps(texelFetch(virtual_raster_uv, raster, 0).xy, tint); }
+ShownMaps maps_at(ivec2 raster, vec4 tint) { return unpack_maps(imageLoad(virtual_raster_uv, raster).xy, tint); }
 
 float roughness_at(ivec2 raster, int material) {
     return materials[material].dielectric.a * maps_at(raster, vec4(0.0)).roughness;

@@ -1,0 +1,328 @@
+"""glTF materials as they are drawn: closed forms of plates with textures."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from protocol.frames import ViewFrame, decode_lut
+from protocol.scene_objects import Surface
+from render_server.gpu.context import GpuContext
+from render_server.renderer import SceneRenderer
+from tests.render_server.gltf_samples import Plate, even
+from tests.render_server.scenes import (
+    FOCAL,
+    HEIGHT,
+    WIDTH,
+    ObjectsRenderer,
+    Stage,
+    ambient,
+    array_of,
+    depth_image,
+    directional,
+    fields_of,
+    floor,
+    frame,
+    look_at,
+    noisy,
+    solve,
+    unlit,
+)
+
+pytestmark = pytest.mark.usefixtures("clean_gl")
+PIXEL = 1.0 / FOCAL  # m that a pixel spans at 1 m
+WIDE, HIGH = 80, 64  # pixels of the plates
+INSIDE = np.s_[HEIGHT // 2 - 24 : HEIGHT // 2 + 24, WIDTH // 2 - 32 : WIDTH // 2 + 32]
+LEFT, RIGHT = np.s_[40:80, 50:70], np.s_[40:80, 90:110]
+UPPER, LOWER = np.s_[35:50, 50:110], np.s_[70:85, 50:110]
+LINEAR = decode_lut(None)[:, 0]
+FLOOR = {"plane": {"point_m": [0, 0, 0], "normal": [0, 0, 1], "tolerance_m": 0.02}}
+NEAREST = {"magFilter": 9728, "minFilter": 9728}
+OBLIQUE = (-0.6, -0.3, -0.74)  # travels to -x and -y
+
+
+def seen_from_above() -> ViewFrame:
+    """A camera 1 m above the origin that looks down on a floor far below."""
+    depth = depth_image(np.full((HEIGHT, WIDTH), 3.0, np.float32))
+    return frame(noisy(), pose=look_at((0.0, 0.0, 1.0), (0.0, 0.0, 0.0)), depth=depth)
+
+
+Draw = Callable[..., np.ndarray]
+
+
+@pytest.fixture
+def draw(objects: ObjectsRenderer, tmp_path: Path) -> Draw:
+    """Draws a plate under some lights; returns the linear picture."""
+
+    def drawn(plate: Plate, lights: list[dict[str, Any]] | None = None) -> np.ndarray:
+        stage = Stage(tmp_path)
+        asset = {"asset": str(plate.write(tmp_path / "plate.glb")), "up_axis": "z"}
+        return objects.linear(unlit(stage.document([asset], lights or [])), seen_from_above())
+
+    return drawn
+
+
+def plate(**options: Any) -> Plate:  # noqa: ANN401
+    return Plate(WIDE * PIXEL, HIGH * PIXEL, **options)
+
+
+def glowing(codes: np.ndarray, sampler: dict[str, Any] | None = None, **options: Any) -> Plate:  # noqa: ANN401
+    """A black plate whose emission is a texture."""
+    made = plate(**options.pop("plate", {}))
+    made.material |= {
+        "pbrMetallicRoughness": {"baseColorFactor": [0, 0, 0, 1], "metallicFactor": 0},
+        "emissiveTexture": made.texture(codes, sampler, **options),
+        "emissiveFactor": [1, 1, 1],
+    }
+    return made
+
+
+def halves(left: int, right: int) -> np.ndarray:
+    codes = even(left, left, left, size=8)
+    codes[:, 4:] = right
+    return codes
+
+
+def test_an_emissive_texture_glows_with_its_value_times_the_strength(draw: Draw) -> None:
+    made = glowing(halves(128, 0))
+    made.material["emissiveFactor"] = [1.0, 0.5, 0.25]
+    made.material["extensions"]["KHR_materials_emissive_strength"] = {"emissiveStrength": 2.0}
+    picture = draw(made)
+    expected = 2 * LINEAR[128] * np.array([1.0, 0.5, 0.25])
+    assert picture[LEFT].reshape(-1, 3) == pytest.approx(np.tile(expected, (800, 1)), rel=0.01)
+    assert np.abs(picture[RIGHT]).max() < 1e-3
+
+
+def test_a_texture_of_roughness_and_metal_is_as_the_factors(draw: Draw) -> None:
+    lights = [directional((0.05, 0.02, -1.0), 2.0, 2.0), ambient(0.1)]
+    pictures = []
+    for is_texture in (True, False):
+        made = plate()
+        pbr: dict[str, Any] = {"baseColorFactor": [0.8, 0.5, 0.2, 1]}
+        if is_texture:
+            pbr |= {"roughnessFactor": 0.8, "metallicFactor": 0.9}
+            pbr["metallicRoughnessTexture"] = made.texture(even(7, 128, 204))
+        else:
+            pbr |= {"roughnessFactor": 0.8 * 128 / 255, "metallicFactor": 0.9 * 204 / 255}
+        made.material = {"pbrMetallicRoughness": pbr}
+        pictures.append(draw(made, lights)[INSIDE])
+    assert pictures[0] == pytest.approx(pictures[1], rel=6e-3, abs=1e-3)
+    assert pictures[0].max() > 1.5 * np.median(pictures[0]), "a highlight is seen"
+
+
+def lambert(normal: Any) -> float:  # noqa: ANN401
+    """Radiance of a white plate of that normal in the oblique light."""
+    normal = np.array(normal) / np.linalg.norm(normal)
+    to_light = -np.array(OBLIQUE) / np.linalg.norm(OBLIQUE)
+    return float(2.0 / np.pi * normal @ to_light)
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_normal_map_of_one_tilt_shades_as_a_tilted_plate(draw: Draw, axis: int, mirrored: bool) -> None:
+    """Red tilts along u, green against v, on mirrored coordinates too. (A tilted one sees a little of the floor.)"""
+    made = plate(mirrored=mirrored)
+    code = [128, 128, 231]
+    code[axis] = 204
+    made.material["pbrMetallicRoughness"] = {"metallicFactor": 0}
+    made.material["normalTexture"] = made.texture(even(*code), scale=0.5)
+    tilt = np.array(code) / 255 * 2 - 1
+    tilt[:2] *= 0.5
+    if mirrored:
+        tilt[0] = -tilt[0]
+    picture = draw(made, [directional(OBLIQUE)])[INSIDE]
+    assert picture == pytest.approx(np.full_like(picture, lambert(tilt)), rel=6e-3)
+
+
+def test_occlusion_dims_indirect_light_only(draw: Draw) -> None:
+    pictures = []
+    for lights in ([ambient(0.4)], [directional()]):
+        made = plate()
+        made.material["pbrMetallicRoughness"] = {"metallicFactor": 0}
+        codes = halves(51, 255)
+        codes[..., 1:] = 9
+        made.material["occlusionTexture"] = made.texture(codes, strength=0.5)
+        pictures.append(draw(made, lights))
+    shade = np.median(pictures[0][LEFT]) / np.median(pictures[0][RIGHT])
+    assert shade == pytest.approx(1 + 0.5 * (51 / 255 - 1), rel=3e-3)
+    assert np.median(pictures[0][RIGHT]) == pytest.approx(0.4, rel=0.02)
+    assert pictures[1][INSIDE] == pytest.approx(np.full_like(pictures[1][INSIDE], 2 / np.pi), rel=3e-3)
+
+
+def test_a_picture_of_black_and_white_averages_in_linear_light(draw: Draw) -> None:
+    """Squares far smaller than a pixel: half of white's light, not the mean of codes."""
+    squares = np.indices((64, 64)).sum(axis=0) % 2 * 255
+    made = glowing(np.repeat(squares[..., None], 3, axis=2), plate={"repeats": 16.0})
+    assert draw(made)[INSIDE] == pytest.approx(np.full((48, 64, 3), 0.5), rel=6e-3)
+
+
+QUARTERS = np.array([[10, 80], [150, 255]], np.uint8)[..., None].repeat(3, axis=2)
+
+
+def corners_of(picture: np.ndarray) -> list[list[int]]:
+    """Codes of the plate's four quarters."""
+    rows, columns = (HEIGHT // 2 - 16, HEIGHT // 2 + 16), (WIDTH // 2 - 20, WIDTH // 2 + 20)
+    return [[int(np.abs(LINEAR - picture[row, column, 0]).argmin()) for column in columns] for row in rows]
+
+
+@pytest.mark.parametrize(
+    ("transform", "expected"),
+    [
+        ({}, [[10, 80], [150, 255]]),
+        ({"offset": [0.5, 0]}, [[80, 10], [255, 150]]),
+        ({"scale": [1, -1]}, [[150, 255], [10, 80]]),
+        ({"scale": [0.5, 0.5], "offset": [0.5, 0.0]}, [[80, 80], [80, 80]]),
+        # Counter-clockwise where v points down: the corner (1, 0) goes to (0, -1).
+        ({"rotation": np.pi / 2}, [[150, 10], [255, 80]]),
+    ],
+)
+def test_a_texture_transform_moves_known_texels(
+    draw: Draw, transform: dict[str, Any], expected: list[list[int]]
+) -> None:
+    made = glowing(QUARTERS, NEAREST, extensions={"KHR_texture_transform": transform})
+    assert corners_of(draw(made)) == [[pytest.approx(code, abs=1) for code in row] for row in expected]
+
+
+@pytest.mark.parametrize(
+    ("wrap", "expected"),
+    [(10497, [[10, 10], [10, 10]]), (33071, [[10, 80], [150, 255]]), (33648, [[10, 80], [150, 255]])],
+)
+def test_what_lies_beyond_the_edge_repeats_clamps_or_mirrors(
+    draw: Draw, wrap: int, expected: list[list[int]]
+) -> None:
+    """Three quarters of the plate lie beyond; texels are looked at near (1/4, 1/4) and (5/4, 5/4)."""
+    sampler = {**NEAREST, "wrapS": wrap, "wrapT": wrap}
+    picture = draw(glowing(QUARTERS, sampler, plate={"repeats": 2.0}))
+    place = (HEIGHT // 2 - 24, WIDTH // 2 - 30), (HEIGHT // 2 + 8, WIDTH // 2 + 10)
+    rows, columns = zip(*place, strict=True)
+    found = [[int(np.abs(LINEAR - picture[row, column, 0]).argmin()) for column in columns] for row in rows]
+    assert found == [[pytest.approx(code, abs=1) for code in row] for row in expected]
+
+
+def test_a_map_may_lie_on_the_second_texture_coordinates(draw: Draw) -> None:
+    made = glowing(QUARTERS, NEAREST, texCoord=1)
+    made.attributes["TEXCOORD_1"] = made.glb.floats([(1, 0), (0, 0), (0, 1), (1, 1)])
+    assert corners_of(draw(made)) == [[255, 150], [80, 10]]
+
+
+def test_unlit_shows_its_colour_in_any_light(draw: Draw) -> None:
+    made = plate()
+    made.material["pbrMetallicRoughness"] = {
+        "baseColorFactor": [0.5, 1, 1, 1],
+        "baseColorTexture": made.texture(even(188, 188, 188)),
+    }
+    made.material["extensions"]["KHR_materials_unlit"] = {}
+    for lights in ([], [directional(), ambient(1.0)]):
+        picture = draw(made, lights)[INSIDE]
+        expected = np.broadcast_to(LINEAR[188] * np.array([0.5, 1, 1]), picture.shape)
+        assert picture == pytest.approx(expected, rel=6e-3)
+
+
+def masked(mode: str, codes: np.ndarray, **alpha: Any) -> Plate:  # noqa: ANN401
+    """A white plate, its alpha from a texture."""
+    made = plate()
+    made.material |= {
+        "alphaMode": mode,
+        "pbrMetallicRoughness": {"metallicFactor": 0, "baseColorTexture": made.texture(codes)},
+        **alpha,
+    }
+    return made
+
+
+def with_alpha(left: int, right: int) -> np.ndarray:
+    codes = even(255, 255, 255, left, size=8)
+    codes[:, 4:, 3] = right
+    return codes
+
+
+ALPHA: list[tuple[str, dict[str, Any], list[float]]] = [
+    ("OPAQUE", {}, [1, 1]),
+    ("MASK", {}, [1, 0]),
+    ("MASK", {"alphaCutoff": 0.7}, [0, 0]),
+    ("MASK", {"alphaCutoff": 0.2}, [1, 1]),
+    ("BLEND", {}, [0.6, 0.3]),
+]
+
+
+@pytest.mark.parametrize("case", ALPHA)
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_alpha_shows_the_cameras_own_picture(
+    objects: ObjectsRenderer, tmp_path: Path, case: tuple[str, dict[str, Any], list[float]], antialiased: bool
+) -> None:
+    """A mask keeps what its cutoff says; what is blended covers pixels by alpha, exactly on average."""
+    mode, alpha, expected = case
+    path = masked(mode, with_alpha(153, 77), **alpha).write(tmp_path / "plate.glb")
+    document = unlit(Stage(tmp_path).document([{"asset": str(path), "up_axis": "z"}], [directional()]))
+    output = document.output.model_copy(update={"antialiasing": antialiased})
+    view = seen_from_above()
+    shown = objects.draw(document.replaced(output=output), view).color
+    covered = objects.newest_coverage()
+    found = [float(covered[half].mean()) for half in (LEFT, RIGHT)]
+    assert found == pytest.approx(expected, abs=0.02)
+    open_pixels = covered == 0
+    assert np.array_equal(shown[open_pixels], view.color[open_pixels])
+    if mode == "BLEND" and antialiased:
+        assert covered[LEFT].std() < 0.07, "eight samples a pixel differ by no more than one"
+
+
+def half_open(edge: float, color: float) -> Plate:
+    """Seen from both sides; its right half is not there."""
+    made = Plate(edge, edge)
+    made.material |= {
+        "alphaMode": "MASK",
+        "doubleSided": True,
+        "pbrMetallicRoughness": {
+            "baseColorFactor": [color, color, color, 1],
+            "metallicFactor": 0,
+            "baseColorTexture": made.texture(with_alpha(255, 0)),
+        },
+    }
+    return made
+
+
+def test_light_falls_through_the_holes_of_a_mask(gpu: GpuContext, tmp_path: Path) -> None:
+    """On the floor below the plate only the left half is in its shadow; and ambient light falls through the hole."""
+    made = half_open(0.24, 0.0)
+    stage = Stage(tmp_path)
+    asset = {
+        "asset": str(made.write(tmp_path / "plate.glb")),
+        "up_axis": "z",
+        "pose": {"translation_m": [0, 0, 0.1]},
+    }
+    lights = [directional((0, 0, -1), 2.0), ambient(0.3)]
+    found = solve(gpu, stage.document([asset], lights, floor()), frame(depth=None))
+    lit, sky = [], []
+    for x in (-0.06, 0.06):
+        near = np.abs(found.position[..., :3] - (x, 0, 0)).max(axis=-1) < 0.03
+        near &= (found.position[..., 3] > 0) & (found.matte == 0)
+        lit.append(found.direct_rho[near].sum() / found.direct_mu[near].sum())
+        sky.append(found.cones_rho[near].sum() / found.cones_mu[near].sum())
+    assert lit == pytest.approx([0.0, 1.0], abs=0.02)
+    assert sky[0] < 0.8 * sky[1]
+
+
+def test_rays_pass_the_holes_of_a_mask(gpu: GpuContext, tmp_path: Path) -> None:
+    """A mirror on the floor shows the plate's kept half, and nothing of its open half."""
+    made = half_open(0.3, 1.0)
+    stage = Stage(tmp_path)
+    stands = {"translation_m": [0, 0.2, 0.15], "rotation_wxyz": [np.sqrt(0.5), np.sqrt(0.5), 0, 0]}
+    asset = {"asset": str(made.write(tmp_path / "plate.glb")), "up_axis": "z", "pose": stands}
+    document = stage.document([asset], [directional((0, 0.6, -0.8))], floor())
+    silver = Surface.model_validate(
+        {"region": FLOOR, "metallic": 1.0, "albedo": [0.9] * 3, "roughness": 0.02}
+    )
+    renderer = SceneRenderer(gpu, document.replaced(real=document.real.replaced(surfaces=(silver,))))
+    renderer.render(frame())
+    assert renderer.graph is not None
+    hidden = array_of(renderer.graph["reflections"])[..., 3]
+    position = fields_of(renderer).position
+    renderer.release()
+    at = [
+        (np.abs(position[..., :2] - (x, 0.1)).max(axis=-1) < 0.04) & (position[..., 3] > 0)
+        for x in (-0.08, 0.08)
+    ]
+    kept, removed = (float(hidden[each].mean()) for each in at)
+    assert kept > 0.8
+    assert removed == 0
