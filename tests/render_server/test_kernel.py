@@ -355,6 +355,27 @@ def test_every_block_is_declared_once_in_glsl_and_once_in_python() -> None:
 # Raster kernels
 
 
+def test_switches_choose_a_variant_that_is_compiled_when_first_run(
+    gpu: GpuContext, make: MakeKernel, out: moderngl.Buffer
+) -> None:
+    """What hangs on a switch is declared and bound only where it is on."""
+    compiled: list[str] = []
+    watch = lambda label, _: compiled.append(label)  # noqa: E731
+    gpu.compile_watchers.append(watch)
+    kernel = make(
+        "#ifndef BRIGHT\n#pragma switch BRIGHT\n#else\nuniform float gain;\n#endif\n",
+        "values[0] = 1.0;\n#ifdef BRIGHT\nvalues[0] *= gain;\n#endif\n",
+    )
+    assert compiled == ["tiny"]
+    for on, expected in ((False, 1.0), (True, 3.0), (False, 1.0), (True, 3.0)):
+        kernel.run((1,), {"BRIGHT": on, "gain": 3.0}, Out=out)
+        assert floats(out, 1) == [expected]
+    gpu.compile_watchers.remove(watch)
+    assert compiled == ["tiny", "tiny BRIGHT"]
+    with pytest.raises(BindingError, match="Kernel tiny needs `BRIGHT`"):
+        kernel.run((1,), Out=out)
+
+
 VERTEX = "in vec2 place; uniform float z; void main() { gl_Position = vec4(place, z, 1.0); }"
 FRAGMENT = "uniform vec4 tint; uniform sampler2D seen; out vec4 color;"
 FRAGMENT += " void main() { color = tint + texelFetch(seen, ivec2(0), 0); }"
