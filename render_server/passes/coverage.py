@@ -59,8 +59,17 @@ class SampleCoverage:
         self._sums.use()
         self._sums.clear()
         for number, (x, y) in enumerate(self._pattern):
-            offset, blended = (x / STEPS, y / STEPS), number / len(self._pattern)
-            geometry.run(raster, mesh, view, scene, offset=offset, rectangle=in_raster, sample=blended)
+            offset = (x / STEPS, y / STEPS)
+            geometry.run(
+                raster,
+                mesh,
+                view,
+                scene,
+                offset=offset,
+                rectangle=in_raster,
+                sample=number / len(self._pattern),
+                sample_coverage=self.texture,
+            )
             self._kernel.run(
                 in_picture[2:],
                 raster.bindings,

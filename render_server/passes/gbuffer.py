@@ -384,11 +384,13 @@ class RasterGeometry:
         offset: tuple[float, float] = (0.0, 0.0),
         rectangle: Rectangle | None = None,
         sample: float = 0.0,
+        sample_coverage: moderngl.Texture | None = None,
     ) -> None:
         """Draws `mesh` as `view` sees it, sampled `offset` pixels from the texels' centres.
 
         `scene` brings the view's camera and the mesh's own materials. `rectangle` limits drawing to the texels that
         can show the mesh; the others keep their contents. `sample`: which part 0..1 of what is blended shows here.
+        Where `sample_coverage` has a sample in front already, uv and vertex colour are not needed.
         """
         target.clear(rectangle)
         self._kernel.draw(
@@ -397,6 +399,7 @@ class RasterGeometry:
             scene,
             clip_from_camera=view.clip_from_camera_at(offset),
             blend_sample=sample,
+            sample_coverage=sample_coverage,
         )
 
     def release(self) -> None:

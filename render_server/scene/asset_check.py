@@ -101,7 +101,16 @@ def left_out(gltf: GltfDocument) -> str | None:
     ]
     if any("specularTexture" in each or "specularColorTexture" in each for each in specular):
         names.append("the textures of KHR_materials_specular")
+    if any(_has_vertex_alpha(gltf, part) for mesh in gltf.entries("meshes") for part in mesh["primitives"]):
+        names.append("the alpha of its vertex colours")
     return f"{gltf.path} is shown without {', '.join(dict.fromkeys(names))}." if names else None
+
+
+def _has_vertex_alpha(gltf: GltfDocument, primitive: dict[str, Any]) -> bool:
+    color, material = primitive["attributes"].get("COLOR_0"), primitive.get("material")
+    if color is None or material is None or gltf.root["accessors"][color]["type"] != "VEC4":
+        return False
+    return bool(gltf.root["materials"][material].get("alphaMode", "OPAQUE") != "OPAQUE")
 
 
 def _json(data: bytes) -> dict[str, Any]:

@@ -1,4 +1,6 @@
-// The maps of a fragment, filtered over its footprint. Needs materials.glsl, shown_maps.glsl and the inputs `world`, `uv`, `second_uv`.
+// The maps of a fragment, filtered over its footprint. Needs materials.glsl, shown_maps.glsl, camera.glsl and the inputs `world`, `uv`,
+// `second_uv`.
+uniform sampler2D sample_coverage;   // of the samples drawn before; one texel of zeros if there is no more than one
 
 struct Slopes { vec4 uv; vec4 second_uv; vec3 right; vec3 down; };   // per pixel: to the right (xy), down (zw); of the place
 Slopes slopes;
@@ -19,13 +21,13 @@ vec4 slopes_of(MapEntry m) {
 // length, of the mip level of its width. Samplers' own anisotropic filters differ between drivers; Mesa's blurs what is enlarged.
 const float PROBES = 8.0;
 
-vec4 map_here(sampler2DArray maps, MapEntry m) {
-    if (!has_map(m)) return vec4(1.0);
+// 1 if not wanted. (llvmpipe executes both sides of a branch, but no turn of a loop too many.)
+vec4 map_here(sampler2DArray maps, MapEntry m, bool wanted) {
     float edge = float(textureSize(maps, 0).x);
     vec4 s = slopes_of(m) * edge;
     vec2 along = dot(s.xy, s.xy) > dot(s.zw, s.zw) ? s.xy : s.zw;
     float major = length(along), minor = max(abs(s.x * s.w - s.y * s.z) / max(major, 1e-12), max(major / PROBES, 1.0));
-    int count = int(clamp(ceil(major / minor), 1.0, PROBES));
+    int count = wanted && has_map(m) ? int(clamp(ceil(major / minor), 1.0, PROBES)) : 0;
     vec2 place = place_on(m, uv_of(m));
     float margin = 0.5 * minor / edge;
     vec4 sum = vec4(0.0);
@@ -33,20 +35,28 @@ vec4 map_here(sampler2DArray maps, MapEntry m) {
         vec2 shift = ((float(i) + 0.5) / float(count) - 0.5) * along / edge;
         sum += textureLod(maps, layer_place(m, place + shift, margin), log2(minor));
     }
-    return sum / float(count);
+    return count == 0 ? vec4(1.0) : sum / float(count);
+}
+
+// Whether an earlier sample represents the pixel: sample_coverage.comp.glsl will not copy this one's maps.
+bool is_represented() {
+    ivec2 pixel = ivec2(gl_FragCoord.xy);
+    bool known = !lens_distortion && all(lessThan(pixel, textureSize(sample_coverage, 0)));
+    return known && texelFetch(sample_coverage, pixel, 0).r > 0.0;
 }
 
 ShownMaps fragment_maps(int index, vec3 tint) {
     MaterialEntry e = materials[index];
-    vec2 rough_metal = map_here(data_maps, e.maps[METALLIC_ROUGHNESS]).gb;
-    float occlusion = 1.0 + e.maps[OCCLUSION].sampling.w * (map_here(data_maps, e.maps[OCCLUSION]).r - 1.0);
-    vec3 base = tint * map_here(color_maps, e.maps[BASE_COLOR]).rgb;
-    return ShownMaps(base, rough_metal.y, rough_metal.x, occlusion, map_here(color_maps, e.maps[EMISSIVE]).rgb);
+    bool wanted = !is_represented();
+    vec2 rough_metal = map_here(data_maps, e.maps[METALLIC_ROUGHNESS], wanted).gb;
+    float occlusion = 1.0 + e.maps[OCCLUSION].sampling.w * (map_here(data_maps, e.maps[OCCLUSION], wanted).r - 1.0);
+    vec3 base = tint * map_here(color_maps, e.maps[BASE_COLOR], wanted).rgb;
+    return ShownMaps(base, rough_metal.y, rough_metal.x, occlusion, map_here(color_maps, e.maps[EMISSIVE], wanted).rgb);
 }
 
 float fragment_opacity(int index) {
     MaterialEntry e = materials[index];
-    return e.alpha.y * map_here(color_maps, e.maps[BASE_COLOR]).a;
+    return e.alpha.y * map_here(color_maps, e.maps[BASE_COLOR], true).a;
 }
 
 // The normal `n` with a normal map's tilt. Tangents are those of the triangle's texture coordinates, turned into the plane across
@@ -61,7 +71,7 @@ vec3 bent_normal(MapEntry m, vec3 n, vec3 v) {
     tangent = normalize(tangent);
     vec3 across = cross(n, tangent);
     if (dot(across, upwards) < 0.0) across = -across;
-    vec3 tilt = map_here(data_maps, m).rgb * 2.0 - 1.0;
+    vec3 tilt = map_here(data_maps, m, true).rgb * 2.0 - 1.0;
     vec3 bent = tilt.x * m.sampling.w * tangent + tilt.y * m.sampling.w * across + tilt.z * n;
     bent = normalize(dot(bent, bent) == 0.0 ? n : bent);
     return normalize(bent + max(1e-2 - dot(bent, v), 0.0) * v);
