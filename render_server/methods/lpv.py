@@ -162,12 +162,16 @@ class LpvCells:
         return self._change_light
 
     def cover_joint(
-        self, objects: VoxelStore, volume: PlacedVolume, _real: moderngl.Buffer | None
+        self,
+        objects: VoxelStore,
+        state: GeometryState,
+        volume: PlacedVolume,
+        _real: moderngl.Buffer | None,
     ) -> moderngl.Buffer | None:
         """Computes the transmittance between cells with the objects; None: nothing is blocked."""
         if not self._has_geometry:
             return None
-        self._cover.run(self._virtual_covered, objects, volume.placement)
+        self._cover.run(self._virtual_covered, objects, volume.placement, state.buffers.cutouts)
         self._transmit.run(self._through_joint, self.size, self._real_covered, self._virtual_covered)
         return self._through_joint
 
@@ -211,7 +215,7 @@ def cell_stages(
     change = g.stage(
         f"inject change{suffix}", cells.inject_change, objects, joint, lit.object_maps, real_light
     )
-    through = g.stage(f"geometry volume{suffix}", cells.cover_joint, objects, volume, through_real)
+    through = g.stage(f"geometry volume{suffix}", cells.cover_joint, objects, s.objects, volume, through_real)
     return CellStages(volume, joint, real_light, change, through)
 
 

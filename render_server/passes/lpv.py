@@ -12,6 +12,7 @@ from jaxtyping import Float64
 
 from render_server.gpu.context import GpuContext
 from render_server.gpu.kernel import Bindings, Kernel, clear_buffer, list_threads
+from render_server.passes.gbuffer import NO_CUTOUTS
 from render_server.passes.voxels import LOWER_VOLUME, VolumePlacement, VoxelMipmap, VoxelStore
 
 COEFFICIENT_BYTES = 16  # per cell and channel: 4 floats
@@ -210,14 +211,26 @@ class LpvCoverFaces:
         self._gpu, self._threads = gpu, list_threads(gpu)
         self._kernel = Kernel(gpu, "lpv_cover_faces")
 
-    def run(self, covered: moderngl.Buffer, store: VoxelStore, cells: VolumePlacement) -> None:
+    def run(
+        self,
+        covered: moderngl.Buffer,
+        store: VoxelStore,
+        cells: VolumePlacement,
+        cutouts: Bindings = NO_CUTOUTS,
+    ) -> None:
         """Replaces the sums of `covered` by those of the surfels of `store`.
 
-        `cells` is the placement of the cells; `store` was voxelised at half a cell per edge.
+        `cells` is the placement of the cells; `store` was voxelised at half a cell per edge, from a mesh with these
+        `cutouts`.
         """
         clear_buffer(self._gpu, covered)
         self._kernel.run(
-            (self._threads,), store.bindings, Covered=covered, cells=cells.size, cell_edge=cells.voxel_edge
+            (self._threads,),
+            store.bindings,
+            cutouts,
+            Covered=covered,
+            cells=cells.size,
+            cell_edge=cells.voxel_edge,
         )
 
     def release(self) -> None:
