@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import Float16, Float32, Shaped, UInt8
 from PIL import Image
 
-from protocol.errors import DeltalightError
-from protocol.frames import decode_lut
-from protocol.scene_objects import Material as MaterialDocument
-from render_server.scene.gltf_document import GltfDocument, GltfFaultError
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import decode_lut
+from deltalight.protocol.scene_objects import Material as MaterialDocument
+from deltalight.render_server.scene.gltf_document import GltfDocument, GltfFaultError
 
 MAX_TEXTURE_PIXELS = 64_000_000
 MAX_FILE_PIXELS = 512_000_000  # of all pictures of a file that are decoded

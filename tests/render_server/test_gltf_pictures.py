@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from protocol.errors import DeltalightError
-from render_server.scene import materials
-from render_server.scene.materials import TextureMap, map_edge
-from render_server.scene.mesh_loading import load_asset
+from deltalight.protocol.errors import DeltalightError
+from deltalight.render_server.scene import materials
+from deltalight.render_server.scene.materials import TextureMap, map_edge
+from deltalight.render_server.scene.mesh_loading import load_asset
 from tests.render_server.gltf_samples import Plate, edited, even
 
 SLOTS: dict[str, Callable[[dict[str, Any], dict[str, Any]], Any]] = {
