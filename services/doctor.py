@@ -112,7 +112,7 @@ def _renderers() -> Iterator[Check]:
 
 
 def _probe(device: int) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-c", _PROBE, str(device)]
+    command = [sys.executable, "-P", "-c", _PROBE, str(device)]
     try:
         return subprocess.run(command, capture_output=True, text=True, timeout=PROBE_TIMEOUT_S, check=False)
     except subprocess.TimeoutExpired:

@@ -1,7 +1,7 @@
 """The process that handles an untrusted file within limits; started by `asset_sandbox`.
 
-Run as `python -m deltalight.services.storage.asset_worker TASK PATH MEMORY_BYTES TIME_S OUTPUT_BYTES [ARGUMENT...]`; prints one
-JSON object.
+Run as `python -m deltalight.services.storage.asset_worker TASK PATH MEMORY_BYTES TIME_S OUTPUT_BYTES [ARGUMENT...]`;
+prints one JSON object.
 """
 
 import json
