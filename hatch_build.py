@@ -31,7 +31,9 @@ class DashboardHook(BuildHookInterface):
             self.app.abort("The dashboard is not built and npm is missing: install Node.js 20.19 or newer.")
         for command in ((npm, "ci"), (npm, "run", "build")):
             if subprocess.run(command, cwd=DASHBOARD, check=False).returncode != 0:
-                self.app.abort(f"The dashboard cannot be built: `npm {' '.join(command[1:])}` failed; see above.")
+                self.app.abort(
+                    f"The dashboard cannot be built: `npm {' '.join(command[1:])}` failed; see above."
+                )
         STAMP.write_text(fingerprint())
 
 
