@@ -5,6 +5,8 @@ from operator import eq, is_
 from typing import Any
 
 import moderngl
+import numpy as np
+from jaxtyping import Float64
 
 from deltalight.protocol.frames import ViewFrame
 from deltalight.protocol.scene_method import Output
@@ -18,6 +20,7 @@ from deltalight.render_server.frame import (
 )
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Bindings
+from deltalight.render_server.gpu.textures import read_texture
 from deltalight.render_server.gpu.timers import PassTimers
 from deltalight.render_server.gpu_scene import GeometryState
 from deltalight.render_server.graph import Graph, Resource
@@ -168,7 +171,7 @@ class FrameGraph:
 
     def _declare_composition(self, composition: Composition) -> Resource[Composite]:
         g, s, layers = self.graph, self.resources, self.layers
-        radiance = g.stage(
+        radiance = self._radiance = g.stage(
             "interior edges", self.buffers.antialias_interior, layers.radiance, s.object_surface
         )
         return g.stage(
@@ -242,6 +245,11 @@ class FrameGraph:
             s.observation.value.surface,
             s.objects.value,
         )
+
+    def radiance(self) -> Float64[np.ndarray, "h w 3"]:
+        """Radiance of the virtual objects as composed, camera units; undefined where they cover nothing."""
+        self.graph.run(self._radiance)
+        return read_texture(self._radiance.value)[..., :3]
 
     def evaluate(self, lights: LightSet) -> Fields:
         """Evaluates the frame's light under other lights, at every pixel and not only near the objects.

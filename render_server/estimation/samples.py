@@ -2,12 +2,12 @@
 
 from dataclasses import dataclass, replace
 
-import moderngl
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 
 from deltalight.protocol.frames import decode_lut
 from deltalight.render_server.frame_graph import FrameGraph
+from deltalight.render_server.gpu.textures import read_texture
 from deltalight.render_server.lights.lights import LightSet
 from deltalight.render_server.scene.albedo import known_albedo, unclipped
 
@@ -72,13 +72,6 @@ def sample_light(graph: FrameGraph, lights: LightSet, bounce: Bounce | None) -> 
         lit,
         np.stack([x, y], axis=1),
     )
-
-
-def read_texture(texture: moderngl.Texture) -> Float64[np.ndarray, "h w c"]:
-    """Returns the contents of a half-float or float texture."""
-    width, height = texture.size
-    dtype = np.float16 if texture.dtype == "f2" else np.float32
-    return np.frombuffer(texture.read(), dtype).reshape(height, width, -1).astype(np.float64)
 
 
 FIRST_WAIT_S = 1.0

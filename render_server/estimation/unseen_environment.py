@@ -15,8 +15,9 @@ from deltalight.render_server.estimation.plane_extrapolation import (
     extrapolate_planes,
 )
 from deltalight.render_server.estimation.registration import unseen_radiance_from_patch
-from deltalight.render_server.estimation.samples import Bounce, read_texture, sample_light
+from deltalight.render_server.estimation.samples import Bounce, sample_light
 from deltalight.render_server.frame_graph import FrameGraph
+from deltalight.render_server.gpu.textures import read_texture
 from deltalight.render_server.lights.environment import LUMINANCE
 from deltalight.render_server.lights.lights import LightSet
 from deltalight.render_server.lights.octahedral import irradiance, octahedral_uv, resample_to_octahedral
