@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32
 
-from protocol.board import BoardSpec
-from protocol.errors import DeltalightError
-from protocol.scene_objects import Region, Surface
+from deltalight.protocol.board import BoardSpec
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.scene_objects import Region, Surface
 
 MAX_SURFACES = 16
 PLANE, BOX, MATERIAL, DIFFUSE_BOX = 0.0, 1.0, 2.0, 3.0
