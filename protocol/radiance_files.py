@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32
 
-from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.errors import DeltalightError, install_command
 
 LINEAR_SUFFIXES = (".hdr", ".exr")
 
@@ -54,7 +54,7 @@ def require_openexr(purpose: str) -> ModuleType:
         return import_module("OpenEXR")  # it has no type information
     except ImportError as error:
         raise DeltalightError(
-            f"{purpose} needs the package OpenEXR: pip install 'deltalight[render]'."
+            f"{purpose} needs the package OpenEXR: {install_command('OpenEXR')}."
         ) from error
 
 

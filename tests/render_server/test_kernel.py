@@ -364,7 +364,8 @@ def blocks_of_the_project() -> dict[str, type[Block]]:
     """The dataclasses of uniform blocks, by the name that the block has in GLSL."""
     for path in SHADERS.parents[1].rglob("*.py"):
         if "(Block):" in path.read_text():
-            importlib.import_module(".".join(path.relative_to(SHADERS.parents[2]).with_suffix("").parts))
+            module = ".".join(path.relative_to(SHADERS.parents[2]).with_suffix("").parts)
+            importlib.import_module(f"deltalight.{module}")
     ours = [
         block for block in Block.__subclasses__() if block.__module__.startswith("deltalight.render_server.")
     ]
