@@ -34,7 +34,7 @@ from deltalight.render_server.passes.gbuffer import CameraImage, GeometryBuffer,
 from deltalight.render_server.passes.shading import DirectLight
 from deltalight.render_server.passes.voxel_light import AlbedoTexture
 from deltalight.render_server.scene.declared_surfaces import SurfaceTable
-from deltalight.render_server.view import CameraView
+from deltalight.render_server.view import NOWHERE, CameraView, Rectangle
 
 
 @dataclass(frozen=True)
@@ -208,7 +208,7 @@ class FrameGraph:
         s.objects.write(inputs.objects, is_)
         s.surfaces.write(inputs.surfaces, is_)
         s.lights.write(inputs.lights, is_)
-        s.everywhere.write(False, eq)
+        s.lit_area.write(NOWHERE, eq)
         s.albedo.write(inputs.albedo, is_)
         self._inputs = inputs
 
@@ -256,11 +256,17 @@ class FrameGraph:
 
         The sources keep these lights until they are set again.
         """
+        cones, layers = self.gather(lights, (0, 0, *self.resources.view.value.size)), self.layers
+        self.graph.run(layers.direct, layers.grid)
+        return Fields(layers.direct.value, cones, layers.grid.value)
+
+    def gather(self, lights: LightSet, area: Rectangle) -> ConeFields:
+        """Gathers the light that cones find under other lights, in a part of the picture; else as `evaluate`."""
         s, layers = self.resources, self.layers
         s.lights.write(lights, is_)
-        s.everywhere.write(True, eq)
-        self.graph.run(layers.direct, layers.cones, layers.grid)
-        return Fields(layers.direct.value, layers.cones.value, layers.grid.value)
+        s.lit_area.write(area, eq)
+        self.graph.run(layers.cones)
+        return layers.cones.value
 
     def advance(self, options: CompositeOptions, until_s: float) -> bool:
         """Works on the frame until then (time.monotonic()); returns whether it is ready to render at once."""
