@@ -15,6 +15,7 @@ from deltalight.render_server.gpu.context import create_context
 from deltalight.render_server.renderer import CompositeFrame, PictureLayers, SceneRenderer
 from deltalight.scene import Scene
 
+HALF_PRECISION = 2.0**-10  # of a value: what the renderer's 16-bit pictures round away
 DARKEST = 1e-4  # radiance of the camera's picture, camera units, below which a ratio to it says nothing
 
 
@@ -48,7 +49,8 @@ class RelitPicture:
     def of(cls, frame: ViewFrame, composite: CompositeFrame, layers: PictureLayers) -> Self:
         """Splits a composite with its linear picture into light that changes and light that is added."""
         camera = linear_color(frame, frame.color)
-        linear = linear_color(frame, composite.color) if composite.linear is None else composite.linear
+        linear = camera if composite.linear is None else composite.linear
+        linear = np.where(np.abs(linear - camera) <= HALF_PRECISION * camera, camera, linear)
         cover = layers.coverage[..., None]
         objects = cover * layers.radiance
         real = np.divide(linear - objects, 1 - cover, out=camera.copy(), where=cover < 1)

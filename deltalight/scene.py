@@ -35,7 +35,7 @@ class Scene:
         Raises:
             DeltalightError: the file cannot be written.
         """
-        text = json.dumps(self.document.model_dump(mode="json", exclude_defaults=True), indent=2)
+        text = json.dumps(self.document.model_dump(mode="json"), indent=2, ensure_ascii=False)
         with replacing(Path(path)) as temporary:
             temporary.write_text(text + "\n", encoding="utf-8")
 
