@@ -23,6 +23,7 @@ SOFTWARE_WALKERS = 1024
 # cones of one texel takes up to about 5000 (16 cones through 256 voxels and the coarse scene).
 SOFTWARE_DIVISOR = 12
 LIST_WALKERS = 16384
+SPARE_PROGRAMS = 256  # kept linked while no kernel uses them: renderers are made again when settings change
 BLOCK_ALIGNMENT = (
     16  # bytes that std140 blocks are padded to; drivers may leave the padding out of their size
 )
@@ -109,6 +110,7 @@ class _Program:
         declared: Declarations,
     ) -> None:
         self._gpu, self.label, self.program, self._declared = gpu, label, program, declared
+        self.users: set[int] = set()  # ids of the kernels that have not been released
         self._samplers: list[_Slot] = []
         self._images: list[_Slot] = []
         self._storage: list[_Slot] = []
@@ -287,6 +289,34 @@ class _Program:
             watch(Dispatch(self.label, size, written))
 
 
+class _Programs:
+    """Linked programs by source: kernels of the same source share one, and the next ones find it again."""
+
+    def __init__(self) -> None:
+        self._programs: dict[tuple[str, ...], _Program] = {}  # the longest unused first
+
+    def take(self, kernel: object, source: tuple[str, ...], link: Callable[[], _Program]) -> _Program:
+        """Returns the program of that source for `kernel`; `link` makes it where there is none."""
+        program = self._programs.pop(source, None) or link()
+        self._programs[source] = program
+        program.users.add(id(kernel))
+        return program
+
+    def give_back(self, kernel: object, program: _Program) -> None:
+        """Takes back what `kernel` took; frees the oldest programs beyond SPARE_PROGRAMS that nobody uses."""
+        program.users.discard(id(kernel))
+        spare = [source for source, item in self._programs.items() if not item.users]
+        for source in spare[: max(0, len(spare) - SPARE_PROGRAMS)]:
+            self._programs.pop(source).program.release()
+
+
+def _programs(gpu: GpuContext) -> _Programs:
+    """Returns the context's programs."""
+    programs = gpu.common.setdefault("programs", _Programs())
+    assert isinstance(programs, _Programs)
+    return programs
+
+
 class _Shader:
     """The programs of one shader: with each set of its switches (`#pragma switch NAME`) that bindings turn on.
 
@@ -294,7 +324,7 @@ class _Shader:
     """
 
     def __init__(self, gpu: GpuContext, name: str | Path, defines: Mapping[str, float | str]) -> None:
-        self._gpu, self._ctx, self._name, self._defines = gpu, gpu.ctx, name, defines
+        self._gpu, self._name, self._defines = gpu, name, defines
         self._plain = self._compiled(defines)
         self._switched: dict[tuple[str, ...], _Program] = {}
         self.label, self.local_size = self._plain.label, self._plain.local_size
@@ -316,9 +346,9 @@ class _Shader:
         return self._plain.resources()
 
     def release(self) -> None:
-        """Frees the GL objects."""
+        """Leaves the programs to other kernels of the same source."""
         for each in (self._plain, *self._switched.values()):
-            each.program.release()
+            _programs(self._gpu).give_back(self, each)
 
 
 class Kernel(_Shader):
@@ -335,7 +365,11 @@ class Kernel(_Shader):
         source = shader_source(SHADERS / f"{self._name}.comp.glsl", defines)
         label = _label(self._name, defines)
         self._gpu.compiled(label, {"comp": source})
-        return _Program(self._gpu, label, self._ctx.compute_shader(source), declarations(source))
+
+        def link() -> _Program:
+            return _Program(self._gpu, label, self._gpu.ctx.compute_shader(source), declarations(source))
+
+        return _programs(self._gpu).take(self, (source,), link)
 
     def run(self, threads: Sequence[int], *shared: Bindings, **own: Binding) -> None:
         """Runs at least `threads` (x[, y[, z]]) invocations; later work sees their writes.
@@ -351,7 +385,7 @@ class Kernel(_Shader):
         counts = [*threads, 1, 1][:3]
         groups = tuple(max(1, -(-count // size)) for count, size in zip(counts, self.local_size, strict=True))
         program.compute.run(*groups)
-        self._ctx.memory_barrier()
+        self._gpu.ctx.memory_barrier()
         program.report(groups, written)
 
     def run_counted(self, groups: moderngl.Buffer, *shared: Bindings, **own: Binding) -> None:
@@ -362,7 +396,7 @@ class Kernel(_Shader):
         program = self._program(own, *shared)
         written = program.bind(shared, own)
         program.compute.run_indirect(groups)
-        self._ctx.memory_barrier()
+        self._gpu.ctx.memory_barrier()
         program.report((), written)
 
 
@@ -378,8 +412,12 @@ class RasterKernel(_Shader):
         )
         label = _label(self._name, defines)
         self._gpu.compiled(label, {"vert": vertex, "frag": fragment})
-        program = self._ctx.program(vertex_shader=vertex, fragment_shader=fragment)
-        return _Program(self._gpu, label, program, declarations(vertex + "\n" + fragment))
+
+        def link() -> _Program:
+            program = self._gpu.ctx.program(vertex_shader=vertex, fragment_shader=fragment)
+            return _Program(self._gpu, label, program, declarations(vertex + "\n" + fragment))
+
+        return _programs(self._gpu).take(self, (vertex, fragment), link)
 
     def draw(
         self,
@@ -400,13 +438,13 @@ class RasterKernel(_Shader):
         target.use()
         target.viewport = box or (0, 0, *target.size)
         target.scissor = box  # type: ignore[assignment]  # None lifts it, which the stubs do not know
-        self._ctx.enable_only(moderngl.DEPTH_TEST)
+        self._gpu.ctx.enable_only(moderngl.DEPTH_TEST)
         if clips:
-            self._ctx.enable_direct(CLIP_DISTANCE0)
+            self._gpu.ctx.enable_direct(CLIP_DISTANCE0)
         assert isinstance(linked.program, moderngl.Program)
         mesh.draw(linked.program)
         if clips:
-            self._ctx.disable_direct(CLIP_DISTANCE0)
+            self._gpu.ctx.disable_direct(CLIP_DISTANCE0)
         target.scissor = None  # type: ignore[assignment]  # or it would cut what is cleared next
         attachments = [*target.color_attachments, target.depth_attachment]
         written = {f"attachment {number}": item for number, item in enumerate(attachments)}
