@@ -2,6 +2,7 @@
 
 from collections import defaultdict
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from render_server.scene.materials import Material
 from render_server.scene.triangle_mesh import (
     FileGeometry,
     TriangleMesh,
+    bounds_of,
     converted,
     joined,
 )
@@ -28,6 +30,11 @@ class Asset:
 
     meshes: list[TriangleMesh]
     animated: GltfAsset | None
+
+    @cached_property
+    def bounds(self) -> Float32[np.ndarray, "2 3"]:
+        """Least and greatest coordinates in the rest pose, in the asset's frame."""
+        return bounds_of(self.meshes)
 
 
 def load_mesh(path: Path) -> list[TriangleMesh]:

@@ -314,6 +314,12 @@ class GpuMesh:
     textures: tuple[np.ndarray, ...]
 
 
+def bounds_of(meshes: Sequence[TriangleMesh]) -> Float32[np.ndarray, "2 3"]:
+    """Returns the least and greatest coordinates of several meshes together."""
+    each = np.stack([mesh.bounds() for mesh in meshes])
+    return np.stack([each[:, 0].min(axis=0), each[:, 1].max(axis=0)])
+
+
 def merge_for_gpu(meshes: Sequence[TriangleMesh]) -> GpuMesh:
     """Merges meshes (each with its own material, in this order) into one interleaved buffer.
 
