@@ -6,6 +6,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import trimesh
 
 from protocol.board import BoardSpec, GreyCard
 from protocol.frames import ViewFrame
@@ -25,7 +26,10 @@ from tests.render_server.scenes import (
     ball,
     camera,
     composite,
+    cube,
     depth_image,
+    fields_of,
+    floor,
     floor_depth,
     frame,
     look_at,
@@ -104,6 +108,17 @@ def mirrored(gpu: GpuContext, document: SceneDocument, view: ViewFrame) -> np.nd
     return found
 
 
+def real_surface(gpu: GpuContext, document: SceneDocument, view: ViewFrame) -> np.ndarray:
+    """World position, depth and surface entry of each pixel, (h, w, 5)."""
+    renderer = SceneRenderer(gpu, document)
+    renderer.render(view)
+    found = fields_of(renderer).position
+    assert renderer.graph is not None
+    entry = array_of(renderer.graph["real surface"].surface.normal)[..., 3:]
+    renderer.release()
+    return np.concatenate([found, entry], axis=2)
+
+
 @pytest.mark.parametrize("noise_m", [0.0005, 0.004])
 def test_the_boards_paper_and_its_cards_are_as_without_the_declared_table(
     gpu: GpuContext, stage: Stage, noise_m: float
@@ -132,6 +147,23 @@ def test_a_flat_thing_on_the_table_is_no_mirror(gpu: GpuContext, stage: Stage) -
     assert not seen[top].any()
     far = cv2.dilate(top.astype(np.uint8), np.ones((11, 11))) == 0
     assert np.mean((seen > 0.5)[far] == (everywhere > 0.5)[far]) > 0.99
+
+
+@pytest.mark.parametrize("geometry", ["model", "depth"])
+def test_the_foot_of_a_standing_box_is_no_mirror(gpu: GpuContext, stage: Stage, geometry: str) -> None:
+    """Its sides within 20 mm of the table, told by their normals; the floor beside is the declared plane."""
+    real = trimesh.util.concatenate([floor(), cube(0.1, (0.0, -0.3, 0.0))])
+    seen = real_surface(gpu, silver(stage.document([stage.virtual(cube())], [ambient(0.2)], real)), frame())
+    if geometry == "depth":
+        view = frame(depth=depth_image(seen[..., 3].astype(np.float32)))
+        seen = real_surface(gpu, silver(glowing_ball(stage)), view)
+    x, y, z = np.moveaxis(seen[..., :3], 2, 0)
+    on_box = (np.abs(x) < 0.045) & (np.abs(y + 0.35) < 0.002) & (z > 0.003) & (z < 0.017)
+    beside = (np.abs(z) < 1e-3) & ((np.abs(x) > 0.07) | (y < -0.37)) & (np.abs(x) < 0.2)
+    assert on_box.sum() > 20
+    assert (seen[on_box, 4] == -1).all()
+    assert beside.sum() > 500
+    assert (seen[beside, 4] == 0).all()
 
 
 def test_a_table_that_is_declared_too_low_still_mirrors(gpu: GpuContext, stage: Stage) -> None:
