@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from protocol.errors import DeltalightError
+from deltalight.protocol.errors import DeltalightError
 
 if TYPE_CHECKING:
-    from benchmarks.speed.measure import SpeedJob
+    from deltalight.benchmarks.speed.measure import SpeedJob
 
 # The methods that `bench quality` compares by default.
 DEFAULT_METHODS = "camera,none,paper,exact,path"
@@ -59,12 +59,12 @@ def speed(
 ) -> None:
     """Time every stage of a frame while camera, object, real scene or light moves, and camera to viewer."""
     if compare is not None:
-        from benchmarks.speed.command import run_comparison
+        from deltalight.benchmarks.speed.command import run_comparison
 
         run_comparison(*compare, as_json=as_json)
         return
     job = _speed_job(methods, motions, frames, size, device)
-    from benchmarks.speed.command import run_speed
+    from deltalight.benchmarks.speed.command import run_speed
 
     run_speed(job, budget_ms, end_to_end=end_to_end, out=out, as_json=as_json)
 
@@ -84,7 +84,7 @@ def counts(
 ) -> None:
     """Count what a frame asks of the GPU, and time what Python takes for it while the GPU is left out."""
     job = _speed_job(methods, motions, frames, size, device)
-    from benchmarks.speed.command import run_counts
+    from deltalight.benchmarks.speed.command import run_counts
 
     run_counts(job, out=out, as_json=as_json)
 
@@ -116,11 +116,11 @@ def quality(
     as_json: AsJson = False,
 ) -> None:
     """Compare relit pictures with path-traced truth: figures, and a page with pictures of the errors."""
-    from services.commands.options import parse_size
+    from deltalight.services.commands.options import parse_size
 
     size_px = parse_size(size)
     try:
-        from benchmarks.quality.command import run_quality
+        from deltalight.benchmarks.quality.command import run_quality
     except ModuleNotFoundError as missing:
         raise DeltalightError(
             f"`bench quality` needs the package {missing.name}; install the project with its dev extra."
@@ -144,8 +144,8 @@ def plot(
     motion: Annotated[str, typer.Option(help="What moves while frames are timed.")] = "camera",
 ) -> None:
     """Draw speed against quality: every method that both reports hold is a point."""
-    from benchmarks.plot import draw_plot, read_plot
-    from protocol.files import write_bytes
+    from deltalight.benchmarks.plot import draw_plot, read_plot
+    from deltalight.protocol.files import write_bytes
 
     found = read_plot(speed, quality, motion)
     write_bytes(out, draw_plot(found).encode())
@@ -164,11 +164,14 @@ def rest(
     as_json: AsJson = False,
 ) -> None:
     """Time the REST API with and without rendering, what 20 live viewers cost, and the dashboard's size."""
-    from protocol.files import write_bytes
-    from services.commands.options import parse_size
+    from deltalight.protocol.files import write_bytes
+    from deltalight.services.commands.options import parse_size
 
     size_px = None if size is None else parse_size(size)
-    from benchmarks.rest import measure_rest, print_report  # needs the api extra, unlike a wrong option
+    from deltalight.benchmarks.rest import (  # needs the api extra, unlike a wrong option
+        measure_rest,
+        print_report,
+    )
 
     report = measure_rest(seconds, size=size_px, device=device)
     if out is not None:
@@ -180,12 +183,12 @@ def rest(
 
 
 def _speed_job(methods: str, motions: str, frames: int, size: str | None, device: int | None) -> "SpeedJob":
-    from benchmarks.variants import RENDERED, parse_variants
-    from services.commands.options import parse_size
+    from deltalight.benchmarks.variants import RENDERED, parse_variants
+    from deltalight.services.commands.options import parse_size
 
     variants, size_px = parse_variants(methods, RENDERED), None if size is None else parse_size(size)
-    from benchmarks.speed.measure import SpeedJob  # needs OpenGL's packages, unlike a wrong option
-    from benchmarks.speed.motions import parse_motions
+    from deltalight.benchmarks.speed.measure import SpeedJob  # needs OpenGL's packages, unlike a wrong option
+    from deltalight.benchmarks.speed.motions import parse_motions
 
     return SpeedJob(variants, parse_motions(motions), frames, size_px, device)
 
@@ -204,12 +207,12 @@ def gpu_check(
     ] = None,
 ) -> None:
     """Check this machine's GPU and driver, eight minutes at most; exit code 1 if a step failed or ran out of time."""
-    from benchmarks.gpu_check.packages import missing_packages
-    from benchmarks.gpu_check.plan import choose_steps
+    from deltalight.benchmarks.gpu_check.packages import missing_packages
+    from deltalight.benchmarks.gpu_check.plan import choose_steps
 
     chosen, missing = choose_steps(steps), missing_packages()
-    from benchmarks.gpu_check.check import check_gpu  # needs some of those packages
-    from services.files import make_output_folder
+    from deltalight.benchmarks.gpu_check.check import check_gpu  # needs some of those packages
+    from deltalight.services.files import make_output_folder
 
     def say(text: str) -> None:
         typer.echo(f"gpu-check: {text}", err=True)

@@ -1,18 +1,18 @@
-"""Writes what docs/how-a-frame-is-made.md shows of the graph: `python -m benchmarks.frame_docs`."""
+"""Writes what docs/how-a-frame-is-made.md shows of the graph: `python -m deltalight.benchmarks.frame_docs`."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from render_server.graph import StageReport
-from services.frame_account import FrameAccount, account_frame
-from services.graph_drawing import draw_graph
+from deltalight.render_server.graph import StageReport
+from deltalight.services.frame_account import FrameAccount, account_frame
+from deltalight.services.graph_drawing import draw_graph
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "how-a-frame-is-made.md"
 PICTURE = ROOT / "docs" / "images" / "frame_graph.svg"
 METHOD = "dvct"
-BEGIN = "<!-- stages: written by `python -m benchmarks.frame_docs` -->"
+BEGIN = "<!-- stages: written by `python -m deltalight.benchmarks.frame_docs` -->"
 END = "<!-- end of stages -->"
 HEADINGS = ("stage", "what it does", "reads", "writes", "clocks", "file")
 

@@ -1,4 +1,4 @@
-"""What cone tracing reaches of the goals of docs/method.md 7.2: `python -m benchmarks.goals`, minutes in software."""
+"""What cone tracing reaches of the goals of docs/method.md 7.2: `python -m deltalight.benchmarks.goals`, minutes in software."""
 
 import tempfile
 from collections.abc import Iterator, Mapping
@@ -14,13 +14,13 @@ from jaxtyping import Bool, Float32, Float64
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.ground_truth.parts import Matrix, looking, placed, turned
-from protocol.camera_model import CameraModel
-from protocol.frames import BoardPose, DepthImage, ViewFrame
-from protocol.scene import SceneDocument, parse_scene
-from render_server.gpu.context import GpuContext, create_context
-from render_server.graph import Graph
-from render_server.renderer import SceneRenderer
+from deltalight.benchmarks.ground_truth.parts import Matrix, looking, placed, turned
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.frames import BoardPose, DepthImage, ViewFrame
+from deltalight.protocol.scene import SceneDocument, parse_scene
+from deltalight.render_server.gpu.context import GpuContext, create_context
+from deltalight.render_server.graph import Graph
+from deltalight.render_server.renderer import SceneRenderer
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 150.0
 WORLD_FROM_CAMERA = looking((0.25, -0.9, 0.65), (0.0, 0.0, 0.06))

@@ -1,4 +1,4 @@
-"""Make the demo that the project ships: `python -m benchmarks.make_demo --out DIR` (needs Mitsuba).
+"""Make the demo that the project ships: `python -m deltalight.benchmarks.make_demo --out DIR` (needs Mitsuba).
 
 Writes demo.mcap (the room of `ground_truth/scene_demo.py` as sensors see it), object.glb and scene.json. With
 `--truth DIR` also the first frame without noise, without and with the object, as PNG and linear NPY.
@@ -16,16 +16,16 @@ from jaxtyping import Float32
 from PIL import Image
 from rich.progress import Progress
 
-from benchmarks.ground_truth import scene_demo
-from benchmarks.ground_truth.demo_object import write_glb
-from benchmarks.ground_truth.render import RoomRenderer, choose_variant
-from benchmarks.ground_truth.sensors import ColorSensor, StereoDepthSensor, srgb_bytes
-from protocol.codecs import encode_color
-from protocol.errors import DeltalightError
-from protocol.frames import DepthImage, SensorFrame
-from protocol.pictures import decode_rgb, depth_from_steps
-from protocol.recording_writer import RecordingWriter
-from protocol.scene import load_scene
+from deltalight.benchmarks.ground_truth import scene_demo
+from deltalight.benchmarks.ground_truth.demo_object import write_glb
+from deltalight.benchmarks.ground_truth.render import RoomRenderer, choose_variant
+from deltalight.benchmarks.ground_truth.sensors import ColorSensor, StereoDepthSensor, srgb_bytes
+from deltalight.protocol.codecs import encode_color
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import DepthImage, SensorFrame
+from deltalight.protocol.pictures import decode_rgb, depth_from_steps
+from deltalight.protocol.recording_writer import RecordingWriter
+from deltalight.protocol.scene import load_scene
 
 SEED = 20210
 JPEG_QUALITY = 85

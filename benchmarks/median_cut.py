@@ -1,6 +1,6 @@
 """Time from a fish-eye picture to lights: split, resampling, filtering; on one core.
 
-`python -m benchmarks.median_cut` prints a table.
+`python -m deltalight.benchmarks.median_cut` prints a table.
 """
 
 import statistics
@@ -13,11 +13,11 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from protocol.hemisphere import texel_directions
-from render_server.lights.fisheye import HemisphereMap, to_world
-from render_server.lights.median_cut import split_map
-from render_server.lights.octahedral import prefilter
-from render_server.lights.sources import RESIDUAL_SIZE
+from deltalight.protocol.hemisphere import texel_directions
+from deltalight.render_server.lights.fisheye import HemisphereMap, to_world
+from deltalight.render_server.lights.median_cut import split_map
+from deltalight.render_server.lights.octahedral import prefilter
+from deltalight.render_server.lights.sources import RESIDUAL_SIZE
 
 ROUNDS = 30
 SIZES = (256, 512)

@@ -1,4 +1,4 @@
-"""The papers' own scene as a dataset folder: `python -m benchmarks.paper_scene DIRTCHAMBER_DATA OUT`.
+"""The papers' own scene as a dataset folder: `python -m deltalight.benchmarks.paper_scene DIRTCHAMBER_DATA OUT`.
 
 DIRTCHAMBER_DATA is the `data` folder of the authors' release (photograph, marker, camera file, light settings,
 Buddha). None of it is part of this project. docs/paper-scene.md describes the conversion.
@@ -15,13 +15,13 @@ import trimesh
 import typer
 from jaxtyping import Float64
 
-from protocol.board import BoardSpec, load_board_yaml
-from protocol.camera_model import CameraModel
-from protocol.dataset_writer import DatasetWriter
-from protocol.errors import DeltalightError
-from protocol.frames import SensorFrame
-from protocol.pictures import decode_rgb
-from sensor_node.markers import BoardDetector
+from deltalight.protocol.board import BoardSpec, load_board_yaml
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.dataset_writer import DatasetWriter
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import SensorFrame
+from deltalight.protocol.pictures import decode_rgb
+from deltalight.sensor_node.markers import BoardDetector
 
 MARKER_LENGTH_M = 0.08  # not published: sets the scale of the scene, nothing else depends on it
 MARGIN_M = 0.011  # white paper around the marker, measured in the photograph against the marker

@@ -9,12 +9,12 @@ from xml.etree import ElementTree
 
 from pydantic import BaseModel
 
-from benchmarks.quality import REPORT_KIND
-from benchmarks.speed.compare import require_alike
-from benchmarks.speed.report import SpeedReport, read_report
-from protocol.documents import read_mapping, validate
-from protocol.errors import DeltalightError
-from services.svg import GREY, INK, LETTER, Point, as_text, new_svg, rect, text
+from deltalight.benchmarks.quality import REPORT_KIND
+from deltalight.benchmarks.speed.compare import require_alike
+from deltalight.benchmarks.speed.report import SpeedReport, read_report
+from deltalight.protocol.documents import read_mapping, validate
+from deltalight.protocol.errors import DeltalightError
+from deltalight.services.svg import GREY, INK, LETTER, Point, as_text, new_svg, rect, text
 
 SIZE = (960, 600)
 LEFT, TOP, RIGHT, BOTTOM = 64.0, 92.0, 936.0, 540.0  # of the field

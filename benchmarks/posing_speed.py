@@ -1,4 +1,4 @@
-"""Processor time of a moving object per frame: `python -m benchmarks.posing_speed` (a minute).
+"""Processor time of a moving object per frame: `python -m deltalight.benchmarks.posing_speed` (a minute).
 
 A ball each of whose vertices depends on four of forty joints. The steps are those of
 `render_server/virtual_objects.py`; the last one is the voxeliser's work before the GPU's, for a volume of 256^3
@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from benchmarks.glb_builder import GlbBuilder
-from render_server.passes.gbuffer import triangle_corners
-from render_server.passes.voxels import pieces_in_volume, place_volume
-from render_server.scene.gltf_meshes import load_gltf
-from render_server.scene.triangle_mesh import merge_for_gpu
+from deltalight.benchmarks.glb_builder import GlbBuilder
+from deltalight.render_server.passes.gbuffer import triangle_corners
+from deltalight.render_server.passes.voxels import pieces_in_volume, place_volume
+from deltalight.render_server.scene.gltf_meshes import load_gltf
+from deltalight.render_server.scene.triangle_mesh import merge_for_gpu
 
 JOINTS = 40
 REPEATS = 9

@@ -10,20 +10,20 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from protocol.methods import GROUP, PLUGINS, InstalledMethod
-from protocol.plugins import Plugin
-from protocol.scene_method import MethodSettings
-from render_server.methods.method import RelightingMethod, ResolvedSettings
+from deltalight.protocol.methods import GROUP, PLUGINS, InstalledMethod
+from deltalight.protocol.plugins import Plugin
+from deltalight.protocol.scene_method import MethodSettings
+from deltalight.render_server.methods.method import RelightingMethod, ResolvedSettings
 
 if TYPE_CHECKING:
-    from render_server.frame import FrameResources
-    from render_server.gpu.kernel import Bindings
-    from render_server.graph import Graph, Resource
-    from render_server.lights.lights import LightSet
-    from render_server.methods.lighting import Layers
-    from render_server.methods.method import Setup
-    from render_server.passes.cones import ConeFields, LowResGrid
-    from render_server.passes.lights import LightBuffers
+    from deltalight.render_server.frame import FrameResources
+    from deltalight.render_server.gpu.kernel import Bindings
+    from deltalight.render_server.graph import Graph, Resource
+    from deltalight.render_server.lights.lights import LightSet
+    from deltalight.render_server.methods.lighting import Layers
+    from deltalight.render_server.methods.method import Setup
+    from deltalight.render_server.passes.cones import ConeFields, LowResGrid
+    from deltalight.render_server.passes.lights import LightBuffers
 
 LEAST = ResolvedSettings(volume_size=32, cone_scale=4, rsm_size=16, triangle_budget=1000)
 """Nothing reads the volume, the shadow maps or the real triangles."""
@@ -37,11 +37,11 @@ class RasterMethod(MethodSettings):
 
 def declare(g: "Graph", s: "FrameResources", setup: "Setup[RasterMethod]") -> "Layers":
     """Declares lamps without views, even light instead of cones, and no change of light."""
-    from render_server.methods import lighting
-    from render_server.methods.light_maps import LitScene
-    from render_server.passes.lights import LightBuffers
-    from render_server.passes.shading import DirectLight
-    from render_server.passes.voxels import PlacedVolume, VolumePlacement
+    from deltalight.render_server.methods import lighting
+    from deltalight.render_server.methods.light_maps import LitScene
+    from deltalight.render_server.passes.lights import LightBuffers
+    from deltalight.render_server.passes.shading import DirectLight
+    from deltalight.render_server.passes.voxels import PlacedVolume, VolumePlacement
 
     size = setup.picture_size
     buffers, direct = LightBuffers(g.gpu, LEAST.rsm_size, 1), DirectLight(g.gpu, size)
@@ -87,7 +87,7 @@ def _resolve(_settings: RasterMethod, _defaults: ResolvedSettings) -> ResolvedSe
 
 def register_raster() -> None:
     """Makes the renderer of this process know the method."""
-    plugin = Plugin(EntryPoint(RasterMethod.method_name(), "benchmarks.raster:METHOD", GROUP))
+    plugin = Plugin(EntryPoint(RasterMethod.method_name(), "deltalight.benchmarks.raster:METHOD", GROUP))
     PLUGINS.values.setdefault(plugin.name, InstalledMethod(plugin, RasterMethod, METHOD))
 
 

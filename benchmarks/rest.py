@@ -15,17 +15,17 @@ import httpx
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.rest_load import Call, send_paced, watch
-from benchmarks.rest_usage import CLIENTS, WEB, Sample, Usage, next_picture, sample
-from protocol.errors import DeltalightError
-from services import ports
-from services.api.static_page import DASHBOARD
-from services.demo import demo_plan, demo_scene
-from services.host import HostPlan
-from services.host_store import activate_document, session_file
-from services.offline import with_output
-from services.storage.store import Store
-from services.supervisor import Supervisor
+from deltalight.benchmarks.rest_load import Call, send_paced, watch
+from deltalight.benchmarks.rest_usage import CLIENTS, WEB, Sample, Usage, next_picture, sample
+from deltalight.protocol.errors import DeltalightError
+from deltalight.services import ports
+from deltalight.services.api.static_page import DASHBOARD
+from deltalight.services.demo import demo_plan, demo_scene
+from deltalight.services.host import HostPlan
+from deltalight.services.host_store import activate_document, session_file
+from deltalight.services.offline import with_output
+from deltalight.services.storage.store import Store
+from deltalight.services.supervisor import Supervisor
 
 REQUESTS_PER_S = 50.0
 VIEWERS, VIEWER_FRAMES_PER_S = 20, 10.0

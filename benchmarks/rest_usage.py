@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import httpx
 
-from protocol.errors import DeltalightError
+from deltalight.protocol.errors import DeltalightError
 
 WEB, CLIENTS = "web process", "clients"  # the clients are this process
 POLL_S = 0.05

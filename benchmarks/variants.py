@@ -4,12 +4,12 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from benchmarks.raster import RasterMethod, register_raster
-from protocol.documents import nearest, parse_mapping, validate
-from protocol.errors import DeltalightError
-from protocol.methods import PLUGINS, SETTINGS
-from protocol.scene import SceneDocument
-from protocol.scene_method import MethodSettings, NoneMethod, Output
+from deltalight.benchmarks.raster import RasterMethod, register_raster
+from deltalight.protocol.documents import nearest, parse_mapping, validate
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.methods import PLUGINS, SETTINGS
+from deltalight.protocol.scene import SceneDocument
+from deltalight.protocol.scene_method import MethodSettings, NoneMethod, Output
 
 RASTER = RasterMethod.method_name()
 MODELS: dict[str, type[MethodSettings]] = {**SETTINGS, RASTER: RasterMethod}

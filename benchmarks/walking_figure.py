@@ -1,4 +1,4 @@
-"""Make the walking figure that the project ships: `python -m benchmarks.walking_figure --out DIR`.
+"""Make the walking figure that the project ships: `python -m deltalight.benchmarks.walking_figure --out DIR`.
 
 Writes figure.glb, a skinned figure of 18 cm with the clips `round` (once around a circle, 3 s) and `walk` (on the
 spot, 1 s), and figure.json, which puts it into the demo's room.
@@ -13,9 +13,9 @@ import numpy as np
 import typer
 from jaxtyping import Float32, Float64, Int32
 
-from benchmarks.glb_builder import GlbBuilder
-from benchmarks.ground_truth import scene_demo
-from render_server.scene.triangle_mesh import face_normals, smooth_normals
+from deltalight.benchmarks.glb_builder import GlbBuilder
+from deltalight.benchmarks.ground_truth import scene_demo
+from deltalight.render_server.scene.triangle_mesh import face_normals, smooth_normals
 
 SIDES = 12
 BLEND_M = 0.008

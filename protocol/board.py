@@ -19,8 +19,8 @@ from pydantic import (
     model_validator,
 )
 
-from protocol.documents import StrictModel, nearest, read_mapping, validate
-from protocol.errors import DeltalightError
+from deltalight.protocol.documents import StrictModel, nearest, read_mapping, validate
+from deltalight.protocol.errors import DeltalightError
 
 ASSUMED_PAPER_ALBEDO = 0.8
 # Patches keep this fraction of a white gap's width away from the black on either side, where blur mixes both.

@@ -9,9 +9,9 @@ import numpy as np
 import yaml
 from jaxtyping import Float64
 
-from protocol.documents import nearest, read_mapping
-from protocol.errors import DeltalightError
-from protocol.poses import require_rigid
+from deltalight.protocol.documents import nearest, read_mapping
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.poses import require_rigid
 
 
 @dataclass(frozen=True, eq=False)

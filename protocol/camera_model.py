@@ -11,8 +11,8 @@ import numpy as np
 import yaml
 from jaxtyping import Float32, Float64
 
-from protocol.documents import read_mapping
-from protocol.errors import DeltalightError
+from deltalight.protocol.documents import read_mapping
+from deltalight.protocol.errors import DeltalightError
 
 DistortionModel = Literal["plumb_bob", "equidistant"]
 DISTORTION_LENGTHS: dict[str, tuple[int, ...]] = {"plumb_bob": (0, 4, 5, 8, 12, 14), "equidistant": (0, 4)}

@@ -11,8 +11,8 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from protocol.errors import DeltalightError
-from protocol.messages import ControlReply, ControlRequest
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.messages import ControlReply, ControlRequest
 
 CLOCK_OP = "clock"
 MAX_DRIFT_PPM = 200.0  # twice that of a bad crystal

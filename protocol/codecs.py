@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Shaped, UInt8
 
-from protocol.envelope import Buffer, EnvelopeError
-from protocol.messages import RESPONSE_SHAPE, DType
+from deltalight.protocol.envelope import Buffer, EnvelopeError
+from deltalight.protocol.messages import RESPONSE_SHAPE, DType
 
 DEFAULT_DEPTH_SCALE_M = 0.0002
 JPEG_QUALITY = 90

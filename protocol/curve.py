@@ -8,8 +8,8 @@ import zmq
 from zmq.auth.thread import ThreadAuthenticator
 from zmq.utils.monitor import recv_monitor_message
 
-from protocol.endpoints import Endpoint
-from protocol.keys import Keys
+from deltalight.protocol.endpoints import Endpoint
+from deltalight.protocol.keys import Keys
 
 ZAP_DOMAIN = "deltalight"
 POLL_MS = 200

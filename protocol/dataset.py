@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from protocol.board import BoardSpec, load_board_yaml
-from protocol.calibration import Extrinsics, load_extrinsics_yaml
-from protocol.camera_model import CameraModel, camera_from_info, load_camera_yaml
-from protocol.dataset_fisheye import FisheyeFolder, load_fisheye_calibration
-from protocol.dataset_lists import (
+from deltalight.protocol.board import BoardSpec, load_board_yaml
+from deltalight.protocol.calibration import Extrinsics, load_extrinsics_yaml
+from deltalight.protocol.camera_model import CameraModel, camera_from_info, load_camera_yaml
+from deltalight.protocol.dataset_fisheye import FisheyeFolder, load_fisheye_calibration
+from deltalight.protocol.dataset_lists import (
     FisheyeEntry,
     ListEntry,
     PoseEntry,
@@ -23,10 +23,10 @@ from protocol.dataset_lists import (
     read_poses,
     require_increasing,
 )
-from protocol.documents import read_mapping
-from protocol.errors import DeltalightError
-from protocol.frames import DepthImage, SensorFrame
-from protocol.pictures import (
+from deltalight.protocol.documents import read_mapping
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import DepthImage, SensorFrame
+from deltalight.protocol.pictures import (
     TUM_DEPTH_SCALE,
     decode_depth_png,
     decode_rgb,
@@ -34,8 +34,8 @@ from protocol.pictures import (
     is_jpeg,
     read_bytes,
 )
-from protocol.response_table import load_response_table
-from protocol.scene import SceneDocument
+from deltalight.protocol.response_table import load_response_table
+from deltalight.protocol.scene import SceneDocument
 
 
 @dataclass(frozen=True)

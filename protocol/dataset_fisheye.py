@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from protocol.dataset_lists import FisheyeEntry, format_timestamp
-from protocol.errors import DeltalightError
-from protocol.fisheye_lens import FisheyeCalibration, load_fisheye_yaml, save_fisheye_yaml
-from protocol.frames import FisheyePictures
-from protocol.pictures import decode_rgb, encode_png, read_bytes
-from protocol.radiance_files import LINEAR_SUFFIXES, read_linear, write_exr
-from protocol.response_table import load_response_table
+from deltalight.protocol.dataset_lists import FisheyeEntry, format_timestamp
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.fisheye_lens import FisheyeCalibration, load_fisheye_yaml, save_fisheye_yaml
+from deltalight.protocol.frames import FisheyePictures
+from deltalight.protocol.pictures import decode_rgb, encode_png, read_bytes
+from deltalight.protocol.radiance_files import LINEAR_SUFFIXES, read_linear, write_exr
+from deltalight.protocol.response_table import load_response_table
 
 CALIBRATION_FILE = "calibration/fisheye.yaml"
 RESPONSE_FILE = "fisheye_response.txt"

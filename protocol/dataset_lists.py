@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from protocol.errors import DeltalightError
-from protocol.poses import interpolate_pose, rigid_matrix, rotation_from_wxyz
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.poses import interpolate_pose, rigid_matrix, rotation_from_wxyz
 
 MAX_TIMESTAMP_NS = 2**63 - 1
 MAX_PAIRING_NS = 20_000_000

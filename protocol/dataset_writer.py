@@ -7,15 +7,15 @@ from typing import Self
 import numpy as np
 from jaxtyping import Float64
 
-from protocol.board import BoardSpec, save_board_yaml
-from protocol.calibration import Extrinsics, save_extrinsics_yaml
-from protocol.camera_model import CameraModel, save_camera_yaml
-from protocol.dataset_fisheye import FisheyeFolderWriter
-from protocol.dataset_lists import format_timestamp
-from protocol.errors import DeltalightError
-from protocol.frames import DepthImage, SensorFrame
-from protocol.pictures import encode_png, exact_depth_scale, steps_from_depth
-from protocol.poses import wxyz_from_rotation
+from deltalight.protocol.board import BoardSpec, save_board_yaml
+from deltalight.protocol.calibration import Extrinsics, save_extrinsics_yaml
+from deltalight.protocol.camera_model import CameraModel, save_camera_yaml
+from deltalight.protocol.dataset_fisheye import FisheyeFolderWriter
+from deltalight.protocol.dataset_lists import format_timestamp
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import DepthImage, SensorFrame
+from deltalight.protocol.pictures import encode_png, exact_depth_scale, steps_from_depth
+from deltalight.protocol.poses import wxyz_from_rotation
 
 DEFAULT_DEPTH_SCALE = 0.001
 HEADERS = {

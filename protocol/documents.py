@@ -11,7 +11,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 from pydantic_core import ErrorDetails, PydanticCustomError
 
-from protocol.errors import DeltalightError
+from deltalight.protocol.errors import DeltalightError
 
 Model = TypeVar("Model", bound=BaseModel)
 

@@ -4,7 +4,7 @@ import ipaddress
 import re
 from dataclasses import dataclass
 
-from protocol.errors import DeltalightError
+from deltalight.protocol.errors import DeltalightError
 
 _TCP = re.compile(
     r"tcp://(?:(?P<peer>[A-Za-z0-9][A-Za-z0-9_-]{0,63})@)?"

@@ -10,8 +10,8 @@ import msgpack
 import numpy as np
 from pydantic import ValidationError
 
-from protocol.errors import DeltalightError
-from protocol.messages import (
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.messages import (
     MAX_HEADER_BYTES,
     MAX_PART_BYTES,
     MESSAGE_TYPES,

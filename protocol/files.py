@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from protocol.errors import DeltalightError
+from deltalight.protocol.errors import DeltalightError
 
 PNG_COMPRESSION = 1  # zlib level; higher levels cost more time than a frame takes to render
 

@@ -12,12 +12,12 @@ import yaml
 from jaxtyping import Float32, Float64
 from numpy.polynomial.polynomial import polyval
 
-from protocol.camera_model import camera_from_info, save_camera_yaml
-from protocol.documents import nearest, read_mapping
-from protocol.equidistant_lens import EquidistantLens
-from protocol.errors import DeltalightError
-from protocol.ocam_lens import OcamLens, load_ocam_results
-from protocol.response_table import load_response_table, require_response
+from deltalight.protocol.camera_model import camera_from_info, save_camera_yaml
+from deltalight.protocol.documents import nearest, read_mapping
+from deltalight.protocol.equidistant_lens import EquidistantLens
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.ocam_lens import OcamLens, load_ocam_results
+from deltalight.protocol.response_table import load_response_table, require_response
 
 FisheyeLens = EquidistantLens | OcamLens
 _LENSES: dict[str, type[EquidistantLens] | type[OcamLens]] = {

@@ -6,9 +6,9 @@ from functools import cache
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 
-from protocol.board import BoardSpec
-from protocol.camera_model import CameraModel
-from protocol.fisheye_lens import FisheyeCalibration
+from deltalight.protocol.board import BoardSpec
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.fisheye_lens import FisheyeCalibration
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +56,7 @@ class RadianceMap:
     """Radiance that reaches the fish-eye camera from the hemisphere about its axis (docs/method.md 2).
 
     `radiance` is linear R G B in the fish-eye camera's units (1.0 = its white at the reference exposure) on the grid
-    of `protocol.hemisphere`, in the axes of its optical frame; 0 where not `seen`. `clipped_share` is the fraction of
+    of `deltalight.protocol.hemisphere`, in the axes of its optical frame; 0 where not `seen`. `clipped_share` is the fraction of
     the seen solid angle that even the shortest exposure clips (so its radiance is a lower bound). `picture` (coded,
     RGB) is for display.
     """

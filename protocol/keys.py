@@ -17,9 +17,9 @@ from tempfile import TemporaryDirectory
 import zmq.auth
 from pydantic import Field
 
-from protocol.documents import StrictModel, nearest
-from protocol.endpoints import Endpoint, parse_endpoint
-from protocol.errors import DeltalightError
+from deltalight.protocol.documents import StrictModel, nearest
+from deltalight.protocol.endpoints import Endpoint, parse_endpoint
+from deltalight.protocol.errors import DeltalightError
 
 PUBLIC, SECRET = ".key", ".key_secret"
 TRUSTED = "trusted"

@@ -5,11 +5,11 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float32
 
-from protocol.codecs import decode_array, decode_color, decode_raw
-from protocol.envelope import EnvelopeError
-from protocol.fisheye_lens import FisheyeCalibration, calibration_of
-from protocol.frames import FisheyePictures, LampPose, RadianceMap
-from protocol.messages import FisheyeMessage, LampsMessage, RadianceMessage
+from deltalight.protocol.codecs import decode_array, decode_color, decode_raw
+from deltalight.protocol.envelope import EnvelopeError
+from deltalight.protocol.fisheye_lens import FisheyeCalibration, calibration_of
+from deltalight.protocol.frames import FisheyePictures, LampPose, RadianceMap
+from deltalight.protocol.messages import FisheyeMessage, LampsMessage, RadianceMessage
 
 Parts = Sequence[memoryview]
 

@@ -12,7 +12,7 @@ from typing import Annotated, Final, Literal, Self, get_args
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints, model_validator
 
-from protocol.quality import Quality
+from deltalight.protocol.quality import Quality
 
 SCHEMA_VERSION: Final = 5
 MAX_HEADER_BYTES = 64 * 1024
@@ -224,7 +224,7 @@ class FisheyeMessage(MessageBase):
 class RadianceMessage(MessageBase):
     """The radiance that a fish-eye camera sees; current until the next one, and repeated for late subscribers.
 
-    Parts: linear R G B on the `size` x `size` grid of the hemisphere (`protocol.hemisphere`), which of it was seen (0
+    Parts: linear R G B on the `size` x `size` grid of the hemisphere (`deltalight.protocol.hemisphere`), which of it was seen (0
     or 1), the picture for display (jpeg), then the response of the fish-eye camera if `has_response`. `camera` is as
     in `FisheyeMessage`; the pose is that of the time of the map, `capture_ns`.
     """

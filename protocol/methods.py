@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import BeforeValidator, Discriminator, Tag
 
-from protocol.plugins import LoadedPlugins, Plugin, installed_plugins, load_plugins
-from protocol.scene_method import BUILT_IN_METHODS, DEFAULT_METHOD, MethodSettings
+from deltalight.protocol.plugins import LoadedPlugins, Plugin, installed_plugins, load_plugins
+from deltalight.protocol.scene_method import BUILT_IN_METHODS, DEFAULT_METHOD, MethodSettings
 
 GROUP = "deltalight.methods"
 

@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Float64
 from numpy.polynomial.polynomial import polyder, polyval
 
-from protocol.camera_model import MAX_EDGE
-from protocol.errors import DeltalightError
-from protocol.radial_lens import RadialLens, RisingCurve, first_root, require_image_circle
+from deltalight.protocol.camera_model import MAX_EDGE
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.radial_lens import RadialLens, RisingCurve, first_root, require_image_circle
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,8 +6,8 @@ from typing import TypeVar
 
 from pydantic import ValidationError
 
-from protocol.envelope import Buffer, EnvelopeError, decode, encode
-from protocol.messages import (
+from deltalight.protocol.envelope import Buffer, EnvelopeError, decode, encode
+from deltalight.protocol.messages import (
     MAX_HEADER_BYTES,
     MAX_PAYLOAD_BYTES,
     ControlReply,

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8, UInt16
 
-from protocol.camera_model import CameraModel
-from protocol.errors import DeltalightError
-from protocol.frames import DepthImage
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import DepthImage
 
 TUM_DEPTH_SCALE = 1 / 5000
 KNOWN_DEPTH_SCALES = (0.001, TUM_DEPTH_SCALE, 0.0001, 0.00025)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from typing import Generic, TypeVar
 
-from protocol.errors import DeltalightError
+from deltalight.protocol.errors import DeltalightError
 
 T = TypeVar("T")
 OWN_PACKAGE = "deltalight"

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float64
 
-from protocol.errors import DeltalightError
+from deltalight.protocol.errors import DeltalightError
 
 
 def rotation_from_wxyz(quaternion: Sequence[float]) -> Float64[np.ndarray, "3 3"]:

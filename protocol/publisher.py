@@ -5,11 +5,11 @@ from collections.abc import Sequence
 
 import zmq
 
-from protocol.curve import guard
-from protocol.errors import DeltalightError
-from protocol.keys import Keys
-from protocol.messages import MAX_PART_BYTES
-from protocol.sockets import HIGH_WATER_MARK, attach, open_socket
+from deltalight.protocol.curve import guard
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.keys import Keys
+from deltalight.protocol.messages import MAX_PART_BYTES
+from deltalight.protocol.sockets import HIGH_WATER_MARK, attach, open_socket
 
 STREAMS_OF_A_NODE = 8
 

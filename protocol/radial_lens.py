@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from protocol.errors import DeltalightError
+from deltalight.protocol.errors import DeltalightError
 
 Values = Float64[np.ndarray, "..."]
 ROUNDING_PX = 1e-6

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32
 
-from protocol.errors import DeltalightError
+from deltalight.protocol.errors import DeltalightError
 
 LINEAR_SUFFIXES = (".hdr", ".exr")
 

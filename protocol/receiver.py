@@ -3,9 +3,9 @@
 from collections import Counter
 from collections.abc import Sequence
 
-from protocol.envelope import MAX_PARTS, MAX_TOPIC_BYTES
-from protocol.keys import Keys
-from protocol.subscriber import ReceivedMultipart, Subscriber
+from deltalight.protocol.envelope import MAX_PARTS, MAX_TOPIC_BYTES
+from deltalight.protocol.keys import Keys
+from deltalight.protocol.subscriber import ReceivedMultipart, Subscriber
 
 MAX_TOPICS = 256
 

@@ -14,12 +14,12 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
 
-from protocol.equidistant_lens import EquidistantLens
-from protocol.errors import DeltalightError
-from protocol.fisheye_lens import FisheyeLens, calibration_of, describe_calibration
-from protocol.frames import FisheyePictures
-from protocol.pictures import decode_rgb, encode_png
-from protocol.recording_format import (
+from deltalight.protocol.equidistant_lens import EquidistantLens
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.fisheye_lens import FisheyeLens, calibration_of, describe_calibration
+from deltalight.protocol.frames import FisheyePictures
+from deltalight.protocol.pictures import decode_rgb, encode_png
+from deltalight.protocol.recording_format import (
     FISHEYE_CAMERA_TOPIC,
     FISHEYE_FRAME,
     FISHEYE_LINEAR_TOPIC,

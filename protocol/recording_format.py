@@ -16,10 +16,10 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from jaxtyping import Float64
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from protocol.board import BoardSpec
-from protocol.camera_model import CameraModel
-from protocol.errors import DeltalightError
-from protocol.poses import wxyz_from_rotation
+from deltalight.protocol.board import BoardSpec
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.poses import wxyz_from_rotation
 
 SCHEMA_VERSION = 1
 ACTIVE_SUFFIX = ".active"

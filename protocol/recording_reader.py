@@ -21,15 +21,15 @@ from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
 from zstandard import ZstdError
 
-from protocol.board import BoardSpec
-from protocol.calibration import Extrinsics
-from protocol.camera_model import CameraModel
-from protocol.documents import parse_mapping
-from protocol.errors import DeltalightError
-from protocol.frames import DepthImage, SensorFrame
-from protocol.pictures import decode_rgb, depth_from_steps, is_jpeg
-from protocol.recording_fisheye import FisheyeTrack
-from protocol.recording_format import (
+from deltalight.protocol.board import BoardSpec
+from deltalight.protocol.calibration import Extrinsics
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.documents import parse_mapping
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import DepthImage, SensorFrame
+from deltalight.protocol.pictures import decode_rgb, depth_from_steps, is_jpeg
+from deltalight.protocol.recording_fisheye import FisheyeTrack
+from deltalight.protocol.recording_format import (
     COLOR_TOPIC,
     DEPTH_TOPIC,
     FISHEYE_RECORD_TOPIC,
@@ -40,7 +40,7 @@ from protocol.recording_format import (
     FrameRecord,
     SessionRecord,
 )
-from protocol.scene import SceneDocument, parse_scene, resolve_asset
+from deltalight.protocol.scene import SceneDocument, parse_scene, resolve_asset
 
 MAX_RECORD_BYTES = 512 * 1024 * 1024
 RECORD_TOPICS = (FRAME_TOPIC, FISHEYE_RECORD_TOPIC)

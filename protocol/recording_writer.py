@@ -15,13 +15,13 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import register_schema
 
-from protocol.board import BoardSpec
-from protocol.calibration import Extrinsics
-from protocol.errors import DeltalightError
-from protocol.frames import DepthImage, FisheyePictures, SensorFrame
-from protocol.pictures import encode_png, exact_depth_scale, known_depth, steps_from_depth
-from protocol.recording_fisheye import fisheye_messages
-from protocol.recording_format import (
+from deltalight.protocol.board import BoardSpec
+from deltalight.protocol.calibration import Extrinsics
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import DepthImage, FisheyePictures, SensorFrame
+from deltalight.protocol.pictures import encode_png, exact_depth_scale, known_depth, steps_from_depth
+from deltalight.protocol.recording_fisheye import fisheye_messages
+from deltalight.protocol.recording_format import (
     ACTIVE_SUFFIX,
     COLOR_CAMERA_TOPIC,
     COLOR_FRAME,
@@ -44,7 +44,7 @@ from protocol.recording_format import (
     timestamp_fields,
     transform_message,
 )
-from protocol.scene import DIGEST_PREFIX, SceneDocument
+from deltalight.protocol.scene import DIGEST_PREFIX, SceneDocument
 
 CHUNK_BYTES = 256 * 1024
 SYNC_PERIOD_S = 1.0

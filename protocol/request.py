@@ -9,13 +9,13 @@ from dataclasses import dataclass
 import structlog
 import zmq
 
-from protocol.curve import guard
-from protocol.envelope import EnvelopeError
-from protocol.errors import DeltalightError
-from protocol.keys import Keys
-from protocol.messages import MAX_PAYLOAD_BYTES, ControlReply, ControlRequest
-from protocol.payloads import decode_control, encode_control
-from protocol.sockets import attach, open_socket
+from deltalight.protocol.curve import guard
+from deltalight.protocol.envelope import EnvelopeError
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.keys import Keys
+from deltalight.protocol.messages import MAX_PAYLOAD_BYTES, ControlReply, ControlRequest
+from deltalight.protocol.payloads import decode_control, encode_control
+from deltalight.protocol.sockets import attach, open_socket
 
 UNREADABLE_ID = "unreadable"
 REMEMBERED_REPLIES = 256

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from protocol.errors import DeltalightError
+from deltalight.protocol.errors import DeltalightError
 
 
 def load_response_table(path: Path) -> Float32[np.ndarray, "256 3"]:

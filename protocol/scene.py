@@ -7,12 +7,12 @@ from typing import Any, Self
 
 from pydantic import Field, field_validator, model_validator
 
-from protocol.documents import StrictModel, read_mapping, validate
-from protocol.errors import DeltalightError
-from protocol.methods import Method
-from protocol.scene_lights import Lights, default_lights
-from protocol.scene_method import DvctMethod, Output, Shading
-from protocol.scene_objects import ModelGeometry, PrecomputedMaterial, RealScene, SceneObject
+from deltalight.protocol.documents import StrictModel, read_mapping, validate
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.methods import Method
+from deltalight.protocol.scene_lights import Lights, default_lights
+from deltalight.protocol.scene_method import DvctMethod, Output, Shading
+from deltalight.protocol.scene_objects import ModelGeometry, PrecomputedMaterial, RealScene, SceneObject
 
 DIGEST_PREFIX = "sha256:"
 

@@ -6,8 +6,16 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import ConfigDict, Discriminator, Field, Tag, model_validator
 
-from protocol.documents import StrictModel
-from protocol.scene_fields import ASSET_TEXT, Asset, Direction, Fraction, NonNegative, Point, Radiance
+from deltalight.protocol.documents import StrictModel
+from deltalight.protocol.scene_fields import (
+    ASSET_TEXT,
+    Asset,
+    Direction,
+    Fraction,
+    NonNegative,
+    Point,
+    Radiance,
+)
 
 DEFAULT_LIGHT_TYPE = "sphere"
 # Without `type` a light is a sphere; the other kinds require the key, so that a document matches one kind only.

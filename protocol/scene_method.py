@@ -4,8 +4,8 @@ from typing import Annotated, Any, Literal, Self, TypeVar, get_args
 
 from pydantic import ConfigDict, Field, model_validator
 
-from protocol.documents import StrictModel
-from protocol.quality import TIERS, Quality, QualityTier
+from deltalight.protocol.documents import StrictModel
+from deltalight.protocol.quality import TIERS, Quality, QualityTier
 
 DEFAULT_METHOD = "dvct"
 T = TypeVar("T")

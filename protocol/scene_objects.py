@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Float64
 from pydantic import Discriminator, Field, Tag, model_validator
 
-from protocol.documents import StrictModel
-from protocol.poses import rigid_matrix, rotation_from_wxyz
-from protocol.scene_fields import (
+from deltalight.protocol.documents import StrictModel
+from deltalight.protocol.poses import rigid_matrix, rotation_from_wxyz
+from deltalight.protocol.scene_fields import (
     ASSET_TEXT,
     Asset,
     Colour,

@@ -2,11 +2,11 @@
 
 import zmq
 
-from protocol.curve import secure
-from protocol.endpoints import Endpoint, parse_endpoint
-from protocol.errors import DeltalightError
-from protocol.keys import CREATE_HINT, Keys
-from protocol.messages import MAX_PART_BYTES
+from deltalight.protocol.curve import secure
+from deltalight.protocol.endpoints import Endpoint, parse_endpoint
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.keys import CREATE_HINT, Keys
+from deltalight.protocol.messages import MAX_PART_BYTES
 
 HIGH_WATER_MARK = 2  # frames; with the default of 1000 a slow consumer saw frames that were seconds old
 RECONNECT_MS = 100

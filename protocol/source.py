@@ -4,12 +4,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Protocol
 
-from protocol.board import BoardSpec
-from protocol.calibration import Extrinsics
-from protocol.camera_model import CameraModel
-from protocol.errors import DeltalightError
-from protocol.frames import SensorFrame
-from protocol.scene import SceneDocument
+from deltalight.protocol.board import BoardSpec
+from deltalight.protocol.calibration import Extrinsics
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import SensorFrame
+from deltalight.protocol.scene import SceneDocument
 
 RECORDING_SUFFIXES = (".mcap", ".mcap.active")
 
@@ -66,13 +66,13 @@ def open_source(path: Path, board: BoardSpec | None = None) -> Source:
     """
     # Imported here because both readers are heavy and few callers need both.
     if path.is_dir():
-        from protocol.dataset import open_dataset
+        from deltalight.protocol.dataset import open_dataset
 
         return open_dataset(path, board)
     if not path.exists():
         raise DeltalightError(f"{path} does not exist; give a dataset folder or an .mcap recording.")
     if not path.name.endswith(RECORDING_SUFFIXES):
         raise DeltalightError(f"{path} is neither a folder nor an .mcap recording; give one of these.")
-    from protocol.recording_reader import RecordingReader
+    from deltalight.protocol.recording_reader import RecordingReader
 
     return RecordingReader(path, board)

@@ -7,13 +7,13 @@ import cv2
 import numpy as np
 from jaxtyping import Float64, Int32, UInt8
 
-from protocol.frames import RadianceMap, ViewFrame
-from protocol.hemisphere import hemisphere_direction
-from render_server.lights.environment import LUMINANCE
-from render_server.lights.fisheye import HemisphereMap
-from render_server.lights.lights import IncidentLight, LightSet, incident_light
-from render_server.lights.median_cut import Region, Split
-from render_server.lights.octahedral import solid_angle_mean
+from deltalight.protocol.frames import RadianceMap, ViewFrame
+from deltalight.protocol.hemisphere import hemisphere_direction
+from deltalight.render_server.lights.environment import LUMINANCE
+from deltalight.render_server.lights.fisheye import HemisphereMap
+from deltalight.render_server.lights.lights import IncidentLight, LightSet, incident_light
+from deltalight.render_server.lights.median_cut import Region, Split
+from deltalight.render_server.lights.octahedral import solid_angle_mean
 
 OUTLINE_POINTS = 24  # per edge of a region: a lens bends straight lines
 MIN_RADIUS_RAD = float(np.radians(1.0))  # smaller lights are drawn at this radius, to stay visible

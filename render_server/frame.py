@@ -5,21 +5,26 @@ from dataclasses import dataclass
 import moderngl
 import numpy as np
 
-from protocol.frames import DepthImage, ViewFrame
-from protocol.quality import QualityTier
-from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import Binding, Bindings
-from render_server.gpu.textures import release_all
-from render_server.gpu.uniform_block import UniformBlock
-from render_server.gpu_scene import GeometryState
-from render_server.graph import Graph, Resource
-from render_server.lights.lights import LightSet
-from render_server.passes.coverage import EdgeUnmixing, InteriorEdgeAA, ObjectCoverage, SampleCoverage
-from render_server.passes.gbuffer import CameraImage, GeometryBuffer, RasterGeometry, RealSurface
-from render_server.passes.voxel_light import AlbedoTexture
-from render_server.scene.declared_surfaces import MAX_ROWS, SHEET, SurfaceTable, plane_fits
-from render_server.scene.depth_surface import DepthSurface
-from render_server.view import CameraBlock, CameraView, Rectangle
+from deltalight.protocol.frames import DepthImage, ViewFrame
+from deltalight.protocol.quality import QualityTier
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import Binding, Bindings
+from deltalight.render_server.gpu.textures import release_all
+from deltalight.render_server.gpu.uniform_block import UniformBlock
+from deltalight.render_server.gpu_scene import GeometryState
+from deltalight.render_server.graph import Graph, Resource
+from deltalight.render_server.lights.lights import LightSet
+from deltalight.render_server.passes.coverage import (
+    EdgeUnmixing,
+    InteriorEdgeAA,
+    ObjectCoverage,
+    SampleCoverage,
+)
+from deltalight.render_server.passes.gbuffer import CameraImage, GeometryBuffer, RasterGeometry, RealSurface
+from deltalight.render_server.passes.voxel_light import AlbedoTexture
+from deltalight.render_server.scene.declared_surfaces import MAX_ROWS, SHEET, SurfaceTable, plane_fits
+from deltalight.render_server.scene.depth_surface import DepthSurface
+from deltalight.render_server.view import CameraBlock, CameraView, Rectangle
 
 BIAS_SIGMAS = 3.0  # of depth noise: keeps real surfaces from shadowing themselves
 

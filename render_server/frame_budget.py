@@ -5,7 +5,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import get_args
 
-from protocol.quality import Quality
+from deltalight.protocol.quality import Quality
 
 WARM_UP = 2  # frames after a change of level: they compile, allocate and build
 WINDOW = 5  # frames: the median tells

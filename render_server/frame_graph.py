@@ -6,9 +6,9 @@ from typing import Any
 
 import moderngl
 
-from protocol.frames import ViewFrame
-from protocol.scene_method import Output
-from render_server.frame import (
+from deltalight.protocol.frames import ViewFrame
+from deltalight.protocol.scene_method import Output
+from deltalight.render_server.frame import (
     FrameResources,
     Measurement,
     Observation,
@@ -16,22 +16,22 @@ from render_server.frame import (
     Scan,
     declare_frame,
 )
-from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import Bindings
-from render_server.gpu.timers import PassTimers
-from render_server.gpu_scene import GeometryState
-from render_server.graph import Graph, Resource
-from render_server.lights.lights import LightSet
-from render_server.methods.lighting import Layers
-from render_server.methods.registry import MethodChoice
-from render_server.occlusion_fields import OcclusionFields
-from render_server.passes.composite import Composite, DebugViews, RelitLayers
-from render_server.passes.cones import ConeFields, LowResGrid
-from render_server.passes.gbuffer import CameraImage, GeometryBuffer, RealSurface
-from render_server.passes.shading import DirectLight
-from render_server.passes.voxel_light import AlbedoTexture
-from render_server.scene.declared_surfaces import SurfaceTable
-from render_server.view import CameraView
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import Bindings
+from deltalight.render_server.gpu.timers import PassTimers
+from deltalight.render_server.gpu_scene import GeometryState
+from deltalight.render_server.graph import Graph, Resource
+from deltalight.render_server.lights.lights import LightSet
+from deltalight.render_server.methods.lighting import Layers
+from deltalight.render_server.methods.registry import MethodChoice
+from deltalight.render_server.occlusion_fields import OcclusionFields
+from deltalight.render_server.passes.composite import Composite, DebugViews, RelitLayers
+from deltalight.render_server.passes.cones import ConeFields, LowResGrid
+from deltalight.render_server.passes.gbuffer import CameraImage, GeometryBuffer, RealSurface
+from deltalight.render_server.passes.shading import DirectLight
+from deltalight.render_server.passes.voxel_light import AlbedoTexture
+from deltalight.render_server.scene.declared_surfaces import SurfaceTable
+from deltalight.render_server.view import CameraView
 
 
 @dataclass(frozen=True)

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from render_server.passes.gbuffer import MaterialTable, MeshBuffers
-from render_server.scene.depth_mesh import back_faces
-from render_server.scene.materials import Material
-from render_server.scene.triangle_mesh import TriangleMesh
+from deltalight.render_server.passes.gbuffer import MaterialTable, MeshBuffers
+from deltalight.render_server.scene.depth_mesh import back_faces
+from deltalight.render_server.scene.materials import Material
+from deltalight.render_server.scene.triangle_mesh import TriangleMesh
 
 # Half the edge of a volume by how far objects reach from its middle, at least. Less than 2 / sqrt(3): twice the edge
 # of a cube leaves it that much in any turn.

@@ -13,11 +13,11 @@ from dataclasses import dataclass, field
 from difflib import get_close_matches
 from typing import Any, Final, Generic, Literal, TypeVar, get_args
 
-from protocol.plugins import Plugin
-from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import Dispatch, watched
-from render_server.gpu.textures import gpu_objects, sizes_bytes
-from render_server.gpu.timers import PassTimers
+from deltalight.protocol.plugins import Plugin
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import Dispatch, watched
+from deltalight.render_server.gpu.textures import gpu_objects, sizes_bytes
+from deltalight.render_server.gpu.timers import PassTimers
 
 Clock = Literal["scene", "lights", "world", "objects", "view"]
 CLOCKS: Final[tuple[Clock, ...]] = get_args(Clock)

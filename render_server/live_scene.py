@@ -5,26 +5,26 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from protocol.frames import ViewFrame
-from protocol.scene import SceneDocument
-from protocol.scene_method import Output
-from protocol.scene_objects import Material
-from render_server.estimation.albedo import AlbedoEstimator
-from render_server.estimation.lighting import LightEstimator
-from render_server.frame_budget import FrameBudget, Level
-from render_server.frame_graph import CompositeOptions, FrameGraph, FrameInputs, ShownBuffers
-from render_server.gpu.context import GpuContext
-from render_server.gpu.textures import release_all
-from render_server.gpu.timers import PassTimers
-from render_server.gpu_scene import GeometryState
-from render_server.methods.registry import MethodChoice, choose_method
-from render_server.occlusion_fields import OcclusionFields
-from render_server.passes.composite import Composite, Enlarge
-from render_server.real_geometry import RealGeometry
-from render_server.scene.declared_surfaces import SurfaceTable, build_surface_table
-from render_server.scene.triangle_mesh import TriangleMesh
-from render_server.view import CameraView, PosedFrame
-from render_server.virtual_objects import VirtualObjects
+from deltalight.protocol.frames import ViewFrame
+from deltalight.protocol.scene import SceneDocument
+from deltalight.protocol.scene_method import Output
+from deltalight.protocol.scene_objects import Material
+from deltalight.render_server.estimation.albedo import AlbedoEstimator
+from deltalight.render_server.estimation.lighting import LightEstimator
+from deltalight.render_server.frame_budget import FrameBudget, Level
+from deltalight.render_server.frame_graph import CompositeOptions, FrameGraph, FrameInputs, ShownBuffers
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.textures import release_all
+from deltalight.render_server.gpu.timers import PassTimers
+from deltalight.render_server.gpu_scene import GeometryState
+from deltalight.render_server.methods.registry import MethodChoice, choose_method
+from deltalight.render_server.occlusion_fields import OcclusionFields
+from deltalight.render_server.passes.composite import Composite, Enlarge
+from deltalight.render_server.real_geometry import RealGeometry
+from deltalight.render_server.scene.declared_surfaces import SurfaceTable, build_surface_table
+from deltalight.render_server.scene.triangle_mesh import TriangleMesh
+from deltalight.render_server.view import CameraView, PosedFrame
+from deltalight.render_server.virtual_objects import VirtualObjects
 
 # Work on a frame at rest, until its picture has the best quality; a stage that was begun is finished.
 REFINE_S = 0.05

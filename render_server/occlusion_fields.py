@@ -14,11 +14,11 @@ from jaxtyping import Float32
 from rich.console import Console
 from rich.progress import Progress
 
-from protocol.errors import DeltalightError
-from protocol.files import replacing
-from protocol.scene_objects import SceneObject
-from render_server.gpu_scene import PlacedObject
-from render_server.scene.occlusion_field import (
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.files import replacing
+from deltalight.protocol.scene_objects import SceneObject
+from deltalight.render_server.gpu_scene import PlacedObject
+from deltalight.render_server.scene.occlusion_field import (
     FieldSettings,
     ObjectRays,
     OcclusionField,
@@ -27,8 +27,13 @@ from render_server.scene.occlusion_field import (
     compute_occlusion,
     place_shells,
 )
-from render_server.scene.occlusion_transfer import LENGTH, compute_transfer, object_surface, surface_pieces
-from render_server.scene.triangle_mesh import TriangleMesh
+from deltalight.render_server.scene.occlusion_transfer import (
+    LENGTH,
+    compute_transfer,
+    object_surface,
+    surface_pieces,
+)
+from deltalight.render_server.scene.triangle_mesh import TriangleMesh
 
 FIELD_VERSION = 1  # rises when the same input gives another field
 CACHE_VARIABLE = "DELTALIGHT_CACHE"

@@ -7,15 +7,15 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float64
 
-from protocol.errors import DeltalightError
-from protocol.frames import ViewFrame
-from render_server.frame_graph import ShownBuffers
-from render_server.gpu.textures import read_texel
-from render_server.gpu_scene import PlacedObject
-from render_server.scene.bvh import first_hit
-from render_server.scene.depth_surface import depth_surface
-from render_server.scene.triangle_mesh import TriangleMesh
-from render_server.view import CameraView
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import ViewFrame
+from deltalight.render_server.frame_graph import ShownBuffers
+from deltalight.render_server.gpu.textures import read_texel
+from deltalight.render_server.gpu_scene import PlacedObject
+from deltalight.render_server.scene.bvh import first_hit
+from deltalight.render_server.scene.depth_surface import depth_surface
+from deltalight.render_server.scene.triangle_mesh import TriangleMesh
+from deltalight.render_server.view import CameraView
 
 SHOWN_FRACTION = 0.5  # of a pixel that an object must cover to be picked
 

@@ -5,19 +5,24 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from protocol.errors import DeltalightError
-from protocol.scene_objects import ModelGeometry, RealScene
-from render_server.frame import Measurement, Scan
-from render_server.gpu.context import GpuContext
-from render_server.gpu_scene import GeometryState
-from render_server.passes.gbuffer import MaterialTable, MeshBuffers, triangle_corners
-from render_server.scene.depth_mesh import depth_mesh
-from render_server.scene.depth_surface import DepthSurface, depth_surface, grazing_depth_fill, noise_sigma
-from render_server.scene.mesh_loading import load_mesh
-from render_server.scene.motion_detection import FrameSamples, KeptWorld, MotionDetector
-from render_server.scene.triangle_mesh import TriangleMesh, merge_for_gpu
-from render_server.scene.tsdf_mesh import TsdfScene
-from render_server.view import CameraView, PosedFrame
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.scene_objects import ModelGeometry, RealScene
+from deltalight.render_server.frame import Measurement, Scan
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu_scene import GeometryState
+from deltalight.render_server.passes.gbuffer import MaterialTable, MeshBuffers, triangle_corners
+from deltalight.render_server.scene.depth_mesh import depth_mesh
+from deltalight.render_server.scene.depth_surface import (
+    DepthSurface,
+    depth_surface,
+    grazing_depth_fill,
+    noise_sigma,
+)
+from deltalight.render_server.scene.mesh_loading import load_mesh
+from deltalight.render_server.scene.motion_detection import FrameSamples, KeptWorld, MotionDetector
+from deltalight.render_server.scene.triangle_mesh import TriangleMesh, merge_for_gpu
+from deltalight.render_server.scene.tsdf_mesh import TsdfScene
+from deltalight.render_server.view import CameraView, PosedFrame
 
 COARSE_DIVISOR = 8  # of the triangles, for the coarse volume: its voxels are several times larger
 BOUND_POINTS = 4000  # sampled from a mesh for fitting light views

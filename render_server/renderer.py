@@ -11,18 +11,18 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
-from protocol.camera_model import CameraModel
-from protocol.errors import DeltalightError
-from protocol.frames import ViewFrame
-from protocol.scene import SceneDocument
-from render_server.frame_budget import Level
-from render_server.gpu.context import GpuContext
-from render_server.gpu.textures import AsyncReadback
-from render_server.graph import Graph
-from render_server.live_scene import LiveScene, RelitFrame
-from render_server.passes.composite import Composite
-from render_server.picking import Pick, ShownFrame
-from render_server.view import CameraView, output_size, resized_frame
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import ViewFrame
+from deltalight.protocol.scene import SceneDocument
+from deltalight.render_server.frame_budget import Level
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.textures import AsyncReadback
+from deltalight.render_server.graph import Graph
+from deltalight.render_server.live_scene import LiveScene, RelitFrame
+from deltalight.render_server.passes.composite import Composite
+from deltalight.render_server.picking import Pick, ShownFrame
+from deltalight.render_server.view import CameraView, output_size, resized_frame
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 from jaxtyping import Float64
 
-from protocol.camera_model import CameraModel
-from protocol.frames import DepthImage, ViewFrame
-from protocol.scene_method import Output
-from render_server.gpu.uniform_block import Block, Bool, Mat4, Vec2, Vec3, Vec4
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.frames import DepthImage, ViewFrame
+from deltalight.protocol.scene_method import Output
+from deltalight.render_server.gpu.uniform_block import Block, Bool, Mat4, Vec2, Vec3, Vec4
 
 NEAR_M = 0.02
 FAR_M = 100.0

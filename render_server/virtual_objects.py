@@ -7,18 +7,18 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from protocol.board import BoardSpec
-from protocol.errors import DeltalightError
-from protocol.scene_objects import Animation, SceneObject
-from protocol.scene_objects import Material as MaterialDocument
-from render_server.gpu.context import GpuContext
-from render_server.gpu_scene import GeometryState, PlacedObject
-from render_server.passes.gbuffer import MaterialTable, MeshBuffers, triangle_corners
-from render_server.scene.gltf_animation import Clip
-from render_server.scene.gltf_meshes import GltfAsset, Pose
-from render_server.scene.materials import Material
-from render_server.scene.mesh_loading import Asset, load_asset
-from render_server.scene.triangle_mesh import GpuMesh, TriangleMesh, bounds_of, merge_for_gpu
+from deltalight.protocol.board import BoardSpec
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.scene_objects import Animation, SceneObject
+from deltalight.protocol.scene_objects import Material as MaterialDocument
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu_scene import GeometryState, PlacedObject
+from deltalight.render_server.passes.gbuffer import MaterialTable, MeshBuffers, triangle_corners
+from deltalight.render_server.scene.gltf_animation import Clip
+from deltalight.render_server.scene.gltf_meshes import GltfAsset, Pose
+from deltalight.render_server.scene.materials import Material
+from deltalight.render_server.scene.mesh_loading import Asset, load_asset
+from deltalight.render_server.scene.triangle_mesh import GpuMesh, TriangleMesh, bounds_of, merge_for_gpu
 
 MARKER_FRAME = "marker:"
 

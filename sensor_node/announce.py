@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import structlog
 
-from protocol.endpoints import Endpoint, is_loopback, parse_endpoint
-from protocol.keys import Keys
-from protocol.messages import SCHEMA_VERSION
+from deltalight.protocol.endpoints import Endpoint, is_loopback, parse_endpoint
+from deltalight.protocol.keys import Keys
+from deltalight.protocol.messages import SCHEMA_VERSION
 
 if TYPE_CHECKING:
     from zeroconf import ServiceInfo

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Self
 
-from protocol.clock import Clock, ClockEstimator, clock_exchange, measure_offset
-from protocol.errors import DeltalightError
-from protocol.frames import SensorFrame
-from protocol.keys import Keys
-from protocol.request import RequestClient
-from sensor_node.cameras.base import Camera, EndOfStream
+from deltalight.protocol.clock import Clock, ClockEstimator, clock_exchange, measure_offset
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import SensorFrame
+from deltalight.protocol.keys import Keys
+from deltalight.protocol.request import RequestClient
+from deltalight.sensor_node.cameras.base import Camera, EndOfStream
 
 POLL_S = 0.1
 CLOCK_PERIOD_S = 2.0

@@ -9,11 +9,11 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int64, UInt8
 from pydantic import Field
 
-from protocol.documents import StrictModel
-from protocol.errors import DeltalightError
-from protocol.frames import DepthImage
-from sensor_node.depth_edges import assign_edges
-from sensor_node.depth_filter import NoiseModel, SmoothedDepth, smooth_inverse_depth
+from deltalight.protocol.documents import StrictModel
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import DepthImage
+from deltalight.sensor_node.depth_edges import assign_edges
+from deltalight.sensor_node.depth_filter import NoiseModel, SmoothedDepth, smooth_inverse_depth
 
 # A normal variable's standard deviation is this multiple of its median absolute deviation.
 SIGMA_PER_MAD = 1.4826

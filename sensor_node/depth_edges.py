@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Int64, UInt8
 
-from sensor_node.depth_filter import NoiseModel
+from deltalight.sensor_node.depth_filter import NoiseModel
 
 Samples = Float32[np.ndarray, "samples n"]
 PerPixel = Float32[np.ndarray, " n"]

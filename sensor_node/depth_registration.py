@@ -3,9 +3,9 @@
 import numpy as np
 from jaxtyping import Float64
 
-from protocol.camera_model import CameraModel
-from protocol.frames import DepthImage
-from sensor_node.depth import known_pixels
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.frames import DepthImage
+from deltalight.sensor_node.depth import known_pixels
 
 # Pixels are enlarged a little, because lenses and slopes stretch some.
 FOOTPRINT_MARGIN = 1.2

@@ -7,12 +7,19 @@ from typing import Literal, TypedDict
 import numpy as np
 from jaxtyping import Float64
 
-from protocol.board import BoardSpec
-from protocol.codecs import encode_array, encode_color, encode_depth
-from protocol.envelope import EnvelopeError, encode
-from protocol.fisheye_lens import describe_calibration
-from protocol.frames import BoardPose, DepthImage, FisheyePictures, LampPose, RadianceMap, SensorFrame
-from protocol.messages import (
+from deltalight.protocol.board import BoardSpec
+from deltalight.protocol.codecs import encode_array, encode_color, encode_depth
+from deltalight.protocol.envelope import EnvelopeError, encode
+from deltalight.protocol.fisheye_lens import describe_calibration
+from deltalight.protocol.frames import (
+    BoardPose,
+    DepthImage,
+    FisheyePictures,
+    LampPose,
+    RadianceMap,
+    SensorFrame,
+)
+from deltalight.protocol.messages import (
     ColorMessage,
     DepthMessage,
     FisheyeMessage,

@@ -4,8 +4,8 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Literal
 
-from protocol.frames import BoardPose
-from sensor_node.cameras.base import Camera
+from deltalight.protocol.frames import BoardPose
+from deltalight.sensor_node.cameras.base import Camera
 
 State = Literal["starting", "running", "waiting", "degraded"]
 

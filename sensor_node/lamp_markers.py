@@ -7,12 +7,12 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
-from protocol.board import BoardSpec, LampMarker
-from protocol.camera_model import CameraModel
-from protocol.frames import LampPose
-from sensor_node.marker_edges import refine_corners
-from sensor_node.marker_finder import REACH_FRACTION, MarkerFinder, linear_luminance, planar_poses
-from sensor_node.markers import AMBIGUOUS_RATIO, CORNER_NOISE_PX, MAX_ERROR_PX
+from deltalight.protocol.board import BoardSpec, LampMarker
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.frames import LampPose
+from deltalight.sensor_node.marker_edges import refine_corners
+from deltalight.sensor_node.marker_finder import REACH_FRACTION, MarkerFinder, linear_luminance, planar_poses
+from deltalight.sensor_node.markers import AMBIGUOUS_RATIO, CORNER_NOISE_PX, MAX_ERROR_PX
 
 
 class _Solution(NamedTuple):

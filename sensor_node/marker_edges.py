@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from protocol.camera_model import CameraModel
+from deltalight.protocol.camera_model import CameraModel
 
 # Positions along an edge, as fractions of its length, at which it is measured; not at the round corners.
 FRACTIONS = np.linspace(0.12, 0.88, 16)

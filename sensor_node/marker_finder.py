@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt8
 
-from protocol.board import BoardSpec
-from protocol.camera_model import CameraModel
-from protocol.frames import decode_lut
-from protocol.poses import rigid_matrix
-from sensor_node.marker_edges import refine_corners
+from deltalight.protocol.board import BoardSpec
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.frames import decode_lut
+from deltalight.protocol.poses import rigid_matrix
+from deltalight.sensor_node.marker_edges import refine_corners
 
 # Search range from a marker's edge, as a fraction of the border cell or the white gap.
 REACH_FRACTION = 0.6

@@ -6,12 +6,12 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 
-from protocol.board import BoardSpec
-from protocol.camera_model import CameraModel
-from protocol.errors import DeltalightError
-from protocol.frames import BoardPose
-from protocol.poses import rigid_matrix
-from sensor_node.marker_finder import MarkerFinder, linear_luminance, planar_poses
+from deltalight.protocol.board import BoardSpec
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import BoardPose
+from deltalight.protocol.poses import rigid_matrix
+from deltalight.sensor_node.marker_finder import MarkerFinder, linear_luminance, planar_poses
 
 # Corners with larger residuals, and above three times the median, are occluded and left out.
 OUTLIER_PX, OUTLIER_MEDIANS = 1.5, 3.0

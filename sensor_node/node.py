@@ -11,22 +11,22 @@ from typing import Generic, Literal, TypeVar
 import structlog
 from pydantic import Field, field_serializer, field_validator
 
-from protocol.documents import StrictModel
-from protocol.envelope import encode
-from protocol.frames import FisheyePictures, RadianceMap, SensorFrame, ViewFrame
-from protocol.keys import Keys
-from protocol.messages import Name, StatsMessage
-from protocol.publisher import Publisher
-from sensor_node.announce import announced
-from sensor_node.cameras.base import Camera
-from sensor_node.cameras.drivers import SYNTHETIC
-from sensor_node.cameras.fisheye_capture import CameraWithFisheye
-from sensor_node.cameras.open import open_camera, open_fisheye
-from sensor_node.cameras.settings import CameraSettings, FisheyeSettings
-from sensor_node.capture import POLL_S, CapturedFrame, CaptureThread, ServerClock
-from sensor_node.depth import DepthSettings
-from sensor_node.fisheye import light_warnings
-from sensor_node.frame_messages import (
+from deltalight.protocol.documents import StrictModel
+from deltalight.protocol.envelope import encode
+from deltalight.protocol.frames import FisheyePictures, RadianceMap, SensorFrame, ViewFrame
+from deltalight.protocol.keys import Keys
+from deltalight.protocol.messages import Name, StatsMessage
+from deltalight.protocol.publisher import Publisher
+from deltalight.sensor_node.announce import announced
+from deltalight.sensor_node.cameras.base import Camera
+from deltalight.sensor_node.cameras.drivers import SYNTHETIC
+from deltalight.sensor_node.cameras.fisheye_capture import CameraWithFisheye
+from deltalight.sensor_node.cameras.open import open_camera, open_fisheye
+from deltalight.sensor_node.cameras.settings import CameraSettings, FisheyeSettings
+from deltalight.sensor_node.capture import POLL_S, CapturedFrame, CaptureThread, ServerClock
+from deltalight.sensor_node.depth import DepthSettings
+from deltalight.sensor_node.fisheye import light_warnings
+from deltalight.sensor_node.frame_messages import (
     Stamps,
     color_multipart,
     depth_multipart,
@@ -35,9 +35,9 @@ from sensor_node.frame_messages import (
     pose_multipart,
     radiance_multipart,
 )
-from sensor_node.health import Health
-from sensor_node.pose_filter import PoseFilter, PoseFilterSettings
-from sensor_node.view_frames import ViewFrameBuilder
+from deltalight.sensor_node.health import Health
+from deltalight.sensor_node.pose_filter import PoseFilter, PoseFilterSettings
+from deltalight.sensor_node.view_frames import ViewFrameBuilder
 
 _log = structlog.get_logger(__name__)
 STATS_PERIOD_S = 1.0

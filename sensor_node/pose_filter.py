@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Float64
 from pydantic import Field
 
-from protocol.documents import StrictModel
-from protocol.frames import BoardPose
-from protocol.poses import rigid_matrix
+from deltalight.protocol.documents import StrictModel
+from deltalight.protocol.frames import BoardPose
+from deltalight.protocol.poses import rigid_matrix
 
 # Cut-off of the speed estimate, Hz, as in the paper.
 SPEED_CUTOFF_HZ = 1.0

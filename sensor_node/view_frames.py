@@ -5,16 +5,16 @@ from typing import Self
 
 import numpy as np
 
-from protocol.errors import DeltalightError
-from protocol.frames import BoardPose, DepthImage, LampPose, SensorFrame, ViewFrame
-from protocol.poses import require_rigid
-from protocol.source import Source
-from sensor_node.cameras.base import Camera
-from sensor_node.depth import DepthSettings, clean_depth, estimate_noise_sigma
-from sensor_node.depth_registration import register_depth
-from sensor_node.fisheye.light import FisheyeLight
-from sensor_node.lamp_markers import detect_lamps
-from sensor_node.markers import BoardDetector
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import BoardPose, DepthImage, LampPose, SensorFrame, ViewFrame
+from deltalight.protocol.poses import require_rigid
+from deltalight.protocol.source import Source
+from deltalight.sensor_node.cameras.base import Camera
+from deltalight.sensor_node.depth import DepthSettings, clean_depth, estimate_noise_sigma
+from deltalight.sensor_node.depth_registration import register_depth
+from deltalight.sensor_node.fisheye.light import FisheyeLight
+from deltalight.sensor_node.lamp_markers import detect_lamps
+from deltalight.sensor_node.markers import BoardDetector
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool
 
-from protocol.board import BoardSpec
-from protocol.errors import DeltalightError
+from deltalight.protocol.board import BoardSpec
+from deltalight.protocol.errors import DeltalightError
 
 MM = 72 / 25.4  # PDF points
 PAPERS_MM = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "letter": (215.9, 279.4)}

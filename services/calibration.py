@@ -9,17 +9,17 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from rich.table import Table
 
-from protocol.errors import DeltalightError
-from protocol.files import replacing, write_png
-from services.files import make_output_folder
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.files import replacing, write_png
+from deltalight.services.files import make_output_folder
 
 if TYPE_CHECKING:
-    from protocol.camera_model import CameraModel
-    from protocol.fisheye_lens import FisheyeLens
-    from sensor_node.calibration.lens_calibration import LensResult
-    from sensor_node.calibration.picture_sources import Series
-    from sensor_node.calibration.targets import Target
-    from sensor_node.calibration.views import ViewCollector
+    from deltalight.protocol.camera_model import CameraModel
+    from deltalight.protocol.fisheye_lens import FisheyeLens
+    from deltalight.sensor_node.calibration.lens_calibration import LensResult
+    from deltalight.sensor_node.calibration.picture_sources import Series
+    from deltalight.sensor_node.calibration.targets import Target
+    from deltalight.sensor_node.calibration.views import ViewCollector
 
 
 def result_path(folder: Path, name: str, *, force: bool) -> Path:
@@ -50,7 +50,7 @@ class Watch:
 
     def collect(self, series: "Series", target: "Target", enough: int) -> "ViewCollector":
         """Collect the views of a series."""
-        from sensor_node.calibration.picture_sources import collect_views
+        from deltalight.sensor_node.calibration.picture_sources import collect_views
 
         if self.total is None:
             self.console.print(
@@ -64,7 +64,7 @@ class Watch:
             return collect_views(series, target, enough=enough, tell=lambda *_: progress.advance(task))
 
     def _tell_live(self, collected: "ViewCollector", taken: bool) -> None:
-        from sensor_node.calibration.coverage import measure_coverage
+        from deltalight.sensor_node.calibration.coverage import measure_coverage
 
         if taken:
             coverage = measure_coverage(collected.views, collected.size)
@@ -78,8 +78,8 @@ class Watch:
 
 def save_lens(path: Path, lens: "CameraModel | FisheyeLens") -> None:
     """Write rgb.yaml or fisheye.yaml; response and vignetting of an older fisheye.yaml stay."""
-    from protocol.camera_model import CameraModel, save_camera_yaml
-    from protocol.fisheye_lens import FisheyeCalibration, load_fisheye_yaml, save_fisheye_yaml
+    from deltalight.protocol.camera_model import CameraModel, save_camera_yaml
+    from deltalight.protocol.fisheye_lens import FisheyeCalibration, load_fisheye_yaml, save_fisheye_yaml
 
     if isinstance(lens, CameraModel):
         write_result(path, lambda aside: save_camera_yaml(aside, lens, path.stem))
@@ -92,7 +92,7 @@ def save_lens(path: Path, lens: "CameraModel | FisheyeLens") -> None:
 
 def save_pictures(result: "LensResult", stem: Path) -> list[str]:
     """Write `<stem>_coverage.png` and `<stem>_residuals.png`; return their names."""
-    from sensor_node.calibration.coverage import draw_coverage, draw_misses
+    from deltalight.sensor_node.calibration.coverage import draw_coverage, draw_misses
 
     pictures = {
         "coverage": draw_coverage(result.brightest, result.fit, result.coverage),

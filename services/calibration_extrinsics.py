@@ -10,12 +10,12 @@ from jaxtyping import Float64
 from rich.console import Console
 from rich.progress import track
 
-from protocol.board import BoardSpec, load_board_yaml
-from protocol.calibration import Extrinsics, load_extrinsics_yaml, save_extrinsics_yaml
-from protocol.errors import DeltalightError
-from protocol.frames import SensorFrame
-from protocol.source import Source, open_source
-from services.calibration import result_path, write_result
+from deltalight.protocol.board import BoardSpec, load_board_yaml
+from deltalight.protocol.calibration import Extrinsics, load_extrinsics_yaml, save_extrinsics_yaml
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import SensorFrame
+from deltalight.protocol.source import Source, open_source
+from deltalight.services.calibration import result_path, write_result
 
 TransformName = Literal["rgb_from_fisheye", "world_from_fisheye", "depth_from_rgb"]
 
@@ -64,7 +64,7 @@ def _find(
 ) -> tuple[Float64[np.ndarray, "4 4"], dict[str, Any]]:
     if what == "depth_from_rgb":
         return _depth_from_rgb(source, board)
-    from sensor_node.calibration.extrinsics import (
+    from deltalight.sensor_node.calibration.extrinsics import (
         mean_placement,
         rgb_from_fisheye_poses,
         world_from_fisheye_poses,
@@ -82,7 +82,7 @@ def _find(
 
 
 def _depth_from_rgb(source: Source, board: BoardSpec) -> tuple[Float64[np.ndarray, "4 4"], dict[str, Any]]:
-    from sensor_node.calibration.depth_extrinsics import depth_views, place_depth_sensor
+    from deltalight.sensor_node.calibration.depth_extrinsics import depth_views, place_depth_sensor
 
     start = source.extrinsics.depth_from_rgb
     placement = place_depth_sensor(

@@ -7,12 +7,12 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float32
 
-from protocol.board import load_board_yaml, save_board_yaml
-from protocol.errors import DeltalightError
-from protocol.source import open_source
-from services.calibration import result_path, write_result
-from services.calibration_extrinsics import board_of
-from services.files import make_output_folder
+from deltalight.protocol.board import load_board_yaml, save_board_yaml
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.source import open_source
+from deltalight.services.calibration import result_path, write_result
+from deltalight.services.calibration_extrinsics import board_of
+from deltalight.services.files import make_output_folder
 
 
 def find_response(source: Path, eye: Literal["rgb", "fisheye"], out: Path, *, force: bool) -> dict[str, Any]:
@@ -21,7 +21,7 @@ def find_response(source: Path, eye: Literal["rgb", "fisheye"], out: Path, *, fo
     Raises:
         DeltalightError: the bracket does not determine it, or there is one already and `force` is not given.
     """
-    from sensor_node.calibration.photometric import calibrate_response, read_bracket
+    from deltalight.sensor_node.calibration.photometric import calibrate_response, read_bracket
 
     path = out / "calibration" / "fisheye.yaml" if eye == "fisheye" else out / "response.txt"
     _require_free(path, eye, force=force)
@@ -40,7 +40,7 @@ def find_response(source: Path, eye: Literal["rgb", "fisheye"], out: Path, *, fo
 
 
 def _require_free(path: Path, eye: str, *, force: bool) -> None:
-    from protocol.fisheye_lens import load_fisheye_yaml
+    from deltalight.protocol.fisheye_lens import load_fisheye_yaml
 
     if eye == "fisheye" and not path.exists():
         raise DeltalightError(f"{path} does not exist; run `deltalight calibrate fisheye` first.")
@@ -50,7 +50,7 @@ def _require_free(path: Path, eye: str, *, force: bool) -> None:
 
 
 def _write_into_fisheye(path: Path, table: Float32[np.ndarray, "256 3"]) -> None:
-    from protocol.fisheye_lens import load_fisheye_yaml, save_fisheye_yaml
+    from deltalight.protocol.fisheye_lens import load_fisheye_yaml, save_fisheye_yaml
 
     calibration = replace(load_fisheye_yaml(path), response=table)
     write_result(path, lambda aside: save_fisheye_yaml(aside, calibration))
@@ -64,7 +64,7 @@ def find_paper_albedo(
     Raises:
         DeltalightError: the pictures do not show it, or the board has one already and `force` is not given.
     """
-    from sensor_node.calibration.photometric import paper_albedo, parse_card
+    from deltalight.sensor_node.calibration.photometric import paper_albedo, parse_card
 
     path = result_path(out, "board.yaml", force=True)
     grey = parse_card(*card)

@@ -10,29 +10,29 @@ from typing import Annotated
 
 import typer
 
-from benchmarks.cli import bench, gpu_check
-from protocol.errors import DeltalightError
-from services.commands.api import api
-from services.commands.board import board
-from services.commands.calibrate import calibrate
-from services.commands.config import config
-from services.commands.demo import demo
-from services.commands.doctor import doctor
-from services.commands.examples import examples_of
-from services.commands.graph import graph
-from services.commands.keys import keys
-from services.commands.node import node
-from services.commands.ping import ping
-from services.commands.record import record
-from services.commands.recordings import recordings
-from services.commands.render import render
-from services.commands.replay import replay
-from services.commands.schema import schema
-from services.commands.server import server
-from services.commands.up import up
-from services.logs import configure_logging
-from services.parent_death_signal import end_with_supervisor
-from services.signals import Terminated, raise_on_sigterm
+from deltalight.benchmarks.cli import bench, gpu_check
+from deltalight.protocol.errors import DeltalightError
+from deltalight.services.commands.api import api
+from deltalight.services.commands.board import board
+from deltalight.services.commands.calibrate import calibrate
+from deltalight.services.commands.config import config
+from deltalight.services.commands.demo import demo
+from deltalight.services.commands.doctor import doctor
+from deltalight.services.commands.examples import examples_of
+from deltalight.services.commands.graph import graph
+from deltalight.services.commands.keys import keys
+from deltalight.services.commands.node import node
+from deltalight.services.commands.ping import ping
+from deltalight.services.commands.record import record
+from deltalight.services.commands.recordings import recordings
+from deltalight.services.commands.render import render
+from deltalight.services.commands.replay import replay
+from deltalight.services.commands.schema import schema
+from deltalight.services.commands.server import server
+from deltalight.services.commands.up import up
+from deltalight.services.logs import configure_logging
+from deltalight.services.parent_death_signal import end_with_supervisor
+from deltalight.services.signals import Terminated, raise_on_sigterm
 
 DEBUG_FLAG = "--debug"
 

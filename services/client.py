@@ -17,11 +17,11 @@ import httpx
 import numpy as np
 from jaxtyping import UInt8
 
-from protocol.codecs import decode_color
-from protocol.errors import DeltalightError
-from protocol.files import replacing, write_bytes
-from protocol.scene import SceneDocument
-from services.live_message import LiveHeader, unpack
+from deltalight.protocol.codecs import decode_color
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.files import replacing, write_bytes
+from deltalight.protocol.scene import SceneDocument
+from deltalight.services.live_message import LiveHeader, unpack
 
 if TYPE_CHECKING:
     from websockets.sync.client import ClientConnection

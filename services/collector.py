@@ -14,15 +14,15 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from protocol.clock import CLOCK_OP
-from protocol.codecs import decode_color
-from protocol.envelope import decode
-from protocol.errors import DeltalightError
-from protocol.files import replacing, write_bytes, write_png
-from protocol.messages import CompositeMessage, ControlRequest, StatsMessage
-from protocol.receiver import Receiver
-from protocol.request import RequestClient
-from services.live_message import age_ms
+from deltalight.protocol.clock import CLOCK_OP
+from deltalight.protocol.codecs import decode_color
+from deltalight.protocol.envelope import decode
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.files import replacing, write_bytes, write_png
+from deltalight.protocol.messages import CompositeMessage, ControlRequest, StatsMessage
+from deltalight.protocol.receiver import Receiver
+from deltalight.protocol.request import RequestClient
+from deltalight.services.live_message import age_ms
 
 CONTROL_TIMEOUT_S = 10.0
 ALIVE_TIMEOUT_S = 1.0  # a separate thread of the render server answers, whatever the renderer does

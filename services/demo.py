@@ -12,16 +12,16 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from protocol.errors import DeltalightError
-from protocol.methods import PLUGINS
-from protocol.scene import SceneDocument, load_scene
-from services import ports
-from services.collector import CompositeCollector, summarize
-from services.files import make_output_folder
-from services.host import HostPlan
-from services.host_store import activate_document, session_file
-from services.storage.store import Store
-from services.supervisor import POLL_INTERVAL_S, Supervisor
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.methods import PLUGINS
+from deltalight.protocol.scene import SceneDocument, load_scene
+from deltalight.services import ports
+from deltalight.services.collector import CompositeCollector, summarize
+from deltalight.services.files import make_output_folder
+from deltalight.services.host import HostPlan
+from deltalight.services.host_store import activate_document, session_file
+from deltalight.services.storage.store import Store
+from deltalight.services.supervisor import POLL_INTERVAL_S, Supervisor
 
 ASSETS = Path(__file__).parent / "demo_assets"
 RECORDING = ASSETS / "demo.mcap"
@@ -35,7 +35,7 @@ LONGEST_FRAME_S = 1800.0  # after it a renderer that still answers hangs
 
 
 def demo_scene(method: str) -> SceneDocument:
-    """Return the demo's scene with a method of `services.commands.options.require_method`.
+    """Return the demo's scene with a method of `deltalight.services.commands.options.require_method`.
 
     Raises:
         DeltalightError: the demo's files are missing.

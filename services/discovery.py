@@ -5,11 +5,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
-from protocol.documents import nearest
-from protocol.errors import DeltalightError
-from protocol.keys import TRUST_HINT, KeySettings, key_folder, trusted_keys
-from protocol.messages import SCHEMA_VERSION
-from sensor_node.announce import SERVICE_TYPE
+from deltalight.protocol.documents import nearest
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.keys import TRUST_HINT, KeySettings, key_folder, trusted_keys
+from deltalight.protocol.messages import SCHEMA_VERSION
+from deltalight.sensor_node.announce import SERVICE_TYPE
 
 if TYPE_CHECKING:
     from zeroconf import ServiceInfo, ServiceStateChange, Zeroconf

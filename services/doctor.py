@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from typing import Literal
 
-from services import ports
+from deltalight.services import ports
 
 PROBE_TIMEOUT_S = 60
 MAXIMUM_DEVICES = 16
@@ -24,7 +24,7 @@ CONTAINER_HINT = (
 
 _PROBE = """
 import json, sys
-from render_server.gpu.context import create_context
+from deltalight.render_server.gpu.context import create_context
 gpu = create_context(int(sys.argv[1]))
 print(json.dumps([gpu.renderer_name, gpu.version, gpu.is_software]))
 """
@@ -121,7 +121,7 @@ def _probe(device: int) -> subprocess.CompletedProcess[str]:
 
 def _methods() -> Iterator[Check]:
     """Every relighting method of a plugin, one line each."""
-    from protocol.methods import PLUGINS
+    from deltalight.protocol.methods import PLUGINS
 
     for name, method in PLUGINS.values.items():
         yield Check(f"method {name}", "ok", f"of package {method.plugin.package}")
@@ -132,8 +132,8 @@ def _methods() -> Iterator[Check]:
 
 def _cameras() -> Iterator[Check]:
     """Report every camera that was found, one line each, then the kinds without any."""
-    from sensor_node.cameras.discovery import discover
-    from sensor_node.cameras.drivers import driver_title
+    from deltalight.sensor_node.cameras.discovery import discover
+    from deltalight.sensor_node.cameras.drivers import driver_title
 
     found = discover()
     for camera in found.cameras:

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from protocol.errors import DeltalightError
-from protocol.recording_format import ACTIVE_SUFFIX
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.recording_format import ACTIVE_SUFFIX
 
 SUFFIX = ".mcap"
 

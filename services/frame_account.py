@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from protocol.camera_model import CameraModel
-from protocol.frames import BoardPose, ViewFrame
-from protocol.scene import SceneDocument, parse_scene
-from render_server.gpu.context import GpuContext, create_context
-from render_server.graph import SourceReport, StageReport
-from render_server.renderer import SceneRenderer
-from services.demo import with_method
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.frames import BoardPose, ViewFrame
+from deltalight.protocol.scene import SceneDocument, parse_scene
+from deltalight.render_server.gpu.context import GpuContext, create_context
+from deltalight.render_server.graph import SourceReport, StageReport
+from deltalight.render_server.renderer import SceneRenderer
+from deltalight.services.demo import with_method
 
 SIZE = (320, 240)
 FOCAL_PX = 300.0

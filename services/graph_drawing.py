@@ -5,9 +5,21 @@ from dataclasses import dataclass
 from typing import Final
 from xml.etree import ElementTree
 
-from render_server.graph import CLOCKS, Clock, SourceReport, StageReport
-from services.graph_layout import Arrow, Box, Layout, lay_out
-from services.svg import BOLD_LETTER, FAINT, GREY, INK, LETTER, PANEL, Point, as_text, new_svg, rect, text
+from deltalight.render_server.graph import CLOCKS, Clock, SourceReport, StageReport
+from deltalight.services.graph_layout import Arrow, Box, Layout, lay_out
+from deltalight.services.svg import (
+    BOLD_LETTER,
+    FAINT,
+    GREY,
+    INK,
+    LETTER,
+    PANEL,
+    Point,
+    as_text,
+    new_svg,
+    rect,
+    text,
+)
 
 WIDTH = 1600
 MARGIN = 20

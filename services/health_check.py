@@ -4,12 +4,12 @@ import urllib.error
 import urllib.request
 import uuid
 
-from protocol.envelope import decode
-from protocol.errors import DeltalightError
-from protocol.keys import Keys, KeySettings
-from protocol.messages import ControlRequest, StatsMessage
-from protocol.receiver import Receiver
-from protocol.request import RequestClient
+from deltalight.protocol.envelope import decode
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.keys import Keys, KeySettings
+from deltalight.protocol.messages import ControlRequest, StatsMessage
+from deltalight.protocol.receiver import Receiver
+from deltalight.protocol.request import RequestClient
 
 HEALTH_PATH = "/api/v1/health"
 
@@ -27,7 +27,7 @@ def check_health(address: str, *, streams: bool, timeout_s: float) -> str | None
 
 
 def _keys(endpoint: str) -> Keys | None:
-    from services.settings import load_configuration
+    from deltalight.services.settings import load_configuration
 
     return load_configuration().section("keys", KeySettings).load([endpoint])
 

@@ -4,11 +4,11 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from protocol.errors import DeltalightError
-from protocol.scene import SceneDocument, load_scene
-from protocol.source import Source
-from services import ports
-from services.supervisor import ChildSpec
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.scene import SceneDocument, load_scene
+from deltalight.protocol.source import Source
+from deltalight.services import ports
+from deltalight.services.supervisor import ChildSpec
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from protocol.files import write_bytes
-from protocol.scene import DIGEST_PREFIX, SceneDocument, load_scene
-from protocol.source import Source
-from services.storage.store import Store
+from deltalight.protocol.files import write_bytes
+from deltalight.protocol.scene import DIGEST_PREFIX, SceneDocument, load_scene
+from deltalight.protocol.source import Source
+from deltalight.services.storage.store import Store
 
 FIRST_SCENE = "First scene"
 CHUNK_BYTES = 1 << 20

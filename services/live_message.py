@@ -10,11 +10,11 @@ from typing import Any, Literal, Self
 
 from pydantic import BaseModel, Field, ValidationError
 
-from protocol.camera_model import DistortionModel
-from protocol.documents import validate
-from protocol.errors import DeltalightError
-from protocol.messages import CompositeMessage
-from protocol.quality import Quality
+from deltalight.protocol.camera_model import DistortionModel
+from deltalight.protocol.documents import validate
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.messages import CompositeMessage
+from deltalight.protocol.quality import Quality
 
 _LENGTH = struct.Struct("<I")
 

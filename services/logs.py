@@ -5,7 +5,7 @@ import sys
 
 import structlog
 
-from protocol.errors import DeltalightError
+from deltalight.protocol.errors import DeltalightError
 
 
 def configure_logging(level: str) -> None:

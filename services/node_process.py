@@ -7,14 +7,14 @@ from dataclasses import asdict
 from pathlib import Path
 from threading import Event
 
-from protocol.documents import nearest
-from protocol.errors import DeltalightError
-from protocol.keys import Keys, KeySettings
-from protocol.messages import ControlRequest
-from protocol.request import ReplyServer
-from sensor_node.cameras.playback import PlaybackCamera
-from sensor_node.node import NodeConfig, run_node
-from services.settings import load_configuration
+from deltalight.protocol.documents import nearest
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.keys import Keys, KeySettings
+from deltalight.protocol.messages import ControlRequest
+from deltalight.protocol.request import ReplyServer
+from deltalight.sensor_node.cameras.playback import PlaybackCamera
+from deltalight.sensor_node.node import NodeConfig, run_node
+from deltalight.services.settings import load_configuration
 
 OPS = ("position", "play", "pause", "seek", "rate")  # of a replay's control endpoint (SPEC.md, section 6)
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from protocol.scene import SceneDocument
-from protocol.scene_objects import SceneObject
+from deltalight.protocol.scene import SceneDocument
+from deltalight.protocol.scene_objects import SceneObject
 
 # As the dashboard judges them (services/dashboard/src/math/bounds.ts).
 SMALLEST_M = 0.01
@@ -33,7 +33,7 @@ def size_warnings(scene: SceneDocument) -> Iterator[str]:
 
 
 def _longest_edge(path: Path) -> float:
-    from render_server.scene.mesh_loading import load_mesh
+    from deltalight.render_server.scene.mesh_loading import load_mesh
 
     bounds = np.stack([mesh.bounds() for mesh in load_mesh(path)])
     return float(np.max(bounds[:, 1].max(axis=0) - bounds[:, 0].min(axis=0)))

@@ -7,17 +7,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from protocol.errors import DeltalightError
-from protocol.files import replacing, write_png
-from protocol.frames import BoardPose, ViewFrame, linear_color
-from protocol.radiance_files import require_openexr, write_exr
-from protocol.scene import SceneDocument
-from protocol.source import Source
-from services.files import make_output_folder
-from services.object_sizes import size_warnings
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.files import replacing, write_png
+from deltalight.protocol.frames import BoardPose, ViewFrame, linear_color
+from deltalight.protocol.radiance_files import require_openexr, write_exr
+from deltalight.protocol.scene import SceneDocument
+from deltalight.protocol.source import Source
+from deltalight.services.files import make_output_folder
+from deltalight.services.object_sizes import size_warnings
 
 if TYPE_CHECKING:
-    from render_server.renderer import CompositeFrame, SceneRenderer
+    from deltalight.render_server.renderer import CompositeFrame, SceneRenderer
 
 INDEX_FILE = "frames.jsonl"
 
@@ -91,8 +91,8 @@ def run_job(job: RenderJob, progress: Progress) -> RenderSummary:
     Raises:
         DeltalightError: bad input, no OpenGL, or the output cannot be written.
     """
-    from render_server.gpu.context import create_context
-    from render_server.renderer import SceneRenderer
+    from deltalight.render_server.gpu.context import create_context
+    from deltalight.render_server.renderer import SceneRenderer
 
     if job.with_exr:
         require_openexr("--exr")
@@ -114,8 +114,8 @@ def run_job(job: RenderJob, progress: Progress) -> RenderSummary:
 def _render_frames(
     job: RenderJob, renderer: "SceneRenderer", summary: RenderSummary, progress: Progress
 ) -> RenderSummary:
-    from sensor_node.fisheye import light_warnings
-    from sensor_node.view_frames import ViewFrameBuilder
+    from deltalight.sensor_node.fisheye import light_warnings
+    from deltalight.sensor_node.view_frames import ViewFrameBuilder
 
     builder = ViewFrameBuilder(
         job.source,

@@ -3,7 +3,7 @@
 import random
 import socket
 
-from protocol.errors import DeltalightError
+from deltalight.protocol.errors import DeltalightError
 
 LOOPBACK = "127.0.0.1"
 NODE_PORT = 5601  # a sensor node publishes

@@ -11,17 +11,24 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from protocol.board import BoardSpec
-from protocol.camera_model import CameraModel
-from protocol.codecs import decode_color, decode_depth, decode_response
-from protocol.documents import validate
-from protocol.frames import DepthImage, FisheyePictures, SensorFrame
-from protocol.light_codecs import fisheye_pictures
-from protocol.messages import ColorMessage, DepthMessage, FisheyeMessage, Message, MessageBase, PoseMessage
+from deltalight.protocol.board import BoardSpec
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.codecs import decode_color, decode_depth, decode_response
+from deltalight.protocol.documents import validate
+from deltalight.protocol.frames import DepthImage, FisheyePictures, SensorFrame
+from deltalight.protocol.light_codecs import fisheye_pictures
+from deltalight.protocol.messages import (
+    ColorMessage,
+    DepthMessage,
+    FisheyeMessage,
+    Message,
+    MessageBase,
+    PoseMessage,
+)
 
 # A SUB socket subscribes one by one: colour last, so that a colour picture comes with its partners.
 RAW_STREAMS = ("fisheye", "depth", "pose", "color")
-DEPTH_TOLERANCE_NS = 20_000_000  # the pairing of recorded pictures (protocol.dataset_lists)
+DEPTH_TOLERANCE_NS = 20_000_000  # the pairing of recorded pictures (deltalight.protocol.dataset_lists)
 WAITING_COLORS = 2  # a partner that has not come with the second colour picture after its own is lost
 KEPT_MESSAGES = 8
 KEPT_FISHEYES = 2  # the newest and the previous one, for colour pictures that still wait; brackets are large

@@ -11,18 +11,18 @@ from pathlib import Path
 from threading import Event
 from typing import Any
 
-from protocol.calibration import Extrinsics
-from protocol.envelope import decode
-from protocol.errors import DeltalightError
-from protocol.frames import SensorFrame
-from protocol.keys import Keys
-from protocol.messages import ControlRequest, Message, StatsMessage
-from protocol.recording_writer import RecordingWriter
-from protocol.request import RequestClient
-from protocol.scene import SceneDocument, parse_scene
-from services.files import require_new_recording
-from services.raw_frames import RAW_STREAMS, RawFrameAssembler
-from services.stream_queue import StreamQueue
+from deltalight.protocol.calibration import Extrinsics
+from deltalight.protocol.envelope import decode
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import SensorFrame
+from deltalight.protocol.keys import Keys
+from deltalight.protocol.messages import ControlRequest, Message, StatsMessage
+from deltalight.protocol.recording_writer import RecordingWriter
+from deltalight.protocol.request import RequestClient
+from deltalight.protocol.scene import SceneDocument, parse_scene
+from deltalight.services.files import require_new_recording
+from deltalight.services.raw_frames import RAW_STREAMS, RawFrameAssembler
+from deltalight.services.stream_queue import StreamQueue
 
 SCENE_TIMEOUT_S = 5.0
 POLL_S = 0.1

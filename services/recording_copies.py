@@ -4,15 +4,15 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from protocol.dataset import open_dataset
-from protocol.dataset_writer import DEFAULT_DEPTH_SCALE, DatasetWriter
-from protocol.errors import DeltalightError
-from protocol.recording_format import ACTIVE_SUFFIX
-from protocol.recording_reader import RecordingReader
-from protocol.recording_writer import RecordingWriter
-from protocol.scene import SceneDocument, load_scene
-from services.files import appearing, make_output_folder, require_absent, require_recording_name
-from services.recording_info import RecordingScan, scan_recording
+from deltalight.protocol.dataset import open_dataset
+from deltalight.protocol.dataset_writer import DEFAULT_DEPTH_SCALE, DatasetWriter
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.recording_format import ACTIVE_SUFFIX
+from deltalight.protocol.recording_reader import RecordingReader
+from deltalight.protocol.recording_writer import RecordingWriter
+from deltalight.protocol.scene import SceneDocument, load_scene
+from deltalight.services.files import appearing, make_output_folder, require_absent, require_recording_name
+from deltalight.services.recording_info import RecordingScan, scan_recording
 
 SCENE_FILE = "scene.json"
 

@@ -13,9 +13,9 @@ import numpy as np
 from mcap.records import Channel, Chunk, Footer, Message
 from mcap.stream_reader import StreamReader, breakup_chunk
 
-from protocol.errors import DeltalightError
-from protocol.recording_format import FISHEYE_RECORD_TOPIC, FRAME_TOPIC, FisheyeRecord, FrameRecord
-from protocol.recording_reader import DAMAGE, MAX_RECORD_BYTES, RecordingReader
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.recording_format import FISHEYE_RECORD_TOPIC, FRAME_TOPIC, FisheyeRecord, FrameRecord
+from deltalight.protocol.recording_reader import DAMAGE, MAX_RECORD_BYTES, RecordingReader
 
 GAP_PERIODS = 1.5  # a step in time longer than this many usual ones is a gap
 

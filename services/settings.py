@@ -13,10 +13,10 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, Field, create_model
 from pydantic_settings import BaseSettings, EnvSettingsSource, SettingsConfigDict, SettingsError
 
-from protocol.documents import StrictModel, validate
-from protocol.errors import DeltalightError
-from protocol.keys import config_home
-from services.ports import COMPOSITE_PORT, CONTROL_PORT, NODE_PORT, endpoint
+from deltalight.protocol.documents import StrictModel, validate
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.keys import config_home
+from deltalight.services.ports import COMPOSITE_PORT, CONTROL_PORT, NODE_PORT, endpoint
 
 FILE_NAME = "deltalight.toml"
 ENV_PREFIX, ENV_DELIMITER = "DELTALIGHT_", "__"

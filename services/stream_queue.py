@@ -3,9 +3,9 @@
 from collections import Counter, deque
 from collections.abc import Sequence
 
-from protocol.envelope import MAX_PARTS, MAX_TOPIC_BYTES
-from protocol.keys import Keys
-from protocol.subscriber import ReceivedMultipart, Subscriber
+from deltalight.protocol.envelope import MAX_PARTS, MAX_TOPIC_BYTES
+from deltalight.protocol.keys import Keys
+from deltalight.protocol.subscriber import ReceivedMultipart, Subscriber
 
 QUEUED_MESSAGES = 64  # per topic: two seconds at 30 a second, which covers a slow disk
 QUEUED_BYTES = 512 * 1024 * 1024  # of all topics together, if pictures are large and raw
@@ -14,7 +14,7 @@ QUEUED_BYTES = 512 * 1024 * 1024  # of all topics together, if pictures are larg
 class StreamQueue(Subscriber):
     """Messages in the order of their arrival; those that arrive while the queue is full are dropped and counted.
 
-    It is the counterpart of `protocol.receiver.Receiver`, whose newest message wins. `topics` are stream names
+    It is the counterpart of `deltalight.protocol.receiver.Receiver`, whose newest message wins. `topics` are stream names
     (`color`); subscriptions are sent in their order. `keys` are required if an endpoint leaves the host.
 
     Raises:

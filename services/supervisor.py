@@ -1,6 +1,6 @@
 """Keeps the processes of one host alive: restarts them within a second, gives up after too many, ends them together.
 
-Each child is a command line of its own (`python -m services.cli ...`): one process, one OpenGL context.
+Each child is a command line of its own (`python -m deltalight.services.cli ...`): one process, one OpenGL context.
 """
 
 import os
@@ -14,8 +14,8 @@ from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Self
 
-from protocol.errors import DeltalightError
-from services.parent_death_signal import SUPERVISOR_VARIABLE
+from deltalight.protocol.errors import DeltalightError
+from deltalight.services.parent_death_signal import SUPERVISOR_VARIABLE
 
 POLL_INTERVAL_S = 0.1
 RESTART_DELAY_S = 0.2
@@ -36,7 +36,7 @@ class ChildSpec:
     @classmethod
     def deltalight(cls, name: str, *arguments: str) -> "ChildSpec":
         """Return a child that runs a command of this command line."""
-        return cls(name, ("-m", "services.cli", *arguments))
+        return cls(name, ("-m", "deltalight.services.cli", *arguments))
 
 
 @dataclass

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import structlog
 
-from services import ports
+from deltalight.services import ports
 
 # A shell starts what it puts into the background with SIGINT ignored, and children inherit that: no test of Ctrl-C
 # could pass.

@@ -68,14 +68,14 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-import protocol
-from protocol.camera_model import CameraModel
-from protocol.frames import BoardPose, ViewFrame
-from protocol.scene import parse_scene
-from render_server.gpu.context import create_context
-from render_server.renderer import SceneRenderer
-from sensor_node.cameras.open import open_camera
-from sensor_node.cameras.settings import CameraSettings
+from deltalight import protocol
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.frames import BoardPose, ViewFrame
+from deltalight.protocol.scene import parse_scene
+from deltalight.render_server.gpu.context import create_context
+from deltalight.render_server.renderer import SceneRenderer
+from deltalight.sensor_node.cameras.open import open_camera
+from deltalight.sensor_node.cameras.settings import CameraSettings
 
 folder = Path(sys.argv[1])
 assert Path(protocol.__file__).is_relative_to(folder)

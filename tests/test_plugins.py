@@ -14,19 +14,19 @@ import numpy as np
 import pytest
 import structlog
 
-from protocol.errors import DeltalightError
-from protocol.methods import InstalledMethod, load_methods
-from protocol.plugins import LoadedPlugins
-from protocol.scene_method import BUILT_IN_METHODS, DvctMethod, NoneMethod
-from render_server.graph import Graph
-from render_server.methods import registry
-from render_server.methods.method import RelightingMethod
-from sensor_node.cameras.discovery import discover
-from sensor_node.cameras.drivers import driver_plugins
-from sensor_node.cameras.open import is_live, open_camera
-from sensor_node.cameras.settings import CameraSettings
-from services import doctor
-from services.cli import run
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.methods import InstalledMethod, load_methods
+from deltalight.protocol.plugins import LoadedPlugins
+from deltalight.protocol.scene_method import BUILT_IN_METHODS, DvctMethod, NoneMethod
+from deltalight.render_server.graph import Graph
+from deltalight.render_server.methods import registry
+from deltalight.render_server.methods.method import RelightingMethod
+from deltalight.sensor_node.cameras.discovery import discover
+from deltalight.sensor_node.cameras.drivers import driver_plugins
+from deltalight.sensor_node.cameras.open import is_live, open_camera
+from deltalight.sensor_node.cameras.settings import CameraSettings
+from deltalight.services import doctor
+from deltalight.services.cli import run
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = (ROOT / "docs" / "plugins.md").read_text(encoding="utf-8")
@@ -81,8 +81,8 @@ def test_the_page_has_a_module_and_a_project_for_each_group() -> None:
 SCRIPT = """
 import json, sys
 from pathlib import Path
-from protocol.errors import DeltalightError
-from protocol.scene import parse_scene, scene_json_schema
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.scene import parse_scene, scene_json_schema
 
 def fault(method):
     try:
@@ -99,10 +99,10 @@ told = {
 
 import numpy as np
 import trimesh
-from protocol.camera_model import CameraModel
-from protocol.frames import BoardPose, ViewFrame
-from render_server.gpu.context import create_context
-from render_server.renderer import SceneRenderer
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.frames import BoardPose, ViewFrame
+from deltalight.render_server.gpu.context import create_context
+from deltalight.render_server.renderer import SceneRenderer
 
 folder = Path(sys.argv[1])
 for name, extents, height in (("floor", (4, 4, 0.02), -0.01), ("cube", (0.2, 0.2, 0.2), 0.1)):
@@ -128,14 +128,14 @@ for name, method in (("none", {"name": "none"}), ("direct", {"name": "direct"}),
     renderer.release()
 np.savez(folder / "pictures.npz", **pictures)
 
-from render_server.gpu.kernel import Kernel
-from render_server.gpu.textures import texture_2d
+from deltalight.render_server.gpu.kernel import Kernel
+from deltalight.render_server.gpu.textures import texture_2d
 
 written = texture_2d(gpu, (2, 2), 4, "f4")
 Kernel(gpu, Path(sys.argv[2]) / "fog").run(written.size, fog_out=written)
-from benchmarks.variants import RENDERED, parse_variants
-from services.commands.options import require_method
-from services.demo import with_method
+from deltalight.benchmarks.variants import RENDERED, parse_variants
+from deltalight.services.commands.options import require_method
+from deltalight.services.demo import with_method
 
 (variant,) = parse_variants("direct:ambient=4", RENDERED)
 chosen = variant.applied(document, 64), with_method(document, "direct")
@@ -280,7 +280,7 @@ GROUPS = ("deltalight.methods", "deltalight.cameras")
 
 def test_doctor_tells_of_methods(install: Install, monkeypatch: pytest.MonkeyPatch) -> None:
     install("fog-method", "2.0", {"deltalight.methods": {"fog": "fog_method:method"}}, {})
-    monkeypatch.setattr("protocol.methods.PLUGINS", load_methods())
+    monkeypatch.setattr("deltalight.protocol.methods.PLUGINS", load_methods())
     direct, fog = doctor._methods()
     assert (direct.name, direct.state, direct.detail) == (
         "method direct",
@@ -321,7 +321,7 @@ def test_a_plugin_takes_no_name_of_a_built_in_camera(install: Install, name: str
 
 
 WEAK_DRIVER = """
-from sensor_node.cameras.driver import CameraDriver
+from deltalight.sensor_node.cameras.driver import CameraDriver
 
 def fail(*_):
     raise ValueError("no firmware")

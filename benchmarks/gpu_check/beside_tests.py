@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import UInt8
 
-from benchmarks.gpu_check.record import Skipped
+from deltalight.benchmarks.gpu_check.record import Skipped
 
 if TYPE_CHECKING:
-    from render_server.gpu.context import GpuContext
+    from deltalight.render_server.gpu.context import GpuContext
 
 ROOT = Path(__file__).resolve().parents[2]
 TESTS = ROOT / "tests" / "render_server"

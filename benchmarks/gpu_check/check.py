@@ -11,10 +11,10 @@ from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from benchmarks.gpu_check.plan import MACHINE, Step
-from benchmarks.gpu_check.record import Record, State, read_record
-from benchmarks.gpu_check.report import Report, about_checkout
-from services.parent_death_signal import SUPERVISOR_VARIABLE
+from deltalight.benchmarks.gpu_check.plan import MACHINE, Step
+from deltalight.benchmarks.gpu_check.record import Record, State, read_record
+from deltalight.benchmarks.gpu_check.report import Report, about_checkout
+from deltalight.services.parent_death_signal import SUPERVISOR_VARIABLE
 
 ROOT = Path(__file__).resolve().parents[2]
 OUTPUT_FILE = "output.log"
@@ -70,7 +70,14 @@ def _take(step: Step, limit_s: float, report: Report, folder: Path) -> Record:
 @contextmanager
 def _child(step: Step, path: Path, out: Path, folder: Path) -> Iterator["subprocess.Popen[bytes]"]:
     """The step's process; it and whatever it started end with the context."""
-    command = [sys.executable, "-m", "benchmarks.gpu_check.child", step.target, str(path), str(out.resolve())]
+    command = [
+        sys.executable,
+        "-m",
+        "deltalight.benchmarks.gpu_check.child",
+        step.target,
+        str(path),
+        str(out.resolve()),
+    ]
     mine = {"DELTALIGHT_CACHE": str(folder / "cache"), SUPERVISOR_VARIABLE: str(os.getpid())}
     with (out / OUTPUT_FILE).open("ab") as output:
         output.write(f"== {step.name}\n".encode())

@@ -1,4 +1,4 @@
-"""One step in a process of its own: `python -m benchmarks.gpu_check.child MODULE:FUNCTION RECORD OUT`."""
+"""One step in a process of its own: `python -m deltalight.benchmarks.gpu_check.child MODULE:FUNCTION RECORD OUT`."""
 
 import importlib
 import sys
@@ -7,9 +7,9 @@ from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from benchmarks.gpu_check.record import Findings, Skipped, State
-from protocol.errors import DeltalightError
-from services.parent_death_signal import end_with_supervisor
+from deltalight.benchmarks.gpu_check.record import Findings, Skipped, State
+from deltalight.protocol.errors import DeltalightError
+from deltalight.services.parent_death_signal import end_with_supervisor
 
 Step = Callable[[Findings], str]
 """A step fills the findings and returns its closing sentence."""

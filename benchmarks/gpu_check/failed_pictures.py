@@ -5,8 +5,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from benchmarks.gpu_check.beside_tests import ComparedPicture, Picture
-from protocol.files import write_png
+from deltalight.benchmarks.gpu_check.beside_tests import ComparedPicture, Picture
+from deltalight.protocol.files import write_png
 
 NAME = "failed_pictures.png"
 LABEL_WIDTH = 240

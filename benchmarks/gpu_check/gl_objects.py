@@ -3,7 +3,7 @@
 import ctypes
 from collections.abc import Callable
 
-from protocol.errors import DeltalightError
+from deltalight.protocol.errors import DeltalightError
 
 KINDS = ("Buffer", "Texture", "Sampler", "Program", "Shader", "Framebuffer", "VertexArray", "Query")
 HIGHEST_NAME = 8192

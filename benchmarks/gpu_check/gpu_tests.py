@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.gpu_check.beside_tests import ROOT, TESTS
-from benchmarks.gpu_check.record import Findings
+from deltalight.benchmarks.gpu_check.beside_tests import ROOT, TESTS
+from deltalight.benchmarks.gpu_check.record import Findings
 
 OTHER_STEPS = "test_protected_pictures.py"  # the pictures have a step of their own
 MOST_WORKERS = 8

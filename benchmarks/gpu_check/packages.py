@@ -2,7 +2,7 @@
 
 from importlib.util import find_spec
 
-from protocol.errors import DeltalightError
+from deltalight.protocol.errors import DeltalightError
 
 FIRST = ("numpy", "cv2", "jaxtyping")
 """Modules without which no step can start."""

@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 from difflib import get_close_matches
 
-from protocol.errors import DeltalightError
+from deltalight.protocol.errors import DeltalightError
 
-STEPS_MODULE = "benchmarks.gpu_check.steps"
+STEPS_MODULE = "deltalight.benchmarks.gpu_check.steps"
 
 
 @dataclass(frozen=True)

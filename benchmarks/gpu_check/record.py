@@ -6,7 +6,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-from protocol.files import write_bytes
+from deltalight.protocol.files import write_bytes
 
 
 class State(StrEnum):

@@ -8,9 +8,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from benchmarks.gpu_check.plan import MACHINE
-from benchmarks.gpu_check.record import Record, State
-from protocol.files import write_bytes
+from deltalight.benchmarks.gpu_check.plan import MACHINE
+from deltalight.benchmarks.gpu_check.record import Record, State
+from deltalight.protocol.files import write_bytes
 
 JSON_FILE = "report.json"
 MARKDOWN_FILE = "report.md"

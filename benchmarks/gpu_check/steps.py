@@ -10,12 +10,12 @@ from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from benchmarks.gpu_check.record import Findings, Skipped
-from protocol.errors import DeltalightError
+from deltalight.benchmarks.gpu_check.record import Findings, Skipped
+from deltalight.protocol.errors import DeltalightError
 
 if TYPE_CHECKING:
-    from render_server.gpu.context import GpuContext
-    from render_server.renderer import SceneRenderer
+    from deltalight.render_server.gpu.context import GpuContext
+    from deltalight.render_server.renderer import SceneRenderer
 
 METHODS = ("exact", "paper", "dlpv", "differential", "dlpv-paper", "none", "aroof")
 """As for `demo --method`; the one that computes longest before its first frame comes last."""
@@ -28,7 +28,7 @@ LEAK_FRAMES = 4
 
 @contextmanager
 def _context() -> "Iterator[GpuContext]":
-    from render_server.gpu.context import create_context
+    from deltalight.render_server.gpu.context import create_context
 
     gpu = create_context()
     try:
@@ -64,7 +64,7 @@ def machine(findings: Findings) -> str:
 
 def doctor(findings: Findings) -> str:
     """Examine the machine as `deltalight doctor` does."""
-    from services.doctor import examine
+    from deltalight.services.doctor import examine
 
     checks: list[dict[str, str]] = []
     for check in examine():
@@ -77,7 +77,7 @@ def doctor(findings: Findings) -> str:
 
 def shaders(findings: Findings) -> str:
     """Let the driver compile every variant of every shader; a refusal leaves out the rest of that scene."""
-    from benchmarks.gpu_check.beside_tests import shader_parts
+    from deltalight.benchmarks.gpu_check.beside_tests import shader_parts
 
     parts, labels = shader_parts(), list[str]()
     with _context() as gpu:
@@ -97,8 +97,8 @@ def _latest(name: str, labels: list[str]) -> str:
 
 def pictures(findings: Findings) -> str:
     """Compare the protected pictures with their goldens; those that differ go into `failed_pictures.png`."""
-    from benchmarks.gpu_check.beside_tests import compare_picture, protected_cases
-    from benchmarks.gpu_check.failed_pictures import FailedPictures
+    from deltalight.benchmarks.gpu_check.beside_tests import compare_picture, protected_cases
+    from deltalight.benchmarks.gpu_check.failed_pictures import FailedPictures
 
     cases, shown, psnr_db = protected_cases(), FailedPictures(findings.out), dict[str, float]()
     with _context() as gpu:
@@ -116,7 +116,7 @@ def pictures(findings: Findings) -> str:
 
 def speed(findings: Findings) -> str:
     """Time every method at each of SIZES, with its stages, in milliseconds."""
-    from benchmarks.gpu_check.timing import time_method
+    from deltalight.benchmarks.gpu_check.timing import time_method
 
     timed: dict[str, dict[str, Any]] = {title: {} for title in SIZES}
     for title, (size, volume) in SIZES.items():
@@ -139,7 +139,7 @@ def memory(findings: Findings) -> str:
 
 
 def _held(gpu: "GpuContext", method: str, folder: Path) -> dict[str, Any]:
-    from benchmarks.gpu_check.gl_objects import count_gl_objects
+    from deltalight.benchmarks.gpu_check.gl_objects import count_gl_objects
 
     before = sum(count_gl_objects().values())
     renderer = _rendered(gpu, method, folder)
@@ -167,7 +167,7 @@ def leaks(findings: Findings) -> str:
 
 
 def _counts(gpu: "GpuContext", method: str, folder: Path) -> Iterator[dict[str, int]]:
-    from benchmarks.gpu_check.gl_objects import count_gl_objects
+    from deltalight.benchmarks.gpu_check.gl_objects import count_gl_objects
 
     for _ in range(LEAK_ROUNDS):
         _rendered(gpu, method, folder).release()
@@ -185,12 +185,12 @@ def slow_tests(findings: Findings) -> str:
 
 
 def _tests(findings: Findings, marked: str) -> str:
-    from benchmarks.gpu_check.beside_tests import require_tests
+    from deltalight.benchmarks.gpu_check.beside_tests import require_tests
 
     require_tests()
     if find_spec("pytest") is None:
         raise Skipped("pytest is not installed")
-    from benchmarks.gpu_check.gpu_tests import run_tests
+    from deltalight.benchmarks.gpu_check.gpu_tests import run_tests
 
     return run_tests(findings, marked)
 
@@ -202,8 +202,8 @@ def quality(findings: Findings) -> str:  # noqa: ARG001
 
 def _rendered(gpu: "GpuContext", method: str, folder: Path) -> "SceneRenderer":
     """Return a renderer after some frames of a given model, during which the camera turns."""
-    from render_server.renderer import SceneRenderer
-    from services.frame_account import room_scene, turned_frame
+    from deltalight.render_server.renderer import SceneRenderer
+    from deltalight.services.frame_account import room_scene, turned_frame
 
     renderer = SceneRenderer(gpu, room_scene(method, folder))
     for number in range(LEAK_FRAMES):

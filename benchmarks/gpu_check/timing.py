@@ -22,8 +22,8 @@ def time_method(method: str, frames: int, size: tuple[int, int], volume: int) ->
     """
     from rich.progress import Progress
 
-    from benchmarks.speed.measure import SpeedJob, measure_speed
-    from benchmarks.variants import parse_variants
+    from deltalight.benchmarks.speed.measure import SpeedJob, measure_speed
+    from deltalight.benchmarks.variants import parse_variants
 
     (variant,) = parse_variants(method)
     if variant.kind in ("dvct", "differential"):

@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32
 
-from benchmarks.ground_truth.benchmark_scene import BenchmarkScene, Finish
-from benchmarks.ground_truth.parts import MeshFolder, diffuse, rgb, shape, two_sided
-from render_server.lights.environment import read_radiance
+from deltalight.benchmarks.ground_truth.benchmark_scene import BenchmarkScene, Finish
+from deltalight.benchmarks.ground_truth.parts import MeshFolder, diffuse, rgb, shape, two_sided
+from deltalight.render_server.lights.environment import read_radiance
 
 ENVIRONMENT_FILE = "environment.hdr"
 

@@ -8,10 +8,10 @@ import numpy as np
 import trimesh
 from jaxtyping import Float32
 
-from benchmarks.ground_truth.lamps import Lamp
-from benchmarks.ground_truth.parts import Matrix, MeshFolder, Triple
-from protocol.board import BoardSpec
-from protocol.camera_model import CameraModel
+from deltalight.benchmarks.ground_truth.lamps import Lamp
+from deltalight.benchmarks.ground_truth.parts import Matrix, MeshFolder, Triple
+from deltalight.protocol.board import BoardSpec
+from deltalight.protocol.camera_model import CameraModel
 
 CAMERA = CameraModel(
     width=640,

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
-from protocol.board import BoardSpec
-from protocol.errors import DeltalightError
+from deltalight.protocol.board import BoardSpec
+from deltalight.protocol.errors import DeltalightError
 
 PIXELS_PER_CELL = 20
 """Texels along one black or white cell of a marker."""

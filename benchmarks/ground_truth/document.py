@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.ground_truth.assembly import ENVIRONMENT_FILE
-from benchmarks.ground_truth.benchmark_scene import BenchmarkScene, VirtualObject
-from protocol.poses import wxyz_from_rotation
+from deltalight.benchmarks.ground_truth.assembly import ENVIRONMENT_FILE
+from deltalight.benchmarks.ground_truth.benchmark_scene import BenchmarkScene, VirtualObject
+from deltalight.protocol.poses import wxyz_from_rotation
 
 DOCUMENT_FILE = "scene.json"
 FRAMES_FOLDER = "scenes"

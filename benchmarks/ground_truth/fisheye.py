@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float32
 
-from benchmarks.ground_truth.sensors import ColorSensor
-from protocol.camera_model import CameraModel, save_camera_yaml
-from protocol.dataset_lists import format_timestamp
-from protocol.errors import DeltalightError
-from protocol.pictures import encode_png
+from deltalight.benchmarks.ground_truth.sensors import ColorSensor
+from deltalight.protocol.camera_model import CameraModel, save_camera_yaml
+from deltalight.protocol.dataset_lists import format_timestamp
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.pictures import encode_png
 
 EDGE_PX = 240
 FIELD_OF_VIEW_DEG = 190.0

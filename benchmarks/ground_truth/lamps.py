@@ -6,7 +6,7 @@ from typing import Any, Protocol
 import numpy as np
 from jaxtyping import Float64
 
-from benchmarks.ground_truth.parts import Triple, placed, rgb, shape
+from deltalight.benchmarks.ground_truth.parts import Triple, placed, rgb, shape
 
 WHITE: Triple = (1.0, 1.0, 1.0)
 

@@ -5,7 +5,7 @@ import trimesh
 from jaxtyping import Float
 from skimage.measure import marching_cubes
 
-from benchmarks.ground_truth.parts import Triple
+from deltalight.benchmarks.ground_truth.parts import Triple
 
 # Centre, half axes and pitch (degrees, nose up) of the rabbit's parts in units of its height; it looks along -y. The
 # left ear and feet mirror the right ones.

@@ -8,8 +8,8 @@ import numpy as np
 import trimesh
 from jaxtyping import Float, Float32
 
-from benchmarks.ground_truth.board_texture import board_texture
-from protocol.board import BoardSpec
+from deltalight.benchmarks.ground_truth.board_texture import board_texture
+from deltalight.protocol.board import BoardSpec
 
 Triple = tuple[float, float, float]
 Matrix = Float[np.ndarray, "4 4"]

@@ -5,10 +5,10 @@ from collections.abc import Iterable
 import numpy as np
 from jaxtyping import Float32
 
-from benchmarks.ground_truth.lamps import Lamp, Spot
-from benchmarks.ground_truth.parts import Matrix
-from benchmarks.ground_truth.render import RoomRenderer
-from protocol.equidistant_lens import EquidistantLens
+from deltalight.benchmarks.ground_truth.lamps import Lamp, Spot
+from deltalight.benchmarks.ground_truth.parts import Matrix
+from deltalight.benchmarks.ground_truth.render import RoomRenderer
+from deltalight.protocol.equidistant_lens import EquidistantLens
 
 LENS_BLUR_PX = 1.5
 """Standard deviation of the spot that a wide lens makes of a point; its energy is that of the point."""

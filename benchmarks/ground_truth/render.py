@@ -12,10 +12,10 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from benchmarks.ground_truth.fisheye import fisheye_sensor
-from benchmarks.ground_truth.parts import Matrix
-from protocol.camera_model import CameraModel
-from protocol.errors import DeltalightError
+from deltalight.benchmarks.ground_truth.fisheye import fisheye_sensor
+from deltalight.benchmarks.ground_truth.parts import Matrix
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.errors import DeltalightError
 
 LLVM_LIBRARY = "libLLVM.so.19.1"
 """Dr.Jit aborts the whole process with the older LLVM that comes with Mesa, so the version is pinned."""

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from benchmarks.ground_truth import benchmark_scene, demo_object
-from benchmarks.ground_truth.assembly import material
-from benchmarks.ground_truth.lamps import Ambient, SphereLamp
-from benchmarks.ground_truth.meshes import mug
-from benchmarks.ground_truth.parts import (
+from deltalight.benchmarks.ground_truth import benchmark_scene, demo_object
+from deltalight.benchmarks.ground_truth.assembly import material
+from deltalight.benchmarks.ground_truth.lamps import Ambient, SphereLamp
+from deltalight.benchmarks.ground_truth.meshes import mug
+from deltalight.benchmarks.ground_truth.parts import (
     Matrix,
     MeshFolder,
     Triple,
@@ -29,7 +29,7 @@ from benchmarks.ground_truth.parts import (
     sheet,
     turned,
 )
-from benchmarks.ground_truth.textures import plaster, wood
+from deltalight.benchmarks.ground_truth.textures import plaster, wood
 
 CAMERA, BOARD, TABLE_Z_M = benchmark_scene.CAMERA, benchmark_scene.BOARD, benchmark_scene.TABLE_Z_M
 

@@ -14,20 +14,25 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 from rich.progress import Progress
 
-from benchmarks.ground_truth import fisheye
-from benchmarks.ground_truth.assembly import Assembly
-from benchmarks.ground_truth.benchmark_scene import BenchmarkScene
-from benchmarks.ground_truth.content_hash import content_hash
-from benchmarks.ground_truth.document import document_path, scene_document
-from benchmarks.ground_truth.point_lamps import LENS_BLUR_PX, point_lamps
-from benchmarks.ground_truth.render import INTEGRATORS, SUBPIXELS, choose_variant
-from benchmarks.ground_truth.sensors import ColorSensor, StereoDepthSensor
-from benchmarks.ground_truth.truth_pictures import TruthRenderer
-from benchmarks.ground_truth.truth_writer import MANIFEST_FILE, TRUTH_FOLDER, picture_path, write_truth
-from protocol.camera_model import CameraModel
-from protocol.errors import DeltalightError
-from protocol.pictures import decode_rgb, read_bytes
-from protocol.scene import SceneDocument, load_scene
+from deltalight.benchmarks.ground_truth import fisheye
+from deltalight.benchmarks.ground_truth.assembly import Assembly
+from deltalight.benchmarks.ground_truth.benchmark_scene import BenchmarkScene
+from deltalight.benchmarks.ground_truth.content_hash import content_hash
+from deltalight.benchmarks.ground_truth.document import document_path, scene_document
+from deltalight.benchmarks.ground_truth.point_lamps import LENS_BLUR_PX, point_lamps
+from deltalight.benchmarks.ground_truth.render import INTEGRATORS, SUBPIXELS, choose_variant
+from deltalight.benchmarks.ground_truth.sensors import ColorSensor, StereoDepthSensor
+from deltalight.benchmarks.ground_truth.truth_pictures import TruthRenderer
+from deltalight.benchmarks.ground_truth.truth_writer import (
+    MANIFEST_FILE,
+    TRUTH_FOLDER,
+    picture_path,
+    write_truth,
+)
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.pictures import decode_rgb, read_bytes
+from deltalight.protocol.scene import SceneDocument, load_scene
 
 RENDER_VERSION = 1
 """Increment when rendering changes in a way that the hashed numbers do not show (seeds, samples of depth...)."""

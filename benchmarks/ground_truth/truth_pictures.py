@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32
 
-from benchmarks.ground_truth import fisheye
-from benchmarks.ground_truth.assembly import Assembly
-from benchmarks.ground_truth.parts import Matrix
-from benchmarks.ground_truth.point_lamps import with_point_lamps
-from benchmarks.ground_truth.render import RoomRenderer, passes
-from benchmarks.ground_truth.sensors import srgb_coded
-from protocol.camera_model import CameraModel
-from protocol.equidistant_lens import EquidistantLens
+from deltalight.benchmarks.ground_truth import fisheye
+from deltalight.benchmarks.ground_truth.assembly import Assembly
+from deltalight.benchmarks.ground_truth.parts import Matrix
+from deltalight.benchmarks.ground_truth.point_lamps import with_point_lamps
+from deltalight.benchmarks.ground_truth.render import RoomRenderer, passes
+from deltalight.benchmarks.ground_truth.sensors import srgb_coded
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.equidistant_lens import EquidistantLens
 
 SEED = 3000
 DEPTH_SAMPLES = 16

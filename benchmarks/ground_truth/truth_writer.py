@@ -9,15 +9,20 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32
 
-from benchmarks.ground_truth.document import write_documents
-from benchmarks.ground_truth.fisheye import write_bracket
-from benchmarks.ground_truth.sensors import ColorSensor, StereoDepthSensor
-from benchmarks.ground_truth.truth_pictures import SEED, FramePictures, TruthRenderer, world_from_fisheye
-from protocol.calibration import Extrinsics
-from protocol.camera_model import CameraModel
-from protocol.dataset_writer import DatasetWriter
-from protocol.frames import SensorFrame
-from protocol.pictures import depth_from_steps, encode_png
+from deltalight.benchmarks.ground_truth.document import write_documents
+from deltalight.benchmarks.ground_truth.fisheye import write_bracket
+from deltalight.benchmarks.ground_truth.sensors import ColorSensor, StereoDepthSensor
+from deltalight.benchmarks.ground_truth.truth_pictures import (
+    SEED,
+    FramePictures,
+    TruthRenderer,
+    world_from_fisheye,
+)
+from deltalight.protocol.calibration import Extrinsics
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.dataset_writer import DatasetWriter
+from deltalight.protocol.frames import SensorFrame
+from deltalight.protocol.pictures import depth_from_steps, encode_png
 
 TRUTH_FOLDER = "truth"
 MANIFEST_FILE = "manifest.json"

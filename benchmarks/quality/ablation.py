@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from benchmarks.variants import Variant
+from deltalight.benchmarks.variants import Variant
 
 PAPER_IN_SOFTWARE: dict[str, Any] = {
     "operator": "paper",

@@ -4,13 +4,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-from benchmarks.ground_truth.benchmark_scene import BenchmarkScene
-from benchmarks.ground_truth.truth import Truth, TruthFrame
-from benchmarks.quality.metrics import Picture
-from benchmarks.quality.regions import Regions, find_regions
-from protocol.frames import ViewFrame
-from protocol.source import open_source
-from sensor_node.view_frames import ViewFrameBuilder
+from deltalight.benchmarks.ground_truth.benchmark_scene import BenchmarkScene
+from deltalight.benchmarks.ground_truth.truth import Truth, TruthFrame
+from deltalight.benchmarks.quality.metrics import Picture
+from deltalight.benchmarks.quality.regions import Regions, find_regions
+from deltalight.protocol.frames import ViewFrame
+from deltalight.protocol.source import open_source
+from deltalight.sensor_node.view_frames import ViewFrameBuilder
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from benchmarks.ground_truth.sensors import srgb_bytes
-from benchmarks.ground_truth.truth import TruthFrame
-from benchmarks.quality.figures import linear
-from benchmarks.quality.metrics import Picture
+from deltalight.benchmarks.ground_truth.sensors import srgb_bytes
+from deltalight.benchmarks.ground_truth.truth import TruthFrame
+from deltalight.benchmarks.quality.figures import linear
+from deltalight.benchmarks.quality.metrics import Picture
 
 REGULARIZER = 1e-3
 """Keeps the ratio finite in black; the same fraction of white as in composition (docs/method.md 3)."""

@@ -7,14 +7,14 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import Progress
 
-from benchmarks.ground_truth.scenes import SCENES, scene_named
-from benchmarks.quality.ablation import ablation_chain
-from benchmarks.quality.evaluate import QualityJob, measure_quality
-from benchmarks.quality.report import require_replaceable, write_report
-from benchmarks.quality.report_data import as_data
-from benchmarks.quality.tables import all_tables
-from benchmarks.variants import Variant, parse_variants
-from protocol.errors import DeltalightError
+from deltalight.benchmarks.ground_truth.scenes import SCENES, scene_named
+from deltalight.benchmarks.quality.ablation import ablation_chain
+from deltalight.benchmarks.quality.evaluate import QualityJob, measure_quality
+from deltalight.benchmarks.quality.report import require_replaceable, write_report
+from deltalight.benchmarks.quality.report_data import as_data
+from deltalight.benchmarks.quality.tables import all_tables
+from deltalight.benchmarks.variants import Variant, parse_variants
+from deltalight.protocol.errors import DeltalightError
 
 
 def run_quality(

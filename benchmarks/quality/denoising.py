@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.ground_truth.render import GuidedPicture
-from benchmarks.quality.regions import Linear
-from protocol.errors import DeltalightError
+from deltalight.benchmarks.ground_truth.render import GuidedPicture
+from deltalight.benchmarks.quality.regions import Linear
+from deltalight.protocol.errors import DeltalightError
 
 MISSING = "`path+oidn` needs the package oidn; install the project with its dev extra, or leave it out of --methods."
 

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32
 
-from benchmarks.quality.metrics import Mask
-from benchmarks.quality.regions import Linear, Regions
+from deltalight.benchmarks.quality.metrics import Mask
+from deltalight.benchmarks.quality.regions import Linear, Regions
 
 NEAR_PIXELS = (5, 5)  # enough to average the noise of single pixels, within the edge of a soft shadow
 

@@ -12,7 +12,7 @@ so black is no error.
 import numpy as np
 from jaxtyping import UInt8
 
-from benchmarks.quality.metrics import CODE_RANGE, Picture
+from deltalight.benchmarks.quality.metrics import CODE_RANGE, Picture
 
 ENHANCEMENT = 64.0
 """n: the brightest colour is an error of 1/8 of the range. ([P1] has n = 16, [D] 4, for larger errors.)"""

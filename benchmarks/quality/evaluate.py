@@ -6,17 +6,17 @@ from pathlib import Path
 
 from rich.progress import Progress
 
-from benchmarks.ground_truth.benchmark_scene import BenchmarkScene
-from benchmarks.ground_truth.truth import ensure_truth
-from benchmarks.quality.case import SceneCase
-from benchmarks.quality.ceiling import ideal_composite
-from benchmarks.quality.denoising import require_denoiser
-from benchmarks.quality.figures import Figures, mean_figures, scene_figures
-from benchmarks.quality.metrics import Picture
-from benchmarks.quality.path_tracing import trace_in_time
-from benchmarks.quality.renders import Rendered, render_variant
-from benchmarks.variants import TIMED_VARIANT, Variant
-from render_server.gpu.context import GpuContext, create_context
+from deltalight.benchmarks.ground_truth.benchmark_scene import BenchmarkScene
+from deltalight.benchmarks.ground_truth.truth import ensure_truth
+from deltalight.benchmarks.quality.case import SceneCase
+from deltalight.benchmarks.quality.ceiling import ideal_composite
+from deltalight.benchmarks.quality.denoising import require_denoiser
+from deltalight.benchmarks.quality.figures import Figures, mean_figures, scene_figures
+from deltalight.benchmarks.quality.metrics import Picture
+from deltalight.benchmarks.quality.path_tracing import trace_in_time
+from deltalight.benchmarks.quality.renders import Rendered, render_variant
+from deltalight.benchmarks.variants import TIMED_VARIANT, Variant
+from deltalight.render_server.gpu.context import GpuContext, create_context
 
 CEILING = Variant(
     "ceiling", "the camera's picture times the true change: what perfect relighting could reach", "camera"

@@ -5,14 +5,14 @@ from dataclasses import asdict
 
 import numpy as np
 
-from benchmarks.ground_truth.truth import TruthFrame
-from benchmarks.quality.case import SceneCase
-from benchmarks.quality.energy import energy_ratios
-from benchmarks.quality.metrics import Comparison, Picture
-from benchmarks.quality.penumbra import EdgeOnPicture
-from benchmarks.quality.regions import Linear, Regions
-from benchmarks.quality.temporal import temporal_deviation
-from protocol.frames import decode_lut
+from deltalight.benchmarks.ground_truth.truth import TruthFrame
+from deltalight.benchmarks.quality.case import SceneCase
+from deltalight.benchmarks.quality.energy import energy_ratios
+from deltalight.benchmarks.quality.metrics import Comparison, Picture
+from deltalight.benchmarks.quality.penumbra import EdgeOnPicture
+from deltalight.benchmarks.quality.regions import Linear, Regions
+from deltalight.benchmarks.quality.temporal import temporal_deviation
+from deltalight.protocol.frames import decode_lut
 
 Figures = dict[str, float]
 PARTS = ("changed", "changed_real", "changed_virtual")

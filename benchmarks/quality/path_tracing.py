@@ -10,16 +10,16 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.ground_truth.assembly import Assembly
-from benchmarks.ground_truth.parts import Matrix
-from benchmarks.ground_truth.render import SUBPIXELS, RoomRenderer, softened
-from benchmarks.ground_truth.sensors import srgb_bytes
-from benchmarks.quality.case import SceneCase
-from benchmarks.quality.denoising import Denoiser
-from benchmarks.quality.figures import linear
-from benchmarks.quality.metrics import Picture
-from benchmarks.quality.regions import Linear
-from benchmarks.quality.renders import Rendered
+from deltalight.benchmarks.ground_truth.assembly import Assembly
+from deltalight.benchmarks.ground_truth.parts import Matrix
+from deltalight.benchmarks.ground_truth.render import SUBPIXELS, RoomRenderer, softened
+from deltalight.benchmarks.ground_truth.sensors import srgb_bytes
+from deltalight.benchmarks.quality.case import SceneCase
+from deltalight.benchmarks.quality.denoising import Denoiser
+from deltalight.benchmarks.quality.figures import linear
+from deltalight.benchmarks.quality.metrics import Picture
+from deltalight.benchmarks.quality.regions import Linear
+from deltalight.benchmarks.quality.renders import Rendered
 
 SEED = 700_001
 """Different from truth's seeds, so that their noise is independent."""

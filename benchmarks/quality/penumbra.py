@@ -7,10 +7,10 @@ from jaxtyping import Float32, Float64
 from scipy.ndimage import map_coordinates
 from scipy.optimize import isotonic_regression
 
-from benchmarks.ground_truth.benchmark_scene import ShadowEdge
-from benchmarks.ground_truth.parts import Matrix
-from benchmarks.quality.regions import REAL_COVER, Linear
-from protocol.camera_model import CameraModel
+from deltalight.benchmarks.ground_truth.benchmark_scene import ShadowEdge
+from deltalight.benchmarks.ground_truth.parts import Matrix
+from deltalight.benchmarks.quality.regions import REAL_COVER, Linear
+from deltalight.protocol.camera_model import CameraModel
 
 ACROSS_PX = 3
 """Parallel lines to either side, a pixel apart: seven of them reduce noise by 2.6."""

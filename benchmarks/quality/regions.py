@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32
 
-from benchmarks.ground_truth.sensors import srgb_coded
-from benchmarks.quality.metrics import Mask
+from deltalight.benchmarks.ground_truth.sensors import srgb_coded
+from deltalight.benchmarks.quality.metrics import Mask
 
 CHANGE_CODES = 2
 """A pixel is changed if a channel changes by more, in 8-bit codes: rounding can move either picture's code by one."""

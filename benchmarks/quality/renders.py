@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from benchmarks.quality.case import SceneCase
-from benchmarks.quality.metrics import Picture
-from benchmarks.variants import Variant
-from protocol.frames import BoardPose, ViewFrame
-from protocol.scene import SceneDocument
-from render_server.gpu.context import GpuContext
-from render_server.renderer import SceneRenderer
+from deltalight.benchmarks.quality.case import SceneCase
+from deltalight.benchmarks.quality.metrics import Picture
+from deltalight.benchmarks.variants import Variant
+from deltalight.protocol.frames import BoardPose, ViewFrame
+from deltalight.protocol.scene import SceneDocument
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.renderer import SceneRenderer
 
 TIMED_PAIRS = 2
 STEP_ASIDE_M = 0.05

@@ -7,16 +7,16 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from benchmarks.quality import REPORT_KIND
-from benchmarks.quality.error_view import error_view
-from benchmarks.quality.evaluate import QualityResult, SceneResult
-from benchmarks.quality.metrics import Picture
-from benchmarks.quality.report_data import as_data
-from benchmarks.quality.report_html import ScenePictures, html_page, picture_name
-from benchmarks.quality.tables import COLUMNS, all_tables
-from protocol.errors import DeltalightError
-from protocol.files import write_png
-from services.files import make_output_folder
+from deltalight.benchmarks.quality import REPORT_KIND
+from deltalight.benchmarks.quality.error_view import error_view
+from deltalight.benchmarks.quality.evaluate import QualityResult, SceneResult
+from deltalight.benchmarks.quality.metrics import Picture
+from deltalight.benchmarks.quality.report_data import as_data
+from deltalight.benchmarks.quality.report_html import ScenePictures, html_page, picture_name
+from deltalight.benchmarks.quality.tables import COLUMNS, all_tables
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.files import write_png
+from deltalight.services.files import make_output_folder
 
 DATA_FILE = "quality.json"
 PICTURES = "pictures"

@@ -5,10 +5,10 @@ import os
 from dataclasses import asdict
 from typing import Any
 
-from benchmarks.quality import REPORT_KIND
-from benchmarks.quality.evaluate import QualityResult, SceneResult
-from benchmarks.quality.figures import Figures
-from benchmarks.quality.tables import COLUMNS
+from deltalight.benchmarks.quality import REPORT_KIND
+from deltalight.benchmarks.quality.evaluate import QualityResult, SceneResult
+from deltalight.benchmarks.quality.figures import Figures
+from deltalight.benchmarks.quality.tables import COLUMNS
 
 
 def as_data(result: QualityResult) -> dict[str, Any]:

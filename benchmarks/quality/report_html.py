@@ -6,9 +6,9 @@ from pathlib import Path
 
 from jinja2 import Environment, StrictUndefined
 
-from benchmarks.quality.error_view import ENHANCEMENT
-from benchmarks.quality.evaluate import QualityResult, SceneResult
-from benchmarks.quality.tables import COLUMNS, all_tables
+from deltalight.benchmarks.quality.error_view import ENHANCEMENT
+from deltalight.benchmarks.quality.evaluate import QualityResult, SceneResult
+from deltalight.benchmarks.quality.tables import COLUMNS, all_tables
 
 TEMPLATE = Path(__file__).with_name("report.html.jinja")
 

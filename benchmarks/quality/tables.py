@@ -8,7 +8,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table as RichTable
 
-from benchmarks.quality.evaluate import CEILING, QualityResult, SceneResult
+from deltalight.benchmarks.quality.evaluate import CEILING, QualityResult, SceneResult
 
 MISSING = "–"
 WHOLE_NAME = 14

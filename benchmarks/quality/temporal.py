@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from benchmarks.quality.metrics import Mask, Picture
+from deltalight.benchmarks.quality.metrics import Mask, Picture
 
 
 @dataclass(frozen=True)

@@ -9,12 +9,12 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import Progress
 
-from benchmarks.speed.compare import compare_reports, print_comparison
-from benchmarks.speed.counts import count_frames, print_counts
-from benchmarks.speed.measure import SpeedJob, measure_speed
-from benchmarks.speed.report import SpeedReport
-from benchmarks.speed.tables import print_report
-from protocol.files import write_bytes
+from deltalight.benchmarks.speed.compare import compare_reports, print_comparison
+from deltalight.benchmarks.speed.counts import count_frames, print_counts
+from deltalight.benchmarks.speed.measure import SpeedJob, measure_speed
+from deltalight.benchmarks.speed.report import SpeedReport
+from deltalight.benchmarks.speed.tables import print_report
+from deltalight.protocol.files import write_bytes
 
 
 def run_speed(job: SpeedJob, budget_ms: float, *, end_to_end: bool, out: Path | None, as_json: bool) -> None:

@@ -6,9 +6,9 @@ from pathlib import Path
 
 from rich.console import Console
 
-from benchmarks.speed.report import MotionFigures, SpeedReport, read_report
-from benchmarks.speed.tables import figure_table
-from protocol.errors import DeltalightError
+from deltalight.benchmarks.speed.report import MotionFigures, SpeedReport, read_report
+from deltalight.benchmarks.speed.tables import figure_table
+from deltalight.protocol.errors import DeltalightError
 
 SLOWER = 1.05
 """Ratio above which a time is marked."""

@@ -8,13 +8,13 @@ from typing import Literal
 from rich.console import Console
 from rich.progress import Progress
 
-from benchmarks.speed.instruments import GpuCounts, ReadBacks, counted
-from benchmarks.speed.measure import WARM_UP_FRAMES, SpeedJob, opened, rendering, time_step
-from benchmarks.speed.motions import Step, prepare_take, steps_of
-from benchmarks.speed.report import Spread
-from benchmarks.speed.tables import figure_table
-from protocol.documents import StrictModel
-from render_server.renderer import SceneRenderer
+from deltalight.benchmarks.speed.instruments import GpuCounts, ReadBacks, counted
+from deltalight.benchmarks.speed.measure import WARM_UP_FRAMES, SpeedJob, opened, rendering, time_step
+from deltalight.benchmarks.speed.motions import Step, prepare_take, steps_of
+from deltalight.benchmarks.speed.report import Spread
+from deltalight.benchmarks.speed.tables import figure_table
+from deltalight.protocol.documents import StrictModel
+from deltalight.render_server.renderer import SceneRenderer
 
 ROWS = {
     "dispatches": "dispatches",

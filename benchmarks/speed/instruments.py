@@ -8,7 +8,7 @@ from typing import Any
 
 import moderngl
 
-from render_server.gpu.textures import AsyncReadback, sizes_bytes
+from deltalight.render_server.gpu.textures import AsyncReadback, sizes_bytes
 
 Wrap = Callable[[Any], Any]
 """Takes what a class has under a name, and returns what stands there instead."""

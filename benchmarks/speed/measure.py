@@ -9,9 +9,9 @@ from importlib.metadata import version
 
 from rich.progress import Progress
 
-from benchmarks.speed.motions import Step, Take, prepare_take, steps_of
-from benchmarks.speed.peaks import measure_peaks, stage_bytes
-from benchmarks.speed.report import (
+from deltalight.benchmarks.speed.motions import Step, Take, prepare_take, steps_of
+from deltalight.benchmarks.speed.peaks import measure_peaks, stage_bytes
+from deltalight.benchmarks.speed.report import (
     EndToEnd,
     MethodFigures,
     MotionFigures,
@@ -20,13 +20,13 @@ from benchmarks.speed.report import (
     Spread,
     StageFigures,
 )
-from benchmarks.variants import Variant
-from protocol.scene import SceneDocument
-from render_server.gpu.context import GpuContext, create_context
-from render_server.graph import Graph
-from render_server.renderer import SceneRenderer
-from services.demo import collect_composites, demo_scene
-from services.offline import with_output
+from deltalight.benchmarks.variants import Variant
+from deltalight.protocol.scene import SceneDocument
+from deltalight.render_server.gpu.context import GpuContext, create_context
+from deltalight.render_server.graph import Graph
+from deltalight.render_server.renderer import SceneRenderer
+from deltalight.services.demo import collect_composites, demo_scene
+from deltalight.services.offline import with_output
 
 Keep = Callable[[SpeedReport], None]
 

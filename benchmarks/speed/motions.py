@@ -9,15 +9,15 @@ import numpy as np
 from jaxtyping import Float64
 from rich.progress import Progress
 
-from protocol.documents import nearest
-from protocol.errors import DeltalightError
-from protocol.frames import ViewFrame
-from protocol.scene import SceneDocument
-from protocol.scene_lights import ManualLight
-from protocol.scene_objects import SceneObject
-from protocol.source import open_source
-from sensor_node.view_frames import ViewFrameBuilder
-from services.demo import RECORDING
+from deltalight.protocol.documents import nearest
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import ViewFrame
+from deltalight.protocol.scene import SceneDocument
+from deltalight.protocol.scene_lights import ManualLight
+from deltalight.protocol.scene_objects import SceneObject
+from deltalight.protocol.source import open_source
+from deltalight.sensor_node.view_frames import ViewFrameBuilder
+from deltalight.services.demo import RECORDING
 
 STANDING = range(20)
 """Frames of the demo's recording in which nothing moves but noise."""

@@ -3,12 +3,12 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from benchmarks.speed.report import Peaks
-from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import Kernel
-from render_server.gpu.textures import gpu_objects, release_all, sizes_bytes
-from render_server.gpu.timers import PassTimers
-from render_server.graph import Graph, StageReport
+from deltalight.benchmarks.speed.report import Peaks
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import Kernel
+from deltalight.render_server.gpu.textures import gpu_objects, release_all, sizes_bytes
+from deltalight.render_server.gpu.timers import PassTimers
+from deltalight.render_server.graph import Graph, StageReport
 
 SHADERS = Path(__file__).parent / "shaders"
 RUNS = 5  # the fastest counts: whatever disturbs a run makes it slower

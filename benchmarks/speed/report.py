@@ -6,8 +6,8 @@ from typing import Final, Literal, Self
 
 import numpy as np
 
-from protocol.documents import StrictModel, read_mapping, validate
-from protocol.errors import DeltalightError
+from deltalight.protocol.documents import StrictModel, read_mapping, validate
+from deltalight.protocol.errors import DeltalightError
 
 REPORT: Final = "deltalight bench speed"
 LEAST_FLOOR_MS = 0.0005

@@ -6,7 +6,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.speed.report import MethodFigures, MotionFigures, SpeedReport, Spread, StageFigures
+from deltalight.benchmarks.speed.report import MethodFigures, MotionFigures, SpeedReport, Spread, StageFigures
 
 MISSING = "–"
 

@@ -1,4 +1,4 @@
-"""Rewrites the byte vectors after a change of the wire and its version: `python -m protocol.vectors`."""
+"""Rewrites the byte vectors after a change of the wire and its version: `python -m deltalight.protocol.vectors`."""
 
 import base64
 import json
@@ -7,9 +7,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from protocol.codecs import encode_array, encode_color, encode_depth
-from protocol.envelope import encode
-from protocol.messages import (
+from deltalight.protocol.codecs import encode_array, encode_color, encode_depth
+from deltalight.protocol.envelope import encode
+from deltalight.protocol.messages import (
     ColorMessage,
     CompositeMessage,
     ControlReply,
@@ -23,7 +23,7 @@ from protocol.messages import (
     RadianceMessage,
     StatsMessage,
 )
-from protocol.vectors import FOLDER, frame_pieces
+from deltalight.protocol.vectors import FOLDER, frame_pieces
 
 CAMERA: dict[str, object] = {
     "width": 4,

@@ -1,11 +1,11 @@
 """Albedo of real surfaces, remembered for when the camera looks elsewhere (docs/method.md 2)."""
 
-from render_server.estimation.samples import BackoffSchedule, sample_light
-from render_server.frame_graph import FrameGraph
-from render_server.gpu.context import GpuContext
-from render_server.lights.lights import LightSet
-from render_server.passes.voxel_light import AlbedoTexture
-from render_server.scene.albedo import MEAN_ALBEDO, AlbedoVolume
+from deltalight.render_server.estimation.samples import BackoffSchedule, sample_light
+from deltalight.render_server.frame_graph import FrameGraph
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.lights.lights import LightSet
+from deltalight.render_server.passes.voxel_light import AlbedoTexture
+from deltalight.render_server.scene.albedo import MEAN_ALBEDO, AlbedoVolume
 
 
 class AlbedoEstimator:

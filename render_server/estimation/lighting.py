@@ -5,21 +5,21 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from protocol import scene_lights as documents
-from protocol.frames import ViewFrame
-from render_server.debug_view import draw_lights
-from render_server.estimation.plane_extrapolation import ExtrapolatedPlanes
-from render_server.estimation.registration import RegistrationAverage, register_lights
-from render_server.estimation.samples import BackoffSchedule, bounced_light
-from render_server.estimation.unseen_environment import (
+from deltalight.protocol import scene_lights as documents
+from deltalight.protocol.frames import ViewFrame
+from deltalight.render_server.debug_view import draw_lights
+from deltalight.render_server.estimation.plane_extrapolation import ExtrapolatedPlanes
+from deltalight.render_server.estimation.registration import RegistrationAverage, register_lights
+from deltalight.render_server.estimation.samples import BackoffSchedule, bounced_light
+from deltalight.render_server.estimation.unseen_environment import (
     find_extrapolated_planes,
     find_unseen_light,
     ground_radiance,
     unseen_light_shape,
 )
-from render_server.frame_graph import FrameGraph
-from render_server.lights.lights import LightSet
-from render_server.lights.sources import open_light_source
+from deltalight.render_server.frame_graph import FrameGraph
+from deltalight.render_server.lights.lights import LightSet
+from deltalight.render_server.lights.sources import open_light_source
 
 Rgb = Float32[np.ndarray, "3"]
 

@@ -6,11 +6,11 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64
 
-from render_server.estimation.samples import bounced_light, sample_light
-from render_server.frame_graph import FrameGraph
-from render_server.lights.environment import LUMINANCE
-from render_server.lights.lights import LightSet
-from render_server.scene.albedo import MIN_PIXELS
+from deltalight.render_server.estimation.samples import bounced_light, sample_light
+from deltalight.render_server.frame_graph import FrameGraph
+from deltalight.render_server.lights.environment import LUMINANCE
+from deltalight.render_server.lights.lights import LightSet
+from deltalight.render_server.scene.albedo import MIN_PIXELS
 
 OUTLIER_DEVIATIONS = 3.0
 MIN_IRRADIANCE = 1e-4

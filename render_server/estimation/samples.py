@@ -6,10 +6,10 @@ import moderngl
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 
-from protocol.frames import decode_lut
-from render_server.frame_graph import FrameGraph
-from render_server.lights.lights import LightSet
-from render_server.scene.albedo import known_albedo, unclipped
+from deltalight.protocol.frames import decode_lut
+from deltalight.render_server.frame_graph import FrameGraph
+from deltalight.render_server.lights.lights import LightSet
+from deltalight.render_server.scene.albedo import known_albedo, unclipped
 
 UNSHADOWED = 0.95  # fraction of its direct light that a pixel gets, from which on it counts as unshadowed
 

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float32
 
-from protocol.frames import decode_lut
-from render_server.estimation.plane_extrapolation import (
+from deltalight.protocol.frames import decode_lut
+from deltalight.render_server.estimation.plane_extrapolation import (
     ExtrapolatedPlanes,
     PointCloud,
     RealSamples,
@@ -14,12 +14,12 @@ from render_server.estimation.plane_extrapolation import (
     detect_planes,
     extrapolate_planes,
 )
-from render_server.estimation.registration import unseen_radiance_from_patch
-from render_server.estimation.samples import Bounce, read_texture, sample_light
-from render_server.frame_graph import FrameGraph
-from render_server.lights.environment import LUMINANCE
-from render_server.lights.lights import LightSet
-from render_server.lights.octahedral import irradiance, octahedral_uv, resample_to_octahedral
+from deltalight.render_server.estimation.registration import unseen_radiance_from_patch
+from deltalight.render_server.estimation.samples import Bounce, read_texture, sample_light
+from deltalight.render_server.frame_graph import FrameGraph
+from deltalight.render_server.lights.environment import LUMINANCE
+from deltalight.render_server.lights.lights import LightSet
+from deltalight.render_server.lights.octahedral import irradiance, octahedral_uv, resample_to_octahedral
 
 GROUND_SIZES = 2.0
 FACES_UP = 0.7  # cosine to the vertical

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import moderngl
 
-from protocol.errors import DeltalightError
+from deltalight.protocol.errors import DeltalightError
 
 SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swiftshader", "swrast")
 

@@ -14,9 +14,9 @@ from typing import Any, Final, Protocol
 import moderngl
 import numpy as np
 
-from render_server.gpu.context import GpuContext
-from render_server.gpu.shader_source import SHADERS, Declarations, declarations, shader_source
-from render_server.gpu.uniform_block import UniformBlock
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.shader_source import SHADERS, Declarations, declarations, shader_source
+from deltalight.render_server.gpu.uniform_block import UniformBlock
 
 SOFTWARE_WALKERS = 1024
 # Mesa's software renderer silently ends all loops of a thread after 65535 iterations in total; tracing the

@@ -9,7 +9,7 @@ import moderngl
 import numpy as np
 from jaxtyping import Float32
 
-from render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.context import GpuContext
 
 
 class Releasable(Protocol):
@@ -61,7 +61,7 @@ def release_all(*items: Releasable | None) -> None:
 
 
 GPU_KINDS = (moderngl.Texture, moderngl.Texture3D, moderngl.TextureArray, moderngl.Buffer)
-OWN_CODE = "render_server."
+OWN_CODE = "deltalight.render_server."
 DEEPEST = 4  # attributes of attributes; a pass holds fields, which hold textures
 
 

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 
 import moderngl
 
-from render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.context import GpuContext
 
 QUERIES_IN_FLIGHT = 3  # frames until a query is read without waiting for the GPU
 

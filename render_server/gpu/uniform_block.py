@@ -7,7 +7,7 @@ from typing import Annotated, Any, Generic, TypeVar, get_type_hints
 
 import numpy as np
 
-from render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.context import GpuContext
 
 Bool = Annotated[bool, "bool"]
 Int = Annotated[int, "int"]

@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Float64
 
-from protocol.errors import DeltalightError
-from protocol.frames import decode_lut
-from protocol.pictures import decode_rgb, read_bytes
-from protocol.radiance_files import LINEAR_SUFFIXES, read_linear
-from protocol.scene_lights import EnvironmentLights
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import decode_lut
+from deltalight.protocol.pictures import decode_rgb, read_bytes
+from deltalight.protocol.radiance_files import LINEAR_SUFFIXES, read_linear
+from deltalight.protocol.scene_lights import EnvironmentLights
 
 WORK_SIZE = (512, 256)
 MAX_EDGE = 16384

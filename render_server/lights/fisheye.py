@@ -14,13 +14,13 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64
 from scipy.optimize import linear_sum_assignment
 
-from protocol.frames import DepthImage, RadianceMap, ViewFrame, decode_lut
-from protocol.hemisphere import hemisphere_uv, texel_directions, texel_solid_angles
-from render_server.lights.environment import LUMINANCE, SkyGrid
-from render_server.lights.median_cut import RegionLight
-from render_server.lights.octahedral import octahedral_grid, sample_octahedral, texel_weights
-from render_server.lights.octahedral import texel_solid_angles as octahedral_solid_angles
-from render_server.scene.albedo import MIN_PIXELS, known_albedo, unclipped
+from deltalight.protocol.frames import DepthImage, RadianceMap, ViewFrame, decode_lut
+from deltalight.protocol.hemisphere import hemisphere_uv, texel_directions, texel_solid_angles
+from deltalight.render_server.lights.environment import LUMINANCE, SkyGrid
+from deltalight.render_server.lights.median_cut import RegionLight
+from deltalight.render_server.lights.octahedral import octahedral_grid, sample_octahedral, texel_weights
+from deltalight.render_server.lights.octahedral import texel_solid_angles as octahedral_solid_angles
+from deltalight.render_server.scene.albedo import MIN_PIXELS, known_albedo, unclipped
 
 COARSE_SIZE = 32
 # Power of the cosine that weights visible directions for an unseen one: half at 24 degrees, about the size of parts
@@ -56,7 +56,7 @@ THICKNESS_M = 0.05
 
 @dataclass(frozen=True, eq=False)
 class HemisphereMap:
-    """Radiance on the grid of `protocol.hemisphere`, 0 where not `seen`; `world_from_map` is a rotation."""
+    """Radiance on the grid of `deltalight.protocol.hemisphere`, 0 where not `seen`; `world_from_map` is a rotation."""
 
     radiance: Float32[np.ndarray, "n n 3"]
     seen: Bool[np.ndarray, "n n"]

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Float64
 
-from render_server.lights.environment import LUMINANCE, WORK_SIZE, EnvironmentMap, SkyGrid
+from deltalight.render_server.lights.environment import LUMINANCE, WORK_SIZE, EnvironmentMap, SkyGrid
 
 PEAK_THRESHOLD = 4.0
 MIN_FRACTION = 0.01

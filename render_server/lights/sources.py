@@ -6,9 +6,9 @@ from typing import Protocol
 import numpy as np
 from jaxtyping import Float64
 
-from protocol import scene_lights as documents
-from protocol.frames import RadianceMap, ViewFrame
-from render_server.lights.fisheye import (
+from deltalight.protocol import scene_lights as documents
+from deltalight.protocol.frames import RadianceMap, ViewFrame
+from deltalight.render_server.lights.fisheye import (
     HemisphereMap,
     LightTracker,
     TrackedLight,
@@ -18,7 +18,7 @@ from render_server.lights.fisheye import (
     paper_light,
     to_world,
 )
-from render_server.lights.lights import (
+from deltalight.render_server.lights.lights import (
     AMBIENT_SIZE,
     DirectionalLight,
     Light,
@@ -27,8 +27,8 @@ from render_server.lights.lights import (
     build_lights,
     light_set,
 )
-from render_server.lights.median_cut import Split, split_map
-from render_server.lights.octahedral import above_horizon, irradiance
+from deltalight.render_server.lights.median_cut import Split, split_map
+from deltalight.render_server.lights.octahedral import above_horizon, irradiance
 
 # Fraction of a lamp's radius that it must move to count as moved. Soft edges of its shadows are then off by a
 # twentieth of their width, whereas noise of the marker's pose would make them tremble and cost a rebuild per frame.

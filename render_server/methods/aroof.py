@@ -8,19 +8,19 @@ from operator import eq
 import moderngl
 import numpy as np
 
-from protocol.scene_method import AroofMethod
-from render_server.frame import FrameResources, Observation
-from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import Binding, Bindings
-from render_server.gpu.textures import release_all
-from render_server.gpu_scene import GeometryState, PlacedObject
-from render_server.graph import Graph, Resource
-from render_server.methods.light_maps import light_stages
-from render_server.methods.lighting import Layers, Shading, ShadingOptions, shading_stages
-from render_server.methods.method import RelightingMethod, ResolvedSettings, Setup
-from render_server.occlusion_fields import OcclusionFields, require_rigid
-from render_server.passes.cones import ConeFields, LowResGrid
-from render_server.passes.occlusion_fields import (
+from deltalight.protocol.scene_method import AroofMethod
+from deltalight.render_server.frame import FrameResources, Observation
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import Binding, Bindings
+from deltalight.render_server.gpu.textures import release_all
+from deltalight.render_server.gpu_scene import GeometryState, PlacedObject
+from deltalight.render_server.graph import Graph, Resource
+from deltalight.render_server.methods.light_maps import light_stages
+from deltalight.render_server.methods.lighting import Layers, Shading, ShadingOptions, shading_stages
+from deltalight.render_server.methods.method import RelightingMethod, ResolvedSettings, Setup
+from deltalight.render_server.occlusion_fields import OcclusionFields, require_rigid
+from deltalight.render_server.passes.cones import ConeFields, LowResGrid
+from deltalight.render_server.passes.occlusion_fields import (
     FieldTextures,
     LightChange,
     LightProbe,
@@ -32,9 +32,9 @@ from render_server.passes.occlusion_fields import (
     field_texture,
     standing_uniforms,
 )
-from render_server.passes.shading import DirectLight
-from render_server.passes.voxels import PlacedVolume, VolumePlacement, VoxelMipmap, place_volume
-from render_server.scene.occlusion_field import FieldSettings, OcclusionField
+from deltalight.render_server.passes.shading import DirectLight
+from deltalight.render_server.passes.voxels import PlacedVolume, VolumePlacement, VoxelMipmap, place_volume
+from deltalight.render_server.scene.occlusion_field import FieldSettings, OcclusionField
 
 SHOWN_CELLS = 64  # for view `volume` alone; the method has no volume
 

@@ -11,15 +11,15 @@ from operator import eq
 import moderngl
 import numpy as np
 
-from protocol.scene_method import DifferentialMethod
-from render_server.frame import FrameResources, Observation
-from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import Binding, Bindings, clear_buffer
-from render_server.gpu_scene import GeometryState, ObjectExtent
-from render_server.graph import Graph, Resource
-from render_server.lights.lights import LightSet
-from render_server.methods.light_maps import LitScene, object_extent, shadow_receivers
-from render_server.methods.lighting import (
+from deltalight.protocol.scene_method import DifferentialMethod
+from deltalight.render_server.frame import FrameResources, Observation
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import Binding, Bindings, clear_buffer
+from deltalight.render_server.gpu_scene import GeometryState, ObjectExtent
+from deltalight.render_server.graph import Graph, Resource
+from deltalight.render_server.lights.lights import LightSet
+from deltalight.render_server.methods.light_maps import LitScene, object_extent, shadow_receivers
+from deltalight.render_server.methods.lighting import (
     SURFEL_SHADOW_SAMPLES,
     Layers,
     Shading,
@@ -28,28 +28,28 @@ from render_server.methods.lighting import (
     surfel_scene,
     volume_placement,
 )
-from render_server.methods.method import (
+from deltalight.render_server.methods.method import (
     RelightingMethod,
     ResolvedSettings,
     Setup,
     march_defines,
     resolve_joint_maps,
 )
-from render_server.methods.voxel_volumes import (
+from deltalight.render_server.methods.voxel_volumes import (
     FAR_SIZE,
     DirectionalVoxels,
     VoxelSet,
     joint_voxels,
     placed_volume,
 )
-from render_server.passes.caustics import Caustics
-from render_server.passes.cones import ConeFields, LowResGrid, TraceCones
-from render_server.passes.gbuffer import MeshBuffers
-from render_server.passes.lights import LightBuffers
-from render_server.passes.shading import DirectLightPair
-from render_server.passes.shadow_maps import ShadowMaps
-from render_server.passes.voxel_light import AlbedoTexture
-from render_server.passes.voxels import (
+from deltalight.render_server.passes.caustics import Caustics
+from deltalight.render_server.passes.cones import ConeFields, LowResGrid, TraceCones
+from deltalight.render_server.passes.gbuffer import MeshBuffers
+from deltalight.render_server.passes.lights import LightBuffers
+from deltalight.render_server.passes.shading import DirectLightPair
+from deltalight.render_server.passes.shadow_maps import ShadowMaps
+from deltalight.render_server.passes.voxel_light import AlbedoTexture
+from deltalight.render_server.passes.voxels import (
     DIRECTIONS,
     VolumePlacement,
     VoxelMipmap,

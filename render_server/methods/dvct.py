@@ -2,16 +2,16 @@
 
 import moderngl
 
-from protocol.scene_method import DvctMethod
-from render_server.frame import FrameResources, Observation
-from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import Binding, Bindings
-from render_server.gpu.textures import release_all
-from render_server.gpu_scene import GeometryState
-from render_server.graph import Graph, Resource
-from render_server.lights.lights import LightSet
-from render_server.methods.light_maps import LitScene, light_stages
-from render_server.methods.lighting import (
+from deltalight.protocol.scene_method import DvctMethod
+from deltalight.render_server.frame import FrameResources, Observation
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import Binding, Bindings
+from deltalight.render_server.gpu.textures import release_all
+from deltalight.render_server.gpu_scene import GeometryState
+from deltalight.render_server.graph import Graph, Resource
+from deltalight.render_server.lights.lights import LightSet
+from deltalight.render_server.methods.light_maps import LitScene, light_stages
+from deltalight.render_server.methods.lighting import (
     Layers,
     Shading,
     ShadingOptions,
@@ -19,14 +19,14 @@ from render_server.methods.lighting import (
     surfel_scene,
     volume_placement,
 )
-from render_server.methods.method import (
+from deltalight.render_server.methods.method import (
     RelightingMethod,
     ResolvedSettings,
     Setup,
     march_defines,
     resolve_voxel_cones,
 )
-from render_server.methods.voxel_volumes import (
+from deltalight.render_server.methods.voxel_volumes import (
     FAR_SIZE,
     DeltaVoxels,
     VoxelSet,
@@ -34,12 +34,17 @@ from render_server.methods.voxel_volumes import (
     joint_voxels,
     placed_volume,
 )
-from render_server.passes.cones import ConeFields, LowResGrid, TraceCones, TraceConesPaper
-from render_server.passes.lights import LightBuffers
-from render_server.passes.shading import DirectLight
-from render_server.passes.split_injection import FilterIsotropic, RealAlbedo, ResolveInjection, SplitInjection
-from render_server.passes.voxel_light import AlbedoTexture
-from render_server.passes.voxels import (
+from deltalight.render_server.passes.cones import ConeFields, LowResGrid, TraceCones, TraceConesPaper
+from deltalight.render_server.passes.lights import LightBuffers
+from deltalight.render_server.passes.shading import DirectLight
+from deltalight.render_server.passes.split_injection import (
+    FilterIsotropic,
+    RealAlbedo,
+    ResolveInjection,
+    SplitInjection,
+)
+from deltalight.render_server.passes.voxel_light import AlbedoTexture
+from deltalight.render_server.passes.voxels import (
     DIRECTIONS,
     VolumePlacement,
     VoxelMipmap,

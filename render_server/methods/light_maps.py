@@ -8,17 +8,17 @@ import moderngl
 import numpy as np
 from jaxtyping import Float64
 
-from protocol.quality import BEST, QualityTier
-from render_server.frame import FrameResources, Observation
-from render_server.gpu.context import GpuContext
-from render_server.gpu_scene import GeometryState, ObjectExtent
-from render_server.graph import Graph, Resource
-from render_server.lights.lights import LightSet
-from render_server.lights.mirror_lights import mirror_lights
-from render_server.methods.method import ResolvedSettings
-from render_server.passes.lights import LightBuffers, MirrorVisibility
-from render_server.passes.shadow_maps import ShadowMaps
-from render_server.scene.declared_surfaces import SurfaceTable
+from deltalight.protocol.quality import BEST, QualityTier
+from deltalight.render_server.frame import FrameResources, Observation
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu_scene import GeometryState, ObjectExtent
+from deltalight.render_server.graph import Graph, Resource
+from deltalight.render_server.lights.lights import LightSet
+from deltalight.render_server.lights.mirror_lights import mirror_lights
+from deltalight.render_server.methods.method import ResolvedSettings
+from deltalight.render_server.passes.lights import LightBuffers, MirrorVisibility
+from deltalight.render_server.passes.shadow_maps import ShadowMaps
+from deltalight.render_server.scene.declared_surfaces import SurfaceTable
 
 SHADOW_REACH = 4.0  # in longest edges of the objects' bounds: how far around them real shadows are resolved
 LARGE_TRIANGLE = 0.1  # of that reach: from here on a triangle's own extent matters, not only its corners

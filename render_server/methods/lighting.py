@@ -8,31 +8,31 @@ from typing import Any
 import moderngl
 import numpy as np
 
-from protocol.quality import BEST, QualityTier
-from render_server.frame import FrameResources, Observation
-from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import Binding, Bindings
-from render_server.gpu_scene import GeometryState, ObjectExtent
-from render_server.graph import Graph, Resource
-from render_server.lights.lights import LightSet
-from render_server.methods.light_maps import LitScene, Points, object_extent
-from render_server.methods.method import ResolvedSettings
-from render_server.passes.caustics import GREATEST_ALPHA, Caustics
-from render_server.passes.composite import ChangeRatio
-from render_server.passes.cones import ConeFields, LowResGrid
-from render_server.passes.gbuffer import ObjectBvh
-from render_server.passes.lights import LightBuffers
-from render_server.passes.reflections import ROUGHEST, MirrorRays, ScreenCones
-from render_server.passes.shading import DirectLight, LightHistory, VirtualSurface
-from render_server.passes.voxel_light import AlbedoTexture
-from render_server.passes.voxels import (
+from deltalight.protocol.quality import BEST, QualityTier
+from deltalight.render_server.frame import FrameResources, Observation
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import Binding, Bindings
+from deltalight.render_server.gpu_scene import GeometryState, ObjectExtent
+from deltalight.render_server.graph import Graph, Resource
+from deltalight.render_server.lights.lights import LightSet
+from deltalight.render_server.methods.light_maps import LitScene, Points, object_extent
+from deltalight.render_server.methods.method import ResolvedSettings
+from deltalight.render_server.passes.caustics import GREATEST_ALPHA, Caustics
+from deltalight.render_server.passes.composite import ChangeRatio
+from deltalight.render_server.passes.cones import ConeFields, LowResGrid
+from deltalight.render_server.passes.gbuffer import ObjectBvh
+from deltalight.render_server.passes.lights import LightBuffers
+from deltalight.render_server.passes.reflections import ROUGHEST, MirrorRays, ScreenCones
+from deltalight.render_server.passes.shading import DirectLight, LightHistory, VirtualSurface
+from deltalight.render_server.passes.voxel_light import AlbedoTexture
+from deltalight.render_server.passes.voxels import (
     PlacedVolume,
     VolumePlacement,
     VoxelMipmap,
     keep_placement,
     place_volume,
 )
-from render_server.view import CameraView
+from deltalight.render_server.view import CameraView
 
 SELF_SHADOW_TEXELS = 1.5  # a virtual receiver is lifted by so many texels of the depth map
 SURFEL_SHADOW_SAMPLES = 4  # of a light's area: a voxel averages many surfels

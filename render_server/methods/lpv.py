@@ -7,16 +7,16 @@ import moderngl
 import numpy as np
 from jaxtyping import Float32
 
-from protocol.scene_method import DlpvMethod
-from render_server.frame import FrameResources, Observation
-from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import Binding, Bindings, clear_buffer
-from render_server.gpu.textures import release_all
-from render_server.gpu_scene import GeometryState
-from render_server.graph import Graph, Resource
-from render_server.lights.lights import LightSet
-from render_server.methods.light_maps import LitScene, light_stages
-from render_server.methods.lighting import (
+from deltalight.protocol.scene_method import DlpvMethod
+from deltalight.render_server.frame import FrameResources, Observation
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import Binding, Bindings, clear_buffer
+from deltalight.render_server.gpu.textures import release_all
+from deltalight.render_server.gpu_scene import GeometryState
+from deltalight.render_server.graph import Graph, Resource
+from deltalight.render_server.lights.lights import LightSet
+from deltalight.render_server.methods.light_maps import LitScene, light_stages
+from deltalight.render_server.methods.lighting import (
     SURFEL_SHADOW_SAMPLES,
     Layers,
     Shading,
@@ -26,10 +26,10 @@ from render_server.methods.lighting import (
     surfel_scene,
     volume_placement,
 )
-from render_server.methods.method import RelightingMethod, ResolvedSettings, Setup
-from render_server.passes.cones import ConeFields, LowResGrid
-from render_server.passes.lights import LightBuffers
-from render_server.passes.lpv import (
+from deltalight.render_server.methods.method import RelightingMethod, ResolvedSettings, Setup
+from deltalight.render_server.passes.cones import ConeFields, LowResGrid
+from deltalight.render_server.passes.lights import LightBuffers
+from deltalight.render_server.passes.lpv import (
     LightVolume,
     LpvBoxFilter,
     LpvCoverFaces,
@@ -43,17 +43,23 @@ from render_server.passes.lpv import (
     moment_weights,
     transmitted_fractions,
 )
-from render_server.passes.lpv_lighting import (
+from deltalight.render_server.passes.lpv_lighting import (
     LpvBounce,
     LpvInjectMaps,
     LpvInjectSurfaces,
     LpvQuery,
     light_volume_bindings,
 )
-from render_server.passes.shading import DirectLight
-from render_server.passes.split_injection import RealAlbedo
-from render_server.passes.voxel_light import AlbedoTexture
-from render_server.passes.voxels import PlacedVolume, VolumePlacement, Voxelize, VoxelMipmap, VoxelStore
+from deltalight.render_server.passes.shading import DirectLight
+from deltalight.render_server.passes.split_injection import RealAlbedo
+from deltalight.render_server.passes.voxel_light import AlbedoTexture
+from deltalight.render_server.passes.voxels import (
+    PlacedVolume,
+    VolumePlacement,
+    Voxelize,
+    VoxelMipmap,
+    VoxelStore,
+)
 
 
 class LpvCells:

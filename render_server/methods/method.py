@@ -8,14 +8,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Generic, TypeVar
 
-from protocol.scene_method import MethodSettings, VoxelConeSettings
-from protocol.scene_objects import SceneObject
+from deltalight.protocol.scene_method import MethodSettings, VoxelConeSettings
+from deltalight.protocol.scene_objects import SceneObject
 
 if TYPE_CHECKING:
-    from render_server.frame import FrameResources
-    from render_server.graph import Graph
-    from render_server.methods.lighting import Layers
-    from render_server.occlusion_fields import OcclusionFields
+    from deltalight.render_server.frame import FrameResources
+    from deltalight.render_server.graph import Graph
+    from deltalight.render_server.methods.lighting import Layers
+    from deltalight.render_server.occlusion_fields import OcclusionFields
 
 Settings = TypeVar("Settings", bound=MethodSettings)
 LEAST_VOLUME = 32  # voxels an edge

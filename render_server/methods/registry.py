@@ -5,25 +5,25 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
-from protocol.methods import PLUGINS
-from protocol.plugins import Plugin
-from protocol.scene_method import DvctMethod, MethodSettings, NoneMethod
-from protocol.scene_objects import SceneObject
-from render_server.frame import FrameResources
-from render_server.graph import Graph
-from render_server.methods.aroof import AROOF
-from render_server.methods.differential import DIFFERENTIAL
-from render_server.methods.dvct import DVCT
-from render_server.methods.lighting import Layers
-from render_server.methods.lpv import DLPV
-from render_server.methods.method import (
+from deltalight.protocol.methods import PLUGINS
+from deltalight.protocol.plugins import Plugin
+from deltalight.protocol.scene_method import DvctMethod, MethodSettings, NoneMethod
+from deltalight.protocol.scene_objects import SceneObject
+from deltalight.render_server.frame import FrameResources
+from deltalight.render_server.graph import Graph
+from deltalight.render_server.methods.aroof import AROOF
+from deltalight.render_server.methods.differential import DIFFERENTIAL
+from deltalight.render_server.methods.dvct import DVCT
+from deltalight.render_server.methods.lighting import Layers
+from deltalight.render_server.methods.lpv import DLPV
+from deltalight.render_server.methods.method import (
     GPU_DEFAULTS,
     SOFTWARE_DEFAULTS,
     RelightingMethod,
     ResolvedSettings,
     Setup,
 )
-from render_server.occlusion_fields import OcclusionFields
+from deltalight.render_server.occlusion_fields import OcclusionFields
 
 BUILT_IN: tuple[RelightingMethod[Any], ...] = (DVCT, DLPV, AROOF, DIFFERENTIAL)
 _BY_SETTINGS = {method.settings: method for method in BUILT_IN}

@@ -11,27 +11,27 @@ import moderngl
 import numpy as np
 from jaxtyping import Float32
 
-from protocol.scene_method import DvctMethod, VoxelConeSettings
-from render_server.frame import FrameResources, Observation
-from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import Binding, Bindings, clear_buffer
-from render_server.gpu.textures import release_all
-from render_server.gpu.uniform_block import UniformBlock
-from render_server.gpu_scene import GeometryState
-from render_server.graph import Graph, Resource
-from render_server.lights.lights import LightSet
-from render_server.methods.light_maps import LitScene
-from render_server.methods.lighting import SURFEL_SHADOW_SAMPLES, casts_caustics, surfel_scene
-from render_server.methods.method import march_defines
-from render_server.passes.lights import LightBuffers
-from render_server.passes.voxel_light import (
+from deltalight.protocol.scene_method import DvctMethod, VoxelConeSettings
+from deltalight.render_server.frame import FrameResources, Observation
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import Binding, Bindings, clear_buffer
+from deltalight.render_server.gpu.textures import release_all
+from deltalight.render_server.gpu.uniform_block import UniformBlock
+from deltalight.render_server.gpu_scene import GeometryState
+from deltalight.render_server.graph import Graph, Resource
+from deltalight.render_server.lights.lights import LightSet
+from deltalight.render_server.methods.light_maps import LitScene
+from deltalight.render_server.methods.lighting import SURFEL_SHADOW_SAMPLES, casts_caustics, surfel_scene
+from deltalight.render_server.methods.method import march_defines
+from deltalight.render_server.passes.lights import LightBuffers
+from deltalight.render_server.passes.voxel_light import (
     AlbedoTexture,
     GatherVoxels,
     GroupSurfels,
     LightVoxels,
     SurfelGroups,
 )
-from render_server.passes.voxels import (
+from deltalight.render_server.passes.voxels import (
     DIRECTIONS,
     ClearVoxels,
     FarVolumeBlock,

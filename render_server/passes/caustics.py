@@ -2,12 +2,12 @@
 
 import math
 
-from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import Binding, Bindings, Kernel, clear_buffer, list_threads
-from render_server.gpu.textures import release_all
-from render_server.passes.cones import LowResGrid, reuse_define
-from render_server.passes.gbuffer import ObjectBvh
-from render_server.passes.lights import LightBuffers
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel, clear_buffer, list_threads
+from deltalight.render_server.gpu.textures import release_all
+from deltalight.render_server.passes.cones import LowResGrid, reuse_define
+from deltalight.render_server.passes.gbuffer import ObjectBvh
+from deltalight.render_server.passes.lights import LightBuffers
 
 # Blocks per edge of a light's object map, each of which sends a beam of rays: they start a 128th of the objects'
 # extent apart, and after a convex object has spread them four- to eightfold they are as far apart as voxels.

@@ -6,16 +6,16 @@ import moderngl
 import numpy as np
 from jaxtyping import UInt8
 
-from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import Binding, Bindings, Kernel, list_threads
-from render_server.gpu.textures import release_all, texture_2d
-from render_server.passes.cones import ConeFields, LowResGrid
-from render_server.passes.coverage import RIM_SIGHT
-from render_server.passes.gbuffer import CameraImage, rgba_bytes
-from render_server.passes.lights import LightBuffers
-from render_server.passes.reflections import RAY_ROUGHNESS
-from render_server.passes.shading import DirectLight
-from render_server.passes.voxels import PlacedVolume, VoxelMipmap
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel, list_threads
+from deltalight.render_server.gpu.textures import release_all, texture_2d
+from deltalight.render_server.passes.cones import ConeFields, LowResGrid
+from deltalight.render_server.passes.coverage import RIM_SIGHT
+from deltalight.render_server.passes.gbuffer import CameraImage, rgba_bytes
+from deltalight.render_server.passes.lights import LightBuffers
+from deltalight.render_server.passes.reflections import RAY_ROUGHNESS
+from deltalight.render_server.passes.shading import DirectLight
+from deltalight.render_server.passes.voxels import PlacedVolume, VoxelMipmap
 
 FILL_RADIUS = 3  # texels of the reduced grid by which the change extends into a hole
 

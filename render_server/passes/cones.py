@@ -4,10 +4,10 @@ from collections.abc import Mapping
 
 import moderngl
 
-from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import Binding, Bindings, Kernel, list_threads
-from render_server.gpu.textures import release_all, texture_2d
-from render_server.passes.voxels import VoxelMipmap
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel, list_threads
+from deltalight.render_server.gpu.textures import release_all, texture_2d
+from deltalight.render_server.passes.voxels import VoxelMipmap
 
 
 class LowResGrid:

@@ -2,11 +2,11 @@
 
 import moderngl
 
-from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import Bindings, Kernel, list_threads
-from render_server.gpu.textures import release_all, release_target, texture_2d
-from render_server.passes.gbuffer import GeometryBuffer, MeshBuffers, RasterGeometry
-from render_server.view import CameraView, Rectangle
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import Bindings, Kernel, list_threads
+from deltalight.render_server.gpu.textures import release_all, release_target, texture_2d
+from deltalight.render_server.passes.gbuffer import GeometryBuffer, MeshBuffers, RasterGeometry
+from deltalight.render_server.view import CameraView, Rectangle
 
 # Sample positions in 1/16 pixels from the pixel's centre, nearest first. Of all patterns of eight with one sample in
 # each column and row of eighths (an upright edge is exact to 1/16) this one has the least worst-case error for an

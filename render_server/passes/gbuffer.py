@@ -5,13 +5,13 @@ import moderngl
 import numpy as np
 from jaxtyping import Float16, Float32, Float64, Int32, UInt8
 
-from protocol.frames import DepthImage, ViewFrame, decode_lut
-from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import Binding, Bindings, Kernel, RasterKernel
-from render_server.gpu.textures import release_all, release_target, texture_2d
-from render_server.scene.bvh import Bvh, build_bvh
-from render_server.scene.triangle_mesh import VERTEX_ATTRIBUTES, VERTEX_LAYOUT, GpuMesh
-from render_server.view import CameraView, Rectangle
+from deltalight.protocol.frames import DepthImage, ViewFrame, decode_lut
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel, RasterKernel
+from deltalight.render_server.gpu.textures import release_all, release_target, texture_2d
+from deltalight.render_server.scene.bvh import Bvh, build_bvh
+from deltalight.render_server.scene.triangle_mesh import VERTEX_ATTRIBUTES, VERTEX_LAYOUT, GpuMesh
+from deltalight.render_server.view import CameraView, Rectangle
 
 INVERSE_SIZE = 8192  # steps of the inverse response: a code is at least 16 of them wide
 TEXTURE_SIZE = 1024  # texels an edge of a base-colour texture

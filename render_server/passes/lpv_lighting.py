@@ -2,13 +2,13 @@
 
 import moderngl
 
-from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import Binding, Bindings, Kernel, list_threads
-from render_server.passes.caustics import GREATEST_ALPHA
-from render_server.passes.cones import ConeFields, LowResGrid
-from render_server.passes.lights import LightBuffers
-from render_server.passes.lpv import LightVolume
-from render_server.passes.voxels import VoxelStore
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel, list_threads
+from deltalight.render_server.passes.caustics import GREATEST_ALPHA
+from deltalight.render_server.passes.cones import ConeFields, LowResGrid
+from deltalight.render_server.passes.lights import LightBuffers
+from deltalight.render_server.passes.lpv import LightVolume
+from deltalight.render_server.passes.voxels import VoxelStore
 
 
 def light_volume_bindings(mu: LightVolume, rho: LightVolume) -> dict[str, Binding]:

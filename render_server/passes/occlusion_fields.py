@@ -7,14 +7,19 @@ import moderngl
 import numpy as np
 from jaxtyping import Float16, Float32, Float64
 
-from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import Binding, Bindings, Kernel, clear_buffer
-from render_server.gpu.textures import texture_2d
-from render_server.lights.octahedral import MAX_ORDER, harmonics, octahedral_grid, texel_solid_angles
-from render_server.passes.cones import ConeFields, LowResGrid
-from render_server.passes.voxels import VoxelMipmap
-from render_server.scene.occlusion_field import OcclusionField
-from render_server.scene.occlusion_transfer import LENGTH
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel, clear_buffer
+from deltalight.render_server.gpu.textures import texture_2d
+from deltalight.render_server.lights.octahedral import (
+    MAX_ORDER,
+    harmonics,
+    octahedral_grid,
+    texel_solid_angles,
+)
+from deltalight.render_server.passes.cones import ConeFields, LowResGrid
+from deltalight.render_server.passes.voxels import VoxelMipmap
+from deltalight.render_server.scene.occlusion_field import OcclusionField
+from deltalight.render_server.scene.occlusion_transfer import LENGTH
 
 MOST_SHELLS = 6
 COEFFICIENTS_PER_TEXEL = 4

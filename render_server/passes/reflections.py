@@ -4,14 +4,14 @@ from collections.abc import Mapping
 
 import moderngl
 
-from protocol.quality import QualityTier
-from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import Bindings, Kernel, ListGroups, list_threads
-from render_server.gpu.textures import release_all, texture_2d
-from render_server.passes.caustics import GREATEST_ALPHA
-from render_server.passes.cones import ConeFields, LowResGrid
-from render_server.passes.gbuffer import ObjectBvh
-from render_server.passes.shading import DirectLight
+from deltalight.protocol.quality import QualityTier
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import Bindings, Kernel, ListGroups, list_threads
+from deltalight.render_server.gpu.textures import release_all, texture_2d
+from deltalight.render_server.passes.caustics import GREATEST_ALPHA
+from deltalight.render_server.passes.cones import ConeFields, LowResGrid
+from deltalight.render_server.passes.gbuffer import ObjectBvh
+from deltalight.render_server.passes.shading import DirectLight
 
 # Of equal energy each: up to RAY_ROUGHNESS they are closer together than voxels. There the cone of the lobe is 48
 # degrees wide and the rays some 12 apart: a fifth of an object's length away from it, six of 64 voxels.

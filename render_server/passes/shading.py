@@ -6,13 +6,13 @@ import moderngl
 import numpy as np
 from jaxtyping import Float64
 
-from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import Binding, Bindings, Kernel, list_threads
-from render_server.gpu.textures import release_all, texture_2d
-from render_server.passes.caustics import Caustics
-from render_server.passes.cones import ConeFields, LowResGrid
-from render_server.passes.lights import LightBuffers
-from render_server.view import CameraView
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel, list_threads
+from deltalight.render_server.gpu.textures import release_all, texture_2d
+from deltalight.render_server.passes.caustics import Caustics
+from deltalight.render_server.passes.cones import ConeFields, LowResGrid
+from deltalight.render_server.passes.lights import LightBuffers
+from deltalight.render_server.view import CameraView
 
 
 class DirectLight:

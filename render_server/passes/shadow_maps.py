@@ -9,12 +9,12 @@ import moderngl
 import numpy as np
 from jaxtyping import Float64
 
-from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import RasterKernel
-from render_server.gpu.textures import release_target, texture_2d
-from render_server.lights.lights import DirectionalLight, Lamp, Light
-from render_server.lights.mirror_lights import MirrorLight
-from render_server.passes.gbuffer import MeshBuffers
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import RasterKernel
+from deltalight.render_server.gpu.textures import release_target, texture_2d
+from deltalight.render_server.lights.lights import DirectionalLight, Lamp, Light
+from deltalight.render_server.lights.mirror_lights import MirrorLight
+from deltalight.render_server.passes.gbuffer import MeshBuffers
 
 NEAR_MARGIN = 0.98  # near and far planes lie a little outside of what they enclose
 FAR_MARGIN = 1.02

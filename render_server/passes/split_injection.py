@@ -2,11 +2,11 @@
 
 import moderngl
 
-from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import Bindings, Kernel, clear_buffer, list_threads
-from render_server.gpu.textures import texture_2d
-from render_server.passes.lights import LightBuffers
-from render_server.passes.voxels import PlacedVolume, VoxelMipmap, VoxelStore
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import Bindings, Kernel, clear_buffer, list_threads
+from deltalight.render_server.gpu.textures import texture_2d
+from deltalight.render_server.passes.lights import LightBuffers
+from deltalight.render_server.passes.voxels import PlacedVolume, VoxelMipmap, VoxelStore
 
 LIGHT_SUMS = 14  # per slot: shaders/common/split_sums.glsl
 

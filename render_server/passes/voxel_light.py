@@ -10,18 +10,18 @@ import moderngl
 import numpy as np
 from jaxtyping import Float32
 
-from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import Binding, Bindings, Kernel, clear_buffer, list_threads
-from render_server.gpu.textures import release_all
-from render_server.passes.caustics import GREATEST_ALPHA
-from render_server.passes.voxels import (
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel, clear_buffer, list_threads
+from deltalight.render_server.gpu.textures import release_all
+from deltalight.render_server.passes.caustics import GREATEST_ALPHA
+from deltalight.render_server.passes.voxels import (
     LOWER_SURFELS,
     LOWER_VOLUME,
     VoxelMipmap,
     VoxelStore,
     group_grid_bytes,
 )
-from render_server.scene.albedo import MEAN_ALBEDO, AlbedoVolume
+from deltalight.render_server.scene.albedo import MEAN_ALBEDO, AlbedoVolume
 
 SUPPORT_BYTES = 24
 

@@ -9,12 +9,19 @@ import moderngl
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from protocol.errors import DeltalightError
-from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import Binding, Bindings, Kernel, clear_buffer, clear_volume, list_threads
-from render_server.gpu.textures import release_all
-from render_server.gpu.uniform_block import Block, Float, Int, UniformBlock, Vec3
-from render_server.scene.triangle_mesh import split_triangles
+from deltalight.protocol.errors import DeltalightError
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import (
+    Binding,
+    Bindings,
+    Kernel,
+    clear_buffer,
+    clear_volume,
+    list_threads,
+)
+from deltalight.render_server.gpu.textures import release_all
+from deltalight.render_server.gpu.uniform_block import Block, Float, Int, UniformBlock, Vec3
+from deltalight.render_server.scene.triangle_mesh import split_triangles
 
 MEGABYTE = 1_000_000
 DIRECTIONS = 6  # of an anisotropic volume; isotropic ones have 1

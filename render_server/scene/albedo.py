@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int64, UInt8
 
-from protocol.board import BoardSpec
-from protocol.camera_model import CameraModel
-from protocol.frames import BoardPose
-from render_server.lights.environment import LUMINANCE
+from deltalight.protocol.board import BoardSpec
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.frames import BoardPose
+from deltalight.render_server.lights.environment import LUMINANCE
 
 MIN_PIXELS = 30
 SUFFICIENT_PIXELS = 10 * MIN_PIXELS

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from protocol.errors import DeltalightError
-from render_server.scene.gltf_document import (
+from deltalight.protocol.errors import DeltalightError
+from deltalight.render_server.scene.gltf_document import (
     COMPONENT_TYPES,
     COMPONENTS,
     GltfDocument,

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int32
 
-from protocol.board import BoardSpec
-from protocol.errors import DeltalightError
-from protocol.frames import DepthImage
-from protocol.scene_objects import Region, Surface
+from deltalight.protocol.board import BoardSpec
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import DepthImage
+from deltalight.protocol.scene_objects import Region, Surface
 
 MAX_SURFACES = 16
 MAX_ROWS = MAX_SURFACES + 17  # with the board's paper and its grey cards

@@ -7,18 +7,18 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64, UInt32
 
-from protocol.camera_model import CameraModel
-from protocol.errors import DeltalightError
-from protocol.frames import DepthImage
-from render_server.scene.depth_surface import (
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import DepthImage
+from deltalight.render_server.scene.depth_surface import (
     DepthSurface,
     by_ray,
     depth_surface,
     jump_threshold,
     surface_normals,
 )
-from render_server.scene.materials import Material
-from render_server.scene.triangle_mesh import TriangleMesh
+from deltalight.render_server.scene.materials import Material
+from deltalight.render_server.scene.triangle_mesh import TriangleMesh
 
 CELL_SAMPLES = 6
 # Pixels of two neighbouring nodes are at most this many cells apart: two in each direction.

@@ -17,8 +17,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Int32, Int64, UInt8
 
-from protocol.camera_model import CameraModel
-from protocol.frames import DepthImage
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.frames import DepthImage
 
 ASSUMED_NOISE_SIGMA_M = 0.002
 MAX_SLOPE_DEG = 80.0

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from render_server.scene.gltf_document import GltfDocument, GltfFaultError, NodeMotion, NodeTree
+from deltalight.render_server.scene.gltf_document import GltfDocument, GltfFaultError, NodeMotion, NodeTree
 
 MovedProperty = Literal["translation", "rotation", "scale", "weights"]
 Interpolation = Literal["STEP", "LINEAR", "CUBICSPLINE"]

@@ -12,7 +12,7 @@ from urllib.parse import unquote
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, Shaped
 
-from protocol.errors import DeltalightError
+from deltalight.protocol.errors import DeltalightError
 
 if TYPE_CHECKING:
     from PIL import Image

@@ -10,12 +10,18 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 from scipy.sparse import csr_array
 
-from protocol.errors import DeltalightError
-from render_server.scene.asset_check import read_gltf
-from render_server.scene.gltf_animation import Clip, read_clips
-from render_server.scene.gltf_document import GltfDocument, GltfFaultError, NodeTree, faults_named, read_nodes
-from render_server.scene.materials import Material
-from render_server.scene.triangle_mesh import (
+from deltalight.protocol.errors import DeltalightError
+from deltalight.render_server.scene.asset_check import read_gltf
+from deltalight.render_server.scene.gltf_animation import Clip, read_clips
+from deltalight.render_server.scene.gltf_document import (
+    GltfDocument,
+    GltfFaultError,
+    NodeTree,
+    faults_named,
+    read_nodes,
+)
+from deltalight.render_server.scene.materials import Material
+from deltalight.render_server.scene.triangle_mesh import (
     MAX_COORDINATE_M,
     ConvertedMesh,
     FileGeometry,

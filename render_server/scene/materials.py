@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float16, Float32
 from PIL import Image
 
-from protocol.errors import DeltalightError
-from protocol.frames import decode_lut
-from protocol.scene_objects import Material as MaterialDocument
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import decode_lut
+from deltalight.protocol.scene_objects import Material as MaterialDocument
 
 MAX_TEXTURE_PIXELS = 64_000_000
 MATERIAL_FLOATS = 16

@@ -9,13 +9,13 @@ import numpy as np
 import trimesh
 from jaxtyping import Float32
 
-from protocol.errors import DeltalightError
-from protocol.frames import decode_lut
-from protocol.scene_objects import GLTF_SUFFIXES
-from render_server.scene.asset_check import check_mesh_file
-from render_server.scene.gltf_meshes import GltfAsset, load_gltf
-from render_server.scene.materials import Material
-from render_server.scene.triangle_mesh import (
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import decode_lut
+from deltalight.protocol.scene_objects import GLTF_SUFFIXES
+from deltalight.render_server.scene.asset_check import check_mesh_file
+from deltalight.render_server.scene.gltf_meshes import GltfAsset, load_gltf
+from deltalight.render_server.scene.materials import Material
+from deltalight.render_server.scene.triangle_mesh import (
     FileGeometry,
     TriangleMesh,
     bounds_of,

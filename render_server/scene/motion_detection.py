@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
-from protocol.camera_model import CameraModel
-from protocol.frames import DepthImage, ViewFrame, decode_lut
-from render_server.scene.depth_surface import MAX_SLOPE_DEG, noise_sigma
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.frames import DepthImage, ViewFrame, decode_lut
+from deltalight.render_server.scene.depth_surface import MAX_SLOPE_DEG, noise_sigma
 
 GRID_STEP_PX = 4
 

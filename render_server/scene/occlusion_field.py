@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Bool, Float16, Float32, Float64, Int32, Int64
 from scipy.ndimage import distance_transform_edt
 
-from protocol.errors import DeltalightError
-from render_server.lights.octahedral import even_directions, harmonics
+from deltalight.protocol.errors import DeltalightError
+from deltalight.render_server.lights.octahedral import even_directions, harmonics
 
 Vectors = Float32[np.ndarray, "m 3"]
 FINER = 4  # ratio of the numbers of directions of successive sets

@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Bool, Float16, Float32, Int64
 from scipy.spatial import cKDTree
 
-from render_server.lights.octahedral import harmonics
-from render_server.scene.occlusion_field import (
+from deltalight.render_server.lights.octahedral import harmonics
+from deltalight.render_server.scene.occlusion_field import (
     CHUNK,
     FieldSettings,
     ObjectRays,
@@ -24,7 +24,7 @@ from render_server.scene.occlusion_field import (
     direction_set,
     fill_inside,
 )
-from render_server.scene.triangle_mesh import TriangleMesh, split_triangles
+from deltalight.render_server.scene.triangle_mesh import TriangleMesh, split_triangles
 
 ORDER = 3  # SH bands of incident and reflected light: both are diffuse
 LENGTH = ORDER**2

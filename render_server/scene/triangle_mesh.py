@@ -9,9 +9,9 @@ from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from protocol.errors import DeltalightError
-from render_server.scene.asset_check import MAX_TRIANGLES
-from render_server.scene.materials import Material, material_table
+from deltalight.protocol.errors import DeltalightError
+from deltalight.render_server.scene.asset_check import MAX_TRIANGLES
+from deltalight.render_server.scene.materials import Material, material_table
 
 # Scanned meshes of 100k triangles are full of edges beyond 40 degrees that nobody means to be sharp.
 CREASE_ANGLE_DEG = 60.0

@@ -6,10 +6,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
-from render_server.scene.depth_mesh import REAL_MATERIAL
-from render_server.scene.depth_surface import DepthSurface
-from render_server.scene.triangle_mesh import TriangleMesh
-from render_server.scene.tsdf_volume import (
+from deltalight.render_server.scene.depth_mesh import REAL_MATERIAL
+from deltalight.render_server.scene.depth_surface import DepthSurface
+from deltalight.render_server.scene.triangle_mesh import TriangleMesh
+from deltalight.render_server.scene.tsdf_volume import (
     BLOCK,
     CORNERS,
     GRID,
@@ -18,7 +18,7 @@ from render_server.scene.tsdf_volume import (
     TsdfVolume,
     aligned_view,
 )
-from render_server.view import CameraView
+from deltalight.render_server.view import CameraView
 
 EDGES = tuple((a, b) for a in range(8) for b in range(a + 1, 8) if np.abs(CORNERS[a] - CORNERS[b]).sum() == 1)
 VOXELS = GRID * BLOCK  # per edge of the whole grid

@@ -17,9 +17,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
-from protocol.camera_model import CameraModel
-from render_server.scene.depth_surface import DepthSurface
-from render_server.view import NEAR_M, CameraView
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.render_server.scene.depth_surface import DepthSurface
+from deltalight.render_server.view import NEAR_M, CameraView
 
 BLOCK = 8  # voxels per edge of a block
 GRID = 128  # blocks per edge of the largest box

@@ -12,15 +12,15 @@ from typing import Generic, TypeVar
 import numpy as np
 from pydantic import Field
 
-from protocol.board import BoardSpec
-from protocol.camera_model import CameraModel
-from protocol.codecs import decode_color, decode_depth, decode_response
-from protocol.documents import StrictModel, validate
-from protocol.errors import DeltalightError
-from protocol.frames import BoardPose, DepthImage, LampPose, RadianceMap, ViewFrame
-from protocol.keys import Keys
-from protocol.light_codecs import lamp_poses, radiance_map
-from protocol.messages import (
+from deltalight.protocol.board import BoardSpec
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.codecs import decode_color, decode_depth, decode_response
+from deltalight.protocol.documents import StrictModel, validate
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import BoardPose, DepthImage, LampPose, RadianceMap, ViewFrame
+from deltalight.protocol.keys import Keys
+from deltalight.protocol.light_codecs import lamp_poses, radiance_map
+from deltalight.protocol.messages import (
     ColorMessage,
     DepthMessage,
     LampsMessage,
@@ -29,8 +29,8 @@ from protocol.messages import (
     PoseMessage,
     RadianceMessage,
 )
-from protocol.receiver import Receiver
-from protocol.subscriber import ReceivedMultipart
+from deltalight.protocol.receiver import Receiver
+from deltalight.protocol.subscriber import ReceivedMultipart
 
 MAX_ENDPOINTS = 16
 EARLIER_SOURCES = "earlier_sources"

@@ -16,22 +16,22 @@ from pathlib import Path
 import structlog
 from pydantic import Field
 
-from protocol.clock import CLOCK_OP, clock_payload
-from protocol.codecs import encode_color
-from protocol.documents import StrictModel
-from protocol.envelope import encode
-from protocol.errors import DeltalightError
-from protocol.files import write_bytes
-from protocol.keys import Keys
-from protocol.messages import ControlRequest, StatsMessage
-from protocol.methods import PLUGINS
-from protocol.publisher import Publisher
-from protocol.request import ReplyServer
-from protocol.scene import SceneDocument, load_scene
-from render_server.gpu.context import create_context
-from render_server.renderer import SceneRenderer
-from render_server.server.frames import FrameAssembler, FrameSource, PairingSettings
-from render_server.server.session import RenderedFrame, Renderer, RenderSession, SourceInUse
+from deltalight.protocol.clock import CLOCK_OP, clock_payload
+from deltalight.protocol.codecs import encode_color
+from deltalight.protocol.documents import StrictModel
+from deltalight.protocol.envelope import encode
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.files import write_bytes
+from deltalight.protocol.keys import Keys
+from deltalight.protocol.messages import ControlRequest, StatsMessage
+from deltalight.protocol.methods import PLUGINS
+from deltalight.protocol.publisher import Publisher
+from deltalight.protocol.request import ReplyServer
+from deltalight.protocol.scene import SceneDocument, load_scene
+from deltalight.render_server.gpu.context import create_context
+from deltalight.render_server.renderer import SceneRenderer
+from deltalight.render_server.server.frames import FrameAssembler, FrameSource, PairingSettings
+from deltalight.render_server.server.session import RenderedFrame, Renderer, RenderSession, SourceInUse
 
 GPU_TIMEOUT_S = 0.002  # a started frame is read back after this time if no other one comes
 RECEIVE_TIMEOUT_S = 0.05  # bounds how long a command waits while no frames arrive

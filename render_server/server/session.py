@@ -15,17 +15,17 @@ import structlog
 from jaxtyping import Float32, Float64, UInt8
 from pydantic import ConfigDict
 
-from protocol.camera_model import CameraModel
-from protocol.documents import StrictModel, nearest, validate
-from protocol.envelope import decode
-from protocol.errors import DeltalightError
-from protocol.frames import ViewFrame
-from protocol.messages import CompositeMessage, ControlRequest, StatsMessage
-from protocol.scene import SceneDocument, parse_scene
-from protocol.subscriber import ReceivedMultipart
-from render_server.frame_budget import Level
-from render_server.server.frames import AssembledFrame, FrameAssembler, SourceOrder
-from render_server.server.snapshot import SnapshotOrder, take_snapshot
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.documents import StrictModel, nearest, validate
+from deltalight.protocol.envelope import decode
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import ViewFrame
+from deltalight.protocol.messages import CompositeMessage, ControlRequest, StatsMessage
+from deltalight.protocol.scene import SceneDocument, parse_scene
+from deltalight.protocol.subscriber import ReceivedMultipart
+from deltalight.render_server.frame_budget import Level
+from deltalight.render_server.server.frames import AssembledFrame, FrameAssembler, SourceOrder
+from deltalight.render_server.server.snapshot import SnapshotOrder, take_snapshot
 
 RATE_WINDOW_S = 5.0
 WAITING_AFTER_S = 2.0

@@ -10,13 +10,13 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 from pydantic import Field, model_validator
 
-from protocol.documents import StrictModel
-from protocol.errors import DeltalightError
-from protocol.files import replacing, write_png
-from protocol.frames import ViewFrame, linear_color
-from protocol.messages import Name
-from protocol.radiance_files import write_exr
-from protocol.scene import SceneDocument, parse_scene
+from deltalight.protocol.documents import StrictModel
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.files import replacing, write_png
+from deltalight.protocol.frames import ViewFrame, linear_color
+from deltalight.protocol.messages import Name
+from deltalight.protocol.radiance_files import write_exr
+from deltalight.protocol.scene import SceneDocument, parse_scene
 
 CAMERA_VIEW = "camera"
 EXR_NAME = "composite.exr"

@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 from jaxtyping import Float64
 
-from protocol.errors import DeltalightError
-from protocol.poses import rigid_matrix
-from protocol.radial_lens import RadialLens
-from sensor_node.calibration.fits import noise_px
-from sensor_node.calibration.views import View
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.poses import rigid_matrix
+from deltalight.protocol.radial_lens import RadialLens
+from deltalight.sensor_node.calibration.fits import noise_px
+from deltalight.sensor_node.calibration.views import View
 
 Pixels = Float64[np.ndarray, "n 2"]
 Poses = Float64[np.ndarray, "v 6"]

@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float64, Int64, UInt8
 
-from sensor_node.calibration.fits import LensFit
-from sensor_node.calibration.views import View
+from deltalight.sensor_node.calibration.fits import LensFit
+from deltalight.sensor_node.calibration.views import View
 
 # Cells along the width. Distortion is smooth: one corner per eighth determines the polynomial there.
 COLUMNS = 8

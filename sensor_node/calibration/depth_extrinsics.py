@@ -7,11 +7,11 @@ import cv2
 import numpy as np
 from jaxtyping import Float64
 
-from protocol.board import BoardSpec
-from protocol.errors import DeltalightError
-from protocol.frames import DepthImage, SensorFrame
-from protocol.poses import rigid_matrix
-from sensor_node.markers import BoardDetector
+from deltalight.protocol.board import BoardSpec
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import DepthImage, SensorFrame
+from deltalight.protocol.poses import rigid_matrix
+from deltalight.sensor_node.markers import BoardDetector
 
 Pose = Float64[np.ndarray, "4 4"]
 # Only depth well inside the board's outline is used: at its border it may be the table's.

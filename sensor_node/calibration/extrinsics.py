@@ -7,16 +7,16 @@ import cv2
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from protocol.board import BoardSpec
-from protocol.dataset_lists import MAX_PAIRING_NS
-from protocol.equidistant_lens import EquidistantLens
-from protocol.errors import DeltalightError
-from protocol.fisheye_lens import FisheyeLens
-from protocol.frames import FisheyePictures, SensorFrame
-from sensor_node.calibration.poses import mean_pose, pose_offsets, target_pose
-from sensor_node.calibration.targets import MarkerBoard
-from sensor_node.calibration.views import LEAST_POINTS
-from sensor_node.markers import BoardDetector
+from deltalight.protocol.board import BoardSpec
+from deltalight.protocol.dataset_lists import MAX_PAIRING_NS
+from deltalight.protocol.equidistant_lens import EquidistantLens
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.fisheye_lens import FisheyeLens
+from deltalight.protocol.frames import FisheyePictures, SensorFrame
+from deltalight.sensor_node.calibration.poses import mean_pose, pose_offsets, target_pose
+from deltalight.sensor_node.calibration.targets import MarkerBoard
+from deltalight.sensor_node.calibration.views import LEAST_POINTS
+from deltalight.sensor_node.markers import BoardDetector
 
 Pose = Float64[np.ndarray, "4 4"]
 # A mean of fewer poses says nothing about its spread.

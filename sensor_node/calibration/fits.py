@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from protocol.camera_model import CameraModel
-from protocol.fisheye_lens import FisheyeLens
-from sensor_node.calibration.views import View
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.fisheye_lens import FisheyeLens
+from deltalight.sensor_node.calibration.views import View
 
 # Corners are found to a few hundredths of a pixel at best: a fit with less noise has too few views.
 LEAST_NOISE_PX = 0.05

@@ -7,15 +7,15 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from protocol.camera_model import CameraModel
-from protocol.equidistant_lens import EquidistantLens
-from protocol.errors import DeltalightError
-from protocol.ocam_lens import OcamLens
-from sensor_node.calibration.coverage import Coverage, image_circle, measure_coverage
-from sensor_node.calibration.fits import LensFit
-from sensor_node.calibration.lens_fits import fit_equidistant, fit_ocam, fit_pinhole
-from sensor_node.calibration.targets import Target
-from sensor_node.calibration.views import View, ViewCollector
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.equidistant_lens import EquidistantLens
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.ocam_lens import OcamLens
+from deltalight.sensor_node.calibration.coverage import Coverage, image_circle, measure_coverage
+from deltalight.sensor_node.calibration.fits import LensFit
+from deltalight.sensor_node.calibration.lens_fits import fit_equidistant, fit_ocam, fit_pinhole
+from deltalight.sensor_node.calibration.targets import Target
+from deltalight.sensor_node.calibration.views import View, ViewCollector
 
 LensKind = Literal["plumb_bob_5", "plumb_bob_8", "equidistant", "ocam"]
 Fitter = Callable[[Sequence[View], tuple[int, int]], LensFit]

@@ -8,16 +8,16 @@ import cv2
 import numpy as np
 from jaxtyping import Float64
 
-from protocol.camera_model import CameraModel
-from protocol.equidistant_lens import EquidistantLens
-from protocol.errors import DeltalightError
-from protocol.fisheye_lens import FisheyeLens
-from protocol.ocam_lens import OcamLens
-from protocol.poses import rigid_matrix
-from sensor_node.calibration.bundle import LensMaker, refine
-from sensor_node.calibration.fits import LensFit, noise_px, rms
-from sensor_node.calibration.poses import target_pose
-from sensor_node.calibration.views import View
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.equidistant_lens import EquidistantLens
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.fisheye_lens import FisheyeLens
+from deltalight.protocol.ocam_lens import OcamLens
+from deltalight.protocol.poses import rigid_matrix
+from deltalight.sensor_node.calibration.bundle import LensMaker, refine
+from deltalight.sensor_node.calibration.fits import LensFit, noise_px, rms
+from deltalight.sensor_node.calibration.poses import target_pose
+from deltalight.sensor_node.calibration.views import View
 
 # Powers of the radius in Scaramuzza's polynomial; slope 0 on the axis, because lenses are smooth there.
 OCAM_POWERS = (0, 2, 3, 4)

@@ -8,15 +8,15 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
-from protocol.board import BoardSpec, GreyCard
-from protocol.dataset_lists import read_list
-from protocol.errors import DeltalightError
-from protocol.frames import SensorFrame, decode_lut
-from protocol.pictures import decode_rgb, read_bytes
-from sensor_node.calibration.picture_sources import PICTURE_SUFFIXES, Eye
-from sensor_node.fisheye.response import estimate_response
-from sensor_node.marker_finder import LUMINANCE
-from sensor_node.markers import BoardDetector
+from deltalight.protocol.board import BoardSpec, GreyCard
+from deltalight.protocol.dataset_lists import read_list
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import SensorFrame, decode_lut
+from deltalight.protocol.pictures import decode_rgb, read_bytes
+from deltalight.sensor_node.calibration.picture_sources import PICTURE_SUFFIXES, Eye
+from deltalight.sensor_node.fisheye.response import estimate_response
+from deltalight.sensor_node.marker_finder import LUMINANCE
+from deltalight.sensor_node.markers import BoardDetector
 
 # Codes between which a pixel measures light: neither noise nor white.
 USABLE_CODES = (20, 235)

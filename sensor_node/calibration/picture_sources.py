@@ -10,14 +10,14 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from protocol.board import BoardSpec
-from protocol.dataset_lists import ListEntry, read_list
-from protocol.errors import DeltalightError
-from protocol.frames import SensorFrame
-from protocol.pictures import decode_rgb, read_bytes
-from protocol.source import RECORDING_SUFFIXES, open_source
-from sensor_node.calibration.targets import Target
-from sensor_node.calibration.views import Picture, ViewCollector
+from deltalight.protocol.board import BoardSpec
+from deltalight.protocol.dataset_lists import ListEntry, read_list
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import SensorFrame
+from deltalight.protocol.pictures import decode_rgb, read_bytes
+from deltalight.protocol.source import RECORDING_SUFFIXES, open_source
+from deltalight.sensor_node.calibration.targets import Target
+from deltalight.sensor_node.calibration.views import Picture, ViewCollector
 
 Eye = Literal["rgb", "fisheye"]
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -51,7 +51,7 @@ def open_series(source: str, eye: Eye) -> Series:
     Raises:
         DeltalightError: there is no such source, or it has no pictures of that eye.
     """
-    from sensor_node.cameras.open import is_live
+    from deltalight.sensor_node.cameras.open import is_live
 
     if is_live(source):
         return Series(_live(source, eye), None, moving=True)
@@ -115,8 +115,8 @@ def _of_frames(frames: Iterable[SensorFrame], eye: Eye) -> Generator[Picture]:
 
 
 def _live(source: str, eye: Eye) -> Generator[Picture]:
-    from sensor_node.cameras.base import EndOfStream
-    from sensor_node.cameras.open import open_camera
+    from deltalight.sensor_node.cameras.base import EndOfStream
+    from deltalight.sensor_node.cameras.open import open_camera
 
     def frames() -> Generator[SensorFrame]:
         with open_camera(source, calibrated=False, depth=False) as camera:

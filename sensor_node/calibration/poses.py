@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float64
 
-from protocol.poses import rigid_matrix, rotation_from_wxyz, wxyz_from_rotation
+from deltalight.protocol.poses import rigid_matrix, rotation_from_wxyz, wxyz_from_rotation
 
 
 def target_pose(

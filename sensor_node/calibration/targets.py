@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt8
 
-from protocol.board import BoardSpec, load_board_yaml
-from protocol.camera_model import CameraModel
-from protocol.errors import DeltalightError
-from protocol.frames import decode_lut
-from sensor_node.marker_finder import MarkerFinder
+from deltalight.protocol.board import BoardSpec, load_board_yaml
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import decode_lut
+from deltalight.sensor_node.marker_finder import MarkerFinder
 
 CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 0.005)
 # Half the edge of the window about a corner, as a fraction of the distance to the next one, which it must not reach.

@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float64, Int64, UInt8
 
-from protocol.camera_model import CameraModel
-from protocol.errors import DeltalightError
-from sensor_node.calibration.targets import Sighting, Target
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.errors import DeltalightError
+from deltalight.sensor_node.calibration.targets import Sighting, Target
 
 # Fewer points do not determine a pose well.
 LEAST_POINTS = 8

@@ -9,11 +9,11 @@ from typing import Literal, Self
 import numpy as np
 from jaxtyping import Float64
 
-from protocol.board import BoardSpec
-from protocol.calibration import Extrinsics
-from protocol.camera_model import CameraModel
-from protocol.errors import DeltalightError
-from protocol.frames import SensorFrame
+from deltalight.protocol.board import BoardSpec
+from deltalight.protocol.calibration import Extrinsics
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import SensorFrame
 
 
 class EndOfStream(Exception):  # noqa: N818 - an end, not an error

@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
-from protocol.errors import DeltalightError
-from protocol.plugins import Plugin
-from sensor_node.cameras.driver import Discovery, FoundCamera, MissingSupport
-from sensor_node.cameras.drivers import load_drivers
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.plugins import Plugin
+from deltalight.sensor_node.cameras.driver import Discovery, FoundCamera, MissingSupport
+from deltalight.sensor_node.cameras.drivers import load_drivers
 
 
 def list_cameras() -> list[FoundCamera]:

@@ -4,9 +4,9 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from sensor_node.cameras.base import Camera
-from sensor_node.cameras.live import LiveCalibration
-from sensor_node.cameras.settings import CameraSettings
+from deltalight.sensor_node.cameras.base import Camera
+from deltalight.sensor_node.cameras.live import LiveCalibration
+from deltalight.sensor_node.cameras.settings import CameraSettings
 
 
 @dataclass(frozen=True)

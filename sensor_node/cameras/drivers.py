@@ -2,17 +2,17 @@
 
 from importlib.metadata import EntryPoint
 
-from protocol.errors import DeltalightError
-from protocol.plugins import LoadedPlugins, Plugin, installed_plugins, load_plugins
-from sensor_node.cameras.driver import CameraDriver
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.plugins import LoadedPlugins, Plugin, installed_plugins, load_plugins
+from deltalight.sensor_node.cameras.driver import CameraDriver
 
 GROUP = "deltalight.cameras"
 SYNTHETIC = "synthetic"
 BUILT_IN = {
-    "oak": "sensor_node.cameras.oak:DRIVER",
-    "uvc": "sensor_node.cameras.uvc:DRIVER",
-    "orbbec": "sensor_node.cameras.rgbd:ORBBEC",
-    "openni2": "sensor_node.cameras.rgbd:OPENNI2",
+    "oak": "deltalight.sensor_node.cameras.oak:DRIVER",
+    "uvc": "deltalight.sensor_node.cameras.uvc:DRIVER",
+    "orbbec": "deltalight.sensor_node.cameras.rgbd:ORBBEC",
+    "openni2": "deltalight.sensor_node.cameras.rgbd:OPENNI2",
 }
 
 

@@ -7,10 +7,10 @@ from dataclasses import replace
 from types import TracebackType
 from typing import Self
 
-from protocol.errors import DeltalightError
-from protocol.fisheye_lens import FisheyeCalibration
-from protocol.frames import FisheyePictures, SensorFrame
-from sensor_node.cameras.base import Camera, EndOfStream, ImuSample, StreamState
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.fisheye_lens import FisheyeCalibration
+from deltalight.protocol.frames import FisheyePictures, SensorFrame
+from deltalight.sensor_node.cameras.base import Camera, EndOfStream, ImuSample, StreamState
 
 # A reported exposure counts as the requested one within 5 % or two lines of a usual rolling shutter (15 us each).
 SAME_EXPOSURE, SAME_EXPOSURE_S = 0.05, 30e-6

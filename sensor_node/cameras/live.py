@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from protocol.board import BoardSpec, load_board_yaml
-from protocol.calibration import Extrinsics, load_extrinsics_yaml
-from protocol.camera_model import CameraModel, camera_from_info, load_camera_yaml
-from protocol.documents import read_mapping
-from protocol.errors import DeltalightError
-from protocol.frames import SensorFrame
-from protocol.response_table import load_response_table
-from sensor_node.cameras.base import Camera, EndOfStream, StaleFrameError
-from sensor_node.cameras.settings import CameraSettings
+from deltalight.protocol.board import BoardSpec, load_board_yaml
+from deltalight.protocol.calibration import Extrinsics, load_extrinsics_yaml
+from deltalight.protocol.camera_model import CameraModel, camera_from_info, load_camera_yaml
+from deltalight.protocol.documents import read_mapping
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import SensorFrame
+from deltalight.protocol.response_table import load_response_table
+from deltalight.sensor_node.cameras.base import Camera, EndOfStream, StaleFrameError
+from deltalight.sensor_node.cameras.settings import CameraSettings
 
 MM = 0.001
 # One is filled while the other is decoded: with a single one drivers lose every second frame.

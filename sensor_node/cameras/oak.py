@@ -5,14 +5,14 @@ from typing import Any
 
 import numpy as np
 
-from protocol.errors import DeltalightError
-from protocol.frames import SensorFrame
-from sensor_node.cameras.base import EndOfStream, ImuSample
-from sensor_node.cameras.driver import CameraDriver, CameraRequest
-from sensor_node.cameras.live import MM, CameraFailure, LiveCalibration, LiveCamera, capture_size
-from sensor_node.cameras.oak_device import STEREO_SIZE, OakDevice, OakStreams
-from sensor_node.cameras.oak_discovery import find_cameras
-from sensor_node.cameras.oak_frames import (
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import SensorFrame
+from deltalight.sensor_node.cameras.base import EndOfStream, ImuSample
+from deltalight.sensor_node.cameras.driver import CameraDriver, CameraRequest
+from deltalight.sensor_node.cameras.live import MM, CameraFailure, LiveCalibration, LiveCamera, capture_size
+from deltalight.sensor_node.cameras.oak_device import STEREO_SIZE, OakDevice, OakStreams
+from deltalight.sensor_node.cameras.oak_discovery import find_cameras
+from deltalight.sensor_node.cameras.oak_frames import (
     Pairing,
     camera_from_calibration,
     camera_from_picture,
@@ -23,8 +23,8 @@ from sensor_node.cameras.oak_frames import (
     nanoseconds,
     picture_of,
 )
-from sensor_node.cameras.oak_sdk import load_depthai
-from sensor_node.cameras.settings import CameraSettings
+from deltalight.sensor_node.cameras.oak_sdk import load_depthai
+from deltalight.sensor_node.cameras.settings import CameraSettings
 
 # How often a waiting read checks for `interrupt` and for a lost device.
 POLL = timedelta(seconds=0.1)

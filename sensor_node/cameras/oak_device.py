@@ -3,11 +3,11 @@
 from dataclasses import dataclass, field
 from typing import Any
 
-from protocol.documents import nearest
-from sensor_node.cameras.live import CameraFailure
-from sensor_node.cameras.oak_frames import SUBPIXEL_BITS
-from sensor_node.cameras.oak_sdk import load_depthai
-from sensor_node.cameras.settings import CameraSettings
+from deltalight.protocol.documents import nearest
+from deltalight.sensor_node.cameras.live import CameraFailure
+from deltalight.sensor_node.cameras.oak_frames import SUBPIXEL_BITS
+from deltalight.sensor_node.cameras.oak_sdk import load_depthai
+from deltalight.sensor_node.cameras.settings import CameraSettings
 
 # Half of the stereo cameras' 1280x800: what the device matches at 30 per second; depth from 0.35 m on.
 STEREO_SIZE = (640, 400)

@@ -4,9 +4,9 @@ import os
 from pathlib import Path
 from typing import Any
 
-from sensor_node.cameras.devices import file_text, usb_devices
-from sensor_node.cameras.driver import Discovery, FoundCamera, MissingSupport
-from sensor_node.cameras.oak_sdk import INSTALL_HINT, load_depthai, sdk_version
+from deltalight.sensor_node.cameras.devices import file_text, usb_devices
+from deltalight.sensor_node.cameras.driver import Discovery, FoundCamera, MissingSupport
+from deltalight.sensor_node.cameras.oak_sdk import INSTALL_HINT, load_depthai, sdk_version
 
 LUXONIS = "03e7"
 RULE_FOLDERS = ("etc/udev/rules.d", "lib/udev/rules.d", "usr/lib/udev/rules.d", "run/udev/rules.d")

@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from protocol.camera_model import CameraModel
-from protocol.errors import DeltalightError
-from protocol.frames import DepthImage
-from protocol.pictures import decode_rgb, depth_from_steps
-from sensor_node.cameras.base import ImuSample
-from sensor_node.cameras.live import MM
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import DepthImage
+from deltalight.protocol.pictures import decode_rgb, depth_from_steps
+from deltalight.sensor_node.cameras.base import ImuSample
+from deltalight.sensor_node.cameras.live import MM
 
 Message = Any  # of the SDK, which is optional
 Lens = Literal["plumb_bob", "equidistant"]

@@ -4,7 +4,7 @@ import os
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
-from protocol.errors import DeltalightError
+from deltalight.protocol.errors import DeltalightError
 
 # The SDK reads these on import. Its log goes to standard output, where it would corrupt `--json`; its telemetry is on
 # unless refused; its signal handlers would replace those of the supervisor.

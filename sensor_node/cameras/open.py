@@ -2,21 +2,21 @@
 
 from pathlib import Path
 
-from protocol.board import BoardSpec
-from protocol.dataset_fisheye import load_fisheye_calibration
-from protocol.documents import nearest
-from protocol.errors import DeltalightError
-from protocol.fisheye_lens import FisheyeCalibration, load_fisheye_yaml
-from protocol.source import RECORDING_SUFFIXES, open_source
-from sensor_node.cameras.base import Camera
-from sensor_node.cameras.driver import CameraRequest
-from sensor_node.cameras.drivers import SYNTHETIC, driver_plugins, load_driver
-from sensor_node.cameras.fisheye_capture import FisheyeCapture
-from sensor_node.cameras.live import load_calibration
-from sensor_node.cameras.reconnect import ReconnectingCamera
-from sensor_node.cameras.replay import ReplayCamera
-from sensor_node.cameras.settings import CameraSettings, FisheyeSettings
-from sensor_node.cameras.synthetic import SyntheticCamera
+from deltalight.protocol.board import BoardSpec
+from deltalight.protocol.dataset_fisheye import load_fisheye_calibration
+from deltalight.protocol.documents import nearest
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.fisheye_lens import FisheyeCalibration, load_fisheye_yaml
+from deltalight.protocol.source import RECORDING_SUFFIXES, open_source
+from deltalight.sensor_node.cameras.base import Camera
+from deltalight.sensor_node.cameras.driver import CameraRequest
+from deltalight.sensor_node.cameras.drivers import SYNTHETIC, driver_plugins, load_driver
+from deltalight.sensor_node.cameras.fisheye_capture import FisheyeCapture
+from deltalight.sensor_node.cameras.live import load_calibration
+from deltalight.sensor_node.cameras.reconnect import ReconnectingCamera
+from deltalight.sensor_node.cameras.replay import ReplayCamera
+from deltalight.sensor_node.cameras.settings import CameraSettings, FisheyeSettings
+from deltalight.sensor_node.cameras.synthetic import SyntheticCamera
 
 _DEFAULTS = CameraSettings()
 

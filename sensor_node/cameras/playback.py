@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from protocol.errors import DeltalightError
-from protocol.frames import FisheyePictures, SensorFrame
-from protocol.source import Source
-from sensor_node.cameras.base import Camera, EndOfStream
-from sensor_node.cameras.replay import CLOCK_STEP_NS, DEFAULT_PERIOD_NS, LATE_NS
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import FisheyePictures, SensorFrame
+from deltalight.protocol.source import Source
+from deltalight.sensor_node.cameras.base import Camera, EndOfStream
+from deltalight.sensor_node.cameras.replay import CLOCK_STEP_NS, DEFAULT_PERIOD_NS, LATE_NS
 
 MIN_RATE, MAX_RATE = 0.05, 20.0
 # Period of repeating a frame that stands still: a change of the scene shows, and nothing looks lost.

@@ -6,9 +6,9 @@ from collections import deque
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
 
-from protocol.errors import DeltalightError
-from protocol.frames import SensorFrame
-from sensor_node.cameras.base import Camera, EndOfStream, ImuSample, StaleFrameError, StreamState
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import SensorFrame
+from deltalight.sensor_node.cameras.base import Camera, EndOfStream, ImuSample, StaleFrameError, StreamState
 
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.5, 10.0
 # Frames buffered for a late reader: an eighth of a second at 30 per second.

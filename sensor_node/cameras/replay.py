@@ -9,10 +9,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from protocol.errors import DeltalightError
-from protocol.frames import FisheyePictures, SensorFrame
-from protocol.source import Source
-from sensor_node.cameras.base import Camera, EndOfStream, StaleFrameError
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import FisheyePictures, SensorFrame
+from deltalight.protocol.source import Source
+from deltalight.sensor_node.cameras.base import Camera, EndOfStream, StaleFrameError
 
 # Gap between the last frame and the first of the next round if a single frame has no period.
 DEFAULT_PERIOD_NS = 33_333_333

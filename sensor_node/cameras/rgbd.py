@@ -10,13 +10,19 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8, UInt16
 
-from protocol.errors import DeltalightError
-from protocol.frames import SensorFrame
-from protocol.pictures import depth_from_steps
-from sensor_node.cameras.devices import file_text, usb_devices
-from sensor_node.cameras.driver import CameraDriver, CameraRequest, Discovery, FoundCamera, MissingSupport
-from sensor_node.cameras.live import CameraFailure, LiveCalibration, LiveCamera, colour_camera
-from sensor_node.cameras.settings import CameraSettings
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import SensorFrame
+from deltalight.protocol.pictures import depth_from_steps
+from deltalight.sensor_node.cameras.devices import file_text, usb_devices
+from deltalight.sensor_node.cameras.driver import (
+    CameraDriver,
+    CameraRequest,
+    Discovery,
+    FoundCamera,
+    MissingSupport,
+)
+from deltalight.sensor_node.cameras.live import CameraFailure, LiveCalibration, LiveCamera, colour_camera
+from deltalight.sensor_node.cameras.settings import CameraSettings
 
 Kind = Literal["openni2", "orbbec"]
 

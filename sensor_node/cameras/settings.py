@@ -5,7 +5,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from protocol.documents import StrictModel
+from deltalight.protocol.documents import StrictModel
 
 # Half an hour is longer than any sensor exposes, one microsecond shorter than any rolling shutter allows.
 Exposure = Annotated[float, Field(ge=1e-6, le=1800)]

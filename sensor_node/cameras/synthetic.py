@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
-from protocol.board import BoardSpec
-from protocol.camera_model import CameraModel
-from protocol.frames import DepthImage, SensorFrame
-from sensor_node.cameras.replay import PacedCamera
-from sensor_node.cameras.synthetic_scene import SAMPLES_PER_EDGE, SHEET_MARGIN, SyntheticScene
+from deltalight.protocol.board import BoardSpec
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.frames import DepthImage, SensorFrame
+from deltalight.sensor_node.cameras.replay import PacedCamera
+from deltalight.sensor_node.cameras.synthetic_scene import SAMPLES_PER_EDGE, SHEET_MARGIN, SyntheticScene
 
 FRAMES_PER_ROUND = 90
 PERIOD_NS = 33_333_333

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
-from protocol.board import BoardSpec
-from protocol.camera_model import CameraModel
+from deltalight.protocol.board import BoardSpec
+from deltalight.protocol.camera_model import CameraModel
 
 SAMPLES_PER_EDGE = 2
 BLACK_ALBEDO, PAPER_ALBEDO = 0.04, 0.8

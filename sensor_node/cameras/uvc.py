@@ -10,20 +10,26 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from protocol.errors import DeltalightError
-from protocol.frames import SensorFrame
-from protocol.pictures import decode_rgb, is_jpeg
-from sensor_node.cameras.devices import file_text
-from sensor_node.cameras.driver import CameraDriver, CameraRequest, Discovery, FoundCamera, MissingSupport
-from sensor_node.cameras.live import (
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import SensorFrame
+from deltalight.protocol.pictures import decode_rgb, is_jpeg
+from deltalight.sensor_node.cameras.devices import file_text
+from deltalight.sensor_node.cameras.driver import (
+    CameraDriver,
+    CameraRequest,
+    Discovery,
+    FoundCamera,
+    MissingSupport,
+)
+from deltalight.sensor_node.cameras.live import (
     DRIVER_BUFFERS,
     CameraFailure,
     LiveCalibration,
     LiveCamera,
     colour_camera,
 )
-from sensor_node.cameras.settings import CameraSettings
-from sensor_node.cameras.uvc_controls import UvcControls
+from deltalight.sensor_node.cameras.settings import CameraSettings
+from deltalight.sensor_node.cameras.uvc_controls import UvcControls
 
 MJPG = cv2.VideoWriter.fourcc(*"MJPG")
 # Automatic exposure and white balance of usual cameras settle within a second.

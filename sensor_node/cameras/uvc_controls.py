@@ -6,7 +6,7 @@ from typing import Protocol
 
 import cv2
 
-from protocol.errors import DeltalightError
+from deltalight.protocol.errors import DeltalightError
 
 # V4L2_CID_EXPOSURE_ABSOLUTE counts in 100 us; V4L2_CID_EXPOSURE_AUTO: 1 = manual, 3 = automatic at a fixed aperture
 # (the only two that USB cameras without an iris have). Source: Linux media documentation, camera controls.

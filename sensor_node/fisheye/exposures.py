@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
-from protocol.errors import DeltalightError
-from protocol.frames import FisheyePictures, decode_lut
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import FisheyePictures, decode_lut
 
 CLIPPED_CODE = 250
 """Codes from here are white: the last 2 % hold the shoulder of a response and the ringing of JPEG."""

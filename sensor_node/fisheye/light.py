@@ -5,11 +5,11 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float64
 
-from protocol.frames import BoardPose, FisheyePictures, RadianceMap, SensorFrame
-from protocol.source import Source
-from sensor_node.cameras.base import Camera
-from sensor_node.fisheye.exposures import reference_exposure
-from sensor_node.fisheye.radiance import SIZE, radiance_map
+from deltalight.protocol.frames import BoardPose, FisheyePictures, RadianceMap, SensorFrame
+from deltalight.protocol.source import Source
+from deltalight.sensor_node.cameras.base import Camera
+from deltalight.sensor_node.fisheye.exposures import reference_exposure
+from deltalight.sensor_node.fisheye.radiance import SIZE, radiance_map
 
 
 class FisheyeLight:

@@ -3,10 +3,10 @@
 import numpy as np
 from jaxtyping import Float64
 
-from protocol.frames import FisheyePictures, RadianceMap
-from protocol.hemisphere import texel_directions, texel_solid_angles
-from sensor_node.fisheye.exposures import display_picture, merge_bracket, reference_exposure
-from sensor_node.fisheye.resampling import hemisphere_sampler
+from deltalight.protocol.frames import FisheyePictures, RadianceMap
+from deltalight.protocol.hemisphere import texel_directions, texel_solid_angles
+from deltalight.sensor_node.fisheye.exposures import display_picture, merge_bracket, reference_exposure
+from deltalight.sensor_node.fisheye.resampling import hemisphere_sampler
 
 SIZE = 256
 LEAST_CLIPPED_FRACTION = 1e-5

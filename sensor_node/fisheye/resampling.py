@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 
-from protocol.fisheye_lens import FisheyeCalibration, FisheyeLens
-from protocol.hemisphere import hemisphere_direction, texel_solid_angles
-from sensor_node.fisheye.exposures import LinearPicture
+from deltalight.protocol.fisheye_lens import FisheyeCalibration, FisheyeLens
+from deltalight.protocol.hemisphere import hemisphere_direction, texel_solid_angles
+from deltalight.sensor_node.fisheye.exposures import LinearPicture
 
 
 @dataclass(frozen=True, eq=False)

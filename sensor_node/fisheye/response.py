@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
-from protocol.errors import DeltalightError
-from sensor_node.fisheye.exposures import CLIPPED_CODE
+from deltalight.protocol.errors import DeltalightError
+from deltalight.sensor_node.fisheye.exposures import CLIPPED_CODE
 
 SAMPLES = 256
 """Pixels whose codes are compared: as many as codes, so that each code occurs about once per exposure."""

@@ -12,30 +12,30 @@ from fastapi.concurrency import run_in_threadpool
 from pydantic.json_schema import models_json_schema
 from starlette.middleware import Middleware
 
-from protocol.keys import Keys
-from protocol.messages import CompositeMessage, Message, StatsMessage
-from services.api.auth import AuthMiddleware, AuthRules
-from services.api.camera_finder import CameraFinder
-from services.api.context import Context
-from services.api.credentials import SecretToken, Tickets
-from services.api.events import EventHub
-from services.api.fisheye import FisheyeView
-from services.api.live_hub import LiveHub
-from services.api.metrics import Meter, Metrics
-from services.api.models import ProcessAnswer
-from services.api.problems import Problems, describe_problems, responses
-from services.api.recording_session import RecordingSession, RecordingSessions
-from services.api.recording_store import RecordingStore
-from services.api.render_link import RenderLink
-from services.api.replay_control import ReplayControl
-from services.api.routes import assets, live, recordings, scenes, snapshots, state
-from services.api.settings import ApiSettings
-from services.api.shown_view import ShownView
-from services.api.snapshot_store import SnapshotStore
-from services.api.static_page import StaticPage
-from services.api.streams import ProcessWatch, Sink, Streams
-from services.live_message import LiveHeader
-from services.storage.store import Store
+from deltalight.protocol.keys import Keys
+from deltalight.protocol.messages import CompositeMessage, Message, StatsMessage
+from deltalight.services.api.auth import AuthMiddleware, AuthRules
+from deltalight.services.api.camera_finder import CameraFinder
+from deltalight.services.api.context import Context
+from deltalight.services.api.credentials import SecretToken, Tickets
+from deltalight.services.api.events import EventHub
+from deltalight.services.api.fisheye import FisheyeView
+from deltalight.services.api.live_hub import LiveHub
+from deltalight.services.api.metrics import Meter, Metrics
+from deltalight.services.api.models import ProcessAnswer
+from deltalight.services.api.problems import Problems, describe_problems, responses
+from deltalight.services.api.recording_session import RecordingSession, RecordingSessions
+from deltalight.services.api.recording_store import RecordingStore
+from deltalight.services.api.render_link import RenderLink
+from deltalight.services.api.replay_control import ReplayControl
+from deltalight.services.api.routes import assets, live, recordings, scenes, snapshots, state
+from deltalight.services.api.settings import ApiSettings
+from deltalight.services.api.shown_view import ShownView
+from deltalight.services.api.snapshot_store import SnapshotStore
+from deltalight.services.api.static_page import StaticPage
+from deltalight.services.api.streams import ProcessWatch, Sink, Streams
+from deltalight.services.live_message import LiveHeader
+from deltalight.services.storage.store import Store
 
 PREFIX = "/api/v1"
 ROUTERS = (

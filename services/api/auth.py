@@ -11,12 +11,12 @@ from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import Headers, QueryParams
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from protocol.errors import DeltalightError
-from services.api.credentials import Principal, SecretToken, Tickets, principal_of, set_principal
-from services.api.limits import RateLimit, StreamLimits, run_while
-from services.api.problems import ProblemError, Problems
-from services.ports import LOOPBACK
-from services.storage.tokens import TokenStore
+from deltalight.protocol.errors import DeltalightError
+from deltalight.services.api.credentials import Principal, SecretToken, Tickets, principal_of, set_principal
+from deltalight.services.api.limits import RateLimit, StreamLimits, run_while
+from deltalight.services.api.problems import ProblemError, Problems
+from deltalight.services.ports import LOOPBACK
+from deltalight.services.storage.tokens import TokenStore
 
 BODY_LIMIT_BYTES = 2 << 20  # three times a document with the maximum number of objects
 UPLOAD_PATH = "/api/v1/assets"

@@ -6,7 +6,7 @@ from concurrent.futures import TimeoutError as FutureTimeoutError
 
 from pydantic import BaseModel, Field
 
-from services.api.problems import ProblemError
+from deltalight.services.api.problems import ProblemError
 
 TIMEOUT_S = 10.0  # an SDK that asks the USB bus takes a second
 
@@ -64,7 +64,7 @@ class CameraFinder:
 
 
 def _find(search: "Future[CamerasAnswer]") -> None:
-    from sensor_node.cameras.discovery import discover
+    from deltalight.sensor_node.cameras.discovery import discover
 
     try:
         found = discover()

@@ -8,8 +8,8 @@ import threading
 from collections import deque
 from collections.abc import Callable
 
-from protocol.errors import DeltalightError
-from services.parent_death_signal import SUPERVISOR_VARIABLE
+from deltalight.protocol.errors import DeltalightError
+from deltalight.services.parent_death_signal import SUPERVISOR_VARIABLE
 
 KEPT_LINES = 20
 START_TIMEOUT_S = 10.0
@@ -31,7 +31,14 @@ class ChildProcess:
         on_end: "Callable[[ChildProcess, int], None]",
         on_line: "Callable[[ChildProcess, str], None]" = lambda _child, _line: None,
     ) -> None:
-        self._command = [sys.executable, "-m", "services.cli", "--log-level", "warning", *arguments]
+        self._command = [
+            sys.executable,
+            "-m",
+            "deltalight.services.cli",
+            "--log-level",
+            "warning",
+            *arguments,
+        ]
         self._on_line, self._on_end = on_line, on_end
         self._process: subprocess.Popen[str] | None = None
         self._errors: deque[str] = deque(maxlen=KEPT_LINES)

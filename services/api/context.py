@@ -8,24 +8,24 @@ from typing import Annotated
 from fastapi import Depends, Header, Response
 from starlette.requests import HTTPConnection
 
-from services.api.camera_finder import CameraFinder
-from services.api.credentials import Tickets
-from services.api.events import EventHub
-from services.api.fisheye import FisheyeView
-from services.api.live_hub import LiveHub
-from services.api.metrics import Metrics
-from services.api.models import SceneAnswer
-from services.api.problems import ProblemError, Problems
-from services.api.recording_session import RecordingSessions
-from services.api.recording_store import RecordingStore
-from services.api.render_link import RenderLink
-from services.api.replay_control import ReplayControl
-from services.api.settings import ApiSettings
-from services.api.snapshot_store import SnapshotStore
-from services.api.streams import ProcessWatch
-from services.storage.documents import Edit
-from services.storage.scenes import StoredScene
-from services.storage.store import Store
+from deltalight.services.api.camera_finder import CameraFinder
+from deltalight.services.api.credentials import Tickets
+from deltalight.services.api.events import EventHub
+from deltalight.services.api.fisheye import FisheyeView
+from deltalight.services.api.live_hub import LiveHub
+from deltalight.services.api.metrics import Metrics
+from deltalight.services.api.models import SceneAnswer
+from deltalight.services.api.problems import ProblemError, Problems
+from deltalight.services.api.recording_session import RecordingSessions
+from deltalight.services.api.recording_store import RecordingStore
+from deltalight.services.api.render_link import RenderLink
+from deltalight.services.api.replay_control import ReplayControl
+from deltalight.services.api.settings import ApiSettings
+from deltalight.services.api.snapshot_store import SnapshotStore
+from deltalight.services.api.streams import ProcessWatch
+from deltalight.services.storage.documents import Edit
+from deltalight.services.storage.scenes import StoredScene
+from deltalight.services.storage.store import Store
 
 _GESTURE = re.compile(r"[A-Za-z0-9_-]{1,64}")
 _ENTITY_TAG = re.compile(r'(?:W/)?"([0-9]{1,18})"|([0-9]{1,18})')

@@ -12,8 +12,8 @@ from pathlib import Path
 
 from starlette.types import Scope
 
-from protocol.errors import DeltalightError
-from services.storage.tokens import Role
+from deltalight.protocol.errors import DeltalightError
+from deltalight.services.storage.tokens import Role
 
 TICKET_LIFE_S = 30.0
 OPEN_TICKETS = 4096  # beyond these, the oldest one expires

@@ -4,8 +4,8 @@ from fastapi.responses import FileResponse
 from starlette.datastructures import Headers
 from starlette.types import Message, Receive, Scope, Send
 
-from services.api.problems import ProblemError
-from services.storage.faults import NotFoundError
+from deltalight.services.api.problems import ProblemError
+from deltalight.services.storage.faults import NotFoundError
 
 
 class StoredFileResponse(FileResponse):

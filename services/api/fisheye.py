@@ -8,11 +8,11 @@ import numpy as np
 from jaxtyping import Float64
 from pydantic import BaseModel, Field
 
-from protocol.fisheye_lens import calibration_of
-from protocol.messages import Message, RadianceMessage
+from deltalight.protocol.fisheye_lens import calibration_of
+from deltalight.protocol.messages import Message, RadianceMessage
 
 if TYPE_CHECKING:
-    from render_server.lights.lights import IncidentLight
+    from deltalight.render_server.lights.lights import IncidentLight
 
 PICTURE_PART = 2  # of a radiance message (SPEC.md, section 3)
 OUTLINE_POINTS = 16
@@ -49,7 +49,7 @@ def lights_in_picture(message: RadianceMessage, described: Sequence[Mapping[str,
     Raises:
         DeltalightError: the calibration is invalid.
     """
-    from render_server.lights.lights import LIGHT_TYPES, incident_light
+    from deltalight.render_server.lights.lights import LIGHT_TYPES, incident_light
 
     viewpoint = np.array(message.world_from_fisheye)[:3, 3]
     found = []

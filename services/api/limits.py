@@ -6,7 +6,7 @@ from collections import Counter, OrderedDict
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
 
-from services.api.problems import ProblemError
+from deltalight.services.api.problems import ProblemError
 
 REMEMBERED_CLIENTS = 4096
 # Behind an SSH tunnel or a proxy all users of a house are one client; four dashboards of one user need eight.

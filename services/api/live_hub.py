@@ -9,8 +9,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Literal
 
-from protocol.messages import CompositeMessage
-from services.live_message import PictureHeader, ViewerHeader, age_ms, pack
+from deltalight.protocol.messages import CompositeMessage
+from deltalight.services.live_message import PictureHeader, ViewerHeader, age_ms, pack
 
 RATE_WINDOW_S = 3.0
 STALE_AFTER_S = 2.0

@@ -9,10 +9,10 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from prometheus_client.registry import Collector
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from services.api.events import EventHub
-from services.api.live_hub import LiveHub
-from services.api.problems import Problems
-from services.api.streams import ProcessWatch
+from deltalight.services.api.events import EventHub
+from deltalight.services.api.live_hub import LiveHub
+from deltalight.services.api.problems import Problems
+from deltalight.services.api.streams import ProcessWatch
 
 MEDIA_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 # From a read out of the cache to a mesh that reaches the time limit of its check.

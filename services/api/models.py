@@ -5,12 +5,12 @@ from typing import Any, Literal, Self
 
 from pydantic import BaseModel, Field
 
-from protocol.scene import SceneDocument
-from services.api.delivery import DeliveryStatus
-from services.api.streams import Report
-from services.storage.asset_kinds import AssetKind
-from services.storage.assets import Asset
-from services.storage.scenes import Revision, SceneHead, StoredScene
+from deltalight.protocol.scene import SceneDocument
+from deltalight.services.api.delivery import DeliveryStatus
+from deltalight.services.api.streams import Report
+from deltalight.services.storage.asset_kinds import AssetKind
+from deltalight.services.storage.assets import Asset
+from deltalight.services.storage.scenes import Revision, SceneHead, StoredScene
 
 
 class SceneSummary(BaseModel):

@@ -13,9 +13,9 @@ from pydantic import BaseModel, Field
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
-from protocol.errors import DeltalightError
-from services.api.render_link import UnansweredError
-from services.storage.faults import (
+from deltalight.protocol.errors import DeltalightError
+from deltalight.services.api.render_link import UnansweredError
+from deltalight.services.storage.faults import (
     ConflictError,
     NotFoundError,
     RejectedAssetError,

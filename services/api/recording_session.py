@@ -13,11 +13,11 @@ from tempfile import NamedTemporaryFile
 from threading import Lock
 from typing import Any
 
-from protocol.errors import DeltalightError
-from protocol.scene import SceneDocument
-from services.api.child_process import ChildProcess
-from services.api.recording_store import RecordingStore
-from services.storage.faults import ConflictError, NotFoundError
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.scene import SceneDocument
+from deltalight.services.api.child_process import ChildProcess
+from deltalight.services.api.recording_store import RecordingStore
+from deltalight.services.storage.faults import ConflictError, NotFoundError
 
 # The writer flushes, syncs the disk and closes: seconds on a slow one.
 STOP_TIMEOUT_S = 20.0

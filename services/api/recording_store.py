@@ -13,14 +13,14 @@ from typing import Any, Literal
 
 import cv2
 
-from protocol.errors import DeltalightError
-from protocol.files import write_bytes
-from protocol.recording_format import ACTIVE_SUFFIX
-from protocol.source import open_source
-from services.files import SUFFIX, make_output_folder
-from services.recording_copies import recover_recording
-from services.recording_info import describe_recording
-from services.storage.faults import ConflictError, NotFoundError
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.files import write_bytes
+from deltalight.protocol.recording_format import ACTIVE_SUFFIX
+from deltalight.protocol.source import open_source
+from deltalight.services.files import SUFFIX, make_output_folder
+from deltalight.services.recording_copies import recover_recording
+from deltalight.services.recording_info import describe_recording
+from deltalight.services.storage.faults import ConflictError, NotFoundError
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")  # no dots: nothing that ends like a suffix
 POSTER_EDGE = 640

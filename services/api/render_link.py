@@ -8,16 +8,16 @@ from collections.abc import Callable, Sequence
 
 import structlog
 
-from protocol.clock import CLOCK_OP
-from protocol.envelope import EnvelopeError
-from protocol.errors import DeltalightError
-from protocol.keys import Keys
-from protocol.messages import ControlRequest
-from protocol.request import RequestClient
-from services.api.delivery import SILENT, Change, Deliveries, DeliveryStatus, pending
-from services.api.shown_view import ShownView, View
-from services.storage.scenes import StoredScene
-from services.storage.store import Store
+from deltalight.protocol.clock import CLOCK_OP
+from deltalight.protocol.envelope import EnvelopeError
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.keys import Keys
+from deltalight.protocol.messages import ControlRequest
+from deltalight.protocol.request import RequestClient
+from deltalight.services.api.delivery import SILENT, Change, Deliveries, DeliveryStatus, pending
+from deltalight.services.api.shown_view import ShownView, View
+from deltalight.services.storage.scenes import StoredScene
+from deltalight.services.storage.store import Store
 
 LOOK_INTERVAL_S = 1.0
 ALIVE_TIMEOUT_S = 1.0  # a separate thread of the server answers this, whatever the renderer does

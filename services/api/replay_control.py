@@ -11,15 +11,15 @@ from typing import Self
 
 import structlog
 
-from protocol.endpoints import parse_endpoint
-from protocol.errors import DeltalightError
-from protocol.keys import Keys
-from protocol.messages import ControlRequest
-from protocol.request import RequestClient
-from services import ports
-from services.api.child_process import ChildProcess
-from services.api.render_link import RenderLink, UnansweredError
-from services.storage.faults import ConflictError
+from deltalight.protocol.endpoints import parse_endpoint
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.keys import Keys
+from deltalight.protocol.messages import ControlRequest
+from deltalight.protocol.request import RequestClient
+from deltalight.services import ports
+from deltalight.services.api.child_process import ChildProcess
+from deltalight.services.api.render_link import RenderLink, UnansweredError
+from deltalight.services.storage.faults import ConflictError
 
 # A child takes two seconds for imports and its first frame on a slow machine, five with two busy cores.
 START_TIMEOUT_S = 20.0

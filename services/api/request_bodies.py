@@ -12,13 +12,13 @@ import yaml
 from fastapi import Body, Depends, Request, Response
 from pydantic import BaseModel, ValidatorFunctionWrapHandler, WrapValidator
 
-from protocol.documents import parse_mapping, validate, yaml_text
-from protocol.methods import Method
-from protocol.scene import SceneDocument
-from protocol.scene_lights import Lights, ManualLight
-from protocol.scene_method import Output, Shading
-from protocol.scene_objects import RealScene, SceneObject
-from services.api.problems import ProblemError
+from deltalight.protocol.documents import parse_mapping, validate, yaml_text
+from deltalight.protocol.methods import Method
+from deltalight.protocol.scene import SceneDocument
+from deltalight.protocol.scene_lights import Lights, ManualLight
+from deltalight.protocol.scene_method import Output, Shading
+from deltalight.protocol.scene_objects import RealScene, SceneObject
+from deltalight.services.api.problems import ProblemError
 
 Model = TypeVar("Model", bound=BaseModel)
 

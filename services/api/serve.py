@@ -7,16 +7,16 @@ import structlog
 import uvicorn
 from fastapi import FastAPI
 
-from protocol.errors import DeltalightError
-from protocol.keys import Keys
-from protocol.messages import ControlRequest
-from protocol.methods import PLUGINS
-from protocol.request import RequestClient
-from protocol.scene import SceneDocument, parse_scene
-from services.api.app import create_app
-from services.api.settings import ApiSettings
-from services.host_store import FIRST_SCENE, activate_document, import_scene
-from services.storage.store import Store, default_folder
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.keys import Keys
+from deltalight.protocol.messages import ControlRequest
+from deltalight.protocol.methods import PLUGINS
+from deltalight.protocol.request import RequestClient
+from deltalight.protocol.scene import SceneDocument, parse_scene
+from deltalight.services.api.app import create_app
+from deltalight.services.api.settings import ApiSettings
+from deltalight.services.host_store import FIRST_SCENE, activate_document, import_scene
+from deltalight.services.storage.store import Store, default_folder
 
 FIRST_TOKEN = "first"
 MAX_CONNECTIONS = 256

@@ -6,8 +6,8 @@ from typing import Annotated
 
 from pydantic import Field, field_validator
 
-from protocol.documents import StrictModel
-from services.ports import COMPOSITE_PORT, CONTROL_PORT, LOOPBACK, NODE_PORT, PAGE_PORT, endpoint
+from deltalight.protocol.documents import StrictModel
+from deltalight.services.ports import COMPOSITE_PORT, CONTROL_PORT, LOOPBACK, NODE_PORT, PAGE_PORT, endpoint
 
 
 class ApiSettings(StrictModel):

@@ -3,8 +3,8 @@
 from collections.abc import Callable
 from typing import Literal
 
-from protocol.scene import SceneDocument
-from services.storage.scenes import StoredScene
+from deltalight.protocol.scene import SceneDocument
+from deltalight.services.storage.scenes import StoredScene
 
 View = Literal["composite", "effects", "delta", "volume", "rsm", "lights"]
 

@@ -13,10 +13,10 @@ from typing import Any
 
 from pydantic import Field, ValidationError
 
-from protocol.documents import StrictModel
-from protocol.methods import Method
-from services.files import make_output_folder
-from services.storage.faults import NotFoundError, StorageFaultError
+from deltalight.protocol.documents import StrictModel
+from deltalight.protocol.methods import Method
+from deltalight.services.files import make_output_folder
+from deltalight.services.storage.faults import NotFoundError, StorageFaultError
 
 FACTS = "snapshot.json"
 ID = re.compile(r"\d{8}-\d{6}-[0-9a-f]{6}")

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import structlog
 
-from protocol.envelope import decode
-from protocol.errors import DeltalightError
-from protocol.keys import Keys
-from protocol.messages import Message, StatsMessage
-from protocol.receiver import Receiver
-from protocol.subscriber import ReceivedMultipart
+from deltalight.protocol.envelope import decode
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.keys import Keys
+from deltalight.protocol.messages import Message, StatsMessage
+from deltalight.protocol.receiver import Receiver
+from deltalight.protocol.subscriber import ReceivedMultipart
 
 RECEIVE_TIMEOUT_S = 0.2
 FORGOTTEN_AFTER_S = 3600.0

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from services.commands.options import ConfigFile, NodeName
-from services.ports import COMPOSITE_PORT, endpoint
+from deltalight.services.commands.options import ConfigFile, NodeName
+from deltalight.services.ports import COMPOSITE_PORT, endpoint
 
 if TYPE_CHECKING:
-    from protocol.keys import KeySettings
-    from services.storage.store import Store
+    from deltalight.protocol.keys import KeySettings
+    from deltalight.services.storage.store import Store
 
 api = typer.Typer(
     invoke_without_command=True, help="Serve the dashboard, REST API and live video, or manage access tokens."
@@ -65,10 +65,10 @@ def serve(
     """Serve the dashboard at /, and scenes, assets, live video and state at /api/v1, until Ctrl-C."""
     if context.invoked_subcommand is not None:
         return
-    from protocol.keys import KeySettings
-    from services.api.serve import run_api
-    from services.api.settings import ApiSettings
-    from services.settings import load_configuration
+    from deltalight.protocol.keys import KeySettings
+    from deltalight.services.api.serve import run_api
+    from deltalight.services.api.settings import ApiSettings
+    from deltalight.services.settings import load_configuration
 
     given: dict[str, Any] = {
         "host": host,
@@ -133,15 +133,15 @@ def _subscriptions(subscribe: list[str] | None, node: str | None, keys: "KeySett
     """Return the given endpoints, or the one of the node to be found beside the render server."""
     if node is None:
         return subscribe or None
-    from services.discovery import node_endpoint
+    from deltalight.services.discovery import node_endpoint
 
     return [*(subscribe or [endpoint(COMPOSITE_PORT)]), node_endpoint(node, keys)]
 
 
 def _store(data: Path | None) -> "Store":
-    from services.api.settings import ApiSettings
-    from services.settings import load_configuration
-    from services.storage.store import Store, default_folder
+    from deltalight.services.api.settings import ApiSettings
+    from deltalight.services.settings import load_configuration
+    from deltalight.services.storage.store import Store, default_folder
 
     configured = load_configuration().section("api", ApiSettings).data
     return Store(data or configured or default_folder())

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
-from protocol.errors import DeltalightError
+from deltalight.protocol.errors import DeltalightError
 
 if TYPE_CHECKING:
-    from protocol.board import BoardSpec
+    from deltalight.protocol.board import BoardSpec
 
 
 class BoardType(StrEnum):
@@ -75,10 +75,10 @@ def board(
     force: Annotated[bool, typer.Option("--force", help="Write over older files.")] = False,
 ) -> None:
     """Write a marker board as true-scale PDF, with its board.yaml."""
-    from protocol.board import save_board_yaml
-    from protocol.files import replacing
-    from services.board_pdf import choose_page, margins_m, write_board_pdf
-    from services.files import make_output_folder
+    from deltalight.protocol.board import save_board_yaml
+    from deltalight.protocol.files import replacing
+    from deltalight.services.board_pdf import choose_page, margins_m, write_board_pdf
+    from deltalight.services.files import make_output_folder
 
     described = out.with_suffix(".yaml")
     if out.suffix.lower() != ".pdf":
@@ -109,8 +109,8 @@ def board(
 
 
 def _spec(kind: BoardType, size: _Defaults, first_id: int, lamps: list[tuple[int, float]]) -> "BoardSpec":
-    from protocol.board import BoardSpec
-    from protocol.documents import validate
+    from deltalight.protocol.board import BoardSpec
+    from deltalight.protocol.documents import validate
 
     data = {
         "type": kind.value,

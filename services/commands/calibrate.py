@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from protocol.errors import DeltalightError
+from deltalight.protocol.errors import DeltalightError
 
 if TYPE_CHECKING:
-    from sensor_node.calibration.lens_calibration import LensKind
-    from sensor_node.calibration.picture_sources import Eye
+    from deltalight.sensor_node.calibration.lens_calibration import LensKind
+    from deltalight.sensor_node.calibration.picture_sources import Eye
 
 calibrate = typer.Typer(
     no_args_is_help=True,
@@ -108,10 +108,10 @@ class _LensJob(NamedTuple):
 
 
 def _calibrate_lens(job: _LensJob, *, force: bool, as_json: bool) -> None:
-    from sensor_node.calibration.lens_calibration import calibrate_lens, require_good
-    from sensor_node.calibration.picture_sources import open_series
-    from sensor_node.calibration.targets import parse_target
-    from services.calibration import (
+    from deltalight.sensor_node.calibration.lens_calibration import calibrate_lens, require_good
+    from deltalight.sensor_node.calibration.picture_sources import open_series
+    from deltalight.sensor_node.calibration.targets import parse_target
+    from deltalight.services.calibration import (
         Watch,
         lens_report,
         print_lens_report,
@@ -146,7 +146,7 @@ def extrinsics(
     as_json: AsJson = False,
 ) -> None:
     """Find where a sensor is: writes a transform to OUT/calibration/extrinsics.yaml."""
-    from services.calibration_extrinsics import ExtrinsicsJob, find_transform
+    from deltalight.services.calibration_extrinsics import ExtrinsicsJob, find_transform
 
     figures = find_transform(ExtrinsicsJob(source, what.value, out, target), force=force)
     _print_figures(figures, as_json=as_json)
@@ -176,7 +176,7 @@ def photometric(
     as_json: AsJson = False,
 ) -> None:
     """Find a camera's response from an exposure bracket, or with --card the albedo of the board's paper."""
-    from services.calibration_photometric import find_paper_albedo, find_response
+    from deltalight.services.calibration_photometric import find_paper_albedo, find_response
 
     if card is None:
         figures = find_response(source, eye.value, out, force=force)

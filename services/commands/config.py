@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from services.commands.options import ConfigFile
+from deltalight.services.commands.options import ConfigFile
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -19,7 +19,7 @@ def config(
     ] = False,
 ) -> None:
     """Print the settings of node, server, API and keys as a configuration file, and where each comes from."""
-    from services.settings import load_configuration
+    from deltalight.services.settings import load_configuration
 
     configuration = load_configuration(config_file)
     values: dict[str, Any] = {}
@@ -37,13 +37,13 @@ def config(
 
 def _models() -> "dict[str, type[BaseModel]]":
     """Return the sections whose programs are installed here."""
-    from protocol.keys import KeySettings
-    from sensor_node.node import NodeConfig
+    from deltalight.protocol.keys import KeySettings
+    from deltalight.sensor_node.node import NodeConfig
 
     models: dict[str, type[BaseModel]] = {"node": NodeConfig, "keys": KeySettings}
     try:
-        from render_server.server.process import ServerSettings
-        from services.api.settings import ApiSettings
+        from deltalight.render_server.server.process import ServerSettings
+        from deltalight.services.api.settings import ApiSettings
     except ModuleNotFoundError:  # a host that only captures
         return models
     return {"node": NodeConfig, "server": ServerSettings, "api": ApiSettings, "keys": KeySettings}

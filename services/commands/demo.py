@@ -5,9 +5,9 @@ from typing import Annotated
 
 import typer
 
-from protocol.errors import DeltalightError
-from services.commands.options import MethodName, require_method
-from services.ports import PAGE_PORT
+from deltalight.protocol.errors import DeltalightError
+from deltalight.services.commands.options import MethodName, require_method
+from deltalight.services.ports import PAGE_PORT
 
 
 def demo(
@@ -29,7 +29,7 @@ def demo(
 ) -> None:
     """Play the shipped recording through node, render server and web process, and open the dashboard."""
     method = require_method(method)
-    from services.demo import run_headless, run_live
+    from deltalight.services.demo import run_headless, run_live
 
     if not headless:
         run_live(method, port=port, with_browser=not no_browser)

@@ -10,7 +10,7 @@ def doctor(
     as_json: Annotated[bool, typer.Option("--json", help="Print the checks as JSON.")] = False,
 ) -> None:
     """Check what this machine has and what is missing; exit code 1 if something required is missing."""
-    from services.doctor import examine
+    from deltalight.services.doctor import examine
 
     checks = list(examine())
     if as_json:

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from services.commands.options import MethodName, require_method
+from deltalight.services.commands.options import MethodName, require_method
 
 if TYPE_CHECKING:
-    from services.frame_account import FrameAccount
+    from deltalight.services.frame_account import FrameAccount
 
 NARROWEST = 150  # columns of a table that no terminal shows
 
@@ -28,9 +28,9 @@ def graph(
     degree.
     """
     method = require_method(method)
-    from protocol.files import write_bytes
-    from services.frame_account import account_frame
-    from services.graph_drawing import draw_graph
+    from deltalight.protocol.files import write_bytes
+    from deltalight.services.frame_account import account_frame
+    from deltalight.services.graph_drawing import draw_graph
 
     with _progress() as watch:
         account = account_frame(method, watch)
@@ -57,7 +57,7 @@ def _print_table(account: "FrameAccount") -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from services.graph_drawing import format_ms
+    from deltalight.services.graph_drawing import format_ms
 
     console = Console()
     if not console.is_terminal:

@@ -19,7 +19,7 @@ def create(
     folder: Folder = None,
 ) -> None:
     """Create a key pair; the public file is for other machines, the secret one stays here."""
-    from protocol.keys import create_keys
+    from deltalight.protocol.keys import create_keys
 
     public, secret = create_keys(name, _folder(folder))
     typer.echo(f"Secret key, for this host only: {secret}")
@@ -33,7 +33,7 @@ def list_keys(
     as_json: Annotated[bool, typer.Option("--json", help="Print the keys as JSON.")] = False,
 ) -> None:
     """List this machine's key pairs and the keys it trusts."""
-    from protocol.keys import load_keys, own_keys, trusted_keys
+    from deltalight.protocol.keys import load_keys, own_keys, trusted_keys
 
     place = _folder(folder)
     own = {name: load_keys(name, place).public.decode() for name in own_keys(place)}
@@ -58,14 +58,14 @@ def trust(
     folder: Folder = None,
 ) -> None:
     """Trust the machine with this public key; takes effect at once, without a restart."""
-    from protocol.keys import trust as keep
+    from deltalight.protocol.keys import trust as keep
 
     kept = keep(file, _folder(folder), name)
     typer.echo(f"Trusted from now on: {kept} (remove that file to end it)")
 
 
 def _folder(given: Path | None) -> Path:
-    from protocol.keys import KeySettings, key_folder
-    from services.settings import load_configuration
+    from deltalight.protocol.keys import KeySettings, key_folder
+    from deltalight.services.settings import load_configuration
 
     return given or load_configuration().section("keys", KeySettings).folder or key_folder()

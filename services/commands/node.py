@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from services.commands.options import ConfigFile
+from deltalight.services.commands.options import ConfigFile
 
 if TYPE_CHECKING:
-    from sensor_node.cameras.driver import Discovery
+    from deltalight.sensor_node.cameras.driver import Discovery
 
 
 def node(
@@ -68,7 +68,7 @@ def node(
         "camera": None if calibration is None else {"calibration": calibration},
         "fisheye": None if fisheye is None else {"source": fisheye},
     }
-    from services.node_process import run_configured_node
+    from deltalight.services.node_process import run_configured_node
 
     run_configured_node({key: value for key, value in given.items() if value is not None}, config_file)
 
@@ -76,7 +76,7 @@ def node(
 def _print_lists(*, cameras: bool, nodes: bool, as_json: bool) -> None:
     data: dict[str, Any] = {}
     if cameras:
-        from sensor_node.cameras.discovery import discover
+        from deltalight.sensor_node.cameras.discovery import discover
 
         found = discover()
         data["cameras"] = [camera.as_dict() for camera in found.cameras]
@@ -84,7 +84,7 @@ def _print_lists(*, cameras: bool, nodes: bool, as_json: bool) -> None:
         if not as_json:
             _print_cameras(found)
     if nodes:
-        from services.discovery import find_nodes
+        from deltalight.services.discovery import find_nodes
 
         data["nodes"] = [each.as_dict() for each in find_nodes()]
         if not as_json:

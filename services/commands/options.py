@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from protocol.errors import DeltalightError
+from deltalight.protocol.errors import DeltalightError
 
 
 class View(StrEnum):
@@ -47,7 +47,7 @@ def require_method(name: str) -> str:
     Raises:
         DeltalightError: there is none, or it comes from a plugin that cannot be used.
     """
-    from protocol.methods import PLUGINS
+    from deltalight.protocol.methods import PLUGINS
 
     known = [*METHODS, *PLUGINS.values]
     if name in known:

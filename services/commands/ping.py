@@ -20,7 +20,7 @@ def ping(
     timeout: Annotated[float, typer.Option(min=0.1, max=60, help="Seconds to wait.")] = 5.0,
 ) -> None:
     """Check whether a process responds; exit code 0 = yes, 1 = no."""
-    from services.health_check import check_health
+    from deltalight.services.health_check import check_health
 
     fault = check_health(address, streams=streams, timeout_s=timeout)
     if fault is not None:

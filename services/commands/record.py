@@ -12,13 +12,13 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from services.commands.options import ConfigFile, NodeName
-from services.ports import NODE_PORT, endpoint
+from deltalight.services.commands.options import ConfigFile, NodeName
+from deltalight.services.ports import NODE_PORT, endpoint
 
 if TYPE_CHECKING:
-    from protocol.keys import Keys, KeySettings
-    from protocol.scene import SceneDocument
-    from services.recorder import Recorder, RecordStatus
+    from deltalight.protocol.keys import Keys, KeySettings
+    from deltalight.protocol.scene import SceneDocument
+    from deltalight.services.recorder import Recorder, RecordStatus
 
 SHOW_PERIOD_S, LINE_PERIOD_S = 0.25, 1.0
 
@@ -54,10 +54,10 @@ def record(
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
     """Record every raw frame of a node until Ctrl-C, or for --duration or --frames."""
-    from protocol.calibration import load_extrinsics_yaml
-    from protocol.keys import KeySettings
-    from services.recorder import Recorder, RecordJob
-    from services.settings import load_configuration
+    from deltalight.protocol.calibration import load_extrinsics_yaml
+    from deltalight.protocol.keys import KeySettings
+    from deltalight.services.recorder import Recorder, RecordJob
+    from deltalight.services.settings import load_configuration
 
     settings = load_configuration(config_file).section("keys", KeySettings)
     places = _endpoints(subscribe, node, settings)
@@ -80,21 +80,21 @@ def record(
 
 def _endpoints(subscribe: list[str] | None, node: str | None, settings: "KeySettings") -> list[str]:
     """Return the given endpoints, or the one of the node to be found."""
-    from protocol.errors import DeltalightError
+    from deltalight.protocol.errors import DeltalightError
 
     if node is None:
         return subscribe or [endpoint(NODE_PORT)]
     if subscribe:
         raise DeltalightError("--subscribe and --node both say where the node is; give one of them.")
-    from services.discovery import node_endpoint
+    from deltalight.services.discovery import node_endpoint
 
     return [node_endpoint(node, settings)]
 
 
 def _scene(path: Path | None, control: str | None, keys: "Keys | None") -> "SceneDocument | None":
-    from protocol.errors import DeltalightError
-    from protocol.scene import load_scene
-    from services.recorder import scene_of_server
+    from deltalight.protocol.errors import DeltalightError
+    from deltalight.protocol.scene import load_scene
+    from deltalight.services.recorder import scene_of_server
 
     if path is not None and control is not None:
         raise DeltalightError("--scene and --control both name a scene to attach; give one of them.")
@@ -127,7 +127,7 @@ def _run(recorder: "Recorder", progress: "AbstractContextManager[Show]", summari
     from concurrent.futures import ThreadPoolExecutor, wait
     from threading import Event
 
-    from services.signals import Terminated
+    from deltalight.services.signals import Terminated
 
     stop, ended_by = Event(), None
     with ThreadPoolExecutor(1) as thread:

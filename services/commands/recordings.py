@@ -12,7 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from services.recording_copies import Copied, Track
+    from deltalight.services.recording_copies import Copied, Track
 
 recordings = typer.Typer(no_args_is_help=True, help="Inspect, repair and convert recordings.")
 
@@ -25,7 +25,7 @@ def info(
     file: FILE, *, as_json: Annotated[bool, typer.Option("--json", help="Print the facts as JSON.")] = False
 ) -> None:
     """Show what a recording contains: frames, rates, sizes, cameras, and what is missing."""
-    from services.recording_info import describe_recording
+    from deltalight.services.recording_info import describe_recording
 
     with _progress("reading", show_count=False) as progress:
         task = progress.add_task("reading", total=1.0)
@@ -55,7 +55,7 @@ def recover(
     as_json: AS_JSON = False,
 ) -> None:
     """Repair a recording that was cut off or damaged; writes a new .mcap and leaves the old file as it is."""
-    from services.recording_copies import recover_recording, recovered_name
+    from deltalight.services.recording_copies import recover_recording, recovered_name
 
     copied = recover_recording(file, out or recovered_name(file), _track("recovering"))
     if copied is None:
@@ -77,7 +77,7 @@ def import_(
     as_json: AS_JSON = False,
 ) -> None:
     """Convert a dataset folder to a recording."""
-    from services.recording_copies import import_folder
+    from deltalight.services.recording_copies import import_folder
 
     _print_copied(import_folder(folder, out, scene, _track("importing")), as_json=as_json)
 
@@ -90,7 +90,7 @@ def export(
     as_json: AS_JSON = False,
 ) -> None:
     """Convert a recording to a dataset folder."""
-    from services.recording_copies import export_recording
+    from deltalight.services.recording_copies import export_recording
 
     _print_copied(export_recording(file, out, _track("exporting")), as_json=as_json)
 

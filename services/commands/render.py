@@ -8,10 +8,10 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from services.commands.options import Quality, View, require_method
+from deltalight.services.commands.options import Quality, View, require_method
 
 if TYPE_CHECKING:
-    from services.offline import RenderSummary
+    from deltalight.services.offline import RenderSummary
 
 
 def render(
@@ -49,11 +49,11 @@ def render(
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
     """Render a recording to pictures: OUT/000000.png and so on, with one line per frame in OUT/frames.jsonl."""
-    from protocol.source import open_source
-    from services.commands.options import parse_frames, parse_size
-    from services.demo import with_method
-    from services.host import choose_scene
-    from services.offline import RenderJob, run_job, with_output
+    from deltalight.protocol.source import open_source
+    from deltalight.services.commands.options import parse_frames, parse_size
+    from deltalight.services.demo import with_method
+    from deltalight.services.host import choose_scene
+    from deltalight.services.offline import RenderJob, run_job, with_output
 
     size_px = None if size is None else parse_size(size)
     recording = open_source(source)

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from services.commands.options import ConfigFile
+from deltalight.services.commands.options import ConfigFile
 
 
 def replay(
@@ -38,10 +38,10 @@ def replay(
     config_file: ConfigFile = None,
 ) -> None:
     """Publish a recording or dataset folder as its node did, until it ends or Ctrl-C."""
-    from protocol.errors import DeltalightError
-    from protocol.source import open_source
-    from sensor_node.cameras.playback import PlaybackCamera
-    from services.node_process import run_configured_node
+    from deltalight.protocol.errors import DeltalightError
+    from deltalight.protocol.source import open_source
+    from deltalight.sensor_node.cameras.playback import PlaybackCamera
+    from deltalight.services.node_process import run_configured_node
 
     frames = open_source(source)  # refuses here what a node would take for a live camera
     if fast and (rate is not None or start is not None or control is not None):

@@ -28,18 +28,18 @@ def schema(
 def _schema(document: Document) -> dict[str, Any]:
     match document:
         case Document.SCENE:
-            from protocol.scene import scene_json_schema
+            from deltalight.protocol.scene import scene_json_schema
 
             return scene_json_schema()
         case Document.NODE:
-            from sensor_node.node import NodeConfig
+            from deltalight.sensor_node.node import NodeConfig
 
             return NodeConfig.model_json_schema()
         case Document.SERVER:
-            from render_server.server.process import ServerSettings
+            from deltalight.render_server.server.process import ServerSettings
 
             return ServerSettings.model_json_schema()
         case Document.API:
-            from services.api.settings import ApiSettings
+            from deltalight.services.api.settings import ApiSettings
 
             return ApiSettings.model_json_schema()

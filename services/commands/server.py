@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from services.commands.options import ConfigFile, NodeName
+from deltalight.services.commands.options import ConfigFile, NodeName
 
 if TYPE_CHECKING:
-    from protocol.keys import KeySettings
+    from deltalight.protocol.keys import KeySettings
 
 
 def server(
@@ -40,9 +40,9 @@ def server(
     config_file: ConfigFile = None,
 ) -> None:
     """Render the frames of sensor nodes and publish the pictures, until Ctrl-C."""
-    from protocol.keys import KeySettings
-    from render_server.server.process import ServerSettings, run_server
-    from services.settings import load_configuration
+    from deltalight.protocol.keys import KeySettings
+    from deltalight.render_server.server.process import ServerSettings, run_server
+    from deltalight.services.settings import load_configuration
 
     configuration = load_configuration(config_file)
     key_settings = configuration.section("keys", KeySettings)
@@ -65,6 +65,6 @@ def _subscriptions(subscribe: list[str] | None, node: str | None, keys: "KeySett
     """Return the given endpoints, or the one of the node to be found."""
     if node is None:
         return subscribe or None
-    from services.discovery import node_endpoint
+    from deltalight.services.discovery import node_endpoint
 
     return [*(subscribe or []), node_endpoint(node, keys)]

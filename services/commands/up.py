@@ -5,12 +5,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from protocol.errors import DeltalightError
-from services.commands.options import ConfigFile, NodeName
-from services.ports import COMPOSITE_PORT, CONTROL_PORT, LOOPBACK, NODE_PORT, PAGE_PORT
+from deltalight.protocol.errors import DeltalightError
+from deltalight.services.commands.options import ConfigFile, NodeName
+from deltalight.services.ports import COMPOSITE_PORT, CONTROL_PORT, LOOPBACK, NODE_PORT, PAGE_PORT
 
 if TYPE_CHECKING:
-    from protocol.source import Source
+    from deltalight.protocol.source import Source
 
 
 def up(
@@ -49,10 +49,10 @@ def up(
 
     With --node, no node is started: the render server uses one that is found on the network.
     """
-    from services.host import HostPlan
-    from services.host_store import scene_to_show, session_file
-    from services.storage.store import Store
-    from services.supervisor import Supervisor
+    from deltalight.services.host import HostPlan
+    from deltalight.services.host_store import scene_to_show, session_file
+    from deltalight.services.storage.store import Store
+    from deltalight.services.supervisor import Supervisor
 
     if node is None:
         source = source or _configured_source(config_file)
@@ -85,9 +85,9 @@ def up(
 
 def _data_folder(data: Path | None, config_file: Path | None) -> Path:
     """Return the web process's data folder: of the command line, the configuration, or the default."""
-    from services.api.settings import ApiSettings
-    from services.settings import load_configuration
-    from services.storage.store import default_folder
+    from deltalight.services.api.settings import ApiSettings
+    from deltalight.services.settings import load_configuration
+    from deltalight.services.storage.store import default_folder
 
     return data or load_configuration(config_file).section("api", ApiSettings).data or default_folder()
 
@@ -98,8 +98,8 @@ def _configured_source(config_file: Path | None) -> str:
     Raises:
         DeltalightError: it names none.
     """
-    from sensor_node.node import NodeConfig
-    from services.settings import DEFAULT, load_configuration
+    from deltalight.sensor_node.node import NodeConfig
+    from deltalight.services.settings import DEFAULT, load_configuration
 
     config, origins = load_configuration(config_file).explained("node", NodeConfig)
     if origins["source"] == DEFAULT:
@@ -111,8 +111,8 @@ def _configured_source(config_file: Path | None) -> str:
 
 def _recording(source: str | None) -> "Source | None":
     """Return the recording that a source names, None if it is a camera, or another host's."""
-    from protocol.source import open_source
-    from sensor_node.cameras.drivers import SYNTHETIC
-    from sensor_node.cameras.open import is_live
+    from deltalight.protocol.source import open_source
+    from deltalight.sensor_node.cameras.drivers import SYNTHETIC
+    from deltalight.sensor_node.cameras.open import is_live
 
     return None if source is None or source == SYNTHETIC or is_live(source) else open_source(Path(source))

@@ -4,11 +4,11 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from protocol.errors import DeltalightError
-from services.storage.asset_kinds import Facts
+from deltalight.protocol.errors import DeltalightError
+from deltalight.services.storage.asset_kinds import Facts
 
 if TYPE_CHECKING:
-    from render_server.scene.triangle_mesh import TriangleMesh
+    from deltalight.render_server.scene.triangle_mesh import TriangleMesh
 
 
 def mesh_facts(path: Path) -> Facts:
@@ -20,13 +20,13 @@ def mesh_facts(path: Path) -> Facts:
     Raises:
         DeltalightError: the file is wrong; the sentence says how.
     """
-    from render_server.scene.asset_check import check_mesh_file, read_gltf
+    from deltalight.render_server.scene.asset_check import check_mesh_file, read_gltf
 
     if check_mesh_file(path) == ".glb":
         read_gltf(path)  # refuses a malformed file before the loader's second of imports
     import numpy as np
 
-    from render_server.scene.mesh_loading import load_asset
+    from deltalight.render_server.scene.mesh_loading import load_asset
 
     asset = load_asset(path)
     meshes, clips = asset.meshes, () if asset.animated is None else asset.animated.clips
@@ -72,7 +72,7 @@ def map_facts(path: Path) -> Facts:
     Raises:
         DeltalightError: the file is wrong; the sentence says how.
     """
-    from protocol.radiance_files import read_linear
+    from deltalight.protocol.radiance_files import read_linear
 
     height, width = read_linear(path).shape[:2]
     if width != 2 * height:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from services.storage.faults import RejectedAssetError
+from deltalight.services.storage.faults import RejectedAssetError
 
 AssetKind = Literal["mesh", "map"]
 Facts = dict[str, Any]  # facts about a loaded file, as JSON

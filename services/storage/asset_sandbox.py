@@ -7,10 +7,10 @@ import sys
 from pathlib import Path
 from typing import Literal
 
-from services.storage.asset_kinds import AssetKind, Facts
-from services.storage.faults import RejectedAssetError
+from deltalight.services.storage.asset_kinds import AssetKind, Facts
+from deltalight.services.storage.faults import RejectedAssetError
 
-WORKER = "services.storage.asset_worker"  # by name: its imports must not happen here
+WORKER = "deltalight.services.storage.asset_worker"  # by name: its imports must not happen here
 # An 8192 x 4096 map takes 1.6 GB while it is checked, a mesh of 10 M triangles 2 GB.
 MEMORY_LIMIT_BYTES = 3 << 30
 TIME_LIMIT_S = 60

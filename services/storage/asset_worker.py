@@ -1,6 +1,6 @@
 """The process that handles an untrusted file within limits; started by `asset_sandbox`.
 
-Run as `python -m services.storage.asset_worker TASK PATH MEMORY_BYTES TIME_S OUTPUT_BYTES [ARGUMENT...]`; prints one
+Run as `python -m deltalight.services.storage.asset_worker TASK PATH MEMORY_BYTES TIME_S OUTPUT_BYTES [ARGUMENT...]`; prints one
 JSON object.
 """
 
@@ -10,8 +10,8 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from protocol.errors import DeltalightError
-from services.storage.asset_kinds import Facts
+from deltalight.protocol.errors import DeltalightError
+from deltalight.services.storage.asset_kinds import Facts
 
 
 def _limit(memory_bytes: int, time_s: int, output_bytes: int) -> None:
@@ -24,14 +24,14 @@ def _limit(memory_bytes: int, time_s: int, output_bytes: int) -> None:
 def _task(name: str) -> Callable[..., Facts]:
     """Return the function of a task; imported here, because each needs other heavy packages."""
     if name == "unzip":
-        from services.storage.gltf_zip import repack
+        from deltalight.services.storage.gltf_zip import repack
 
         return repack
     if name.endswith("-thumbnail"):
-        from services.storage import thumbnails
+        from deltalight.services.storage import thumbnails
 
         return thumbnails.draw_mesh if name == "mesh-thumbnail" else thumbnails.draw_map
-    from services.storage import asset_facts
+    from deltalight.services.storage import asset_facts
 
     return asset_facts.mesh_facts if name == "mesh" else asset_facts.map_facts
 

@@ -19,9 +19,9 @@ from uuid import uuid4
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from protocol.errors import DeltalightError
-from protocol.scene import DIGEST_PREFIX, SceneDocument
-from services.storage.asset_kinds import (
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.scene import DIGEST_PREFIX, SceneDocument
+from deltalight.services.storage.asset_kinds import (
     BY_NAME,
     HEAD_BYTES,
     AssetFormat,
@@ -31,10 +31,10 @@ from services.storage.asset_kinds import (
     is_archive,
     recognise,
 )
-from services.storage.asset_sandbox import Task, probe, run_limited
-from services.storage.database import Database
-from services.storage.faults import ConflictError, NotFoundError, StorageFaultError, TooLargeError
-from services.storage.tables import AssetNameRow, AssetRow, AssetUseRow, SceneRow
+from deltalight.services.storage.asset_sandbox import Task, probe, run_limited
+from deltalight.services.storage.database import Database
+from deltalight.services.storage.faults import ConflictError, NotFoundError, StorageFaultError, TooLargeError
+from deltalight.services.storage.tables import AssetNameRow, AssetRow, AssetUseRow, SceneRow
 
 Probe = Callable[[Path, AssetKind, str], Facts]
 LEFT_OVER_AFTER_S = 24 * 3600  # no upload takes a day: older files were left by a killed process

@@ -10,9 +10,9 @@ from sqlalchemy.exc import DatabaseError, IntegrityError
 from sqlalchemy.orm import Session
 from sqlalchemy.pool import ConnectionPoolEntry
 
-from protocol.errors import DeltalightError
-from services.storage.faults import StorageFaultError
-from services.storage.tables import MIGRATIONS, SCHEMA_VERSION, Base
+from deltalight.protocol.errors import DeltalightError
+from deltalight.services.storage.faults import StorageFaultError
+from deltalight.services.storage.tables import MIGRATIONS, SCHEMA_VERSION, Base
 
 BUSY_TIMEOUT_S = 10.0
 _IMMEDIATE = "deltalight_immediate"

@@ -3,10 +3,10 @@
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
-from protocol.documents import validate
-from protocol.errors import DeltalightError
-from protocol.scene import SceneDocument
-from services.storage.faults import NotFoundError, StaleRevisionError
+from deltalight.protocol.documents import validate
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.scene import SceneDocument
+from deltalight.services.storage.faults import NotFoundError, StaleRevisionError
 
 Document = dict[str, Any]
 Edit = Callable[[Document], Any]

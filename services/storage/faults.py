@@ -1,6 +1,6 @@
 """Errors of the storage that callers distinguish; each is a sentence for the user."""
 
-from protocol.errors import DeltalightError
+from deltalight.protocol.errors import DeltalightError
 
 
 class NotFoundError(DeltalightError):

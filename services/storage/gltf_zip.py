@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
-from protocol.errors import DeltalightError
-from services.storage.asset_kinds import Facts
+from deltalight.protocol.errors import DeltalightError
+from deltalight.services.storage.asset_kinds import Facts
 
 MAX_ENTRIES = 1000
 _JSON_CHUNK, _BIN_CHUNK = 0x4E4F534A, 0x004E4942

@@ -9,13 +9,13 @@ from typing import Any
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
-from protocol.documents import parse_mapping
-from protocol.scene import DIGEST_PREFIX, SceneDocument
-from services.storage.assets import AssetNames
-from services.storage.database import Database
-from services.storage.documents import Edit, checked_document, require_revision
-from services.storage.faults import ConflictError, NotFoundError
-from services.storage.tables import AssetUseRow, ChoiceRow, RevisionRow, SceneRow
+from deltalight.protocol.documents import parse_mapping
+from deltalight.protocol.scene import DIGEST_PREFIX, SceneDocument
+from deltalight.services.storage.assets import AssetNames
+from deltalight.services.storage.database import Database
+from deltalight.services.storage.documents import Edit, checked_document, require_revision
+from deltalight.services.storage.faults import ConflictError, NotFoundError
+from deltalight.services.storage.tables import AssetUseRow, ChoiceRow, RevisionRow, SceneRow
 
 ACTIVE = "active_scene"
 FIRST_REVISION = 1

@@ -4,12 +4,12 @@ import os
 from pathlib import Path
 from typing import Self
 
-from protocol.errors import DeltalightError
-from services.storage.asset_sandbox import probe as probe_asset
-from services.storage.assets import AssetStore, Probe
-from services.storage.database import Database
-from services.storage.scenes import SceneStore
-from services.storage.tokens import TokenStore
+from deltalight.protocol.errors import DeltalightError
+from deltalight.services.storage.asset_sandbox import probe as probe_asset
+from deltalight.services.storage.assets import AssetStore, Probe
+from deltalight.services.storage.database import Database
+from deltalight.services.storage.scenes import SceneStore
+from deltalight.services.storage.tokens import TokenStore
 
 
 class Store:

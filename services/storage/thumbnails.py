@@ -8,12 +8,12 @@ from embreex.mesh_construction import TriangleMesh as EmbreeMesh
 from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Float32, Int
 
-from protocol.radiance_files import read_linear
-from render_server.lights.environment import LUMINANCE
-from render_server.scene.asset_check import check_mesh_file
-from render_server.scene.mesh_loading import load_mesh
-from render_server.scene.triangle_mesh import TriangleMesh
-from services.storage.asset_kinds import Facts
+from deltalight.protocol.radiance_files import read_linear
+from deltalight.render_server.lights.environment import LUMINANCE
+from deltalight.render_server.scene.asset_check import check_mesh_file
+from deltalight.render_server.scene.mesh_loading import load_mesh
+from deltalight.render_server.scene.triangle_mesh import TriangleMesh
+from deltalight.services.storage.asset_kinds import Facts
 
 SIZE = 256
 SAMPLES = 2  # rays along each edge of a pixel

@@ -11,10 +11,10 @@ from typing import Literal
 
 from sqlalchemy import func, select
 
-from protocol.errors import DeltalightError
-from services.storage.database import Database
-from services.storage.faults import ConflictError, NotFoundError
-from services.storage.tables import TokenRow
+from deltalight.protocol.errors import DeltalightError
+from deltalight.services.storage.database import Database
+from deltalight.services.storage.faults import ConflictError, NotFoundError
+from deltalight.services.storage.tables import TokenRow
 
 Role = Literal["view", "control"]
 PREFIX = "deltalight"

@@ -3,7 +3,7 @@
 import os
 import time
 
-from benchmarks.gpu_check.record import Findings, Skipped
+from deltalight.benchmarks.gpu_check.record import Findings, Skipped
 
 
 def fine(findings: Findings) -> str:

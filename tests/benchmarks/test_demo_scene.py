@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 import trimesh
 
-from benchmarks.ground_truth import scene_demo
-from benchmarks.ground_truth.board_texture import INK_ALBEDO, board_texture
-from benchmarks.ground_truth.demo_object import BASE_COLOR, ROUGHNESS, object_mesh, write_glb
-from benchmarks.ground_truth.sensors import ColorSensor, StereoDepthSensor, srgb_bytes
-from protocol.board import BoardSpec
-from protocol.errors import DeltalightError
-from protocol.frames import SensorFrame, decode_lut
-from protocol.recording_reader import RecordingReader
-from protocol.scene import load_scene
-from sensor_node.markers import BoardDetector
+from deltalight.benchmarks.ground_truth import scene_demo
+from deltalight.benchmarks.ground_truth.board_texture import INK_ALBEDO, board_texture
+from deltalight.benchmarks.ground_truth.demo_object import BASE_COLOR, ROUGHNESS, object_mesh, write_glb
+from deltalight.benchmarks.ground_truth.sensors import ColorSensor, StereoDepthSensor, srgb_bytes
+from deltalight.protocol.board import BoardSpec
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import SensorFrame, decode_lut
+from deltalight.protocol.recording_reader import RecordingReader
+from deltalight.protocol.scene import load_scene
+from deltalight.sensor_node.markers import BoardDetector
 
 ASSETS = Path(__file__).parents[2] / "services" / "demo_assets"
 RECORDING = ASSETS / "demo.mcap"

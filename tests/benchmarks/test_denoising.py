@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from rich.progress import Progress
 
-from benchmarks.ground_truth.render import GuidedPicture, softened
-from benchmarks.ground_truth.scenes import scene_named
-from benchmarks.ground_truth.truth import ensure_truth
-from benchmarks.quality import denoising
-from benchmarks.quality.case import SceneCase
-from benchmarks.quality.denoising import Denoiser
-from benchmarks.quality.path_tracing import trace_in_time
-from services.cli import run
+from deltalight.benchmarks.ground_truth.render import GuidedPicture, softened
+from deltalight.benchmarks.ground_truth.scenes import scene_named
+from deltalight.benchmarks.ground_truth.truth import ensure_truth
+from deltalight.benchmarks.quality import denoising
+from deltalight.benchmarks.quality.case import SceneCase
+from deltalight.benchmarks.quality.denoising import Denoiser
+from deltalight.benchmarks.quality.path_tracing import trace_in_time
+from deltalight.services.cli import run
 
 needs_oidn = pytest.mark.skipif(
     importlib.util.find_spec("oidn") is None, reason="Open Image Denoise is not installed (dev extra)"
@@ -38,7 +38,7 @@ def test_without_the_denoiser_the_command_says_so_before_it_measures(
 ) -> None:
     pytest.importorskip("flip_evaluator")  # the whole command needs the dev extra
     monkeypatch.setattr(denoising, "find_spec", lambda _: None)
-    monkeypatch.setattr("benchmarks.quality.evaluate.create_context", pytest.fail)
+    monkeypatch.setattr("deltalight.benchmarks.quality.evaluate.create_context", pytest.fail)
     options = ("--methods", "exact,path+oidn", "--out", str(tmp_path / "quality"))
     assert run(["bench", "quality", *options]) == 2
     (line,) = capsys.readouterr().err.strip().splitlines()

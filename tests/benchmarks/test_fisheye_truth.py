@@ -6,19 +6,19 @@ import numpy as np
 import pytest
 from rich.progress import Progress
 
-from benchmarks.ground_truth.scenes import scene_named
-from benchmarks.ground_truth.truth import Truth, ensure_truth
-from benchmarks.quality.case import SceneCase
-from benchmarks.quality.metrics import Comparison
-from benchmarks.variants import FIXED, parse_variants
-from protocol.frames import ViewFrame
-from protocol.scene_lights import Lights
-from protocol.scene_lights import SphereLight as GivenSphere
-from render_server.gpu.context import create_context
-from render_server.lights.environment import LUMINANCE
-from render_server.lights.lights import IncidentLight, LightSet, SphereLight, incident_light
-from render_server.lights.sources import FisheyeSource
-from render_server.renderer import SceneRenderer
+from deltalight.benchmarks.ground_truth.scenes import scene_named
+from deltalight.benchmarks.ground_truth.truth import Truth, ensure_truth
+from deltalight.benchmarks.quality.case import SceneCase
+from deltalight.benchmarks.quality.metrics import Comparison
+from deltalight.benchmarks.variants import FIXED, parse_variants
+from deltalight.protocol.frames import ViewFrame
+from deltalight.protocol.scene_lights import Lights
+from deltalight.protocol.scene_lights import SphereLight as GivenSphere
+from deltalight.render_server.gpu.context import create_context
+from deltalight.render_server.lights.environment import LUMINANCE
+from deltalight.render_server.lights.lights import IncidentLight, LightSet, SphereLight, incident_light
+from deltalight.render_server.lights.sources import FisheyeSource
+from deltalight.render_server.renderer import SceneRenderer
 
 if importlib.util.find_spec("mitsuba") is None:
     pytest.skip("Mitsuba is not installed (dev extra)", allow_module_level=True)

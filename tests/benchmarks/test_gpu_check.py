@@ -15,16 +15,16 @@ import cv2
 import numpy as np
 import pytest
 
-from benchmarks.gpu_check import beside_tests, packages
-from benchmarks.gpu_check.beside_tests import ComparedPicture
-from benchmarks.gpu_check.check import check_gpu
-from benchmarks.gpu_check.child import take_step
-from benchmarks.gpu_check.plan import BUDGETS_S, MACHINE, STEPS, Step, choose_steps
-from benchmarks.gpu_check.record import Findings, Record, State
-from benchmarks.gpu_check.report import Report
-from protocol.errors import DeltalightError
-from render_server.gpu.context import GpuContext
-from services.cli import run
+from deltalight.benchmarks.gpu_check import beside_tests, packages
+from deltalight.benchmarks.gpu_check.beside_tests import ComparedPicture
+from deltalight.benchmarks.gpu_check.check import check_gpu
+from deltalight.benchmarks.gpu_check.child import take_step
+from deltalight.benchmarks.gpu_check.plan import BUDGETS_S, MACHINE, STEPS, Step, choose_steps
+from deltalight.benchmarks.gpu_check.record import Findings, Record, State
+from deltalight.benchmarks.gpu_check.report import Report
+from deltalight.protocol.errors import DeltalightError
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.services.cli import run
 from tests.render_server import protected_scenes, shader_variants
 from tests.render_server.protected_scenes import Case
 
@@ -143,7 +143,7 @@ def test_a_step_that_crashes_hangs_or_fails_ends_itself_alone(tmp_path: Path) ->
 def test_a_step_that_hangs_runs_out_of_time_and_the_next_begins(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("benchmarks.gpu_check.check.MACHINE", sample("fine", 1))
+    monkeypatch.setattr("deltalight.benchmarks.gpu_check.check.MACHINE", sample("fine", 1))
     report = check_gpu(tmp_path, [sample("hang", 12), sample("left_out")], [], lambda _: None)
     hung = report.records["hang"]
     assert hung.state is State.OUT_OF_TIME
@@ -156,7 +156,14 @@ def test_a_step_that_hangs_runs_out_of_time_and_the_next_begins(
 
 @pytest.mark.slow
 def test_the_command_takes_chosen_steps_in_software(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "services.cli", "gpu-check", "--steps", "doctor,shaders,quality"]
+    command = [
+        sys.executable,
+        "-m",
+        "deltalight.services.cli",
+        "gpu-check",
+        "--steps",
+        "doctor,shaders,quality",
+    ]
     done = subprocess.run(
         [*command, "--out", str(tmp_path)], cwd=ROOT, capture_output=True, text=True, timeout=280, check=False
     )
@@ -173,7 +180,7 @@ def test_the_command_takes_chosen_steps_in_software(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("one_picture")
 def test_a_picture_like_its_golden_passes(tmp_path: Path) -> None:
     step = findings(tmp_path)
-    take_step("benchmarks.gpu_check.steps:pictures", step)
+    take_step("deltalight.benchmarks.gpu_check.steps:pictures", step)
     assert (step.record.state, step.record.sentence) == (
         State.PASSED,
         "1 of 1 pictures agree with their goldens",
@@ -189,7 +196,7 @@ def test_a_changed_golden_fails_with_a_picture(tmp_path: Path, own_goldens: Path
         str(own_goldens / "protected_paper.png"), np.clip(sheet.astype(int) + 3, 0, 255).astype(np.uint8)
     )
     step = findings(tmp_path)
-    take_step("benchmarks.gpu_check.steps:pictures", step)
+    take_step("deltalight.benchmarks.gpu_check.steps:pictures", step)
     assert step.record.state is State.FAILED
     assert step.record.faults[0].startswith("paper-model-plain: 3")
     assert step.record.faults[0].endswith(" dB, at least 60 are asked for")
@@ -203,7 +210,7 @@ def test_one_picture_that_cannot_be_rendered_leaves_the_others(
 ) -> None:
     monkeypatch.setattr(protected_scenes, "cases", lambda: iter([Case("paper", "model", "no kind"), CASE]))
     step = findings(tmp_path)
-    take_step("benchmarks.gpu_check.steps:pictures", step)
+    take_step("deltalight.benchmarks.gpu_check.steps:pictures", step)
     assert step.record.faults == ["paper-model-no kind: KeyError, 'no kind'"]
     assert step.record.sentence == "1 of 2 pictures agree with their goldens"
 
@@ -220,7 +227,7 @@ def test_a_shader_that_the_driver_refuses_is_named(tmp_path: Path, monkeypatch: 
 
     monkeypatch.setattr(shader_variants, "PARTS", {"first": refused, "second": taken})
     step = findings(tmp_path)
-    take_step("benchmarks.gpu_check.steps:shaders", step)
+    take_step("deltalight.benchmarks.gpu_check.steps:shaders", step)
     assert step.record.state is State.FAILED
     assert step.record.faults[0].startswith("first, odd ODD=1: Error, GLSL Compiler failed")
     assert step.record.figures["variants"] == ["even", "odd ODD=1"]
@@ -229,7 +236,7 @@ def test_a_shader_that_the_driver_refuses_is_named(tmp_path: Path, monkeypatch: 
 @pytest.mark.usefixtures("one_picture", "own_goldens")
 def test_a_missing_golden_fails(tmp_path: Path) -> None:
     step = findings(tmp_path)
-    take_step("benchmarks.gpu_check.steps:pictures", step)
+    take_step("deltalight.benchmarks.gpu_check.steps:pictures", step)
     assert step.record.faults == ["paper-model-plain: its golden is missing"]
     assert json.loads((tmp_path / "record.json").read_text())["state"] == "failed"
 
@@ -240,15 +247,15 @@ def test_an_installed_package_has_no_tests(
 ) -> None:
     monkeypatch.setattr(beside_tests, "TESTS", tmp_path / "nowhere")
     step = findings(tmp_path)
-    take_step(f"benchmarks.gpu_check.steps:{name}", step)
+    take_step(f"deltalight.benchmarks.gpu_check.steps:{name}", step)
     assert step.record.state is State.SKIPPED
     assert step.record.sentence.startswith("the project's tests are not here")
 
 
 def test_without_pytest_the_tests_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("benchmarks.gpu_check.steps.find_spec", lambda _: None)
+    monkeypatch.setattr("deltalight.benchmarks.gpu_check.steps.find_spec", lambda _: None)
     step = findings(tmp_path)
-    take_step("benchmarks.gpu_check.steps:tests", step)
+    take_step("deltalight.benchmarks.gpu_check.steps:tests", step)
     assert (step.record.state, step.record.sentence) == (State.SKIPPED, "pytest is not installed")
 
 
@@ -266,8 +273,8 @@ def test_tests_are_counted_and_what_fails_is_named(tmp_path: Path) -> None:
     (tmp_path / "some" / "test_other.py").write_text("import no_such_package")
     (tmp_path / "some" / "test_some.py").write_text("\n".join(["import pytest", *lines]))
     code = (
-        "import sys; from pathlib import Path; from benchmarks.gpu_check.gpu_tests import run_tests;"
-        "from benchmarks.gpu_check.record import Findings; here = Path(sys.argv[1]);"
+        "import sys; from pathlib import Path; from deltalight.benchmarks.gpu_check.gpu_tests import run_tests;"
+        "from deltalight.benchmarks.gpu_check.record import Findings; here = Path(sys.argv[1]);"
         "print('said:', run_tests(Findings(here / 'record.json', here, here), 'not slow', here / 'some'))"
     )
     done = subprocess.run(
@@ -288,11 +295,11 @@ def test_tests_are_counted_and_what_fails_is_named(tmp_path: Path) -> None:
 
 def test_leaks_are_counted_by_kind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     counts = iter([{"Buffer": 3, "Texture": 5}, {"Buffer": 3, "Texture": 5}, {"Buffer": 3, "Texture": 7}])
-    monkeypatch.setattr("benchmarks.gpu_check.steps.METHODS", ("paper",))
-    monkeypatch.setattr("benchmarks.gpu_check.gl_objects.count_gl_objects", lambda: next(counts))
-    monkeypatch.setattr("benchmarks.gpu_check.steps._rendered", Mock())
+    monkeypatch.setattr("deltalight.benchmarks.gpu_check.steps.METHODS", ("paper",))
+    monkeypatch.setattr("deltalight.benchmarks.gpu_check.gl_objects.count_gl_objects", lambda: next(counts))
+    monkeypatch.setattr("deltalight.benchmarks.gpu_check.steps._rendered", Mock())
     step = findings(tmp_path)
-    take_step("benchmarks.gpu_check.steps:leaks", step)
+    take_step("deltalight.benchmarks.gpu_check.steps:leaks", step)
     assert step.record.faults == ["paper: +2 Texture after 2 more renderers"]
 
 
@@ -300,11 +307,11 @@ def test_leaks_are_counted_by_kind(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 def test_a_method_leaves_no_objects_and_says_what_it_holds(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("benchmarks.gpu_check.steps.METHODS", ("paper",))
+    monkeypatch.setattr("deltalight.benchmarks.gpu_check.steps.METHODS", ("paper",))
     step = findings(tmp_path)
-    take_step("benchmarks.gpu_check.steps:leaks", step)
+    take_step("deltalight.benchmarks.gpu_check.steps:leaks", step)
     assert step.record.state is State.PASSED, step.record
-    take_step("benchmarks.gpu_check.steps:memory", step)
+    take_step("deltalight.benchmarks.gpu_check.steps:memory", step)
     assert step.record.state is State.PASSED, step.record
     assert step.record.figures["held"]["paper"]["gl_objects"] > 50
     assert step.record.figures["held"]["paper"]["total_bytes"] > 1_000_000
@@ -312,11 +319,11 @@ def test_a_method_leaves_no_objects_and_says_what_it_holds(
 
 @pytest.mark.slow
 def test_speed_is_told_by_frames_and_stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("benchmarks.gpu_check.steps.METHODS", ("paper",))
-    monkeypatch.setattr("benchmarks.gpu_check.steps.SIZES", {"small": ((64, 48), 32)})
-    monkeypatch.setattr("benchmarks.gpu_check.steps.SPEED_FRAMES", 2)
+    monkeypatch.setattr("deltalight.benchmarks.gpu_check.steps.METHODS", ("paper",))
+    monkeypatch.setattr("deltalight.benchmarks.gpu_check.steps.SIZES", {"small": ((64, 48), 32)})
+    monkeypatch.setattr("deltalight.benchmarks.gpu_check.steps.SPEED_FRAMES", 2)
     step = findings(tmp_path)
-    take_step("benchmarks.gpu_check.steps:speed", step)
+    take_step("deltalight.benchmarks.gpu_check.steps:speed", step)
     assert step.record.state is State.PASSED, step.record
     assert step.record.figures["timed"]["small"]["paper"]["frames_ms"]["camera"] > 0
     report = Report(tmp_path, {}, [])
@@ -357,5 +364,5 @@ def test_run_takes_a_python_that_has_the_packages(tmp_path: Path) -> None:
         assert done.returncode == 0, done.stderr
         return done.stdout
 
-    assert said("gpu-check", "--out", "x") == f"{tmp_path}: -m services.cli gpu-check --out x\n"
-    assert said("doctor", DELTALIGHT_PYTHON=str(python)) == f"{tmp_path}: -m services.cli doctor\n"
+    assert said("gpu-check", "--out", "x") == f"{tmp_path}: -m deltalight.services.cli gpu-check --out x\n"
+    assert said("doctor", DELTALIGHT_PYTHON=str(python)) == f"{tmp_path}: -m deltalight.services.cli doctor\n"

@@ -5,17 +5,17 @@ import pytest
 from scipy.special import ndtri
 from scipy.stats import norm
 
-from benchmarks.ground_truth.benchmark_scene import ShadowEdge
-from benchmarks.ground_truth.parts import looking
-from benchmarks.quality.energy import energy_ratios
-from benchmarks.quality.error_view import error_view
-from benchmarks.quality.figures import mean_figures
-from benchmarks.quality.metrics import Comparison
-from benchmarks.quality.penumbra import EdgeOnPicture, step_width
-from benchmarks.quality.regions import Regions, find_regions
-from benchmarks.quality.temporal import temporal_deviation
-from protocol.camera_model import CameraModel
-from protocol.frames import decode_lut
+from deltalight.benchmarks.ground_truth.benchmark_scene import ShadowEdge
+from deltalight.benchmarks.ground_truth.parts import looking
+from deltalight.benchmarks.quality.energy import energy_ratios
+from deltalight.benchmarks.quality.error_view import error_view
+from deltalight.benchmarks.quality.figures import mean_figures
+from deltalight.benchmarks.quality.metrics import Comparison
+from deltalight.benchmarks.quality.penumbra import EdgeOnPicture, step_width
+from deltalight.benchmarks.quality.regions import Regions, find_regions
+from deltalight.benchmarks.quality.temporal import temporal_deviation
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.frames import decode_lut
 
 SIZE = (24, 32)
 

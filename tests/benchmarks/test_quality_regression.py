@@ -9,9 +9,9 @@ import importlib.util
 import pytest
 from rich.progress import Progress
 
-from benchmarks.ground_truth.scenes import scene_named
-from benchmarks.quality.evaluate import QualityJob, QualityResult, measure_quality
-from benchmarks.variants import parse_variants
+from deltalight.benchmarks.ground_truth.scenes import scene_named
+from deltalight.benchmarks.quality.evaluate import QualityJob, QualityResult, measure_quality
+from deltalight.benchmarks.variants import parse_variants
 
 if importlib.util.find_spec("mitsuba") is None:
     pytest.skip("Mitsuba is not installed (dev extra)", allow_module_level=True)

@@ -7,13 +7,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.ground_truth.scenes import SCENES
-from benchmarks.quality import report
-from benchmarks.quality.evaluate import CEILING, QualityJob, QualityResult, SceneResult, VariantResult
-from benchmarks.quality.report import require_replaceable, write_report
-from benchmarks.quality.tables import COLUMNS
-from benchmarks.variants import parse_variants
-from protocol.errors import DeltalightError
+from deltalight.benchmarks.ground_truth.scenes import SCENES
+from deltalight.benchmarks.quality import report
+from deltalight.benchmarks.quality.evaluate import (
+    CEILING,
+    QualityJob,
+    QualityResult,
+    SceneResult,
+    VariantResult,
+)
+from deltalight.benchmarks.quality.report import require_replaceable, write_report
+from deltalight.benchmarks.quality.tables import COLUMNS
+from deltalight.benchmarks.variants import parse_variants
+from deltalight.protocol.errors import DeltalightError
 
 
 def result(psnr_db: float = 31.25) -> QualityResult:

@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.ground_truth import fisheye, scene_demo
-from benchmarks.ground_truth.assembly import environment_light, material
-from benchmarks.ground_truth.benchmark_scene import Finish
-from benchmarks.ground_truth.lamps import Ambient
-from benchmarks.ground_truth.parts import looking, placed, rectangle, rgb, shape, turned, two_sided
-from benchmarks.ground_truth.render import RoomRenderer, choose_variant, passes
-from protocol.camera_model import CameraModel
-from protocol.errors import DeltalightError
-from render_server.lights.environment import EnvironmentMap, map_directions
+from deltalight.benchmarks.ground_truth import fisheye, scene_demo
+from deltalight.benchmarks.ground_truth.assembly import environment_light, material
+from deltalight.benchmarks.ground_truth.benchmark_scene import Finish
+from deltalight.benchmarks.ground_truth.lamps import Ambient
+from deltalight.benchmarks.ground_truth.parts import looking, placed, rectangle, rgb, shape, turned, two_sided
+from deltalight.benchmarks.ground_truth.render import RoomRenderer, choose_variant, passes
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.errors import DeltalightError
+from deltalight.render_server.lights.environment import EnvironmentMap, map_directions
 
 if importlib.util.find_spec("mitsuba") is None:
     pytest.skip("Mitsuba is not installed (dev extra)", allow_module_level=True)

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.rest import VIEWERS, dashboard_sizes, measure_rest, print_report
-from services.cli import run
-from services.demo import RECORDING, SCENE
+from deltalight.benchmarks.rest import VIEWERS, dashboard_sizes, measure_rest, print_report
+from deltalight.services.cli import run
+from deltalight.services.demo import RECORDING, SCENE
 
 
 def test_the_page_counts_as_it_is_sent(tmp_path: Path) -> None:

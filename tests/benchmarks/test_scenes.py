@@ -9,22 +9,22 @@ import numpy as np
 import pytest
 import trimesh
 
-from benchmarks.ground_truth import meshes
-from benchmarks.ground_truth.benchmark_scene import BenchmarkScene
-from benchmarks.ground_truth.document import scene_document
-from benchmarks.ground_truth.lamps import Ambient, Lamp, Panel, SphereLamp, Spot
-from benchmarks.ground_truth.parts import diffuse, looking, placed, rgb, shape
-from benchmarks.ground_truth.scenes import SCENES, scene_named
-from protocol.camera_model import CameraModel
-from protocol.errors import DeltalightError
-from protocol.scene import parse_scene
-from render_server.lights.environment import map_directions, pixel_solid_angles
+from deltalight.benchmarks.ground_truth import meshes
+from deltalight.benchmarks.ground_truth.benchmark_scene import BenchmarkScene
+from deltalight.benchmarks.ground_truth.document import scene_document
+from deltalight.benchmarks.ground_truth.lamps import Ambient, Lamp, Panel, SphereLamp, Spot
+from deltalight.benchmarks.ground_truth.parts import diffuse, looking, placed, rgb, shape
+from deltalight.benchmarks.ground_truth.scenes import SCENES, scene_named
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.scene import parse_scene
+from deltalight.render_server.lights.environment import map_directions, pixel_solid_angles
 
 if importlib.util.find_spec("mitsuba") is None:
     pytest.skip("Mitsuba is not installed (dev extra)", allow_module_level=True)
 
-from benchmarks.ground_truth.assembly import Assembly, environment_light
-from benchmarks.ground_truth.render import RoomRenderer, choose_variant
+from deltalight.benchmarks.ground_truth.assembly import Assembly, environment_light
+from deltalight.benchmarks.ground_truth.render import RoomRenderer, choose_variant
 
 each_scene = pytest.mark.parametrize("scene", SCENES, ids=lambda scene: scene.name)
 PATCH_CAMERA = CameraModel(

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from rich.progress import Progress
 
-from benchmarks.cli import DEFAULT_MOTIONS, TIMED_METHODS
-from benchmarks.speed.counts import count_motion
-from benchmarks.speed.measure import WARM_UP_FRAMES, FrameTimes, motion_figures, time_step
-from benchmarks.speed.motions import (
+from deltalight.benchmarks.cli import DEFAULT_MOTIONS, TIMED_METHODS
+from deltalight.benchmarks.speed.counts import count_motion
+from deltalight.benchmarks.speed.measure import WARM_UP_FRAMES, FrameTimes, motion_figures, time_step
+from deltalight.benchmarks.speed.motions import (
     ARM_STEPS,
     DRAG_STEPS,
     LAMP_SHARES,
@@ -24,18 +24,18 @@ from benchmarks.speed.motions import (
     parse_motions,
     steps_of,
 )
-from benchmarks.speed.peaks import measure_peaks, stage_bytes
-from benchmarks.speed.report import MotionFigures, Peaks, read_report
-from benchmarks.variants import FIXED, RENDERED, parse_variants
-from protocol.errors import DeltalightError
-from protocol.scene import SceneDocument
-from protocol.source import open_source
-from render_server.gpu.context import GpuContext, create_context
-from render_server.renderer import SceneRenderer
-from render_server.view import resized_frame
-from sensor_node.view_frames import ViewFrameBuilder
-from services.cli import run
-from services.demo import RECORDING, demo_scene
+from deltalight.benchmarks.speed.peaks import measure_peaks, stage_bytes
+from deltalight.benchmarks.speed.report import MotionFigures, Peaks, read_report
+from deltalight.benchmarks.variants import FIXED, RENDERED, parse_variants
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.scene import SceneDocument
+from deltalight.protocol.source import open_source
+from deltalight.render_server.gpu.context import GpuContext, create_context
+from deltalight.render_server.renderer import SceneRenderer
+from deltalight.render_server.view import resized_frame
+from deltalight.sensor_node.view_frames import ViewFrameBuilder
+from deltalight.services.cli import run
+from deltalight.services.demo import RECORDING, demo_scene
 
 pytestmark = pytest.mark.skipif(
     not RECORDING.is_file(), reason="the demo's recording is not in this checkout"
@@ -211,8 +211,8 @@ def test_figures_are_of_the_frames_in_which_a_stage_ran() -> None:
 
 
 def test_peaks_are_measured(gpu: GpuContext, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("benchmarks.speed.peaks.COPIED_BYTES", 1 << 20)
-    monkeypatch.setattr("benchmarks.speed.peaks.SOFTWARE_THREADS", 256)
+    monkeypatch.setattr("deltalight.benchmarks.speed.peaks.COPIED_BYTES", 1 << 20)
+    monkeypatch.setattr("deltalight.benchmarks.speed.peaks.SOFTWARE_THREADS", 256)
     found = measure_peaks(gpu)
     assert min(found.bytes_per_s, found.flops_per_s) > 0
     assert gpu.ctx.error == "GL_NO_ERROR"
@@ -251,10 +251,10 @@ def prepared(monkeypatch: pytest.MonkeyPatch, take: Take, scene: SceneDocument) 
     def small(_: Progress) -> Take:
         return take
 
-    monkeypatch.setattr("benchmarks.speed.measure.prepare_take", small)
-    monkeypatch.setattr("benchmarks.speed.counts.prepare_take", small)
-    monkeypatch.setattr("benchmarks.speed.measure.measure_peaks", lambda _: PEAKS)
-    monkeypatch.setattr("benchmarks.speed.measure.demo_scene", lambda _: scene)
+    monkeypatch.setattr("deltalight.benchmarks.speed.measure.prepare_take", small)
+    monkeypatch.setattr("deltalight.benchmarks.speed.counts.prepare_take", small)
+    monkeypatch.setattr("deltalight.benchmarks.speed.measure.measure_peaks", lambda _: PEAKS)
+    monkeypatch.setattr("deltalight.benchmarks.speed.measure.demo_scene", lambda _: scene)
 
 
 @pytest.mark.usefixtures("prepared")
@@ -285,7 +285,7 @@ def test_a_run_that_is_stopped_loses_nothing_and_has_told_what_it_did(
             raise KeyboardInterrupt
         return time_step(renderer, step)
 
-    monkeypatch.setattr("benchmarks.speed.measure.time_step", until_ctrl_c)
+    monkeypatch.setattr("deltalight.benchmarks.speed.measure.time_step", until_ctrl_c)
     report = tmp_path / "speed.json"
     assert run(["bench", "speed", *OPTIONS, "--out", str(report)]) == 130
     out, err = capsys.readouterr()

@@ -8,10 +8,17 @@ from xml.etree import ElementTree
 
 import pytest
 
-from benchmarks.plot import BOTTOM, LEFT, RIGHT, TOP, place_labels
-from benchmarks.speed.compare import Row, compare_reports
-from benchmarks.speed.report import MethodFigures, MotionFigures, Peaks, SpeedReport, Spread, StageFigures
-from services.cli import run
+from deltalight.benchmarks.plot import BOTTOM, LEFT, RIGHT, TOP, place_labels
+from deltalight.benchmarks.speed.compare import Row, compare_reports
+from deltalight.benchmarks.speed.report import (
+    MethodFigures,
+    MotionFigures,
+    Peaks,
+    SpeedReport,
+    Spread,
+    StageFigures,
+)
+from deltalight.services.cli import run
 
 
 def motion(frame_ms: float, **stages_ms: float) -> MotionFigures:

@@ -7,10 +7,10 @@ import moderngl
 import numpy as np
 import pytest
 
-from benchmarks.speed.instruments import GpuCounts, ReadBacks, counted
-from render_server.gpu.context import GpuContext, create_context
-from render_server.gpu.kernel import Kernel
-from render_server.gpu.textures import AsyncReadback, texture_2d
+from deltalight.benchmarks.speed.instruments import GpuCounts, ReadBacks, counted
+from deltalight.render_server.gpu.context import GpuContext, create_context
+from deltalight.render_server.gpu.kernel import Kernel
+from deltalight.render_server.gpu.textures import AsyncReadback, texture_2d
 
 FILL = """layout(local_size_x = 1) in;
 layout(std430) writeonly buffer Out { float values[]; };

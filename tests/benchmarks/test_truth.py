@@ -10,26 +10,32 @@ import pytest
 import trimesh
 from rich.progress import Progress
 
-from benchmarks.ground_truth import fisheye
-from benchmarks.ground_truth.assembly import Assembly
-from benchmarks.ground_truth.benchmark_scene import BOARD, CAMERA, BenchmarkScene, Finish, VirtualObject
-from benchmarks.ground_truth.lamps import Ambient, SphereLamp
-from benchmarks.ground_truth.parts import MeshFolder, box, looking, placed, rectangle, sheet
-from benchmarks.ground_truth.point_lamps import point_lamps, with_point_lamps
-from benchmarks.ground_truth.render import RoomRenderer, choose_variant
-from benchmarks.ground_truth.scenes import scene_named
-from benchmarks.ground_truth.truth import Truth, default_cache, ensure_truth
-from benchmarks.ground_truth.truth_pictures import world_from_fisheye
-from protocol.camera_model import load_camera_yaml
-from protocol.dataset import open_dataset
-from protocol.equidistant_lens import EquidistantLens
-from protocol.errors import DeltalightError
-from protocol.fisheye_lens import FisheyeCalibration
-from protocol.frames import FisheyePictures
-from protocol.hemisphere import texel_solid_angles
-from protocol.pictures import decode_rgb
-from protocol.source import open_source
-from sensor_node.fisheye import radiance_map
+from deltalight.benchmarks.ground_truth import fisheye
+from deltalight.benchmarks.ground_truth.assembly import Assembly
+from deltalight.benchmarks.ground_truth.benchmark_scene import (
+    BOARD,
+    CAMERA,
+    BenchmarkScene,
+    Finish,
+    VirtualObject,
+)
+from deltalight.benchmarks.ground_truth.lamps import Ambient, SphereLamp
+from deltalight.benchmarks.ground_truth.parts import MeshFolder, box, looking, placed, rectangle, sheet
+from deltalight.benchmarks.ground_truth.point_lamps import point_lamps, with_point_lamps
+from deltalight.benchmarks.ground_truth.render import RoomRenderer, choose_variant
+from deltalight.benchmarks.ground_truth.scenes import scene_named
+from deltalight.benchmarks.ground_truth.truth import Truth, default_cache, ensure_truth
+from deltalight.benchmarks.ground_truth.truth_pictures import world_from_fisheye
+from deltalight.protocol.camera_model import load_camera_yaml
+from deltalight.protocol.dataset import open_dataset
+from deltalight.protocol.equidistant_lens import EquidistantLens
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.fisheye_lens import FisheyeCalibration
+from deltalight.protocol.frames import FisheyePictures
+from deltalight.protocol.hemisphere import texel_solid_angles
+from deltalight.protocol.pictures import decode_rgb
+from deltalight.protocol.source import open_source
+from deltalight.sensor_node.fisheye import radiance_map
 
 if importlib.util.find_spec("mitsuba") is None:
     pytest.skip("Mitsuba is not installed (dev extra)", allow_module_level=True)
@@ -109,7 +115,7 @@ def test_another_scene_has_another_folder(
 ) -> None:
     names: list[str] = []
     monkeypatch.setattr(
-        "benchmarks.ground_truth.truth._render", lambda truth, *_: names.append(truth.folder.name)
+        "deltalight.benchmarks.ground_truth.truth._render", lambda truth, *_: names.append(truth.folder.name)
     )
     make(replace(SCENE, **change), tmp_path)
     make(SCENE, tmp_path)

@@ -4,13 +4,13 @@ from itertools import pairwise
 
 import pytest
 
-from benchmarks.cli import DEFAULT_METHODS
-from benchmarks.quality.ablation import ABLATION_STEPS, ablation_chain
-from benchmarks.variants import RENDERED, parse_variants
-from protocol.errors import DeltalightError
-from protocol.scene import parse_scene
-from protocol.scene_method import DvctMethod, NoneMethod
-from render_server.methods.registry import choose_method
+from deltalight.benchmarks.cli import DEFAULT_METHODS
+from deltalight.benchmarks.quality.ablation import ABLATION_STEPS, ablation_chain
+from deltalight.benchmarks.variants import RENDERED, parse_variants
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.scene import parse_scene
+from deltalight.protocol.scene_method import DvctMethod, NoneMethod
+from deltalight.render_server.methods.registry import choose_method
 
 SCENE = parse_scene({"method": {"name": "dvct", "volume_edge_m": 0.7}})
 

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import walking_figure
-from protocol.scene import load_scene
-from render_server.scene.gltf_meshes import GltfAsset, load_gltf
+from deltalight.benchmarks import walking_figure
+from deltalight.protocol.scene import load_scene
+from deltalight.render_server.scene.gltf_meshes import GltfAsset, load_gltf
 
 ASSETS = Path(__file__).parents[2] / "services" / "demo_assets"
 MAX_BYTES = 200_000

@@ -15,7 +15,7 @@ import pytest
 import yaml
 from prometheus_client.parser import text_string_to_metric_families
 
-from services import ports
+from deltalight.services import ports
 
 ROOT = Path(__file__).parents[2]
 DEPLOY = ROOT / "deploy"
@@ -89,7 +89,7 @@ def test_the_nvidia_command_is_the_other_one_without_software() -> None:
 
 @contextmanager
 def running(words: list[str]) -> Iterator[None]:
-    child = subprocess.Popen([sys.executable, "-m", "services.cli", *words], cwd=ROOT)
+    child = subprocess.Popen([sys.executable, "-m", "deltalight.services.cli", *words], cwd=ROOT)
     try:
         yield
     finally:
@@ -103,7 +103,10 @@ def running(words: list[str]) -> Iterator[None]:
 
 def healthy(words: list[str]) -> bool:
     return (
-        subprocess.run([sys.executable, "-m", "services.cli", *words], cwd=ROOT, check=False).returncode == 0
+        subprocess.run(
+            [sys.executable, "-m", "deltalight.services.cli", *words], cwd=ROOT, check=False
+        ).returncode
+        == 0
     )
 
 

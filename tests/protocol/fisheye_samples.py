@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from protocol.camera_model import CameraModel
-from protocol.equidistant_lens import EquidistantLens
-from protocol.fisheye_lens import FisheyeCalibration
-from protocol.frames import FisheyePictures, SensorFrame
-from protocol.ocam_lens import OcamLens
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.equidistant_lens import EquidistantLens
+from deltalight.protocol.fisheye_lens import FisheyeCalibration
+from deltalight.protocol.frames import FisheyePictures, SensorFrame
+from deltalight.protocol.ocam_lens import OcamLens
 
 WIDTH, HEIGHT = 40, 36
 BRACKET_S = (0.1, 1 / 3, 0.0125)

@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from protocol.board import BoardSpec, CustomDictionary, load_board_yaml, save_board_yaml
-from protocol.errors import DeltalightError
+from deltalight.protocol.board import BoardSpec, CustomDictionary, load_board_yaml, save_board_yaml
+from deltalight.protocol.errors import DeltalightError
 
 PIXELS_PER_M = 4000
 

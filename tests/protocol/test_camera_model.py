@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from protocol.camera_model import CameraModel, load_camera_yaml, save_camera_yaml
-from protocol.errors import DeltalightError
+from deltalight.protocol.camera_model import CameraModel, load_camera_yaml, save_camera_yaml
+from deltalight.protocol.errors import DeltalightError
 
 
 def camera(model: str = "plumb_bob", coefficients: tuple[float, ...] = ()) -> CameraModel:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protocol.clock import (
+from deltalight.protocol.clock import (
     ClockEstimator,
     ClockSample,
     clock_exchange,
@@ -15,9 +15,9 @@ from protocol.clock import (
     measure_offset,
     sample_from_stamps,
 )
-from protocol.errors import DeltalightError
-from protocol.messages import ControlRequest
-from protocol.request import ReplyServer, RequestClient
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.messages import ControlRequest
+from deltalight.protocol.request import ReplyServer, RequestClient
 
 MS = 1_000_000
 SECOND = 1_000_000_000

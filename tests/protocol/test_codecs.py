@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from protocol.codecs import (
+from deltalight.protocol.codecs import (
     DEFAULT_DEPTH_SCALE_M,
     decode_array,
     decode_color,
@@ -24,7 +24,7 @@ from protocol.codecs import (
     encode_depth,
     jpeg_size,
 )
-from protocol.envelope import EnvelopeError
+from deltalight.protocol.envelope import EnvelopeError
 
 pictures = hnp.arrays(np.uint8, st.tuples(st.integers(1, 24), st.integers(1, 24), st.just(3)))
 

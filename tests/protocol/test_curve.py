@@ -12,12 +12,12 @@ from typing import Any
 import pytest
 import structlog
 
-from protocol.errors import DeltalightError
-from protocol.keys import Keys, create_keys, load_keys, trust
-from protocol.messages import ControlRequest
-from protocol.publisher import Publisher
-from protocol.receiver import Receiver
-from protocol.request import ReplyServer, RequestClient
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.keys import Keys, create_keys, load_keys, trust
+from deltalight.protocol.messages import ControlRequest
+from deltalight.protocol.publisher import Publisher
+from deltalight.protocol.receiver import Receiver
+from deltalight.protocol.request import ReplyServer, RequestClient
 
 ANY = "tcp://127.0.0.1:0"
 SETTLE_S = 5.0

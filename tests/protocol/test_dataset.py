@@ -7,15 +7,15 @@ import cv2
 import numpy as np
 import pytest
 
-from protocol.board import BoardSpec
-from protocol.calibration import Extrinsics
-from protocol.camera_model import CameraModel, save_camera_yaml
-from protocol.dataset import open_dataset
-from protocol.dataset_writer import DatasetWriter
-from protocol.errors import DeltalightError
-from protocol.frames import SensorFrame
-from protocol.pictures import depth_from_steps
-from protocol.source import open_source
+from deltalight.protocol.board import BoardSpec
+from deltalight.protocol.calibration import Extrinsics
+from deltalight.protocol.camera_model import CameraModel, save_camera_yaml
+from deltalight.protocol.dataset import open_dataset
+from deltalight.protocol.dataset_writer import DatasetWriter
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import SensorFrame
+from deltalight.protocol.pictures import depth_from_steps
+from deltalight.protocol.source import open_source
 
 WIDTH, HEIGHT = 32, 24
 

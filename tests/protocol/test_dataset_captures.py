@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from protocol.camera_model import CameraModel, save_camera_yaml
-from protocol.dataset import DatasetReader, open_dataset
-from protocol.errors import DeltalightError
-from protocol.source import open_source
+from deltalight.protocol.camera_model import CameraModel, save_camera_yaml
+from deltalight.protocol.dataset import DatasetReader, open_dataset
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.source import open_source
 
 
 def link_lists(folder: Path, colors: list[Path], depths: list[Path]) -> None:

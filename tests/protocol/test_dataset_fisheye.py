@@ -8,13 +8,13 @@ import cv2
 import numpy as np
 import pytest
 
-from protocol.camera_model import CameraModel
-from protocol.dataset import DatasetReader, open_dataset
-from protocol.dataset_writer import DatasetWriter
-from protocol.errors import DeltalightError
-from protocol.fisheye_lens import save_fisheye_yaml
-from protocol.frames import FisheyePictures, SensorFrame
-from protocol.radiance_files import write_exr
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.dataset import DatasetReader, open_dataset
+from deltalight.protocol.dataset_writer import DatasetWriter
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.fisheye_lens import save_fisheye_yaml
+from deltalight.protocol.frames import FisheyePictures, SensorFrame
+from deltalight.protocol.radiance_files import write_exr
 from tests.protocol.fisheye_samples import (
     HEIGHT,
     WIDTH,

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from pydantic import ValidationError
 
-from protocol.envelope import EnvelopeError, decode, encode, pack_header, unpack_header
-from protocol.errors import DeltalightError
-from protocol.messages import (
+from deltalight.protocol.envelope import EnvelopeError, decode, encode, pack_header, unpack_header
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.messages import (
     MAX_HEADER_BYTES,
     MESSAGE_TYPES,
     SCHEMA_VERSION,
@@ -29,7 +29,7 @@ from protocol.messages import (
     PoseMessage,
     StatsMessage,
 )
-from protocol.vectors import FOLDER, unframe_pieces
+from deltalight.protocol.vectors import FOLDER, unframe_pieces
 
 CAMERA: dict[str, object] = {"width": 4, "height": 2, "distortion": [0.1, 0.0]}
 IDENTITY = np.eye(4).tolist()

@@ -8,16 +8,16 @@ import pytest
 import yaml
 from jaxtyping import Float64
 
-from protocol.camera_model import CameraModel
-from protocol.equidistant_lens import EquidistantLens
-from protocol.errors import DeltalightError
-from protocol.fisheye_lens import (
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.equidistant_lens import EquidistantLens
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.fisheye_lens import (
     FisheyeCalibration,
     FisheyeLens,
     load_fisheye_yaml,
     save_fisheye_yaml,
 )
-from protocol.ocam_lens import OcamLens, load_ocam_results
+from deltalight.protocol.ocam_lens import OcamLens, load_ocam_results
 
 
 def equidistant(

@@ -3,7 +3,12 @@
 import numpy as np
 import pytest
 
-from protocol.hemisphere import hemisphere_direction, hemisphere_uv, texel_directions, texel_solid_angles
+from deltalight.protocol.hemisphere import (
+    hemisphere_direction,
+    hemisphere_uv,
+    texel_directions,
+    texel_solid_angles,
+)
 
 
 def test_the_axis_is_the_centre_and_the_horizon_the_border() -> None:

@@ -5,9 +5,17 @@ from pathlib import Path
 
 import pytest
 
-from protocol.endpoints import parse_endpoint
-from protocol.errors import DeltalightError
-from protocol.keys import KeySettings, create_keys, key_folder, load_keys, own_keys, trust, trusted_keys
+from deltalight.protocol.endpoints import parse_endpoint
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.keys import (
+    KeySettings,
+    create_keys,
+    key_folder,
+    load_keys,
+    own_keys,
+    trust,
+    trusted_keys,
+)
 
 
 def test_a_secret_key_is_its_owners_only(tmp_path: Path) -> None:

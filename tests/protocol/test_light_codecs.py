@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from protocol.envelope import MAX_PARTS, EnvelopeError, decode
-from protocol.errors import DeltalightError
-from protocol.frames import FisheyePictures, LampPose, RadianceMap
-from protocol.light_codecs import fisheye_pictures, lamp_poses, radiance_map
-from protocol.messages import MAX_EXPOSURES, FisheyeMessage, LampsMessage, RadianceMessage
-from sensor_node.frame_messages import (
+from deltalight.protocol.envelope import MAX_PARTS, EnvelopeError, decode
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import FisheyePictures, LampPose, RadianceMap
+from deltalight.protocol.light_codecs import fisheye_pictures, lamp_poses, radiance_map
+from deltalight.protocol.messages import MAX_EXPOSURES, FisheyeMessage, LampsMessage, RadianceMessage
+from deltalight.sensor_node.frame_messages import (
     Stamps,
     fisheye_multipart,
     lamps_multipart,

@@ -4,8 +4,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from protocol.errors import DeltalightError
-from protocol.radiance_files import read_linear, write_exr
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.radiance_files import read_linear, write_exr
 
 
 def write_channels(path: Path, **channels: np.ndarray) -> None:

@@ -14,16 +14,16 @@ import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from protocol.board import BoardSpec
-from protocol.calibration import Extrinsics
-from protocol.camera_model import CameraModel
-from protocol.errors import DeltalightError
-from protocol.frames import DepthImage, SensorFrame
-from protocol.pictures import depth_from_steps
-from protocol.recording_reader import RecordingReader
-from protocol.recording_writer import RecordingWriter
-from protocol.scene import parse_scene
-from protocol.source import open_source
+from deltalight.protocol.board import BoardSpec
+from deltalight.protocol.calibration import Extrinsics
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import DepthImage, SensorFrame
+from deltalight.protocol.pictures import depth_from_steps
+from deltalight.protocol.recording_reader import RecordingReader
+from deltalight.protocol.recording_writer import RecordingWriter
+from deltalight.protocol.scene import parse_scene
+from deltalight.protocol.source import open_source
 from tests.protocol.fisheye_samples import assert_same_frames
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -328,9 +328,9 @@ import sys, time
 from dataclasses import replace
 from pathlib import Path
 import numpy as np
-from protocol.camera_model import CameraModel
-from protocol.frames import SensorFrame
-from protocol.recording_writer import RecordingWriter
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.frames import SensorFrame
+from deltalight.protocol.recording_writer import RecordingWriter
 camera = CameraModel(64, 48, np.array([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]))
 writer = RecordingWriter(Path(sys.argv[1]))
 for index in range(10_000):

@@ -10,21 +10,21 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from protocol.calibration import Extrinsics
-from protocol.camera_model import CameraModel
-from protocol.dataset import open_dataset
-from protocol.dataset_writer import DatasetWriter
-from protocol.envelope import decode
-from protocol.equidistant_lens import EquidistantLens
-from protocol.errors import DeltalightError
-from protocol.fisheye_lens import FisheyeCalibration, save_fisheye_yaml
-from protocol.frames import FisheyePictures, SensorFrame
-from protocol.light_codecs import fisheye_pictures
-from protocol.messages import FisheyeMessage
-from protocol.recording_reader import RecordingReader
-from protocol.recording_writer import RecordingWriter
-from protocol.source import Source, open_source
-from sensor_node.frame_messages import Stamps, fisheye_multipart
+from deltalight.protocol.calibration import Extrinsics
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.dataset import open_dataset
+from deltalight.protocol.dataset_writer import DatasetWriter
+from deltalight.protocol.envelope import decode
+from deltalight.protocol.equidistant_lens import EquidistantLens
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.fisheye_lens import FisheyeCalibration, save_fisheye_yaml
+from deltalight.protocol.frames import FisheyePictures, SensorFrame
+from deltalight.protocol.light_codecs import fisheye_pictures
+from deltalight.protocol.messages import FisheyeMessage
+from deltalight.protocol.recording_reader import RecordingReader
+from deltalight.protocol.recording_writer import RecordingWriter
+from deltalight.protocol.source import Source, open_source
+from deltalight.sensor_node.frame_messages import Stamps, fisheye_multipart
 from tests.protocol.fisheye_samples import BRACKET_S, HEIGHT, WIDTH, assert_same_pictures, coded, linear
 
 MS = 1_000_000

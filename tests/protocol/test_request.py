@@ -8,11 +8,11 @@ from typing import Any
 import pytest
 import zmq
 
-from protocol.envelope import EnvelopeError, decode, encode
-from protocol.errors import DeltalightError
-from protocol.messages import MAX_HEADER_BYTES, ControlReply, ControlRequest, StatsMessage
-from protocol.payloads import INLINE_CHARACTERS, decode_control, encode_control
-from protocol.request import ReplyMemory, ReplyServer, RequestClient
+from deltalight.protocol.envelope import EnvelopeError, decode, encode
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.messages import MAX_HEADER_BYTES, ControlReply, ControlRequest, StatsMessage
+from deltalight.protocol.payloads import INLINE_CHARACTERS, decode_control, encode_control
+from deltalight.protocol.request import ReplyMemory, ReplyServer, RequestClient
 
 ANY = "tcp://127.0.0.1:0"
 

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from protocol.errors import DeltalightError
-from protocol.scene import SceneDocument, load_scene, parse_scene, scene_json_schema
-from protocol.scene_lights import AmbientLight, DirectionalLight, SphereLight
-from protocol.scene_method import DvctMethod, NoneMethod
-from protocol.scene_objects import ModelGeometry, PrecomputedMaterial
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.scene import SceneDocument, load_scene, parse_scene, scene_json_schema
+from deltalight.protocol.scene_lights import AmbientLight, DirectionalLight, SphereLight
+from deltalight.protocol.scene_method import DvctMethod, NoneMethod
+from deltalight.protocol.scene_objects import ModelGeometry, PrecomputedMaterial
 
 
 def an_object(**changes: object) -> dict[str, Any]:

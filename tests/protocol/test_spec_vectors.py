@@ -9,11 +9,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from protocol.codecs import decode_color, decode_depth, decode_raw, decode_response
-from protocol.envelope import decode, encode
-from protocol.light_codecs import fisheye_pictures, lamp_poses, radiance_map
-from protocol.messages import MAX_HEADER_BYTES, MAX_PART_BYTES, MESSAGE_TYPES, SCHEMA_VERSION, Message
-from protocol.vectors import FOLDER, frame_pieces, unframe_pieces
+from deltalight.protocol.codecs import decode_color, decode_depth, decode_raw, decode_response
+from deltalight.protocol.envelope import decode, encode
+from deltalight.protocol.light_codecs import fisheye_pictures, lamp_poses, radiance_map
+from deltalight.protocol.messages import (
+    MAX_HEADER_BYTES,
+    MAX_PART_BYTES,
+    MESSAGE_TYPES,
+    SCHEMA_VERSION,
+    Message,
+)
+from deltalight.protocol.vectors import FOLDER, frame_pieces, unframe_pieces
 
 NAMES = sorted(path.stem for path in Path(FOLDER).glob("*.bin"))
 SPEC = (Path(FOLDER).parent / "SPEC.md").read_text()

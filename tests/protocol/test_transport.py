@@ -13,13 +13,13 @@ import psutil
 import pytest
 import zmq
 
-from protocol.envelope import decode, encode
-from protocol.errors import DeltalightError
-from protocol.messages import MAX_PART_BYTES, StatsMessage
-from protocol.publisher import Publisher
-from protocol.receiver import Receiver
-from protocol.request import ReplyServer, RequestClient
-from protocol.sockets import check_endpoint
+from deltalight.protocol.envelope import decode, encode
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.messages import MAX_PART_BYTES, StatsMessage
+from deltalight.protocol.publisher import Publisher
+from deltalight.protocol.receiver import Receiver
+from deltalight.protocol.request import ReplyServer, RequestClient
+from deltalight.protocol.sockets import check_endpoint
 
 ANY = "tcp://127.0.0.1:0"
 SETTLE_S = 5.0
@@ -246,9 +246,9 @@ def test_a_taken_port_is_named(opened: Callable[[Any], Any]) -> None:
 PUBLISH = """
 import sys, time
 import numpy as np
-from protocol.envelope import encode
-from protocol.messages import ColorMessage
-from protocol.publisher import Publisher
+from deltalight.protocol.envelope import encode
+from deltalight.protocol.messages import ColorMessage
+from deltalight.protocol.publisher import Publisher
 
 publisher = Publisher("tcp://127.0.0.1:0")
 print(publisher.endpoint, flush=True)

@@ -7,10 +7,10 @@ import moderngl
 import numpy as np
 import pytest
 
-from render_server.gpu import kernel as kernel_module
-from render_server.gpu.context import GpuContext, create_context
-from render_server.gpu.kernel import Kernel
-from render_server.gpu.textures import texture_2d
+from deltalight.render_server.gpu import kernel as kernel_module
+from deltalight.render_server.gpu.context import GpuContext, create_context
+from deltalight.render_server.gpu.kernel import Kernel
+from deltalight.render_server.gpu.textures import texture_2d
 from tests.render_server.scenes import ObjectsRenderer, Stage
 from tests.render_server.tiny_kernel import OUT, MakeKernel
 

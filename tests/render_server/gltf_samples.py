@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from benchmarks.glb_builder import GlbBuilder
-from render_server.scene.gltf_meshes import load_gltf
-from render_server.scene.triangle_mesh import TriangleMesh
+from deltalight.benchmarks.glb_builder import GlbBuilder
+from deltalight.render_server.scene.gltf_meshes import load_gltf
+from deltalight.render_server.scene.triangle_mesh import TriangleMesh
 
 HALF = np.sqrt(0.5)
 QUARTER_TURN = (0.0, 0.0, HALF, HALF)  # about z, x y z w

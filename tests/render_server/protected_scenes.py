@@ -12,12 +12,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from protocol.board import BoardSpec
-from protocol.frames import BoardPose, ViewFrame
-from protocol.scene import SceneDocument, parse_scene
-from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import Dispatch, watched
-from render_server.renderer import SceneRenderer
+from deltalight.protocol.board import BoardSpec
+from deltalight.protocol.frames import BoardPose, ViewFrame
+from deltalight.protocol.scene import SceneDocument, parse_scene
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import Dispatch, watched
+from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.gltf_samples import QUARTER_TURN, bent_bar
 from tests.render_server.scenes import (
     HEIGHT,

@@ -9,12 +9,12 @@ import numpy as np
 import trimesh
 from scipy.ndimage import binary_erosion
 
-from protocol.camera_model import CameraModel
-from protocol.frames import BoardPose, DepthImage, ViewFrame
-from protocol.scene import SceneDocument, parse_scene
-from protocol.scene_method import NoneMethod
-from render_server.gpu.context import GpuContext
-from render_server.renderer import CompositeFrame, SceneRenderer
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.frames import BoardPose, DepthImage, ViewFrame
+from deltalight.protocol.scene import SceneDocument, parse_scene
+from deltalight.protocol.scene_method import NoneMethod
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.renderer import CompositeFrame, SceneRenderer
 
 WIDTH, HEIGHT = 160, 120
 FOCAL = 150.0

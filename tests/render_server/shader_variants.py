@@ -8,14 +8,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from protocol.scene import SceneDocument, parse_scene
-from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import Kernel
-from render_server.passes.caustics import TILE
-from render_server.passes.composite import Enlarge
-from render_server.passes.cones import reuse_define
-from render_server.passes.lpv import LpvPropagate
-from render_server.renderer import SceneRenderer
+from deltalight.protocol.scene import SceneDocument, parse_scene
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import Kernel
+from deltalight.render_server.passes.caustics import TILE
+from deltalight.render_server.passes.composite import Enlarge
+from deltalight.render_server.passes.cones import reuse_define
+from deltalight.render_server.passes.lpv import LpvPropagate
+from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.protected_scenes import Case, frames_of, scene_of
 from tests.render_server.scenes import Stage
 

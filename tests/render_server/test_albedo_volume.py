@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from render_server.scene.albedo import CELLS, MEAN_ALBEDO, AlbedoVolume
+from deltalight.render_server.scene.albedo import CELLS, MEAN_ALBEDO, AlbedoVolume
 
 BOUNDS = (np.zeros(3), np.ones(3))
 

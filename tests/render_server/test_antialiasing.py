@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from protocol.camera_model import CameraModel
-from protocol.frames import ViewFrame, decode_lut
-from protocol.scene import SceneDocument
-from render_server.gpu.context import GpuContext
-from render_server.passes.coverage import PATTERN_8, STEPS
-from render_server.renderer import SceneRenderer
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.frames import ViewFrame, decode_lut
+from deltalight.protocol.scene import SceneDocument
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.passes.coverage import PATTERN_8, STEPS
+from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (
     FOCAL,
     HEIGHT,

@@ -9,11 +9,11 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.optimize import curve_fit
 
-from protocol.scene import SceneDocument, parse_scene
-from render_server.gpu.context import GpuContext
-from render_server.lights.lights import RectangleLight, SpotLight, build_lights
-from render_server.passes.shadow_maps import light_views
-from render_server.renderer import SceneRenderer
+from deltalight.protocol.scene import SceneDocument, parse_scene
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.lights.lights import RectangleLight, SpotLight, build_lights
+from deltalight.render_server.passes.shadow_maps import light_views
+from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (
     COARSE,
     Fields,

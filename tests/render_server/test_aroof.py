@@ -10,16 +10,16 @@ import pytest
 import trimesh
 from jaxtyping import Float64
 
-from protocol.errors import DeltalightError
-from protocol.frames import BoardPose
-from protocol.scene import SceneDocument, parse_scene
-from protocol.scene_method import AroofMethod
-from render_server.gpu.context import GpuContext
-from render_server.lights.octahedral import even_directions, harmonics, octahedral_grid
-from render_server.occlusion_fields import compute_field
-from render_server.passes.occlusion_fields import LightProbeCapture
-from render_server.renderer import SceneRenderer
-from render_server.scene.occlusion_field import OcclusionField
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import BoardPose
+from deltalight.protocol.scene import SceneDocument, parse_scene
+from deltalight.protocol.scene_method import AroofMethod
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.lights.octahedral import even_directions, harmonics, octahedral_grid
+from deltalight.render_server.occlusion_fields import compute_field
+from deltalight.render_server.passes.occlusion_fields import LightProbeCapture
+from deltalight.render_server.renderer import SceneRenderer
+from deltalight.render_server.scene.occlusion_field import OcclusionField
 from tests.render_server.scenes import (
     Fields,
     Stage,
@@ -280,7 +280,7 @@ def test_a_scene_that_comes_later_is_shown_at_once_and_shaded_when_its_field_is_
         was_shown.wait(PATIENCE_S)
         return compute_field(*given)
 
-    monkeypatch.setattr("render_server.occlusion_fields.compute_field", compute_later)
+    monkeypatch.setattr("deltalight.render_server.occlusion_fields.compute_field", compute_later)
     document = stage.document([stage.virtual(ball(RADIUS), (0.0,) * 3)], [ambient(1.0)], floor())
     renderer = SceneRenderer(gpu, document)
     view = frame(plain(), pose=look_at(*CLOSE))

@@ -8,19 +8,24 @@ import pytest
 import trimesh
 from jaxtyping import Float64
 
-from render_server.gpu_scene import PlacedObject
-from render_server.lights.octahedral import even_directions, harmonics
-from render_server.occlusion_fields import (
+from deltalight.render_server.gpu_scene import PlacedObject
+from deltalight.render_server.lights.octahedral import even_directions, harmonics
+from deltalight.render_server.occlusion_fields import (
     OcclusionFields,
     compute_field,
     field_digest,
     load_field,
     store_field,
 )
-from render_server.scene.materials import Material
-from render_server.scene.occlusion_field import FieldSettings, ObjectRays, OcclusionField, place_shells
-from render_server.scene.occlusion_transfer import object_surface
-from render_server.scene.triangle_mesh import TriangleMesh
+from deltalight.render_server.scene.materials import Material
+from deltalight.render_server.scene.occlusion_field import (
+    FieldSettings,
+    ObjectRays,
+    OcclusionField,
+    place_shells,
+)
+from deltalight.render_server.scene.occlusion_transfer import object_surface
+from deltalight.render_server.scene.triangle_mesh import TriangleMesh
 
 SETTINGS = FieldSettings(order=4, shells=3, resolution=12, reach=4.0, rays=256, indirect=True)
 RADIUS = 0.5
@@ -207,7 +212,9 @@ def test_a_second_start_computes_nothing(
     tmp_path: Path, ball: TriangleMesh, ball_field: OcclusionField, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     store_field(tmp_path, field_digest(object_surface([ball], plain=True), SETTINGS), ball_field)
-    monkeypatch.setattr("render_server.occlusion_fields.compute_field", lambda *_: pytest.fail("computed"))
+    monkeypatch.setattr(
+        "deltalight.render_server.occlusion_fields.compute_field", lambda *_: pytest.fail("computed")
+    )
     found = OcclusionFields(pytest.fail, tmp_path).find(placed(ball), SETTINGS)
     assert found is not None
     assert (found.occlusion == ball_field.occlusion).all()

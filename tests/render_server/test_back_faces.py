@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from protocol.frames import decode_lut
-from protocol.scene_method import DlpvMethod, DvctMethod
-from render_server.gpu.context import GpuContext
-from render_server.scene.depth_mesh import BACK_OFFSET_VOXELS, back_faces
+from deltalight.protocol.frames import decode_lut
+from deltalight.protocol.scene_method import DlpvMethod, DvctMethod
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.scene.depth_mesh import BACK_OFFSET_VOXELS, back_faces
 from tests.render_server.scenes import (
     HEIGHT,
     WIDTH,

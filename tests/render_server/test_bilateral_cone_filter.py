@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.context import GpuContext
 from tests.render_server.scenes import Stage, ambient, ball, floor, solve
 
 pytestmark = pytest.mark.usefixtures("clean_gl")

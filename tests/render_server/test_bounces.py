@@ -7,11 +7,11 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 
-from protocol.frames import decode_lut
-from protocol.scene import SceneDocument
-from render_server.gpu.context import GpuContext
-from render_server.passes.voxels import VoxelMipmap
-from render_server.renderer import SceneRenderer
+from deltalight.protocol.frames import decode_lut
+from deltalight.protocol.scene import SceneDocument
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.passes.voxels import VoxelMipmap
+from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (
     GREY,
     Stage,

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from jaxtyping import Float32
 
-from protocol.frames import decode_lut
-from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import Kernel
+from deltalight.protocol.frames import decode_lut
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import Kernel
 from tests.render_server.scenes import GREY, Stage, ambient, ball, floor, solve
 
 pytestmark = pytest.mark.usefixtures("clean_gl")

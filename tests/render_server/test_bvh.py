@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import Bindings, Kernel
-from render_server.passes.gbuffer import MeshBuffers, ObjectBvh
-from render_server.scene.bvh import LEAF_SIZE, Bvh, build_bvh
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import Bindings, Kernel
+from deltalight.render_server.passes.gbuffer import MeshBuffers, ObjectBvh
+from deltalight.render_server.scene.bvh import LEAF_SIZE, Bvh, build_bvh
 
 pytestmark = pytest.mark.usefixtures("clean_gl")
 RAYS = 2048

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from protocol.scene import SceneDocument
-from render_server.gpu.context import GpuContext
-from render_server.passes.caustics import GREATEST_ALPHA
-from render_server.renderer import SceneRenderer
+from deltalight.protocol.scene import SceneDocument
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.passes.caustics import GREATEST_ALPHA
+from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (
     COARSE,
     EYE,

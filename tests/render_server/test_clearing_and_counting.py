@@ -7,8 +7,8 @@ import moderngl
 import numpy as np
 import pytest
 
-from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import (
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import (
     CLEARING_GROUPS,
     BindingError,
     Dispatch,

@@ -6,12 +6,12 @@ from typing import Any
 
 import pytest
 
-from protocol.frames import ViewFrame
-from protocol.scene import SceneDocument
-from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import watched
-from render_server.graph import Graph
-from render_server.renderer import SceneRenderer
+from deltalight.protocol.frames import ViewFrame
+from deltalight.protocol.scene import SceneDocument
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import watched
+from deltalight.render_server.graph import Graph
+from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.protected_scenes import EYE, METHODS, TARGET, TURNED, Case, scene_of
 from tests.render_server.scenes import Stage, ball, checkered, directional, frame, look_at
 

@@ -8,10 +8,10 @@ import moderngl
 import numpy as np
 import pytest
 
-from render_server.gpu import kernel as kernel_module
-from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import Kernel
-from render_server.graph import Graph, GraphError
+from deltalight.render_server.gpu import kernel as kernel_module
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import Kernel
+from deltalight.render_server.graph import Graph, GraphError
 from tests.render_server.protected_scenes import METHODS, Case, pictures_of
 
 pytestmark = pytest.mark.usefixtures("clean_gl")
@@ -85,7 +85,7 @@ def test_a_kernel_may_write_what_its_stage_returns_and_what_nobody_has(gpu: GpuC
 class Holder:
     """As a pass holds its textures: an attribute."""
 
-    __module__ = "render_server.passes.example"
+    __module__ = "deltalight.render_server.passes.example"
 
     def __init__(self, buffer: moderngl.Buffer) -> None:
         self.buffer = buffer

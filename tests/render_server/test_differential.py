@@ -11,12 +11,12 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 
-from protocol.errors import DeltalightError
-from protocol.frames import decode_lut
-from protocol.scene import SceneDocument, parse_scene
-from protocol.scene_method import DifferentialMethod, VoxelConeSettings
-from render_server.gpu.context import GpuContext
-from render_server.renderer import SceneRenderer
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import decode_lut
+from deltalight.protocol.scene import SceneDocument, parse_scene
+from deltalight.protocol.scene_method import DifferentialMethod, VoxelConeSettings
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (
     GREY,
     Fields,

@@ -8,16 +8,16 @@ import pytest
 import trimesh
 from jaxtyping import Float64
 
-from protocol.errors import DeltalightError
-from protocol.frames import BoardPose, ViewFrame, decode_lut
-from protocol.scene import SceneDocument, parse_scene
-from protocol.scene_method import DlpvMethod
-from protocol.scene_objects import Pose
-from render_server.estimation.albedo import AlbedoEstimator
-from render_server.gpu.context import GpuContext
-from render_server.graph import Graph
-from render_server.passes.lpv import CONSTANT, LOBE, LightVolume, LpvPropagate, lobe_weights
-from render_server.renderer import SceneRenderer
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import BoardPose, ViewFrame, decode_lut
+from deltalight.protocol.scene import SceneDocument, parse_scene
+from deltalight.protocol.scene_method import DlpvMethod
+from deltalight.protocol.scene_objects import Pose
+from deltalight.render_server.estimation.albedo import AlbedoEstimator
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.graph import Graph
+from deltalight.render_server.passes.lpv import CONSTANT, LOBE, LightVolume, LpvPropagate, lobe_weights
+from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (
     GREY,
     Fields,

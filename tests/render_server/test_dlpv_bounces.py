@@ -7,14 +7,14 @@ import pytest
 import trimesh
 from jaxtyping import Float64
 
-from protocol.errors import DeltalightError
-from protocol.frames import decode_lut
-from protocol.scene import SceneDocument, parse_scene
-from protocol.scene_method import DlpvMethod
-from render_server.gpu.context import GpuContext
-from render_server.passes.lpv import CONSTANT, LOBE, LightVolume, injected_sums
-from render_server.passes.lpv_lighting import LpvBounce
-from render_server.renderer import SceneRenderer
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import decode_lut
+from deltalight.protocol.scene import SceneDocument, parse_scene
+from deltalight.protocol.scene_method import DlpvMethod
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.passes.lpv import CONSTANT, LOBE, LightVolume, injected_sums
+from deltalight.render_server.passes.lpv_lighting import LpvBounce
+from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.scenes import GREY, Stage, ambient, cube, floor, frame, shifted, solve, sphere_light
 
 pytestmark = pytest.mark.usefixtures("clean_gl")

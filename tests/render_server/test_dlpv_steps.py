@@ -5,8 +5,8 @@ import pytest
 from jaxtyping import Float32
 from scipy.ndimage import uniform_filter
 
-from render_server.gpu.context import GpuContext
-from render_server.passes.lpv import (
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.passes.lpv import (
     LOBE,
     LightVolume,
     LpvBoxFilter,

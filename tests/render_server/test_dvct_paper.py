@@ -11,13 +11,13 @@ import pytest
 import trimesh
 from jaxtyping import Bool, Float32, Float64
 
-from protocol.camera_model import CameraModel
-from protocol.frames import BoardPose, ViewFrame, decode_lut
-from protocol.scene import SceneDocument, parse_scene
-from render_server.gpu.context import GpuContext
-from render_server.graph import Graph
-from render_server.passes.voxels import VoxelMipmap
-from render_server.renderer import SceneRenderer
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.frames import BoardPose, ViewFrame, decode_lut
+from deltalight.protocol.scene import SceneDocument, parse_scene
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.graph import Graph
+from deltalight.render_server.passes.voxels import VoxelMipmap
+from deltalight.render_server.renderer import SceneRenderer
 
 WIDTH, HEIGHT, VOXELS = 160, 120, 32
 EDGE = 0.2  # of the box, m

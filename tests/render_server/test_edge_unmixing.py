@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from protocol.camera_model import CameraModel
-from protocol.frames import ViewFrame, decode_lut
-from protocol.scene import SceneDocument
-from protocol.scene_objects import Pose
-from render_server.gpu.context import GpuContext
-from render_server.renderer import SceneRenderer
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.frames import ViewFrame, decode_lut
+from deltalight.protocol.scene import SceneDocument
+from deltalight.protocol.scene_objects import Pose
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (
     HEIGHT,
     WIDTH,

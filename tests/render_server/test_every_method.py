@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from protocol.scene import parse_scene
-from render_server.gpu.context import GpuContext
-from render_server.renderer import SceneRenderer
+from deltalight.protocol.scene import parse_scene
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.scenes import Stage, cube, everyday, frame, look_at, noisy
 
 pytestmark = pytest.mark.usefixtures("clean_gl")

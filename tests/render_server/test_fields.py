@@ -11,8 +11,8 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.optimize import curve_fit
 
-from render_server.gpu.context import GpuContext
-from render_server.passes.voxels import VolumePlacement
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.passes.voxels import VolumePlacement
 from tests.render_server.scenes import (
     Fields,
     Stage,

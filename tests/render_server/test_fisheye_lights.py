@@ -6,20 +6,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from protocol import scene_lights as documents
-from protocol.board import BoardSpec
-from protocol.camera_model import CameraModel
-from protocol.equidistant_lens import EquidistantLens
-from protocol.fisheye_lens import FisheyeCalibration
-from protocol.frames import DepthImage, LampPose, RadianceMap, ViewFrame, decode_lut
-from protocol.hemisphere import texel_directions
-from protocol.scene import SceneDocument
-from render_server.gpu.context import GpuContext
-from render_server.lights.fisheye import is_occluded
-from render_server.lights.lights import DirectionalLight, LightSet, SphereLight
-from render_server.lights.octahedral import octahedral_grid, sample_octahedral
-from render_server.lights.sources import FisheyeSource, TrackedSource
-from render_server.renderer import SceneRenderer
+from deltalight.protocol import scene_lights as documents
+from deltalight.protocol.board import BoardSpec
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.equidistant_lens import EquidistantLens
+from deltalight.protocol.fisheye_lens import FisheyeCalibration
+from deltalight.protocol.frames import DepthImage, LampPose, RadianceMap, ViewFrame, decode_lut
+from deltalight.protocol.hemisphere import texel_directions
+from deltalight.protocol.scene import SceneDocument
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.lights.fisheye import is_occluded
+from deltalight.render_server.lights.lights import DirectionalLight, LightSet, SphereLight
+from deltalight.render_server.lights.octahedral import octahedral_grid, sample_octahedral
+from deltalight.render_server.lights.sources import FisheyeSource, TrackedSource
+from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (
     COARSE,
     Stage,

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from protocol.envelope import decode
-from protocol.errors import DeltalightError
-from protocol.frames import LampPose, ViewFrame
-from protocol.messages import RadianceMessage
-from render_server.server.frames import TOPICS, FrameAssembler
-from sensor_node.frame_messages import Stamps, lamps_multipart, radiance_multipart
+from deltalight.protocol.envelope import decode
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import LampPose, ViewFrame
+from deltalight.protocol.messages import RadianceMessage
+from deltalight.render_server.server.frames import TOPICS, FrameAssembler
+from deltalight.sensor_node.frame_messages import Stamps, lamps_multipart, radiance_multipart
 from tests.protocol.test_light_codecs import assert_same_map, placed, sample_map
 from tests.services.conftest import color, pose, received
 

@@ -7,12 +7,12 @@ import cv2
 import numpy as np
 import pytest
 
-from protocol.errors import DeltalightError
-from protocol.scene import SceneDocument, parse_scene
-from render_server.frame_budget import PATIENCE, WARM_UP, WINDOW, FrameBudget, Level
-from render_server.gpu.context import GpuContext
-from render_server.renderer import CompositeFrame, SceneRenderer
-from render_server.server.snapshot import SnapshotOrder, SnapshotPicture, take_snapshot
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.scene import SceneDocument, parse_scene
+from deltalight.render_server.frame_budget import PATIENCE, WARM_UP, WINDOW, FrameBudget, Level
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.renderer import CompositeFrame, SceneRenderer
+from deltalight.render_server.server.snapshot import SnapshotOrder, SnapshotPicture, take_snapshot
 from tests.render_server.protected_scenes import Case, scene_of
 from tests.render_server.scenes import Stage, psnr_db
 from tests.render_server.test_quality_tiers import seen

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.context import GpuContext
 from tests.render_server.voxel_lab import VoxelLab, cosine_directions, directions_everywhere, gpu_mesh
 
 pytestmark = pytest.mark.usefixtures("clean_gl")

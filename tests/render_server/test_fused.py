@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from protocol.frames import BoardPose, ViewFrame
-from protocol.scene import SceneDocument
-from render_server.gpu.context import GpuContext
-from render_server.real_geometry import STILL_FRAMES
-from render_server.renderer import SceneRenderer
+from deltalight.protocol.frames import BoardPose, ViewFrame
+from deltalight.protocol.scene import SceneDocument
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.real_geometry import STILL_FRAMES
+from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (
     COARSE,
     HEIGHT,

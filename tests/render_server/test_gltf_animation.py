@@ -10,10 +10,10 @@ import trimesh
 from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation, Slerp
 
-from benchmarks.glb_builder import GlbBuilder
-from protocol.scene_objects import Animation
-from render_server.scene.gltf_meshes import load_gltf
-from render_server.scene.mesh_loading import load_asset, load_mesh
+from deltalight.benchmarks.glb_builder import GlbBuilder
+from deltalight.protocol.scene_objects import Animation
+from deltalight.render_server.scene.gltf_meshes import load_gltf
+from deltalight.render_server.scene.mesh_loading import load_asset, load_mesh
 from tests.render_server.gltf_samples import (
     HALF,
     IDENTITY,

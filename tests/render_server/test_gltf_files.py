@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.glb_builder import GlbBuilder
-from protocol.errors import DeltalightError
-from render_server.scene.gltf_meshes import GltfAsset, load_gltf
-from render_server.scene.mesh_loading import load_asset, load_mesh
+from deltalight.benchmarks.glb_builder import GlbBuilder
+from deltalight.protocol.errors import DeltalightError
+from deltalight.render_server.scene.gltf_meshes import GltfAsset, load_gltf
+from deltalight.render_server.scene.mesh_loading import load_asset, load_mesh
 from tests.render_server.gltf_samples import (
     bent_bar,
     box,

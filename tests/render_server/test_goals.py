@@ -1,11 +1,11 @@
-"""What cone tracing reaches of its goals (docs/method.md 7.2); `python -m benchmarks.goals` compares it with them."""
+"""What cone tracing reaches of its goals (docs/method.md 7.2); `python -m deltalight.benchmarks.goals` compares it with them."""
 
 from pathlib import Path
 
 import pytest
 
-from benchmarks.goals import DEPTH_NOISE_M, GOALS, Difference, differences, floor_irradiance
-from render_server.gpu.context import GpuContext
+from deltalight.benchmarks.goals import DEPTH_NOISE_M, GOALS, Difference, differences, floor_irradiance
+from deltalight.render_server.gpu.context import GpuContext
 
 pytestmark = pytest.mark.usefixtures("clean_gl")
 SAME = Difference(0.0, 0.0)

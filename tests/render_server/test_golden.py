@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from protocol.frames import ViewFrame
-from protocol.scene import SceneDocument
-from render_server.gpu.context import GpuContext
+from deltalight.protocol.frames import ViewFrame
+from deltalight.protocol.scene import SceneDocument
+from deltalight.render_server.gpu.context import GpuContext
 from tests.render_server.scenes import (
     Stage,
     ambient,

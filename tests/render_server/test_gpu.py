@@ -13,10 +13,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protocol.errors import DeltalightError
-from protocol.scene_method import DifferentialMethod, DvctMethod
-from render_server.gpu import shader_source as shader_text
-from render_server.gpu.context import (
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.scene_method import DifferentialMethod, DvctMethod
+from deltalight.render_server.gpu import shader_source as shader_text
+from deltalight.render_server.gpu.context import (
     NEEDED,
     GpuContext,
     check_limits,
@@ -24,13 +24,13 @@ from render_server.gpu.context import (
     is_software_renderer,
     limits_of,
 )
-from render_server.gpu.kernel import Kernel
-from render_server.gpu.textures import AsyncReadback, gpu_objects, sizes_bytes, texture_2d
-from render_server.gpu.timers import PassTimers
-from render_server.methods.differential import SolutionVoxels
-from render_server.methods.dvct import InjectedVoxels
-from render_server.methods.voxel_volumes import DeltaVoxels
-from render_server.passes.voxels import (
+from deltalight.render_server.gpu.kernel import Kernel
+from deltalight.render_server.gpu.textures import AsyncReadback, gpu_objects, sizes_bytes, texture_2d
+from deltalight.render_server.gpu.timers import PassTimers
+from deltalight.render_server.methods.differential import SolutionVoxels
+from deltalight.render_server.methods.dvct import InjectedVoxels
+from deltalight.render_server.methods.voxel_volumes import DeltaVoxels
+from deltalight.render_server.passes.voxels import (
     LARGEST_ITEM_BYTES,
     LEAST_SURFELS,
     PlacedVolume,
@@ -42,7 +42,7 @@ from render_server.passes.voxels import (
     place_volume,
     volume_memory_bytes,
 )
-from render_server.renderer import SceneRenderer
+from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.scenes import Stage, cube, directional, floor, frame
 
 ROOT = Path(__file__).parents[2]
@@ -218,9 +218,9 @@ def test_software_renderers_are_known_by_name(name: str, software: bool) -> None
 
 
 CHILD = """
-from protocol.errors import DeltalightError
-from protocol.scene_method import DifferentialMethod, DvctMethod
-from render_server.gpu.context import create_context
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.scene_method import DifferentialMethod, DvctMethod
+from deltalight.render_server.gpu.context import create_context
 try:
     create_context(device=99)
 except DeltalightError as error:

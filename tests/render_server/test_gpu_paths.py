@@ -14,8 +14,8 @@ import moderngl
 import numpy as np
 import pytest
 
-from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import Bindings, _Program
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import Bindings, _Program
 from tests.render_server.protected_scenes import METHODS, Case, pictures_of
 from tests.render_server.test_golden import psnr_db
 
@@ -149,7 +149,7 @@ def test_the_paths_of_gpus_make_the_same_picture_without_waiting(
     pictures, dispatches = pictures_of(replace(gpu, is_software=False), case, tmp_path, checks=True)
     assert min(psnr_db(one, other) for one, other in zip(pictures, expected, strict=True)) >= LEAST_PSNR_DB
     assert audit == []
-    assert readers == {"render_server.gpu.textures"}
+    assert readers == {"deltalight.render_server.gpu.textures"}
     assert any(one.kernel.startswith("mirror_smooth") for part in dispatches for one in part) == (
         case.method in ("exact", "differential", "dlpv")
     )

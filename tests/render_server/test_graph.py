@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from render_server.gpu.context import GpuContext
-from render_server.gpu.timers import PassTimers
-from render_server.graph import Graph, GraphError, Resource
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.timers import PassTimers
+from deltalight.render_server.graph import Graph, GraphError, Resource
 
 pytestmark = pytest.mark.usefixtures("clean_gl")
 

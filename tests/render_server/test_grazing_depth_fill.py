@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from jaxtyping import Bool, Float32, UInt8
 
-from protocol.frames import BoardPose, DepthImage
-from protocol.source import open_source
-from render_server.gpu.context import GpuContext
-from render_server.scene.depth_mesh import depth_mesh
-from render_server.scene.depth_surface import grazing_depth_fill
-from sensor_node.view_frames import ViewFrameBuilder
+from deltalight.protocol.frames import BoardPose, DepthImage
+from deltalight.protocol.source import open_source
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.scene.depth_mesh import depth_mesh
+from deltalight.render_server.scene.depth_surface import grazing_depth_fill
+from deltalight.sensor_node.view_frames import ViewFrameBuilder
 from tests.render_server.scenes import COARSE, Stage, camera, cube, directional, frame, look_at, solve
 
 CAMERA = camera(320, 240, 300)

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from protocol.frames import ViewFrame
-from protocol.scene import SceneDocument
-from protocol.scene_objects import Pose, Surface
-from render_server.gpu.context import GpuContext
-from render_server.passes.voxels import VolumePlacement
-from render_server.renderer import CompositeFrame, SceneRenderer
+from deltalight.protocol.frames import ViewFrame
+from deltalight.protocol.scene import SceneDocument
+from deltalight.protocol.scene_objects import Pose, Surface
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.passes.voxels import VolumePlacement
+from deltalight.render_server.renderer import CompositeFrame, SceneRenderer
 from tests.render_server.scenes import (
     Stage,
     Vector,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from render_server.lights.lights import (
+from deltalight.render_server.lights.lights import (
     DirectionalLight,
     Light,
     RectangleLight,

@@ -9,12 +9,12 @@ import moderngl
 import numpy as np
 import pytest
 
-from render_server.gpu import kernel as kernel_module
-from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import BindingError, Dispatch, RasterKernel, watched
-from render_server.gpu.shader_source import SHADERS
-from render_server.gpu.textures import texture_2d
-from render_server.gpu.uniform_block import (
+from deltalight.render_server.gpu import kernel as kernel_module
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import BindingError, Dispatch, RasterKernel, watched
+from deltalight.render_server.gpu.shader_source import SHADERS
+from deltalight.render_server.gpu.textures import texture_2d
+from deltalight.render_server.gpu.uniform_block import (
     STD140,
     Block,
     Bool,
@@ -336,7 +336,9 @@ def blocks_of_the_project() -> dict[str, type[Block]]:
     for path in SHADERS.parents[1].rglob("*.py"):
         if "(Block):" in path.read_text():
             importlib.import_module(".".join(path.relative_to(SHADERS.parents[2]).with_suffix("").parts))
-    ours = [block for block in Block.__subclasses__() if block.__module__.startswith("render_server.")]
+    ours = [
+        block for block in Block.__subclasses__() if block.__module__.startswith("deltalight.render_server.")
+    ]
     return {block.__name__.removesuffix("Block"): block for block in ours}
 
 

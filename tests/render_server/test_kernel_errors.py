@@ -8,10 +8,10 @@ import moderngl
 import numpy as np
 import pytest
 
-from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import BindingError
-from render_server.gpu.textures import texture_2d
-from render_server.gpu.uniform_block import (
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import BindingError
+from deltalight.render_server.gpu.textures import texture_2d
+from deltalight.render_server.gpu.uniform_block import (
     Block,
     Float,
     UniformBlock,

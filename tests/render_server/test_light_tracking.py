@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from render_server.lights.fisheye import LightTracker
-from render_server.lights.median_cut import Region, RegionLight
-from render_server.lights.octahedral import texel_solid_angles
+from deltalight.render_server.lights.fisheye import LightTracker
+from deltalight.render_server.lights.median_cut import Region, RegionLight
+from deltalight.render_server.lights.octahedral import texel_solid_angles
 
 SECOND = 1_000_000_000
 NOWHERE = Region(0, 1, 0, 1)

@@ -10,10 +10,10 @@ import moderngl
 import numpy as np
 import pytest
 
-from protocol.scene import SceneDocument
-from render_server.gpu import kernel as kernel_module
-from render_server.gpu.context import GpuContext
-from render_server.gpu.shader_source import shader_source
+from deltalight.protocol.scene import SceneDocument
+from deltalight.render_server.gpu import kernel as kernel_module
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.shader_source import shader_source
 from tests.render_server.scenes import (
     GREY,
     Stage,

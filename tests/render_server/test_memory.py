@@ -1,7 +1,7 @@
 """How much of the GPU's memory things take."""
 
-from render_server.gpu.context import GpuContext
-from render_server.gpu.textures import sizes_bytes
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.textures import sizes_bytes
 
 
 def test_what_several_hold_counts_for_the_one_that_holds_least(gpu: GpuContext) -> None:

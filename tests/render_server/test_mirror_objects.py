@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from protocol.frames import ViewFrame, decode_lut
-from protocol.scene import SceneDocument
-from protocol.scene_objects import Surface
-from render_server.gpu.context import GpuContext
-from render_server.passes.reflections import RAY_ROUGHNESS
-from render_server.renderer import SceneRenderer
+from deltalight.protocol.frames import ViewFrame, decode_lut
+from deltalight.protocol.scene import SceneDocument
+from deltalight.protocol.scene_objects import Surface
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.passes.reflections import RAY_ROUGHNESS
+from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (
     COARSE,
     HEIGHT,

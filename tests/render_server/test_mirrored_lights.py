@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import trimesh
 
-from protocol.scene import SceneDocument
-from protocol.scene_objects import Surface
-from render_server.gpu.context import GpuContext
-from render_server.lights.lights import DirectionalLight, RectangleLight, SphereLight
-from render_server.lights.mirror_lights import MIRROR_ROUGHNESS, mirror_lights
-from render_server.renderer import SceneRenderer
-from render_server.scene.declared_surfaces import SurfaceTable, build_surface_table
+from deltalight.protocol.scene import SceneDocument
+from deltalight.protocol.scene_objects import Surface
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.lights.lights import DirectionalLight, RectangleLight, SphereLight
+from deltalight.render_server.lights.mirror_lights import MIRROR_ROUGHNESS, mirror_lights
+from deltalight.render_server.renderer import SceneRenderer
+from deltalight.render_server.scene.declared_surfaces import SurfaceTable, build_surface_table
 from tests.render_server.scenes import (
     COARSE,
     Fields,

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from protocol.camera_model import CameraModel
-from protocol.frames import BoardPose, DepthImage, ViewFrame
-from render_server.scene.motion_detection import FrameSamples, MotionDetector
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.frames import BoardPose, DepthImage, ViewFrame
+from deltalight.render_server.scene.motion_detection import FrameSamples, MotionDetector
 
 CAMERA = CameraModel(160, 120, np.array([[150.0, 0, 79.5], [0, 150.0, 59.5], [0, 0, 1]]))
 SIGMA = 0.002

@@ -7,16 +7,16 @@ import moderngl
 import numpy as np
 import pytest
 
-from benchmarks.glb_builder import GlbBuilder
-from protocol.errors import DeltalightError
-from protocol.frames import ViewFrame
-from protocol.scene import SceneDocument
-from protocol.scene_method import DlpvMethod
-from render_server.gpu.context import GpuContext
-from render_server.passes.gbuffer import MeshBuffers
-from render_server.renderer import SceneRenderer
-from render_server.scene.gltf_meshes import load_gltf
-from render_server.virtual_objects import VirtualObjects
+from deltalight.benchmarks.glb_builder import GlbBuilder
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import ViewFrame
+from deltalight.protocol.scene import SceneDocument
+from deltalight.protocol.scene_method import DlpvMethod
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.passes.gbuffer import MeshBuffers
+from deltalight.render_server.renderer import SceneRenderer
+from deltalight.render_server.scene.gltf_meshes import load_gltf
+from deltalight.render_server.virtual_objects import VirtualObjects
 from tests.render_server.gltf_samples import (
     IDENTITY,
     QUARTER_TURN,

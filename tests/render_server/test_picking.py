@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import trimesh
 
-from protocol.errors import DeltalightError
-from protocol.frames import ViewFrame
-from protocol.scene import SceneDocument
-from render_server.gpu.context import GpuContext
-from render_server.picking import Pick
-from render_server.renderer import SceneRenderer
-from render_server.scene.bvh import first_hit
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import ViewFrame
+from deltalight.protocol.scene import SceneDocument
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.picking import Pick
+from deltalight.render_server.renderer import SceneRenderer
+from deltalight.render_server.scene.bvh import first_hit
 from tests.render_server.scenes import (
     COARSE,
     HEIGHT,

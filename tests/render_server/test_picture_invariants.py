@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from protocol.scene_method import NoneMethod
-from protocol.scene_objects import Pose
-from render_server.gpu.context import GpuContext
-from render_server.renderer import SceneRenderer
+from deltalight.protocol.scene_method import NoneMethod
+from deltalight.protocol.scene_objects import Pose
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (
     COARSE,
     HEIGHT,
@@ -85,7 +85,7 @@ def test_same_input_gives_the_same_bytes(gpu: GpuContext, stage: Stage) -> None:
 
 CHILD = """
 import hashlib, sys, tempfile, pathlib
-from render_server.gpu.context import create_context
+from deltalight.render_server.gpu.context import create_context
 from tests.render_server.scenes import COARSE, Stage, composite, everyday, frame, noisy
 folder = tempfile.TemporaryDirectory()
 picture = composite(create_context(), everyday(Stage(pathlib.Path(folder.name), COARSE)), frame(noisy()))

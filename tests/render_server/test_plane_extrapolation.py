@@ -7,9 +7,9 @@ import pytest
 import trimesh
 from jaxtyping import Float32, Float64
 
-from protocol.frames import decode_lut
-from protocol.scene import SceneDocument
-from render_server.estimation.plane_extrapolation import (
+from deltalight.protocol.frames import decode_lut
+from deltalight.protocol.scene import SceneDocument
+from deltalight.render_server.estimation.plane_extrapolation import (
     DetectedPlane,
     ExtrapolatedPlanes,
     PointCloud,
@@ -18,10 +18,10 @@ from render_server.estimation.plane_extrapolation import (
     detect_planes,
     extrapolate_planes,
 )
-from render_server.gpu.context import GpuContext
-from render_server.lights.lights import Light, SphereLight
-from render_server.lights.octahedral import octahedral_grid, sample_octahedral
-from render_server.renderer import SceneRenderer
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.lights.lights import Light, SphereLight
+from deltalight.render_server.lights.octahedral import octahedral_grid, sample_octahedral
+from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.scenes import COARSE, Stage, ambient, cube, floor, frame, look_at, plain, shifted
 
 SIZE = 32

@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import Dispatch
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import Dispatch
 from tests.render_server.protected_scenes import (
     FOLDER,
     GEOMETRIES,

@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 import pytest
 
-from protocol.frames import ViewFrame
-from protocol.quality import TIERS
-from protocol.scene import SceneDocument
-from protocol.scene_method import DvctMethod
-from render_server.gpu.context import GpuContext
-from render_server.renderer import SceneRenderer
+from deltalight.protocol.frames import ViewFrame
+from deltalight.protocol.quality import TIERS
+from deltalight.protocol.scene import SceneDocument
+from deltalight.protocol.scene_method import DvctMethod
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.protected_scenes import EYE, METHODS, Case, scene_of
 from tests.render_server.scenes import Stage, camera, depth_image, floor_depth, frame, look_at, psnr_db
 

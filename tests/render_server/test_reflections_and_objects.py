@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from protocol.scene import parse_scene
-from render_server.gpu.context import GpuContext
+from deltalight.protocol.scene import parse_scene
+from deltalight.render_server.gpu.context import GpuContext
 from tests.render_server.scenes import Stage, checkered
 from tests.render_server.test_history import HERE, fresh, room, seen
 

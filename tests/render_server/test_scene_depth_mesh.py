@@ -4,11 +4,11 @@ import cv2
 import numpy as np
 import pytest
 
-from protocol.camera_model import CameraModel
-from protocol.errors import DeltalightError
-from protocol.frames import DepthImage
-from render_server.scene.depth_mesh import depth_mesh, stride_for_budget
-from render_server.scene.depth_surface import depth_surface
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import DepthImage
+from deltalight.render_server.scene.depth_mesh import depth_mesh, stride_for_budget
+from deltalight.render_server.scene.depth_surface import depth_surface
 
 WIDTH, HEIGHT = 160, 120
 MATRIX = np.array([[150.0, 0, 81.3], [0, 152.0, 58.9], [0, 0, 1]])

@@ -5,10 +5,10 @@ import cv2
 import numpy as np
 import pytest
 
-from protocol import scene_lights as documents
-from protocol.errors import DeltalightError
-from protocol.radiance_files import write_exr
-from render_server.lights.environment import (
+from deltalight.protocol import scene_lights as documents
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.radiance_files import write_exr
+from deltalight.render_server.lights.environment import (
     LUMINANCE,
     EnvironmentMap,
     load_environment,
@@ -16,9 +16,9 @@ from render_server.lights.environment import (
     orientation,
     pixel_solid_angles,
 )
-from render_server.lights.lights import DirectionalLight, SphereLight, build_lights
-from render_server.lights.median_cut import split_environment
-from render_server.lights.octahedral import (
+from deltalight.render_server.lights.lights import DirectionalLight, SphereLight, build_lights
+from deltalight.render_server.lights.median_cut import split_environment
+from deltalight.render_server.lights.octahedral import (
     irradiance,
     octahedral_direction,
     octahedral_uv,

@@ -7,11 +7,11 @@ import pytest
 import trimesh
 from PIL import Image
 
-from protocol.errors import DeltalightError
-from protocol.scene_objects import Material as MaterialDocument
-from render_server.scene.materials import Material
-from render_server.scene.mesh_loading import load_mesh
-from render_server.scene.triangle_mesh import TriangleMesh, merge_for_gpu, split_triangles
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.scene_objects import Material as MaterialDocument
+from deltalight.render_server.scene.materials import Material
+from deltalight.render_server.scene.mesh_loading import load_mesh
+from deltalight.render_server.scene.triangle_mesh import TriangleMesh, merge_for_gpu, split_triangles
 
 CUBE_OBJ = """
 mtllib cube.mtl

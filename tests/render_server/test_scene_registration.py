@@ -1,16 +1,16 @@
 import numpy as np
 import pytest
 
-from protocol.board import BoardSpec, GreyCard
-from protocol.camera_model import CameraModel
-from protocol.frames import BoardPose
-from render_server.estimation.registration import (
+from deltalight.protocol.board import BoardSpec, GreyCard
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.frames import BoardPose
+from deltalight.render_server.estimation.registration import (
     Registration,
     RegistrationAverage,
     registration_from_albedo_percentile,
     registration_from_patch,
 )
-from render_server.scene.albedo import known_albedo, paper_pixels, unclipped
+from deltalight.render_server.scene.albedo import known_albedo, paper_pixels, unclipped
 
 FACTOR = np.array([2.0, 1.5, 0.75])
 BOARD = BoardSpec(

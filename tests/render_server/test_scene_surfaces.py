@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from protocol.board import BoardSpec, GreyCard
-from protocol.errors import DeltalightError
-from protocol.scene_objects import BoxRegion, PlaneRegion, Region, Surface
-from render_server.scene.declared_surfaces import build_surface_table
+from deltalight.protocol.board import BoardSpec, GreyCard
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.scene_objects import BoxRegion, PlaneRegion, Region, Surface
+from deltalight.render_server.scene.declared_surfaces import build_surface_table
 
 BOARD = BoardSpec(
     type="aruco_grid", dictionary="DICT_4X4_50", marker_length_m=0.06, separation_m=0.02, rows=2, columns=3

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from protocol.scene import SceneDocument
-from protocol.scene_lights import Lights
-from render_server.gpu.context import GpuContext
-from render_server.passes.reflections import ROUGHEST
-from render_server.renderer import SceneRenderer
+from deltalight.protocol.scene import SceneDocument
+from deltalight.protocol.scene_lights import Lights
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.passes.reflections import ROUGHEST
+from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (
     FOCAL,
     HEIGHT,

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from render_server.gpu.context import NEEDED, create_context
-from render_server.gpu.kernel import IMAGES, SAMPLERS
-from render_server.gpu.shader_source import SHADERS
+from deltalight.render_server.gpu.context import NEEDED, create_context
+from deltalight.render_server.gpu.kernel import IMAGES, SAMPLERS
+from deltalight.render_server.gpu.shader_source import SHADERS
 from tests.render_server.shader_variants import PARTS
 
 VALIDATOR = shutil.which("glslangValidator")

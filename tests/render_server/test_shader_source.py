@@ -1,6 +1,6 @@
 """What a shader's text declares, once its branches are resolved."""
 
-from render_server.gpu.shader_source import declarations, preprocessed
+from deltalight.render_server.gpu.shader_source import declarations, preprocessed
 
 
 def test_declarations_are_those_that_the_defines_leave() -> None:

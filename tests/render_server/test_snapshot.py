@@ -7,14 +7,14 @@ import cv2
 import numpy as np
 import pytest
 
-from protocol.documents import validate
-from protocol.errors import DeltalightError
-from protocol.frames import ViewFrame
-from protocol.radiance_files import read_linear
-from protocol.scene import SceneDocument
-from render_server.gpu.context import GpuContext
-from render_server.renderer import SceneRenderer
-from render_server.server.snapshot import SnapshotOrder, take_snapshot
+from deltalight.protocol.documents import validate
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import ViewFrame
+from deltalight.protocol.radiance_files import read_linear
+from deltalight.protocol.scene import SceneDocument
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.renderer import SceneRenderer
+from deltalight.render_server.server.snapshot import SnapshotOrder, take_snapshot
 from tests.render_server.scenes import (
     Stage,
     ambient,

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from protocol.scene import SceneDocument
-from render_server.gpu.context import GpuContext
-from render_server.renderer import CompositeFrame, SceneRenderer
+from deltalight.protocol.scene import SceneDocument
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.renderer import CompositeFrame, SceneRenderer
 from tests.render_server.protected_scenes import METHODS
 from tests.render_server.scenes import Stage, composite, everyday, frame, look_at
 

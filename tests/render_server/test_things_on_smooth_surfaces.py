@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 import trimesh
 
-from protocol.board import BoardSpec, GreyCard
-from protocol.frames import ViewFrame
-from protocol.scene import SceneDocument
-from protocol.scene_objects import PlaneRegion, Region, Surface
-from render_server.gpu.context import GpuContext
-from render_server.renderer import SceneRenderer
-from render_server.scene.declared_surfaces import UNBOUNDED_M, build_surface_table, plane_fits
-from render_server.scene.depth_surface import depth_surface
+from deltalight.protocol.board import BoardSpec, GreyCard
+from deltalight.protocol.frames import ViewFrame
+from deltalight.protocol.scene import SceneDocument
+from deltalight.protocol.scene_objects import PlaneRegion, Region, Surface
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.renderer import SceneRenderer
+from deltalight.render_server.scene.declared_surfaces import UNBOUNDED_M, build_surface_table, plane_fits
+from deltalight.render_server.scene.depth_surface import depth_surface
 from tests.render_server.scenes import (
     COARSE,
     HEIGHT,

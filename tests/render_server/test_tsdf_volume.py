@@ -6,13 +6,13 @@ import cv2
 import numpy as np
 import pytest
 
-from protocol.camera_model import CameraModel
-from protocol.frames import DepthImage
-from render_server.scene.depth_surface import DepthSurface, depth_surface
-from render_server.scene.triangle_mesh import TriangleMesh
-from render_server.scene.tsdf_mesh import TsdfScene, decimated, extract_mesh
-from render_server.scene.tsdf_volume import aligned_view, interpolate
-from render_server.view import CameraView
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.frames import DepthImage
+from deltalight.render_server.scene.depth_surface import DepthSurface, depth_surface
+from deltalight.render_server.scene.triangle_mesh import TriangleMesh
+from deltalight.render_server.scene.tsdf_mesh import TsdfScene, decimated, extract_mesh
+from deltalight.render_server.scene.tsdf_volume import aligned_view, interpolate
+from deltalight.render_server.view import CameraView
 
 MATRIX = np.array([[150.0, 0, 79.5], [0, 150.0, 59.5], [0, 0, 1]])
 PINHOLE = CameraModel(160, 120, MATRIX)

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from protocol.scene import SceneDocument
-from protocol.scene_method import DlpvMethod
-from render_server.gpu.context import GpuContext
-from render_server.passes.voxels import VolumePlacement, place_volume
-from render_server.renderer import SceneRenderer
-from render_server.virtual_objects import VirtualObjects
+from deltalight.protocol.scene import SceneDocument
+from deltalight.protocol.scene_method import DlpvMethod
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.passes.voxels import VolumePlacement, place_volume
+from deltalight.render_server.renderer import SceneRenderer
+from deltalight.render_server.virtual_objects import VirtualObjects
 from tests.render_server.scenes import (
     Stage,
     ambient,

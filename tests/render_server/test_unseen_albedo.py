@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from protocol.frames import BoardPose, ViewFrame
-from protocol.scene import SceneDocument
-from render_server.estimation.samples import BackoffSchedule
-from render_server.gpu.context import GpuContext
-from render_server.renderer import SceneRenderer
+from deltalight.protocol.frames import BoardPose, ViewFrame
+from deltalight.protocol.scene import SceneDocument
+from deltalight.render_server.estimation.samples import BackoffSchedule
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (
     HEIGHT,
     WIDTH,

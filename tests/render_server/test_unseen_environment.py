@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from protocol.board import BoardSpec
-from protocol.frames import ViewFrame, decode_lut
-from protocol.scene import SceneDocument
-from render_server.estimation.registration import unseen_radiance_from_patch
-from render_server.gpu.context import GpuContext
-from render_server.renderer import SceneRenderer
+from deltalight.protocol.board import BoardSpec
+from deltalight.protocol.frames import ViewFrame, decode_lut
+from deltalight.protocol.scene import SceneDocument
+from deltalight.render_server.estimation.registration import unseen_radiance_from_patch
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.scenes import COARSE, Stage, ambient, cube, directional, floor, frame, plain
 
 ALBEDO = 0.7

@@ -8,9 +8,9 @@ import pytest
 import trimesh
 from scipy import ndimage
 
-from render_server.gpu.context import GpuContext
-from render_server.passes.gbuffer import triangle_corners
-from render_server.passes.voxels import (
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.passes.gbuffer import triangle_corners
+from deltalight.render_server.passes.voxels import (
     SURFEL_BYTES,
     SURFELS_HEADER_BYTES,
     PlacedVolume,

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import moderngl
 import numpy as np
 
-from render_server.gpu.kernel import Kernel
-from render_server.gpu.uniform_block import Block, Float, Vec4
+from deltalight.render_server.gpu.kernel import Kernel
+from deltalight.render_server.gpu.uniform_block import Block, Float, Vec4
 
 OUT = "layout(std430) buffer Out { float values[]; };\n"
 MakeKernel = Callable[..., Kernel]

@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from render_server.gpu.context import GpuContext
-from render_server.gpu.kernel import Binding, Kernel
-from render_server.gpu.uniform_block import UniformBlock
-from render_server.passes.gbuffer import MaterialTable, triangle_corners
-from render_server.passes.lights import LightBuffers
-from render_server.passes.voxel_light import LightVoxels
-from render_server.passes.voxels import (
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import Binding, Kernel
+from deltalight.render_server.gpu.uniform_block import UniformBlock
+from deltalight.render_server.passes.gbuffer import MaterialTable, triangle_corners
+from deltalight.render_server.passes.lights import LightBuffers
+from deltalight.render_server.passes.voxel_light import LightVoxels
+from deltalight.render_server.passes.voxels import (
     DIRECTIONS,
     SURFEL_BYTES,
     SURFELS_HEADER_BYTES,
@@ -25,8 +25,8 @@ from render_server.passes.voxels import (
     VoxelMipmap,
     VoxelStore,
 )
-from render_server.scene.materials import Material
-from render_server.scene.triangle_mesh import GpuMesh, TriangleMesh, merge_for_gpu, smooth_normals
+from deltalight.render_server.scene.materials import Material
+from deltalight.render_server.scene.triangle_mesh import GpuMesh, TriangleMesh, merge_for_gpu, smooth_normals
 
 
 def gpu_mesh(mesh: trimesh.Trimesh, radiance: float = 0.0, *, inside_out: bool = False) -> GpuMesh:

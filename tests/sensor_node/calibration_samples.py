@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
-from protocol.camera_model import CameraModel
-from protocol.poses import rigid_matrix
-from sensor_node.calibration.targets import Chessboard
-from sensor_node.calibration.views import View
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.poses import rigid_matrix
+from deltalight.sensor_node.calibration.targets import Chessboard
+from deltalight.sensor_node.calibration.views import View
 
 Project = Callable[[Float64[np.ndarray, "n 3"]], Float64[np.ndarray, "n 2"]]
 SQUARE_M = 0.04

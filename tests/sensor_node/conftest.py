@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from jaxtyping import Float64
 
-from sensor_node.cameras.synthetic import SyntheticCamera
+from deltalight.sensor_node.cameras.synthetic import SyntheticCamera
 
 
 def pose_difference(

@@ -3,11 +3,11 @@
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
-from protocol.camera_model import CameraModel
-from protocol.equidistant_lens import EquidistantLens
-from protocol.fisheye_lens import FisheyeCalibration, FisheyeLens
-from protocol.frames import FisheyePictures, decode_lut
-from protocol.ocam_lens import OcamLens
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.equidistant_lens import EquidistantLens
+from deltalight.protocol.fisheye_lens import FisheyeCalibration, FisheyeLens
+from deltalight.protocol.frames import FisheyePictures, decode_lut
+from deltalight.protocol.ocam_lens import OcamLens
 
 
 def equidistant(edge: int, degrees: float = 190.0, circle: float | None = None) -> EquidistantLens:

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sensor_node.cameras.oak_frames import Pairing
-from sensor_node.cameras.oak_sdk import load_depthai
+from deltalight.sensor_node.cameras.oak_frames import Pairing
+from deltalight.sensor_node.cameras.oak_sdk import load_depthai
 
 pytest.importorskip("depthai", reason="the OAK SDK is not installed")
 dai = load_depthai()

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from jaxtyping import Float64
 
-from protocol.dataset import open_dataset
-from sensor_node.markers import BoardDetector
+from deltalight.protocol.dataset import open_dataset
+from deltalight.sensor_node.markers import BoardDetector
 from tests.sensor_node.conftest import pose_difference
 
 Poses = Float64[np.ndarray, "n 4 4"]

@@ -8,21 +8,21 @@ import numpy as np
 import pytest
 from jaxtyping import Float64
 
-from protocol.camera_model import CameraModel
-from protocol.equidistant_lens import EquidistantLens
-from protocol.errors import DeltalightError
-from protocol.fisheye_lens import FisheyeCalibration
-from protocol.frames import DepthImage, FisheyePictures, SensorFrame
-from protocol.poses import rigid_matrix
-from sensor_node.calibration.depth_extrinsics import DepthView, depth_views, place_depth_sensor
-from sensor_node.calibration.extrinsics import (
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.equidistant_lens import EquidistantLens
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.fisheye_lens import FisheyeCalibration
+from deltalight.protocol.frames import DepthImage, FisheyePictures, SensorFrame
+from deltalight.protocol.poses import rigid_matrix
+from deltalight.sensor_node.calibration.depth_extrinsics import DepthView, depth_views, place_depth_sensor
+from deltalight.sensor_node.calibration.extrinsics import (
     mean_placement,
     rgb_from_fisheye_poses,
     world_from_fisheye_poses,
 )
-from sensor_node.calibration.poses import mean_pose, target_pose
-from sensor_node.cameras.synthetic import SyntheticCamera, default_camera, srgb_codes
-from sensor_node.cameras.synthetic_scene import SAMPLES_PER_EDGE
+from deltalight.sensor_node.calibration.poses import mean_pose, target_pose
+from deltalight.sensor_node.cameras.synthetic import SyntheticCamera, default_camera, srgb_codes
+from deltalight.sensor_node.cameras.synthetic_scene import SAMPLES_PER_EDGE
 from tests.sensor_node.calibration_samples import BOARD
 from tests.sensor_node.conftest import pose_difference
 

@@ -9,20 +9,25 @@ import numpy as np
 import pytest
 from jaxtyping import Float64
 
-from protocol.board import BoardSpec
-from protocol.camera_model import CameraModel
-from protocol.equidistant_lens import EquidistantLens
-from protocol.errors import DeltalightError
-from protocol.ocam_lens import OcamLens
-from protocol.radial_lens import RadialLens
-from sensor_node.calibration.coverage import image_circle, measure_coverage
-from sensor_node.calibration.fits import rms
-from sensor_node.calibration.lens_calibration import LensKind, LensResult, calibrate_lens, require_good
-from sensor_node.calibration.lens_fits import fit_equidistant
-from sensor_node.calibration.picture_sources import open_series
-from sensor_node.calibration.poses import target_pose
-from sensor_node.calibration.targets import MarkerBoard, parse_target
-from sensor_node.calibration.views import View, ViewCollector
+from deltalight.protocol.board import BoardSpec
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.equidistant_lens import EquidistantLens
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.ocam_lens import OcamLens
+from deltalight.protocol.radial_lens import RadialLens
+from deltalight.sensor_node.calibration.coverage import image_circle, measure_coverage
+from deltalight.sensor_node.calibration.fits import rms
+from deltalight.sensor_node.calibration.lens_calibration import (
+    LensKind,
+    LensResult,
+    calibrate_lens,
+    require_good,
+)
+from deltalight.sensor_node.calibration.lens_fits import fit_equidistant
+from deltalight.sensor_node.calibration.picture_sources import open_series
+from deltalight.sensor_node.calibration.poses import target_pose
+from deltalight.sensor_node.calibration.targets import MarkerBoard, parse_target
+from deltalight.sensor_node.calibration.views import View, ViewCollector
 from tests.sensor_node.calibration_samples import BOARD, facing, poses, views
 
 SIZE = (640, 480)

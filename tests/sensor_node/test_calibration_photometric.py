@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from jaxtyping import Float32, UInt8
 
-from protocol.board import GreyCard
-from protocol.errors import DeltalightError
-from protocol.frames import SensorFrame
-from sensor_node.calibration.photometric import (
+from deltalight.protocol.board import GreyCard
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import SensorFrame
+from deltalight.sensor_node.calibration.photometric import (
     Bracket,
     bracket_residual,
     calibrate_response,
@@ -19,8 +19,8 @@ from sensor_node.calibration.photometric import (
     parse_card,
     read_bracket,
 )
-from sensor_node.cameras.synthetic import SyntheticCamera, srgb_codes
-from sensor_node.cameras.synthetic_scene import PAPER_ALBEDO, irradiance
+from deltalight.sensor_node.cameras.synthetic import SyntheticCamera, srgb_codes
+from deltalight.sensor_node.cameras.synthetic_scene import PAPER_ALBEDO, irradiance
 
 GAMMA = 2.6
 TRUTH = np.repeat((np.arange(256) / 255)[:, None] ** GAMMA, 3, axis=1).astype(np.float32)

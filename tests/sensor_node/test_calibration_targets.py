@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from jaxtyping import UInt8
 
-from protocol.board import BoardSpec, save_board_yaml
-from protocol.camera_model import CameraModel
-from protocol.errors import DeltalightError
-from sensor_node.calibration.picture_sources import MOST_VIEWS, Series, collect_views, open_series
-from sensor_node.calibration.targets import Chessboard, MarkerBoard, Sighting, parse_target
-from sensor_node.calibration.views import Picture, ViewCollector
-from sensor_node.cameras.synthetic import SyntheticCamera
+from deltalight.protocol.board import BoardSpec, save_board_yaml
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.errors import DeltalightError
+from deltalight.sensor_node.calibration.picture_sources import MOST_VIEWS, Series, collect_views, open_series
+from deltalight.sensor_node.calibration.targets import Chessboard, MarkerBoard, Sighting, parse_target
+from deltalight.sensor_node.calibration.views import Picture, ViewCollector
+from deltalight.sensor_node.cameras.synthetic import SyntheticCamera
 from tests.sensor_node.calibration_samples import BOARD, facing, picture
 
 CAMERA = CameraModel(
@@ -179,7 +179,7 @@ def test_a_dataset_without_calibration_is_a_film_or_single_shots(tmp_path: Path)
 
 
 def test_a_live_camera_needs_no_calibration_and_is_closed_at_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    from sensor_node.cameras import open as opening
+    from deltalight.sensor_node.cameras import open as opening
 
     asked: list[tuple[str, dict[str, bool]]] = []
     closed: list[bool] = []
@@ -205,7 +205,7 @@ def test_a_live_camera_needs_no_calibration_and_is_closed_at_the_end(monkeypatch
 
 
 def test_a_recording_gives_its_frames_and_its_board(tmp_path: Path, synthetic: SyntheticCamera) -> None:
-    from protocol.recording_writer import RecordingWriter
+    from deltalight.protocol.recording_writer import RecordingWriter
 
     frames = [synthetic.frame_at(index) for index in range(2)]
     with RecordingWriter(tmp_path / "take.mcap", board=synthetic.board) as writer:

@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from protocol.dataset import DatasetReader, open_dataset
-from protocol.dataset_writer import DatasetWriter
-from protocol.errors import DeltalightError
-from sensor_node.cameras.base import EndOfStream, StaleFrameError
-from sensor_node.cameras.replay import ReplayCamera
-from sensor_node.cameras.synthetic import PERIOD_NS, SyntheticCamera, SyntheticNoise
+from deltalight.protocol.dataset import DatasetReader, open_dataset
+from deltalight.protocol.dataset_writer import DatasetWriter
+from deltalight.protocol.errors import DeltalightError
+from deltalight.sensor_node.cameras.base import EndOfStream, StaleFrameError
+from deltalight.sensor_node.cameras.replay import ReplayCamera
+from deltalight.sensor_node.cameras.synthetic import PERIOD_NS, SyntheticCamera, SyntheticNoise
 from tests.protocol.fisheye_samples import coded
 
 FRAMES = 4
@@ -157,7 +157,9 @@ def test_synthetic_depth_lies_on_the_table_or_the_box(synthetic: SyntheticCamera
 
 
 def test_a_node_needs_no_opengl() -> None:
-    code = "import sys; sys.modules['moderngl'] = None; import sensor_node.node; print(*sys.modules)"
+    code = (
+        "import sys; sys.modules['moderngl'] = None; import deltalight.sensor_node.node; print(*sys.modules)"
+    )
     root = Path(__file__).resolve().parents[2]
     done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

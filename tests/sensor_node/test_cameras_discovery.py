@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from sensor_node.cameras import oak_discovery
-from sensor_node.cameras.discovery import discover, list_cameras
-from sensor_node.cameras.driver import FoundCamera
-from sensor_node.cameras.oak_sdk import load_depthai, sdk_version
-from sensor_node.cameras.rgbd import has_backend
+from deltalight.sensor_node.cameras import oak_discovery
+from deltalight.sensor_node.cameras.discovery import discover, list_cameras
+from deltalight.sensor_node.cameras.driver import FoundCamera
+from deltalight.sensor_node.cameras.oak_sdk import load_depthai, sdk_version
+from deltalight.sensor_node.cameras.rgbd import has_backend
 
 
 def add_video(root: Path, number: int, name: str, index: int = 0, capabilities: str | None = None) -> None:

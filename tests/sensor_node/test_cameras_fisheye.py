@@ -8,14 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from protocol.camera_model import CameraModel
-from protocol.equidistant_lens import EquidistantLens
-from protocol.errors import DeltalightError
-from protocol.fisheye_lens import FisheyeCalibration
-from protocol.frames import FisheyePictures, SensorFrame
-from sensor_node.cameras.base import Camera, EndOfStream, StreamState
-from sensor_node.cameras.fisheye_capture import CameraWithFisheye, FisheyeCapture
-from sensor_node.cameras.reconnect import ReconnectingCamera
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.equidistant_lens import EquidistantLens
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.fisheye_lens import FisheyeCalibration
+from deltalight.protocol.frames import FisheyePictures, SensorFrame
+from deltalight.sensor_node.cameras.base import Camera, EndOfStream, StreamState
+from deltalight.sensor_node.cameras.fisheye_capture import CameraWithFisheye, FisheyeCapture
+from deltalight.sensor_node.cameras.reconnect import ReconnectingCamera
 
 SIZE, PERIOD_S, WAIT_S = 16, 0.003, 20.0
 LENS = CameraModel(SIZE, SIZE, np.array([[5.0, 0, 7.5], [0, 5, 7.5], [0, 0, 1]]), "equidistant", np.zeros(4))

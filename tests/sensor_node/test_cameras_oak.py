@@ -11,13 +11,13 @@ import cv2
 import numpy as np
 import pytest
 
-from protocol.camera_model import CameraModel
-from protocol.errors import DeltalightError
-from sensor_node.cameras.base import EndOfStream, ImuSample
-from sensor_node.cameras.live import CameraFailure, LiveCalibration
-from sensor_node.cameras.oak import OakCamera
-from sensor_node.cameras.oak_device import OakDevice, OakStreams, _queue
-from sensor_node.cameras.oak_frames import (
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.errors import DeltalightError
+from deltalight.sensor_node.cameras.base import EndOfStream, ImuSample
+from deltalight.sensor_node.cameras.live import CameraFailure, LiveCalibration
+from deltalight.sensor_node.cameras.oak import OakCamera
+from deltalight.sensor_node.cameras.oak_device import OakDevice, OakStreams, _queue
+from deltalight.sensor_node.cameras.oak_frames import (
     LONGEST_WAIT_FRAMES,
     Pairing,
     camera_from_calibration,
@@ -28,8 +28,8 @@ from sensor_node.cameras.oak_frames import (
     imu_samples,
     picture_of,
 )
-from sensor_node.cameras.reconnect import ReconnectingCamera
-from sensor_node.cameras.settings import CameraSettings
+from deltalight.sensor_node.cameras.reconnect import ReconnectingCamera
+from deltalight.sensor_node.cameras.settings import CameraSettings
 from tests.sensor_node.oak_samples import (
     FULL,
     HEIGHT,

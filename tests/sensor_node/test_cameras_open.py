@@ -7,18 +7,18 @@ import cv2
 import numpy as np
 import pytest
 
-from protocol.camera_model import CameraModel, save_camera_yaml
-from protocol.dataset_writer import DatasetWriter
-from protocol.equidistant_lens import EquidistantLens
-from protocol.errors import DeltalightError
-from protocol.fisheye_lens import FisheyeCalibration, save_fisheye_yaml
-from sensor_node.cameras import rgbd
-from sensor_node.cameras.live import LiveCalibration, load_calibration
-from sensor_node.cameras.open import is_live, open_camera, open_fisheye
-from sensor_node.cameras.reconnect import ReconnectingCamera
-from sensor_node.cameras.replay import ReplayCamera
-from sensor_node.cameras.settings import CameraSettings, FisheyeSettings
-from sensor_node.cameras.synthetic import SyntheticCamera, default_board
+from deltalight.protocol.camera_model import CameraModel, save_camera_yaml
+from deltalight.protocol.dataset_writer import DatasetWriter
+from deltalight.protocol.equidistant_lens import EquidistantLens
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.fisheye_lens import FisheyeCalibration, save_fisheye_yaml
+from deltalight.sensor_node.cameras import rgbd
+from deltalight.sensor_node.cameras.live import LiveCalibration, load_calibration
+from deltalight.sensor_node.cameras.open import is_live, open_camera, open_fisheye
+from deltalight.sensor_node.cameras.reconnect import ReconnectingCamera
+from deltalight.sensor_node.cameras.replay import ReplayCamera
+from deltalight.sensor_node.cameras.settings import CameraSettings, FisheyeSettings
+from deltalight.sensor_node.cameras.synthetic import SyntheticCamera, default_board
 
 WAIT_S = 20.0
 
@@ -170,7 +170,7 @@ def test_a_live_camera_goes_on_over_the_end_of_its_stream(calibration: Path, tmp
 
 
 def test_rgbd_cameras_say_what_this_opencv_lacks(calibration: Path) -> None:
-    from sensor_node.cameras.rgbd import has_backend
+    from deltalight.sensor_node.cameras.rgbd import has_backend
 
     if has_backend("openni2"):
         pytest.skip("this OpenCV reads OpenNI 2 cameras")

@@ -8,13 +8,13 @@ from contextlib import suppress
 import numpy as np
 import pytest
 
-from protocol.camera_model import CameraModel
-from protocol.errors import DeltalightError
-from protocol.frames import SensorFrame
-from sensor_node.cameras.base import Camera, EndOfStream, StaleFrameError, StreamState
-from sensor_node.cameras.live import CameraFailure
-from sensor_node.cameras.reconnect import ReconnectingCamera
-from sensor_node.capture import CaptureThread
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import SensorFrame
+from deltalight.sensor_node.cameras.base import Camera, EndOfStream, StaleFrameError, StreamState
+from deltalight.sensor_node.cameras.live import CameraFailure
+from deltalight.sensor_node.cameras.reconnect import ReconnectingCamera
+from deltalight.sensor_node.capture import CaptureThread
 
 CAMERA = CameraModel(8, 6, np.array([[6.0, 0, 3.5], [0, 6, 2.5], [0, 0, 1]]))
 PERIOD_S = 0.005
@@ -247,7 +247,7 @@ def test_a_driver_that_hangs_keeps_nobody_waiting_and_is_not_opened_twice(
             self.released.wait(WAIT_S)
             raise CameraFailure("time-out of the driver.")
 
-    monkeypatch.setattr("sensor_node.cameras.reconnect.CLOSE_S", 0.05)
+    monkeypatch.setattr("deltalight.sensor_node.cameras.reconnect.CLOSE_S", 0.05)
     inner = Hanging()
     camera = reconnecting(inner)
     camera.open()

@@ -10,13 +10,13 @@ import cv2
 import numpy as np
 import pytest
 
-from protocol.camera_model import CameraModel
-from protocol.errors import DeltalightError
-from sensor_node.cameras.base import EndOfStream, StaleFrameError
-from sensor_node.cameras.live import CameraFailure, HostClock, LiveCalibration
-from sensor_node.cameras.settings import CameraSettings
-from sensor_node.cameras.uvc import UvcCamera, decode
-from sensor_node.cameras.uvc_controls import AUTOMATIC, MANUAL, UvcControls
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.errors import DeltalightError
+from deltalight.sensor_node.cameras.base import EndOfStream, StaleFrameError
+from deltalight.sensor_node.cameras.live import CameraFailure, HostClock, LiveCalibration
+from deltalight.sensor_node.cameras.settings import CameraSettings
+from deltalight.sensor_node.cameras.uvc import UvcCamera, decode
+from deltalight.sensor_node.cameras.uvc_controls import AUTOMATIC, MANUAL, UvcControls
 
 WIDTH, HEIGHT, FRAMES = 64, 48, 6
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from jaxtyping import Bool, Float32, UInt8
 
-from protocol.camera_model import CameraModel
-from protocol.errors import DeltalightError
-from protocol.frames import DepthImage
-from sensor_node.depth import DepthSettings, clean_depth, estimate_noise_sigma
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import DepthImage
+from deltalight.sensor_node.depth import DepthSettings, clean_depth, estimate_noise_sigma
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 300.0
 SIGMA = 0.002

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from jaxtyping import Bool, Float32, UInt8
 
-from protocol.camera_model import CameraModel
-from protocol.frames import DepthImage
-from protocol.source import open_source
-from sensor_node.depth import DepthSettings, clean_depth
-from sensor_node.depth_edges import assign_edges
-from sensor_node.depth_filter import NoiseModel
-from sensor_node.view_frames import ViewFrameBuilder
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.frames import DepthImage
+from deltalight.protocol.source import open_source
+from deltalight.sensor_node.depth import DepthSettings, clean_depth
+from deltalight.sensor_node.depth_edges import assign_edges
+from deltalight.sensor_node.depth_filter import NoiseModel
+from deltalight.sensor_node.view_frames import ViewFrameBuilder
 
 WIDTH, HEIGHT = 160, 120
 CAMERA = CameraModel(WIDTH, HEIGHT, np.array([[150.0, 0, 79.5], [0, 150.0, 59.5], [0, 0, 1]]))

@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
-from protocol.camera_model import CameraModel
-from protocol.frames import DepthImage
-from protocol.poses import rigid_matrix
-from sensor_node.cameras.synthetic import SyntheticCamera
-from sensor_node.depth_registration import register_depth
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.frames import DepthImage
+from deltalight.protocol.poses import rigid_matrix
+from deltalight.sensor_node.cameras.synthetic import SyntheticCamera
+from deltalight.sensor_node.depth_registration import register_depth
 
 COLOR = CameraModel(320, 240, np.array([[300.0, 0, 160], [0, 300.0, 121], [0, 0, 1]]))
 DEPTH = CameraModel(

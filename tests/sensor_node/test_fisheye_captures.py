@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from jaxtyping import Float32, Float64
 
-from protocol.camera_model import CameraModel
-from protocol.equidistant_lens import EquidistantLens
-from protocol.fisheye_lens import FisheyeCalibration
-from protocol.frames import FisheyePictures, RadianceMap
-from protocol.hemisphere import hemisphere_uv, texel_directions, texel_solid_angles
-from protocol.ocam_lens import load_ocam_results
-from protocol.pictures import decode_rgb
-from sensor_node.fisheye import estimate_response, light_warnings, radiance_map
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.equidistant_lens import EquidistantLens
+from deltalight.protocol.fisheye_lens import FisheyeCalibration
+from deltalight.protocol.frames import FisheyePictures, RadianceMap
+from deltalight.protocol.hemisphere import hemisphere_uv, texel_directions, texel_solid_angles
+from deltalight.protocol.ocam_lens import load_ocam_results
+from deltalight.protocol.pictures import decode_rgb
+from deltalight.sensor_node.fisheye import estimate_response, light_warnings, radiance_map
 
 SIZE = 256
 EFFICACY = 179.0 * np.array([0.265, 0.670, 0.065])

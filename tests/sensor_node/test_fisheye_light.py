@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from jaxtyping import Float64
 
-from protocol.board import LampMarker
-from protocol.calibration import Extrinsics
-from protocol.frames import FisheyePictures, SensorFrame
-from sensor_node.cameras.synthetic import SyntheticCamera
-from sensor_node.view_frames import ViewFrameBuilder
+from deltalight.protocol.board import LampMarker
+from deltalight.protocol.calibration import Extrinsics
+from deltalight.protocol.frames import FisheyePictures, SensorFrame
+from deltalight.sensor_node.cameras.synthetic import SyntheticCamera
+from deltalight.sensor_node.view_frames import ViewFrameBuilder
 from tests.sensor_node.fisheye_samples import bracket, equidistant
 
 LENS = equidistant(64)

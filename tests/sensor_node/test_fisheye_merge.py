@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from protocol.errors import DeltalightError
-from protocol.fisheye_lens import FisheyeCalibration
-from protocol.frames import FisheyePictures
-from sensor_node.fisheye import estimate_response
-from sensor_node.fisheye.exposures import LinearPicture, merge_bracket, reference_exposure
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.fisheye_lens import FisheyeCalibration
+from deltalight.protocol.frames import FisheyePictures
+from deltalight.sensor_node.fisheye import estimate_response
+from deltalight.sensor_node.fisheye.exposures import LinearPicture, merge_bracket, reference_exposure
 from tests.sensor_node.fisheye_samples import bracket, coded, equidistant
 
 LENS = equidistant(60)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from jaxtyping import Float32, Float64
 
-from protocol.fisheye_lens import FisheyeCalibration, FisheyeLens
-from protocol.frames import FisheyePictures, RadianceMap
-from protocol.hemisphere import texel_directions, texel_solid_angles
-from sensor_node.fisheye import light_warnings, radiance_map
+from deltalight.protocol.fisheye_lens import FisheyeCalibration, FisheyeLens
+from deltalight.protocol.frames import FisheyePictures, RadianceMap
+from deltalight.protocol.hemisphere import texel_directions, texel_solid_angles
+from deltalight.sensor_node.fisheye import light_warnings, radiance_map
 from tests.sensor_node.fisheye_samples import equidistant, even, ocam, pixel_solid_angles
 
 LENSES: dict[str, FisheyeLens] = {

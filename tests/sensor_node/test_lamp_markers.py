@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from protocol.board import BoardSpec, LampMarker, load_board_yaml, save_board_yaml
-from protocol.camera_model import CameraModel
-from protocol.frames import LampPose
-from protocol.poses import rigid_matrix
-from sensor_node import lamp_markers
-from sensor_node.cameras.synthetic import default_camera, srgb_codes
-from sensor_node.lamp_markers import detect_lamps
+from deltalight.protocol.board import BoardSpec, LampMarker, load_board_yaml, save_board_yaml
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.frames import LampPose
+from deltalight.protocol.poses import rigid_matrix
+from deltalight.sensor_node import lamp_markers
+from deltalight.sensor_node.cameras.synthetic import default_camera, srgb_codes
+from deltalight.sensor_node.lamp_markers import detect_lamps
 from tests.sensor_node.conftest import pose_difference
 
 LENGTH_M = 0.06

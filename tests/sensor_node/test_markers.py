@@ -7,12 +7,12 @@ import cv2
 import numpy as np
 import pytest
 
-from protocol.board import BoardSpec, load_board_yaml
-from protocol.camera_model import CameraModel
-from protocol.dataset import open_dataset
-from protocol.errors import DeltalightError
-from sensor_node.cameras.synthetic import SyntheticCamera, default_camera, srgb_codes
-from sensor_node.markers import BoardDetector
+from deltalight.protocol.board import BoardSpec, load_board_yaml
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.dataset import open_dataset
+from deltalight.protocol.errors import DeltalightError
+from deltalight.sensor_node.cameras.synthetic import SyntheticCamera, default_camera, srgb_codes
+from deltalight.sensor_node.markers import BoardDetector
 from tests.sensor_node.conftest import pose_difference
 
 MATRIX = np.array([[500.0, 0, 319.5], [0, 500.0, 239.5], [0, 0, 1]])

@@ -10,14 +10,14 @@ import cv2
 import numpy as np
 import pytest
 
-from protocol.camera_model import CameraModel
-from protocol.clock import CLOCK_OP, clock_payload
-from protocol.codecs import decode_color, decode_depth
-from protocol.dataset_writer import DatasetWriter
-from protocol.envelope import decode
-from protocol.errors import DeltalightError
-from protocol.frames import DepthImage
-from protocol.messages import (
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.clock import CLOCK_OP, clock_payload
+from deltalight.protocol.codecs import decode_color, decode_depth
+from deltalight.protocol.dataset_writer import DatasetWriter
+from deltalight.protocol.envelope import decode
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import DepthImage
+from deltalight.protocol.messages import (
     ColorMessage,
     ControlRequest,
     DepthMessage,
@@ -25,12 +25,12 @@ from protocol.messages import (
     PoseMessage,
     StatsMessage,
 )
-from protocol.receiver import Receiver
-from protocol.request import ReplyServer
-from sensor_node.cameras.synthetic import SyntheticCamera, default_camera
-from sensor_node.capture import CaptureThread
-from sensor_node.frame_messages import depth_multipart, fitting_step_m
-from sensor_node.node import NodeConfig, run_node
+from deltalight.protocol.receiver import Receiver
+from deltalight.protocol.request import ReplyServer
+from deltalight.sensor_node.cameras.synthetic import SyntheticCamera, default_camera
+from deltalight.sensor_node.capture import CaptureThread
+from deltalight.sensor_node.frame_messages import depth_multipart, fitting_step_m
+from deltalight.sensor_node.node import NodeConfig, run_node
 from tests.sensor_node.conftest import pose_difference
 
 Received = list[tuple[Message, list[memoryview]]]

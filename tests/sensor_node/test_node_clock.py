@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from protocol.clock import clock_payload
-from protocol.messages import ControlRequest
-from protocol.request import ReplyServer
-from sensor_node import capture
-from sensor_node.capture import ServerClock
+from deltalight.protocol.clock import clock_payload
+from deltalight.protocol.messages import ControlRequest
+from deltalight.protocol.request import ReplyServer
+from deltalight.sensor_node import capture
+from deltalight.sensor_node.capture import ServerClock
 
 SECOND = 1_000_000_000
 

@@ -10,16 +10,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from protocol.board import BoardSpec
-from protocol.calibration import Extrinsics
-from protocol.camera_model import CameraModel
-from protocol.dataset_writer import DatasetWriter
-from protocol.envelope import decode
-from protocol.equidistant_lens import EquidistantLens
-from protocol.fisheye_lens import FisheyeCalibration
-from protocol.frames import BoardPose, FisheyePictures
-from protocol.keys import create_keys, load_keys, trust
-from protocol.messages import (
+from deltalight.protocol.board import BoardSpec
+from deltalight.protocol.calibration import Extrinsics
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.dataset_writer import DatasetWriter
+from deltalight.protocol.envelope import decode
+from deltalight.protocol.equidistant_lens import EquidistantLens
+from deltalight.protocol.fisheye_lens import FisheyeCalibration
+from deltalight.protocol.frames import BoardPose, FisheyePictures
+from deltalight.protocol.keys import create_keys, load_keys, trust
+from deltalight.protocol.messages import (
     FisheyeMessage,
     LampsMessage,
     Message,
@@ -27,15 +27,15 @@ from protocol.messages import (
     RadianceMessage,
     StatsMessage,
 )
-from protocol.receiver import Receiver
-from sensor_node import node
-from sensor_node.cameras.base import Camera, StreamState
-from sensor_node.cameras.settings import CameraSettings, FisheyeSettings
-from sensor_node.cameras.synthetic import SyntheticCamera, default_board
-from sensor_node.health import Health
-from sensor_node.node import NodeConfig, Repeater, run_node
-from sensor_node.pose_filter import PoseFilterSettings
-from services import ports
+from deltalight.protocol.receiver import Receiver
+from deltalight.sensor_node import node
+from deltalight.sensor_node.cameras.base import Camera, StreamState
+from deltalight.sensor_node.cameras.settings import CameraSettings, FisheyeSettings
+from deltalight.sensor_node.cameras.synthetic import SyntheticCamera, default_board
+from deltalight.sensor_node.health import Health
+from deltalight.sensor_node.node import NodeConfig, Repeater, run_node
+from deltalight.sensor_node.pose_filter import PoseFilterSettings
+from deltalight.services import ports
 
 PERIOD_NS = 33_333_333
 SIZE = 96

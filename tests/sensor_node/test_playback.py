@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 
-from protocol.errors import DeltalightError
-from protocol.frames import SensorFrame
-from protocol.source import Source, open_source
-from sensor_node.cameras import playback
-from sensor_node.cameras.base import EndOfStream
-from sensor_node.cameras.playback import PlaybackCamera
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import SensorFrame
+from deltalight.protocol.source import Source, open_source
+from deltalight.sensor_node.cameras import playback
+from deltalight.sensor_node.cameras.base import EndOfStream
+from deltalight.sensor_node.cameras.playback import PlaybackCamera
 from tests.services.record_samples import PERIOD_NS, frames, write
 
 COUNT = 12

@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from protocol.frames import BoardPose
-from protocol.poses import rigid_matrix
-from sensor_node.pose_filter import PoseFilter, PoseFilterSettings
+from deltalight.protocol.frames import BoardPose
+from deltalight.protocol.poses import rigid_matrix
+from deltalight.sensor_node.pose_filter import PoseFilter, PoseFilterSettings
 from tests.sensor_node.conftest import pose_difference
 
 PERIOD_NS = 33_333_333

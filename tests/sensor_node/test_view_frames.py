@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from protocol.camera_model import CameraModel
-from protocol.dataset import open_dataset
-from protocol.dataset_writer import DatasetWriter
-from protocol.errors import DeltalightError
-from protocol.frames import DepthImage, SensorFrame
-from sensor_node.cameras.synthetic import SyntheticCamera, SyntheticNoise
-from sensor_node.view_frames import ViewFrameBuilder
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.dataset import open_dataset
+from deltalight.protocol.dataset_writer import DatasetWriter
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import DepthImage, SensorFrame
+from deltalight.sensor_node.cameras.synthetic import SyntheticCamera, SyntheticNoise
+from deltalight.sensor_node.view_frames import ViewFrameBuilder
 from tests.sensor_node.conftest import pose_difference
 
 

@@ -9,15 +9,15 @@ from pathlib import Path
 
 import httpx
 
-from protocol.request import ReplyServer
-from protocol.scene import SceneDocument
-from render_server.server.session import RenderSession
-from services import ports
-from services.api.app import create_app
-from services.api.serve import http_server, listening
-from services.api.settings import ApiSettings
-from services.storage.assets import Probe
-from services.storage.store import Store
+from deltalight.protocol.request import ReplyServer
+from deltalight.protocol.scene import SceneDocument
+from deltalight.render_server.server.session import RenderSession
+from deltalight.services import ports
+from deltalight.services.api.app import create_app
+from deltalight.services.api.serve import http_server, listening
+from deltalight.services.api.settings import ApiSettings
+from deltalight.services.storage.assets import Probe
+from deltalight.services.storage.store import Store
 from tests.services.storage_samples import trusting_probe
 from tests.services.test_session import InvertingRenderer
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from protocol.camera_model import CameraModel
-from protocol.codecs import encode_color, encode_depth
-from protocol.envelope import encode
-from protocol.messages import ColorMessage, DepthMessage, PoseMessage
-from protocol.subscriber import ReceivedMultipart
-from services.cli import run
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.codecs import encode_color, encode_depth
+from deltalight.protocol.envelope import encode
+from deltalight.protocol.messages import ColorMessage, DepthMessage, PoseMessage
+from deltalight.protocol.subscriber import ReceivedMultipart
+from deltalight.services.cli import run
 
 ROOT = Path(__file__).parents[2]
 WIDTH, HEIGHT = 64, 48
@@ -54,7 +54,12 @@ def cli_process(homes: None) -> RunCli:
     del homes
 
     def start(*arguments: object, timeout_s: float = 60) -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, "-m", "services.cli", *(str(argument) for argument in arguments)]
+        command = [
+            sys.executable,
+            "-m",
+            "deltalight.services.cli",
+            *(str(argument) for argument in arguments),
+        ]
         return subprocess.run(
             command,
             cwd=ROOT,

@@ -19,14 +19,14 @@ from jaxtyping import UInt8
 from numpy.typing import ArrayLike
 from playwright.sync_api import BrowserContext, ConsoleMessage, Locator, Page
 
-from protocol.camera_model import CameraModel
-from protocol.scene import SceneDocument
-from services import ports
-from services.api.static_page import DASHBOARD
-from services.demo import NAME, RECORDING, demo_plan, demo_scene
-from services.host_store import activate_document, session_file
-from services.storage.store import Store
-from services.supervisor import Supervisor
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.scene import SceneDocument
+from deltalight.services import ports
+from deltalight.services.api.static_page import DASHBOARD
+from deltalight.services.demo import NAME, RECORDING, demo_plan, demo_scene
+from deltalight.services.host_store import activate_document, session_file
+from deltalight.services.storage.store import Store
+from deltalight.services.supervisor import Supervisor
 from tests.services.live_samples import live_socket, read_frame, wait_for_frames
 
 PATIENCE_S = 90.0

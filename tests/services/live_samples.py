@@ -16,11 +16,11 @@ import numpy as np
 import pytest
 from websockets.sync.client import ClientConnection, connect
 
-from protocol.codecs import encode_color
-from protocol.envelope import encode
-from protocol.messages import CompositeMessage, StatsMessage
-from protocol.publisher import Publisher
-from services import ports
+from deltalight.protocol.codecs import encode_color
+from deltalight.protocol.envelope import encode
+from deltalight.protocol.messages import CompositeMessage, StatsMessage
+from deltalight.protocol.publisher import Publisher
+from deltalight.services import ports
 from tests.services.api_samples import RenderServer, RunningApi, running_api
 from tests.services.conftest import HEIGHT, IDENTITY, WIDTH, camera
 

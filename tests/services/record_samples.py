@@ -10,15 +10,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from protocol.board import BoardSpec
-from protocol.calibration import Extrinsics
-from protocol.camera_model import CameraModel
-from protocol.frames import BoardPose, SensorFrame
-from protocol.pictures import depth_from_steps
-from protocol.publisher import Publisher
-from protocol.recording_writer import RecordingWriter
-from protocol.scene import SceneDocument
-from sensor_node.frame_messages import (
+from deltalight.protocol.board import BoardSpec
+from deltalight.protocol.calibration import Extrinsics
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.frames import BoardPose, SensorFrame
+from deltalight.protocol.pictures import depth_from_steps
+from deltalight.protocol.publisher import Publisher
+from deltalight.protocol.recording_writer import RecordingWriter
+from deltalight.protocol.scene import SceneDocument
+from deltalight.sensor_node.frame_messages import (
     Stamps,
     color_multipart,
     depth_multipart,

@@ -6,10 +6,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from protocol.errors import DeltalightError
-from protocol.messages import ControlRequest
-from protocol.request import ReplyServer
-from services import ports
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.messages import ControlRequest
+from deltalight.protocol.request import ReplyServer
+from deltalight.services import ports
 
 NOWHERE = {"kind": "nothing", "object": None, "point_m": None, "normal": None, "distance_m": None}
 

@@ -4,9 +4,9 @@ import json
 import struct
 from pathlib import Path
 
-from services.storage.asset_kinds import AssetKind, Facts
-from services.storage.assets import Asset
-from services.storage.store import Store
+from deltalight.services.storage.asset_kinds import AssetKind, Facts
+from deltalight.services.storage.assets import Asset
+from deltalight.services.storage.store import Store
 
 TETRAHEDRON = b"""v 0 0 0
 v 1 0 0

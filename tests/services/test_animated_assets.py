@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from services.storage.asset_sandbox import probe
-from services.storage.faults import RejectedAssetError
+from deltalight.services.storage.asset_sandbox import probe
+from deltalight.services.storage.faults import RejectedAssetError
 
 ASSETS = Path(__file__).parents[2] / "services" / "demo_assets"
 

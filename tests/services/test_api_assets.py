@@ -12,9 +12,9 @@ import httpx
 import numpy as np
 import pytest
 
-from protocol.radiance_files import write_exr
-from services.storage.asset_sandbox import probe
-from services.storage.faults import RejectedAssetError
+from deltalight.protocol.radiance_files import write_exr
+from deltalight.services.storage.asset_sandbox import probe
+from deltalight.services.storage.faults import RejectedAssetError
 from tests.services.api_samples import UPLOAD, RunningApi, running_api, sentence
 from tests.services.conftest import ROOT
 from tests.services.storage_samples import TETRAHEDRON, glb, lying_glb

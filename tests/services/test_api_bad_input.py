@@ -19,11 +19,11 @@ import httpx
 import numpy as np
 import pytest
 
-from protocol.radiance_files import write_exr
-from services import ports
-from services.api.problems import TYPE_PREFIX
-from services.storage.asset_sandbox import probe
-from services.storage.faults import StorageFaultError
+from deltalight.protocol.radiance_files import write_exr
+from deltalight.services import ports
+from deltalight.services.api.problems import TYPE_PREFIX
+from deltalight.services.storage.asset_sandbox import probe
+from deltalight.services.storage.faults import StorageFaultError
 from tests.services.api_samples import UPLOAD, RenderServer, RunningApi, running_api, sentence
 from tests.services.record_samples import frames, write
 from tests.services.storage_samples import TETRAHEDRON, glb

@@ -9,8 +9,8 @@ from datetime import UTC, datetime
 import pytest
 import websockets
 
-from protocol.envelope import encode
-from services.api.events import QUEUE_EVENTS, EventHub
+from deltalight.protocol.envelope import encode
+from deltalight.services.api.events import QUEUE_EVENTS, EventHub
 from tests.services.api_samples import UPLOAD, RenderServer
 from tests.services.live_samples import LiveApi, event_socket, live_api, next_event, report
 from tests.services.storage_samples import TETRAHEDRON

@@ -6,14 +6,14 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from protocol.codecs import encode_array, encode_color
-from protocol.envelope import encode
-from protocol.messages import RadianceMessage
-from protocol.publisher import Publisher
-from sensor_node.cameras.driver import Discovery, FoundCamera, MissingSupport
-from services import ports
-from services.api import camera_finder
-from services.api.fisheye import lights_in_picture
+from deltalight.protocol.codecs import encode_array, encode_color
+from deltalight.protocol.envelope import encode
+from deltalight.protocol.messages import RadianceMessage
+from deltalight.protocol.publisher import Publisher
+from deltalight.sensor_node.cameras.driver import Discovery, FoundCamera, MissingSupport
+from deltalight.services import ports
+from deltalight.services.api import camera_finder
+from deltalight.services.api.fisheye import lights_in_picture
 from tests.services.api_samples import sentence
 from tests.services.conftest import IDENTITY
 from tests.services.live_samples import LiveApi, live_api
@@ -135,7 +135,9 @@ def test_while_a_recording_is_shown_its_light_is_the_one_that_counts(live: LiveA
 def test_cameras_of_this_host_are_listed(live: LiveApi, monkeypatch: pytest.MonkeyPatch) -> None:
     found = FoundCamera("Webcam", "uvc:0", "uvc", "/dev/video0", "no permission")
     missing = MissingSupport("oak", "not installed", "install it")
-    monkeypatch.setattr("sensor_node.cameras.discovery.discover", lambda: Discovery((found,), (missing,)))
+    monkeypatch.setattr(
+        "deltalight.sensor_node.cameras.discovery.discover", lambda: Discovery((found,), (missing,))
+    )
     answer = live.client.get("/cameras").json()
     assert answer["cameras"] == [found.as_dict()]
     assert answer["missing"][0]["hint"] == "install it"
@@ -143,5 +145,5 @@ def test_cameras_of_this_host_are_listed(live: LiveApi, monkeypatch: pytest.Monk
 
 def test_a_search_that_hangs_is_a_sentence(live: LiveApi, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(camera_finder, "TIMEOUT_S", 0.05)
-    monkeypatch.setattr("sensor_node.cameras.discovery.discover", lambda: time.sleep(0.5))
+    monkeypatch.setattr("deltalight.sensor_node.cameras.discovery.discover", lambda: time.sleep(0.5))
     assert "takes too long" in sentence(live.client.get("/cameras"), 503)

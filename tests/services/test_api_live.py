@@ -14,13 +14,13 @@ import pytest
 import websockets
 from websockets.sync.client import ClientConnection
 
-from protocol.errors import DeltalightError
-from protocol.messages import ControlRequest
-from services import ports
-from services.api.credentials import OPEN_TICKETS, TICKET_LIFE_S, Principal, Tickets
-from services.api.limits import STREAMS_PER_CLIENT
-from services.api.live_hub import LiveHub
-from services.api.routes.live import WINDOW
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.messages import ControlRequest
+from deltalight.services import ports
+from deltalight.services.api.credentials import OPEN_TICKETS, TICKET_LIFE_S, Principal, Tickets
+from deltalight.services.api.limits import STREAMS_PER_CLIENT
+from deltalight.services.api.live_hub import LiveHub
+from deltalight.services.api.routes.live import WINDOW
 from tests.services.api_samples import sentence
 from tests.services.conftest import HEIGHT, ROOT, WIDTH
 from tests.services.live_samples import (
@@ -306,7 +306,7 @@ def test_tickets_end_and_the_oldest_are_forgotten() -> None:
 
 
 def test_a_revoked_token_ends_what_it_opened(guarded: LiveApi, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("services.api.limits.CHECK_INTERVAL_S", 0.1)
+    monkeypatch.setattr("deltalight.services.api.limits.CHECK_INTERVAL_S", 0.1)
     headers = bearer(guarded, "guest", "view")
     with live_socket(guarded.address, additional_headers=headers) as socket:
         read_frame(socket)
@@ -339,7 +339,16 @@ def test_a_client_has_only_so_many_places(live: LiveApi) -> None:
 def test_ctrl_c_ends_the_process_in_spite_of_open_streams_and_it_starts_again(tmp_path: Path) -> None:
     port, control_port, stream_port = ports.private_ports(3)
     stream = StandInStream(stream_port)
-    command = [sys.executable, "-m", "services.cli", "api", "--port", str(port), "--data", str(tmp_path)]
+    command = [
+        sys.executable,
+        "-m",
+        "deltalight.services.cli",
+        "api",
+        "--port",
+        str(port),
+        "--data",
+        str(tmp_path),
+    ]
     command += ["--control", ports.endpoint(control_port), "--subscribe", ports.endpoint(stream_port)]
     address = f"{ports.LOOPBACK}:{port}"
     for number, expected in ((signal.SIGTERM, ENDED_BY_SIGTERM), (signal.SIGINT, 130)):

@@ -14,8 +14,8 @@ from typing import Any
 
 import pytest
 
-from services import ports
-from services.api import recording_session, replay_control
+from deltalight.services import ports
+from deltalight.services.api import recording_session, replay_control
 from tests.services.api_samples import RunningApi, running_api
 from tests.services.live_samples import StandInStream, wait_for_frames
 from tests.services.record_samples import frames, write

@@ -24,7 +24,7 @@ def build(place: Path) -> Path:
 def serving(folder: Path) -> Iterator[httpx.Client]:
     """A client of the root of a service that serves `folder`."""
     with pytest.MonkeyPatch.context() as patch, ExitStack() as stack:
-        patch.setattr("services.api.static_page.DASHBOARD", folder)
+        patch.setattr("deltalight.services.api.static_page.DASHBOARD", folder)
         port = stack.enter_context(running_api(folder.parent / "data")).client.base_url.port
         yield stack.enter_context(httpx.Client(base_url=f"http://127.0.0.1:{port}"))
 

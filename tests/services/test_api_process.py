@@ -13,14 +13,14 @@ import httpx
 import pytest
 from typer.testing import CliRunner
 
-from protocol.documents import validate
-from protocol.errors import DeltalightError
-from protocol.messages import ControlRequest
-from protocol.request import RequestClient
-from services import ports
-from services.api.serve import listening, run_api
-from services.api.settings import ApiSettings
-from services.commands.api import api
+from deltalight.protocol.documents import validate
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.messages import ControlRequest
+from deltalight.protocol.request import RequestClient
+from deltalight.services import ports
+from deltalight.services.api.serve import listening, run_api
+from deltalight.services.api.settings import ApiSettings
+from deltalight.services.commands.api import api
 from tests.services.api_samples import sentence
 from tests.services.conftest import ROOT, RunCli
 
@@ -30,7 +30,7 @@ ENDED_BY_SIGTERM = 143
 
 @contextmanager
 def process(*arguments: object) -> Iterator[subprocess.Popen[bytes]]:
-    command = [sys.executable, "-m", "services.cli", *map(str, arguments)]
+    command = [sys.executable, "-m", "deltalight.services.cli", *map(str, arguments)]
     running = subprocess.Popen(command, cwd=ROOT)
     try:
         yield running
@@ -120,7 +120,16 @@ def test_tokens_are_made_listed_and_revoked(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_leaving_loopback_makes_and_prints_a_token_once(tmp_path: Path) -> None:
     (port,) = ports.private_ports(1)
-    command = [sys.executable, "-m", "services.cli", "api", "--host", "0.0.0.0", "--port", str(port)]
+    command = [
+        sys.executable,
+        "-m",
+        "deltalight.services.cli",
+        "api",
+        "--host",
+        "0.0.0.0",
+        "--port",
+        str(port),
+    ]
     outputs = []
     for _ in range(2):
         running = subprocess.Popen(

@@ -14,9 +14,9 @@ import numpy as np
 import psutil
 import pytest
 
-from protocol.scene import SceneDocument
-from protocol.source import open_source
-from services import ports
+from deltalight.protocol.scene import SceneDocument
+from deltalight.protocol.source import open_source
+from deltalight.services import ports
 from tests.services.api_samples import RunningApi, running_api, sentence
 from tests.services.record_samples import HEIGHT, WIDTH, Feed, feeding, frames, write
 

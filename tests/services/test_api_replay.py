@@ -8,13 +8,13 @@ import httpx
 import psutil
 import pytest
 
-from protocol.messages import ControlRequest
-from protocol.request import RequestClient
-from services import ports
-from services.api.replay_control import ReplayEndpoints
-from services.recorder import Recorder as StreamRecorder
-from services.recorder import RecordJob
-from services.storage.faults import ConflictError
+from deltalight.protocol.messages import ControlRequest
+from deltalight.protocol.request import RequestClient
+from deltalight.services import ports
+from deltalight.services.api.replay_control import ReplayEndpoints
+from deltalight.services.recorder import Recorder as StreamRecorder
+from deltalight.services.recorder import RecordJob
+from deltalight.services.storage.faults import ConflictError
 from tests.services.api_samples import RunningApi, running_api, sentence
 from tests.services.record_samples import PERIOD_NS, frames, write
 from tests.services.render_server_samples import Recorder

@@ -8,9 +8,9 @@ import httpx
 import pytest
 import yaml
 
-from protocol.messages import ControlRequest
-from services import ports
-from services.api.render_link import ALIVE_TIMEOUT_S
+from deltalight.protocol.messages import ControlRequest
+from deltalight.services import ports
+from deltalight.services.api.render_link import ALIVE_TIMEOUT_S
 from tests.services.api_samples import UPLOAD, RenderServer, RunningApi, running_api, sentence
 from tests.services.storage_samples import TETRAHEDRON
 

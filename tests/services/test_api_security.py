@@ -6,11 +6,11 @@ from pathlib import Path
 import httpx
 import pytest
 
-from protocol.errors import DeltalightError
-from services.api.auth import WRONG_TOKENS_AT_ONCE
-from services.api.credentials import SecretToken
-from services.api.limits import REMEMBERED_CLIENTS, RateLimit
-from services.api.settings import ApiSettings
+from deltalight.protocol.errors import DeltalightError
+from deltalight.services.api.auth import WRONG_TOKENS_AT_ONCE
+from deltalight.services.api.credentials import SecretToken
+from deltalight.services.api.limits import REMEMBERED_CLIENTS, RateLimit
+from deltalight.services.api.settings import ApiSettings
 from tests.services.api_samples import RunningApi, running_api, sentence
 
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from services.api.snapshot_store import SnapshotStore
+from deltalight.services.api.snapshot_store import SnapshotStore
 from tests.services.api_samples import RunningApi, running_api, sentence
 from tests.services.render_server_samples import Recorder
 from tests.services.test_api_scenes import wait_for

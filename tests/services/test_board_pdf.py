@@ -9,15 +9,15 @@ import pytest
 from jaxtyping import Float64, UInt8
 from typer.testing import CliRunner, Result
 
-from protocol.board import BoardSpec, LampMarker, load_board_yaml
-from protocol.camera_model import CameraModel
-from protocol.errors import DeltalightError
-from protocol.poses import rigid_matrix
-from sensor_node.calibration.targets import MarkerBoard
-from sensor_node.cameras.synthetic import srgb_codes
-from sensor_node.markers import BoardDetector
-from services.board_pdf import PAPERS_MM, choose_page, write_board_pdf
-from services.cli import app
+from deltalight.protocol.board import BoardSpec, LampMarker, load_board_yaml
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.poses import rigid_matrix
+from deltalight.sensor_node.calibration.targets import MarkerBoard
+from deltalight.sensor_node.cameras.synthetic import srgb_codes
+from deltalight.sensor_node.markers import BoardDetector
+from deltalight.services.board_pdf import PAPERS_MM, choose_page, write_board_pdf
+from deltalight.services.cli import app
 
 DPI = 300
 MM_PER_PIXEL = 25.4 / DPI

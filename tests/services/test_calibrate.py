@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from protocol.board import load_board_yaml
-from protocol.calibration import Extrinsics, load_extrinsics_yaml, save_extrinsics_yaml
-from protocol.camera_model import CameraModel, load_camera_yaml
-from protocol.dataset_writer import DatasetWriter
-from protocol.equidistant_lens import EquidistantLens
-from protocol.errors import DeltalightError
-from protocol.fisheye_lens import FisheyeCalibration, load_fisheye_yaml, save_fisheye_yaml
-from sensor_node.cameras.synthetic import SyntheticCamera
-from services.cli import app
+from deltalight.protocol.board import load_board_yaml
+from deltalight.protocol.calibration import Extrinsics, load_extrinsics_yaml, save_extrinsics_yaml
+from deltalight.protocol.camera_model import CameraModel, load_camera_yaml
+from deltalight.protocol.dataset_writer import DatasetWriter
+from deltalight.protocol.equidistant_lens import EquidistantLens
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.fisheye_lens import FisheyeCalibration, load_fisheye_yaml, save_fisheye_yaml
+from deltalight.sensor_node.cameras.synthetic import SyntheticCamera
+from deltalight.services.cli import app
 from tests.sensor_node.calibration_samples import picture, poses
 from tests.services.conftest import RunCli
 
@@ -148,7 +148,7 @@ def test_extrinsics_are_refused_or_kept_and_never_overwritten(take: Path, tmp_pa
 def test_extrinsics_are_written_beside_the_others(
     take: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from sensor_node.calibration import extrinsics
+    from deltalight.sensor_node.calibration import extrinsics
 
     known = np.eye(4)
     known[:3, 3] = 0.1, 0.2, 0.3

@@ -10,10 +10,10 @@ from typer.core import TyperGroup
 from typer.main import get_command
 from typer.testing import CliRunner
 
-from services import doctor, ports
-from services.api.serve import listening
-from services.cli import app
-from services.commands.examples import EXAMPLES
+from deltalight.services import doctor, ports
+from deltalight.services.api.serve import listening
+from deltalight.services.cli import app
+from deltalight.services.commands.examples import EXAMPLES
 from tests.services.conftest import ROOT, RunCli
 
 COMMANDS = {
@@ -123,7 +123,7 @@ def test_wrong_use_ends_with_2_and_names_what_is_wrong(
 
 def test_help_loads_no_heavy_module() -> None:
     heavy = "('cv2', 'moderngl', 'zmq', 'fastapi', 'numpy', 'pydantic')"
-    code = f"import sys, services.cli\nprint([name for name in {heavy} if name in sys.modules])"
+    code = f"import sys, deltalight.services.cli\nprint([name for name in {heavy} if name in sys.modules])"
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=30, check=True
     )
@@ -150,7 +150,7 @@ def test_doctor_finds_what_the_demo_needs(cli: RunCli) -> None:
 def test_doctor_says_what_is_missing_without_opengl(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from services.commands.doctor import _print_table
+    from deltalight.services.commands.doctor import _print_table
 
     monkeypatch.setenv("GLCONTEXT_LINUX_LIBEGL", "/nonexistent/libEGL.so")
     monkeypatch.setattr(doctor, "PACKAGES", {"render": ("no-such-package",)})

@@ -16,11 +16,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from protocol.camera_model import CameraModel
-from protocol.dataset_writer import DatasetWriter
-from protocol.recording_writer import RecordingWriter
-from sensor_node.cameras.synthetic import SyntheticCamera
-from services.object_sizes import likely_factor
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.dataset_writer import DatasetWriter
+from deltalight.protocol.recording_writer import RecordingWriter
+from deltalight.sensor_node.cameras.synthetic import SyntheticCamera
+from deltalight.services.object_sizes import likely_factor
 from tests.services.conftest import ROOT, RunCli
 
 FRAMES = 3
@@ -351,7 +351,17 @@ def test_debug_shows_the_traceback(cli_process: RunCli, tmp_path: Path) -> None:
 def test_ctrl_c_is_130_and_leaves_whole_files(take: Path, tmp_path: Path) -> None:
     scene = write_scene(take / "slow.json", method={"name": "dvct", "volume_size": 128})
     out = tmp_path / "out"
-    command = [sys.executable, "-m", "services.cli", "render", take / "take", "--scene", scene, "--out", out]
+    command = [
+        sys.executable,
+        "-m",
+        "deltalight.services.cli",
+        "render",
+        take / "take",
+        "--scene",
+        scene,
+        "--out",
+        out,
+    ]
     process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
     deadline_s = time.monotonic() + 60
     while not out.exists() and time.monotonic() < deadline_s:

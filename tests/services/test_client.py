@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from protocol.errors import DeltalightError
-from protocol.scene import SceneDocument
-from protocol.source import open_source
-from services import ports
-from services.client import ApiError, Client
-from services.live_message import unpack
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.scene import SceneDocument
+from deltalight.protocol.source import open_source
+from deltalight.services import ports
+from deltalight.services.client import ApiError, Client
+from deltalight.services.live_message import unpack
 from tests.services.api_samples import RunningApi, running_api
 from tests.services.conftest import HEIGHT, ROOT, WIDTH
 from tests.services.live_samples import StandInStream, wait_for_frames

@@ -7,13 +7,13 @@ import cv2
 import numpy as np
 import pytest
 
-from protocol.codecs import encode_color
-from protocol.envelope import encode
-from protocol.errors import DeltalightError
-from protocol.publisher import Publisher
-from services import collector as collector_module
-from services import demo, ports
-from services.collector import CompositeCollector, summarize
+from deltalight.protocol.codecs import encode_color
+from deltalight.protocol.envelope import encode
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.publisher import Publisher
+from deltalight.services import collector as collector_module
+from deltalight.services import demo, ports
+from deltalight.services.collector import CompositeCollector, summarize
 from tests.services.api_samples import RenderServer
 from tests.services.conftest import HEIGHT, WIDTH
 from tests.services.live_samples import StandInStream, composite, report

@@ -8,9 +8,9 @@ import pytest
 import trimesh
 from playwright.sync_api import Browser, Route, sync_playwright
 
-from protocol.camera_model import CameraModel
-from services.api.static_page import DASHBOARD
-from services.demo import RECORDING, SCENE
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.services.api.static_page import DASHBOARD
+from deltalight.services.demo import RECORDING, SCENE
 from tests.services.dashboard_samples import AXE, SIZE, Desk, Stack, demo_stack, desk, find_chromium
 
 CHROMIUM = find_chromium()

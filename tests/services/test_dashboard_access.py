@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import pytest
 from playwright.sync_api import Browser, Locator, Page, expect, sync_playwright
 
-from services.api.static_page import DASHBOARD
+from deltalight.services.api.static_page import DASHBOARD
 from tests.services.dashboard_samples import (
     AXE,
     PATIENCE_S,

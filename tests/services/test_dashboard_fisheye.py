@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from playwright.sync_api import sync_playwright
 
-from protocol.scene import load_scene
-from services.api.static_page import DASHBOARD
+from deltalight.protocol.scene import load_scene
+from deltalight.services.api.static_page import DASHBOARD
 from tests.sensor_node.fisheye_samples import equidistant
 from tests.services.dashboard_samples import SIZE, Desk, desk, find_chromium, running_stack
 from tests.services.test_light_chain import LAMP, write_scene, write_take

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import pytest
 from playwright.sync_api import Browser, Route, expect, sync_playwright
 
-from services.api.static_page import DASHBOARD
+from deltalight.services.api.static_page import DASHBOARD
 from tests.services.dashboard_samples import PATIENCE_S, SIZE, Desk, Stack, find_chromium
 from tests.services.live_samples import LiveApi, live_api
 

@@ -16,16 +16,16 @@ import httpx
 import psutil
 import pytest
 
-from protocol.envelope import decode
-from protocol.messages import CompositeMessage, ControlRequest
-from protocol.receiver import Receiver
-from protocol.request import RequestClient
-from services import ports
-from services.api.serve import listening
-from services.demo import RECORDING, SCENE, demo_plan, demo_scene
-from services.host import HostPlan
-from services.host_store import session_file
-from services.supervisor import Supervisor
+from deltalight.protocol.envelope import decode
+from deltalight.protocol.messages import CompositeMessage, ControlRequest
+from deltalight.protocol.receiver import Receiver
+from deltalight.protocol.request import RequestClient
+from deltalight.services import ports
+from deltalight.services.api.serve import listening
+from deltalight.services.demo import RECORDING, SCENE, demo_plan, demo_scene
+from deltalight.services.host import HostPlan
+from deltalight.services.host_store import session_file
+from deltalight.services.supervisor import Supervisor
 from tests.services.conftest import ROOT, RunCli
 from tests.services.live_samples import live_socket, read_frame, wait_for_frames
 
@@ -146,7 +146,15 @@ def wait_until_shown(client: httpx.Client, answer: dict[str, Any]) -> None:
 @contextmanager
 def demo(page_port: int, *options: str) -> Iterator[str]:
     """A demo that shows frames, at host:port; Ctrl-C ends it and leaves nothing."""
-    command = [sys.executable, "-m", "services.cli", "demo", "--no-browser", "--port", str(page_port)]
+    command = [
+        sys.executable,
+        "-m",
+        "deltalight.services.cli",
+        "demo",
+        "--no-browser",
+        "--port",
+        str(page_port),
+    ]
     demo = subprocess.Popen(
         [*command, *options], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )

@@ -4,12 +4,12 @@ from pathlib import Path
 
 import pytest
 
-from protocol.endpoints import parse_endpoint
-from protocol.errors import DeltalightError
-from protocol.keys import Keys, KeySettings, create_keys, load_keys, trust
-from protocol.messages import SCHEMA_VERSION
-from sensor_node.announce import announced, service_info
-from services.discovery import FoundNode, choose, find_nodes, node_endpoint
+from deltalight.protocol.endpoints import parse_endpoint
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.keys import Keys, KeySettings, create_keys, load_keys, trust
+from deltalight.protocol.messages import SCHEMA_VERSION
+from deltalight.sensor_node.announce import announced, service_info
+from deltalight.services.discovery import FoundNode, choose, find_nodes, node_endpoint
 
 LOOPBACK = ["127.0.0.1"]
 STREAMS = ("color", "pose")

@@ -4,10 +4,10 @@ import json
 
 import pytest
 
-from sensor_node.cameras import discovery
-from sensor_node.cameras.driver import Discovery, FoundCamera, MissingSupport
-from services import doctor
-from services.doctor import Check
+from deltalight.sensor_node.cameras import discovery
+from deltalight.sensor_node.cameras.driver import Discovery, FoundCamera, MissingSupport
+from deltalight.services import doctor
+from deltalight.services.doctor import Check
 from tests.services.conftest import RunCli
 
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from protocol.envelope import EnvelopeError, decode
-from protocol.subscriber import ReceivedMultipart
-from render_server.server.frames import FrameAssembler, PairingSettings
+from deltalight.protocol.envelope import EnvelopeError, decode
+from deltalight.protocol.subscriber import ReceivedMultipart
+from deltalight.render_server.server.frames import FrameAssembler, PairingSettings
 from tests.services.conftest import color, depth, pose
 
 MS = 1_000_000

@@ -14,11 +14,11 @@ import httpx
 import numpy as np
 import pytest
 
-from render_server.scene.mesh_loading import load_mesh
-from services.storage.asset_sandbox import probe
-from services.storage.assets import Asset
-from services.storage.faults import RejectedAssetError, TooLargeError
-from services.storage.store import Store
+from deltalight.render_server.scene.mesh_loading import load_mesh
+from deltalight.services.storage.asset_sandbox import probe
+from deltalight.services.storage.assets import Asset
+from deltalight.services.storage.faults import RejectedAssetError, TooLargeError
+from deltalight.services.storage.store import Store
 from tests.services.api_samples import UPLOAD, running_api, sentence
 
 POSITIONS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], "<f4")

@@ -7,12 +7,12 @@ from xml.etree import ElementTree
 
 import pytest
 
-from benchmarks import frame_docs
-from render_server.graph import CLOCKS
-from services import frame_account
-from services.frame_account import FrameAccount, account_frame
-from services.graph_drawing import draw_graph
-from services.graph_layout import lay_out
+from deltalight.benchmarks import frame_docs
+from deltalight.render_server.graph import CLOCKS
+from deltalight.services import frame_account
+from deltalight.services.frame_account import FrameAccount, account_frame
+from deltalight.services.graph_drawing import draw_graph
+from deltalight.services.graph_layout import lay_out
 from tests.services.conftest import RunCli
 
 SVG = "{http://www.w3.org/2000/svg}"
@@ -136,12 +136,12 @@ def test_wrong_method_is_one_sentence_with_the_nearest_name(cli: RunCli) -> None
 
 def test_page_has_the_table_of_the_graph(account: FrameAccount) -> None:
     page = frame_docs.PAGE.read_text(encoding="utf-8")
-    assert frame_docs.with_table(page, account) == page, "run `python -m benchmarks.frame_docs`"
+    assert frame_docs.with_table(page, account) == page, "run `python -m deltalight.benchmarks.frame_docs`"
 
 
 def test_pages_picture_is_that_of_the_graph(account: FrameAccount) -> None:
     committed = frame_docs.PICTURE.read_text(encoding="utf-8")
-    assert committed == frame_docs.picture(account), "run `python -m benchmarks.frame_docs`"
+    assert committed == frame_docs.picture(account), "run `python -m deltalight.benchmarks.frame_docs`"
     assert frame_docs.PICTURE.name in frame_docs.PAGE.read_text(encoding="utf-8")
     for stage in account.stages:
         assert stage.name in words(committed)

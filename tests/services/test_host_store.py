@@ -6,14 +6,14 @@ from types import SimpleNamespace
 
 import pytest
 
-from protocol.errors import DeltalightError
-from protocol.scene import SceneDocument, load_scene
-from services import ports
-from services.api.serve import make_first_scene
-from services.api.settings import ApiSettings
-from services.host import HostPlan
-from services.host_store import FIRST_SCENE, scene_to_show, session_file
-from services.storage.store import Store
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.scene import SceneDocument, load_scene
+from deltalight.services import ports
+from deltalight.services.api.serve import make_first_scene
+from deltalight.services.api.settings import ApiSettings
+from deltalight.services.host import HostPlan
+from deltalight.services.host_store import FIRST_SCENE, scene_to_show, session_file
+from deltalight.services.storage.store import Store
 from tests.services.api_samples import RenderServer
 from tests.services.storage_samples import TETRAHEDRON, trusting_probe
 

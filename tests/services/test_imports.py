@@ -7,7 +7,7 @@ from graphlib import TopologicalSorter
 from tests.services.conftest import ROOT
 
 PACKAGES = ("protocol", "services")
-BENCHMARKS_ENTRY = "benchmarks.cli"
+BENCHMARKS_ENTRY = "deltalight.benchmarks.cli"
 
 
 @cache

@@ -15,14 +15,14 @@ import pytest
 import trimesh
 from jaxtyping import Float64
 
-from protocol.calibration import Extrinsics
-from protocol.codecs import decode_color
-from protocol.dataset_writer import DatasetWriter
-from protocol.envelope import decode
-from protocol.messages import CompositeMessage
-from protocol.receiver import Receiver
-from sensor_node.cameras.synthetic import SyntheticCamera, default_camera
-from services import ports
+from deltalight.protocol.calibration import Extrinsics
+from deltalight.protocol.codecs import decode_color
+from deltalight.protocol.dataset_writer import DatasetWriter
+from deltalight.protocol.envelope import decode
+from deltalight.protocol.messages import CompositeMessage
+from deltalight.protocol.receiver import Receiver
+from deltalight.sensor_node.cameras.synthetic import SyntheticCamera, default_camera
+from deltalight.services import ports
 from tests.sensor_node.fisheye_samples import bracket, equidistant
 from tests.services.conftest import ROOT
 
@@ -73,7 +73,7 @@ def write_scene(folder: Path) -> Path:
 @contextmanager
 def command(*arguments: object) -> Iterator[subprocess.Popen[str]]:
     """A command in a process of its own; Ctrl-C ends it, and it has said nothing that it should not."""
-    words = [sys.executable, "-m", "services.cli", *map(str, arguments)]
+    words = [sys.executable, "-m", "deltalight.services.cli", *map(str, arguments)]
     process = subprocess.Popen(words, cwd=ROOT, stderr=subprocess.PIPE, text=True)
     try:
         yield process

@@ -13,10 +13,10 @@ from pathlib import Path
 
 import pytest
 
-from protocol.dataset_writer import DatasetWriter
-from protocol.receiver import Receiver
-from sensor_node.cameras.synthetic import SyntheticCamera
-from services import ports
+from deltalight.protocol.dataset_writer import DatasetWriter
+from deltalight.protocol.receiver import Receiver
+from deltalight.sensor_node.cameras.synthetic import SyntheticCamera
+from deltalight.services import ports
 from tests.services.conftest import ROOT, RunCli
 
 LIMIT_S = 30.0
@@ -40,7 +40,7 @@ def endpoint() -> str:
 
 @contextmanager
 def node_process(*arguments: str) -> Iterator[subprocess.Popen[str]]:
-    command = [sys.executable, "-m", "services.cli", "node", *arguments]
+    command = [sys.executable, "-m", "deltalight.services.cli", "node", *arguments]
     process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
     try:
         yield process

@@ -19,19 +19,19 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from protocol.calibration import Extrinsics, save_extrinsics_yaml
-from protocol.envelope import decode
-from protocol.errors import DeltalightError
-from protocol.messages import ControlRequest
-from protocol.pictures import depth_from_steps
-from protocol.publisher import Publisher
-from protocol.request import ReplyServer
-from protocol.scene import parse_scene
-from protocol.source import open_source
-from services import ports, recorder
-from services.cli import app
-from services.recorder import Recorder, RecordJob, RecordStatus
-from services.stream_queue import StreamQueue
+from deltalight.protocol.calibration import Extrinsics, save_extrinsics_yaml
+from deltalight.protocol.envelope import decode
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.messages import ControlRequest
+from deltalight.protocol.pictures import depth_from_steps
+from deltalight.protocol.publisher import Publisher
+from deltalight.protocol.request import ReplyServer
+from deltalight.protocol.scene import parse_scene
+from deltalight.protocol.source import open_source
+from deltalight.services import ports, recorder
+from deltalight.services.cli import app
+from deltalight.services.recorder import Recorder, RecordJob, RecordStatus
+from deltalight.services.stream_queue import StreamQueue
 from tests.services.conftest import ROOT, RunCli
 from tests.services.record_samples import BOARD, HEIGHT, WIDTH, camera, feeding, frames, messages, write
 
@@ -47,7 +47,7 @@ def start() -> Iterator[Start]:
     def run(*arguments: object, limit_bytes: int | None = None) -> "subprocess.Popen[str]":
         words = [str(argument) for argument in arguments]
         limit = f"resource.setrlimit(resource.RLIMIT_FSIZE, ({limit_bytes}, {limit_bytes}))"
-        code = f"import resource, sys\n{limit if limit_bytes else ''}\nfrom services.cli import main\nmain()"
+        code = f"import resource, sys\n{limit if limit_bytes else ''}\nfrom deltalight.services.cli import main\nmain()"
         process = subprocess.Popen(
             [sys.executable, "-c", code, *words],
             cwd=ROOT,

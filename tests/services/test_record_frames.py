@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from protocol.envelope import decode
-from protocol.errors import DeltalightError
-from protocol.frames import BoardPose, SensorFrame
-from protocol.messages import ColorMessage
-from protocol.publisher import Publisher
-from services.raw_frames import RawFrameAssembler
-from services.stream_queue import QUEUED_MESSAGES, StreamQueue
+from deltalight.protocol.envelope import decode
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import BoardPose, SensorFrame
+from deltalight.protocol.messages import ColorMessage
+from deltalight.protocol.publisher import Publisher
+from deltalight.services.raw_frames import RawFrameAssembler
+from deltalight.services.stream_queue import QUEUED_MESSAGES, StreamQueue
 from tests.protocol.fisheye_samples import assert_same_frames, assert_same_pictures, linear
 from tests.services.record_samples import BOARD, PERIOD_NS, frames, messages
 

@@ -11,21 +11,21 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 from typer.testing import CliRunner
 
-from protocol.errors import DeltalightError
-from protocol.frames import DepthImage, SensorFrame
-from protocol.recording_format import FOXGLOVE_TOPICS
-from protocol.recording_writer import RecordingWriter
-from protocol.scene import parse_scene
-from protocol.source import open_source
-from services.cli import app
-from services.recording_copies import (
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import DepthImage, SensorFrame
+from deltalight.protocol.recording_format import FOXGLOVE_TOPICS
+from deltalight.protocol.recording_writer import RecordingWriter
+from deltalight.protocol.scene import parse_scene
+from deltalight.protocol.source import open_source
+from deltalight.services.cli import app
+from deltalight.services.recording_copies import (
     Copied,
     export_recording,
     import_folder,
     recover_recording,
     recovered_name,
 )
-from services.recording_info import describe_recording
+from deltalight.services.recording_info import describe_recording
 from tests.protocol.fisheye_samples import assert_same_frames, linear
 from tests.services.conftest import RunCli
 from tests.services.record_samples import BOARD, PERIOD_NS, camera, frames, write

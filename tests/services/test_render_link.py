@@ -9,11 +9,11 @@ from typing import Any
 import httpx
 import pytest
 
-from services import ports
-from services.api import delivery, render_link
-from services.api.delivery import BUSY, WAITERS, Change, Deliveries, DeliveryStatus
-from services.api.render_link import MAX_COMMANDS, FifoLock
-from services.api.routes import live
+from deltalight.services import ports
+from deltalight.services.api import delivery, render_link
+from deltalight.services.api.delivery import BUSY, WAITERS, Change, Deliveries, DeliveryStatus
+from deltalight.services.api.render_link import MAX_COMMANDS, FifoLock
+from deltalight.services.api.routes import live
 from tests.services.api_samples import RunningApi, running_api, sentence
 from tests.services.live_samples import event_socket, next_event
 from tests.services.render_server_samples import Recorder

@@ -9,14 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from protocol.envelope import decode
-from protocol.messages import CompositeMessage, ControlReply, ControlRequest
-from protocol.publisher import Publisher
-from protocol.receiver import Receiver
-from protocol.request import RequestClient
-from protocol.scene import SceneDocument
-from render_server.server.process import ServerSettings, serve
-from services import ports
+from deltalight.protocol.envelope import decode
+from deltalight.protocol.messages import CompositeMessage, ControlReply, ControlRequest
+from deltalight.protocol.publisher import Publisher
+from deltalight.protocol.receiver import Receiver
+from deltalight.protocol.request import RequestClient
+from deltalight.protocol.scene import SceneDocument
+from deltalight.render_server.server.process import ServerSettings, serve
+from deltalight.services import ports
 from tests.services.api_samples import UPLOAD, running_api
 from tests.services.conftest import color, depth, pose
 from tests.services.storage_samples import TETRAHEDRON

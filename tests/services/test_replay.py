@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from protocol.errors import DeltalightError
-from protocol.source import open_source
-from services import ports
-from services.cli import app
-from services.recorder import Recorder, RecordJob
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.source import open_source
+from deltalight.services import ports
+from deltalight.services.cli import app
+from deltalight.services.recorder import Recorder, RecordJob
 from tests.services.conftest import ROOT, RunCli
 from tests.services.record_samples import BOARD, PERIOD_NS, frames, write
 
@@ -24,7 +24,16 @@ def test_what_is_replayed_and_recorded_again_is_the_same(tmp_path: Path) -> None
     original = frames(8, with_fisheye=True)
     source = write(tmp_path / "a.mcap", original)
     endpoint = ports.endpoint(ports.private_ports(1)[0])
-    command = [sys.executable, "-m", "services.cli", "replay", str(source), "--loop", "--publish", endpoint]
+    command = [
+        sys.executable,
+        "-m",
+        "deltalight.services.cli",
+        "replay",
+        str(source),
+        "--loop",
+        "--publish",
+        endpoint,
+    ]
     with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True) as process:
         try:
             status = Recorder(RecordJob(tmp_path / "b.mcap", (endpoint,), frames=20), print).run(Event())

@@ -16,8 +16,8 @@ import psutil
 import pytest
 from jaxtyping import UInt8
 
-from protocol.source import open_source
-from services import ports
+from deltalight.protocol.source import open_source
+from deltalight.services import ports
 from tests.services.conftest import ROOT
 from tests.services.record_samples import PERIOD_NS, feeding, frames, write
 
@@ -38,7 +38,9 @@ def wait_for(condition: Callable[[], object]) -> None:
 
 @contextmanager
 def process(*arguments: object) -> Iterator[subprocess.Popen[bytes]]:
-    running = subprocess.Popen([sys.executable, "-m", "services.cli", *map(str, arguments)], cwd=ROOT)
+    running = subprocess.Popen(
+        [sys.executable, "-m", "deltalight.services.cli", *map(str, arguments)], cwd=ROOT
+    )
     try:
         yield running
     finally:

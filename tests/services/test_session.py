@@ -8,14 +8,14 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 
-from protocol.camera_model import CameraModel
-from protocol.errors import DeltalightError
-from protocol.frames import ViewFrame
-from protocol.messages import ControlRequest
-from protocol.scene import SceneDocument
-from render_server.frame_budget import Level
-from render_server.server.frames import FrameAssembler
-from render_server.server.session import MAXIMUM_FAULTS_IN_A_ROW, RenderSession, SourceInUse
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import ViewFrame
+from deltalight.protocol.messages import ControlRequest
+from deltalight.protocol.scene import SceneDocument
+from deltalight.render_server.frame_budget import Level
+from deltalight.render_server.server.frames import FrameAssembler
+from deltalight.render_server.server.session import MAXIMUM_FAULTS_IN_A_ROW, RenderSession, SourceInUse
 from tests.services.conftest import IDENTITY, camera, color, depth, pose, received
 
 START = 10**15

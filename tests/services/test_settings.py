@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from protocol.errors import DeltalightError
-from protocol.keys import KeySettings
-from render_server.server.process import ServerSettings
-from sensor_node.node import NodeConfig
-from services.settings import load_configuration
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.keys import KeySettings
+from deltalight.render_server.server.process import ServerSettings
+from deltalight.sensor_node.node import NodeConfig
+from deltalight.services.settings import load_configuration
 from tests.services.conftest import RunCli
 
 

@@ -9,7 +9,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 PROGRAM = """
 import os, signal, time
-from services.signals import raise_on_sigterm
+from deltalight.services.signals import raise_on_sigterm
 
 class Freed:
     def __del__(self):
@@ -34,7 +34,7 @@ def test_a_signal_while_an_object_is_freed_ends_the_program_all_the_same(name: s
 
 FINISHING = """
 import os, signal, time
-from services.signals import Terminated, raise_on_sigterm
+from deltalight.services.signals import Terminated, raise_on_sigterm
 
 raise_on_sigterm()
 try:

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from protocol.errors import DeltalightError
-from services.storage.documents import (
+from deltalight.protocol.errors import DeltalightError
+from deltalight.services.storage.documents import (
     add_object,
     merge_patch,
     patch_document,
@@ -20,14 +20,14 @@ from services.storage.documents import (
     replace_document,
     replace_object,
 )
-from services.storage.faults import (
+from deltalight.services.storage.faults import (
     ConflictError,
     NotFoundError,
     RejectedAssetError,
     StaleRevisionError,
     TooLargeError,
 )
-from services.storage.store import Store
+from deltalight.services.storage.store import Store
 from tests.services.storage_samples import TETRAHEDRON, trusting_probe, upload
 
 

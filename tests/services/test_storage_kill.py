@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from services.storage.documents import patch_document
-from services.storage.store import Store
+from deltalight.services.storage.documents import patch_document
+from deltalight.services.storage.store import Store
 from tests.services.storage_samples import TETRAHEDRON, trusting_probe, upload
 
 pytestmark = pytest.mark.slow

@@ -10,8 +10,8 @@ from pathlib import Path
 import psutil
 import pytest
 
-from protocol.errors import DeltalightError
-from services.supervisor import ChildSpec, Supervisor
+from deltalight.protocol.errors import DeltalightError
+from deltalight.services.supervisor import ChildSpec, Supervisor
 
 SLEEP_FOREVER = "import time\nwhile True: time.sleep(60)"
 IGNORE_SIGTERM = f"import signal\nsignal.signal(signal.SIGTERM, signal.SIG_IGN)\n{SLEEP_FOREVER}"
@@ -84,12 +84,12 @@ def test_stop_ends_even_a_child_that_ignores_sigterm() -> None:
 def test_children_end_when_the_supervisor_is_killed(tmp_path: Path) -> None:
     pid_file = tmp_path / "pid"
     child = (
-        "import os, time, pathlib; from services.parent_death_signal import end_with_supervisor;"
+        "import os, time, pathlib; from deltalight.services.parent_death_signal import end_with_supervisor;"
         "end_with_supervisor();"
         f"pathlib.Path({str(pid_file)!r}).write_text(str(os.getpid())); time.sleep(600)"
     )
     parent = (
-        "from services.supervisor import ChildSpec, Supervisor\n"
+        "from deltalight.services.supervisor import ChildSpec, Supervisor\n"
         f"with Supervisor([ChildSpec('child', ('-c', {child!r}))]) as supervisor: supervisor.run()"
     )
     process = subprocess.Popen([sys.executable, "-c", parent])

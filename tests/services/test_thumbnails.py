@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
-from protocol.radiance_files import write_exr
-from services.storage.asset_sandbox import run_limited
-from services.storage.faults import RejectedAssetError
-from services.storage.store import Store
-from services.storage.thumbnails import SIZE
+from deltalight.protocol.radiance_files import write_exr
+from deltalight.services.storage.asset_sandbox import run_limited
+from deltalight.services.storage.faults import RejectedAssetError
+from deltalight.services.storage.store import Store
+from deltalight.services.storage.thumbnails import SIZE
 from tests.services.api_samples import UPLOAD, running_api, sentence
 from tests.services.storage_samples import TETRAHEDRON, glb
 from tests.services.test_gltf_zip import FILES, packed

@@ -2,8 +2,8 @@
 
 import difflib
 
-from benchmarks.ground_truth.benchmark_scene import BenchmarkScene
-from benchmarks.ground_truth.scenes import (
+from deltalight.benchmarks.ground_truth.benchmark_scene import BenchmarkScene
+from deltalight.benchmarks.ground_truth.scenes import (
     concave_box,
     cornell,
     glossy_table,
@@ -15,7 +15,7 @@ from benchmarks.ground_truth.scenes import (
     tabletop,
     two_lights,
 )
-from protocol.errors import DeltalightError
+from deltalight.protocol.errors import DeltalightError
 
 SCENES: tuple[BenchmarkScene, ...] = (
     tabletop.SCENE,

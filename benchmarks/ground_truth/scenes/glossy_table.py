@@ -2,12 +2,18 @@
 
 from typing import Any
 
-from benchmarks.ground_truth.benchmark_scene import BOARD, TABLE_Z_M, BenchmarkScene, Finish, VirtualObject
-from benchmarks.ground_truth.lamps import Ambient, SphereLamp
-from benchmarks.ground_truth.meshes import pawn, vase
-from benchmarks.ground_truth.parts import MeshFolder, looking, shape, sheet_surface, texture
-from benchmarks.ground_truth.scenes import rooms
-from benchmarks.ground_truth.textures import wood
+from deltalight.benchmarks.ground_truth.benchmark_scene import (
+    BOARD,
+    TABLE_Z_M,
+    BenchmarkScene,
+    Finish,
+    VirtualObject,
+)
+from deltalight.benchmarks.ground_truth.lamps import Ambient, SphereLamp
+from deltalight.benchmarks.ground_truth.meshes import pawn, vase
+from deltalight.benchmarks.ground_truth.parts import MeshFolder, looking, shape, sheet_surface, texture
+from deltalight.benchmarks.ground_truth.scenes import rooms
+from deltalight.benchmarks.ground_truth.textures import wood
 
 ROUGHNESS = 0.25
 SPECULAR = 0.5

@@ -2,11 +2,25 @@
 
 from typing import Any
 
-from benchmarks.ground_truth.benchmark_scene import BOARD, TABLE_Z_M, BenchmarkScene, Finish, VirtualObject
-from benchmarks.ground_truth.lamps import Ambient, SphereLamp
-from benchmarks.ground_truth.meshes import rabbit, ring
-from benchmarks.ground_truth.parts import MeshFolder, Triple, looking, rgb, shape, sheet, sheet_surface
-from benchmarks.ground_truth.scenes import rooms
+from deltalight.benchmarks.ground_truth.benchmark_scene import (
+    BOARD,
+    TABLE_Z_M,
+    BenchmarkScene,
+    Finish,
+    VirtualObject,
+)
+from deltalight.benchmarks.ground_truth.lamps import Ambient, SphereLamp
+from deltalight.benchmarks.ground_truth.meshes import rabbit, ring
+from deltalight.benchmarks.ground_truth.parts import (
+    MeshFolder,
+    Triple,
+    looking,
+    rgb,
+    shape,
+    sheet,
+    sheet_surface,
+)
+from deltalight.benchmarks.ground_truth.scenes import rooms
 
 ROUGHNESS = 0.1
 STEEL: Triple = (0.62, 0.60, 0.57)

@@ -4,12 +4,17 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.ground_truth.benchmark_scene import TABLE_Z_M, BenchmarkScene, Finish, VirtualObject
-from benchmarks.ground_truth.lamps import Ambient, SphereLamp
-from benchmarks.ground_truth.meshes import block, rabbit
-from benchmarks.ground_truth.parts import Matrix, MeshFolder, Triple, looking
-from benchmarks.ground_truth.scenes import rooms
-from benchmarks.ground_truth.scenes.shadow_edges import edge_of_shadow
+from deltalight.benchmarks.ground_truth.benchmark_scene import (
+    TABLE_Z_M,
+    BenchmarkScene,
+    Finish,
+    VirtualObject,
+)
+from deltalight.benchmarks.ground_truth.lamps import Ambient, SphereLamp
+from deltalight.benchmarks.ground_truth.meshes import block, rabbit
+from deltalight.benchmarks.ground_truth.parts import Matrix, MeshFolder, Triple, looking
+from deltalight.benchmarks.ground_truth.scenes import rooms
+from deltalight.benchmarks.ground_truth.scenes.shadow_edges import edge_of_shadow
 
 FRAMES = 12
 STEP_M = 0.004

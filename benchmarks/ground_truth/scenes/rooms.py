@@ -2,9 +2,9 @@
 
 from typing import Any
 
-from benchmarks.ground_truth import meshes
-from benchmarks.ground_truth.benchmark_scene import BOARD, TABLE_Z_M
-from benchmarks.ground_truth.parts import (
+from deltalight.benchmarks.ground_truth import meshes
+from deltalight.benchmarks.ground_truth.benchmark_scene import BOARD, TABLE_Z_M
+from deltalight.benchmarks.ground_truth.parts import (
     Matrix,
     MeshFolder,
     Triple,
@@ -18,7 +18,7 @@ from benchmarks.ground_truth.parts import (
     texture,
     turned,
 )
-from benchmarks.ground_truth.textures import plaster, wood
+from deltalight.benchmarks.ground_truth.textures import plaster, wood
 
 OCHRE: Triple = (0.66, 0.50, 0.33)
 SLATE: Triple = (0.28, 0.42, 0.47)

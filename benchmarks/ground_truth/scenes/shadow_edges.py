@@ -3,9 +3,9 @@
 import numpy as np
 from jaxtyping import Float
 
-from benchmarks.ground_truth.benchmark_scene import TABLE_Z_M, ShadowEdge
-from benchmarks.ground_truth.lamps import SphereLamp
-from benchmarks.ground_truth.parts import Triple
+from deltalight.benchmarks.ground_truth.benchmark_scene import TABLE_Z_M, ShadowEdge
+from deltalight.benchmarks.ground_truth.lamps import SphereLamp
+from deltalight.benchmarks.ground_truth.parts import Triple
 
 
 def edge_of_shadow(

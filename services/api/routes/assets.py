@@ -5,12 +5,12 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 
-from protocol.scene import DIGEST_PREFIX
-from services.api.context import Shared
-from services.api.file_response import StoredFileResponse
-from services.api.models import AssetAnswer
-from services.api.problems import ProblemError, responses
-from services.storage.asset_kinds import FORMATS
+from deltalight.protocol.scene import DIGEST_PREFIX
+from deltalight.services.api.context import Shared
+from deltalight.services.api.file_response import StoredFileResponse
+from deltalight.services.api.models import AssetAnswer
+from deltalight.services.api.problems import ProblemError, responses
+from deltalight.services.storage.asset_kinds import FORMATS
 
 router = APIRouter(tags=["assets"], prefix="/assets")
 ROUTERS = (router,)

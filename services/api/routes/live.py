@@ -9,15 +9,15 @@ from fastapi import APIRouter, Body, Request, Response, WebSocket, WebSocketDisc
 from fastapi.responses import StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field
 
-from protocol.messages import MAX_EDGE_PX, RadianceMessage
-from services.api.context import Shared
-from services.api.credentials import TICKET_LIFE_S, principal_of
-from services.api.events import EventQueue, packed
-from services.api.fisheye import FisheyeLight, lights_in_picture
-from services.api.live_hub import LiveFrame, LiveHub
-from services.api.problems import ProblemError, responses
-from services.api.shown_view import View
-from services.storage.faults import NotFoundError
+from deltalight.protocol.messages import MAX_EDGE_PX, RadianceMessage
+from deltalight.services.api.context import Shared
+from deltalight.services.api.credentials import TICKET_LIFE_S, principal_of
+from deltalight.services.api.events import EventQueue, packed
+from deltalight.services.api.fisheye import FisheyeLight, lights_in_picture
+from deltalight.services.api.live_hub import LiveFrame, LiveHub
+from deltalight.services.api.problems import ProblemError, responses
+from deltalight.services.api.shown_view import View
+from deltalight.services.storage.faults import NotFoundError
 
 WINDOW = 2  # frames in flight to one viewer before it has to acknowledge
 PICK_TIMEOUT_S = 5.0  # some frames of the slowest renderer

@@ -6,18 +6,18 @@ from typing import Annotated, Any, Literal, Self
 from fastapi import APIRouter, Body, Path, Response
 from pydantic import Field
 
-from protocol.documents import StrictModel
-from protocol.errors import DeltalightError
-from protocol.messages import Name
-from sensor_node.cameras.playback import MAX_RATE, MIN_RATE
-from services.api.context import Context, Shared
-from services.api.file_response import StoredFileResponse
-from services.api.problems import responses
-from services.api.recording_session import RecordingSession
-from services.api.recording_store import NAME, RecordingStore, StoredRecording
-from services.api.replay_control import Position, ReplayOrder
-from services.api.request_bodies import AS_SENT, checked
-from services.storage.faults import ConflictError
+from deltalight.protocol.documents import StrictModel
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.messages import Name
+from deltalight.sensor_node.cameras.playback import MAX_RATE, MIN_RATE
+from deltalight.services.api.context import Context, Shared
+from deltalight.services.api.file_response import StoredFileResponse
+from deltalight.services.api.problems import responses
+from deltalight.services.api.recording_session import RecordingSession
+from deltalight.services.api.recording_store import NAME, RecordingStore, StoredRecording
+from deltalight.services.api.replay_control import Position, ReplayOrder
+from deltalight.services.api.request_bodies import AS_SENT, checked
+from deltalight.services.storage.faults import ConflictError
 
 router = APIRouter(tags=["recordings"], prefix="/recordings")
 replay_router = APIRouter(tags=["recordings"], prefix="/replay")

@@ -6,15 +6,15 @@ from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Path, Query, Response
 
-from protocol.methods import Method
-from protocol.scene import SceneDocument
-from protocol.scene_lights import Lights, ManualLight
-from protocol.scene_method import Output, Shading
-from protocol.scene_objects import RealScene, SceneObject
-from services.api.context import ExpectedRevision, IfUnchanged, Shared, with_revision_of
-from services.api.models import RevisionEntry, SceneAnswer, SceneSummary
-from services.api.problems import responses
-from services.api.request_bodies import (
+from deltalight.protocol.methods import Method
+from deltalight.protocol.scene import SceneDocument
+from deltalight.protocol.scene_lights import Lights, ManualLight
+from deltalight.protocol.scene_method import Output, Shading
+from deltalight.protocol.scene_objects import RealScene, SceneObject
+from deltalight.services.api.context import ExpectedRevision, IfUnchanged, Shared, with_revision_of
+from deltalight.services.api.models import RevisionEntry, SceneAnswer, SceneSummary
+from deltalight.services.api.problems import responses
+from deltalight.services.api.request_bodies import (
     DOCUMENT_BODY,
     DOCUMENT_FILES,
     LightBody,
@@ -32,7 +32,7 @@ from services.api.request_bodies import (
     ShadingBody,
     document_file,
 )
-from services.storage.documents import (
+from deltalight.services.storage.documents import (
     add_light,
     add_object,
     light_at,
@@ -47,7 +47,7 @@ from services.storage.documents import (
     replace_object,
     replace_part,
 )
-from services.storage.faults import NotFoundError
+from deltalight.services.storage.faults import NotFoundError
 
 scenes_router = APIRouter(tags=["scenes"])
 objects_router = APIRouter(tags=["objects"], prefix="/scenes/{scene_id}/objects")

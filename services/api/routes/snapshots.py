@@ -6,16 +6,16 @@ from typing import Annotated, Any, get_args
 from fastapi import APIRouter, Body, Path, Response
 from pydantic import Field, StrictBool, model_validator
 
-from protocol.documents import StrictModel
-from protocol.messages import Name
-from protocol.methods import Method
-from protocol.scene_method import Output
-from services.api.context import Context, Shared
-from services.api.file_response import StoredFileResponse
-from services.api.problems import ProblemError, responses
-from services.api.request_bodies import AS_SENT, checked
-from services.api.routes.assets import UNCHANGING
-from services.api.snapshot_store import ID, SnapshotFacts, SnapshotPicture, files_of, now
+from deltalight.protocol.documents import StrictModel
+from deltalight.protocol.messages import Name
+from deltalight.protocol.methods import Method
+from deltalight.protocol.scene_method import Output
+from deltalight.services.api.context import Context, Shared
+from deltalight.services.api.file_response import StoredFileResponse
+from deltalight.services.api.problems import ProblemError, responses
+from deltalight.services.api.request_bodies import AS_SENT, checked
+from deltalight.services.api.routes.assets import UNCHANGING
+from deltalight.services.api.snapshot_store import ID, SnapshotFacts, SnapshotPicture, files_of, now
 
 router = APIRouter(tags=["snapshots"], prefix="/snapshots")
 ROUTERS = (router,)

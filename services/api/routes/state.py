@@ -7,13 +7,13 @@ from fastapi import APIRouter, Response
 from fastapi.responses import PlainTextResponse
 from pydantic import BaseModel, Field
 
-from services.api.camera_finder import CamerasAnswer
-from services.api.context import Shared
-from services.api.live_hub import LiveFrame
-from services.api.metrics import MEDIA_TYPE
-from services.api.models import PictureState, ProcessAnswer
-from services.api.problems import responses
-from services.api.streams import Report
+from deltalight.services.api.camera_finder import CamerasAnswer
+from deltalight.services.api.context import Shared
+from deltalight.services.api.live_hub import LiveFrame
+from deltalight.services.api.metrics import MEDIA_TYPE
+from deltalight.services.api.models import PictureState, ProcessAnswer
+from deltalight.services.api.problems import responses
+from deltalight.services.api.streams import Report
 
 state_router = APIRouter(tags=["state"])
 nodes_router = APIRouter(tags=["nodes"])

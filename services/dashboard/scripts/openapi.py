@@ -5,9 +5,9 @@ import sys
 import tempfile
 from pathlib import Path
 
-from services.api.app import create_app
-from services.api.settings import ApiSettings
-from services.storage.store import Store
+from deltalight.services.api.app import create_app
+from deltalight.services.api.settings import ApiSettings
+from deltalight.services.storage.store import Store
 
 
 def write_openapi(target: Path) -> None:
