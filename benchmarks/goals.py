@@ -1,4 +1,7 @@
-"""What cone tracing reaches of the goals of docs/method.md 7.2: `python -m deltalight.benchmarks.goals`, minutes in software."""
+"""What cone tracing reaches of the goals of docs/method.md 7.2.
+
+`python -m deltalight.benchmarks.goals` takes minutes in software.
+"""
 
 import tempfile
 from collections.abc import Iterator, Mapping

@@ -1,4 +1,7 @@
-"""The one exception type that is shown to users."""
+"""The one exception type that is shown to users, and the command that installs what they lack."""
+
+import shlex
+import sys
 
 
 class DeltalightError(Exception):
@@ -6,3 +9,8 @@ class DeltalightError(Exception):
 
     The command line prints it without a traceback and exits with code 2.
     """
+
+
+def install_command(*requirements: str) -> str:
+    """Return the command that adds packages or extras to the Python that runs, which need not be the shell's."""
+    return shlex.join([sys.executable, "-m", "pip", "install", *requirements])

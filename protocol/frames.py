@@ -56,9 +56,9 @@ class RadianceMap:
     """Radiance that reaches the fish-eye camera from the hemisphere about its axis (docs/method.md 2).
 
     `radiance` is linear R G B in the fish-eye camera's units (1.0 = its white at the reference exposure) on the grid
-    of `deltalight.protocol.hemisphere`, in the axes of its optical frame; 0 where not `seen`. `clipped_share` is the fraction of
-    the seen solid angle that even the shortest exposure clips (so its radiance is a lower bound). `picture` (coded,
-    RGB) is for display.
+    of `deltalight.protocol.hemisphere`, in the axes of its optical frame; 0 where not `seen`. `clipped_share` is the
+    fraction of the seen solid angle that even the shortest exposure clips (so its radiance is a lower bound).
+    `picture` (coded, RGB) is for display.
     """
 
     timestamp_ns: int

@@ -224,9 +224,9 @@ class FisheyeMessage(MessageBase):
 class RadianceMessage(MessageBase):
     """The radiance that a fish-eye camera sees; current until the next one, and repeated for late subscribers.
 
-    Parts: linear R G B on the `size` x `size` grid of the hemisphere (`deltalight.protocol.hemisphere`), which of it was seen (0
-    or 1), the picture for display (jpeg), then the response of the fish-eye camera if `has_response`. `camera` is as
-    in `FisheyeMessage`; the pose is that of the time of the map, `capture_ns`.
+    Parts: linear R G B on the `size` x `size` grid of the hemisphere (`deltalight.protocol.hemisphere`), which of it
+    was seen (0 or 1), the picture for display (jpeg), then the response of the fish-eye camera if `has_response`.
+    `camera` is as in `FisheyeMessage`; the pose is that of the time of the map, `capture_ns`.
     """
 
     stream: Literal["radiance"] = "radiance"

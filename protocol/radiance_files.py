@@ -1,6 +1,7 @@
 """Files of linear radiance: Radiance .hdr and OpenEXR."""
 
 import errno
+from collections.abc import Mapping
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -10,7 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32
 
-from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.errors import DeltalightError, install_command
 
 LINEAR_SUFFIXES = (".hdr", ".exr")
 
@@ -28,16 +29,24 @@ def read_linear(path: Path) -> Float32[np.ndarray, "h w 3"]:
     return np.asarray(np.maximum(picture, 0))
 
 
-def write_exr(path: Path, linear: Float32[np.ndarray, "h w 3"]) -> None:
-    """Write linear RGB as an OpenEXR file of 32-bit floats, without loss.
+def write_exr(
+    path: Path,
+    linear: Float32[np.ndarray, "h w c"],
+    layers: Mapping[str, Float32[np.ndarray, "h w ..."]] | None = None,
+) -> None:
+    """Write linear RGB or RGBA as an OpenEXR file of 32-bit floats, without loss.
+
+    `layers` by name: further ones with R G B of their own, or with one value, such as `Z`.
 
     Raises:
         DeltalightError: the package OpenEXR is not installed.
         OSError: the file cannot be written.
     """
     exr = require_openexr(f"writing {path}")
+    pictures = {"RGBA"[: linear.shape[2]]: linear, **(layers or {})}
+    channels = {name: np.ascontiguousarray(values) for name, values in pictures.items()}
     header = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
-    with exr.File(header, {"RGB": np.ascontiguousarray(linear)}) as file:
+    with exr.File(header, channels) as file:
         try:
             file.write(str(path))
         except RuntimeError as error:  # how the package reports a full disk
@@ -54,7 +63,7 @@ def require_openexr(purpose: str) -> ModuleType:
         return import_module("OpenEXR")  # it has no type information
     except ImportError as error:
         raise DeltalightError(
-            f"{purpose} needs the package OpenEXR: pip install 'deltalight[render]'."
+            f"{purpose} needs the package OpenEXR: {install_command('OpenEXR')}."
         ) from error
 
 

@@ -91,7 +91,7 @@ class FrameResources:
     This module's stages compute the rest. `observation` changes only when something moved, so a new picture of a
     scene at rest relights nothing. `measured` is the observation that lights the real scene's voxels and maps: the
     same, or, where the world is kept while the camera moves, that of `measurement`. `geometry` holds the bindings of
-    both surfaces; `everywhere` requests light at every pixel (for estimation).
+    both surfaces; `lit_area` requests light in a part of the picture, whatever the objects reach (for estimation).
     """
 
     image: Resource[CameraImage]
@@ -102,7 +102,7 @@ class FrameResources:
     objects: Resource[GeometryState]
     surfaces: Resource[SurfaceTable]
     lights: Resource[LightSet]
-    everywhere: Resource[bool]
+    lit_area: Resource[Rectangle]
     albedo: Resource[AlbedoTexture]
     observation: Resource[Observation]
     measured: Resource[Observation]
@@ -278,7 +278,7 @@ def declare_frame(graph: Graph, buffers: PictureBuffers) -> FrameResources:
     objects = graph.source("object geometry", "objects")
     surfaces = graph.source("surface table", "scene")
     lights = graph.source("light set", "lights")
-    everywhere = graph.source("everywhere", "lights")
+    lit_area = graph.source("lit area", "lights")
     albedo = graph.source("albedo", "world")
     graph.section("surfaces")
     declared = graph.value("declared surfaces", buffers.declare_surfaces, surfaces)
@@ -299,7 +299,7 @@ def declare_frame(graph: Graph, buffers: PictureBuffers) -> FrameResources:
         objects,
         surfaces,
         lights,
-        everywhere,
+        lit_area,
         albedo,
         observation,
         measured,

@@ -5,6 +5,8 @@ from operator import eq, is_
 from typing import Any
 
 import moderngl
+import numpy as np
+from jaxtyping import Float64
 
 from deltalight.protocol.frames import ViewFrame
 from deltalight.protocol.scene_method import Output
@@ -18,6 +20,7 @@ from deltalight.render_server.frame import (
 )
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Bindings
+from deltalight.render_server.gpu.textures import read_texture
 from deltalight.render_server.gpu.timers import PassTimers
 from deltalight.render_server.gpu_scene import GeometryState
 from deltalight.render_server.graph import Graph, Resource
@@ -31,7 +34,7 @@ from deltalight.render_server.passes.gbuffer import CameraImage, GeometryBuffer,
 from deltalight.render_server.passes.shading import DirectLight
 from deltalight.render_server.passes.voxel_light import AlbedoTexture
 from deltalight.render_server.scene.declared_surfaces import SurfaceTable
-from deltalight.render_server.view import CameraView
+from deltalight.render_server.view import NOWHERE, CameraView, Rectangle
 
 
 @dataclass(frozen=True)
@@ -168,7 +171,7 @@ class FrameGraph:
 
     def _declare_composition(self, composition: Composition) -> Resource[Composite]:
         g, s, layers = self.graph, self.resources, self.layers
-        radiance = g.stage(
+        radiance = self._radiance = g.stage(
             "interior edges", self.buffers.antialias_interior, layers.radiance, s.object_surface
         )
         return g.stage(
@@ -205,7 +208,7 @@ class FrameGraph:
         s.objects.write(inputs.objects, is_)
         s.surfaces.write(inputs.surfaces, is_)
         s.lights.write(inputs.lights, is_)
-        s.everywhere.write(False, eq)
+        s.lit_area.write(NOWHERE, eq)
         s.albedo.write(inputs.albedo, is_)
         self._inputs = inputs
 
@@ -243,16 +246,27 @@ class FrameGraph:
             s.objects.value,
         )
 
+    def radiance(self) -> Float64[np.ndarray, "h w 3"]:
+        """Radiance of the virtual objects as composed, camera units; undefined where they cover nothing."""
+        self.graph.run(self._radiance)
+        return read_texture(self._radiance.value)[..., :3]
+
     def evaluate(self, lights: LightSet) -> Fields:
         """Evaluates the frame's light under other lights, at every pixel and not only near the objects.
 
         The sources keep these lights until they are set again.
         """
+        cones, layers = self.gather(lights, (0, 0, *self.resources.view.value.size)), self.layers
+        self.graph.run(layers.direct, layers.grid)
+        return Fields(layers.direct.value, cones, layers.grid.value)
+
+    def gather(self, lights: LightSet, area: Rectangle) -> ConeFields:
+        """Gathers the light that cones find under other lights, in a part of the picture; else as `evaluate`."""
         s, layers = self.resources, self.layers
         s.lights.write(lights, is_)
-        s.everywhere.write(True, eq)
-        self.graph.run(layers.direct, layers.cones, layers.grid)
-        return Fields(layers.direct.value, layers.cones.value, layers.grid.value)
+        s.lit_area.write(area, eq)
+        self.graph.run(layers.cones)
+        return layers.cones.value
 
     def advance(self, options: CompositeOptions, until_s: float) -> bool:
         """Works on the frame until then (time.monotonic()); returns whether it is ready to render at once."""

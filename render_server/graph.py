@@ -403,7 +403,7 @@ class Graph:
                 self._section_of(stage),
                 stage.name in self._values,
                 _summary(stage.function),
-                stage.function.__module__.replace(".", "/") + ".py",
+                stage.function.__module__.removeprefix("deltalight.").replace(".", "/") + ".py",
             )
             for stage in self._sorted()
         ]

@@ -5,6 +5,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+from jaxtyping import Float64
+
 from deltalight.protocol.frames import ViewFrame
 from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.scene_method import Output
@@ -59,6 +62,10 @@ class RelitFrame:
     def shown(self) -> ShownBuffers:
         """Returns the geometry buffers."""
         return self.graph.shown()
+
+    def radiance(self) -> Float64[np.ndarray, "h w 3"]:
+        """Returns the radiance of the virtual objects, camera units."""
+        return self.graph.radiance()
 
 
 @dataclass(frozen=True, eq=False)

@@ -64,7 +64,7 @@ def compute_field(
     """Computes the field of an object (`object_surface`, asset's frame); takes seconds.
 
     Raises:
-        DeltalightError: the package embreex is not installed.
+        DeltalightError: no package that traces rays is installed.
     """
     rays = ObjectRays(np.ascontiguousarray(surface[..., :3]))
     grid = place_shells(rays, settings)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import ViewFrame
@@ -21,6 +21,7 @@ SHOWN_FRACTION = 0.5  # of a pixel that an object must cover to be picked
 
 Vector = Float64[np.ndarray, "3"]
 Pixel = tuple[int, int]
+Texels = Int64[np.ndarray, "h w"]
 Surface = tuple[Vector, Vector]  # position, m; normal
 
 
@@ -145,13 +146,19 @@ def _surface_in_buffers(shown: ShownBuffers, pixel: Pixel, *, of_object: bool) -
     return place[:3], read_texel(buffer.normal, texel)[:3].astype(np.float64)
 
 
-def _raster_texel(view: CameraView, pixel: Pixel) -> Pixel:
-    """Returns the texel of the objects' raster that a pixel sees (passes/shaders/common/geometry.glsl)."""
+def raster_texels(view: CameraView) -> tuple[Texels, Texels]:
+    """Returns column and row in the objects' raster that each pixel sees (passes/shaders/common/geometry.glsl)."""
     if view.antialiased or not view.camera.has_distortion:
-        return pixel
+        row, column = np.indices(view.size[::-1])
+        return column, row
     (fx, fy, cx, cy), _ = view.raster
-    x, y = view.camera.rays()[pixel[1], pixel[0]]
-    return int(np.floor(fx * x + cx + 0.5)), int(np.floor(fy * y + cy + 0.5))
+    x, y = np.moveaxis(view.camera.rays(), -1, 0)
+    return np.floor(fx * x + cx + 0.5).astype(np.int64), np.floor(fy * y + cy + 0.5).astype(np.int64)
+
+
+def _raster_texel(view: CameraView, pixel: Pixel) -> Pixel:
+    column, row = (int(texels[pixel[1], pixel[0]]) for texels in raster_texels(view))
+    return column, row
 
 
 def _owner(objects: Sequence[PlacedObject], material: int) -> str:

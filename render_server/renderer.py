@@ -17,11 +17,11 @@ from deltalight.protocol.frames import ViewFrame
 from deltalight.protocol.scene import SceneDocument
 from deltalight.render_server.frame_budget import Level
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu.textures import AsyncReadback
+from deltalight.render_server.gpu.textures import AsyncReadback, read_texture
 from deltalight.render_server.graph import Graph
 from deltalight.render_server.live_scene import LiveScene, RelitFrame
 from deltalight.render_server.passes.composite import Composite
-from deltalight.render_server.picking import Pick, ShownFrame
+from deltalight.render_server.picking import SHOWN_FRACTION, Pick, ShownFrame, raster_texels
 from deltalight.render_server.view import CameraView, output_size, resized_frame
 
 
@@ -45,6 +45,20 @@ class CompositeFrame:
     pass_times_ms: dict[str, float] = field(default_factory=dict)
     lights: list[dict[str, Any]] = field(default_factory=list)
     level: Level | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class PictureLayers:
+    """What a picture is composed of.
+
+    `coverage` (0..1) is the share of a pixel that virtual objects cover, `radiance` theirs (camera units), not yet
+    times the coverage. `depth_m` is along the optical axis: of the object where it covers half of the pixel or more,
+    else of the real surface; 0 where it is unknown.
+    """
+
+    coverage: Float32[np.ndarray, "h w"]
+    radiance: Float32[np.ndarray, "h w 3"]
+    depth_m: Float32[np.ndarray, "h w"]
 
 
 @dataclass(frozen=True)
@@ -83,6 +97,7 @@ class SceneRenderer:
         self._with_linear = with_linear
         self._sized: tuple[ViewFrame, ViewFrame] | None = None
         self._shown: ShownFrame | None = None
+        self._relit: RelitFrame | None = None
         self.scene = scene
 
     def set_scene(self, scene: SceneDocument) -> None:
@@ -109,12 +124,12 @@ class SceneRenderer:
         `whole`: at full size whatever the budget, as `with_linear` always is.
         """
         started_s = time.perf_counter()
-        frame, self._shown = self.sized(frame), None
+        frame, self._shown, self._relit = self.sized(frame), None, None
         if frame.pose is None:
             self._shown = ShownFrame(frame, None, None)
             return _at_once(self._shown, frame.color)
         view = CameraView(frame.camera, frame.pose.world_from_camera)
-        relit = self._live.relight(frame, view, whole=whole or with_linear)
+        relit = self._relit = self._live.relight(frame, view, whole=whole or with_linear)
         lights = self._live.describe_lights()
         name = self.scene.output.view
         shows_lights = name == "lights" and bool(lights)
@@ -158,6 +173,28 @@ class SceneRenderer:
         if self._shown is None:
             raise DeltalightError("Nothing was rendered yet; ask again when there is a picture.")
         return self._shown.pick(x, y, ignore)
+
+    def layers(self) -> PictureLayers:
+        """Reads back the layers of the newest picture, which is the camera's and at full size.
+
+        Raises:
+            DeltalightError: nothing was rendered yet.
+        """
+        if self._shown is None:
+            raise DeltalightError("Nothing was rendered yet; render a frame first.")
+        frame = self._shown.frame
+        if self._relit is None:
+            nothing = np.zeros(frame.color.shape, np.float32)
+            depth_m = nothing[..., 0] if frame.depth is None else frame.depth.depth_m * frame.depth.valid
+            return PictureLayers(nothing[..., 0], nothing, depth_m.astype(np.float32))
+        shown = self._relit.shown()
+        coverage = read_texture(shown.object_coverage)[..., 0]
+        radiance = np.where(coverage[..., None] > 0, self._relit.radiance(), 0)
+        column, row = raster_texels(shown.view)
+        of_objects = read_texture(shown.object_buffer.position)[row, column, 3]
+        real = read_texture(shown.real_surface.position)[..., 3]
+        depth_m = np.where(coverage >= SHOWN_FRACTION, of_objects, np.maximum(real, 0))
+        return PictureLayers(*(values.astype(np.float32) for values in (coverage, radiance, depth_m)))
 
     def _composed(
         self,

@@ -17,6 +17,7 @@ FAR_M = 100.0
 RECTANGLE_MARGIN_PX = 8  # a lens bends the edges between the corners of a box
 
 Rectangle = tuple[int, int, int, int]  # first column and row, width and height
+NOWHERE: Rectangle = (0, 0, 0, 0)
 
 
 @dataclass(frozen=True, eq=False)

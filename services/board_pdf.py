@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from deltalight.protocol.board import BoardSpec
-from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.errors import DeltalightError, install_command
 
 MM = 72 / 25.4  # PDF points
 PAPERS_MM = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "letter": (215.9, 279.4)}
@@ -94,7 +94,9 @@ def write_board_pdf(path: Path, board: BoardSpec, paper: str) -> None:
     try:
         from reportlab.pdfgen.canvas import Canvas
     except ImportError as error:
-        raise DeltalightError("boards need the package reportlab: pip install 'deltalight[node]'.") from error
+        raise DeltalightError(
+            f"boards need the package reportlab: {install_command('reportlab')}."
+        ) from error
     page = choose_page(board, paper)
     canvas = Canvas(str(path), pagesize=(page.width * MM, page.height * MM), invariant=True)
     canvas.setTitle(f"Deltalight marker board, {board.type}")

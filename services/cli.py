@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 
+from deltalight import __version__
 from deltalight.benchmarks.cli import bench, gpu_check
 from deltalight.protocol.errors import DeltalightError
 from deltalight.services.commands.api import api
@@ -55,9 +56,7 @@ app.command()(gpu_check)
 
 def _show_version(wanted: bool) -> None:
     if wanted:
-        from importlib.metadata import version
-
-        typer.echo(f"deltalight {version('deltalight')}")
+        typer.echo(f"deltalight {__version__}")
         raise typer.Exit
 
 

@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from deltalight.protocol.errors import DeltalightError
-from deltalight.protocol.methods import PLUGINS
+from deltalight.protocol.method_names import with_method
 from deltalight.protocol.scene import SceneDocument, load_scene
 from deltalight.services import ports
 from deltalight.services.collector import CompositeCollector, summarize
@@ -35,7 +35,7 @@ LONGEST_FRAME_S = 1800.0  # after it a renderer that still answers hangs
 
 
 def demo_scene(method: str) -> SceneDocument:
-    """Return the demo's scene with a method of `deltalight.services.commands.options.require_method`.
+    """Return the demo's scene with a method of `deltalight.protocol.method_names`.
 
     Raises:
         DeltalightError: the demo's files are missing.
@@ -44,19 +44,6 @@ def demo_scene(method: str) -> SceneDocument:
         raise DeltalightError(f"The demo's files are missing in {ASSETS}; install Deltalight again.")
     scene = load_scene(SCENE)
     return with_method(scene, method)
-
-
-def with_method(scene: SceneDocument, method: str) -> SceneDocument:
-    """Return the scene with a method: `exact` or `paper` (operators of dvct), or NAME[-OPERATOR].
-
-    An installed plugin's, too. A method that the scene has keeps its settings.
-    """
-    if method in ("exact", "paper"):
-        name, operator = "dvct", method
-    else:
-        name, _, operator = (method, "", "") if method in PLUGINS.values else method.partition("-")
-    chosen = scene if scene.method.method_name() == name else scene.replaced(method={"name": name})
-    return chosen.replaced(method=chosen.method.replaced(operator=operator)) if operator else chosen
 
 
 def run_live(method: str, *, port: int, with_browser: bool) -> None:

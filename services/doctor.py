@@ -8,13 +8,14 @@ from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from typing import Literal
 
+from deltalight.protocol.errors import install_command
 from deltalight.services import ports
 
 PROBE_TIMEOUT_S = 60
 MAXIMUM_DEVICES = 16
 PACKAGES = {
-    "render": ("moderngl", "trimesh", "scipy", "OpenEXR"),
-    "api": ("fastapi", "uvicorn", "websockets", "sqlalchemy", "prometheus-client"),
+    "to render": ("moderngl", "trimesh", "scipy", "OpenEXR"),
+    "to serve": ("fastapi", "uvicorn", "websockets", "sqlalchemy", "prometheus-client"),
 }
 
 CONTAINER_HINT = (
@@ -56,14 +57,14 @@ def examine() -> Iterator[Check]:
 
 
 def _packages() -> Iterator[Check]:
-    for extra, names in PACKAGES.items():
+    for use, names in PACKAGES.items():
         missing = [name for name in names if _version(name) is None]
         if missing:
-            hint = f"pip install 'deltalight[{extra}]'"
-            yield Check(f"packages [{extra}]", "missing", f"not installed: {', '.join(missing)}", hint)
+            what = f"not installed: {', '.join(missing)}"
+            yield Check(f"packages {use}", "missing", what, install_command(*missing))
         else:
             found = ", ".join(f"{name} {_version(name)}" for name in names)
-            yield Check(f"packages [{extra}]", "ok", found)
+            yield Check(f"packages {use}", "ok", found)
 
 
 def _version(package: str) -> str | None:
@@ -112,7 +113,7 @@ def _renderers() -> Iterator[Check]:
 
 
 def _probe(device: int) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-c", _PROBE, str(device)]
+    command = [sys.executable, "-P", "-c", _PROBE, str(device)]
     try:
         return subprocess.run(command, capture_output=True, text=True, timeout=PROBE_TIMEOUT_S, check=False)
     except subprocess.TimeoutExpired:

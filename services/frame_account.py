@@ -11,11 +11,11 @@ import numpy as np
 
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.frames import BoardPose, ViewFrame
+from deltalight.protocol.method_names import with_method
 from deltalight.protocol.scene import SceneDocument, parse_scene
 from deltalight.render_server.gpu.context import GpuContext, create_context
 from deltalight.render_server.graph import SourceReport, StageReport
 from deltalight.render_server.renderer import SceneRenderer
-from deltalight.services.demo import with_method
 
 SIZE = (320, 240)
 FOCAL_PX = 300.0

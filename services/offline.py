@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
+import numpy as np
+
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.files import replacing, write_png
 from deltalight.protocol.frames import BoardPose, ViewFrame, linear_color
@@ -17,6 +19,7 @@ from deltalight.services.files import make_output_folder
 from deltalight.services.object_sizes import size_warnings
 
 if TYPE_CHECKING:
+    from deltalight.relighting import RelitPicture
     from deltalight.render_server.renderer import CompositeFrame, SceneRenderer
 
 INDEX_FILE = "frames.jsonl"
@@ -32,6 +35,12 @@ class RenderJob:
     out: Path
     device: int | None = None
     with_exr: bool = False
+    with_layers: bool = False
+
+    @property
+    def with_linear(self) -> bool:
+        """Whether anything is written that is linear."""
+        return self.with_exr or self.with_layers
 
 
 @dataclass
@@ -94,13 +103,13 @@ def run_job(job: RenderJob, progress: Progress) -> RenderSummary:
     from deltalight.render_server.gpu.context import create_context
     from deltalight.render_server.renderer import SceneRenderer
 
-    if job.with_exr:
-        require_openexr("--exr")
+    if job.with_linear:
+        require_openexr("--exr" if job.with_exr else "--layers exr")
     make_output_folder(job.out)
     gpu = create_context(job.device, allow_software=True)
     try:
         progress.renderer(gpu.renderer_name, is_software=gpu.is_software)
-        renderer = SceneRenderer(gpu, job.scene, with_linear=job.with_exr)
+        renderer = SceneRenderer(gpu, job.scene, with_linear=job.with_linear)
         try:
             for sentence in size_warnings(job.scene):
                 progress.notice(sentence)
@@ -114,30 +123,33 @@ def run_job(job: RenderJob, progress: Progress) -> RenderSummary:
 def _render_frames(
     job: RenderJob, renderer: "SceneRenderer", summary: RenderSummary, progress: Progress
 ) -> RenderSummary:
+    from deltalight.relighting import RelitPicture
     from deltalight.sensor_node.fisheye import light_warnings
-    from deltalight.sensor_node.view_frames import ViewFrameBuilder
+    from deltalight.take import Take
 
-    builder = ViewFrameBuilder(
+    take = Take(
         job.source,
         needs_depth=job.scene.real.geometry in ("depth", "fused"),
         needs_light=job.scene.lights.mode in ("fisheye", "tracked"),
     )
-    notified: set[str] = set()
+    notified = set(job.source.notes)
     warnings: list[str] | None = None
     for number in job.frames:
-        frame = builder(job.source[number])
+        frame = take[number]
         if number == job.frames.start:
-            _require_light(job.scene, frame, builder.notes)
+            _require_light(job.scene, frame, take.notes)
         started_s = time.perf_counter()
         composite = renderer.render(frame)
         summary.add(composite, 1000 * (time.perf_counter() - started_s))
         if frame.radiance_map is not None and warnings is None:  # the first map represents all
             warnings = light_warnings(frame.radiance_map)
-        for sentence in (*builder.notes, *(warnings or ()), *renderer.notices):
+        for sentence in (*take.notes, *(warnings or ()), *renderer.notices):
             if sentence not in notified:
                 progress.notice(sentence)
                 notified.add(sentence)
         _write_frame(job, number, frame, composite)
+        if job.with_layers:
+            _write_layers(job, number, RelitPicture.of(renderer.sized(frame), composite, renderer.layers()))
         progress.frame_done()
     return summary
 
@@ -164,6 +176,13 @@ def _write_frame(job: RenderJob, number: int, frame: ViewFrame, composite: "Comp
     mode = "w" if number == job.frames.start else "a"  # the first picture replaces an older run's index
     with (job.out / INDEX_FILE).open(mode, encoding="utf-8") as index:
         index.write(json.dumps(frame_record(number, frame, composite)) + "\n")
+
+
+def _write_layers(job: RenderJob, number: int, picture: "RelitPicture") -> None:
+    """Writes the picture so that compositing programs can redo it: plate x ratio, and RGBA over it."""
+    over = np.dstack([picture.additive, picture.coverage])
+    with replacing(job.out / f"{number:06d}.layers.exr") as temporary:
+        write_exr(temporary, over, {"ratio": picture.ratio, "Z": picture.depth})
 
 
 def frame_record(number: int, frame: ViewFrame, composite: "CompositeFrame") -> dict[str, Any]:

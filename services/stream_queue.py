@@ -14,8 +14,8 @@ QUEUED_BYTES = 512 * 1024 * 1024  # of all topics together, if pictures are larg
 class StreamQueue(Subscriber):
     """Messages in the order of their arrival; those that arrive while the queue is full are dropped and counted.
 
-    It is the counterpart of `deltalight.protocol.receiver.Receiver`, whose newest message wins. `topics` are stream names
-    (`color`); subscriptions are sent in their order. `keys` are required if an endpoint leaves the host.
+    It is the counterpart of `deltalight.protocol.receiver.Receiver`, whose newest message wins. `topics` are stream
+    names (`color`); subscriptions are sent in their order. `keys` are required if an endpoint leaves the host.
 
     Raises:
         DeltalightError: an endpoint leaves the host without keys, or is malformed.

@@ -1,6 +1,7 @@
 """Keeps the processes of one host alive: restarts them within a second, gives up after too many, ends them together.
 
-Each child is a command line of its own (`python -m deltalight.services.cli ...`): one process, one OpenGL context.
+Each child is a command line of its own (`python -P -m deltalight.services.cli ...`): one process, one OpenGL
+context. `-P` keeps Python from importing what lies in the folder where the command was called.
 """
 
 import os
@@ -36,7 +37,7 @@ class ChildSpec:
     @classmethod
     def deltalight(cls, name: str, *arguments: str) -> "ChildSpec":
         """Return a child that runs a command of this command line."""
-        return cls(name, ("-m", "deltalight.services.cli", *arguments))
+        return cls(name, ("-P", "-m", "deltalight.services.cli", *arguments))
 
 
 @dataclass

@@ -43,7 +43,7 @@ def changed(text: str, change: str) -> str:
 def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The project with all examples in it."""
     folder = tmp_path_factory.mktemp("copy")
-    for part in ("protocol", "render_server", "sensor_node", "services/dashboard/src/forms"):
+    for part in ("deltalight", "protocol", "render_server", "sensor_node", "services/dashboard/src/forms"):
         shutil.copytree(ROOT / part, folder / part, ignore=shutil.ignore_patterns("__pycache__"))
     for title, section in SECTIONS.items():
         for path, text in files_of(title).items():

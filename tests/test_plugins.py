@@ -134,8 +134,7 @@ from deltalight.render_server.gpu.textures import texture_2d
 written = texture_2d(gpu, (2, 2), 4, "f4")
 Kernel(gpu, Path(sys.argv[2]) / "fog").run(written.size, fog_out=written)
 from deltalight.benchmarks.variants import RENDERED, parse_variants
-from deltalight.services.commands.options import require_method
-from deltalight.services.demo import with_method
+from deltalight.protocol.method_names import require_method, with_method
 
 (variant,) = parse_variants("direct:ambient=4", RENDERED)
 chosen = variant.applied(document, 64), with_method(document, "direct")

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 METHODS = ("exact", "paper", "dlpv", "differential", "dlpv-paper", "none", "aroof")
 """As for `demo --method`; the one that computes longest before its first frame comes last."""
-NEEDLESS_CHECKS = ("packages [api]",)  # of doctor: what rendering does without
+NEEDLESS_CHECKS = ("packages to serve",)  # of doctor: what rendering does without
 SIZES = {"640x480, 64^3": ((640, 480), 64), "1280x720, 256^3": ((1280, 720), 256)}
 SPEED_FRAMES = 30  # the demo's recording; its camera moves in the last ten
 LEAK_ROUNDS = 3

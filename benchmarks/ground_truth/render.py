@@ -79,7 +79,8 @@ def choose_variant() -> str:
 @cache
 def _llvm_works() -> bool:
     return (
-        subprocess.run([sys.executable, "-c", LLVM_PROBE], capture_output=True, check=False).returncode == 0
+        subprocess.run([sys.executable, "-P", "-c", LLVM_PROBE], capture_output=True, check=False).returncode
+        == 0
     )
 
 

@@ -2,12 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import fields
-from importlib.metadata import version
 from typing import Literal
 
 from rich.console import Console
 from rich.progress import Progress
 
+from deltalight import __version__
 from deltalight.benchmarks.speed.instruments import GpuCounts, ReadBacks, counted
 from deltalight.benchmarks.speed.measure import WARM_UP_FRAMES, SpeedJob, opened, rendering, time_step
 from deltalight.benchmarks.speed.motions import Step, prepare_take, steps_of
@@ -65,7 +65,7 @@ def count_frames(job: SpeedJob, progress: Progress) -> CountsReport:
         renderer_name = gpu.renderer_name
     camera = take.standing[0].camera
     return CountsReport(
-        version=version("deltalight"),
+        version=__version__,
         renderer=renderer_name,
         size=job.size or (camera.width, camera.height),
         frames=job.frames,

@@ -5,10 +5,10 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib.metadata import version
 
 from rich.progress import Progress
 
+from deltalight import __version__
 from deltalight.benchmarks.speed.motions import Step, Take, prepare_take, steps_of
 from deltalight.benchmarks.speed.peaks import measure_peaks, stage_bytes
 from deltalight.benchmarks.speed.report import (
@@ -85,7 +85,7 @@ def measure_speed(
     with opened(job.device) as gpu:
         frame = take.standing[0].camera
         report = SpeedReport(
-            version=version("deltalight"),
+            version=__version__,
             renderer=gpu.renderer_name,
             cpus=os.cpu_count() or 1,
             size=job.size or (frame.width, frame.height),

@@ -10,7 +10,7 @@ from deltalight.protocol.frames import ViewFrame
 from deltalight.render_server.debug_view import draw_lights
 from deltalight.render_server.estimation.plane_extrapolation import ExtrapolatedPlanes
 from deltalight.render_server.estimation.registration import RegistrationAverage, register_lights
-from deltalight.render_server.estimation.samples import BackoffSchedule, bounced_light
+from deltalight.render_server.estimation.samples import BackoffSchedule, bounced_light, sample_light
 from deltalight.render_server.estimation.unseen_environment import (
     find_extrapolated_planes,
     find_unseen_light,
@@ -125,11 +125,11 @@ class LightEstimator:
         """Estimates the light from out of view, as this frame shows it."""
         if self._ground is not None:
             lights = lights.with_ground(self._ground)
-        bounce = bounced_light(graph, lights)
-        walls = self._walls = find_extrapolated_planes(graph, lights, bounce)
+        known = sample_light(graph, lights, bounced_light(graph, lights))
+        walls = self._walls = find_extrapolated_planes(graph, lights, known)
         shape = unseen_light_shape(graph, len(lights.environment)) * (1 - walls.probability)
         lights = lights.with_surfaces(walls.radiance, walls.probability)
-        found = find_unseen_light(graph, lights, shape, bounce)
+        found = find_unseen_light(graph, lights, shape, known)
         if found is not None:
             self._sky = (found, shape)
             radiance = ", ".join(f"{value:.3g}" for value in found)

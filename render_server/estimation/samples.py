@@ -2,18 +2,19 @@
 
 from dataclasses import dataclass, replace
 
-import moderngl
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 
 from deltalight.protocol.frames import decode_lut
 from deltalight.render_server.frame_graph import FrameGraph
+from deltalight.render_server.gpu.textures import read_texture
 from deltalight.render_server.lights.lights import LightSet
 from deltalight.render_server.scene.albedo import known_albedo, unclipped
 
 UNSHADOWED = 0.95  # fraction of its direct light that a pixel gets, from which on it counts as unshadowed
 
-Bounce = Float64[np.ndarray, "h w 3"]
+Gathered = Float64[np.ndarray, "h w 3"]
+"""Irradiance that cones gather at each texel of the reduced grid."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,14 +36,26 @@ class LightSamples:
         """Which samples receive nearly all of their direct light."""
         return np.asarray(self.lit >= UNSHADOWED)
 
+    def of(self, chosen: Bool[np.ndarray, " k"]) -> "LightSamples":
+        """Returns some of the samples."""
+        return LightSamples(**{name: values[chosen] for name, values in vars(self).items()})
 
-def bounced_light(graph: FrameGraph, lights: LightSet) -> Bounce:
+    def gather(self, graph: FrameGraph, lights: LightSet) -> Float64[np.ndarray, "k 3"]:
+        """Returns the irradiance that cones gather at the samples under other lights."""
+        scale = graph.layers.grid.value.scale
+        low, high = self.pixel.min(axis=0) - 2 * scale, self.pixel.max(axis=0) + 2 * scale  # a filter's reach
+        found = read_texture(graph.gather(lights, (*low.tolist(), *(high - low).tolist())).mu)
+        column, row = (self.pixel // scale).T
+        return found[row, column, :3]
+
+
+def bounced_light(graph: FrameGraph, lights: LightSet) -> Gathered:
     """Returns the irradiance that cones gather from real surfaces alone, traced under a black environment."""
     black = replace(lights, environment=np.zeros_like(lights.environment))
-    return read_texture(graph.evaluate(black).cones.mu)[..., :3]
+    return read_texture(graph.gather(black, (0, 0, *graph.inputs.view.size)).mu)[..., :3]
 
 
-def sample_light(graph: FrameGraph, lights: LightSet, bounce: Bounce | None) -> LightSamples:
+def sample_light(graph: FrameGraph, lights: LightSet, bounce: Gathered | None) -> LightSamples:
     """Reads the fields back where the real scene is visible; a pixel's cones are those of its texel of the grid.
 
     Without `bounce`, all light that the cones gather is attributed to the lights.
@@ -72,13 +85,6 @@ def sample_light(graph: FrameGraph, lights: LightSet, bounce: Bounce | None) -> 
         lit,
         np.stack([x, y], axis=1),
     )
-
-
-def read_texture(texture: moderngl.Texture) -> Float64[np.ndarray, "h w c"]:
-    """Returns the contents of a half-float or float texture."""
-    width, height = texture.size
-    dtype = np.float16 if texture.dtype == "f2" else np.float32
-    return np.frombuffer(texture.read(), dtype).reshape(height, width, -1).astype(np.float64)
 
 
 FIRST_WAIT_S = 1.0

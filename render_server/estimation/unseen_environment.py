@@ -15,11 +15,12 @@ from deltalight.render_server.estimation.plane_extrapolation import (
     extrapolate_planes,
 )
 from deltalight.render_server.estimation.registration import unseen_radiance_from_patch
-from deltalight.render_server.estimation.samples import Bounce, read_texture, sample_light
+from deltalight.render_server.estimation.samples import LightSamples
 from deltalight.render_server.frame_graph import FrameGraph
+from deltalight.render_server.gpu.textures import read_texture
 from deltalight.render_server.lights.environment import LUMINANCE
 from deltalight.render_server.lights.lights import LightSet
-from deltalight.render_server.lights.octahedral import irradiance, octahedral_uv, resample_to_octahedral
+from deltalight.render_server.lights.octahedral import irradiance_map, octahedral_uv
 
 GROUND_SIZES = 2.0
 FACES_UP = 0.7  # cosine to the vertical
@@ -28,9 +29,11 @@ PLANE_SAMPLES = 6000  # pixels used to detect planes: the smallest accepted plan
 FLATNESS = 0.01  # of the distance: tolerance of walls, tables and lenses
 
 
-def find_extrapolated_planes(graph: FrameGraph, lights: LightSet, bounce: Bounce) -> ExtrapolatedPlanes:
-    """Extrapolates table, walls or floor where the picture's border cuts them (plane_extrapolation.py)."""
-    known = sample_light(graph, lights, bounce)
+def find_extrapolated_planes(graph: FrameGraph, lights: LightSet, known: LightSamples) -> ExtrapolatedPlanes:
+    """Extrapolates table, walls or floor where the picture's border cuts them (plane_extrapolation.py).
+
+    `known` are samples under `lights`.
+    """
     inputs = graph.inputs
     usable = np.flatnonzero(known.usable)
     chosen = usable[:: max(1, len(usable) // PLANE_SAMPLES)]
@@ -50,24 +53,21 @@ def find_extrapolated_planes(graph: FrameGraph, lights: LightSet, bounce: Bounce
 
 
 def find_unseen_light(
-    graph: FrameGraph, lights: LightSet, shape: Float32[np.ndarray, "n n 1"], bounce: Bounce
+    graph: FrameGraph, lights: LightSet, shape: Float32[np.ndarray, "n n 1"], known: LightSamples
 ) -> Float32[np.ndarray, "3"] | None:
     """Estimates the radiance, times `shape`, of what neither camera nor lights show.
 
     Walls beside and behind the camera reflect light too. On paper of known albedo the picture gives the irradiance;
     what the lights and the visible scene leave unexplained comes from those walls. None without such paper.
+    `known` are samples under the same lamps as `lights`, whatever the environment.
     """
-    board = graph.inputs.frame.board
-    if board is None or (board.white_albedo is None and not board.grey_cards):
+    board, paper = graph.inputs.frame.board, known.of(known.usable & (known.albedo > 0))
+    if board is None or (board.white_albedo is None and not board.grey_cards) or not len(paper.albedo):
         return None
     black = replace(lights, environment=np.zeros_like(lights.environment))
-    known = sample_light(graph, lights, bounce)
-    even = sample_light(graph, black.with_sky(np.ones(3, np.float32), shape), bounce)
-    paper = known.usable & (known.albedo > 0)
-    total, per_radiance = known.light + known.bounce, even.light - known.direct
-    return unseen_radiance_from_patch(
-        known.measured[paper], total[paper], per_radiance[paper], known.albedo[paper]
-    )
+    total = paper.direct + paper.gather(graph, lights)
+    even = paper.gather(graph, black.with_sky(np.ones(3, np.float32), shape)) - paper.bounce
+    return unseen_radiance_from_patch(paper.measured, total, even, paper.albedo)
 
 
 def ground_radiance(graph: FrameGraph) -> Float32[np.ndarray, "3"] | None:
@@ -102,10 +102,5 @@ def unseen_light_shape(graph: FrameGraph, size: int) -> Float32[np.ndarray, "n n
     count = np.bincount(flat, minlength=size * size)
     mean = np.bincount(flat, luminance, size * size) / np.maximum(count, 1)
     seen_radiance = np.repeat(mean.reshape(size, size, 1), 3, axis=2).astype(np.float32)
-
-    def received(facing: Float32[np.ndarray, "n m 3"]) -> Float32[np.ndarray, "n m 1"]:
-        light = irradiance(seen_radiance, facing.reshape(-1, 3))[:, 0]
-        return np.asarray(light.reshape(*facing.shape[:2], 1), np.float32)
-
-    shape = resample_to_octahedral(received, size, supersampling=1)
+    shape = irradiance_map(seen_radiance)[..., :1]
     return shape / shape.max() if shape.max() > 0 else np.ones_like(shape)

@@ -57,7 +57,7 @@ class GpuContext:
     watchers: list[Callable[[Any], None]] = field(default_factory=list)
     """Told of every run of a kernel (gpu/kernel.py)."""
     compile_watchers: list[Callable[[str, Mapping[str, str]], None]] = field(default_factory=list)
-    """Told of every program that is compiled: its label and the text of each of its stages."""
+    """Told of every program that a kernel asks for: its label and the text of each of its stages."""
 
     def compiled(self, label: str, sources: Mapping[str, str]) -> None:
         """Tells the compile watchers about a program."""
@@ -66,7 +66,7 @@ class GpuContext:
 
     @cached_property
     def common(self) -> dict[str, object]:
-        """What is made once and used by all, by name: the kernels that clear and count (gpu/kernel.py)."""
+        """What is made once and used by all, by name: programs, the kernels that clear and count (gpu/kernel.py)."""
         return {}
 
     @cached_property

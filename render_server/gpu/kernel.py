@@ -23,6 +23,7 @@ SOFTWARE_WALKERS = 1024
 # cones of one texel takes up to about 5000 (16 cones through 256 voxels and the coarse scene).
 SOFTWARE_DIVISOR = 12
 LIST_WALKERS = 16384
+SPARE_PROGRAMS = 256  # kept linked while no kernel uses them: renderers are made again when settings change
 BLOCK_ALIGNMENT = (
     16  # bytes that std140 blocks are padded to; drivers may leave the padding out of their size
 )
@@ -109,6 +110,7 @@ class _Program:
         declared: Declarations,
     ) -> None:
         self._gpu, self.label, self.program, self._declared = gpu, label, program, declared
+        self.users: set[int] = set()  # ids of the kernels that have not been released
         self._samplers: list[_Slot] = []
         self._images: list[_Slot] = []
         self._storage: list[_Slot] = []
@@ -266,6 +268,34 @@ class _Program:
             watch(Dispatch(self.label, size, written))
 
 
+class _Programs:
+    """Linked programs by source: kernels of the same source share one, and the next ones find it again."""
+
+    def __init__(self) -> None:
+        self._programs: dict[tuple[str, ...], _Program] = {}  # the longest unused first
+
+    def take(self, kernel: object, source: tuple[str, ...], link: Callable[[], _Program]) -> _Program:
+        """Returns the program of that source for `kernel`; `link` makes it where there is none."""
+        program = self._programs.pop(source, None) or link()
+        self._programs[source] = program
+        program.users.add(id(kernel))
+        return program
+
+    def give_back(self, kernel: object, program: _Program) -> None:
+        """Takes back what `kernel` took; frees the oldest programs beyond SPARE_PROGRAMS that nobody uses."""
+        program.users.discard(id(kernel))
+        spare = [source for source, item in self._programs.items() if not item.users]
+        for source in spare[: max(0, len(spare) - SPARE_PROGRAMS)]:
+            self._programs.pop(source).program.release()
+
+
+def _programs(gpu: GpuContext) -> _Programs:
+    """Returns the context's programs."""
+    programs = gpu.common.setdefault("programs", _Programs())
+    assert isinstance(programs, _Programs)
+    return programs
+
+
 class Kernel:
     """A compute shader with its defines: `name`.comp.glsl of the shaders' folder, or of another one if it is a path.
 
@@ -274,12 +304,14 @@ class Kernel:
     """
 
     def __init__(self, gpu: GpuContext, name: str | Path, **defines: float | str) -> None:
-        self._ctx = gpu.ctx
+        self._gpu = gpu
         source = shader_source(SHADERS / f"{name}.comp.glsl", defines)
         declared = declarations(source)
         self.label = _label(name, defines)
         gpu.compiled(self.label, {"comp": source})
-        self._program = _Program(gpu, self.label, gpu.ctx.compute_shader(source), declared)
+        self._program = _programs(gpu).take(
+            self, (source,), lambda: _Program(gpu, self.label, gpu.ctx.compute_shader(source), declared)
+        )
         self.local_size = declared.local_size
 
     def run(self, threads: Sequence[int], *shared: Bindings, **own: Binding) -> None:
@@ -295,7 +327,7 @@ class Kernel:
         counts = [*threads, 1, 1][:3]
         groups = tuple(max(1, -(-count // size)) for count, size in zip(counts, self.local_size, strict=True))
         self._compute.run(*groups)
-        self._ctx.memory_barrier()
+        self._gpu.ctx.memory_barrier()
         self._program.report(groups, written)
 
     def run_counted(self, groups: moderngl.Buffer, *shared: Bindings, **own: Binding) -> None:
@@ -305,7 +337,7 @@ class Kernel:
         """
         written = self._program.bind(shared, own)
         self._compute.run_indirect(groups)
-        self._ctx.memory_barrier()
+        self._gpu.ctx.memory_barrier()
         self._program.report((), written)
 
     @property
@@ -319,22 +351,26 @@ class Kernel:
         return self._program.resources()
 
     def release(self) -> None:
-        """Frees the GL object."""
-        self._program.program.release()
+        """Leaves the program to other kernels of the same source."""
+        _programs(self._gpu).give_back(self, self._program)
 
 
 class RasterKernel:
     """A vertex and a fragment shader of one name; draws with depth test into a framebuffer."""
 
     def __init__(self, gpu: GpuContext, name: str, **defines: float | str) -> None:
-        self._ctx = gpu.ctx
+        self._gpu = gpu
         vertex, fragment = (
             shader_source(SHADERS / f"{name}.{stage}.glsl", defines) for stage in ("vert", "frag")
         )
         self.label = _label(name, defines)
         gpu.compiled(self.label, {"vert": vertex, "frag": fragment})
-        program = gpu.ctx.program(vertex_shader=vertex, fragment_shader=fragment)
-        self._program = _Program(gpu, self.label, program, declarations(vertex + "\n" + fragment))
+
+        def link() -> _Program:
+            program = gpu.ctx.program(vertex_shader=vertex, fragment_shader=fragment)
+            return _Program(gpu, self.label, program, declarations(vertex + "\n" + fragment))
+
+        self._program = _programs(gpu).take(self, (vertex, fragment), link)
 
     def draw(
         self,
@@ -354,14 +390,14 @@ class RasterKernel:
         target.use()
         target.viewport = box or (0, 0, *target.size)
         target.scissor = box  # type: ignore[assignment]  # None lifts it, which the stubs do not know
-        self._ctx.enable_only(moderngl.DEPTH_TEST)
+        self._gpu.ctx.enable_only(moderngl.DEPTH_TEST)
         if clips:
-            self._ctx.enable_direct(CLIP_DISTANCE0)
+            self._gpu.ctx.enable_direct(CLIP_DISTANCE0)
         program = self._program.program
         assert isinstance(program, moderngl.Program)
         mesh.draw(program)
         if clips:
-            self._ctx.disable_direct(CLIP_DISTANCE0)
+            self._gpu.ctx.disable_direct(CLIP_DISTANCE0)
         target.scissor = None  # type: ignore[assignment]  # or it would cut what is cleared next
         attachments = [*target.color_attachments, target.depth_attachment]
         written = {f"attachment {number}": item for number, item in enumerate(attachments)}
@@ -372,8 +408,8 @@ class RasterKernel:
         return self._program.resources()
 
     def release(self) -> None:
-        """Frees the GL object."""
-        self._program.program.release()
+        """Leaves the program to other kernels of the same source."""
+        _programs(self._gpu).give_back(self, self._program)
 
 
 def _label(name: str | Path, defines: Mapping[str, float | str]) -> str:

@@ -56,7 +56,10 @@ THICKNESS_M = 0.05
 
 @dataclass(frozen=True, eq=False)
 class HemisphereMap:
-    """Radiance on the grid of `deltalight.protocol.hemisphere`, 0 where not `seen`; `world_from_map` is a rotation."""
+    """Radiance on the grid of `deltalight.protocol.hemisphere`, 0 where not `seen`.
+
+    `world_from_map` is a rotation.
+    """
 
     radiance: Float32[np.ndarray, "n n 3"]
     seen: Bool[np.ndarray, "n n"]

@@ -225,6 +225,15 @@ def _tangent_frames(axis: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 
     return np.stack([np.stack(column, axis=-1) for column in columns], axis=-1)
 
 
+def irradiance_map(radiance: Float32[np.ndarray, "n n 3"]) -> Float32[np.ndarray, "n n 3"]:
+    """Returns the irradiance on a surface that faces each direction, as the widest level of `prefilter` has it."""
+    source = radiance
+    while len(source) > SUMMED_SIZE:
+        source = _halved(source)
+    level = np.pi * _cone_sum(source, np.pi / 2, min(len(radiance), MIN_LEVEL_SIZE))
+    return sample_octahedral(level, octahedral_grid(len(radiance)))
+
+
 def irradiance(
     radiance: Float32[np.ndarray, "n n 3"], normals: Float[np.ndarray, "k 3"]
 ) -> Float64[np.ndarray, "k 3"]:

@@ -55,6 +55,7 @@ from deltalight.render_server.passes.voxels import (
     VoxelMipmap,
     memory_statement,
 )
+from deltalight.render_server.view import NOWHERE, Rectangle
 
 
 class SolutionVoxels(DirectionalVoxels):
@@ -171,13 +172,13 @@ class SolutionLights:
         return tuple(buffers.set_environment(lights.environment) for buffers in (self.mu, self.rho))
 
     def fit_views(
-        self, lights: LightSet, real: GeometryState, extent: ObjectExtent, everywhere: bool
+        self, lights: LightSet, real: GeometryState, extent: ObjectExtent, area: Rectangle
     ) -> bytes:
         """Fits the views, the same for both solutions, so that their maps differ by the objects alone.
 
         Returns their records, which tell whether the maps are still those of the views.
         """
-        receivers = real.points if everywhere else shadow_receivers(real, extent.upright)
+        receivers = shadow_receivers(real, extent.upright) if area == NOWHERE else real.points
         receivers, points = (np.concatenate([each, extent.points]) for each in (receivers, real.points))
         for buffers in (self.mu, self.rho):
             buffers.place(list(lights.lights), points, receivers, np.zeros((0, 3)))
@@ -246,7 +247,7 @@ def differential(g: Graph, s: FrameResources, setup: Setup[DifferentialMethod]) 
     g.section("lights")
     lights = SolutionLights(g.gpu, settings, resolved, size)
     environment = g.stage("environment", lights.set_environment, s.lights)
-    fitted = s.lights, s.real, object_extent(g, s), s.everywhere
+    fitted = s.lights, s.real, object_extent(g, s), s.lit_area
     views = g.stage("light views", lights.fit_views, *fitted, same=eq)
     mu_maps = g.stage("shadow maps mu", lights.draw_mu, views, s.real)
     rho_maps = g.stage("shadow maps rho", lights.draw_rho, views, s.real, s.objects)

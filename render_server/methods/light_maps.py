@@ -19,6 +19,7 @@ from deltalight.render_server.methods.method import ResolvedSettings
 from deltalight.render_server.passes.lights import LightBuffers, MirrorVisibility
 from deltalight.render_server.passes.shadow_maps import ShadowMaps
 from deltalight.render_server.scene.declared_surfaces import SurfaceTable
+from deltalight.render_server.view import NOWHERE, Rectangle
 
 SHADOW_REACH = 4.0  # in longest edges of the objects' bounds: how far around them real shadows are resolved
 LARGE_TRIANGLE = 0.1  # of that reach: from here on a triangle's own extent matters, not only its corners
@@ -77,14 +78,15 @@ class LightStages:
         real: GeometryState,
         extent: ObjectExtent,
         surfaces: SurfaceTable,
-        everywhere: bool,
+        area: Rectangle,
     ) -> tuple[bytes, bytes]:
-        """Fits the views: of real shadows around the objects (or `everywhere`), and closely around the objects.
+        """Fits the views: of real shadows around the objects, and closely around the objects.
 
-        Returns the records of both, which tell whether their maps are still those of the views.
+        If an `area` of the picture is to be lit too, real shadows are those of the whole scene. Returns the records
+        of both, which tell whether their maps are still those of the views.
         """
         around = _snapped(extent.upright) if self._keeps_views else extent.upright
-        receivers = real.points if everywhere else shadow_receivers(real, around)
+        receivers = shadow_receivers(real, around) if area == NOWHERE else real.points
         shining = list(lights.lights)
         mirrors = mirror_lights(shining, surfaces, np.mean(extent.points, axis=0)) if self._mirrors else []
         self.buffers.place(shining, real.points, receivers, extent.points, mirrors)
@@ -138,7 +140,7 @@ def light_stages(
     )
     extent = object_extent(g, s)
     environment = g.stage("environment", stages.set_environment, s.lights)
-    fitted = s.lights, s.real, extent, s.surfaces, s.everywhere
+    fitted = s.lights, s.real, extent, s.surfaces, s.lit_area
     views = "light views real", "light views objects"
     real_views, object_views = g.stages("light views", stages.fit_views, *fitted, outputs=views, same=eq)
     real_maps = g.stage("shadow maps real", stages.draw_real, real_views, s.real)

@@ -32,7 +32,7 @@ from deltalight.render_server.passes.voxels import (
     keep_placement,
     place_volume,
 )
-from deltalight.render_server.view import CameraView
+from deltalight.render_server.view import CameraView, Rectangle
 
 SELF_SHADOW_TEXELS = 1.5  # a virtual receiver is lifted by so many texels of the depth map
 SURFEL_SHADOW_SAMPLES = 4  # of a light's area: a voxel averages many surfels
@@ -141,7 +141,7 @@ class Shading:
         options: ShadingOptions,
     ) -> None:
         self._gpu, self._options, self._lights, self._direct = gpu, options, lights, direct
-        self._scale = resolved.cone_scale
+        self.size, self._scale = size, resolved.cone_scale
         self.reuses_light = options.tier.refresh_tiles > 0
         self._bvh = ObjectBvh(gpu)
         self.grid = LowResGrid(gpu, size, resolved.cone_scale)
@@ -167,7 +167,7 @@ class Shading:
         objects: GeometryState,
         view: CameraView,
         volume: PlacedVolume,
-        everywhere: bool,
+        area: Rectangle,
         *_lights: object,
     ) -> dict[str, Binding]:
         """Returns the bindings of stages that shade pixels.
@@ -185,7 +185,7 @@ class Shading:
             "sample_distance": 1.5 * self._scale / view.camera.matrix[0, 0],
             "object_low": tuple(bounds[:3]),
             "object_high": tuple(1.0 - bounds[3:]),
-            "everywhere": everywhere or self.is_everywhere,
+            "lit_area": (0, 0, *self.size) if self.is_everywhere else area,
             "has_caustics": self._caustics is not None and casts_caustics(objects),
             "hidden_too": self._screen is not None and reflects_screen(objects),
         }
@@ -337,7 +337,7 @@ def shading_stages(
         s.objects,
         s.view,
         volume,
-        s.everywhere,
+        s.lit_area,
         *lit.all,
         s.lights,
     )
@@ -348,7 +348,7 @@ def shading_stages(
     grid = g.stage("low res grid", shading.choose_pixels, scene)
     if shading.reuses_light:
         # What light at real surfaces depends on, besides the camera: another value whenever any of it changes.
-        changing: tuple[Resource[Any], ...] = (s.objects, s.surfaces, volume, s.everywhere, s.lights)
+        changing: tuple[Resource[Any], ...] = (s.objects, s.surfaces, volume, s.lit_area, s.lights)
         changing += (*lit.all, shown, marching)
         light = g.value("light state", _new_object, *changing)
         scene = g.stage("light reuse", shading.reuse_light, scene, grid, light, s.view)

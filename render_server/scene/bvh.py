@@ -1,9 +1,15 @@
-"""Bounding volume hierarchy of triangles for stackless traversal (passes/shaders/common/ray_mesh.glsl)."""
+"""Bounding volume hierarchy of triangles for stackless traversal (passes/shaders/common/ray_mesh.glsl).
 
+Many rays are cast on the processor by Embree (`RayCaster`), a single one by `first_hit`.
+"""
+
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64
+
+from deltalight.protocol.errors import DeltalightError, install_command
 
 LEAF_SIZE = 4  # triangles at most: boxes around fewer cost as many tests as they save
 BINS = 16  # places an axis where a node may be split (Wald 2007)
@@ -244,3 +250,66 @@ def first_hit(
     normal = np.cross(u_edge[nearest], v_edge[nearest])
     normal /= np.linalg.norm(normal)
     return float(distance[nearest]), -normal if normal @ direction > 0 else normal
+
+
+@dataclass(frozen=True, eq=False)
+class FirstHits:
+    """What each ray meets first: a triangle, -1 for none, and the weights of its second and third corner there."""
+
+    triangle: Int32[np.ndarray, " r"]
+    u: Float32[np.ndarray, " r"]
+    v: Float32[np.ndarray, " r"]
+
+
+class RayCaster:
+    """Casts rays at triangles with Embree: by embreex, or by libigl where embreex has no wheel (Linux on arm64).
+
+    libigl takes rays one by one and needs seven times as long.
+
+    Raises:
+        DeltalightError: neither package is installed.
+    """
+
+    def __init__(self, positions: Float32[np.ndarray, "n 3"], triangles: Int32[np.ndarray, "m 3"]) -> None:
+        for backend in (_embreex, _libigl):
+            try:
+                self._cast = backend(positions, triangles)
+            except ImportError:
+                continue
+            return
+        raise DeltalightError(f"Rays are cast by the package embreex: {install_command('embreex')}.")
+
+    def cast(self, origins: Float32[np.ndarray, "r 3"], directions: Float32[np.ndarray, "r 3"]) -> FirstHits:
+        """Returns what rays without an end meet first."""
+        return self._cast(np.ascontiguousarray(origins), np.ascontiguousarray(directions))
+
+
+_Cast = Callable[[Float32[np.ndarray, "r 3"], Float32[np.ndarray, "r 3"]], FirstHits]
+
+
+def _embreex(positions: Float32[np.ndarray, "n 3"], triangles: Int32[np.ndarray, "m 3"]) -> _Cast:
+    from embreex.mesh_construction import TriangleMesh
+    from embreex.rtcore_scene import EmbreeScene
+
+    scene = EmbreeScene()
+    TriangleMesh(scene, np.ascontiguousarray(positions), np.ascontiguousarray(triangles))
+
+    def cast(origins: Float32[np.ndarray, "r 3"], directions: Float32[np.ndarray, "r 3"]) -> FirstHits:
+        found = scene.run(origins, directions, output=1)
+        return FirstHits(found["primID"], found["u"], found["v"])
+
+    return cast
+
+
+def _libigl(positions: Float32[np.ndarray, "n 3"], triangles: Int32[np.ndarray, "m 3"]) -> _Cast:
+    from igl.embree import EmbreeIntersector
+
+    scene = EmbreeIntersector()
+    scene.init(np.asfortranarray(positions), np.asfortranarray(triangles))
+
+    def cast(origins: Float32[np.ndarray, "r 3"], directions: Float32[np.ndarray, "r 3"]) -> FirstHits:
+        rays = zip(origins, directions, strict=True)
+        found = np.array([scene.intersectRay_first(*ray) for ray in rays]).reshape(-1, 4)
+        return FirstHits(found[:, 0].astype(np.int32), *found[:, 2:].astype(np.float32).T)
+
+    return cast

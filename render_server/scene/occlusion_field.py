@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Bool, Float16, Float32, Float64, Int32, Int64
 from scipy.ndimage import distance_transform_edt
 
-from deltalight.protocol.errors import DeltalightError
 from deltalight.render_server.lights.octahedral import even_directions, harmonics
+from deltalight.render_server.scene.bvh import RayCaster
 
 Vectors = Float32[np.ndarray, "m 3"]
 FINER = 4  # ratio of the numbers of directions of successive sets
@@ -63,21 +63,12 @@ class ObjectRays:
     """Traces rays to the triangles of one object; knows the sphere around them.
 
     Raises:
-        DeltalightError: the package embreex is not installed.
+        DeltalightError: no package that traces rays is installed.
     """
 
     def __init__(self, corners: Float32[np.ndarray, "m 3 3"]) -> None:
-        try:
-            from embreex.mesh_construction import TriangleMesh
-            from embreex.rtcore_scene import EmbreeScene
-        except ImportError as error:
-            raise DeltalightError(
-                "Method aroof traces rays with the package embreex, which is not installed: pip install embreex."
-            ) from error
-        self._scene = EmbreeScene()
-        vertices = np.ascontiguousarray(corners.reshape(-1, 3))
-        faces = np.arange(len(vertices), dtype=np.int32).reshape(-1, 3)
-        self._mesh = TriangleMesh(self._scene, vertices, faces)
+        vertices = corners.reshape(-1, 3)
+        self._caster = RayCaster(vertices, np.arange(len(vertices), dtype=np.int32).reshape(-1, 3))
         edges = corners[:, 1:] - corners[:, :1]
         self._normals = np.cross(edges[:, 0], edges[:, 1])
         low, high = vertices.min(axis=0), vertices.max(axis=0)
@@ -138,9 +129,7 @@ class ObjectRays:
     ) -> RayHits:
         if not len(start):
             return RayHits(point, direction, np.zeros(0, np.int32), np.zeros(0, bool))
-        triangle = self._scene.run(
-            np.ascontiguousarray(start), np.ascontiguousarray(directions), query="INTERSECT"
-        )
+        triangle = self._caster.cast(start, directions).triangle
         met = triangle >= 0
         found = triangle[met]
         behind = np.einsum("hk,hk->h", directions[met], self._normals[found]) > 0

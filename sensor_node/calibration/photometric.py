@@ -10,7 +10,7 @@ from jaxtyping import Float32, Float64, UInt8
 
 from deltalight.protocol.board import BoardSpec, GreyCard
 from deltalight.protocol.dataset_lists import read_list
-from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.errors import DeltalightError, install_command
 from deltalight.protocol.frames import SensorFrame, decode_lut
 from deltalight.protocol.pictures import decode_rgb, read_bytes
 from deltalight.sensor_node.calibration.picture_sources import PICTURE_SUFFIXES, Eye
@@ -93,7 +93,8 @@ def _exif_exposure(path: Path) -> float | None:
         from PIL import Image
     except ImportError as error:
         raise DeltalightError(
-            "reading exposures from EXIF needs Pillow: pip install pillow, or list them as third column of rgb.txt."
+            f"reading exposures from EXIF needs Pillow: {install_command('pillow')}, or list them as third column of"
+            " rgb.txt."
         ) from error
     with Image.open(path) as picture:
         exposure = picture.getexif().get_ifd(EXIF_BLOCK).get(EXPOSURE_TIME)

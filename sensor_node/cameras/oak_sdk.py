@@ -4,7 +4,7 @@ import os
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
-from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.errors import DeltalightError, install_command
 
 # The SDK reads these on import. Its log goes to standard output, where it would corrupt `--json`; its telemetry is on
 # unless refused; its signal handlers would replace those of the supervisor.
@@ -13,7 +13,7 @@ ENVIRONMENT = {
     "DEPTHAI_TELEMETRY": "0",
     "DEPTHAI_INSTALL_SIGNAL_HANDLER": "0",
 }
-INSTALL_HINT = "pip install 'deltalight[oak]'"
+INSTALL_HINT = install_command("deltalight[oak]")
 
 
 def sdk_version() -> str | None:

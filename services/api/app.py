@@ -4,7 +4,6 @@ import asyncio
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import asdict
-from importlib.metadata import version
 from typing import Any
 
 from fastapi import FastAPI
@@ -12,6 +11,7 @@ from fastapi.concurrency import run_in_threadpool
 from pydantic.json_schema import models_json_schema
 from starlette.middleware import Middleware
 
+from deltalight import __version__
 from deltalight.protocol.keys import Keys
 from deltalight.protocol.messages import CompositeMessage, Message, StatsMessage
 from deltalight.services.api.auth import AuthMiddleware, AuthRules
@@ -121,7 +121,7 @@ def create_app(settings: ApiSettings, store: Store, keys: Keys | None = None) ->
     )
     app = _App(
         title="Deltalight",
-        version=version("deltalight"),
+        version=__version__,
         description=DESCRIPTION,
         openapi_tags=TAGS,
         docs_url=None,  # its page would load scripts from other hosts

@@ -33,6 +33,7 @@ class ChildProcess:
     ) -> None:
         self._command = [
             sys.executable,
+            "-P",
             "-m",
             "deltalight.services.cli",
             "--log-level",

@@ -3,6 +3,7 @@
 from html import escape
 from pathlib import Path
 
+from starlette.exceptions import HTTPException
 from starlette.responses import HTMLResponse, Response
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Receive, Scope, Send
@@ -69,7 +70,10 @@ class StaticPage:
     async def _answer(self, scope: Scope) -> Response:
         if scope["path"] == "/" and not self._index.is_file():
             return HTMLResponse(_NOT_BUILT, 503)
-        return await self._files.get_response(self._files.get_path(scope), scope)
+        path = self._files.get_path(scope)
+        if "\0" in path:  # which older versions of Starlette hand to the system
+            raise HTTPException(404)
+        return await self._files.get_response(path, scope)
 
 
 def _cache_control(path: str, answer: Response) -> str:

@@ -6,7 +6,8 @@ from typing import Annotated
 import typer
 
 from deltalight.protocol.errors import DeltalightError
-from deltalight.services.commands.options import MethodName, require_method
+from deltalight.protocol.method_names import require_method
+from deltalight.services.commands.options import MethodName
 from deltalight.services.ports import PAGE_PORT
 
 

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from deltalight.services.commands.options import MethodName, require_method
+from deltalight.protocol.method_names import require_method
+from deltalight.services.commands.options import MethodName
 
 if TYPE_CHECKING:
     from deltalight.services.frame_account import FrameAccount

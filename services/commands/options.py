@@ -1,7 +1,6 @@
 """Values shared by several commands."""
 
 import re
-from difflib import get_close_matches
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -9,6 +8,7 @@ from typing import Annotated
 import typer
 
 from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.method_names import METHODS
 
 
 class View(StrEnum):
@@ -30,8 +30,6 @@ class Quality(StrEnum):
     BEST = "best"
 
 
-METHODS = ("dvct", "exact", "paper", "dlpv", "dlpv-paper", "aroof", "differential", "none")
-"""The project's relighting methods: dvct as the scene says, or one of its operators, or another one's defaults."""
 MethodName = Annotated[
     str,
     typer.Option(
@@ -39,24 +37,6 @@ MethodName = Annotated[
         help=f"Relighting method: {', '.join(METHODS)}, or a plugin's; dvct is as the demo's scene says.",
     ),
 ]
-
-
-def require_method(name: str) -> str:
-    """Return the name if there is such a method, the project's or an installed plugin's.
-
-    Raises:
-        DeltalightError: there is none, or it comes from a plugin that cannot be used.
-    """
-    from deltalight.protocol.methods import PLUGINS
-
-    known = [*METHODS, *PLUGINS.values]
-    if name in known:
-        return name
-    fault = PLUGINS.fault(name)
-    if fault is not None:
-        raise DeltalightError(fault)
-    nearest = get_close_matches(name, known, 1, cutoff=0)[0]
-    raise DeltalightError(f"'{name}' is no method; the nearest is {nearest}, of {', '.join(known)}.")
 
 
 ConfigFile = Annotated[

@@ -1,6 +1,7 @@
 """`deltalight render`: a recording to composites on disk."""
 
 import json
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -8,10 +9,16 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from deltalight.services.commands.options import Quality, View, require_method
+from deltalight.services.commands.options import Quality, View
 
 if TYPE_CHECKING:
     from deltalight.services.offline import RenderSummary
+
+
+class Layers(StrEnum):
+    """File format of the layers."""
+
+    EXR = "exr"
 
 
 def render(
@@ -43,27 +50,39 @@ def render(
         Quality, typer.Option(help="What may be given up for speed while something moves.")
     ] = Quality.BEST,
     exr: Annotated[bool, typer.Option("--exr", help="Also write linear OpenEXR files.")] = False,
+    layers: Annotated[
+        Layers | None,
+        typer.Option(help="Also write light and objects as layers, for a compositing program."),
+    ] = None,
     allow_software: Annotated[
         bool, typer.Option("--allow-software", help="Do not warn about a missing GPU.")
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
     """Render a recording to pictures: OUT/000000.png and so on, with one line per frame in OUT/frames.jsonl."""
+    from deltalight.protocol.method_names import with_method
     from deltalight.protocol.source import open_source
     from deltalight.services.commands.options import parse_frames, parse_size
-    from deltalight.services.demo import with_method
     from deltalight.services.host import choose_scene
     from deltalight.services.offline import RenderJob, run_job, with_output
 
     size_px = None if size is None else parse_size(size)
     recording = open_source(source)
     document = with_output(choose_scene(recording, scene), size_px, view and view.value)
-    document = document if method is None else with_method(document, require_method(method))
+    document = document if method is None else with_method(document, method)
     document = document.replaced(
         method=document.method.replaced(quality=quality.value),
         output=document.output.replaced(frame_budget_ms=None),
     )
-    job = RenderJob(recording, document, parse_frames(frames, len(recording)), out, device, with_exr=exr)
+    job = RenderJob(
+        recording,
+        document,
+        parse_frames(frames, len(recording)),
+        out,
+        device,
+        with_exr=exr,
+        with_layers=layers is not None,
+    )
     for note in recording.notes:
         typer.echo(note, err=True)
     bar = _Bar(len(job.frames), warn=not allow_software)

@@ -37,7 +37,7 @@ def run_limited(
     limits = [str(memory_bytes), str(TIME_LIMIT_S), str(output_bytes)]
     try:
         done = subprocess.run(
-            [sys.executable, "-m", WORKER, task, str(path), *limits, *arguments],
+            [sys.executable, "-P", "-m", WORKER, task, str(path), *limits, *arguments],
             capture_output=True,
             text=True,
             timeout=TIME_LIMIT_S,

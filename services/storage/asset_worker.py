@@ -1,7 +1,7 @@
 """The process that handles an untrusted file within limits; started by `asset_sandbox`.
 
-Run as `python -m deltalight.services.storage.asset_worker TASK PATH MEMORY_BYTES TIME_S OUTPUT_BYTES [ARGUMENT...]`; prints one
-JSON object.
+Run as `python -m deltalight.services.storage.asset_worker TASK PATH MEMORY_BYTES TIME_S OUTPUT_BYTES [ARGUMENT...]`;
+prints one JSON object.
 """
 
 import json
@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.errors import DeltalightError, install_command
 from deltalight.services.storage.asset_kinds import Facts
 
 
@@ -43,7 +43,7 @@ def _main(task: str, path: str, memory_bytes: str, time_s: str, output_bytes: st
     except DeltalightError as fault:
         facts = {"fault": str(fault)}
     except ModuleNotFoundError as fault:
-        facts = {"fault": f"{path} cannot be checked without {fault.name}: pip install 'deltalight[render]'."}
+        facts = {"fault": f"{path} cannot be checked without {fault.name}: {install_command('deltalight')}."}
     except MemoryError:
         facts = {"fault": f"{path} needs more than {int(memory_bytes) >> 20} MB to load; simplify it."}
     print(json.dumps(facts))

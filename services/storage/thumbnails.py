@@ -4,13 +4,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from embreex.mesh_construction import TriangleMesh as EmbreeMesh
-from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Float32, Int
 
 from deltalight.protocol.radiance_files import read_linear
 from deltalight.render_server.lights.environment import LUMINANCE
 from deltalight.render_server.scene.asset_check import check_mesh_file
+from deltalight.render_server.scene.bvh import RayCaster
 from deltalight.render_server.scene.mesh_loading import load_mesh
 from deltalight.render_server.scene.triangle_mesh import TriangleMesh
 from deltalight.services.storage.asset_kinds import Facts
@@ -68,28 +67,32 @@ class _Shot:
         bounds = np.stack([mesh.bounds() for mesh in meshes])
         low, high = bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)
         radius = max(float(np.linalg.norm(high - low)) / 2, 1e-9)
-        self._scene, self._places = EmbreeScene(), []
-        for mesh in meshes:
-            centred = (mesh.positions - (low + high) / 2) / radius @ self._camera_from_file.T
-            placed = np.ascontiguousarray(centred - [0, 0, DISTANCE], np.float32)
-            EmbreeMesh(self._scene, placed, mesh.triangles)
-            self._places.append(placed[mesh.triangles.ravel()])
+        placed = [
+            ((mesh.positions - (low + high) / 2) / radius @ self._camera_from_file.T - [0, 0, DISTANCE])
+            for mesh in meshes
+        ]
+        counts = [0, *np.cumsum([len(mesh.positions) for mesh in meshes])]
+        triangles = [mesh.triangles + first for mesh, first in zip(meshes, counts, strict=False)]
+        self._positions = np.concatenate(placed).astype(np.float32)
+        self._triangles = np.concatenate(triangles).astype(np.int32)
+        self._caster = RayCaster(self._positions, self._triangles)
 
     def rays(self, size: int) -> Pixels:
         """Cast size x size rays around the meshes; return premultiplied linear colour and coverage."""
-        used = np.concatenate(self._places)
+        used = self._positions[self._triangles.ravel()]
         seen = used[:, :2] / -used[:, 2:]
         middle = (seen.min(axis=0) + seen.max(axis=0)) / 2
         reach = MARGIN * float(np.ptp(seen, axis=0).max()) / 2
         steps = (2 * (np.arange(size) + 0.5) / size - 1) * reach
         right, up = np.meshgrid(middle[0] + steps, middle[1] - steps)
         directions = np.dstack([right, up, -np.ones_like(right)]).reshape(-1, 3).astype(np.float32)
-        hits = self._scene.run(np.zeros_like(directions), directions, output=1)
-        pixels = np.zeros((size * size, 4), np.float32)
-        for index, mesh in enumerate(self._meshes):
-            rays = np.flatnonzero(hits["geomID"] == index)
-            corners = mesh.triangles[hits["primID"][rays]]
-            u, v = hits["u"][rays], hits["v"][rays]
+        hits = self._caster.cast(np.zeros_like(directions), directions)
+        pixels, own = np.zeros((size * size, 4), np.float32), hits.triangle
+        for mesh in self._meshes:
+            rays = np.flatnonzero((own >= 0) & (own < len(mesh.triangles)))
+            corners = mesh.triangles[own[rays]]
+            own = own - len(mesh.triangles)  # the next mesh begins with its triangle 0
+            u, v = hits.u[rays], hits.v[rays]
             weights = np.stack([1 - u - v, u, v], axis=1)
             pixels[rays, :3] = self._shaded(mesh, corners, weights, directions[rays])
             pixels[rays, 3] = 1

@@ -1,4 +1,4 @@
-"""What the renderer's tests share: one GL context a module, and no GL error left behind."""
+"""What the renderer's tests share: one GL context, and no GL error left behind."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,7 +15,7 @@ from tests.render_server.scenes import ObjectsRenderer, Stage
 from tests.render_server.tiny_kernel import OUT, MakeKernel
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def gpu() -> Iterator[GpuContext]:
     context = create_context()
     yield context

@@ -1,5 +1,7 @@
 """Hierarchy over triangles: holds all of them, and rays find in it what they find by trying every triangle."""
 
+import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import moderngl
@@ -7,10 +9,11 @@ import numpy as np
 import pytest
 import trimesh
 
+from deltalight.protocol.errors import DeltalightError
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Bindings, Kernel
 from deltalight.render_server.passes.gbuffer import MeshBuffers, ObjectBvh
-from deltalight.render_server.scene.bvh import LEAF_SIZE, Bvh, build_bvh
+from deltalight.render_server.scene.bvh import LEAF_SIZE, Bvh, RayCaster, build_bvh
 
 pytestmark = pytest.mark.usefixtures("clean_gl")
 RAYS = 2048
@@ -204,3 +207,41 @@ def test_a_refitted_bvh_of_shuffled_triangles_is_worn(gpu: GpuContext) -> None:
         assert nodes.read() == build_bvh(each).packed()
     objects.release()
     mesh.release()
+
+
+RAY_PACKAGES = {"embreex": "embreex.mesh_construction", "igl": "igl.embree"}
+
+
+def only(package: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As if no other package that casts rays were installed."""
+    for name, module in RAY_PACKAGES.items():
+        if name != package:
+            monkeypatch.setitem(sys.modules, module, None)
+
+
+@pytest.mark.parametrize("package", RAY_PACKAGES)
+def test_each_package_casts_rays_as_every_triangle_says(
+    package: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if find_spec(package) is None:
+        pytest.skip(f"{package} is not installed (it has no wheel for this machine, or the set-up is old)")
+    only(package, monkeypatch)
+    corners, (origins, directions) = torus(), random_rays()
+    found = RayCaster(corners.reshape(-1, 3), vertices_of(corners)).cast(
+        origins.astype(np.float32), directions.astype(np.float32)
+    )
+    expected = brute_force(corners, origins, directions)
+    hit = found.triangle >= 0
+    assert 0.1 < hit.mean() < 0.9
+    assert np.mean(hit != np.isfinite(expected)) < 0.002, "only rays along an edge may differ"
+    both = hit & np.isfinite(expected)
+    weights = np.stack([1 - found.u - found.v, found.u, found.v], axis=1)[both]
+    places = np.einsum("hk,hkc->hc", weights, corners[found.triangle[both]])
+    distances = np.einsum("hc,hc->h", places - origins[both], directions[both])
+    np.testing.assert_allclose(distances, expected[both], rtol=1e-4, atol=1e-4)
+
+
+def test_without_any_package_a_sentence_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    only("none", monkeypatch)
+    with pytest.raises(DeltalightError, match="-m pip install embreex"):
+        RayCaster(torus().reshape(-1, 3), vertices_of(torus()))

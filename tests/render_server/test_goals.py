@@ -1,4 +1,7 @@
-"""What cone tracing reaches of its goals (docs/method.md 7.2); `python -m deltalight.benchmarks.goals` compares it with them."""
+"""What cone tracing reaches of its goals (docs/method.md 7.2).
+
+`python -m deltalight.benchmarks.goals` compares it with them.
+"""
 
 from pathlib import Path
 

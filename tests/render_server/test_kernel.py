@@ -9,6 +9,7 @@ import moderngl
 import numpy as np
 import pytest
 
+from deltalight.benchmarks.gpu_check.gl_objects import count_gl_objects
 from deltalight.render_server.gpu import kernel as kernel_module
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import BindingError, Dispatch, RasterKernel, watched
@@ -107,6 +108,34 @@ def test_labels_tell_variants_apart(gpu: GpuContext, make: MakeKernel) -> None:
     gpu.compile_watchers.clear()
     assert list(compiled) == ["tiny REAL SIZE=0.5"]
     assert "#define REAL 1\n#define SIZE 0.5\n" in compiled["tiny REAL SIZE=0.5"]
+
+
+def test_kernels_of_one_source_share_a_program_and_each_runs_with_its_own_values(
+    make: MakeKernel, out: moderngl.Buffer
+) -> None:
+    before = count_gl_objects()["Program"]
+    first, second = (make("uniform float a;", "values[0] = a;") for _ in range(2))
+    other = make("uniform float a;", "values[0] = a;", TWICE=1)
+    assert count_gl_objects()["Program"] - before == 2
+    for kernel, value in ((first, 3), (second, 4), (first, 3)):
+        kernel.run((1,), Out=out, a=value)
+        assert floats(out, 1) == [value]
+    first.release()
+    second.run((1,), Out=out, a=5)
+    other.run((1,), a=6, Out=out)
+    assert floats(out, 1) == [6]
+
+
+def test_programs_that_nobody_uses_are_freed_beyond_some(
+    make: MakeKernel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(kernel_module, "SPARE_PROGRAMS", 0)
+    kept = make("", "values[0] = 1.0;", KEPT=1)
+    before = count_gl_objects()["Program"]
+    for number in range(3):
+        make("", "values[0] = 1.0;", NUMBER=number).release()
+    assert count_gl_objects()["Program"] <= before
+    assert kept.resources()["storage blocks"] == ["Out"]
 
 
 def test_watchers_are_told_what_may_have_been_written(
@@ -335,7 +364,8 @@ def blocks_of_the_project() -> dict[str, type[Block]]:
     """The dataclasses of uniform blocks, by the name that the block has in GLSL."""
     for path in SHADERS.parents[1].rglob("*.py"):
         if "(Block):" in path.read_text():
-            importlib.import_module(".".join(path.relative_to(SHADERS.parents[2]).with_suffix("").parts))
+            module = ".".join(path.relative_to(SHADERS.parents[2]).with_suffix("").parts)
+            importlib.import_module(f"deltalight.{module}")
     ours = [
         block for block in Block.__subclasses__() if block.__module__.startswith("deltalight.render_server.")
     ]

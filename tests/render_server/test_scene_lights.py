@@ -20,7 +20,9 @@ from deltalight.render_server.lights.lights import DirectionalLight, SphereLight
 from deltalight.render_server.lights.median_cut import split_environment
 from deltalight.render_server.lights.octahedral import (
     irradiance,
+    irradiance_map,
     octahedral_direction,
+    octahedral_grid,
     octahedral_uv,
     prefilter,
     resample_to_octahedral,
@@ -94,6 +96,9 @@ def test_linear_sky_gives_its_closed_form() -> None:
     assert widest.half_angles[-1] == pytest.approx(np.pi / 2)
     wide = sample_octahedral(widest.levels[-1], normals[:, None])[:, 0] * np.pi
     assert wide == pytest.approx(expected, rel=0.02)
+    texels = octahedral_grid(64).reshape(-1, 3)
+    expected = np.repeat(np.pi + 2 * np.pi / 3 * texels[:, 2:], 3, axis=1)
+    assert irradiance_map(radiance).reshape(-1, 3) == pytest.approx(expected, rel=0.02)
 
 
 def test_narrow_cones_keep_a_disc_and_its_energy() -> None:
@@ -271,7 +276,9 @@ def test_openexr_maps_are_read_without_loss(tmp_path: Path) -> None:
 def test_openexr_maps_need_their_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_exr(tmp_path / "room.exr", np.ones((16, 32, 3), np.float32))
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
-    with pytest.raises(DeltalightError, match=r"room\.exr needs the package OpenEXR: pip install"):
+    with pytest.raises(
+        DeltalightError, match=r"room\.exr needs the package OpenEXR: .* -m pip install OpenEXR"
+    ):
         load_environment(documents.EnvironmentLights(map=str(tmp_path / "room.exr")))
 
 

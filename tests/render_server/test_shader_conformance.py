@@ -8,6 +8,7 @@ import shutil
 import subprocess
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import pytest
@@ -66,6 +67,11 @@ class Shader:
         command = [VALIDATOR, *options, str(self.path)]
         return subprocess.run(command, capture_output=True, text=True, check=False).stdout
 
+    @cached_property
+    def linked(self) -> str:
+        """What it says of the shader as a program of its own: faults, and what the program uses."""
+        return self.validator("-l", "-q")
+
 
 Programs = dict[str, list[Shader]]
 
@@ -105,7 +111,7 @@ def test_every_shader_of_the_project_is_among_them(programs: Programs) -> None:
 
 
 def test_every_variant_is_valid_glsl(programs: Programs) -> None:
-    said = {name: shader.validator() for name, shader in shaders_of(programs)}
+    said = {name: shader.linked for name, shader in shaders_of(programs)}
     assert {name: text for name, text in said.items() if "ERROR" in text or "WARNING" in text} == {}
     assert len(said) > 90
 
@@ -130,7 +136,7 @@ def needs_of(shader: Shader) -> dict[str, int]:
     Blocks count as soon as they are declared (std140 and std430 keep unused ones), textures and images where used.
     """
     text = shader.validator("-E")
-    reflection = shader.validator("-l", "-q")
+    reflection = shader.linked
     blocks = BLOCK.findall(text)
     needs = {
         "storage blocks": blocks.count("buffer"),

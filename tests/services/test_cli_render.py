@@ -13,12 +13,17 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import OpenEXR
 import pytest
 import trimesh
 
+import deltalight as dl
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.dataset_writer import DatasetWriter
+from deltalight.protocol.frames import linear_color
+from deltalight.protocol.radiance_files import read_linear
 from deltalight.protocol.recording_writer import RecordingWriter
+from deltalight.render_server.view import resized_frame
 from deltalight.sensor_node.cameras.synthetic import SyntheticCamera
 from deltalight.services.object_sizes import likely_factor
 from tests.services.conftest import ROOT, RunCli
@@ -134,13 +139,38 @@ def test_second_run_overwrites_and_is_bit_identical(
 
 
 def test_size_exr_and_json(cli: RunCli, take: Path, tmp_path: Path) -> None:
-    options = ("--frames", "0:1", "--size", "160x120", "--exr", "--json", "--allow-software")
+    options = (
+        "--frames",
+        "0:1",
+        "--size",
+        "160x120",
+        "--exr",
+        "--layers",
+        "exr",
+        "--json",
+        "--allow-software",
+    )
     done = cli("render", take / "take", "--scene", take / "scene.json", "--out", tmp_path, *options)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["frames"] == 1
     assert read_rgb(tmp_path / "000000.png").shape == (120, 160, 3)
     assert (tmp_path / "000000.exr").read_bytes()[:4] == struct.pack("<I", 20000630)
     assert "no GPU" not in done.stderr
+    with OpenEXR.File(str(tmp_path / "000000.layers.exr")) as file:
+        layers = {name: channel.pixels for name, channel in file.channels().items()}
+    plate = linear_color_of(take / "take", (160, 120))
+    over, cover = layers["RGBA"][..., :3], layers["RGBA"][..., 3:]
+    assert 0 < np.count_nonzero(cover) < cover.size / 4
+    assert plate * layers["ratio"] * (1 - cover) + over == pytest.approx(
+        read_linear(tmp_path / "000000.exr"), rel=2e-3, abs=1e-4
+    )
+    assert layers["Z"][60, 80] == pytest.approx(np.median(layers["Z"]), rel=0.5), "metres, as the room's"
+
+
+def linear_color_of(folder: Path, size: tuple[int, int]) -> np.ndarray:
+    """The camera's first picture in linear units at another size."""
+    frame = resized_frame(dl.open(folder)[0], *size)
+    return linear_color(frame, frame.color)
 
 
 def test_another_method_by_the_short_form_of_out(cli: RunCli, take: Path, tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ def imports() -> dict[str, set[str]]:
     paths = [path for package in PACKAGES for path in (ROOT / package).rglob("*.py")]
     dashboard = ROOT / "services" / "dashboard"
     return {
-        ".".join(path.relative_to(ROOT).with_suffix("").parts): imported(path.read_text())
+        ".".join(("deltalight", *path.relative_to(ROOT).with_suffix("").parts)): imported(path.read_text())
         for path in paths
         if not path.is_relative_to(dashboard)
     }
@@ -40,6 +40,8 @@ def test_no_modules_import_each_other_in_a_circle() -> None:
 
 
 def test_benchmarks_are_imported_through_their_entry_alone() -> None:
-    found = {each for names in imports().values() for each in names if each.split(".")[0] == "benchmarks"}
+    found = {
+        each for names in imports().values() for each in names if each.startswith("deltalight.benchmarks")
+    }
     assert {each for each in found if not each.startswith(BENCHMARKS_ENTRY)} == set()
     assert BENCHMARKS_ENTRY in found

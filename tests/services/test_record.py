@@ -47,7 +47,8 @@ def start() -> Iterator[Start]:
     def run(*arguments: object, limit_bytes: int | None = None) -> "subprocess.Popen[str]":
         words = [str(argument) for argument in arguments]
         limit = f"resource.setrlimit(resource.RLIMIT_FSIZE, ({limit_bytes}, {limit_bytes}))"
-        code = f"import resource, sys\n{limit if limit_bytes else ''}\nfrom deltalight.services.cli import main\nmain()"
+        program = "from deltalight.services.cli import main\nmain()"
+        code = f"import resource, sys\n{limit if limit_bytes else ''}\n{program}"
         process = subprocess.Popen(
             [sys.executable, "-c", code, *words],
             cwd=ROOT,

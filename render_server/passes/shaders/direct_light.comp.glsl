@@ -23,7 +23,7 @@ layout(rgba16f) writeonly uniform image2D lobe_rho;
 #include "common/camera.glsl"
 uniform float noise_sigma;   // m at 1 m
 uniform bool specular_surfaces;
-uniform bool everywhere;       // also out of the objects' reach (photometric registration)
+#include "common/lit_area.glsl"
 
 #ifdef SHADOW_CONES
 bool shadow_may_reach(vec3 p, vec3 n, float bias) { return object_meets_cone(p, n); }
@@ -44,7 +44,7 @@ void light(ivec2 pixel, ivec2 size) {
     float bias = 3.0 * noise_sigma * position.w * position.w;
     // Where neither cones nor shadows of the objects reach, the picture stays unchanged.
     bool reached = position.w > 0.0
-        && (everywhere || inside_volume(volume_coordinate(position.xyz))
+        && (is_in_lit_area(pixel) || inside_volume(volume_coordinate(position.xyz))
             || shadow_may_reach(position.xyz, normal.xyz, bias));
     if (reached) {
         vec3 v = normalize(camera_position - position.xyz);

@@ -17,7 +17,7 @@ layout(rgba16f) writeonly uniform image2D irradiance_rho;
 layout(rgba16f) writeonly uniform image2D specular_mu;
 layout(rgba16f) writeonly uniform image2D specular_rho;
 #include "common/camera.glsl"
-uniform bool everywhere;   // also out of the objects' reach (photometric registration)
+#include "common/lit_area.glsl"
 
 #ifdef REUSES
 #include "common/last_texels.glsl"
@@ -63,7 +63,7 @@ void main() {
     ivec2 texel = ivec2(gl_GlobalInvocationID.xy);
     if (any(greaterThanEqual(texel, low_resolution_size))) return;
     SurfacePoint s = surface_point(texel);
-    bool reached = s.present && (everywhere || volume_fade(volume_coordinate(s.position)) > 0.0
+    bool reached = s.present && (is_in_lit_area(real_pixel(texel)) || volume_fade(volume_coordinate(s.position)) > 0.0
         || object_may_shadow(s.position, 0.0));
     if (!reached) leave(texel, s);
     else if (!remembered(texel, s)) append_texel(texel, low_resolution_size.x);

@@ -2,13 +2,13 @@
 
 import asyncio
 from collections.abc import AsyncIterator, Coroutine
-from importlib.metadata import version
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Body, Request, Response, WebSocket, WebSocketDisconnect
 from fastapi.responses import StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field
 
+from deltalight import __version__
 from deltalight.protocol.messages import MAX_EDGE_PX, RadianceMessage
 from deltalight.services.api.context import Shared
 from deltalight.services.api.credentials import TICKET_LIFE_S, principal_of
@@ -163,7 +163,7 @@ async def events(socket: WebSocket, shared: Shared) -> None:
     await socket.accept()
     with shared.events.listening() as queue:
         role = principal_of(socket.scope).role
-        await socket.send_text(packed("hello", {"version": version("deltalight"), "role": role}))
+        await socket.send_text(packed("hello", {"version": __version__, "role": role}))
         await _first_of(_send_events(socket, queue), _expect_nothing(socket))
 
 

@@ -1,12 +1,12 @@
 """Routes that report on the service, the processes around it, and the cameras of this host."""
 
-from importlib.metadata import version
 from typing import Literal
 
 from fastapi import APIRouter, Response
 from fastapi.responses import PlainTextResponse
 from pydantic import BaseModel, Field
 
+from deltalight import __version__
 from deltalight.services.api.camera_finder import CamerasAnswer
 from deltalight.services.api.context import Shared
 from deltalight.services.api.live_hub import LiveFrame
@@ -80,7 +80,7 @@ def health(shared: Shared) -> Health:
         status="ok" if shared.link.is_reachable else "degraded",
         render_server=_server(shared),
         stream=_stream(shared),
-        version=version("deltalight"),
+        version=__version__,
     )
 
 
@@ -107,7 +107,7 @@ def metrics(shared: Shared) -> Response:
 def settings(shared: Shared) -> Settings:
     """Limits of this service."""
     return Settings(
-        version=version("deltalight"),
+        version=__version__,
         needs_token=shared.settings.leaves_host,
         upload_limit_bytes=shared.settings.upload_limit_mb << 20,
         requests_per_s=shared.settings.requests_per_s,

@@ -10,9 +10,13 @@ struct SurfacePoint { bool present; vec3 position; vec3 normal; float roughness;
 #include "common/surfaces.glsl"
 uniform bool hidden_too;   // also grid texels whose real surfaces are hidden, because virtual surfaces reflect them
 
-SurfacePoint surface_point(ivec2 texel) {
+ivec2 real_pixel(ivec2 texel) {
     ivec2 pixel = texelFetch(sample_pixels, texel, 0).xy;
-    if (hidden_too && pixel.x < -1) pixel = -2 - pixel;
+    return hidden_too && pixel.x < -1 ? -2 - pixel : pixel;
+}
+
+SurfacePoint surface_point(ivec2 texel) {
+    ivec2 pixel = real_pixel(texel);
     if (pixel.x < 0) return SurfacePoint(false, vec3(0.0), vec3(0.0, 0.0, 1.0), -1.0);
     vec4 normal = texelFetch(real_surface_normal, pixel, 0);
     float roughness = normal.w < 0.0 ? -1.0 : surfaces[int(normal.w)].surface.x;

@@ -1,0 +1,165 @@
+"""Relighting of frames in this process: no servers, no sockets."""
+
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Literal, Self
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import ViewFrame, linear_color
+from deltalight.protocol.method_names import require_method, with_method
+from deltalight.protocol.scene import SceneDocument
+from deltalight.render_server.gpu.context import create_context
+from deltalight.render_server.renderer import CompositeFrame, PictureLayers, SceneRenderer
+from deltalight.scene import Scene
+
+HALF_PRECISION = 2.0**-10  # of a value: what the renderer's 16-bit pictures round away
+DARKEST = 1e-4  # radiance of the camera's picture, camera units, below which a ratio to it says nothing
+
+
+@dataclass(frozen=True, eq=False)
+class RelitPicture:
+    """A relit frame, in numpy arrays of one size. Camera units: 1.0 = sensor white at the reference exposure.
+
+    With the camera's own linear picture b, `linear` = (1 - coverage) ratio b + additive, at every pixel.
+
+    Attributes:
+        color: the picture as the camera would code it, (h, w, 3) uint8; untouched pixels are the camera's to the bit.
+        linear: the same before the camera's response, (h, w, 3) float32, camera units.
+        delta: what the objects change, `linear` - b, (h, w, 3) float32, camera units.
+        ratio: by what the real scene's light changes, (h, w, 3) float32; 1 where nothing does, 0 in full shadow.
+        additive: light on top of that: objects times coverage, new light where b is black, (h, w, 3) float32.
+        coverage: share of the pixel that objects cover, (h, w) float32, 0..1.
+        depth: of the nearest surface, real or virtual, along the optical axis, (h, w) float32, m; 0 = unknown.
+        composite: what the renderer delivered with it: frame_id, timestamp_ns, pass times, lights, status.
+    """
+
+    color: UInt8[np.ndarray, "h w 3"]
+    linear: Float32[np.ndarray, "h w 3"]
+    delta: Float32[np.ndarray, "h w 3"]
+    ratio: Float32[np.ndarray, "h w 3"]
+    additive: Float32[np.ndarray, "h w 3"]
+    coverage: Float32[np.ndarray, "h w"]
+    depth: Float32[np.ndarray, "h w"]
+    composite: CompositeFrame
+
+    @classmethod
+    def of(cls, frame: ViewFrame, composite: CompositeFrame, layers: PictureLayers) -> Self:
+        """Splits a composite with its linear picture into light that changes and light that is added."""
+        camera = linear_color(frame, frame.color)
+        linear = camera if composite.linear is None else composite.linear
+        linear = np.where(np.abs(linear - camera) <= HALF_PRECISION * camera, camera, linear)
+        cover = layers.coverage[..., None]
+        objects = cover * layers.radiance
+        real = np.divide(linear - objects, 1 - cover, out=camera.copy(), where=cover < 1)
+        ratio = np.divide(real, camera, out=np.ones_like(camera), where=(camera > DARKEST) & (cover < 1))
+        ratio = np.maximum(ratio, 0)
+        additive = linear - (1 - cover) * ratio * camera
+        delta = linear - camera
+        return cls(
+            composite.color, linear, delta, ratio, additive, layers.coverage, layers.depth_m, composite
+        )
+
+
+class Renderer:
+    """Relights frames: `with dl.Renderer(method="dvct") as r: picture = r.render(frame, scene)`.
+
+    It keeps what it learnt from earlier frames (the fused room, estimates of light), so give it the frames of one
+    take in their order; `forget` before those of another. One thread uses it.
+
+    Args:
+        method: `exact`, `paper`, `dlpv`, `dlpv-paper`, `aroof`, `differential`, `none` or a plugin's; None: as the
+            scene says.
+        quality: `live`, `balanced` or `best`; None: as the scene says.
+        device: EGL device, as `deltalight doctor` lists them; None: the driver's first.
+
+    Raises:
+        DeltalightError: there is no OpenGL 4.3 driver, no such device, method or quality.
+    """
+
+    def __init__(
+        self,
+        method: str | None = None,
+        quality: Literal["live", "balanced", "best"] | None = "best",
+        *,
+        device: int | None = None,
+    ) -> None:
+        self._method = None if method is None else require_method(method)
+        self._quality, self._is_closed = quality, False
+        self._gpu = create_context(device)
+        self._renderer: SceneRenderer | None = None
+
+    @property
+    def device_name(self) -> str:
+        """Name of the GPU, or of the software renderer."""
+        return self._gpu.renderer_name
+
+    @property
+    def is_software(self) -> bool:
+        """Whether it renders without a GPU, which is slow."""
+        return self._gpu.is_software
+
+    @property
+    def notices(self) -> list[str]:
+        """Sentences that a user should read, each once."""
+        return [] if self._renderer is None else list(self._renderer.notices)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def render(self, frame: ViewFrame, scene: Scene | SceneDocument) -> RelitPicture:
+        """Relights one frame of a take.
+
+        Without a pose (the board is out of view) or a visible object, the picture is the camera's.
+
+        Raises:
+            DeltalightError: an asset cannot be read, the scene needs more memory than it allows, or the renderer is
+                closed.
+        """
+        if self._is_closed:
+            raise DeltalightError("The renderer is closed; make another one.")
+        document = self._adjusted(scene.document if isinstance(scene, Scene) else scene)
+        with self._gpu.ctx:  # another renderer's may be current
+            renderer = self._prepared(document)
+            composite = renderer.render(frame, with_linear=True)
+            return RelitPicture.of(renderer.sized(frame), composite, renderer.layers())
+
+    def _adjusted(self, document: SceneDocument) -> SceneDocument:
+        """Returns the scene with the method and quality that were asked for; offline, no budget applies."""
+        document = document if self._method is None else with_method(document, self._method)
+        if self._quality is not None:
+            document = document.replaced(method=document.method.replaced(quality=self._quality))
+        return document.replaced(output=document.output.replaced(frame_budget_ms=None))
+
+    def _prepared(self, document: SceneDocument) -> SceneRenderer:
+        if self._renderer is None:
+            self._renderer = SceneRenderer(self._gpu, document, with_linear=True)
+        elif document != self._renderer.scene:
+            self._renderer.set_scene(document)
+        return self._renderer
+
+    def forget(self) -> None:
+        """Forgets everything seen in earlier frames, because the next ones come from another take."""
+        if self._renderer is not None:
+            with self._gpu.ctx:
+                self._renderer.forget_frames()
+
+    def close(self) -> None:
+        """Frees everything on the GPU; idempotent."""
+        if self._is_closed:
+            return
+        self._is_closed = True
+        if self._renderer is not None:
+            with self._gpu.ctx:
+                self._renderer.release()
+        self._gpu.release()

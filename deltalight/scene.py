@@ -1,0 +1,117 @@
+"""A scene that code can change: objects added, moved and removed."""
+
+import json
+from pathlib import Path
+from typing import Any, Self
+
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.files import replacing
+from deltalight.protocol.scene import SceneDocument, load_scene, resolve_asset
+from deltalight.protocol.scene_objects import Material, Pose, SceneObject
+
+
+class Scene:
+    """Virtual objects, lights and settings: a scene document (docs/formats.md 3), replaced with every change.
+
+    The world is the marker board's frame: origin at the top-left corner of its first marker, +x right, +y up the
+    sheet, +z out of the paper; metres.
+    """
+
+    def __init__(self, document: SceneDocument | None = None) -> None:
+        self.document = document or SceneDocument()
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Reads a scene document (JSON or YAML); its assets are relative to it.
+
+        Raises:
+            DeltalightError: the file, a key or an asset is missing or wrong.
+        """
+        return cls(load_scene(Path(path)))
+
+    def save(self, path: str | Path) -> None:
+        """Writes the scene document as JSON; its assets stay where they are.
+
+        Raises:
+            DeltalightError: the file cannot be written.
+        """
+        text = json.dumps(self.document.model_dump(mode="json"), indent=2, ensure_ascii=False)
+        with replacing(Path(path)) as temporary:
+            temporary.write_text(text + "\n", encoding="utf-8")
+
+    def add(
+        self,
+        asset: str | Path,
+        *,
+        at: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        name: str | None = None,
+        scale: float = 1.0,
+        rotation_wxyz: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0),
+        material: Material | None = None,
+    ) -> str:
+        """Adds an object and returns its name.
+
+        Args:
+            asset: a mesh (.glb, .gltf, .obj, .ply, .stl), relative to the working folder.
+            at: the place of its origin in the world, m.
+            name: its id; default: the asset's name, with a number where that is taken.
+            scale: a factor on the asset, which is taken to be in metres.
+            rotation_wxyz: its turn, as a quaternion.
+            material: in place of the asset's own.
+
+        Raises:
+            DeltalightError: there is no such file, or the name is taken.
+        """
+        found = Path(resolve_asset(str(asset), Path.cwd()))
+        if not found.is_file():
+            raise DeltalightError(f"{asset} does not exist; correct the path.")
+        name = self._free_name(found.stem) if name is None else name
+        if name in self._names():
+            raise DeltalightError(f"The scene has an object `{name}` already; give another name.")
+        pose = Pose(translation_m=at, rotation_wxyz=rotation_wxyz, scale=scale)
+        added = SceneObject(id=name, asset=str(found), pose=pose, material=material)
+        self.document = self.document.replaced(objects=(*self.document.objects, added))
+        return name
+
+    def change(self, name: str, **fields: Any) -> None:  # noqa: ANN401 (whatever an object has)
+        """Changes fields of an object, such as `pose`, `material` or `visible`.
+
+        Raises:
+            DeltalightError: there is no such object, or a field does not fit.
+        """
+        self._require(name)
+        objects = [item.replaced(**fields) if item.id == name else item for item in self.document.objects]
+        self.document = self.document.replaced(objects=tuple(objects))
+
+    def move(self, name: str, to: tuple[float, float, float]) -> None:
+        """Moves an object's origin to a place in the world, m; its turn and size stay.
+
+        Raises:
+            DeltalightError: there is no such object.
+        """
+        self.change(name, pose=self._require(name).pose.replaced(translation_m=to))
+
+    def remove(self, name: str) -> None:
+        """Removes an object.
+
+        Raises:
+            DeltalightError: there is no such object.
+        """
+        self._require(name)
+        kept = tuple(item for item in self.document.objects if item.id != name)
+        self.document = self.document.replaced(objects=kept)
+
+    def _names(self) -> list[str]:
+        return [item.id for item in self.document.objects]
+
+    def _free_name(self, stem: str) -> str:
+        taken = self._names()
+        numbered = (f"{stem} {number}" for number in range(2, len(taken) + 3))
+        return next(name for name in (stem, *numbered) if name not in taken)
+
+    def _require(self, name: str) -> SceneObject:
+        for item in self.document.objects:
+            if item.id == name:
+                return item
+        known = ", ".join(self._names()) or "none"
+        raise DeltalightError(f"The scene has no object `{name}`; it has: {known}.")

@@ -1,0 +1,195 @@
+"""`import deltalight`: takes, scenes and renderers of a program's own."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+
+import deltalight as dl
+from deltalight.protocol.scene import load_scene
+from deltalight.sensor_node.cameras.synthetic import SyntheticCamera
+from deltalight.services.demo import RECORDING, SCENE
+
+PAGE = (Path(__file__).resolve().parents[1] / "docs" / "python.md").read_text(encoding="utf-8")
+EXAMPLES = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+SMALL = {"name": "dvct", "operator": "paper", "volume_size": 32, "rsm_size": 128, "triangle_budget": 5000}
+SIZE = (160, 120)
+
+
+@pytest.fixture(scope="module")
+def take() -> dl.Take:
+    opened = dl.open(RECORDING)
+    assert isinstance(opened, dl.Take)
+    return opened
+
+
+@pytest.fixture
+def scene() -> dl.Scene:
+    """The demo's scene, small."""
+    found = dl.Scene.load(SCENE)
+    output = {"width": SIZE[0], "height": SIZE[1]}
+    found.document = found.document.replaced(method=SMALL, output=output)
+    return found
+
+
+@pytest.fixture(scope="module")
+def cube(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("api") / "cube.glb"
+    trimesh.creation.box((0.05, 0.05, 0.05)).export(path)
+    return path
+
+
+def test_importing_it_imports_nothing_else() -> None:
+    script = "import sys, deltalight; deltalight.__version__; print(*(n for n in sys.modules if 'deltalight' in n))"
+    found = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert found.stdout.split() == ["deltalight"]
+
+
+def test_every_public_name_is_there_and_no_other() -> None:
+    for name in dl.__all__:
+        assert getattr(dl, name) is not None
+    with pytest.raises(AttributeError, match="has no attribute 'Render'"):
+        dl.Render  # noqa: B018
+
+
+def test_a_take_is_a_sequence_of_frames(take: dl.Take) -> None:
+    every_third = take[::3]
+    assert isinstance(every_third, dl.Take)
+    assert (len(take), len(every_third), len(take[4:6])) == (30, 10, 2)
+    assert every_third[1].frame_id == take[3].frame_id
+    assert take[-1].frame_id == take[29].frame_id
+    assert [frame.frame_id for frame in take[4:6]] == [take[4].frame_id, take[5].frame_id]
+    frame = take[0]
+    assert frame.pose is not None
+    assert frame.depth is not None
+    with pytest.raises(IndexError):
+        take[30]
+    assert take.scene is not None
+    assert take.scene.document.objects[0].id == load_scene(SCENE).objects[0].id
+
+
+def test_a_camera_is_a_take_that_goes_on() -> None:
+    with dl.LiveTake(SyntheticCamera(realtime=False)) as live:
+        frames = iter(live)
+        first, second = next(frames), next(frames)
+    assert second.timestamp_ns > first.timestamp_ns
+    assert first.pose is not None
+    assert isinstance(dl.open("synthetic"), dl.LiveTake)
+
+
+@pytest.mark.parametrize("method", [None, "dlpv"])
+def test_its_layers_compose_the_picture(
+    take: dl.Take, scene: dl.Scene, cube: Path, method: str | None
+) -> None:
+    scene.add(cube, at=(0.1, 0.1, 0.025))
+    with dl.Renderer(method, quality=None if method is None else "best") as renderer:
+        picture = renderer.render(take[0], scene)
+    assert picture.color.shape == (SIZE[1], SIZE[0], 3)
+    camera = picture.linear - picture.delta
+    cover = picture.coverage[..., None]
+    composed = (1 - cover) * picture.ratio * camera + picture.additive
+    assert composed == pytest.approx(picture.linear, abs=1e-5)
+    alone = picture.coverage == 0
+    assert 0.01 < 1 - alone.mean() < 0.2
+    assert picture.ratio[alone].min() < 0.5, "a shadow"
+    assert np.abs(picture.additive[alone]).max() < 1e-3, "diffuse surfaces change by their ratio"
+    still = alone & (picture.delta == 0).all(axis=-1)
+    assert (picture.ratio[still] == 1).all()
+
+
+def test_depth_is_that_of_the_nearest_surface(take: dl.Take, scene: dl.Scene) -> None:
+    with dl.Renderer() as renderer:
+        picture = renderer.render(take[0], scene)
+    frame = take[0]
+    assert frame.depth is not None
+    real = cv2.resize(frame.depth.depth_m, SIZE, interpolation=cv2.INTER_NEAREST)
+    away = (picture.coverage == 0) & (real > 0) & (picture.depth > 0)
+    assert np.median(np.abs(picture.depth[away] - real[away])) < 0.005
+    front = (picture.coverage == 1) & (real > 0)
+    assert (picture.depth[front] < real[front]).mean() > 0.95, "the knot stands before what the camera saw"
+
+
+def test_a_frame_without_the_board_stays_as_it_is(take: dl.Take, scene: dl.Scene) -> None:
+    camera = SyntheticCamera(realtime=False)
+    with dl.LiveTake(camera) as live:
+        (lost,) = [next(iter(live))]
+    object.__setattr__(lost, "pose", None)
+    with dl.Renderer() as renderer:
+        picture = renderer.render(lost, scene)
+        assert picture.composite.status == "no_pose"
+        assert renderer.render(take[0], scene).composite.status == "ok"
+    assert (picture.coverage.max(), picture.ratio.min(), np.abs(picture.delta).max()) == (0, 1, 0)
+
+
+def test_scenes_change_while_a_renderer_lives_and_renderers_live_beside_each_other(
+    take: dl.Take, scene: dl.Scene, cube: Path
+) -> None:
+    with dl.Renderer() as one, dl.Renderer("none") as other:
+        before = one.render(take[0], scene)
+        name = scene.add(cube, at=(0.1, 0.1, 0.025))
+        added = one.render(take[0], scene)
+        scene.move(name, to=(0.1, 0.1, 0.125))
+        moved = one.render(take[0], scene)
+        bare = other.render(take[0], scene)
+        scene.remove(name)
+        after = one.render(take[0], scene)
+        one.forget()
+        again = one.render(take[0], scene)
+    assert added.coverage.sum() > before.coverage.sum()
+    assert moved.depth[added.coverage > 0].mean() != added.depth[added.coverage > 0].mean()
+    assert (bare.ratio[bare.coverage == 0] == 1).all(), "method none changes no light"
+    assert after.coverage == pytest.approx(before.coverage)
+    assert again.color.astype(int) == pytest.approx(before.color.astype(int), abs=2)
+
+
+def test_objects_are_named_changed_and_saved(scene: dl.Scene, cube: Path, tmp_path: Path) -> None:
+    assert [scene.add(cube), scene.add(cube), scene.add(cube, name="mine", scale=2)] == [
+        "cube",
+        "cube 2",
+        "mine",
+    ]
+    scene.change("cube", material=dl.Material(metallic=1.0), visible=False)
+    scene.save(tmp_path / "saved.json")
+    assert dl.Scene.load(tmp_path / "saved.json").document == scene.document
+
+
+def test_wrong_input_is_a_sentence(scene: dl.Scene, cube: Path, tmp_path: Path) -> None:
+    cases = {
+        "no object `cup`; it has: ": lambda: scene.move("cup", to=(0, 0, 0)),
+        "does not exist; correct the path": lambda: scene.add(tmp_path / "cup.glb"),
+        "has an object `knot` already": lambda: scene.add(cube, name="knot"),
+        "is no method; the nearest is dlpv": lambda: dl.Renderer("dlvp"),
+        "cannot be read|does not exist|no such": lambda: dl.open(tmp_path / "none.mcap"),
+    }
+    for sentence, call in cases.items():
+        with pytest.raises(dl.DeltalightError, match=sentence):
+            call()
+
+
+def test_a_closed_renderer_says_so(take: dl.Take, scene: dl.Scene) -> None:
+    renderer = dl.Renderer()
+    renderer.close()
+    renderer.close()
+    with pytest.raises(dl.DeltalightError, match="closed"):
+        renderer.render(take[0], scene)
+
+
+@pytest.mark.slow
+def test_the_examples_of_the_page_run(tmp_path: Path, cube: Path) -> None:
+    """As a reader would run them: one after the other, in a folder with the files that they name."""
+    (tmp_path / "desk.mcap").write_bytes(RECORDING.read_bytes())
+    (tmp_path / "bunny.glb").write_bytes(cube.read_bytes())
+    dl.Scene.load(SCENE).save(tmp_path / "scene.json")
+    script = "\n".join(EXAMPLES)
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert len(EXAMPLES) == 4
+    assert len(list(tmp_path.glob("relit_*.png"))) == 3
+    assert (tmp_path / "methods.png").is_file()
