@@ -26,6 +26,7 @@ ASSUMED_PAPER_ALBEDO = 0.8
 # Patches keep this fraction of a white gap's width away from the black on either side, where blur mixes both.
 PATCH_INSET = 0.2
 Length = Annotated[float, Field(gt=0, lt=10)]
+Margin = Annotated[float, Field(ge=0, lt=10)]
 
 
 class CustomDictionary(StrictModel):
@@ -130,6 +131,10 @@ class BoardSpec(StrictModel):
     white_albedo: float | None = Field(
         default=None, gt=0, le=1, description="Diffuse albedo of the paper; null = unknown, 0.8 is assumed."
     )
+    margins_m: tuple[Margin, Margin, Margin, Margin] | None = Field(
+        default=None,
+        description="Paper beyond the print: left, top, right, bottom, metres; null = not known.",
+    )
     grey_cards: tuple[GreyCard, ...] = Field(
         default=(), max_length=16, description="Cards of known albedo that lie in the sheet's plane."
     )
@@ -181,9 +186,13 @@ class BoardSpec(StrictModel):
             raise ValueError(f"the dictionary has {size} markers, so lamp_markers go from 0 to {size - 1}")
 
     @model_serializer(mode="wrap")
-    def _without_empty_lists(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out empty lists, so that a board without cards or lamps serialises as before these existed."""
-        return {key: value for key, value in dump(self).items() if value not in ((), [])}
+    def _without_what_is_not_given(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out margins, cards and lamps of a board without: it serialises as before these existed."""
+        return {
+            key: value
+            for key, value in dump(self).items()
+            if value not in ((), []) and (key, value) != ("margins_m", None)
+        }
 
     @property
     def paper_albedo(self) -> float:
@@ -249,6 +258,23 @@ class BoardSpec(StrictModel):
             return _rectangle(*self._first_square(), self.columns * self._pitch, self.rows * self._pitch)
         gap = self.separation_m
         return _rectangle(0.0, 0.0, self.columns * self._pitch - gap, self.rows * self._pitch - gap)
+
+    def paper_outline(self) -> Float64[np.ndarray, "4 3"]:
+        """Return the corners of the paper (as in `sheet_outline`).
+
+        Where `margins_m` does not give them, only the margin is certain that markers need to be found: one cell, and
+        separation_m around a single marker; a chessboard needs none.
+        """
+        left, top, right, bottom = self.margins_m or (self._least_margin,) * 4
+        outward = np.array([(-left, top, 0), (right, top, 0), (right, -bottom, 0), (-left, -bottom, 0)])
+        return np.asarray(self.sheet_outline() + outward)
+
+    @property
+    def _least_margin(self) -> float:
+        if self.type == "charuco":
+            return 0.0
+        cell = self.marker_length_m / float(self.opencv_dictionary().markerSize + 2 * self.border_bits)
+        return max(cell, self.separation_m) if self.type == "single" else cell
 
     def paper_patches(self) -> Float64[np.ndarray, "n 4 3"]:
         """Return quads of white paper between the markers (corners as in `sheet_outline`).

@@ -151,7 +151,13 @@ class SceneObject(StrictModel):
         moved by the pose.
         """
         matrix = self.pose.matrix()
-        return matrix @ Z_UP_FROM_Y_UP if self.resolved_up_axis == "y" else matrix
+        matrix[:3, :3] @= self.asset_rotation
+        return matrix
+
+    @property
+    def asset_rotation(self) -> Float64[np.ndarray, "3 3"]:
+        """Rotation of the asset that makes its up axis z."""
+        return Z_UP_FROM_Y_UP[:3, :3] if self.resolved_up_axis == "y" else np.eye(3)
 
 
 class ModelGeometry(StrictModel):

@@ -22,7 +22,7 @@ from deltalight.render_server.passes.coverage import (
 )
 from deltalight.render_server.passes.gbuffer import CameraImage, GeometryBuffer, RasterGeometry, RealSurface
 from deltalight.render_server.passes.voxel_light import AlbedoTexture
-from deltalight.render_server.scene.declared_surfaces import DIFFUSE_BOX, MAX_SURFACES, SurfaceTable
+from deltalight.render_server.scene.declared_surfaces import MAX_ROWS, SHEET, SurfaceTable, plane_fits
 from deltalight.render_server.scene.depth_surface import DepthSurface
 from deltalight.render_server.view import CameraBlock, CameraView, Rectangle
 
@@ -113,8 +113,8 @@ class FrameResources:
 class ObservationBuffers:
     """The camera's picture and the real surfaces that it shows, in textures of one picture size."""
 
-    def __init__(self, gpu: GpuContext, view: CameraView) -> None:
-        self._gpu = gpu
+    def __init__(self, gpu: GpuContext, view: CameraView, geometry: RasterGeometry) -> None:
+        self._gpu, self._geometry = gpu, geometry
         self.image = CameraImage(gpu, view.size)
         self.real_surface = RealSurface(gpu, view.size)
         self._model_raster: GeometryBuffer | None = None
@@ -127,22 +127,24 @@ class ObservationBuffers:
         return view
 
     def observe(
-        self,
-        geometry: RasterGeometry,
-        scan: Scan,
-        real: GeometryState,
-        view: CameraView,
-        declared: Bindings,
+        self, scan: Scan, real: GeometryState, view: CameraView, declared: Bindings, surfaces: SurfaceTable
     ) -> Observation:
         """Fills the real geometry buffer from depth, from the given model, or from both if depth is fused."""
-        raster_scene = {"Camera": self.raster_camera, **self.image.bindings, **declared}
-        if scan.depth is not None and scan.surface is not None:
-            self.real_surface.from_depth(scan.depth, scan.surface.normals, raster_scene)
+        normals = None if scan.surface is None else scan.surface.normals
+        raster_scene: dict[str, Binding] = {
+            "Camera": self.raster_camera,
+            **self.image.bindings,
+            **declared,
+            "noise_sigma": scan.noise_sigma,
+            "plane_fits": plane_fits(surfaces, scan.depth, normals, view.world_from_camera, scan.noise_sigma),
+        }
+        if scan.depth is not None and normals is not None:
+            self.real_surface.from_depth(scan.depth, normals, raster_scene)
         if scan.depth is None or scan.tolerance is not None:
             if self._model_raster is None:
                 self._model_raster = GeometryBuffer(self._gpu, view.raster[1])
             own = {**raster_scene, **real.materials.bindings}
-            geometry.run(self._model_raster, real.buffers, view.without_antialiasing, own)
+            self._geometry.run(self._model_raster, real.buffers, view.without_antialiasing, own)
             self.real_surface.from_model(self._model_raster, raster_scene, tolerance=scan.tolerance)
         bindings: dict[str, Binding] = {
             "Camera": self.camera,
@@ -169,15 +171,15 @@ class PictureBuffers:
         size, raster_size = view.size, view.raster[1]
         self.key = (size, raster_size)
         self._gpu, self._tier = gpu, tier
-        self._observed = ObservationBuffers(gpu, view)
-        self.measured = ObservationBuffers(gpu, view) if tier.refresh_tiles else None
+        self._geometry = RasterGeometry(gpu)
+        self._observed = ObservationBuffers(gpu, view, self._geometry)
+        self.measured = ObservationBuffers(gpu, view, self._geometry) if tier.refresh_tiles else None
         self.coverage = ObjectCoverage(gpu, size)
         self._raster = GeometryBuffer(gpu, raster_size)
         self._samples: SampleCoverage | None = None
         self._interior_edges: InteriorEdgeAA | None = None
         self._unmixing = EdgeUnmixing(gpu, size)
-        self._geometry = RasterGeometry(gpu)
-        self._surfaces = gpu.ctx.buffer(reserve=MAX_SURFACES * 80 + 80)
+        self._surfaces = gpu.ctx.buffer(reserve=MAX_ROWS * 80)
 
     @property
     def image(self) -> CameraImage:
@@ -188,23 +190,27 @@ class PictureBuffers:
         """Uploads the declared surfaces of the real scene; returns what shaders read of them."""
         if len(table):
             self._surfaces.write(np.ascontiguousarray(table.packed, np.float32).tobytes())
-        specular = bool((table.packed[:, 3, 3] < DIFFUSE_BOX).any())
+        specular = bool((table.packed[:, 3, 3] < SHEET).any())
         return {"Surfaces": self._surfaces, "surface_count": len(table), "specular_surfaces": specular}
 
     def set_camera(self, view: CameraView) -> CameraView:
         """Writes the camera blocks: for rasters through the lens, and for reading the objects' geometry."""
         return self._observed.set_camera(view)
 
-    def observe(self, scan: Scan, real: GeometryState, view: CameraView, declared: Bindings) -> Observation:
+    def observe(
+        self, scan: Scan, real: GeometryState, view: CameraView, declared: Bindings, surfaces: SurfaceTable
+    ) -> Observation:
         """Fills the real geometry buffer from depth, from the given model, or from both if depth is fused."""
-        return self._observed.observe(self._geometry, scan, real, view, declared)
+        return self._observed.observe(scan, real, view, declared, surfaces)
 
-    def measure(self, taken: Measurement, real: GeometryState, declared: Bindings) -> Observation:
+    def measure(
+        self, taken: Measurement, real: GeometryState, declared: Bindings, surfaces: SurfaceTable
+    ) -> Observation:
         """Fills the buffers of the measurement that lights the real scene."""
         assert self.measured is not None
         self.measured.image.upload(taken.frame)
         self.measured.set_camera(taken.view)
-        return self.measured.observe(self._geometry, taken.scan, real, taken.view, declared)
+        return self.measured.observe(taken.scan, real, taken.view, declared, surfaces)
 
     def draw_objects(self, objects: GeometryState, seen: Observation, view: CameraView) -> ObjectSurface:
         """Rasters the objects, computes their coverage of pixels, and unmixes the edges of real things."""
@@ -277,11 +283,11 @@ def declare_frame(graph: Graph, buffers: PictureBuffers) -> FrameResources:
     graph.section("surfaces")
     declared = graph.value("declared surfaces", buffers.declare_surfaces, surfaces)
     camera = graph.value("camera", buffers.set_camera, view)
-    observation = graph.stage("real surface", buffers.observe, scan, real, camera, declared)
+    observation = graph.stage("real surface", buffers.observe, scan, real, camera, declared, surfaces)
     measurement, measured = None, observation
     if buffers.measured is not None:
         measurement = graph.source("measurement", "world")
-        measured = graph.stage("measured surface", buffers.measure, measurement, real, declared)
+        measured = graph.stage("measured surface", buffers.measure, measurement, real, declared, surfaces)
     surface = graph.stage("object surface", buffers.draw_objects, objects, observation, camera)
     geometry = graph.value("geometry", _geometry_bindings, observation, surface, objects)
     return FrameResources(

@@ -10,6 +10,40 @@ from deltalight.render_server.scene.depth_mesh import back_faces
 from deltalight.render_server.scene.materials import Material
 from deltalight.render_server.scene.triangle_mesh import TriangleMesh
 
+# Half the edge of a volume by how far objects reach from its middle, at least. Less than 2 / sqrt(3): twice the edge
+# of a cube leaves it that much in any turn.
+TURN_CLEARANCE = 1.15
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectExtent:
+    """Where virtual objects are throughout their animations.
+
+    `points` enclose them (world, m). `upright` holds the least and greatest coordinates as if every object was turned
+    back about its own middle: what is placed by them stands still while objects turn.
+    """
+
+    points: Float64[np.ndarray, "n 3"]
+    upright: Float64[np.ndarray, "2 3"]
+
+    def equals(self, other: "ObjectExtent") -> bool:
+        """Whether both are the same."""
+        return np.array_equal(self.points, other.points) and np.array_equal(self.upright, other.upright)
+
+    @property
+    def bounds(self) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
+        """Least and greatest coordinates of the points, m."""
+        return self.points.min(axis=0), self.points.max(axis=0)
+
+    @property
+    def volume_edge(self) -> float:
+        """Edge of a volume around, m: twice the longest edge of `upright` ([P1] 3.2).
+
+        More only where several objects, turned, would come nearer to its border than one alone can.
+        """
+        reach = float(np.abs(self.points - self.upright.mean(axis=0)).max())
+        return 2.0 * max(float(np.ptp(self.upright, axis=0).max()), TURN_CLEARANCE * reach)
+
 
 @dataclass(frozen=True, eq=False)
 class PlacedObject:
@@ -32,6 +66,7 @@ class GeometryState:
 
     `corners` are for the voxeliser (`triangle_corners` in passes/gbuffer.py), `points` enclose the set.
     `swept_points` enclose it at all times of its animations: what is fitted around them stands still while it moves.
+    `upright_points` enclose the objects at all times as they would stand if each was turned back about its middle.
     """
 
     buffers: MeshBuffers
@@ -43,6 +78,7 @@ class GeometryState:
     )
     objects: tuple[PlacedObject, ...] = ()  # what the triangles of virtual geometry were made from
     swept_points: Float64[np.ndarray, "k 3"] | None = None  # None: nothing is animated
+    upright_points: Float64[np.ndarray, "n 3"] | None = None  # of virtual objects
     is_open: bool = False  # one camera's view of what is solid: backs are not in it
 
     def solid_corners(self, voxel_edge: float) -> Float32[np.ndarray, "k 3 10"]:
@@ -63,9 +99,8 @@ class GeometryState:
         return self.points if self.swept_points is None else self.swept_points
 
     @property
-    def lasting_bounds(self) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
-        """Least and greatest coordinates at all times of its animations, m.
-
-        Volumes and light views are fitted to them.
-        """
-        return self.lasting_points.min(axis=0), self.lasting_points.max(axis=0)
+    def extent(self) -> ObjectExtent:
+        """Where the set is throughout its animations, and as its objects turn."""
+        points = self.lasting_points
+        upright = points if self.upright_points is None else self.upright_points
+        return ObjectExtent(points, np.stack([upright.min(axis=0), upright.max(axis=0)]))

@@ -18,7 +18,7 @@ from deltalight.render_server.scene.gltf_animation import Clip
 from deltalight.render_server.scene.gltf_meshes import GltfAsset, Pose
 from deltalight.render_server.scene.materials import Material
 from deltalight.render_server.scene.mesh_loading import Asset, load_asset
-from deltalight.render_server.scene.triangle_mesh import GpuMesh, TriangleMesh, merge_for_gpu
+from deltalight.render_server.scene.triangle_mesh import GpuMesh, TriangleMesh, bounds_of, merge_for_gpu
 
 MARKER_FRAME = "marker:"
 
@@ -156,6 +156,7 @@ class VirtualObjects:
             materials,
             objects=tuple(objects),
             swept_points=np.vstack(swept) if any(item.moves for item in objects) else None,
+            upright_points=np.vstack([self._upright(item) for item in self._shown]),
         )
 
     def _material_table(self, merged: GpuMesh) -> MaterialTable:
@@ -207,6 +208,21 @@ class VirtualObjects:
         matrix = item.world_from_asset
         corners = _box_corners(self._moving[item.id].bounds)
         return np.asarray(corners @ matrix[:3, :3].T + matrix[:3, 3])
+
+    def _upright(self, item: SceneObject) -> Float64[np.ndarray, "8 3"]:
+        """Returns the corners of the object's box at all times, about its middle in the world but not turned."""
+        corners = _box_corners(self._lasting_bounds(item))
+        middle = corners.mean(axis=0)
+        matrix = world_from_frame(item, self._board) @ item.world_from_object()
+        from_middle = (corners - middle) @ item.asset_rotation.T * item.pose.scale
+        return np.asarray(matrix[:3, :3] @ middle + matrix[:3, 3] + from_middle)
+
+    def _lasting_bounds(self, item: SceneObject) -> np.ndarray:
+        """Returns the least and greatest coordinates of an object at all times, in the asset's frame."""
+        moving = self._moving.get(item.id)
+        if moving is None:
+            return self._assets[item.asset].bounds
+        return bounds_of(moving.meshes) if moving.is_still else moving.bounds
 
     def release(self) -> None:
         """Frees the GL objects."""

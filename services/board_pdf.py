@@ -57,6 +57,18 @@ def choose_page(board: BoardSpec, paper: str) -> Page:
     )
 
 
+def margins_m(board: BoardSpec, page: Page) -> tuple[float, float, float, float]:
+    """Return the paper left of, above, right of and below the printed board, in metres (BoardSpec.margins_m)."""
+    width, height = _board_mm(board)
+    left, top, right, bottom = _margins_mm(width, height, page)
+    return left / 1e3, top / 1e3, right / 1e3, bottom / 1e3
+
+
+def _margins_mm(width: float, height: float, page: Page) -> tuple[float, float, float, float]:
+    side = (page.width - width) / 2
+    return side, TOP_MM, side, page.height - TOP_MM - height
+
+
 def _fitting(width: float, height: float, paper: str) -> Page | None:
     pages = [Page(*edges) for edges in _orientations(paper)]
     return next((page for page in pages if width <= page.room[0] and height <= page.room[1]), None)
@@ -106,11 +118,10 @@ class _Sheet:
         self._right, self._bottom = outline[2, 0], outline[2, 1]
 
     def draw(self) -> None:
-        page, canvas, width = self._page, self._canvas, self._right - self._left
+        page, canvas = self._page, self._canvas
+        left, top, _, _ = _margins_mm(self._right - self._left, self._top - self._bottom, page)
         canvas.saveState()
-        canvas.translate(
-            (page.width - width) / 2 * MM - self._left * MM, (page.height - TOP_MM) * MM - self._top * MM
-        )
+        canvas.translate((left - self._left) * MM, (page.height - top - self._top) * MM)
         if self._board.type == "charuco":
             self._draw_squares()
         cells = marker_cells(self._board)

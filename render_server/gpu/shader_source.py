@@ -75,6 +75,7 @@ def declarations(source: str) -> Declarations:
     names = {name for _, _, _, name in _variables(whole)} | {name for _, _, name in _BLOCK.findall(whole)}
     text = preprocessed(text)
     sizes = {axis: int(size) for axis, size in _LOCAL_SIZE.findall(text)}
+    switches = tuple(dict.fromkeys(_SWITCH.findall(text)))
     text = _declaring(text)
     formats: dict[str, frozenset[str]] = {}
     written: set[str] = set()
@@ -85,7 +86,6 @@ def declarations(source: str) -> Declarations:
     for access, kind, name in _BLOCK.findall(text):
         written |= {name} if kind == "buffer" and "readonly" not in access else set()
     local_size = (sizes.get("x", 1), sizes.get("y", 1), sizes.get("z", 1))
-    switches = tuple(dict.fromkeys(_SWITCH.findall(text)))
     return Declarations(frozenset(names), formats, frozenset(written), switches, local_size)
 
 

@@ -15,10 +15,10 @@ from deltalight.protocol.scene_method import DifferentialMethod
 from deltalight.render_server.frame import FrameResources, Observation
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, clear_buffer
-from deltalight.render_server.gpu_scene import GeometryState
+from deltalight.render_server.gpu_scene import GeometryState, ObjectExtent
 from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.lights.lights import LightSet
-from deltalight.render_server.methods.light_maps import LitScene, Points, object_extent, shadow_receivers
+from deltalight.render_server.methods.light_maps import LitScene, object_extent, shadow_receivers
 from deltalight.render_server.methods.lighting import (
     SURFEL_SHADOW_SAMPLES,
     Layers,
@@ -171,13 +171,15 @@ class SolutionLights:
         """Uploads the residual environment to both."""
         return tuple(buffers.set_environment(lights.environment) for buffers in (self.mu, self.rho))
 
-    def fit_views(self, lights: LightSet, real: GeometryState, extent: Points, area: Rectangle) -> bytes:
+    def fit_views(
+        self, lights: LightSet, real: GeometryState, extent: ObjectExtent, area: Rectangle
+    ) -> bytes:
         """Fits the views, the same for both solutions, so that their maps differ by the objects alone.
 
         Returns their records, which tell whether the maps are still those of the views.
         """
-        receivers = shadow_receivers(real, extent) if area == NOWHERE else real.points
-        receivers, points = (np.concatenate([each, extent]) for each in (receivers, real.points))
+        receivers = shadow_receivers(real, extent.upright) if area == NOWHERE else real.points
+        receivers, points = (np.concatenate([each, extent.points]) for each in (receivers, real.points))
         for buffers in (self.mu, self.rho):
             buffers.place(list(lights.lights), points, receivers, np.zeros((0, 3)))
         return self.rho.real_records

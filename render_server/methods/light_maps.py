@@ -11,7 +11,7 @@ from jaxtyping import Float64
 from deltalight.protocol.quality import BEST, QualityTier
 from deltalight.render_server.frame import FrameResources, Observation
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu_scene import GeometryState
+from deltalight.render_server.gpu_scene import GeometryState, ObjectExtent
 from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.lights.lights import LightSet
 from deltalight.render_server.lights.mirror_lights import mirror_lights
@@ -73,18 +73,23 @@ class LightStages:
         return self.buffers.set_environment(lights.environment)
 
     def fit_views(
-        self, lights: LightSet, real: GeometryState, extent: Points, surfaces: SurfaceTable, area: Rectangle
+        self,
+        lights: LightSet,
+        real: GeometryState,
+        extent: ObjectExtent,
+        surfaces: SurfaceTable,
+        area: Rectangle,
     ) -> tuple[bytes, bytes]:
         """Fits the views: of real shadows around the objects, and closely around the objects.
 
         If an `area` of the picture is to be lit too, real shadows are those of the whole scene. Returns the records
         of both, which tell whether their maps are still those of the views.
         """
-        around = _snapped(extent) if self._keeps_views else extent
+        around = _snapped(extent.upright) if self._keeps_views else extent.upright
         receivers = shadow_receivers(real, around) if area == NOWHERE else real.points
         shining = list(lights.lights)
-        mirrors = mirror_lights(shining, surfaces, np.mean(extent, axis=0)) if self._mirrors else []
-        self.buffers.place(shining, real.points, receivers, extent, mirrors)
+        mirrors = mirror_lights(shining, surfaces, np.mean(extent.points, axis=0)) if self._mirrors else []
+        self.buffers.place(shining, real.points, receivers, extent.points, mirrors)
         return self.buffers.real_records, self.buffers.virtual_records
 
     def draw_real(self, _views: bytes, real: GeometryState) -> LightBuffers:
@@ -104,7 +109,7 @@ class LightStages:
         _real: LightBuffers,
         _objects: LightBuffers,
         _lights: LightSet,
-        _extent: Points,
+        _extent: ObjectExtent,
         seen: Observation,
     ) -> moderngl.TextureArray | None:
         """Maps where smooth planes show the lights; None where no plane does."""
@@ -151,20 +156,20 @@ def _both_none(old: object, new: object) -> bool:
     return old is None and new is None
 
 
-def object_extent(g: Graph, s: FrameResources) -> Resource[Points]:
-    """Declares the points that enclose the objects throughout their animations, for fitting volumes and views."""
+def object_extent(g: Graph, s: FrameResources) -> Resource[ObjectExtent]:
+    """Declares where the objects are throughout their animations, for fitting volumes and views."""
     if "object extent" in g:
         return g.resource("object extent")
-    return g.value("object extent", _lasting_points, s.objects, same=np.array_equal)
+    return g.value("object extent", _extent_of, s.objects, same=ObjectExtent.equals)
 
 
-def _lasting_points(objects: GeometryState) -> Points:
-    """Points that enclose the objects at all times of their animations."""
-    return objects.lasting_points
+def _extent_of(objects: GeometryState) -> ObjectExtent:
+    """Where the objects are at all times of their animations, and as they turn."""
+    return objects.extent
 
 
 def _snapped(extent: Points) -> Points:
-    """Returns the corners of a box around points, snapped to half of their longest edge."""
+    """Returns the corners of a box around points, snapped to half of its longest edge."""
     low, high = extent.min(axis=0), extent.max(axis=0)
     step = max(float(np.max(high - low)) / 2, 1e-6)
     step = 2.0 ** np.ceil(np.log2(step))  # an object that turns keeps it

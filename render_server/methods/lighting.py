@@ -12,7 +12,7 @@ from deltalight.protocol.quality import BEST, QualityTier
 from deltalight.render_server.frame import FrameResources, Observation
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings
-from deltalight.render_server.gpu_scene import GeometryState
+from deltalight.render_server.gpu_scene import GeometryState, ObjectExtent
 from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.lights.lights import LightSet
 from deltalight.render_server.methods.light_maps import LitScene, Points, object_extent
@@ -46,12 +46,13 @@ def volume_placement(
     """Declares the cube of voxels or cells around the objects; a quick tier moves it only when it must."""
     placed: VolumePlacement | None = None
 
-    def place(extent: Points) -> VolumePlacement:
-        """Places a cube around the objects, snapped to its cells."""
+    def place(extent: ObjectExtent) -> VolumePlacement:
+        """Places a cube around the objects, snapped to its cells; it stands still while they turn."""
         nonlocal placed
-        low, high = extent.min(axis=0), extent.max(axis=0)
-        wanted = place_volume(low, high, size, edge_m)
-        if placed is None or not tier.refresh_tiles or not keep_placement(placed, low, high, wanted):
+        edge = extent.volume_edge if edge_m is None else edge_m
+        low, high = extent.upright
+        wanted = place_volume(low, high, size, edge)
+        if placed is None or not tier.refresh_tiles or not keep_placement(placed, *extent.bounds, wanted):
             placed = wanted
         return placed
 

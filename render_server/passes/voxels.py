@@ -43,6 +43,7 @@ SPARE_EDGE = (
 )
 
 BORDER_VOXELS = 1e-3  # of rounding: this near, a triangle counts on both sides of a border
+SNAP_VOXELS = 0.01
 LONGEST_EDGE_VOXELS = 8.0  # longer ones are split before: balances the threads, bounds each one's loops
 
 
@@ -103,11 +104,12 @@ def place_volume(
 ) -> VolumePlacement:
     """Places a cube around the objects' bounds: twice their longest edge ([P1]) unless `edge_m` is given.
 
-    Snapping to voxels keeps the grid fixed in the world while the objects move.
+    Snapping to voxels keeps the grid fixed in the world while the objects move; rounding errors of a place on the
+    border between two voxels do not move it.
     """
     edge = edge_m if edge_m is not None else 2.0 * float(np.max(high - low))
     voxel = edge / size
-    origin = np.floor(((low + high) / 2 - edge / 2) / voxel) * voxel
+    origin = np.floor(((low + high) / 2 - edge / 2) / voxel + SNAP_VOXELS) * voxel
     return VolumePlacement((float(origin[0]), float(origin[1]), float(origin[2])), voxel, size)
 
 

@@ -4,15 +4,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int32
+from jaxtyping import Bool, Float, Float32, Float64, Int32
 
 from deltalight.protocol.board import BoardSpec
 from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import DepthImage
 from deltalight.protocol.scene_objects import Region, Surface
 
 MAX_SURFACES = 16
-PLANE, BOX, MATERIAL, DIFFUSE_BOX = 0.0, 1.0, 2.0, 3.0
+MAX_ROWS = MAX_SURFACES + 17  # with the board's paper and its grey cards
+PLANE, BOX, MATERIAL, SHEET = 0.0, 1.0, 2.0, 3.0
 SHEET_TOLERANCE_M = 0.005
+# What leans on a plane by more than 45 degrees is no part of it (a cosine; common/measured_surfaces.glsl).
+FLUSH = 0.7071
+SAMPLE_STEP, LEAST_SAMPLES = 4, 30
+UNBOUNDED_M = 1e6
 # Reflectance of a declared metal without a colour in the document (that of silver and aluminium).
 ASSUMED_METAL_F0 = 0.9
 
@@ -24,8 +30,9 @@ class SurfaceTable:
     A row of `packed` is five vectors (SurfaceEntry of passes/shaders/common/surfaces.glsl): (F0 R G B, metallic);
     (roughness, 0, 0, 0); (albedo R G B, 1 if declared); and two for the region, whose kind is the last component of
     the first. 0 plane: (point, kind), (unit normal, tolerance); 1 box: (lower corner, kind), (upper corner, 0); 2
-    material of the given model: (its index, 0, 0, kind), zeros; 3 box in which everything is diffuse: the marker
-    sheet, which comes first.
+    material of the given model: (its index, 0, 0, kind), zeros; 3 diffuse sheet in the plane z = 0: (centre x, y,
+    tolerance, kind), (unit direction of an edge x, y, half the edge, half the other edge). The board's paper and its
+    grey cards are sheets, and come first.
     """
 
     packed: Float32[np.ndarray, "n 5 4"]
@@ -50,13 +57,13 @@ class SurfaceTable:
     def lookup(
         self, points: Float[np.ndarray, "k 3"], materials: Int32[np.ndarray, " k"] | None = None
     ) -> Int32[np.ndarray, " k"]:
-        """Returns the row of each world point's surface, -1 for diffuse (reference for the shaders).
+        """Returns the row of each world point's surface, -1 for diffuse (reference for the shaders, without noise).
 
         `materials` are the material indices of points on a given model.
         """
         entry = np.full(len(points), -1, np.int32)
         for index in reversed(range(len(self.packed))):
-            is_diffuse = self.packed[index, 3, 3] == DIFFUSE_BOX
+            is_diffuse = self.packed[index, 3, 3] == SHEET
             entry[_inside(self.packed[index], points, materials)] = -1 if is_diffuse else index
         return entry
 
@@ -69,8 +76,11 @@ def _inside(
     first, second = row[3], row[4]
     if first[3] == PLANE:
         inside = np.abs((points - first[:3]) @ second[:3]) <= second[3]
-    elif first[3] in (BOX, DIFFUSE_BOX):
+    elif first[3] == BOX:
         inside = ((points >= first[:3]) & (points <= second[:3])).all(axis=1)
+    elif first[3] == SHEET:
+        on_edges = np.abs((points[:, :2] - first[:2]) @ np.array([second[:2], (-second[1], second[0])]).T)
+        inside = (on_edges <= second[2:]).all(axis=1) & (np.abs(points[:, 2]) <= first[2])
     elif materials is None:
         inside = np.zeros(len(points), bool)
     else:
@@ -92,7 +102,7 @@ def build_surface_table(
         raise DeltalightError(
             f"real.surfaces has {len(surfaces)} entries; declare at most {MAX_SURFACES}, no diffuse ones."
         )
-    rows = [] if board is None else [_sheet_row(board)]
+    rows = [] if board is None else [_sheet_row(quad) for quad in _sheets(board)]
     rows += [_row(surface, material_names) for surface in surfaces]
     return SurfaceTable(np.array(rows, np.float32).reshape(-1, 5, 4))
 
@@ -122,10 +132,74 @@ def _region(region: Region, material_names: Sequence[str]) -> tuple[list[float],
     return [float(list(material_names).index(region.material)), 0.0, 0.0, MATERIAL], [0.0] * 4
 
 
-def _sheet_row(board: BoardSpec) -> list[list[float]]:
-    """Returns the row of the board's printed sheet, 5 mm thick to either side."""
-    outline = board.sheet_outline()
-    thickness = np.array([0, 0, SHEET_TOLERANCE_M])
-    low, high = outline.min(axis=0) - thickness, outline.max(axis=0) + thickness
+def plane_fits(
+    table: SurfaceTable,
+    depth: DepthImage | None,
+    normals: Float32[np.ndarray, "h w 3"] | None,
+    world_from_camera: Float64[np.ndarray, "4 4"],
+    noise_sigma: float,
+) -> Float32[np.ndarray, "r 2"]:
+    """Returns how depth saw each declared plane: its height over the declared one (m), and the noise at 1 m (m).
+
+    A plane may be declared some millimetres off, and depth errs by more than its noise where its calibration does:
+    the height is the median of what lies within the tolerance and faces the plane's way, the noise the larger of
+    `noise_sigma` and what the median deviation says. Unbounded where there is no depth, or too little of the plane.
+    """
+    fits = np.tile(np.array([0.0, UNBOUNDED_M], np.float32), (MAX_ROWS, 1))
+    planes = np.flatnonzero(table.packed[:, 3, 3] == PLANE)
+    if depth is None or normals is None or not len(planes):
+        return fits
+    seen = _sampled(depth, normals, world_from_camera)
+    for index in planes:
+        fits[index] = _plane_fit(table.packed[index].astype(float), seen, noise_sigma)
+    return fits
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """Measured points: world position (m), change of it by a metre of depth, unit normal, depth (m)."""
+
+    points: Float64[np.ndarray, "n 3"]
+    rays: Float64[np.ndarray, "n 3"]
+    normals: Float64[np.ndarray, "n 3"]
+    depth_m: Float64[np.ndarray, " n"]
+
+
+def _sampled(
+    depth: DepthImage, normals: Float32[np.ndarray, "h w 3"], world_from_camera: Float64[np.ndarray, "4 4"]
+) -> _Seen:
+    """Returns the points of every fourth row and column whose normals are known."""
+    grid = (slice(None, None, SAMPLE_STEP),) * 2
+    z, facing, rays = depth.depth_m[grid], normals[grid], depth.camera.rays()[grid]
+    known = depth.valid[grid] & (z > 0) & facing.any(axis=2)
+    z, rotation = z[known].astype(float), world_from_camera[:3, :3]
+    along = np.column_stack([rays[known], np.ones(len(z))]) @ rotation.T
+    points = along * z[:, None] + world_from_camera[:3, 3]
+    return _Seen(points, along, facing[known] @ rotation.T, z)
+
+
+def _plane_fit(row: Float64[np.ndarray, "5 4"], seen: _Seen, noise_sigma: float) -> tuple[float, float]:
+    point, normal, tolerance_m = row[3, :3], row[4, :3], row[4, 3]
+    heights = (seen.points - point) @ normal
+    near = (np.abs(heights) <= tolerance_m) & (np.abs(seen.normals @ normal) >= FLUSH)
+    if near.sum() < LEAST_SAMPLES:
+        return 0.0, UNBOUNDED_M
+    level = float(np.median(heights[near]))
+    by_depth = np.maximum(np.abs(seen.rays[near] @ normal) * seen.depth_m[near] ** 2, 1e-9)
+    deviation = 1.4826 * float(np.median(np.abs(heights[near] - level) / by_depth))
+    return level, max(noise_sigma, deviation)
+
+
+def _sheets(board: BoardSpec) -> list[Float64[np.ndarray, "4 3"]]:
+    """Returns the outlines of the board's paper and of the grey cards."""
+    return [board.paper_outline(), *(card.outline() for card in board.grey_cards)]
+
+
+def _sheet_row(outline: Float64[np.ndarray, "4 3"]) -> list[list[float]]:
+    """Returns the row of a rectangular sheet of which everything within 5 mm is taken for paper."""
+    centre, edge, other = outline.mean(axis=0), outline[1] - outline[0], outline[3] - outline[0]
+    length = float(np.linalg.norm(edge))
     nothing = [0.0] * 4
-    return [nothing, [1.0, 0.0, 0.0, 0.0], nothing, [*low.tolist(), DIFFUSE_BOX], [*high.tolist(), 0.0]]
+    place = [*centre[:2].tolist(), SHEET_TOLERANCE_M, SHEET]
+    extent = [*(edge[:2] / length).tolist(), length / 2, float(np.linalg.norm(other)) / 2]
+    return [nothing, [1.0, 0.0, 0.0, 0.0], nothing, place, extent]

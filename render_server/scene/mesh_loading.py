@@ -2,6 +2,7 @@
 
 from collections import defaultdict
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from deltalight.render_server.scene.materials import Material
 from deltalight.render_server.scene.triangle_mesh import (
     FileGeometry,
     TriangleMesh,
+    bounds_of,
     converted,
     joined,
 )
@@ -32,6 +34,11 @@ class Asset:
     meshes: list[TriangleMesh]
     animated: GltfAsset | None
     left_out: str | None = None
+
+    @cached_property
+    def bounds(self) -> Float32[np.ndarray, "2 3"]:
+        """Least and greatest coordinates in the rest pose, in the asset's frame."""
+        return bounds_of(self.meshes)
 
 
 def load_mesh(path: Path) -> list[TriangleMesh]:

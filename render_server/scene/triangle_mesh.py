@@ -335,6 +335,12 @@ def _map_area(material: Material) -> float:
     return 1.0 if placed is None else abs(float(np.linalg.det(placed.from_uv[:, :2])))
 
 
+def bounds_of(meshes: Sequence[TriangleMesh]) -> Float32[np.ndarray, "2 3"]:
+    """Returns the least and greatest coordinates of several meshes together."""
+    each = np.stack([mesh.bounds() for mesh in meshes])
+    return np.stack([each[:, 0].min(axis=0), each[:, 1].max(axis=0)])
+
+
 def merge_for_gpu(meshes: Sequence[TriangleMesh]) -> GpuMesh:
     """Merges meshes (each with its own material, in this order) into one interleaved buffer.
 

@@ -9,7 +9,7 @@ from deltalight.protocol.board import BoardSpec
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.frames import DepthImage, SensorFrame
 from deltalight.sensor_node.cameras.replay import PacedCamera
-from deltalight.sensor_node.cameras.synthetic_scene import SAMPLES_PER_EDGE, SyntheticScene
+from deltalight.sensor_node.cameras.synthetic_scene import SAMPLES_PER_EDGE, SHEET_MARGIN, SyntheticScene
 
 FRAMES_PER_ROUND = 90
 PERIOD_NS = 33_333_333
@@ -41,6 +41,7 @@ def default_board() -> BoardSpec:
             "separation_m": 0.015,
             "rows": 3,
             "columns": 4,
+            "margins_m": (SHEET_MARGIN * 0.05,) * 4,
         }
     )
 

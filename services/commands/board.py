@@ -77,7 +77,7 @@ def board(
     """Write a marker board as true-scale PDF, with its board.yaml."""
     from deltalight.protocol.board import save_board_yaml
     from deltalight.protocol.files import replacing
-    from deltalight.services.board_pdf import write_board_pdf
+    from deltalight.services.board_pdf import choose_page, margins_m, write_board_pdf
     from deltalight.services.files import make_output_folder
 
     described = out.with_suffix(".yaml")
@@ -99,6 +99,7 @@ def board(
         first_id,
         [(name, lamp_marker_mm) for name in lamp_marker or ()],
     )
+    spec = spec.replaced(margins_m=margins_m(spec, choose_page(spec, paper.value)))
     make_output_folder(out.parent)
     with replacing(out) as aside:
         write_board_pdf(aside, spec, paper.value)

@@ -54,6 +54,19 @@ def test_corners_are_opencvs_with_y_and_z_turned(spec: BoardSpec) -> None:
         assert spec.chessboard_corners() == pytest.approx(inner, abs=1e-7)
 
 
+def test_the_paper_reaches_beyond_the_print_by_its_margins_or_by_what_markers_need() -> None:
+    """A cell of a 4x4 marker with its border is a sixth of its edge; a chessboard needs no margin."""
+    left, top, right, bottom = 0.01, 0.02, 0.03, 0.04
+    known = grid(margins_m=(left, top, right, bottom))
+    beyond = known.paper_outline() - known.sheet_outline()
+    assert beyond[0] == pytest.approx([-left, top, 0])
+    assert beyond[2] == pytest.approx([right, -bottom, 0])
+    assert (grid().paper_outline() - grid().sheet_outline())[1] == pytest.approx([0.04 / 6, 0.04 / 6, 0])
+    assert np.array_equal(charuco().paper_outline(), charuco().sheet_outline())
+    assert "margins_m" not in grid().model_dump(mode="json")
+    assert BoardSpec.model_validate(known.model_dump(mode="json")) == known
+
+
 def test_rows_lie_below_the_first_and_ids_go_row_by_row() -> None:
     corners = grid().corner_points()
     assert corners[8][0] == pytest.approx([0.05, 0, 0])

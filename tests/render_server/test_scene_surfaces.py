@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from deltalight.protocol.board import BoardSpec
+from deltalight.protocol.board import BoardSpec, GreyCard
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.scene_objects import BoxRegion, PlaneRegion, Region, Surface
 from deltalight.render_server.scene.declared_surfaces import build_surface_table
@@ -34,9 +34,23 @@ def test_normal_reflectance_follows_metallic() -> None:
 def test_the_marker_sheet_always_is_diffuse() -> None:
     everything = Surface(region=Region(box=BoxRegion(min_m=(-9, -9, -9), max_m=(9, 9, 9))))
     table = build_surface_table([everything], BOARD)
-    points = np.array([[0.1, -0.05, 0.001], [0.1, -0.05, 0.05], [0.1, 0.5, 0.0]])
-    assert table.lookup(points).tolist() == [-1, 1, 1]
+    cell = 0.06 / 6  # of a marker: the least margin that it is found with
+    points = np.array(
+        [[0.1, -0.05, 0.001], [0.1, -0.05, 0.05], [0.1, 0.5, 0.0], [0.1, 0.9 * cell, 0], [0.1, 1.1 * cell, 0]]
+    )
+    assert table.lookup(points).tolist() == [-1, 1, 1, -1, 1]
     assert len(table) == 2
+    known = BOARD.replaced(margins_m=(0.0, 0.03, 0.0, 0.0))
+    assert build_surface_table([everything], known).lookup(points).tolist() == [-1, 1, 1, -1, -1]
+
+
+def test_grey_cards_are_diffuse_where_they_lie() -> None:
+    """Turned by 45 degrees: its corner lies on the x axis, half a diagonal from its middle."""
+    everything = Surface(region=Region(box=BoxRegion(min_m=(-9, -9, -9), max_m=(9, 9, 9))))
+    card = GreyCard(center_m=(1.0, 1.0), size_m=(0.2, 0.2), rotation_deg=45, albedo=0.18)
+    table = build_surface_table([everything], BOARD.replaced(grey_cards=(card,)))
+    points = np.array([[1.13, 1.0, 0], [1.15, 1.0, 0], [1.09, 1.09, 0], [1.0, 0.87, 0.004]])
+    assert table.lookup(points).tolist() == [-1, 2, 2, -1]
 
 
 def test_materials_of_the_model_are_found_by_name() -> None:

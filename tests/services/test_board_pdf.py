@@ -59,6 +59,10 @@ def test_printed_marks_are_where_board_yaml_says_within_a_tenth_of_a_millimetre(
     printed = found.pixels * MM_PER_PIXEL * (1, -1)
     wanted = 1e3 * target.points[found.numbers][:, :2]
     assert np.abs((printed - printed.mean(axis=0)) - (wanted - wanted.mean(axis=0))).max() < 0.1
+    paper = 1e3 * load_board_yaml(tmp_path / "board.yaml").paper_outline()[:, :2]
+    height, width = (MM_PER_PIXEL * length for length in page(tmp_path / "board.pdf").shape[:2])
+    edges = np.array([(0, 0), (width, 0), (width, -height), (0, -height)])
+    np.testing.assert_allclose(paper - wanted.mean(axis=0), edges - printed.mean(axis=0), atol=0.2)
 
 
 def seen_by(

@@ -1,6 +1,6 @@
 // World position and normal of the real surface at each pixel, from the clean depth map and its fitted normals
 // (render_server/scene/depth_surface.py).
-#include "common/surfaces.glsl"
+#include "common/measured_surfaces.glsl"
 
 layout(local_size_x = 8, local_size_y = 8) in;
 uniform sampler2D depth_map;       // m along the optical axis, 0 unknown
@@ -8,7 +8,33 @@ uniform sampler2D picture_rays;    // (x/z, y/z)
 uniform sampler2D fitted_normals;  // optical frame; zero where unknown
 layout(rgba32f) writeonly uniform image2D position_out;
 layout(rgba16f) writeonly uniform image2D normal_out;
-#include "common/camera.glsl"
+
+vec3 camera_at(ivec2 pixel, float z) { return vec3(texelFetch(picture_rays, pixel, 0).xy, 1.0) * z; }
+
+vec3 world_at(ivec2 pixel, float z) { return (world_from_camera * vec4(camera_at(pixel, z), 1.0)).xyz; }
+
+bool is_plane(int entry) { return entry >= 0 && surfaces[entry].region[0].w == PLANE; }
+
+// Whether most of the pixel and its neighbours are off the plane: single ones are outliers of the noise.
+bool leaves_plane(int entry, ivec2 pixel) {
+    ivec2 last = textureSize(depth_map, 0) - 1;
+    int known = 0, off = 0;
+    for (int j = 0; j < 9; ++j) {
+        ivec2 at = clamp(pixel + ivec2(j % 3, j / 3) - 1, ivec2(0), last);
+        float z = texelFetch(depth_map, at, 0).r;
+        if (z <= 0.0) continue;
+        ++known;
+        off += int(is_off_plane(entry, world_at(at, z), z));
+    }
+    return 2 * off > known;
+}
+
+// `normal`: zero if unknown.
+int entry_of(ivec2 pixel, vec3 world, float z, vec3 normal) {
+    int entry = measured_entry(0, world, z, normal, -2.0);
+    while (is_plane(entry) && leaves_plane(entry, pixel)) entry = measured_entry(entry + 1, world, z, normal, -2.0);
+    return entry;
+}
 
 void main() {
     ivec2 pixel = ivec2(gl_GlobalInvocationID.xy);
@@ -20,10 +46,10 @@ void main() {
         imageStore(normal_out, pixel, vec4(0.0, 0.0, 1.0, -1.0));
         return;
     }
-    vec3 camera = vec3(texelFetch(picture_rays, pixel, 0).xy, 1.0) * z;
-    vec3 world = (world_from_camera * vec4(camera, 1.0)).xyz;
+    vec3 world = world_at(pixel, z);
     vec3 fitted = texelFetch(fitted_normals, pixel, 0).xyz;
-    vec3 normal = mat3(world_from_camera) * normalize(fitted == vec3(0.0) ? -camera : fitted);
+    bool unknown = fitted == vec3(0.0);
+    vec3 normal = mat3(world_from_camera) * normalize(unknown ? -camera_at(pixel, z) : fitted);
     imageStore(position_out, pixel, vec4(world, z));
-    imageStore(normal_out, pixel, vec4(normal, float(surface_entry(world, -2.0))));
+    imageStore(normal_out, pixel, vec4(normal, float(entry_of(pixel, world, z, unknown ? vec3(0.0) : normal))));
 }

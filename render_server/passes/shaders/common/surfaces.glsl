@@ -8,12 +8,22 @@ struct SurfaceEntry {
 layout(std430) readonly buffer Surfaces { SurfaceEntry surfaces[]; };
 uniform int surface_count;
 
-const float PLANE = 0.0, BOX = 1.0, MATERIAL = 2.0;   // kind 3: a box in which everything is diffuse (the marker sheet)
+const float PLANE = 0.0, BOX = 1.0, MATERIAL = 2.0, SHEET = 3.0;
+
+// Rectangle of paper in the plane z = 0, in which everything is diffuse.
+bool on_sheet(SurfaceEntry e, vec3 p) {
+    vec2 from = p.xy - e.region[0].xy, edge = e.region[1].xy;
+    vec2 along = vec2(dot(from, edge), dot(from, vec2(-edge.y, edge.x)));
+    return all(lessThanEqual(abs(along), e.region[1].zw)) && abs(p.z) <= e.region[0].z;
+}
+
+float plane_height(SurfaceEntry e, vec3 p) { return dot(p - e.region[0].xyz, e.region[1].xyz); }
 
 bool in_region(SurfaceEntry e, vec3 p, float material) {
     float kind = e.region[0].w;
-    if (kind == PLANE) return abs(dot(p - e.region[0].xyz, e.region[1].xyz)) <= e.region[1].w;
+    if (kind == PLANE) return abs(plane_height(e, p)) <= e.region[1].w;
     if (kind == MATERIAL) return e.region[0].x == material;
+    if (kind == SHEET) return on_sheet(e, p);
     return all(greaterThanEqual(p, e.region[0].xyz)) && all(lessThanEqual(p, e.region[1].xyz));
 }
 
@@ -21,6 +31,6 @@ bool in_region(SurfaceEntry e, vec3 p, float material) {
 // none.
 int surface_entry(vec3 p, float material) {
     for (int i = 0; i < surface_count; ++i)
-        if (in_region(surfaces[i], p, material)) return surfaces[i].region[0].w > MATERIAL ? -1 : i;
+        if (in_region(surfaces[i], p, material)) return surfaces[i].region[0].w == SHEET ? -1 : i;
     return -1;
 }
