@@ -326,3 +326,24 @@ def test_rays_pass_the_holes_of_a_mask(gpu: GpuContext, tmp_path: Path) -> None:
     kept, removed = (float(hidden[each].mean()) for each in at)
     assert kept > 0.8
     assert removed == 0
+
+
+def test_stripes_that_run_away_stay_apart_at_a_grazing_angle(
+    objects: ObjectsRenderer, tmp_path: Path
+) -> None:
+    """A pixel's footprint is ten texels long and less than one wide: stripes along it do not run into each other."""
+    stripes = np.zeros((64, 64, 3), np.uint8)
+    stripes[:, np.arange(64) % 8 < 4] = 255
+    made = Plate(0.6, 2.0)
+    made.material |= {
+        "pbrMetallicRoughness": {"baseColorFactor": [0, 0, 0, 1], "metallicFactor": 0},
+        "emissiveTexture": made.texture(stripes, extensions={"KHR_texture_transform": {"scale": [1, 8]}}),
+        "emissiveFactor": [1, 1, 1],
+    }
+    asset = {"asset": str(made.write(tmp_path / "plate.glb")), "up_axis": "z"}
+    depth = depth_image(np.full((HEIGHT, WIDTH), 3.0, np.float32))
+    view = frame(noisy(), pose=look_at((0.0, -0.8, 0.1), (0.0, 0.0, 0.0)), depth=depth)
+    picture = objects.linear(unlit(Stage(tmp_path).document([asset], [])), view)
+    row = picture[HEIGHT // 2, WIDTH // 2 - 40 : WIDTH // 2 + 40, 0]
+    assert row.mean() == pytest.approx(0.5, abs=0.08)
+    assert row.std() > 0.4, "grey would have no deviation, sharp stripes one of 0.5"

@@ -15,6 +15,7 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.render_server.scene import materials
 from deltalight.render_server.scene.materials import TextureMap, map_edge
 from deltalight.render_server.scene.mesh_loading import load_asset
+from deltalight.services.storage.asset_facts import mesh_facts
 from tests.render_server.gltf_samples import Plate, edited, even
 
 SLOTS: dict[str, Callable[[dict[str, Any], dict[str, Any]], Any]] = {
@@ -147,3 +148,18 @@ def test_what_is_left_out_is_named_once(tmp_path: Path) -> None:
         "the alpha of its vertex colours."
     )
     assert load_asset(textured().write(tmp_path / "other.glb")).left_out is None
+
+
+def test_facts_of_an_asset_hold_the_means_of_its_textures(tmp_path: Path) -> None:
+    """Overriding a material begins with them: a lamp on a box must not make all of the box glow."""
+    plate = Plate(1, 1)
+    lamp = even(0, 0, 0, size=8)
+    lamp[:2, :4] = 255
+    plate.material |= {
+        "emissiveTexture": plate.texture(lamp),
+        "emissiveFactor": [1, 0.5, 0],
+        "pbrMetallicRoughness": {"metallicRoughnessTexture": plate.texture(even(0, 51, 102))},
+    }
+    facts = mesh_facts(plate.write(tmp_path / "plate.glb"))["material"]
+    assert facts["emission"] == pytest.approx([0.125, 0.0625, 0])
+    assert (facts["roughness"], facts["metallic"]) == (0.2, 0.4)
