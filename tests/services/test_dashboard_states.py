@@ -11,7 +11,7 @@ from playwright.sync_api import Browser, Route, expect, sync_playwright
 
 from deltalight.services.api.static_page import DASHBOARD
 from tests.services.dashboard_samples import PATIENCE_S, SIZE, Desk, Stack, find_chromium
-from tests.services.live_samples import LiveApi, live_api
+from tests.services.live_samples import AGE_S, LiveApi, live_api
 
 CHROMIUM = find_chromium()
 pytestmark = [
@@ -51,6 +51,7 @@ def stack(live: LiveApi) -> Stack:
     store = live.api.store
     scene = store.scenes.activate(store.scenes.create(SCENE).head.id)
     live.stream.scene, live.stream.is_busy, live.stream.camera_fps = (scene.head.id, 1), False, 15.0
+    live.stream.ages_s = (AGE_S,)
     return Stack(live.address, live.client, f"/scenes/{scene.head.id}")
 
 
@@ -94,6 +95,39 @@ def test_a_slow_frame_is_told_as_work_and_not_as_a_fault(live: LiveApi, stack: S
     expect(banner).to_have_text(re.compile(r"Waiting for the next frame… \d+ s"))
     live.stream.is_busy = False
     says(page, "Live")
+
+
+SLOW_DECODER = """
+    const decode = window.createImageBitmap;
+    window.createImageBitmap = async (...picture) => {
+        await new Promise((resolve) => setTimeout(resolve, 300));
+        return decode(...picture);
+    };
+"""
+
+
+def test_the_delay_is_from_the_capture_to_the_page(live: LiveApi, page: Desk) -> None:
+    live.stream.ages_s = (60.0, *[10.0] * 6)
+    page.page.add_init_script(SLOW_DECODER)
+    page.open()
+    page.named("tab", "Performance").click()
+    strip = page.page.locator(".status-strip dl div", has_text="Delay")
+    median_s, p95_s = 0.0, 0.0
+
+    def shows_both() -> bool:
+        nonlocal median_s, p95_s
+        found = re.fullmatch(r"([\d.]+) s \(p95 ([\d.]+) s\)", strip.locator("dd").inner_text())
+        median_s, p95_s = map(float, found.groups()) if found else (0.0, 0.0)
+        return median_s < 60 <= p95_s
+
+    page.until(shows_both, "the median and the oldest")
+    assert median_s >= 10.3, "with the time that the page took"
+    assert p95_s >= 60.3
+    assert "capture" in (strip.get_attribute("title") or "")
+    assert page.page.evaluate(
+        """() => document.querySelector(".status-strip dl").innerText.replace(/\\s+/g, " ").includes(
+            document.querySelectorAll(".performance figcaption")[1].innerText.replace(/\\s+/g, " "))"""
+    ), "the panel and the strip say the same"
 
 
 def test_frames_that_stay_away_are_told_with_where_to_look(live: LiveApi, page: Desk) -> None:
