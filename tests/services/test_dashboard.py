@@ -154,6 +154,47 @@ def test_an_object_that_is_added_finds_room_beside_the_first(stack: Stack, page:
     page.photograph("added")
 
 
+def test_a_copy_finds_room_beside_the_original(stack: Stack, page: Desk) -> None:
+    page.named("treeitem", "knot").click()
+    page.named("button", "Duplicate").click()
+    page.until(
+        lambda: page.named("treeitem", "knot 2").get_attribute("aria-selected") == "true", "the copy selected"
+    )
+    original, copy = stack.object("knot"), stack.object("knot 2")
+    way_m = np.subtract(copy["pose"]["translation_m"], original["pose"]["translation_m"])
+    assert np.linalg.norm(way_m[:2]) > 0.1, "beside the original"
+    assert abs(way_m[2]) < 0.2, "on the table or on a thing that stands on it"
+    assert copy["pose"]["rotation_wxyz"] == original["pose"]["rotation_wxyz"]
+    assert copy["asset"] == original["asset"]
+
+
+def steep_place(page: Desk, stack: Stack) -> tuple[float, float]:
+    """A place on the screen where the picture shows something real that stands upright."""
+    box = page.page.locator("#stage").bounding_box()
+    assert box is not None
+    for row, column in np.ndindex(9, 16):
+        place = (box["x"] + box["width"] * (column + 0.5) / 16, box["y"] + box["height"] * (row + 0.5) / 9)
+        seen = stack.client.post("/live/pick", json=page.pixel_at(place)).json()
+        if seen["kind"] == "real" and seen["normal"] and abs(seen["normal"][2]) < 0.3:
+            return place
+    pytest.fail("the picture shows nothing steep")
+
+
+def test_nothing_is_placed_on_a_wall(stack: Stack, page: Desk) -> None:
+    page.named("treeitem", "knot").click()
+    before = stack.object("knot")["pose"]
+    page.page.locator("#stage").focus()
+    page.page.keyboard.press("p")
+    page.page.mouse.click(*steep_place(page, stack))
+    page.page.get_by_text("too steep to stand on").wait_for()
+    assert stack.object("knot")["pose"] == before
+    page.page.mouse.click(*page.place_of(FREE_TABLE_M))
+    page.until(lambda: stack.object("knot")["pose"] != before, "the knot where the next click was")
+    pose = stack.object("knot")["pose"]
+    assert np.linalg.norm(np.subtract(pose["translation_m"], FREE_TABLE_M)[:2]) < 0.06
+    assert pose["rotation_wxyz"] == before["rotation_wxyz"]
+
+
 def test_an_override_of_the_material_begins_with_the_files_own(stack: Stack, page: Desk) -> None:
     page.named("treeitem", "knot").click()
     page.named("switch", "Override material").click()
