@@ -154,6 +154,17 @@ def test_an_object_that_is_added_finds_room_beside_the_first(stack: Stack, page:
     page.photograph("added")
 
 
+def test_a_simple_object_is_taken_from_the_shelf(stack: Stack, page: Desk) -> None:
+    page.named("button", "Add object").click()
+    page.named("menuitem", "Chrome ball").click()
+    page.named("treeitem", "Chrome ball").wait_for()
+    ball, names = stack.object("Chrome ball"), {each["asset"]: each["names"] for each in stack.get("/assets")}
+    assert names[ball["asset"]] == ["Chrome ball.glb"]
+    page.named("button", "Add Chrome ball.glb").wait_for()
+    page.named("button", "Add object").click()
+    assert page.named("menuitem", "Chrome ball.glb").count() == 0, "it is in the menu once"
+
+
 def test_a_copy_finds_room_beside_the_original(stack: Stack, page: Desk) -> None:
     page.named("treeitem", "knot").click()
     page.named("button", "Duplicate").click()

@@ -4,12 +4,14 @@ Node and renderer are stand-ins.
 """
 
 import re
+import shutil
 from collections.abc import Iterator
 
 import pytest
 from playwright.sync_api import Browser, Route, expect, sync_playwright
 
 from deltalight.services.api.static_page import DASHBOARD
+from deltalight.services.demo import POSTER
 from tests.services.dashboard_samples import PATIENCE_S, SIZE, Desk, Stack, find_chromium
 from tests.services.live_samples import AGE_S, LiveApi, live_api
 
@@ -169,6 +171,34 @@ def test_nothing_false_is_said_while_the_page_connects(stack: Stack, page: Desk)
     page.shows_newest()
     expect(page.page.locator(".skeleton")).to_have_count(0)
     expect(page.named("treeitem", "Lamp 1")).to_be_visible()
+
+
+HELD_DECODER = """
+    const decode = window.createImageBitmap;
+    const released = new Promise((resolve) => (window.release = resolve));
+    window.createImageBitmap = async (...picture) => {
+        await released;
+        return decode(...picture);
+    };
+"""
+
+
+@pytest.mark.skipif(not POSTER.is_file(), reason="the demo's files are not in this checkout")
+def test_a_still_is_shown_until_the_first_live_picture(live: LiveApi, stack: Stack, page: Desk) -> None:
+    still = page.named("img", "Still picture")
+    page.page.add_init_script(HELD_DECODER)
+    shutil.copyfile(POSTER, live.api.store.poster)
+    try:
+        page.page.goto(f"http://{stack.address}/")
+        page.until(lambda: still.count() and still.evaluate("each => each.naturalWidth"), "the still")
+    finally:
+        live.api.store.poster.unlink()
+    expect(page.page.locator(".picture-banner")).to_contain_text("A still picture")
+    page.photograph("poster")
+    page.page.evaluate("release()")
+    page.shows_newest()
+    expect(still).to_have_count(0)
+    expect(page.page.locator(".picture-banner")).to_have_count(0)
 
 
 def test_a_view_is_neither_in_the_scene_nor_in_its_history(live: LiveApi, stack: Stack, page: Desk) -> None:
