@@ -163,6 +163,8 @@ def test_a_simple_object_is_taken_from_the_shelf(stack: Stack, page: Desk) -> No
     page.named("button", "Add Chrome ball.glb").wait_for()
     page.named("button", "Add object").click()
     assert page.named("menuitem", "Chrome ball.glb").count() == 0, "it is in the menu once"
+    page.shows_newest()
+    page.photograph("shelf")
 
 
 def test_a_copy_finds_room_beside_the_original(stack: Stack, page: Desk) -> None:
@@ -323,6 +325,26 @@ def test_a_lamp_changes_the_light_on_the_object(stack: Stack, page: Desk) -> Non
     dim = page.pixels()
     assert dim[shows_knot(dim)].mean() < 0.9 * bright[shows_knot(bright)].mean()
     assert page.named("slider", "Intensity, slider").input_value() == "0.5"
+
+
+def test_a_lamp_follows_its_shadow(stack: Stack, page: Desk) -> None:
+    def lamp_m() -> np.ndarray:
+        return np.array(stack.document()["lights"]["manual"][0]["position_m"])
+
+    before_m, on_knot_m = lamp_m(), np.add(knot_m(stack), [0, 0, 0.1])
+    shadow_m = before_m + (on_knot_m - before_m) * before_m[2] / (before_m - on_knot_m)[2]
+    page.drag(page.place_of(shadow_m), page.place_of(np.add(shadow_m, [0, 0.15, 0])))
+    page.until(lambda: lamp_m()[1] < before_m[1] - 0.3, "the lamp, which goes the other way")
+    page.until(
+        lambda: page.named("treeitem", "Lamp 1").get_attribute("aria-selected") == "true", "its selection"
+    )
+    page.shows_newest()
+    page.photograph("shadow")
+    reach_m = [np.linalg.norm(each - on_knot_m) for each in (before_m, lamp_m())]
+    assert reach_m[0] == pytest.approx(reach_m[1], abs=0.15), "as far from the knot as before"
+    assert lamp_m()[2] > 0.2, "above the table"
+    page.page.keyboard.press("Control+z")
+    page.until(lambda: np.array_equal(lamp_m(), before_m), "one undo takes the whole drag back")
 
 
 def test_another_method_renders_the_next_picture(stack: Stack, page: Desk) -> None:

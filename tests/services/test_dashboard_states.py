@@ -193,6 +193,7 @@ def test_a_still_is_shown_until_the_first_live_picture(live: LiveApi, stack: Sta
         page.until(lambda: still.count() and still.evaluate("each => each.naturalWidth"), "the still")
     finally:
         live.api.store.poster.unlink()
+    assert still.bounding_box() == page.page.locator(".picture").bounding_box(), "it fills the picture"
     expect(page.page.locator(".picture-banner")).to_contain_text("A still picture")
     page.photograph("poster")
     page.page.evaluate("release()")

@@ -9,7 +9,7 @@ export function Poster() {
   const isGone = useSignal(frame.value !== null);
   if (!hasPoster.value || isGone.value) return null;
   return (
-    <div class={`layer poster ${frame.value ? "fading" : ""}`} onTransitionEnd={() => (isGone.value = true)}>
+    <div class={`layer still ${frame.value ? "fading" : ""}`} onTransitionEnd={() => (isGone.value = true)}>
       <SecureImage path={`${API}/poster.jpg`} alt="Still picture" />
     </div>
   );
