@@ -163,8 +163,6 @@ def test_a_simple_object_is_taken_from_the_shelf(stack: Stack, page: Desk) -> No
     page.named("button", "Add Chrome ball.glb").wait_for()
     page.named("button", "Add object").click()
     assert page.named("menuitem", "Chrome ball.glb").count() == 0, "it is in the menu once"
-    page.shows_newest()
-    page.photograph("shelf")
 
 
 def test_a_copy_finds_room_beside_the_original(stack: Stack, page: Desk) -> None:
@@ -338,8 +336,6 @@ def test_a_lamp_follows_its_shadow(stack: Stack, page: Desk) -> None:
     page.until(
         lambda: page.named("treeitem", "Lamp 1").get_attribute("aria-selected") == "true", "its selection"
     )
-    page.shows_newest()
-    page.photograph("shadow")
     reach_m = [np.linalg.norm(each - on_knot_m) for each in (before_m, lamp_m())]
     assert reach_m[0] == pytest.approx(reach_m[1], abs=0.15), "as far from the knot as before"
     assert lamp_m()[2] > 0.2, "above the table"
