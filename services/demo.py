@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import sys
 import time
 import webbrowser
@@ -26,6 +27,7 @@ from deltalight.services.supervisor import POLL_INTERVAL_S, Supervisor
 ASSETS = Path(__file__).parent / "demo_assets"
 RECORDING = ASSETS / "demo.mcap"
 SCENE = ASSETS / "scene.json"
+POSTER = ASSETS / "poster.jpg"
 NAME = "Demo"
 FRAME_BUDGET_MS = 125.0  # of what a viewer calls live: eight pictures a second
 FIRST_FRAME_TIMEOUT_S = 120.0  # a cold shader cache on a slow machine takes a while
@@ -40,7 +42,7 @@ def demo_scene(method: str) -> SceneDocument:
     Raises:
         DeltalightError: the demo's files are missing.
     """
-    if not (RECORDING.is_file() and SCENE.is_file()):
+    if not all(path.is_file() for path in (RECORDING, SCENE, POSTER)):
         raise DeltalightError(f"The demo's files are missing in {ASSETS}; install Deltalight again.")
     scene = load_scene(SCENE)
     return with_method(scene, method)
@@ -76,6 +78,7 @@ def _kept(method: str, data: Path) -> Iterator[Path]:
             output=scene.output.replaced(frame_budget_ms=FRAME_BUDGET_MS),
         )
         scene = activate_document(store, paced)
+        shutil.copyfile(POSTER, store.poster)
     with session_file(scene) as session:
         yield session
 

@@ -28,7 +28,7 @@ from deltalight.services.api.recording_session import RecordingSession, Recordin
 from deltalight.services.api.recording_store import RecordingStore
 from deltalight.services.api.render_link import RenderLink
 from deltalight.services.api.replay_control import ReplayControl
-from deltalight.services.api.routes import assets, live, recordings, scenes, snapshots, state
+from deltalight.services.api.routes import assets, live, recordings, scenes, shelf, snapshots, state
 from deltalight.services.api.settings import ApiSettings
 from deltalight.services.api.shown_view import ShownView
 from deltalight.services.api.snapshot_store import SnapshotStore
@@ -41,6 +41,7 @@ PREFIX = "/api/v1"
 ROUTERS = (
     *scenes.ROUTERS,
     *assets.ROUTERS,
+    *shelf.ROUTERS,
     *live.ROUTERS,
     *recordings.ROUTERS,
     *snapshots.ROUTERS,

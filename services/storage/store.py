@@ -40,6 +40,11 @@ class Store:
     def __exit__(self, *_fault: object) -> None:
         self.close()
 
+    @property
+    def poster(self) -> Path:
+        """The still that the dashboard shows until the first live picture comes; such a file may be missing."""
+        return self.folder / "poster.jpg"
+
     def close(self) -> None:
         """Close the database."""
         self._database.close()

@@ -25,6 +25,7 @@ from tests.services.api_samples import RenderServer, RunningApi, running_api
 from tests.services.conftest import HEIGHT, IDENTITY, WIDTH, camera
 
 PERIOD_S = 0.02
+AGE_S = 0.005
 LIGHT = {"type": "sphere", "position_m": [0.0, 0.0, 2.0], "intensity": [2.0, 1.0, 1.0], "radius_m": 0.1}
 AROUND = {"type": "environment", "mean_radiance": [0.1, 0.1, 0.1]}
 
@@ -33,7 +34,7 @@ class StandInStream:
     """Publishes a composite every 20 ms, each tenth time a report too; `scene` = id and revision of what it shows.
 
     While `is_busy` it does neither, as a renderer that is at work on a slow frame; a camera that sends `camera_fps`
-    frames a second reports meanwhile.
+    frames a second reports meanwhile. `ages_s` are the times since the composites' capture, in turn.
     """
 
     def __init__(self, port: int) -> None:
@@ -41,6 +42,7 @@ class StandInStream:
         self.scene: tuple[str | None, int | None] = (None, None)
         self.is_busy = False
         self.camera_fps: float | None = None
+        self.ages_s: tuple[float, ...] = (AGE_S,)
         self._stop = threading.Event()
         self.publisher = Publisher(ports.endpoint(port))
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -60,18 +62,21 @@ class StandInStream:
                 self.publisher.send(encode(report("camera", rates={"fps": self.camera_fps})))
             if self.is_busy:
                 continue
-            self.publisher.send(encode(composite(number, *self.scene), [jpeg]))
+            age_s = self.ages_s[number % len(self.ages_s)]
+            self.publisher.send(encode(composite(number, *self.scene, age_s=age_s), [jpeg]))
             if number % 10 == 0:
                 self.publisher.send(encode(report("render-server", "stand-in renderer")))
             self.sent = number
 
 
-def composite(number: int, scene_id: str | None = None, revision: int | None = None) -> CompositeMessage:
+def composite(
+    number: int, scene_id: str | None = None, revision: int | None = None, age_s: float = AGE_S
+) -> CompositeMessage:
     now_ns = time.time_ns()
     return CompositeMessage(
         node="render-server",
         frame_id=number,
-        capture_ns=now_ns - 5_000_000,
+        capture_ns=now_ns - round(age_s * 1e9),
         encoding="jpeg",
         shape=(HEIGHT, WIDTH, 3),
         status="ok",

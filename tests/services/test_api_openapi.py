@@ -95,6 +95,7 @@ def fill(api: RunningApi) -> dict[str, list[str]]:
         "digest": [asset.reference for asset in assets],
         "scene_id": scenes,
         "object_id": ["knot"],
+        "item": ["grey-ball"],
         "index": ["0"],
         "revision": ["1"],
         "snapshot_id": snapshots,

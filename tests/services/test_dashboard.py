@@ -154,6 +154,58 @@ def test_an_object_that_is_added_finds_room_beside_the_first(stack: Stack, page:
     page.photograph("added")
 
 
+def test_a_simple_object_is_taken_from_the_shelf(stack: Stack, page: Desk) -> None:
+    page.named("button", "Add object").click()
+    page.named("menuitem", "Chrome ball").click()
+    page.named("treeitem", "Chrome ball").wait_for()
+    ball, names = stack.object("Chrome ball"), {each["asset"]: each["names"] for each in stack.get("/assets")}
+    assert names[ball["asset"]] == ["Chrome ball.glb"]
+    page.named("button", "Add Chrome ball.glb").wait_for()
+    page.named("button", "Add object").click()
+    assert page.named("menuitem", "Chrome ball.glb").count() == 0, "it is in the menu once"
+
+
+def test_a_copy_finds_room_beside_the_original(stack: Stack, page: Desk) -> None:
+    page.named("treeitem", "knot").click()
+    page.named("button", "Duplicate").click()
+    page.until(
+        lambda: page.named("treeitem", "knot 2").get_attribute("aria-selected") == "true", "the copy selected"
+    )
+    original, copy = stack.object("knot"), stack.object("knot 2")
+    way_m = np.subtract(copy["pose"]["translation_m"], original["pose"]["translation_m"])
+    assert np.linalg.norm(way_m[:2]) > 0.1, "beside the original"
+    assert abs(way_m[2]) < 0.2, "on the table or on a thing that stands on it"
+    assert copy["pose"]["rotation_wxyz"] == original["pose"]["rotation_wxyz"]
+    assert copy["asset"] == original["asset"]
+
+
+def steep_place(page: Desk, stack: Stack) -> tuple[float, float]:
+    """A place on the screen where the picture shows something real that stands upright."""
+    box = page.page.locator("#stage").bounding_box()
+    assert box is not None
+    for row, column in np.ndindex(9, 16):
+        place = (box["x"] + box["width"] * (column + 0.5) / 16, box["y"] + box["height"] * (row + 0.5) / 9)
+        seen = stack.client.post("/live/pick", json=page.pixel_at(place)).json()
+        if seen["kind"] == "real" and seen["normal"] and abs(seen["normal"][2]) < 0.3:
+            return place
+    pytest.fail("the picture shows nothing steep")
+
+
+def test_nothing_is_placed_on_a_wall(stack: Stack, page: Desk) -> None:
+    page.named("treeitem", "knot").click()
+    before = stack.object("knot")["pose"]
+    page.page.locator("#stage").focus()
+    page.page.keyboard.press("p")
+    page.page.mouse.click(*steep_place(page, stack))
+    page.page.get_by_text("too steep to stand on").wait_for()
+    assert stack.object("knot")["pose"] == before
+    page.page.mouse.click(*page.place_of(FREE_TABLE_M))
+    page.until(lambda: stack.object("knot")["pose"] != before, "the knot where the next click was")
+    pose = stack.object("knot")["pose"]
+    assert np.linalg.norm(np.subtract(pose["translation_m"], FREE_TABLE_M)[:2]) < 0.06
+    assert pose["rotation_wxyz"] == before["rotation_wxyz"]
+
+
 def test_an_override_of_the_material_begins_with_the_files_own(stack: Stack, page: Desk) -> None:
     page.named("treeitem", "knot").click()
     page.named("switch", "Override material").click()
@@ -271,6 +323,24 @@ def test_a_lamp_changes_the_light_on_the_object(stack: Stack, page: Desk) -> Non
     dim = page.pixels()
     assert dim[shows_knot(dim)].mean() < 0.9 * bright[shows_knot(bright)].mean()
     assert page.named("slider", "Intensity, slider").input_value() == "0.5"
+
+
+def test_a_lamp_follows_its_shadow(stack: Stack, page: Desk) -> None:
+    def lamp_m() -> np.ndarray:
+        return np.array(stack.document()["lights"]["manual"][0]["position_m"])
+
+    before_m, on_knot_m = lamp_m(), np.add(knot_m(stack), [0, 0, 0.1])
+    shadow_m = before_m + (on_knot_m - before_m) * before_m[2] / (before_m - on_knot_m)[2]
+    page.drag(page.place_of(shadow_m), page.place_of(np.add(shadow_m, [0, 0.15, 0])))
+    page.until(lambda: lamp_m()[1] < before_m[1] - 0.3, "the lamp, which goes the other way")
+    page.until(
+        lambda: page.named("treeitem", "Lamp 1").get_attribute("aria-selected") == "true", "its selection"
+    )
+    reach_m = [np.linalg.norm(each - on_knot_m) for each in (before_m, lamp_m())]
+    assert reach_m[0] == pytest.approx(reach_m[1], abs=0.15), "as far from the knot as before"
+    assert lamp_m()[2] > 0.2, "above the table"
+    page.page.keyboard.press("Control+z")
+    page.until(lambda: np.array_equal(lamp_m(), before_m), "one undo takes the whole drag back")
 
 
 def test_another_method_renders_the_next_picture(stack: Stack, page: Desk) -> None:

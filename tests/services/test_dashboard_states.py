@@ -4,14 +4,16 @@ Node and renderer are stand-ins.
 """
 
 import re
+import shutil
 from collections.abc import Iterator
 
 import pytest
 from playwright.sync_api import Browser, Route, expect, sync_playwright
 
 from deltalight.services.api.static_page import DASHBOARD
+from deltalight.services.demo import POSTER
 from tests.services.dashboard_samples import PATIENCE_S, SIZE, Desk, Stack, find_chromium
-from tests.services.live_samples import LiveApi, live_api
+from tests.services.live_samples import AGE_S, LiveApi, live_api
 
 CHROMIUM = find_chromium()
 pytestmark = [
@@ -51,6 +53,7 @@ def stack(live: LiveApi) -> Stack:
     store = live.api.store
     scene = store.scenes.activate(store.scenes.create(SCENE).head.id)
     live.stream.scene, live.stream.is_busy, live.stream.camera_fps = (scene.head.id, 1), False, 15.0
+    live.stream.ages_s = (AGE_S,)
     return Stack(live.address, live.client, f"/scenes/{scene.head.id}")
 
 
@@ -96,6 +99,39 @@ def test_a_slow_frame_is_told_as_work_and_not_as_a_fault(live: LiveApi, stack: S
     says(page, "Live")
 
 
+SLOW_DECODER = """
+    const decode = window.createImageBitmap;
+    window.createImageBitmap = async (...picture) => {
+        await new Promise((resolve) => setTimeout(resolve, 300));
+        return decode(...picture);
+    };
+"""
+
+
+def test_the_delay_is_from_the_capture_to_the_page(live: LiveApi, page: Desk) -> None:
+    live.stream.ages_s = (60.0, *[10.0] * 6)
+    page.page.add_init_script(SLOW_DECODER)
+    page.open()
+    page.named("tab", "Performance").click()
+    strip = page.page.locator(".status-strip dl div", has_text="Delay")
+    median_s, p95_s = 0.0, 0.0
+
+    def shows_both() -> bool:
+        nonlocal median_s, p95_s
+        found = re.fullmatch(r"([\d.]+) s \(p95 ([\d.]+) s\)", strip.locator("dd").inner_text())
+        median_s, p95_s = map(float, found.groups()) if found else (0.0, 0.0)
+        return median_s < 60 <= p95_s
+
+    page.until(shows_both, "the median and the oldest")
+    assert median_s >= 10.3, "with the time that the page took"
+    assert p95_s >= 60.3
+    assert "capture" in (strip.get_attribute("title") or "")
+    assert page.page.evaluate(
+        """() => document.querySelector(".status-strip dl").innerText.replace(/\\s+/g, " ").includes(
+            document.querySelectorAll(".performance figcaption")[1].innerText.replace(/\\s+/g, " "))"""
+    ), "the panel and the strip say the same"
+
+
 def test_frames_that_stay_away_are_told_with_where_to_look(live: LiveApi, page: Desk) -> None:
     page.open()
     live.stream.is_busy, live.stream.camera_fps = True, 0.0
@@ -135,6 +171,35 @@ def test_nothing_false_is_said_while_the_page_connects(stack: Stack, page: Desk)
     page.shows_newest()
     expect(page.page.locator(".skeleton")).to_have_count(0)
     expect(page.named("treeitem", "Lamp 1")).to_be_visible()
+
+
+HELD_DECODER = """
+    const decode = window.createImageBitmap;
+    const released = new Promise((resolve) => (window.release = resolve));
+    window.createImageBitmap = async (...picture) => {
+        await released;
+        return decode(...picture);
+    };
+"""
+
+
+@pytest.mark.skipif(not POSTER.is_file(), reason="the demo's files are not in this checkout")
+def test_a_still_is_shown_until_the_first_live_picture(live: LiveApi, stack: Stack, page: Desk) -> None:
+    still = page.named("img", "Still picture")
+    page.page.add_init_script(HELD_DECODER)
+    shutil.copyfile(POSTER, live.api.store.poster)
+    try:
+        page.page.goto(f"http://{stack.address}/")
+        page.until(lambda: still.count() and still.evaluate("each => each.naturalWidth"), "the still")
+    finally:
+        live.api.store.poster.unlink()
+    assert still.bounding_box() == page.page.locator(".picture").bounding_box(), "it fills the picture"
+    expect(page.page.locator(".picture-banner")).to_contain_text("A still picture")
+    page.photograph("poster")
+    page.page.evaluate("release()")
+    page.shows_newest()
+    expect(still).to_have_count(0)
+    expect(page.page.locator(".picture-banner")).to_have_count(0)
 
 
 def test_a_view_is_neither_in_the_scene_nor_in_its_history(live: LiveApi, stack: Stack, page: Desk) -> None:

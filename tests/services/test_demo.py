@@ -22,7 +22,7 @@ from deltalight.protocol.receiver import Receiver
 from deltalight.protocol.request import RequestClient
 from deltalight.services import ports
 from deltalight.services.api.serve import listening
-from deltalight.services.demo import RECORDING, SCENE, demo_plan, demo_scene
+from deltalight.services.demo import POSTER, RECORDING, SCENE, demo_plan, demo_scene
 from deltalight.services.host import HostPlan
 from deltalight.services.host_store import session_file
 from deltalight.services.supervisor import Supervisor
@@ -68,6 +68,13 @@ def test_headless_demo_writes_composites_sheet_and_video(cli_process: RunCli, tm
     frames = [record["frame"] for record in records]
     assert frames == sorted(set(frames))
     assert all(record["age_ms"] > 0 for record in records)
+
+
+def test_the_poster_is_small_and_of_the_pictures_shape() -> None:
+    assert POSTER.stat().st_size < 60_000
+    picture = cv2.imread(str(POSTER))
+    assert picture is not None
+    assert picture.shape == (480, 640, 3)
 
 
 def test_headless_demo_needs_a_folder(cli: RunCli) -> None:
@@ -178,8 +185,9 @@ def demo(page_port: int, *options: str) -> Iterator[str]:
 def test_ctrl_c_ends_the_demo_without_orphans_and_it_starts_again() -> None:
     """The first as people start it; in the second, a change by REST is in the next picture that is begun."""
     (page_port,) = ports.private_ports(1)
-    with demo(page_port):
-        pass
+    with demo(page_port) as address:
+        assert httpx.get(f"http://{address}/api/v1/settings").json()["has_poster"]
+        assert httpx.get(f"http://{address}/api/v1/poster.jpg").content == POSTER.read_bytes()
     with demo(page_port, "--method", "paper") as address:
         check_changes(address)
 

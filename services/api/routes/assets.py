@@ -6,11 +6,12 @@ from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 
 from deltalight.protocol.scene import DIGEST_PREFIX
-from deltalight.services.api.context import Shared
+from deltalight.services.api.context import Context, Shared
 from deltalight.services.api.file_response import StoredFileResponse
 from deltalight.services.api.models import AssetAnswer
 from deltalight.services.api.problems import ProblemError, responses
 from deltalight.services.storage.asset_kinds import FORMATS
+from deltalight.services.storage.assets import Asset
 
 router = APIRouter(tags=["assets"], prefix="/assets")
 ROUTERS = (router,)
@@ -27,10 +28,10 @@ PNG: dict[int | str, dict[str, Any]] = {
     200: {"content": {"image/png": {"schema": {"type": "string", "format": "binary"}}}}
 }
 _KNOWN = ", ".join(each.name.upper() for each in FORMATS)
-_UPLOAD_ANSWERS: dict[int | str, dict[str, Any]] = {
-    200: {"model": AssetAnswer, "description": "The same content was there already."},
-    **responses(400, 413, 415, 422),
+KEPT_ANSWERS: dict[int | str, dict[str, Any]] = {
+    200: {"model": AssetAnswer, "description": "The same content was there already."}
 }
+_UPLOAD_ANSWERS = {**KEPT_ANSWERS, **responses(400, 413, 415, 422)}
 _UPLOAD_BODY = {
     "requestBody": {
         "required": True,
@@ -65,6 +66,11 @@ async def upload_asset(
         async for chunk in request.stream():
             await run_in_threadpool(incoming.write, chunk)
         asset, is_new = await run_in_threadpool(assets.keep, incoming, name)
+    return announced(shared, asset, response, is_new=is_new)
+
+
+def announced(shared: Context, asset: Asset, response: Response, *, is_new: bool) -> AssetAnswer:
+    """Describe an asset that was kept; tell all listeners."""
     shared.events.publish("asset", {"digest": asset.reference, "name": asset.names[0]})
     response.status_code = 201 if is_new else 200
     response.headers["Location"] = f"/api/v1/assets/{asset.reference}"

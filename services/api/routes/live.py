@@ -13,6 +13,7 @@ from deltalight.protocol.messages import MAX_EDGE_PX, RadianceMessage
 from deltalight.services.api.context import Shared
 from deltalight.services.api.credentials import TICKET_LIFE_S, principal_of
 from deltalight.services.api.events import EventQueue, packed
+from deltalight.services.api.file_response import StoredFileResponse
 from deltalight.services.api.fisheye import FisheyeLight, lights_in_picture
 from deltalight.services.api.live_hub import LiveFrame, LiveHub
 from deltalight.services.api.problems import ProblemError, responses
@@ -110,6 +111,17 @@ async def live_picture(shared: Shared) -> Response:
     if frame is None:
         raise ProblemError(503, "no-picture", "No picture has come from the render server yet; see /state.")
     return Response(frame.jpeg, media_type="image/jpeg", headers=PICTURE_HEADERS)
+
+
+@live_router.get(
+    "/poster.jpg", response_class=StoredFileResponse, responses={**responses(404), **JPEG_ANSWER}
+)
+def poster(shared: Shared) -> StoredFileResponse:
+    """Return the still that stands for the live picture until it comes; `/settings` says whether there is one."""
+    path = shared.store.poster
+    if not path.is_file():
+        raise NotFoundError("there is no poster; wait for the live picture.")
+    return StoredFileResponse(path, media_type="image/jpeg", headers=PICTURE_HEADERS)
 
 
 @live_router.post("/live/pick", responses=responses(400, 503))

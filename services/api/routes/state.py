@@ -59,6 +59,7 @@ class Settings(BaseModel):
     needs_token: bool
     upload_limit_bytes: int
     requests_per_s: float
+    has_poster: bool = Field(description="Whether `/poster.jpg` stands for the live picture until it comes.")
 
 
 class NodeAnswer(ProcessAnswer):
@@ -111,6 +112,7 @@ def settings(shared: Shared) -> Settings:
         needs_token=shared.settings.leaves_host,
         upload_limit_bytes=shared.settings.upload_limit_mb << 20,
         requests_per_s=shared.settings.requests_per_s,
+        has_poster=shared.store.poster.is_file(),
     )
 
 

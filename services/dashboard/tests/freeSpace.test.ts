@@ -3,7 +3,7 @@ import type { PickAnswer, Pose, Vector } from "../src/api/types";
 import type { Bounds } from "../src/math/bounds";
 import { meetPlane, type Pixel, type View } from "../src/math/camera";
 import { UP } from "../src/math/vector";
-import { beforeWall, footprintOf, freePlace, isFree, standable, type Wanted } from "../src/state/freeSpace";
+import { beforeWall, footprintOf, freePlace, isFree, standable, startAt, type Wanted } from "../src/state/freeSpace";
 
 const BOX: Bounds = { minimum: [-0.1, -0.1, 0], maximum: [0.1, 0.1, 0.2] };
 const UPRIGHT: Pose = { translation_m: [0, 0, 0], rotation_wxyz: [1, 0, 0, 0], scale: 1 };
@@ -21,7 +21,7 @@ const MIDDLE: Pixel = [319.5, 239.5];
 
 function wanted(...taken: Vector[]): Wanted {
   const footprints = taken.map((translation_m) => footprintOf({ ...UPRIGHT, translation_m }, BOX));
-  return { view: VIEW, pixel: MIDDLE, pose: UPRIGHT, bounds: BOX, taken: footprints };
+  return { view: VIEW, start: [0, 0, 0], pose: UPRIGHT, bounds: BOX, taken: footprints };
 }
 
 /** A table at height 0, with objects of a scene and of the room on it. */
@@ -36,7 +36,14 @@ function look(seenAt: (point: Vector) => Partial<PickAnswer> = () => ({})): (pix
 const radius = footprintOf(UPRIGHT, BOX).radius;
 
 describe("room for a new object", () => {
-  it("is the middle of the picture where nothing stands there", async () => {
+  it("begins at the surface in the picture's middle, or where the board's plane is behind what stands there", async () => {
+    const shelf = look(([x, y]) => ({ point_m: [x, y, 0.4] }));
+    expect((await startAt(VIEW, MIDDLE, shelf))![2]).toBe(0.4);
+    const virtual = look(() => ({ kind: "object", object: "first", normal: [1, 0, 0] }));
+    expect((await startAt(VIEW, MIDDLE, virtual))![2]).toBeCloseTo(0, 9);
+  });
+
+  it("is where it is wanted where nothing stands there", async () => {
     const place = await freePlace(wanted(), look());
     place!.forEach((value) => expect(value).toBeCloseTo(0, 9));
   });

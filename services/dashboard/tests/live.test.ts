@@ -1,4 +1,5 @@
 import { describe, expect, it } from "vitest";
+import { delayFigures, delayText } from "../src/live/delay";
 import { droppedFrames, parseLiveMessage, qualityText } from "../src/live/message";
 import { lateBy } from "../src/live/picture";
 import { RateMeter } from "../src/live/rate";
@@ -16,7 +17,7 @@ function message(header: object, jpeg: readonly number[]): ArrayBuffer {
 }
 
 function sample(at: number, passes: Record<string, number>): Sample {
-  return { at, age: 10, rate: 30, took: 20, passes, kept: new Set(), shows: "a 1" };
+  return { at, rate: 30, took: 20, passes, kept: new Set(), shows: "a 1" };
 }
 
 describe("a message of the live picture", () => {
@@ -99,6 +100,22 @@ describe("the rate", () => {
     expect(meter.rate(11_000)).toBeCloseTo(1, 9);
     meter.note(1, 12_000);
     expect(meter.rate(12_500)).toBeNull();
+  });
+});
+
+describe("the delay", () => {
+  const shown = (at: number, delay: number) => ({ at, delay });
+
+  it("is the median and the 95th percentile of the last ten seconds", () => {
+    expect(delayFigures([])).toBeNull();
+    expect(delayFigures([shown(5, 80)])).toEqual({ median: 80, p95: 80 });
+    const hundred = Array.from({ length: 100 }, (_, index) => shown(20 + index / 100, ((index * 37) % 100) + 1));
+    expect(delayFigures([shown(1, 5000), ...hundred])).toEqual({ median: 50, p95: 95 });
+  });
+
+  it("is told in one way everywhere", () => {
+    expect(delayText({ median: 181.4, p95: 1240 })).toBe("181 ms (p95 1.24 s)");
+    expect(delayText(null)).toBe("–");
   });
 });
 

@@ -28,6 +28,7 @@ export type {
   RecordingAnswer as Recording,
   ReplayAnswer as Replay,
   ReplayChange,
+  ShelfAnswer as ShelfItem,
   SnapshotFacts as Snapshot,
   TicketAnswer as Ticket,
 } from "./schema";

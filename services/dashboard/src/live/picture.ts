@@ -3,6 +3,7 @@ import { computed, signal, type ReadonlySignal } from "@preact/signals";
 import { API } from "../api/http";
 import type { LiveHeader } from "../api/types";
 import { lensOf, type View } from "../math/camera";
+import { noteDrawn } from "./delay";
 import { RateMeter } from "./rate";
 import { note, slowestMs } from "./telemetry";
 import { parseLiveMessage } from "./message";
@@ -67,10 +68,12 @@ export function retryPicture(): void {
 
 async function receive(event: MessageEvent<unknown>): Promise<void> {
   if (!(event.data instanceof ArrayBuffer)) return;
+  const arrival = performance.now();
   try {
     const { header, jpeg } = parseLiveMessage(event.data);
     const bitmap = await createImageBitmap(new Blob([jpeg], { type: "image/jpeg" }));
     draw(bitmap, header);
+    noteDrawn(header.age_ms, arrival);
     bitmap.close();
   } finally {
     socket.send("ack");

@@ -1,11 +1,10 @@
-// What the plots show: times, delay and rate of the last frames.
+// What the plots show: times and rate of the last frames.
 import { signal } from "@preact/signals";
 import type { LiveHeader } from "../api/types";
 
 export interface Sample {
   /** Seconds since the page was opened. */
   readonly at: number;
-  readonly age: number | null;
   readonly rate: number | null;
   /** What the renderer took for the frame, ms. */
   readonly took: number;
@@ -27,7 +26,7 @@ export function note(header: LiveHeader, nowMs: number, rate: number | null): vo
   const at = nowMs / 1000;
   const shows = header.scene && `${header.scene.id} ${header.scene.revision}`;
   const passes = withKept(samples.value.at(-1), header.pass_times_ms, shows);
-  const sample: Sample = { at, age: header.age_ms, rate, took: header.render_ms, shows, ...passes };
+  const sample: Sample = { at, rate, took: header.render_ms, shows, ...passes };
   const kept = samples.value.filter((each) => each.at > at - KEPT_S);
   samples.value = [...kept, sample];
 }

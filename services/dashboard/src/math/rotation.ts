@@ -43,6 +43,11 @@ export function multiply(a: Quaternion, b: Quaternion): Quaternion {
   ];
 }
 
+/** The turn back. */
+export function conjugate([w, x, y, z]: Quaternion): Quaternion {
+  return [w, -x, -y, -z];
+}
+
 export function rotate(q: Quaternion, v: Vector): Vector {
   const axis: Vector = [q[1], q[2], q[3]];
   const first = cross(axis, v);

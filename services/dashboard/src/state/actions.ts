@@ -1,26 +1,15 @@
 // What people do to the scene, in one step each.
 import { API, request } from "../api/http";
-import { lookAt } from "../live/pick";
-import type {
-  AssetAnswer,
-  LightType,
-  ManualLight,
-  Method,
-  MethodName,
-  PickAnswer,
-  Pose,
-  SceneAnswer,
-  Vector,
-} from "../api/types";
-import { boundsOf, longestEdge, restOn, sensibleScale, standOn, type Bounds } from "../math/bounds";
-import { meetPlane, type Pixel } from "../math/camera";
+import type { AssetAnswer, LightType, ManualLight, Method, MethodName, Pose, SceneAnswer } from "../api/types";
+import { boundsOf, longestEdge, restOn, sensibleScale } from "../math/bounds";
+import type { Pixel } from "../math/camera";
 import { UP } from "../math/vector";
 import { size, trimmed } from "../math/units";
-import { pictureSize, view } from "../live/picture";
 import { assetName, boundsByObject } from "./assets";
-import { beforeWall, footprintOf, freePlace, standable } from "./freeSpace";
+import { footprintOf } from "./freeSpace";
 import { edit } from "./gesture";
 import { rounded } from "./handle";
+import { isTooSteep, pick, pointAt, restingOn, roomBeside, roomInMiddle } from "./placing";
 import { change, lights, objects, readScene, readScenes, sceneDocument, takeScene } from "./scene";
 import { selectLight, selectObject } from "./selection";
 import { documentTarget, objectTarget, partTarget } from "./targets";
@@ -28,10 +17,6 @@ import { announce, attempt, toast } from "./toasts";
 import { tool } from "./tools";
 
 const UPRIGHT: Pose = { translation_m: [0, 0, 0], rotation_wxyz: [1, 0, 0, 0], scale: 1 };
-
-export async function pick(pixel: Pixel): Promise<PickAnswer | undefined> {
-  return attempt(() => lookAt(pixel));
-}
 
 /** Add an object of an asset, named as a file: at a pixel, or where the middle of the picture has room for it. */
 export async function addObject(
@@ -43,7 +28,7 @@ export async function addObject(
   const bounds = boundsOf(asset, null);
   const scale = bounds ? sensibleScale(bounds) : 1;
   const pose: Pose = { ...UPRIGHT, scale };
-  const point = pixel ? await pointAt(pixel, footprintOf(pose, bounds).radius) : await roomFor(pose, bounds);
+  const point = pixel ? await pointAt(pixel, footprintOf(pose, bounds).radius) : await roomInMiddle(pose, bounds);
   const id = freeId(name);
   const body = { id, asset: asset.asset, pose: rounded(restOn(pose, bounds, point, UP)) };
   if (!(await change("POST", "/objects", body))) return;
@@ -53,38 +38,6 @@ export async function addObject(
     const edge = longestEdge(bounds);
     toast(`${id} is ${size(edge)} long in its file, so it was added at scale ${trimmed(scale, 9)}.`);
   }
-}
-
-/** Where something new stands at a pixel: on the surface seen there, or on what is behind a virtual object. */
-async function pointAt(pixel: Pixel, radius: number): Promise<Vector> {
-  const first = await pick(pixel);
-  const found = first?.kind === "object" && first.object ? await attempt(() => lookAt(pixel, first.object!)) : first;
-  const point = standable(found);
-  if (point) return point;
-  toast("There is no level surface there, so the object stands on the plane of the board.");
-  return found?.point_m ? beforeWall(found.point_m, found.normal, radius) : onBoard(pixel);
-}
-
-function onBoard(pixel: Pixel): Vector {
-  return (view.value && meetPlane(view.value, pixel, [0, 0, 0], UP)) ?? [0, 0, 0];
-}
-
-/** The free place nearest to the picture's middle. */
-async function roomFor(pose: Pose, bounds: Bounds | null): Promise<Vector> {
-  if (!view.value) return [0, 0, 0];
-  const taken = objects.value.flatMap((item) =>
-    item.frame === "world" ? footprintOf(item.pose, boundsByObject.value.get(item.id) ?? null) : [],
-  );
-  const wanted = { view: view.value, pixel: centre(), pose, bounds, taken };
-  const found = await freePlace(wanted, (at) => attempt(() => lookAt(at)));
-  if (found) return found;
-  toast("No free place was found, so the object stands in the middle of the picture. Drag it where you want it.");
-  return onBoard(centre());
-}
-
-function centre(): Pixel {
-  const { width, height } = pictureSize.value ?? { width: 0, height: 0 };
-  return [(width - 1) / 2, (height - 1) / 2];
 }
 
 /** A name for a new object: the file's, with a number where it is taken. */
@@ -134,11 +87,13 @@ export async function removeObject(id: string): Promise<void> {
   if (removed) announce(`${id} removed. Undo brings it back.`);
 }
 
+/** Put a copy of an object beside it, turned as it is. */
 export async function duplicateObject(id: string): Promise<void> {
   const item = objects.value.find((each) => each.id === id);
   if (!item) return;
-  const [x, y, z] = item.pose.translation_m;
-  const copy = { ...item, id: freeId(id), pose: { ...item.pose, translation_m: [x + 0.05, y, z] } };
+  const bounds = boundsByObject.value.get(id) ?? null;
+  const pose = restOn(item.pose, bounds, await roomBeside(item), UP);
+  const copy = { ...item, id: freeId(id), pose: rounded(pose) };
   if (await change("POST", "/objects", copy)) selectObject(copy.id);
 }
 
@@ -146,7 +101,7 @@ export function setVisible(id: string, visible: boolean): Promise<number | null>
   return edit(objectTarget(id), { visible });
 }
 
-/** Stand an object on what the picture shows at a pixel. */
+/** Stand an object on what the picture shows at a pixel, as dragging it there does. */
 export async function placeObject(id: string, pixel: Pixel): Promise<void> {
   const item = objects.value.find((each) => each.id === id);
   const found = await pick(pixel);
@@ -159,7 +114,12 @@ export async function placeObject(id: string, pixel: Pixel): Promise<void> {
     );
     return;
   }
-  const pose = standOn(item.pose, boundsByObject.value.get(id) ?? null, found.point_m, found.normal ?? UP);
+  const normal = found.normal ?? UP;
+  if (isTooSteep(normal)) {
+    toast("That surface is too steep to stand on. Click on a level one, or switch on Lean with surfaces.");
+    return;
+  }
+  const pose = restingOn(item.pose, boundsByObject.value.get(id) ?? null, found.point_m, normal);
   tool.value = "move";
   await edit(objectTarget(id), { pose: rounded(pose) });
 }

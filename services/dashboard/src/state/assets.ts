@@ -1,7 +1,7 @@
 // Uploaded files, and those on their way.
 import { computed, signal } from "@preact/signals";
 import { API, request } from "../api/http";
-import type { AssetAnswer, Material, SceneObject } from "../api/types";
+import type { AssetAnswer, Material, SceneObject, ShelfItem } from "../api/types";
 import { uploadAsset } from "../api/upload";
 import { boundsOfObject, type Bounds } from "../math/bounds";
 import { objects } from "./scene";
@@ -15,6 +15,8 @@ export interface Upload {
 }
 
 export const assets = signal<readonly AssetAnswer[]>([]);
+/** Simple objects that the service makes. */
+export const shelf = signal<readonly ShelfItem[]>([]);
 export const uploads = signal<readonly Upload[]>([]);
 let count = 0;
 
@@ -32,17 +34,37 @@ export async function readAssets(): Promise<void> {
   if (found) assets.value = found;
 }
 
+export async function readShelf(): Promise<void> {
+  const found = await attempt(() => request<readonly ShelfItem[]>("GET", `${API}/shelf`));
+  if (found) shelf.value = found;
+}
+
 /** Send a file; a refusal is told. */
-export async function upload(file: File): Promise<AssetAnswer | undefined> {
+export function upload(file: File): Promise<AssetAnswer | undefined> {
+  return receive(file.name, (progress) => uploadAsset(file, progress));
+}
+
+/** Have the service make one of its simple objects; a refusal is told. */
+export function takeFromShelf({ name, file_name }: ShelfItem): Promise<AssetAnswer | undefined> {
+  return receive(file_name, (progress) => {
+    progress(1);
+    return request<AssetAnswer>("POST", `${API}/shelf/${name}`);
+  });
+}
+
+async function receive(
+  name: string,
+  send: (progress: (share: number) => void) => Promise<AssetAnswer>,
+): Promise<AssetAnswer | undefined> {
   const id = ++count;
-  uploads.value = [...uploads.value, { id, name: file.name, share: 0 }];
+  uploads.value = [...uploads.value, { id, name, share: 0 }];
   const progress = (share: number): void => {
     uploads.value = uploads.value.map((each) => (each.id === id ? { ...each, share } : each));
   };
-  const asset = await attempt(() => uploadAsset(file, progress));
+  const asset = await attempt(() => send(progress));
   uploads.value = uploads.value.filter((each) => each.id !== id);
   if (asset) {
-    announce(`${file.name} uploaded.`);
+    announce(`${name} is among the assets.`);
     await readAssets();
   }
   return asset;

@@ -11,6 +11,8 @@ const RETRY_MS = 3000;
 
 export const needsToken = signal(false);
 export const uploadLimitBytes = signal(Infinity);
+/** Whether a still stands for the live picture until it comes. */
+export const hasPoster = signal(false);
 
 /** Ask the service what it needs; the sign-in page comes up where that is a token. */
 export async function begin(): Promise<void> {
@@ -18,6 +20,7 @@ export async function begin(): Promise<void> {
     const settings = await request<Settings>("GET", `${API}/settings`);
     needsToken.value = settings.needs_token;
     uploadLimitBytes.value = settings.upload_limit_bytes;
+    hasPoster.value = settings.has_poster;
     await readSchemas();
     phase.value = "ready";
     startEvents();

@@ -4,7 +4,7 @@ import { API } from "../api/http";
 import { role, version } from "../api/session";
 import type { PictureState, ProcessAnswer, Recording, Replay, View } from "../api/types";
 import { ReconnectingSocket } from "../live/socket";
-import { readAssets } from "./assets";
+import { readAssets, readShelf } from "./assets";
 import { readRevisions } from "./history";
 import { readState, takeReport } from "./processes";
 import { chosenView, readScene, readScenes, readView, scene, takePicture } from "./scene";
@@ -38,6 +38,7 @@ export async function readAll(): Promise<void> {
     readScenes(),
     readView(),
     readAssets(),
+    readShelf(),
     readState(),
     readRecordings(),
     readReplay(),

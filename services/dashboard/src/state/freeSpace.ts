@@ -14,14 +14,15 @@ export interface Footprint {
 
 export interface Wanted {
   readonly view: View;
-  readonly pixel: Pixel;
+  /** The point that the place is to be near to. */
+  readonly start: Vector;
   /** The pose to be put somewhere, and the box of its file. */
   readonly pose: Pose;
   readonly bounds: Bounds | null;
   readonly taken: readonly Footprint[];
 }
 
-const GAP_M = 0.02;
+export const GAP_M = 0.02;
 const SMALLEST_RADIUS_M = 0.03;
 const RINGS = 6;
 // Eighths of a turn, in an order whose beginning looks in all directions already.
@@ -59,8 +60,9 @@ export function isFree(place: Vector, radius: number, taken: readonly Footprint[
   );
 }
 
-/** Places on a level plane, the nearest to a point first, that are in the picture and clear of other objects. */
-export function places(wanted: Wanted, start: Vector, radius: number): Vector[] {
+/** Places on a level plane, the nearest to the wanted first, that are in the picture and clear of other objects. */
+export function places(wanted: Wanted, radius: number): Vector[] {
+  const { start } = wanted;
   const step = Math.max(radius, SMALLEST_RADIUS_M);
   const all: Vector[] = [start];
   for (let ring = 1; ring <= RINGS; ring++) {
@@ -80,13 +82,11 @@ function isWellInPicture(view: View, place: Vector): boolean {
   return x > MARGIN && x < 1 - MARGIN && y > MARGIN && y < 1 - MARGIN;
 }
 
-/** The free place on a real, level surface that is nearest to a pixel; null where none was found. */
+/** The free place on a real, level surface that is nearest to a point; null where none was found. */
 export async function freePlace(wanted: Wanted, look: Look): Promise<Vector | null> {
   const { radius } = footprintOf(restOn(wanted.pose, wanted.bounds, [0, 0, 0], UP), wanted.bounds);
-  const start = await startOf(wanted, look);
-  if (!start) return null;
   let second: Vector | null = null;
-  for (const place of places(wanted, start, radius).slice(0, MOST_PLACES)) {
+  for (const place of places(wanted, radius).slice(0, MOST_PLACES)) {
     const seen = await lookAround(wanted.view, place, radius, look);
     if (!seen || !isFree(seen.point, radius, wanted.taken)) continue;
     if (seen.isClear) return seen.point;
@@ -96,7 +96,7 @@ export async function freePlace(wanted: Wanted, look: Look): Promise<Vector | nu
 }
 
 /** A point at the height of the surface at a pixel, else on the board's plane. */
-async function startOf({ view, pixel }: Wanted, look: Look): Promise<Vector | null> {
+export async function startAt(view: View, pixel: Pixel, look: Look): Promise<Vector | null> {
   const found = standable(await look(pixel));
   return found ?? meetPlane(view, pixel, [0, 0, 0], UP);
 }

@@ -2,14 +2,15 @@
 import type { PickAnswer, Pose, Vector } from "../api/types";
 import { lookAt, NewestPick } from "../live/pick";
 import { view } from "../live/picture";
-import { footOf, isSteep, isTurnedAlike, levelled, restOn, standOn, type Bounds } from "../math/bounds";
+import { footOf, isTurnedAlike, levelled, type Bounds } from "../math/bounds";
 import { eyeOf, meetPlane, project, type Pixel } from "../math/camera";
 import { snap, SNAP_M, stepped } from "../math/snap";
 import { add, dot, length, subtract, UP } from "../math/vector";
 import { boundsByObject } from "./assets";
 import { handle, HandleDrag, type Handle } from "./handle";
 import { track } from "./pending";
-import { leansWithSurfaces, standsOnSurfaces } from "./preferences";
+import { isTooSteep, restingOn } from "./placing";
+import { standsOnSurfaces } from "./preferences";
 import { footing, type Footing } from "./tools";
 
 export interface Slide {
@@ -139,7 +140,7 @@ export class SurfaceSlide implements Slide {
   private take({ point_m, normal }: PickAnswer): void {
     if (this.isOver || !point_m) return;
     const seen: Footing = { point: point_m, normal: levelled(normal ?? UP) };
-    if (!leansWithSurfaces.value && isSteep(seen.normal)) return; // nothing stands on walls and edges
+    if (isTooSteep(seen.normal)) return;
     const away = Math.abs(dot(subtract(seen.point, this.plane.point), this.plane.normal));
     if (away < SAME_M && isTurnedAlike(seen.normal, this.plane.normal)) return;
     this.plane = seen;
@@ -150,16 +151,10 @@ export class SurfaceSlide implements Slide {
     const point = this.foot && view.value && meetPlane(view.value, this.foot, this.plane.point, this.plane.normal);
     if (!point || !view.value || length(subtract(point, eyeOf(view.value))) > FARTHEST_M) return;
     const { normal } = this.plane;
-    const pose = this.restingOn(point);
+    const pose = restingOn(this.held.pose, this.bounds, point, normal);
     const shown = this.snaps ? stepped(pose, normal) : pose;
     footing.value = { point: add(point, subtract(shown.translation_m, pose.translation_m)), normal };
     this.drag.move(shown);
-  }
-
-  private restingOn(point: Vector): Pose {
-    const { pose } = this.held;
-    if (leansWithSurfaces.value) return standOn(pose, this.bounds, point, this.plane.normal);
-    return restOn(pose, this.bounds, point, UP); // along a measured normal it would float by its error
   }
 }
 

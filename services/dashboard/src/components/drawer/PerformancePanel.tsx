@@ -1,4 +1,5 @@
 import type uPlot from "uplot";
+import { delay, DELAY_TIP, delayText, shown } from "../../live/delay";
 import { frame, rate } from "../../live/picture";
 import { leadingPasses, OTHERS, samples, stacked, timeOf, type Sample } from "../../live/telemetry";
 import { milliseconds, rateText } from "../../math/units";
@@ -34,14 +35,10 @@ export function PerformancePanel() {
       </figure>
       <PassLegend sample={last} names={names} />
       <figure class="plot-box">
-        <figcaption>
-          Capture to page, ms <b>{last.age === null ? "–" : milliseconds(last.age)}</b>
+        <figcaption title={DELAY_TIP}>
+          Delay <b>{delayText(delay.value)}</b>
         </figcaption>
-        <Plot
-          label="Delay, milliseconds"
-          series={line("delay", "#f0a03c")}
-          data={[times, all.map((each) => each.age)]}
-        />
+        <Plot label="Delay, milliseconds" series={line("delay", "#f0a03c")} data={delayData(last.at)} />
       </figure>
       <figure class="plot-box">
         <figcaption>
@@ -51,6 +48,11 @@ export function PerformancePanel() {
       </figure>
     </div>
   );
+}
+
+/** Times before `now`, and the delay of what was shown then. */
+function delayData(now: number): uPlot.AlignedData {
+  return [shown.value.map((each) => each.at - now), shown.value.map((each) => each.delay)];
 }
 
 /** The highest area is drawn first, so that the lower ones lie over it. */

@@ -30,7 +30,7 @@ export function Guide() {
           <button type="button" onClick={() => (inspectorTab.value = "lights")}>
             Change the light
           </button>
-          <span>Colour, strength and position of each lamp.</span>
+          <span>Colour, strength and position of each lamp. Or drag a shadow: its lamp follows.</span>
         </li>
         <li>
           <button type="button" onClick={() => openDrawer("compare")}>

@@ -62,7 +62,11 @@ function LightEditor({ index, light, disabled }: LightEditorProps) {
           disabled={disabled}
         />
       </Field>
-      {isOutOfSight(light) && <p class="quiet small">This lamp is outside the picture. Use its fields to move it.</p>}
+      {isOutOfSight(light) && (
+        <p class="quiet small">
+          This lamp is outside the picture. Use its fields to move it, or drag a shadow that it throws.
+        </p>
+      )}
       <LightFields light={light} onChange={gesture.push} onEnd={gesture.end} disabled={disabled} />
       <ColorField
         label="Colour"

@@ -58,7 +58,7 @@ export function PoseSection({ item, disabled }: PoseSectionProps) {
       />
       <Field
         label="Lean with surfaces"
-        help="While you drag it over the picture, the object tilts with slopes and walls. Otherwise it keeps its rotation, and stands only on surfaces that are not too steep."
+        help="While you drag it over the picture or place it on a surface, the object tilts with slopes and walls. Otherwise it keeps its rotation, and stands only on surfaces that are not too steep."
         inline
       >
         <Switch

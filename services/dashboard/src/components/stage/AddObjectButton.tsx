@@ -1,18 +1,26 @@
 import { useRef } from "preact/hooks";
 import { role } from "../../api/session";
+import type { ShelfItem } from "../../api/types";
 import { addObject } from "../../state/actions";
-import { assetName, assets, upload } from "../../state/assets";
+import { assetName, assets, shelf, takeFromShelf, upload } from "../../state/assets";
 import { Icon } from "../ui/Icon";
 import { Menu, type MenuEntry } from "../ui/Menu";
 
 export const MESH_TYPES = ".glb,.gltf,.zip,.obj,.ply,.stl";
 
-/** Adds an object where the picture has room: of an asset that is there, or of a file. */
+/** Adds an object where the picture has room: of a file, a simple one of the service's, or an asset that is there. */
 export function AddObjectButton() {
   const file = useRef<HTMLInputElement>(null);
-  const meshes = assets.value.filter((each) => each.kind === "mesh");
+  const ofShelf = new Set(shelf.value.map((item) => item.file_name));
+  const meshes = assets.value.filter((each) => each.kind === "mesh" && !ofShelf.has(assetName(each)));
   const entries: MenuEntry[] = [
     { label: "From a file…", icon: "upload", onClick: () => file.current?.click() },
+    ...shelf.value.map((item, index): MenuEntry => ({
+      label: item.label,
+      icon: "box",
+      begins: index === 0,
+      onClick: () => void addFromShelf(item),
+    })),
     ...meshes.map((asset, index): MenuEntry => ({
       label: assetName(asset),
       icon: "box",
@@ -36,4 +44,9 @@ export function AddObjectButton() {
       <input ref={file} type="file" hidden accept={MESH_TYPES} onChange={(event) => void onFile(event.currentTarget)} />
     </>
   );
+}
+
+async function addFromShelf(item: ShelfItem): Promise<void> {
+  const asset = await takeFromShelf(item);
+  if (asset) await addObject(asset, null, item.file_name);
 }

@@ -14,6 +14,7 @@ import { usePictureBox } from "./fit";
 import { Outlines } from "./Outlines";
 import { PicturePointer } from "./pointer";
 import { PictureNotice } from "./PictureNotice";
+import { Poster } from "./Poster";
 import { stepSelection } from "./stepSelection";
 import { useGizmo } from "./useGizmo";
 
@@ -61,6 +62,7 @@ export function Picture() {
         onDrop={onDrop}
       >
         <canvas class="layer" ref={picture} role="img" aria-label="Live picture" />
+        <Poster />
         <Outlines box={box} />
         <canvas class="layer" ref={handles} aria-hidden="true" />
         <div

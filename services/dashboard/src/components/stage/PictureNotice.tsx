@@ -1,5 +1,6 @@
 import { lateMs, retryPicture } from "../../live/picture";
 import { changeMs, isSending, liveState } from "../../state/liveState";
+import { hasPoster } from "../../state/begin";
 import { hasFisheye, renderServer } from "../../state/processes";
 import { isSceneRead, lights, scene } from "../../state/scene";
 import { isTakingSnapshot } from "../../state/takes";
@@ -12,8 +13,11 @@ import { useStateWatch } from "../ui/useStateWatch";
 export function PictureNotice() {
   switch (liveState.value) {
     case "connecting":
+      if (hasPoster.value) return <Working text={STILL} />;
       return <Full title="Connecting to the live picture" text="Asking the service for the newest frame." />;
     case "waiting":
+      if (hasPoster.value)
+        return isWorking() ? <Working text={STILL + waitingText()} /> : <Banner text={waitingText()} />;
       return <Full title="No picture yet" text={waitingText()} />;
     case "reconnecting":
       return (
@@ -35,6 +39,7 @@ export function PictureNotice() {
   }
 }
 
+const STILL = "A still picture; the live one follows. ";
 const NOTHING_SENDS =
   "Neither a camera nor a recording is sending frames. Start one with `deltalight up --source CAMERA`, or replay a recording below.";
 const PREPARING =
@@ -43,6 +48,11 @@ const SILENT = "The render server does not answer. Your changes are kept, and sh
 const STOPPED = "No new frames are coming from the camera. See Nodes below for what has stopped.";
 const NO_FISHEYE =
   "This scene is lit by a fish-eye camera, and none is sending. Objects appear once one does; or choose another light under Lights.";
+
+/** Whether a picture will come by itself. */
+function isWorking(): boolean {
+  return renderServer.value === null || isSending();
+}
 
 function waitingText(): string {
   if (renderServer.value === null) return "Asking the service what is running.";
@@ -71,7 +81,7 @@ function SceneNotice() {
 function Working({ text }: { readonly text: string }) {
   return (
     <p class="picture-banner working">
-      <i aria-hidden="true" /> {text}
+      <i aria-hidden="true" /> <Sentence text={text} />
     </p>
   );
 }

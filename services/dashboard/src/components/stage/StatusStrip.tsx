@@ -1,3 +1,4 @@
+import { delay, DELAY_TIP, delayText } from "../../live/delay";
 import { frame, rate, view } from "../../live/picture";
 import { droppedFrames, qualityText } from "../../live/message";
 import { lensDeviation } from "../../math/camera";
@@ -22,7 +23,7 @@ export function StatusStrip() {
             value={String(header.scene?.revision ?? "–")}
             tip="Revision of the scene that this frame shows"
           />
-          <Figure name="Delay" value={milliseconds(header.age_ms)} />
+          <Figure name="Delay" value={delayText(delay.value)} tip={DELAY_TIP} />
           <Figure name="Rate" value={rateText(rate.value)} />
           <Figure
             name="Quality"

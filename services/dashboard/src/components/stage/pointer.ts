@@ -1,10 +1,12 @@
-// The pointer on the picture: a click selects, dragging the selected object or lamp slides it.
+// The pointer on the picture: a click selects, dragging slides the selected object or lamp, or a shadow.
 import { signal } from "@preact/signals";
 import { role } from "../../api/session";
 import type { Gizmo } from "../../gizmo/gizmo";
 import { pictureSize, view } from "../../live/picture";
 import type { Pixel } from "../../math/camera";
-import { pick, placeObject } from "../../state/actions";
+import { placeObject } from "../../state/actions";
+import { pick } from "../../state/placing";
+import { ShadowSlide } from "../../state/shadowSlide";
 import { beginSlide, slidesOnSurfaces, type Slide } from "../../state/slide";
 import { selectedLight, selectedObjectId, selectLight, selectObject } from "../../state/selection";
 import { isSnapping, tool } from "../../state/tools";
@@ -19,7 +21,8 @@ export const hovered = signal<string | null>(null);
 interface Press {
   readonly x: number;
   readonly y: number;
-  readonly slides: boolean;
+  /** Begins what moving the pointer slides; null where that is nothing. */
+  readonly begin: ((pixel: Pixel) => Slide | null) | null;
   /** On a handle of the gizmo, where a click means nothing. */
   readonly isOnHandle: boolean;
   slide: Slide | null;
@@ -37,10 +40,10 @@ export class PicturePointer {
     if (event.button !== 0 || !event.isPrimary) return;
     const [x, y] = this.place(event);
     const grip = this.gizmo()?.gripAt(event) ?? null;
-    if (grip === null) this.press = { x, y, slides: this.grabs([x, y]), isOnHandle: false, slide: null };
+    if (grip === null) this.press = { x, y, begin: this.takes([x, y]), isOnHandle: false, slide: null };
     else if (grip === "free" && slidesOnSurfaces()) {
       this.gizmo()?.pause(true); // its own drag would leave the surfaces
-      this.press = { x, y, slides: true, isOnHandle: true, slide: null };
+      this.press = { x, y, begin: beginSlide, isOnHandle: true, slide: null };
     }
   }
 
@@ -53,8 +56,8 @@ export class PicturePointer {
       hovered.value = view.value && !isOnGizmo ? (objectsAt(view.value, this.pixel(at))[0] ?? null) : null;
       return;
     }
-    if (!press.slide && press.slides && !isClick(press, at, event)) {
-      press.slide = beginSlide(this.pixel([press.x, press.y]));
+    if (!press.slide && press.begin && !isClick(press, at, event)) {
+      press.slide = press.begin(this.pixel([press.x, press.y]));
       this.surface.setPointerCapture(event.pointerId);
     }
     press.slide?.move(this.pixel(at), event.shiftKey !== isSnapping.value);
@@ -91,12 +94,14 @@ export class PicturePointer {
     return this.pixel(this.place(event));
   }
 
-  /** Whether a press here holds the selection, so that moving the pointer slides it. */
-  private grabs(at: Pixel): boolean {
-    if (role.value !== "control" || tool.value === "place" || !view.value) return false;
+  /** What a press here holds: the selection, or else the shadow that may be there. */
+  private takes(at: Pixel): Press["begin"] {
+    if (role.value !== "control" || tool.value === "place" || !view.value) return null;
     const lamp = lampAt(this.sheet(), at);
-    if (lamp !== null) return lamp === selectedLight.value;
-    return selectedObjectId.value !== null && objectsAt(view.value, this.pixel(at)).includes(selectedObjectId.value);
+    if (lamp !== null) return lamp === selectedLight.value ? beginSlide : null;
+    const held = selectedObjectId.value;
+    if (held !== null && objectsAt(view.value, this.pixel(at)).includes(held)) return beginSlide;
+    return (pixel) => new ShadowSlide(pixel);
   }
 
   private async click(at: Pixel): Promise<void> {

@@ -1,0 +1,46 @@
+"""Routes of the shelf: simple objects that the service generates."""
+
+from typing import Annotated
+
+from fastapi import APIRouter, Path, Response
+from pydantic import BaseModel, Field
+
+from deltalight.services.api.context import Shared
+from deltalight.services.api.models import AssetAnswer
+from deltalight.services.api.problems import responses
+from deltalight.services.api.routes.assets import KEPT_ANSWERS, announced
+from deltalight.services.storage.shelf import SHELF, shelf_item
+
+router = APIRouter(tags=["assets"], prefix="/shelf")
+ROUTERS = (router,)
+
+
+class ShelfAnswer(BaseModel):
+    """An object of the shelf."""
+
+    name: str = Field(examples=["chrome-ball"])
+    label: str = Field(description="Its name for people.", examples=["Chrome ball"])
+    file_name: str = Field(description="Name of the asset that it becomes.", examples=["Chrome ball.glb"])
+
+
+@router.get("")
+def list_shelf() -> list[ShelfAnswer]:
+    """List the simple objects that every service has: shapes of plain materials."""
+    return [
+        ShelfAnswer(name=each.name, label=each.label, file_name=each.file_name) for each in SHELF.values()
+    ]
+
+
+@router.post("/{item}", status_code=201, responses={**KEPT_ANSWERS, **responses(404)})
+def take_from_shelf(
+    shared: Shared,
+    response: Response,
+    item: Annotated[str, Path(description="Its `name`.", examples=["chrome-ball"])],
+) -> AssetAnswer:
+    """Make an asset of an object of the shelf, to be named by scenes; 200 where it is there already."""
+    found, assets = shelf_item(item), shared.store.assets
+    content = found.glb()
+    with assets.receiving(len(content)) as incoming:
+        incoming.write(content)
+        asset, is_new = assets.keep(incoming, found.file_name)
+    return announced(shared, asset, response, is_new=is_new)
