@@ -4,12 +4,13 @@ import ctypes
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import moderngl
 
 from deltalight.protocol.errors import DeltalightError
 
+SPARE_PROGRAMS = 256  # kept linked while no kernel uses them: renderers are made again when settings change
 SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swiftshader", "swrast")
 
 # What EGL and the GL loader say, and what a user can do about it.
@@ -43,6 +44,36 @@ UNLISTED: Final = {  # limits that moderngl does not list
 }
 
 
+class Program(Protocol):
+    """A linked program and the ids of what uses it."""
+
+    users: set[int]
+
+    def release(self) -> None:
+        """Frees the GL object."""
+
+
+class SharedPrograms:
+    """Linked programs by source: kernels of the same source share one, and the next ones find it again."""
+
+    def __init__(self) -> None:
+        self._programs: dict[tuple[str, ...], Program] = {}  # the longest unused first
+
+    def take(self, user: object, source: tuple[str, ...], link: Callable[[], Program]) -> Program:
+        """Returns the program of that source for `user`; `link` makes it where there is none."""
+        program = self._programs.pop(source, None) or link()
+        self._programs[source] = program
+        program.users.add(id(user))
+        return program
+
+    def give_back(self, user: object, program: Program) -> None:
+        """Takes back what `user` took; frees the oldest programs beyond SPARE_PROGRAMS that nobody uses."""
+        program.users.discard(id(user))
+        spare = [source for source, item in self._programs.items() if not item.users]
+        for source in spare[: max(0, len(spare) - SPARE_PROGRAMS)]:
+            self._programs.pop(source).release()
+
+
 @dataclass(frozen=True)
 class GpuContext:
     """A current OpenGL 4.3 context and its device.
@@ -59,6 +90,8 @@ class GpuContext:
     compile_watchers: list[Callable[[str, Mapping[str, str]], None]] = field(default_factory=list)
     """Told of every program that a kernel asks for: its label and the text of each of its stages."""
 
+    programs: SharedPrograms = field(default_factory=SharedPrograms)
+
     def compiled(self, label: str, sources: Mapping[str, str]) -> None:
         """Tells the compile watchers about a program."""
         for watch in self.compile_watchers:
@@ -66,7 +99,7 @@ class GpuContext:
 
     @cached_property
     def common(self) -> dict[str, object]:
-        """What is made once and used by all, by name: programs, the kernels that clear and count (gpu/kernel.py)."""
+        """What is made once and used by all, by name: the kernels that clear and count (gpu/kernel.py)."""
         return {}
 
     @cached_property

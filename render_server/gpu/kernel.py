@@ -4,6 +4,7 @@ Linking assigns units and binding points, so shaders state none, and every run p
 needs.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -23,7 +24,6 @@ SOFTWARE_WALKERS = 1024
 # cones of one texel takes up to about 5000 (16 cones through 256 voxels and the coarse scene).
 SOFTWARE_DIVISOR = 12
 LIST_WALKERS = 16384
-SPARE_PROGRAMS = 256  # kept linked while no kernel uses them: renderers are made again when settings change
 BLOCK_ALIGNMENT = (
     16  # bytes that std140 blocks are padded to; drivers may leave the padding out of their size
 )
@@ -283,41 +283,17 @@ class _Program:
             "uniform blocks": [slot.name for slot in self._blocks],
         }
 
+    def release(self) -> None:
+        """Frees the GL object."""
+        self.program.release()
+
     def report(self, size: tuple[int, ...], written: Mapping[str, object]) -> None:
         """Tells the watchers that the program ran."""
         for watch in self._gpu.watchers:
             watch(Dispatch(self.label, size, written))
 
 
-class _Programs:
-    """Linked programs by source: kernels of the same source share one, and the next ones find it again."""
-
-    def __init__(self) -> None:
-        self._programs: dict[tuple[str, ...], _Program] = {}  # the longest unused first
-
-    def take(self, kernel: object, source: tuple[str, ...], link: Callable[[], _Program]) -> _Program:
-        """Returns the program of that source for `kernel`; `link` makes it where there is none."""
-        program = self._programs.pop(source, None) or link()
-        self._programs[source] = program
-        program.users.add(id(kernel))
-        return program
-
-    def give_back(self, kernel: object, program: _Program) -> None:
-        """Takes back what `kernel` took; frees the oldest programs beyond SPARE_PROGRAMS that nobody uses."""
-        program.users.discard(id(kernel))
-        spare = [source for source, item in self._programs.items() if not item.users]
-        for source in spare[: max(0, len(spare) - SPARE_PROGRAMS)]:
-            self._programs.pop(source).program.release()
-
-
-def _programs(gpu: GpuContext) -> _Programs:
-    """Returns the context's programs."""
-    programs = gpu.common.setdefault("programs", _Programs())
-    assert isinstance(programs, _Programs)
-    return programs
-
-
-class _Shader:
+class _Shader(ABC):
     """The programs of one shader: with each set of its switches (`#pragma switch NAME`) that bindings turn on.
 
     All but the one without any are compiled when first run: what a scene lacks costs nothing.
@@ -329,8 +305,14 @@ class _Shader:
         self._switched: dict[tuple[str, ...], _Program] = {}
         self.label, self.local_size = self._plain.label, self._plain.local_size
 
+    @abstractmethod
     def _compiled(self, defines: Mapping[str, float | str]) -> _Program:
-        raise NotImplementedError
+        """Returns the linked program of these defines."""
+
+    def _shared(self, *source: str, link: Callable[[], _Program]) -> _Program:
+        program = self._gpu.programs.take(self, source, link)
+        assert isinstance(program, _Program)
+        return program
 
     def _program(self, *sources: Bindings) -> _Program:
         """Returns the program that the bindings choose."""
@@ -348,7 +330,7 @@ class _Shader:
     def release(self) -> None:
         """Leaves the programs to other kernels of the same source."""
         for each in (self._plain, *self._switched.values()):
-            _programs(self._gpu).give_back(self, each)
+            self._gpu.programs.give_back(self, each)
 
 
 class Kernel(_Shader):
@@ -369,7 +351,7 @@ class Kernel(_Shader):
         def link() -> _Program:
             return _Program(self._gpu, label, self._gpu.ctx.compute_shader(source), declarations(source))
 
-        return _programs(self._gpu).take(self, (source,), link)
+        return self._shared(source, link=link)
 
     def run(self, threads: Sequence[int], *shared: Bindings, **own: Binding) -> None:
         """Runs at least `threads` (x[, y[, z]]) invocations; later work sees their writes.
@@ -417,7 +399,7 @@ class RasterKernel(_Shader):
             program = self._gpu.ctx.program(vertex_shader=vertex, fragment_shader=fragment)
             return _Program(self._gpu, label, program, declarations(vertex + "\n" + fragment))
 
-        return _programs(self._gpu).take(self, (vertex, fragment), link)
+        return self._shared(vertex, fragment, link=link)
 
     def draw(
         self,

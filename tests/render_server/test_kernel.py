@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from deltalight.benchmarks.gpu_check.gl_objects import count_gl_objects
+from deltalight.render_server.gpu import context as context_module
 from deltalight.render_server.gpu import kernel as kernel_module
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import BindingError, Dispatch, RasterKernel, watched
@@ -129,7 +130,7 @@ def test_kernels_of_one_source_share_a_program_and_each_runs_with_its_own_values
 def test_programs_that_nobody_uses_are_freed_beyond_some(
     make: MakeKernel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(kernel_module, "SPARE_PROGRAMS", 0)
+    monkeypatch.setattr(context_module, "SPARE_PROGRAMS", 0)
     kept = make("", "values[0] = 1.0;", KEPT=1)
     before = count_gl_objects()["Program"]
     for number in range(3):
