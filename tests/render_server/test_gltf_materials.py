@@ -347,3 +347,10 @@ def test_stripes_that_run_away_stay_apart_at_a_grazing_angle(
     row = picture[HEIGHT // 2, WIDTH // 2 - 40 : WIDTH // 2 + 40, 0]
     assert row.mean() == pytest.approx(0.5, abs=0.08)
     assert row.std() > 0.4, "grey would have no deviation, sharp stripes one of 0.5"
+
+
+def test_users_read_what_of_a_file_is_left_out(objects: ObjectsRenderer, draw: Draw) -> None:
+    made = plate()
+    made.glb.document["extensionsUsed"] = ["KHR_lights_punctual"]
+    draw(made, [directional()])
+    assert objects.renderer.notices[-1].endswith("plate.glb is shown without KHR_lights_punctual.")
