@@ -16,10 +16,17 @@ from tests.render_server.tiny_kernel import OUT, MakeKernel
 
 
 @pytest.fixture(scope="session")
-def gpu() -> Iterator[GpuContext]:
+def shared_context() -> Iterator[GpuContext]:
+    """The context that keeps linked programs from module to module."""
     context = create_context()
     yield context
     context.release()
+
+
+@pytest.fixture(scope="module")
+def gpu(shared_context: GpuContext) -> GpuContext:
+    shared_context.ctx.__enter__()  # other modules make contexts of their own, which are current then
+    return shared_context
 
 
 @pytest.fixture(scope="module")

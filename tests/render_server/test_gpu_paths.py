@@ -110,7 +110,7 @@ def audit(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
     def audited(program: _Program, shared: Sequence[Bindings], own: Bindings) -> dict[str, object]:
         written = bind(program, shared, own)
         slots = [*program._samplers, *program._images, *program._storage]
-        bound = [(slot.name, program._find(slot.name, (own, *shared))) for slot in slots]
+        bound = [(slot.name, program.find(slot.name, (own, *shared))) for slot in slots]
         for name, item in written.items():
             others = [other for other, value in bound if value is item and other != name]
             faults.extend(f"{program.label}: {name} and {other}" for other in others)
