@@ -191,7 +191,12 @@ class PictureBuffers:
         if len(table):
             self._surfaces.write(np.ascontiguousarray(table.packed, np.float32).tobytes())
         specular = bool((table.packed[:, 3, 3] < SHEET).any())
-        return {"Surfaces": self._surfaces, "surface_count": len(table), "specular_surfaces": specular}
+        return {
+            "Surfaces": self._surfaces,
+            "surface_count": len(table),
+            "specular_surfaces": specular,
+            "DECLARED_SURFACES": len(table) > 0,
+        }
 
     def set_camera(self, view: CameraView) -> CameraView:
         """Writes the camera blocks: for rasters through the lens, and for reading the objects' geometry."""

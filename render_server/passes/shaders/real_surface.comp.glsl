@@ -13,6 +13,7 @@ vec3 camera_at(ivec2 pixel, float z) { return vec3(texelFetch(picture_rays, pixe
 
 vec3 world_at(ivec2 pixel, float z) { return (world_from_camera * vec4(camera_at(pixel, z), 1.0)).xyz; }
 
+#ifdef DECLARED_SURFACES
 bool is_plane(int entry) { return entry >= 0 && surfaces[entry].region[0].w == PLANE; }
 
 // Whether most of the pixel and its neighbours are off the plane: single ones are outliers of the noise.
@@ -35,6 +36,9 @@ int entry_of(ivec2 pixel, vec3 world, float z, vec3 normal) {
     while (is_plane(entry) && leaves_plane(entry, pixel)) entry = measured_entry(entry + 1, world, z, normal, -2.0);
     return entry;
 }
+#else
+int entry_of(ivec2 pixel, vec3 world, float z, vec3 normal) { return -1; }
+#endif
 
 void main() {
     ivec2 pixel = ivec2(gl_GlobalInvocationID.xy);

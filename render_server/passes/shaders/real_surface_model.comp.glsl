@@ -10,12 +10,16 @@ layout(rgba16f) writeonly uniform image2D normal_out;
 uniform bool keeps_depth;     // the frame's own depth is present, and stays where it differs
 uniform vec2 tolerance;       // up to which both agree: m, and m at 1 m
 
+#ifdef DECLARED_SURFACES
 int entry_of(vec4 position, vec4 seen) {
     int entry = measured_entry(0, position.xyz, position.w, seen.xyz, seen.w);
     while (entry >= 0 && surfaces[entry].region[0].w == PLANE && is_off_plane(entry, position.xyz, position.w))
         entry = measured_entry(entry + 1, position.xyz, position.w, seen.xyz, seen.w);
     return entry;
 }
+#else
+int entry_of(vec4 position, vec4 seen) { return -1; }
+#endif
 
 void main() {
     ivec2 pixel = ivec2(gl_GlobalInvocationID.xy);

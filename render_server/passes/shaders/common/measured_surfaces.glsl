@@ -1,5 +1,6 @@
 // Declared surfaces at points that were measured: noise moves a point along its ray, and not all that lies within a
 // plane's tolerance belongs to the plane (docs/method.md 4.8).
+#pragma switch DECLARED_SURFACES
 #include "common/surfaces.glsl"
 
 uniform float noise_sigma;      // m at 1 m
