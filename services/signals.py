@@ -4,7 +4,7 @@ import os
 import signal
 import sys
 import threading
-from types import FrameType
+from types import FrameType, TracebackType
 
 AGAIN_AFTER_S = 0.02
 
@@ -21,11 +21,18 @@ def raise_on_sigterm() -> None:
     """
     signal.signal(signal.SIGTERM, _raise_terminated)
     sys.unraisablehook = _deliver_again
+    sys.excepthook = _print_faults
 
 
 def _raise_terminated(_number: int, _frame: FrameType | None) -> None:
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     raise Terminated
+
+
+def _print_faults(kind: type[BaseException], fault: BaseException, trace: TracebackType | None) -> None:
+    """Prints what nobody caught, but no signal: compiled code prints one here before `_deliver_again` resends it."""
+    if not issubclass(kind, KeyboardInterrupt | Terminated):
+        sys.__excepthook__(kind, fault, trace)
 
 
 def _deliver_again(lost: "sys.UnraisableHookArgs") -> None:

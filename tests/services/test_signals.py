@@ -51,3 +51,32 @@ def test_further_signals_do_not_break_off_what_the_first_one_ends() -> None:
     program = [sys.executable, "-c", FINISHING]
     ended = subprocess.run(program, cwd=ROOT, capture_output=True, text=True, timeout=30, check=False)
     assert (ended.stdout.strip(), ended.stderr, ended.returncode) == ("finished", "", 0)
+
+
+FREEING = """
+import os, signal, threading, time
+import zmq
+from deltalight.services.signals import raise_on_sigterm
+
+raise_on_sigterm()
+frames = [zmq.Frame(b"") for _ in range(300_000)]
+freeing = threading.Event()
+
+def interrupt():
+    freeing.wait()
+    os.kill(os.getpid(), signal.SIGINT)
+
+threading.Thread(target=interrupt).start()
+try:
+    freeing.set()
+    frames.clear()  # each frame looks for signals as it is freed, in compiled code that prints what it cannot raise
+    time.sleep(60)
+except KeyboardInterrupt:
+    print("ended")
+"""
+
+
+def test_a_signal_that_compiled_code_catches_leaves_no_traceback() -> None:
+    program = [sys.executable, "-c", FREEING]
+    ended = subprocess.run(program, cwd=ROOT, capture_output=True, text=True, timeout=30, check=False)
+    assert (ended.stdout.strip(), ended.stderr, ended.returncode) == ("ended", "", 0)
