@@ -100,7 +100,7 @@ class CameraImage:
 
 def rgba_bytes(color: UInt8[np.ndarray, "h w 3"]) -> bytes:
     """Returns a picture as the bytes of an opaque RGBA texture."""
-    return cv2.cvtColor(color, cv2.COLOR_RGB2RGBA).tobytes()
+    return np.asarray(cv2.cvtColor(color, cv2.COLOR_RGB2RGBA)).tobytes()
 
 
 def inverse_response(decode: Float32[np.ndarray, "256 3"]) -> Float32[np.ndarray, "n 4"]:

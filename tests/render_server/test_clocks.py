@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import pytest
 
 from deltalight.protocol.frames import ViewFrame
@@ -121,6 +122,17 @@ def test_frame_at_rest_is_composed_and_nothing_else(walk: Walk) -> None:
     else:
         assert step == Step({"composite"}, {"recompose"})
         assert changed == ["camera image"]
+
+
+def test_picture_at_rest_is_the_same_to_the_bit_as_one_composed_in_full(walk: Walk) -> None:
+    walk.step()
+    color = checkered()
+    color[::2, ::3] += 1  # less than motion
+    again = frame(color, pose=look_at(EYE, TARGET), timestamp_ns=(walk.count + 1) * 10**7)
+    kept = walk.renderer.render(again)
+    whole = walk.renderer.render(again, with_linear=True)
+    assert np.array_equal(kept.color, whole.color)
+    assert not np.array_equal(kept.color, color)
 
 
 def test_object_that_moves_between_others_leaves_the_real_scene_alone(walk: Walk) -> None:
