@@ -221,6 +221,10 @@ class FrameGraph:
         )
         return g.stage("composite", composition.compose_again, s.image, relit)
 
+    def fits(self, view: CameraView) -> bool:
+        """Whether its pictures have the size of this view's."""
+        return self.buffers.key == (view.size, view.raster[1])
+
     def upload(self, frame: ViewFrame) -> None:
         """Begins a frame by uploading its picture, which is composed anew whatever it shows."""
         self.graph.begin_frame()
