@@ -85,14 +85,16 @@ def received(multipart: list[bytes], received_ns: int) -> ReceivedMultipart:
     return ReceivedMultipart([memoryview(piece) for piece in multipart], received_ns)
 
 
-def color(frame_id: int, capture_ns: int, received_ns: int = 0) -> ReceivedMultipart:
+def color(
+    frame_id: int, capture_ns: int, received_ns: int = 0, described: dict[str, object] | None = None
+) -> ReceivedMultipart:
     message = ColorMessage(
         node="cam",
         frame_id=frame_id,
         capture_ns=capture_ns,
         encoding="raw",
         shape=(HEIGHT, WIDTH, 3),
-        camera=camera().to_dict(),
+        camera=described or camera().to_dict(),
     )
     return received(encode(message, [encode_color(picture(frame_id % 256), "raw")]), received_ns)
 
