@@ -20,7 +20,13 @@ from deltalight.protocol.documents import StrictModel, nearest, validate
 from deltalight.protocol.envelope import decode
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import ViewFrame
-from deltalight.protocol.messages import CompositeMessage, ControlRequest, StatsMessage, as_counts, as_sentence
+from deltalight.protocol.messages import (
+    CompositeMessage,
+    ControlRequest,
+    StatsMessage,
+    as_counts,
+    as_sentence,
+)
 from deltalight.protocol.scene import SceneDocument, parse_scene
 from deltalight.protocol.subscriber import ReceivedMultipart
 from deltalight.render_server.frame_budget import Level

@@ -178,6 +178,11 @@ def responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
     return {status: {"model": Problem, "description": HTTPStatus(status).phrase} for status in statuses}
 
 
+def unavailable(when: str) -> dict[int | str, dict[str, Any]]:
+    """Return the 503 of a route for its OpenAPI description; `when` is a sentence."""
+    return {503: {"model": Problem, "description": when}}
+
+
 def _slug(status: int) -> str:
     return HTTPStatus(status).phrase.lower().replace(" ", "-")
 

@@ -217,7 +217,11 @@ def test_what_nodes_send_is_cut_to_the_limits_of_statistics_and_composites(
 ) -> None:
     topics = {f"color.{number:03}{'x' * 110}": 2 for number in range(200)}
     session = RenderSession(
-        renderer, SceneDocument(), mailbox_drops=lambda: topics, clock_ns=lambda: START, renderer_name="abacus"
+        renderer,
+        SceneDocument(),
+        mailbox_drops=lambda: topics,
+        clock_ns=lambda: START,
+        renderer_name="abacus",
     )
     wrong = color(1, START, START, {**camera().to_dict(), "distortion_model": "w" * 5000})
     for message in (wrong, depth(1, START), pose(1, START)):
