@@ -13,7 +13,7 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.yaml_text import parse_yaml
 
 Model = TypeVar("Model", bound=BaseModel)
-LONGEST_WORD = 200  # characters that are compared: longer than any known word
+LONGEST_WORD = 200  # characters of a word that are compared and shown: longer than any known one
 
 
 def nearest(word: str, known: Iterable[str]) -> str | None:
@@ -95,9 +95,16 @@ def validate(model: type[Model], data: Mapping[str, Any], name: str, *, strict: 
     try:
         return model.model_validate(_plain(data, {}), strict=True) if strict else model.model_validate(data)
     except ValidationError as error:
-        raise DeltalightError(f"{name}: {_sentence(error.errors(include_url=False)[0], data)}") from error
+        raise DeltalightError(f"{name}: {_first_fault(error, data)}") from error
     except RecursionError as error:
         raise DeltalightError(f"{name} is nested too deeply; send the keys that it has.") from error
+
+
+def _first_fault(error: ValidationError, document: Mapping[str, Any]) -> str:
+    try:
+        return _sentence(error.errors(include_url=False)[0], document)
+    except UnicodeEncodeError:  # pydantic cannot show it
+        return "it holds text with a lone surrogate; correct it."
 
 
 def _plain(value: Any, known: dict[int, Any]) -> Any:  # noqa: ANN401 - JSON
@@ -122,7 +129,8 @@ def _sentence(fault: ErrorDetails, document: Mapping[str, Any]) -> str:
     context = fault.get("ctx", {})
     match fault["type"]:
         case "unknown_key":
-            where = f"{place}.{context['key']}" if place else context["key"]
+            key = context["key"][:LONGEST_WORD]
+            where = f"{place}.{key}" if place else key
             return f"unknown key `{where}`; {context['advice']}."
         case "missing":
             return f"the key `{place}` is missing; add it."

@@ -36,6 +36,7 @@ from deltalight.render_server.server.snapshot import SnapshotOrder, take_snapsho
 RATE_WINDOW_S = 5.0
 WAITING_AFTER_S = 2.0
 MAXIMUM_FAULTS_IN_A_ROW = 30
+LOG_INTERVAL_NS = 10**9
 
 log = structlog.get_logger()
 
@@ -200,6 +201,7 @@ class RenderSession:
         self._last_fault = ""
         self._faults_in_a_row = 0
         self._logged_notices = 0
+        self._logged_ns = -LOG_INTERVAL_NS
 
     def receive(self, multipart: ReceivedMultipart) -> None:
         """Takes a message of the sensor node; a malformed one is counted and logged."""
@@ -412,7 +414,10 @@ class RenderSession:
         self.counts[kind] += 1
         named = str(fault) if isinstance(fault, DeltalightError) else f"{type(fault).__name__}: {fault}"
         sentence = as_sentence(named)
-        if sentence != self._last_fault:  # a fault of every frame is one line, not thirty a second
+        now_ns = self._clock_ns()
+        # A fault of every frame is one line, not thirty a second, and a node that finds others fills no disk.
+        if sentence != self._last_fault and now_ns - self._logged_ns >= LOG_INTERVAL_NS:
+            self._logged_ns = now_ns
             log.warning(kind, fault=sentence)
             log.debug("traceback", exc_info=fault)
         self._last_fault = sentence

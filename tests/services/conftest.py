@@ -99,7 +99,9 @@ def color(
     return received(encode(message, [encode_color(picture(frame_id % 256), "raw")]), received_ns)
 
 
-def depth(frame_id: int, capture_ns: int, metres: float = 1.0) -> ReceivedMultipart:
+def depth(
+    frame_id: int, capture_ns: int, metres: float = 1.0, described: dict[str, object] | None = None
+) -> ReceivedMultipart:
     message = DepthMessage(
         node="cam",
         stream="clean_depth",
@@ -108,7 +110,7 @@ def depth(frame_id: int, capture_ns: int, metres: float = 1.0) -> ReceivedMultip
         encoding="raw",
         shape=(HEIGHT, WIDTH),
         depth_scale_m=0.001,
-        camera=camera().to_dict(),
+        camera=described or camera().to_dict(),
     )
     image = np.full((HEIGHT, WIDTH), metres, np.float32)
     return received(encode(message, [encode_depth(image, image > 0, "raw", 0.001)]), 0)

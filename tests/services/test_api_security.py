@@ -1,10 +1,12 @@
 """Who may do what: loopback, tokens and roles, other sites' pages, rates, sizes."""
 
+import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
 
 import httpx
 import pytest
+from websockets.sync.client import connect
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.services.api.auth import WRONG_TOKENS_AT_ONCE
@@ -67,6 +69,28 @@ def test_elsewhere_every_request_needs_a_token(guarded: RunningApi) -> None:
     assert client.get(f"/scenes?token={token}").status_code == 401
     guarded.store.tokens.revoke("me")
     assert "not known" in sentence(client.get("/scenes", headers=bearer(token)), 401)
+
+
+def test_a_token_that_an_earlier_version_stored_is_told_to_be_made_again(guarded: RunningApi) -> None:
+    token = guarded.store.tokens.create("old", "control")
+    with sqlite3.connect(guarded.store.folder / "store.sqlite3") as database:
+        database.execute("UPDATE tokens SET hash = ?", (b"\0" * 64,))  # the length of a scrypt hash
+    database.close()
+    answer = guarded.client.get("/scenes", headers=bearer(token))
+    assert "earlier version; revoke it" in sentence(answer, 401)
+
+
+def test_no_log_line_holds_a_token_or_ticket(guarded: RunningApi, capfd: pytest.CaptureFixture[str]) -> None:
+    token = guarded.store.tokens.create("me", "control")
+    ticket = guarded.client.post("/tickets", headers=bearer(token)).json()["ticket"]
+    address = f"127.0.0.1:{guarded.client.base_url.port}/api/v1"
+    with connect(f"ws://{address}/events?ticket={ticket}"):
+        assert guarded.client.get("/scenes", headers=bearer(token)).status_code == 200
+        assert guarded.client.get(f"/scenes?ticket={ticket}").status_code == 401
+        assert guarded.client.get("/scenes", headers=bearer(f"{token}x")).status_code == 401
+    for text in capfd.readouterr():
+        assert token not in text
+        assert ticket not in text
 
 
 def test_role_view_may_look_only(guarded: RunningApi) -> None:

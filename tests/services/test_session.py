@@ -13,6 +13,7 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import ViewFrame
 from deltalight.protocol.messages import MAX_LABELS, MAX_SENTENCE, ControlRequest
 from deltalight.protocol.scene import SceneDocument
+from deltalight.protocol.subscriber import ReceivedMultipart
 from deltalight.render_server.frame_budget import Level
 from deltalight.render_server.server import frames
 from deltalight.render_server.server.frames import FrameAssembler
@@ -236,6 +237,19 @@ def test_what_nodes_send_is_cut_to_the_limits_of_statistics_and_composites(
     rendered = session.step()
     assert rendered is not None
     assert len(rendered.message.drops) == MAX_LABELS
+
+
+@pytest.mark.parametrize(("stream", "other"), [(color, depth), (depth, color)])
+def test_a_camera_of_another_size_than_its_picture_is_refused(
+    session: RenderSession,
+    stream: Callable[..., ReceivedMultipart],
+    other: Callable[..., ReceivedMultipart],
+) -> None:
+    vast = {**camera().to_dict(), "width": 16384, "height": 16384}
+    for message in (stream(1, START, described=vast), other(1, START), pose(1, START)):
+        session.receive(message)
+    assert session.step() is None
+    assert "16384x16384" in session.stats().detail
 
 
 def test_data_of_a_node_never_ends_the_renderer(
