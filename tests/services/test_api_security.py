@@ -1,5 +1,6 @@
 """Who may do what: loopback, tokens and roles, other sites' pages, rates, sizes."""
 
+import socket
 import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,6 +10,7 @@ import pytest
 from websockets.sync.client import connect
 
 from deltalight.protocol.errors import DeltalightError
+from deltalight.services.api import connections
 from deltalight.services.api.auth import WRONG_TOKENS_AT_ONCE
 from deltalight.services.api.credentials import SecretToken
 from deltalight.services.api.limits import REMEMBERED_CLIENTS, RateLimit
@@ -136,6 +138,30 @@ def test_no_answer_carries_cross_origin_rights_or_cookies(open_api: RunningApi) 
     assert answer.status_code == 405
     for response in (answer, open_api.client.get("/scenes")):
         assert not {"access-control-allow-origin", "set-cookie", "server"} & set(response.headers)
+
+
+def ended(connection: socket.socket) -> bool:
+    """Wait until the service closes a connection."""
+    connection.settimeout(30)
+    return connection.recv(1) == b""
+
+
+def test_connections_that_ask_nothing_take_nobodys_place(
+    guarded: RunningApi, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    address = str(guarded.client.base_url.host), guarded.client.base_url.port
+    assert guarded.client.get("/health").status_code == 200
+    monkeypatch.setattr(connections, "CONNECTIONS_PER_CLIENT", 8)
+    idle = [socket.create_connection(address) for _ in range(12)]
+    assert ended(idle[-1])
+    assert guarded.client.get("/health").status_code == 200
+    for each in idle:
+        each.close()
+    monkeypatch.setattr(connections, "HEAD_TIMEOUT_S", 0.2)
+    with socket.create_connection(address) as silent, socket.create_connection(address) as dripping:
+        dripping.sendall(b"GET /api/v1/health HTT")
+        assert ended(silent)
+        assert ended(dripping)
 
 
 def test_too_many_requests_are_told_when_to_come_again(tmp_path_factory: pytest.TempPathFactory) -> None:
