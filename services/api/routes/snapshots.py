@@ -60,6 +60,7 @@ class NewSnapshot(StrictModel):
         default=tuple(WantedPicture(name=view, view=view) for view in VIEWS),
         min_length=1,
         max_length=MAX_PICTURES,
+        fail_fast=True,
         description="All of one and the same frame.",
     )
     exr: StrictBool = Field(default=False, description=f"Add {EXR}: the composite's linear radiance.")
