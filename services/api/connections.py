@@ -36,7 +36,7 @@ class LimitedProtocol(H11Protocol):
         self._await_request()
 
     def _count_of(self, host: str) -> int:
-        clients: list[Any] = [connection.client for connection in self.connections]
+        clients: list[Any] = [getattr(connection, "client", None) for connection in self.connections]
         return sum(client is not None and client[0] == host for client in clients)
 
     def _await_request(self) -> None:
