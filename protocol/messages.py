@@ -104,7 +104,8 @@ def _rigid(rows: "Matrix4") -> "Matrix4":
     return rows
 
 
-Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")]
+NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$"
+Name = Annotated[str, StringConstraints(pattern=NAME_PATTERN)]
 Label = Annotated[str, StringConstraints(min_length=1, max_length=MAX_LABEL)]
 Sentence = Annotated[str, StringConstraints(max_length=MAX_SENTENCE)]
 Nanoseconds = Annotated[int, Field(ge=0, le=2**63 - 1)]
