@@ -23,6 +23,10 @@ MAX_LIGHTS = 64
 MAX_EXPOSURES = 24
 MAX_LAMPS = 64
 MAX_PLAIN_DEPTH = 16
+MAX_LABEL = 96
+MAX_LABELS = 128
+MAX_SENTENCE = 2000
+OTHERS = "others"  # the sum of what is counted under labels beyond the allowed number
 RESPONSE_SHAPE = (256, 3)
 ROTATION_TOLERANCE = 1e-3
 
@@ -48,9 +52,10 @@ def _plain(value: object, depth: int = 0) -> object:
     if depth > MAX_PLAIN_DEPTH:
         raise ValueError(f"is nested deeper than {MAX_PLAIN_DEPTH} levels")
     if isinstance(value, dict):
-        if not all(isinstance(key, str) for key in value):
-            raise ValueError("has a key that is not text")
-        for item in value.values():
+        for key, item in value.items():
+            if not isinstance(key, str):
+                raise ValueError("has a key that is not text")
+            _encodable(key)
             _plain(item, depth + 1)
     elif isinstance(value, list | tuple):
         for item in value:
@@ -58,9 +63,35 @@ def _plain(value: object, depth: int = 0) -> object:
     elif isinstance(value, float):
         if not math.isfinite(value):
             raise ValueError("holds a number that is not finite")
-    elif value is not None and not isinstance(value, str | int):
+    elif isinstance(value, str):
+        _encodable(value)
+    elif value is not None and not isinstance(value, int):
         raise ValueError(f"holds a {type(value).__name__}, which is not plain data")
     return value
+
+
+def _encodable(text: str) -> None:
+    """Refuse lone surrogates, which JSON can escape and no message can carry."""
+    try:
+        text.encode()
+    except UnicodeEncodeError as error:
+        raise ValueError("holds text with a lone surrogate") from error
+
+
+def as_sentence(text: str) -> str:
+    """Return any text as a `Sentence`: cut to its length, with question marks for lone surrogates."""
+    return text[:MAX_SENTENCE].encode("utf-8", "replace").decode()
+
+
+def as_counts(counts: Mapping[str, int]) -> dict[str, int]:
+    """Return any counts as `Counts`: labels cut to their length, those beyond the first 127 as one sum `others`."""
+    kept: dict[str, int] = {}
+    for label, count in counts.items():
+        name = label[:MAX_LABEL]
+        if name not in kept and len(kept) >= MAX_LABELS - 1:
+            name = OTHERS
+        kept[name] = kept.get(name, 0) + count
+    return kept
 
 
 def _rigid(rows: "Matrix4") -> "Matrix4":
@@ -73,9 +104,10 @@ def _rigid(rows: "Matrix4") -> "Matrix4":
     return rows
 
 
-Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")]
-Label = Annotated[str, StringConstraints(min_length=1, max_length=96)]
-Sentence = Annotated[str, StringConstraints(max_length=2000)]
+NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$"
+Name = Annotated[str, StringConstraints(pattern=NAME_PATTERN)]
+Label = Annotated[str, StringConstraints(min_length=1, max_length=MAX_LABEL)]
+Sentence = Annotated[str, StringConstraints(max_length=MAX_SENTENCE)]
 Nanoseconds = Annotated[int, Field(ge=0, le=2**63 - 1)]
 Count = Annotated[int, Field(ge=0, le=2**63 - 1)]
 Edge = Annotated[int, Field(ge=1, le=MAX_EDGE_PX, strict=True)]
@@ -90,9 +122,9 @@ PictureShape = Annotated[tuple[Edge, Edge, Channels], Field(strict=False)]
 DepthShape = Annotated[tuple[Edge, Edge], Field(strict=False)]
 PlainDict = Annotated[dict[str, object], AfterValidator(_plain)]
 LightList = Annotated[tuple[PlainDict, ...], Field(strict=False, max_length=MAX_LIGHTS)]
-Durations = Annotated[dict[Label, Annotated[float, Field(ge=0, le=1e7)]], Field(max_length=128)]
-Counts = Annotated[dict[Label, Count], Field(max_length=128)]
-Rates = Annotated[dict[Label, Annotated[float, Field(ge=0, le=1e6)]], Field(max_length=128)]
+Durations = Annotated[dict[Label, Annotated[float, Field(ge=0, le=1e7)]], Field(max_length=MAX_LABELS)]
+Counts = Annotated[dict[Label, Count], Field(max_length=MAX_LABELS)]
+Rates = Annotated[dict[Label, Annotated[float, Field(ge=0, le=1e6)]], Field(max_length=MAX_LABELS)]
 
 
 @dataclass(frozen=True)

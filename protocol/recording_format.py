@@ -22,7 +22,6 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.poses import wxyz_from_rotation
 
 SCHEMA_VERSION = 1
-ACTIVE_SUFFIX = ".active"
 SCENE_ATTACHMENT = "scene.json"
 COLOR_TOPIC, COLOR_CAMERA_TOPIC = "/color/image", "/color/calibration"
 DEPTH_TOPIC, DEPTH_CAMERA_TOPIC = "/depth/image", "/depth/calibration"

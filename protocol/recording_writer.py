@@ -18,11 +18,11 @@ from mcap_protobuf.schema import register_schema
 from deltalight.protocol.board import BoardSpec
 from deltalight.protocol.calibration import Extrinsics
 from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.files import ACTIVE_SUFFIX
 from deltalight.protocol.frames import DepthImage, FisheyePictures, SensorFrame
 from deltalight.protocol.pictures import encode_png, exact_depth_scale, known_depth, steps_from_depth
 from deltalight.protocol.recording_fisheye import fisheye_messages
 from deltalight.protocol.recording_format import (
-    ACTIVE_SUFFIX,
     COLOR_CAMERA_TOPIC,
     COLOR_FRAME,
     COLOR_TOPIC,

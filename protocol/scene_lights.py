@@ -197,10 +197,12 @@ class Lights(StrictModel):
     """Where light comes from."""
 
     mode: Literal["fisheye", "tracked", "manual", "environment"] = "manual"
-    manual: tuple[ManualLight, ...] = Field(default=(), max_length=64, description="Lights of mode `manual`.")
+    manual: tuple[ManualLight, ...] = Field(
+        default=(), max_length=64, fail_fast=True, description="Lights of mode `manual`."
+    )
     fisheye: FisheyeLights = Field(default_factory=FisheyeLights)
     tracked: tuple[TrackedLamp, ...] = Field(
-        default=(), max_length=16, description="Lamps of mode `tracked`."
+        default=(), max_length=16, fail_fast=True, description="Lamps of mode `tracked`."
     )
     environment: EnvironmentLights = Field(default_factory=EnvironmentLights)
     registration: Registration | None = Field(

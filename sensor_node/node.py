@@ -15,7 +15,7 @@ from deltalight.protocol.documents import StrictModel
 from deltalight.protocol.envelope import encode
 from deltalight.protocol.frames import FisheyePictures, RadianceMap, SensorFrame, ViewFrame
 from deltalight.protocol.keys import Keys
-from deltalight.protocol.messages import Name, StatsMessage
+from deltalight.protocol.messages import Name, StatsMessage, as_sentence
 from deltalight.protocol.publisher import Publisher
 from deltalight.sensor_node.announce import announced
 from deltalight.sensor_node.cameras.base import Camera
@@ -41,7 +41,6 @@ from deltalight.sensor_node.view_frames import ViewFrameBuilder
 
 _log = structlog.get_logger(__name__)
 STATS_PERIOD_S = 1.0
-MAX_SENTENCE = 2000  # of the wire (SPEC.md, section 3)
 STREAMS = ("fisheye", "depth", "radiance", "clean_depth", "lamps", "pose", "color", "stats")
 # Fish-eye pictures further than this from their frame are stamped by another clock (a loop restarted).
 LONGEST_HOLD_NS = 60_000_000_000
@@ -260,7 +259,7 @@ class _Node:
             clock_offset_ns=offset_ns,
             clock_bound_ns=bound_ns,
             state="stopping" if is_ending else state,
-            detail=detail[:MAX_SENTENCE],
+            detail=as_sentence(detail),
             rates={"fps": self._frames / elapsed_s, "without_board": self._without_board / elapsed_s},
             drops={"capture": drops, "connections_refused": self._publisher.refused},
         )

@@ -251,7 +251,7 @@ class FrameAssembler:
             frame_id=header.frame_id,
             timestamp_ns=header.capture_ns,
             color=decode_color(color.parts[0], header.encoding, header.shape),
-            camera=self._camera(header.camera),
+            camera=_of_size(self._camera(header.camera), header.shape),
             response=decode_response(color.parts[1]) if header.has_response else None,
             exposure_scale=(header.exposure_s or 1.0) / (self._reference_exposure_s or 1.0),
             pose=None if pose is None else _board_pose(pose.message),
@@ -265,7 +265,8 @@ class FrameAssembler:
     def _depth_image(self, depth: _Held[DepthMessage]) -> DepthImage:
         header = depth.message
         depth_m, valid = decode_depth(depth.parts[0], header.encoding, header.shape, header.depth_scale_m)
-        return DepthImage(depth_m, valid, self._depth_camera(header.camera), header.noise_sigma_m)
+        camera = _of_size(self._depth_camera(header.camera), header.shape)
+        return DepthImage(depth_m, valid, camera, header.noise_sigma_m)
 
 
 class _Unchanged(Generic[Built]):
@@ -300,6 +301,16 @@ def _board_pose(message: PoseMessage) -> BoardPose | None:
         message.reprojection_error_px,
         None if message.alternative is None else np.array(message.alternative),
     )
+
+
+def _of_size(camera: CameraModel, shape: Sequence[int]) -> CameraModel:
+    """Returns the camera if it is the one of a picture of this shape: the renderer allocates by the camera."""
+    if (camera.height, camera.width) != tuple(shape[:2]):
+        raise DeltalightError(
+            f"A camera of {camera.width}x{camera.height} pixels came with a picture of {shape[1]}x{shape[0]}; "
+            "send the camera at the picture's size."
+        )
+    return camera
 
 
 def _board_spec(data: Mapping[str, object]) -> BoardSpec:
