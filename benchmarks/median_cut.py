@@ -14,8 +14,8 @@ from rich.console import Console
 from rich.table import Table
 
 from deltalight.protocol.hemisphere import texel_directions
-from deltalight.render_server.lights.fisheye import HemisphereMap, to_world
-from deltalight.render_server.lights.median_cut import split_map
+from deltalight.protocol.hemisphere_map import HemisphereMap, to_world
+from deltalight.protocol.median_cut import split_map
 from deltalight.render_server.lights.octahedral import prefilter
 from deltalight.render_server.lights.sources import RESIDUAL_SIZE
 

@@ -10,6 +10,9 @@ from deltalight.protocol.board import BoardSpec
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.fisheye_lens import FisheyeCalibration
 
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
+"""Weights of linear R G B (ITU-R BT.709)."""
+
 
 @dataclass(frozen=True, eq=False)
 class BoardPose:

@@ -7,12 +7,12 @@ import cv2
 import numpy as np
 from jaxtyping import Float64, Int32, UInt8
 
-from deltalight.protocol.frames import RadianceMap, ViewFrame
+from deltalight.protocol.frames import LUMINANCE, RadianceMap, ViewFrame
 from deltalight.protocol.hemisphere import hemisphere_direction
-from deltalight.render_server.lights.environment import LUMINANCE
-from deltalight.render_server.lights.fisheye import HemisphereMap
+from deltalight.protocol.hemisphere_map import HemisphereMap
+from deltalight.protocol.median_cut import Split
+from deltalight.protocol.sky_lights import Region
 from deltalight.render_server.lights.lights import IncidentLight, LightSet, incident_light
-from deltalight.render_server.lights.median_cut import Region, Split
 from deltalight.render_server.lights.octahedral import solid_angle_mean
 
 OUTLINE_POINTS = 24  # per edge of a region: a lens bends straight lines

@@ -8,16 +8,12 @@ from jaxtyping import Float64
 
 from deltalight.protocol import scene_lights as documents
 from deltalight.protocol.frames import RadianceMap, ViewFrame
-from deltalight.render_server.lights.fisheye import (
-    HemisphereMap,
-    LightTracker,
-    TrackedLight,
-    WorldSky,
-    fit_distance,
-    is_occluded,
-    paper_light,
-    to_world,
-)
+from deltalight.protocol.hemisphere_map import HemisphereMap, WorldSky, to_world
+from deltalight.protocol.light_tracker import LightTracker
+from deltalight.protocol.median_cut import Split, split_map
+from deltalight.protocol.occlusion import is_occluded
+from deltalight.protocol.sky_lights import TrackedLight
+from deltalight.render_server.lights.light_distance import fit_distance, paper_light
 from deltalight.render_server.lights.lights import (
     AMBIENT_SIZE,
     DirectionalLight,
@@ -27,7 +23,6 @@ from deltalight.render_server.lights.lights import (
     build_lights,
     light_set,
 )
-from deltalight.render_server.lights.median_cut import Split, split_map
 from deltalight.render_server.lights.octahedral import above_horizon, irradiance
 
 # Fraction of a lamp's radius that it must move to count as moved. Soft edges of its shadows are then off by a

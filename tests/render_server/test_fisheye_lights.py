@@ -13,11 +13,11 @@ from deltalight.protocol.equidistant_lens import EquidistantLens
 from deltalight.protocol.fisheye_lens import FisheyeCalibration
 from deltalight.protocol.frames import DepthImage, LampPose, RadianceMap, ViewFrame, decode_lut
 from deltalight.protocol.hemisphere import texel_directions
+from deltalight.protocol.occlusion import is_occluded
+from deltalight.protocol.octahedral import octahedral_grid, sample_octahedral
 from deltalight.protocol.scene import SceneDocument
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.lights.fisheye import is_occluded
 from deltalight.render_server.lights.lights import DirectionalLight, LightSet, SphereLight
-from deltalight.render_server.lights.octahedral import octahedral_grid, sample_octahedral
 from deltalight.render_server.lights.sources import FisheyeSource, TrackedSource
 from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (

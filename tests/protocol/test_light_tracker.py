@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from deltalight.render_server.lights.fisheye import LightTracker
-from deltalight.render_server.lights.median_cut import Region, RegionLight
-from deltalight.render_server.lights.octahedral import texel_solid_angles
+from deltalight.protocol.light_tracker import LightTracker
+from deltalight.protocol.median_cut import RegionLight
+from deltalight.protocol.octahedral import texel_solid_angles
+from deltalight.protocol.sky_lights import Region
 
 SECOND = 1_000_000_000
 NOWHERE = Region(0, 1, 0, 1)
