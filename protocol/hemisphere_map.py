@@ -78,7 +78,7 @@ def to_world(sky: HemisphereMap, size: int) -> WorldSky:
     samples = cv2.remap(rgbs, place, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     samples *= weight[..., None]
     mean = cv2.resize(samples, (size, size), interpolation=cv2.INTER_AREA)
-    return WorldSky(np.ascontiguousarray(mean[..., :3]), mean[..., 3:])
+    return WorldSky(np.ascontiguousarray(mean[..., :3]), np.minimum(mean[..., 3:], 1))
 
 
 @lru_cache(maxsize=4)

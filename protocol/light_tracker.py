@@ -8,6 +8,7 @@ from scipy.optimize import linear_sum_assignment
 
 from deltalight.protocol.frames import LUMINANCE
 from deltalight.protocol.median_cut import RegionLight
+from deltalight.protocol.messages import MAX_LIGHTS
 from deltalight.protocol.sky_lights import TrackedLight
 
 # Lights of successive pictures within this angle may be the same. A hand-held lamp at 1 m moves as far within a time
@@ -17,6 +18,7 @@ GATE_RAD = float(np.radians(20.0))
 STEPS_PER_CONSTANT = 5
 SETTLED_CONSTANTS = 7.0  # after which 0.1 % of a change is left and counts as done
 FORGOTTEN_FRACTION = 1e-3  # of all lights' irradiance: fading lights are dropped below
+MOST_LIGHTS = MAX_LIGHTS - 1  # composites list the environment with them
 NS = 1e-9
 
 
@@ -48,7 +50,8 @@ class LightTracker:
         self._target_residual = residual
         known = {light.identity for light in self.lights}
         new = (light for light in self._target if light.identity not in known)
-        self.lights += tuple(replace(light, irradiance=np.zeros(3)) for light in new)
+        appearing = tuple(replace(light, irradiance=np.zeros(3)) for light in new)
+        self.lights = self._without_faint(self.lights + appearing)
         self._to_settle_s = SETTLED_CONSTANTS * self._smoothing_s
         if self.residual is None or self._smoothing_s == 0:
             self._settle()
@@ -76,12 +79,20 @@ class LightTracker:
         target = {light.identity: light for light in self._target}
         assert self.residual is not None
         assert self._target_residual is not None
-        moved = [_blended(light, target.get(light.identity), fraction) for light in self.lights]
-        faintest = FORGOTTEN_FRACTION * sum(_strength(light) for light in moved)
-        self.lights = tuple(
-            light for light in moved if light.identity in target or _strength(light) > faintest
+        self.lights = self._without_faint(
+            tuple(_blended(light, target.get(light.identity), fraction) for light in self.lights)
         )
         self.residual = self.residual + np.float32(fraction) * (self._target_residual - self.residual)
+
+    def _without_faint(self, lights: tuple[TrackedLight, ...]) -> tuple[TrackedLight, ...]:
+        """Drop fading lights that are too faint to matter, and the faintest of too many."""
+        target = self._target_identities
+        faintest = FORGOTTEN_FRACTION * sum(_strength(light) for light in lights)
+        fading = sorted((_strength(light) for light in lights if light.identity not in target), reverse=True)
+        room = MOST_LIGHTS - len(target)
+        if len(fading) > room:
+            faintest = max(faintest, fading[room])
+        return tuple(light for light in lights if light.identity in target or _strength(light) > faintest)
 
     def _identified(self, lights: tuple[RegionLight, ...]) -> tuple[TrackedLight, ...]:
         """Give each new light the identity of the light that it continues, or a new one."""

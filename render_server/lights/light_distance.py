@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from deltalight.protocol.frames import ViewFrame, decode_lut
-from deltalight.protocol.median_cut import RegionLight
+from deltalight.protocol.sky_lights import TrackedLight
 from deltalight.render_server.scene.albedo import MIN_PIXELS, known_albedo, unclipped
 
 # Candidate inverse distances, 1/m: from far away to 20 cm, finer than the paper resolves.
@@ -53,7 +53,7 @@ def paper_light(frame: ViewFrame) -> PaperLight | None:
 def fit_distance(
     paper: PaperLight,
     position: Float64[np.ndarray, "3"],
-    lights: Sequence[RegionLight],
+    lights: Sequence[TrackedLight],
     ambient: Float64[np.ndarray, "3"],
 ) -> float | None:
     """Estimates the distance of the lights from the fish-eye camera at `position`, m; None where they seem far away.
@@ -78,7 +78,7 @@ def fit_distance(
 def _predicted(
     paper: PaperLight,
     position: Float64[np.ndarray, "3"],
-    lights: Sequence[RegionLight],
+    lights: Sequence[TrackedLight],
     ambient: Float64[np.ndarray, "3"],
     inverse: float,
 ) -> Float64[np.ndarray, "k 3"]:
