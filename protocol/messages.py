@@ -83,6 +83,12 @@ def _unit(vector: "Vector3") -> "Vector3":
     return vector
 
 
+def _power_of_two(size: int) -> int:
+    if size & (size - 1):
+        raise ValueError("it must be a power of two")
+    return size
+
+
 def _rectangle(edges: "Rectangle") -> "Rectangle":
     top, bottom, left, right = edges
     if top >= bottom or left >= right:
@@ -106,6 +112,7 @@ Vector3 = Annotated[tuple[Coordinate, Coordinate, Coordinate], Field(strict=Fals
 UnitVector = Annotated[Vector3, AfterValidator(_unit)]
 Strength = Annotated[float, Field(ge=0, le=1e12, strict=True)]
 Strengths = Annotated[tuple[Strength, Strength, Strength], Field(strict=False)]
+ResidualSize = Annotated[int, Field(ge=4, le=512, strict=True), AfterValidator(_power_of_two)]
 TexelEdge = Annotated[int, Field(ge=0, le=MAX_EDGE_PX, strict=True)]
 Rectangle = Annotated[tuple[TexelEdge, TexelEdge, TexelEdge, TexelEdge], Field(strict=False)]
 RegionEdges = Annotated[Rectangle, AfterValidator(_rectangle)]
@@ -295,7 +302,7 @@ class LightsMessage(MessageBase):
 
     stream: Literal["lights"] = "lights"
     encoding: Literal["blosc2", "raw"]
-    size: Edge
+    size: ResidualSize
     count: LightCount
     split: SplitKind
     threshold: PeakThreshold

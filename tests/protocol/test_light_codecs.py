@@ -199,6 +199,7 @@ def test_lights_that_cannot_be_are_refused(change: dict[str, object], sentence: 
     with pytest.raises(ValueError, match=sentence):
         LightsMessage.model_validate(header)
     for field, wrong in (
+        ("size", 48),
         ("count", 17),
         ("threshold", 0.0),
         ("regions", [(3, 3, 0, 1)]),

@@ -139,25 +139,25 @@ def test_broken_map_costs_one_frame() -> None:
     assert share(assembler, 2, START + 2 * MS) == 0.1
 
 
-def add_lights(assembler: FrameAssembler, frame_id: int, capture_ns: int) -> None:
+def add_lights(assembler: FrameAssembler, frame_id: int, capture_ns: int, size: int) -> None:
     own = stamps(frame_id, capture_ns)
-    add(assembler, lights_multipart(sample_lights(frame_id), own, own))
+    add(assembler, lights_multipart(sample_lights(size), own, own))
 
 
 def test_lights_hold_like_maps_and_are_one_object_while_they_do() -> None:
     assembler = assembler_without_depth()
     assert view(assembler, 0, START - MS).sky_lights is None
-    add_lights(assembler, 2, START)
+    add_lights(assembler, 2, START, 8)
     first = view(assembler, 3, START + MS).sky_lights
     assert first is not None
-    assert_same_lights(first, sample_lights(2))
-    add_lights(assembler, 2, START)  # again, for late subscribers
+    assert_same_lights(first, sample_lights(8))
+    add_lights(assembler, 2, START, 8)  # again, for late subscribers
     assert view(assembler, 4, START + 2 * MS).sky_lights is first
-    add_lights(assembler, 6, START + 9 * MS)
+    add_lights(assembler, 6, START + 9 * MS, 4)
     assert view(assembler, 5, START + 3 * MS).sky_lights is first
     second = view(assembler, 6, START + 9 * MS).sky_lights
     assert second is not None
-    assert len(second.residual) == 6
+    assert len(second.residual) == 4
 
 
 def test_lamps_are_those_of_the_frame_itself_or_none() -> None:
