@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float32, Float64
 from deltalight.protocol.frames import RadianceMap
 from deltalight.protocol.hemisphere import hemisphere_uv, texel_directions, texel_solid_angles
 from deltalight.protocol.median_cut import SkyGrid
-from deltalight.protocol.octahedral import octahedral_grid, sample_octahedral, texel_weights
+from deltalight.protocol.octahedral import octahedral_grid, sample_at, texel_coordinates, texel_weights
 from deltalight.protocol.octahedral import texel_solid_angles as octahedral_solid_angles
 
 COARSE_SIZE = 32
@@ -108,7 +108,13 @@ def _nearby_mean(
     small = cv2.resize(both, (coarse, coarse), interpolation=cv2.INTER_AREA)
     sums = _lobe_weights(coarse) @ (small * octahedral_solid_angles(coarse)[..., None]).reshape(-1, 4)
     mean = sums[:, :3] / np.maximum(sums[:, 3:], 1e-12)
-    return sample_octahedral(mean.reshape(coarse, coarse, 3), octahedral_grid(size))
+    return sample_at(mean.reshape(coarse, coarse, 3), _coarse_coordinates(size, coarse))
+
+
+@cache
+def _coarse_coordinates(size: int, coarse: int) -> Float32[np.ndarray, "m m 2"]:
+    """Return where to read a coarse map for the texels of a finer one."""
+    return texel_coordinates(octahedral_grid(size), coarse)
 
 
 @cache
