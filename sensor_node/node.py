@@ -271,7 +271,7 @@ class _Node:
             self._radiance_stamps = stamps
             return radiance_multipart(radiance, stamps, self._config.jpeg_quality)
 
-        # Both together, so that no late subscriber cuts a map himself whose lights are about to come.
+        # Both together, so that no late subscriber cuts a map itself whose lights are about to come.
         with_map = self._radiance.send(radiance, made, self._publisher.send)
         self._send_lights(replace(view, timestamp_ns=stamps["capture_ns"]), stamps, now=with_map)
 
