@@ -9,6 +9,7 @@ import sys
 from typing import Annotated
 
 import typer
+from typer.main import get_command
 
 from deltalight import __version__
 from deltalight.benchmarks.cli import bench, gpu_check
@@ -91,7 +92,7 @@ def run(arguments: list[str]) -> int:
     """
     words = [argument for argument in arguments if argument != DEBUG_FLAG]
     try:
-        app(words, prog_name="deltalight")
+        get_command(app)(words, prog_name="deltalight")  # calling `app` would replace sys.excepthook
     except SystemExit as stop:
         return int(stop.code or 0)
     except Terminated:

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from deltalight.services.cli import run
+
 ROOT = Path(__file__).parents[2]
 PROGRAM = """
 import os, signal, time
@@ -80,3 +82,9 @@ def test_a_signal_that_compiled_code_catches_leaves_no_traceback() -> None:
     program = [sys.executable, "-c", FREEING]
     ended = subprocess.run(program, cwd=ROOT, capture_output=True, text=True, timeout=30, check=False)
     assert (ended.stdout.strip(), ended.stderr, ended.returncode) == ("ended", "", 0)
+
+
+def test_commands_keep_what_handles_such_a_signal(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "excepthook", sys.__excepthook__)
+    assert run(["--version"]) == 0
+    assert sys.excepthook is sys.__excepthook__
