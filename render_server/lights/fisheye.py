@@ -12,7 +12,6 @@ from typing import Self
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
-from scipy.optimize import linear_sum_assignment
 
 from deltalight.protocol.frames import DepthImage, RadianceMap, ViewFrame, decode_lut
 from deltalight.protocol.hemisphere import hemisphere_uv, texel_directions, texel_solid_angles
@@ -245,6 +244,8 @@ class LightTracker:
         ]
         if not old or not lights:
             return {}
+        from scipy.optimize import linear_sum_assignment
+
         cosine = (
             np.array([light.to_light for light in old]) @ np.array([light.to_light for light in lights]).T
         )
