@@ -53,16 +53,29 @@ def _expand(path: Path, seen: list[Path]) -> str:
     seen.append(path)
     number = len(seen) - 1
     lines = [f"#line 1 {number}"]
-    for index, line in enumerate(path.read_text().splitlines(), start=1):
-        match = INCLUDE.match(line)
-        if match is None:
-            lines.append(line)
+    for before, target, next_line in _split(path.read_text()):
+        lines += before
+        if target is None:
             continue
-        target = SHADERS / match.group(1)
         if target not in seen:
             lines.append(_expand(target, seen))
-        lines.append(f"#line {index + 1} {number}")
+        lines.append(f"#line {next_line} {number}")
     return "\n".join(lines)
+
+
+@lru_cache(maxsize=512)  # every file of the project: renderers are made again and again
+def _split(text: str) -> list[tuple[list[str], Path | None, int]]:
+    """Splits a file at its includes: lines before one, what it includes, number of the next line; last the rest."""
+    parts: list[tuple[list[str], Path | None, int]] = []
+    before: list[str] = []
+    for index, line in enumerate(text.splitlines(), start=1):
+        match = INCLUDE.match(line)
+        if match is None:
+            before.append(line)
+        else:
+            parts.append((before, SHADERS / match.group(1), index + 1))
+            before = []
+    return [*parts, (before, None, 0)]
 
 
 @lru_cache(
