@@ -128,11 +128,13 @@ def live_api(folder: Path, **settings: object) -> Iterator[LiveApi]:
 
 def wait_for_frames(address: str, patience_s: float = 30) -> None:
     deadline_s = time.monotonic() + patience_s
-    while time.monotonic() < deadline_s:
-        with suppress(httpx.TransportError, KeyError):
-            if httpx.get(f"http://{address}/api/v1/health").json()["stream"]["status"] == "ok":
-                return
-        time.sleep(0.05)
+    # One client for all requests: each made anew takes 40 ms of processor time.
+    with httpx.Client(base_url=f"http://{address}/api/v1") as client:
+        while time.monotonic() < deadline_s:
+            with suppress(httpx.TransportError, KeyError):
+                if client.get("/health").json()["stream"]["status"] == "ok":
+                    return
+            time.sleep(0.05)
     pytest.fail("no frame ever came")
 
 
