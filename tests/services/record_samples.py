@@ -44,7 +44,7 @@ def slow_demo(folder: Path) -> Path:
     For tests that wait for pictures of running processes: a node and a renderer of the whole recording keep two cores
     busy all the time.
     """
-    reader, out = RecordingReader(RECORDING), folder / "slow_demo.mcap"
+    reader, out = RecordingReader(RECORDING), folder / "demo.mcap"
     with RecordingWriter(out, board=reader.board, extrinsics=reader.extrinsics) as writer:
         for number in STANDING[::3]:
             writer.add(reader[number])
