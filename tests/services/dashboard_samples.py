@@ -38,6 +38,8 @@ from tests.services.live_samples import live_socket, read_frame, wait_for_frames
 from tests.services.record_samples import slow_demo
 
 PATIENCE_S = 90.0
+# Between pictures of a stand-in: a browser takes longer to draw one than the stand-in to send it.
+STAND_IN_PERIOD_S = 0.1
 # Where this names a folder, the tests leave pictures of what they see there, in the camera's size.
 SCREENSHOTS = os.environ.get("DELTALIGHT_SCREENSHOTS")
 SIZE = {"width": 1280, "height": 800}

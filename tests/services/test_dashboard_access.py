@@ -10,6 +10,7 @@ from tests.services.dashboard_samples import (
     NEEDS_BROWSER,
     PATIENCE_S,
     SIZE,
+    STAND_IN_PERIOD_S,
     complaints_of,
     photograph,
 )
@@ -41,7 +42,7 @@ LOOKING = {
 @pytest.fixture
 def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveApi]:
     """With the rules of an address that leaves the host (the test itself listens on loopback)."""
-    with live_api(tmp_path_factory.mktemp("data"), host="0.0.0.0") as running:
+    with live_api(tmp_path_factory.mktemp("data"), period_s=STAND_IN_PERIOD_S, host="0.0.0.0") as running:
         store = running.api.store
         store.scenes.activate(store.scenes.create(SCENE).head.id)
         yield running

@@ -11,7 +11,14 @@ import pytest
 from playwright.sync_api import Browser, Route, expect
 
 from deltalight.services.demo import POSTER
-from tests.services.dashboard_samples import NEEDS_BROWSER, PATIENCE_S, SIZE, Desk, Stack
+from tests.services.dashboard_samples import (
+    NEEDS_BROWSER,
+    PATIENCE_S,
+    SIZE,
+    STAND_IN_PERIOD_S,
+    Desk,
+    Stack,
+)
 from tests.services.live_samples import AGE_S, LiveApi, live_api
 
 pytestmark = NEEDS_BROWSER
@@ -24,7 +31,7 @@ PANELS = ("Object", "Lights", "Real", "Method", "Output")
 
 @pytest.fixture(scope="module")
 def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveApi]:
-    with live_api(tmp_path_factory.mktemp("data")) as running:
+    with live_api(tmp_path_factory.mktemp("data"), period_s=STAND_IN_PERIOD_S) as running:
         yield running
 
 
