@@ -72,10 +72,26 @@ GOALS = {
 }
 
 
-def differences(gpu: GpuContext, goal: Goal, folder: Path) -> dict[str, Difference]:
-    """Renders a goal's scene twice; how much direct light and that of cones differ."""
-    reference = change_in_room(gpu, folder, goal.reference)
-    other = change_in_room(gpu, folder, goal.settings, goal.turn_deg)
+@dataclass(frozen=True, eq=False)
+class Rooms:
+    """What objects change in the room (`change_in_room`), rendered once for each of the settings."""
+
+    gpu: GpuContext
+    folder: Path
+    _found: dict[tuple[object, ...], LightChange] = field(default_factory=dict)
+
+    def change(self, settings: Mapping[str, object], turn_deg: float = 0.0) -> LightChange:
+        """Returns the change under these settings."""
+        key = (*sorted(settings.items()), turn_deg)
+        if key not in self._found:
+            self._found[key] = change_in_room(self.gpu, self.folder, settings, turn_deg)
+        return self._found[key]
+
+
+def differences(rooms: Rooms, goal: Goal) -> dict[str, Difference]:
+    """How much direct light and that of cones differ between a goal's two scenes."""
+    reference = rooms.change(goal.reference)
+    other = rooms.change(goal.settings, goal.turn_deg)
     inside = reference.inside & other.inside
     return {
         "direct": _difference(reference.direct[inside], other.direct[inside]),
@@ -208,8 +224,9 @@ def main() -> None:
     gpu = create_context()
     with tempfile.TemporaryDirectory() as path:
         folder = Path(path)
+        rooms = Rooms(gpu, folder)
         for name, goal in GOALS.items():
-            table.add_row(*_row(name, goal.bound, differences(gpu, goal, folder)))
+            table.add_row(*_row(name, goal.bound, differences(rooms, goal)))
         for noise_m in (0.0, DEPTH_NOISE_M):
             off = abs(floor_irradiance(gpu, folder, noise_m).mean() - 1)
             verdict = "reached" if off <= DEPTH_GOAL else "missed"

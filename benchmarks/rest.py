@@ -47,13 +47,13 @@ def measure_rest(seconds: float, *, size: tuple[int, int] | None, device: int | 
         "seconds": seconds,
         "requests_per_s": REQUESTS_PER_S,
     }
-    with _running(size, device, with_rendering=False) as (address, _):
-        report["without_rendering"] = _requests(address, seconds, sample)
-    with _running(size, device, with_rendering=True) as (address, supervisor):
-        _wait_for_pictures(address, supervisor)
-        report["with_rendering"] = _requests(address, seconds, next_picture)
-        report["viewers"] = _viewers(address, seconds)
-        report |= _picture(address)
+    with _running(size, device, with_rendering=False) as (client, _):
+        report["without_rendering"] = _requests(client, seconds, sample)
+    with _running(size, device, with_rendering=True) as (client, supervisor):
+        _wait_for_pictures(client, supervisor)
+        report["with_rendering"] = _requests(client, seconds, next_picture)
+        report["viewers"] = _viewers(client, seconds)
+        report |= _picture(client)
     report["dashboard"] = dashboard_sizes(DASHBOARD)
     return report
 
@@ -61,8 +61,8 @@ def measure_rest(seconds: float, *, size: tuple[int, int] | None, device: int | 
 @contextmanager
 def _running(
     size: tuple[int, int] | None, device: int | None, *, with_rendering: bool
-) -> Iterator[tuple[str, Supervisor]]:
-    """Start the demo's processes, or the web process alone, with a data folder of their own."""
+) -> Iterator[tuple[httpx.Client, Supervisor]]:
+    """Start the demo's processes, or the web process alone, with a data folder of their own; a client of the API."""
     scene = with_output(demo_scene("dvct"), size, None)
     with TemporaryDirectory(prefix="deltalight-bench-") as folder:
         data = Path(folder)
@@ -73,23 +73,24 @@ def _running(
             plan: HostPlan = replace(demo_plan(session), data=data, page_port=port, device=device)
             with Supervisor(plan.specs() if with_rendering else plan.specs()[-1:]) as supervisor:
                 supervisor.run(until=lambda: ports.answers(port))
-                yield f"http://{ports.LOOPBACK}:{port}/api/v1", supervisor
+                with httpx.Client(base_url=f"http://{ports.LOOPBACK}:{port}/api/v1") as client:
+                    yield client, supervisor
 
 
-def _wait_for_pictures(address: str, supervisor: Supervisor) -> None:
+def _wait_for_pictures(client: httpx.Client, supervisor: Supervisor) -> None:
     deadline_s = time.monotonic() + START_TIMEOUT_S
 
     def comes() -> bool:
         if time.monotonic() > deadline_s:
             raise DeltalightError("No picture came from the render server; see the lines above.")
-        return sample(address).frames >= 2
+        return sample(client).frames >= 2
 
     supervisor.run(until=comes)
 
 
-def _requests(address: str, seconds: float, mark: Callable[[str], Sample]) -> dict[str, Any]:
+def _requests(client: httpx.Client, seconds: float, mark: Callable[[httpx.Client], Sample]) -> dict[str, Any]:
     """Read four times, then move the shown scene's object once, repeatedly; count pictures between two marks."""
-    scene = httpx.get(f"{address}/active-scene").raise_for_status().json()
+    scene = client.get("/active-scene").raise_for_status().json()
     path, thing = f"/scenes/{scene['id']}", scene["document"]["objects"][0]
     x, y, z = thing["pose"]["translation_m"]
     moves = [{"pose": {"translation_m": [x + STEP_M * step, y, z]}} for step in (1, 2, 1, 0)]
@@ -100,22 +101,22 @@ def _requests(address: str, seconds: float, mark: Callable[[str], Sample]) -> di
         Call("GET", "/scenes"),
         Call("PATCH", f"{path}/objects/{thing['id']}", moves),
     ]
-    usage, started = Usage(), mark(address)
-    times = asyncio.run(send_paced(address, calls, REQUESTS_PER_S, seconds))
-    usage.add(started, sample(address), mark(address))
+    usage, started = Usage(), mark(client)
+    times = asyncio.run(send_paced(_address(client), calls, REQUESTS_PER_S, seconds))
+    usage.add(started, sample(client), mark(client))
     return {**times.figures(), "frames_per_s": usage.frames_per_s, "cores": usage.cores}
 
 
-def _viewers(address: str, seconds: float) -> dict[str, Any]:
+def _viewers(client: httpx.Client, seconds: float) -> dict[str, Any]:
     """Measure many viewers against none, in turn: pictures rendered per second, and processor time."""
     alone, watched, got = Usage(), Usage(), list[int]()
     for _ in range(ROUNDS):
-        started = next_picture(address)
+        started = next_picture(client)
         time.sleep(seconds)
-        alone.add(started, sample(address), next_picture(address))
-        started = next_picture(address)
-        got.extend(asyncio.run(watch(address, VIEWERS, VIEWER_FRAMES_PER_S, seconds)))
-        watched.add(started, sample(address), next_picture(address))
+        alone.add(started, sample(client), next_picture(client))
+        started = next_picture(client)
+        got.extend(asyncio.run(watch(_address(client), VIEWERS, VIEWER_FRAMES_PER_S, seconds)))
+        watched.add(started, sample(client), next_picture(client))
     more = {name: watched.cores[name] - alone.cores[name] for name in (WEB, CLIENTS)}
     return {
         "viewers": VIEWERS,
@@ -131,15 +132,19 @@ def _viewers(address: str, seconds: float) -> dict[str, Any]:
     }
 
 
-def _picture(address: str) -> dict[str, Any]:
+def _address(client: httpx.Client) -> str:
+    return str(client.base_url).removesuffix("/")
+
+
+def _picture(client: httpx.Client) -> dict[str, Any]:
     """Return the renderer's name and the size of its pictures."""
     import cv2
     import numpy as np
 
-    jpeg = httpx.get(f"{address}/live.jpg").raise_for_status().content
+    jpeg = client.get("/live.jpg").raise_for_status().content
     picture = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
     assert picture is not None
-    processes = httpx.get(f"{address}/nodes").raise_for_status().json()
+    processes = client.get("/nodes").raise_for_status().json()
     renderer = next((each["detail"] for each in processes if each["kind"] == "render_server"), "")
     return {"renderer": renderer, "size": [picture.shape[1], picture.shape[0]]}
 

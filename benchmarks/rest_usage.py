@@ -50,15 +50,15 @@ class Usage:
         return {name: used_s / self.wall_s for name, used_s in self.cpu_s.items()}
 
 
-def sample(address: str) -> Sample:
-    """Return the current counts."""
-    lines = httpx.get(f"{address}/metrics").raise_for_status().text.splitlines()
+def sample(client: httpx.Client) -> Sample:
+    """Return the current counts; the client's base address is that of the API."""
+    lines = client.get("/metrics").raise_for_status().text.splitlines()
     values = dict(line.rsplit(" ", 1) for line in lines if not line.startswith("#"))
     cpu_s = {WEB: float(values[_CPU_S]), CLIENTS: time.process_time()}
     return Sample(time.perf_counter(), float(values[_FRAMES]), cpu_s)
 
 
-def next_picture(address: str) -> Sample:
+def next_picture(client: httpx.Client) -> Sample:
     """Return the counts at the arrival of the next picture.
 
     Rates are measured from one picture to another: a fixed time would be off by one of its twenty pictures.
@@ -66,8 +66,8 @@ def next_picture(address: str) -> Sample:
     Raises:
         DeltalightError: none arrives.
     """
-    before, deadline_s = sample(address), time.monotonic() + PATIENCE_S
-    while (now := sample(address)).frames == before.frames:
+    before, deadline_s = sample(client), time.monotonic() + PATIENCE_S
+    while (now := sample(client)).frames == before.frames:
         if time.monotonic() > deadline_s:
             raise DeltalightError("No picture comes from the render server any more; see the lines above.")
         time.sleep(POLL_S)

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float32
-from scipy.optimize import linear_sum_assignment
 
 from deltalight.protocol.frames import LUMINANCE
 from deltalight.protocol.median_cut import RegionLight
@@ -116,6 +115,8 @@ class LightTracker:
         ]
         if not old or not lights:
             return {}
+        from scipy.optimize import linear_sum_assignment
+
         cosine = (
             np.array([light.to_light for light in old]) @ np.array([light.to_light for light in lights]).T
         )

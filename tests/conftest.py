@@ -1,19 +1,29 @@
-"""Both tiers of the tests, what keeps workers apart that run at the same time, and fixtures that all rooms share."""
+"""Both tiers of the tests, what keeps workers apart that run at the same time, and what all rooms share: one GL
+context, real captures.
+"""
 
+import gc
 import os
 import signal
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 import structlog
 
 from deltalight.services import ports
 
+if TYPE_CHECKING:
+    from deltalight.render_server.gpu.context import GpuContext
+
 # A shell starts what it puts into the background with SIGINT ignored, and children inherit that: no test of Ctrl-C
 # could pass.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# Thousands of tests and modules come to stay: to look through them again and again takes a third of the collection.
+gc.disable()
 
 SLOW_MARKERS = ("slow", "data")
 THREAD_COUNTS = ("LP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
@@ -47,6 +57,11 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         items[:] = quick
 
 
+def pytest_collection_finish() -> None:
+    gc.enable()
+    gc.freeze()
+
+
 def _is_slow(item: pytest.Item) -> bool:
     return any(item.get_closest_marker(name) for name in SLOW_MARKERS)
 
@@ -70,6 +85,22 @@ def fresh_logs() -> Iterator[None]:
     """A command that runs in this process sends log lines to a stderr that pytest closes after the test."""
     yield
     structlog.reset_defaults()
+
+
+@pytest.fixture(scope="session")
+def shared_context() -> Iterator["GpuContext"]:
+    """The context that keeps linked programs from module to module."""
+    from deltalight.render_server.gpu.context import create_context
+
+    context = create_context()
+    yield context
+    context.release()
+
+
+@pytest.fixture(scope="module")
+def gpu(shared_context: "GpuContext") -> "GpuContext":
+    shared_context.ctx.__enter__()  # other modules make contexts of their own, which are current then
+    return shared_context
 
 
 @pytest.fixture(scope="session")

@@ -87,7 +87,7 @@ def test_its_layers_compose_the_picture(
     take: dl.Take, scene: dl.Scene, cube: Path, method: str | None
 ) -> None:
     scene.add(cube, at=(0.1, 0.1, 0.025))
-    with dl.Renderer(method, quality=None if method is None else "best") as renderer:
+    with dl.Renderer(method, quality=None if method is None else "live") as renderer:
         picture = renderer.render(take[0], scene)
     assert picture.color.shape == (SIZE[1], SIZE[0], 3)
     camera = picture.linear - picture.delta
@@ -129,7 +129,7 @@ def test_a_frame_without_the_board_stays_as_it_is(take: dl.Take, scene: dl.Scene
 def test_scenes_change_while_a_renderer_lives_and_renderers_live_beside_each_other(
     take: dl.Take, scene: dl.Scene, cube: Path
 ) -> None:
-    with dl.Renderer() as one, dl.Renderer("none") as other:
+    with dl.Renderer() as one, dl.Renderer("none", "live") as other:
         before = one.render(take[0], scene)
         name = scene.add(cube, at=(0.1, 0.1, 0.025))
         added = one.render(take[0], scene)
@@ -184,7 +184,9 @@ def test_the_examples_of_the_page_run(tmp_path: Path, cube: Path) -> None:
     """As a reader would run them: one after the other, in a folder with the files that they name."""
     (tmp_path / "desk.mcap").write_bytes(RECORDING.read_bytes())
     (tmp_path / "bunny.glb").write_bytes(cube.read_bytes())
-    dl.Scene.load(SCENE).save(tmp_path / "scene.json")
+    example = dl.Scene.load(SCENE)
+    example.document = example.document.replaced(output={"width": SIZE[0], "height": SIZE[1]})
+    example.save(tmp_path / "scene.json")
     script = "\n".join(EXAMPLES)
     done = subprocess.run(
         [sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=False

@@ -17,6 +17,7 @@ import numpy as np
 
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.shader_source import SHADERS, Declarations, declarations, shader_source
+from deltalight.render_server.gpu.textures import image_format
 from deltalight.render_server.gpu.uniform_block import UniformBlock
 
 SOFTWARE_WALKERS = 1024
@@ -24,9 +25,6 @@ SOFTWARE_WALKERS = 1024
 # cones of one texel takes up to about 5000 (16 cones through 256 voxels and the coarse scene).
 SOFTWARE_DIVISOR = 12
 LIST_WALKERS = 16384
-BLOCK_ALIGNMENT = (
-    16  # bytes that std140 blocks are padded to; drivers may leave the padding out of their size
-)
 CLEARING_GROUPS = 4096  # of workgroups at most; they stride over larger buffers
 WORD_BYTES = 4
 GL_INT = 0x1404
@@ -51,14 +49,6 @@ IMAGES: Final = {
     0x9063: moderngl.Texture,  # uimage2D
     0x904E: moderngl.Texture3D,  # image3D
     0x9053: moderngl.TextureArray,  # image2DArray
-}
-FORMATS: Final = {
-    "f1": {1: "r8", 2: "rg8", 4: "rgba8"},
-    "f2": {1: "r16f", 2: "rg16f", 4: "rgba16f"},
-    "f4": {1: "r32f", 2: "rg32f", 4: "rgba32f"},
-    "u1": {1: "r8ui", 2: "rg8ui", 4: "rgba8ui"},
-    "i2": {1: "r16i", 2: "rg16i", 4: "rgba16i"},
-    "u4": {1: "r32ui", 2: "rg32ui", 4: "rgba32ui"},
 }
 
 
@@ -208,7 +198,7 @@ class _Program:
         if not isinstance(value, Texture) or not isinstance(value, kind):
             raise self._wrong(slot, value, f"a {kind.__name__} that is written or read texel by texel")
         wanted = self._declared.formats[slot.name]
-        found = FORMATS.get(value.dtype, {}).get(value.components, "no image format")
+        found = image_format(value)
         if wanted and found not in wanted:
             raise BindingError(
                 f"Kernel {self.label}: `{slot.name}` is declared {' or '.join(sorted(wanted))}, "
@@ -228,7 +218,7 @@ class _Program:
     def _bind_block(self, slot: _Slot, value: Binding) -> None:
         if not isinstance(value, UniformBlock):
             raise self._wrong(slot, value, "a uniform block")
-        if value.size != -(-slot.member.size // BLOCK_ALIGNMENT) * BLOCK_ALIGNMENT:
+        if not value.fits(slot.member.size):
             raise BindingError(
                 f"Kernel {self.label}: block `{slot.name}` takes {slot.member.size} bytes, "
                 f"{type(value.value).__name__} packs {value.size}."

@@ -60,19 +60,30 @@ def _expand(path: Path, seen: list[Path]) -> str:
     seen.append(path)
     number = len(seen) - 1
     lines = [f"#line 1 {number}"]
-    for index, line in enumerate(path.read_text().splitlines(), start=1):
-        if constant := _CONSTANT.match(line):
-            lines += [constant[0], f"const bool {constant[1]} = switched;", f"#line {index + 1} {number}"]
-            continue
-        match = INCLUDE.match(line)
-        if match is None:
-            lines.append(line)
-            continue
-        target = SHADERS / match.group(1)
-        if target not in seen:
+    for before, target, next_line in _split(path.read_text()):
+        lines += before
+        if target is not None and target not in seen:
             lines.append(_expand(target, seen))
-        lines.append(f"#line {index + 1} {number}")
+        if next_line:
+            lines.append(f"#line {next_line} {number}")
     return "\n".join(lines)
+
+
+@lru_cache(maxsize=512)  # every file of the project: renderers are made again and again
+def _split(text: str) -> list[tuple[list[str], Path | None, int]]:
+    """Splits a file at includes and constants: lines before, what is included, number of the next line, if any."""
+    parts: list[tuple[list[str], Path | None, int]] = []
+    before: list[str] = []
+    for index, line in enumerate(text.splitlines(), start=1):
+        match, constant = INCLUDE.match(line), _CONSTANT.match(line)
+        if constant:
+            before += [constant[0], f"const bool {constant[1]} = switched;"]
+        if not (match or constant):
+            before.append(line)
+        else:
+            parts.append((before, SHADERS / match[1] if match else None, index + 1))
+            before = []
+    return [*parts, (before, None, 0)]
 
 
 @lru_cache(

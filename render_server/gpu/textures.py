@@ -3,13 +3,22 @@
 import math
 from collections import deque
 from collections.abc import Iterator, Sequence
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
 import moderngl
 import numpy as np
 from jaxtyping import Float32, Float64
 
 from deltalight.render_server.gpu.context import GpuContext
+
+IMAGE_FORMATS: Final = {  # by type and number of components
+    "f1": {1: "r8", 2: "rg8", 4: "rgba8"},
+    "f2": {1: "r16f", 2: "rg16f", 4: "rgba16f"},
+    "f4": {1: "r32f", 2: "rg32f", 4: "rgba32f"},
+    "u1": {1: "r8ui", 2: "rg8ui", 4: "rgba8ui"},
+    "i2": {1: "r16i", 2: "rg16i", 4: "rgba16i"},
+    "u4": {1: "r32ui", 2: "rg32ui", 4: "rgba32ui"},
+}
 
 
 class Releasable(Protocol):
@@ -35,6 +44,11 @@ def texture_2d(
         texture.filter = (mode, mode)
     texture.repeat_x = texture.repeat_y = False
     return texture
+
+
+def image_format(texture: moderngl.Texture | moderngl.Texture3D | moderngl.TextureArray) -> str:
+    """Returns the format layout qualifier (GLSL 4.30) of the texels; "no image format" if GLSL has none for them."""
+    return IMAGE_FORMATS.get(texture.dtype, {}).get(texture.components, "no image format")
 
 
 def read_texel(texture: moderngl.Texture, place: tuple[int, int]) -> Float32[np.ndarray, " c"]:

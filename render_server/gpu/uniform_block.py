@@ -28,6 +28,7 @@ STD140 = {
     "vec4": (16, 16, "4f"),
     "mat4": (16, 64, "16f"),
 }
+ALIGNMENT = 16  # of blocks, bytes
 
 
 _MEMBERS: dict[type, tuple[tuple[str, str], ...]] = {}
@@ -55,7 +56,7 @@ class Block:
             if kind == "mat4":
                 value = np.asarray(value, np.float32).T.ravel()
             data.extend(struct.pack("<" + form, *value) if size > 4 else struct.pack("<" + form, value))
-        return bytes(data) + bytes(-len(data) % 16)
+        return bytes(data) + bytes(-len(data) % ALIGNMENT)
 
 
 Kind = TypeVar("Kind", bound=Block)
@@ -73,6 +74,10 @@ class UniformBlock(Generic[Kind]):
     def size(self) -> int:
         """Size in bytes."""
         return len(self._data)
+
+    def fits(self, declared: int) -> bool:
+        """Whether a program's block of that size in bytes, with or without its padding, is of these members."""
+        return self.size == declared + -declared % ALIGNMENT
 
     def write(self, value: Kind) -> None:
         """Replaces the value."""

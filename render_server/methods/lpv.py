@@ -45,10 +45,10 @@ from deltalight.render_server.passes.lpv import (
 )
 from deltalight.render_server.passes.lpv_lighting import (
     LpvBounce,
+    LpvFields,
     LpvInjectMaps,
     LpvInjectSurfaces,
-    LpvQuery,
-    light_volume_bindings,
+    query_bindings,
 )
 from deltalight.render_server.passes.shading import DirectLight
 from deltalight.render_server.passes.split_injection import RealAlbedo
@@ -246,11 +246,6 @@ class Propagated:
         _release_all(self)
 
 
-def query_bindings(settings: DlpvMethod) -> dict[str, Binding]:
-    """Returns the bindings for reading light from volumes (shaders/common/lpv_light.glsl)."""
-    return {"has_geometry": settings.resolved_geometry_volume, "damping": settings.resolved_damping}
-
-
 class DifferenceVolumes:
     """V_rho and V_mu.
 
@@ -361,46 +356,6 @@ class PrintedVolumes:
     def release(self) -> None:
         """Frees the GL objects."""
         _release_all(self)
-
-
-class LpvFields:
-    """Reads from the volumes what other methods trace by cones."""
-
-    def __init__(self, gpu: GpuContext, settings: DlpvMethod, fields: ConeFields) -> None:
-        self._fields, self._bindings = fields, query_bindings(settings)
-        self._query = LpvQuery(gpu)
-
-    def marching(self, rho: LightVolume, volume: PlacedVolume) -> dict[str, Binding]:
-        """Returns the bindings for lighting reflected points from V_rho, which fills the `volume`."""
-        return {**light_volume_bindings(rho, rho), **volume.bindings, **self._bindings}
-
-    def read_difference(
-        self, scene: Bindings, grid: LowResGrid, mu: LightVolume, rho: LightVolume
-    ) -> ConeFields:
-        """Reads the irradiance at real surfaces and at the objects."""
-        own = {**scene, **self._bindings}
-        self._query.read_real(self._fields, grid, mu, rho, own)
-        self._query.read_virtual(self._fields, grid, rho, own)
-        return self._fields
-
-    def read_printed(
-        self,
-        scene: Bindings,
-        grid: LowResGrid,
-        delta: LightVolume,
-        direct: LightVolume | None,
-        rho: LightVolume,
-        rho_volume: PlacedVolume,
-    ) -> ConeFields:
-        """Reads the change of irradiance at real surfaces, and the irradiance at the objects."""
-        own = {**scene, **self._bindings}
-        self._query.read_change(self._fields, grid, delta, direct, own)
-        self._query.read_virtual(self._fields, grid, rho, {**own, **rho_volume.bindings})
-        return self._fields
-
-    def release(self) -> None:
-        """Frees the programs."""
-        self._query.release()
 
 
 @dataclass(frozen=True, eq=False)

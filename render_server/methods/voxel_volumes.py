@@ -123,7 +123,7 @@ class FarScene:
     @property
     def bindings(self) -> dict[str, Binding]:
         """Returns all bindings that march.glsl reads of it."""
-        return {"pyramid_far": self.mipmap.texture, "FarVolume": self._block}
+        return {"mipmap_far": self.mipmap.texture, "FarVolume": self._block}
 
     def release(self) -> None:
         """Frees the GL objects."""
@@ -174,8 +174,8 @@ class DirectionalVoxels:
         return {
             **self._light.bindings,
             **self.far.bindings,
-            "pyramid_mu": self.mu.texture,
-            "pyramid_rho": self.rho.texture,
+            "mipmap_mu": self.mu.texture,
+            "mipmap_rho": self.rho.texture,
             "cone_count": cone_count,
         }
 

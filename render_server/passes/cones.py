@@ -164,7 +164,7 @@ class TraceCones:
             **grid.bindings,
         }
         self._select.run(grid.size, traced, scene)
-        self._real.run(self._threads(grid), traced, scene, pyramid_mu=mu.texture, pyramid_rho=rho.texture)
+        self._real.run(self._threads(grid), traced, scene, mipmap_mu=mu.texture, mipmap_rho=rho.texture)
         self._filter.filter_real((self._mu, self._rho), (fields.mu, fields.rho), grid, scene)
 
     def trace_virtual(
@@ -181,8 +181,8 @@ class TraceCones:
             scene,
             irradiance_rho=self._irradiance,
             specular_rho=fields.virtual_specular,
-            pyramid_mu=mu.texture,
-            pyramid_rho=rho.texture,
+            mipmap_mu=mu.texture,
+            mipmap_rho=rho.texture,
         )
         self._filter.filter_virtual(self._irradiance, fields.virtual, grid, scene)
 
@@ -218,7 +218,7 @@ class TraceConesPaper:
             grid.size,
             grid.bindings,
             scene,
-            pyramid=delta.texture,
+            mipmap=delta.texture,
             irradiance_mu=fields.mu,
             irradiance_rho=fields.rho,
             specular_mu=fields.specular_mu,
@@ -231,7 +231,7 @@ class TraceConesPaper:
             grid.size,
             grid.bindings,
             scene,
-            pyramid=rho.texture,
+            mipmap=rho.texture,
             irradiance_rho=fields.virtual,
             specular_rho=fields.virtual_specular,
         )

@@ -2,13 +2,14 @@
 
 import moderngl
 
+from deltalight.protocol.scene_method import DlpvMethod
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel, list_threads
 from deltalight.render_server.passes.caustics import GREATEST_ALPHA
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid
 from deltalight.render_server.passes.lights import LightBuffers
 from deltalight.render_server.passes.lpv import LightVolume
-from deltalight.render_server.passes.voxels import VoxelStore
+from deltalight.render_server.passes.voxels import PlacedVolume, VoxelStore
 
 
 def light_volume_bindings(mu: LightVolume, rho: LightVolume) -> dict[str, Binding]:
@@ -164,3 +165,48 @@ class LpvQuery:
         """Frees the GL objects."""
         for kernel in (self._real, self._change, self._virtual):
             kernel.release()
+
+
+def query_bindings(settings: DlpvMethod) -> dict[str, Binding]:
+    """Returns the bindings for reading light from volumes (shaders/common/lpv_light.glsl)."""
+    return {"has_geometry": settings.resolved_geometry_volume, "damping": settings.resolved_damping}
+
+
+class LpvFields:
+    """Reads from the volumes what other methods trace by cones."""
+
+    def __init__(self, gpu: GpuContext, settings: DlpvMethod, fields: ConeFields) -> None:
+        self._fields, self._bindings = fields, query_bindings(settings)
+        self._query = LpvQuery(gpu)
+
+    def marching(self, rho: LightVolume, volume: PlacedVolume) -> dict[str, Binding]:
+        """Returns the bindings for lighting reflected points from V_rho, which fills the `volume`."""
+        return {**light_volume_bindings(rho, rho), **volume.bindings, **self._bindings}
+
+    def read_difference(
+        self, scene: Bindings, grid: LowResGrid, mu: LightVolume, rho: LightVolume
+    ) -> ConeFields:
+        """Reads the irradiance at real surfaces and at the objects."""
+        own = {**scene, **self._bindings}
+        self._query.read_real(self._fields, grid, mu, rho, own)
+        self._query.read_virtual(self._fields, grid, rho, own)
+        return self._fields
+
+    def read_printed(  # noqa: PLR0917 (a stage, which the graph gives its inputs in order)
+        self,
+        scene: Bindings,
+        grid: LowResGrid,
+        delta: LightVolume,
+        direct: LightVolume | None,
+        rho: LightVolume,
+        rho_volume: PlacedVolume,
+    ) -> ConeFields:
+        """Reads the change of irradiance at real surfaces, and the irradiance at the objects."""
+        own = {**scene, **self._bindings}
+        self._query.read_change(self._fields, grid, delta, direct, own)
+        self._query.read_virtual(self._fields, grid, rho, {**own, **rho_volume.bindings})
+        return self._fields
+
+    def release(self) -> None:
+        """Frees the programs."""
+        self._query.release()

@@ -63,7 +63,7 @@ class DirectLight:
         caustics: Caustics | None = None,
     ) -> None:
         """Shades the pixels. `joint`: the voxels that shadow cones march through; `caustics`: added to E_rho."""
-        voxels: dict[str, Binding] = {} if joint is None else {"joint_pyramid": joint}
+        voxels: dict[str, Binding] = {} if joint is None else {"joint_mipmap": joint}
         threads = (list_threads(self._gpu, math.prod(self._size)),) if self._reuses else self._size
         self._kernel.run(threads, self.bindings, voxels, _caustics_on(grid, caustics), scene)
 

@@ -251,8 +251,8 @@ class GatherVoxels:
             store.bindings,
             groups.bindings,
             scene,
-            pyramid_mu=mipmaps[0].texture,
-            pyramid_rho=mipmaps[1].texture,
+            mipmap_mu=mipmaps[0].texture,
+            mipmap_rho=mipmaps[1].texture,
             cone_count=GATHER_CONES,
         )
 

@@ -374,7 +374,7 @@ class ClearVoxels:
                 (self._threads,),
                 store.bindings,
                 volume.bindings,
-                pyramid=mipmap.texture,
+                mipmap=mipmap.texture,
                 free_slots=index == len(mipmaps) - 1,
             )
         store.reset(0)
@@ -395,7 +395,7 @@ class ResolveVoxels:
 
     def resolve_mu(self, mu: VoxelMipmap, real: VoxelStore, volume: PlacedVolume) -> None:
         """Writes (c_mu, a_real)."""
-        self._mu.run((self._threads,), real.bindings, volume.bindings, pyramid=mu.texture)
+        self._mu.run((self._threads,), real.bindings, volume.bindings, mipmap=mu.texture)
 
     def resolve_rho(
         self, rho: VoxelMipmap, real: VoxelStore, virtual: VoxelStore, volume: PlacedVolume
@@ -405,13 +405,13 @@ class ResolveVoxels:
             (self._threads,),
             real.bindings,
             volume.bindings,
-            pyramid=rho.texture,
+            mipmap=rho.texture,
             DeltaSums=real.delta_sums,
             OtherGrid=virtual.grid,
             OtherSums=virtual.sums,
         )
         self._rho_virtual.run(
-            (self._threads,), virtual.bindings, volume.bindings, pyramid=rho.texture, OtherGrid=real.grid
+            (self._threads,), virtual.bindings, volume.bindings, mipmap=rho.texture, OtherGrid=real.grid
         )
 
     def release(self) -> None:
@@ -431,7 +431,7 @@ class FilterVoxels:
         for level in range(1, volume.placement.levels):
             cells = volume.placement.size >> level
             self._kernel.run(
-                (cells, cells, cells * DIRECTIONS), volume.bindings, pyramid=mipmap.texture, level=level
+                (cells, cells, cells * DIRECTIONS), volume.bindings, mipmap=mipmap.texture, level=level
             )
 
     def release(self) -> None:

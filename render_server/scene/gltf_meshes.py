@@ -4,11 +4,10 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
-from scipy.sparse import csr_array
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.render_server.scene.asset_check import left_out, read_gltf
@@ -32,6 +31,9 @@ from deltalight.render_server.scene.triangle_mesh import (
     joined_triangles,
     unit_or,
 )
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 # Times at which the bounds of a clip are sampled beside its keys: a full turn then has steps of 6 degrees, and an arc
@@ -59,7 +61,7 @@ class Skin:
 
     joints: Int64[np.ndarray, " j"]
     joint_from_mesh: Float64[np.ndarray, "j 4 4"]
-    weights: csr_array
+    weights: "csr_array"
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,7 +241,7 @@ def _delta(
     return np.asarray(rows[made.source])
 
 
-def _joint_weights(gltf: GltfDocument, primitive: dict[str, Any], joint_count: int) -> csr_array:
+def _joint_weights(gltf: GltfDocument, primitive: dict[str, Any], joint_count: int) -> "csr_array":
     """Returns the weight of each joint at each of the file's vertices."""
     attributes = primitive["attributes"]
     sets = [name.removeprefix("JOINTS_") for name in sorted(attributes) if name.startswith("JOINTS_")]
@@ -258,6 +260,8 @@ def _joint_weights(gltf: GltfDocument, primitive: dict[str, Any], joint_count: i
     sums = weights.sum(axis=1, keepdims=True)
     weights[sums[:, 0] == 0, 0] = 1.0  # as viewers do: vertices without weights move with their first joint
     weights /= np.where(sums == 0, 1, sums)
+    from scipy.sparse import csr_array
+
     rows = np.repeat(np.arange(len(joints)), joints.shape[1])
     # Duplicates are added up, and entries of a row sorted: the same file gives the same sums.
     matrix = csr_array((weights.ravel(), (rows, joints.ravel())), shape=(len(joints), joint_count))

@@ -4,9 +4,9 @@ from collections import defaultdict
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
 from jaxtyping import Float32
 
 from deltalight.protocol.errors import DeltalightError
@@ -22,6 +22,9 @@ from deltalight.render_server.scene.triangle_mesh import (
     converted,
     joined,
 )
+
+if TYPE_CHECKING:
+    import trimesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +75,9 @@ def load_asset(path: Path) -> Asset:
     return Asset([joined(same) for same in together.values()], None)
 
 
-def _open_scene(path: Path) -> trimesh.Scene:
+def _open_scene(path: Path) -> "trimesh.Scene":
+    import trimesh
+
     try:
         return trimesh.load_scene(path, process=False, maintain_order=True)
     except MemoryError:
@@ -81,14 +86,16 @@ def _open_scene(path: Path) -> trimesh.Scene:
         raise DeltalightError(f"{path} cannot be read as a mesh ({error}); export it again.") from error
 
 
-def _parts(scene: trimesh.Scene, path: Path) -> list[tuple[int, TriangleMesh]]:
+def _parts(scene: "trimesh.Scene", path: Path) -> list[tuple[int, TriangleMesh]]:
     """Returns (material key, mesh in the file's frame) of every node that shows triangles."""
+    from trimesh import Trimesh
+
     materials: dict[int, Material] = {}
     parts = []
     for node in scene.graph.nodes_geometry:
         matrix, name = scene.graph[node]
         geometry = scene.geometry[name]
-        if not isinstance(geometry, trimesh.Trimesh) or len(geometry.faces) == 0:
+        if not isinstance(geometry, Trimesh) or len(geometry.faces) == 0:
             continue
         key = id(getattr(geometry.visual, "material", None))
         if key not in materials:
@@ -100,16 +107,18 @@ def _parts(scene: trimesh.Scene, path: Path) -> list[tuple[int, TriangleMesh]]:
     return parts
 
 
-def _material(geometry: trimesh.Trimesh, path: Path) -> Material:
+def _material(geometry: "trimesh.Trimesh", path: Path) -> Material:
     try:
         return _described_material(geometry).checked(str(path))
     except (TypeError, ValueError, AttributeError) as error:
         raise DeltalightError(f"{path} has a malformed material ({error}); export it again.") from error
 
 
-def _described_material(geometry: trimesh.Trimesh) -> Material:
+def _described_material(geometry: "trimesh.Trimesh") -> Material:
+    from trimesh.visual.material import SimpleMaterial
+
     loaded = getattr(geometry.visual, "material", None)
-    if loaded is not None and isinstance(loaded, trimesh.visual.material.SimpleMaterial):
+    if loaded is not None and isinstance(loaded, SimpleMaterial):
         # An image that no file names is the loader's own placeholder.
         image = loaded.image if loaded.image is not None and "file_path" in loaded.image.info else None
         return Material.from_mtl(str(loaded.name or ""), loaded.kwargs or {}, image)
@@ -117,7 +126,7 @@ def _described_material(geometry: trimesh.Trimesh) -> Material:
     return Material(base_color=np.ones(3, np.float32)) if has_colors else Material()
 
 
-def _file_geometry(geometry: trimesh.Trimesh) -> FileGeometry:
+def _file_geometry(geometry: "trimesh.Trimesh") -> FileGeometry:
     positions = np.asarray(geometry.vertices, np.float32)
     has_normals = "vertex_normals" in geometry._cache
     return FileGeometry(
@@ -129,7 +138,7 @@ def _file_geometry(geometry: trimesh.Trimesh) -> FileGeometry:
     )
 
 
-def _uv(geometry: trimesh.Trimesh, count: int) -> Float32[np.ndarray, "n 2"] | None:
+def _uv(geometry: "trimesh.Trimesh", count: int) -> Float32[np.ndarray, "n 2"] | None:
     """Returns texture coordinates with the origin at the top; the loader has it at the bottom."""
     uv = getattr(geometry.visual, "uv", None)
     if uv is None or np.shape(uv) != (count, 2) or not np.isfinite(uv).all():
@@ -137,7 +146,7 @@ def _uv(geometry: trimesh.Trimesh, count: int) -> Float32[np.ndarray, "n 2"] | N
     return np.column_stack([uv[:, 0], 1 - uv[:, 1]]).astype(np.float32)
 
 
-def _colors(geometry: trimesh.Trimesh) -> Float32[np.ndarray, "n 3"] | None:
+def _colors(geometry: "trimesh.Trimesh") -> Float32[np.ndarray, "n 3"] | None:
     """Returns linear vertex colours: sRGB bytes of PLY, STL and OBJ."""
     if geometry.visual.kind != "vertex":
         return None

@@ -12,7 +12,6 @@ from functools import cache
 
 import numpy as np
 from jaxtyping import Bool, Float16, Float32, Float64, Int32, Int64
-from scipy.ndimage import distance_transform_edt
 
 from deltalight.render_server.lights.octahedral import even_directions, harmonics
 from deltalight.render_server.scene.bvh import RayCaster
@@ -230,5 +229,7 @@ def fill_inside(
     """Gives samples inside the object the nearest value outside: all is occluded inside, half at the surface."""
     if not inside.any() or inside.all():
         return values
+    from scipy.ndimage import distance_transform_edt
+
     nearest = distance_transform_edt(inside, sampling=spacing, return_distances=False, return_indices=True)
     return np.asarray(values[tuple(nearest)])

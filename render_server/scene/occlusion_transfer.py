@@ -11,7 +11,6 @@ from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Bool, Float16, Float32, Int64
-from scipy.spatial import cKDTree
 
 from deltalight.render_server.lights.octahedral import harmonics
 from deltalight.render_server.scene.occlusion_field import (
@@ -124,6 +123,8 @@ def _representative_pieces(
     count = len(pieces.corners)
     if count <= MAX_PIECES:
         return np.arange(count), np.arange(count)
+    from scipy.spatial import cKDTree
+
     edges = pieces.corners[:, 1:] - pieces.corners[:, :1]
     area = np.cumsum(np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1))
     chosen = np.unique(np.searchsorted(area, np.linspace(0, area[-1], MAX_PIECES + 1)[:-1], side="right"))

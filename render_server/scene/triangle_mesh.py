@@ -6,8 +6,6 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.render_server.scene.asset_check import MAX_TRIANGLES
@@ -114,6 +112,9 @@ def _smoothing_groups(
     welded: Int64[np.ndarray, "m 3"], normals: Float64[np.ndarray, "m 3"], cos_crease: float
 ) -> Int32[np.ndarray, " c"]:
     """Returns the smoothing group of every corner (3 * triangle + k)."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
     start, end = welded.ravel(), np.roll(welded, -1, axis=1).ravel()
     low, high = np.minimum(start, end), np.maximum(start, end)
     order = np.lexsort((low, high))

@@ -162,7 +162,7 @@ def test_the_command_takes_chosen_steps_in_software(tmp_path: Path) -> None:
         "deltalight.services.cli",
         "gpu-check",
         "--steps",
-        "doctor,shaders,quality",
+        "doctor,quality",
     ]
     done = subprocess.run(
         [*command, "--out", str(tmp_path)], cwd=ROOT, capture_output=True, text=True, timeout=280, check=False
@@ -171,7 +171,6 @@ def test_the_command_takes_chosen_steps_in_software(tmp_path: Path) -> None:
     assert done.stdout.startswith("gpu-check: no step failed on llvmpipe")
     steps = written(tmp_path)["steps"]
     assert steps["doctor"]["figures"]["checks"][0]["name"] == "python"
-    assert len(steps["shaders"]["figures"]["variants"]) > 90
     assert steps["quality"]["state"] == "skipped"
     assert "no truth beside this machine" in steps["quality"]["sentence"]
     assert {path.name for path in tmp_path.iterdir()} == {"report.json", "report.md", "output.log"}
@@ -261,7 +260,9 @@ def test_without_pytest_the_tests_are_left_out(tmp_path: Path, monkeypatch: pyte
 
 @pytest.mark.slow
 def test_tests_are_counted_and_what_fails_is_named(tmp_path: Path) -> None:
-    """In a process of its own, as the step has it: pytest runs in a process once."""
+    """In a process of its own, as the step has it: pytest runs in a process once. Without plugins that take a second
+    of each of its processes.
+    """
     (tmp_path / "some").mkdir()
     lines = [
         "def test_good(): pass",
@@ -280,6 +281,7 @@ def test_tests_are_counted_and_what_fails_is_named(tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-c", code, str(tmp_path)],
         cwd=ROOT,
+        env={**os.environ, "PYTEST_ADDOPTS": "-p no:schemathesis -p no:hypothesispytest"},
         capture_output=True,
         text=True,
         timeout=120,

@@ -26,13 +26,12 @@ PAPER_GAIN_DB = 4.0  # the project's goal (8.7)
 
 
 @pytest.fixture(scope="module")
-def measured(tmp_path_factory: pytest.TempPathFactory) -> QualityResult:
+def measured() -> QualityResult:
     scenes = [scene_named(name) for name in PICTURE_FLOOR_DB]
     variants = parse_variants("camera,paper,exact")
-    job = QualityJob(
-        scenes, variants, SIZE, LIGHT_PATHS, volume_size=64, cache=tmp_path_factory.mktemp("truth")
-    )
-    with Progress(disable=True) as progress:
+    job = QualityJob(scenes, variants, SIZE, LIGHT_PATHS, volume_size=64)
+    with Progress(disable=True) as progress, pytest.MonkeyPatch.context() as patch:
+        patch.setattr("deltalight.benchmarks.quality.renders.TIMED_PAIRS", 1)
         return measure_quality(job, progress)
 
 

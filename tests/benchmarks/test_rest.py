@@ -9,6 +9,7 @@ import pytest
 from deltalight.benchmarks.rest import VIEWERS, dashboard_sizes, measure_rest, print_report
 from deltalight.services.cli import run
 from deltalight.services.demo import RECORDING, SCENE
+from tests.services.record_samples import slow_demo
 
 
 def test_the_page_counts_as_it_is_sent(tmp_path: Path) -> None:
@@ -28,7 +29,10 @@ def test_the_page_counts_as_it_is_sent(tmp_path: Path) -> None:
 @pytest.mark.skipif(
     not (RECORDING.is_file() and SCENE.is_file()), reason="the demo's recording is not in this checkout"
 )
-def test_it_runs_and_reports(capsys: pytest.CaptureFixture[str]) -> None:
+def test_it_runs_and_reports(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("deltalight.services.demo.RECORDING", slow_demo(tmp_path))
     report = measure_rest(0.4, size=(96, 72), device=None)
     for key in ("without_rendering", "with_rendering"):
         figures = report[key]

@@ -30,7 +30,7 @@ from deltalight.benchmarks.variants import FIXED, RENDERED, parse_variants
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.source import open_source
-from deltalight.render_server.gpu.context import GpuContext, create_context
+from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.renderer import SceneRenderer
 from deltalight.render_server.view import resized_frame
 from deltalight.sensor_node.view_frames import ViewFrameBuilder
@@ -44,11 +44,9 @@ SIZE = (64, 48)
 PEAKS = Peaks(bytes_per_s=1e9, flops_per_s=1e9)
 
 
-@pytest.fixture(scope="module")
-def gpu() -> Iterator[GpuContext]:
-    context = create_context()
-    yield context
-    context.release()
+@pytest.fixture(autouse=True)
+def current(gpu: GpuContext) -> None:
+    gpu.ctx.__enter__()  # the command, which tests before may have run, makes a context of its own
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from deltalight.benchmarks.speed.instruments import GpuCounts, ReadBacks, counted
-from deltalight.render_server.gpu.context import GpuContext, create_context
+from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Kernel
 from deltalight.render_server.gpu.textures import AsyncReadback, texture_2d
 
@@ -20,13 +20,6 @@ void main() { values[0] = first; values[1] = others.x; values[2] = others.y; val
 """
 CORNER = "#version 430\nvoid main() { gl_Position = vec4(gl_VertexID & 1, gl_VertexID >> 1, 0, 1); }"
 WHITE = "#version 430\nout vec4 color; void main() { color = vec4(1); }"
-
-
-@pytest.fixture(scope="module")
-def gpu() -> Iterator[GpuContext]:
-    context = create_context()
-    yield context
-    context.release()
 
 
 @pytest.fixture

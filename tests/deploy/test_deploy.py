@@ -16,6 +16,7 @@ import yaml
 from prometheus_client.parser import text_string_to_metric_families
 
 from deltalight.services import ports
+from tests.services.record_samples import slow_demo
 
 ROOT = Path(__file__).parents[2]
 DEPLOY = ROOT / "deploy"
@@ -121,7 +122,7 @@ def test_the_commands_of_compose_run_and_their_health_checks_pass(tmp_path: Path
     places = {
         "/run/deltalight": str(tmp_path / "run"),
         "/var/lib/deltalight": str(tmp_path / "data"),
-        "/recordings": str(ROOT / "services" / "demo_assets"),
+        "/recordings": str(slow_demo(tmp_path).parent),
         "/run/secrets/control_token": str(secret),
         "127.0.0.1:8000": f"127.0.0.1:{port}",
     }

@@ -1,4 +1,4 @@
-"""What the renderer's tests share: one GL context, and no GL error left behind."""
+"""What the renderer's tests share: scenes, kernels, and no GL error left behind."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -8,25 +8,11 @@ import numpy as np
 import pytest
 
 from deltalight.render_server.gpu import kernel as kernel_module
-from deltalight.render_server.gpu.context import GpuContext, create_context
+from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Kernel
 from deltalight.render_server.gpu.textures import texture_2d
 from tests.render_server.scenes import ObjectsRenderer, Stage
 from tests.render_server.tiny_kernel import OUT, MakeKernel
-
-
-@pytest.fixture(scope="session")
-def shared_context() -> Iterator[GpuContext]:
-    """The context that keeps linked programs from module to module."""
-    context = create_context()
-    yield context
-    context.release()
-
-
-@pytest.fixture(scope="module")
-def gpu(shared_context: GpuContext) -> GpuContext:
-    shared_context.ctx.__enter__()  # other modules make contexts of their own, which are current then
-    return shared_context
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,7 @@
-"""Stages write what they declare, and nothing that another stage made: the graph checks it, kernel by kernel."""
+"""Stages write what they declare, and nothing that another stage made: the graph checks it, kernel by kernel.
+
+Here in small; test_protected_pictures.py has it checked while every method renders.
+"""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +15,6 @@ from deltalight.render_server.gpu import kernel as kernel_module
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Kernel
 from deltalight.render_server.graph import Graph, GraphError
-from tests.render_server.protected_scenes import METHODS, Case, pictures_of
 
 pytestmark = pytest.mark.usefixtures("clean_gl")
 COPY = """
@@ -21,30 +23,6 @@ layout(std430) readonly buffer From { int from[]; };
 layout(std430) buffer To { int to[]; };
 void main() { to[gl_GlobalInvocationID.x] = from[gl_GlobalInvocationID.x] + 1; }
 """
-CHANGES = {  # between the frames: what the camera sees of the real scene, the objects, the light
-    "mirror": "depth",
-    "animated": "model",
-    "estimated": "depth",
-}
-
-
-def cases() -> list[Case]:
-    """`aroof` refuses objects that change their shape."""
-    found = [Case(method, geometry, kind) for method in METHODS for kind, geometry in CHANGES.items()]
-    return [case for case in found if (case.method, case.kind) != ("aroof", "animated")]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("case", cases(), ids=str)
-def test_no_stage_writes_what_it_did_not_declare(
-    gpu: GpuContext, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, case: Case
-) -> None:
-    monkeypatch.setenv("DELTALIGHT_CACHE", str(tmp_path / "cache"))
-    _, dispatches = pictures_of(gpu, case, tmp_path, checks=True)
-    assert any(run.written for run in dispatches[1])
-
-
-# In small
 
 
 @pytest.fixture

@@ -7,7 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from deltalight.benchmarks.goals import DEPTH_NOISE_M, GOALS, Difference, differences, floor_irradiance
+from deltalight.benchmarks.goals import (
+    DEPTH_NOISE_M,
+    GOALS,
+    Difference,
+    Rooms,
+    differences,
+    floor_irradiance,
+)
 from deltalight.render_server.gpu.context import GpuContext
 
 pytestmark = pytest.mark.usefixtures("clean_gl")
@@ -23,6 +30,11 @@ REACHED = {
 }
 
 
+@pytest.fixture(scope="module")
+def rooms(gpu: GpuContext, tmp_path_factory: pytest.TempPathFactory) -> Rooms:
+    return Rooms(gpu, tmp_path_factory.mktemp("rooms"))
+
+
 def test_every_goal_has_its_bound() -> None:
     assert set(REACHED) == set(GOALS)
 
@@ -30,10 +42,8 @@ def test_every_goal_has_its_bound() -> None:
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=() if "maps" in name else pytest.mark.slow) for name in REACHED]
 )
-def test_change_of_light_depends_little_on_settings_and_turn(
-    gpu: GpuContext, tmp_path: Path, name: str
-) -> None:
-    found = differences(gpu, GOALS[name], tmp_path)
+def test_change_of_light_depends_little_on_settings_and_turn(rooms: Rooms, name: str) -> None:
+    found = differences(rooms, GOALS[name])
     print(f"{name}: {found}")
     for part, bound in zip(found.values(), REACHED[name], strict=True):
         assert part.mean <= bound.mean

@@ -46,7 +46,7 @@ from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.scenes import Stage, cube, directional, floor, frame
 
 ROOT = Path(__file__).parents[2]
-TEXELS = Path(__file__).with_name("pyramid_texels")
+TEXELS = Path(__file__).with_name("mipmap_texels")
 pytestmark = pytest.mark.usefixtures("clean_gl")
 
 
@@ -423,7 +423,7 @@ def test_shaders_lay_out_and_look_up_the_mipmap_so(
     everything = [(level, direction) for level in range(placement.levels) for direction in range(6)]
     for level, direction in everything:
         threads = ((size >> level) ** 3,)
-        paint.run(threads, volume.bindings, pyramid=mipmap.texture, level=level, direction=direction)
+        paint.run(threads, volume.bindings, mipmap=mipmap.texture, level=level, direction=direction)
         expected[block(size, level, direction)] = level * 8 + direction + 1
     texels = np.frombuffer(mipmap.texture.read(), np.float16).reshape(*expected.shape, 4)
     assert np.array_equal(texels[..., 0], expected)
@@ -431,7 +431,7 @@ def test_shaders_lay_out_and_look_up_the_mipmap_so(
         look_up.run(
             (500,),
             volume.bindings,
-            pyramid=mipmap.texture,
+            mipmap=mipmap.texture,
             Places=place_buffer,
             Found=found,
             level=level,

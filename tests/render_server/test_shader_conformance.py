@@ -6,17 +6,19 @@ Mesa accepts more than the language allows, and has more of everything than driv
 import re
 import shutil
 import subprocess
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 import pytest
 
-from deltalight.render_server.gpu.context import NEEDED, create_context
+from deltalight.benchmarks.gpu_check.child import take_step
+from deltalight.benchmarks.gpu_check.record import Findings, State
+from deltalight.render_server.gpu.context import NEEDED, GpuContext
 from deltalight.render_server.gpu.kernel import IMAGES, SAMPLERS
-from deltalight.render_server.gpu.shader_source import SHADERS
-from tests.render_server.shader_variants import PARTS
+from deltalight.render_server.gpu.shader_source import SHADERS, VERSION
+from tests.render_server import shader_variants
 
 VALIDATOR = shutil.which("glslangValidator")
 pytestmark = [
@@ -61,24 +63,31 @@ class Shader:
     text: str
     path: Path
 
-    def validator(self, *options: str) -> str:
-        """What glslangValidator says."""
-        assert VALIDATOR is not None
-        command = [VALIDATOR, *options, str(self.path)]
-        return subprocess.run(command, capture_output=True, text=True, check=False).stdout
-
     @cached_property
     def linked(self) -> str:
-        """What it says of the shader as a program of its own: faults, and what the program uses."""
-        return self.validator("-l", "-q")
+        """What glslangValidator says of it as a program of its own: faults, and what the program uses."""
+        return validator("-l", "-q", self.path)
+
+
+def validator(*arguments: str | Path) -> str:
+    """What glslangValidator says."""
+    assert VALIDATOR is not None
+    return subprocess.run([VALIDATOR, *arguments], capture_output=True, text=True, check=False).stdout
 
 
 Programs = dict[str, list[Shader]]
 
 
 @pytest.fixture(scope="module")
-def programs(tmp_path_factory: pytest.TempPathFactory) -> Programs:
-    """The programs that rendering compiles, and those that only a GPU would need, by label."""
+def step(tmp_path_factory: pytest.TempPathFactory) -> Findings:
+    """Step `shaders` of `gpu-check`, not yet taken."""
+    folder = tmp_path_factory.mktemp("step")
+    return Findings(folder / "record.json", folder, folder)
+
+
+@pytest.fixture(scope="module")
+def programs(step: Findings, tmp_path_factory: pytest.TempPathFactory) -> Programs:
+    """The programs that rendering compiles, and those that only a GPU would need, by label: those of the step."""
     folder = tmp_path_factory.mktemp("shaders")
     found: Programs = {}
 
@@ -90,12 +99,18 @@ def programs(tmp_path_factory: pytest.TempPathFactory) -> Programs:
                 path.write_text(text)
                 found[label].append(Shader(stage, text, path))
 
-    gpu = create_context()
-    gpu.compile_watchers.append(keep)
-    for compile_part in PARTS.values():
-        compile_part(gpu, tmp_path_factory.mktemp("scene"))
-    gpu.release()
+    def begin(gpu: GpuContext, folder: Path) -> None:  # noqa: ARG001
+        gpu.compile_watchers.append(keep)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(shader_variants, "PARTS", {"begin": begin, **shader_variants.PARTS})
+        take_step("deltalight.benchmarks.gpu_check.steps:shaders", step)
     return found
+
+
+def test_the_driver_takes_them_all_and_gpu_check_lists_them(programs: Programs, step: Findings) -> None:
+    assert step.record.state is State.PASSED, step.record
+    assert step.record.figures["variants"] == sorted(programs)
 
 
 def shaders_of(programs: Programs) -> Iterator[tuple[str, Shader]]:
@@ -117,7 +132,12 @@ def test_every_variant_is_valid_glsl(programs: Programs) -> None:
 
 
 def test_no_variant_needs_more_than_opengl_guarantees(programs: Programs) -> None:
-    needs = {(name, shader.stage): needs_of(shader) for name, shader in shaders_of(programs)}
+    named = dict(shaders_of(programs))
+    texts = preprocessed(named.values())
+    needs = {
+        (name, shader.stage): needs_of(shader, text)
+        for (name, shader), text in zip(named.items(), texts, strict=True)
+    }
     for (name, _), needed in needs.items():  # shown with a failure
         print(f"{name:60} " + ", ".join(f"{count} {kind}" for kind, count in needed.items() if count))
     beyond = {
@@ -130,12 +150,17 @@ def test_no_variant_needs_more_than_opengl_guarantees(programs: Programs) -> Non
     assert max(needed.get("shared bytes", 0) for needed in needs.values()) > 16384
 
 
-def needs_of(shader: Shader) -> dict[str, int]:
-    """What a shader takes of each thing that is limited.
+def preprocessed(shaders: Iterable[Shader]) -> list[str]:
+    """The text of each without conditions and macros, by one run of the validator: most of a run is its start."""
+    _, *texts = validator("-E", *(shader.path for shader in shaders)).split(f"{VERSION}\n")
+    return texts
+
+
+def needs_of(shader: Shader, text: str) -> dict[str, int]:
+    """What a shader takes of each thing that is limited, of its `preprocessed` text and what its program uses.
 
     Blocks count as soon as they are declared (std140 and std430 keep unused ones), textures and images where used.
     """
-    text = shader.validator("-E")
     reflection = shader.linked
     blocks = BLOCK.findall(text)
     needs = {

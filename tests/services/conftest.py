@@ -2,8 +2,9 @@
 
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -16,11 +17,23 @@ from deltalight.protocol.messages import ColorMessage, DepthMessage, PoseMessage
 from deltalight.protocol.subscriber import ReceivedMultipart
 from deltalight.services.cli import run
 
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
+
 ROOT = Path(__file__).parents[2]
 WIDTH, HEIGHT = 64, 48
 IDENTITY = tuple(tuple(float(value) for value in row) for row in np.eye(4))
 
 RunCli = Callable[..., subprocess.CompletedProcess[str]]
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator["Browser"]:
+    """Not for the whole session: while it runs, nothing else in this thread can run an event loop."""
+    from tests.services.dashboard_samples import chromium
+
+    with chromium() as running:
+        yield running
 
 
 @pytest.fixture

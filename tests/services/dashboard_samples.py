@@ -17,19 +17,29 @@ import numpy as np
 import pytest
 from jaxtyping import UInt8
 from numpy.typing import ArrayLike
-from playwright.sync_api import BrowserContext, ConsoleMessage, Locator, Page
+from playwright.sync_api import (
+    Browser,
+    BrowserContext,
+    ConsoleMessage,
+    Locator,
+    Page,
+    sync_playwright,
+)
 
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.scene import SceneDocument
 from deltalight.services import ports
 from deltalight.services.api.static_page import DASHBOARD
-from deltalight.services.demo import NAME, RECORDING, demo_plan, demo_scene
+from deltalight.services.demo import NAME, demo_plan, demo_scene
 from deltalight.services.host_store import activate_document, session_file
 from deltalight.services.storage.store import Store
 from deltalight.services.supervisor import Supervisor
 from tests.services.live_samples import live_socket, read_frame, wait_for_frames
+from tests.services.record_samples import slow_demo
 
 PATIENCE_S = 90.0
+# Between pictures of a stand-in: a browser takes longer to draw one than the stand-in to send it.
+STAND_IN_PERIOD_S = 0.1
 # Where this names a folder, the tests leave pictures of what they see there, in the camera's size.
 SCREENSHOTS = os.environ.get("DELTALIGHT_SCREENSHOTS")
 SIZE = {"width": 1280, "height": 800}
@@ -37,9 +47,26 @@ AXE = DASHBOARD.parent / "node_modules" / "axe-core" / "axe.min.js"  # comes wit
 JPEG_QUALITY = 82  # keeps each below 200 kB
 
 
-def find_chromium() -> str | None:
-    names = ("chromium", "chromium-browser", "google-chrome")
-    return next((path for path in map(shutil.which, names) if path), None)
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+NEEDS_BROWSER = [
+    pytest.mark.slow,
+    pytest.mark.skipif(
+        CHROMIUM is None, reason="no Chromium is installed (Debian: apt-get install chromium)"
+    ),
+    pytest.mark.skipif(
+        not (DASHBOARD / "index.html").is_file(),
+        reason="the dashboard is not built; `./run test --all` builds it",
+    ),
+]
+
+
+@contextmanager
+def chromium() -> Iterator[Browser]:
+    """A running browser."""
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield browser
+        browser.close()
 
 
 @dataclass(frozen=True)
@@ -80,7 +107,7 @@ class Stack:
 @contextmanager
 def demo_stack(data: Path) -> Iterator[Stack]:
     """The demo with small pictures, so that a software renderer makes several a second."""
-    with running_stack(data, _scene(), RECORDING) as stack:
+    with running_stack(data, _scene(), slow_demo(data)) as stack:
         yield stack
 
 

@@ -10,12 +10,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from deltalight.benchmarks.speed.motions import STANDING
 from deltalight.protocol.board import BoardSpec
 from deltalight.protocol.calibration import Extrinsics
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.frames import BoardPose, SensorFrame
 from deltalight.protocol.pictures import depth_from_steps
 from deltalight.protocol.publisher import Publisher
+from deltalight.protocol.recording_reader import RecordingReader
 from deltalight.protocol.recording_writer import RecordingWriter
 from deltalight.protocol.scene import SceneDocument
 from deltalight.sensor_node.frame_messages import (
@@ -25,6 +27,7 @@ from deltalight.sensor_node.frame_messages import (
     fisheye_multipart,
     pose_multipart,
 )
+from deltalight.services.demo import RECORDING
 from tests.protocol.fisheye_samples import coded
 
 WIDTH, HEIGHT = 64, 48
@@ -33,6 +36,19 @@ PERIOD_NS = 33_333_333
 BOARD = BoardSpec(
     type="aruco_grid", dictionary="DICT_4X4_50", marker_length_m=0.04, separation_m=0.01, rows=3, columns=4
 )
+
+
+def slow_demo(folder: Path) -> Path:
+    """Every third frame of the demo's recording while its camera stands still: five a second, not fifteen.
+
+    For tests that wait for pictures of running processes: a node and a renderer of the whole recording keep two cores
+    busy all the time.
+    """
+    reader, out = RecordingReader(RECORDING), folder / "demo.mcap"
+    with RecordingWriter(out, board=reader.board, extrinsics=reader.extrinsics) as writer:
+        for number in STANDING[::3]:
+            writer.add(reader[number])
+    return out
 
 
 def camera(width: int = WIDTH, height: int = HEIGHT) -> CameraModel:

@@ -139,13 +139,13 @@ def test_leaving_loopback_makes_and_prints_a_token_once(tmp_path: Path) -> None:
             stderr=subprocess.PIPE,
             text=True,
         )
-        url = f"http://{ports.LOOPBACK}:{port}/api/v1"
-        wait_for(lambda url=url: httpx.get(f"{url}/health").status_code == 200)  # type: ignore[misc]
-        assert "token is needed" in sentence(httpx.get(f"{url}/scenes"), 401)
-        if outputs:
-            token = outputs[0][0].split()[-1]
-            scenes = httpx.get(f"{url}/scenes", headers={"Authorization": f"Bearer {token}"}).json()
-            assert [scene["active"] for scene in scenes] == [True]  # there is something to begin with
+        with httpx.Client(base_url=f"http://{ports.LOOPBACK}:{port}/api/v1") as client:
+            wait_for(lambda client=client: client.get("/health").status_code == 200)  # type: ignore[misc]
+            assert "token is needed" in sentence(client.get("/scenes"), 401)
+            if outputs:
+                token = outputs[0][0].split()[-1]
+                scenes = client.get("/scenes", headers={"Authorization": f"Bearer {token}"}).json()
+                assert [scene["active"] for scene in scenes] == [True]  # there is something to begin with
         running.terminate()
         outputs.append(running.communicate(timeout=20))
     assert "shown this once: deltalight-" in outputs[0][0]

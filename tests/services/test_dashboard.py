@@ -6,25 +6,16 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from playwright.sync_api import Browser, Route, sync_playwright
+from playwright.sync_api import Browser, Route
 
 from deltalight.protocol.camera_model import CameraModel
-from deltalight.services.api.static_page import DASHBOARD
 from deltalight.services.demo import RECORDING, SCENE
-from tests.services.dashboard_samples import AXE, SIZE, Desk, Stack, demo_stack, desk, find_chromium
+from tests.services.dashboard_samples import AXE, NEEDS_BROWSER, SIZE, Desk, Stack, demo_stack, desk
 
-CHROMIUM = find_chromium()
 pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(
-        CHROMIUM is None, reason="no Chromium is installed (Debian: apt-get install chromium)"
-    ),
+    *NEEDS_BROWSER,
     pytest.mark.skipif(
         not (RECORDING.is_file() and SCENE.is_file()), reason="the demo's recording is not in this checkout"
-    ),
-    pytest.mark.skipif(
-        not (DASHBOARD / "index.html").is_file(),
-        reason="the dashboard is not built; `./run test --all` builds it",
     ),
 ]
 FREE_TABLE_M = (0.05, 0.25, 0.0)  # between the board and the boxes, where nothing stands
@@ -38,14 +29,6 @@ GIZMO_SIZE = 1.35  # as the page sets it
 def stack(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stack]:
     with demo_stack(tmp_path_factory.mktemp("data")) as running:
         yield running
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        yield browser
-        browser.close()
 
 
 @pytest.fixture(scope="module")

@@ -3,30 +3,20 @@
 from collections.abc import Iterator
 
 import pytest
-from playwright.sync_api import Browser, Locator, Page, expect, sync_playwright
+from playwright.sync_api import Browser, Locator, Page, expect
 
-from deltalight.services.api.static_page import DASHBOARD
 from tests.services.dashboard_samples import (
     AXE,
+    NEEDS_BROWSER,
     PATIENCE_S,
     SIZE,
+    STAND_IN_PERIOD_S,
     complaints_of,
-    find_chromium,
     photograph,
 )
 from tests.services.live_samples import LiveApi, live_api
 
-CHROMIUM = find_chromium()
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(
-        CHROMIUM is None, reason="no Chromium is installed (Debian: apt-get install chromium)"
-    ),
-    pytest.mark.skipif(
-        not (DASHBOARD / "index.html").is_file(),
-        reason="the dashboard is not built; `./run test --all` builds it",
-    ),
-]
+pytestmark = NEEDS_BROWSER
 SCENE = {
     "name": "Gallery",
     "lights": {"mode": "manual", "manual": [{"type": "sphere", "position_m": [1, 0, 1], "intensity": 5}]},
@@ -52,18 +42,10 @@ LOOKING = {
 @pytest.fixture
 def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveApi]:
     """With the rules of an address that leaves the host (the test itself listens on loopback)."""
-    with live_api(tmp_path_factory.mktemp("data"), host="0.0.0.0") as running:
+    with live_api(tmp_path_factory.mktemp("data"), period_s=STAND_IN_PERIOD_S, host="0.0.0.0") as running:
         store = running.api.store
         store.scenes.activate(store.scenes.create(SCENE).head.id)
         yield running
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        yield browser
-        browser.close()
 
 
 @pytest.fixture

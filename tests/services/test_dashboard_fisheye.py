@@ -5,36 +5,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from playwright.sync_api import sync_playwright
+from playwright.sync_api import Browser
 
 from deltalight.protocol.scene import load_scene
-from deltalight.services.api.static_page import DASHBOARD
 from tests.sensor_node.fisheye_samples import equidistant
-from tests.services.dashboard_samples import SIZE, Desk, desk, find_chromium, running_stack
+from tests.services.dashboard_samples import NEEDS_BROWSER, SIZE, Desk, desk, running_stack
 from tests.services.test_light_chain import LAMP, write_scene, write_take
 
-CHROMIUM = find_chromium()
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(
-        CHROMIUM is None, reason="no Chromium is installed (Debian: apt-get install chromium)"
-    ),
-    pytest.mark.skipif(
-        not (DASHBOARD / "index.html").is_file(),
-        reason="the dashboard is not built; `./run test --all` builds it",
-    ),
-]
+pytestmark = NEEDS_BROWSER
 
 
 @pytest.fixture
-def page(tmp_path: Path) -> Iterator[Desk]:
+def page(tmp_path: Path, browser: Browser) -> Iterator[Desk]:
     """The dashboard over a take whose bracket shows an even room with one lamp."""
     write_take(tmp_path / "take")
     scene = load_scene(write_scene(tmp_path))
     with (
         running_stack(tmp_path / "data", scene, tmp_path / "take") as stack,
-        sync_playwright() as playwright,
-        playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"]) as browser,
         browser.new_context(viewport=SIZE, color_scheme="dark") as context,  # type: ignore[arg-type]
         desk(stack, context) as seat,
     ):

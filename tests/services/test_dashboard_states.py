@@ -8,24 +8,20 @@ import shutil
 from collections.abc import Iterator
 
 import pytest
-from playwright.sync_api import Browser, Route, expect, sync_playwright
+from playwright.sync_api import Browser, Route, expect
 
-from deltalight.services.api.static_page import DASHBOARD
 from deltalight.services.demo import POSTER
-from tests.services.dashboard_samples import PATIENCE_S, SIZE, Desk, Stack, find_chromium
+from tests.services.dashboard_samples import (
+    NEEDS_BROWSER,
+    PATIENCE_S,
+    SIZE,
+    STAND_IN_PERIOD_S,
+    Desk,
+    Stack,
+)
 from tests.services.live_samples import AGE_S, LiveApi, live_api
 
-CHROMIUM = find_chromium()
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(
-        CHROMIUM is None, reason="no Chromium is installed (Debian: apt-get install chromium)"
-    ),
-    pytest.mark.skipif(
-        not (DASHBOARD / "index.html").is_file(),
-        reason="the dashboard is not built; `./run test --all` builds it",
-    ),
-]
+pytestmark = NEEDS_BROWSER
 LAMP = {"type": "sphere", "position_m": [1, 0, 1], "intensity": 5}
 SCENE = {"name": "Gallery", "lights": {"mode": "manual", "manual": [LAMP]}}
 PHONE = {"width": 390, "height": 844}
@@ -35,16 +31,8 @@ PANELS = ("Object", "Lights", "Real", "Method", "Output")
 
 @pytest.fixture(scope="module")
 def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveApi]:
-    with live_api(tmp_path_factory.mktemp("data")) as running:
+    with live_api(tmp_path_factory.mktemp("data"), period_s=STAND_IN_PERIOD_S) as running:
         yield running
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        yield browser
-        browser.close()
 
 
 @pytest.fixture

@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ from deltalight.services.host_store import session_file
 from deltalight.services.supervisor import Supervisor
 from tests.services.conftest import ROOT, RunCli
 from tests.services.live_samples import live_socket, read_frame, wait_for_frames
+from tests.services.record_samples import slow_demo
 
 pytestmark = pytest.mark.skipif(
     not (RECORDING.is_file() and SCENE.is_file()), reason="the demo's recording is not in this checkout"
@@ -84,9 +86,9 @@ def test_headless_demo_needs_a_folder(cli: RunCli) -> None:
 
 
 @pytest.mark.slow
-def test_picture_returns_after_node_and_server_are_killed() -> None:
+def test_picture_returns_after_node_and_server_are_killed(tmp_path: Path) -> None:
     with session_file(demo_scene("paper").replaced(output=SMALL)) as session:
-        plan = demo_plan(session)
+        plan = replace(demo_plan(session), source=str(slow_demo(tmp_path)))
         lines: list[str] = []
         with Supervisor(plan.specs(), forward=lines.append) as supervisor:
             receiver = Receiver([ports.endpoint(plan.composite_port)], ["composite"])

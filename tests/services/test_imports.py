@@ -1,4 +1,5 @@
-"""Modules of protocol and services import each other one way; benchmarks are reached through one module."""
+"""Modules of protocol and services import each other one way; benchmarks are reached through one module; a render
+server starts without what it may never need."""
 
 import ast
 from functools import cache
@@ -8,6 +9,8 @@ from tests.services.conftest import ROOT
 
 PACKAGES = ("protocol", "services")
 BENCHMARKS_ENTRY = "deltalight.benchmarks.cli"
+# Most of a second, by which a render server that was killed would be away longer.
+SLOW_TO_IMPORT = {"scipy", "trimesh"}
 
 
 @cache
@@ -45,3 +48,11 @@ def test_benchmarks_are_imported_through_their_entry_alone() -> None:
     }
     assert {each for each in found if not each.startswith(BENCHMARKS_ENTRY)} == set()
     assert BENCHMARKS_ENTRY in found
+
+
+def test_render_servers_import_slow_libraries_where_they_use_them() -> None:
+    for path in (ROOT / "render_server").rglob("*.py"):
+        lines = ast.parse(path.read_text()).body
+        when_loaded = [line for line in lines if isinstance(line, ast.Import | ast.ImportFrom)]
+        found = {name.split(".")[0] for line in when_loaded for name in imported(ast.unparse(line))}
+        assert not found & SLOW_TO_IMPORT, path

@@ -29,6 +29,7 @@ from tests.services.conftest import ROOT
 pytestmark = pytest.mark.slow
 PATIENCE_S = 60.0
 SIZE = 320, 240
+PERIOD_NS = 200_000_000
 PLACE_M = (0.2, -0.1, 0.05)
 # Towards the lamp, in the fish-eye's frame; its radius in the picture is 3 degrees.
 LAMP = np.array([0.5, -0.3, 0.8]) / np.linalg.norm([0.5, -0.3, 0.8])
@@ -40,7 +41,7 @@ TURN = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
 
 
 def write_take(folder: Path) -> None:
-    """Two frames of the synthetic table; the bracket shows an even room with one lamp."""
+    """Two frames, five a second, of the synthetic table at rest; the bracket shows an even room with one lamp."""
     lens = equidistant(160)
     pixels = np.stack(np.meshgrid(np.arange(160.0), np.arange(160.0)), axis=-1).reshape(-1, 2)
     is_lamp = (lens.directions(pixels) @ LAMP > LAMP_COSINE).reshape(160, 160, 1)
@@ -51,7 +52,7 @@ def write_take(folder: Path) -> None:
     extrinsics = Extrinsics(world_from_fisheye=world_from_fisheye)
     with DatasetWriter(folder, board=camera.board, extrinsics=extrinsics) as writer:
         for index in range(2):
-            frame = camera.frame_at(index)
+            frame = replace(camera.frame_at(0), frame_id=index, timestamp_ns=index * PERIOD_NS)
             pictures = replace(bracket(light, EXPOSURES_S, lens), timestamp_ns=0)
             writer.add(replace(frame, fisheye=pictures))
 

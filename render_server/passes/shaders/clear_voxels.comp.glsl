@@ -5,13 +5,13 @@
 #include "common/voxel_store.glsl"
 
 layout(local_size_x = 64) in;
-layout(rgba16f) writeonly uniform image3D pyramid;
+layout(rgba16f) writeonly uniform image3D mipmap;
 uniform bool free_slots;    // also release the slots
 
 void main() {
     for (uint i = gl_GlobalInvocationID.x; i < slot_count; i += gl_NumWorkGroups.x * 64u) {
         ivec3 v = voxel_of_index(touched[i], volume_size);
-        for (int k = 0; k < DIRECTIONS; ++k) imageStore(pyramid, v + ivec3(0, 0, k * volume_size), vec4(0.0));
+        for (int k = 0; k < DIRECTIONS; ++k) imageStore(mipmap, v + ivec3(0, 0, k * volume_size), vec4(0.0));
         if (free_slots) grid[touched[i]] = 0u;
     }
 }

@@ -4,10 +4,10 @@
 #include "common/volume.glsl"
 
 layout(local_size_x = 4, local_size_y = 4, local_size_z = 4) in;
-layout(rgba16f) uniform image3D pyramid;
+layout(rgba16f) uniform image3D mipmap;
 uniform int level;          // the level to write; >= 1
 
-vec4 fetch(ivec3 cell, int k) { return imageLoad(pyramid, level_base(level - 1, k) + cell); }
+vec4 fetch(ivec3 cell, int k) { return imageLoad(mipmap, level_base(level - 1, k) + cell); }
 
 vec4 front_to_back(vec4 front, vec4 back) {
     float room = 1.0 - front.a;
@@ -30,5 +30,5 @@ void main() {
         ivec3 across = (j & 1) * step_u + (j >> 1) * step_v;
         sum += front_to_back(fetch(front + across, k), fetch(back + across, k));
     }
-    imageStore(pyramid, level_base(level, k) + cell, 0.25 * sum);
+    imageStore(mipmap, level_base(level, k) + cell, 0.25 * sum);
 }

@@ -26,7 +26,7 @@ float open_fraction(vec3 from, vec3 to) {
     for (int i = 0; i < 1024; ++i) {
         vec3 at = sample_point(w);
         if (travelled(w) > end || coverage >= WALL) break;
-        if (inside_volume(at)) coverage += slice_fraction(w) * directional_sample(pyramid_mu, volume_size, at, w).a;
+        if (inside_volume(at)) coverage += slice_fraction(w) * directional_sample(mipmap_mu, volume_size, at, w).a;
         w.plane += 1;
         w.ahead = vec3(0.0);
     }

@@ -7,7 +7,7 @@
 #include "common/voxel_store.glsl"
 
 layout(local_size_x = 64) in;
-layout(rgba16f) writeonly uniform image3D pyramid;
+layout(rgba16f) writeonly uniform image3D mipmap;
 #ifdef RHO_REAL
 layout(std430) readonly buffer DeltaSums { int delta_sums[]; };
 layout(std430) readonly buffer OtherSums { int other_sums[]; };
@@ -50,7 +50,7 @@ void main() {
             uint other = other_grid[voxel];
             if (other != 0u) c = at_most_covered(c + virtual_texel(int(other - 1u), k));
 #endif
-            imageStore(pyramid, v + ivec3(0, 0, k * volume_size), c);
+            imageStore(mipmap, v + ivec3(0, 0, k * volume_size), c);
         }
     }
 }

@@ -58,7 +58,7 @@ vec4 look(vec3 from, vec3 d, float spread) {
 #ifdef VOXELS
     if (seen.a < 1.0) {
         bool differs;
-        Crossed met = march_one(pyramid_rho, volume_coordinate(from), d, spread, differs);
+        Crossed met = march_one(mipmap_rho, volume_coordinate(from), d, spread, differs);
         vec3 behind = (1.0 - blocked_fraction(met.coverage)) * environment(d, atan(0.5 * spread));
         seen += (1.0 - seen.a) * vec4(met.c + behind, 1.0);
     }

@@ -19,7 +19,7 @@ uniform vec3 object_high;
 layout(rgba16f) writeonly uniform image2D irradiance_rho;   // rgb E_rho, a: 1 where traced
 layout(rgba16f) writeonly uniform image2D specular_rho;     // rgb mean radiance of the specular cone
 #endif
-uniform sampler3D pyramid;   // V_delta for REAL, V_rho otherwise; a: V_eta
+uniform sampler3D mipmap;   // V_delta for REAL, V_rho otherwise; a: V_eta
 #include "common/camera.glsl"
 
 const float START = 2.0;    // voxels along the normal, to leave the surface's own voxels
@@ -48,7 +48,7 @@ vec3 diffuse(vec3 q, vec3 n, bool with_environment) {
     for (int k = 0; k < CONES; ++k) {
         vec3 local = cone_direction(k);
         vec3 d = basis * local;
-        vec4 c = march(pyramid, q, d, RATIO, in_volume(q, d));
+        vec4 c = march(mipmap, q, d, RATIO, in_volume(q, d));
         if (with_environment) c.rgb += (1.0 - c.a) * environment(d, HALF_ANGLE);
         e += local.z * c.rgb;
     }
@@ -79,8 +79,8 @@ void specular(ivec2 texel, SurfacePoint s, vec3 q) {
     vec3 d = reflect(-v, s.normal);
     float half_angle = specular_half_angle(s.roughness);
     float ratio = 2.0 * tan(half_angle);
-    vec3 added = march(pyramid, q, d, ratio, in_volume(q, d)).rgb;
-    float hidden = march(pyramid, q, d, ratio, box_interval(q, d, object_low - 0.5, object_high + 0.5)).a;
+    vec3 added = march(mipmap, q, d, ratio, in_volume(q, d)).rgb;
+    float hidden = march(mipmap, q, d, ratio, box_interval(q, d, object_low - 0.5, object_high + 0.5)).a;
     store_specular(texel, hidden * mirrored(texel, s, v, d, half_angle), added);
 }
 
@@ -102,7 +102,7 @@ void shade(ivec2 texel, SurfacePoint s) {
         e = diffuse(q, s.normal, true);
         vec3 d = reflect(normalize(s.position - camera_position), s.normal);
         float half_angle = specular_half_angle(s.roughness);
-        vec4 met = march(pyramid, q, d, 2.0 * tan(half_angle), in_volume(q, d));
+        vec4 met = march(mipmap, q, d, 2.0 * tan(half_angle), in_volume(q, d));
         c = met.rgb + (1.0 - met.a) * environment(d, half_angle);
     }
     imageStore(irradiance_rho, texel, vec4(e, s.present ? 1.0 : 0.0));

@@ -7,9 +7,9 @@
 // through at any step size: no furnace test could hold.)
 #include "common/volume.glsl"
 
-uniform sampler3D pyramid_mu;
-uniform sampler3D pyramid_rho;
-uniform sampler3D pyramid_far;   // real scene beyond the volume, coarse, the same in mu and rho
+uniform sampler3D mipmap_mu;
+uniform sampler3D mipmap_rho;
+uniform sampler3D mipmap_far;   // real scene beyond the volume, coarse, the same in mu and rho
 layout(std140) uniform FarVolume {
     vec3 far_origin;   // world position of its low corner, m
     float far_edge;    // of a voxel, m
@@ -90,11 +90,11 @@ void advance(inout Walk w, float ratio, float before, int levels) {
 
 #ifdef ISOTROPIC_VOXELS
 // One radiance and one opacity for all directions: the sum of all six, with the opacity of the densest direction.
-vec4 directional_sample(sampler3D pyramid, int n, vec3 q, Walk w) {
+vec4 directional_sample(sampler3D mipmap, int n, vec3 q, Walk w) {
     vec4 sum = vec4(0.0);
     float most = 0.0;
     for (int k = 0; k < 6; ++k) {
-        vec4 cell = volume_sample(pyramid, n, q, w.level, k);
+        vec4 cell = volume_sample(mipmap, n, q, w.level, k);
         sum += cell;
         most = max(most, cell.a);
     }
@@ -105,18 +105,18 @@ vec4 directional_sample(sampler3D pyramid, int n, vec3 q, Walk w) {
 // and away from the ray along each axis. The net area n.d is exact; a closed lump adds, on the side that the ray
 // sees, at most half of `round` (exact for a sphere) and of the pairs min(f, b) (exact, 0, for a plane: no surface
 // occludes itself).
-vec4 directional_sample(sampler3D pyramid, int n, vec3 q, Walk w) {
-    vec4 x = volume_sample(pyramid, n, q, w.level, w.facing.x);
-    vec4 y = volume_sample(pyramid, n, q, w.level, w.facing.y);
-    vec4 z = volume_sample(pyramid, n, q, w.level, w.facing.z);
+vec4 directional_sample(sampler3D mipmap, int n, vec3 q, Walk w) {
+    vec4 x = volume_sample(mipmap, n, q, w.level, w.facing.x);
+    vec4 y = volume_sample(mipmap, n, q, w.level, w.facing.y);
+    vec4 z = volume_sample(mipmap, n, q, w.level, w.facing.z);
     vec3 weights = abs(w.slope);
     vec4 most = weights.x * x + weights.y * y + weights.z * z;
     if (most.a <= 0.0) return vec4(0.0);
     vec3 f = vec3(x.a, y.a, z.a);
     vec3 b = vec3(
-        volume_sample(pyramid, n, q, w.level, w.facing.x ^ 1).a,
-        volume_sample(pyramid, n, q, w.level, w.facing.y ^ 1).a,
-        volume_sample(pyramid, n, q, w.level, w.facing.z ^ 1).a);
+        volume_sample(mipmap, n, q, w.level, w.facing.x ^ 1).a,
+        volume_sample(mipmap, n, q, w.level, w.facing.y ^ 1).a,
+        volume_sample(mipmap, n, q, w.level, w.facing.z ^ 1).a);
     float net = dot(weights, f - b);
     float round = 0.5 * (net + max(abs(net), length(weights * (f + b))));
     float paired = max(net, 0.0) + length(weights * min(f, b));
@@ -126,7 +126,7 @@ vec4 directional_sample(sampler3D pyramid, int n, vec3 q, Walk w) {
 
 // Through the volume around the objects, from q (voxels), until a wall or the volume's end at distance t (voxels).
 // `differs`: the path crossed cells where mu and rho differ.
-Crossed march_near(sampler3D pyramid, vec3 q, vec3 d, float ratio, out float t, out bool differs) {
+Crossed march_near(sampler3D mipmap, vec3 q, vec3 d, float ratio, out float t, out bool differs) {
     Crossed sum = Crossed(vec3(0.0), 0.0);
     Walk w = walk_from(q, d);
     vec3 low = vec3(support[0], support[1], support[2]);
@@ -137,7 +137,7 @@ Crossed march_near(sampler3D pyramid, vec3 q, vec3 d, float ratio, out float t, 
         if (!inside_volume(at) || sum.coverage >= WALL) break;
         vec3 reach = vec3(1.5 * float(1 << w.level));
         differs = differs || (all(greaterThan(at, low - reach)) && all(lessThan(at, high + reach)));
-        cross_cell(slice_fraction(w) * directional_sample(pyramid, volume_size, at, w), sum);
+        cross_cell(slice_fraction(w) * directional_sample(mipmap, volume_size, at, w), sum);
         advance(w, ratio, 0.0, volume_levels);
     }
     t = travelled(w);
@@ -152,15 +152,15 @@ void march_far(vec3 q, vec3 d, float before, float ratio, inout Crossed sum) {
     for (int i = 0; i < 256; ++i) {
         vec3 at = sample_point(w);
         if (!inside_cube(at, far_size) || sum.coverage >= WALL) break;
-        cross_cell(slice_fraction(w) * directional_sample(pyramid_far, far_size, at, w), sum);
+        cross_cell(slice_fraction(w) * directional_sample(mipmap_far, far_size, at, w), sum);
         advance(w, ratio, before, far_levels);
     }
 }
 
 // One march from q (voxels) along d, continued into the coarse scene.
-Crossed march_one(sampler3D pyramid, vec3 q, vec3 d, float ratio, out bool differs) {
+Crossed march_one(sampler3D mipmap, vec3 q, vec3 d, float ratio, out bool differs) {
     float t;
-    Crossed sum = march_near(pyramid, q, d, ratio, t, differs);
+    Crossed sum = march_near(mipmap, q, d, ratio, t, differs);
     if (far_size > 0 && sum.coverage < WALL) {
         vec3 leave = (volume_origin + (q + t * d) * voxel_edge - far_origin) / far_edge;
         // A surface that starts the march outside of the volume must not hit its own coarse voxels.
@@ -173,8 +173,8 @@ Crossed march_one(sampler3D pyramid, vec3 q, vec3 d, float ratio, out bool diffe
 // Both marches from q (voxels) along d; `ratio` = cone diameter / distance. With `only_rho`, mu is that of rho.
 March march(vec3 q, vec3 d, float ratio, bool only_rho) {
     bool differs;
-    Crossed rho = march_one(pyramid_rho, q, d, ratio, differs);
+    Crossed rho = march_one(mipmap_rho, q, d, ratio, differs);
     Crossed mu = rho;
-    if (differs && !only_rho) mu = march_one(pyramid_mu, q, d, ratio, differs);
+    if (differs && !only_rho) mu = march_one(mipmap_mu, q, d, ratio, differs);
     return March(mu.c, 1.0 - blocked_fraction(mu.coverage), rho.c, 1.0 - blocked_fraction(rho.coverage));
 }

@@ -7,12 +7,12 @@ const float OPAQUE = 0.99;   // opacity that ends a march
 
 // Premultiplied (c, a) seen by a cone along d. One-sided mipmaps are sampled for both sides: a cone that starts
 // inside an object is blocked by its far wall.
-vec4 cone_sample(sampler3D pyramid, vec3 q, int level, vec3 d) {
+vec4 cone_sample(sampler3D mipmap, vec3 q, int level, vec3 d) {
 #if DIRECTIONS == 1
-    return volume_sample(pyramid, volume_size, q, level, 0);
+    return volume_sample(mipmap, volume_size, q, level, 0);
 #else
     vec4 sum = vec4(0.0);
-    for (int k = 0; k < DIRECTIONS; ++k) sum += abs(d[k >> 1]) * volume_sample(pyramid, volume_size, q, level, k);
+    for (int k = 0; k < DIRECTIONS; ++k) sum += abs(d[k >> 1]) * volume_sample(mipmap, volume_size, q, level, k);
     return sum;
 #endif
 }
@@ -37,14 +37,14 @@ vec4 accumulated(vec4 sum, vec4 v) {
 }
 
 // (c, a) of the cone from q (voxels) along d within `interval`; `ratio` = diameter / distance.
-vec4 march(sampler3D pyramid, vec3 q, vec3 d, float ratio, vec2 interval) {
+vec4 march(sampler3D mipmap, vec3 q, vec3 d, float ratio, vec2 interval) {
     vec4 sum = vec4(0.0);
     float t = interval.x;
     for (int i = 0; i < 1024 && t < interval.y && sum.a < OPAQUE; ++i) {
         float diameter = max(1.0, ratio * t);
         int level = min(int(floor(log2(diameter) + 0.5)), volume_levels - 1);
         float edge = exp2(float(level));
-        sum = accumulated(sum, cone_sample(pyramid, q + (t + 0.5 * edge) * d, level, d));
+        sum = accumulated(sum, cone_sample(mipmap, q + (t + 0.5 * edge) * d, level, d));
         t += edge;
     }
     return sum;

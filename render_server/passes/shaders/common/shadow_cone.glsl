@@ -4,7 +4,7 @@
 #include "common/march_joint.glsl"
 #include "common/lights.glsl"
 
-uniform sampler3D joint_pyramid;
+uniform sampler3D joint_mipmap;
 uniform vec3 object_low;     // voxels that hold the objects
 uniform vec3 object_high;
 
@@ -41,6 +41,6 @@ vec2 cone_visibility(Light light, vec3 p, vec3 n, float bias) {
     float v_mu = real_visibility(light, p, n, bias);
     ShadowCone cone = shadow_cone(light, p, n);
     if (v_mu == 0.0 || cone.interval.x >= cone.interval.y) return vec2(v_mu);
-    float blocked = march(joint_pyramid, cone.start, cone.d, cone.ratio, cone.interval).a;
+    float blocked = march(joint_mipmap, cone.start, cone.d, cone.ratio, cone.interval).a;
     return v_mu * vec2(1.0, 1.0 - blocked);
 }

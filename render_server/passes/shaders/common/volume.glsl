@@ -19,10 +19,10 @@ ivec3 level_base_of(int n, int level, int k) {
 ivec3 level_base(int level, int k) { return level_base_of(volume_size, level, k); }
 
 // Premultiplied (c, a) at q (voxels of level 0 from the low corner), trilinear within one level and direction.
-vec4 volume_sample(sampler3D pyramid, int n, vec3 q, int level, int k) {
+vec4 volume_sample(sampler3D mipmap, int n, vec3 q, int level, int k) {
     float cells = float(n >> level);
     vec3 c = clamp(q * exp2(-float(level)), vec3(0.5), vec3(cells - 0.5)) + vec3(level_base_of(n, level, k));
-    return textureLod(pyramid, c / vec3(textureSize(pyramid, 0)), 0.0);
+    return textureLod(mipmap, c / vec3(textureSize(mipmap, 0)), 0.0);
 }
 
 vec3 volume_coordinate(vec3 p) { return (p - volume_origin) / voxel_edge; }
