@@ -14,20 +14,17 @@ DOCS = ROOT / "docs"
 ROOMS = ("protocol", "sensor_node", "render_server", "services", "deltalight")
 
 
-@pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The built site; every broken link, anchor or page outside of the navigation would have raised."""
+def build_site(folder: Path) -> None:
+    """Build it; every broken link or anchor, and every page outside of the navigation, raises."""
     pytest.importorskip("material", reason="mkdocs-material is not installed")
     from mkdocs.commands.build import build
     from mkdocs.config import load_config
 
-    folder = tmp_path_factory.mktemp("site")
     config = load_config(str(DOCS / "site" / "mkdocs.yml"), site_dir=str(folder), strict=True)
     logging.getLogger("mkdocs").setLevel(logging.WARNING)
     config.plugins.on_startup(command="build", dirty=False)
     build(config)
     config.plugins.on_shutdown()
-    return folder
 
 
 class Loaded(HTMLParser):
@@ -44,8 +41,7 @@ class Loaded(HTMLParser):
             self.addresses.append(fetched)
 
 
-@pytest.mark.slow
-def test_pages_load_nothing_from_other_hosts(site: Path) -> None:
+def check_that_pages_load_nothing_from_other_hosts(site: Path) -> None:
     pages = [*site.rglob("*.html")]
     assert len(pages) > len([*DOCS.glob("*.md")])
     for page in pages:
@@ -58,8 +54,7 @@ def test_pages_load_nothing_from_other_hosts(site: Path) -> None:
                 assert (page.parent / address.partition("?")[0]).exists(), f"{page.name}: {address}"
 
 
-@pytest.mark.slow
-def test_formulas_notebooks_and_files_outside_are_pages(site: Path) -> None:
+def check_formulas_notebooks_and_files_outside_of_docs(site: Path) -> None:
     def page(name: str) -> str:
         return (site / f"{name}.html").read_text(encoding="utf-8")
 
@@ -71,11 +66,18 @@ def test_formulas_notebooks_and_files_outside_are_pages(site: Path) -> None:
     assert 'href="source/protocol/SPEC.html' in page("formats")
 
 
-@pytest.mark.slow
-def test_the_reference_has_every_public_name(site: Path) -> None:
+def check_that_the_reference_has_every_public_name(site: Path) -> None:
     page = (site / "api.html").read_text(encoding="utf-8")
     for name in set(dl.__all__) - {"__version__", "open"} | {"open_take", "render", "forget"}:
         assert re.search(rf'id="deltalight\.[\w.]*\b{name}"', page), name
+
+
+@pytest.mark.slow
+def test_the_site_is_whole_and_needs_no_other_host(tmp_path: Path) -> None:
+    build_site(tmp_path)
+    check_that_pages_load_nothing_from_other_hosts(tmp_path)
+    check_formulas_notebooks_and_files_outside_of_docs(tmp_path)
+    check_that_the_reference_has_every_public_name(tmp_path)
 
 
 def spoken() -> str:

@@ -4,6 +4,7 @@ import json
 import posixpath
 import re
 from collections.abc import Iterator
+from contextlib import suppress
 from html import unescape
 from pathlib import Path
 
@@ -27,8 +28,10 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
     parts = [*(ROOT / "deltalight").glob("*.py"), *(ROOT / room for room in ROOMS)]
     for part in parts:
         link = API / part.name
-        link.unlink(missing_ok=True)
-        link.symlink_to(part)
+        if not link.exists():
+            link.unlink(missing_ok=True)
+            with suppress(FileExistsError):  # of a build beside this one
+                link.symlink_to(part)
     return config
 
 
