@@ -17,6 +17,7 @@ from deltalight.protocol.messages import ControlReply, ControlRequest
 CLOCK_OP = "clock"
 MAX_DRIFT_PPM = 200.0  # twice that of a bad crystal
 WINDOW = 64
+LATEST_NS = 2**62  # in the year 2116; messages hold no greater offset (SPEC.md, section 3)
 
 Clock = Callable[[], int]
 Exchange = Callable[[], tuple[int, int]]
@@ -128,6 +129,8 @@ def clock_exchange(
         t1, t2 = reply.payload.get("received_ns"), reply.payload.get("sent_ns")
         if not isinstance(t1, int) or not isinstance(t2, int):
             raise DeltalightError(f"the server does not tell its time ({reply.error}): update it")
+        if not (0 <= t1 <= LATEST_NS and 0 <= t2 <= LATEST_NS):
+            raise DeltalightError("the server's clock is centuries off: set it")
         return t1, t2
 
     return exchange

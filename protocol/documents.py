@@ -2,24 +2,24 @@
 
 import difflib
 import json
-import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
-import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 from pydantic_core import ErrorDetails, PydanticCustomError
 
 from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.yaml_text import parse_yaml
 
 Model = TypeVar("Model", bound=BaseModel)
+LONGEST_WORD = 200  # characters of a word that are compared and shown: longer than any known one
 
 
 def nearest(word: str, known: Iterable[str]) -> str | None:
     """Return the known word most similar to `word`, or None if none is similar."""
     by_lower = {name.lower(): name for name in known}
-    found = difflib.get_close_matches(word.lower(), by_lower, n=1, cutoff=0.4)
+    found = difflib.get_close_matches(word[:LONGEST_WORD].lower(), by_lower, n=1, cutoff=0.4)
     return by_lower[found[0]] if found else None
 
 
@@ -72,8 +72,8 @@ def parse_mapping(text: str, name: str, *, is_json: bool) -> dict[str, Any]:
     """
     kind = "JSON" if is_json else "YAML"
     try:
-        data = json.loads(text) if is_json else yaml.load(text, _Loader)
-    except (ValueError, yaml.YAMLError, RecursionError) as error:
+        data = json.loads(text) if is_json else parse_yaml(text)
+    except (ValueError, RecursionError) as error:
         detail = " ".join(str(error).split())[:160]
         raise DeltalightError(f"{name} is not valid {kind} ({detail}); correct it there.") from error
     if not isinstance(data, dict):
@@ -81,25 +81,6 @@ def parse_mapping(text: str, name: str, *, is_json: bool) -> dict[str, Any]:
             f"{name} must hold keys and values, not a {type(data).__name__}; write `key: value` lines."
         )
     return data
-
-
-def yaml_text(data: Mapping[str, Any]) -> str:
-    """Return the YAML of a document with its keys in order, which `parse_mapping` reads back."""
-    return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
-
-
-class _Loader(yaml.SafeLoader):
-    """Reads `1e-3` as a number, as in YAML 1.2; in YAML 1.1 it is a string."""
-
-
-class _Dumper(yaml.SafeDumper):
-    """Quotes strings that `_Loader` would take for numbers."""
-
-
-for _kind in (_Loader, _Dumper):
-    _kind.add_implicit_resolver(
-        "tag:yaml.org,2002:float", re.compile(r"[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+$"), list("-+0123456789")
-    )
 
 
 def validate(model: type[Model], data: Mapping[str, Any], name: str, *, strict: bool = False) -> Model:
@@ -114,9 +95,16 @@ def validate(model: type[Model], data: Mapping[str, Any], name: str, *, strict: 
     try:
         return model.model_validate(_plain(data, {}), strict=True) if strict else model.model_validate(data)
     except ValidationError as error:
-        raise DeltalightError(f"{name}: {_sentence(error.errors(include_url=False)[0], data)}") from error
+        raise DeltalightError(f"{name}: {_first_fault(error, data)}") from error
     except RecursionError as error:
         raise DeltalightError(f"{name} is nested too deeply; send the keys that it has.") from error
+
+
+def _first_fault(error: ValidationError, document: Mapping[str, Any]) -> str:
+    try:
+        return _sentence(error.errors(include_url=False)[0], document)
+    except UnicodeEncodeError:  # pydantic cannot show it
+        return "it holds text with a lone surrogate; correct it."
 
 
 def _plain(value: Any, known: dict[int, Any]) -> Any:  # noqa: ANN401 - JSON
@@ -141,7 +129,8 @@ def _sentence(fault: ErrorDetails, document: Mapping[str, Any]) -> str:
     context = fault.get("ctx", {})
     match fault["type"]:
         case "unknown_key":
-            where = f"{place}.{context['key']}" if place else context["key"]
+            key = context["key"][:LONGEST_WORD]
+            where = f"{place}.{key}" if place else key
             return f"unknown key `{where}`; {context['advice']}."
         case "missing":
             return f"the key `{place}` is missing; add it."

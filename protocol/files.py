@@ -11,6 +11,7 @@ from jaxtyping import UInt8
 
 from deltalight.protocol.errors import DeltalightError
 
+ACTIVE_SUFFIX = ".active"  # of a recording that is not finished
 PNG_COMPRESSION = 1  # zlib level; higher levels cost more time than a frame takes to render
 
 

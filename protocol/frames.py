@@ -9,6 +9,10 @@ from jaxtyping import Bool, Float32, Float64, UInt8
 from deltalight.protocol.board import BoardSpec
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.fisheye_lens import FisheyeCalibration
+from deltalight.protocol.sky_lights import SkyLights
+
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
+"""Weights of linear R G B (ITU-R BT.709)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +112,8 @@ class ViewFrame:
     """The input of one composite.
 
     Linear camera colour is `decode_lut(response)[color] / exposure_scale`. `depth` is clean and registered to colour;
-    None if the scene gives a model. `board` lets the renderer find the board's white paper.
+    None if the scene gives a model. `board` lets the renderer find the board's white paper. `sky_lights` are lights
+    that the sensor node cut from its maps of radiance; the same object while they do not change.
     """
 
     frame_id: int
@@ -122,6 +127,7 @@ class ViewFrame:
     board: BoardSpec | None = None
     radiance_map: RadianceMap | None = None
     lamps: tuple[LampPose, ...] = ()
+    sky_lights: SkyLights | None = None
 
 
 def decode_lut(response: Float32[np.ndarray, "256 3"] | None) -> Float32[np.ndarray, "256 3"]:

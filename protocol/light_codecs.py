@@ -1,4 +1,4 @@
-"""Decoding of light messages: fish-eye pictures, radiance maps, lamps (SPEC.md, section 3)."""
+"""Decoding of light messages: fish-eye pictures, radiance maps, lights, lamps (SPEC.md, section 3)."""
 
 from collections.abc import Sequence
 
@@ -9,7 +9,9 @@ from deltalight.protocol.codecs import decode_array, decode_color, decode_raw
 from deltalight.protocol.envelope import EnvelopeError
 from deltalight.protocol.fisheye_lens import FisheyeCalibration, calibration_of
 from deltalight.protocol.frames import FisheyePictures, LampPose, RadianceMap
-from deltalight.protocol.messages import FisheyeMessage, LampsMessage, RadianceMessage
+from deltalight.protocol.messages import FisheyeMessage, LampsMessage, LightsMessage, RadianceMessage
+from deltalight.protocol.scene_lights import LightCut
+from deltalight.protocol.sky_lights import Region, SkyLights, TrackedLight
 
 Parts = Sequence[memoryview]
 
@@ -43,6 +45,37 @@ def radiance_map(message: RadianceMessage, parts: Parts) -> RadianceMap:
         clipped_share=message.clipped_share,
         picture=decode_color(parts[2], "jpeg", message.picture_shape),
         calibration=_calibration(message, parts),
+    )
+
+
+def sky_lights(message: LightsMessage, parts: Parts) -> SkyLights:
+    """Return the lights of a message.
+
+    Raises:
+        DeltalightError: a part cannot be decoded or holds impossible values.
+    """
+    size = message.size
+    residual = decode_array(parts[0], message.encoding, (size, size, 3), "float32")
+    seen = decode_array(parts[1], message.encoding, (size, size), "float32")
+    if not ((seen >= 0) & (seen <= 1)).all():
+        raise EnvelopeError("the seen fractions of a residual are not all between 0 and 1: correct them")
+    return SkyLights(
+        cut=LightCut(
+            count=message.count,
+            split=message.split,
+            threshold=message.threshold,
+            smoothing_s=message.smoothing_s,
+        ),
+        world_from_fisheye=np.array(message.world_from_fisheye),
+        lights=tuple(
+            TrackedLight(
+                light.id, np.array(light.to_light), np.array(light.irradiance), light.angular_radius_rad
+            )
+            for light in message.lights
+        ),
+        regions=tuple(Region(*edges) for edges in message.regions),
+        residual=_require_radiance(residual),
+        seen=seen[..., None],
     )
 
 

@@ -13,8 +13,9 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints, model_validator
 
 from deltalight.protocol.quality import Quality
+from deltalight.protocol.scene_fields import LightCount, PeakThreshold, SmoothingTime, SplitKind
 
-SCHEMA_VERSION: Final = 5
+SCHEMA_VERSION: Final = 6
 MAX_HEADER_BYTES = 64 * 1024
 MAX_PART_BYTES = 64 * 1024 * 1024
 MAX_PAYLOAD_BYTES = 4 * 1024 * 1024
@@ -22,9 +23,15 @@ MAX_EDGE_PX = 16384
 MAX_LIGHTS = 64
 MAX_EXPOSURES = 24
 MAX_LAMPS = 64
+MAX_REGIONS = 16
 MAX_PLAIN_DEPTH = 16
+MAX_LABEL = 96
+MAX_LABELS = 128
+MAX_SENTENCE = 2000
+OTHERS = "others"  # the sum of what is counted under labels beyond the allowed number
 RESPONSE_SHAPE = (256, 3)
 ROTATION_TOLERANCE = 1e-3
+LENGTH_TOLERANCE = 1e-2
 
 DType = Literal["uint8", "uint16", "float32"]
 Stream = Literal[
@@ -33,6 +40,7 @@ Stream = Literal[
     "clean_depth",
     "fisheye",
     "radiance",
+    "lights",
     "pose",
     "lamps",
     "composite",
@@ -48,9 +56,10 @@ def _plain(value: object, depth: int = 0) -> object:
     if depth > MAX_PLAIN_DEPTH:
         raise ValueError(f"is nested deeper than {MAX_PLAIN_DEPTH} levels")
     if isinstance(value, dict):
-        if not all(isinstance(key, str) for key in value):
-            raise ValueError("has a key that is not text")
-        for item in value.values():
+        for key, item in value.items():
+            if not isinstance(key, str):
+                raise ValueError("has a key that is not text")
+            _encodable(key)
             _plain(item, depth + 1)
     elif isinstance(value, list | tuple):
         for item in value:
@@ -58,9 +67,35 @@ def _plain(value: object, depth: int = 0) -> object:
     elif isinstance(value, float):
         if not math.isfinite(value):
             raise ValueError("holds a number that is not finite")
-    elif value is not None and not isinstance(value, str | int):
+    elif isinstance(value, str):
+        _encodable(value)
+    elif value is not None and not isinstance(value, int):
         raise ValueError(f"holds a {type(value).__name__}, which is not plain data")
     return value
+
+
+def _encodable(text: str) -> None:
+    """Refuse lone surrogates, which JSON can escape and no message can carry."""
+    try:
+        text.encode()
+    except UnicodeEncodeError as error:
+        raise ValueError("holds text with a lone surrogate") from error
+
+
+def as_sentence(text: str) -> str:
+    """Return any text as a `Sentence`: cut to its length, with question marks for lone surrogates."""
+    return text[:MAX_SENTENCE].encode("utf-8", "replace").decode()
+
+
+def as_counts(counts: Mapping[str, int]) -> dict[str, int]:
+    """Return any counts as `Counts`: labels cut to their length, those beyond the first 127 as one sum `others`."""
+    kept: dict[str, int] = {}
+    for label, count in counts.items():
+        name = label[:MAX_LABEL]
+        if name not in kept and len(kept) >= MAX_LABELS - 1:
+            name = OTHERS
+        kept[name] = kept.get(name, 0) + count
+    return kept
 
 
 def _rigid(rows: "Matrix4") -> "Matrix4":
@@ -73,9 +108,29 @@ def _rigid(rows: "Matrix4") -> "Matrix4":
     return rows
 
 
-Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")]
-Label = Annotated[str, StringConstraints(min_length=1, max_length=96)]
-Sentence = Annotated[str, StringConstraints(max_length=2000)]
+def _unit(vector: "Vector3") -> "Vector3":
+    if abs(math.hypot(*vector) - 1) > LENGTH_TOLERANCE:
+        raise ValueError("it must be a unit vector")
+    return vector
+
+
+def _power_of_two(size: int) -> int:
+    if size & (size - 1):
+        raise ValueError("it must be a power of two")
+    return size
+
+
+def _rectangle(edges: "Rectangle") -> "Rectangle":
+    top, bottom, left, right = edges
+    if top >= bottom or left >= right:
+        raise ValueError("it must be from above to below and from left to right: top, bottom, left, right")
+    return edges
+
+
+NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$"
+Name = Annotated[str, StringConstraints(pattern=NAME_PATTERN)]
+Label = Annotated[str, StringConstraints(min_length=1, max_length=MAX_LABEL)]
+Sentence = Annotated[str, StringConstraints(max_length=MAX_SENTENCE)]
 Nanoseconds = Annotated[int, Field(ge=0, le=2**63 - 1)]
 Count = Annotated[int, Field(ge=0, le=2**63 - 1)]
 Edge = Annotated[int, Field(ge=1, le=MAX_EDGE_PX, strict=True)]
@@ -85,14 +140,22 @@ Seconds = Annotated[float, Field(gt=0, le=3600, strict=True)]
 Row4 = Annotated[tuple[Coordinate, Coordinate, Coordinate, Coordinate], Field(strict=False)]
 Matrix4 = Annotated[tuple[Row4, Row4, Row4, Row4], Field(strict=False)]
 RigidMatrix = Annotated[Matrix4, AfterValidator(_rigid)]
+Vector3 = Annotated[tuple[Coordinate, Coordinate, Coordinate], Field(strict=False)]
+UnitVector = Annotated[Vector3, AfterValidator(_unit)]
+Strength = Annotated[float, Field(ge=0, le=1e12, strict=True)]
+Strengths = Annotated[tuple[Strength, Strength, Strength], Field(strict=False)]
+ResidualSize = Annotated[int, Field(ge=4, le=512, strict=True), AfterValidator(_power_of_two)]
+TexelEdge = Annotated[int, Field(ge=0, le=MAX_EDGE_PX, strict=True)]
+Rectangle = Annotated[tuple[TexelEdge, TexelEdge, TexelEdge, TexelEdge], Field(strict=False)]
+RegionEdges = Annotated[Rectangle, AfterValidator(_rectangle)]
 Channels = Annotated[int, Field(ge=3, le=3, strict=True)]
 PictureShape = Annotated[tuple[Edge, Edge, Channels], Field(strict=False)]
 DepthShape = Annotated[tuple[Edge, Edge], Field(strict=False)]
 PlainDict = Annotated[dict[str, object], AfterValidator(_plain)]
 LightList = Annotated[tuple[PlainDict, ...], Field(strict=False, max_length=MAX_LIGHTS)]
-Durations = Annotated[dict[Label, Annotated[float, Field(ge=0, le=1e7)]], Field(max_length=128)]
-Counts = Annotated[dict[Label, Count], Field(max_length=128)]
-Rates = Annotated[dict[Label, Annotated[float, Field(ge=0, le=1e6)]], Field(max_length=128)]
+Durations = Annotated[dict[Label, Annotated[float, Field(ge=0, le=1e7)]], Field(max_length=MAX_LABELS)]
+Counts = Annotated[dict[Label, Count], Field(max_length=MAX_LABELS)]
+Rates = Annotated[dict[Label, Annotated[float, Field(ge=0, le=1e6)]], Field(max_length=MAX_LABELS)]
 
 
 @dataclass(frozen=True)
@@ -122,7 +185,7 @@ class MessageBase(BaseModel):
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
-    schema_version: Literal[5] = SCHEMA_VERSION
+    schema_version: Literal[6] = SCHEMA_VERSION
     node: Name
     stream: Stream
     frame_id: Count
@@ -247,6 +310,48 @@ class RadianceMessage(MessageBase):
             PartRule("picture", self.picture_shape, "uint8", compressed=True),
         )
         return (*rules, RESPONSE_RULE) if self.has_response else rules
+
+
+class LightEntry(BaseModel):
+    """A distant light (`SkyLights.lights`): where it is, and its irradiance R G B across the beam."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+    id: Count
+    to_light: UnitVector
+    irradiance: Strengths
+    angular_radius_rad: Annotated[float, Field(ge=0, le=1.6)]
+
+
+class LightsMessage(MessageBase):
+    """Lights cut from a node's radiance maps and tracked over time; they hold until the next, and are repeated.
+
+    Parts: the residual, linear R G B on the `size` x `size` octahedral grid in world axes
+    (`deltalight.protocol.octahedral`), and the fraction of each texel that was seen. `count`, `split`, `threshold`
+    and `smoothing_s` are the settings of the cut (`LightCut`); `radiance_frame_id` and `radiance_capture_ns` name the
+    `radiance` message that was cut last, `regions` are the rows and columns (top, bottom, left, right) of its map.
+    """
+
+    stream: Literal["lights"] = "lights"
+    encoding: Literal["blosc2", "raw"]
+    size: ResidualSize
+    count: LightCount
+    split: SplitKind
+    threshold: PeakThreshold
+    smoothing_s: SmoothingTime
+    radiance_frame_id: Count
+    radiance_capture_ns: Nanoseconds
+    world_from_fisheye: RigidMatrix
+    lights: Annotated[tuple[LightEntry, ...], Field(strict=False, max_length=MAX_LIGHTS)]
+    regions: Annotated[tuple[RegionEdges, ...], Field(strict=False, max_length=MAX_REGIONS)] = ()
+
+    def part_rules(self) -> tuple[PartRule, ...]:
+        """The residual, and what of it was seen."""
+        compressed = self.encoding == "blosc2"
+        return (
+            PartRule("residual", (self.size, self.size, 3), "float32", compressed),
+            PartRule("seen", (self.size, self.size), "float32", compressed),
+        )
 
 
 class PoseMessage(MessageBase):
@@ -388,6 +493,7 @@ Message = (
     | DepthMessage
     | FisheyeMessage
     | RadianceMessage
+    | LightsMessage
     | PoseMessage
     | LampsMessage
     | CompositeMessage

@@ -11,7 +11,7 @@ from deltalight.protocol.keys import Keys
 from deltalight.protocol.messages import MAX_PART_BYTES
 from deltalight.protocol.sockets import HIGH_WATER_MARK, attach, open_socket
 
-STREAMS_OF_A_NODE = 8
+STREAMS_OF_A_NODE = 9
 
 
 class Publisher:

@@ -8,6 +8,7 @@ from deltalight.protocol.keys import Keys
 from deltalight.protocol.subscriber import ReceivedMultipart, Subscriber
 
 MAX_TOPICS = 256
+MAX_WAITING_BYTES = 1 << 30  # of all topics together: sixteen of the largest pictures
 
 
 class Receiver(Subscriber):
@@ -28,6 +29,7 @@ class Receiver(Subscriber):
     ) -> None:
         self._topics = tuple(topics)
         self._slots: dict[str, ReceivedMultipart] = {}
+        self._waiting_bytes = 0
         self._drops: Counter[str] = Counter()
         self._refused = 0
         self._seen: set[str] = set()
@@ -40,7 +42,7 @@ class Receiver(Subscriber):
         """
         with self._changed:
             self._changed.wait_for(lambda: self._slots or self._closed, timeout_s)
-            taken, self._slots = self._slots, {}
+            taken, self._slots, self._waiting_bytes = self._slots, {}, 0
         return taken or None
 
     @property
@@ -51,7 +53,7 @@ class Receiver(Subscriber):
 
     @property
     def refused(self) -> int:
-        """Number of messages dropped for an unreadable topic, too many parts, or one topic too many."""
+        """Number of messages dropped for an unreadable topic, too many parts, or one topic or byte too many."""
         return self._refused
 
     def _store(self, message: ReceivedMultipart) -> None:
@@ -60,9 +62,13 @@ class Receiver(Subscriber):
             self._refused += 1
             return
         with self._changed:
+            waiting = self._waiting_bytes + _size(message) - _size(self._slots.get(topic, ()))
+            if waiting > MAX_WAITING_BYTES:
+                self._refused += 1
+                return
             if topic in self._slots:
                 self._drops[topic] += 1
-            self._slots[topic] = message
+            self._slots[topic], self._waiting_bytes = message, waiting
             self._changed.notify()
 
     def _accepts(self, topic: str, pieces: int) -> bool:
@@ -75,3 +81,7 @@ class Receiver(Subscriber):
             return False
         self._seen.add(topic)
         return True
+
+
+def _size(message: Sequence[memoryview]) -> int:
+    return sum(piece.nbytes for piece in message)

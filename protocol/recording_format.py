@@ -24,7 +24,6 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.poses import rigid_matrix, rotation_from_wxyz, wxyz_from_rotation
 
 SCHEMA_VERSION = 1
-ACTIVE_SUFFIX = ".active"
 SCENE_ATTACHMENT = "scene.json"
 COLOR_TOPIC, COLOR_CAMERA_TOPIC = "/color/image", "/color/calibration"
 DEPTH_TOPIC, DEPTH_CAMERA_TOPIC = "/depth/image", "/depth/calibration"

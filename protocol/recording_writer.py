@@ -15,9 +15,9 @@ from mcap_protobuf.schema import register_schema
 from deltalight.protocol.board import BoardSpec
 from deltalight.protocol.calibration import Extrinsics
 from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.files import ACTIVE_SUFFIX
 from deltalight.protocol.frames import SensorFrame
 from deltalight.protocol.recording_format import (
-    ACTIVE_SUFFIX,
     FOXGLOVE_TOPICS,
     OWN_TOPICS,
     SCENE_ATTACHMENT,

@@ -13,7 +13,7 @@ from deltalight.protocol.curve import guard
 from deltalight.protocol.envelope import EnvelopeError
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.keys import Keys
-from deltalight.protocol.messages import MAX_PAYLOAD_BYTES, ControlReply, ControlRequest
+from deltalight.protocol.messages import MAX_PAYLOAD_BYTES, ControlReply, ControlRequest, as_sentence
 from deltalight.protocol.payloads import decode_control, encode_control
 from deltalight.protocol.sockets import attach, open_socket
 
@@ -173,7 +173,7 @@ class ReplyServer:
             capture_ns=time.time_ns(),
             id=request_id,
             ok=error is None,
-            error=None if error is None else error[:2000],
+            error=None if error is None else as_sentence(error),
             payload=payload or {},
         )
 

@@ -28,7 +28,9 @@ class SceneDocument(StrictModel):
     name: str = Field(default="", max_length=200, description="Title for people.")
     revision: int = Field(default=0, ge=0, description="Counts up with every change.")
     real: RealScene = Field(default_factory=RealScene)
-    objects: tuple[SceneObject, ...] = Field(default=(), max_length=1024, description="Virtual objects.")
+    objects: tuple[SceneObject, ...] = Field(
+        default=(), max_length=1024, fail_fast=True, description="Virtual objects."
+    )
     lights: Lights = Field(default_factory=default_lights)
     method: Method = Field(default_factory=DvctMethod, description="Relighting method; default dvct.")
     shading: Shading = Field(default_factory=Shading)

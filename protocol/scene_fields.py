@@ -1,9 +1,15 @@
 """Field types that the parts of the scene document share."""
 
 import math
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, StringConstraints
+
+# How a map of radiance is cut into lights, in scenes, settings of nodes and messages alike.
+LightCount = Annotated[int, Field(ge=1, le=16)]
+SplitKind = Literal["peaks", "all"]
+PeakThreshold = Annotated[float, Field(gt=0, le=1000)]
+SmoothingTime = Annotated[float, Field(ge=0, le=60)]
 
 
 def _unit(values: tuple[float, ...]) -> tuple[float, ...]:

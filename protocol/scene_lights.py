@@ -12,9 +12,13 @@ from deltalight.protocol.scene_fields import (
     Asset,
     Direction,
     Fraction,
+    LightCount,
     NonNegative,
+    PeakThreshold,
     Point,
     Radiance,
+    SmoothingTime,
+    SplitKind,
 )
 
 DEFAULT_LIGHT_TYPE = "sphere"
@@ -141,31 +145,37 @@ Distance = Annotated[
 ]
 
 
-class FisheyeLights(StrictModel):
-    """How lights are taken from the fish-eye picture (docs/method.md 2); environment maps are split alike."""
+class LightCut(StrictModel):
+    """How a map of radiance is cut into lights, and how fast they follow it (docs/method.md 2)."""
 
-    count: int = Field(default=4, ge=1, le=16, description="Number of lights.")
-    split: Literal["peaks", "all"] = Field(
+    count: LightCount = Field(default=4, description="Number of lights.")
+    split: SplitKind = Field(
         default="peaks",
         description="Cut only what outshines its surroundings, or (as in the papers) the whole map.",
     )
-    threshold: float = Field(
+    threshold: PeakThreshold = Field(
         default=4.0,
-        gt=0,
-        le=1000,
         description="Luminance above which light is cut out, as a multiple of the map's mean (split peaks).",
     )
-    smoothing_s: float = Field(
+    smoothing_s: SmoothingTime = Field(
         default=0.5,
-        ge=0,
-        le=60,
         description="Time constant with which lights follow what the fish-eye camera sees, seconds; 0 = at once.",
     )
+
+
+class FisheyeLights(LightCut):
+    """How lights are taken from the fish-eye picture (docs/method.md 2); environment maps are split alike."""
+
     distance_m: Distance = Field(
         default="auto",
         description="Distance of the lights from the fish-eye camera, metres; `far` = as the sun; `auto` = from how "
         "light falls off over the board's paper, far where none is seen.",
     )
+
+    @property
+    def cut(self) -> LightCut:
+        """The settings that a sensor node has, too."""
+        return LightCut(**self.model_dump(exclude={"distance_m"}))
 
 
 class TrackedLamp(_Light):
@@ -197,10 +207,12 @@ class Lights(StrictModel):
     """Where light comes from."""
 
     mode: Literal["fisheye", "tracked", "manual", "environment"] = "manual"
-    manual: tuple[ManualLight, ...] = Field(default=(), max_length=64, description="Lights of mode `manual`.")
+    manual: tuple[ManualLight, ...] = Field(
+        default=(), max_length=64, fail_fast=True, description="Lights of mode `manual`."
+    )
     fisheye: FisheyeLights = Field(default_factory=FisheyeLights)
     tracked: tuple[TrackedLamp, ...] = Field(
-        default=(), max_length=16, description="Lamps of mode `tracked`."
+        default=(), max_length=16, fail_fast=True, description="Lamps of mode `tracked`."
     )
     environment: EnvironmentLights = Field(default_factory=EnvironmentLights)
     registration: Registration | None = Field(

@@ -244,7 +244,7 @@ class RealScene(StrictModel):
         default="depth", description="`depth` (of each frame), `fused`, or a given model."
     )
     surfaces: tuple[Surface, ...] = Field(
-        default=(), max_length=16, description="First match wins; the rest is diffuse."
+        default=(), max_length=16, fail_fast=True, description="First match wins; the rest is diffuse."
     )
     unseen_albedo: Annotated[float, Field(ge=0, le=0.95)] | None = Field(
         default=None,

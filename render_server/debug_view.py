@@ -1,18 +1,16 @@
 """Debug view `lights`: lights drawn over the fish-eye picture, or over the camera's if there is none."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from jaxtyping import Float64, Int32, UInt8
 
-from deltalight.protocol.frames import RadianceMap, ViewFrame
+from deltalight.protocol.frames import LUMINANCE, RadianceMap, ViewFrame
 from deltalight.protocol.hemisphere import hemisphere_direction
-from deltalight.render_server.lights.environment import LUMINANCE
-from deltalight.render_server.lights.fisheye import HemisphereMap
+from deltalight.protocol.sky_lights import Region
 from deltalight.render_server.lights.lights import IncidentLight, LightSet, incident_light
-from deltalight.render_server.lights.median_cut import Region, Split
 from deltalight.render_server.lights.octahedral import solid_angle_mean
 
 OUTLINE_POINTS = 24  # per edge of a region: a lens bends straight lines
@@ -65,13 +63,11 @@ class _Canvas:
             )
 
 
-def draw_lights(
-    frame: ViewFrame, lights: LightSet, split: Split[HemisphereMap] | None
-) -> UInt8[np.ndarray, "h w 3"]:
+def draw_lights(frame: ViewFrame, lights: LightSet, regions: Sequence[Region]) -> UInt8[np.ndarray, "h w 3"]:
     """Draws lights as discs of their size and colour, with number and irradiance, at the frame's size.
 
-    Draws on the frame's fish-eye picture if it has one, letterboxed, with the outlines of the regions of
-    `split`.
+    Draws on the frame's fish-eye picture if it has one, letterboxed, with the outlines of the `regions` of
+    its map.
     """
     fisheye = frame.radiance_map
     canvas = _camera_canvas(frame) if fisheye is None else _fisheye_canvas(frame, fisheye)
@@ -80,9 +76,9 @@ def draw_lights(
     colors = [_color(light, strongest) for light in seen]
     for light, color in zip(seen, colors, strict=True):
         _draw_disc(canvas, light, color)
-    if split is not None:
-        for cut in split.lights:
-            canvas.line(_outline(cut.region, split.residual), REGION_COLOR, 1, closed=True)
+    if fisheye is not None:
+        for region in regions:
+            canvas.line(_outline(region, fisheye), REGION_COLOR, 1, closed=True)
     names = lights.identities or tuple(range(1, len(seen) + 1))
     for row, (light, name, color) in enumerate(zip(seen, names, colors, strict=True), start=1):
         where = "" if _draw_centre(canvas, light, f"{name}", color) else ", out of view"
@@ -155,9 +151,9 @@ def _camera_canvas(frame: ViewFrame) -> _Canvas:
     )
 
 
-def _outline(region: Region, residual: HemisphereMap) -> Float64[np.ndarray, "n 3"]:
+def _outline(region: Region, seen: RadianceMap) -> Float64[np.ndarray, "n 3"]:
     """Returns directions (world) along the edges of a region."""
-    size = len(residual.radiance)
+    size = len(seen.radiance)
     low, high = np.array([region.left, region.top]) / size, np.array([region.right, region.bottom]) / size
     corners = np.array([low, (high[0], low[1]), high, (low[0], high[1])])
     along = np.linspace(0, 1, OUTLINE_POINTS, endpoint=False)[:, None]
@@ -165,7 +161,7 @@ def _outline(region: Region, residual: HemisphereMap) -> Float64[np.ndarray, "n 
         start + along * (end - start)
         for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True)
     ]
-    return np.asarray(hemisphere_direction(np.concatenate(edges)) @ residual.world_from_map.T)
+    return np.asarray(hemisphere_direction(np.concatenate(edges)) @ seen.world_from_fisheye[:3, :3].T)
 
 
 def _circle(to_light: Float64[np.ndarray, "3"], radius_rad: float) -> Float64[np.ndarray, "n 3"]:

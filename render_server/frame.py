@@ -22,7 +22,7 @@ from deltalight.render_server.passes.coverage import (
 )
 from deltalight.render_server.passes.gbuffer import CameraImage, GeometryBuffer, RasterGeometry, RealSurface
 from deltalight.render_server.passes.voxel_light import AlbedoTexture
-from deltalight.render_server.scene.declared_surfaces import MAX_ROWS, SHEET, SurfaceTable, plane_fits
+from deltalight.render_server.scene.declared_surfaces import MAX_ROWS, SurfaceTable, plane_fits
 from deltalight.render_server.scene.depth_surface import DepthSurface
 from deltalight.render_server.view import CameraBlock, CameraView, Rectangle
 
@@ -190,11 +190,10 @@ class PictureBuffers:
         """Uploads the declared surfaces of the real scene; returns what shaders read of them."""
         if len(table):
             self._surfaces.write(np.ascontiguousarray(table.packed, np.float32).tobytes())
-        specular = bool((table.packed[:, 3, 3] < SHEET).any())
         return {
             "Surfaces": self._surfaces,
             "surface_count": len(table),
-            "specular_surfaces": specular,
+            "specular_surfaces": table.is_specular,
             "DECLARED_SURFACES": len(table) > 0,
         }
 
@@ -214,6 +213,7 @@ class PictureBuffers:
         """Fills the buffers of the measurement that lights the real scene."""
         assert self.measured is not None
         self.measured.image.upload(taken.frame)
+        self.measured.image.linearize()
         self.measured.set_camera(taken.view)
         return self.measured.observe(taken.scan, real, taken.view, declared, surfaces)
 

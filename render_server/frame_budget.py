@@ -9,6 +9,7 @@ from deltalight.protocol.quality import Quality
 
 WARM_UP = 2  # frames after a change of level: they compile, allocate and build
 WINDOW = 5  # frames: the median tells
+URGENT, URGENTLY = 2, 2.0  # frames in a row, each so many times as long as the budget: these tell at once
 TOLERANCE = 1.1  # of the budget: what a level may take before a lower one is chosen
 ROOM = 0.8  # of the budget: what the level above must be expected to take before it is chosen
 PATIENCE = 30  # frames with that much room; twice as many after each try that failed
@@ -63,20 +64,23 @@ class FrameBudget:
             self._ignored -= 1
             return
         self._times_ms.append(frame_ms)
-        if len(self._times_ms) == WINDOW:
+        newest = list(self._times_ms)[-URGENT:]
+        if len(newest) == URGENT and min(newest) > URGENTLY * self._budget_ms:
+            self._judge(min(newest), self._budget_ms)
+        elif len(self._times_ms) == WINDOW:
             self._judge(statistics.median(self._times_ms), self._budget_ms)
 
-    def _judge(self, median_ms: float, budget_ms: float) -> None:
+    def _judge(self, typical_ms: float, budget_ms: float) -> None:
         """Goes down to the first level that should hold the budget, or up by one when that has long had room."""
         cost = LEVELS[self.level]
-        expected = [median_ms * LEVELS[level] / cost for level in self._levels]
+        expected = [typical_ms * LEVELS[level] / cost for level in self._levels]
         last = len(self._levels) - 1
-        if median_ms > TOLERANCE * budget_ms:
+        if typical_ms > TOLERANCE * budget_ms:
             lower = [at for at in range(self._at + 1, len(self._levels)) if expected[at] <= budget_ms]
             if self._at == last and self.remark is None:
                 self.remark = (
-                    f"A frame takes {median_ms:.0f} ms at the lowest quality, so output.frame_budget_ms "
-                    f"({budget_ms:g}) cannot be held here: expect {1000 / median_ms:.1f} frames/s, or lower "
+                    f"A frame takes {typical_ms:.0f} ms at the lowest quality, so output.frame_budget_ms "
+                    f"({budget_ms:g}) cannot be held here: expect {1000 / typical_ms:.1f} frames/s, or lower "
                     "output.width."
                 )
             self._patience *= 2 if self._is_trying else 1

@@ -52,15 +52,27 @@ class CompositeOptions:
     @property
     def bindings(self) -> Bindings:
         """Returns the uniforms of composite.comp.glsl."""
-        needs_linear = self.with_linear or self.output.view in ("effects", "delta")
-        is_filmic = self.output.tone == "aces"
         return {
             "additive": self.additive,
             "relights_real": self.relights_real,
-            "filmic": is_filmic,
-            "store_linear": needs_linear,
-            "whole": needs_linear or is_filmic,
+            "filmic": self._is_filmic,
+            "store_linear": self._needs_linear,
+            "whole": self._needs_linear or self._is_filmic,
         }
+
+    @property
+    def reuses_ratio(self) -> bool:
+        """Whether a new picture in the same light can be composed by the ratio of the last one."""
+        is_whole = self._needs_linear or self._is_filmic or self.output.view != "composite"
+        return not (is_whole or self.additive)
+
+    @property
+    def _needs_linear(self) -> bool:
+        return self.with_linear or self.output.view in ("effects", "delta")
+
+    @property
+    def _is_filmic(self) -> bool:
+        return self.output.tone == "aces"
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,6 +113,15 @@ class ShownBuffers:
     objects: GeometryState
 
 
+@dataclass(frozen=True, eq=False)
+class RelitPicture:
+    """A composed picture, and what it was composed of."""
+
+    composite: Composite
+    layers: RelitLayers
+    scene: Bindings
+
+
 class Composition:
     """Composes the picture, and overwrites it with a debug view on request."""
 
@@ -114,8 +135,8 @@ class Composition:
         scene: Bindings,
         options: CompositeOptions,
         *layers: Any,  # noqa: ANN401 (of RelitLayers, in their order)
-    ) -> Composite:
-        """Composes the relit picture."""
+    ) -> RelitPicture:
+        """Composes the relit picture, and keeps by which ratio it changed."""
         relit = RelitLayers(scene["object_coverage"], *layers)
         self._composite.run(image, relit, {**scene, **options.bindings})
         view = options.output.view
@@ -131,7 +152,13 @@ class Composition:
                 relit.object_coverage,
                 effects=view == "effects",
             )
-        return self._composite
+        return RelitPicture(self._composite, relit, scene)
+
+    def compose_again(self, image: CameraImage, relit: RelitPicture) -> Composite:
+        """Composes the newest picture by the kept ratio, unless it is composed already."""
+        if not image.is_linear:
+            relit.composite.run_again(image, relit.layers, relit.scene)
+        return relit.composite
 
     def release(self) -> None:
         """Frees the GL objects."""
@@ -166,6 +193,8 @@ class FrameGraph:
             self.release()
             raise
         self._options: Resource[CompositeOptions] = self.graph.source("output", "scene")
+        self._linear: Resource[CameraImage] = self.graph.source("linear picture", "view")
+        self._others: tuple[int, ...] = ()  # versions of the other sources
         self._composite = self._declare_composition(Composition(gpu, view.size))
         self._inputs: FrameInputs | None = None
 
@@ -174,10 +203,10 @@ class FrameGraph:
         radiance = self._radiance = g.stage(
             "interior edges", self.buffers.antialias_interior, layers.radiance, s.object_surface
         )
-        return g.stage(
-            "composite",
+        relit = g.stage(
+            "relit picture",
             composition.compose,
-            s.image,
+            self._linear,
             "shading scene",
             self._options,
             radiance,
@@ -190,9 +219,14 @@ class FrameGraph:
             layers.lights,
             layers.reflection,
         )
+        return g.stage("composite", composition.compose_again, s.image, relit)
+
+    def fits(self, view: CameraView) -> bool:
+        """Whether its pictures have the size of this view's."""
+        return self.buffers.key == (view.size, view.raster[1])
 
     def upload(self, frame: ViewFrame) -> None:
-        """Begins a frame by uploading its picture: a change, whatever it shows."""
+        """Begins a frame by uploading its picture, which is composed anew whatever it shows."""
         self.graph.begin_frame()
         self.buffers.image.upload(frame)
         self.resources.image.write(self.buffers.image)
@@ -230,13 +264,13 @@ class FrameGraph:
     @property
     def observation(self) -> Observation:
         """The visible real surfaces, brought up to date."""
-        self.graph.run(self.resources.observation)
+        self._run(self.resources.observation)
         return self.resources.observation.value
 
     def shown(self) -> ShownBuffers:
         """The geometry buffers, brought up to date."""
         s = self.resources
-        self.graph.run(s.geometry)
+        self._run(s.geometry)
         surface = s.object_surface.value
         return ShownBuffers(
             s.view.value,
@@ -248,7 +282,7 @@ class FrameGraph:
 
     def radiance(self) -> Float64[np.ndarray, "h w 3"]:
         """Radiance of the virtual objects as composed, camera units; undefined where they cover nothing."""
-        self.graph.run(self._radiance)
+        self._run(self._radiance)
         return read_texture(self._radiance.value)[..., :3]
 
     def evaluate(self, lights: LightSet) -> Fields:
@@ -257,7 +291,7 @@ class FrameGraph:
         The sources keep these lights until they are set again.
         """
         cones, layers = self.gather(lights, (0, 0, *self.resources.view.value.size)), self.layers
-        self.graph.run(layers.direct, layers.grid)
+        self._run(layers.direct, layers.grid)
         return Fields(layers.direct.value, cones, layers.grid.value)
 
     def gather(self, lights: LightSet, area: Rectangle) -> ConeFields:
@@ -265,19 +299,32 @@ class FrameGraph:
         s, layers = self.resources, self.layers
         s.lights.write(lights, is_)
         s.lit_area.write(area, eq)
-        self.graph.run(layers.cones)
+        self._run(layers.cones)
         return layers.cones.value
 
     def advance(self, options: CompositeOptions, until_s: float) -> bool:
         """Works on the frame until then (time.monotonic()); returns whether it is ready to render at once."""
         self._options.write(options, eq)
-        return self.graph.run(until_s=until_s)
+        return self._run(until_s=until_s)
 
     def render(self, options: CompositeOptions) -> Composite:
         """Composes the frame."""
         self._options.write(options, eq)
-        self.graph.run()
+        self._run()
         return self._composite.value
+
+    def _run(self, *targets: Resource[Any], until_s: float | None = None) -> bool:
+        """Runs the graph with the newest picture in linear radiance; a scene at rest does without."""
+        s, image = self.resources, self.buffers.image
+        sources = s.view, s.scan, s.measurement, s.real, s.objects, s.surfaces, s.lights, s.lit_area, s.albedo
+        others = *(item.version for item in sources if item is not None), self._options.version
+        options = self._options.value if self._options.version else None
+        reuses_ratio = options is not None and options.reuses_ratio and not s.surfaces.value.is_specular
+        if not image.is_linear and not (reuses_ratio and others == self._others):
+            image.linearize()
+            self._linear.write(image)
+        self._others = others
+        return self.graph.run(*targets, until_s=until_s)
 
     def release(self) -> None:
         """Frees the GL objects."""

@@ -365,8 +365,10 @@ class Graph:
     def _require_declared(self, stage: Stage, results: Sequence[Any], dispatches: Sequence[Dispatch]) -> None:
         """Refuses that a kernel wrote what another stage made and this one does not hand on."""
         written = [(run.kernel, name, item) for run in dispatches for name, item in run.written.items()]
+        if not written:
+            return
         own = {id(item) for value in results for item in gpu_objects(value)}
-        for other in self._resources.values() if written else ():
+        for other in self._resources.values():
             if other.stage is stage or other.version == 0:
                 continue
             held = {id(item) for item in gpu_objects(other.value)} - own

@@ -104,6 +104,7 @@ class LiveScene:
         self._albedo = AlbedoEstimator(gpu)
         self.graph: FrameGraph | None = None
         self._best: FrameGraph | None = None
+        self._spare: FrameGraph | None = None  # of the picture size before, which a budget may choose again
         self._enlarge: Enlarge | None = None
         self._changing: tuple[
             object, ...
@@ -177,8 +178,8 @@ class LiveScene:
         self._plan = plan
 
     def _drop_graph(self) -> None:
-        release_all(self.graph, self._best)
-        self.graph = self._best = None
+        release_all(self.graph, self._best, self._spare)
+        self.graph = self._best = self._spare = None
 
     def forget_frames(self) -> None:
         """Forgets all observations and estimates: another camera shows another room."""
@@ -231,6 +232,8 @@ class LiveScene:
             graph.set_lights(self.lighting.lights)
             if self._best is not None:
                 self._best.renew_albedo()
+            if self._spare is not None:
+                self._spare.renew_albedo()
         self._accumulated = frame
         changing = (objects, self.lighting.lights, self._plan)
         changed = moved or not _same_objects(changing, self._changing)
@@ -310,12 +313,17 @@ class LiveScene:
         return self._surfaces
 
     def _graph_for(self, view: CameraView) -> FrameGraph:
-        """Returns the graph for this picture size; a new one if lens or size changed."""
+        """Returns the graph for this picture size; a new one if lens or size changed.
+
+        In software the one before is kept: a GPU builds what it holds in no time, and its memory is scarcer.
+        """
+        if self._gpu.is_software and self.graph is not None and not self.graph.fits(view):
+            self.graph, self._spare = self._spare, self.graph
         self.graph = self._fitting(self.graph, view, self._plan.method)
         return self.graph
 
     def _fitting(self, graph: FrameGraph | None, view: CameraView, method: MethodChoice) -> FrameGraph:
-        if graph is not None and graph.buffers.key == (view.size, view.raster[1]):
+        if graph is not None and graph.fits(view):
             return graph
         release_all(graph)
         return FrameGraph(self._gpu, view, method, self._fields, self.timers, checks=self._checks)
@@ -331,6 +339,7 @@ class LiveScene:
             self._real,
             self.graph,
             self._best,
+            self._spare,
             self._enlarge,
             self._albedo,
             self._fields,

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
+import cv2
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
@@ -214,7 +215,7 @@ class SceneRenderer:
         submitted_ms = 1e3 * (time.perf_counter() - started_s)
 
         def finish() -> CompositeFrame:
-            color = np.ascontiguousarray(self._readback.pop()[..., :3])
+            color = cv2.cvtColor(self._readback.pop(), cv2.COLOR_RGBA2RGB)
             linear = self._readback.pop()[..., :3].astype(np.float32) if with_linear else None
             self._live.account(relit, max(submitted_ms, sum(times.values())))
             return CompositeFrame(

@@ -25,10 +25,13 @@ from deltalight.protocol.messages import (
     FisheyeMessage,
     LampEntry,
     LampsMessage,
+    LightEntry,
+    LightsMessage,
     Matrix4,
     PoseMessage,
     RadianceMessage,
 )
+from deltalight.protocol.sky_lights import SkyLights, TrackedLight
 
 # Depth without a step of its own is sent in this step times the least power of two that fits its range.
 FINEST_DEPTH_STEP_M = 0.0001
@@ -159,6 +162,36 @@ def radiance_multipart(radiance: RadianceMap, stamps: Stamps, jpeg_quality: int)
         encode_color(radiance.picture, "jpeg", jpeg_quality),
     ]
     return encode(message, parts if response is None else [*parts, response])
+
+
+def lights_multipart(sky: SkyLights, stamps: Stamps, radiance: Stamps) -> list[bytes]:
+    """Return the message of lights; `radiance` are the stamps of the map that was cut last.
+
+    The stamps are those of the first frame with these lights, even when they are repeated for late subscribers.
+    """
+    message = LightsMessage(
+        **stamps,
+        **dict(sky.cut),
+        encoding="blosc2",
+        size=len(sky.residual),
+        radiance_frame_id=radiance["frame_id"],
+        radiance_capture_ns=radiance["capture_ns"],
+        world_from_fisheye=_rows(sky.world_from_fisheye),
+        lights=tuple(map(_light_entry, sky.lights)),
+        regions=tuple((each.top, each.bottom, each.left, each.right) for each in sky.regions),
+    )
+    return encode(message, [encode_array(sky.residual, "blosc2"), encode_array(sky.seen, "blosc2")])
+
+
+def _light_entry(light: TrackedLight) -> LightEntry:
+    x, y, z = light.to_light.tolist()
+    red, green, blue = light.irradiance.tolist()
+    return LightEntry(
+        id=light.identity,
+        to_light=(x, y, z),
+        irradiance=(red, green, blue),
+        angular_radius_rad=light.angular_radius_rad,
+    )
 
 
 def lamps_multipart(lamps: Sequence[LampPose], stamps: Stamps) -> list[bytes]:

@@ -10,7 +10,7 @@ from jaxtyping import Float32, Float64, Int64, UInt8
 
 from deltalight.protocol.board import BoardSpec
 from deltalight.protocol.camera_model import CameraModel
-from deltalight.protocol.frames import decode_lut
+from deltalight.protocol.frames import LUMINANCE, decode_lut
 from deltalight.protocol.poses import rigid_matrix
 from deltalight.sensor_node.marker_edges import refine_corners
 
@@ -22,7 +22,6 @@ WINDOW_HALF_PX = (2, 8)
 WINDOW_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 0.005)
 # Narrower markers cannot be read.
 LEAST_SIDE_PX = 10
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
 Quads = dict[int, Float64[np.ndarray, "4 2"]]
 

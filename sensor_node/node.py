@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
-from typing import Generic, Literal, TypeVar
+from typing import TYPE_CHECKING, Generic, Literal, TypeVar
 
 import structlog
 from pydantic import Field, field_serializer, field_validator
@@ -15,8 +15,10 @@ from deltalight.protocol.documents import StrictModel
 from deltalight.protocol.envelope import encode
 from deltalight.protocol.frames import FisheyePictures, RadianceMap, SensorFrame, ViewFrame
 from deltalight.protocol.keys import Keys
-from deltalight.protocol.messages import Name, StatsMessage
+from deltalight.protocol.messages import Name, StatsMessage, as_sentence
 from deltalight.protocol.publisher import Publisher
+from deltalight.protocol.scene_lights import LightCut
+from deltalight.protocol.sky_lights import SkyLights
 from deltalight.sensor_node.announce import announced
 from deltalight.sensor_node.cameras.base import Camera
 from deltalight.sensor_node.cameras.drivers import SYNTHETIC
@@ -32,6 +34,7 @@ from deltalight.sensor_node.frame_messages import (
     depth_multipart,
     fisheye_multipart,
     lamps_multipart,
+    lights_multipart,
     pose_multipart,
     radiance_multipart,
 )
@@ -39,10 +42,12 @@ from deltalight.sensor_node.health import Health
 from deltalight.sensor_node.pose_filter import PoseFilter, PoseFilterSettings
 from deltalight.sensor_node.view_frames import ViewFrameBuilder
 
+if TYPE_CHECKING:
+    from deltalight.protocol.light_cutter import LightCutter
+
 _log = structlog.get_logger(__name__)
 STATS_PERIOD_S = 1.0
-MAX_SENTENCE = 2000  # of the wire (SPEC.md, section 3)
-STREAMS = ("fisheye", "depth", "radiance", "clean_depth", "lamps", "pose", "color", "stats")
+STREAMS = ("fisheye", "depth", "radiance", "lights", "clean_depth", "lamps", "pose", "color", "stats")
 # Fish-eye pictures further than this from their frame are stamped by another clock (a loop restarted).
 LONGEST_HOLD_NS = 60_000_000_000
 # A late subscriber has the light after this time; at 1 MB per map it costs less than one stream of pictures.
@@ -83,6 +88,10 @@ class NodeConfig(StrictModel):
         default=5.0, gt=0, le=600, description="Age of the newest frame from which the camera is lost, s."
     )
     depth: DepthSettings = Field(default=DepthSettings(), description="Depth clean-up.")
+    lights: LightCut = Field(
+        default=LightCut(),
+        description="How the fish-eye picture is cut into lights, which servers take whose scene asks for the same.",
+    )
     pose_filter: PoseFilterSettings | None = Field(
         default=None, description="Smooth the poses that the board gives; null = publish them as found."
     )
@@ -120,9 +129,10 @@ def run_node(
 ) -> None:
     """Publish frames until `stop` is set or the source ends; return within a second of `stop`.
 
-    For each frame: fish-eye pictures and radiance if new, raw depth, clean depth, lamps, pose, then colour, all with
-    its `frame_id` and capture time; so a receiver of the colour has received the rest. Statistics are sent once a
-    second. `keys` are required if an endpoint leaves the host; `camera` replaces the configured source.
+    For each frame: fish-eye pictures if new, raw depth, radiance and lights if new, clean depth, lamps, pose, then
+    colour, all with its `frame_id` and capture time; so a receiver of the colour has received the rest. Statistics
+    are sent once a second. `keys` are required if an endpoint leaves the host; `camera` replaces the configured
+    source.
 
     Raises:
         DeltalightError: the source or the endpoint cannot be used, or a frame of the source is broken.
@@ -151,15 +161,23 @@ class Repeater(Generic[Item]):
         self._multipart: list[bytes] = []
         self._sent_s = 0.0
 
-    def send(self, item: Item, made: Callable[[], list[bytes]], send: Callable[[list[bytes]], None]) -> None:
-        """Send the message of `item`, created by `made`, if it is due."""
+    def send(
+        self,
+        item: Item,
+        made: Callable[[], list[bytes]],
+        send: Callable[[list[bytes]], None],
+        *,
+        now: bool = False,
+    ) -> bool:
+        """Send the message of `item`, created by `made`, if it is due or has to be sent `now`; whether it was."""
         now_s = time.monotonic()
         if item is not self._item:
             self._item, self._multipart = item, made()
-        elif now_s - self._sent_s < REPEAT_S:
-            return
+        elif not now and now_s - self._sent_s < REPEAT_S:
+            return False
         send(self._multipart)
         self._sent_s = now_s
+        return True
 
 
 class _Node:
@@ -172,6 +190,10 @@ class _Node:
         self._health = Health(camera, config.stale_after_s, config.lost_after_s)
         self._fisheye: Repeater[FisheyePictures] = Repeater()
         self._radiance: Repeater[RadianceMap] = Repeater()
+        self._radiance_stamps: Stamps | None = None
+        self._lights: Repeater[SkyLights] = Repeater()
+        self._cutter: LightCutter | None = None
+        self._sky: SkyLights | None = None
         self._light_remarks: list[str] = []
         self._heard = self._logged = ""
         self._period_s = time.monotonic()
@@ -196,7 +218,7 @@ class _Node:
         if frame.depth is not None:
             self._publisher.send(depth_multipart(frame.depth, stamps, "depth", self._camera.depth_scale))
         view = self._filtered(self._builder(frame), frame)
-        self._send_radiance(view, stamps)
+        self._send_light(view, stamps)
         if view.depth is not None:
             self._publisher.send(depth_multipart(view.depth, stamps, "clean_depth"))
         if view.board is not None and view.board.lamp_markers:
@@ -237,17 +259,34 @@ class _Node:
 
         self._fisheye.send(pictures, made, self._publisher.send)
 
-    def _send_radiance(self, view: ViewFrame, stamps: Stamps) -> None:
-        """Send a radiance map once, and repeat it for late subscribers."""
+    def _send_light(self, view: ViewFrame, stamps: Stamps) -> None:
+        """Send a radiance map once and its lights whenever they changed; repeat both for late subscribers."""
         radiance = view.radiance_map
         if radiance is None:
             return
 
         def made() -> list[bytes]:
             self._light_remarks = light_warnings(radiance)
+            self._radiance_stamps = stamps
             return radiance_multipart(radiance, stamps, self._config.jpeg_quality)
 
-        self._radiance.send(radiance, made, self._publisher.send)
+        # Both together, so that no late subscriber cuts a map itself whose lights are about to come.
+        with_map = self._radiance.send(radiance, made, self._publisher.send)
+        self._send_lights(replace(view, timestamp_ns=stamps["capture_ns"]), stamps, now=with_map)
+
+    def _send_lights(self, view: ViewFrame, stamps: Stamps, *, now: bool) -> None:
+        if self._cutter is None:
+            # Takes 0.6 s (scipy), of which nodes without a fish-eye camera have no use.
+            from deltalight.protocol.light_cutter import LightCutter
+
+            self._cutter = LightCutter(self._config.lights)
+        sky = self._sky = self._cutter.update(view) or self._sky
+        radiance_stamps = self._radiance_stamps
+        assert sky is not None
+        assert radiance_stamps is not None
+        self._lights.send(
+            sky, lambda: lights_multipart(sky, stamps, radiance_stamps), self._publisher.send, now=now
+        )
 
     def _send_stats(self, drops: int, *, is_ending: bool = False) -> None:
         now_ns, elapsed_s = time.time_ns(), max(time.monotonic() - self._period_s, 1e-3)
@@ -260,7 +299,7 @@ class _Node:
             clock_offset_ns=offset_ns,
             clock_bound_ns=bound_ns,
             state="stopping" if is_ending else state,
-            detail=detail[:MAX_SENTENCE],
+            detail=as_sentence(detail),
             rates={"fps": self._frames / elapsed_s, "without_board": self._without_board / elapsed_s},
             drops={"capture": drops, "connections_refused": self._publisher.refused},
         )

@@ -1,5 +1,6 @@
 """Discovery of the sensor nodes that announce themselves on the local network."""
 
+import re
 import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -8,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from deltalight.protocol.documents import nearest
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.keys import TRUST_HINT, KeySettings, key_folder, trusted_keys
-from deltalight.protocol.messages import SCHEMA_VERSION
+from deltalight.protocol.messages import MESSAGE_TYPES, NAME_PATTERN, SCHEMA_VERSION
 from deltalight.sensor_node.announce import SERVICE_TYPE
 
 if TYPE_CHECKING:
@@ -102,18 +103,21 @@ def find_nodes(
 
 
 def _node(info: "ServiceInfo") -> FoundNode | None:
-    """Parse an announcement; return None if it is incomplete."""
+    """Parse an announcement; return None if it is none of a node's: anybody on the network can send one."""
     texts = {key: value or "" for key, value in info.decoded_properties.items()}
     addresses = info.parsed_addresses()
-    if not addresses or info.port is None or not texts.get("name") or not texts.get("schema", "").isdecimal():
+    if not addresses or info.port is None or not texts.get("schema", "").isdecimal():
         return None
+    if not re.fullmatch(NAME_PATTERN, texts.get("name", "")):
+        return None
+    key = texts.get("key", "")
     return FoundNode(
         name=texts["name"],
         address=addresses[0],
         port=info.port,
-        streams=tuple(filter(None, texts.get("streams", "").split(","))),
+        streams=tuple(each for each in texts.get("streams", "").split(",") if each in MESSAGE_TYPES),
         schema_version=int(texts["schema"]),
-        key=texts.get("key", "") if texts.get("curve") == "1" else "",
+        key=key if texts.get("curve") == "1" and key.isprintable() else "",
     )
 
 

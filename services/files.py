@@ -7,7 +7,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from deltalight.protocol.errors import DeltalightError
-from deltalight.protocol.recording_format import ACTIVE_SUFFIX
+from deltalight.protocol.files import ACTIVE_SUFFIX
 
 SUFFIX = ".mcap"
 

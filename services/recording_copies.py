@@ -7,7 +7,7 @@ from pathlib import Path
 from deltalight.protocol.dataset import open_dataset
 from deltalight.protocol.dataset_writer import DEFAULT_DEPTH_SCALE, DatasetWriter
 from deltalight.protocol.errors import DeltalightError
-from deltalight.protocol.recording_format import ACTIVE_SUFFIX
+from deltalight.protocol.files import ACTIVE_SUFFIX
 from deltalight.protocol.recording_reader import RecordingReader
 from deltalight.protocol.recording_writer import RecordingWriter
 from deltalight.protocol.scene import SceneDocument, load_scene

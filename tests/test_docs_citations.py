@@ -90,6 +90,14 @@ def test_cited_sections_exist() -> None:
     assert not missing, "\n".join(missing)
 
 
+def test_the_tests_that_the_security_page_names_exist() -> None:
+    page = (ROOT / "docs" / "security.md").read_text(encoding="utf-8")
+    named = re.findall(r"`([a-z_/]+\.py): (test_\w+)`", page)
+    assert named
+    for file, test in named:
+        assert f"def {test}(" in (ROOT / "tests" / file).read_text(encoding="utf-8"), (file, test)
+
+
 def test_unpublished_documents_are_not_cited() -> None:
     found = [
         place(name, text, match) for name, text in tracked_sources() for match in UNPUBLISHED.finditer(text)

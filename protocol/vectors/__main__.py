@@ -18,6 +18,8 @@ from deltalight.protocol.messages import (
     FisheyeMessage,
     LampEntry,
     LampsMessage,
+    LightEntry,
+    LightsMessage,
     Message,
     PoseMessage,
     RadianceMessage,
@@ -58,7 +60,13 @@ Example = tuple[str, Message, Sequence[bytes], Sequence[Sequence[float]]]
 
 def main() -> None:
     """Write every vector into the folder of this module."""
-    examples = [*_picture_examples(), *_depth_examples(), *_radiance_examples(), *_small_examples()]
+    examples = [
+        *_picture_examples(),
+        *_depth_examples(),
+        *_radiance_examples(),
+        *_lights_examples(),
+        *_small_examples(),
+    ]
     for name, message, parts, values in examples:
         pieces = encode(message, parts)
         (FOLDER / f"{name}.bin").write_bytes(frame_pieces(pieces))
@@ -189,6 +197,34 @@ def _radiance_examples() -> Iterator[Example]:
         parts = [encode_array(radiance, encoding), encode_array(seen.astype(np.uint8), encoding), picture]
         values = [radiance.ravel().tolist(), seen.astype(int).ravel().tolist()]
         yield f"radiance_{encoding}", message, parts, values
+
+
+def _lights_examples() -> Iterator[Example]:
+    residual = np.arange(48, dtype=np.float32).reshape(4, 4, 3) * np.float32(0.25)
+    seen = np.arange(16, dtype=np.float32).reshape(4, 4) / np.float32(16)
+    lights = (
+        LightEntry(id=3, to_light=(0.0, 0.6, 0.8), irradiance=(2.5, 2.0, 1.5), angular_radius_rad=0.0625),
+        LightEntry(id=5, to_light=(-1.0, 0.0, 0.0), irradiance=(0.0, 0.0, 0.0), angular_radius_rad=0.25),
+    )
+    encodings: tuple[Literal["raw", "blosc2"], ...] = ("raw", "blosc2")
+    for encoding in encodings:
+        message = LightsMessage(
+            node=NODE,
+            **_stamps(),
+            encoding=encoding,
+            size=4,
+            count=4,
+            split="peaks",
+            threshold=4.0,
+            smoothing_s=0.5,
+            radiance_frame_id=FRAME - 2,
+            radiance_capture_ns=CAPTURE_NS - 66_666_667,
+            world_from_fisheye=POSE,
+            lights=lights,
+            regions=((0, 2, 1, 4),),
+        )
+        parts = [encode_array(residual, encoding), encode_array(seen, encoding)]
+        yield f"lights_{encoding}", message, parts, [residual.ravel().tolist(), seen.ravel().tolist()]
 
 
 def _small_examples() -> Iterator[Example]:

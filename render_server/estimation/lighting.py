@@ -108,7 +108,7 @@ class LightEstimator:
     def picture(self, frame: ViewFrame) -> UInt8[np.ndarray, "h w 3"]:
         """Draws the lights (view `lights`), once there are any."""
         assert self.lights is not None
-        return draw_lights(frame, self.lights, self._source.split)
+        return draw_lights(frame, self.lights, self._source.regions)
 
     def _register(self, graph: FrameGraph, raw: LightSet) -> None:
         """Registers the lights on this frame and averages the result with earlier ones."""

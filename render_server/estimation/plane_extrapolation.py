@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
+from deltalight.protocol.octahedral import octahedral_grid
 from deltalight.render_server.lights.lights import Light, incident_light
-from deltalight.render_server.lights.octahedral import octahedral_grid
 
 # Twice the planes of a room's corner: things have large faces too.
 MAX_PLANES = 6

@@ -6,9 +6,9 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64
 
+from deltalight.protocol.frames import LUMINANCE
 from deltalight.render_server.estimation.samples import bounced_light, sample_light
 from deltalight.render_server.frame_graph import FrameGraph
-from deltalight.render_server.lights.environment import LUMINANCE
 from deltalight.render_server.lights.lights import LightSet
 from deltalight.render_server.scene.albedo import MIN_PIXELS
 

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float32
 
-from deltalight.protocol.frames import decode_lut
+from deltalight.protocol.frames import LUMINANCE, decode_lut
+from deltalight.protocol.octahedral import octahedral_uv
 from deltalight.render_server.estimation.plane_extrapolation import (
     ExtrapolatedPlanes,
     PointCloud,
@@ -18,9 +19,8 @@ from deltalight.render_server.estimation.registration import unseen_radiance_fro
 from deltalight.render_server.estimation.samples import LightSamples
 from deltalight.render_server.frame_graph import FrameGraph
 from deltalight.render_server.gpu.textures import read_texture
-from deltalight.render_server.lights.environment import LUMINANCE
 from deltalight.render_server.lights.lights import LightSet
-from deltalight.render_server.lights.octahedral import irradiance_map, octahedral_uv
+from deltalight.render_server.lights.octahedral import irradiance_map
 
 GROUND_SIZES = 2.0
 FACES_UP = 0.7  # cosine to the vertical

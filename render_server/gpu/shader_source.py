@@ -18,7 +18,9 @@ _VARIABLE = re.compile(
 _BLOCK = re.compile(
     r"((?:(?:readonly|writeonly|coherent|volatile|restrict)\s+)*)\b(buffer|uniform)\s+(\w+)\s*\{"
 )
-_SWITCH = re.compile(r"^\s*#\s*pragma\s+switch\s+(\w+)\s*$", re.MULTILINE)
+_SWITCH = re.compile(r"^\s*#\s*pragma\s+switch\s+(?:bool\s+)?(\w+)\s*$", re.MULTILINE)
+_CONSTANT = re.compile(r"#pragma switch bool (\w+)")
+_VALUE = re.compile(r"^const bool (\w+) = switched;$", re.MULTILINE)
 _LOCAL_SIZE = re.compile(r"\blocal_size_([xyz])\s*=\s*(\d+)")
 _DIRECTIVE = re.compile(r"\s*#\s*(define|ifdef|ifndef|if|elif|else|endif)\b\s*(\w*)(?:[ \t]+(.*))?")
 
@@ -29,7 +31,8 @@ class Declarations:
 
     `names` are those of all variants; the rest is of the one that the defines leave: `formats` of images (layout
     qualifiers; none where it is written only and has no format), `written` images and storage blocks (all that are
-    not `readonly`), and `switches`: defines that the bindings of a run turn on (`#pragma switch NAME`).
+    not `readonly`), and `switches`: defines that the bindings of a run turn on (`#pragma switch NAME`), or constants
+    that they make true (`#pragma switch bool name`).
     """
 
     names: frozenset[str]
@@ -42,8 +45,12 @@ class Declarations:
 def shader_source(path: Path, defines: Mapping[str, int | float | str] | None = None) -> str:
     """Returns the source of the shader at `path` with includes (from the shaders' folder) and defines."""
     files: list[Path] = []
-    body = _expand(path, files)
-    head = [VERSION, *(f"#define {name} {value}" for name, value in (defines or {}).items())]
+    body, given = _expand(path, files), defines or {}
+    constants = _VALUE.findall(body)
+    body = _VALUE.sub(
+        lambda found: f"const bool {found[1]} = {'true' if found[1] in given else 'false'};", body
+    )
+    head = [VERSION, *(f"#define {name} {value}" for name, value in given.items() if name not in constants)]
     table = [f"// file {index}: {file.parent.name}/{file.name}" for index, file in enumerate(files)]
     return "\n".join([*head, *table, body])
 
@@ -54,6 +61,9 @@ def _expand(path: Path, seen: list[Path]) -> str:
     number = len(seen) - 1
     lines = [f"#line 1 {number}"]
     for index, line in enumerate(path.read_text().splitlines(), start=1):
+        if constant := _CONSTANT.match(line):
+            lines += [constant[0], f"const bool {constant[1]} = switched;", f"#line {index + 1} {number}"]
+            continue
         match = INCLUDE.match(line)
         if match is None:
             lines.append(line)
@@ -76,6 +86,7 @@ def declarations(source: str) -> Declarations:
     text = preprocessed(text)
     sizes = {axis: int(size) for axis, size in _LOCAL_SIZE.findall(text)}
     switches = tuple(dict.fromkeys(_SWITCH.findall(text)))
+    names |= set(switches)
     text = _declaring(text)
     formats: dict[str, frozenset[str]] = {}
     written: set[str] = set()

@@ -1,7 +1,7 @@
-"""Environment maps in latitude-longitude form: loading, orientation, area averaging."""
+"""Environment maps in latitude-longitude form: loading, orientation, area averaging, splitting into lights."""
 
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from pathlib import Path
 from typing import Self
 
@@ -11,28 +11,14 @@ from jaxtyping import Float, Float32, Float64
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import decode_lut
+from deltalight.protocol.median_cut import PEAK_THRESHOLD, SkyGrid, Split, luminance_of, split_map
 from deltalight.protocol.pictures import decode_rgb, read_bytes
 from deltalight.protocol.radiance_files import LINEAR_SUFFIXES, read_linear
 from deltalight.protocol.scene_lights import EnvironmentLights
 
 WORK_SIZE = (512, 256)
 MAX_EDGE = 16384
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 _CODED_SUFFIXES = (".png", ".jpg", ".jpeg")
-
-
-@dataclass(frozen=True, eq=False)
-class SkyGrid:
-    """Unit direction (map axes) and solid angle (sr) of every pixel of a map."""
-
-    directions: Float32[np.ndarray, "h w 3"]
-    solid_angles: Float32[np.ndarray, "h w"]
-
-    @cached_property
-    def moments(self) -> Float32[np.ndarray, "h w 4"]:
-        """Solid angle, and solid angle times direction, of every pixel."""
-        parts = [np.ones_like(self.solid_angles)[..., None], self.directions]
-        return np.asarray(np.concatenate(parts, axis=-1) * self.solid_angles[..., None])
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +75,29 @@ class EnvironmentMap:
         return np.asarray(
             cv2.remap(wrapped, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32
         )
+
+
+def split_environment(
+    environment: EnvironmentMap,
+    count: int = 4,
+    *,
+    threshold: float = PEAK_THRESHOLD,
+    whole_map: bool = False,
+) -> Split[EnvironmentMap]:
+    """Splits a latitude-longitude map as `split_map`, in its working size and opened where it is darkest."""
+    small = environment.resized(*WORK_SIZE)
+    bright = luminance_of(small.radiance)
+    limit = threshold * float(np.vdot(bright, small.grid.solid_angles)) / small.known_solid_angle
+    peaks = np.maximum(bright - np.float32(limit), 0) * small.grid.solid_angles
+    opened = small.rolled(_darkest_column(peaks.sum(axis=0)))
+    return split_map(opened, count, threshold=threshold, whole_map=whole_map)
+
+
+def _darkest_column(columns: Float[np.ndarray, " w"]) -> int:
+    """Finds where to open the map so that the seam is least likely to cut a light in two."""
+    width = max(1, len(columns) // 64)
+    around = np.convolve(np.concatenate([columns, columns[: width - 1]]), np.ones(width), "valid")
+    return (int(np.argmin(around)) + width // 2) % len(columns)
 
 
 def row_cosines(rows: int) -> Float32[np.ndarray, " h"]:

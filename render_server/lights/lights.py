@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from deltalight.protocol import scene_lights as documents
-from deltalight.render_server.lights.environment import load_environment
-from deltalight.render_server.lights.median_cut import split_environment
-from deltalight.render_server.lights.octahedral import above_horizon, resample_to_octahedral, solid_angle_mean
+from deltalight.protocol.octahedral import resample_to_octahedral
+from deltalight.render_server.lights.environment import load_environment, split_environment
+from deltalight.render_server.lights.octahedral import above_horizon, solid_angle_mean
 
 ENVIRONMENT_SIZE = 256
 AMBIENT_SIZE = 64  # texels of 1.5 to 5 degrees: a metal of roughness 0.3 still resolves the edge of a wall

@@ -1,23 +1,18 @@
 """Sources of a scene document's lights over time: fixed, lamps with markers, or a fish-eye (docs/method.md 2)."""
 
-from functools import partial
+import json
+from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
 from jaxtyping import Float64
 
 from deltalight.protocol import scene_lights as documents
-from deltalight.protocol.frames import RadianceMap, ViewFrame
-from deltalight.render_server.lights.fisheye import (
-    HemisphereMap,
-    LightTracker,
-    TrackedLight,
-    WorldSky,
-    fit_distance,
-    is_occluded,
-    paper_light,
-    to_world,
-)
+from deltalight.protocol.frames import ViewFrame
+from deltalight.protocol.light_cutter import LightCutter
+from deltalight.protocol.scene_lights import LightCut
+from deltalight.protocol.sky_lights import Region, SkyLights, TrackedLight
+from deltalight.render_server.lights.light_distance import fit_distance, paper_light
 from deltalight.render_server.lights.lights import (
     AMBIENT_SIZE,
     DirectionalLight,
@@ -27,15 +22,11 @@ from deltalight.render_server.lights.lights import (
     build_lights,
     light_set,
 )
-from deltalight.render_server.lights.median_cut import Split, split_map
 from deltalight.render_server.lights.octahedral import above_horizon, irradiance
 
 # Fraction of a lamp's radius that it must move to count as moved. Soft edges of its shadows are then off by a
 # twentieth of their width, whereas noise of the marker's pose would make them tremble and cost a rebuild per frame.
 STILL_FRACTION = 0.1
-# Texels of 1.6 degrees, finer than glossy surfaces resolve; lights are not in it. Filtering it takes a third of the
-# time of a map of mode `environment`, which never changes.
-RESIDUAL_SIZE = 128
 UP = np.array([[0.0, 0.0, 1.0]])
 
 
@@ -47,8 +38,8 @@ class LightSource(Protocol):
         ...
 
     @property
-    def split(self) -> Split[HemisphereMap] | None:
-        """The latest split of a fish-eye picture, for the debug view."""
+    def regions(self) -> Sequence[Region]:
+        """Regions into which the latest fish-eye picture was cut, for the debug view."""
         ...
 
     @property
@@ -60,7 +51,7 @@ class LightSource(Protocol):
 class FixedLights:
     """Lights of modes `manual` and `environment`, which never change."""
 
-    split: Split[HemisphereMap] | None = None
+    regions: Sequence[Region] = ()
     remarks: tuple[str, ...] = ()
 
     def __init__(self, lights: documents.Lights) -> None:
@@ -80,7 +71,7 @@ class TrackedSource:
         self._positions: dict[int, Float64[np.ndarray, " 3"]] = {}
         self._visible: set[int] = set()
         self._started = False
-        self.split: Split[HemisphereMap] | None = None
+        self.regions: Sequence[Region] = ()
 
     def update(self, frame: ViewFrame) -> LightSet | None:
         """Returns the unregistered lights of a frame; None where they did not change."""
@@ -139,88 +130,92 @@ def _lamps(markers: list[int]) -> str:
 
 
 class FisheyeSource:
-    """Lights of mode `fisheye`: a camera's radiance maps, split into lights and tracked over time."""
+    """Lights of mode `fisheye`: those that the sensor node sends, if it cuts its maps as the scene document asks.
+
+    Else the maps are cut here, in the same way.
+    """
 
     def __init__(self, lights: documents.Lights) -> None:
         self._document = lights
-        self._tracker = LightTracker(lights.fisheye.smoothing_s)
-        self._map: RadianceMap | None = None
-        self._sky: WorldSky | None = None
+        self._cut = lights.fisheye.cut
+        self._cutter = LightCutter(self._cut)
+        self._sky: SkyLights | None = None
+        self._remark: str | None = None
         self._distance_m: float | None = None
         self._wants_distance = lights.fisheye.distance_m == "auto"
         if isinstance(lights.fisheye.distance_m, float):
             self._distance_m = lights.fisheye.distance_m
-        self.split: Split[HemisphereMap] | None = None
 
     def update(self, frame: ViewFrame) -> LightSet | None:
         """Returns the unregistered lights of a frame; None where they did not change.
 
         There are none until a frame brings the first map.
         """
-        if frame.radiance_map is not None and frame.radiance_map is not self._map:
-            self._map = frame.radiance_map
-            self._split_map(frame, frame.radiance_map)
-        elif self._map is None or not (
-            self._tracker.advance(frame.timestamp_ns) | self._find_distance(frame, self._map)
-        ):
+        changed = self._changed(frame)
+        self._sky = changed or self._sky
+        if self._sky is None:
             return None
-        return self._lights()
+        found = self._find_distance(frame, self._sky)
+        return self._lights(self._sky) if changed is not None or found else None
+
+    def _changed(self, frame: ViewFrame) -> SkyLights | None:
+        """Returns the lights of a frame, None where they are those of the last one."""
+        sent = frame.sky_lights
+        if sent is None or sent.cut != self._cut:
+            self._remark = None if sent is None else _cut_here(sent.cut, self._cut)
+            return self._cutter.update(frame)
+        self._remark = None
+        return None if sent is self._sky else sent
+
+    @property
+    def regions(self) -> Sequence[Region]:
+        """Regions into which the latest fish-eye picture was cut, for the debug view."""
+        return () if self._sky is None else self._sky.regions
 
     @property
     def remarks(self) -> tuple[str, ...]:
         """Sentences for the user."""
-        if self._map is None:
+        if self._sky is None:
             return (_NO_PICTURE,)
+        remarks = () if self._remark is None else (self._remark,)
         if self._distance_m is None or self._document.fisheye.distance_m != "auto":
-            return ()
-        return (f"lights of the fish-eye picture: {self._distance_m:.2g} m away, as the board's paper tells",)
+            return remarks
+        found = f"lights of the fish-eye picture: {self._distance_m:.2g} m away, as the board's paper tells"
+        return (*remarks, found)
 
-    def _split_map(self, frame: ViewFrame, seen: RadianceMap) -> None:
-        settings = self._document.fisheye
-        occlusion_test = None
-        if frame.depth is not None and frame.pose is not None:
-            position = seen.world_from_fisheye[:3, 3]
-            occlusion_test = partial(is_occluded, frame.depth, frame.pose.world_from_camera, position)
-        self.split = split_map(
-            HemisphereMap.of(seen),
-            settings.count,
-            threshold=settings.threshold,
-            whole_map=settings.split == "all",
-            is_occluded=occlusion_test,
-        )
-        self._sky = to_world(self.split.residual, RESIDUAL_SIZE)
-        self._tracker.set_target(frame.timestamp_ns, self.split.lights, self._sky.filled())
-        self._find_distance(frame, seen)
-
-    def _find_distance(self, frame: ViewFrame, seen: RadianceMap) -> bool:
+    def _find_distance(self, frame: ViewFrame, sky: SkyLights) -> bool:
         """Estimates the lights' distance on the first frame with enough paper; returns whether that succeeded."""
-        assert self.split is not None
-        assert self._tracker.residual is not None
-        paper = paper_light(frame) if self._wants_distance and self.split.lights else None
+        paper = paper_light(frame) if self._wants_distance and sky.lights else None
         if paper is None:
             return False
         self._wants_distance = False
-        ambient = irradiance(self._tracker.residual, UP)[0]
-        position = seen.world_from_fisheye[:3, 3]
-        self._distance_m = fit_distance(paper, position, self.split.lights, ambient)
+        ambient = irradiance(sky.residual, UP)[0]
+        self._distance_m = fit_distance(paper, sky.world_from_fisheye[:3, 3], sky.lights, ambient)
         return self._distance_m is not None
 
-    def _lights(self) -> LightSet:
-        assert self._map is not None
-        assert self._sky is not None
-        assert self._tracker.residual is not None
-        position, distance_m = self._map.world_from_fisheye[:3, 3], self._distance_m
-        tracked = self._tracker.lights
+    def _lights(self, sky: SkyLights) -> LightSet:
+        position, distance_m = sky.world_from_fisheye[:3, 3], self._distance_m
         return light_set(
             self._document,
             tuple(
                 _distant(light) if distance_m is None else _near(light, position, distance_m)
-                for light in tracked
+                for light in sky.lights
             ),
-            self._tracker.residual,
-            (1 - self._sky.seen) * (1 - above_horizon(RESIDUAL_SIZE)),
-            tuple(light.identity for light in tracked),
+            sky.residual,
+            (1 - sky.seen) * (1 - above_horizon(len(sky.residual))),
+            tuple(light.identity for light in sky.lights),
         )
+
+
+def _cut_here(sent: LightCut, wanted: LightCut) -> str:
+    """Returns the sentence on lights that a node cut in another way than the scene asks for."""
+    asked = ", ".join(
+        f"{name} = {json.dumps(value)}" for name, value in wanted if value != getattr(sent, name)
+    )
+    return (
+        f"The scene asks for other lights than the sensor node cuts, so they are cut here; set {asked} in "
+        "[node.lights] of its configuration to share them."
+    )
 
 
 def _distant(light: TrackedLight) -> Light:

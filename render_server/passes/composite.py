@@ -81,12 +81,17 @@ class RelitLayers:
 
 
 class Composite:
-    """Writes `code` (RGBA8UI, with the camera's response) and `linear` (RGBA16F, camera units)."""
+    """Writes `code` (RGBA8UI, with the camera's response) and `linear` (RGBA16F, camera units).
+
+    Keeps the ratio by which each pixel's radiance changed, so that the next picture in the same light costs little.
+    """
 
     def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
         self._threads = list_threads(gpu, size[0] * size[1])
         self.code = texture_2d(gpu, size, 4, "u1")
         self.linear = texture_2d(gpu, size, 4, "f2")
+        self._ratio = texture_2d(gpu, size, 4, "f4")
+        self._again = Kernel(gpu, "recompose")
         self._kernel = Kernel(
             gpu, "composite", FILL_RADIUS=FILL_RADIUS, RIM_SIGHT=RIM_SIGHT, RAY_ROUGHNESS=RAY_ROUGHNESS
         )
@@ -125,11 +130,34 @@ class Composite:
             has_reflection=layers.reflection is not None,
             code_out=self.code,
             linear_out=self.linear,
+            ratio_out=self._ratio,
+        )
+
+    def run_again(self, image: CameraImage, layers: RelitLayers, scene: Bindings) -> None:
+        """Composes a new picture in the light of the last run, of which nothing but the picture changed.
+
+        Without options of `run`, and without smooth surfaces: what these show depends on more than the ratio.
+        """
+        self.code.write(image.bytes, alignment=1)
+        self._again.run(
+            (self._threads,),
+            scene,
+            picture=image.code,
+            code_radiance=image.code_radiance,
+            inverse_response=image.inverse_response,
+            exposure_scale=image.exposure_scale,
+            relit_ratio=self._ratio,
+            virtual_radiance=layers.virtual_radiance,
+            object_coverage=layers.object_coverage,
+            sample_pixels=layers.grid.pixels,
+            scale=layers.grid.scale,
+            Texels=layers.change.texels,
+            code_out=self.code,
         )
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_all(self.code, self.linear, self._kernel)
+        release_all(self.code, self.linear, self._ratio, self._kernel, self._again)
 
 
 class Enlarge:

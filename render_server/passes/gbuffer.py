@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
+import cv2
 import moderngl
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, UInt8
@@ -32,18 +33,21 @@ WORN = 1.5
 
 
 class CameraImage:
-    """Code (RGBA8UI), linear radiance in camera units with mip levels (RGBA16F), response (256 x 1), pixel rays."""
+    """Codes (RGBA8UI), their linear radiance in camera units (256 x 1), the same of every pixel with mip levels
+    (RGBA16F), and pixel rays.
+    """
 
     def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
         self.size = size
         self.code = texture_2d(gpu, size, 4, "u1")
         self.linear = texture_2d(gpu, size, 4, "f2", linear=True)
         self.build_levels()
-        self.response = texture_2d(gpu, (256, 1), 4, "f4")
+        self.code_radiance = texture_2d(gpu, (256, 1), 4, "f2")
         self.inverse_response = texture_2d(gpu, (INVERSE_SIZE, 1), 4, "f4")
         self.rays = texture_2d(gpu, size, 2, "f4")
         self.exposure_scale = 1.0
         self.bytes = b""
+        self.is_linear = False  # whether `linear` shows the picture that was uploaded last
         self._linearize = Kernel(gpu, "linearize")
         self._rays_of: object = None
         self._response_of: object = None
@@ -54,30 +58,32 @@ class CameraImage:
         return {"linear_picture": self.linear, "picture_rays": self.rays}
 
     def upload(self, frame: ViewFrame) -> None:
-        """Uploads a frame's picture and linearises it."""
-        self.bytes = rgba_bytes(frame.color)
+        """Uploads a frame's picture; `linear` shows the one before until `linearize`."""
+        self.bytes, self.is_linear = rgba_bytes(frame.color), False
         self.code.write(self.bytes, alignment=1)
-        self._write_response(decode_lut(frame.response))
+        self._write_response(decode_lut(frame.response), frame.exposure_scale)
         if self._rays_of != frame.camera:
             self.rays.write(np.ascontiguousarray(frame.camera.rays(), np.float32).tobytes(), alignment=1)
             self._rays_of = frame.camera
-        self.exposure_scale = frame.exposure_scale
+
+    def linearize(self) -> None:
+        """Computes the linear radiance of the picture that was uploaded last, once."""
+        if self.is_linear:
+            return
+        self.is_linear = True
         self._linearize.run(
-            self.size,
-            picture=self.code,
-            response=self.response,
-            linear_out=self.linear,
-            exposure_scale=frame.exposure_scale,
+            self.size, picture=self.code, code_radiance=self.code_radiance, linear_out=self.linear
         )
 
-    def _write_response(self, decode: Float32[np.ndarray, "256 3"]) -> None:
-        """Uploads the response and its inverse, unless they are the same as before."""
-        if decode is self._response_of:
+    def _write_response(self, decode: Float32[np.ndarray, "256 3"], exposure_scale: float) -> None:
+        """Uploads the radiance of the codes and its inverse, unless they are the same as before."""
+        if decode is self._response_of and exposure_scale == self.exposure_scale:
             return
         self._response_of = decode
-        lut = np.ones((256, 4), np.float32)
-        lut[:, :3] = decode
-        self.response.write(lut.tobytes(), alignment=1)
+        self.exposure_scale = exposure_scale
+        radiance = np.ones((256, 4), np.float16)
+        radiance[:, :3] = decode / np.float32(exposure_scale)
+        self.code_radiance.write(radiance.tobytes(), alignment=1)
         self.inverse_response.write(inverse_response(decode).tobytes(), alignment=1)
 
     def build_levels(self) -> None:
@@ -87,16 +93,14 @@ class CameraImage:
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_all(self.code, self.linear, self.response, self.inverse_response, self.rays, self._linearize)
+        release_all(
+            self.code, self.linear, self.code_radiance, self.inverse_response, self.rays, self._linearize
+        )
 
 
 def rgba_bytes(color: UInt8[np.ndarray, "h w 3"]) -> bytes:
     """Returns a picture as the bytes of an opaque RGBA texture."""
-    height, width, _ = color.shape
-    rgba = np.empty((height, width, 4), np.uint8)
-    rgba[..., :3] = color
-    rgba[..., 3] = 255
-    return rgba.tobytes()
+    return np.asarray(cv2.cvtColor(color, cv2.COLOR_RGB2RGBA)).tobytes()
 
 
 def inverse_response(decode: Float32[np.ndarray, "256 3"]) -> Float32[np.ndarray, "n 4"]:

@@ -7,12 +7,13 @@ import moderngl
 import numpy as np
 from jaxtyping import Float32, Float64
 
+from deltalight.protocol.octahedral import octahedral_grid, sample_octahedral
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
 from deltalight.render_server.gpu.uniform_block import Block, Float, Int, UniformBlock
 from deltalight.render_server.lights.lights import DirectionalLight, Light
 from deltalight.render_server.lights.mirror_lights import MirrorLight
-from deltalight.render_server.lights.octahedral import octahedral_grid, prefilter, sample_octahedral
+from deltalight.render_server.lights.octahedral import prefilter
 from deltalight.render_server.passes.shadow_maps import (
     NEAREST_M,
     LightView,

@@ -144,6 +144,7 @@ class LightHistory:
             shared,
             scene,
             sample_pixels=self._grid.pixels,
+            reused_direct_rho=self._direct.rho,
             stale_out=self._stale,
             real_texels_out=self._real_texels[0],
             object_texels_out=self._object_texels[0],

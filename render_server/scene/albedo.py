@@ -11,8 +11,7 @@ from jaxtyping import Bool, Float, Float32, Float64, Int64, UInt8
 
 from deltalight.protocol.board import BoardSpec
 from deltalight.protocol.camera_model import CameraModel
-from deltalight.protocol.frames import BoardPose
-from deltalight.render_server.lights.environment import LUMINANCE
+from deltalight.protocol.frames import LUMINANCE, BoardPose
 
 MIN_PIXELS = 30
 SUFFICIENT_PIXELS = 10 * MIN_PIXELS

@@ -54,6 +54,11 @@ class SurfaceTable:
         """Perceptual roughness."""
         return self.packed[:, 1, 0]
 
+    @property
+    def is_specular(self) -> bool:
+        """Whether any of them reflects, other than sheets."""
+        return bool((self.packed[:, 3, 3] < SHEET).any())
+
     def lookup(
         self, points: Float[np.ndarray, "k 3"], materials: Int32[np.ndarray, " k"] | None = None
     ) -> Int32[np.ndarray, " k"]:

@@ -1,7 +1,7 @@
 """Frames from sensor nodes: the endpoints that are read, and pairing of their streams into complete frames.
 
 A colour frame triggers; pose and lamps are those of the same frame, the depth the nearest in capture time within a
-tolerance, the radiance map the latest. Frames without a partner, or overtaken by a newer frame, are counted.
+tolerance, radiance map and lights the latest. Frames without a partner, or overtaken by a newer frame, are counted.
 """
 
 from collections import Counter, deque
@@ -17,13 +17,14 @@ from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.codecs import decode_color, decode_depth, decode_response
 from deltalight.protocol.documents import StrictModel, validate
 from deltalight.protocol.errors import DeltalightError
-from deltalight.protocol.frames import BoardPose, DepthImage, LampPose, RadianceMap, ViewFrame
+from deltalight.protocol.frames import BoardPose, DepthImage, LampPose, ViewFrame
 from deltalight.protocol.keys import Keys
-from deltalight.protocol.light_codecs import lamp_poses, radiance_map
+from deltalight.protocol.light_codecs import lamp_poses, radiance_map, sky_lights
 from deltalight.protocol.messages import (
     ColorMessage,
     DepthMessage,
     LampsMessage,
+    LightsMessage,
     Message,
     MessageBase,
     PoseMessage,
@@ -34,7 +35,7 @@ from deltalight.protocol.subscriber import ReceivedMultipart
 
 MAX_ENDPOINTS = 16
 EARLIER_SOURCES = "earlier_sources"
-TOPICS = ("color", "clean_depth", "pose", "radiance", "lamps")
+TOPICS = ("color", "clean_depth", "pose", "radiance", "lights", "lamps")
 KEPT_MESSAGES = 8  # per stream; a renderer that falls behind further drops frames anyway
 
 Built = TypeVar("Built")
@@ -148,8 +149,8 @@ class FrameAssembler:
         self._depths: deque[_Held[DepthMessage]] = deque(maxlen=KEPT_MESSAGES)
         self._poses: deque[_Held[PoseMessage]] = deque(maxlen=KEPT_MESSAGES)
         self._lamps: deque[LampsMessage] = deque(maxlen=KEPT_MESSAGES)
-        self._radiance: deque[_Held[RadianceMessage]] = deque(maxlen=KEPT_MESSAGES)
-        self._map: tuple[_Held[RadianceMessage], RadianceMap] | None = None  # the last one decoded
+        self._radiance = _Repeated(radiance_map)
+        self._lights = _Repeated(sky_lights)
         self._reference_exposure_s: float | None = None  # of the first frame, as for recordings
         self._camera = _Unchanged(CameraModel.from_dict)
         self._depth_camera = _Unchanged(CameraModel.from_dict)
@@ -174,9 +175,9 @@ class FrameAssembler:
             case LampsMessage():
                 self._lamps.append(message)
             case RadianceMessage():
-                # Maps are sent repeatedly, for late subscribers.
-                if all(_identity(held.message) != _identity(message) for held in self._radiance):
-                    self._radiance.append(_Held(message, parts, received_ns))
+                self._radiance.add(_Held(message, parts, received_ns))
+            case LightsMessage():
+                self._lights.add(_Held(message, parts, received_ns))
 
     def take(self, now_ns: int) -> AssembledFrame | None:
         """Returns the newest complete frame, or the newest that has waited too long; drops older ones.
@@ -222,24 +223,6 @@ class FrameAssembler:
         own = (message for message in self._lamps if _identity(message) == _identity(color))
         return next((lamp_poses(message) for message in own), ())
 
-    def _map_of(self, color: ColorMessage) -> RadianceMap | None:
-        """Returns the newest map not later than the frame; before the first map, the first."""
-        own = [held for held in self._radiance if held.message.node == color.node]
-        if not own:
-            return None
-        earlier = [held for held in own if held.message.capture_ns <= color.capture_ns]
-        newest = max(earlier, key=_captured) if earlier else min(own, key=_captured)
-        if self._map is None or self._map[0] is not newest:
-            self._map = newest, self._decode_map(newest)
-        return self._map[1]
-
-    def _decode_map(self, held: _Held[RadianceMessage]) -> RadianceMap:
-        try:
-            return radiance_map(held.message, held.parts)
-        except DeltalightError:
-            self._radiance.remove(held)  # so that it costs one frame, and not every frame that would use it
-            raise
-
     def _build(
         self, color: _Held[ColorMessage], pose: _Held[PoseMessage] | None, depth: _Held[DepthMessage] | None
     ) -> AssembledFrame:
@@ -251,21 +234,58 @@ class FrameAssembler:
             frame_id=header.frame_id,
             timestamp_ns=header.capture_ns,
             color=decode_color(color.parts[0], header.encoding, header.shape),
-            camera=self._camera(header.camera),
+            camera=_of_size(self._camera(header.camera), header.shape),
             response=decode_response(color.parts[1]) if header.has_response else None,
             exposure_scale=(header.exposure_s or 1.0) / (self._reference_exposure_s or 1.0),
             pose=None if pose is None else _board_pose(pose.message),
             depth=None if depth is None else self._depth_image(depth),
             board=None if pose is None or pose.message.board is None else self._board(pose.message.board),
-            radiance_map=self._map_of(header),
+            radiance_map=self._radiance.at(header),
             lamps=self._lamps_of(header),
+            sky_lights=self._lights.at(header),
         )
         return AssembledFrame(view, header, color.received_ns)
 
     def _depth_image(self, depth: _Held[DepthMessage]) -> DepthImage:
         header = depth.message
         depth_m, valid = decode_depth(depth.parts[0], header.encoding, header.shape, header.depth_scale_m)
-        return DepthImage(depth_m, valid, self._depth_camera(header.camera), header.noise_sigma_m)
+        camera = _of_size(self._depth_camera(header.camera), header.shape)
+        return DepthImage(depth_m, valid, camera, header.noise_sigma_m)
+
+
+class _Repeated(Generic[Kind, Built]):
+    """Messages that hold until the next one of their node and are sent repeatedly, for late subscribers."""
+
+    def __init__(self, decode: Callable[[Kind, Sequence[memoryview]], Built]) -> None:
+        self._decode = decode
+        self._held: deque[_Held[Kind]] = deque(maxlen=KEPT_MESSAGES)
+        self._last: tuple[_Held[Kind], Built] | None = None
+
+    def add(self, new: _Held[Kind]) -> None:
+        """Stores a message, unless it is the repetition of one."""
+        if all(_identity(held.message) != _identity(new.message) for held in self._held):
+            self._held.append(new)
+
+    def at(self, color: ColorMessage) -> Built | None:
+        """Returns what the newest message not later than a frame holds; before the first one, the first.
+
+        The same object as long as it is the same message.
+        """
+        own = [held for held in self._held if held.message.node == color.node]
+        if not own:
+            return None
+        earlier = [held for held in own if held.message.capture_ns <= color.capture_ns]
+        newest = max(earlier, key=_captured) if earlier else min(own, key=_captured)
+        if self._last is None or self._last[0] is not newest:
+            self._last = newest, self._decoded(newest)
+        return self._last[1]
+
+    def _decoded(self, held: _Held[Kind]) -> Built:
+        try:
+            return self._decode(held.message, held.parts)
+        except DeltalightError:
+            self._held.remove(held)  # so that it costs one frame, and not every frame that would use it
+            raise
 
 
 class _Unchanged(Generic[Built]):
@@ -300,6 +320,16 @@ def _board_pose(message: PoseMessage) -> BoardPose | None:
         message.reprojection_error_px,
         None if message.alternative is None else np.array(message.alternative),
     )
+
+
+def _of_size(camera: CameraModel, shape: Sequence[int]) -> CameraModel:
+    """Returns the camera if it is the one of a picture of this shape: the renderer allocates by the camera."""
+    if (camera.height, camera.width) != tuple(shape[:2]):
+        raise DeltalightError(
+            f"A camera of {camera.width}x{camera.height} pixels came with a picture of {shape[1]}x{shape[0]}; "
+            "send the camera at the picture's size."
+        )
+    return camera
 
 
 def _board_spec(data: Mapping[str, object]) -> BoardSpec:

@@ -23,7 +23,7 @@ from deltalight.protocol.envelope import encode
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.files import write_bytes
 from deltalight.protocol.keys import Keys
-from deltalight.protocol.messages import ControlRequest, StatsMessage
+from deltalight.protocol.messages import ControlRequest, Name, StatsMessage
 from deltalight.protocol.methods import PLUGINS
 from deltalight.protocol.publisher import Publisher
 from deltalight.protocol.request import ReplyServer
@@ -54,7 +54,7 @@ class ServerSettings(StrictModel):
     subscribe: tuple[str, ...] = Field(min_length=1, description="Endpoints of sensor nodes.")
     publish: str = Field(description="Endpoint for composites and stats.")
     control: str = Field(description="Endpoint for commands.")
-    name: str = Field(default="render-server", description="Name in topics and messages.")
+    name: Name = Field(default="render-server", description="Name in topics and messages.")
     device: int | None = Field(default=None, ge=0, description="EGL device; null = the driver's first.")
     allow_software: bool = Field(default=False, description="Accept a renderer without a GPU.")
     jpeg_quality: int = Field(default=90, ge=1, le=100, description="Quality of published composites.")
@@ -225,7 +225,7 @@ def serve(
             renderer_name=renderer_name,
             keep_scene=lambda kept: _keep(settings.session, kept),
             use_source=use_source,
-            mailbox_drops=lambda: {**source.drops, "send": sender.dropped},
+            mailbox_drops=lambda: {"send": sender.dropped, **source.drops},
         )
         commands = CommandQueue()
         replies = ReplyServer(settings.control, commands.ask, node=settings.name, keys=keys)
@@ -249,9 +249,17 @@ def _loop(session: RenderSession, source: FrameSource, sender: Sender, commands:
         if rendered is not None:
             sender.offer(rendered)
         if time.monotonic() >= stats_due_s:
-            sender.offer(session.stats())
+            _offer_stats(session, sender)
             stats_due_s = time.monotonic() + STATS_INTERVAL_S
         commands.serve(session.execute)
+
+
+def _offer_stats(session: RenderSession, sender: Sender) -> None:
+    """Offers the statistics; a fault in them is no reason to stop rendering."""
+    try:
+        sender.offer(session.stats())
+    except Exception as fault:
+        log.warning("no statistics", fault=str(fault))
 
 
 def _keep(path: Path | None, scene: SceneDocument) -> None:

@@ -20,7 +20,13 @@ from deltalight.protocol.documents import StrictModel, nearest, validate
 from deltalight.protocol.envelope import decode
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import ViewFrame
-from deltalight.protocol.messages import CompositeMessage, ControlRequest, StatsMessage
+from deltalight.protocol.messages import (
+    CompositeMessage,
+    ControlRequest,
+    StatsMessage,
+    as_counts,
+    as_sentence,
+)
 from deltalight.protocol.scene import SceneDocument, parse_scene
 from deltalight.protocol.subscriber import ReceivedMultipart
 from deltalight.render_server.frame_budget import Level
@@ -30,6 +36,7 @@ from deltalight.render_server.server.snapshot import SnapshotOrder, take_snapsho
 RATE_WINDOW_S = 5.0
 WAITING_AFTER_S = 2.0
 MAXIMUM_FAULTS_IN_A_ROW = 30
+LOG_INTERVAL_NS = 10**9
 
 log = structlog.get_logger()
 
@@ -194,6 +201,7 @@ class RenderSession:
         self._last_fault = ""
         self._faults_in_a_row = 0
         self._logged_notices = 0
+        self._logged_ns = -LOG_INTERVAL_NS
 
     def receive(self, multipart: ReceivedMultipart) -> None:
         """Takes a message of the sensor node; a malformed one is counted and logged."""
@@ -223,6 +231,10 @@ class RenderSession:
             return finished
         try:
             frame = self._assembler.take(self._clock_ns())
+        except Exception as fault:  # a node's data is no reason to end
+            self._count_fault("bad_frames", fault)
+            return None
+        try:
             return self._render(frame)
         except DeltalightError as fault:
             self._count_fault("bad_frames", fault)
@@ -234,8 +246,8 @@ class RenderSession:
         return None
 
     def drops(self) -> dict[str, int]:
-        """Returns the numbers of lost frames, by cause."""
-        return {**self._mailbox_drops(), **self._assembler.counts, **self.counts}
+        """Returns the numbers of lost frames, by cause; topics come last, because nodes choose their number."""
+        return as_counts({**self._assembler.counts, **self.counts, **self._mailbox_drops()})
 
     def stats(self) -> StatsMessage:
         """Returns the state of the session."""
@@ -247,7 +259,7 @@ class RenderSession:
             node=self._name,
             capture_ns=now_ns,
             state="degraded" if self._last_fault else "running" if is_running else "waiting",
-            detail=f"{self._renderer_name}; {self._last_fault}" if self._last_fault else self._renderer_name,
+            detail=as_sentence("; ".join(filter(None, (self._renderer_name, self._last_fault)))),
             rates={"frames_per_s": len(self._rendered_ns) / RATE_WINDOW_S},
             drops=self.drops(),
         )
@@ -400,8 +412,12 @@ class RenderSession:
 
     def _count_fault(self, kind: str, fault: Exception) -> None:
         self.counts[kind] += 1
-        sentence = str(fault) if isinstance(fault, DeltalightError) else f"{type(fault).__name__}: {fault}"
-        if sentence != self._last_fault:  # a fault of every frame is one line, not thirty a second
+        named = str(fault) if isinstance(fault, DeltalightError) else f"{type(fault).__name__}: {fault}"
+        sentence = as_sentence(named)
+        now_ns = self._clock_ns()
+        # A fault of every frame is one line, not thirty a second, and a node that finds others fills no disk.
+        if sentence != self._last_fault and now_ns - self._logged_ns >= LOG_INTERVAL_NS:
+            self._logged_ns = now_ns
             log.warning(kind, fault=sentence)
             log.debug("traceback", exc_info=fault)
         self._last_fault = sentence

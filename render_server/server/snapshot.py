@@ -35,7 +35,7 @@ class SnapshotOrder(StrictModel):
     """What to write into an existing folder; `exr` adds composite.exr (linear, the scene's own method)."""
 
     folder: Path
-    pictures: tuple[SnapshotPicture, ...] = Field(default=(), max_length=MAX_PICTURES)
+    pictures: tuple[SnapshotPicture, ...] = Field(default=(), max_length=MAX_PICTURES, fail_fast=True)
     exr: bool = False
 
     @model_validator(mode="after")

@@ -75,7 +75,7 @@ def _least_squares(
     """Levenberg-Marquardt (Marquardt 1963) by normal equations; return the values and the Jacobian there.
 
     scipy's solvers decompose the whole Jacobian in each iteration, or converge slowly without; this takes a twentieth
-    of their time, and a node needs no scipy.
+    of their time.
     """
     misses, damping = problem.misses(values), 1e-3
     for _ in range(MAX_ROUNDS):

@@ -11,11 +11,10 @@ from jaxtyping import Float32, Float64, UInt8
 from deltalight.protocol.board import BoardSpec, GreyCard
 from deltalight.protocol.dataset_lists import read_list
 from deltalight.protocol.errors import DeltalightError, install_command
-from deltalight.protocol.frames import SensorFrame, decode_lut
+from deltalight.protocol.frames import LUMINANCE, SensorFrame, decode_lut
 from deltalight.protocol.pictures import decode_rgb, read_bytes
 from deltalight.sensor_node.calibration.picture_sources import PICTURE_SUFFIXES, Eye
 from deltalight.sensor_node.fisheye.response import estimate_response
-from deltalight.sensor_node.marker_finder import LUMINANCE
 from deltalight.sensor_node.markers import BoardDetector
 
 # Codes between which a pixel measures light: neither noise nor white.

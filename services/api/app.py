@@ -23,6 +23,7 @@ from deltalight.services.api.fisheye import FisheyeView
 from deltalight.services.api.live_hub import LiveHub
 from deltalight.services.api.metrics import Meter, Metrics
 from deltalight.services.api.models import ProcessAnswer
+from deltalight.services.api.pools import make_pools
 from deltalight.services.api.problems import Problems, describe_problems, responses
 from deltalight.services.api.recording_session import RecordingSession, RecordingSessions
 from deltalight.services.api.recording_store import RecordingStore
@@ -51,8 +52,9 @@ ANYWHERE = (400, 401, 403, 413, 422, 429, 503)  # raised by the middleware, by a
 DESCRIPTION = """Scenes, assets and the state of a Deltalight installation.
 
 Every change of a scene is a revision; `If-Match` with the revision that a change is made to refuses it (409) where
-somebody else was faster. Errors are problem details (RFC 9457) with one sentence in `detail`. On loopback no token is
-needed; elsewhere each request carries `Authorization: Bearer TOKEN`, or its address a ticket (`?ticket=...`).
+somebody else was faster. Errors are problem details (RFC 9457) with one sentence in `detail`; 503 with `Retry-After`
+says that too many requests wait for the same thing. On loopback no token is needed; elsewhere each request carries
+`Authorization: Bearer TOKEN`, or its address a ticket (`?ticket=...`).
 
 Not described here: the WebSockets `/api/v1/live` (pictures) and `/api/v1/events`, and `/api/v1/live.mjpg`."""
 TAGS = [
@@ -188,6 +190,7 @@ def _context(settings: ApiSettings, store: Store, keys: Keys | None) -> Context:
         settings=settings,
         problems=problems,
         metrics=Metrics(problems, watch, link, live_hub, events),
+        pools=make_pools(),
     )
 
 

@@ -16,6 +16,7 @@ from deltalight.services.api.credentials import Principal, SecretToken, Tickets,
 from deltalight.services.api.limits import RateLimit, StreamLimits, run_while
 from deltalight.services.api.problems import ProblemError, Problems
 from deltalight.services.ports import LOOPBACK
+from deltalight.services.storage.faults import OutdatedTokenError
 from deltalight.services.storage.tokens import TokenStore
 
 BODY_LIMIT_BYTES = 2 << 20  # three times a document with the maximum number of objects
@@ -153,7 +154,10 @@ class AuthMiddleware:
         principal = None if self._secret is None else self._secret.verify(given.strip())
         if principal is not None:
             return principal
-        token = await run_in_threadpool(self._tokens.verify, given.strip())
+        try:
+            token = await run_in_threadpool(self._tokens.verify, given.strip())
+        except OutdatedTokenError as fault:
+            raise _unauthorized(str(fault)) from fault
         return None if token is None else Principal(token.role, token.id, token.name)
 
     def _body_limit(self, scope: Scope) -> int:
@@ -220,6 +224,10 @@ def _unknown_token(was_given: bool) -> ProblemError:
         if was_given
         else "A token is needed; send it as `Authorization: Bearer TOKEN`."
     )
+    return _unauthorized(sentence)
+
+
+def _unauthorized(sentence: str) -> ProblemError:
     return ProblemError(401, "token", sentence, {"WWW-Authenticate": "Bearer"})
 
 

@@ -1,9 +1,10 @@
 """What the routes share: the service's parts, and the revision that a request expects."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Coroutine, Mapping
 from dataclasses import dataclass, replace
-from typing import Annotated
+from functools import partial, wraps
+from typing import Annotated, Any, ParamSpec, TypeVar
 
 from fastapi import Depends, Header, Response
 from starlette.requests import HTTPConnection
@@ -15,6 +16,7 @@ from deltalight.services.api.fisheye import FisheyeView
 from deltalight.services.api.live_hub import LiveHub
 from deltalight.services.api.metrics import Metrics
 from deltalight.services.api.models import SceneAnswer
+from deltalight.services.api.pools import Pool, PoolName
 from deltalight.services.api.problems import ProblemError, Problems
 from deltalight.services.api.recording_session import RecordingSessions
 from deltalight.services.api.recording_store import RecordingStore
@@ -26,6 +28,9 @@ from deltalight.services.api.streams import ProcessWatch
 from deltalight.services.storage.documents import Edit
 from deltalight.services.storage.scenes import StoredScene
 from deltalight.services.storage.store import Store
+
+Given = ParamSpec("Given")
+Answer = TypeVar("Answer")
 
 _GESTURE = re.compile(r"[A-Za-z0-9_-]{1,64}")
 _ENTITY_TAG = re.compile(r'(?:W/)?"([0-9]{1,18})"|([0-9]{1,18})')
@@ -61,6 +66,7 @@ class Context:
     settings: ApiSettings
     problems: Problems
     metrics: Metrics
+    pools: Mapping[PoolName, Pool]
 
     def change(
         self, scene_id: str, edit: Edit, what: str, precondition: Precondition, response: Response
@@ -84,13 +90,13 @@ class Context:
         self.events.publish("scene", {**body, "active": head.is_active})
 
 
-def _context(connection: HTTPConnection) -> Context:
+async def _context(connection: HTTPConnection) -> Context:
     context = connection.app.state.context
     assert isinstance(context, Context)
     return context
 
 
-def _if_match(
+async def _if_match(
     if_match: Annotated[
         str | None,
         Header(
@@ -107,7 +113,7 @@ def _if_match(
     return int(match.group(1) or match.group(2))
 
 
-def _precondition(
+async def _precondition(
     expected: Annotated[int | None, Depends(_if_match)],
     gesture: Annotated[
         str | None,
@@ -129,6 +135,23 @@ def _precondition(
 Shared = Annotated[Context, Depends(_context)]
 ExpectedRevision = Annotated[int | None, Depends(_if_match)]
 IfUnchanged = Annotated[Precondition, Depends(_precondition)]
+
+
+def in_pool(
+    name: PoolName,
+) -> Callable[[Callable[Given, Answer]], Callable[Given, Coroutine[Any, Any, Answer]]]:
+    """Run a route, which has a parameter `shared`, in a pool of its own."""
+
+    def pooled(route: Callable[Given, Answer]) -> Callable[Given, Coroutine[Any, Any, Answer]]:
+        @wraps(route)
+        async def run(*args: Given.args, **kwargs: Given.kwargs) -> Answer:
+            shared = kwargs["shared"]
+            assert isinstance(shared, Context)
+            return await shared.pools[name].run(partial(route, *args, **kwargs))
+
+        return run
+
+    return pooled
 
 
 def with_revision_of(document: object, precondition: Precondition) -> Precondition:

@@ -1,12 +1,13 @@
 """The newest fish-eye picture, and the positions of a composite's lights in it."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float64
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, ConfigDict, Field
 
 from deltalight.protocol.fisheye_lens import calibration_of
 from deltalight.protocol.messages import Message, RadianceMessage
@@ -34,6 +35,8 @@ class FisheyeView:
 class FisheyeLight(BaseModel):
     """A light of the newest composite, as the fish-eye camera sees it."""
 
+    model_config = ConfigDict(allow_inf_nan=False)
+
     x: float = Field(description="Of its middle, pixels of the picture.")
     y: float
     radius_px: float = Field(description="Greatest distance of its outline from its middle.")
@@ -46,21 +49,28 @@ class FisheyeLight(BaseModel):
 def lights_in_picture(message: RadianceMessage, described: Sequence[Mapping[str, Any]]) -> list[FisheyeLight]:
     """Return the lights that the picture of `message` shows; `described` are those of a composite.
 
+    What no render server describes so is left out: other processes can send composites too.
+
     Raises:
         DeltalightError: the calibration is invalid.
     """
-    from deltalight.render_server.lights.lights import LIGHT_TYPES, incident_light
-
-    viewpoint = np.array(message.world_from_fisheye)[:3, 3]
     found = []
     for each in described:
-        if each.get("type") == ENVIRONMENT:
-            continue
-        seen = incident_light(LIGHT_TYPES[each["type"]].from_values(each), viewpoint)
-        pixels = _pixels(message, np.vstack([seen.to_light, _outline(seen)]))
-        if np.isfinite(pixels[0]).all():
-            found.append(_marked(each, seen, pixels))
+        with suppress(KeyError, TypeError, ValueError, ArithmeticError), np.errstate(all="ignore"):
+            found += _shown(message, each)
     return found
+
+
+def _shown(message: RadianceMessage, described: Mapping[str, Any]) -> list[FisheyeLight]:
+    """Return a light, or nothing where the picture does not show it."""
+    from deltalight.render_server.lights.lights import LIGHT_TYPES, incident_light
+
+    if described.get("type") == ENVIRONMENT:
+        return []
+    viewpoint = np.array(message.world_from_fisheye)[:3, 3]
+    seen = incident_light(LIGHT_TYPES[described["type"]].from_values(described), viewpoint)
+    pixels = _pixels(message, np.vstack([seen.to_light, _outline(seen)]))
+    return [_marked(described, seen, pixels)] if np.isfinite(pixels[0]).all() else []
 
 
 def _marked(

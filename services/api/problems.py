@@ -14,6 +14,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
 from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.messages import as_sentence
 from deltalight.services.api.render_link import UnansweredError
 from deltalight.services.storage.faults import (
     ConflictError,
@@ -89,13 +90,13 @@ class Problems:
         headers: Mapping[str, str] | None = None,
         revision: int | None = None,
     ) -> JSONResponse:
-        """Return a problem as a response; a lone surrogate in `sentence` becomes a question mark."""
+        """Return a problem as a response; what a client sent may be part of `sentence`."""
         self.counts[kind] += 1
         problem = Problem(
             type=TYPE_PREFIX + kind,
             title=HTTPStatus(status).phrase,
             status=status,
-            detail=sentence.encode("utf-8", "replace").decode(),
+            detail=as_sentence(sentence),
             revision=revision,
         )
         return JSONResponse(
@@ -176,6 +177,11 @@ def describe_problems(schema: dict[str, Any]) -> dict[str, Any]:
 def responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
     """Return the errors of a route for its OpenAPI description."""
     return {status: {"model": Problem, "description": HTTPStatus(status).phrase} for status in statuses}
+
+
+def unavailable(when: str) -> dict[int | str, dict[str, Any]]:
+    """Return the 503 of a route for its OpenAPI description; `when` is a sentence."""
+    return {503: {"model": Problem, "description": when}}
 
 
 def _slug(status: int) -> str:

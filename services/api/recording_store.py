@@ -11,15 +11,9 @@ from pathlib import Path
 from threading import Lock
 from typing import Any, Literal
 
-import cv2
-
 from deltalight.protocol.errors import DeltalightError
-from deltalight.protocol.files import write_bytes
-from deltalight.protocol.recording_format import ACTIVE_SUFFIX
-from deltalight.protocol.source import open_source
+from deltalight.protocol.files import ACTIVE_SUFFIX, write_bytes
 from deltalight.services.files import SUFFIX, make_output_folder
-from deltalight.services.recording_copies import recover_recording
-from deltalight.services.recording_info import describe_recording
 from deltalight.services.storage.faults import ConflictError, NotFoundError
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")  # no dots: nothing that ends like a suffix
@@ -115,6 +109,8 @@ class RecordingStore:
             ConflictError: it is complete.
             DeltalightError: nothing in it can be read, or the disk refuses.
         """
+        from deltalight.services.recording_copies import recover_recording  # readers of recordings take 0.1 s
+
         path = self._path(name)
         out = self.folder / (name + SUFFIX)
         if path == out:
@@ -189,6 +185,8 @@ def _cached_facts(path: Path, key: list[int]) -> tuple[Facts | None, str] | None
 
 
 def _read_facts(path: Path) -> tuple[Facts | None, str]:
+    from deltalight.services.recording_info import describe_recording
+
     try:
         with _naming(path):
             return describe_recording(path), ""
@@ -212,6 +210,10 @@ def _naming(path: Path) -> Iterator[None]:
 
 
 def _first_picture(path: Path) -> bytes:
+    import cv2
+
+    from deltalight.protocol.source import open_source
+
     frame = open_source(path)[0]
     height, width = frame.color.shape[:2]
     scale = min(1.0, POSTER_EDGE / max(width, height))

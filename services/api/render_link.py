@@ -22,7 +22,6 @@ from deltalight.services.storage.store import Store
 LOOK_INTERVAL_S = 1.0
 ALIVE_TIMEOUT_S = 1.0  # a separate thread of the server answers this, whatever the renderer does
 COMMAND_TIMEOUT_S = 25.0  # the server itself times out after 20 s
-MAX_COMMANDS = 8  # at once: each occupies one of the 40 threads that handle requests
 
 log = structlog.get_logger()
 
@@ -79,7 +78,6 @@ class RenderLink:
         self._view = view or ShownView()
         self._client = RequestClient(control, keys=keys)
         self._asking = FifoLock()  # held during requests to the server; guards the fields below
-        self._commands = threading.BoundedSemaphore(MAX_COMMANDS)
         self._changed = threading.Event()
         self._view_changed = threading.Event()
         self._deliveries = Deliveries()
@@ -134,18 +132,11 @@ class RenderLink:
         """Execute a command at the render server, after those that wait, and return the payload of its reply.
 
         Raises:
-            UnansweredError: the server does not answer, or too many commands wait.
+            UnansweredError: the server does not answer.
             DeltalightError: the server refused the command.
         """
         self._refuse_where_silent()
-        if not self._commands.acquire(blocking=False):
-            raise UnansweredError(
-                f"The render server is busy with {MAX_COMMANDS} other commands; try again soon."
-            )
-        try:
-            return self._execute(op, payload, timeout_s)
-        finally:
-            self._commands.release()
+        return self._execute(op, payload, timeout_s)
 
     @property
     def view(self) -> View | None:

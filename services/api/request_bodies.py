@@ -6,18 +6,21 @@ key. Whole documents can also be sent and downloaded as YAML.
 
 import json
 from collections.abc import Mapping
+from functools import partial
 from typing import Annotated, Any, TypeVar, cast
 
 import yaml
 from fastapi import Body, Depends, Request, Response
 from pydantic import BaseModel, ValidatorFunctionWrapHandler, WrapValidator
 
-from deltalight.protocol.documents import parse_mapping, validate, yaml_text
+from deltalight.protocol.documents import parse_mapping, validate
 from deltalight.protocol.methods import Method
 from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.scene_lights import Lights, ManualLight
 from deltalight.protocol.scene_method import Output, Shading
 from deltalight.protocol.scene_objects import RealScene, SceneObject
+from deltalight.protocol.yaml_text import yaml_text
+from deltalight.services.api.context import Shared
 from deltalight.services.api.problems import ProblemError
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -90,7 +93,7 @@ DOCUMENT_BODY: dict[str, Any] = {
 DOCUMENT_FILES: dict[int | str, dict[str, Any]] = {200: {"content": {YAML_TYPE: {"schema": _REFERENCE}}}}
 
 
-async def _sent(request: Request) -> object:
+async def _sent(request: Request, shared: Shared) -> object:
     media_type = request.headers.get("content-type", JSON_TYPE).partition(";")[0].strip().lower()
     body = await request.body()
     if not body:
@@ -101,7 +104,9 @@ async def _sent(request: Request) -> object:
         raise ProblemError(
             415, "media-type", f"Send the document with Content-Type: {JSON_TYPE} or {YAML_TYPE}."
         )
-    return parse_mapping(_text(body), "the document", is_json=False)
+    text = _text(body)
+    parse = partial(parse_mapping, text, "the document", is_json=False)
+    return await shared.pools["documents"].run(parse)
 
 
 def _parsed_json(body: bytes) -> object:

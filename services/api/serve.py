@@ -14,6 +14,7 @@ from deltalight.protocol.methods import PLUGINS
 from deltalight.protocol.request import RequestClient
 from deltalight.protocol.scene import SceneDocument, parse_scene
 from deltalight.services.api.app import create_app
+from deltalight.services.api.connections import LimitedProtocol
 from deltalight.services.api.settings import ApiSettings
 from deltalight.services.host_store import FIRST_SCENE, activate_document, import_scene
 from deltalight.services.storage.store import Store, default_folder
@@ -65,6 +66,7 @@ def http_server(app: FastAPI) -> uvicorn.Server:
     """Return the web server that runs the application."""
     config = uvicorn.Config(
         app,
+        http=LimitedProtocol,
         log_level="warning",
         access_log=False,
         server_header=False,

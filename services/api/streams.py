@@ -15,6 +15,7 @@ from deltalight.protocol.receiver import Receiver
 from deltalight.protocol.subscriber import ReceivedMultipart
 
 RECEIVE_TIMEOUT_S = 0.2
+LOG_INTERVAL_S = 1.0  # a faulty node sends hundreds of messages a second
 FORGOTTEN_AFTER_S = 3600.0
 RADIANCE = "radiance."  # prefix of the topics on which nodes publish measured light
 
@@ -73,6 +74,8 @@ class Streams:
         self._sinks = sinks
         self._source: Receiver | None = None
         self._changing = threading.Lock()
+        self._refused = 0
+        self._logged_s = -LOG_INTERVAL_S
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="streams", daemon=True)
 
@@ -114,4 +117,10 @@ class Streams:
             message, parts = decode(multipart)
             self._sinks[message.stream](message, parts)
         except DeltalightError as fault:
-            log.warning("message not understood", fault=str(fault))
+            self._log(fault)
+
+    def _log(self, fault: DeltalightError) -> None:
+        self._refused += 1
+        if time.monotonic() - self._logged_s >= LOG_INTERVAL_S:
+            self._logged_s = time.monotonic()
+            log.warning("message not understood", fault=str(fault), so_far=self._refused)

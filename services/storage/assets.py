@@ -195,6 +195,8 @@ class AssetStore:
         asset = self.get(digest)
         path = self.path(asset)
         place = path.with_name(THUMBNAIL)
+        if place.is_file():
+            return place
         with self._children:
             if not place.is_file():
                 task: Task = "mesh-thumbnail" if asset.format.kind == "mesh" else "map-thumbnail"

@@ -29,3 +29,7 @@ class TooLargeError(DeltalightError):
 
 class StorageFaultError(DeltalightError):
     """The disk or the database refuses."""
+
+
+class OutdatedTokenError(DeltalightError):
+    """A token is stored in the way of an earlier version, and has to be made again."""

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Int
 
+from deltalight.protocol.frames import LUMINANCE
 from deltalight.protocol.radiance_files import read_linear
-from deltalight.render_server.lights.environment import LUMINANCE
 from deltalight.render_server.scene.asset_check import check_mesh_file
 from deltalight.render_server.scene.bvh import RayCaster
 from deltalight.render_server.scene.mesh_loading import load_mesh

@@ -11,11 +11,10 @@ from deltalight.benchmarks.ground_truth.truth import Truth, ensure_truth
 from deltalight.benchmarks.quality.case import SceneCase
 from deltalight.benchmarks.quality.metrics import Comparison
 from deltalight.benchmarks.variants import FIXED, parse_variants
-from deltalight.protocol.frames import ViewFrame
+from deltalight.protocol.frames import LUMINANCE, ViewFrame
 from deltalight.protocol.scene_lights import Lights
 from deltalight.protocol.scene_lights import SphereLight as GivenSphere
 from deltalight.render_server.gpu.context import create_context
-from deltalight.render_server.lights.environment import LUMINANCE
 from deltalight.render_server.lights.lights import IncidentLight, LightSet, SphereLight, incident_light
 from deltalight.render_server.lights.sources import FisheyeSource
 from deltalight.render_server.renderer import SceneRenderer

@@ -16,7 +16,7 @@ from deltalight.protocol.clock import (
     sample_from_stamps,
 )
 from deltalight.protocol.errors import DeltalightError
-from deltalight.protocol.messages import ControlRequest
+from deltalight.protocol.messages import ControlReply, ControlRequest
 from deltalight.protocol.request import ReplyServer, RequestClient
 
 MS = 1_000_000
@@ -139,6 +139,16 @@ def test_offset_over_real_sockets() -> None:
         server.close()
     assert abs(sample.offset_ns - ahead) <= sample.bound_ns
     assert sample.bound_ns < SECOND
+
+
+@pytest.mark.parametrize("time_ns", [-1, 2**63])
+def test_a_clock_that_no_message_can_follow_is_refused(time_ns: int) -> None:
+    def reply(asked: ControlRequest, _timeout_s: float) -> ControlReply:
+        payload = {"received_ns": time_ns, "sent_ns": time_ns}
+        return ControlReply(node="server", id=asked.id, ok=True, payload=payload)
+
+    with pytest.raises(DeltalightError, match="centuries off"):
+        clock_exchange(reply, "desk")()
 
 
 def test_a_server_without_a_clock_is_named() -> None:

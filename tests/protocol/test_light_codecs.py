@@ -8,12 +8,22 @@ import pytest
 from deltalight.protocol.envelope import MAX_PARTS, EnvelopeError, decode
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import FisheyePictures, LampPose, RadianceMap
-from deltalight.protocol.light_codecs import fisheye_pictures, lamp_poses, radiance_map
-from deltalight.protocol.messages import MAX_EXPOSURES, FisheyeMessage, LampsMessage, RadianceMessage
+from deltalight.protocol.light_codecs import fisheye_pictures, lamp_poses, radiance_map, sky_lights
+from deltalight.protocol.messages import (
+    MAX_EXPOSURES,
+    MAX_LIGHTS,
+    FisheyeMessage,
+    LampsMessage,
+    LightsMessage,
+    RadianceMessage,
+)
+from deltalight.protocol.scene_lights import LightCut
+from deltalight.protocol.sky_lights import Region, SkyLights, TrackedLight
 from deltalight.sensor_node.frame_messages import (
     Stamps,
     fisheye_multipart,
     lamps_multipart,
+    lights_multipart,
     radiance_multipart,
 )
 from tests.protocol.fisheye_samples import assert_same_pictures, coded, linear, uncoded_response
@@ -39,6 +49,32 @@ def sample_map(size: int = 16, fisheye: FisheyePictures | None = None) -> Radian
     picture = np.repeat(np.arange(0, 240, 6, dtype=np.uint8)[:, None, None], 44, axis=1).repeat(3, axis=2)
     calibration = (fisheye or coded(NOW)).calibration
     return RadianceMap(NOW, radiance, seen, placed(0.25, -0.5, 0.05), 0.015, picture, calibration)
+
+
+def sample_lights(size: int = 8) -> SkyLights:
+    """Two lights, one of which fades, and a residual; of numbers that only their own bits hold."""
+    rng = np.random.default_rng(5)
+    toward = rng.normal(size=(2, 3))
+    lights = tuple(
+        TrackedLight(identity, each / np.linalg.norm(each), rng.random(3) * strength, rng.random())
+        for identity, each, strength in zip((4, 9), toward, (30.0, 1e-3), strict=True)
+    )
+    cut = LightCut(count=7, split="all", threshold=1.5, smoothing_s=0.125)
+    residual, seen = rng.random((size, size, 3), np.float32), rng.random((size, size, 1), np.float32)
+    return SkyLights(cut, placed(0.25, -0.5, 0.05), lights, (Region(0, 3, 2, 5),), residual, seen)
+
+
+def assert_same_lights(ours: SkyLights, theirs: SkyLights) -> None:
+    """Everything is the same to the bit."""
+    assert (ours.cut, ours.regions) == (theirs.cut, theirs.regions)
+    for one, other in zip(ours.lights, theirs.lights, strict=True):
+        assert (one.identity, one.angular_radius_rad) == (other.identity, other.angular_radius_rad)
+        assert np.array_equal(one.to_light, other.to_light)
+        assert np.array_equal(one.irradiance, other.irradiance)
+    for name in ("world_from_fisheye", "residual", "seen"):
+        mine, other_array = getattr(ours, name), getattr(theirs, name)
+        assert mine.dtype == other_array.dtype
+        assert np.array_equal(mine, other_array)
 
 
 def assert_same_map(ours: RadianceMap, theirs: RadianceMap) -> None:
@@ -126,6 +162,65 @@ def test_the_same_camera_is_the_same_object_in_every_message() -> None:
     assert first.calibration is pictures.calibration
 
 
+def lights_message(multipart: list[bytes]) -> tuple[LightsMessage, list[memoryview]]:
+    message, parts = decode(multipart)
+    assert isinstance(message, LightsMessage)
+    return message, parts
+
+
+def test_lights_come_back_to_the_bit_and_name_their_map() -> None:
+    of_map = STAMPS | {"frame_id": 5, "capture_ns": NOW - 70}
+    message, parts = lights_message(lights_multipart(sample_lights(), STAMPS, of_map))  # type: ignore[arg-type]
+    assert_same_lights(sky_lights(message, parts), sample_lights())
+    assert (message.frame_id, message.radiance_frame_id, message.radiance_capture_ns) == (7, 5, NOW - 70)
+
+
+def test_as_many_lights_as_a_message_may_hold_fit_into_it() -> None:
+    sky = sample_lights()
+    many = replace(sky, lights=sky.lights[:1] * MAX_LIGHTS)
+    multipart = lights_multipart(many, STAMPS, STAMPS)
+    assert len(multipart[1]) < 20_000
+    assert len(sky_lights(*lights_message(multipart)).lights) == MAX_LIGHTS
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"to_light": (1.0, 1.0, 0.0)}, "unit vector"),
+        ({"irradiance": (1.0, -1e-9, 0.0)}, "greater than or equal to 0"),
+        ({"irradiance": (1.0, float("inf"), 0.0)}, "finite"),
+        ({"angular_radius_rad": 2.0}, "less than or equal to 1.6"),
+    ],
+)
+def test_lights_that_cannot_be_are_refused(change: dict[str, object], sentence: str) -> None:
+    message, _ = lights_message(lights_multipart(sample_lights(), STAMPS, STAMPS))
+    header = message.model_dump()
+    header["lights"][1].update(change)
+    with pytest.raises(ValueError, match=sentence):
+        LightsMessage.model_validate(header)
+    for field, wrong in (
+        ("size", 48),
+        ("count", 17),
+        ("threshold", 0.0),
+        ("regions", [(3, 3, 0, 1)]),
+        ("split", "none"),
+        ("lights", [message.lights[0].model_dump()] * (MAX_LIGHTS + 1)),
+    ):
+        with pytest.raises(ValueError, match=field):
+            LightsMessage.model_validate(message.model_dump() | {field: wrong})
+
+
+def test_residuals_that_cannot_be_are_refused() -> None:
+    for change, sentence in (
+        ({"residual": np.full((8, 8, 3), -1e-6, np.float32)}, "negative or non-finite"),
+        ({"seen": np.full((8, 8, 1), 1.0001, np.float32)}, "between 0 and 1"),
+        ({"seen": np.full((8, 8, 1), np.nan, np.float32)}, "between 0 and 1"),
+    ):
+        wrong = replace(sample_lights(), **change)  # type: ignore[arg-type]
+        with pytest.raises(EnvelopeError, match=sentence):
+            sky_lights(*lights_message(lights_multipart(wrong, STAMPS, STAMPS)))
+
+
 def test_lamps_come_back() -> None:
     lamps = (LampPose(40, placed(1, 2, 3)), LampPose(7, placed(-1, 0, 0.5)))
     message, _ = decode(lamps_multipart(lamps, STAMPS))
@@ -176,10 +271,11 @@ def test_mutated_messages_raise_nothing_but_sentences() -> None:
     multiparts = [
         radiance_multipart(sample_map(), STAMPS, JPEG_QUALITY),
         fisheye_multipart(coded(NOW), STAMPS, "jpeg", JPEG_QUALITY),
+        lights_multipart(sample_lights(), STAMPS, STAMPS),
     ]
     refused = 0
     for number in range(1500):
-        pieces = [bytearray(piece) for piece in multiparts[number % 2]]
+        pieces = [bytearray(piece) for piece in multiparts[number % 3]]
         piece = pieces[rng.integers(1, len(pieces))]
         place = rng.integers(min(len(piece), 64) if rng.random() < 0.5 else len(piece))
         piece[place] = rng.integers(256)
@@ -189,6 +285,8 @@ def test_mutated_messages_raise_nothing_but_sentences() -> None:
                 radiance_map(message, parts)
             elif isinstance(message, FisheyeMessage):
                 fisheye_pictures(message, parts)
+            elif isinstance(message, LightsMessage):
+                sky_lights(message, parts)
         except DeltalightError:
             refused += 1
     assert refused > 100

@@ -70,6 +70,8 @@ def test_a_long_payload_is_not_carried_out_twice(opened: Callable[[Any], Any]) -
         (b"[1]", "no plain data"),
         (b'{"n": NaN}', "no plain data"),
         (b'{"n": 1e999}', "no plain data"),
+        (b'{"text": ["\\ud800"]}', "lone surrogate"),
+        (b'{"a": {"\\udfff": 1}}', "lone surrogate"),
         (b'{"a": ' * 30 + b"1" + b"}" * 30, "no plain data"),
         (b'{"a": ' * 100_000 + b"1" + b"}" * 100_000, "not JSON"),
         (b'{"n": ' + b"9" * 5000 + b"}", "not JSON"),
@@ -108,6 +110,8 @@ def test_refusals_faults_and_bad_answers_are_sentences_and_the_server_lives_on(
     def handler(control: ControlRequest) -> dict[str, object]:
         if control.op == "refuse":
             raise DeltalightError("the scene has no object: add one")
+        if control.op == "surrogate":
+            raise DeltalightError("there is no \ud800" + "x" * 3000)
         if control.op == "fault":
             raise ZeroDivisionError("oops")
         return {"large": "x" * 5_000_000} if control.op == "large" else {"object": object()}
@@ -115,10 +119,12 @@ def test_refusals_faults_and_bad_answers_are_sentences_and_the_server_lives_on(
     server = opened(ReplyServer(ANY, handler))
     client = opened(RequestClient(server.endpoint))
     answers = {
-        op: client.request(request(id=op, op=op), 5) for op in ("refuse", "fault", "large", "odd", "refuse")
+        op: client.request(request(id=op, op=op), 5)
+        for op in ("refuse", "surrogate", "fault", "large", "odd", "refuse")
     }
     assert not any(answer.ok for answer in answers.values())
     assert answers["refuse"].error == "the scene has no object: add one"
+    assert str(answers["surrogate"].error).startswith("there is no ?x")
     assert "ZeroDivisionError" in str(answers["fault"].error)
     assert "cannot be sent" in str(answers["large"].error)
     assert "odd failed" in str(answers["odd"].error)

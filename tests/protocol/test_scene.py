@@ -1,11 +1,13 @@
 """Scene documents: defaults, faults in one sentence, assets, transforms."""
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.scene import SceneDocument, load_scene, parse_scene, scene_json_schema
@@ -257,3 +259,17 @@ def test_the_bunny_stands_on_the_real_table(shared_data: Path) -> None:
     heights = (world - [0.5312, 0.0899, 0.5998]) @ (up / np.linalg.norm(up))
     assert abs(heights.min()) < 0.005
     assert 0.1 < heights.max() < 0.25
+
+
+@pytest.mark.parametrize(
+    "place", [("objects",), ("lights", "manual"), ("lights", "tracked"), ("real", "surfaces")]
+)
+def test_of_a_list_of_faults_only_the_first_is_made(place: tuple[str, ...]) -> None:
+    """A body of 2 MB has a million, which take ten seconds and all threads wait for."""
+    document: Any = [1] * 1000
+    for key in reversed(place):
+        document = {key: document}
+    with pytest.raises(DeltalightError, match=rf"{re.escape('.'.join(place))}\[0\]") as fault:
+        parse_scene(document)
+    assert isinstance(fault.value.__cause__, ValidationError)
+    assert fault.value.__cause__.error_count() == 1

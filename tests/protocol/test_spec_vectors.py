@@ -11,7 +11,7 @@ import pytest
 
 from deltalight.protocol.codecs import decode_color, decode_depth, decode_raw, decode_response
 from deltalight.protocol.envelope import decode, encode
-from deltalight.protocol.light_codecs import fisheye_pictures, lamp_poses, radiance_map
+from deltalight.protocol.light_codecs import fisheye_pictures, lamp_poses, radiance_map, sky_lights
 from deltalight.protocol.messages import (
     MAX_HEADER_BYTES,
     MAX_PART_BYTES,
@@ -19,6 +19,8 @@ from deltalight.protocol.messages import (
     SCHEMA_VERSION,
     Message,
 )
+from deltalight.protocol.scene_lights import LightCut
+from deltalight.protocol.sky_lights import Region
 from deltalight.protocol.vectors import FOLDER, frame_pieces, unframe_pieces
 
 NAMES = sorted(path.stem for path in Path(FOLDER).glob("*.bin"))
@@ -43,6 +45,9 @@ def pictures(message: Message, parts: list[memoryview]) -> list[np.ndarray]:
     if message.stream == "radiance":
         light = radiance_map(message, parts)
         return [light.radiance, light.seen]
+    if message.stream == "lights":
+        sky = sky_lights(message, parts)
+        return [sky.residual, sky.seen]
     return [decode_color(parts[0], message.encoding, message.shape)]
 
 
@@ -95,6 +100,11 @@ def test_the_light_vectors_tell_lens_response_and_places() -> None:
     light = radiance_map(*decode(load("radiance_raw")[0]))
     assert light.clipped_share == 0.125
     assert light.world_from_fisheye.tolist() == lamps[0].world_from_marker.tolist()
+    sky = sky_lights(*decode(load("lights_raw")[0]))
+    assert sky.cut == LightCut()
+    assert [one.identity for one in sky.lights] == [3, 5]
+    assert sky.lights[0].to_light.tolist() == [0, 0.6, 0.8]
+    assert sky.regions == (Region(0, 2, 1, 4),)
 
 
 @pytest.mark.parametrize("stream", sorted(MESSAGE_TYPES))

@@ -13,6 +13,7 @@ import psutil
 import pytest
 import zmq
 
+from deltalight.protocol import receiver as receiver_module
 from deltalight.protocol.envelope import decode, encode
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.messages import MAX_PART_BYTES, StatsMessage
@@ -20,6 +21,7 @@ from deltalight.protocol.publisher import Publisher
 from deltalight.protocol.receiver import Receiver
 from deltalight.protocol.request import ReplyServer, RequestClient
 from deltalight.protocol.sockets import check_endpoint
+from deltalight.protocol.subscriber import ReceivedMultipart
 
 ANY = "tcp://127.0.0.1:0"
 SETTLE_S = 5.0
@@ -83,7 +85,8 @@ def test_a_row_of_messages_for_one_frame_is_not_torn(opened: Callable[[Any], Any
     publisher = opened(Publisher(ANY))
     receiver = opened(Receiver([publisher.endpoint], []))
     connected(publisher, receiver)
-    streams = [b"color", b"depth", b"clean_depth", b"fisheye", b"radiance", b"pose", b"lamps", b"stats"]
+    streams = [b"color", b"depth", b"clean_depth", b"fisheye", b"radiance"]
+    streams += [b"lights", b"pose", b"lamps", b"stats"]
     for i in range(15):
         time.sleep(1 / 60)
         for stream in streams:
@@ -119,6 +122,19 @@ def test_topics_without_end_and_broken_topics_take_no_memory(opened: Callable[[A
     got = receiver.latest(0)
     assert got is not None
     assert len(got) == 255
+
+
+def test_large_messages_of_many_topics_take_no_memory_without_end(
+    opened: Callable[[Any], Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(receiver_module, "MAX_WAITING_BYTES", 10_000)
+    receiver = opened(Receiver([ANY], ["color"], bind=True))
+    for _ in range(2):  # what is taken makes room again
+        for topic in (b"color.a", b"color.a", b"color.b", b"color.c"):
+            receiver._store(ReceivedMultipart([memoryview(topic), memoryview(bytes(4500))], 0))
+        assert set(receiver.latest(0) or {}) == {"color.a", "color.b"}
+    assert receiver.refused == 2
+    assert receiver.drops == {"color.a": 2}
 
 
 def test_a_waiting_consumer_is_woken_by_a_message_and_by_closing(opened: Callable[[Any], Any]) -> None:

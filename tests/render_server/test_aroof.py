@@ -12,10 +12,11 @@ from jaxtyping import Float64
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import BoardPose
+from deltalight.protocol.octahedral import octahedral_grid
 from deltalight.protocol.scene import SceneDocument, parse_scene
 from deltalight.protocol.scene_method import AroofMethod
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.lights.octahedral import even_directions, harmonics, octahedral_grid
+from deltalight.render_server.lights.octahedral import even_directions, harmonics
 from deltalight.render_server.occlusion_fields import compute_field
 from deltalight.render_server.passes.occlusion_fields import LightProbeCapture
 from deltalight.render_server.renderer import SceneRenderer

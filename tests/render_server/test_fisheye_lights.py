@@ -9,17 +9,23 @@ import pytest
 from deltalight.protocol import scene_lights as documents
 from deltalight.protocol.board import BoardSpec
 from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.envelope import decode
 from deltalight.protocol.equidistant_lens import EquidistantLens
 from deltalight.protocol.fisheye_lens import FisheyeCalibration
 from deltalight.protocol.frames import DepthImage, LampPose, RadianceMap, ViewFrame, decode_lut
 from deltalight.protocol.hemisphere import texel_directions
+from deltalight.protocol.light_codecs import sky_lights
+from deltalight.protocol.light_cutter import LightCutter
+from deltalight.protocol.messages import LightsMessage
+from deltalight.protocol.occlusion import is_occluded
+from deltalight.protocol.octahedral import octahedral_grid, sample_octahedral
 from deltalight.protocol.scene import SceneDocument
+from deltalight.protocol.sky_lights import SkyLights
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.lights.fisheye import is_occluded
 from deltalight.render_server.lights.lights import DirectionalLight, LightSet, SphereLight
-from deltalight.render_server.lights.octahedral import octahedral_grid, sample_octahedral
 from deltalight.render_server.lights.sources import FisheyeSource, TrackedSource
 from deltalight.render_server.renderer import SceneRenderer
+from deltalight.sensor_node.frame_messages import Stamps, lights_multipart
 from tests.render_server.scenes import (
     COARSE,
     Stage,
@@ -136,6 +142,58 @@ def test_lights_keep_their_number_and_settle_after_a_jump() -> None:
     assert isinstance(after, DirectionalLight)
     assert after.irradiance[0] == pytest.approx(2 * before.irradiance[0], rel=0.06)
     assert lights.describe()[0]["id"] == 1
+
+
+def from_node(sky: SkyLights) -> SkyLights:
+    """The lights as they come from a sensor node, through bytes."""
+    stamps = Stamps(node="desk", frame_id=0, capture_ns=0, clock_offset_ns=0, clock_bound_ns=None)
+    message, parts = decode(lights_multipart(sky, stamps, stamps))
+    assert isinstance(message, LightsMessage)
+    return sky_lights(message, parts)
+
+
+def assert_same_light(ours: LightSet, theirs: LightSet) -> None:
+    """All that the renderer takes is the same to the bit."""
+    assert ours.describe() == theirs.describe()
+    assert ours.identities == theirs.identities
+    for name in ("environment", "ground_fraction", "registration"):
+        assert np.array_equal(getattr(ours, name), getattr(theirs, name))
+
+
+def changing_light() -> list[ViewFrame]:
+    """A lamp that moves and gets brighter while the lights still follow, in 12 frames."""
+    maps = [seen(), seen(np.array([0.5, -0.4, 0.7]) / np.linalg.norm([0.5, -0.4, 0.7]), 170.0)]
+    return [frame(radiance_map=maps[step // 3 % 2], timestamp_ns=step * SECOND // 10) for step in range(12)]
+
+
+def test_lights_of_the_node_are_those_of_a_cut_here_for_all_servers(monkeypatch: pytest.MonkeyPatch) -> None:
+    views, cutter = changing_light(), LightCutter(documents.LightCut())
+    own, sent, newest = source(), [], None
+    expected = [own.update(view) for view in views]
+    for view in views:
+        newest = cutter.update(view)
+        sent.append(from_node(newest) if newest is not None else sent[-1])
+    monkeypatch.delattr("deltalight.protocol.light_cutter.split_map")  # no server cuts any more
+    servers = [source(), source()]
+    for view, sky, alone in zip(views, sent, expected, strict=True):
+        for server in servers:
+            taken = server.update(replace(view, sky_lights=sky))
+            assert (taken is None) == (alone is None)
+            if taken is not None and alone is not None:
+                assert_same_light(taken, alone)
+    assert len({id(sky) for sky in sent}) > 4
+    late = followed(source(), replace(views[-1], sky_lights=sent[-1]))
+    assert_same_light(late, next(one for one in reversed(expected) if one is not None))
+    assert servers[0].regions == servers[1].regions == own.regions != ()
+
+
+def test_lights_cut_in_another_way_are_cut_here_and_it_is_said() -> None:
+    sky = LightCutter(documents.LightCut(count=2, smoothing_s=1.0)).update(frame(radiance_map=seen()))
+    view = frame(radiance_map=seen(), sky_lights=sky)
+    one = source(count=7, threshold=2.5, smoothing_s=1.0)
+    assert_same_light(followed(one, view), followed(source(count=7, threshold=2.5, smoothing_s=1.0), view))
+    assert "set count = 7, threshold = 2.5 in [node.lights]" in one.remarks[0]
+    assert source(count=2, smoothing_s=1.0).update(replace(view, radiance_map=None)) is not None
 
 
 def test_a_given_distance_makes_lamps_of_lights() -> None:
@@ -290,6 +348,10 @@ def test_fisheye_light_is_registered_on_paper_and_moves_without_registering_agai
     first = renderer.render(view)
     again = renderer.render(view)
     assert np.array_equal(first.color, again.color)
+    sky = LightCutter(documents.LightCut()).update(view)
+    assert sky is not None
+    taken = renderer.render(replace(view, sky_lights=from_node(sky)))
+    assert np.array_equal(first.color, taken.color)
     assert not np.array_equal(first.color, view.color)
     (factor,) = [sentence for sentence in renderer.notices if "lights registered by patch" in sentence]
     lamp = first.lights[0]

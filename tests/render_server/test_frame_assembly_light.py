@@ -10,8 +10,19 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import LampPose, ViewFrame
 from deltalight.protocol.messages import RadianceMessage
 from deltalight.render_server.server.frames import TOPICS, FrameAssembler
-from deltalight.sensor_node.frame_messages import Stamps, lamps_multipart, radiance_multipart
-from tests.protocol.test_light_codecs import assert_same_map, placed, sample_map
+from deltalight.sensor_node.frame_messages import (
+    Stamps,
+    lamps_multipart,
+    lights_multipart,
+    radiance_multipart,
+)
+from tests.protocol.test_light_codecs import (
+    assert_same_lights,
+    assert_same_map,
+    placed,
+    sample_lights,
+    sample_map,
+)
 from tests.services.conftest import color, pose, received
 
 MS = 1_000_000
@@ -56,7 +67,7 @@ def assembler_without_depth() -> FrameAssembler:
 
 
 def test_streams_of_light_are_subscribed() -> None:
-    assert {"radiance", "lamps"} <= set(TOPICS)
+    assert {"radiance", "lights", "lamps"} <= set(TOPICS)
 
 
 def test_the_newest_map_that_is_not_later_holds() -> None:
@@ -126,6 +137,27 @@ def test_broken_map_costs_one_frame() -> None:
     with pytest.raises(DeltalightError):
         view(assembler, 1, START + MS)
     assert share(assembler, 2, START + 2 * MS) == 0.1
+
+
+def add_lights(assembler: FrameAssembler, frame_id: int, capture_ns: int, size: int) -> None:
+    own = stamps(frame_id, capture_ns)
+    add(assembler, lights_multipart(sample_lights(size), own, own))
+
+
+def test_lights_hold_like_maps_and_are_one_object_while_they_do() -> None:
+    assembler = assembler_without_depth()
+    assert view(assembler, 0, START - MS).sky_lights is None
+    add_lights(assembler, 2, START, 8)
+    first = view(assembler, 3, START + MS).sky_lights
+    assert first is not None
+    assert_same_lights(first, sample_lights(8))
+    add_lights(assembler, 2, START, 8)  # again, for late subscribers
+    assert view(assembler, 4, START + 2 * MS).sky_lights is first
+    add_lights(assembler, 6, START + 9 * MS, 4)
+    assert view(assembler, 5, START + 3 * MS).sky_lights is first
+    second = view(assembler, 6, START + 9 * MS).sky_lights
+    assert second is not None
+    assert len(second.residual) == 4
 
 
 def test_lamps_are_those_of_the_frame_itself_or_none() -> None:

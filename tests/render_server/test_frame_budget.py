@@ -11,6 +11,7 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.scene import SceneDocument, parse_scene
 from deltalight.render_server.frame_budget import PATIENCE, WARM_UP, WINDOW, FrameBudget, Level
 from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import watched
 from deltalight.render_server.renderer import CompositeFrame, SceneRenderer
 from deltalight.render_server.server.snapshot import SnapshotOrder, SnapshotPicture, take_snapshot
 from tests.render_server.protected_scenes import Case, scene_of
@@ -54,6 +55,12 @@ def test_single_long_frames_do_not_count() -> None:
     for _ in range(10):
         spend(budget, 400, 1)
         assert spend(budget, 90, 4) == LIVE
+
+
+def test_frames_far_too_long_are_not_waited_for() -> None:
+    budget = FrameBudget(100, "live")
+    assert spend(budget, 600, WARM_UP + 1) == LIVE
+    assert spend(budget, 600, 1) == HALF
 
 
 def test_what_gave_way_comes_back_when_there_has_long_been_room() -> None:
@@ -190,6 +197,22 @@ def test_at_rest_a_smaller_picture_becomes_the_best(
     assert shown.level == Level("best")
     assert psnr_db(shown.color, wanted) > 55
     assert hurried.show(aside + 0.02).level == HALF
+
+
+def test_a_size_that_was_shown_before_is_not_built_again(gpu: GpuContext, hurried: Walker) -> None:
+    """A look inside at full size between two smaller pictures."""
+    scene = hurried.renderer.scene
+    inside = scene.replaced(output=scene.output.replaced(view="effects"))
+    hurried.show()
+    for shown in (inside, scene, inside):
+        hurried.renderer.set_scene(shown)
+        hurried.show()
+    kernels: set[str] = set()
+    hurried.renderer.set_scene(scene)
+    with watched(gpu, lambda run: kernels.add(run.kernel.split(" ")[0])):
+        assert hurried.show().level == HALF
+    assert "composite" in kernels
+    assert not kernels & {"voxelize", "reflective_shadow_map"}
 
 
 def test_snapshots_are_full_size(hurried: Walker, whole: Walker, tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import trimesh
 from jaxtyping import Float32, Float64
 
 from deltalight.protocol.frames import decode_lut
+from deltalight.protocol.octahedral import octahedral_grid, sample_octahedral
 from deltalight.protocol.scene import SceneDocument
 from deltalight.render_server.estimation.plane_extrapolation import (
     DetectedPlane,
@@ -20,7 +21,6 @@ from deltalight.render_server.estimation.plane_extrapolation import (
 )
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.lights.lights import Light, SphereLight
-from deltalight.render_server.lights.octahedral import octahedral_grid, sample_octahedral
 from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.scenes import COARSE, Stage, ambient, cube, floor, frame, look_at, plain, shifted
 

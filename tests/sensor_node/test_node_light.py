@@ -22,12 +22,14 @@ from deltalight.protocol.keys import create_keys, load_keys, trust
 from deltalight.protocol.messages import (
     FisheyeMessage,
     LampsMessage,
+    LightsMessage,
     Message,
     PoseMessage,
     RadianceMessage,
     StatsMessage,
 )
 from deltalight.protocol.receiver import Receiver
+from deltalight.protocol.scene_lights import LightCut
 from deltalight.sensor_node import node
 from deltalight.sensor_node.cameras.base import Camera, StreamState
 from deltalight.sensor_node.cameras.settings import CameraSettings, FisheyeSettings
@@ -105,23 +107,35 @@ def endpoint(tmp_path: Path) -> str:
     return f"ipc://{tmp_path}/node"
 
 
+def lights_of(messages: list[Message]) -> list[LightsMessage]:
+    return [message for message in messages if isinstance(message, LightsMessage)]
+
+
 def test_light_goes_out_when_it_is_new_and_again_for_whoever_comes_late(
     take: Path, endpoint: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(node, "REPEAT_S", 0.3)
-    config = NodeConfig(source=str(take), endpoint=endpoint)
+    config = NodeConfig(source=str(take), endpoint=endpoint, lights=LightCut(smoothing_s=0.05))
 
     def repeated(got: list[Message]) -> bool:
-        return sum(isinstance(message, RadianceMessage) for message in got) >= 4
+        """Maps, and lights that followed one in more than one step."""
+        steps = {(message.radiance_capture_ns, message.capture_ns) for message in lights_of(got)}
+        maps = sum(isinstance(message, RadianceMessage) for message in got)
+        return maps >= 4 and len({of_map for of_map, _ in steps}) < len(steps)
 
-    with messages_of(config, ["fisheye", "radiance"]) as collect:
+    with messages_of(config, ["fisheye", "radiance", "lights"]) as collect:
         got = collect(repeated)
+    lights = lights_of(got)
     maps = [message for message in got if isinstance(message, RadianceMessage)]
     raw = [message for message in got if isinstance(message, FisheyeMessage)]
     assert maps[0].world_from_fisheye[2][3] == pytest.approx(0.3)
     assert raw[0].dtype == "float32"
     assert len({message.capture_ns for message in maps}) >= 2
     assert raw[0].capture_ns <= maps[-1].capture_ns
+    cut = {(message.radiance_frame_id, message.radiance_capture_ns) for message in lights}
+    assert {(message.frame_id, message.capture_ns) for message in maps[:-1]} <= cut
+    assert all((message.count, message.smoothing_s) == (4, 0.05) for message in lights)
+    assert all(message.world_from_fisheye == maps[0].world_from_fisheye for message in lights)
 
 
 def test_lamps_go_out_with_each_frame(take: Path, endpoint: str) -> None:
@@ -273,6 +287,10 @@ def test_a_repeater_makes_a_message_once_for_each_object(monkeypatch: pytest.Mon
     repeats.send(first, lambda: [b"not made again"], sent.append)
     assert len(sent) == 4
     assert sent[-1] == sent[-2]
+    monkeypatch.setattr(node, "REPEAT_S", 99.0)
+    assert not repeats.send(first, lambda: [b"not made again"], sent.append)
+    assert repeats.send(first, lambda: [b"not made again"], sent.append, now=True)
+    assert len(sent) == 5
 
 
 def test_a_camera_of_a_node_is_told_to_replay_by_the_node_itself() -> None:

@@ -85,19 +85,23 @@ def received(multipart: list[bytes], received_ns: int) -> ReceivedMultipart:
     return ReceivedMultipart([memoryview(piece) for piece in multipart], received_ns)
 
 
-def color(frame_id: int, capture_ns: int, received_ns: int = 0) -> ReceivedMultipart:
+def color(
+    frame_id: int, capture_ns: int, received_ns: int = 0, described: dict[str, object] | None = None
+) -> ReceivedMultipart:
     message = ColorMessage(
         node="cam",
         frame_id=frame_id,
         capture_ns=capture_ns,
         encoding="raw",
         shape=(HEIGHT, WIDTH, 3),
-        camera=camera().to_dict(),
+        camera=described or camera().to_dict(),
     )
     return received(encode(message, [encode_color(picture(frame_id % 256), "raw")]), received_ns)
 
 
-def depth(frame_id: int, capture_ns: int, metres: float = 1.0) -> ReceivedMultipart:
+def depth(
+    frame_id: int, capture_ns: int, metres: float = 1.0, described: dict[str, object] | None = None
+) -> ReceivedMultipart:
     message = DepthMessage(
         node="cam",
         stream="clean_depth",
@@ -106,7 +110,7 @@ def depth(frame_id: int, capture_ns: int, metres: float = 1.0) -> ReceivedMultip
         encoding="raw",
         shape=(HEIGHT, WIDTH),
         depth_scale_m=0.001,
-        camera=camera().to_dict(),
+        camera=described or camera().to_dict(),
     )
     image = np.full((HEIGHT, WIDTH), metres, np.float32)
     return received(encode(message, [encode_depth(image, image > 0, "raw", 0.001)]), 0)

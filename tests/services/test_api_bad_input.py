@@ -13,12 +13,14 @@ import zlib
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import httpx
 import numpy as np
 import pytest
 
+from deltalight.protocol.messages import MAX_SENTENCE
 from deltalight.protocol.radiance_files import write_exr
 from deltalight.services import ports
 from deltalight.services.api.problems import TYPE_PREFIX
@@ -29,6 +31,7 @@ from tests.services.record_samples import frames, write
 from tests.services.storage_samples import TETRAHEDRON, glb
 
 LIMIT_MB = 2
+JSON = {"Content-Type": "application/json"}
 TRIANGLE = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4").tobytes()
 WORKERS = 16
 
@@ -255,6 +258,19 @@ def test_yaml_that_is_a_trap(api: RunningApi) -> None:
         "name: 2020-13-45",
     ):
         refused(api, lambda text=text: sent(text), 422, "invalid")
+
+
+def test_text_that_no_encoding_has_and_long_keys(api: RunningApi) -> None:
+    key = b'"\\ud800": 1'
+    for path, body in (
+        ("/scenes", b"{%s}" % key),
+        ("/recordings", b"{%s}" % key),
+        ("/snapshots", b'{"pictures": [{"name": "a", "method": {"name": "dvct", %s}}]}' % key),
+        ("/scenes", b'{"name": "\\ud800"}'),
+        ("/scenes", b'{"%s": 1}' % (b"x" * 100_000)),
+    ):
+        text = refused(api, partial(api.client.post, path, content=body, headers=JSON), 422, "invalid")
+        assert len(text) <= MAX_SENTENCE
 
 
 def test_stale_changes_and_assets_in_use(api: RunningApi) -> None:

@@ -52,6 +52,23 @@ def radiance() -> RadianceMessage:
     )
 
 
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"type": "moon"},
+        {"type": ["sphere"]},
+        {"type": "sphere"},
+        {**SPHERE, "position_m": "up"},
+        {**SPHERE, "position_m": [0.0, 0.0, 0.0]},
+        {**SPHERE, "position_m": [0.0, 0.0, 2.0], "intensity": [1e308, 1e308, 1e308]},
+        {**SPHERE, "position_m": [0.0, 0.0, 2.0], "id": "four"},
+    ],
+)
+def test_lights_that_no_render_server_describes_so_are_left_out(wrong: dict[str, object]) -> None:
+    right = {**SPHERE, "position_m": [0.0, 0.0, 2.0]}
+    assert len(lights_in_picture(radiance(), [wrong, right])) == 1
+
+
 def test_lights_are_where_the_lens_shows_them() -> None:
     directional = {"type": "directional", "direction": [0.0, -np.sin(0.5), -np.cos(0.5)]}
     directional |= {"irradiance": [1.0, 1.0, 1.0], "angular_radius_deg": 2.0}

@@ -240,6 +240,7 @@ def test_pages_of_other_sites_open_no_socket(live: LiveApi, open_socket: object)
     assert callable(open_socket)
     for options in (
         {"origin": websockets.Origin("http://evil.example")},
+        {"origin": websockets.Origin("null")},
         {"additional_headers": {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Dest": "websocket"}},
     ):
         with pytest.raises(websockets.InvalidStatus) as refused:

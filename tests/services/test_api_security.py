@@ -1,12 +1,16 @@
 """Who may do what: loopback, tokens and roles, other sites' pages, rates, sizes."""
 
+import socket
+import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
 
 import httpx
 import pytest
+from websockets.sync.client import connect
 
 from deltalight.protocol.errors import DeltalightError
+from deltalight.services.api import connections
 from deltalight.services.api.auth import WRONG_TOKENS_AT_ONCE
 from deltalight.services.api.credentials import SecretToken
 from deltalight.services.api.limits import REMEMBERED_CLIENTS, RateLimit
@@ -69,6 +73,28 @@ def test_elsewhere_every_request_needs_a_token(guarded: RunningApi) -> None:
     assert "not known" in sentence(client.get("/scenes", headers=bearer(token)), 401)
 
 
+def test_a_token_that_an_earlier_version_stored_is_told_to_be_made_again(guarded: RunningApi) -> None:
+    token = guarded.store.tokens.create("old", "control")
+    with sqlite3.connect(guarded.store.folder / "store.sqlite3") as database:
+        database.execute("UPDATE tokens SET hash = ?", (b"\0" * 64,))  # the length of a scrypt hash
+    database.close()
+    answer = guarded.client.get("/scenes", headers=bearer(token))
+    assert "earlier version; revoke it" in sentence(answer, 401)
+
+
+def test_no_log_line_holds_a_token_or_ticket(guarded: RunningApi, capfd: pytest.CaptureFixture[str]) -> None:
+    token = guarded.store.tokens.create("me", "control")
+    ticket = guarded.client.post("/tickets", headers=bearer(token)).json()["ticket"]
+    address = f"127.0.0.1:{guarded.client.base_url.port}/api/v1"
+    with connect(f"ws://{address}/events?ticket={ticket}"):
+        assert guarded.client.get("/scenes", headers=bearer(token)).status_code == 200
+        assert guarded.client.get(f"/scenes?ticket={ticket}").status_code == 401
+        assert guarded.client.get("/scenes", headers=bearer(f"{token}x")).status_code == 401
+    for text in capfd.readouterr():
+        assert token not in text
+        assert ticket not in text
+
+
 def test_role_view_may_look_only(guarded: RunningApi) -> None:
     client, headers = guarded.client, bearer(guarded.store.tokens.create("wall", "view"))
     scene_id = guarded.store.scenes.create({"name": "room"}).head.id
@@ -112,6 +138,30 @@ def test_no_answer_carries_cross_origin_rights_or_cookies(open_api: RunningApi) 
     assert answer.status_code == 405
     for response in (answer, open_api.client.get("/scenes")):
         assert not {"access-control-allow-origin", "set-cookie", "server"} & set(response.headers)
+
+
+def ended(connection: socket.socket) -> bool:
+    """Wait until the service closes a connection."""
+    connection.settimeout(30)
+    return connection.recv(1) == b""
+
+
+def test_connections_that_ask_nothing_take_nobodys_place(
+    guarded: RunningApi, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    address = str(guarded.client.base_url.host), guarded.client.base_url.port
+    assert guarded.client.get("/health").status_code == 200
+    monkeypatch.setattr(connections, "CONNECTIONS_PER_CLIENT", 8)
+    idle = [socket.create_connection(address) for _ in range(12)]
+    assert ended(idle[-1])
+    assert guarded.client.get("/health").status_code == 200
+    for each in idle:
+        each.close()
+    monkeypatch.setattr(connections, "HEAD_TIMEOUT_S", 0.2)
+    with socket.create_connection(address) as silent, socket.create_connection(address) as dripping:
+        dripping.sendall(b"GET /api/v1/health HTT")
+        assert ended(silent)
+        assert ended(dripping)
 
 
 def test_too_many_requests_are_told_when_to_come_again(tmp_path_factory: pytest.TempPathFactory) -> None:

@@ -3,12 +3,14 @@
 from pathlib import Path
 
 import pytest
+from zeroconf import ServiceInfo
 
 from deltalight.protocol.endpoints import parse_endpoint
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.keys import Keys, KeySettings, create_keys, load_keys, trust
 from deltalight.protocol.messages import SCHEMA_VERSION
-from deltalight.sensor_node.announce import announced, service_info
+from deltalight.sensor_node.announce import SERVICE_TYPE, announced, service_info
+from deltalight.services import discovery
 from deltalight.services.discovery import FoundNode, choose, find_nodes, node_endpoint
 
 LOOPBACK = ["127.0.0.1"]
@@ -47,6 +49,33 @@ def test_the_announcement_never_holds_a_secret(keys: Keys) -> None:
     info = service_info("desk", parse_endpoint("tcp://127.0.0.1:5999"), STREAMS, keys, LOOPBACK)
     assert keys.public in info.text
     assert keys.secret not in info.text
+
+
+@pytest.mark.parametrize(
+    ("said", "expected"),
+    [
+        ({b"name": b"desk\x1b[2J"}, None),
+        ({b"name": b"\xff"}, None),
+        ({b"name": b"desk\n"}, None),
+        ({b"schema": b"-5"}, None),
+        ({b"streams": b"color,\x1b]0;x\x07"}, FoundNode("desk", "10.0.0.5", 5601, ("color",), 5, "k")),
+        ({b"key": b"\x1b[31m"}, FoundNode("desk", "10.0.0.5", 5601, STREAMS, 5, "")),
+    ],
+)
+def test_what_strangers_announce_writes_nothing_odd_to_a_terminal(
+    said: dict[bytes, bytes], expected: FoundNode | None
+) -> None:
+    texts = {
+        b"name": b"desk",
+        b"schema": b"5",
+        b"streams": b"color,pose",
+        b"curve": b"1",
+        b"key": b"k",
+        **said,
+    }
+    address = bytes([10, 0, 0, 5])
+    info = ServiceInfo(SERVICE_TYPE, f"x.{SERVICE_TYPE}", port=5601, addresses=[address], properties=texts)
+    assert discovery._node(info) == expected
 
 
 def test_one_node_is_chosen_by_name_or_because_it_is_the_only_one() -> None:

@@ -19,7 +19,7 @@ from deltalight.protocol.calibration import Extrinsics
 from deltalight.protocol.codecs import decode_color
 from deltalight.protocol.dataset_writer import DatasetWriter
 from deltalight.protocol.envelope import decode
-from deltalight.protocol.messages import CompositeMessage
+from deltalight.protocol.messages import CompositeMessage, LightsMessage
 from deltalight.protocol.receiver import Receiver
 from deltalight.sensor_node.cameras.synthetic import SyntheticCamera, default_camera
 from deltalight.services import ports
@@ -85,15 +85,15 @@ def command(*arguments: object) -> Iterator[subprocess.Popen[str]]:
     assert "error" not in said
 
 
-def lit_composite(receiver: Receiver) -> tuple[CompositeMessage, bytes]:
-    """The first composite that has lights."""
-    deadline_s = time.monotonic() + PATIENCE_S
+def lit_composite(receiver: Receiver) -> tuple[CompositeMessage, bytes, LightsMessage]:
+    """The first composite that has lights, and the lights that the node sent."""
+    deadline_s, sent = time.monotonic() + PATIENCE_S, None
     while time.monotonic() < deadline_s:
         for multipart in (receiver.latest(0.2) or {}).values():
             message, parts = decode(multipart)
-            assert isinstance(message, CompositeMessage)
-            if message.status == "ok" and message.lights:
-                return message, bytes(parts[0])
+            sent = message if isinstance(message, LightsMessage) else sent
+            if isinstance(message, CompositeMessage) and message.status == "ok" and message.lights and sent:
+                return message, bytes(parts[0]), sent
     raise AssertionError("no composite with lights came")
 
 
@@ -107,16 +107,19 @@ def test_a_lamp_in_the_bracket_lights_the_composite_from_its_side(tmp_path: Path
     frames, composites, control = map(ports.endpoint, ports.private_ports(3))
     serve = ("server", "--scene", write_scene(tmp_path), "--allow-software", "--subscribe", frames)
     with ExitStack() as stack:
-        receiver = Receiver([composites], ["composite"])
+        receiver = Receiver([composites, frames], ["composite", "lights"])
         stack.callback(receiver.close)
         stack.enter_context(command("node", "--source", take, "--loop", "--publish", frames))
         stack.enter_context(command(*serve, "--publish", composites, "--control", control))
-        message, data = lit_composite(receiver)
+        message, data, sent = lit_composite(receiver)
     lamps = [light for light in message.lights if light["type"] == "directional"]
     assert len(lamps) == 1
     assert lamps[0]["id"] == 1
     travels = np.array(lamps[0]["direction"], np.float64)
     assert degrees_between(-travels, TURN @ LAMP) < 1  # a pixel of the fish-eye picture is 1.2 degrees
+    (light,) = sent.lights
+    assert (-travels).tolist() == np.float32(light.to_light).tolist()  # as the node cut it, to the bit
+    assert lamps[0]["angular_radius_deg"] == np.degrees(light.angular_radius_rad)
     assert abs(np.array(lamps[0]["angular_radius_deg"], np.float64) - 3) < 0.5
     assert message.lights[-1]["type"] == "environment"
     picture = decode_color(data, message.encoding, message.shape)

@@ -18,7 +18,7 @@ from deltalight.protocol.scene import SceneDocument
 from deltalight.render_server.server.process import ServerSettings, serve
 from deltalight.services import ports
 from tests.services.api_samples import UPLOAD, running_api
-from tests.services.conftest import color, depth, pose
+from tests.services.conftest import camera, color, depth, pose
 from tests.services.storage_samples import TETRAHEDRON
 from tests.services.test_session import InvertingRenderer
 
@@ -184,6 +184,21 @@ def test_another_source_is_read_at_once_and_the_old_one_never_shows_again() -> N
         assert all(message.frame_id < 10**6 for message in itertools.islice(server.composites(), 20))
         here.close()
         there.close()
+
+
+def test_a_faulty_node_does_not_end_the_server() -> None:
+    with serving() as (server, _, node_port):
+        faulty = Publisher(ports.endpoint(node_port))
+        wrong = {**camera().to_dict(), "distortion_model": "w" * 5000}
+        while "bad_frames" not in server.ask("stats").payload["stats"]["drops"]:  # type: ignore[index, call-overload, operator]
+            for number in range(140):
+                faulty.send([f"color.{number:03}{'x' * 110}".encode(), b"no header"])
+            for message in (color(1, 1, 0, wrong), depth(1, 1), pose(1, 1)):
+                faulty.send(message)
+        faulty.close()
+        node = Node(ports.endpoint(node_port), first=2)
+        assert server.first(lambda message: message.frame_id >= 2).status == "ok"
+        node.close()
 
 
 def test_frames_go_on_after_a_snapshot_and_commands_wait_for_it(tmp_path: Path) -> None:

@@ -11,9 +11,11 @@ import pytest
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import ViewFrame
-from deltalight.protocol.messages import ControlRequest
+from deltalight.protocol.messages import MAX_LABELS, MAX_SENTENCE, ControlRequest
 from deltalight.protocol.scene import SceneDocument
+from deltalight.protocol.subscriber import ReceivedMultipart
 from deltalight.render_server.frame_budget import Level
+from deltalight.render_server.server import frames
 from deltalight.render_server.server.frames import FrameAssembler
 from deltalight.render_server.server.session import MAXIMUM_FAULTS_IN_A_ROW, RenderSession, SourceInUse
 from tests.services.conftest import IDENTITY, camera, color, depth, pose, received
@@ -209,6 +211,57 @@ def test_bad_message_is_counted(session: RenderSession) -> None:
     session.receive(received([b"color.cam", b"\xc1garbage", b""], START))
     assert session.counts["bad_messages"] == 1
     assert session.drops()["bad_messages"] == 1
+
+
+def test_what_nodes_send_is_cut_to_the_limits_of_statistics_and_composites(
+    renderer: InvertingRenderer,
+) -> None:
+    topics = {f"color.{number:03}{'x' * 110}": 2 for number in range(200)}
+    session = RenderSession(
+        renderer,
+        SceneDocument(),
+        mailbox_drops=lambda: topics,
+        clock_ns=lambda: START,
+        renderer_name="abacus",
+    )
+    wrong = color(1, START, START, {**camera().to_dict(), "distortion_model": "w" * 5000})
+    for message in (wrong, depth(1, START), pose(1, START)):
+        session.receive(message)
+    assert session.step() is None
+    stats = session.stats()
+    assert stats.detail.startswith("abacus; ")
+    assert len(stats.detail) == MAX_SENTENCE
+    assert stats.drops["bad_frames"] == 1
+    assert sum(stats.drops.values()) == 401
+    feed(session, 2)
+    rendered = session.step()
+    assert rendered is not None
+    assert len(rendered.message.drops) == MAX_LABELS
+
+
+@pytest.mark.parametrize(("stream", "other"), [(color, depth), (depth, color)])
+def test_a_camera_of_another_size_than_its_picture_is_refused(
+    session: RenderSession,
+    stream: Callable[..., ReceivedMultipart],
+    other: Callable[..., ReceivedMultipart],
+) -> None:
+    vast = {**camera().to_dict(), "width": 16384, "height": 16384}
+    for message in (stream(1, START, described=vast), other(1, START), pose(1, START)):
+        session.receive(message)
+    assert session.step() is None
+    assert "16384x16384" in session.stats().detail
+
+
+def test_data_of_a_node_never_ends_the_renderer(
+    session: RenderSession, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_arguments: object) -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(frames, "decode_color", fail)
+    for number in range(MAXIMUM_FAULTS_IN_A_ROW + 1):
+        feed(session, number)
+        assert session.step() is None
 
 
 def test_set_scene_is_idempotent_by_revision(

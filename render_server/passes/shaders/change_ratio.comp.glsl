@@ -17,7 +17,7 @@ uniform sampler2D cone_rho;
 uniform sampler2D cone_specular_mu;
 uniform sampler2D cone_specular_rho;
 uniform sampler2D reflection;   // a: fraction of a smooth surface's lobe that objects fill
-uniform bool has_reflection;
+#pragma switch bool has_reflection
 uniform int scale;
 
 const float LEAST_IRRADIANCE = 1e-4;

@@ -1,6 +1,7 @@
 // Relit picture: real pixels by the ratio of irradiances or by addition, virtual pixels over them by coverage, camera
 // response; the camera's own bytes where nothing changed (docs/method.md 3, composition).
 #include "common/brdf.glsl"
+#include "common/camera_response.glsl"
 #include "common/geometry.glsl"
 #include "common/surfaces.glsl"
 #include "common/upsample.glsl"
@@ -9,13 +10,13 @@
 layout(local_size_x = 64) in;
 layout(rgba8ui) writeonly uniform uimage2D code_out;
 layout(rgba16f) writeonly uniform image2D linear_out;
+layout(rgba32f) writeonly uniform image2D ratio_out;   // a: 1 where the picture changes (recompose.comp.glsl)
 // Images, because OpenGL guarantees no more than sixteen samplers.
 layout(rgba16f) readonly uniform image2D lobe_mu;
 layout(rgba16f) readonly uniform image2D lobe_rho;
 layout(rgba16f) readonly uniform image2D virtual_radiance;
 uniform usampler2D picture;
 uniform sampler2D linear_picture;
-uniform sampler2D inverse_response;   // camera code of linear values
 uniform sampler2D object_coverage;
 uniform sampler2D direct_mu;
 uniform sampler2D direct_rho;
@@ -26,14 +27,14 @@ uniform sampler2D cone_specular_rho;
 uniform sampler2D change_ratio;
 uniform sampler2D reflection;         // of objects in smooth surfaces, by rays; a: fraction of the lobe
 uniform sampler2D edge_correction;    // edge_unmixing.comp.glsl
-uniform bool has_reflection;
+#pragma switch bool has_reflection
 uniform float exposure_scale;
 uniform float sample_distance;   // m at 1 m depth
 #include "common/camera.glsl"
-uniform bool additive;
+#pragma switch bool additive
 uniform bool relights_real;      // method `none` shows objects and keeps the real scene
-uniform bool filmic;             // ACES tone curve on the whole picture instead of the camera's response
-uniform bool specular_surfaces;
+#pragma switch bool filmic   // ACES tone curve on the whole picture instead of the camera's response
+#pragma switch bool specular_surfaces
 uniform bool whole;              // compose every pixel, not only those near a change
 uniform bool store_linear;       // for views and files; the picture itself needs only codes
 
@@ -116,14 +117,15 @@ vec3 specular_change(Change c, vec3 glossy) {
     return c.hidden > 0.0 ? c.gained - max(c.hidden * glossy, lost) : more - lost;
 }
 
-vec3 relit(ivec2 pixel, Change c, vec4 normal, vec3 b) {
+// `ratio`: of the light; all that there is where nothing is added and the surface is not specular.
+vec3 relit(ivec2 pixel, Change c, vec4 normal, vec3 b, out vec3 ratio) {
+    float e = 1e-3 * max(texelFetch(direct_mu, pixel, 0).a, 1e-6);
+    ratio = (max(c.e_mu + c.delta, vec3(0.0)) + e) / (c.e_mu + e);
     if (additive) {
         vec3 albedo = clamp(PI * b / max(c.e_mu, vec3(1e-6)), ALBEDO_RANGE.x, ALBEDO_RANGE.y);
         vec3 glossy = c.hidden > 0.0 ? (1.0 - diffuse_fraction(pixel, c, normal, b)) * b : vec3(0.0);
         return max(vec3(0.0), b + albedo / PI * c.delta + specular_change(c, glossy));
     }
-    float e = 1e-3 * max(texelFetch(direct_mu, pixel, 0).a, 1e-6);
-    vec3 ratio = (max(c.e_mu + c.delta, vec3(0.0)) + e) / (c.e_mu + e);
     vec3 w = diffuse_fraction(pixel, c, normal, b), glossy = (1.0 - w) * b;
     return w * b * ratio + max(vec3(0.0), glossy + specular_change(c, glossy));
 }
@@ -148,15 +150,6 @@ vec3 surrounding_ratio(ivec2 pixel, vec3 b) {
     return sum / total;
 }
 
-// Camera code of each channel; the table is uniform in the square root, where codes are about evenly spaced.
-uvec3 encode(vec3 x) {
-    int last = textureSize(inverse_response, 0).x - 1;
-    ivec3 at = ivec3(round(sqrt(clamp(x, 0.0, 1.0)) * float(last)));
-    return uvec3(round(vec3(
-        texelFetch(inverse_response, ivec2(at.r, 0), 0).r, texelFetch(inverse_response, ivec2(at.g, 0), 0).g,
-        texelFetch(inverse_response, ivec2(at.b, 0), 0).b)));
-}
-
 // ACES tone curve (Narkowicz's fit, 2015).
 vec3 aces(vec3 x) { return clamp(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 0.0, 1.0); }
 
@@ -169,7 +162,7 @@ ivec2 surface_pixel(ivec2 pixel) {
 void compose(ivec2 pixel) {
     uvec4 code = uvec4(texelFetch(picture, pixel, 0).rgb, 255u);
     vec3 b = max(texelFetch(linear_picture, pixel, 0).rgb + texelFetch(edge_correction, pixel, 0).rgb, vec3(0.0));
-    vec3 result = b;
+    vec3 result = b, ratio = vec3(1.0);
     bool changed = filmic;
     ivec2 at = surface_pixel(pixel);
     vec4 position = texelFetch(real_surface_position, at, 0);
@@ -178,10 +171,10 @@ void compose(ivec2 pixel) {
     if (relights && position.w > 0.0) {
         vec4 normal = texelFetch(real_surface_normal, at, 0);
         Change c = change_at(at, position, normal);
-        if (c.any_change) { result = relit(at, c, normal, b); changed = true; }
+        if (c.any_change) { result = relit(at, c, normal, b, ratio); changed = true; }
     }
     if (relights && position.w <= 0.0) {
-        vec3 ratio = surrounding_ratio(pixel, b);
+        ratio = surrounding_ratio(pixel, b);
         if (ratio != vec3(1.0)) { result = b * ratio; changed = true; }
     }
     if (shown > 0.0) {
@@ -194,6 +187,7 @@ void compose(ivec2 pixel) {
         code.rgb = encode(x);
     }
     imageStore(code_out, pixel, code);
+    imageStore(ratio_out, pixel, vec4(ratio, changed ? 1.0 : 0.0));
     if (store_linear) imageStore(linear_out, pixel, vec4(result, 1.0));
 }
 

@@ -22,7 +22,7 @@ layout(rgba16f) writeonly uniform image2D lobe_mu;      // rgb radiance of light
 layout(rgba16f) writeonly uniform image2D lobe_rho;
 #include "common/camera.glsl"
 uniform float noise_sigma;   // m at 1 m
-uniform bool specular_surfaces;
+#pragma switch bool specular_surfaces
 #include "common/lit_area.glsl"
 
 #ifdef SHADOW_CONES

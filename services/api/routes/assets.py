@@ -6,7 +6,7 @@ from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 
 from deltalight.protocol.scene import DIGEST_PREFIX
-from deltalight.services.api.context import Context, Shared
+from deltalight.services.api.context import Context, Shared, in_pool
 from deltalight.services.api.file_response import StoredFileResponse
 from deltalight.services.api.models import AssetAnswer
 from deltalight.services.api.problems import ProblemError, responses
@@ -65,7 +65,7 @@ async def upload_asset(
     with assets.receiving(shared.settings.upload_limit_mb << 20) as incoming:
         async for chunk in request.stream():
             await run_in_threadpool(incoming.write, chunk)
-        asset, is_new = await run_in_threadpool(assets.keep, incoming, name)
+        asset, is_new = await shared.pools["assets"].run(lambda: assets.keep(incoming, name))
     return announced(shared, asset, response, is_new=is_new)
 
 
@@ -94,6 +94,7 @@ def download_asset(shared: Shared, digest: Digest) -> StoredFileResponse:
 
 
 @router.get("/{digest}/thumbnail.png", response_class=StoredFileResponse, responses=responses(404, 422) | PNG)
+@in_pool("thumbnails")
 def thumbnail(shared: Shared, digest: Digest) -> StoredFileResponse:
     """Return a picture of a mesh or map, 256 x 256 pixels on a transparent ground."""
     path = shared.store.assets.thumbnail(digest.removeprefix(DIGEST_PREFIX))

@@ -10,13 +10,13 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from deltalight import __version__
 from deltalight.protocol.messages import MAX_EDGE_PX, RadianceMessage
-from deltalight.services.api.context import Shared
+from deltalight.services.api.context import Shared, in_pool
 from deltalight.services.api.credentials import TICKET_LIFE_S, principal_of
 from deltalight.services.api.events import EventQueue, packed
 from deltalight.services.api.file_response import StoredFileResponse
 from deltalight.services.api.fisheye import FisheyeLight, lights_in_picture
 from deltalight.services.api.live_hub import LiveFrame, LiveHub
-from deltalight.services.api.problems import ProblemError, responses
+from deltalight.services.api.problems import ProblemError, responses, unavailable
 from deltalight.services.api.shown_view import View
 from deltalight.services.storage.faults import NotFoundError
 
@@ -25,6 +25,7 @@ PICK_TIMEOUT_S = 5.0  # some frames of the slowest renderer
 POLICY_VIOLATION, GOING_AWAY = 1008, 1001  # WebSocket close codes (RFC 6455, 7.4.1)
 BOUNDARY = "frame"
 PICTURE_HEADERS = {"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff"}
+NO_ANSWER = "The render server does not answer, or (with Retry-After) too many requests wait for it."
 JPEG_ANSWER: dict[int | str, dict[str, Any]] = {200: {"content": {"image/jpeg": {}}}}
 
 live_router = APIRouter(tags=["live"])
@@ -104,7 +105,11 @@ async def live_mjpeg(shared: Shared) -> StreamingResponse:
     return StreamingResponse(_mjpeg(shared.live), media_type=media_type, headers=PICTURE_HEADERS)
 
 
-@live_router.get("/live.jpg", response_class=Response, responses={**responses(503), **JPEG_ANSWER})
+@live_router.get(
+    "/live.jpg",
+    response_class=Response,
+    responses={**unavailable("No picture has come from the render server yet."), **JPEG_ANSWER},
+)
 async def live_picture(shared: Shared) -> Response:
     """Return the newest composite."""
     frame = shared.live.newest
@@ -124,7 +129,8 @@ def poster(shared: Shared) -> StoredFileResponse:
     return StoredFileResponse(path, media_type="image/jpeg", headers=PICTURE_HEADERS)
 
 
-@live_router.post("/live/pick", responses=responses(400, 503))
+@live_router.post("/live/pick", responses={**responses(400), **unavailable(NO_ANSWER)})
+@in_pool("render server")
 def pick(shared: Shared, pixel: Annotated[Pixel, Body(examples=[{"x": 320, "y": 200}])]) -> Pick:
     """Say what a pixel of the newest composite shows: where to put an object, or which one was clicked on."""
     payload = pixel.model_dump(exclude_none=True)

@@ -10,7 +10,7 @@ from deltalight.protocol.documents import StrictModel
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.messages import Name
 from deltalight.sensor_node.cameras.playback import MAX_RATE, MIN_RATE
-from deltalight.services.api.context import Context, Shared
+from deltalight.services.api.context import Context, Shared, in_pool
 from deltalight.services.api.file_response import StoredFileResponse
 from deltalight.services.api.problems import responses
 from deltalight.services.api.recording_session import RecordingSession
@@ -150,6 +150,7 @@ class ReplayAnswer(StrictModel):
 
 
 @router.get("")
+@in_pool("recordings")
 def list_recordings(shared: Shared) -> list[RecordingAnswer]:
     """List all recordings, those that grow first, then the newest first."""
     growing = shared.recording_sessions.running()
@@ -159,6 +160,7 @@ def list_recordings(shared: Shared) -> list[RecordingAnswer]:
 
 
 @router.post("", status_code=201, responses=responses(409, 422, 503))
+@in_pool("recordings")
 def start_recording(
     shared: Shared,
     response: Response,
@@ -174,6 +176,7 @@ def start_recording(
 
 
 @router.get("/{recording_id}", responses=responses(404))
+@in_pool("recordings")
 def get_recording(shared: Shared, recording_id: RecordingId) -> RecordingAnswer:
     """Return what is known of a recording."""
     growing = _growing(shared, recording_id)
@@ -185,6 +188,7 @@ def get_recording(shared: Shared, recording_id: RecordingId) -> RecordingAnswer:
 
 
 @router.post("/{recording_id}/stop", responses=responses(404, 409, 422))
+@in_pool("recordings")
 def stop_recording(shared: Shared, recording_id: RecordingId) -> RecordingAnswer:
     """End a recording; 409 where no frame had come, so that there is none."""
     shared.recording_sessions.stop(recording_id)
@@ -192,6 +196,7 @@ def stop_recording(shared: Shared, recording_id: RecordingId) -> RecordingAnswer
 
 
 @router.post("/{recording_id}/recover", responses=responses(404, 409, 422))
+@in_pool("recordings")
 def recover_recording(shared: Shared, recording_id: RecordingId) -> RecordingAnswer:
     """Mend an interrupted recording: all frames that can be read, finished."""
     _require_at_rest(shared, recording_id)
@@ -203,6 +208,7 @@ def recover_recording(shared: Shared, recording_id: RecordingId) -> RecordingAns
     response_class=StoredFileResponse,
     responses=responses(404, 409, 416) | DOWNLOAD_ANSWER,
 )
+@in_pool("recordings")
 def download_recording(shared: Shared, recording_id: RecordingId) -> StoredFileResponse:
     """Download the .mcap file; ranges of it too."""
     _require_at_rest(shared, recording_id)
@@ -218,6 +224,7 @@ def download_recording(shared: Shared, recording_id: RecordingId) -> StoredFileR
     response_class=StoredFileResponse,
     responses=responses(404, 409, 422) | POSTER_ANSWER,
 )
+@in_pool("recordings")
 def recording_poster(shared: Shared, recording_id: RecordingId) -> StoredFileResponse:
     """Return the first colour picture, at most 640 pixels wide or high."""
     _require_at_rest(shared, recording_id)
@@ -225,6 +232,7 @@ def recording_poster(shared: Shared, recording_id: RecordingId) -> StoredFileRes
 
 
 @router.delete("/{recording_id}", status_code=204, responses=responses(404, 409))
+@in_pool("recordings")
 def delete_recording(shared: Shared, recording_id: RecordingId) -> None:
     """Delete a recording for good; not one that grows or is shown."""
     _require_at_rest(shared, recording_id)
@@ -234,12 +242,14 @@ def delete_recording(shared: Shared, recording_id: RecordingId) -> None:
 
 
 @replay_router.get("", responses=responses(503))
+@in_pool("replay")
 def get_replay(shared: Shared) -> ReplayAnswer:
     """Return which recording is shown and where it is."""
     return replay_answer(shared.replay.position())
 
 
 @replay_router.put("", responses=responses(404, 409, 422, 503))
+@in_pool("replay")
 def start_replay(
     shared: Shared,
     wanted: Annotated[
@@ -255,6 +265,7 @@ def start_replay(
 
 
 @replay_router.patch("", responses=responses(409, 422, 503))
+@in_pool("replay")
 def change_replay(
     shared: Shared,
     change: Annotated[ReplayChange, AS_SENT, Body(examples=[{"position_s": 4.2, "playing": False}])],
@@ -265,6 +276,7 @@ def change_replay(
 
 
 @replay_router.delete("", status_code=204)
+@in_pool("replay")
 def end_replay(shared: Shared) -> None:
     """Show the live nodes again."""
     shared.replay.stop()

@@ -5,7 +5,7 @@ from typing import Annotated
 from fastapi import APIRouter, Path, Response
 from pydantic import BaseModel, Field
 
-from deltalight.services.api.context import Shared
+from deltalight.services.api.context import Shared, in_pool
 from deltalight.services.api.models import AssetAnswer
 from deltalight.services.api.problems import responses
 from deltalight.services.api.routes.assets import KEPT_ANSWERS, announced
@@ -32,6 +32,7 @@ def list_shelf() -> list[ShelfAnswer]:
 
 
 @router.post("/{item}", status_code=201, responses={**KEPT_ANSWERS, **responses(404)})
+@in_pool("assets")
 def take_from_shelf(
     shared: Shared,
     response: Response,

@@ -10,11 +10,12 @@ from deltalight.protocol.documents import StrictModel
 from deltalight.protocol.messages import Name
 from deltalight.protocol.methods import Method
 from deltalight.protocol.scene_method import Output
-from deltalight.services.api.context import Context, Shared
+from deltalight.services.api.context import Context, Shared, in_pool
 from deltalight.services.api.file_response import StoredFileResponse
-from deltalight.services.api.problems import ProblemError, responses
+from deltalight.services.api.problems import ProblemError, responses, unavailable
 from deltalight.services.api.request_bodies import AS_SENT, checked
 from deltalight.services.api.routes.assets import UNCHANGING
+from deltalight.services.api.routes.live import NO_ANSWER
 from deltalight.services.api.snapshot_store import ID, SnapshotFacts, SnapshotPicture, files_of, now
 
 router = APIRouter(tags=["snapshots"], prefix="/snapshots")
@@ -59,6 +60,7 @@ class NewSnapshot(StrictModel):
         default=tuple(WantedPicture(name=view, view=view) for view in VIEWS),
         min_length=1,
         max_length=MAX_PICTURES,
+        fail_fast=True,
         description="All of one and the same frame.",
     )
     exr: StrictBool = Field(default=False, description=f"Add {EXR}: the composite's linear radiance.")
@@ -77,7 +79,8 @@ def list_snapshots(shared: Shared) -> list[SnapshotFacts]:
     return shared.snapshots.all()
 
 
-@router.post("", status_code=201, responses=responses(409, 422, 502, 503))
+@router.post("", status_code=201, responses={**responses(409, 422, 502), **unavailable(NO_ANSWER)})
+@in_pool("render server")
 def take_snapshot(
     shared: Shared,
     response: Response,

@@ -8,7 +8,7 @@ from pydantic import BaseModel, Field
 
 from deltalight import __version__
 from deltalight.services.api.camera_finder import CamerasAnswer
-from deltalight.services.api.context import Shared
+from deltalight.services.api.context import Shared, in_pool
 from deltalight.services.api.live_hub import LiveFrame
 from deltalight.services.api.metrics import MEDIA_TYPE
 from deltalight.services.api.models import PictureState, ProcessAnswer
@@ -124,6 +124,7 @@ def list_nodes(shared: Shared) -> list[NodeAnswer]:
 
 
 @nodes_router.get("/cameras", responses=responses(503))
+@in_pool("cameras")
 def list_cameras(shared: Shared) -> CamerasAnswer:
     """List the cameras that are attached to this host, and what keeps others from being found."""
     return shared.cameras.find()

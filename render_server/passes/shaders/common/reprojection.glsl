@@ -1,7 +1,8 @@
 // What the last frame saw of a surface that this frame sees. Needs geometry.glsl.
+#include "common/lens.glsl"
 uniform sampler2D last_position;        // world m; w: depth, 0 unknown
 uniform mat4 last_camera_from_world;
-uniform bool has_history;
+#pragma switch bool has_history
 uniform float pixel_size;               // m at 1 m depth
 uniform int turns;
 uniform int turn;
@@ -18,7 +19,7 @@ vec2 last_pixel(vec3 p) {
     if (c.z <= 0.0) return vec2(-1e4);
     vec2 pixel = camera_pinhole.xy * c.xy / c.z + camera_pinhole.zw + 0.5;
     ivec2 last = textureSize(picture_rays, 0) - 1;
-    for (int i = 0; i < 2; ++i) {   // displaced by the lens
+    for (int i = 0; i < (lens_bends ? 2 : 0); ++i) {
         ivec2 at = clamp(ivec2(pixel), ivec2(0), last);
         pixel = vec2(at) + 0.5 + camera_pinhole.xy * (c.xy / c.z - texelFetch(picture_rays, at, 0).xy);
     }

@@ -3,8 +3,8 @@
 // the stride at whose end it is behind the picture's surface.
 #include "common/geometry.glsl"
 #include "common/camera_image.glsl"
+#include "common/lens.glsl"
 
-uniform bool lens_bends;      // picture_pixel is a pinhole's
 uniform float noise_sigma;    // m at 1 m
 
 const float NEAREST = 0.02;     // m in front of the camera

@@ -4736,7 +4736,7 @@ export interface operations {
                     readonly "application/problem+json": components["schemas"]["Problem"];
                 };
             };
-            /** @description Service Unavailable */
+            /** @description No picture has come from the render server yet. */
             readonly 503: {
                 headers: {
                     readonly [name: string]: unknown;
@@ -4823,7 +4823,7 @@ export interface operations {
                     readonly "application/problem+json": components["schemas"]["Problem"];
                 };
             };
-            /** @description Service Unavailable */
+            /** @description The render server does not answer, or (with Retry-After) too many requests wait for it. */
             readonly 503: {
                 headers: {
                     readonly [name: string]: unknown;
@@ -10935,7 +10935,7 @@ export interface operations {
                     readonly "application/problem+json": components["schemas"]["Problem"];
                 };
             };
-            /** @description Service Unavailable */
+            /** @description The render server does not answer, or (with Retry-After) too many requests wait for it. */
             readonly 503: {
                 headers: {
                     readonly [name: string]: unknown;

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from deltalight.render_server.lights.fisheye import LightTracker
-from deltalight.render_server.lights.median_cut import Region, RegionLight
-from deltalight.render_server.lights.octahedral import texel_solid_angles
+from deltalight.protocol.light_tracker import MOST_LIGHTS, LightTracker
+from deltalight.protocol.median_cut import RegionLight
+from deltalight.protocol.octahedral import texel_solid_angles
+from deltalight.protocol.sky_lights import Region
 
 SECOND = 1_000_000_000
 NOWHERE = Region(0, 1, 0, 1)
@@ -128,6 +129,19 @@ def test_lights_fade_in_and_out() -> None:
     for step in range(60):  # maps go on coming: what faded is gone in the end all the same
         tracker.set_target(2 * SECOND + step * SECOND // 10, (light(150, 1),), rest())
     assert [one.identity for one in tracker.lights] == [2]
+
+
+def test_there_are_never_more_lights_than_a_composite_lists() -> None:
+    """Lights that jump with each map leave more and more behind that fade."""
+    tracker, rng = LightTracker(60.0), np.random.default_rng(2)
+    for step in range(30):
+        jumped = tuple(light(*rng.uniform((0, 1, -90), (360, 9, 90))) for _ in range(16))
+        tracker.set_target(step * SECOND, jumped, rest())
+        assert len(tracker.lights) <= MOST_LIGHTS
+    assert len(tracker.lights) == MOST_LIGHTS
+    tracker.advance(1000 * SECOND)
+    shown = sorted(float(one.irradiance[0]) for one in tracker.lights)
+    assert shown == pytest.approx(sorted(float(one.irradiance[0]) for one in jumped))
 
 
 def test_a_light_that_comes_back_is_the_same() -> None:

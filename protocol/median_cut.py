@@ -2,19 +2,35 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Generic, Protocol, Self, TypeVar
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, Float64
+from jaxtyping import Float32, Float64
 
-from deltalight.render_server.lights.environment import LUMINANCE, WORK_SIZE, EnvironmentMap, SkyGrid
+from deltalight.protocol.frames import LUMINANCE
+from deltalight.protocol.sky_lights import Region
 
 PEAK_THRESHOLD = 4.0
 MIN_FRACTION = 0.01
 # Regions of this angular radius are not cut again: sampling the disc of a light resolves the rest.
 MIN_RADIUS_RAD = float(np.radians(5.0))
 OcclusionTest = Callable[[Float64[np.ndarray, "3"]], bool]
+
+
+@dataclass(frozen=True, eq=False)
+class SkyGrid:
+    """Unit direction (map axes) and solid angle (sr) of every pixel of a map."""
+
+    directions: Float32[np.ndarray, "h w 3"]
+    solid_angles: Float32[np.ndarray, "h w"]
+
+    @cached_property
+    def moments(self) -> Float32[np.ndarray, "h w 4"]:
+        """Solid angle, and solid angle times direction, of every pixel."""
+        parts = [np.ones_like(self.solid_angles)[..., None], self.directions]
+        return np.asarray(np.concatenate(parts, axis=-1) * self.solid_angles[..., None])
 
 
 class SkyMap(Protocol):
@@ -41,26 +57,11 @@ class SkyMap(Protocol):
         ...
 
     def with_radiance(self, radiance: Float32[np.ndarray, "h w 3"]) -> Self:
-        """Returns the map with other radiance."""
+        """Return the map with other radiance."""
         ...
 
 
 MapT = TypeVar("MapT", bound=SkyMap)
-
-
-@dataclass(frozen=True)
-class Region:
-    """A rectangle of a map's grid: rows and columns from..to (exclusive)."""
-
-    top: int
-    bottom: int
-    left: int
-    right: int
-
-    @property
-    def window(self) -> tuple[slice, slice]:
-        """The region as an index."""
-        return np.s_[self.top : self.bottom, self.left : self.right]
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,22 +85,6 @@ class Split(Generic[MapT]):
     residual: MapT
 
 
-def split_environment(
-    environment: EnvironmentMap,
-    count: int = 4,
-    *,
-    threshold: float = PEAK_THRESHOLD,
-    whole_map: bool = False,
-) -> Split[EnvironmentMap]:
-    """Splits a latitude-longitude map as `split_map`, in its working size and opened where it is darkest."""
-    small = environment.resized(*WORK_SIZE)
-    luminance = _luminance(small.radiance)
-    limit = threshold * float(np.vdot(luminance, small.grid.solid_angles)) / small.known_solid_angle
-    peaks = np.maximum(luminance - np.float32(limit), 0) * small.grid.solid_angles
-    opened = small.rolled(_darkest_column(peaks.sum(axis=0)))
-    return split_map(opened, count, threshold=threshold, whole_map=whole_map)
-
-
 def split_map(
     sky: MapT,
     count: int = 4,
@@ -108,13 +93,13 @@ def split_map(
     whole_map: bool = False,
     is_occluded: OcclusionTest | None = None,
 ) -> Split[MapT]:
-    """Splits a map into at most `count` lights and a residual (docs/method.md 2).
+    """Split a map into at most `count` lights and a residual (docs/method.md 2).
 
     R = L min(1, c / lum L) with c = `threshold` times the solid-angle mean of what is known; P = L - R is cut into
     regions, each of which becomes a light. Regions under 1 % of the map's energy go back to R, and so do those whose
     direction (unit, world) `is_occluded`. With `whole_map`, as in the papers, everything but occluded regions is cut.
     """
-    luminance = _luminance(sky.radiance)
+    luminance = luminance_of(sky.radiance)
     energy = float(np.vdot(luminance, sky.grid.solid_angles))
     limit = 0.0 if whole_map else threshold * energy / max(sky.known_solid_angle, 1e-9)
     least = 0.0 if whole_map else MIN_FRACTION * energy
@@ -133,18 +118,19 @@ def split_map(
     return Split(tuple(lights), sky.with_radiance(residual))
 
 
-def _luminance(radiance: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w"]:
+def luminance_of(radiance: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w"]:
+    """Return the luminance of every pixel (ITU-R BT.709)."""
     return np.asarray(cv2.transform(radiance, LUMINANCE[None]), np.float32)
 
 
 def _fraction_above(luminance: Float32[np.ndarray, "h w"], limit: float) -> Float32[np.ndarray, "h w 1"]:
-    """Returns the fraction of each pixel's light above the limit, 0..1."""
+    """Return the fraction of each pixel's light above the limit, 0..1."""
     above = np.maximum(luminance - np.float32(limit), 0)
     return np.asarray(above / np.maximum(luminance, np.float32(1e-30)))[..., None]
 
 
 def _bounding(luminance: Float32[np.ndarray, "h w"], limit: float, region: Region) -> Region:
-    """Returns the least rectangle around a region's pixels above the limit; empty if there are none."""
+    """Return the least rectangle around a region's pixels above the limit; empty if there are none."""
     above = cv2.compare(luminance[region.window], limit, cv2.CMP_GT)
     left, top, width, height = cv2.boundingRect(above)
     return _moved(Region(top, top + height, left, left + width), region)
@@ -156,10 +142,10 @@ def _moved(region: Region, origin: Region) -> Region:
 
 
 def _region_light(sky: SkyMap, region: Region, peaks: Float32[np.ndarray, "h w 3"]) -> RegionLight:
-    """Integrates a region: E = sum P dw, centroid, radius = sqrt(2 mean squared angle) (a disc's own radius)."""
+    """Integrate a region: E = sum P dw, centroid, radius = sqrt(2 mean squared angle) (a disc's own radius)."""
     directions = sky.grid.directions[region.window]
     solid_angles = sky.grid.solid_angles[region.window]
-    weight = (_luminance(peaks) * solid_angles).ravel()
+    weight = (luminance_of(peaks) * solid_angles).ravel()
     energy = float(weight.sum(dtype=np.float64))
     pull = (weight @ directions.reshape(-1, 3)).astype(np.float64)
     length = float(np.linalg.norm(pull))
@@ -175,13 +161,6 @@ def _region_light(sky: SkyMap, region: Region, peaks: Float32[np.ndarray, "h w 3
         float(min(radius, np.pi / 2)),
         region,
     )
-
-
-def _darkest_column(columns: Float[np.ndarray, " w"]) -> int:
-    """Finds where to open the map so that the seam is least likely to cut a light in two."""
-    width = max(1, len(columns) // 64)
-    around = np.convolve(np.concatenate([columns, columns[: width - 1]]), np.ones(width), "valid")
-    return (int(np.argmin(around)) + width // 2) % len(columns)
 
 
 def variance_cut(moments: Float32[np.ndarray, "h w 4"], count: int) -> list[Region]:
@@ -218,14 +197,14 @@ class _Table:
         return np.asarray(lower[region.right] - lower[region.left] - upper[region.right] + upper[region.left])
 
     def spread(self, region: Region) -> float:
-        """Returns the spread of a region that is worth cutting, else 0."""
+        """Return the spread of a region that is worth cutting, else 0."""
         sums = self.sums(region)
         spread = float(_spread(sums))
         # Radius as of a light: sqrt(2 mean squared angle).
         return 0.0 if 2 * spread <= MIN_RADIUS_RAD**2 * sums[0] else spread
 
     def halves(self, region: Region) -> tuple[Region, Region] | None:
-        """Cuts a region where the sum of both sides' spreads is least; None for a single pixel."""
+        """Cut a region where the sum of both sides' spreads is least; None for a single pixel."""
         top, bottom, left, right = region.top, region.bottom, region.left, region.right
         row = _best_cut(self.values[top : bottom + 1, right] - self.values[top : bottom + 1, left])
         column = _best_cut(self.values[bottom, left : right + 1] - self.values[top, left : right + 1])
@@ -240,7 +219,7 @@ class _Table:
 
 
 def _best_cut(running: Float64[np.ndarray, "n 4"]) -> tuple[int, float] | None:
-    """Returns where to cut a row of running sums, and the spread of both sides; None if it cannot be cut."""
+    """Return where to cut a row of running sums, and the spread of both sides; None if it cannot be cut."""
     if len(running) < 3:
         return None
     before = running[1:-1] - running[0]
@@ -250,7 +229,7 @@ def _best_cut(running: Float64[np.ndarray, "n 4"]) -> tuple[int, float] | None:
 
 
 def _spread(moments: Float64[np.ndarray, "*n 4"]) -> Float64[np.ndarray, "*n"]:
-    """Returns the weighted sum of squared distances of unit vectors to their centroid: W - |sum w d|^2 / W."""
+    """Return the weighted sum of squared distances of unit vectors to their centroid: W - |sum w d|^2 / W."""
     weight = moments[..., 0]
     pull = np.einsum("...i,...i", moments[..., 1:], moments[..., 1:])
     return np.asarray(np.maximum(weight - pull / np.maximum(weight, 1e-300), 0))

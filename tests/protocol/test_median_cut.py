@@ -5,12 +5,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from deltalight.protocol.frames import LUMINANCE
 from deltalight.protocol.hemisphere import texel_directions, texel_solid_angles
-from deltalight.render_server.lights.environment import LUMINANCE, WORK_SIZE, EnvironmentMap, read_radiance
-from deltalight.render_server.lights.fisheye import HemisphereMap, to_world
-from deltalight.render_server.lights.median_cut import RegionLight, Split, split_environment, split_map
-from deltalight.render_server.lights.octahedral import octahedral_grid, sample_octahedral
-from deltalight.render_server.lights.octahedral import texel_solid_angles as sphere
+from deltalight.protocol.hemisphere_map import HemisphereMap, to_world
+from deltalight.protocol.median_cut import RegionLight, Split, split_map
+from deltalight.protocol.octahedral import octahedral_grid, sample_octahedral
+from deltalight.protocol.octahedral import texel_solid_angles as sphere
+from deltalight.render_server.lights.environment import (
+    WORK_SIZE,
+    EnvironmentMap,
+    read_radiance,
+    split_environment,
+)
 
 SIZE = 128
 TILTED = np.array([[0.8, 0.0, 0.6], [0.0, 1.0, 0.0], [-0.6, 0.0, 0.8]])

@@ -1,0 +1,113 @@
+"""Maps of the whole sphere on a square: the octahedral mapping, resampling.
+
+Texel (row j, column i) of an n x n map has its centre at uv = ((i + 0.5)/n, (j + 0.5)/n). With
+p = 2 uv - 1 the direction is (px, py, 1 - |px| - |py|) where |px| + |py| <= 1 (upper half, +z in the centre);
+beyond, the corners are folded down (Engelhardt & Dachsbacher 2008). Axes are world axes.
+"""
+
+from collections.abc import Callable
+from functools import cache
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float32, Float64
+
+SampleMap = Callable[[Float32[np.ndarray, "n m 3"]], Float32[np.ndarray, "n m c"]]
+
+
+def octahedral_direction(uv: Float[np.ndarray, "*shape 2"]) -> Float64[np.ndarray, "*shape 3"]:
+    """Return the unit direction of map coordinates in 0..1."""
+    folded = _folded_direction(uv)
+    return np.asarray(folded / np.linalg.norm(folded, axis=-1, keepdims=True))
+
+
+def _folded_direction(uv: Float[np.ndarray, "*shape 2"]) -> Float64[np.ndarray, "*shape 3"]:
+    """Return the point of the octahedron |x| + |y| + |z| = 1."""
+    p = 2 * np.asarray(uv, np.float64) - 1
+    z = 1 - np.abs(p).sum(axis=-1)
+    below = np.maximum(-z, 0)[..., None]
+    return np.concatenate([p - np.copysign(below, p), z[..., None]], axis=-1)
+
+
+def octahedral_uv(direction: Float[np.ndarray, "*shape 3"]) -> Float[np.ndarray, "*shape 2"]:
+    """Return the map coordinates in 0..1 of directions of any length."""
+    d = np.asarray(direction)
+    d = d / np.abs(d).sum(axis=-1, keepdims=True)
+    p = d[..., :2]
+    folded = np.copysign(1 - np.abs(p[..., ::-1]), p)
+    return np.asarray(np.where(d[..., 2:] < 0, folded, p) / 2 + 0.5)
+
+
+@cache
+def octahedral_grid(size: int) -> Float64[np.ndarray, "n n 3"]:
+    """Return the unit directions of the texel centres of a size x size map (read-only)."""
+    directions = octahedral_direction(_grid_uv(size))
+    directions.flags.writeable = False
+    return directions
+
+
+@cache
+def texel_weights(size: int, supersampling: int) -> Float32[np.ndarray, "k k"]:
+    """Return the solid angles of supersampling^2 samples per texel, relative to the mean of their texel."""
+    weight = np.linalg.norm(_folded_direction(_grid_uv(size * supersampling)), axis=-1) ** -3
+    mean = weight.reshape(size, supersampling, size, supersampling).mean(axis=(1, 3))
+    return np.asarray(weight / mean.repeat(supersampling, 0).repeat(supersampling, 1), np.float32)
+
+
+def _grid_uv(size: int) -> Float64[np.ndarray, "n n 2"]:
+    centres = (np.arange(size) + 0.5) / size
+    return np.stack(np.meshgrid(centres, centres), axis=-1)
+
+
+@cache
+def texel_solid_angles(size: int) -> Float32[np.ndarray, "n n"]:
+    """Return the solid angle of every texel, sr; they add up to 4 pi.
+
+    A patch dA of the octahedron seen from the centre at distance r has dA cos / r^2, proportional to r^-3.
+    """
+    fine = max(1, 256 // size)
+    weight = np.linalg.norm(_folded_direction(_grid_uv(size * fine)), axis=-1) ** -3
+    weight = weight.reshape(size, fine, size, fine).mean(axis=(1, 3))
+    weight = (weight * (4 * np.pi / weight.sum())).astype(np.float32)
+    weight.flags.writeable = False
+    return np.asarray(weight)
+
+
+def resample_to_octahedral(sample: SampleMap, size: int, supersampling: int = 2) -> np.ndarray:
+    """Average a radiance function over the texels of an octahedral map, weighted by solid angle.
+
+    `sample` maps directions (n, m, 3) to radiance (n, m, c); every texel takes supersampling^2 of them.
+    """
+    uv = _grid_uv(size * supersampling)
+    folded = _folded_direction(uv)
+    weight = (np.linalg.norm(folded, axis=-1, keepdims=True) ** -3).astype(np.float32)
+    weighted = sample(folded.astype(np.float32)) * weight
+    blocks = (size, supersampling, size, supersampling, -1)
+    total = weighted.reshape(blocks).sum(axis=(1, 3)) / weight.reshape(blocks).sum(axis=(1, 3))
+    return np.asarray(total, np.float32)
+
+
+def sample_octahedral(
+    radiance: Float32[np.ndarray, "n n 3"], directions: Float[np.ndarray, "a b 3"]
+) -> Float32[np.ndarray, "a b 3"]:
+    """Read a map bilinearly; interpolation continues across the map's border."""
+    return sample_at(radiance, texel_coordinates(directions, len(radiance)))
+
+
+def texel_coordinates(directions: Float[np.ndarray, "a b 3"], size: int) -> Float32[np.ndarray, "a b 2"]:
+    """Return where `sample_at` reads a map of this size for directions."""
+    return (octahedral_uv(directions) * size + 0.5).astype(np.float32)
+
+
+def sample_at(
+    radiance: Float32[np.ndarray, "n n 3"], coordinates: Float32[np.ndarray, "a b 2"]
+) -> Float32[np.ndarray, "a b 3"]:
+    """Read a map bilinearly at coordinates that `texel_coordinates` returned."""
+    return np.asarray(cv2.remap(_bordered(radiance), coordinates, None, cv2.INTER_LINEAR))
+
+
+def _bordered(radiance: Float32[np.ndarray, "n n 3"]) -> Float32[np.ndarray, "m m 3"]:
+    """Add a border of one texel: across an edge of the map lies the same edge, mirrored about its middle."""
+    rows = np.concatenate([radiance[:1, ::-1], radiance, radiance[-1:, ::-1]])
+    left, right = rows[::-1, :1].copy(), rows[::-1, -1:].copy()
+    return np.ascontiguousarray(np.concatenate([left, rows, right], axis=1))

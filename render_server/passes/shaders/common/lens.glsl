@@ -1,0 +1,1 @@
+#pragma switch bool lens_bends   // the camera's picture is not a pinhole's

@@ -1,0 +1,33 @@
+// A new picture in the light of an earlier one: by the ratio that composite.comp.glsl kept of every pixel near a change.
+#include "common/camera_codes.glsl"
+#include "common/camera_response.glsl"
+#include "common/work_list.glsl"
+
+layout(local_size_x = 64) in;
+layout(rgba8ui) writeonly uniform uimage2D code_out;
+layout(rgba32f) readonly uniform image2D relit_ratio;
+layout(rgba16f) readonly uniform image2D virtual_radiance;
+uniform sampler2D object_coverage;
+uniform sampler2D edge_correction;   // edge_unmixing.comp.glsl
+uniform isampler2D sample_pixels;
+uniform int scale;
+uniform float exposure_scale;
+
+void recompose(ivec2 pixel) {
+    uvec4 code = uvec4(texelFetch(picture, pixel, 0).rgb, 255u);
+    vec4 ratio = imageLoad(relit_ratio, pixel);
+    vec3 b = max(radiance_of(code.rgb) + texelFetch(edge_correction, pixel, 0).rgb, vec3(0.0));
+    float shown = texelFetch(object_coverage, pixel, 0).r;
+    vec3 result = mix(b * ratio.rgb, imageLoad(virtual_radiance, pixel).rgb, shown);
+    if (ratio.a > 0.0) code.rgb = encode(result * exposure_scale);
+    imageStore(code_out, pixel, code);
+}
+
+void main() {
+    ivec2 size = textureSize(picture, 0), grid = textureSize(sample_pixels, 0);
+    uint block = uint(scale * scale), count = listed_count() * block;
+    for (uint i = gl_GlobalInvocationID.x; i < count; i += gl_NumWorkGroups.x * 64u) {
+        ivec2 pixel = pixel_in_block(texel_of_index(texels[i / block], grid.x), int(i % block), scale);
+        if (all(lessThan(pixel, size))) recompose(pixel);
+    }
+}
