@@ -7,8 +7,12 @@ import sys
 class DeltalightError(Exception):
     """A fault that the user can fix: the message says in one sentence what is wrong and what to do.
 
-    The command line prints it without a traceback and exits with code 2.
+    The command line prints it without a traceback and exits with code 2; notebooks show the sentence alone.
     """
+
+    def _render_traceback_(self) -> list[str]:
+        """Returns the lines that IPython shows in place of a traceback."""
+        return [str(self)]
 
 
 def install_command(*requirements: str) -> str:

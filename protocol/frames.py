@@ -89,7 +89,8 @@ class SensorFrame:
     `frame_id` is the zero-based index of the line in rgb.txt for datasets. `color` is RGB, camera-coded. `response`
     is linear R G B for each code (None = sRGB). `exposure_s` None = reference exposure. `world_from_camera` is a
     given pose, if any. `color_jpeg` holds the encoded bytes if the source has them. `fisheye` are the current
-    fish-eye pictures.
+    fish-eye pictures. `found_pose` is what a node once found by the marker board: for viewers, because whoever
+    renders the frame finds it again.
     """
 
     frame_id: int
@@ -103,6 +104,7 @@ class SensorFrame:
     world_from_camera: Float64[np.ndarray, "4 4"] | None = None
     color_jpeg: bytes | None = None
     fisheye: FisheyePictures | None = None
+    found_pose: Float64[np.ndarray, "4 4"] | None = None
 
 
 @dataclass(frozen=True, eq=False)

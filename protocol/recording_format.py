@@ -1,7 +1,8 @@
 """Contents of a recording (docs/formats.md 2): topics, Deltalight's own messages, and Foxglove's beside them.
 
 Every frame is a group of messages with one log time, the capture time: picture, depth and calibration as Foxglove
-displays them, and last a `FrameRecord`, which completes the group. The first group begins with a `SessionRecord`.
+displays them, and last a `FrameRecord`, which completes the group. The first group begins with a `SessionRecord` and,
+if a scene document is attached, what Foxglove displays of it.
 Fish-eye pictures have groups of their own (`recording_fisheye`).
 """
 
@@ -13,13 +14,14 @@ from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from jaxtyping import Float64
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from deltalight.protocol.board import BoardSpec
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.errors import DeltalightError
-from deltalight.protocol.poses import wxyz_from_rotation
+from deltalight.protocol.poses import rigid_matrix, rotation_from_wxyz, wxyz_from_rotation
 
 SCHEMA_VERSION = 1
 SCENE_ATTACHMENT = "scene.json"
@@ -28,6 +30,7 @@ DEPTH_TOPIC, DEPTH_CAMERA_TOPIC = "/depth/image", "/depth/calibration"
 FISHEYE_TOPIC, FISHEYE_LINEAR_TOPIC = "/fisheye/image", "/fisheye/linear"
 FISHEYE_CAMERA_TOPIC = "/fisheye/calibration"
 POSE_TOPIC = "/tf"
+SCENE_TOPIC = "/scene"
 SESSION_TOPIC, FRAME_TOPIC = "/deltalight/session", "/deltalight/frame"
 FISHEYE_RECORD_TOPIC = "/deltalight/fisheye"
 FOXGLOVE_TOPICS: dict[str, Any] = {
@@ -39,6 +42,7 @@ FOXGLOVE_TOPICS: dict[str, Any] = {
     FISHEYE_LINEAR_TOPIC: RawImage,
     FISHEYE_CAMERA_TOPIC: CameraCalibration,
     POSE_TOPIC: FrameTransform,
+    SCENE_TOPIC: SceneUpdate,
 }
 WORLD_FRAME, COLOR_FRAME, DEPTH_FRAME, FISHEYE_FRAME = "world", "camera", "depth_camera", "fisheye_camera"
 RESPONSE_BYTES = 256 * 3 * 4
@@ -181,3 +185,10 @@ def transform_message(
     rotation = message.rotation
     rotation.w, rotation.x, rotation.y, rotation.z = wxyz_from_rotation(parent_from_child[:3, :3])
     return message
+
+
+def matrix_of(message: FrameTransform) -> Float64[np.ndarray, "4 4"]:
+    """Return the transform that a message of `transform_message` describes: parent_from_child."""
+    place, turn = message.translation, message.rotation
+    rotation = rotation_from_wxyz((turn.w, turn.x, turn.y, turn.z))
+    return rigid_matrix(rotation, np.array([place.x, place.y, place.z]))

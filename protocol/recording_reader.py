@@ -10,6 +10,7 @@ from typing import IO, Any
 
 import numpy as np
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
 from mcap.exceptions import McapError
@@ -30,15 +31,18 @@ from deltalight.protocol.frames import DepthImage, SensorFrame
 from deltalight.protocol.pictures import decode_rgb, depth_from_steps, is_jpeg
 from deltalight.protocol.recording_fisheye import FisheyeTrack
 from deltalight.protocol.recording_format import (
+    COLOR_FRAME,
     COLOR_TOPIC,
     DEPTH_TOPIC,
     FISHEYE_RECORD_TOPIC,
     FRAME_TOPIC,
+    POSE_TOPIC,
     SCENE_ATTACHMENT,
     SESSION_TOPIC,
     DepthRecord,
     FrameRecord,
     SessionRecord,
+    matrix_of,
 )
 from deltalight.protocol.scene import SceneDocument, parse_scene, resolve_asset
 
@@ -130,6 +134,7 @@ class RecordingReader:
             world_from_camera=None if pose is None else np.array(pose).reshape(4, 4),
             color_jpeg=data if is_jpeg(data) else None,
             fisheye=self._fisheye.at(record.timestamp_ns),
+            found_pose=_found_pose(parts.get(POSE_TOPIC)) if pose is None else None,
         )
 
     def _camera(self, record: FrameRecord) -> CameraModel:
@@ -317,6 +322,15 @@ def _depth_image(record: DepthRecord, data: bytes) -> DepthImage:
         return depth_from_steps(values.astype(np.uint16), record.scale, camera, record.noise_sigma_m)
     depth_m = values.astype(np.float32)
     return DepthImage(depth_m, depth_m > 0, camera, record.noise_sigma_m)
+
+
+def _found_pose(data: bytes | None) -> np.ndarray | None:
+    """Return the pose among a frame's transforms, whose last it is."""
+    try:
+        message = FrameTransform.FromString(data or b"")
+    except DecodeError:
+        return None
+    return matrix_of(message) if message.child_frame_id == COLOR_FRAME else None
 
 
 def _response(record: FrameRecord) -> np.ndarray | None:

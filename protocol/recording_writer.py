@@ -9,9 +9,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-import numpy as np
-from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
-from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import register_schema
 
@@ -19,35 +16,22 @@ from deltalight.protocol.board import BoardSpec
 from deltalight.protocol.calibration import Extrinsics
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.files import ACTIVE_SUFFIX
-from deltalight.protocol.frames import DepthImage, FisheyePictures, SensorFrame
-from deltalight.protocol.pictures import encode_png, exact_depth_scale, known_depth, steps_from_depth
-from deltalight.protocol.recording_fisheye import fisheye_messages
+from deltalight.protocol.frames import SensorFrame
 from deltalight.protocol.recording_format import (
-    COLOR_CAMERA_TOPIC,
-    COLOR_FRAME,
-    COLOR_TOPIC,
-    DEPTH_CAMERA_TOPIC,
-    DEPTH_FRAME,
-    DEPTH_TOPIC,
-    FISHEYE_FRAME,
     FOXGLOVE_TOPICS,
-    FRAME_TOPIC,
     OWN_TOPICS,
-    POSE_TOPIC,
     SCENE_ATTACHMENT,
+    SCENE_TOPIC,
     SESSION_TOPIC,
-    WORLD_FRAME,
-    DepthRecord,
-    FrameRecord,
     SessionRecord,
-    calibration_message,
-    timestamp_fields,
-    transform_message,
 )
+from deltalight.protocol.recording_messages import FrameMessages
+from deltalight.protocol.recording_scene import scene_message
 from deltalight.protocol.scene import DIGEST_PREFIX, SceneDocument
 
 CHUNK_BYTES = 256 * 1024
 SYNC_PERIOD_S = 1.0
+NO_SCHEMA = 0  # of MCAP's channels
 
 
 class RecordingWriter:
@@ -77,16 +61,11 @@ class RecordingWriter:
     ) -> None:
         self.path, self.active_path = path, path.with_name(path.name + ACTIVE_SUFFIX)
         self._check_names()
-        self._extrinsics, self._depth_scale, self._usual_scale = (
-            extrinsics or Extrinsics(),
-            depth_scale,
-            depth_scale,
-        )
-        self._session = SessionRecord(
-            board=board, extrinsics=self._extrinsics.to_dict(), depth_scale=depth_scale
-        )
+        extrinsics = extrinsics or Extrinsics()
+        self._messages = FrameMessages(extrinsics, depth_scale)
+        self._session = SessionRecord(board=board, extrinsics=extrinsics.to_dict(), depth_scale=depth_scale)
+        self._scene = scene
         self._last_ns, self._count, self._is_open = -1, 0, True
-        self._fisheye_ns: int | None = None
         with self._disk_errors():
             self._file = self.active_path.open("xb")
             self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
@@ -126,9 +105,12 @@ class RecordingWriter:
                 self._write(SESSION_TOPIC, frame.timestamp_ns, self._session.packed())
                 # In a chunk with nothing but the channels, because without these no other chunk can be read.
                 self._writer.flush()
-            if frame.fisheye is not None and frame.fisheye.timestamp_ns != self._fisheye_ns:
-                self._write_fisheye(frame.fisheye, frame.timestamp_ns)
-            self._write_frame(frame)
+                if self._scene is not None:
+                    self._write(
+                        SCENE_TOPIC, frame.timestamp_ns, scene_message(self._scene, frame.timestamp_ns)
+                    )
+            for topic, data in self._messages.of(frame):
+                self._write(topic, frame.timestamp_ns, data)
             self._writer.flush()
         self._last_ns = frame.timestamp_ns
         self._count += 1
@@ -158,9 +140,9 @@ class RecordingWriter:
         for topic, kind in FOXGLOVE_TOPICS.items():
             channels[topic] = self._writer.register_channel(topic, "protobuf", schemas[kind])
         for topic, record in OWN_TOPICS.items():
-            schema = json.dumps(record.model_json_schema()).encode()
-            schema_id = self._writer.register_schema(f"deltalight.{record.__name__}", "jsonschema", schema)
-            channels[topic] = self._writer.register_channel(topic, "msgpack", schema_id)
+            # No schema of MCAP describes msgpack: what a message holds is told beside it.
+            told = {"name": f"deltalight.{record.__name__}", "fields": json.dumps(record.model_json_schema())}
+            channels[topic] = self._writer.register_channel(topic, "msgpack", NO_SCHEMA, told)
         return channels
 
     def _attach_scene(self, scene: SceneDocument) -> None:
@@ -175,81 +157,6 @@ class RecordingWriter:
 
     def _write(self, topic: str, timestamp_ns: int, data: bytes) -> None:
         self._writer.add_message(self._channels[topic], timestamp_ns, data, timestamp_ns)
-
-    def _write_frame(self, frame: SensorFrame) -> None:
-        now = frame.timestamp_ns
-        self._write(COLOR_TOPIC, now, _color_message(frame).SerializeToString())
-        camera = calibration_message(frame.camera, COLOR_FRAME, now)
-        self._write(COLOR_CAMERA_TOPIC, now, camera.SerializeToString())
-        depth = None if frame.depth is None else self._write_depth(frame.depth, frame)
-        pose = frame.world_from_camera
-        if pose is not None:
-            transform = transform_message(pose, WORLD_FRAME, COLOR_FRAME, now)
-            self._write(POSE_TOPIC, now, transform.SerializeToString())
-        record = FrameRecord(
-            frame_id=frame.frame_id,
-            timestamp_ns=now,
-            camera=frame.camera.to_dict(),
-            exposure_s=frame.exposure_s,
-            response=None if frame.response is None else frame.response.astype("<f4").tobytes(),
-            world_from_camera=None if pose is None else pose.ravel().tolist(),
-            depth=depth,
-            fisheye_ns=None if frame.fisheye is None else frame.fisheye.timestamp_ns,
-        )
-        self._write(FRAME_TOPIC, now, record.packed())
-
-    def _write_depth(self, depth: DepthImage, frame: SensorFrame) -> DepthRecord:
-        now, scale = frame.timestamp_ns, self._scale_for(depth)
-        values = (
-            known_depth(depth).astype("<f4")
-            if scale is None
-            else steps_from_depth(depth, scale).astype("<u2")
-        )
-        name = COLOR_FRAME if depth.camera == frame.camera else DEPTH_FRAME
-        message = RawImage(
-            timestamp=timestamp_fields(now if frame.depth_timestamp_ns is None else frame.depth_timestamp_ns),
-            frame_id=name,
-            width=values.shape[1],
-            height=values.shape[0],
-            encoding="32FC1" if scale is None else "16UC1",
-            step=values.strides[0],
-            data=values.tobytes(),
-        )
-        self._write(DEPTH_TOPIC, now, message.SerializeToString())
-        camera = calibration_message(depth.camera, name, now)
-        self._write(DEPTH_CAMERA_TOPIC, now, camera.SerializeToString())
-        if name == DEPTH_FRAME:
-            self._write_depth_place(now)
-        return DepthRecord(
-            camera=depth.camera.to_dict(),
-            timestamp_ns=frame.depth_timestamp_ns,
-            scale=scale,
-            noise_sigma_m=depth.noise_sigma_m,
-        )
-
-    def _write_fisheye(self, pictures: FisheyePictures, now: int) -> None:
-        for topic, data in fisheye_messages(pictures):
-            self._write(topic, now, data)
-        own, probe = self._extrinsics.rgb_from_fisheye, self._extrinsics.world_from_fisheye
-        parent, place = (WORLD_FRAME, probe) if own is None else (COLOR_FRAME, own)
-        if place is not None:
-            transform = transform_message(place, parent, FISHEYE_FRAME, now)
-            self._write(POSE_TOPIC, now, transform.SerializeToString())
-        self._fisheye_ns = pictures.timestamp_ns
-
-    def _write_depth_place(self, now: int) -> None:
-        depth_from_rgb = self._extrinsics.depth_from_rgb
-        rgb_from_depth = np.eye(4) if depth_from_rgb is None else np.linalg.inv(depth_from_rgb)
-        transform = transform_message(rgb_from_depth, COLOR_FRAME, DEPTH_FRAME, now)
-        self._write(POSE_TOPIC, now, transform.SerializeToString())
-
-    def _scale_for(self, depth: DepthImage) -> float | None:
-        if self._depth_scale is not None:
-            return self._depth_scale
-        # The last frame's exact step is most likely exact again.
-        scale = exact_depth_scale(depth, self._usual_scale)
-        self._usual_scale = scale
-        return scale
 
     def _sync_each_second(self) -> None:
         """Synchronise in a separate thread, so that a slow disk does not delay the frames."""
@@ -270,9 +177,3 @@ class RecordingWriter:
             self.active_path.unlink()
         elif rename:
             self.active_path.rename(self.path)
-
-
-def _color_message(frame: SensorFrame) -> CompressedImage:
-    kind, data = ("jpeg", frame.color_jpeg) if frame.color_jpeg else ("png", encode_png(frame.color))
-    stamp = timestamp_fields(frame.timestamp_ns)
-    return CompressedImage(timestamp=stamp, frame_id=COLOR_FRAME, data=data, format=kind)

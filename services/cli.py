@@ -21,6 +21,7 @@ from deltalight.services.commands.config import config
 from deltalight.services.commands.demo import demo
 from deltalight.services.commands.doctor import doctor
 from deltalight.services.commands.examples import examples_of
+from deltalight.services.commands.foxglove import foxglove
 from deltalight.services.commands.graph import graph
 from deltalight.services.commands.keys import keys
 from deltalight.services.commands.node import node
@@ -45,7 +46,22 @@ app = typer.Typer(
     rich_markup_mode="rich",
     help="Mixed-reality relighting: virtual objects in a camera picture, with light that acts both ways.",
 )
-for command in (render, demo, node, server, up, record, replay, config, doctor, graph, schema, board, ping):
+for command in (
+    render,
+    demo,
+    node,
+    server,
+    up,
+    record,
+    replay,
+    foxglove,
+    config,
+    doctor,
+    graph,
+    schema,
+    board,
+    ping,
+):
     app.command(epilog=examples_of(command.__name__))(command)
 app.add_typer(api, name="api")
 app.add_typer(recordings, name="recordings")

@@ -1,7 +1,7 @@
 """Reassembly of a sensor node's raw streams into the frames that its camera delivered.
 
-Each colour picture gets the depth of its moment, the current fish-eye picture, and its pose if one was given; a pose
-found by the marker board is found again when the frame is replayed.
+Each colour picture gets the depth of its moment, the current fish-eye picture, and its pose if one was given. A pose
+found by the marker board is kept apart, because it is found again when the frame is replayed.
 """
 
 from collections import Counter, deque
@@ -153,6 +153,7 @@ class RawFrameAssembler:
             world_from_camera=None if pose is None else _given_pose(pose),
             color_jpeg=jpeg,
             fisheye=self._fisheye_at(header.capture_ns),
+            found_pose=None if pose is None else _found_pose(pose),
         )
 
     def _depth_image(self, depth: _Held[DepthMessage]) -> DepthImage:
@@ -185,6 +186,17 @@ class RawFrameAssembler:
 
 def _given_pose(pose: PoseMessage) -> np.ndarray | None:
     """Return the pose if it was given with the frame: without a reprojection error, no board was searched."""
-    if pose.world_from_camera is None or pose.reprojection_error_px is not None:
-        return None
-    return np.array(pose.world_from_camera)
+    return None if _is_found(pose) else _matrix(pose)
+
+
+def _found_pose(pose: PoseMessage) -> np.ndarray | None:
+    """Return the pose if the node found it by the board."""
+    return _matrix(pose) if _is_found(pose) else None
+
+
+def _is_found(pose: PoseMessage) -> bool:
+    return pose.reprojection_error_px is not None
+
+
+def _matrix(pose: PoseMessage) -> np.ndarray | None:
+    return None if pose.world_from_camera is None else np.array(pose.world_from_camera)

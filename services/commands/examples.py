@@ -11,6 +11,7 @@ EXAMPLES = {
     "up": ("deltalight up --source synthetic", "deltalight up --source take.mcap --scene scene.json"),
     "record": ("deltalight record -o take.mcap --duration 10",),
     "replay": ("deltalight replay take.mcap",),
+    "foxglove": ("deltalight foxglove", "deltalight foxglove --port 8766"),
     "config": ("deltalight config",),
     "doctor": ("deltalight doctor",),
     "graph": ("deltalight graph", "deltalight graph --method dlpv"),

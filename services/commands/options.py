@@ -3,12 +3,16 @@
 import re
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.method_names import METHODS
+from deltalight.services.ports import NODE_PORT, endpoint
+
+if TYPE_CHECKING:
+    from deltalight.protocol.keys import KeySettings
 
 
 class View(StrEnum):
@@ -90,3 +94,18 @@ def parse_frames(text: str | None, count: int) -> range:
             f" choose A < B within 0:{count}."
         )
     return range(first, end)
+
+
+def node_endpoints(subscribe: list[str] | None, node: str | None, settings: "KeySettings") -> list[str]:
+    """Return the given endpoints, or the one of the node to be found, or the default.
+
+    Raises:
+        DeltalightError: both were given, or no such node announces itself.
+    """
+    if node is None:
+        return subscribe or [endpoint(NODE_PORT)]
+    if subscribe:
+        raise DeltalightError("--subscribe and --node both say where the node is; give one of them.")
+    from deltalight.services.discovery import node_endpoint
+
+    return [node_endpoint(node, settings)]

@@ -12,11 +12,10 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from deltalight.services.commands.options import ConfigFile, NodeName
-from deltalight.services.ports import NODE_PORT, endpoint
+from deltalight.services.commands.options import ConfigFile, NodeName, node_endpoints
 
 if TYPE_CHECKING:
-    from deltalight.protocol.keys import Keys, KeySettings
+    from deltalight.protocol.keys import Keys
     from deltalight.protocol.scene import SceneDocument
     from deltalight.services.recorder import Recorder, RecordStatus
 
@@ -60,7 +59,7 @@ def record(
     from deltalight.services.settings import load_configuration
 
     settings = load_configuration(config_file).section("keys", KeySettings)
-    places = _endpoints(subscribe, node, settings)
+    places = node_endpoints(subscribe, node, settings)
     keys = settings.load(places if control is None else [*places, control])
     job = RecordJob(
         out,
@@ -76,19 +75,6 @@ def record(
     recorder = Recorder(job, lambda sentence: console.print(sentence, markup=False, highlight=False))
     shown = _progress_lines() if progress else _progress_on(console)
     _run(recorder, shown, lambda status: _print_summary(status, as_json=as_json))
-
-
-def _endpoints(subscribe: list[str] | None, node: str | None, settings: "KeySettings") -> list[str]:
-    """Return the given endpoints, or the one of the node to be found."""
-    from deltalight.protocol.errors import DeltalightError
-
-    if node is None:
-        return subscribe or [endpoint(NODE_PORT)]
-    if subscribe:
-        raise DeltalightError("--subscribe and --node both say where the node is; give one of them.")
-    from deltalight.services.discovery import node_endpoint
-
-    return [node_endpoint(node, settings)]
 
 
 def _scene(path: Path | None, control: str | None, keys: "Keys | None") -> "SceneDocument | None":

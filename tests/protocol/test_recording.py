@@ -158,11 +158,13 @@ def test_foxglove_messages_say_what_the_frame_holds(tmp_path: Path) -> None:
         summary = reader.get_summary()
         assert summary is not None
         topics = {channel.topic: channel for channel in summary.channels.values()}
-        schemas = {name: summary.schemas[channel.schema_id] for name, channel in topics.items()}
+        schemas = {channel.topic: summary.schemas.get(channel.schema_id) for channel in topics.values()}
         assert schemas["/color/image"].name == "foxglove.CompressedImage"
         assert schemas["/depth/image"].name == "foxglove.RawImage"
-        assert topics["/deltalight/frame"].message_encoding == "msgpack"
-        assert json.loads(schemas["/deltalight/frame"].data)["title"] == "FrameRecord"
+        own = topics["/deltalight/frame"]
+        assert own.message_encoding == "msgpack"
+        assert schemas["/deltalight/frame"] is None, "no schema of MCAP describes msgpack"
+        assert json.loads(own.metadata["fields"])["title"] == "FrameRecord"
         shown = ["/color/image", "/color/calibration", "/depth/image", "/tf"]
         first = {
             (item.channel.topic, getattr(item.decoded_message, "child_frame_id", "")): item.decoded_message
@@ -179,6 +181,18 @@ def test_foxglove_messages_say_what_the_frame_holds(tmp_path: Path) -> None:
     assert pose.parent_frame_id == "world"
     assert recorded[0].world_from_camera is not None
     assert pose.translation.x == recorded[0].world_from_camera[0, 3]
+
+
+def test_a_pose_that_a_node_found_is_for_viewers(tmp_path: Path) -> None:
+    found = np.eye(4)
+    found[:3] = [[0, -1, 0, 0.1], [1, 0, 0, 0.2], [0, 0, 1, 0.3]]
+    taken = replace(frames(1)[0], world_from_camera=None, found_pose=found)
+    (frame,) = RecordingReader(record(tmp_path / "a.mcap", [taken]))
+    assert frame.world_from_camera is None, "a replay finds it again"
+    assert frame.found_pose is not None
+    np.testing.assert_allclose(frame.found_pose, found, atol=1e-12)
+    (other,) = RecordingReader(record(tmp_path / "b.mcap", [replace(taken, found_pose=None)]))
+    assert other.found_pose is None, "the depth camera's transform is another one"
 
 
 def test_the_scene_is_attached_with_paths_relative_to_the_recording(tmp_path: Path) -> None:

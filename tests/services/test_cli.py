@@ -43,6 +43,7 @@ COMMANDS = {
     "keys trust",
     "config",
     "doctor",
+    "foxglove",
     "graph",
     "schema",
     "bench speed",

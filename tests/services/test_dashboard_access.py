@@ -125,3 +125,13 @@ def test_axe_finds_no_fault_in_the_sign_in_page(page: Page) -> None:
     page.get_by_label("Token").wait_for()
     page.evaluate(AXE.read_text())
     assert page.evaluate("async () => (await axe.run()).violations.map((each) => each.help)") == []
+
+
+def test_the_reference_of_the_api_comes_from_the_service_alone(guarded: LiveApi, page: Page) -> None:
+    fetched: list[str] = []
+    page.on("request", lambda request: fetched.append(request.url))
+    page.goto(f"http://{guarded.address}/docs")
+    page.locator(".opblock-summary").first.click()
+    expect(page.get_by_text("List all scenes.")).to_be_visible()
+    assert all(url.startswith((f"http://{guarded.address}/", "data:")) for url in fetched), fetched
+    assert any(url.endswith("/openapi.json") for url in fetched)
