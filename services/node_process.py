@@ -14,6 +14,7 @@ from deltalight.protocol.messages import ControlRequest
 from deltalight.protocol.request import ReplyServer
 from deltalight.sensor_node.cameras.playback import PlaybackCamera
 from deltalight.sensor_node.node import NodeConfig, run_node
+from deltalight.services.kept_memory import keep_freed_memory
 from deltalight.services.settings import load_configuration
 
 OPS = ("position", "play", "pause", "seek", "rate")  # of a replay's control endpoint (SPEC.md, section 6)
@@ -36,6 +37,7 @@ def run_configured_node(
     Raises:
         DeltalightError: the settings are wrong, or the source, an endpoint or a key cannot be used.
     """
+    keep_freed_memory()
     configuration = load_configuration(config_file)
     config = configuration.section("node", NodeConfig, given)
     endpoints = [each for each in (config.endpoint, config.clock_endpoint, control) if each is not None]
