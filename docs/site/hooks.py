@@ -10,6 +10,7 @@ from pathlib import Path
 
 from latex2mathml.converter import convert
 from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.plugins import event_priority
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
@@ -22,6 +23,7 @@ FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>',
 LEXERS = {".py": "python", ".yml": "yaml", ".toml": "toml"}
 
 
+@event_priority(100)  # mkdocstrings drops paths that do not exist yet
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
     """Lays out the package as wheels have it, because griffe reads sources and knows no `__path__`."""
     API.mkdir(parents=True, exist_ok=True)
