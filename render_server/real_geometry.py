@@ -140,7 +140,8 @@ class RealGeometry:
                 "The source has no depth: record depth, or give the scene a model (`real: {geometry: {model: ...}}`)."
             )
         samples = FrameSamples.of(taken.frame)
-        moved = self._motion.update(samples)
+        # Depth without a surface (a camera that starts) explains nothing: the next frame counts as another scene.
+        moved = self._motion.update(samples) or self.state is None
         if moved:
             self._last, self.seen = samples, taken
             self._surfaces.clear()

@@ -14,7 +14,7 @@ from deltalight.protocol.methods import PLUGINS
 from deltalight.protocol.request import RequestClient
 from deltalight.protocol.scene import SceneDocument, parse_scene
 from deltalight.services.api.app import create_app
-from deltalight.services.api.connections import LimitedProtocol
+from deltalight.services.api.connections import HEAD_TIMEOUT_S, LimitedProtocol
 from deltalight.services.api.settings import ApiSettings
 from deltalight.services.host_store import FIRST_SCENE, activate_document, import_scene
 from deltalight.services.storage.store import Store, default_folder
@@ -72,6 +72,8 @@ def http_server(app: FastAPI) -> uvicorn.Server:
         server_header=False,
         proxy_headers=False,  # anybody could send them, and so choose the address that is counted
         limit_concurrency=MAX_CONNECTIONS,
+        # Longer than clients keep a connection (httpx: 5 s), which would meet its end with a request.
+        timeout_keep_alive=round(HEAD_TIMEOUT_S),
         timeout_graceful_shutdown=1,
         ws_max_size=LARGEST_SOCKET_MESSAGE,
         ws_per_message_deflate=False,  # JPEG does not compress further

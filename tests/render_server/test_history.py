@@ -146,3 +146,18 @@ def test_an_object_that_moves_less_than_a_voxel(gpu: GpuContext, stage: Stage, o
     renderer.release()
     assert placements[0] == placements[1]
     assert differing_pixels(found, fresh(gpu, end, seen(HERE))) == 0
+
+
+def test_depth_that_begins_empty_is_taken_when_it_comes(gpu: GpuContext, stage: Stage) -> None:
+    """A depth camera that starts shows no surface at first, while nothing in the room moves."""
+    document = room(stage, has_model=False, operator="paper", volume_edge_m=0.5)
+    good = seen(HERE)
+    blind = frame(
+        checkered(), pose=look_at(HERE), depth=depth_image(np.zeros_like(floor_depth(look_at(HERE))))
+    )
+    renderer = SceneRenderer(gpu, document)
+    for _ in range(2):
+        assert np.array_equal(renderer.render(blind).color, renderer.sized(blind).color)
+    found = renderer.render(good)
+    renderer.release()
+    assert np.array_equal(found.color, fresh(gpu, document, good).color)
