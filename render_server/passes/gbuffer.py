@@ -77,14 +77,15 @@ class CameraImage:
 
     def _write_response(self, decode: Float32[np.ndarray, "256 3"], exposure_scale: float) -> None:
         """Uploads the radiance of the codes and its inverse, unless they are the same as before."""
-        if decode is self._response_of and exposure_scale == self.exposure_scale:
+        is_same = decode is self._response_of
+        if is_same and exposure_scale == self.exposure_scale:
             return
-        self._response_of = decode
-        self.exposure_scale = exposure_scale
+        self._response_of, self.exposure_scale = decode, exposure_scale
         radiance = np.ones((256, 4), np.float16)
         radiance[:, :3] = decode / np.float32(exposure_scale)
         self.code_radiance.write(radiance.tobytes(), alignment=1)
-        self.inverse_response.write(inverse_response(decode).tobytes(), alignment=1)
+        if not is_same:  # exposure may change with every frame, and the inverse takes a millisecond
+            self.inverse_response.write(inverse_response(decode).tobytes(), alignment=1)
 
     def build_levels(self) -> None:
         """Builds the mip levels of the linear picture (for samples that cover several pixels)."""

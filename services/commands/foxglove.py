@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from deltalight.services.commands.options import ConfigFile, NodeName, node_endpoints
+from deltalight.services.commands.options import ConfigFile, NodeName, NodeStreams, node_endpoints
 from deltalight.services.ports import COMPOSITE_PORT, CONTROL_PORT, LOOPBACK, endpoint
 
 FOXGLOVE_PORT = 8765  # which Foxglove suggests
@@ -13,12 +13,7 @@ FOXGLOVE_PORT = 8765  # which Foxglove suggests
 
 def foxglove(
     *,
-    subscribe: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Endpoint of the node's streams; may be given more than once. Default: tcp://127.0.0.1:5601."
-        ),
-    ] = None,
+    subscribe: NodeStreams = None,
     node: NodeName = None,
     name: Annotated[str | None, typer.Option(help="Name of the node, if several publish there.")] = None,
     composites: Annotated[

@@ -50,6 +50,12 @@ ConfigFile = Annotated[
         help="Configuration file; default: ./deltalight.toml, then ~/.config/deltalight/deltalight.toml.",
     ),
 ]
+NodeStreams = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="Endpoint of the node's streams; may be given more than once. Default: tcp://127.0.0.1:5601."
+    ),
+]
 NodeName = Annotated[
     str | None,
     typer.Option("--node", help="Name of a node to find on the network; `auto` uses the only one found."),

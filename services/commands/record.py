@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from deltalight.services.commands.options import ConfigFile, NodeName, node_endpoints
+from deltalight.services.commands.options import ConfigFile, NodeName, NodeStreams, node_endpoints
 
 if TYPE_CHECKING:
     from deltalight.protocol.keys import Keys
@@ -29,12 +29,7 @@ def record(
     out: Annotated[
         Path, typer.Option("--out", "-o", help="Recording to write, NAME.mcap; it must not exist.")
     ],
-    subscribe: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Endpoint of the node's streams; may be given more than once. Default: tcp://127.0.0.1:5601."
-        ),
-    ] = None,
+    subscribe: NodeStreams = None,
     node: NodeName = None,
     name: Annotated[str | None, typer.Option(help="Name of the node, if several publish there.")] = None,
     scene: Annotated[Path | None, typer.Option(help="Scene document to attach.")] = None,
