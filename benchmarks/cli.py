@@ -90,6 +90,30 @@ def counts(
 
 
 @bench.command()
+def sweep(
+    *,
+    full: Annotated[
+        bool,
+        typer.Option(
+            "--full", help="All sizes, for a GPU: up to 512 voxels an edge; default what two CPUs do."
+        ),
+    ] = False,
+    size: Size = None,
+    frames: Annotated[int, typer.Option(min=1, max=1000, help="Frames of each size.")] = 8,
+    device: Device = None,
+    out: ReportFile = None,
+    as_json: AsJson = False,
+) -> None:
+    """Time stages as shadow maps, volumes and steps grow, beside the times published in the dissertation."""
+    from deltalight.services.commands.options import parse_size
+
+    size_px = None if size is None else parse_size(size)
+    from deltalight.benchmarks.speed.command import run_sweeps
+
+    run_sweeps(frames, size_px, device, full=full, out=out, as_json=as_json)
+
+
+@bench.command()
 def quality(
     *,
     scenes: Annotated[
@@ -128,6 +152,24 @@ def quality(
     chosen = None if scenes is None else scenes.split(",")
     compared = None if ablation else methods
     run_quality(chosen, compared, size_px, spp, volume_size=volume, device=device, out=out, as_json=as_json)
+
+
+@bench.command()
+def real(
+    *,
+    data: Annotated[Path, typer.Option(help="Folder of real pairs: carton_table and robot_bins.")],
+    out: Annotated[Path, typer.Option(help="Folder for the report.")] = Path("real"),
+    device: Device = None,
+    as_json: AsJson = False,
+) -> None:
+    """Compare relit tables with photographs taken with and without things: lights fitted in one, tested in others."""
+    try:
+        from deltalight.benchmarks.real.command import run_real
+    except ModuleNotFoundError as missing:
+        raise DeltalightError(
+            f"`bench real` needs the package {missing.name}; install the project with its dev extra."
+        ) from missing
+    run_real(data, out, device=device, as_json=as_json)
 
 
 @bench.command()
@@ -180,6 +222,41 @@ def rest(
         typer.echo(json.dumps(report, indent=2))
     else:
         print_report(report)
+
+
+@bench.command()
+def soak(
+    *,
+    minutes: Annotated[
+        float, typer.Option(min=0, max=7 * 24 * 60, help="Length; each fault is run at least once.")
+    ] = 2.0,
+    profile: Annotated[
+        str,
+        typer.Option(
+            help="station: four nodes, 320x240, 15 pictures a second; desk: one node, 10 a second; small: one node, "
+            "5 a second, short faults."
+        ),
+    ] = "station",
+    faults: Annotated[
+        str,
+        typer.Option(
+            help="all, none, or of these, separated by commas: kill-node, kill-server, kill-web, kill-recorder, "
+            "stop-node, stop-server, stop-web, viewers, churn, nonsense, link-arm, link-foxglove, cut."
+        ),
+    ] = "all",
+    seed: Annotated[
+        int, typer.Option(min=0, help="What the order of faults and all chance in them follow.")
+    ] = 0,
+    out: Annotated[Path, typer.Option(help="Folder for the report.")] = Path("soak"),
+) -> None:
+    """Run a station of real processes under faults, and report what became of age, rate, memory and handles."""
+    from deltalight.benchmarks.soak.command import SoakJob, print_report, run_soak
+    from deltalight.benchmarks.soak.faults import parse_faults
+    from deltalight.benchmarks.soak.profiles import choose_profile
+
+    choose_profile(profile)
+    job = SoakJob(profile, parse_faults(faults), 60 * minutes, seed)
+    print_report(run_soak(job, out, lambda text: typer.echo(f"soak: {text}", err=True)), out)
 
 
 def _speed_job(methods: str, motions: str, frames: int, size: str | None, device: int | None) -> "SpeedJob":

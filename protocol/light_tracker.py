@@ -7,7 +7,7 @@ from jaxtyping import Float32
 
 from deltalight.protocol.frames import LUMINANCE
 from deltalight.protocol.median_cut import RegionLight
-from deltalight.protocol.messages import MAX_LIGHTS
+from deltalight.protocol.message_fields import MAX_LIGHTS
 from deltalight.protocol.sky_lights import TrackedLight
 
 # Lights of successive pictures within this angle may be the same. A hand-held lamp at 1 m moves as far within a time

@@ -13,7 +13,8 @@ from deltalight.protocol.curve import guard
 from deltalight.protocol.envelope import EnvelopeError
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.keys import Keys
-from deltalight.protocol.messages import MAX_PAYLOAD_BYTES, ControlReply, ControlRequest, as_sentence
+from deltalight.protocol.message_fields import as_sentence
+from deltalight.protocol.messages import MAX_PAYLOAD_BYTES, ControlReply, ControlRequest
 from deltalight.protocol.payloads import decode_control, encode_control
 from deltalight.protocol.sockets import attach, open_socket
 

@@ -6,6 +6,7 @@ from pydantic import ConfigDict, Field, model_validator
 
 from deltalight.protocol.documents import StrictModel
 from deltalight.protocol.quality import TIERS, Quality, QualityTier
+from deltalight.protocol.scene_fields import View
 
 DEFAULT_METHOD = "dvct"
 T = TypeVar("T")
@@ -469,8 +470,6 @@ class Output(StrictModel):
     )
     antialiasing: bool = Field(default=False, description="Smooth the edges of virtual objects.")
     camera_artifacts: bool = Field(
-        default=False, description="Put the camera's noise and blur on the virtual part."
+        default=False, description="Put the camera's noise on the virtual part, as its still frames show it."
     )
-    view: Literal["composite", "effects", "delta", "volume", "rsm", "lights"] = Field(
-        default="composite", description="The picture, or a look inside."
-    )
+    view: View = Field(default="composite", description="The picture, or a look inside.")

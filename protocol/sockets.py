@@ -9,6 +9,8 @@ from deltalight.protocol.keys import CREATE_HINT, Keys
 from deltalight.protocol.messages import MAX_PART_BYTES
 
 HIGH_WATER_MARK = 2  # frames; with the default of 1000 a slow consumer saw frames that were seconds old
+# What the kernel may hold for one subscriber. It would take megabytes by itself, which on a slow network are seconds.
+SEND_BUFFER_BYTES = 1 << 17
 RECONNECT_MS = 100
 RECONNECT_MAX_MS = 1000
 HEARTBEAT_MS = 1000
@@ -43,6 +45,7 @@ def open_socket(
     socket.linger = 0
     if kind == zmq.PUB:
         socket.sndhwm = high_water_mark
+        socket.sndbuf = SEND_BUFFER_BYTES
     else:  # a SUB socket sends its subscriptions, and loses those beyond its send mark
         socket.rcvhwm = high_water_mark
     socket.maxmsgsize = max_bytes

@@ -137,7 +137,12 @@ class Composition:
         *layers: Any,  # noqa: ANN401 (of RelitLayers, in their order)
     ) -> RelitPicture:
         """Composes the relit picture, and keeps by which ratio it changed."""
-        relit = RelitLayers(scene["object_coverage"], *layers)
+        return self.compose_layers(image, scene, options, RelitLayers(scene["object_coverage"], *layers))
+
+    def compose_layers(
+        self, image: CameraImage, scene: Bindings, options: CompositeOptions, relit: RelitLayers
+    ) -> RelitPicture:
+        """Composes the relit picture of layers that belong together."""
         self._composite.run(image, relit, {**scene, **options.bindings})
         view = options.output.view
         if view == "volume" and relit.voxels is not None:
@@ -195,6 +200,8 @@ class FrameGraph:
         self._options: Resource[CompositeOptions] = self.graph.source("output", "scene")
         self._linear: Resource[CameraImage] = self.graph.source("linear picture", "view")
         self._others: tuple[int, ...] = ()  # versions of the other sources
+        self._gpu, self._timers = gpu, timers
+        self._views: Composition | None = None  # made when somebody looks at another view
         self._composite = self._declare_composition(Composition(gpu, view.size))
         self._inputs: FrameInputs | None = None
 
@@ -203,7 +210,7 @@ class FrameGraph:
         radiance = self._radiance = g.stage(
             "interior edges", self.buffers.antialias_interior, layers.radiance, s.object_surface
         )
-        relit = g.stage(
+        relit = self._relit = g.stage(
             "relit picture",
             composition.compose,
             self._linear,
@@ -312,6 +319,20 @@ class FrameGraph:
         self._options.write(options, eq)
         self._run()
         return self._composite.value
+
+    def render_view(self, options: CompositeOptions) -> Composite:
+        """Composes the frame once more, with other options; what `render` composed stays as it is.
+
+        So the next frame at rest is composed by the kept ratio all the same.
+        """
+        image, relit = self.buffers.image, self._relit.value
+        if not image.is_linear:
+            image.linearize()
+        if self._views is None:
+            self._views = Composition(self._gpu, self.resources.view.value.size)
+            self.graph.own(self._views)
+        with self._timers.measure("other views"):
+            return self._views.compose_layers(image, relit.scene, options, relit.layers).composite
 
     def _run(self, *targets: Resource[Any], until_s: float | None = None) -> bool:
         """Runs the graph with the newest picture in linear radiance; a scene at rest does without."""

@@ -10,6 +10,7 @@ from jaxtyping import Float64
 
 from deltalight.protocol.frames import ViewFrame
 from deltalight.protocol.scene import SceneDocument
+from deltalight.protocol.scene_fields import View
 from deltalight.protocol.scene_method import Output
 from deltalight.protocol.scene_objects import Material
 from deltalight.render_server.estimation.albedo import AlbedoEstimator
@@ -58,6 +59,11 @@ class RelitFrame:
             return composite
         self.enlarge.run(self.frame.color, self.graph.buffers.image, composite, self.shown().object_coverage)
         return self.enlarge
+
+    def compose_view(self, view: View) -> Composite:
+        """Renders the frame in another view, at the size of its graph."""
+        output = self.options.output.replaced(view=view)
+        return self.graph.render_view(replace(self.options, output=output, with_linear=False))
 
     def shown(self) -> ShownBuffers:
         """Returns the geometry buffers."""
@@ -111,14 +117,17 @@ class LiveScene:
         ] = ()  # what the newest picture was made from, camera and room left out,
         self._changed_ns = 0  # and when that or anything else last changed
         self._fields = OcclusionFields(self._notify, waits=waits)
+        self._waits = waits
+        self._unobserved = False  # the real scene moved while its lights were provisional
         self._accumulated: ViewFrame | None = None  # last frame already accumulated
         self._budget = self._new_budget(scene)
         self._plan = self._planned(scene)
+        self._waits = True  # from now on, what is shown already would change twice
         self.lighting = self._plan.lighting
         self._apply(self._plan)
 
-    def _planned(self, scene: SceneDocument) -> _Plan:
-        """Checks everything that can fail before anything is replaced."""
+    def _planned(self, scene: SceneDocument, before: LightEstimator | None = None) -> _Plan:
+        """Checks everything that can fail before anything is replaced. `before`: the lights so far, of this room."""
         document = scene.method.replaced(quality=self._budget.level.quality)
         method = choose_method(document, software=self._gpu.is_software)
         if method.remark is not None:
@@ -127,7 +136,8 @@ class LiveScene:
         self._objects.load(scene.objects)
         for sentence in (*unsupported_requests(scene), *self._objects.left_out(scene.objects)):
             self._notify(sentence)
-        return _Plan(scene, method, LightEstimator(scene.lights, self._notify))
+        known = before if method.keeps_world else None
+        return _Plan(scene, method, LightEstimator(scene.lights, self._notify, known, waits=self._waits))
 
     def _notify(self, sentence: str) -> None:
         if sentence not in self._notices:
@@ -139,7 +149,7 @@ class LiveScene:
         if (scene.method, scene.output.frame_budget_ms) != (old.method, old.output.frame_budget_ms):
             self._budget = self._new_budget(scene)
         try:
-            self._apply(self._planned(scene))
+            self._apply(self._planned(scene, self.lighting))
         except BaseException:
             self._budget = before
             raise
@@ -226,8 +236,12 @@ class LiveScene:
         surfaces = self._surface_table(frame, moved=moved)
         inputs = self._inputs(self._real, taken, size, objects, surfaces)
         graph.set_inputs(inputs)
-        graph.set_lights(self.lighting.estimate(graph, moved=moved))
-        if moved and self._real.has_unseen and self._albedo.observe(graph, self.lighting.lights):
+        changed = self._note_change(objects, frame, moved=moved)
+        graph.set_lights(self.lighting.estimate(graph, moved=moved, is_at_rest=self._is_at_rest(frame)))
+        self._unobserved |= moved
+        is_due = self._unobserved and not self.lighting.is_provisional
+        self._unobserved &= not is_due
+        if is_due and self._real.has_unseen and self._albedo.observe(graph, self.lighting.lights):
             graph.renew_albedo()
             graph.set_lights(self.lighting.lights)
             if self._best is not None:
@@ -235,17 +249,26 @@ class LiveScene:
             if self._spare is not None:
                 self._spare.renew_albedo()
         self._accumulated = frame
-        changing = (objects, self.lighting.lights, self._plan)
-        changed = moved or not _same_objects(changing, self._changing)
-        if changed:
-            self._changing, self._changed_ns = changing, frame.timestamp_ns
+        changed |= self._note_change(objects, frame, moved=False)
         options = self._options(self._plan.scene.output)
-        if self._real.is_settled and frame.timestamp_ns - self._changed_ns >= REST_NS:
+        if self._is_at_rest(frame):
             best = self._refined(self._inputs(self._real, taken, view.size, objects, surfaces))
             if best is not None:
                 return RelitFrame(frame, best, options, Level("best"), moves=False, enlarge=None)
         enlarge = None if size == view.size else self._enlarged_to(view.size)
         return RelitFrame(frame, graph, options, level, changed, enlarge)
+
+    def _note_change(self, objects: GeometryState, frame: ViewFrame, *, moved: bool) -> bool:
+        """Returns whether anything differs from what the newest picture was made from, and notes when it did."""
+        changing = (objects, self.lighting.lights, self._plan)
+        changed = moved or not _same_objects(changing, self._changing)
+        if changed:
+            self._changing, self._changed_ns = changing, frame.timestamp_ns
+        return changed
+
+    def _is_at_rest(self, frame: ViewFrame) -> bool:
+        assert self._real is not None
+        return self._real.is_settled and frame.timestamp_ns - self._changed_ns >= REST_NS
 
     def _level(self, *, whole: bool) -> Level:
         """Returns what the next frame is rendered at; views of the inside are never enlarged."""
@@ -359,7 +382,6 @@ def unsupported_requests(scene: SceneDocument) -> list[str]:
     """Returns sentences on requests of the document that this release does not render."""
     materials = [item.material for item in scene.objects if isinstance(item.material, Material)]
     requests = {
-        "output.camera_artifacts": scene.output.camera_artifacts,
         f"shading.name `{scene.shading.name}`": scene.shading.name not in ("auto", "volume"),
         "a material's transmission": any(material.transmission > 0 for material in materials),
     }

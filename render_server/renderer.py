@@ -4,26 +4,39 @@ No sockets, no files except the scene's assets.
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import cv2
+import moderngl
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
 from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.camera_noise import CameraNoise
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import ViewFrame
 from deltalight.protocol.scene import SceneDocument
+from deltalight.protocol.scene_fields import ShownView, View
 from deltalight.render_server.frame_budget import Level
+from deltalight.render_server.frame_graph import ShownBuffers
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.textures import AsyncReadback, read_texture
 from deltalight.render_server.graph import Graph
 from deltalight.render_server.live_scene import LiveScene, RelitFrame
-from deltalight.render_server.passes.composite import Composite
+from deltalight.render_server.passes.composite import Composite, Enlarge
 from deltalight.render_server.picking import SHOWN_FRACTION, Pick, ShownFrame, raster_texels
 from deltalight.render_server.view import CameraView, output_size, resized_frame
+
+
+@dataclass(frozen=True, eq=False)
+class OtherView:
+    """A frame in another view, at the composite's size; a pose of None: it is not the camera's picture."""
+
+    view: ShownView
+    color: UInt8[np.ndarray, "h w 3"]
+    world_from_camera: Float64[np.ndarray, "4 4"] | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +46,7 @@ class CompositeFrame:
     `color` is camera-coded, `linear` the same in camera units (before the response). `lights` are plain
     values. `camera` and `world_from_camera` are those that the picture was rendered with: while nothing
     moves, the pose stays that of the frame that the real scene was built from. It is None if the frame has
-    none, or if the picture is not the camera's.
+    none, or if the picture is not the camera's. `others` is the frame in the other views that were requested.
     """
 
     frame_id: int
@@ -46,6 +59,7 @@ class CompositeFrame:
     pass_times_ms: dict[str, float] = field(default_factory=dict)
     lights: list[dict[str, Any]] = field(default_factory=list)
     level: Level | None = None
+    others: tuple[OtherView, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,8 +92,8 @@ class SceneRenderer:
 
     `with_linear`: composites carry the linear picture too (for files). `notices` collects sentences that a user
     should read (registration, memory), each once. `waits`: the first picture waits for what a method precomputes of
-    objects; pictures after `set_scene` never do. `checks` is `Graph`'s. `with_linear` leaves the document's budget
-    aside.
+    objects (pictures after `set_scene` never do), and for the search for light out of sight. `checks` is `Graph`'s.
+    `with_linear` leaves the document's budget aside.
     """
 
     def __init__(
@@ -99,6 +113,7 @@ class SceneRenderer:
         self._sized: tuple[ViewFrame, ViewFrame] | None = None
         self._shown: ShownFrame | None = None
         self._relit: RelitFrame | None = None
+        self._noise = CameraNoise()
         self.scene = scene
 
     def set_scene(self, scene: SceneDocument) -> None:
@@ -113,40 +128,54 @@ class SceneRenderer:
     def forget_frames(self) -> None:
         """Forgets everything seen in earlier frames, because the next ones come from another source."""
         self._shown = self._sized = None
+        self._noise.forget()
         self._live.forget_frames()
 
     def render(self, frame: ViewFrame, *, with_linear: bool = False) -> CompositeFrame:
         """Renders one frame; without a pose or visible object, returns the camera's picture byte for byte."""
         return self.submit(frame, with_linear=with_linear).finish()
 
-    def submit(self, frame: ViewFrame, *, with_linear: bool = False, whole: bool = False) -> PendingComposite:
+    def submit(
+        self,
+        frame: ViewFrame,
+        *,
+        with_linear: bool = False,
+        whole: bool = False,
+        others: Sequence[ShownView] = (),
+    ) -> PendingComposite:
         """Starts a frame on the GPU; reading its picture back does not stall later frames.
 
-        `whole`: at full size whatever the budget, as `with_linear` always is.
+        `whole`: at full size whatever the budget, as `with_linear` always is. `others`: views in which the frame is
+        rendered beside the document's own.
         """
         started_s = time.perf_counter()
-        frame, self._shown, self._relit = self.sized(frame), None, None
+        with_linear = with_linear or self._with_linear
+        source = self._source(self.sized(frame), whole=whole or with_linear)
+        main = self._start(source, self.scene.output.view, with_linear=with_linear)
+        rest = [self._start_other(source, view) for view in others]
+        cameras = next((each.seen for each in (main, *rest) if each.seen is not None), None)
+        self._shown = ShownFrame(source.frame, cameras, source.buffers, self._live.model)
+        times = {} if source.relit is None else dict(self._live.timers.end_frame())
+        submitted_ms = 1e3 * (time.perf_counter() - started_s)
+
+        def finish() -> CompositeFrame:
+            if main.composed is not None:
+                self._live.account(main.composed, max(submitted_ms, sum(times.values())))
+            return self._finished(source, main, rest, times, with_linear=with_linear)
+
+        is_immediate = all(each.composed is None for each in (main, *rest))
+        return PendingComposite(finish, is_immediate or self._gpu.is_software)
+
+    def _source(self, frame: ViewFrame, *, whole: bool) -> "_Source":
+        """Relights a frame; without a pose there is nothing but the camera's picture."""
+        self._shown = self._relit = None
         if frame.pose is None:
-            self._shown = ShownFrame(frame, None, None)
-            return _at_once(self._shown, frame.color)
+            return _Source(frame, None, None, None, [])
         view = CameraView(frame.camera, frame.pose.world_from_camera)
-        relit = self._relit = self._live.relight(frame, view, whole=whole or with_linear)
-        lights = self._live.describe_lights()
-        name = self.scene.output.view
-        shows_lights = name == "lights" and bool(lights)
-        is_cameras = frame.radiance_map is None if shows_lights else relit is None or name != "rsm"
+        relit = self._relit = self._live.relight(frame, view, whole=whole)
         buffers = None if relit is None else relit.shown()
         seen = view if buffers is None else buffers.view
-        shown = ShownFrame(frame, seen if is_cameras else None, buffers, self._live.model)
-        self._shown = shown
-        if shows_lights:
-            times = {} if relit is None else dict(self._live.timers.end_frame())
-            return _at_once(shown, self._live.lighting.picture(frame), times, lights)
-        if relit is None:
-            return _at_once(shown, frame.color)
-        return self._composed(
-            shown, relit, lights, with_linear=with_linear or self._with_linear, started_s=started_s
-        )
+        return _Source(frame, relit, buffers, seen, self._live.describe_lights())
 
     @property
     def graph(self) -> Graph | None:
@@ -197,41 +226,88 @@ class SceneRenderer:
         depth_m = np.where(coverage >= SHOWN_FRACTION, of_objects, np.maximum(real, 0))
         return PictureLayers(*(values.astype(np.float32) for values in (coverage, radiance, depth_m)))
 
-    def _composed(
-        self,
-        shown: ShownFrame,
-        relit: RelitFrame,
-        lights: list[dict[str, Any]],
-        *,
-        with_linear: bool,
-        started_s: float,
-    ) -> PendingComposite:
-        composite, timers = relit.compose(with_linear=with_linear), self._live.timers
-        with timers.measure("readback"):
-            self._readback.push(composite.code, "u1")
+    def _start(self, source: "_Source", view: View, *, with_linear: bool) -> "_StartedView":
+        """Starts the picture of the document's own view, and its linear radiance if `with_linear`."""
+        relit = source.relit
+        if relit is None or (view == "lights" and source.is_lit):
+            return self._start_other(source, view)
+        composite = relit.compose(with_linear=with_linear)
+        with self._live.timers.measure("readback"):
+            take = self._begin_reading(source.frame, relit, view, composite)
             if isinstance(composite, Composite) and with_linear:
                 self._readback.push(composite.linear, "f2")
-        times, frame, pose = dict(timers.end_frame()), shown.frame, shown.world_from_camera
-        submitted_ms = 1e3 * (time.perf_counter() - started_s)
+        return _StartedView(view, source.seen_in(view), take, relit)
 
-        def finish() -> CompositeFrame:
-            color = cv2.cvtColor(self._readback.pop(), cv2.COLOR_RGBA2RGB)
-            linear = self._readback.pop()[..., :3].astype(np.float32) if with_linear else None
-            self._live.account(relit, max(submitted_ms, sum(times.values())))
-            return CompositeFrame(
-                frame.frame_id,
-                frame.timestamp_ns,
-                color,
-                linear,
-                "ok",
-                frame.camera,
-                pose,
-                times,
-                lights,
-                relit.level,
-            )
+    def _start_other(self, source: "_Source", view: ShownView) -> "_StartedView":
+        """Starts the frame in a view that was asked for beside the document's own."""
+        frame, relit, seen = source.frame, source.relit, source.seen_in(view)
+        if view == "lights" and source.is_lit:
+            lights = self._live.lighting.picture(frame)
+            return _StartedView(view, seen, lambda: lights, None)
+        if view == "camera" or relit is None:
+            return _StartedView(view, seen, lambda: frame.color, None)
+        composite = relit.compose_view(view)
+        with self._live.timers.measure("readback"):
+            take = self._begin_reading(frame, relit, view, composite)
+        return _StartedView(view, seen, take, relit)
 
-        return PendingComposite(finish, self._gpu.is_software)
+    def _begin_reading(
+        self, frame: ViewFrame, relit: RelitFrame, view: ShownView, composite: Composite | Enlarge
+    ) -> Callable[[], UInt8[np.ndarray, "h w 3"]]:
+        """Begins to read a picture, and what the camera's noise on it needs; returns what takes both."""
+        covered = self._noisy_part(frame, relit, view)
+        self._readback.push(composite.code, "u1")
+        if covered is None:
+            return lambda: self._read(frame)
+        self._readback.push(covered, covered.dtype)
+
+        def take() -> UInt8[np.ndarray, "h w 3"]:
+            color = self._read(frame)
+            return self._noise.applied(color, self._readback.pop()[..., 0].astype(np.float32), frame)
+
+        return take
+
+    def _finished(
+        self,
+        source: "_Source",
+        main: "_StartedView",
+        rest: Sequence["_StartedView"],
+        times: dict[str, float],
+        *,
+        with_linear: bool,
+    ) -> CompositeFrame:
+        """Takes the pictures in the order in which they were started."""
+        frame, color, linear = source.frame, main.take(), None
+        if with_linear and main.composed is not None:
+            linear = self._readback.pop()[..., :3].astype(np.float32)
+        return CompositeFrame(
+            frame.frame_id,
+            frame.timestamp_ns,
+            color,
+            linear,
+            "no_pose" if frame.pose is None else "ok",
+            frame.camera,
+            main.world_from_camera,
+            times,
+            source.lights,
+            None if main.composed is None else main.composed.level,
+            tuple(OtherView(each.view, each.take(), each.world_from_camera) for each in rest),
+        )
+
+    def _read(self, frame: ViewFrame) -> UInt8[np.ndarray, "h w 3"]:
+        """Returns the oldest picture in flight, at the frame's size."""
+        color = cv2.cvtColor(self._readback.pop(), cv2.COLOR_RGBA2RGB)
+        size = frame.camera.width, frame.camera.height
+        return np.asarray(color if color.shape[1::-1] == size else cv2.resize(color, size))
+
+    def _noisy_part(self, frame: ViewFrame, relit: RelitFrame, view: ShownView) -> moderngl.Texture | None:
+        """Learns the camera's noise; returns what the objects cover if the scene asks for that noise on them."""
+        output = self.scene.output
+        if not output.camera_artifacts or view != "composite" or output.tone != "camera":
+            return None
+        self._noise.observe(frame)
+        coverage = relit.shown().object_coverage
+        return coverage if coverage.size == frame.color.shape[1::-1] else None
 
     def release(self) -> None:
         """Frees all GL objects."""
@@ -239,17 +315,38 @@ class SceneRenderer:
         self._readback.release()
 
 
-def _at_once(
-    shown: ShownFrame,
-    color: UInt8[np.ndarray, "h w 3"],
-    times: dict[str, float] | None = None,
-    lights: list[dict[str, Any]] | None = None,
-) -> PendingComposite:
-    """Wraps a picture made without the GPU: the camera's own, or the view of the lights."""
-    frame = shown.frame
-    status = "no_pose" if frame.pose is None else "ok"
-    pose = shown.world_from_camera
-    composite = CompositeFrame(
-        frame.frame_id, frame.timestamp_ns, color, None, status, frame.camera, pose, times or {}, lights or []
-    )
-    return PendingComposite(lambda: composite, immediate=True)
+@dataclass(frozen=True, eq=False)
+class _Source:
+    """What all views of a frame are made from; `lights` are plain values."""
+
+    frame: ViewFrame
+    relit: RelitFrame | None
+    buffers: ShownBuffers | None
+    seen: CameraView | None
+    lights: list[dict[str, Any]]
+
+    @property
+    def is_lit(self) -> bool:
+        """Whether there are lights to show."""
+        return bool(self.lights)
+
+    def seen_in(self, view: ShownView) -> CameraView | None:
+        """Returns the camera's view; None if the picture is not the camera's, or there is no pose."""
+        if view == "lights" and self.is_lit:
+            return self.seen if self.frame.radiance_map is None else None
+        return None if view == "rsm" and self.relit is not None else self.seen
+
+
+@dataclass(frozen=True, eq=False)
+class _StartedView:
+    """A picture of one view; `take` returns it, and waits for the GPU if it was `composed` there."""
+
+    view: ShownView
+    seen: CameraView | None
+    take: Callable[[], UInt8[np.ndarray, "h w 3"]]
+    composed: RelitFrame | None
+
+    @property
+    def world_from_camera(self) -> Float64[np.ndarray, "4 4"] | None:
+        """The pose that the picture was made with; None if there is none, or it is not the camera's."""
+        return None if self.seen is None else self.seen.world_from_camera

@@ -19,6 +19,7 @@ from deltalight.protocol.frames import (
     RadianceMap,
     SensorFrame,
 )
+from deltalight.protocol.message_fields import Matrix4
 from deltalight.protocol.messages import (
     ColorMessage,
     DepthMessage,
@@ -27,7 +28,6 @@ from deltalight.protocol.messages import (
     LampsMessage,
     LightEntry,
     LightsMessage,
-    Matrix4,
     PoseMessage,
     RadianceMessage,
 )

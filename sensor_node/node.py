@@ -15,7 +15,8 @@ from deltalight.protocol.documents import StrictModel
 from deltalight.protocol.envelope import encode
 from deltalight.protocol.frames import FisheyePictures, RadianceMap, SensorFrame, ViewFrame
 from deltalight.protocol.keys import Keys
-from deltalight.protocol.messages import Name, StatsMessage, as_sentence
+from deltalight.protocol.message_fields import Name, as_sentence
+from deltalight.protocol.messages import StatsMessage
 from deltalight.protocol.publisher import Publisher
 from deltalight.protocol.scene_lights import LightCut
 from deltalight.protocol.sky_lights import SkyLights

@@ -36,6 +36,7 @@ from deltalight.services.commands.up import up
 from deltalight.services.logs import configure_logging
 from deltalight.services.parent_death_signal import end_with_supervisor
 from deltalight.services.signals import Terminated, raise_on_sigterm
+from deltalight.services.warm_spare import wait_if_spare
 
 DEBUG_FLAG = "--debug"
 
@@ -98,6 +99,7 @@ def main() -> None:
     """Run the command line of this process and exit with its code."""
     raise_on_sigterm()
     end_with_supervisor()
+    wait_if_spare()
     sys.exit(run(sys.argv[1:]))
 
 

@@ -21,6 +21,7 @@ from deltalight.protocol.codecs import decode_color
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.files import replacing, write_bytes
 from deltalight.protocol.scene import SceneDocument
+from deltalight.protocol.scene_fields import ShownView
 from deltalight.services.live_message import LiveHeader, unpack
 
 if TYPE_CHECKING:
@@ -256,18 +257,21 @@ class Client:
 
     def upload(self, path: Path) -> Asset:
         """Upload a mesh or an environment map."""
+        return Asset.of(self._upload("/assets", path))
+
+    def upload_recording(self, path: Path) -> Json:
+        """Upload an .mcap recording, or a .zip of a dataset folder; return its facts, with a checklist."""
+        return cast(Json, self._upload("/recordings/upload", path))
+
+    def _upload(self, address: str, path: Path) -> Any:  # noqa: ANN401 - JSON
+        headers = {"Content-Type": "application/octet-stream"}
         try:
             with path.open("rb") as file:
-                answer = self.request(
-                    "POST",
-                    "/assets",
-                    params={"name": path.name},
-                    content=file,
-                    headers={"Content-Type": "application/octet-stream"},
+                return self.request(
+                    "POST", address, params={"name": path.name}, content=file, headers=headers, timeout=None
                 )
         except OSError as fault:
             raise DeltalightError(f"{path} cannot be read ({fault.strerror}); correct the path.") from fault
-        return Asset.of(answer)
 
     def state(self) -> Json:
         """Return rates, drops and delays of the processes."""
@@ -317,9 +321,13 @@ class Client:
                 for chunk in response.iter_bytes():
                     file.write(chunk)
 
-    def frames(self) -> Iterator[LiveFrame]:
-        """Yield composites as they arrive, always the newest; a slow caller misses some."""
-        with self._socket("/live") as socket:
+    def frames(self, view: ShownView | None = None) -> Iterator[LiveFrame]:
+        """Yield composites as they arrive, always the newest; a slow caller misses some.
+
+        `view`: what to look at; None = the scene's own. Until the renderer shows it, frames are in the scene's own
+        (`frame.header.view`).
+        """
+        with self._socket("/live" if view is None else f"/live?view={view}") as socket:
             for message in socket:
                 if isinstance(message, bytes):
                     yield LiveFrame(*unpack(message))
@@ -368,7 +376,8 @@ class Client:
         from websockets.exceptions import WebSocketException
         from websockets.sync.client import connect
 
-        query = f"?ticket={self.request('POST', '/tickets')['ticket']}" if self._headers else ""
+        mark = "&" if "?" in path else "?"
+        query = f"{mark}ticket={self.request('POST', '/tickets')['ticket']}" if self._headers else ""
         address = f"ws{self._address.removeprefix('http')}/api/v1{path}{query}"
         try:
             with connect(address, max_size=None, compression=None) as socket:

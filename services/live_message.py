@@ -15,6 +15,7 @@ from deltalight.protocol.documents import validate
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.messages import CompositeMessage
 from deltalight.protocol.quality import Quality
+from deltalight.protocol.scene_fields import ShownView
 
 _LENGTH = struct.Struct("<I")
 
@@ -54,6 +55,9 @@ class PictureHeader(BaseModel):
     lights: list[dict[str, Any]] = Field(description="What it was lit with.")
     camera: LiveCamera = Field(description="What projects points of the camera's space onto this picture.")
     world_from_camera: tuple[Row, Row, Row, Row] | None = Field(description="null without a pose.")
+    view: ShownView = Field(
+        description="What it shows: the view that was asked for, or until there is a picture of it the scene's own."
+    )
     scene: ShownScene | None = Field(description="null where another program set the server's scene.")
     renderer: str
     quality: Quality | None = Field(

@@ -139,7 +139,7 @@ def memory(findings: Findings) -> str:
 
 
 def _held(gpu: "GpuContext", method: str, folder: Path) -> dict[str, Any]:
-    from deltalight.benchmarks.gpu_check.gl_objects import count_gl_objects
+    from deltalight.render_server.gpu.context import count_gl_objects
 
     before = sum(count_gl_objects().values())
     renderer = _rendered(gpu, method, folder)
@@ -167,7 +167,7 @@ def leaks(findings: Findings) -> str:
 
 
 def _counts(gpu: "GpuContext", method: str, folder: Path) -> Iterator[dict[str, int]]:
-    from deltalight.benchmarks.gpu_check.gl_objects import count_gl_objects
+    from deltalight.render_server.gpu.context import count_gl_objects
 
     for _ in range(LEAK_ROUNDS):
         _rendered(gpu, method, folder).release()

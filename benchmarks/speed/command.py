@@ -13,6 +13,7 @@ from deltalight.benchmarks.speed.compare import compare_reports, print_compariso
 from deltalight.benchmarks.speed.counts import count_frames, print_counts
 from deltalight.benchmarks.speed.measure import SpeedJob, measure_speed
 from deltalight.benchmarks.speed.report import SpeedReport
+from deltalight.benchmarks.speed.sweep import as_data, measure_sweeps, print_sweeps
 from deltalight.benchmarks.speed.tables import print_report
 from deltalight.protocol.files import write_bytes
 
@@ -57,6 +58,27 @@ def run_counts(job: SpeedJob, *, out: Path | None, as_json: bool) -> None:
         print(text)
     else:
         print_counts(report, Console())
+
+
+def run_sweeps(
+    frames: int,
+    size: tuple[int, int] | None,
+    device: int | None,
+    *,
+    full: bool,
+    out: Path | None,
+    as_json: bool,
+) -> None:
+    """Measure the dissertation's sweeps, write them to `out` if given, and print them."""
+    with _progress() as progress:
+        measured = measure_sweeps(frames, size, device, progress, full=full)
+    text = dumps(as_data(measured), indent=2)
+    if out is not None:
+        write_bytes(out, text.encode())
+    if as_json:
+        print(text)
+    else:
+        print_sweeps(measured, Console())
 
 
 def run_comparison(before: Path, after: Path, *, as_json: bool) -> None:

@@ -21,6 +21,7 @@ from deltalight.protocol.messages import (
     LightEntry,
     LightsMessage,
     Message,
+    OtherPicture,
     PoseMessage,
     RadianceMessage,
     StatsMessage,
@@ -154,8 +155,9 @@ def _picture_examples() -> Iterator[Example]:
             drops={"color.desk": 3},
             quality="live",
             scale=0.5,
+            others=(OtherPicture(view="rsm"),),
         ),
-        [pixels.tobytes()],
+        [pixels.tobytes(), pixels[::-1].tobytes()],
         [pixels.ravel().tolist()],
     )
 

@@ -29,13 +29,22 @@ class LightEstimator:
 
     Registration, ground and unseen environment are estimated from the first usable frame, and apply to all lights
     that the source delivers afterwards. The registration is a running mean over later frames, measured with
-    exponential back-off. `notify` receives sentences for the user.
+    exponential back-off. `notify` receives sentences for the user. `before`: the estimator of other lights, whose
+    unseen environment is assumed until the scene rests, where pictures must be quick. `waits`: the first picture
+    waits for the search for light out of sight, which takes longer than the picture; otherwise the second has it.
 
     Raises:
         DeltalightError: an environment map cannot be read.
     """
 
-    def __init__(self, settings: documents.Lights, notify: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        settings: documents.Lights,
+        notify: Callable[[str], None],
+        before: "LightEstimator | None" = None,
+        *,
+        waits: bool = True,
+    ) -> None:
         self._source = open_light_source(settings)
         self._notify = notify
         self._has_tracked_lamps = settings.mode == "tracked"
@@ -43,18 +52,31 @@ class LightEstimator:
         given = settings.mode in ("manual", "tracked") and not self._wants_registration
         self._wants_unseen = given and settings.surroundings == "auto"
         self._wants_ground = self._wants_unseen or settings.mode == "fisheye"
+        self._postpones = self._wants_unseen and not waits
+        self.is_provisional = False  # of the newest lights: the search was postponed
         self._raw: LightSet | None = None
         self._reset()
+        if before is not None and self._wants_unseen and before.has_unseen:
+            self._assume(before)
         self.lights: LightSet | None = None
+
+    @property
+    def has_unseen(self) -> bool:
+        """Whether it has estimated the unseen environment, or assumes another's estimate."""
+        return self._wants_unseen and (self._is_complete or self._is_assumed)
 
     def _reset(self) -> None:
         """Resets all estimates."""
-        self._is_complete = False
+        self._is_complete = self._is_assumed = False
         self._average, self._schedule = RegistrationAverage(), BackoffSchedule()
         self._factor: Rgb | None = None
         self._ground: Rgb | None = None
         self._walls: ExtrapolatedPlanes | None = None
         self._sky: tuple[Rgb, Float32[np.ndarray, "n n 1"]] | None = None
+
+    def _assume(self, before: "LightEstimator") -> None:
+        self._ground, self._walls, self._sky = before._ground, before._walls, before._sky
+        self._is_assumed = True
 
     def update(self, frame: ViewFrame) -> bool:
         """Updates the lights from a frame; returns whether there are any yet."""
@@ -81,14 +103,19 @@ class LightEstimator:
         self.lights = lights
         return lights
 
-    def estimate(self, graph: FrameGraph, *, moved: bool) -> LightSet:
+    def estimate(self, graph: FrameGraph, *, moved: bool, is_at_rest: bool) -> LightSet:
         """Returns the lights in camera units, with all estimates that the picture allows.
 
         Evaluates the graph under trial lights. It measures again only if the real scene or the camera has `moved`, so
-        that pictures of a scene at rest do not change.
+        that pictures of a scene at rest do not change. What is assumed is measured once all `is_at_rest`.
         """
         assert self._raw is not None
         assert self.lights is not None
+        if self._is_assumed:
+            if not is_at_rest:
+                return self.lights
+            self._reset()
+            self._apply()
         shines = bool(self._raw.lights) or bool(self._raw.environment.any())
         if self._has_tracked_lamps and not shines:
             return self.lights
@@ -98,11 +125,12 @@ class LightEstimator:
         elif self._is_complete:
             return self.lights
         if not self._is_complete:
-            self._is_complete = True
-            if self._wants_ground:
+            self.is_provisional, self._postpones = self._postpones, False
+            self._is_complete = not self.is_provisional
+            if self._wants_ground and self._ground is None:
                 self._ground = ground_radiance(graph)
-            if self._wants_unseen:
-                self._find_unseen(graph, self.lights)
+            if self._wants_unseen and self._is_complete:
+                self._find_unseen(graph, self._raw.registered(self._factor))
         return self._apply()
 
     def picture(self, frame: ViewFrame) -> UInt8[np.ndarray, "h w 3"]:

@@ -43,6 +43,9 @@ UNLISTED: Final = {  # limits that moderngl does not list
     "GL_MAX_COMPUTE_SHARED_MEMORY_SIZE": 0x8262,
 }
 
+OBJECT_KINDS = ("Buffer", "Texture", "Sampler", "Program", "Shader", "Framebuffer", "VertexArray", "Query")
+HIGHEST_NAME = 8192  # drivers name objects from 1 on and use freed names again; some hundreds live at a time
+
 
 class Program(Protocol):
     """A linked program and the ids of what uses it."""
@@ -192,6 +195,28 @@ def limits_of(ctx: moderngl.Context) -> dict[str, int]:
         read(number, ctypes.byref(value))
         limits[name] = value.value
     return limits
+
+
+def count_gl_objects() -> dict[str, int]:
+    """Returns the number of objects in the current context, by kind, as glIsBuffer and the like tell.
+
+    It counts those too that were never freed, which Python has long forgotten.
+
+    Raises:
+        DeltalightError: EGL knows no such function.
+    """
+    return {kind: sum(map(_is_one(kind), range(1, HIGHEST_NAME))) for kind in OBJECT_KINDS}
+
+
+def _is_one(kind: str) -> Callable[[int], int]:
+    """Whether a name is that of an object of this kind."""
+    egl = ctypes.CDLL("libEGL.so.1")
+    egl.eglGetProcAddress.restype = ctypes.c_void_p
+    address = egl.eglGetProcAddress(f"glIs{kind}".encode())
+    if address is None:
+        raise DeltalightError(f"This driver has no glIs{kind}; update the graphics driver.")
+    found: Callable[[int], int] = ctypes.CFUNCTYPE(ctypes.c_ubyte, ctypes.c_uint)(address)
+    return found
 
 
 def create_context(device: int | None = None, *, allow_software: bool = True) -> GpuContext:

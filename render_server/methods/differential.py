@@ -97,6 +97,8 @@ class SolutionVoxels(DirectionalVoxels):
     ) -> "SolutionVoxels":
         """Lights, resolves and filters mu, then rho."""
         self._light_both(mu, rho, gathered=False)
+        self._occupy.run(self.mu, self.real.volume, self.real.store)
+        self._occupy.run(self.rho, self.real.volume, self.real.store, self.objects.store)
         return self
 
     def bounce(self, _lit: "SolutionVoxels", mu: Bindings, rho: Bindings) -> "SolutionVoxels":

@@ -36,6 +36,7 @@ from deltalight.render_server.passes.voxels import (
     ClearVoxels,
     FarVolumeBlock,
     FilterVoxels,
+    OccupyVoxels,
     PlacedVolume,
     ResolveVoxels,
     VolumePlacement,
@@ -99,6 +100,7 @@ class FarScene:
         self._light = light
         self._resolve = ResolveVoxels(gpu)
         self._filter = FilterVoxels(gpu)
+        self._occupy = OccupyVoxels(gpu)
         self._block = UniformBlock[FarVolumeBlock](gpu, self._set.volume.placement.far_block(is_used=is_used))
 
     def voxelize(self, real: GeometryState) -> VoxelSet:
@@ -117,17 +119,22 @@ class FarScene:
             voxels.forget_light()
             self._light.light_real(voxels.store, {**scene, **voxels.volume.bindings})
             self._resolve.resolve_mu(self.mipmap, voxels.store, voxels.volume)
+            self._occupy.run(self.mipmap, voxels.volume, voxels.store)
             self._filter.run(self.mipmap, voxels.volume)
         return voxels
 
     @property
     def bindings(self) -> dict[str, Binding]:
         """Returns all bindings that march.glsl reads of it."""
-        return {"mipmap_far": self.mipmap.texture, "FarVolume": self._block}
+        return {
+            "mipmap_far": self.mipmap.texture,
+            "OccupiedFar": self.mipmap.occupied,
+            "FarVolume": self._block,
+        }
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_all(self.mipmap, self._set, self._resolve, self._filter, self._block)
+        release_all(self.mipmap, self._set, self._resolve, self._filter, self._occupy, self._block)
 
 
 class DirectionalVoxels:
@@ -145,6 +152,7 @@ class DirectionalVoxels:
         self._gather = GatherVoxels(gpu, march_defines(settings))
         self._resolve = ResolveVoxels(gpu)
         self._filter = FilterVoxels(gpu)
+        self._occupy = OccupyVoxels(gpu)
 
     def voxelize_real(self, real: GeometryState, placement: VolumePlacement) -> VoxelSet:
         """Voxelises the real scene, with back faces if one camera saw it."""
@@ -176,6 +184,7 @@ class DirectionalVoxels:
             **self.far.bindings,
             "mipmap_mu": self.mu.texture,
             "mipmap_rho": self.rho.texture,
+            "Occupied": self.rho.occupied,
             "cone_count": cone_count,
         }
 
@@ -192,6 +201,7 @@ class DirectionalVoxels:
             self._gather,
             self._resolve,
             self._filter,
+            self._occupy,
         )
 
 
@@ -235,6 +245,7 @@ class DeltaVoxels(DirectionalVoxels):
 
     def filter_real(self, _lit: VoxelSet) -> VoxelMipmap:
         """Filters the lit voxels into mu."""
+        self._occupy.run(self.mu, self.real.volume, self.real.store)
         self._filter_mu()
         return self.mu
 
@@ -281,6 +292,7 @@ class DeltaVoxels(DirectionalVoxels):
 
     def filter_joint(self, _lit: LitVoxels) -> VoxelMipmap:
         """Filters the lit voxels of both sets into rho."""
+        self._occupy.run(self.rho, self.real.volume, self.real.store, self.objects.store)
         self._filter_rho()
         return self.rho
 

@@ -34,9 +34,16 @@ class LowResGrid:
         """The bindings of low_res_grid.glsl and upsample.glsl."""
         return {"sample_pixels": self.pixels, "low_resolution_size": self.size, "scale": self.scale}
 
+    def empty_list(self, texels: moderngl.Buffer) -> None:
+        """Clears a list of texels (count, then indices), and makes room for all of the grid."""
+        needed = 4 * (1 + self.texel_count)
+        if texels.size < needed:
+            texels.orphan(needed)
+        texels.write(bytes(4))
+
     def run(self, scene: Bindings) -> None:
         """Selects the pixels."""
-        self.virtual_texels.write(bytes(4))
+        self.empty_list(self.virtual_texels)
         self._kernel.run(
             self.size,
             scene,
@@ -154,7 +161,7 @@ class TraceCones:
         self, fields: ConeFields, grid: LowResGrid, mu: VoxelMipmap, rho: VoxelMipmap, scene: Bindings
     ) -> None:
         """Traces E_mu, E_rho and the specular cones of real surfaces."""
-        self._empty_list(grid)
+        grid.empty_list(self._texels)
         traced: Bindings = {
             "irradiance_mu": self._mu,
             "irradiance_rho": self._rho,
@@ -164,7 +171,14 @@ class TraceCones:
             **grid.bindings,
         }
         self._select.run(grid.size, traced, scene)
-        self._real.run(self._threads(grid), traced, scene, mipmap_mu=mu.texture, mipmap_rho=rho.texture)
+        self._real.run(
+            self._threads(grid),
+            traced,
+            scene,
+            mipmap_mu=mu.texture,
+            mipmap_rho=rho.texture,
+            Occupied=rho.occupied,
+        )
         self._filter.filter_real((self._mu, self._rho), (fields.mu, fields.rho), grid, scene)
 
     def trace_virtual(
@@ -183,15 +197,9 @@ class TraceCones:
             specular_rho=fields.virtual_specular,
             mipmap_mu=mu.texture,
             mipmap_rho=rho.texture,
+            Occupied=rho.occupied,
         )
         self._filter.filter_virtual(self._irradiance, fields.virtual, grid, scene)
-
-    def _empty_list(self, grid: LowResGrid) -> None:
-        """Clears the list of real texels, and makes room for all of the grid."""
-        needed = 4 * (1 + grid.texel_count)
-        if self._texels.size < needed:
-            self._texels.orphan(needed)
-        self._texels.write(bytes(4))
 
     def _threads(self, grid: LowResGrid) -> tuple[int]:
         return (list_threads(self._gpu, grid.texel_count),)

@@ -11,7 +11,7 @@ from deltalight.protocol.octahedral import octahedral_grid, sample_octahedral
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
 from deltalight.render_server.gpu.uniform_block import Block, Float, Int, UniformBlock
-from deltalight.render_server.lights.lights import DirectionalLight, Light
+from deltalight.render_server.lights.lights import DirectionalLight, Light, RectangleLight
 from deltalight.render_server.lights.mirror_lights import MirrorLight
 from deltalight.render_server.lights.octahedral import prefilter
 from deltalight.render_server.passes.shadow_maps import (
@@ -83,6 +83,8 @@ class LightBuffers:
             "mirror_visibility": self.mirror_visibility,
             "environment_map": self._environment,
             "shadow_samples": self.shadow_samples,
+            "has_rectangles": any(isinstance(light, RectangleLight) for light in self.lights),
+            "has_mirror_images": bool(self.mirrors),
         }
 
     def set_environment(self, radiance: Float32[np.ndarray, "n n 3"]) -> moderngl.TextureArray:

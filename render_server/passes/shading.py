@@ -10,7 +10,7 @@ from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel, list_threads
 from deltalight.render_server.gpu.textures import release_all, texture_2d
 from deltalight.render_server.passes.caustics import Caustics
-from deltalight.render_server.passes.cones import ConeFields, LowResGrid
+from deltalight.render_server.passes.cones import ConeFields, LowResGrid, reuse_define
 from deltalight.render_server.passes.lights import LightBuffers
 from deltalight.render_server.view import CameraView
 
@@ -19,8 +19,8 @@ class DirectLight:
     """E_mu and E_rho of the lights (RGBA16F), and their lobes on declared specular surfaces.
 
     With `shadow_cones`, that many cones through voxels give the objects' shadows ([P1] eq. 4); without, shadow maps
-    do. Without `objects_shadow` other passes do, and E_rho is E_mu. With `reuses`, only the texels that the scene
-    lists are shaded.
+    do. Without `objects_shadow` other passes do, and E_rho is E_mu. Pixels that objects do not reach are 0. With
+    `reuses`, only those are shaded whose light the last frame does not know (LightHistory).
     """
 
     def __init__(
@@ -32,7 +32,7 @@ class DirectLight:
         objects_shadow: bool = True,
         reuses: bool = False,
     ) -> None:
-        self._gpu, self._size, self._reuses = gpu, size, reuses
+        self._gpu, self._size = gpu, size
         self.mu = texture_2d(gpu, size, 4, "f2")
         self.rho = texture_2d(gpu, size, 4, "f2")
         self.lobe_mu = texture_2d(gpu, size, 4, "f2")
@@ -40,9 +40,9 @@ class DirectLight:
         defines = {} if shadow_cones is None else {"SHADOW_CONES": 1, "DIRECTIONS": shadow_cones}
         if not objects_shadow:
             defines = {"REAL_SHADOWS": 1}
-        if reuses:
-            defines = {**defines, "LISTED": 1}
         self._kernel = Kernel(gpu, "direct_light", **defines)
+        self._select = Kernel(gpu, "select_direct_texels", **defines, **reuse_define(reuses))
+        self._texels = gpu.ctx.buffer(reserve=4)
 
     @property
     def bindings(self) -> dict[str, Binding]:
@@ -64,13 +64,18 @@ class DirectLight:
     ) -> None:
         """Shades the pixels. `joint`: the voxels that shadow cones march through; `caustics`: added to E_rho."""
         voxels: dict[str, Binding] = {} if joint is None else {"joint_mipmap": joint}
-        threads = (list_threads(self._gpu, math.prod(self._size)),) if self._reuses else self._size
-        self._kernel.run(threads, self.bindings, voxels, _caustics_on(grid, caustics), scene)
+        self._shade(grid, self.bindings, voxels, _caustics_on(grid, caustics), scene)
+
+    def _shade(self, grid: LowResGrid, targets: Bindings, *scene: Bindings) -> None:
+        """Lists the texels that need light, empties the others, and shades those of the list."""
+        grid.empty_list(self._texels)
+        listed: Bindings = {**targets, **grid.bindings, "Texels": self._texels}
+        self._select.run(grid.size, listed, *scene)
+        self._kernel.run((list_threads(self._gpu, math.prod(self._size)),), listed, *scene)
 
     def release(self) -> None:
         """Frees the GL objects."""
-        for item in (self.mu, self.rho, self.lobe_mu, self.lobe_rho, self._kernel):
-            item.release()
+        release_all(self.mu, self.rho, self.lobe_mu, self.lobe_rho, self._kernel, self._select, self._texels)
 
 
 class LightHistory:
@@ -92,14 +97,13 @@ class LightHistory:
             [texture_2d(gpu, grid.size, 4, "f4") for _ in range(2)] for _ in range(2)
         )
         self._stale = texture_2d(gpu, grid.size, 1, "u1")
-        self._texels = gpu.ctx.buffer(reserve=4 * (1 + grid.texel_count))
         self._reproject = Kernel(gpu, "reproject_light")
         self._find_stale = Kernel(gpu, "stale_texels")
         self._seen: tuple[object, Float64[np.ndarray, "4 4"]] | None = None
         self._turn = 0
 
     def run(self, scene: Bindings, light: object, view: CameraView) -> dict[str, Binding]:
-        """Fills in the light that the last frame knows, and lists the rest.
+        """Fills in the light that the last frame knows, and marks where cones and caustics are to compute it.
 
         `light` is the same object as in the last frame if nothing but the camera has changed since. Returns the
         bindings of the passes that compute the rest.
@@ -120,15 +124,15 @@ class LightHistory:
             "last_real_texels": self._real_texels[1],
             "last_object_texels": self._object_texels[1],
             "stale_texels": self._stale,
-            "Texels": self._texels,
+            "turns": self._turns,
+            "turn": self._turn,
             **self._cones.remember(),
         }
-        self._texels.write(bytes(4))
         self._fill(scene, found)
         return found
 
     def _fill(self, scene: Bindings, found: Bindings) -> None:
-        shared: Bindings = {**found, "scale": self._grid.scale, "turns": self._turns, "turn": self._turn}
+        shared: Bindings = {**found, "scale": self._grid.scale}
         self._reproject.run(
             self._grid.picture_size,
             shared,
@@ -144,7 +148,6 @@ class LightHistory:
             shared,
             scene,
             sample_pixels=self._grid.pixels,
-            reused_direct_rho=self._direct.rho,
             stale_out=self._stale,
             real_texels_out=self._real_texels[0],
             object_texels_out=self._object_texels[0],
@@ -158,7 +161,6 @@ class LightHistory:
             *self._real_texels,
             *self._object_texels,
             self._stale,
-            self._texels,
             self._reproject,
             self._find_stale,
         )
@@ -177,13 +179,8 @@ class DirectLightPair(DirectLight):
     def run_both(self, mu: LightBuffers, rho: LightBuffers, grid: LowResGrid, scene: Bindings) -> None:
         """Shades every pixel in both solutions."""
         self.run(grid, {**scene, **mu.bindings})
-        self._kernel.run(
-            self._size,
-            {**self.bindings, "direct_mu": self._unused[0], "lobe_mu": self._unused[1]},
-            _caustics_on(grid, None),
-            rho.bindings,
-            scene,
-        )
+        targets = {**self.bindings, "direct_mu": self._unused[0], "lobe_mu": self._unused[1]}
+        self._shade(grid, targets, _caustics_on(grid, None), rho.bindings, scene)
 
     def release(self) -> None:
         """Frees the GL objects."""

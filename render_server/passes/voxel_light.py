@@ -253,6 +253,7 @@ class GatherVoxels:
             scene,
             mipmap_mu=mipmaps[0].texture,
             mipmap_rho=mipmaps[1].texture,
+            Occupied=mipmaps[1].occupied,
             cone_count=GATHER_CONES,
         )
 

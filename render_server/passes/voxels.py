@@ -162,9 +162,16 @@ def mipmap_shape(size: int, directions: int) -> tuple[int, int, int]:
     return size, size, directions * size + math.ceil(directions / 2) * size // 2
 
 
+def occupancy_bytes(size: int) -> int:
+    """Returns the bytes of a mipmap's occupancy, bits of all levels (shaders/common/occupancy.glsl)."""
+    first, above = ((cells + 1) ** 2 * (cells // 32 + 1) for cells in (size, size // 2))
+    return 4 * (first + above * size.bit_length()) if size else 0
+
+
 def volume_memory_bytes(size: int, directions: int) -> int:
     """Returns the bytes of an RGBA16F mipmap and of the grids of one voxel set: its slots, and its groups."""
-    return math.prod(mipmap_shape(size, directions)) * 8 + size**3 * 4 + group_grid_bytes(size)
+    mipmap_bytes = math.prod(mipmap_shape(size, directions)) * 8 + occupancy_bytes(size)
+    return mipmap_bytes + size**3 * 4 + group_grid_bytes(size)
 
 
 def group_grid_bytes(size: int) -> int:
@@ -191,7 +198,10 @@ def memory_statement(size: int, directions: int, budget_mb: int, far_size: int =
 
 
 class VoxelMipmap:
-    """An RGBA16F volume with mip levels: premultiplied radiance and coverage, a slab per direction."""
+    """An RGBA16F volume with mip levels: premultiplied radiance and coverage, a slab per direction.
+
+    `occupied` has a bit for each place where a sample of a level may meet anything (shaders/common/occupancy.glsl).
+    """
 
     def __init__(self, gpu: GpuContext, size: int, directions: int) -> None:
         shape = mipmap_shape(size, directions)
@@ -206,10 +216,11 @@ class VoxelMipmap:
         self.texture.filter = (moderngl.LINEAR, moderngl.LINEAR)
         self.texture.repeat_x = self.texture.repeat_y = self.texture.repeat_z = False
         clear_volume(gpu, self.texture)
+        self.occupied = gpu.storage_buffer(occupancy_bytes(size), LOWER_VOLUME)
 
     def release(self) -> None:
-        """Frees the texture."""
-        self.texture.release()
+        """Frees the texture and the buffer."""
+        release_all(self.texture, self.occupied)
 
 
 class VoxelStore:
@@ -378,6 +389,24 @@ class ClearVoxels:
                 free_slots=index == len(mipmaps) - 1,
             )
         store.reset(0)
+
+    def release(self) -> None:
+        """Frees the program."""
+        self._kernel.release()
+
+
+class OccupyVoxels:
+    """Finds which cells of a mipmap hold anything, from the voxels that sets touched."""
+
+    def __init__(self, gpu: GpuContext) -> None:
+        self._gpu, self._threads = gpu, list_threads(gpu)
+        self._kernel = Kernel(gpu, "occupy_voxels")
+
+    def run(self, mipmap: VoxelMipmap, volume: PlacedVolume, *stores: VoxelStore) -> None:
+        """Replaces the mipmap's occupancy by that of the stores."""
+        clear_buffer(self._gpu, mipmap.occupied)
+        for store in stores:
+            self._kernel.run((self._threads,), store.bindings, volume.bindings, Occupied=mipmap.occupied)
 
     def release(self) -> None:
         """Frees the program."""

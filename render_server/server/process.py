@@ -7,12 +7,13 @@ which owns the OpenGL context and does nothing but render and execute commands.
 import queue
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as FutureTimeoutError
 from contextlib import ExitStack
 from pathlib import Path
 
+import numpy as np
 import structlog
 from pydantic import Field
 
@@ -23,12 +24,15 @@ from deltalight.protocol.envelope import encode
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.files import write_bytes
 from deltalight.protocol.keys import Keys
-from deltalight.protocol.messages import ControlRequest, Name, StatsMessage
+from deltalight.protocol.message_fields import Name
+from deltalight.protocol.messages import ControlRequest, StatsMessage
 from deltalight.protocol.methods import PLUGINS
 from deltalight.protocol.publisher import Publisher
 from deltalight.protocol.request import ReplyServer
 from deltalight.protocol.scene import SceneDocument, load_scene
-from deltalight.render_server.gpu.context import create_context
+from deltalight.render_server.gpu.context import count_gl_objects, create_context
+from deltalight.render_server.lights.lights import ENVIRONMENT_SIZE
+from deltalight.render_server.lights.octahedral import prefilter
 from deltalight.render_server.renderer import SceneRenderer
 from deltalight.render_server.server.frames import FrameAssembler, FrameSource, PairingSettings
 from deltalight.render_server.server.session import RenderedFrame, Renderer, RenderSession, SourceInUse
@@ -163,8 +167,13 @@ class Sender:
     def _multipart(self, item: RenderedFrame | StatsMessage) -> list[bytes]:
         if isinstance(item, StatsMessage):
             return encode(item)
-        jpeg = encode_color(item.pixels, "jpeg", self._quality)
-        return encode(item.message.model_copy(update={"encoding": "jpeg"}), [jpeg])
+        jpegs = [encode_color(picture, "jpeg", self._quality) for picture in item.pictures]
+        return encode(item.message.model_copy(update={"encoding": "jpeg"}), jpegs)
+
+
+def warm_up() -> None:
+    """Prepares what every renderer needs before its first picture and what takes no OpenGL, for spare processes."""
+    prefilter(np.zeros((ENVIRONMENT_SIZE, ENVIRONMENT_SIZE, 3), np.float32))
 
 
 def run_server(settings: ServerSettings, keys: Keys | None = None) -> None:
@@ -185,7 +194,14 @@ def run_server(settings: ServerSettings, keys: Keys | None = None) -> None:
             log.warning("no GPU found, rendering slowly in software", renderer=gpu.renderer_name)
         renderer = SceneRenderer(gpu, scene, waits=False)  # commands are answered meanwhile
         stack.callback(renderer.release)
-        serve(settings, renderer, scene, renderer_name=gpu.renderer_name, keys=keys)
+        serve(
+            settings,
+            renderer,
+            scene,
+            renderer_name=gpu.renderer_name,
+            keys=keys,
+            count_objects=count_gl_objects,
+        )
 
 
 def serve(
@@ -195,10 +211,11 @@ def serve(
     *,
     renderer_name: str,
     keys: Keys | None = None,
+    count_objects: Callable[[], Mapping[str, int]] = dict,
 ) -> None:
     """Opens the sockets around a renderer that shows `scene`, and serves until a `shutdown` command.
 
-    Renders in the calling thread.
+    Renders in the calling thread. `count_objects` is as for `RenderSession`.
 
     Raises:
         DeltalightError: a port is in use, or an endpoint leaves the host without keys.
@@ -225,6 +242,7 @@ def serve(
             renderer_name=renderer_name,
             keep_scene=lambda kept: _keep(settings.session, kept),
             use_source=use_source,
+            count_objects=count_objects,
             mailbox_drops=lambda: {"send": sender.dropped, **source.drops},
         )
         commands = CommandQueue()

@@ -13,21 +13,23 @@ from typing import Any, Protocol
 import numpy as np
 import structlog
 from jaxtyping import Float32, Float64, UInt8
-from pydantic import ConfigDict
+from pydantic import ConfigDict, Field
 
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.documents import StrictModel, nearest, validate
 from deltalight.protocol.envelope import decode
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import ViewFrame
+from deltalight.protocol.message_fields import as_counts, as_sentence
 from deltalight.protocol.messages import (
+    MAX_OTHERS,
     CompositeMessage,
     ControlRequest,
+    OtherPicture,
     StatsMessage,
-    as_counts,
-    as_sentence,
 )
 from deltalight.protocol.scene import SceneDocument, parse_scene
+from deltalight.protocol.scene_fields import ShownView
 from deltalight.protocol.subscriber import ReceivedMultipart
 from deltalight.render_server.frame_budget import Level
 from deltalight.render_server.server.frames import AssembledFrame, FrameAssembler, SourceOrder
@@ -39,6 +41,22 @@ MAXIMUM_FAULTS_IN_A_ROW = 30
 LOG_INTERVAL_NS = 10**9
 
 log = structlog.get_logger()
+
+
+class OtherView(Protocol):
+    """A frame in another view (`renderer.OtherView`)."""
+
+    @property
+    def view(self) -> ShownView:
+        """What it shows."""
+
+    @property
+    def color(self) -> UInt8[np.ndarray, "h w 3"]:
+        """The picture, of the composite's size."""
+
+    @property
+    def world_from_camera(self) -> Float64[np.ndarray, "4 4"] | None:
+        """The camera's pose; None if the picture is not the camera's."""
 
 
 class Composite(Protocol):
@@ -76,6 +94,10 @@ class Composite(Protocol):
     def linear(self) -> Float32[np.ndarray, "h w 3"] | None:
         """The picture before the camera's response, if requested."""
 
+    @property
+    def others(self) -> Sequence[OtherView]:
+        """The same frame in the other views that were requested."""
+
 
 class Pick(Protocol):
     """What a pixel shows (`picking.Pick`)."""
@@ -103,8 +125,18 @@ class Renderer(Protocol):
     def notices(self) -> Sequence[str]:
         """Sentences for the user; the list only grows."""
 
-    def submit(self, frame: ViewFrame, *, with_linear: bool = False, whole: bool = False) -> Pending:
-        """Starts the composite of one frame, at full size if `whole`; frames finish in the order of their starts."""
+    def submit(
+        self,
+        frame: ViewFrame,
+        *,
+        with_linear: bool = False,
+        whole: bool = False,
+        others: Sequence[ShownView] = (),
+    ) -> Pending:
+        """Starts the composite of one frame, at full size if `whole`, and the same in `others`.
+
+        Frames finish in the order of their starts.
+        """
 
     def sized(self, frame: ViewFrame) -> ViewFrame:
         """Returns the frame at the composite's size."""
@@ -121,20 +153,21 @@ class Renderer(Protocol):
 
 @dataclass(frozen=True)
 class RenderedFrame:
-    """A composite to be encoded and sent; `pixels` belong to `message` (declared as raw)."""
+    """A composite to be encoded and sent; `pictures` are the parts of `message` (declared as raw)."""
 
     message: CompositeMessage
-    pixels: UInt8[np.ndarray, "h w 3"]
+    pictures: tuple[UInt8[np.ndarray, "h w 3"], ...]
 
 
 @dataclass(frozen=True)
 class _Started:
-    """A frame in flight on the GPU, with the id and revision of the scene that it was started with."""
+    """A frame in flight on the GPU, with id, revision and view of the scene that it was started with."""
 
     frame: AssembledFrame
     pending: Pending
     scene_id: str | None
     scene_revision: int
+    view: ShownView
 
 
 @dataclass(frozen=True)
@@ -155,6 +188,12 @@ class PickOrder(StrictModel):
     ignore: str | None = None
 
 
+class WatchOrder(StrictModel):
+    """The views that somebody looks at."""
+
+    views: tuple[ShownView, ...] = Field(max_length=MAX_OTHERS + 1)
+
+
 def _only_configured(_endpoints: Sequence[str] | None) -> SourceInUse:
     raise DeltalightError("This render session cannot change its source; start it with other endpoints.")
 
@@ -162,9 +201,10 @@ def _only_configured(_endpoints: Sequence[str] | None) -> SourceInUse:
 class RenderSession:
     """Holds one scene, its renderer and the frames that wait for it.
 
-    `scene_id` is the sender's id of the scene, if given; `instance` distinguishes this session from those before a
-    restart. `keep_scene` is called with every accepted scene, so that a restart can resume with it; `mailbox_drops`
-    returns what the receiver dropped, by topic; `use_source` makes it read other endpoints (None: those configured).
+    Frames are rendered in the views `watched`, too. `scene_id` is the sender's id of the scene, if given; `instance`
+    distinguishes this session from those before a restart. `keep_scene` is called with every accepted scene, so that
+    a restart can resume with it; `mailbox_drops` returns what the receiver dropped, by topic; `use_source` makes it
+    read other endpoints (None: those configured); `count_objects` returns what the GPU holds, by kind.
     """
 
     def __init__(
@@ -178,6 +218,7 @@ class RenderSession:
         keep_scene: Callable[[SceneDocument], None] = lambda _scene: None,
         mailbox_drops: Callable[[], Mapping[str, int]] = dict,
         use_source: Callable[[Sequence[str] | None], SourceInUse] = _only_configured,
+        count_objects: Callable[[], Mapping[str, int]] = dict,
         clock_ns: Callable[[], int] = time.time_ns,
     ) -> None:
         self.scene = scene
@@ -185,6 +226,7 @@ class RenderSession:
         self.instance = uuid.uuid4().hex
         self.counts: Counter[str] = Counter()
         self.stopping = False
+        self.watched: tuple[ShownView, ...] = ()
         self._renderer = renderer
         self._assembler = assembler or FrameAssembler()
         self._assembler.needs_depth = _needs_depth(scene)
@@ -193,6 +235,7 @@ class RenderSession:
         self._keep_scene = keep_scene
         self._mailbox_drops = mailbox_drops
         self._use_source = use_source
+        self._count_objects = count_objects
         self._clock_ns = clock_ns
         self._newest: AssembledFrame | None = None
         self._finished: RenderedFrame | None = None
@@ -275,10 +318,12 @@ class RenderSession:
             "get_scene": lambda _: {"scene": self.scene.model_dump(mode="json")},
             "set_scene": self._set_scene,
             "set_view": self._set_view,
+            "watch": self._watch,
             "pick": self._pick,
             "snapshot": self._snapshot,
             "set_source": self._set_source,
             "stats": lambda _: {"stats": self.stats().model_dump(mode="json")},
+            "gl_objects": lambda _: dict(self._count_objects()),
             "shutdown": self._shut_down,
         }
         if request.op not in commands:
@@ -292,6 +337,12 @@ class RenderSession:
     def _set_view(self, request: ControlRequest) -> dict[str, object]:
         """Changes the view; the sender of the previous scene does not know the result, so its id is dropped."""
         return self._use_scene(_with_view(self.scene, request.payload.get("view")), scene_id=None)
+
+    def _watch(self, request: ControlRequest) -> dict[str, object]:
+        """Renders frames in these views too from now on."""
+        views = validate(WatchOrder, request.payload, "the command watch").views
+        self.watched = tuple(dict.fromkeys(views))
+        return {"views": list(self.watched)}
 
     def _shut_down(self, _request: ControlRequest) -> dict[str, object]:
         self.stopping = True
@@ -335,12 +386,16 @@ class RenderSession:
         before, self._started = self._started, None
         if frame is not None:
             self._newest = frame
-            self._started = _Started(
-                frame, self._renderer.submit(frame.view), self.scene_id, self.scene.revision
-            )
+            self._started = self._start(frame)
         if before is None and self._started is not None and self._started.pending.immediate:
             before, self._started = self._started, None
         return None if before is None else self._finish(before)
+
+    def _start(self, frame: AssembledFrame) -> "_Started":
+        view = self.scene.output.view
+        others = tuple(each for each in self.watched if each != view)
+        pending = self._renderer.submit(frame.view, others=others)
+        return _Started(frame, pending, self.scene_id, self.scene.revision, view)
 
     def _finish(self, started: "_Started") -> RenderedFrame:
         composite, frame = started.pending.finish(), started.frame
@@ -369,8 +424,13 @@ class RenderSession:
             drops=self.drops(),
             quality=None if composite.level is None else composite.level.quality,
             scale=1.0 if composite.level is None else composite.level.scale,
+            view=started.view,
+            others=tuple(
+                OtherPicture(view=other.view, world_from_camera=_rows(other.world_from_camera))
+                for other in composite.others
+            ),
         )
-        return RenderedFrame(message, composite.color)
+        return RenderedFrame(message, (composite.color, *(other.color for other in composite.others)))
 
     def _set_scene(self, request: ControlRequest) -> dict[str, object]:
         """Sets a scene, idempotently by id and revision: confirms the current revision and refuses an older one."""

@@ -14,7 +14,7 @@ from deltalight.protocol.documents import StrictModel
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.files import replacing, write_png
 from deltalight.protocol.frames import ViewFrame, linear_color
-from deltalight.protocol.messages import Name
+from deltalight.protocol.message_fields import Name
 from deltalight.protocol.radiance_files import write_exr
 from deltalight.protocol.scene import SceneDocument, parse_scene
 

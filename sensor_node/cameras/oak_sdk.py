@@ -7,13 +7,15 @@ from typing import Any
 from deltalight.protocol.errors import DeltalightError, install_command
 
 # The SDK reads these on import. Its log goes to standard output, where it would corrupt `--json`; its telemetry is on
-# unless refused; its signal handlers would replace those of the supervisor.
+# unless refused; its signal handlers would replace those of the supervisor; its own calibration would change what a
+# station was calibrated with.
 ENVIRONMENT = {
     "DEPTHAI_LEVEL": "error",
     "DEPTHAI_TELEMETRY": "0",
     "DEPTHAI_INSTALL_SIGNAL_HANDLER": "0",
+    "DEPTHAI_AUTOCALIBRATION": "OFF",
 }
-INSTALL_HINT = install_command("deltalight[oak]")
+INSTALL_HINT = install_command("depthai>=3")  # by its own name, for clones too
 
 
 def sdk_version() -> str | None:

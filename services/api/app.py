@@ -4,6 +4,7 @@ import asyncio
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 from fastapi import FastAPI
@@ -31,12 +32,12 @@ from deltalight.services.api.render_link import RenderLink
 from deltalight.services.api.replay_control import ReplayControl
 from deltalight.services.api.routes import assets, live, recordings, scenes, shelf, snapshots, state
 from deltalight.services.api.settings import ApiSettings
-from deltalight.services.api.shown_view import ShownView
 from deltalight.services.api.snapshot_store import SnapshotStore
 from deltalight.services.api.static_page import StaticPage
 from deltalight.services.api.streams import ProcessWatch, Sink, Streams
 from deltalight.services.live_message import LiveHeader
 from deltalight.services.storage.store import Store
+from deltalight.services.storage.tokens import Role
 
 PREFIX = "/api/v1"
 ROUTERS = (
@@ -121,6 +122,7 @@ def create_app(settings: ApiSettings, store: Store, keys: Keys | None = None) ->
         needs_token=settings.leaves_host,
         requests_per_s=settings.requests_per_s,
         upload_limit_bytes=settings.upload_limit_mb << 20,
+        recording_limit_bytes=settings.recording_limit_mb << 20,
     )
     app = _App(
         title="Deltalight",
@@ -140,7 +142,7 @@ def create_app(settings: ApiSettings, store: Store, keys: Keys | None = None) ->
                 tokens=store.tokens,
                 tickets=context.tickets,
                 problems=context.problems,
-                secret=None if settings.token_file is None else SecretToken(settings.token_file),
+                secrets=_secret_tokens(settings),
             ),
         ],
     )
@@ -152,15 +154,24 @@ def create_app(settings: ApiSettings, store: Store, keys: Keys | None = None) ->
     return app
 
 
+def _secret_tokens(settings: ApiSettings) -> list[SecretToken]:
+    """Read the tokens of files; one that may change things first."""
+    files: tuple[tuple[Path | None, Role], ...] = (
+        (settings.token_file, "control"),
+        (settings.view_token_file, "view"),
+    )
+    return [SecretToken(path, role) for path, role in files if path is not None]
+
+
 def _context(settings: ApiSettings, store: Store, keys: Keys | None) -> Context:
-    events, watch, live_hub, problems = EventHub(), ProcessWatch(), LiveHub(), Problems()
+    events, watch, problems = EventHub(), ProcessWatch(), Problems()
     link = RenderLink(
         store,
         settings.control,
         keys,
         on_delivery=lambda status: events.publish("picture", asdict(status)),
-        view=ShownView(lambda view: events.publish("view", {"view": view})),
     )
+    live_hub = LiveHub(link.watch)
     recording_store = RecordingStore(store.folder / "recordings")
 
     def publish_recording(session: RecordingSession, is_growing: bool) -> None:
@@ -205,7 +216,7 @@ def _sinks(context: Context) -> dict[str, Sink]:
 
 def _publish_composite(context: Context, message: Message, parts: Sequence[memoryview]) -> None:
     if isinstance(message, CompositeMessage) and message.encoding == "jpeg":
-        context.live.publish(message, bytes(parts[0]), context.watch.detail(message.node))
+        context.live.publish(message, [bytes(part) for part in parts], context.watch.detail(message.node))
 
 
 def _publish_report(context: Context, message: Message) -> None:

@@ -3,7 +3,7 @@
 It checks host, origin, rate, token, role and the size of the body.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from urllib.parse import urlsplit
 
@@ -21,6 +21,7 @@ from deltalight.services.storage.tokens import TokenStore
 
 BODY_LIMIT_BYTES = 2 << 20  # three times a document with the maximum number of objects
 UPLOAD_PATH = "/api/v1/assets"
+RECORDING_UPLOAD_PATH = "/api/v1/recordings/upload"
 PROTECTED = "/api/"  # the page's files and the API's description are public
 OPEN_PATHS = frozenset({"/api/v1/health"})  # it reveals nothing that requires a token
 STREAM_PATHS = frozenset({"/api/v1/live.mjpg"})  # endless responses that are no WebSockets
@@ -39,6 +40,7 @@ class AuthRules:
     needs_token: bool
     requests_per_s: float
     upload_limit_bytes: int
+    recording_limit_bytes: int
 
 
 class AuthMiddleware:
@@ -56,13 +58,13 @@ class AuthMiddleware:
         tokens: TokenStore,
         tickets: Tickets,
         problems: Problems,
-        secret: SecretToken | None = None,
+        secrets: Sequence[SecretToken] = (),
     ) -> None:
         self._app = app
         self._rules = rules
         self._tokens = tokens
         self._tickets = tickets
-        self._secret = secret
+        self._secrets = secrets
         self._problems = problems
         self._rate = RateLimit(rules.requests_per_s, 2 * rules.requests_per_s)
         self._wrong_tokens = RateLimit(WRONG_TOKENS_PER_S, WRONG_TOKENS_AT_ONCE)
@@ -151,9 +153,9 @@ class AuthMiddleware:
     async def _verified(self, scheme: str, given: str) -> Principal | None:
         if scheme.lower() != "bearer":
             return None
-        principal = None if self._secret is None else self._secret.verify(given.strip())
-        if principal is not None:
-            return principal
+        for secret in self._secrets:
+            if (principal := secret.verify(given.strip())) is not None:
+                return principal
         try:
             token = await run_in_threadpool(self._tokens.verify, given.strip())
         except OutdatedTokenError as fault:
@@ -161,8 +163,11 @@ class AuthMiddleware:
         return None if token is None else Principal(token.role, token.id, token.name)
 
     def _body_limit(self, scope: Scope) -> int:
-        is_upload = scope["path"] == UPLOAD_PATH and scope["method"] == "POST"
-        return self._rules.upload_limit_bytes if is_upload else BODY_LIMIT_BYTES
+        uploads = {
+            UPLOAD_PATH: self._rules.upload_limit_bytes,
+            RECORDING_UPLOAD_PATH: self._rules.recording_limit_bytes,
+        }
+        return uploads.get(scope["path"], BODY_LIMIT_BYTES) if scope["method"] == "POST" else BODY_LIMIT_BYTES
 
 
 class _BodyLimit:

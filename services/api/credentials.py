@@ -50,7 +50,8 @@ class SecretToken:
     Tokens are compared by their hashes in constant time.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, role: Role = "control") -> None:
+        self._role: Role = role
         try:
             token = path.read_text(encoding="ascii").strip()
         except (OSError, UnicodeDecodeError) as fault:
@@ -67,7 +68,7 @@ class SecretToken:
     def verify(self, given: str) -> Principal | None:
         """Return the principal of this token, or None if it is not the file's."""
         is_equal = hmac.compare_digest(self._hash, _hash(given))
-        return Principal("control", name=SECRET_NAME) if is_equal else None
+        return Principal(self._role, name=SECRET_NAME) if is_equal else None
 
 
 def _hash(token: str) -> bytes:

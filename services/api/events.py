@@ -21,7 +21,6 @@ EventType = Literal[
     "recording",
     "replay",
     "snapshot",
-    "view",
     "notice",
     "lost",
 ]

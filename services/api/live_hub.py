@@ -4,12 +4,13 @@ import asyncio
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Literal
 
 from deltalight.protocol.messages import CompositeMessage
+from deltalight.protocol.scene_fields import ShownView
 from deltalight.services.live_message import PictureHeader, ViewerHeader, age_ms, pack
 
 RATE_WINDOW_S = 3.0
@@ -17,31 +18,54 @@ STALE_AFTER_S = 2.0
 
 
 @dataclass(frozen=True)
-class LiveFrame:
-    """A composite for viewers; `number` counts the frames that arrived, `header` is a `PictureHeader` as JSON.
+class LivePicture:
+    """A picture as JPEG, and its `PictureHeader` as JSON."""
 
-    It arrived at `arrived_s` of the monotonic clock and `arrived_ns` of this host's.
+    header: bytes
+    jpeg: bytes
+
+
+@dataclass(frozen=True)
+class LiveFrame:
+    """A composite for viewers; `number` counts the frames that arrived.
+
+    It arrived at `arrived_s` of the monotonic clock and `arrived_ns` of this host's. `pictures` holds the scene's own
+    view, first, and those that somebody asked for.
     """
 
     number: int
     message: CompositeMessage
-    jpeg: bytes
     arrived_s: float
     arrived_ns: int
-    header: bytes
+    pictures: Mapping[ShownView, LivePicture]
 
-    def packed(self, skipped: int) -> bytes:
-        """Return the message for a viewer that was not sent `skipped` frames."""
-        return pack(self.header, ViewerHeader(age_ms=age_ms(self.message), skipped=skipped), self.jpeg)
+    def picture(self, view: ShownView | None) -> LivePicture:
+        """Return the picture in a view; the scene's own where it is not there (yet), and for None."""
+        own = self.pictures[self.message.view]
+        return own if view is None else self.pictures.get(view, own)
+
+    def packed(self, view: ShownView | None, skipped: int) -> bytes:
+        """Return the message for a viewer of `view` that was not sent `skipped` frames."""
+        picture = self.picture(view)
+        return pack(picture.header, ViewerHeader(age_ms=age_ms(self.message), skipped=skipped), picture.jpeg)
 
 
 class Viewer:
-    """One viewer of the stream; `skipped` counts the frames that it was not sent."""
+    """One viewer of the stream; `skipped` counts the frames that it was not sent.
 
-    def __init__(self, hub: "LiveHub") -> None:
+    It looks at `view`; None = the scene's own.
+    """
+
+    def __init__(self, hub: "LiveHub", view: ShownView | None) -> None:
         self.skipped = 0
+        self.view = view
         self._hub = hub
         self._number = 0
+
+    def look_at(self, view: ShownView | None) -> None:
+        """Look at another view, as soon as a frame shows it."""
+        self.view = view
+        self._hub.note_views()
 
     async def next(self) -> LiveFrame | None:
         """Wait for a frame newer than this viewer's last; None = the stream has ended."""
@@ -55,10 +79,15 @@ class Viewer:
 
 
 class LiveHub:
-    """Holds only the newest frame; viewers that wait for a newer one do not delay each other."""
+    """Holds only the newest frame; viewers that wait for a newer one do not delay each other.
 
-    def __init__(self) -> None:
-        self.viewers = 0
+    `on_watch` is called in the event loop with the views that are looked at beside the scene's own, when they change.
+    """
+
+    def __init__(self, on_watch: Callable[[Sequence[ShownView]], None] = lambda _views: None) -> None:
+        self._viewers: set[Viewer] = set()
+        self._watched: list[ShownView] = []
+        self._on_watch = on_watch
         self.sent = 0
         self.skipped = 0
         self._newest: LiveFrame | None = None
@@ -72,8 +101,10 @@ class LiveHub:
         """Wake viewers in this event loop from now on."""
         self._loop = loop
 
-    def publish(self, message: CompositeMessage, jpeg: bytes, renderer: str) -> None:
+    def publish(self, message: CompositeMessage, jpegs: Sequence[bytes], renderer: str) -> None:
         """Publish a composite as the newest, and wake all waiting viewers (any thread).
+
+        `jpegs` are its own picture, then those of its `others`.
 
         Raises:
             DeltalightError: its header is invalid.
@@ -83,8 +114,12 @@ class LiveHub:
             self._arrivals_s.append(now_s)
             number = 1 if self._newest is None else self._newest.number + 1
             header = PictureHeader.of(message, number=number, frames_per_s=self._rate(), renderer=renderer)
-            encoded = header.model_dump_json().encode()
-            self._newest = LiveFrame(number, message, jpeg, now_s, time.time_ns(), encoded)
+            headers = [header, *(header.model_copy(update=dict(other)) for other in message.others)]
+            pictures = {
+                each.view: LivePicture(each.model_dump_json().encode(), jpeg)
+                for each, jpeg in zip(headers, jpegs, strict=True)
+            }
+            self._newest = LiveFrame(number, message, now_s, time.time_ns(), pictures)
         self._wake_soon()
 
     def close(self) -> None:
@@ -92,14 +127,29 @@ class LiveHub:
         self._ended = True
         self._wake_soon()
 
+    @property
+    def viewers(self) -> int:
+        """The number of viewers."""
+        return len(self._viewers)
+
     @contextmanager
-    def viewer(self) -> Iterator[Viewer]:
+    def viewer(self, view: ShownView | None = None) -> Iterator[Viewer]:
         """Join the stream for the duration of the block (in the event loop)."""
-        self.viewers += 1
+        viewer = Viewer(self, view)
+        self._viewers.add(viewer)
+        self.note_views()
         try:
-            yield Viewer(self)
+            yield viewer
         finally:
-            self.viewers -= 1
+            self._viewers.remove(viewer)
+            self.note_views()
+
+    def note_views(self) -> None:
+        """Tell which views are looked at, if that changed."""
+        watched = sorted({each.view for each in self._viewers if each.view is not None})
+        if watched != self._watched:
+            self._watched = watched
+            self._on_watch(watched)
 
     @property
     def received(self) -> int:

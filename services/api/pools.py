@@ -13,7 +13,16 @@ from anyio import CapacityLimiter, to_thread
 
 from deltalight.services.api.problems import ProblemError
 
-PoolName = Literal["render server", "replay", "recordings", "assets", "thumbnails", "cameras", "documents"]
+PoolName = Literal[
+    "render server",
+    "replay",
+    "recordings",
+    "recording uploads",
+    "assets",
+    "thumbnails",
+    "cameras",
+    "documents",
+]
 Answer = TypeVar("Answer")
 
 
@@ -49,6 +58,7 @@ def make_pools() -> Mapping[PoolName, Pool]:
         Pool("render server", 8, patience_s=10.0),
         Pool("replay", 4, patience_s=10.0),
         Pool("recordings", 4, patience_s=10.0),
+        Pool("recording uploads", 2, patience_s=60.0),  # the check of one may take minutes
         Pool("assets", 4, patience_s=60.0),  # the check of one may take a minute
         Pool("thumbnails", 4, patience_s=10.0),
         Pool("cameras", 2, patience_s=10.0),

@@ -14,7 +14,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
 from deltalight.protocol.errors import DeltalightError
-from deltalight.protocol.messages import as_sentence
+from deltalight.protocol.message_fields import as_sentence
 from deltalight.services.api.render_link import UnansweredError
 from deltalight.services.storage.faults import (
     ConflictError,

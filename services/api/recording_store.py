@@ -3,22 +3,30 @@
 import json
 import os
 import re
+import shutil
 import time
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from threading import Lock
 from typing import Any, Literal
+from uuid import uuid4
 
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.files import ACTIVE_SUFFIX, write_bytes
 from deltalight.services.files import SUFFIX, make_output_folder
-from deltalight.services.storage.faults import ConflictError, NotFoundError
+from deltalight.services.storage.asset_kinds import clean_name
+from deltalight.services.storage.asset_sandbox import MEMORY_LIMIT_BYTES, run_limited
+from deltalight.services.storage.assets import Incoming, disk_faults
+from deltalight.services.storage.faults import ConflictError, NotFoundError, TooLargeError
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")  # no dots: nothing that ends like a suffix
 POSTER_EDGE = 640
 POSTER_QUALITY = 85
+UPLOAD_LEFT_OVER_AFTER_S = 24 * 3600.0  # no upload takes a day
+CHECK_TIME_S = 600  # of an upload; a zipped folder is made into a recording meanwhile
 LEFT_OVER_AFTER_S = 3600.0  # recovery writes continuously: an older file was left by a killed process
 
 Facts = dict[str, Any]
@@ -50,6 +58,11 @@ class RecordingStore:
     def __init__(self, folder: Path) -> None:
         self.folder = make_output_folder(folder)
         self._cache = make_output_folder(folder / ".cache")
+        self._incoming = make_output_folder(folder / ".incoming")
+        for left in self._incoming.iterdir():
+            if left.stat().st_mtime < time.time() - UPLOAD_LEFT_OVER_AFTER_S:
+                shutil.rmtree(left, ignore_errors=True)
+        self._naming_new = Lock()
         self._reading = Lock()  # recordings are read one at a time, because reading occupies the disk
         for path in folder.glob(f".*.tmp{SUFFIX}*"):
             if path.stat().st_mtime < time.time() - LEFT_OVER_AFTER_S:
@@ -86,6 +99,76 @@ class RecordingStore:
         if path.exists() or path.with_name(path.name + ACTIVE_SUFFIX).exists():
             raise ConflictError(f"there is a recording called {name}; choose another name.")
         return path
+
+    @contextmanager
+    def receiving(self, limit_bytes: int, quota_bytes: int) -> Iterator[Incoming]:
+        """Yield a place for an upload; it is removed at the end unless `keep` took it.
+
+        `quota_bytes` is what all recordings, and what is received, may take together.
+
+        Raises:
+            TooLargeError: there is no room for one more.
+            StorageFaultError: the disk refuses.
+        """
+        used = self._used_bytes()
+        if used >= quota_bytes:
+            raise TooLargeError(
+                f"the recordings take {used >> 20} MB and may take {quota_bytes >> 20} MB; delete some."
+            )
+        folder = self._incoming / uuid4().hex
+        limit = min(limit_bytes, quota_bytes - used)
+        try:
+            with disk_faults():
+                folder.mkdir()
+                file = (folder / f"upload{SUFFIX}").open("xb")
+            with file:
+                yield Incoming(
+                    Path(file.name), file, limit, advice="cut it into shorter ones, or delete some"
+                )
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+
+    def keep(self, incoming: Incoming, name: str) -> StoredRecording:
+        """Check a received file in a limited process, and store it under the name of the file, or one like it.
+
+        A .zip of a dataset folder is stored as the recording made of it.
+
+        Raises:
+            RejectedAssetError: it is no recording, or a broken one.
+        """
+        made = incoming.path.with_name(f"made{SUFFIX}")
+        with disk_faults():
+            incoming.file.flush()
+        checked = run_limited(
+            "recording",
+            incoming.path,
+            clean_name(name),
+            str(made),
+            str(incoming.limit_bytes),
+            memory_bytes=MEMORY_LIMIT_BYTES + 2 * incoming.size_bytes,  # files are mapped
+            output_bytes=incoming.limit_bytes,
+            time_s=CHECK_TIME_S,
+        )
+        with disk_faults(), self._naming_new:
+            path = self._free_path(Path(clean_name(name)).stem)
+            (made if checked["is_made"] else incoming.path).rename(path)
+        return self._described(path)
+
+    def _used_bytes(self) -> int:
+        """Return what all files take, those being received included."""
+        used = 0
+        for path in self.folder.rglob("*"):
+            with suppress(FileNotFoundError):  # deleted meanwhile
+                used += path.stat().st_size
+        return used
+
+    def _free_path(self, stem: str) -> Path:
+        """Return the path of a new recording, its name as like `stem` as may be."""
+        plain = re.sub(r"[^A-Za-z0-9_-]+", "-", stem).strip("-_")[:56] or "upload"
+        for number in count(1):
+            with suppress(ConflictError):
+                return self.new_path(plain if number == 1 else f"{plain}-{number}")
+        raise AssertionError  # count never ends
 
     def poster(self, name: str) -> Path:
         """Return the JPEG file of a recording's first colour picture, created on first request.

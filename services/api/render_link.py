@@ -14,8 +14,8 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.keys import Keys
 from deltalight.protocol.messages import ControlRequest
 from deltalight.protocol.request import RequestClient
+from deltalight.protocol.scene_fields import ShownView
 from deltalight.services.api.delivery import SILENT, Change, Deliveries, DeliveryStatus, pending
-from deltalight.services.api.shown_view import ShownView, View
 from deltalight.services.storage.scenes import StoredScene
 from deltalight.services.storage.store import Store
 
@@ -71,21 +71,20 @@ class RenderLink:
         keys: Keys | None = None,
         *,
         on_delivery: Callable[[DeliveryStatus], None] = lambda _status: None,
-        view: ShownView | None = None,
     ) -> None:
         self._store = store
         self._on_delivery = on_delivery
-        self._view = view or ShownView()
         self._client = RequestClient(control, keys=keys)
         self._asking = FifoLock()  # held during requests to the server; guards the fields below
         self._changed = threading.Event()
-        self._view_changed = threading.Event()
         self._deliveries = Deliveries()
         self._look_due_s = 0.0
         self._answers: bool | None = None  # not asked yet
         self._instance: str | None = None  # of the server; a different one has lost its scene
         self._has_scene = False  # whether this instance received a scene from here
         self._source: list[str] | None = None
+        self._watched: tuple[ShownView, ...] = ()
+        self._sent_watched: tuple[ShownView, ...] | None = None  # by the server that answers; None: not yet
         self.on_source: Callable[[Sequence[str] | None], None] = lambda _endpoints: None
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="render-link", daemon=True)
@@ -138,15 +137,9 @@ class RenderLink:
         self._refuse_where_silent()
         return self._execute(op, payload, timeout_s)
 
-    @property
-    def view(self) -> View | None:
-        """The view that is shown in place of the document's own, if any."""
-        return self._view.chosen
-
-    def use_view(self, view: View | None) -> None:
-        """Show a view as soon as the server takes it; None = the document's. Neither scene nor revision change."""
-        self._view.choose(view, self._store.scenes.active())
-        self._view_changed.set()
+    def watch(self, views: Sequence[ShownView]) -> None:
+        """Have frames rendered in these views beside the scene's own, as soon as the server takes it."""
+        self._watched = tuple(views)
         self._changed.set()
 
     def use_source(self, endpoints: Sequence[str] | None) -> None:
@@ -167,6 +160,7 @@ class RenderLink:
         with self._asking:
             if self._changed.is_set():
                 self._send_newest()
+                self._send_watched()
             self._refuse_where_silent()  # the first check may just have found no server
             self._require_alive()
             return self._request(op, timeout_s, payload)
@@ -186,10 +180,6 @@ class RenderLink:
     def _send_newest(self) -> None:
         """Send the newest revision of the active scene unless the server has it (while holding the lock)."""
         self._changed.clear()
-        if self._view_changed.is_set():
-            self._view_changed.clear()
-            self._has_scene = False  # the same revision again, which the server is not to compare
-            self._deliveries.forget()
         awaited = self._deliveries.awaited
         active = self._store.scenes.active()
         if active is None:
@@ -204,6 +194,20 @@ class RenderLink:
         self._deliveries.note(status, awaited)
         if status != before:
             self._on_delivery(status)
+
+    def _send_watched(self) -> None:
+        """Tell the server which views are looked at, unless it knows (while holding the lock)."""
+        watched = self._watched
+        if not self._answers or watched == self._sent_watched:
+            return
+        try:
+            self._request("watch", COMMAND_TIMEOUT_S, {"views": list(watched)})
+        except UnansweredError:
+            self._note_reachable(False)
+            return
+        except DeltalightError as fault:  # viewers see the scene's own view
+            log.warning("the render server shows no other views", fault=str(fault))
+        self._sent_watched = watched
 
     def _send(self, active: StoredScene) -> DeliveryStatus:
         revision = active.document.revision
@@ -225,7 +229,7 @@ class RenderLink:
         """
         if self._instance is None:
             self._instance = self._server_instance()
-        scene = self._store.assets.localised(self._view.applied(active)).model_dump(mode="json")
+        scene = self._store.assets.localised(active.document).model_dump(mode="json")
         revision = active.document.revision if self._has_scene else None
         self._request(
             "set_scene", COMMAND_TIMEOUT_S, {"scene": scene}, scene_id=active.head.id, revision=revision
@@ -243,6 +247,7 @@ class RenderLink:
                 with self._asking:
                     self._check_if_due()
                     self._send_newest()
+                    self._send_watched()
             except (DeltalightError, OSError) as fault:
                 log.warning("the render server cannot be kept up to date", fault=str(fault))
             self._changed.wait(max(0.0, self._look_due_s - time.monotonic()))
@@ -266,6 +271,7 @@ class RenderLink:
             is_new = instance != self._instance  # it was (re)started
             if is_new or not answered_before:
                 self._restore_source()
+                self._sent_watched = None
         except UnansweredError:
             self._note_reachable(False)
             return

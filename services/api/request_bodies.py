@@ -23,6 +23,8 @@ from deltalight.protocol.yaml_text import yaml_text
 from deltalight.services.api.context import Shared
 from deltalight.services.api.problems import ProblemError
 
+UPLOAD_TYPE = "application/octet-stream"
+
 Model = TypeVar("Model", bound=BaseModel)
 
 
@@ -137,3 +139,13 @@ def document_file(document: SceneDocument, name: str, *, as_yaml: bool) -> Respo
         content, media_type, suffix = document.model_dump_json(), JSON_TYPE, "json"
     headers = {"Content-Disposition": f'attachment; filename="{name}.{suffix}"'}
     return Response(content, media_type=media_type, headers=headers)
+
+
+def require_upload_type(request: Request) -> None:
+    """Refuse a body that is no file as it is.
+
+    Raises:
+        ProblemError: it is of another media type.
+    """
+    if request.headers.get("content-type", "").partition(";")[0].strip().lower() != UPLOAD_TYPE:
+        raise ProblemError(415, "media-type", f"Send the file as the body, with Content-Type: {UPLOAD_TYPE}.")

@@ -27,6 +27,9 @@ class ApiSettings(StrictModel):
         description="File with one more token, of role control, which is never stored: a secret of the container "
         "engine or of systemd.",
     )
+    view_token_file: Path | None = Field(
+        default=None, description="The same for a token of role view, such as that of a monitor."
+    )
     control: str = Field(
         default=endpoint(CONTROL_PORT), description="Endpoint of the render server's commands."
     )
@@ -35,6 +38,12 @@ class ApiSettings(StrictModel):
         description="Endpoints of the render server and of the nodes: pictures, and how they are doing.",
     )
     upload_limit_mb: int = Field(default=256, ge=1, le=512, description="Greatest size of an upload, MB.")
+    recording_limit_mb: int = Field(
+        default=4096, ge=1, le=65_536, description="Greatest size of an uploaded recording, MB."
+    )
+    recording_quota_mb: int = Field(
+        default=51_200, ge=1, description="What all recordings may take before uploads are refused, MB."
+    )
     requests_per_s: Annotated[float, Field(ge=1, le=10_000)] = Field(
         default=100.0,
         description="Requests a second that one client may send for long; twice as many at once.",

@@ -49,6 +49,9 @@ def serve(
         Path | None,
         typer.Option(help="File with an additional token of role control, such as a container's secret."),
     ] = None,
+    view_token_file: Annotated[
+        Path | None, typer.Option(help="The same for a token of role view, such as a monitor's.")
+    ] = None,
     control: Annotated[
         str | None,
         typer.Option(help="Endpoint of the render server's commands. Default: tcp://127.0.0.1:5603."),
@@ -75,6 +78,7 @@ def serve(
         "port": port,
         "data": data,
         "token_file": token_file,
+        "view_token_file": view_token_file,
         "control": control,
     }
     configuration = load_configuration(config_file)

@@ -9,6 +9,8 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from deltalight.services.exports import ExportFormat
+
 if TYPE_CHECKING:
     from rich.table import Table
 
@@ -66,7 +68,9 @@ def recover(
 
 @recordings.command(name="import")
 def import_(
-    folder: Annotated[Path, typer.Argument(help="Dataset folder with rgb.txt.")],
+    folder: Annotated[
+        Path, typer.Argument(help="Dataset folder with rgb.txt, or a ROS bag: a .bag file or ROS 2's folder.")
+    ],
     *,
     out: Annotated[
         Path, typer.Option("--out", "-o", help="Recording to write, NAME.mcap; it must not exist.")
@@ -76,9 +80,13 @@ def import_(
     ] = None,
     as_json: AS_JSON = False,
 ) -> None:
-    """Convert a dataset folder to a recording."""
+    """Convert a dataset folder or a ROS bag to a recording."""
+    from deltalight.services.exports.ros_bags import import_bag, is_bag
     from deltalight.services.recording_copies import import_folder
 
+    if is_bag(folder) and scene is None:
+        _print_copied(import_bag(folder, out, _track("importing")), as_json=as_json)
+        return
     _print_copied(import_folder(folder, out, scene, _track("importing")), as_json=as_json)
 
 
@@ -86,13 +94,19 @@ def import_(
 def export(
     file: FILE,
     *,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Dataset folder to write; it must not exist.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder or file to write; it must not exist.")],
+    format: Annotated[  # the option's name
+        ExportFormat, typer.Option(help="What to write; see docs/recording.md.")
+    ] = ExportFormat.DATASET,
+    scene: Annotated[
+        Path | None, typer.Option(help="Scene document for --format glb; default: the attached one.")
+    ] = None,
     as_json: AS_JSON = False,
 ) -> None:
-    """Convert a recording to a dataset folder."""
-    from deltalight.services.recording_copies import export_recording
+    """Convert a recording to a dataset folder, or to the format of another program."""
+    from deltalight.services.exports.recording import export_as
 
-    _print_copied(export_recording(file, out, _track("exporting")), as_json=as_json)
+    _print_copied(export_as(format, file, out, scene, _track("exporting")), as_json=as_json)
 
 
 def _progress(words: str, *, show_count: bool = True) -> Progress:

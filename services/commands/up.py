@@ -43,6 +43,13 @@ def up(
     allow_software: Annotated[
         bool, typer.Option("--allow-software", help="Render without a GPU if there is none.")
     ] = False,
+    spares: Annotated[
+        bool,
+        typer.Option(
+            "--spares/--no-spares",
+            help="Keep a spare of each process, which replaces a dead one sooner (some 350 MB).",
+        ),
+    ] = True,
     config_file: ConfigFile = None,
 ) -> None:
     """Run node, render server and dashboard on this machine until Ctrl-C, and restart what fails.
@@ -76,6 +83,7 @@ def up(
             page_port=port,
             device=device,
             allow_software=allow_software,
+            spares=spares,
         )
         plan.require_free_ports()
         with Supervisor(plan.specs()) as supervisor:

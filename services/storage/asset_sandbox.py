@@ -16,7 +16,7 @@ MEMORY_LIMIT_BYTES = 3 << 30
 TIME_LIMIT_S = 60
 _ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}  # each thread's buffers count as memory
 
-Task = Literal["mesh", "map", "mesh-thumbnail", "map-thumbnail", "unzip"]
+Task = Literal["mesh", "map", "mesh-thumbnail", "map-thumbnail", "unzip", "recording"]
 
 
 def run_limited(
@@ -26,6 +26,7 @@ def run_limited(
     *arguments: str,
     memory_bytes: int = MEMORY_LIMIT_BYTES,
     output_bytes: int = 0,
+    time_s: int = TIME_LIMIT_S,
 ) -> Facts:
     """Run a task on a file in the worker and return its facts; `name` names the file in sentences.
 
@@ -34,20 +35,18 @@ def run_limited(
     Raises:
         RejectedAssetError: the file is invalid, or exceeds the limits.
     """
-    limits = [str(memory_bytes), str(TIME_LIMIT_S), str(output_bytes)]
+    limits = [str(memory_bytes), str(time_s), str(output_bytes)]
     try:
         done = subprocess.run(
             [sys.executable, "-P", "-m", WORKER, task, str(path), *limits, *arguments],
             capture_output=True,
             text=True,
-            timeout=TIME_LIMIT_S,
+            timeout=time_s,
             check=False,
             env={**os.environ, **_ENVIRONMENT},
         )
     except subprocess.TimeoutExpired as fault:
-        raise RejectedAssetError(
-            f"{name} takes longer than {TIME_LIMIT_S} s to load; simplify it."
-        ) from fault
+        raise RejectedAssetError(f"{name} takes longer than {time_s} s to load; simplify it.") from fault
     try:
         answer = json.loads(done.stdout.splitlines()[-1])
     except (IndexError, ValueError) as fault:

@@ -27,6 +27,10 @@ def _task(name: str) -> Callable[..., Facts]:
         from deltalight.services.storage.gltf_zip import repack
 
         return repack
+    if name == "recording":
+        from deltalight.services.storage.recording_check import check_recording
+
+        return check_recording
     if name.endswith("-thumbnail"):
         from deltalight.services.storage import thumbnails
 

@@ -68,6 +68,7 @@ class Incoming:
     path: Path
     file: BinaryIO
     limit_bytes: int
+    advice: str = "simplify it"
     size_bytes: int = 0
     head: bytes = b""
     digest: "hashlib._Hash" = field(default_factory=hashlib.sha256)
@@ -80,7 +81,7 @@ class Incoming:
             StorageFaultError: the disk is full.
         """
         self._note(chunk)
-        with _disk():
+        with disk_faults():
             self.file.write(chunk)
 
     def take_over(self) -> None:
@@ -90,14 +91,14 @@ class Incoming:
             TooLargeError: the file exceeds the limit.
             StorageFaultError: the disk refuses.
         """
-        with _disk(), self.path.open("rb") as file:
+        with disk_faults(), self.path.open("rb") as file:
             while chunk := file.read(CHUNK_BYTES):
                 self._note(chunk)
 
     def _note(self, chunk: bytes) -> None:
         self.size_bytes += len(chunk)
         if self.size_bytes > self.limit_bytes:
-            raise TooLargeError(f"the file is larger than {self.limit_bytes >> 20} MB; simplify it.")
+            raise TooLargeError(f"the file is larger than {self.limit_bytes >> 20} MB; {self.advice}.")
         self.head = (self.head + chunk)[:HEAD_BYTES] if len(self.head) < HEAD_BYTES else self.head
         self.digest.update(chunk)
 
@@ -111,7 +112,7 @@ class AssetStore:
         self._incoming = folder / ".incoming"
         self._probe = probe
         self._children = BoundedSemaphore(CONCURRENT_CHILDREN)
-        with _disk():
+        with disk_faults():
             self._incoming.mkdir(parents=True, exist_ok=True)
             self._remove_left_over()
 
@@ -120,7 +121,7 @@ class AssetStore:
         """Yield a place for an upload; it is removed at the end unless `keep` took it."""
         path = self._incoming / uuid4().hex
         try:
-            with _disk():
+            with disk_faults():
                 file = path.open("xb")
             with file:
                 yield Incoming(path, file, limit_bytes)
@@ -143,7 +144,7 @@ class AssetStore:
             return self._keep(unpacked, Path(shown).stem + ".glb")
 
     def _unpack(self, incoming: Incoming, unpacked: Incoming, name: str) -> None:
-        with _disk():
+        with disk_faults():
             incoming.file.flush()
         limit = incoming.limit_bytes
         with self._children:
@@ -155,7 +156,7 @@ class AssetStore:
         digest = incoming.digest.hexdigest()
         checked = incoming.path.with_suffix(found.suffix)
         try:
-            with _disk():
+            with disk_faults():
                 incoming.file.flush()
                 os.fsync(incoming.file.fileno())
                 incoming.path.rename(checked)
@@ -207,7 +208,7 @@ class AssetStore:
         drawn = self._incoming / uuid4().hex
         try:
             run_limited(task, path, name, str(drawn), output_bytes=THUMBNAIL_BYTES)
-            with _disk():
+            with disk_faults():
                 drawn.replace(place)
         finally:
             drawn.unlink(missing_ok=True)
@@ -256,7 +257,7 @@ class AssetStore:
         with self._database.writing() as session:
             known = session.get(AssetRow, row.digest)
             place = self._path(row.digest, row.format)
-            with _disk():
+            with disk_faults():
                 place.parent.mkdir(exist_ok=True)
                 checked.replace(place)
                 _sync_folder(place.parent)
@@ -362,7 +363,8 @@ def _columns(digest: str, found: AssetFormat, size_bytes: int, facts: Facts) -> 
 
 
 @contextmanager
-def _disk() -> Iterator[None]:
+def disk_faults() -> Iterator[None]:
+    """Turn what the disk refuses into a fault of the storage."""
     try:
         yield
     except OSError as fault:

@@ -4,20 +4,19 @@ import base64
 import binascii
 import json
 import posixpath
-import stat
 import zipfile
-import zlib
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
 from deltalight.protocol.errors import DeltalightError
+from deltalight.services.storage.archive import Archive, unpacking
 from deltalight.services.storage.asset_kinds import Facts
 
 MAX_ENTRIES = 1000
+CONTENTS = "one glTF and its files"
 _JSON_CHUNK, _BIN_CHUNK = 0x4E4F534A, 0x004E4942
 _IMAGE_TYPES = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg", ".webp": "image/webp"}
-_ENCRYPTED = 1  # general purpose flag, bit 0 (APPNOTE 4.4.4)
 
 
 def repack(path: Path, out: str, limit: str) -> Facts:
@@ -28,58 +27,13 @@ def repack(path: Path, out: str, limit: str) -> Facts:
     Raises:
         DeltalightError: the archive is wrong; the sentence says how.
     """
-    try:
-        with zipfile.ZipFile(path) as archive:
-            glb = _repacked(_Archive(archive, path, int(limit)))
-    except (zipfile.BadZipFile, NotImplementedError, zlib.error, EOFError, OSError) as error:
-        raise DeltalightError(f"{path} is a damaged or unusual .zip ({error}); pack it again.") from error
+    with unpacking(path), zipfile.ZipFile(path) as archive:
+        glb = _repacked(Archive(archive, path, int(limit), MAX_ENTRIES, CONTENTS))
     Path(out).write_bytes(glb)
     return {"size_bytes": len(glb)}
 
 
-class _Archive:
-    """The files of an archive by their paths; checked before anything is unpacked."""
-
-    def __init__(self, archive: zipfile.ZipFile, path: Path, limit_bytes: int) -> None:
-        self.path = path
-        self._archive = archive
-        listed = [each for each in archive.infolist() if not each.is_dir()]
-        if len(listed) > MAX_ENTRIES:
-            raise DeltalightError(f"{path} holds more than {MAX_ENTRIES} files; pack one glTF and its files.")
-        for entry in listed:
-            self._check(entry)
-        if sum(entry.file_size for entry in listed) > limit_bytes:
-            raise DeltalightError(f"{path} holds more than {limit_bytes >> 20} MB unpacked; simplify it.")
-        self.entries = {entry.filename: entry for entry in listed if not _is_litter(entry.filename)}
-        if len(self.entries) < len([entry for entry in listed if not _is_litter(entry.filename)]):
-            raise DeltalightError(f"{path} holds two files of the same name; pack it again.")
-
-    def read(self, name: str) -> bytes:
-        if name not in self.entries:
-            raise DeltalightError(
-                f"{self.path} does not hold {name!r:.200}, which its glTF names; pack it too."
-            )
-        return self._archive.read(self.entries[name])  # never more than the size that was checked
-
-    def _check(self, entry: zipfile.ZipInfo) -> None:
-        name = entry.filename
-        steps = name.split("/")
-        if name.startswith("/") or "\\" in name or ":" in steps[0] or ".." in steps:
-            raise DeltalightError(
-                f"{self.path} holds the name {name!r:.200}, outside its own folder; pack it again."
-            )
-        if stat.S_ISLNK(entry.external_attr >> 16):
-            raise DeltalightError(f"{self.path} holds the link {name!r:.200}; pack the file itself.")
-        if entry.flag_bits & _ENCRYPTED:
-            raise DeltalightError(f"{self.path} is encrypted; pack it without a password.")
-
-
-def _is_litter(name: str) -> bool:
-    """Whether a file manager added the file, which may even end in .gltf."""
-    return name.startswith("__MACOSX/") or posixpath.basename(name).startswith(".")
-
-
-def _repacked(archive: _Archive) -> bytes:
+def _repacked(archive: Archive) -> bytes:
     models = [name for name in archive.entries if name.lower().endswith((".gltf", ".glb"))]
     if len(models) != 1:
         found = "two or more glTF files" if models else "no glTF file"
@@ -97,7 +51,7 @@ def _repacked(archive: _Archive) -> bytes:
         ) from error
 
 
-def _joined(document: dict[str, Any], archive: _Archive, folder: str) -> tuple[dict[str, Any], bytes]:
+def _joined(document: dict[str, Any], archive: Archive, folder: str) -> tuple[dict[str, Any], bytes]:
     """Join all buffers, then all pictures, into one; buffer views are shifted accordingly."""
     binary, starts = bytearray(), []
     for buffer in document.get("buffers", []):
@@ -126,7 +80,7 @@ def _append(binary: bytearray, content: bytes) -> int:
     return start
 
 
-def _content(uri: str, archive: _Archive, folder: str) -> bytes:
+def _content(uri: str, archive: Archive, folder: str) -> bytes:
     if uri.startswith("data:"):
         try:
             return base64.b64decode(uri.partition("base64,")[2], validate=True)

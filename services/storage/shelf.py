@@ -85,6 +85,24 @@ def _ring() -> "trimesh.Trimesh":
     return torus(*RING_RADII_M, major_sections=SECTIONS, minor_sections=SECTIONS // 2)
 
 
+def _cylinder() -> "trimesh.Trimesh":
+    from trimesh.creation import cylinder
+
+    return cylinder(radius=0.04, height=0.12, sections=SECTIONS)
+
+
+def _cone() -> "trimesh.Trimesh":
+    from trimesh.creation import cone
+
+    return cone(radius=0.05, height=0.12, sections=SECTIONS)
+
+
+def _plate() -> "trimesh.Trimesh":
+    from trimesh.creation import box
+
+    return box((0.18, 0.12, 0.005))
+
+
 # Colours of chromium and gold as tabulated for physically based materials (documentation of Unreal Engine).
 # Chrome and grey ball are those that record the light of a film set.
 SHELF = {
@@ -94,6 +112,9 @@ SHELF = {
         ShelfItem("grey-ball", "Grey ball", _ball, (0.18, 0.18, 0.18), metallic=0.0, roughness=1.0),
         ShelfItem("matte-cube", "Matte cube", _cube, (0.8, 0.8, 0.8), metallic=0.0, roughness=1.0),
         ShelfItem("glazed-vase", "Glazed vase", _vase, (0.03, 0.12, 0.3), metallic=0.0, roughness=0.12),
+        ShelfItem("cylinder", "Cylinder", _cylinder, (0.5, 0.5, 0.5), metallic=0.0, roughness=0.6),
+        ShelfItem("cone", "Cone", _cone, (0.5, 0.5, 0.5), metallic=0.0, roughness=0.6),
+        ShelfItem("plate", "Plate", _plate, (0.5, 0.5, 0.5), metallic=0.0, roughness=0.6),
         ShelfItem("gold-ring", "Gold ring", _ring, (1.0, 0.766, 0.336), metallic=1.0, roughness=0.2),
     )
 }

@@ -298,7 +298,7 @@ def test_tests_are_counted_and_what_fails_is_named(tmp_path: Path) -> None:
 def test_leaks_are_counted_by_kind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     counts = iter([{"Buffer": 3, "Texture": 5}, {"Buffer": 3, "Texture": 5}, {"Buffer": 3, "Texture": 7}])
     monkeypatch.setattr("deltalight.benchmarks.gpu_check.steps.METHODS", ("paper",))
-    monkeypatch.setattr("deltalight.benchmarks.gpu_check.gl_objects.count_gl_objects", lambda: next(counts))
+    monkeypatch.setattr("deltalight.render_server.gpu.context.count_gl_objects", lambda: next(counts))
     monkeypatch.setattr("deltalight.benchmarks.gpu_check.steps._rendered", Mock())
     step = findings(tmp_path)
     take_step("deltalight.benchmarks.gpu_check.steps:leaks", step)

@@ -21,7 +21,8 @@ from tests.services.record_samples import slow_demo
 ROOT = Path(__file__).parents[2]
 DEPLOY = ROOT / "deploy"
 COMPOSE = ROOT / "docker-compose.yml"
-NVIDIA = DEPLOY / "docker-compose.nvidia.yml"
+NVIDIA, DRI, OAK = (DEPLOY / f"docker-compose.{name}.yml" for name in ("nvidia", "dri", "oak"))
+VIEW_TOKEN = "another-token-of-thirty-two-characters-or-more"
 TOKEN = "a-token-of-at-least-thirty-two-characters"
 VARIABLE = re.compile(r"\$\{[A-Z_]+:-([^}]*)\}")
 METRIC = re.compile(r"\bdeltalight_\w+")
@@ -47,7 +48,11 @@ def compose() -> dict[str, Any]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("files", [[COMPOSE], [COMPOSE, NVIDIA]], ids=["mesa", "nvidia"])
+@pytest.mark.parametrize(
+    "files",
+    [[COMPOSE], [COMPOSE, NVIDIA], [COMPOSE, DRI], [COMPOSE, OAK]],
+    ids=["mesa", "nvidia", "dri", "oak"],
+)
 def test_compose_accepts_the_files(files: list[Path]) -> None:
     options = [part for file in files for part in ("--file", str(file))]
     for profile in ([], ["--profile", "monitoring"]):
@@ -82,8 +87,25 @@ def test_every_target_and_mounted_file_of_compose_is_there() -> None:
             assert not source.startswith(".") or (ROOT / source).exists()
 
 
-def test_the_nvidia_command_is_the_other_one_without_software() -> None:
-    override = yaml.safe_load(NVIDIA.read_text())["services"]["server"]["command"]
+def test_volumes_belong_to_the_user_that_runs() -> None:
+    """A new volume takes its owner from the folder that the image has at its place."""
+    made = re.search(
+        r"install --directory --owner=deltalight .*\\\n(.*)", (DEPLOY / "Dockerfile").read_text()
+    )
+    assert made is not None
+    mounted = {
+        mount.split(":")[1]
+        for service in compose()["services"].values()
+        if service.get("image", "").startswith("deltalight/")
+        for mount in service["volumes"]
+        if not mount.startswith((".", "/"))
+    }
+    assert mounted == set(made[1].split())
+
+
+@pytest.mark.parametrize("file", [NVIDIA, DRI], ids=["nvidia", "dri"])
+def test_the_commands_on_gpus_are_the_other_one_without_software(file: Path) -> None:
+    override = yaml.safe_load(file.read_text())["services"]["server"]["command"]
     ours = [word for word in compose()["services"]["server"]["command"] if word != "--allow-software"]
     assert override == ours
 
@@ -103,12 +125,7 @@ def running(words: list[str]) -> Iterator[None]:
 
 
 def healthy(words: list[str]) -> bool:
-    return (
-        subprocess.run(
-            [sys.executable, "-m", "deltalight.services.cli", *words], cwd=ROOT, check=False
-        ).returncode
-        == 0
-    )
+    return subprocess.run([sys.executable, "-m", *words], cwd=ROOT, check=False).returncode == 0
 
 
 @pytest.mark.slow
@@ -119,11 +136,14 @@ def test_the_commands_of_compose_run_and_their_health_checks_pass(tmp_path: Path
         (tmp_path / folder).mkdir()
     secret = tmp_path / "control_token"
     secret.write_text(TOKEN + "\n")
+    seeing = tmp_path / "view_token"
+    seeing.write_text(VIEW_TOKEN + "\n")
     places = {
         "/run/deltalight": str(tmp_path / "run"),
         "/var/lib/deltalight": str(tmp_path / "data"),
         "/recordings": str(slow_demo(tmp_path).parent),
         "/run/secrets/control_token": str(secret),
+        "/run/secrets/view_token": str(seeing),
         "127.0.0.1:8000": f"127.0.0.1:{port}",
     }
 
@@ -139,9 +159,9 @@ def test_the_commands_of_compose_run_and_their_health_checks_pass(tmp_path: Path
             stack.enter_context(running([*here(service["command"]), *own]))
         for name, service in services.items():
             check = here(service["healthcheck"]["test"])
-            assert check[:2] == ["CMD", "deltalight"]
+            assert check[:3] == ["CMD", "python", "-m"]
             deadline = time.monotonic() + 120
-            while not healthy(check[2:]):
+            while not healthy(check[3:]):
                 assert time.monotonic() < deadline, f"{name} did not become healthy"
         client = httpx.Client(base_url=f"http://127.0.0.1:{port}/api/v1", timeout=30)
         assert client.get("/state").status_code == 401
@@ -149,6 +169,8 @@ def test_the_commands_of_compose_run_and_their_health_checks_pass(tmp_path: Path
         assert client.get("/state").json()["render_server"] == "answers"
         scenes = client.get("/scenes").json()
         assert [scene["active"] for scene in scenes] == [True], "the first start shows a scene"
+        client.headers["Authorization"] = f"Bearer {VIEW_TOKEN}"
+        assert client.post("/scenes", json={}).status_code == 403, "a monitor changes nothing"
         check_metrics(client.get("/metrics").text)
 
 

@@ -9,14 +9,8 @@ from deltalight.protocol.envelope import MAX_PARTS, EnvelopeError, decode
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import FisheyePictures, LampPose, RadianceMap
 from deltalight.protocol.light_codecs import fisheye_pictures, lamp_poses, radiance_map, sky_lights
-from deltalight.protocol.messages import (
-    MAX_EXPOSURES,
-    MAX_LIGHTS,
-    FisheyeMessage,
-    LampsMessage,
-    LightsMessage,
-    RadianceMessage,
-)
+from deltalight.protocol.message_fields import MAX_EXPOSURES, MAX_LIGHTS
+from deltalight.protocol.messages import FisheyeMessage, LampsMessage, LightsMessage, RadianceMessage
 from deltalight.protocol.scene_lights import LightCut
 from deltalight.protocol.sky_lights import Region, SkyLights, TrackedLight
 from deltalight.sensor_node.frame_messages import (

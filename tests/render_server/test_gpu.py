@@ -312,7 +312,9 @@ def test_the_stated_memory_is_what_is_allocated(
     sets = [voxels.real, voxels.objects, *([voxels.far._set] if far_size else [])]
     grids = [grid for each in sets for grid in (each.store.grid, each.groups._grid)]
     stated = 2 * volume_memory_bytes(size, directions) + volume_memory_bytes(far_size, 6)
-    assert sum(sizes_bytes([*large, *grids])) == stated
+    mipmaps = [each for each in vars(voxels).values() if isinstance(each, VoxelMipmap)]
+    occupied = [each.occupied for each in (*mipmaps, *([voxels.far.mipmap] if far_size else []))]
+    assert sum(sizes_bytes([*large, *grids, *occupied])) == stated
     assert f"{math.ceil(stated / 1e6)} MB" in memory_statement(size, directions, 4096, far_size)
     surfels = 3 * LEAST_SURFELS * 400  # bytes a surfel, with its slot, light and group
     assert sizes_bytes([voxels])[0] - stated < surfels
@@ -326,7 +328,7 @@ def test_a_volume_begins_empty(gpu: GpuContext) -> None:
 
 
 def test_memory_beyond_the_budget_is_refused_with_both_numbers() -> None:
-    grids = 512**3 * 4 + 6 * 256**3 * 4
+    grids = 512**3 * 4 + 6 * 256**3 * 4 + 4 * (513**2 * 17 + 10 * 257**2 * 9)
     needed = math.ceil(2 * (512 * 512 * (6 * 512 + 3 * 256) * 8 + grids) / 1e6)
     with pytest.raises(DeltalightError, match=rf"{needed} MB.*2048 MB.*volume_size"):
         memory_statement(512, 6, 2048)

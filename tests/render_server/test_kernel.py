@@ -9,10 +9,9 @@ import moderngl
 import numpy as np
 import pytest
 
-from deltalight.benchmarks.gpu_check.gl_objects import count_gl_objects
 from deltalight.render_server.gpu import context as context_module
 from deltalight.render_server.gpu import kernel as kernel_module
-from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.context import GpuContext, count_gl_objects
 from deltalight.render_server.gpu.kernel import BindingError, Dispatch, RasterKernel, watched
 from deltalight.render_server.gpu.shader_source import SHADERS
 from deltalight.render_server.gpu.textures import texture_2d

@@ -295,3 +295,12 @@ def test_another_real_model_gives_what_a_fresh_renderer_gives(gpu: GpuContext, t
     renderer.release()
     assert not np.array_equal(before, after)
     assert np.array_equal(after, composite(gpu, changed, frame(checkered())))
+
+
+def test_under_lamps_alone_the_volumes_border_does_not_show(gpu: GpuContext, stage: Stage) -> None:
+    """Cones of the reduced grid reach pixels beyond the border, where the lamp must be known to compare with."""
+    lamp = directional((-0.2, 0.1, -1.0))
+    document = stage.document([stage.virtual(cube(0.12))], [lamp], floor(), cone_scale=4, volume_edge_m=0.4)
+    picture = composite(gpu, document, frame(plain(120))).astype(int)
+    assert (picture != 120).any()
+    assert picture[solve(gpu, document, frame(plain(120))).matte == 0].max() < 160

@@ -49,3 +49,29 @@ def test_no_frame_is_lost_and_none_shows_what_was_before(gpu: GpuContext, docume
 
 def check(shown: CompositeFrame, frame_id: int) -> None:
     assert (shown.frame_id, shown.status) == (frame_id, "ok")
+
+
+def test_other_views_of_a_frame_are_what_each_alone_would_show(gpu: GpuContext, tmp_path: Path) -> None:
+    document = everyday(Stage(tmp_path), cone_scale=2, cone_count=4)
+    document = document.replaced(output=document.output.replaced(width=64))
+    renderer = SceneRenderer(gpu, document)
+    try:
+        alone, _ = (renderer.render(frame(frame_id=index)) for index in range(2))
+        several = renderer.submit(frame(frame_id=2), others=("delta", "camera", "rsm")).finish()
+        again = renderer.render(frame(frame_id=3))
+        assert alone.others == again.others == ()
+        assert "other views" in several.pass_times_ms
+        assert "relit picture" not in several.pass_times_ms, "its own picture is as cheap as ever"
+        for shown in (several, again):
+            np.testing.assert_array_equal(shown.color, alone.color)
+        views = {each.view: each for each in several.others}
+        assert list(views) == ["delta", "camera", "rsm"]
+        assert views["rsm"].world_from_camera is None, "not the camera's picture"
+        np.testing.assert_array_equal(views["delta"].world_from_camera, alone.world_from_camera)
+        np.testing.assert_array_equal(views["camera"].color, renderer.sized(frame()).color)
+        assert renderer.pick(32, 24).kind != "nothing", "picking goes on"
+        for view in ("delta", "rsm"):
+            renderer.set_scene(document.replaced(output=document.output.replaced(view=view)))
+            np.testing.assert_array_equal(views[view].color, renderer.render(frame(frame_id=4)).color)
+    finally:
+        renderer.release()

@@ -1,5 +1,6 @@
 """Light of the unseen environment, found on the board's paper."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -76,6 +77,31 @@ def test_without_surroundings_only_the_lights_shine(gpu: GpuContext, tmp_path: P
     assert found == pytest.approx([KNOWN] * 3, rel=1e-3)
 
 
+@pytest.mark.usefixtures("clean_gl")
+def test_while_lamps_change_live_pictures_assume_what_was_found(gpu: GpuContext, tmp_path: Path) -> None:
+    """The search takes longer than pictures do; it is made once all is at rest."""
+    made = document(Stage(tmp_path, COARSE))
+    live = made.replaced(method=made.method.replaced(quality="live"))
+    dimmed = live.replaced(
+        lights=live.lights.replaced(manual=[directional((0, 0, -1), 0.5 * SUN), *live.lights.manual[1:]])
+    )
+    color = picture(SUN + np.pi * (KNOWN + OUT_OF_SIGHT))
+    renderer, fresh = SceneRenderer(gpu, live), SceneRenderer(gpu, dimmed)
+
+    def sky_at(time_ms: int, shown: SceneRenderer = renderer) -> float:
+        view = frame(color, board=BOARD, frame_id=time_ms, timestamp_ns=time_ms * 1_000_000)
+        return float(shown.render(view).lights[-1]["mean_radiance"][0])
+
+    found = sky_at(100)
+    renderer.set_scene(dimmed)
+    assumed, rested, wanted = [sky_at(200), sky_at(300)], sky_at(2500), sky_at(100, fresh)
+    renderer.release()
+    fresh.release()
+    assert assumed == pytest.approx([found] * 2, rel=1e-6)
+    assert rested == pytest.approx(wanted, rel=1e-3)
+    assert rested > 1.2 * found
+
+
 def test_shadows_and_stains_on_the_paper_do_not_count() -> None:
     rng = np.random.default_rng(1)
     irradiance, per_radiance = rng.uniform(1, 2, (400, 3)), rng.uniform(2, np.pi, (400, 3))
@@ -86,3 +112,22 @@ def test_shadows_and_stains_on_the_paper_do_not_count() -> None:
     assert found is not None
     assert found[0] == pytest.approx(wanted[0], abs=0.01)
     assert unseen_radiance_from_patch(measured[:20], irradiance[:20], per_radiance[:20], ALBEDO) is None
+
+
+@pytest.mark.usefixtures("clean_gl")
+def test_a_servers_first_picture_does_not_wait_for_the_search(gpu: GpuContext, tmp_path: Path) -> None:
+    """The second has what the first one of a renderer that waits has; so have the first ones of later scenes."""
+    scene = document(Stage(tmp_path, COARSE))
+    view = frame(picture(SUN + np.pi * (KNOWN + OUT_OF_SIGHT)), board=BOARD)
+    waiting, server = SceneRenderer(gpu, scene), SceneRenderer(gpu, scene, waits=False)
+    expected = waiting.render(view)
+    first, second = server.render(view), server.render(replace(view, frame_id=1, timestamp_ns=10**9))
+    mean = [each.lights[-1]["mean_radiance"][0] for each in (expected, first, second)]
+    assert mean[1] < 0.9 * mean[0]
+    assert second.lights == expected.lights
+    assert np.array_equal(second.color, expected.color)
+    other_order = scene.lights.model_copy(update={"manual": scene.lights.manual[::-1]})
+    server.set_scene(scene.replaced(lights=other_order, revision=2))
+    assert server.render(replace(view, frame_id=2, timestamp_ns=2 * 10**9)).lights == expected.lights
+    waiting.release()
+    server.release()

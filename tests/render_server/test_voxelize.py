@@ -95,6 +95,32 @@ def test_aligned_plane_covers_its_voxels_once(lab: VoxelLab, height: float) -> N
     assert np.abs(texels[5, int(height), ..., 0] - 1).max() < 2e-3
 
 
+def test_a_sample_that_meets_anything_counts_as_occupied(lab: VoxelLab) -> None:
+    """Of each level, a bit for each corner of cells: set if one of the eight around it is touched."""
+    ball = trimesh.creation.icosphere(3, 9.0)
+    ball.apply_translation((30.3, 31.6, 12.2))
+    voxels = lab.fill(gpu_mesh(ball, 1.0))
+    bits = np.unpackbits(np.frombuffer(voxels.rho.occupied.read(), np.uint8), bitorder="little")
+    voxels.release()
+    covered, first = np.zeros((SIZE,) * 3, bool), 0
+    covered[tuple(lab.surfels(gpu_mesh(ball))[3].T[::-1])] = True
+    for level in range(lab.placement.levels):
+        cells = SIZE >> level
+        padded = np.pad(covered, 1)
+        corners = np.logical_or.reduce(
+            [
+                padded[z : z + cells + 1, y : y + cells + 1, x : x + cells + 1]
+                for z, y, x in np.ndindex(2, 2, 2)
+            ]
+        )
+        row = 32 * (cells // 32 + 1)
+        held = bits[first : first + (cells + 1) ** 2 * row].reshape(cells + 1, cells + 1, row)
+        assert np.array_equal(held[..., : cells + 1], corners)
+        half = SIZE // 2
+        first += held.size if level == 0 else (half + 1) ** 2 * 32 * (half // 32 + 1)
+        covered = covered.reshape(cells // 2, 2, cells // 2, 2, cells // 2, 2).any(axis=(1, 3, 5))
+
+
 @pytest.mark.parametrize("edge", [0.12, 0.07, 0.3])
 def test_faces_on_borders_of_voxels_keep_their_area(gpu: GpuContext, edge: float) -> None:
     """But for rounding, which differs between the CPU, which makes room, and shaders."""

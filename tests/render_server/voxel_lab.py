@@ -18,6 +18,7 @@ from deltalight.render_server.passes.voxels import (
     SURFELS_HEADER_BYTES,
     FarVolumeBlock,
     FilterVoxels,
+    OccupyVoxels,
     PlacedVolume,
     ResolveVoxels,
     VolumePlacement,
@@ -67,6 +68,7 @@ class VoxelLab:
         self._light = LightVoxels(gpu)
         self._resolve = ResolveVoxels(gpu)
         self._filter = FilterVoxels(gpu)
+        self._occupy = OccupyVoxels(gpu)
         self._lights = LightBuffers(gpu, 64, 4)
         self._lights.set_environment(np.zeros((16, 16, 3), np.float32))
         self._cones = Kernel(gpu, Path(__file__).with_name("cones"))
@@ -103,6 +105,7 @@ class VoxelLab:
         self._voxelize.run(voxels.store, triangle_corners(mesh), self._volume)
         self._light.light_virtual(voxels.store, scene)
         self._resolve.resolve_rho(voxels.rho, voxels.empty, voxels.store, self._volume)
+        self._occupy.run(voxels.rho, self._volume, voxels.store)
         self._filter.run(voxels.rho, self._volume)
         materials.release()
         return voxels
@@ -128,7 +131,9 @@ class VoxelLab:
             self._light.bindings,
             mipmap_mu=voxels.mu.texture,
             mipmap_rho=voxels.rho.texture,
+            Occupied=voxels.rho.occupied,
             mipmap_far=None,
+            OccupiedFar=None,
             FarVolume=self._beyond,
             Rays=ray_buffer,
             Results=results,
@@ -147,6 +152,7 @@ class VoxelLab:
             self._light,
             self._resolve,
             self._filter,
+            self._occupy,
             self._lights,
             self._cones,
         ):

@@ -79,7 +79,7 @@ def test_usb_devices_of_known_makers_are_named_with_what_they_need(tmp_path: Pat
     (tmp_path / "sys/bus/usb/devices/usb1").mkdir()
     found = {camera.source: camera for camera in discover(tmp_path).cameras}
     assert list(found) == ["oak", "orbbec:0", "orbbec:1", "openni2:0"]
-    assert found["oak"].hint == f"depthai is not installed: {install_command('deltalight[oak]')}"
+    assert found["oak"].hint == f"depthai is not installed: {install_command('depthai>=3')}"
     assert found["orbbec:1"].name == "Astra Mini"
     assert ("WITH_OPENNI2=ON" in found["openni2:0"].hint) is not has_backend("openni2")
 
@@ -88,7 +88,7 @@ def test_what_is_missing_is_said_for_each_kind(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(oak_discovery, "sdk_version", lambda: None)
     missing = {kind.kind: kind for kind in discover(tmp_path).missing}
     assert "does not list" in missing["uvc"].details
-    assert missing["oak"].hint == install_command("deltalight[oak]")
+    assert missing["oak"].hint == install_command("depthai>=3")
     (tmp_path / "sys/class").mkdir(parents=True)
     missing = {kind.kind: kind for kind in discover(tmp_path).missing}
     assert "no video device" in missing["uvc"].details

@@ -51,6 +51,7 @@ def test_the_sdk_is_quiet_and_sends_nothing_home(capfd: pytest.CaptureFixture[st
     import os
 
     assert os.environ["DEPTHAI_TELEMETRY"] == "0"
+    assert os.environ["DEPTHAI_AUTOCALIBRATION"] == "OFF", "a station has its own calibration"
     dai.Device.getAllAvailableDevices()
     assert capfd.readouterr().out == ""
 

@@ -15,6 +15,7 @@ import cv2
 import httpx
 import numpy as np
 import pytest
+import trimesh
 from jaxtyping import UInt8
 from numpy.typing import ArrayLike
 from playwright.sync_api import (
@@ -301,3 +302,51 @@ def desk(stack: Stack, context: BrowserContext) -> Iterator[Desk]:
         assert seat.complaints == []
     finally:
         seat.page.close()
+
+
+def knot_m(stack: Stack) -> np.ndarray:
+    return np.array(stack.object("knot")["pose"]["translation_m"])
+
+
+def shows_knot(picture: np.ndarray) -> np.ndarray:
+    """Where the knot's blue-green is, which nothing else in the room has."""
+    hue, saturation, _ = cv2.split(cv2.cvtColor(picture, cv2.COLOR_BGR2HSV))
+    is_knot = np.asarray((hue > 75) & (hue < 95) & (saturation > 110))
+    assert is_knot.sum() > 100
+    return is_knot
+
+
+def green_centre(picture: np.ndarray) -> np.ndarray:
+    """Mean column and row of the knot."""
+    rows, columns = np.nonzero(shows_knot(picture))
+    return np.array([columns.mean(), rows.mean()])
+
+
+def recorded_s(stack: Stack) -> float:
+    return max((each["duration_s"] or 0 for each in stack.get("/recordings")), default=0)
+
+
+def steep_place(page: Desk, stack: Stack) -> tuple[float, float]:
+    """A place on the screen where the picture shows something real that stands upright."""
+    box = page.page.locator("#stage").bounding_box()
+    assert box is not None
+    for row, column in np.ndindex(9, 16):
+        place = (box["x"] + box["width"] * (column + 0.5) / 16, box["y"] + box["height"] * (row + 0.5) / 9)
+        seen = stack.client.post("/live/pick", json=page.pixel_at(place)).json()
+        if seen["kind"] == "real" and seen["normal"] and abs(seen["normal"][2]) < 0.3:
+            return place
+    pytest.fail("the picture shows nothing steep")
+
+
+def magenta(picture: np.ndarray) -> int:
+    blue, green, red = (channel.astype(int) for channel in cv2.split(picture))
+    return int(((red > 1.6 * green) & (blue > 1.4 * green)).sum())
+
+
+def box_glb() -> bytes:
+    """A magenta box of 12 cm, a colour that the room does not have."""
+    box = trimesh.creation.box((0.12, 0.12, 0.12))
+    material = trimesh.visual.material.PBRMaterial(baseColorFactor=[255, 0, 200, 255], metallicFactor=0.0)
+    box.visual = trimesh.visual.TextureVisuals(material=material)
+    content: bytes = box.export(file_type="glb")
+    return content

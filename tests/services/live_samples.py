@@ -5,11 +5,11 @@ import json
 import struct
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import httpx
 import numpy as np
@@ -18,8 +18,9 @@ from websockets.sync.client import ClientConnection, connect
 
 from deltalight.protocol.codecs import encode_color
 from deltalight.protocol.envelope import encode
-from deltalight.protocol.messages import CompositeMessage, StatsMessage
+from deltalight.protocol.messages import CompositeMessage, OtherPicture, StatsMessage
 from deltalight.protocol.publisher import Publisher
+from deltalight.protocol.scene_fields import ShownView
 from deltalight.services import ports
 from tests.services.api_samples import RenderServer, RunningApi, running_api
 from tests.services.conftest import HEIGHT, IDENTITY, WIDTH, camera
@@ -34,7 +35,8 @@ class StandInStream:
     """Publishes a composite every `period_s`, each tenth time a report too; `scene` = id and revision of what it has.
 
     While `is_busy` it does neither, as a renderer that is at work on a slow frame; a camera that sends `camera_fps`
-    frames a second reports meanwhile. `ages_s` are the times since the composites' capture, in turn.
+    frames a second reports meanwhile. `ages_s` are the times since the composites' capture, in turn. `watched`
+    returns the views that are wanted beside the picture: `shade` tells them apart.
     """
 
     def __init__(self, port: int, period_s: float = PERIOD_S) -> None:
@@ -43,6 +45,7 @@ class StandInStream:
         self.is_busy = False
         self.camera_fps: float | None = None
         self.ages_s: tuple[float, ...] = (AGE_S,)
+        self.watched: Callable[[], Sequence[ShownView]] = tuple
         self._stop = threading.Event()
         self.publisher = Publisher(ports.endpoint(port))
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -63,10 +66,20 @@ class StandInStream:
             if self.is_busy:
                 continue
             age_s = self.ages_s[number % len(self.ages_s)]
-            self.publisher.send(encode(composite(number, *self.scene, age_s=age_s), [jpeg]))
+            others = tuple(OtherPicture(view=view) for view in self.watched())
+            message = composite(number, *self.scene, age_s=age_s).model_copy(update={"others": others})
+            pictures = [
+                encode_color(np.full((HEIGHT, WIDTH, 3), shade(each.view), np.uint8)) for each in others
+            ]
+            self.publisher.send(encode(message, [jpeg, *pictures]))
             if number % 10 == 0:
                 self.publisher.send(encode(report("render-server", "stand-in renderer")))
             self.sent = number
+
+
+def shade(view: ShownView) -> int:
+    """The grey of the stand-in's picture in a view."""
+    return 30 * (1 + get_args(ShownView).index(view))
 
 
 def composite(
@@ -116,6 +129,7 @@ def live_api(folder: Path, *, period_s: float = PERIOD_S, **settings: object) ->
     control_port, stream_port = ports.private_ports(2)
     endpoints = {"control": ports.endpoint(control_port), "subscribe": [ports.endpoint(stream_port)]}
     stream, server = StandInStream(stream_port, period_s), RenderServer(control_port)
+    stream.watched = lambda: server.session.watched
     try:
         with running_api(folder, **endpoints, **settings) as api:
             address = f"{ports.LOOPBACK}:{api.client.base_url.port}"

@@ -1,14 +1,23 @@
-"""A stand-in for the render server's control socket: notes what is asked, writes what snapshots want."""
+"""Stand-ins for the render server's control socket, and for the renderer in it."""
 
 import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, Literal
 
 import cv2
 import numpy as np
 
+from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import ViewFrame
 from deltalight.protocol.messages import ControlRequest
 from deltalight.protocol.request import ReplyServer
+from deltalight.protocol.scene import SceneDocument
+from deltalight.protocol.scene_fields import ShownView
+from deltalight.render_server.frame_budget import Level
+from deltalight.render_server.renderer import OtherView
 from deltalight.services import ports
 
 NOWHERE = {"kind": "nothing", "object": None, "point_m": None, "normal": None, "distance_m": None}
@@ -25,7 +34,7 @@ class Recorder:
         self.asked: list[tuple[str, dict[str, object]]] = []
         self.fault: str | None = None
         self.scene_id: str | None = None
-        self.revision = 1
+        self.revision, self.instance = 1, "stand-in"
         self.gate = threading.Event()
         self.gate.set()
         self.is_busy = threading.Event()
@@ -38,11 +47,16 @@ class Recorder:
     def payloads(self, op: str) -> list[dict[str, object]]:
         return [payload for asked, payload in self.asked if asked == op]
 
+    def watched(self) -> list[ShownView]:
+        """The views that are ordered."""
+        orders = self.payloads("watch")
+        return list(orders[-1]["views"]) if orders else []  # type: ignore[call-overload]
+
     def _execute(self, request: ControlRequest) -> dict[str, object]:
         self.asked.append((request.op, dict(request.payload)))
         match request.op:
             case "ping":
-                return {"scene_id": self.scene_id, "revision": self.revision, "instance": "stand-in"}
+                return {"scene_id": self.scene_id, "revision": self.revision, "instance": self.instance}
             case "set_scene":
                 self._wait_at_gate()
                 self.scene_id, self.revision = request.scene_id, request.revision or self.revision + 1
@@ -69,3 +83,87 @@ class Recorder:
             files.append(f"{picture['name']}.png")
             cv2.imwrite(str(folder / files[-1]), np.full((4, 6, 3), len(files), np.uint8))
         return {"frame_id": 17, "capture_ns": 1_763_700_000_000_000_000, "files": files, "errors": errors}
+
+
+@dataclass
+class Picture:
+    color: np.ndarray
+    status: Literal["ok", "no_pose"]
+    camera: CameraModel
+    world_from_camera: np.ndarray | None
+    pass_times_ms: dict[str, float] = field(default_factory=lambda: {"linearize": 1.5})
+    lights: list[dict[str, Any]] = field(default_factory=list)
+    linear: np.ndarray | None = None
+    level: Level | None = field(default_factory=lambda: Level("live", 0.5))
+    others: tuple[OtherView, ...] = ()
+
+
+@dataclass
+class Picked:
+    frame_id: int
+    pixel: tuple[float, float]
+
+    def as_dict(self) -> dict[str, object]:
+        return {"frame_id": self.frame_id, "kind": "nothing", "pixel": list(self.pixel)}
+
+
+@dataclass
+class Started:
+    finish: Callable[[], Picture]
+    immediate: bool
+
+
+class InvertingRenderer:
+    """Inverts the picture; fails where the test says so."""
+
+    def __init__(self) -> None:
+        self.fails_at: set[int] = set()
+        self.immediate = True
+        self.notices: list[str] = []
+        self.scenes: list[SceneDocument] = []
+        self.sources_begun = 0
+        self.newest: ViewFrame | None = None
+        self.ignored: str | None = None
+        self.unfinished: list[int] = []
+
+    def submit(
+        self,
+        frame: ViewFrame,
+        *,
+        with_linear: bool = False,
+        whole: bool = False,  # noqa: ARG002
+        others: Sequence[ShownView] = (),
+    ) -> Started:
+        self.newest = frame
+        if frame.frame_id in self.fails_at:
+            raise RuntimeError("the volume fell over")
+        pose = None if frame.pose is None else frame.pose.world_from_camera
+        picture = Picture(255 - frame.color, "no_pose" if pose is None else "ok", frame.camera, pose)
+        picture.others = tuple(OtherView(view, frame.color, None) for view in others)
+        if with_linear:
+            picture.linear = picture.color.astype(np.float32) / 255
+        self.unfinished.append(frame.frame_id)
+
+        def finish() -> Picture:
+            assert self.unfinished.pop(0) == frame.frame_id, "frames are finished in the order of their start"
+            return picture
+
+        return Started(finish, self.immediate)
+
+    def sized(self, frame: ViewFrame) -> ViewFrame:
+        return frame
+
+    def pick(self, x: float, y: float, ignore: str | None = None) -> Picked:
+        if self.newest is None:
+            raise DeltalightError("Nothing was rendered yet; ask again when there is a picture.")
+        self.ignored = ignore
+        return Picked(self.newest.frame_id, (x, y))
+
+    def forget_frames(self) -> None:
+        self.sources_begun += 1
+        self.newest = None
+
+    def set_scene(self, scene: SceneDocument) -> None:
+        if scene.name == "refused":
+            raise DeltalightError("This scene cannot be shown; take another.")
+        self.scenes.append(scene)

@@ -20,7 +20,7 @@ import httpx
 import numpy as np
 import pytest
 
-from deltalight.protocol.messages import MAX_SENTENCE
+from deltalight.protocol.message_fields import MAX_SENTENCE
 from deltalight.protocol.radiance_files import write_exr
 from deltalight.services import ports
 from deltalight.services.api.problems import TYPE_PREFIX

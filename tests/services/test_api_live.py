@@ -14,6 +14,7 @@ import pytest
 import websockets
 from websockets.sync.client import ClientConnection
 
+from deltalight.protocol.codecs import decode_color
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.messages import ControlRequest
 from deltalight.services import ports
@@ -21,6 +22,7 @@ from deltalight.services.api.credentials import OPEN_TICKETS, TICKET_LIFE_S, Pri
 from deltalight.services.api.limits import STREAMS_PER_CLIENT
 from deltalight.services.api.live_hub import LiveHub
 from deltalight.services.api.routes.live import WINDOW
+from deltalight.services.live_message import unpack
 from tests.services.api_samples import sentence
 from tests.services.conftest import HEIGHT, ROOT, WIDTH
 from tests.services.live_samples import (
@@ -31,8 +33,10 @@ from tests.services.live_samples import (
     live_api,
     live_socket,
     read_frame,
+    shade,
     wait_for_frames,
 )
+from tests.services.test_api_scenes import wait_for
 
 ENDED_BY_SIGTERM = 143
 MANY = 20
@@ -80,10 +84,47 @@ def test_a_frames_header_says_what_it_shows_and_where_time_went(live: LiveApi) -
     assert {"number", "frame_id", "capture_ns", "frames_per_s", "renderer"} <= set(header)
 
 
+def view_of(socket: ClientConnection, wanted: str) -> int:
+    """The grey of the first picture in a view."""
+    for _ in range(200):
+        message = socket.recv(timeout=10)
+        socket.send("ack")
+        assert isinstance(message, bytes)
+        header, jpeg = unpack(message)
+        if header.view == wanted:
+            assert (header.world_from_camera is None) == (wanted != "composite")
+            return int(decode_color(memoryview(jpeg), "jpeg", (HEIGHT, WIDTH, 3)).mean())
+    pytest.fail(f"the view {wanted} never came")
+
+
+def test_two_viewers_look_at_different_views_of_the_same_frames(live: LiveApi) -> None:
+    with live_socket(live.address, "?view=delta") as one, live_socket(live.address) as other:
+        assert view_of(one, "delta") == shade("delta")
+        view_of(other, "composite")
+        other.send("view camera")
+        assert view_of(other, "camera") == shade("camera")
+        assert view_of(one, "delta") == shade("delta")
+        wait_for(lambda: live.server.session.watched == ("camera", "delta"))
+        other.send("view")
+        view_of(other, "composite")
+    wait_for(lambda: live.server.session.watched == ())
+    picture = live.client.get("/live.jpg", params={"view": "volume"}).content
+    assert int(decode_color(memoryview(picture), "jpeg", (HEIGHT, WIDTH, 3)).mean()) == shade("volume")
+    wait_for(lambda: live.server.session.watched == ())
+    assert "view" in sentence(live.client.get("/live.jpg", params={"view": "sideways"}), 422)
+
+
+def test_a_view_that_there_is_not_ends_the_connection(live: LiveApi) -> None:
+    with live_socket(live.address) as socket:
+        socket.send("view sideways")
+        with pytest.raises(websockets.ConnectionClosed, match=r"output\.view"):
+            follow(socket)
+
+
 def test_a_composite_without_a_camera_is_refused() -> None:
     hub = LiveHub()
     with pytest.raises(DeltalightError, match=r"`camera\.width`"):
-        hub.publish(composite(1).model_copy(update={"camera": {}}), b"", "")
+        hub.publish(composite(1).model_copy(update={"camera": {}}), [b""], "")
     assert hub.newest is None
 
 

@@ -8,7 +8,7 @@ import copy
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -68,6 +68,7 @@ def full_api(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Runnin
     control_port, stream_port = ports.private_ports(2)
     endpoints = {"control": ports.endpoint(control_port), "subscribe": [ports.endpoint(stream_port)]}
     server, stream = Recorder(control_port), StandInStream(stream_port)
+    stream.watched = server.watched
     with running_api(tmp_path / "data", requests_per_s=10_000, **endpoints) as running:
         wait_for_frames(f"{ports.LOOPBACK}:{running.client.base_url.port}")
         yield running
@@ -82,7 +83,7 @@ def api(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningApi]:
         yield running
 
 
-def fill(api: RunningApi) -> dict[str, list[str]]:
+def fill(api: RunningApi) -> dict[str, Sequence[str | int]]:
     """Put things of every kind into the store; gives their ids by the parameter that takes them."""
     assets = [upload(api.store, TETRAHEDRON + b"#%d" % n, f"t{n}.obj") for n in range(OF_EACH)]
     scenes = [api.store.scenes.create(SCENE).head.id for _ in range(OF_EACH)]
@@ -96,8 +97,8 @@ def fill(api: RunningApi) -> dict[str, list[str]]:
         "scene_id": scenes,
         "object_id": ["knot"],
         "item": ["grey-ball"],
-        "index": ["0"],
-        "revision": ["1"],
+        "index": [0],
+        "revision": [1],
         "snapshot_id": snapshots,
         "file": ["a.png"],
         "recording_id": [take.stem for take in takes],
@@ -117,7 +118,7 @@ def with_plain_tuples(schema: Any) -> Any:  # noqa: ANN401 - JSON
     return plain
 
 
-def configuration(known: dict[str, list[str]]) -> str:
+def configuration(known: dict[str, Sequence[str | int]]) -> str:
     """schemathesis.toml: ids that exist in most requests, others in the rest."""
     lines = [f"[dictionaries.{name}]\nvalues = {json.dumps(ids)}" for name, ids in known.items()]
     lines.append("[parameters]")

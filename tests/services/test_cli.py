@@ -50,7 +50,10 @@ COMMANDS = {
     "bench counts",
     "bench plot",
     "bench quality",
+    "bench real",
     "bench rest",
+    "bench soak",
+    "bench sweep",
     "gpu-check",
 }
 

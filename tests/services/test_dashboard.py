@@ -1,16 +1,33 @@
 """The dashboard in a real browser, beside REST: what is done in the page is in the scene, and in the picture."""
 
+import shutil
 from collections.abc import Iterator
+from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
-import trimesh
 from playwright.sync_api import Browser, Route
 
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.services.demo import RECORDING, SCENE
-from tests.services.dashboard_samples import AXE, NEEDS_BROWSER, SIZE, Desk, Stack, demo_stack, desk
+from deltalight.services.recording_copies import export_recording
+from tests.services.dashboard_samples import (
+    AXE,
+    NEEDS_BROWSER,
+    SIZE,
+    Desk,
+    Stack,
+    box_glb,
+    demo_stack,
+    desk,
+    green_centre,
+    knot_m,
+    magenta,
+    recorded_s,
+    shows_knot,
+    steep_place,
+)
+from tests.services.record_samples import frames, write
 
 pytestmark = [
     *NEEDS_BROWSER,
@@ -47,24 +64,6 @@ def page(stack: Stack, browser: Browser, first_document: dict[str, object]) -> I
         yield seat
 
 
-def knot_m(stack: Stack) -> np.ndarray:
-    return np.array(stack.object("knot")["pose"]["translation_m"])
-
-
-def shows_knot(picture: np.ndarray) -> np.ndarray:
-    """Where the knot's blue-green is, which nothing else in the room has."""
-    hue, saturation, _ = cv2.split(cv2.cvtColor(picture, cv2.COLOR_BGR2HSV))
-    is_knot = np.asarray((hue > 75) & (hue < 95) & (saturation > 110))
-    assert is_knot.sum() > 100
-    return is_knot
-
-
-def green_centre(picture: np.ndarray) -> np.ndarray:
-    """Mean column and row of the knot."""
-    rows, columns = np.nonzero(shows_knot(picture))
-    return np.array([columns.mean(), rows.mean()])
-
-
 def test_the_first_start_shows_a_working_scene_and_what_to_try(page: Desk) -> None:
     picture = page.pixels()
     assert picture.std() > 20, "the picture is not empty"
@@ -78,20 +77,6 @@ def test_the_first_start_shows_a_working_scene_and_what_to_try(page: Desk) -> No
     page.page.reload()
     page.shows_newest()
     assert guide.count() == 0, "what was dismissed stays away"
-
-
-def box_glb() -> bytes:
-    """A magenta box of 12 cm, a colour that the room does not have."""
-    box = trimesh.creation.box((0.12, 0.12, 0.12))
-    material = trimesh.visual.material.PBRMaterial(baseColorFactor=[255, 0, 200, 255], metallicFactor=0.0)
-    box.visual = trimesh.visual.TextureVisuals(material=material)
-    content: bytes = box.export(file_type="glb")
-    return content
-
-
-def magenta(picture: np.ndarray) -> int:
-    blue, green, red = (channel.astype(int) for channel in cv2.split(picture))
-    return int(((red > 1.6 * green) & (blue > 1.4 * green)).sum())
 
 
 def test_a_glb_that_is_dropped_stands_where_it_was_let_go(stack: Stack, page: Desk) -> None:
@@ -160,18 +145,6 @@ def test_a_copy_finds_room_beside_the_original(stack: Stack, page: Desk) -> None
     assert abs(way_m[2]) < 0.2, "on the table or on a thing that stands on it"
     assert copy["pose"]["rotation_wxyz"] == original["pose"]["rotation_wxyz"]
     assert copy["asset"] == original["asset"]
-
-
-def steep_place(page: Desk, stack: Stack) -> tuple[float, float]:
-    """A place on the screen where the picture shows something real that stands upright."""
-    box = page.page.locator("#stage").bounding_box()
-    assert box is not None
-    for row, column in np.ndindex(9, 16):
-        place = (box["x"] + box["width"] * (column + 0.5) / 16, box["y"] + box["height"] * (row + 0.5) / 9)
-        seen = stack.client.post("/live/pick", json=page.pixel_at(place)).json()
-        if seen["kind"] == "real" and seen["normal"] and abs(seen["normal"][2]) < 0.3:
-            return place
-    pytest.fail("the picture shows nothing steep")
 
 
 def test_nothing_is_placed_on_a_wall(stack: Stack, page: Desk) -> None:
@@ -409,8 +382,26 @@ def test_three_seconds_are_recorded_and_replayed(stack: Stack, page: Desk) -> No
     page.until(lambda: stack.get("/replay")["recording"] is None, "live again")
 
 
-def recorded_s(stack: Stack) -> float:
-    return max((each["duration_s"] or 0 for each in stack.get("/recordings")), default=0)
+def test_a_zipped_folder_that_is_dropped_is_opened_with_a_checklist(
+    stack: Stack, page: Desk, tmp_path: Path
+) -> None:
+    take = write(tmp_path / "desk.mcap", frames(3))
+    export_recording(take, tmp_path / "desk", lambda numbers: numbers)
+    content = Path(shutil.make_archive(str(tmp_path / "desk"), "zip", tmp_path, "desk")).read_bytes()
+    page.drop("desk.zip", content, page.place_of(FREE_TABLE_M))
+    card = page.named("article", "desk")
+    card.wait_for()
+    needs = card.get_by_role("list", name="What relighting needs").get_by_role("listitem")
+    assert needs.all_inner_texts() == [
+        "Depth in 3 of 3 frames.",
+        "Poses are given.",
+        "No fish-eye camera: place lamps by hand.",
+    ]
+    page.until(lambda: stack.get("/replay")["recording"] == "desk", "its replay")
+    page.photograph("open_recording")
+    page.named("button", "Back to live").click()
+    page.until(lambda: stack.get("/replay")["recording"] is None, "live again")
+    stack.client.delete("/recordings/desk").raise_for_status()
 
 
 def test_a_reload_finds_everything_as_it_was(stack: Stack, page: Desk) -> None:

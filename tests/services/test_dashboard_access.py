@@ -36,6 +36,7 @@ LOOKING = {
         "Sign out",
     ),
     *("Outlines and lamps", "Close the drawer", "Lamp 1"),
+    *("View", "Picture", "Effects", "Change of light", "Volume", "Light's view", "Camera"),
 }
 
 

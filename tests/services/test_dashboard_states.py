@@ -19,7 +19,7 @@ from tests.services.dashboard_samples import (
     Desk,
     Stack,
 )
-from tests.services.live_samples import AGE_S, LiveApi, live_api
+from tests.services.live_samples import AGE_S, LiveApi, live_api, shade
 
 pytestmark = NEEDS_BROWSER
 LAMP = {"type": "sphere", "position_m": [1, 0, 1], "intensity": 5}
@@ -194,15 +194,32 @@ def test_a_view_is_neither_in_the_scene_nor_in_its_history(live: LiveApi, stack:
     page.open()
     view = page.page.get_by_role("toolbar").get_by_label("View")
     view.select_option("delta")
-    page.until(lambda: live.server.session.scene.output.view == "delta", "the view")
+    page.until(lambda: live.server.session.watched == ("delta",), "the view")
+    page.until(lambda: abs(page.pixels().mean() - shade("delta")) < 2, "its picture")
     page.page.keyboard.press("Escape")
     page.page.locator("#stage").press("2")
-    page.until(lambda: live.server.session.scene.output.view == "effects", "the view of a key")
+    page.until(lambda: live.server.session.watched == ("effects",), "the view of a key")
     expect(view).to_have_value("effects")
     expect(page.named("button", "Undo")).to_be_disabled()
     assert (stack.scene()["revision"], stack.document()["output"]["view"]) == (1, "composite")
     stack.client.patch(f"{stack.path}/output", json={"view": "volume"}).raise_for_status()
     expect(view).to_have_value("volume")
+
+
+def test_the_guide_ticks_off_what_was_tried_and_keeps_it(stack: Stack, page: Desk) -> None:
+    page.open()
+    steps = page.named("region", "Try this").get_by_role("listitem")
+    done = page.page.locator(".guide li.done")
+    expect(steps).to_have_count(4)
+    expect(done).to_have_count(0)
+    page.named("button", "Add light").click()
+    page.page.get_by_role("menuitem", name="Spot").click()
+    expect(done).to_have_count(1)
+    expect(done.first).to_contain_text("Change the light")
+    page.photograph("guide")
+    page.page.reload()
+    expect(done).to_have_count(1)
+    assert stack.document()["lights"]["manual"][-1]["type"] == "spot"
 
 
 def test_a_name_is_kept_as_it_is_typed_while_the_scene_changes(stack: Stack, page: Desk) -> None:

@@ -15,7 +15,7 @@ from deltalight.services.api.delivery import BUSY, WAITERS, Change, Deliveries, 
 from deltalight.services.api.render_link import FifoLock
 from deltalight.services.api.routes import live
 from tests.services.api_samples import RunningApi, running_api, sentence
-from tests.services.live_samples import event_socket, next_event
+from tests.services.live_samples import event_socket, live_socket, next_event
 from tests.services.render_server_samples import Recorder
 from tests.services.test_api_scenes import wait_for
 
@@ -109,26 +109,28 @@ def test_the_newest_of_many_changes_is_sent_and_all_are_answered(shown: Shown) -
     assert shown.client.get("/state").json()["picture"] == last["picture"]
 
 
-def test_a_view_is_no_change_of_the_scene_and_ends_with_a_change_of_its_own(shown: Shown) -> None:
-    def sent() -> list[object]:
-        return [order["scene"]["output"]["view"] for order in shown.server.payloads("set_scene")]  # type: ignore[index]
+def test_the_views_that_viewers_look_at_are_ordered_and_no_change_of_the_scene(shown: Shown) -> None:
+    def watched() -> list[object]:
+        return [order["views"] for order in shown.server.payloads("watch")]
 
-    before = shown.client.get(f"/scenes/{shown.id}").json()
-    assert shown.client.get("/view").json() == {"view": None}
-    shown.client.put("/view", json={"view": "delta"}).raise_for_status()
-    wait_for(lambda: sent() == ["composite", "delta"])
-    wait_for(lambda: shown.client.get(f"/scenes/{shown.id}").json() == before)
+    before, sent = shown.client.get(f"/scenes/{shown.id}").json(), len(shown.server.payloads("set_scene"))
+    wait_for(lambda: watched() == [[]])
+    with live_socket(shown.address, "?view=delta"), live_socket(shown.address) as other:
+        wait_for(lambda: watched()[1:] == [["delta"]])
+        other.send("view rsm")
+        wait_for(lambda: watched()[2:] == [["delta", "rsm"]])
+    wait_for(lambda: watched()[-1] == [])
+    assert len(shown.server.payloads("set_scene")) == sent
+    assert shown.client.get(f"/scenes/{shown.id}").json() == before
     assert not before["can_undo"]
-    assert shown.rename("other")["revision"] == 2
-    assert sent() == ["composite", "delta", "delta"]
-    shown.client.patch(f"/scenes/{shown.id}/output", json={"view": "volume"}).raise_for_status()
-    assert sent()[-1] == "volume", "the document's newer wish"
-    assert shown.client.get("/view").json() == {"view": None}
-    shown.client.put("/view", json={"view": "rsm"}).raise_for_status()
-    wait_for(lambda: sent()[-1] == "rsm")
-    shown.client.put("/view", json={"view": None}).raise_for_status()
-    wait_for(lambda: sent()[-1] == "volume")
-    assert "view" in sentence(shown.client.put("/view", json={"view": "sideways"}), 422)
+
+
+def test_a_restarted_render_server_is_told_again_which_views_are_looked_at(shown: Shown) -> None:
+    with live_socket(shown.address, "?view=delta"):
+        wait_for(lambda: {"views": ["delta"]} in shown.server.payloads("watch"))
+        before = len(shown.server.payloads("watch"))
+        shown.server.instance = "another"
+        wait_for(lambda: shown.server.payloads("watch")[before:] == [{"views": ["delta"]}])
 
 
 def test_who_waits_for_the_same_revision_holds_a_few_threads_only(shown: Shown) -> None:

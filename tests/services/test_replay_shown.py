@@ -189,7 +189,7 @@ def set_to_work(api: Api, name: str) -> list[psutil.Process]:
 def require_whole(host: Host, name: str) -> None:
     folder = host.data / "recordings"
     assert len(open_source(folder / f"{name}.mcap")) > 3
-    left = {path.name for path in folder.iterdir()} - {".cache"}
+    left = {path.name for path in folder.iterdir()} - {".cache", ".incoming"}
     assert not [each for each in left if each.endswith(".active") or each.startswith(".")]
 
 

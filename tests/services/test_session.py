@@ -1,101 +1,24 @@
 """A render session with a renderer that the test gives: frames, faults, commands."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pytest
 
-from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.errors import DeltalightError
-from deltalight.protocol.frames import ViewFrame
-from deltalight.protocol.messages import MAX_LABELS, MAX_SENTENCE, ControlRequest
+from deltalight.protocol.message_fields import MAX_LABELS, MAX_SENTENCE
+from deltalight.protocol.messages import ControlRequest
 from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.subscriber import ReceivedMultipart
-from deltalight.render_server.frame_budget import Level
 from deltalight.render_server.server import frames
 from deltalight.render_server.server.frames import FrameAssembler
 from deltalight.render_server.server.session import MAXIMUM_FAULTS_IN_A_ROW, RenderSession, SourceInUse
 from tests.services.conftest import IDENTITY, camera, color, depth, pose, received
+from tests.services.render_server_samples import InvertingRenderer
 
 START = 10**15
-
-
-@dataclass
-class Picture:
-    color: np.ndarray
-    status: Literal["ok", "no_pose"]
-    camera: CameraModel
-    world_from_camera: np.ndarray | None
-    pass_times_ms: dict[str, float] = field(default_factory=lambda: {"linearize": 1.5})
-    lights: list[dict[str, Any]] = field(default_factory=list)
-    linear: np.ndarray | None = None
-    level: Level | None = field(default_factory=lambda: Level("live", 0.5))
-
-
-@dataclass
-class Picked:
-    frame_id: int
-    pixel: tuple[float, float]
-
-    def as_dict(self) -> dict[str, object]:
-        return {"frame_id": self.frame_id, "kind": "nothing", "pixel": list(self.pixel)}
-
-
-@dataclass
-class Started:
-    finish: Callable[[], Picture]
-    immediate: bool
-
-
-class InvertingRenderer:
-    """Inverts the picture; fails where the test says so."""
-
-    def __init__(self) -> None:
-        self.fails_at: set[int] = set()
-        self.immediate = True
-        self.notices: list[str] = []
-        self.scenes: list[SceneDocument] = []
-        self.sources_begun = 0
-        self.newest: ViewFrame | None = None
-        self.ignored: str | None = None
-        self.unfinished: list[int] = []
-
-    def submit(self, frame: ViewFrame, *, with_linear: bool = False, whole: bool = False) -> Started:  # noqa: ARG002
-        self.newest = frame
-        if frame.frame_id in self.fails_at:
-            raise RuntimeError("the volume fell over")
-        pose = None if frame.pose is None else frame.pose.world_from_camera
-        picture = Picture(255 - frame.color, "no_pose" if pose is None else "ok", frame.camera, pose)
-        if with_linear:
-            picture.linear = picture.color.astype(np.float32) / 255
-        self.unfinished.append(frame.frame_id)
-
-        def finish() -> Picture:
-            assert self.unfinished.pop(0) == frame.frame_id, "frames are finished in the order of their start"
-            return picture
-
-        return Started(finish, self.immediate)
-
-    def sized(self, frame: ViewFrame) -> ViewFrame:
-        return frame
-
-    def pick(self, x: float, y: float, ignore: str | None = None) -> Picked:
-        if self.newest is None:
-            raise DeltalightError("Nothing was rendered yet; ask again when there is a picture.")
-        self.ignored = ignore
-        return Picked(self.newest.frame_id, (x, y))
-
-    def forget_frames(self) -> None:
-        self.sources_begun += 1
-        self.newest = None
-
-    def set_scene(self, scene: SceneDocument) -> None:
-        if scene.name == "refused":
-            raise DeltalightError("This scene cannot be shown; take another.")
-        self.scenes.append(scene)
 
 
 def request(
@@ -145,7 +68,7 @@ def test_composite_carries_its_own_frames_header(session: RenderSession) -> None
     assert rendered.message.pass_times_ms == {"linearize": 1.5}
     assert (rendered.message.quality, rendered.message.scale) == ("live", 0.5)
     assert rendered.message.drops["color.cam"] == 4
-    assert np.all(rendered.pixels == 250)
+    assert np.all(rendered.pictures[0] == 250)
     assert session.step() is None
 
 
@@ -322,6 +245,30 @@ def test_wrong_or_refused_scene_changes_nothing(session: RenderSession, kept: li
     assert kept == []
 
 
+def test_watched_views_come_with_each_composite_as_long_as_they_are_watched(
+    session: RenderSession, renderer: InvertingRenderer
+) -> None:
+    def shown(frame_id: int) -> list[str]:
+        feed(session, frame_id)
+        rendered = session.step()
+        assert rendered is not None
+        assert len(rendered.pictures) == len(rendered.message.part_rules())
+        np.testing.assert_array_equal(rendered.pictures[0], 255 - renderer.newest.color)  # type: ignore[union-attr]
+        return [rendered.message.view, *(other.view for other in rendered.message.others)]
+
+    assert shown(1) == ["composite"]
+    assert session.execute(request("watch", views=["delta", "composite", "delta"])) == {
+        "views": ["delta", "composite"]
+    }
+    assert shown(2) == ["composite", "delta"], "once each, the scene's own without an order"
+    session.execute(request("set_view", view="delta"))
+    assert shown(3) == ["delta", "composite"]
+    session.execute(request("watch", views=[]))
+    assert shown(4) == ["delta"]
+    with pytest.raises(DeltalightError, match="the command watch"):
+        session.execute(request("watch", views=["sideways"]))
+
+
 def test_set_view_and_get_scene(session: RenderSession) -> None:
     assert session.execute(request("set_view", view="delta")) == {"revision": 4}
     scene = session.execute(request("get_scene"))["scene"]
@@ -463,3 +410,8 @@ def test_another_source_begins_with_nothing_of_the_one_before(renderer: Invertin
         assert session.execute(request("set_source", endpoints=["x"]))
     assert used == [None, ("x",), ("x",)]
     assert renderer.sources_begun == 2
+
+
+def test_what_the_gpu_holds_is_counted_when_asked(renderer: InvertingRenderer) -> None:
+    session = RenderSession(renderer, SceneDocument(), count_objects=lambda: {"Texture": 3, "Buffer": 5})
+    assert session.execute(request("gl_objects")) == {"Texture": 3, "Buffer": 5}

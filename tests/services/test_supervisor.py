@@ -1,5 +1,7 @@
 """The supervisor with real child processes: restart, giving up, wrong input, no orphans."""
 
+import os
+import pkgutil
 import signal
 import subprocess
 import sys
@@ -11,7 +13,9 @@ import psutil
 import pytest
 
 from deltalight.protocol.errors import DeltalightError
+from deltalight.services.host import PREPARED
 from deltalight.services.supervisor import ChildSpec, Supervisor
+from deltalight.services.warm_spare import SPARE_VARIABLE
 
 SLEEP_FOREVER = "import time\nwhile True: time.sleep(60)"
 IGNORE_SIGTERM = f"import signal\nsignal.signal(signal.SIGTERM, signal.SIG_IGN)\n{SLEEP_FOREVER}"
@@ -100,3 +104,55 @@ def test_children_end_when_the_supervisor_is_killed(tmp_path: Path) -> None:
     process.send_signal(signal.SIGKILL)
     process.wait()
     assert psutil.wait_procs([orphan], timeout=10)[1] == []
+
+
+WARM_CHILD = """
+import os, sys, time
+from deltalight.services.warm_spare import wait_if_spare
+wait_if_spare()
+print("runs with", "colorsys" in sys.modules, repr(sys.stdin.read()), file=sys.stderr, flush=True)
+while True: time.sleep(60)
+"""
+
+
+def test_a_spare_takes_the_place_of_a_process_that_dies(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("deltalight.services.supervisor.SPARE_AFTER_S", 0.0)
+    lines: list[str] = []
+    spec = ChildSpec("a", ("-c", WARM_CHILD), warm=("colorsys",))
+    with Supervisor([spec], forward=lines.append) as supervisor:
+        poll_until(supervisor, lambda: bool(supervisor.spare_ids()) and "a: runs with False ''" in lines)
+        first, spare = supervisor.process_ids()["a"], supervisor.spare_ids()["a"]
+        psutil.Process(first).kill()
+        poll_until(supervisor, lambda: supervisor.process_ids()["a"] == spare)
+        poll_until(supervisor, lambda: "a: runs with True ''" in lines)
+        poll_until(supervisor, lambda: "a" in supervisor.spare_ids())
+        another = supervisor.spare_ids()["a"]
+        assert another not in {first, spare}
+    assert not any(psutil.pid_exists(number) for number in (first, spare, another))
+
+
+def test_a_dead_spare_is_nobodys_replacement(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("deltalight.services.supervisor.SPARE_AFTER_S", 0.0)
+    spec = ChildSpec("a", ("-c", WARM_CHILD), warm=("no_such_module",))
+    with Supervisor([spec], forward=lambda _line: None) as supervisor:
+        poll_until(supervisor, lambda: bool(supervisor.spare_ids()))
+        first, spare = supervisor.process_ids()["a"], supervisor.spare_ids()["a"]
+        poll_until(supervisor, lambda: psutil.Process(spare).status() == psutil.STATUS_ZOMBIE)
+        psutil.Process(first).kill()
+        poll_until(supervisor, lambda: supervisor.restarts()["a"] == 1)
+        assert supervisor.process_ids()["a"] not in {first, spare}
+
+
+def test_a_spare_ends_with_its_supervisor() -> None:
+    waiting = subprocess.Popen(
+        [sys.executable, "-c", WARM_CHILD], stdin=subprocess.PIPE, env={**os.environ, SPARE_VARIABLE: ""}
+    )
+    assert waiting.stdin is not None
+    waiting.stdin.close()
+    assert waiting.wait(timeout=20) == 0
+
+
+def test_all_that_spares_prepare_is_there() -> None:
+    for names in PREPARED.values():
+        for name in names:
+            assert pkgutil.resolve_name(name)

@@ -15,7 +15,6 @@ layout(rgba16f) writeonly uniform image2D irradiance_mu;
 uniform usampler2D stale_texels;   // the others hold means already
 #endif
 #include "common/camera.glsl"
-uniform float sample_distance;
 
 float tent(ivec2 o) { return float((2 - abs(o.x)) * (2 - abs(o.y))); }
 

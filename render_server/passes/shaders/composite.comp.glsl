@@ -29,7 +29,6 @@ uniform sampler2D reflection;         // of objects in smooth surfaces, by rays;
 uniform sampler2D edge_correction;    // edge_unmixing.comp.glsl
 #pragma switch bool has_reflection
 uniform float exposure_scale;
-uniform float sample_distance;   // m at 1 m depth
 #include "common/camera.glsl"
 #pragma switch bool additive
 uniform bool relights_real;      // method `none` shows objects and keeps the real scene

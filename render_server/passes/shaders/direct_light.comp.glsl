@@ -1,38 +1,23 @@
 // Direct irradiance of the real surface at each pixel without and with the virtual objects (docs/method.md 3, direct), and
 // the light lobes on declared specular surfaces.
-#include "common/lights.glsl"
+#include "common/light_reach.glsl"
 #include "common/brdf.glsl"
-#include "common/geometry.glsl"
 #include "common/surfaces.glsl"
-#include "common/volume.glsl"
 #include "common/caustics.glsl"
-#ifdef SHADOW_CONES
-#include "common/shadow_cone.glsl"
-#endif
-
-#ifdef LISTED
 #include "common/work_list.glsl"
+
 layout(local_size_x = 64) in;
-#else
-layout(local_size_x = 8, local_size_y = 8) in;
-#endif
 layout(rgba16f) writeonly uniform image2D direct_mu;    // rgb E_mu; a: unshadowed E, mean of channels
 layout(rgba16f) writeonly uniform image2D direct_rho;   // rgb E_rho
 layout(rgba16f) writeonly uniform image2D lobe_mu;      // rgb radiance of light lobes
 layout(rgba16f) writeonly uniform image2D lobe_rho;
-#include "common/camera.glsl"
-uniform float noise_sigma;   // m at 1 m
 #pragma switch bool specular_surfaces
-#include "common/lit_area.glsl"
 
 #ifdef SHADOW_CONES
-bool shadow_may_reach(vec3 p, vec3 n, float bias) { return object_meets_cone(p, n); }
 vec2 light_visibility(Light light, vec3 p, vec3 n, float bias) { return cone_visibility(light, p, n, bias); }
 #elif defined(REAL_SHADOWS)
-bool shadow_may_reach(vec3 p, vec3 n, float bias) { return false; }
 vec2 light_visibility(Light light, vec3 p, vec3 n, float bias) { return vec2(real_visibility(light, p, n, bias)); }
 #else
-bool shadow_may_reach(vec3 p, vec3 n, float bias) { return object_may_shadow(p, bias); }
 vec2 light_visibility(Light light, vec3 p, vec3 n, float bias) { return visibility(light, p, n, bias, bias); }
 #endif
 
@@ -41,11 +26,8 @@ void light(ivec2 pixel, ivec2 size) {
     vec4 normal = texelFetch(real_surface_normal, pixel, 0);
     vec3 e_mu = vec3(0.0), e_rho = vec3(0.0), s_mu = vec3(0.0), s_rho = vec3(0.0);
     float unshadowed = 0.0;
-    float bias = 3.0 * noise_sigma * position.w * position.w;
-    // Where neither cones nor shadows of the objects reach, the picture stays unchanged.
-    bool reached = position.w > 0.0
-        && (is_in_lit_area(pixel) || inside_volume(volume_coordinate(position.xyz))
-            || shadow_may_reach(position.xyz, normal.xyz, bias));
+    float bias = shadow_bias(position.w);
+    bool reached = light_may_change(pixel, position, normal.xyz);
     if (reached) {
         vec3 v = normalize(camera_position - position.xyz);
         for (int i = 0; i < light_count; ++i) {
@@ -78,15 +60,10 @@ void light(ivec2 pixel, ivec2 size) {
 
 void main() {
     ivec2 size = textureSize(real_surface_position, 0);
-#ifdef LISTED
     int grid_width = (size.x + scale - 1) / scale;
     uint block = uint(scale * scale);
     for (uint i = gl_GlobalInvocationID.x; i < listed_count() * block; i += gl_NumWorkGroups.x * 64u) {
         ivec2 pixel = pixel_in_block(texel_of_index(texels[i / block], grid_width), int(i % block), scale);
         if (all(lessThan(pixel, size))) light(pixel, size);
     }
-#else
-    ivec2 pixel = ivec2(gl_GlobalInvocationID.xy);
-    if (all(lessThan(pixel, size))) light(pixel, size);
-#endif
 }

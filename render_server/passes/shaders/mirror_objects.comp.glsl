@@ -15,7 +15,6 @@ uniform sampler2D hit_position;
 uniform sampler2D hit_normal;
 uniform sampler2D hit_irradiance;
 uniform sampler2D hit_specular;
-uniform float sample_distance;   // m at 1 m: size of a texel of the reduced grid
 
 shared vec4 of_ray[64];
 shared float counted[64];    // 1: the ray leaves the surface

@@ -1,29 +1,18 @@
-// Where light must be computed at each texel of the reduced grid. Cones and caustics: where the last frame did not see
-// the texel's surface. Direct light (a list): where it is unknown at a pixel. And in turn, one tile in `turns`, so that
-// errors of resampling do not add up. Keeps the points that the next frame looks up.
+// Where cones and caustics must be computed at each texel of the reduced grid: where the last frame did not see the
+// texel's surface; and in turn, one tile in `turns`, so that errors of resampling do not add up. Keeps the points that
+// the next frame looks up.
 #include "common/geometry.glsl"
-#define APPENDS_TEXELS
-#include "common/work_list.glsl"
 #include "common/reprojection.glsl"
 #include "common/last_texels.glsl"
 
 layout(local_size_x = 8, local_size_y = 8) in;
 uniform isampler2D sample_pixels;
-uniform sampler2D reused_direct_rho;   // reproject_light.comp.glsl
 layout(r8ui) writeonly uniform uimage2D stale_out;
 layout(rgba32f) writeonly uniform image2D real_texels_out;
 layout(rgba32f) writeonly uniform image2D object_texels_out;
 
 bool is_unknown(vec4 position, vec3 normal, bool object) {
     return position.w > 0.0 && (!has_history || last_texels(position, normal, object).total < LEAST_WEIGHT);
-}
-
-bool is_direct_light_known(ivec2 texel) {
-    ivec2 last = textureSize(reused_direct_rho, 0) - 1;
-    float known = has_history ? 1.0 : 0.0;
-    for (int i = 0; i < (has_history ? scale * scale : 0); ++i)
-        known = min(known, texelFetch(reused_direct_rho, min(pixel_in_block(texel, i, scale), last), 0).a);
-    return known > 0.0;
 }
 
 void main() {
@@ -45,7 +34,6 @@ void main() {
     bool due = is_due(texel);
     uint stale = due || is_unknown(real, real_normal, false) ? STALE_REAL : 0u;
     if (object.w > 0.0 && (due || is_unknown(object, object_normal, true))) stale |= STALE_OBJECT;
-    if (due || !is_direct_light_known(texel)) append_texel(texel, textureSize(sample_pixels, 0).x);
     imageStore(stale_out, texel, uvec4(stale));
     imageStore(real_texels_out, texel, real);
     imageStore(object_texels_out, texel, object);

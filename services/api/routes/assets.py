@@ -9,7 +9,8 @@ from deltalight.protocol.scene import DIGEST_PREFIX
 from deltalight.services.api.context import Context, Shared, in_pool
 from deltalight.services.api.file_response import StoredFileResponse
 from deltalight.services.api.models import AssetAnswer
-from deltalight.services.api.problems import ProblemError, responses
+from deltalight.services.api.problems import responses
+from deltalight.services.api.request_bodies import UPLOAD_TYPE, require_upload_type
 from deltalight.services.storage.asset_kinds import FORMATS
 from deltalight.services.storage.assets import Asset
 
@@ -18,7 +19,6 @@ ROUTERS = (router,)
 Digest = Annotated[
     str, Path(description="`sha256:<hex>` or the digits alone.", examples=["sha256:2c26b46b68ffc68f..."])
 ]
-UPLOAD_TYPE = "application/octet-stream"
 UNCHANGING = {
     "Cache-Control": "private, max-age=31536000, immutable",
     "X-Content-Type-Options": "nosniff",
@@ -59,8 +59,7 @@ async def upload_asset(
     The file is recognised by its content and loaded once in a process of its own, with limits of memory and time.
     A .zip of one glTF and its files is kept as one .glb.
     """
-    if request.headers.get("content-type", "").partition(";")[0].strip().lower() != UPLOAD_TYPE:
-        raise ProblemError(415, "media-type", f"Send the file as the body, with Content-Type: {UPLOAD_TYPE}.")
+    require_upload_type(request)
     assets = shared.store.assets
     with assets.receiving(shared.settings.upload_limit_mb << 20) as incoming:
         async for chunk in request.stream():

@@ -4,29 +4,36 @@ import asyncio
 from collections.abc import AsyncIterator, Coroutine
 from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Body, Request, Response, WebSocket, WebSocketDisconnect
+from fastapi import APIRouter, Body, Query, Request, Response, WebSocket, WebSocketDisconnect
 from fastapi.responses import StreamingResponse
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
 from deltalight import __version__
-from deltalight.protocol.messages import MAX_EDGE_PX, RadianceMessage
+from deltalight.protocol.message_fields import MAX_EDGE_PX
+from deltalight.protocol.messages import RadianceMessage
+from deltalight.protocol.scene_fields import ShownView
 from deltalight.services.api.context import Shared, in_pool
 from deltalight.services.api.credentials import TICKET_LIFE_S, principal_of
 from deltalight.services.api.events import EventQueue, packed
 from deltalight.services.api.file_response import StoredFileResponse
 from deltalight.services.api.fisheye import FisheyeLight, lights_in_picture
-from deltalight.services.api.live_hub import LiveFrame, LiveHub
+from deltalight.services.api.live_hub import LiveHub, Viewer
 from deltalight.services.api.problems import ProblemError, responses, unavailable
-from deltalight.services.api.shown_view import View
 from deltalight.services.storage.faults import NotFoundError
 
 WINDOW = 2  # frames in flight to one viewer before it has to acknowledge
 PICK_TIMEOUT_S = 5.0  # some frames of the slowest renderer
+VIEW_TIMEOUT_S = 10.0  # the same, and its shaders' compilation
 POLICY_VIOLATION, GOING_AWAY = 1008, 1001  # WebSocket close codes (RFC 6455, 7.4.1)
 BOUNDARY = "frame"
 PICTURE_HEADERS = {"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff"}
 NO_ANSWER = "The render server does not answer, or (with Retry-After) too many requests wait for it."
 JPEG_ANSWER: dict[int | str, dict[str, Any]] = {200: {"content": {"image/jpeg": {}}}}
+
+WantedView = Annotated[
+    ShownView | None, Query(description="What to look at; without, the scene's own `output.view`.")
+]
+_VIEW: TypeAdapter[ShownView | None] = TypeAdapter(ShownView | None)
 
 live_router = APIRouter(tags=["live"])
 events_router = APIRouter(tags=["state"])
@@ -65,14 +72,6 @@ class Pixel(BaseModel):
     )
 
 
-class ViewAnswer(BaseModel):
-    """The view that the live picture shows."""
-
-    model_config = ConfigDict(strict=True, extra="forbid")
-
-    view: View | None = Field(description="null: the one of the scene's document, `output.view`.")
-
-
 class FisheyeAnswer(BaseModel):
     """The fish-eye picture's size and the lights in it; a light that it does not show is left out."""
 
@@ -91,18 +90,19 @@ def create_ticket(shared: Shared, request: Request) -> TicketAnswer:
 
 
 @live_router.websocket("/live")
-async def live(socket: WebSocket, shared: Shared) -> None:
+async def live(socket: WebSocket, shared: Shared, view: WantedView = None) -> None:
     """Send the newest frame whenever this viewer acknowledged enough; others are not affected."""
     await socket.accept()
     credits = asyncio.BoundedSemaphore(WINDOW)
-    await _first_of(_send_frames(socket, shared.live, credits), _take_acknowledgements(socket, credits))
+    with shared.live.viewer(view) as viewer:
+        await _first_of(_send_frames(socket, viewer, credits), _take_messages(socket, viewer, credits))
 
 
 @live_router.get("/live.mjpg", include_in_schema=False)  # it never ends, which its description cannot express
-async def live_mjpeg(shared: Shared) -> StreamingResponse:
+async def live_mjpeg(shared: Shared, view: WantedView = None) -> StreamingResponse:
     """The newest frames as one endless multipart answer, for pictures in pages."""
     media_type = f"multipart/x-mixed-replace; boundary={BOUNDARY}"
-    return StreamingResponse(_mjpeg(shared.live), media_type=media_type, headers=PICTURE_HEADERS)
+    return StreamingResponse(_mjpeg(shared.live, view), media_type=media_type, headers=PICTURE_HEADERS)
 
 
 @live_router.get(
@@ -110,12 +110,13 @@ async def live_mjpeg(shared: Shared) -> StreamingResponse:
     response_class=Response,
     responses={**unavailable("No picture has come from the render server yet."), **JPEG_ANSWER},
 )
-async def live_picture(shared: Shared) -> Response:
-    """Return the newest composite."""
+async def live_picture(shared: Shared, view: WantedView = None) -> Response:
+    """Return the newest composite; with `view`, the next one, in that view."""
     frame = shared.live.newest
     if frame is None:
         raise ProblemError(503, "no-picture", "No picture has come from the render server yet; see /state.")
-    return Response(frame.jpeg, media_type="image/jpeg", headers=PICTURE_HEADERS)
+    jpeg = frame.picture(None).jpeg if view is None else await _next_in(shared.live, view)
+    return Response(jpeg, media_type="image/jpeg", headers=PICTURE_HEADERS)
 
 
 @live_router.get(
@@ -153,22 +154,6 @@ def fisheye(shared: Shared) -> FisheyeAnswer:
     )
 
 
-@live_router.get("/view")
-def get_view(shared: Shared) -> ViewAnswer:
-    """Return the view that the live picture shows."""
-    return ViewAnswer(view=shared.link.view)
-
-
-@live_router.put("/view", responses=responses(400, 422))
-def put_view(shared: Shared, wanted: Annotated[ViewAnswer, Body(examples=[{"view": "delta"}])]) -> ViewAnswer:
-    """Show everybody another view; the scene and its history stay as they are.
-
-    It ends when another scene is shown, or when the `output.view` of the scene changes.
-    """
-    shared.link.use_view(wanted.view)
-    return wanted
-
-
 @live_router.get("/fisheye.jpg", response_class=Response, responses={**responses(404), **JPEG_ANSWER})
 def fisheye_picture(shared: Shared) -> Response:
     """Return the newest fish-eye picture."""
@@ -196,37 +181,57 @@ async def _first_of(*streams: Coroutine[Any, Any, None]) -> None:
         await asyncio.gather(*tasks, return_exceptions=True)
 
 
-async def _send_frames(socket: WebSocket, hub: LiveHub, credits: asyncio.Semaphore) -> None:
-    with hub.viewer() as viewer:
-        while True:
-            await credits.acquire()
-            frame = await viewer.next()
-            if frame is None:
-                await socket.close(GOING_AWAY)
-                return
-            await socket.send_bytes(frame.packed(viewer.skipped))
+async def _send_frames(socket: WebSocket, viewer: Viewer, credits: asyncio.Semaphore) -> None:
+    while True:
+        await credits.acquire()
+        frame = await viewer.next()
+        if frame is None:
+            await socket.close(GOING_AWAY)
+            return
+        await socket.send_bytes(frame.packed(viewer.view, viewer.skipped))
 
 
-async def _take_acknowledgements(socket: WebSocket, credits: asyncio.BoundedSemaphore) -> None:
+async def _take_messages(socket: WebSocket, viewer: Viewer, credits: asyncio.BoundedSemaphore) -> None:
+    """Take acknowledgements, and `view NAME` for another view (`view` alone: the scene's own)."""
     try:
         while True:
-            await socket.receive_text()
-            credits.release()
+            text = await socket.receive_text()
+            if text.startswith("view"):
+                viewer.look_at(_VIEW.validate_python(text.removeprefix("view").strip() or None))
+            else:
+                credits.release()
     except WebSocketDisconnect:
         return
-    except (ValueError, KeyError):  # it acknowledged a frame that it never got, or sent bytes
-        await socket.close(POLICY_VIOLATION, "acknowledge each frame once")
+    except (ValueError, KeyError):  # it acknowledged a frame that it never got, sent bytes, or named no view
+        await socket.close(POLICY_VIOLATION, "acknowledge each frame once; views are as in output.view")
 
 
-async def _mjpeg(hub: LiveHub) -> AsyncIterator[bytes]:
-    with hub.viewer() as viewer:
+async def _next_in(hub: LiveHub, view: ShownView) -> bytes:
+    """Return the next picture in a view.
+
+    Raises:
+        ProblemError: none came in time.
+    """
+    with hub.viewer(view) as viewer:
+        try:
+            async with asyncio.timeout(VIEW_TIMEOUT_S):
+                while (frame := await viewer.next()) is not None:
+                    if view in frame.pictures:
+                        return frame.pictures[view].jpeg
+        except TimeoutError:
+            pass
+    raise ProblemError(503, "no-picture", f"No picture in the view {view} has come; see /state.")
+
+
+async def _mjpeg(hub: LiveHub, view: ShownView | None) -> AsyncIterator[bytes]:
+    with hub.viewer(view) as viewer:
         while (frame := await viewer.next()) is not None:
-            yield _part(frame)
+            yield _part(frame.picture(view).jpeg)
 
 
-def _part(frame: LiveFrame) -> bytes:
-    head = f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(frame.jpeg)}\r\n\r\n"
-    return head.encode() + frame.jpeg + b"\r\n"
+def _part(jpeg: bytes) -> bytes:
+    head = f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
+    return head.encode() + jpeg + b"\r\n"
 
 
 def _newest_fisheye(shared: Shared) -> tuple[RadianceMessage, bytes]:

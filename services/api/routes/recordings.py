@@ -3,20 +3,21 @@
 from datetime import UTC, datetime
 from typing import Annotated, Any, Literal, Self
 
-from fastapi import APIRouter, Body, Path, Response
+from fastapi import APIRouter, Body, Path, Query, Request, Response
+from fastapi.concurrency import run_in_threadpool
 from pydantic import Field
 
 from deltalight.protocol.documents import StrictModel
 from deltalight.protocol.errors import DeltalightError
-from deltalight.protocol.messages import Name
+from deltalight.protocol.message_fields import Name
 from deltalight.sensor_node.cameras.playback import MAX_RATE, MIN_RATE
 from deltalight.services.api.context import Context, Shared, in_pool
 from deltalight.services.api.file_response import StoredFileResponse
 from deltalight.services.api.problems import responses
 from deltalight.services.api.recording_session import RecordingSession
-from deltalight.services.api.recording_store import NAME, RecordingStore, StoredRecording
+from deltalight.services.api.recording_store import NAME, Facts, RecordingStore, StoredRecording
 from deltalight.services.api.replay_control import Position, ReplayOrder
-from deltalight.services.api.request_bodies import AS_SENT, checked
+from deltalight.services.api.request_bodies import AS_SENT, UPLOAD_TYPE, checked, require_upload_type
 from deltalight.services.storage.faults import ConflictError
 
 router = APIRouter(tags=["recordings"], prefix="/recordings")
@@ -31,6 +32,13 @@ Rate = Annotated[float, Field(ge=MIN_RATE, le=MAX_RATE, description="Recorded se
 Seconds = Annotated[float, Field(ge=0, le=1e6, description="From the recording's first frame.")]
 POSTER_ANSWER: dict[int | str, dict[str, Any]] = {
     200: {"content": {"image/jpeg": {"schema": {"type": "string", "format": "binary"}}}}
+}
+_UPLOAD_BODY = {
+    "requestBody": {
+        "required": True,
+        "description": "The file itself: MCAP, or a ZIP of one dataset folder.",
+        "content": {UPLOAD_TYPE: {"schema": {"type": "string", "format": "binary"}}},
+    }
 }
 DOWNLOAD_ANSWER: dict[int | str, dict[str, Any]] = {
     200: {"content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}}
@@ -58,6 +66,44 @@ class Stream(StrictModel):
     size_bytes: int = Field(description="Before compression.")
 
 
+class Check(StrictModel):
+    """One thing that relighting needs."""
+
+    what: Literal["depth", "pose", "light"]
+    is_there: bool
+    text: str = Field(description="What there is, or what to do without.")
+
+
+def _checklist(facts: Facts) -> list[Check]:
+    depth, light = facts["depth"], facts["fisheye"]
+    has_pose = facts["board"] is not None or facts["given_poses"] > 0
+    return [
+        Check(
+            what="depth",
+            is_there=depth is not None,
+            text="No depth: give the scene a model of the room."
+            if depth is None
+            else f"Depth in {depth['frames']} of {facts['frames']} frames.",
+        ),
+        Check(
+            what="pose",
+            is_there=has_pose,
+            text="Poses are given."
+            if facts["given_poses"]
+            else "A marker board is described."
+            if has_pose
+            else "No marker board and no poses: objects cannot be placed.",
+        ),
+        Check(
+            what="light",
+            is_there=light is not None,
+            text="No fish-eye camera: place lamps by hand."
+            if light is None
+            else "Light of a fish-eye camera.",
+        ),
+    ]
+
+
 class RecordingAnswer(StrictModel):
     """A recording, finished or growing."""
 
@@ -74,6 +120,7 @@ class RecordingAnswer(StrictModel):
     lost: dict[str, int] = Field(description="What never came, by stream; known while it grows.")
     streams: dict[str, Stream]
     scene: str | None = Field(description="Title of the attached scene, empty for one without; null = none.")
+    checklist: list[Check] = Field(description="What relighting needs; empty while it grows.")
     notes: list[str] = Field(description="What else is to be known of it.")
 
     @classmethod
@@ -92,6 +139,7 @@ class RecordingAnswer(StrictModel):
             lost={**figures.get("missing", {}), **figures.get("dropped", {})},
             streams={},
             scene=None,
+            checklist=[],
             notes=[],
         )
 
@@ -114,6 +162,7 @@ class RecordingAnswer(StrictModel):
                 for topic, figures in facts.get("streams", {}).items()
             },
             scene=facts.get("scene"),
+            checklist=_checklist(facts) if facts else [],
             notes=[note.replace(str(recording.path), recording.id) for note in facts.get("notes", [])],
         )
 
@@ -173,6 +222,32 @@ def start_recording(
     session = shared.recording_sessions.start(order.name, order.node, order.duration_s, scene)
     response.headers["Location"] = f"/api/v1/recordings/{session.id}"
     return RecordingAnswer.growing(session)
+
+
+@router.post("/upload", status_code=201, responses=responses(400, 413, 415, 422), openapi_extra=_UPLOAD_BODY)
+async def upload_recording(
+    shared: Shared,
+    request: Request,
+    response: Response,
+    name: Annotated[str, Query(max_length=1000, description="Name of the file.", examples=["desk.mcap"])],
+) -> RecordingAnswer:
+    """Upload an .mcap recording, or a .zip of a dataset folder, as the body of the request.
+
+    It is recognised by its content and read once in a process of its own, with limits of memory, time and disk. It is
+    kept under the name of the file, with a number where that is taken.
+    """
+    require_upload_type(request)
+    settings = shared.settings
+    limits = settings.recording_limit_mb << 20, settings.recording_quota_mb << 20
+    store = shared.recordings
+    with store.receiving(*limits) as incoming:
+        async for chunk in request.stream():
+            await run_in_threadpool(incoming.write, chunk)
+        kept = await shared.pools["recording uploads"].run(lambda: store.keep(incoming, name))
+    answer = RecordingAnswer.stored(kept)
+    shared.events.publish("recording", answer.model_dump())
+    response.headers["Location"] = f"/api/v1/recordings/{kept.id}"
+    return answer
 
 
 @router.get("/{recording_id}", responses=responses(404))

@@ -7,7 +7,7 @@ from fastapi import APIRouter, Body, Path, Response
 from pydantic import Field, StrictBool, model_validator
 
 from deltalight.protocol.documents import StrictModel
-from deltalight.protocol.messages import Name
+from deltalight.protocol.message_fields import Name
 from deltalight.protocol.methods import Method
 from deltalight.protocol.scene_method import Output
 from deltalight.services.api.context import Context, Shared, in_pool

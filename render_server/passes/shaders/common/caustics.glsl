@@ -4,7 +4,6 @@
 #include "common/upsample.glsl"
 
 uniform bool has_caustics;       // the sums are bound
-uniform float sample_distance;   // m at 1 m depth: size of a texel of the reduced grid
 
 // `p`, `n`, `depth`: the pixel's surface in that layer.
 vec3 caustic_irradiance(ivec2 pixel, ivec2 size, int layer, vec3 p, vec3 n, float depth) {

@@ -32,7 +32,7 @@ vec3 ray_point(LightView view, vec2 s, float depth) {
 // emitted from its centre: its flux is right, its spread over near surfaces is too narrow.
 float intensity_towards(Light light, vec3 d) {
     vec3 normal_area = 4.0 * cross(light.axis_u.xyz, light.axis_v.xyz);
-    return light.place.w == RECTANGLE ? max(dot(d, normal_area), 0.0) : spot_fraction(light, d);
+    return is_rectangle(light) ? max(dot(d, normal_area), 0.0) : spot_fraction(light, d);
 }
 
 // Light of a texel's rays before any reflection: I dW, or E_perp A (no cosine: a tilted surface receives the same

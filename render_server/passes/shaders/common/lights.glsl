@@ -17,6 +17,13 @@ struct Light {
     ivec4 views;   // first view and count in the real atlas, first and count in the virtual atlas
 };
 const float DIRECTIONAL = 0.0, SPHERE = 1.0, SPOT = 2.0, RECTANGLE = 3.0;   // kinds
+// Of the scene's lights. llvmpipe executes what one kind needs for every light, so that a scene without it does without.
+#pragma switch bool has_rectangles
+#pragma switch bool has_mirror_images
+
+bool is_rectangle(Light light) { return has_rectangles && light.place.w == RECTANGLE; }
+
+bool is_image(Light light) { return has_mirror_images && light.mirror.w >= 0.0; }
 
 struct LightView {
     mat4 view_from_world;   // light at the origin (unless directional), looking along +z
@@ -77,12 +84,12 @@ vec3 rectangle_vector(Light light, int edges, vec3 p, vec3 n) {
 vec3 unmirrored_light_at(Light light, vec3 p, vec3 n, out vec3 to_light, out float angular_radius) {
     vec3 d = light.place.xyz - p;
     float distance2 = max(dot(d, d), 1e-8);
-    vec3 vector = rectangle_vector(light, light.place.w == RECTANGLE ? 5 : 0, p, n);
-    if (light.place.w == RECTANGLE) {
+    if (has_rectangles) {
+        vec3 vector = rectangle_vector(light, is_rectangle(light) ? 5 : 0, p, n);
         float across = length(vector);
         to_light = across > 1e-12 ? vector / across : d * inversesqrt(distance2);
         angular_radius = asin(min(sqrt(across / PI), 1.0));
-        return light.color.rgb * across;
+        if (is_rectangle(light)) return light.color.rgb * across;
     }
     if (light.place.w == DIRECTIONAL) {
         to_light = -light.place.xyz;
@@ -93,8 +100,6 @@ vec3 unmirrored_light_at(Light light, vec3 p, vec3 n, out vec3 to_light, out flo
     angular_radius = asin(min(light.shape.x * inversesqrt(distance2), 1.0));
     return light.color.rgb / distance2 * spot_fraction(light, -to_light);
 }
-
-bool is_image(Light light) { return light.mirror.w >= 0.0; }
 
 vec3 light_at(Light light, vec3 p, vec3 n, out vec3 to_light, out float angular_radius) {
     vec3 across = unmirrored_light_at(light, p, n, to_light, angular_radius);
@@ -112,7 +117,7 @@ vec2 mirror_fraction(Light light, vec3 p) {
     vec3 direction = distant ? -light.place.xyz : light.place.xyz - p;
     float part = max(dot(n, p) + light.plane.w, 0.0) / max(-dot(n, direction), 1e-6);   // fraction of the path up to the plane
     vec3 q = p + part * direction;
-    float radius = light.place.w == RECTANGLE ? sqrt(length(light.axis_u.xyz) * length(light.axis_v.xyz)) : light.shape.x;
+    float radius = is_rectangle(light) ? sqrt(length(light.axis_u.xyz) * length(light.axis_v.xyz)) : light.shape.x;
     float texels = 2.0 * radius * part * length(light.map_u.xyz) * float(textureSize(mirror_visibility, 0).x);
     vec2 uv = vec2(dot(light.map_u.xyz, q) + light.map_u.w, dot(light.map_v.xyz, q) + light.map_v.w);
     return textureLod(mirror_visibility, vec3(uv, light.mirror.w), log2(max(texels, 1.0))).rg;
@@ -184,7 +189,7 @@ const float STEEPEST_LEAN = 0.9;   // samples as deep in the view as the receive
 
 Spread spread_of(Light light, LightView view, vec2 s, float depth) {
     float size = light.shape.x;
-    Spread k = Spread(vec2(size, 0.0), vec2(0.0, size), vec2(0.0), size, light.place.w == RECTANGLE);
+    Spread k = Spread(vec2(size, 0.0), vec2(0.0, size), vec2(0.0), size, is_rectangle(light));
     if (k.square) {
         vec3 u = mat3(view.view_from_world) * light.axis_u.xyz, v = mat3(view.view_from_world) * light.axis_v.xyz;
         k.u = u.xy - s * u.z;
@@ -266,7 +271,7 @@ vec2 blockers(sampler2D map, Spread k, LightView view, Receiver r) {
         : widest > WIDE_TEXELS * texel ? 2 * shadow_samples : shadow_samples;
     Blocking found = Blocking(0.0, 0.0, 0.0);
     add_blockers(false, map, k, view, r, k.square ? 0 : count, found);
-    add_blockers(true, map, k, view, r, k.square ? count : 0, found);
+    if (has_rectangles) add_blockers(true, map, k, view, r, k.square ? count : 0, found);
     if (found.hits == 0.0) return vec2(lit_fraction(map, view, r.s, r.depth - r.bias) < 1.0 ? r.depth : NOTHING);
     return vec2(found.sum / found.hits, found.deepest);
 }
@@ -301,7 +306,7 @@ Occluder occluder(sampler2D map, Light light, int first, int count, vec3 p, vec3
 // rise towards the light there, but things a quarter of the distance to the blockers above it do block.
 float passes(sampler2D map, Occluder o, vec2 offset) {
     float lit = 1.0;
-    for (int i = 0; i < (o.spread.square ? 2 : 1); ++i) {
+    for (int i = 0; i < (has_rectangles && o.spread.square ? 2 : 1); ++i) {
         vec2 s = o.receiver.s + shift_to(o.spread, o.gap[i], offset);
         float highest = mix(o.receiver.depth, o.blocker[i], 0.75);
         float depth = clamp(plane_depth(o.view, o.receiver, s), highest, o.receiver.depth);
@@ -364,7 +369,7 @@ vec2 visible_fraction(Light light, Occluder real, Occluder object, vec3 p, vec3 
     Spread k = real.present ? real.spread : object.spread;
     vec3 sum = vec3(0.0);
     add_samples(false, light, k, real, object, p, n, k.square ? 0 : count, sum);
-    add_samples(true, light, k, real, object, p, n, k.square ? count : 0, sum);
+    if (has_rectangles) add_samples(true, light, k, real, object, p, n, k.square ? count : 0, sum);
     return sum.z > 0.0 ? sum.xy / sum.z : vec2(1.0);
 }
 

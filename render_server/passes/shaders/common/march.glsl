@@ -6,6 +6,7 @@
 // blocked when the sum reaches that of a wall. (Front-to-back products of a one-voxel shell let e^-2 of the light
 // through at any step size: no furnace test could hold.)
 #include "common/volume.glsl"
+#include "common/occupancy.glsl"
 
 uniform sampler3D mipmap_mu;
 uniform sampler3D mipmap_rho;
@@ -16,6 +17,7 @@ layout(std140) uniform FarVolume {
     int far_size;      // voxels per edge, 0: not used
     int far_levels;
 };
+layout(std430) readonly buffer OccupiedFar { uint occupied_far[]; };   // as Occupied, of mipmap_far
 layout(std430) readonly buffer Support { int support[6]; };   // voxels where mu and rho differ: min, -max
 
 // A wall's summed coverage scatters about 1 with its slant and position on the grid (2/3..4/3 at 45 degrees) and with
@@ -124,6 +126,16 @@ vec4 directional_sample(sampler3D mipmap, int n, vec3 q, Walk w) {
 }
 #endif
 
+// Whether a trilinear sample at q (voxels) may meet anything, of the volume around the objects and of the one beyond.
+bool may_be_near(vec3 q, int level) {
+    ivec3 corner = corner_of(q, level);
+    return (occupied[corner_word(volume_size, level, corner)] >> (corner.x & 31) & 1u) != 0u;
+}
+bool may_be_far(vec3 q, int level) {
+    ivec3 corner = corner_of(q, level);
+    return (occupied_far[corner_word(far_size, level, corner)] >> (corner.x & 31) & 1u) != 0u;
+}
+
 // Through the volume around the objects, from q (voxels), until a wall or the volume's end at distance t (voxels).
 // `differs`: the path crossed cells where mu and rho differ.
 Crossed march_near(sampler3D mipmap, vec3 q, vec3 d, float ratio, out float t, out bool differs) {
@@ -132,13 +144,21 @@ Crossed march_near(sampler3D mipmap, vec3 q, vec3 d, float ratio, out float t, o
     vec3 low = vec3(support[0], support[1], support[2]);
     vec3 high = vec3(-support[3], -support[4], -support[5]) + 1.0;
     differs = false;
-    for (int i = 0; i < 1024; ++i) {
-        vec3 at = sample_point(w);
-        if (!inside_volume(at) || sum.coverage >= WALL) break;
-        vec3 reach = vec3(1.5 * float(1 << w.level));
-        differs = differs || (all(greaterThan(at, low - reach)) && all(lessThan(at, high + reach)));
+    vec3 at = sample_point(w);
+    for (int i = 0; i < 1024 && inside_volume(at) && sum.coverage < WALL; ++i) {
+        // Most cells are empty: the lanes of a processor pass them in a loop of their own, and then sample together.
+        bool met = false;
+        for (int j = 0; j < 1024 && inside_volume(at) && !met; ++j) {
+            vec3 reach = vec3(1.5 * float(1 << w.level));
+            differs = differs || (all(greaterThan(at, low - reach)) && all(lessThan(at, high + reach)));
+            met = may_be_near(at, w.level);
+            if (!met) advance(w, ratio, 0.0, volume_levels);
+            at = sample_point(w);
+        }
+        if (!met) break;
         cross_cell(slice_fraction(w) * directional_sample(mipmap, volume_size, at, w), sum);
         advance(w, ratio, 0.0, volume_levels);
+        at = sample_point(w);
     }
     t = travelled(w);
     return sum;
@@ -149,11 +169,17 @@ void march_far(vec3 q, vec3 d, float before, float ratio, inout Crossed sum) {
     Walk w = walk_from(q, d);
     for (int i = 1; i < far_levels; ++i) choose_level(w, ratio, before, far_levels);
     w.ahead *= float(1 << w.level);
-    for (int i = 0; i < 256; ++i) {
-        vec3 at = sample_point(w);
-        if (!inside_cube(at, far_size) || sum.coverage >= WALL) break;
+    float edge = float(far_size);
+    vec3 at = sample_point(w);
+    for (int i = 0; i < 256 && inside_cube(at, edge) && sum.coverage < WALL; ++i) {
+        for (int j = 0; j < 256 && inside_cube(at, edge) && !may_be_far(at, w.level); ++j) {
+            advance(w, ratio, before, far_levels);
+            at = sample_point(w);
+        }
+        if (!inside_cube(at, edge)) break;
         cross_cell(slice_fraction(w) * directional_sample(mipmap_far, far_size, at, w), sum);
         advance(w, ratio, before, far_levels);
+        at = sample_point(w);
     }
 }
 

@@ -27,9 +27,9 @@ vec4 volume_sample(sampler3D mipmap, int n, vec3 q, int level, int k) {
 
 vec3 volume_coordinate(vec3 p) { return (p - volume_origin) / voxel_edge; }
 
-bool inside_cube(vec3 q, int n) { return all(greaterThan(q, vec3(0.0))) && all(lessThan(q, vec3(float(n)))); }
+bool inside_cube(vec3 q, float edge) { return all(greaterThan(q, vec3(0.0))) && all(lessThan(q, vec3(edge))); }
 
-bool inside_volume(vec3 q) { return inside_cube(q, volume_size); }
+bool inside_volume(vec3 q) { return inside_cube(q, float(volume_size)); }
 
 // The delta fades over the last voxels, so that nothing is cut off at the border.
 const float FADE_VOXELS = 4.0;

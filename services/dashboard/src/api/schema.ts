@@ -204,7 +204,7 @@ export interface paths {
         };
         /**
          * Live Picture
-         * @description Return the newest composite.
+         * @description Return the newest composite; with `view`, the next one, in that view.
          */
         readonly get: operations["live_picture"];
         readonly put?: never;
@@ -313,6 +313,29 @@ export interface paths {
          * @description Begin to record a node, with the active scene attached; events tell how far it is.
          */
         readonly post: operations["start_recording"];
+        readonly delete?: never;
+        readonly options?: never;
+        readonly head?: never;
+        readonly patch?: never;
+        readonly trace?: never;
+    };
+    readonly "/api/v1/recordings/upload": {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        readonly get?: never;
+        readonly put?: never;
+        /**
+         * Upload Recording
+         * @description Upload an .mcap recording, or a .zip of a dataset folder, as the body of the request.
+         *
+         *     It is recognised by its content and read once in a process of its own, with limits of memory, time and disk. It is
+         *     kept under the name of the file, with a number where that is taken.
+         */
+        readonly post: operations["upload_recording"];
         readonly delete?: never;
         readonly options?: never;
         readonly head?: never;
@@ -1026,32 +1049,6 @@ export interface paths {
         readonly patch?: never;
         readonly trace?: never;
     };
-    readonly "/api/v1/view": {
-        readonly parameters: {
-            readonly query?: never;
-            readonly header?: never;
-            readonly path?: never;
-            readonly cookie?: never;
-        };
-        /**
-         * Get View
-         * @description Return the view that the live picture shows.
-         */
-        readonly get: operations["get_view"];
-        /**
-         * Put View
-         * @description Show everybody another view; the scene and its history stay as they are.
-         *
-         *     It ends when another scene is shown, or when the `output.view` of the scene changes.
-         */
-        readonly put: operations["put_view"];
-        readonly post?: never;
-        readonly delete?: never;
-        readonly options?: never;
-        readonly head?: never;
-        readonly patch?: never;
-        readonly trace?: never;
-    };
 }
 export type webhooks = Record<string, never>;
 export interface components {
@@ -1347,6 +1344,24 @@ export interface components {
              * @description Kinds of which none was found, and why.
              */
             readonly missing: readonly components["schemas"]["MissingCameras"][];
+        };
+        /**
+         * Check
+         * @description One thing that relighting needs.
+         */
+        readonly Check: {
+            /** Is There */
+            readonly is_there: boolean;
+            /**
+             * Text
+             * @description What there is, or what to do without.
+             */
+            readonly text: string;
+            /**
+             * What
+             * @enum {string}
+             */
+            readonly what: "depth" | "pose" | "light";
         };
         /**
          * DifferentialMethod
@@ -2109,6 +2124,12 @@ export interface components {
              */
             readonly status: "ok" | "no_pose";
             /**
+             * View
+             * @description What it shows: the view that was asked for, or until there is a picture of it the scene's own.
+             * @enum {string}
+             */
+            readonly view: "composite" | "effects" | "delta" | "volume" | "rsm" | "lights" | "camera";
+            /**
              * World From Camera
              * @description null without a pose.
              */
@@ -2421,7 +2442,7 @@ export interface components {
             readonly antialiasing: boolean;
             /**
              * Camera Artifacts
-             * @description Put the camera's noise and blur on the virtual part.
+             * @description Put the camera's noise on the virtual part, as its still frames show it.
              * @default false
              */
             readonly camera_artifacts: boolean;
@@ -2743,6 +2764,11 @@ export interface components {
              * @description When it was finished; while it grows: when it was begun.
              */
             readonly changed: string;
+            /**
+             * Checklist
+             * @description What relighting needs; empty while it grows.
+             */
+            readonly checklist: readonly components["schemas"]["Check"][];
             /**
              * Detail
              * @description What keeps it from growing, or from being read; else empty.
@@ -3532,17 +3558,6 @@ export interface components {
             readonly radius_m: number;
         };
         /**
-         * ViewAnswer
-         * @description The view that the live picture shows.
-         */
-        readonly ViewAnswer: {
-            /**
-             * View
-             * @description null: the one of the scene's document, `output.view`.
-             */
-            readonly view: ("composite" | "effects" | "delta" | "volume" | "rsm" | "lights") | null;
-        };
-        /**
          * WantedPicture
          * @description A picture to take.
          */
@@ -3578,6 +3593,7 @@ export type AssetAnswer = components['schemas']['AssetAnswer'];
 export type BoxRegion = components['schemas']['BoxRegion'];
 export type CameraAnswer = components['schemas']['CameraAnswer'];
 export type CamerasAnswer = components['schemas']['CamerasAnswer'];
+export type Check = components['schemas']['Check'];
 export type DifferentialMethod = components['schemas']['DifferentialMethod'];
 export type DirectionalLight = components['schemas']['DirectionalLight'];
 export type DlpvMethod = components['schemas']['DlpvMethod'];
@@ -3632,7 +3648,6 @@ export type StreamState = components['schemas']['StreamState'];
 export type Surface = components['schemas']['Surface'];
 export type TicketAnswer = components['schemas']['TicketAnswer'];
 export type TrackedLamp = components['schemas']['TrackedLamp'];
-export type ViewAnswer = components['schemas']['ViewAnswer'];
 export type WantedPicture = components['schemas']['WantedPicture'];
 export type $defs = Record<string, never>;
 export interface operations {
@@ -4666,7 +4681,10 @@ export interface operations {
     };
     readonly live_picture: {
         readonly parameters: {
-            readonly query?: never;
+            readonly query?: {
+                /** @description What to look at; without, the scene's own `output.view`. */
+                readonly view?: ("composite" | "effects" | "delta" | "volume" | "rsm" | "lights" | "camera") | null;
+            };
             readonly header?: never;
             readonly path?: never;
             readonly cookie?: never;
@@ -5235,6 +5253,106 @@ export interface operations {
             };
             /** @description Request Entity Too Large */
             readonly 413: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Unprocessable Entity */
+            readonly 422: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too Many Requests */
+            readonly 429: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Service Unavailable */
+            readonly 503: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    readonly upload_recording: {
+        readonly parameters: {
+            readonly query: {
+                /** @description Name of the file. */
+                readonly name: string;
+            };
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        /** @description The file itself: MCAP, or a ZIP of one dataset folder. */
+        readonly requestBody: {
+            readonly content: {
+                readonly "application/octet-stream": string;
+            };
+        };
+        readonly responses: {
+            /** @description Successful Response */
+            readonly 201: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/json": components["schemas"]["RecordingAnswer"];
+                };
+            };
+            /** @description Bad Request */
+            readonly 400: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Unauthorized */
+            readonly 401: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Forbidden */
+            readonly 403: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Request Entity Too Large */
+            readonly 413: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Unsupported Media Type */
+            readonly 415: {
                 headers: {
                     readonly [name: string]: unknown;
                 };
@@ -11331,176 +11449,6 @@ export interface operations {
                 };
                 content: {
                     readonly "application/json": components["schemas"]["TicketAnswer"];
-                };
-            };
-            /** @description Bad Request */
-            readonly 400: {
-                headers: {
-                    readonly [name: string]: unknown;
-                };
-                content: {
-                    readonly "application/problem+json": components["schemas"]["Problem"];
-                };
-            };
-            /** @description Unauthorized */
-            readonly 401: {
-                headers: {
-                    readonly [name: string]: unknown;
-                };
-                content: {
-                    readonly "application/problem+json": components["schemas"]["Problem"];
-                };
-            };
-            /** @description Forbidden */
-            readonly 403: {
-                headers: {
-                    readonly [name: string]: unknown;
-                };
-                content: {
-                    readonly "application/problem+json": components["schemas"]["Problem"];
-                };
-            };
-            /** @description Request Entity Too Large */
-            readonly 413: {
-                headers: {
-                    readonly [name: string]: unknown;
-                };
-                content: {
-                    readonly "application/problem+json": components["schemas"]["Problem"];
-                };
-            };
-            /** @description Unprocessable Entity */
-            readonly 422: {
-                headers: {
-                    readonly [name: string]: unknown;
-                };
-                content: {
-                    readonly "application/problem+json": components["schemas"]["Problem"];
-                };
-            };
-            /** @description Too Many Requests */
-            readonly 429: {
-                headers: {
-                    readonly [name: string]: unknown;
-                };
-                content: {
-                    readonly "application/problem+json": components["schemas"]["Problem"];
-                };
-            };
-            /** @description Service Unavailable */
-            readonly 503: {
-                headers: {
-                    readonly [name: string]: unknown;
-                };
-                content: {
-                    readonly "application/problem+json": components["schemas"]["Problem"];
-                };
-            };
-        };
-    };
-    readonly get_view: {
-        readonly parameters: {
-            readonly query?: never;
-            readonly header?: never;
-            readonly path?: never;
-            readonly cookie?: never;
-        };
-        readonly requestBody?: never;
-        readonly responses: {
-            /** @description Successful Response */
-            readonly 200: {
-                headers: {
-                    readonly [name: string]: unknown;
-                };
-                content: {
-                    readonly "application/json": components["schemas"]["ViewAnswer"];
-                };
-            };
-            /** @description Bad Request */
-            readonly 400: {
-                headers: {
-                    readonly [name: string]: unknown;
-                };
-                content: {
-                    readonly "application/problem+json": components["schemas"]["Problem"];
-                };
-            };
-            /** @description Unauthorized */
-            readonly 401: {
-                headers: {
-                    readonly [name: string]: unknown;
-                };
-                content: {
-                    readonly "application/problem+json": components["schemas"]["Problem"];
-                };
-            };
-            /** @description Forbidden */
-            readonly 403: {
-                headers: {
-                    readonly [name: string]: unknown;
-                };
-                content: {
-                    readonly "application/problem+json": components["schemas"]["Problem"];
-                };
-            };
-            /** @description Request Entity Too Large */
-            readonly 413: {
-                headers: {
-                    readonly [name: string]: unknown;
-                };
-                content: {
-                    readonly "application/problem+json": components["schemas"]["Problem"];
-                };
-            };
-            /** @description Unprocessable Entity */
-            readonly 422: {
-                headers: {
-                    readonly [name: string]: unknown;
-                };
-                content: {
-                    readonly "application/problem+json": components["schemas"]["Problem"];
-                };
-            };
-            /** @description Too Many Requests */
-            readonly 429: {
-                headers: {
-                    readonly [name: string]: unknown;
-                };
-                content: {
-                    readonly "application/problem+json": components["schemas"]["Problem"];
-                };
-            };
-            /** @description Service Unavailable */
-            readonly 503: {
-                headers: {
-                    readonly [name: string]: unknown;
-                };
-                content: {
-                    readonly "application/problem+json": components["schemas"]["Problem"];
-                };
-            };
-        };
-    };
-    readonly put_view: {
-        readonly parameters: {
-            readonly query?: never;
-            readonly header?: never;
-            readonly path?: never;
-            readonly cookie?: never;
-        };
-        readonly requestBody: {
-            readonly content: {
-                readonly "application/json": components["schemas"]["ViewAnswer"];
-            };
-        };
-        readonly responses: {
-            /** @description Successful Response */
-            readonly 200: {
-                headers: {
-                    readonly [name: string]: unknown;
-                };
-                content: {
-                    readonly "application/json": components["schemas"]["ViewAnswer"];
                 };
             };
             /** @description Bad Request */

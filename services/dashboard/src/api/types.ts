@@ -42,7 +42,8 @@ export type ManualLight = Lights["manual"][number];
 export type LightType = ManualLight["type"];
 export type Method = NonNullable<Generated.SceneDocument["method"]>;
 export type MethodName = Method["name"];
-export type View = Generated.Output["view"];
+/** What can be looked at: a view of the scene's document, or the camera's own picture. */
+export type View = Generated.LiveHeader["view"];
 export type RealScene = Generated.RealScene;
 
 export type SceneDocument = Omit<Generated.SceneDocument, "objects" | "lights" | "method" | "output" | "real"> & {
@@ -60,6 +61,6 @@ export type Quaternion = readonly [number, number, number, number];
 /** What one picture of a snapshot shows; `camera` is the camera's own picture. */
 export interface WantedPicture {
   readonly name: string;
-  readonly view: View | "camera";
+  readonly view: View;
   readonly method?: Method | { readonly name: MethodName };
 }

@@ -21,4 +21,5 @@ export const VIEWS: readonly ViewText[] = [
     help: "What the first lamp sees: the real scene on the left, objects on the right.",
   },
   { value: "lights", label: "Lights", help: "The lights found in the fish-eye picture." },
+  { value: "camera", label: "Camera", help: "The camera's own picture, without objects." },
 ];

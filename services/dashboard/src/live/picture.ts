@@ -1,8 +1,9 @@
 // The live picture: newest frame drawn and acknowledged, its header shared with everything that goes over it.
-import { computed, signal, type ReadonlySignal } from "@preact/signals";
+import { computed, effect, signal, type ReadonlySignal } from "@preact/signals";
 import { API } from "../api/http";
 import type { LiveHeader } from "../api/types";
 import { lensOf, type View } from "../math/camera";
+import { lookedAt } from "../state/scene";
 import { noteDrawn } from "./delay";
 import { RateMeter } from "./rate";
 import { note, slowestMs } from "./telemetry";
@@ -26,6 +27,11 @@ let canvas: HTMLCanvasElement | null = null;
 
 const socket = new ReconnectingSocket(`${API}/live`, (event) => void receive(event));
 export const connection = socket.state as ReadonlySignal<Connection>;
+
+effect(() => {
+  const view = lookedAt.value ?? "";
+  if (connection.value === "open") socket.send(`view ${view}`);
+});
 
 /** The newest frame's camera in the world; null without a pose. */
 export const view = computed<View | null>(() => {

@@ -56,18 +56,27 @@ async function receive(
   name: string,
   send: (progress: (share: number) => void) => Promise<AssetAnswer>,
 ): Promise<AssetAnswer | undefined> {
-  const id = ++count;
-  uploads.value = [...uploads.value, { id, name, share: 0 }];
-  const progress = (share: number): void => {
-    uploads.value = uploads.value.map((each) => (each.id === id ? { ...each, share } : each));
-  };
-  const asset = await attempt(() => send(progress));
-  uploads.value = uploads.value.filter((each) => each.id !== id);
+  const asset = await sendShown(name, send);
   if (asset) {
     announce(`${name} is among the assets.`);
     await readAssets();
   }
   return asset;
+}
+
+/** Send a file, its progress shown; a refusal is told. */
+export async function sendShown<Answer>(
+  name: string,
+  send: (progress: (share: number) => void) => Promise<Answer>,
+): Promise<Answer | undefined> {
+  const id = ++count;
+  uploads.value = [...uploads.value, { id, name, share: 0 }];
+  const progress = (share: number): void => {
+    uploads.value = uploads.value.map((each) => (each.id === id ? { ...each, share } : each));
+  };
+  const answer = await attempt(() => send(progress));
+  uploads.value = uploads.value.filter((each) => each.id !== id);
+  return answer;
 }
 
 export async function removeAsset(asset: AssetAnswer): Promise<void> {

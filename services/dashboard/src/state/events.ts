@@ -2,12 +2,12 @@
 import { signal } from "@preact/signals";
 import { API } from "../api/http";
 import { role, version } from "../api/session";
-import type { PictureState, ProcessAnswer, Recording, Replay, View } from "../api/types";
+import type { PictureState, ProcessAnswer, Recording, Replay } from "../api/types";
 import { ReconnectingSocket } from "../live/socket";
 import { readAssets, readShelf } from "./assets";
 import { readRevisions } from "./history";
 import { readState, takeReport } from "./processes";
-import { chosenView, readScene, readScenes, readView, scene, takePicture } from "./scene";
+import { readScene, readScenes, scene, takePicture } from "./scene";
 import { readRecordings, readReplay, readSnapshots, replay } from "./takes";
 import { toast } from "./toasts";
 
@@ -36,7 +36,6 @@ export async function readAll(): Promise<void> {
   await Promise.all([
     readScene(),
     readScenes(),
-    readView(),
     readAssets(),
     readShelf(),
     readState(),
@@ -71,10 +70,6 @@ async function take(event: Event): Promise<void> {
       return readSnapshots();
     case "picture": {
       takePictureEvent(event as unknown as PictureEvent);
-      return;
-    }
-    case "view": {
-      chosenView.value = (event as unknown as { readonly view: View | null }).view;
       return;
     }
     case "notice": {

@@ -26,6 +26,14 @@ export const isDrawerOpen = kept("drawer", false);
 export const drawerTab = kept<DrawerTab>("drawer-tab", "performance");
 export const isGuideDismissed = kept("guide-dismissed", false);
 
+export type GuideStep = "drag" | "drop" | "light" | "compare";
+/** What of the guide was tried. */
+export const tried = kept<readonly GuideStep[]>("guide-tried", []);
+
+export function noteTried(step: GuideStep): void {
+  if (!tried.value.includes(step)) tried.value = [...tried.value, step];
+}
+
 /** An object that is dragged stands on what the camera sees under it; without, it keeps its height. */
 export const standsOnSurfaces = kept("stands-on-surfaces", true);
 /** It leans with a slope that it is dragged onto; without, it stays turned as it is. */

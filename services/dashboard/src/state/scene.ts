@@ -3,6 +3,7 @@ import { computed, signal } from "@preact/signals";
 import { API, ProblemError, request } from "../api/http";
 import type { PictureState, SceneAnswer, SceneDocument, SceneSummary, View } from "../api/types";
 import { settled } from "./pending";
+import { noteTried } from "./preferences";
 import { attempt, tell, toast } from "./toasts";
 
 export type Overlay = (document: SceneDocument) => SceneDocument;
@@ -18,9 +19,14 @@ export const sceneDocument = computed<SceneDocument | null>(() => {
   return [...overlays.value.values()].reduce((document, overlay) => overlay(document), served.value.document);
 });
 export const objects = computed(() => sceneDocument.value?.objects ?? []);
-/** The view in place of the document's own; null without. */
-export const chosenView = signal<View | null>(null);
-export const shownView = computed<View | null>(() => chosenView.value ?? sceneDocument.value?.output.view ?? null);
+/** What this page looks at in place of the document's own view, until that changes; others look at what they like. */
+const chosenView = signal<{ readonly view: View; readonly insteadOf: View } | null>(null);
+const ownView = computed<View | null>(() => served.value?.document.output.view ?? null);
+export const lookedAt = computed<View | null>(() => {
+  const chosen = chosenView.value;
+  return chosen?.insteadOf === ownView.value ? chosen.view : null;
+});
+export const shownView = computed<View | null>(() => lookedAt.value ?? ownView.value);
 export const lights = computed(() => sceneDocument.value?.lights ?? null);
 
 export function overlay(key: object, change: Overlay | null): void {
@@ -59,17 +65,9 @@ export async function readScene(): Promise<void> {
   isSceneRead.value = true;
 }
 
-export async function readView(): Promise<void> {
-  const found = await attempt(() => request<{ readonly view: View | null }>("GET", `${API}/view`));
-  if (found) chosenView.value = found.view;
-}
-
-/** Look at the scene in another way; that is no change of the scene. */
-export async function setView(view: View): Promise<void> {
-  const before = chosenView.value;
-  chosenView.value = view;
-  const shown = await attempt(() => request<unknown>("PUT", `${API}/view`, { body: { view } }));
-  if (shown === undefined) chosenView.value = before;
+/** Look at the scene in another way; nobody else sees that, and it is no change of the scene. */
+export function setView(view: View): void {
+  chosenView.value = ownView.value === null ? null : { view, insteadOf: ownView.value };
 }
 
 export async function readScenes(): Promise<void> {
@@ -95,12 +93,21 @@ export async function change(
     const ifMatch = options.strict === true ? served.value?.revision : undefined;
     const answer = await request<SceneAnswer>(method, scenePath(rest), { body, ifMatch, gesture: options.gesture });
     takeScene(answer);
+    noteChange(method, rest, body);
     if (answer.picture?.state === "refused") toast(answer.picture.detail, "error");
     return answer;
   } catch (fault) {
     await tellChange(fault);
     return null;
   }
+}
+
+/** Tick off what the guide proposes. */
+function noteChange(method: string, rest: string, body: unknown): void {
+  if (rest.startsWith("/lights")) noteTried("light");
+  else if (method === "POST" && rest === "/objects") noteTried("drop");
+  else if (rest.startsWith("/objects/") && typeof body === "object" && body !== null && "pose" in body)
+    noteTried("drag");
 }
 
 async function tellChange(fault: unknown): Promise<void> {

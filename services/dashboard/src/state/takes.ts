@@ -2,7 +2,10 @@
 import { computed, signal } from "@preact/signals";
 import { API, request } from "../api/http";
 import type { Recording, Replay, ReplayChange, Snapshot, WantedPicture } from "../api/types";
-import { attempt } from "./toasts";
+import { uploadRecording } from "../api/upload";
+import { sendShown } from "./assets";
+import { openDrawer } from "./preferences";
+import { announce, attempt } from "./toasts";
 
 export const recordings = signal<readonly Recording[]>([]);
 export const replay = signal<Replay | null>(null);
@@ -43,6 +46,27 @@ export async function stopRecording(id: string): Promise<void> {
 export async function deleteRecording(id: string): Promise<void> {
   await attempt(() => request("DELETE", `${API}/recordings/${id}`));
   await readRecordings();
+}
+
+// The end of an archive lists the names of its files.
+const LISTED_BYTES = 8 << 20;
+
+/** Whether a file is a recording, or a zipped dataset folder, and not something to be put into the scene. */
+export async function isRecording(file: File): Promise<boolean> {
+  const name = file.name.toLowerCase();
+  if (!name.endsWith(".zip")) return name.endsWith(".mcap");
+  const list = await file.slice(Math.max(0, file.size - LISTED_BYTES)).text();
+  return /(^|[^a-z0-9_])rgb\.txt/.test(list);
+}
+
+/** Send a recording and show it; its card tells what relighting lacks. */
+export async function openRecording(file: File): Promise<void> {
+  const kept = await sendShown(file.name, (progress) => uploadRecording(file, progress));
+  if (!kept) return;
+  announce(`${kept.id} is among the recordings.`);
+  await readRecordings();
+  openDrawer("recordings");
+  await showRecording(kept.id);
 }
 
 /** Show a recording in place of the camera; `settings` are those of the replay so far. */

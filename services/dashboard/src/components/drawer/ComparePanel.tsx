@@ -5,6 +5,7 @@ import type { MethodName, Snapshot, WantedPicture } from "../../api/types";
 import { methods } from "../../forms/methods";
 import { methodOf } from "../../state/actions";
 import { comparison, type Side } from "../../state/comparison";
+import { noteTried } from "../../state/preferences";
 import { isTakingSnapshot, takeSnapshot } from "../../state/takes";
 import { toast } from "../../state/toasts";
 import { Button } from "../ui/Button";
@@ -27,7 +28,9 @@ export function ComparePanel() {
     const taken = await takeSnapshot([pictureOf("a", a.value), pictureOf("b", b.value)], false);
     if (!taken) return;
     const sides = [sideOf(taken, "a", a.value), sideOf(taken, "b", b.value)] as const;
-    if (sides[0] && sides[1]) comparison.value = { a: sides[0], b: sides[1], frameId: taken.frame_id };
+    if (!sides[0] || !sides[1]) return;
+    comparison.value = { a: sides[0], b: sides[1], frameId: taken.frame_id };
+    noteTried("compare");
   };
   const isBusy = isTakingSnapshot.value;
   return (

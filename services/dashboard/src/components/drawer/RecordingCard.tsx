@@ -28,6 +28,7 @@ export function RecordingCard({ recording }: { readonly recording: Recording }) 
       <div class="take-text">
         <h3 class="cut">{recording.id}</h3>
         <p class="quiet small">{recording.detail || factsText(recording)}</p>
+        <Checklist recording={recording} />
         <div class="row">
           {isRunning ? (
             <Button icon="stop" disabled={!mayChange} onClick={() => stopRecording(recording.id)}>
@@ -50,6 +51,21 @@ export function RecordingCard({ recording }: { readonly recording: Recording }) 
         </div>
       </div>
     </article>
+  );
+}
+
+/** What relighting needs of a recording, and what to do without. */
+function Checklist({ recording }: { readonly recording: Recording }) {
+  if (recording.checklist.length === 0) return null;
+  return (
+    <ul class="checklist small" aria-label="What relighting needs">
+      {recording.checklist.map(({ what, is_there, text }) => (
+        <li key={what} class={is_there ? "there" : "missing"}>
+          <Icon name={is_there ? "check" : "alert"} />
+          {text}
+        </li>
+      ))}
+    </ul>
   );
 }
 

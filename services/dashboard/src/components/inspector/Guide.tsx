@@ -1,10 +1,27 @@
 import { role } from "../../api/session";
-import { isGuideDismissed, openDrawer } from "../../state/preferences";
+import type { ComponentChildren } from "preact";
+import { isGuideDismissed, openDrawer, tried, type GuideStep } from "../../state/preferences";
 import { objects } from "../../state/scene";
 import { inspectorTab, selectedObjectId, selectObject } from "../../state/selection";
 import { IconButton } from "../ui/IconButton";
 
-/** What to try first; goes for good when it is closed. */
+interface StepProps {
+  readonly of: GuideStep;
+  readonly children: ComponentChildren;
+}
+
+/** One thing to try, with a tick once it was. */
+function Step({ of, children }: StepProps) {
+  const isDone = tried.value.includes(of);
+  return (
+    <li class={isDone ? "done" : ""}>
+      {children}
+      {isDone && <span class="visually-hidden">Done.</span>}
+    </li>
+  );
+}
+
+/** What to try first, ticked off as it is tried; goes for good when it is closed. */
 export function Guide() {
   if (isGuideDismissed.value || role.value !== "control") return null;
   const first = objects.value[0];
@@ -16,28 +33,28 @@ export function Guide() {
         <IconButton icon="close" label="Close Try this" onClick={() => (isGuideDismissed.value = true)} />
       </header>
       <ol>
-        <li>
+        <Step of="drag">
           <button type="button" disabled={!first} onClick={() => first && selectObject(first.id)}>
             Drag the object
           </button>
           <span>Click it, then drag it or its arrows. Shadow and colour follow.</span>
-        </li>
-        <li>
+        </Step>
+        <Step of="drop">
           <b>Drop a .glb onto the picture</b>
           <span>It stands where you let go.</span>
-        </li>
-        <li>
+        </Step>
+        <Step of="light">
           <button type="button" onClick={() => (inspectorTab.value = "lights")}>
             Change the light
           </button>
           <span>Colour, strength and position of each lamp. Or drag a shadow: its lamp follows.</span>
-        </li>
-        <li>
+        </Step>
+        <Step of="compare">
           <button type="button" onClick={() => openDrawer("compare")}>
             Compare methods
           </button>
           <span>One frame, two methods, and a split to drag.</span>
-        </li>
+        </Step>
       </ol>
     </section>
   );

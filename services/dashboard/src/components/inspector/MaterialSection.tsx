@@ -1,8 +1,10 @@
 import type { Material, SceneObject } from "../../api/types";
+import { MATERIALS } from "../../forms/materials";
 import { schemas } from "../../forms/schemas";
 import { assets, materialOfFile } from "../../state/assets";
 import { edit } from "../../state/gesture";
 import { objectTarget } from "../../state/targets";
+import { Button } from "../ui/Button";
 import { ColorField } from "../ui/ColorField";
 import { SliderField } from "../ui/SliderField";
 import { Switch } from "../ui/Switch";
@@ -43,6 +45,17 @@ function MaterialFields({ item, material, disabled }: MaterialFieldsProps) {
   const shares = ["roughness", "metallic", "specular"] as const;
   return (
     <>
+      <div class="presets" role="group" aria-label="Materials to begin with">
+        {MATERIALS.map(({ label, material: change }) => (
+          <Button
+            key={label}
+            disabled={disabled}
+            onClick={() => edit(objectTarget(item.id), { material: { ...material, ...change } })}
+          >
+            {label}
+          </Button>
+        ))}
+      </div>
       <ColorField
         label="Base colour"
         value={material.base_color}

@@ -25,8 +25,7 @@ export function OutputPanel() {
                 name="view"
                 aria-label={each.label}
                 checked={each.value === shownView.value}
-                disabled={disabled}
-                onChange={() => void setView(each.value)}
+                onChange={() => setView(each.value)}
               />
               <span>
                 <b>{each.label}</b>

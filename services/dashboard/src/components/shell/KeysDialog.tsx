@@ -44,7 +44,7 @@ const GROUPS: readonly { readonly title: string; readonly keys: readonly (readon
     title: "Views",
     keys: [
       ["1", "picture"],
-      ["2 … 6", "effects, change of light, volume, light's view, lights"],
+      ["2 … 7", "effects, change of light, volume, light's view, lights, camera"],
       ["?", "this list"],
     ],
   },

@@ -54,7 +54,7 @@ function onPlainKey(key: string): boolean {
   const nextTool = TOOL_KEYS[key];
   const nextView = VIEWS[Number(key) - 1];
   if (nextTool) tool.value = nextTool;
-  else if (nextView && role.value === "control") void setView(nextView.value);
+  else if (nextView) setView(nextView.value);
   else if (key === "f" && role.value === "control") standsOnSurfaces.value = !standsOnSurfaces.value;
   else if (key === "h") areOutlinesShown.value = !areOutlinesShown.value;
   else if (key === "?") areKeysShown.value = true;

@@ -8,6 +8,7 @@ import { upload } from "../../state/assets";
 import { isOutdated } from "../../state/liveState";
 import { nudge } from "../../state/nudge";
 import { selectedObjectId } from "../../state/selection";
+import { isRecording, openRecording } from "../../state/takes";
 import { tool } from "../../state/tools";
 import { CompareSlider } from "./CompareSlider";
 import { usePictureBox } from "./fit";
@@ -81,7 +82,7 @@ export function Picture() {
         />
         <CompareSlider />
         <PictureNotice />
-        {isDropping.value && <p class="drop-hint">Drop it where the object should stand</p>}
+        {isDropping.value && <p class="drop-hint">Drop an object where it should stand, or a recording</p>}
       </div>
     </div>
   );
@@ -90,7 +91,11 @@ export function Picture() {
 async function dropAt(event: DragEvent, pixel: readonly [number, number]): Promise<void> {
   const dragged = droppedAsset(event.dataTransfer?.getData(ASSET_DRAG));
   if (dragged) return addObject(dragged, pixel);
-  for (const file of event.dataTransfer?.files ?? []) {
+  for (const file of [...(event.dataTransfer?.files ?? [])]) {
+    if (await isRecording(file)) {
+      await openRecording(file);
+      continue;
+    }
     const asset = await upload(file);
     if (asset?.kind === "mesh") await addObject(asset, pixel, file.name);
   }

@@ -73,7 +73,7 @@ export function StageBar() {
         value={shownView.value ?? NOTHING.value}
         choices={document ? VIEWS : [NOTHING]}
         onChange={setView}
-        disabled={isDisabled}
+        disabled={document === null}
       />
     </div>
   );

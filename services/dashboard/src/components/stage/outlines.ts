@@ -1,7 +1,7 @@
 // What is drawn over the picture besides the gizmo: boxes of objects, and lamps.
 import type { ManualLight, Pose, Vector } from "../../api/types";
 import { corners, EDGES, type Bounds } from "../../math/bounds";
-import { project, type Pixel, type View } from "../../math/camera";
+import { cameraFromWorld, project, type Pixel, type View } from "../../math/camera";
 import { hexFromLinear } from "../../math/color";
 import { add, cross, normalized, scaled } from "../../math/vector";
 import type { Footing } from "../../state/tools";
@@ -24,6 +24,8 @@ export interface LampMark {
   readonly index: number;
   readonly at: Pixel;
   readonly isOutside: boolean;
+  /** The direction in which the lamp lies, radians, where it is outside. */
+  readonly towards: number;
 }
 
 const MARGIN_PX = 18;
@@ -94,12 +96,20 @@ export function lampMarks(
   lamps: readonly ManualLight[],
 ): LampMark[] {
   return lamps.flatMap((light, index) => {
-    const at = "position_m" in light ? onSheet(sheet.view, sheet.factor, light.position_m) : null;
-    if (!at) return [];
+    if (!("position_m" in light)) return [];
+    const at = onSheet(sheet.view, sheet.factor, light.position_m) ?? beyondEdge(sheet, light.position_m);
     const x = Math.max(MARGIN_PX, Math.min(sheet.width - MARGIN_PX, at[0]));
     const y = Math.max(MARGIN_PX, Math.min(sheet.height - MARGIN_PX, at[1]));
-    return { index, at: [x, y] as const, isOutside: x !== at[0] || y !== at[1] };
+    const towards = Math.atan2(at[1] - y, at[0] - x);
+    return { index, at: [x, y] as const, isOutside: x !== at[0] || y !== at[1], towards };
   });
+}
+
+/** Where to look for a point behind the camera: far beyond the edge that one has to turn towards. */
+function beyondEdge({ view, width, height }: Pick<Sheet, "view" | "width" | "height">, point: Vector): Pixel {
+  const [x, y] = cameraFromWorld(view, point);
+  const far = (2 * (width + height)) / Math.max(Math.hypot(x, y), 1e-9);
+  return [width / 2 + x * far, height / 2 + y * far];
 }
 
 export function drawLamp({ context }: Sheet, mark: LampMark, light: ManualLight, accent: string | null): void {
@@ -120,8 +130,24 @@ export function drawLamp({ context }: Sheet, mark: LampMark, light: ManualLight,
     context.lineTo(x + cos * LAMP_PX * 1.3, y + sin * LAMP_PX * 1.3);
   }
   context.stroke();
+  if (mark.isOutside) drawPointer(context, mark.at, mark.towards);
   context.globalAlpha = 1;
   context.shadowBlur = 0;
+}
+
+/** An arrow out of the picture, towards what it does not show. */
+function drawPointer(context: CanvasRenderingContext2D, [x, y]: Pixel, towards: number): void {
+  const along = (reach: number, turn: number): Pixel => [
+    x + LAMP_PX * reach * Math.cos(towards + turn),
+    y + LAMP_PX * reach * Math.sin(towards + turn),
+  ];
+  context.beginPath();
+  context.moveTo(...along(1.9, 0));
+  context.lineTo(...along(1.5, 0.35));
+  context.lineTo(...along(1.5, -0.35));
+  context.closePath();
+  context.fill();
+  context.stroke();
 }
 
 /** A line from a lamp straight down to the board's plane, which tells where it hangs. */

@@ -1,0 +1,1 @@
+"""`bench real`: relighting compared with photographs taken with and without an object."""

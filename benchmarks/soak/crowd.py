@@ -1,0 +1,143 @@
+"""Viewers of a soaked station: one that measures, and others that behave badly."""
+
+import asyncio
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Coroutine
+from contextlib import suppress
+from dataclasses import dataclass
+from random import Random
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.exceptions import WebSocketException
+
+from deltalight.benchmarks.soak.link import LoopThread
+from deltalight.services.live_message import LiveHeader, unpack
+
+KEPT_PICTURES = 200_000  # 3.7 hours at 15 a second; the oldest go first
+AGAIN_AFTER_S = 0.05
+SLOW_S = 1.0
+LONGEST_VISIT_S = 3.0
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A picture as it came: seconds of the monotonic clock, its age and the part of it that was waiting, ms."""
+
+    at_s: float
+    capture_ns: int
+    age_ms: float
+    waiting_ms: float
+
+
+class Crowd:
+    """Viewers in an event loop of their own; the measuring one connects again whenever it has to."""
+
+    def __init__(self, thread: LoopThread, port: int) -> None:
+        self.seen: deque[Seen] = deque(maxlen=KEPT_PICTURES)
+        self._thread = thread
+        self._address = f"ws://127.0.0.1:{port}/api/v1/live"
+        self._newest: tuple[LiveHeader, bytes] | None = None
+        self._lock = threading.Lock()
+        thread.start(self._measure())
+
+    def picture(self) -> tuple[int, UInt8[np.ndarray, "h w 3"]] | None:
+        """Return capture time (ns) and pixels of the newest picture, None before the first."""
+        with self._lock:
+            newest = self._newest
+        if newest is None:
+            return None
+        pixels = cv2.imdecode(np.frombuffer(newest[1], np.uint8), cv2.IMREAD_COLOR)
+        return None if pixels is None else (newest[0].capture_ns, pixels.astype(np.uint8))
+
+    def between(self, began_s: float, ended_s: float) -> list[Seen]:
+        """Return the pictures that came in a span of the monotonic clock."""
+        with self._lock:
+            return [each for each in self.seen if began_s <= each.at_s < ended_s]
+
+    def join(self, behaviour: str) -> Callable[[], None]:
+        """Add a viewer of BEHAVIOURS; return what makes it leave."""
+        task = self._thread.start(_visit(self._address, BEHAVIOURS[behaviour]))
+        return lambda: self._thread.cancel(task)
+
+    def come_and_go(self, viewers: int, seed: int) -> Callable[[], None]:
+        """Have so many viewers at a time join and leave at random; return what makes all leave."""
+        dice = Random(seed)
+        visits = [self._thread.start(_visits(self._address, Random(dice.random()))) for _ in range(viewers)]
+
+        def leave() -> None:
+            for task in visits:
+                self._thread.cancel(task)
+
+        return leave
+
+    async def _measure(self) -> None:
+        while True:
+            with suppress(OSError, WebSocketException, TimeoutError):
+                async with connect(self._address, max_size=None, compression=None) as socket:
+                    while True:
+                        self._note(await socket.recv())
+                        await socket.send("ack")
+            await asyncio.sleep(AGAIN_AFTER_S)
+
+    def _note(self, message: str | bytes) -> None:
+        assert isinstance(message, bytes)
+        header, jpeg = unpack(message)
+        if header.status != "ok":
+            return  # a stranger's, whom nothing tells where it is
+        age_ms = (time.time_ns() - header.capture_ns) / 1e6  # one host, one clock
+        waiting_ms = max(0.0, header.render_ms - sum(header.pass_times_ms.values()))
+        with self._lock:
+            self._newest = header, jpeg
+            self.seen.append(Seen(time.monotonic(), header.capture_ns, age_ms, waiting_ms))
+
+
+Behaviour = Callable[[ClientConnection], Coroutine[Any, Any, None]]
+
+
+async def _slow(socket: ClientConnection) -> None:
+    while True:
+        await socket.recv()
+        await asyncio.sleep(SLOW_S)
+        await socket.send("ack")
+
+
+async def _never_acknowledging(socket: ClientConnection) -> None:
+    while True:
+        await socket.recv()
+
+
+async def _silent(_socket: ClientConnection) -> None:
+    await asyncio.Event().wait()
+
+
+BEHAVIOURS: Final[dict[str, Behaviour]] = {
+    "slow": _slow,
+    "never acknowledging": _never_acknowledging,
+    "silent": _silent,
+}
+
+
+async def _visit(address: str, behaviour: Behaviour) -> None:
+    with suppress(OSError, WebSocketException, TimeoutError):
+        async with connect(address, max_size=None, compression=None) as socket:
+            await behaviour(socket)
+
+
+async def _visits(address: str, dice: Random) -> None:
+    while True:
+        stay_s = dice.uniform(0, LONGEST_VISIT_S)
+        with suppress(TimeoutError):
+            await asyncio.wait_for(_visit(address, _quick), stay_s)
+        await asyncio.sleep(dice.uniform(0, 1))
+
+
+async def _quick(socket: ClientConnection) -> None:
+    while True:
+        await socket.recv()
+        await socket.send("ack")

@@ -1,0 +1,336 @@
+"""The faults that a soaked station is put to: what is done, and what came of it."""
+
+import os
+import signal
+import time
+import uuid
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from random import Random
+from typing import Any
+
+import httpx
+import numpy as np
+from jaxtyping import UInt8
+
+from deltalight.benchmarks.soak.crowd import BEHAVIOURS, Crowd, Seen
+from deltalight.benchmarks.soak.link import SHAPES
+from deltalight.benchmarks.soak.nonsense import send_nonsense
+from deltalight.benchmarks.soak.profiles import Profile
+from deltalight.benchmarks.soak.station import SERVER, WEB, Station
+from deltalight.benchmarks.soak.takes_killed import kill_recorder
+from deltalight.protocol.documents import nearest
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.messages import ControlRequest
+from deltalight.protocol.request import RequestClient
+from deltalight.services import ports
+
+PATIENCE_S = 90.0
+SETTLE_S = 20.0  # after a start the picture may still refine
+POLL_S = 0.05
+CUT_S = 5.0
+LARGEST_DIFFERENCE = 2.0  # mean of a picture's codes: noise and JPEG are below 1, a missing object is above
+
+Outcome = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Run:
+    """What faults act on."""
+
+    station: Station
+    crowd: Crowd
+    profile: Profile
+    dice: Random
+
+
+class Fault(ABC):
+    """One kind of fault."""
+
+    @abstractmethod
+    def run(self, run: Run) -> Outcome:
+        """Do it and wait until the station has recovered; return figures.
+
+        Raises:
+            DeltalightError: the picture did not come back.
+        """
+
+
+@dataclass(frozen=True)
+class Kill(Fault):
+    """SIGKILL of a process: when the picture is back, and whether the scene is the same by document and by pixels."""
+
+    process: str
+
+    def run(self, run: Run) -> Outcome:
+        """Do it, and wait for a picture captured later."""
+        station = run.station
+        name = _chosen(self.process, run)
+        documents, picture = _documents(station), _picture(run)
+        restarts = station.restarts()[name]
+        killed_ns, killed_s = time.time_ns(), time.monotonic()
+        station.kill(name)
+        _wait(run, lambda: station.restarts()[name] > restarts)
+        _wait(run, lambda: _is_back(run, name, killed_ns, killed_s))
+        back_s = time.monotonic() - killed_s
+        return {
+            "process": name,
+            "back_s": back_s,
+            "same_document": _documents(station) == documents,
+            "difference": _settled_difference(run, picture),
+        }
+
+
+@dataclass(frozen=True)
+class Stop(Fault):
+    """SIGSTOP of a process for a while: how soon after it goes on the picture is back."""
+
+    process: str
+
+    def run(self, run: Run) -> Outcome:
+        """Do it, and wait for a picture captured after it went on."""
+        name = _chosen(self.process, run)
+        process_id = run.station.process_id(name)
+        os.kill(process_id, signal.SIGSTOP)
+        try:
+            time.sleep(run.profile.stop_s)
+        finally:
+            os.kill(process_id, signal.SIGCONT)
+        resumed_ns, resumed_s = time.time_ns(), time.monotonic()
+        _wait(run, lambda: _is_back(run, name, resumed_ns, resumed_s))
+        return {
+            "process": name,
+            "stopped_s": run.profile.stop_s,
+            "back_s": time.monotonic() - resumed_s,
+            "restarted": run.station.process_id(name) != process_id,
+        }
+
+
+@dataclass(frozen=True)
+class Viewers(Fault):
+    """Viewers that are slow, silent or never acknowledge; others' rate and age before and meanwhile."""
+
+    def run(self, run: Run) -> Outcome:
+        """Have one of each watch for a while."""
+        with _compared(run) as outcome:
+            leave = [run.crowd.join(behaviour) for behaviour in BEHAVIOURS]
+            time.sleep(run.profile.load_s)
+            for each in leave:
+                each()
+        return outcome
+
+
+@dataclass(frozen=True)
+class Churn(Fault):
+    """Many viewers that join and leave; others' rate and age before and meanwhile."""
+
+    def run(self, run: Run) -> Outcome:
+        """Have them do so for a while."""
+        with _compared(run) as outcome:
+            leave = run.crowd.come_and_go(run.profile.viewers, run.dice.randrange(2**32))
+            time.sleep(run.profile.load_s)
+            leave()
+        return {"viewers": run.profile.viewers, **outcome}
+
+
+@dataclass(frozen=True)
+class Nonsense(Fault):
+    """A node that sends mutated messages; others' rate and age before and meanwhile."""
+
+    def run(self, run: Run) -> Outcome:
+        """Have it send for a while."""
+        with _compared(run) as outcome:
+            sent = send_nonsense(run.station.places.stranger, run.profile.load_s, run.dice)
+        return {"sent": sent, **outcome}
+
+
+@dataclass(frozen=True)
+class BadLink(Fault):
+    """Delay, jitter, a narrow band and loss between all nodes and the render server."""
+
+    shape: str
+
+    def run(self, run: Run) -> Outcome:
+        """Have it so for a while."""
+        with _compared(run) as outcome:
+            try:
+                for link in run.station.links:
+                    link.shape = SHAPES[self.shape]
+                time.sleep(run.profile.load_s)
+            finally:
+                for link in run.station.links:
+                    link.shape = None
+        return outcome
+
+
+@dataclass(frozen=True)
+class Cut(Fault):
+    """All links are cut for 5 s: how soon after that the picture is back."""
+
+    def run(self, run: Run) -> Outcome:
+        """Do it, and wait for a picture captured after it."""
+        links = run.station.links
+        try:
+            for link in links:
+                link.cut(True)
+            time.sleep(CUT_S)
+        finally:
+            for link in links:
+                link.cut(False)
+        mended_ns, mended_s = time.time_ns(), time.monotonic()
+        _wait(run, lambda: any(each.capture_ns > mended_ns for each in _since(run, mended_s)))
+        return {"cut_s": CUT_S, "back_s": time.monotonic() - mended_s}
+
+
+@dataclass(frozen=True)
+class KilledRecorder(Fault):
+    """SIGKILL of a recorder of the first node: how much is lost, and whether the file can be closed."""
+
+    def run(self, run: Run) -> Outcome:
+        """Do it."""
+        return kill_recorder(run.station.places.nodes[0], run.dice)
+
+
+FAULTS: dict[str, Fault] = {
+    "kill-node": Kill("node"),
+    "kill-server": Kill(SERVER),
+    "kill-web": Kill(WEB),
+    "kill-recorder": KilledRecorder(),
+    "stop-node": Stop("node"),
+    "stop-server": Stop(SERVER),
+    "stop-web": Stop(WEB),
+    "viewers": Viewers(),
+    "churn": Churn(),
+    "nonsense": Nonsense(),
+    "link-arm": BadLink("arm"),
+    "link-foxglove": BadLink("foxglove"),
+    "cut": Cut(),
+}
+
+
+def parse_faults(text: str) -> list[str]:
+    """Return names of FAULTS: of `all`, `none`, or names separated by commas.
+
+    Raises:
+        DeltalightError: there is no such fault.
+    """
+    if text in ("all", "none"):
+        return list(FAULTS) if text == "all" else []
+    names = [name.strip() for name in text.split(",")]
+    for name in names:
+        if name not in FAULTS:
+            hint = nearest(name, FAULTS) or ", ".join(FAULTS)
+            raise DeltalightError(f"There is no fault '{name}'; did you mean {hint}?")
+    return list(dict.fromkeys(names))
+
+
+@dataclass(frozen=True)
+class Flow:
+    """Pictures that the measuring viewer got in a span: a second, ages in ms, and the longest wait for one in s."""
+
+    frames_per_s: float
+    age_p50_ms: float | None
+    age_p95_ms: float | None
+    unwaited_p95_ms: float | None = field(metadata={"what": "of the ages without waiting for the renderer"})
+    longest_gap_s: float
+
+    @classmethod
+    def of(cls, seen: Sequence[Seen], began_s: float, ended_s: float) -> "Flow":
+        """Describe pictures that came between two moments."""
+        moments = [began_s, *(each.at_s for each in seen), ended_s]
+        ages = [each.age_ms for each in seen]
+        unwaited = [each.age_ms - each.waiting_ms for each in seen]
+        return cls(
+            len(seen) / (ended_s - began_s),
+            _percentile(ages, 50),
+            _percentile(ages, 95),
+            _percentile(unwaited, 95),
+            float(np.max(np.diff(moments))),
+        )
+
+
+def _percentile(values: Sequence[float], share: float) -> float | None:
+    return float(np.percentile(values, share)) if values else None
+
+
+@contextmanager
+def _compared(run: Run) -> Iterator[Outcome]:
+    """Yield an outcome that holds, after the block, the flow of pictures before it and during it."""
+    outcome: Outcome = {}
+    began_s = time.monotonic()
+    before = Flow.of(
+        run.crowd.between(began_s - run.profile.calm_s, began_s), began_s - run.profile.calm_s, began_s
+    )
+    yield outcome
+    ended_s = time.monotonic()
+    during = Flow.of(run.crowd.between(began_s, ended_s), began_s, ended_s)
+    outcome |= {"before": vars(before), "during": vars(during)}
+
+
+def _chosen(process: str, run: Run) -> str:
+    return run.dice.choice(run.station.node_names) if process == "node" else process
+
+
+def _since(run: Run, began_s: float) -> list[Seen]:
+    return run.crowd.between(began_s, float("inf"))
+
+
+def _is_back(run: Run, name: str, after_ns: int, after_s: float) -> bool:
+    """Whether a picture captured later has come, and of a node that it reports again."""
+    if not any(each.capture_ns > after_ns for each in _since(run, after_s)):
+        return False
+    return name not in run.station.node_names or _reports(run.station, name, after_s)
+
+
+def _reports(station: Station, name: str, after_s: float) -> bool:
+    """Whether a node has reported since then."""
+    topic = name.replace(" ", "")
+    try:
+        known = station.client.get("/nodes").raise_for_status().json()
+    except httpx.HTTPError:
+        return False
+    ages_s = [each["age_s"] for each in known if each["name"] == topic]
+    return any(age_s < time.monotonic() - after_s for age_s in ages_s)
+
+
+def _documents(station: Station) -> tuple[object, object]:
+    """Return the scene that is stored and the one that is rendered."""
+    stored = station.client.get("/active-scene").raise_for_status().json()["document"]
+    client = RequestClient(ports.endpoint(station.places.control))
+    try:
+        reply = client.request(ControlRequest(node="soak", id=uuid.uuid4().hex, op="get_scene"), PATIENCE_S)
+    finally:
+        client.close()
+    return stored, reply.payload.get("scene")
+
+
+def _picture(run: Run) -> UInt8[np.ndarray, "h w 3"]:
+    found = run.crowd.picture()
+    if found is None:
+        raise DeltalightError("There is no picture yet to which a later one could be compared.")
+    return found[1]
+
+
+def _settled_difference(run: Run, before: UInt8[np.ndarray, "h w 3"]) -> float:
+    """Return the mean difference of codes from the picture before, as soon as it is small or time is up."""
+    deadline_s = time.monotonic() + SETTLE_S
+    while True:
+        now = _picture(run)
+        found = np.inf if now.shape != before.shape else float(np.abs(now.astype(int) - before).mean())
+        if found <= LARGEST_DIFFERENCE or time.monotonic() > deadline_s:
+            return found
+        time.sleep(0.2)
+
+
+def _wait(run: Run, condition: Callable[[], bool]) -> None:
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not condition():
+        run.station.check()
+        if time.monotonic() > deadline_s:
+            last = run.station.lines[-1] if run.station.lines else "nothing was logged"
+            raise DeltalightError(
+                f"No picture came back within {PATIENCE_S:.0f} s; the last line was: {last}"
+            )
+        time.sleep(POLL_S)

@@ -1,0 +1,202 @@
+"""Figures of a soak, from samples, pictures and outcomes of faults."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from deltalight.benchmarks.soak.crowd import Seen
+from deltalight.benchmarks.soak.faults import LARGEST_DIFFERENCE, Flow
+from deltalight.benchmarks.soak.profiles import Profile
+from deltalight.benchmarks.soak.report import Bar, FaultRecord, Figure, period_bar, worst
+from deltalight.benchmarks.soak.samples import (
+    ProcessSample,
+    Sample,
+    objects_of_server,
+    of_process,
+    steady_spans,
+)
+from deltalight.benchmarks.soak.station import SERVER, WEB
+
+SETTLED_AFTER_S = 60.0  # from when on memory should not grow
+LOOSE_HANDLES = 2  # connections that open and close as they are needed
+GROWTH = 5.0  # per cent
+
+BACK = Bar("< 3 s", lambda value: value < 3.0)
+BACK_FROM_CUT = Bar("< 1 s", lambda value: value < 1.0)
+NONE = Bar("0", lambda value: value == 0)
+ALL = Bar("every time", lambda value: value == 1)
+LOST = Bar("<= 1 s", lambda value: value <= 1.0)
+
+
+@dataclass(frozen=True)
+class Soaked:
+    """What a soak collected; times are of the monotonic clock, `calm` are the spans without a fault."""
+
+    profile: Profile
+    samples: Sequence[Sample]
+    calm: Sequence[tuple[float, float]]
+    seen: Sequence[Seen]
+    faults: Sequence[FaultRecord]
+    deaths: Mapping[str, int]
+    orphans: int
+
+    def is_calm(self, at_s: float) -> bool:
+        """Whether there was no fault then."""
+        return any(began_s <= at_s < ended_s for began_s, ended_s in self.calm)
+
+
+def all_figures(soaked: Soaked) -> list[Figure]:
+    """Return the table; what was not measured is left out."""
+    outcomes = _Outcomes(soaked.faults)
+    lost_s = outcomes.of("kill-recorder", "lost_s")
+    figures = [
+        worst("crashes", "deaths that no fault caused, by process", list(soaked.deaths.values()), NONE, ""),
+        worst("orphans", "processes that outlived the station", [soaked.orphans], NONE, ""),
+        *_resources(soaked),
+        _age(soaked),
+        *_kills(outcomes),
+        *_loads(outcomes),
+        *_links(outcomes),
+        worst("lost of a recording", "SIGKILL of the recorder", lost_s, LOST, "s"),
+    ]
+    return [each for each in figures if each is not None]
+
+
+class _Outcomes:
+    """Values of faults by the fault's name and the outcome's key."""
+
+    def __init__(self, faults: Sequence[FaultRecord]) -> None:
+        self._faults = faults
+
+    def of(self, name: str, *path: str) -> list[float]:
+        """Return the values at a path of all faults of that name; those that are None are left out."""
+        found = []
+        for fault in self._faults:
+            value: Any = fault.outcome if fault.name == name else None
+            for key in path:
+                value = None if value is None else value.get(key)
+            if value is not None:
+                found.append(float(value))
+        return found
+
+
+def _resources(soaked: Soaked) -> list[Figure | None]:
+    growths, handles = [], []
+    for name, span in steady_spans(soaked.samples, soaked.is_calm, SETTLED_AFTER_S):
+        own = [process for _, process in of_process(span, name)]
+        growths.append(100 * (own[-1].rss_bytes / own[0].rss_bytes - 1))
+        handles.append(float(own[-1].handles - own[0].handles))
+    counts = [each for each in objects_of_server(soaked.samples) if len(each) > 2]
+    objects = [float(max(each[1:]) - each[1]) for each in counts]
+    after = f"calm samples of one process, from {SETTLED_AFTER_S:.0f} s after its start to its last"
+    few = Bar(f"<= {LOOSE_HANDLES} more", lambda value: value <= LOOSE_HANDLES)
+    return [
+        worst("growth of memory (RSS)", after, growths, Bar(f"< {GROWTH:g} %", lambda v: v < GROWTH), "%"),
+        worst("growth of open handles", after, handles, few, ""),
+        worst("growth of GL objects", "of one render server, from its second count on", objects, NONE, ""),
+    ]
+
+
+def _age(soaked: Soaked) -> Figure | None:
+    ages = [each.age_ms - each.waiting_ms for each in soaked.seen if soaked.is_calm(each.at_s)]
+    p95_ms = [float(np.percentile(ages, 95))] if ages else []
+    how = f"95 of 100 of {len(ages)} pictures without a fault"
+    return worst("age of a picture without waiting", how, p95_ms, period_bar(soaked.profile), "ms")
+
+
+def _kills(outcomes: _Outcomes) -> list[Figure | None]:
+    names = {"kill-node": "node", "kill-server": SERVER, "kill-web": WEB}
+    figures = [
+        worst(f"picture back, {who}", "SIGKILL", outcomes.of(name, "back_s"), BACK, "s")
+        for name, who in names.items()
+    ]
+    same = [value for name in names for value in outcomes.of(name, "same_document")]
+    apart = [value for name in names for value in outcomes.of(name, "difference")]
+    alike = Bar(f"<= {LARGEST_DIFFERENCE:g}", lambda value: value <= LARGEST_DIFFERENCE)
+    figures += [
+        worst("scene equal by document", "after SIGKILL, 1 = equal", same, ALL, "", smallest=True),
+        worst("scene equal by pixels", "after SIGKILL, mean difference of codes", apart, alike, "codes"),
+    ]
+    return figures + [
+        worst(f"picture back, {who}", "SIGSTOP, from SIGCONT on", outcomes.of(name, "back_s"), BACK, "s")
+        for name, who in (("stop-node", "node"), ("stop-server", SERVER), ("stop-web", WEB))
+    ]
+
+
+def _loads(outcomes: _Outcomes) -> list[Figure | None]:
+    near = Bar("within 5 %", lambda value: value <= 5.0)
+    figures = []
+    for name, what in (
+        ("viewers", "slow, silent and never acknowledging viewers"),
+        ("churn", "viewers that join and leave"),
+        ("nonsense", "a node that sends nonsense"),
+    ):
+        before, during = (outcomes.of(name, when, "frames_per_s") for when in ("before", "during"))
+        changes = [100 * abs(now / then - 1) for then, now in zip(before, during, strict=True) if then]
+        figures.append(worst("change of others' rate", what, changes, near, "%"))
+    return figures
+
+
+def _links(outcomes: _Outcomes) -> list[Figure | None]:
+    any_age = Bar("shown", lambda _value: True)
+    figures = [
+        worst("picture back after a cut", "5 s, all links", outcomes.of("cut", "back_s"), BACK_FROM_CUT, "s")
+    ]
+    for name, what in (
+        ("link-arm", "25 Mbit/s, 20±10 ms, 0.5 % lost"),
+        ("link-foxglove", "80±20 ms, 2 % lost"),
+    ):
+        for key, title, unit in (
+            ("age_p50_ms", "age, median", "ms"),
+            ("age_p95_ms", "age, 95 of 100", "ms"),
+            ("longest_gap_s", "longest gap", "s"),
+        ):
+            figures.append(worst(title, what, outcomes.of(name, "during", key), any_age, unit))
+    return figures
+
+
+def all_courses(
+    samples: Sequence[Sample], seen: Sequence[Seen], names: Sequence[str]
+) -> dict[str, dict[str, list[float | None]]]:
+    """Return what is plotted, by panel and line, at the times of the samples."""
+    flows = [Flow.of(own, *span) for span, own in _by_sample(samples, seen)]
+
+    def of_each(read: Callable[[ProcessSample], float]) -> dict[str, list[float | None]]:
+        known = {name: [sample.processes.get(name) for sample in samples] for name in names}
+        return {
+            name: _rounded(None if each is None else read(each) for each in processes)
+            for name, processes in known.items()
+        }
+
+    return {
+        "age, ms": {
+            "median": _rounded(flow.age_p50_ms for flow in flows),
+            "95 of 100": _rounded(flow.age_p95_ms for flow in flows),
+        },
+        "pictures a second": {"at a viewer": _rounded(flow.frames_per_s for flow in flows)},
+        "RSS, MB": of_each(lambda process: process.rss_bytes / 1e6),
+        "open handles": of_each(lambda process: process.handles),
+        "GL objects": {SERVER: _rounded(each.gl_objects for each in samples)},
+        "drops since the start": {"all": _rounded(each.drops for each in samples)},
+    }
+
+
+def _rounded(values: Iterable[float | None]) -> list[float | None]:
+    return [None if value is None else round(value, 1) for value in values]
+
+
+def _by_sample(
+    samples: Sequence[Sample], seen: Sequence[Seen]
+) -> Iterable[tuple[tuple[float, float], list[Seen]]]:
+    """Yield the span that ends with each sample, and the pictures in it."""
+    number = 0
+    for before, sample in zip([None, *samples], samples, strict=False):
+        began_s = sample.at_s - 1.0 if before is None else before.at_s
+        own = []
+        while number < len(seen) and seen[number].at_s < sample.at_s:
+            if seen[number].at_s >= began_s:
+                own.append(seen[number])
+            number += 1
+        yield (began_s, sample.at_s), own

@@ -1,0 +1,194 @@
+"""The station that is soaked: nodes, render server and web process, all supervised, and links between them."""
+
+import os
+import signal
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import httpx
+import structlog
+
+from deltalight.benchmarks.soak.link import Link, LoopThread
+from deltalight.benchmarks.soak.profiles import Profile
+from deltalight.benchmarks.soak.take import write_take
+from deltalight.protocol.documents import validate
+from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.scene import SceneDocument
+from deltalight.services import ports
+from deltalight.services.demo import demo_scene
+from deltalight.services.host import HostPlan
+from deltalight.services.host_store import activate_document, session_file
+from deltalight.services.storage.store import Store
+from deltalight.services.supervisor import ChildSpec, Supervisor
+
+SERVER, WEB = "render server", "web process"
+REQUEST_TIMEOUT_S = 10.0
+MOST_RESTARTS = 10**6  # the faults are ours
+
+log = structlog.get_logger()
+
+
+@dataclass(frozen=True)
+class Ports:
+    """Where the processes listen; `stranger` is the endpoint's of a node that only sends nonsense."""
+
+    nodes: Sequence[int]
+    links: Sequence[int]
+    stranger: int
+    composite: int
+    control: int
+    page: int
+
+    @classmethod
+    def private(cls, nodes: int) -> "Ports":
+        """Choose free ones."""
+        found = ports.private_ports(2 * nodes + 4)
+        return cls(found[:nodes], found[nodes : 2 * nodes], *found[2 * nodes :])
+
+
+class Station:
+    """Processes that run; `links` lie between nodes and the others, `ids` are all processes there ever were."""
+
+    def __init__(
+        self, places: Ports, supervisor: Supervisor, links: Sequence[Link], node_names: Sequence[str]
+    ) -> None:
+        self.places = places
+        self.links = links
+        self.node_names = node_names
+        self.ids: set[int] = set()
+        self.kills: dict[str, int] = {}
+        self.fault: Exception | None = None
+        self.lines: list[str] = []
+        self._supervisor = supervisor
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._supervise, name="supervisor", daemon=True)
+        self.client = httpx.Client(
+            base_url=f"http://{ports.LOOPBACK}:{places.page}/api/v1", timeout=REQUEST_TIMEOUT_S
+        )
+
+    def start(self) -> None:
+        """Start to watch the processes."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop watching them, before their supervisor ends them."""
+        self._ending.set()
+        self._thread.join()
+        self.client.close()
+
+    @property
+    def names(self) -> list[str]:
+        """Names of all processes."""
+        return [*self.node_names, SERVER, WEB]
+
+    def process_id(self, name: str) -> int:
+        """Return the id of the process of that name which was started last."""
+        return self._supervisor.process_ids()[name]
+
+    def restarts(self) -> dict[str, int]:
+        """Return how often each process was started again."""
+        return self._supervisor.restarts()
+
+    def deaths(self) -> dict[str, int]:
+        """Return how often each process died that nobody killed."""
+        return {name: count - self.kills.get(name, 0) for name, count in self.restarts().items()}
+
+    def kill(self, name: str) -> None:
+        """Kill a process at once (SIGKILL)."""
+        self.kills[name] = self.kills.get(name, 0) + 1
+        os.kill(self.process_id(name), signal.SIGKILL)
+
+    def check(self) -> None:
+        """Raise what ended the supervisor.
+
+        Raises:
+            DeltalightError: a process refused its input.
+        """
+        if self.fault is not None:
+            raise self.fault
+
+    def _supervise(self) -> None:
+        try:
+            self._supervisor.run(until=self._note_ids)
+        except DeltalightError as fault:
+            self.fault = fault
+
+    def _note_ids(self) -> bool:
+        self.ids.update(self._supervisor.process_ids().values())
+        self.ids.update(self._supervisor.spare_ids().values())
+        return self._ending.is_set()
+
+
+@contextmanager
+def running_station(profile: Profile, thread: LoopThread, seed: int) -> Iterator[Station]:
+    """Start a station with a data folder of its own; all of it ends with the block.
+
+    Raises:
+        DeltalightError: no OpenGL, missing demo files, or no free ports.
+    """
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(TemporaryDirectory(prefix="deltalight-soak-")))
+        take = folder / "take.mcap"
+        write_take(take, profile.size, profile.frames_per_s)
+        with Store(folder / "data") as store:
+            shown = activate_document(store, soaked_scene(profile))
+        session = stack.enter_context(session_file(shown))
+        places = Ports.private(profile.nodes)
+        links = [
+            Link(port, node, seed + number)
+            for number, (port, node) in enumerate(zip(places.links, places.nodes, strict=True))
+        ]
+        for link in links:
+            thread.start(link.serve())
+        specs = _specs(places, take, session, folder / "data")
+        lines: list[str] = []
+        supervisor = Supervisor(specs, forward=lines.append, maximum_restarts=MOST_RESTARTS)
+        stack.enter_context(supervisor)
+        station = Station(places, supervisor, links, [spec.name for spec in specs[: profile.nodes]])
+        station.lines = lines
+        stack.callback(station.close)
+        station.start()
+        yield station
+
+
+def soaked_scene(profile: Profile) -> SceneDocument:
+    """Return the demo's scene as the profile changes it."""
+    scene = demo_scene("dvct")
+    document = scene.model_dump(mode="json")
+    document["method"] |= profile.method
+    document["output"] |= profile.output
+    changed = validate(SceneDocument, document, "the soaked scene")
+    return scene.replaced(method=changed.method, output=changed.output)
+
+
+def _specs(places: Ports, take: Path, session: Path, data: Path) -> list[ChildSpec]:
+    """Return the nodes, the render server, which reads them all, and the web process."""
+    plan = HostPlan(
+        str(take),
+        session,
+        node_port=places.links[0],
+        composite_port=places.composite,
+        control_port=places.control,
+        data=data,
+        page_port=places.page,
+        allow_software=True,
+        log_level="warning",
+        spares=True,
+    )
+    *_, server, web = plan.specs()
+    others = [*places.links[1:], places.stranger]
+    read = [option for port in others for option in ("--subscribe", ports.endpoint(port))]
+    return [
+        *(_node(plan, number, port) for number, port in enumerate(places.nodes, start=1)),
+        replace(server, arguments=(*server.arguments, *read)),
+        replace(web, arguments=(*web.arguments, *read)),
+    ]
+
+
+def _node(plan: HostPlan, number: int, port: int) -> ChildSpec:
+    spec = replace(plan, node_port=port).specs()[0]
+    return replace(spec, name=f"node {number}", arguments=(*spec.arguments, "--name", f"node{number}"))

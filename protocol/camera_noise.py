@@ -1,0 +1,205 @@
+"""The camera's noise, measured in pictures of a still scene, and put on the virtual part of a picture ([D] 6.2).
+
+In the sensor's linear units (1 = white) the variance of a pixel of intensity I is a + b I by channel: read noise and
+the photons' (Foi et al. 2008). Demosaicking and compression correlate neighbours; noise is modelled as white noise
+after a filter [k 1 k] along rows and columns, whose correlation of neighbours is 2 k / (1 + 2 k^2).
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, UInt8
+
+from deltalight.protocol.frames import ViewFrame, decode_lut
+
+BINS, LEAST_PIXELS = 24, 500
+CODES = (4, 251)
+"""Codes outside are clipped, in the picture or by its noise."""
+BLOCK_PX = 16
+STILL_SIGMAS = 4.0
+"""A block has moved if its mean changed by more, in standard errors."""
+LEAST_STILL = 0.5
+"""Share of the blocks that must not have moved."""
+MOST_PAIRS = 16
+GAUSSIAN = 1.4826
+"""Standard deviation over median absolute deviation."""
+MOST_CORRELATION = 0.7
+
+Color = UInt8[np.ndarray, "h w 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseModel:
+    """`read` a and `shot` b, R G B, in units of sensor white; `correlation` of neighbours along rows and columns."""
+
+    read: Float64[np.ndarray, " 3"]
+    shot: Float64[np.ndarray, " 3"]
+    correlation: tuple[float, float]
+
+    def variance(self, intensity: Float64[np.ndarray, "*n 3"]) -> Float64[np.ndarray, "*n 3"]:
+        """Return the variance at linear intensities, R G B."""
+        return np.asarray(np.maximum(self.read + self.shot * intensity, 0))
+
+
+def estimate_noise(
+    first: Color, second: Color, response: Float32[np.ndarray, "256 3"] | None
+) -> NoiseModel | None:
+    """Return the noise of two pictures of a still scene; None if too much moves, or too little is exposed well."""
+    lut = decode_lut(response)
+    pair = [lut[each, np.arange(3)].astype(np.float64) for each in (first, second)]
+    difference, mean = (pair[0] - pair[1]) / np.sqrt(2), (pair[0] + pair[1]) / 2
+    still = _still_pixels(difference)
+    exposed = ((np.minimum(first, second) >= CODES[0]) & (np.maximum(first, second) <= CODES[1])).all(axis=2)
+    used = still & exposed
+    if still.mean() < LEAST_STILL or used.sum() < LEAST_PIXELS:
+        return None
+    steps = np.gradient(lut.astype(np.float64), axis=0)
+    lines = [_fit_line(mean[used, c], difference[used, c], lut[:, c], steps[:, c]) for c in range(3)]
+    read, shot = np.array(lines).T
+    return NoiseModel(read, shot, (_correlation(difference, used, 1), _correlation(difference, used, 0)))
+
+
+def _still_pixels(difference: Float64[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
+    """Return the pixels whose block's mean changed by no more than noise explains."""
+    luma = difference.mean(axis=2)
+    block = (BLOCK_PX, BLOCK_PX)
+    mean, square = cv2.blur(luma, block), cv2.blur(luma**2, block)
+    # Correlated neighbours make means noisier than independent ones: by up to a factor of 2 along each axis.
+    error = 2 * np.sqrt(np.maximum(square - mean**2, 0)) / BLOCK_PX
+    return np.asarray(np.abs(mean) <= STILL_SIGMAS * error)
+
+
+def _fit_line(
+    mean: Float64[np.ndarray, " n"],
+    difference: Float64[np.ndarray, " n"],
+    lut: Float64[np.ndarray, " 256"],
+    steps: Float64[np.ndarray, " 256"],
+) -> tuple[float, float]:
+    """Return a and b of the variances of bins of intensity, without what rounding to codes adds."""
+    edges = np.quantile(mean, np.linspace(0, 1, BINS + 1))
+    which = np.clip(np.searchsorted(edges, mean, side="right") - 1, 0, BINS - 1)
+    rows: list[tuple[float, float, float]] = []
+    for number in range(BINS):
+        inside = which == number
+        count = int(np.count_nonzero(inside))
+        if count < LEAST_PIXELS // BINS:
+            continue
+        centre = float(mean[inside].mean())
+        rounding = float(np.interp(centre, lut, steps)) ** 2 / 12
+        rows.append((centre, max(_robust_variance(difference[inside]) - rounding, 0.0), np.sqrt(count)))
+    centres, variances, weights = np.array(rows).T
+    scale = weights / np.maximum(variances, 1e-3 * variances.max() + 1e-12)  # relative errors count alike
+    return _non_negative_line(centres, variances, scale)
+
+
+def _non_negative_line(
+    x: Float64[np.ndarray, " n"], y: Float64[np.ndarray, " n"], weights: Float64[np.ndarray, " n"]
+) -> tuple[float, float]:
+    columns = np.stack([np.ones_like(x), x], axis=1) * weights[:, None]
+    a, b = np.linalg.lstsq(columns, y * weights, rcond=None)[0]
+    square = weights**2
+    if a < 0:
+        return 0.0, max(float((square * x * y).sum() / (square * x * x).sum()), 0.0)
+    if b < 0:
+        return float((square * y).sum() / square.sum()), 0.0
+    return float(a), float(b)
+
+
+def _robust_variance(values: Float64[np.ndarray, " n"]) -> float:
+    """Return the mean square of deviations up to 4 robust sigmas: codes are too coarse for the median alone."""
+    sigma = GAUSSIAN * float(np.median(np.abs(values)))
+    kept = values[np.abs(values) <= 4 * sigma] if sigma > 0 else values
+    return float(np.mean(kept**2))
+
+
+def _correlation(difference: Float64[np.ndarray, "h w 3"], used: Bool[np.ndarray, "h w"], axis: int) -> float:
+    ahead, behind = (
+        tuple(slice(*cut) if each == axis else slice(None) for each in (0, 1)) for cut in ((1, None), (0, -1))
+    )
+    both = used[ahead] & used[behind]
+    one, other = difference[ahead][both], difference[behind][both]
+    power = float((one**2).mean() + (other**2).mean()) / 2
+    return float(np.clip((one * other).mean() / power, 0, MOST_CORRELATION)) if power > 0 else 0.0
+
+
+def add_noise(
+    color: Color,
+    coverage: Float32[np.ndarray, "h w"],
+    model: NoiseModel,
+    frame_id: int,
+    response: Float32[np.ndarray, "256 3"] | None,
+) -> Color:
+    """Return a picture with noise where virtual objects cover it; other pixels are the same to the bit.
+
+    The real part of an edge's pixel has its own share of noise; what is added completes its variance. Equal frame ids
+    give equal noise.
+    """
+    rows, columns = np.nonzero(coverage > 0)
+    if not len(rows):
+        return color
+    box = slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1)
+    cover, codes = coverage[box], color[box]
+    lut = decode_lut(response).astype(np.float64)
+    intensity = lut[codes, np.arange(3)]
+    sigma = np.sqrt(model.variance(intensity) * (1 - (1 - np.clip(cover, 0, 1)) ** 2)[..., None])
+    noisy = intensity + sigma * _unit_noise(codes.shape, model.correlation, frame_id)
+    coded = np.stack([np.interp(noisy[..., c], lut[:, c], np.arange(256)) for c in range(3)], axis=-1)
+    result = color.copy()
+    result[box] = np.where(cover[..., None] > 0, np.rint(coded), codes).astype(np.uint8)
+    return result
+
+
+def _unit_noise(
+    shape: tuple[int, ...], correlation: tuple[float, float], frame_id: int
+) -> Float64[np.ndarray, "h w 3"]:
+    white = np.random.default_rng(frame_id).standard_normal(shape)
+    along_rows, along_columns = (_kernel(each) for each in correlation)
+    filtered = cv2.sepFilter2D(white, -1, along_rows, along_columns, borderType=cv2.BORDER_REFLECT_101)
+    return np.asarray(filtered)
+
+
+def _kernel(correlation: float) -> Float64[np.ndarray, " 3"]:
+    """Return [k 1 k], scaled so that white noise keeps its variance."""
+    k = 0.0 if correlation <= 0 else (1 - np.sqrt(1 - 2 * correlation**2)) / (2 * correlation)
+    return np.asarray(np.array([k, 1, k]) / np.sqrt(1 + 2 * k * k))
+
+
+class CameraNoise:
+    """Learns a camera's noise from its frames: of pairs between which little moved, until it has seen enough."""
+
+    def __init__(self) -> None:
+        self._last: ViewFrame | None = None
+        self._found: list[NoiseModel] = []
+
+    def forget(self) -> None:
+        """Forget everything: other frames come from another camera."""
+        self._last, self._found = None, []
+
+    def observe(self, frame: ViewFrame) -> None:
+        """Compare a frame with the one before."""
+        last = self._last
+        if last is frame or len(self._found) >= MOST_PAIRS:
+            return
+        self._last = frame
+        if last is None or last.frame_id == frame.frame_id or last.color.shape != frame.color.shape:
+            return
+        if last.exposure_scale == frame.exposure_scale:
+            found = estimate_noise(last.color, frame.color, frame.response)
+            self._found += [] if found is None else [found]
+
+    @property
+    def model(self) -> NoiseModel | None:
+        """The mean of what was found; None before."""
+        if not self._found:
+            return None
+        read, shot = (
+            np.mean([getattr(each, name) for each in self._found], axis=0) for name in ("read", "shot")
+        )
+        rows, columns = np.mean([each.correlation for each in self._found], axis=0)
+        return NoiseModel(read, shot, (float(rows), float(columns)))
+
+    def applied(self, color: Color, coverage: Float32[np.ndarray, "h w"], frame: ViewFrame) -> Color:
+        """Return a frame's picture with noise on its virtual part; as it is while no noise is known."""
+        model = self.model
+        return color if model is None else add_noise(color, coverage, model, frame.frame_id, frame.response)

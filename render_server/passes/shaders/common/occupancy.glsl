@@ -1,0 +1,22 @@
+// Which cells of a mipmap's levels hold anything: a bit for each corner between cells, set if any of the eight around it
+// is touched, so that one bit tells of all cells that a trilinear sample reads.
+#ifdef OCCUPANCY_ACCESS
+layout(std430) buffer Occupied { uint occupied[]; };
+#else
+layout(std430) readonly buffer Occupied { uint occupied[]; };
+#endif
+
+// Words of a row and of a level with that many cells an edge; level 1 and all above take as many as level 1.
+int row_words(int cells) { return cells / 32 + 1; }
+
+int level_words(int cells) { return (cells + 1) * (cells + 1) * row_words(cells); }
+
+// Word that holds the bit of a corner.
+int corner_word(int n, int level, ivec3 corner) {
+    int cells = n >> level;
+    int first = level == 0 ? 0 : level_words(n) + (level - 1) * level_words(n >> 1);
+    return first + (corner.z * (cells + 1) + corner.y) * row_words(cells) + (corner.x >> 5);
+}
+
+// The corner around which a trilinear sample at q (voxels of level 0) reads.
+ivec3 corner_of(vec3 q, int level) { return ivec3(floor(q * exp2(-float(level)) + 0.5)); }

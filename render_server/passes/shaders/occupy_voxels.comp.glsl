@@ -1,0 +1,29 @@
+// Marks the touched voxels of a set in a mipmap's occupancy, on all levels.
+#include "common/volume.glsl"
+#define TOUCHED_ACCESS readonly
+#include "common/voxel_store.glsl"
+#define OCCUPANCY_ACCESS
+#include "common/occupancy.glsl"
+
+layout(local_size_x = 64) in;
+
+void mark(int level, ivec3 corner, uint bits) {
+    int word = corner_word(volume_size, level, corner);
+    if ((occupied[word] & bits) != bits) atomicOr(occupied[word], bits);
+}
+
+void occupy(ivec3 cell, int level) {
+    int bit = cell.x & 31;
+    for (int j = 0; j < 4; ++j) {
+        ivec3 corner = cell + ivec3(0, j & 1, j >> 1);
+        mark(level, corner, bit < 31 ? 3u << bit : 1u << 31);
+        if (bit == 31) mark(level, corner + ivec3(1, 0, 0), 1u);
+    }
+}
+
+void main() {
+    for (uint i = gl_GlobalInvocationID.x; i < slot_count; i += gl_NumWorkGroups.x * 64u) {
+        ivec3 v = voxel_of_index(touched[i], volume_size);
+        for (int level = 0; level < volume_levels; ++level) occupy(v >> level, level);
+    }
+}

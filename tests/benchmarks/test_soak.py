@@ -1,0 +1,238 @@
+"""`deltalight bench soak`: its links, figures and plots by themselves, and a short soak of real processes."""
+
+import json
+import random
+import socket
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+from deltalight.benchmarks.soak.command import SoakJob, run_soak
+from deltalight.benchmarks.soak.crowd import Seen
+from deltalight.benchmarks.soak.faults import FAULTS, Flow, parse_faults
+from deltalight.benchmarks.soak.figures import Soaked, all_figures
+from deltalight.benchmarks.soak.link import SHAPES, Link, LoopThread, Schedule, Shape
+from deltalight.benchmarks.soak.nonsense import _messages, mutated
+from deltalight.benchmarks.soak.plots import known_runs, nice_ceiling
+from deltalight.benchmarks.soak.profiles import PROFILES
+from deltalight.benchmarks.soak.report import FaultRecord, SoakReport
+from deltalight.benchmarks.soak.samples import ProcessSample, Sample, parse_drops
+from deltalight.protocol.envelope import decode, encode
+from deltalight.protocol.errors import DeltalightError
+from deltalight.services import ports
+from deltalight.services.cli import run
+from deltalight.services.demo import RECORDING, SCENE
+
+SLOW_LINK = Shape(bits_per_s=8e6, delay_s=0.05, jitter_s=0.0, loss=0.0)
+
+
+def test_a_link_delays_by_its_band_and_its_way() -> None:
+    schedule = Schedule(random.Random(1))
+    assert schedule.leaves_s(10.0, 1000, None) == 10.0
+    assert schedule.leaves_s(10.0, 1000, SLOW_LINK) == pytest.approx(10.051)
+    assert schedule.leaves_s(10.0, 2000, SLOW_LINK) == pytest.approx(10.053)  # behind the first
+    assert schedule.leaves_s(20.0, 1000, SLOW_LINK) == pytest.approx(20.051)
+
+
+def test_what_is_lost_holds_up_all_behind_it_for_a_round_trip() -> None:
+    lossy = Schedule(random.Random(1))
+    assert lossy.leaves_s(10.0, 1000, replace(SLOW_LINK, loss=1.0)) == pytest.approx(10.151)
+    assert lossy.leaves_s(10.0, 1000, SLOW_LINK) == pytest.approx(10.152)
+
+
+def test_jitter_keeps_the_order() -> None:
+    schedule, shape = Schedule(random.Random(1)), SHAPES["arm"]
+    left_s = [schedule.leaves_s(0.001 * number, 100, shape) for number in range(500)]
+    assert left_s == sorted(left_s)
+    delays_s = [left - 0.001 * number for number, left in enumerate(left_s)]
+    assert min(delays_s) >= shape.delay_s - shape.jitter_s
+
+
+@pytest.fixture
+def link() -> Iterator[tuple[Link, socket.socket, socket.socket]]:
+    """A link, and the two ends of a connection through it."""
+    with LoopThread("links") as thread, socket.create_server((ports.LOOPBACK, 0)) as node:
+        (port,) = ports.private_ports(1)
+        between = Link(port, node.getsockname()[1], seed=1)
+        thread.start(between.serve())
+        while not ports.answers(port):
+            time.sleep(0.01)
+        node.settimeout(10)
+        node.accept()[0].close()  # of the question whether it answers
+        with socket.create_connection((ports.LOOPBACK, port), timeout=10) as server:
+            accepted, _ = node.accept()
+            accepted.settimeout(10)
+            with accepted:
+                yield between, accepted, server
+
+
+def received(end: socket.socket, size: int) -> bytes:
+    found = b""
+    while len(found) < size:
+        piece = end.recv(size - len(found))
+        assert piece
+        found += piece
+    return found
+
+
+def test_a_link_carries_both_ways_whatever_its_shape(
+    link: tuple[Link, socket.socket, socket.socket],
+) -> None:
+    between, node, server = link
+    data = random.Random(1).randbytes(200_000)
+    for shape in (None, SHAPES["arm"]):
+        between.shape = shape
+        node.sendall(data)
+        assert received(server, len(data)) == data
+        server.sendall(b"subscribe")
+        assert received(node, 9) == b"subscribe"
+
+
+def test_a_cut_link_carries_nothing_until_it_is_mended(
+    link: tuple[Link, socket.socket, socket.socket],
+) -> None:
+    between, node, server = link
+    between.cut(True)
+    time.sleep(0.1)  # it takes effect in another thread
+    node.sendall(b"late")
+    server.settimeout(0.3)
+    with pytest.raises(TimeoutError):
+        server.recv(1)
+    between.cut(False)
+    server.settimeout(10)
+    assert received(server, 4) == b"late"
+
+
+def test_nonsense_is_refused_or_read_and_nothing_else() -> None:
+    dice, known, refused = random.Random(3), _messages(), 0
+    for pieces in known:
+        assert decode(pieces)[0].node == "stranger"
+    for _ in range(1000):
+        try:
+            message, parts = decode(mutated(dice, dice.choice(known)))
+        except DeltalightError:
+            refused += 1
+            continue
+        assert decode(encode(message, parts))[0] == message
+    assert 500 < refused < 1000
+
+
+def test_drops_are_summed_over_processes_by_cause() -> None:
+    text = """# TYPE deltalight_process_drops counter
+deltalight_process_drops_total{cause="color.a",process="render-server"} 3.0
+deltalight_process_drops_total{cause="bad_messages",process="render-server"} 2.0
+deltalight_process_drops_total{cause="bad_messages",process="b"} 1.0
+deltalight_process_rate{process="b",rate="fps"} 15.0"""
+    assert parse_drops(text.splitlines()) == {"color.a": 3, "bad_messages": 3}
+
+
+def test_flow_is_of_the_span_with_its_ends() -> None:
+    seen = [Seen(at_s, 0, age_ms, 10.0) for at_s, age_ms in ((1.0, 30.0), (1.5, 50.0))]
+    flow = Flow.of(seen, 0.0, 4.0)
+    assert (flow.frames_per_s, flow.age_p50_ms, flow.longest_gap_s) == (0.5, 40.0, 2.5)
+    assert flow.unwaited_p95_ms == pytest.approx(39.0)
+    assert Flow.of([], 0.0, 4.0).age_p50_ms is None
+
+
+def soaked(**changed: object) -> Soaked:
+    """Two minutes of a station in which nothing happens; the process `leaky` opens a handle a second."""
+    samples = [
+        Sample(
+            float(second),
+            {
+                "render server": ProcessSample(1, 10**8, 30),
+                "leaky": ProcessSample(2, 10**8 + 10**5 * second, second),
+            },
+            0,
+            0,
+            200,
+        )
+        for second in range(120)
+    ]
+    seen = [Seen(second / 15, 0, 60.0, 20.0) for second in range(15 * 120)]
+    record = Soaked(PROFILES["station"], samples, [(0.0, 200.0)], seen, [], {"leaky": 0}, 0)
+    return replace(record, **changed)  # type: ignore[arg-type]
+
+
+def test_figures_meet_their_bars_or_not() -> None:
+    kill = FaultRecord(
+        name="kill-server",
+        began_s=1,
+        ended_s=9,
+        outcome={"back_s": 3.5, "same_document": True, "difference": 0.5},
+    )
+    figures = {each.what: each for each in all_figures(soaked(faults=[kill]))}
+    met = {name: each.is_met for name, each in figures.items()}
+    assert met == {
+        "crashes": True,
+        "orphans": True,
+        "growth of memory (RSS)": False,
+        "growth of open handles": False,
+        "growth of GL objects": True,
+        "age of a picture without waiting": True,
+        "picture back, render server": False,
+        "scene equal by document": True,
+        "scene equal by pixels": True,
+    }
+    assert figures["picture back, render server"].result == "3.5 s"
+    assert figures["growth of open handles"].result == "0 to 59"
+    assert figures["age of a picture without waiting"].result == "40 ms"
+
+
+def test_only_calm_samples_and_late_ones_count() -> None:
+    quiet = {each.what: each for each in all_figures(soaked(calm=[(0.0, 61.0)], deaths={"leaky": 1}))}
+    assert quiet["growth of open handles"].is_met
+    assert not quiet["crashes"].is_met
+
+
+def test_lines_end_where_nothing_is_known() -> None:
+    assert known_runs([None, 1.0, 2.0, None, 3.0]) == [[1, 2], [4]]
+    assert known_runs([1.0, None, 2.0, None, 3.0, None, None, 4.0]) == [[0, 2, 4], [7]]
+    assert known_runs([None]) == []
+    assert [nice_ceiling(value) for value in (0.0, 0.3, 1.0, 1.1, 30.0, 51.0)] == [1, 0.5, 1, 2, 50, 100]
+
+
+@pytest.mark.parametrize(
+    ("option", "words"),
+    [(("--faults", "kill-servr"), "kill-server"), (("--profile", "staton"), "station")],
+)
+def test_wrong_options_are_sentences(
+    option: tuple[str, str], words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["bench", "soak", *option]) == 2
+    assert f"did you mean {words}?" in capsys.readouterr().err
+    assert parse_faults("all") == list(FAULTS)
+    assert parse_faults("none") == []
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(
+    not (RECORDING.is_file() and SCENE.is_file()), reason="the demo's recording is not in this checkout"
+)
+def test_a_short_soak_loses_nothing(tmp_path: Path) -> None:
+    """Nothing here depends on how fast the machine is."""
+    names = ["kill-node", "kill-server", "kill-web", "kill-recorder", "nonsense"]
+    said: list[str] = []
+    report = run_soak(SoakJob("small", names, 0.0, 3), tmp_path, said.append)
+    assert sorted(each.name for each in report.faults) == sorted(names)
+    assert set(report.deaths.values()) == {0}, said
+    assert report.orphans == 0
+    of = {each.name: each.outcome for each in report.faults}
+    for name in ("kill-node", "kill-server", "kill-web"):
+        assert of[name]["same_document"]
+    figures = {each.what: each.is_met for each in report.figures}
+    assert figures["scene equal by pixels"]
+    assert figures["growth of GL objects"]
+    assert of["nonsense"]["sent"] > 100
+    assert of["kill-recorder"]["frames"] > 0
+    written = SoakReport.model_validate(json.loads((tmp_path / "soak.json").read_text()))
+    assert written == report
+    assert len(report.courses) == 6
+    lengths = {len(values) for lines in report.courses.values() for values in lines.values()}
+    assert lengths == {len(report.times_s)}
+    assert "picture back, web process" in (tmp_path / "soak.md").read_text()
+    ElementTree.parse(tmp_path / "soak.svg")

@@ -1,0 +1,41 @@
+"""`output.camera_artifacts`: objects are as noisy as the camera, and nothing else changes."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deltalight.benchmarks.ground_truth.sensors import ColorSensor
+from deltalight.protocol.frames import decode_lut
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.renderer import SceneRenderer
+from tests.render_server.scenes import COARSE, Stage, ambient, cube, fields_of, floor, frame, plain
+
+pytestmark = pytest.mark.usefixtures("clean_gl")
+
+
+def test_objects_get_the_cameras_noise(gpu: GpuContext, tmp_path: Path) -> None:
+    """From the second still frame on; pixels without objects are those of the picture without it, to the bit."""
+    sensor, rng = ColorSensor(3e-4, 0.01), np.random.default_rng(1)
+    clean = decode_lut(None)[plain(150), np.arange(3)] * np.linspace(0.2, 1, plain().shape[1])[None, :, None]
+    frames = [
+        frame(sensor.expose(clean.astype(np.float32), rng), frame_id=number, timestamp_ns=number)
+        for number in range(2)
+    ]
+    stage = Stage(tmp_path, COARSE)
+    document = stage.document([stage.virtual(cube(0.3))], [ambient(0.5)], floor())
+    noisy = document.replaced(output=document.output.replaced(camera_artifacts=True))
+    pictures = {}
+    for name, scene in (("off", document), ("on", noisy)):
+        renderer = SceneRenderer(gpu, scene)
+        pictures[name] = [renderer.render(each).color for each in (*frames, frames[1])]
+        covered = fields_of(renderer).matte > 0.99
+        inside = fields_of(renderer).matte > 0
+        renderer.release()
+    (first, second, _), (plain_first, plain_second, _) = pictures["on"], pictures["off"]
+    assert np.array_equal(first, plain_first)
+    assert np.array_equal(second[~inside], plain_second[~inside])
+    assert np.array_equal(pictures["on"][1], pictures["on"][2])
+    before, after = (decode_lut(None)[each, np.arange(3)][covered] for each in (plain_second, second))
+    expected = np.mean(0.01**2 + 3e-4 * before)
+    assert np.mean((after - before) ** 2) == pytest.approx(expected, rel=0.2)
