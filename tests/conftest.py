@@ -7,7 +7,7 @@ import os
 import signal
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 import structlog
@@ -39,6 +39,24 @@ def pytest_xdist_setupnodes() -> None:
     """Give each worker that starts now one thread to render and to compute with: together they fill the cores."""
     for name in THREAD_COUNTS:
         os.environ.setdefault(name, "1")
+
+
+killed: set[str] = set()
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_handlecrashitem(crashitem: str, report: pytest.TestReport, sched: Any) -> None:  # noqa: ANN401 (no stubs)
+    """Run a test again whose worker was killed: one machine's fault is no fault of the test, twice the same is."""
+    if crashitem not in killed:
+        killed.add(crashitem)
+        report.outcome = "rerun"  # type: ignore[assignment]  # no outcome that pytest counts
+        sched.mark_test_pending(crashitem)
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Name the tests whose worker was killed, whatever came of them."""
+    for test in sorted(killed):
+        terminalreporter.write_line(f"a worker was killed in {test}, which ran again")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
