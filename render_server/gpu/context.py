@@ -1,6 +1,7 @@
 """The OpenGL context of a process (EGL, headless)."""
 
 import ctypes
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -94,6 +95,11 @@ class GpuContext:
     """Told of every program that a kernel asks for: its label and the text of each of its stages."""
 
     programs: SharedPrograms = field(default_factory=SharedPrograms)
+
+    @cached_property
+    def defines(self) -> dict[str, str]:
+        """What all shaders are compiled with: in software, the cores that share a kernel (common/walk.glsl)."""
+        return {"CORES": f"{os.cpu_count() or 1}u"} if self.is_software else {}
 
     def compiled(self, label: str, sources: Mapping[str, str]) -> None:
         """Tells the compile watchers about a program."""

@@ -334,7 +334,7 @@ class Kernel(_Shader):
         super().__init__(gpu, name, defines)
 
     def _compiled(self, defines: Mapping[str, float | str]) -> _Program:
-        source = shader_source(SHADERS / f"{self._name}.comp.glsl", defines)
+        source = shader_source(SHADERS / f"{self._name}.comp.glsl", {**self._gpu.defines, **defines})
         label = _label(self._name, defines)
         self._gpu.compiled(label, {"comp": source})
 

@@ -153,7 +153,8 @@ class Shading:
         self._change = ChangeRatio(gpu, self.grid.size)
         self._caustics: Caustics | None = None
         if options.caustics:
-            self._caustics = Caustics(gpu, self.grid, self._bvh, reuses=self.reuses_light)
+            blocks = options.tier.caustic_blocks
+            self._caustics = Caustics(gpu, self.grid, self._bvh, blocks=blocks, reuses=self.reuses_light)
         self._screen: ScreenCones | None = None
         if options.screen_space:
             self._screen = ScreenCones(gpu, self.grid, options.march, options.tier)

@@ -9,10 +9,7 @@ from deltalight.render_server.passes.cones import LowResGrid, reuse_define
 from deltalight.render_server.passes.gbuffer import ObjectBvh
 from deltalight.render_server.passes.lights import LightBuffers
 
-# Blocks per edge of a light's object map, each of which sends a beam of rays: they start a 128th of the objects'
-# extent apart, and after a convex object has spread them four- to eightfold they are as far apart as voxels.
-BLOCKS = 64
-RAYS = 4
+RAYS = 4  # of each block of a light's object map
 # Above this GGX alpha a lobe (2 alpha wide) is, at half the objects' extent, wider than such beams: rays then sample
 # the lobe, each with a fraction of its energy.
 WIDE_ALPHA = 1 / 32
@@ -26,12 +23,17 @@ SUMS_BYTES = 6 * 4  # per pixel: three channels on its real surface, three on it
 
 
 class Caustics:
-    """Renders caustics as fixed-point irradiance on real surfaces and objects (shaders/common/caustic_sums.glsl)."""
+    """Renders caustics as fixed-point irradiance on real surfaces and objects (shaders/common/caustic_sums.glsl).
+
+    `blocks` per edge of a light's object map each send a beam of rays. With 64 these start a 128th of the objects'
+    extent apart, and after a convex object has spread them four- to eightfold they are as far apart as voxels.
+    """
 
     def __init__(
-        self, gpu: GpuContext, grid: LowResGrid, objects: ObjectBvh, *, reuses: bool = False
+        self, gpu: GpuContext, grid: LowResGrid, objects: ObjectBvh, *, blocks: int, reuses: bool = False
     ) -> None:
         self._gpu, self._threads, self._grid, self._objects = gpu, list_threads(gpu), grid, objects
+        self._blocks = blocks
         size = SUMS_BYTES * (math.prod(grid.picture_size) + math.prod(grid.size))
         lower = "output.width and output.height"
         self._sums = gpu.storage_buffer(size, lower)
@@ -86,7 +88,7 @@ class Caustics:
 
     def _empty_beams(self, views: int) -> None:
         """Allocates and clears the beams of that many views."""
-        most = max(views * BLOCKS**2 * RAYS, 1)
+        most = max(views * self._blocks**2 * RAYS, 1)
         if self._places.size < PLACE_BYTES * most:
             self._beams.orphan(HEADER_BYTES + BEAM_BYTES * most)
             self._places.orphan(PLACE_BYTES * most)
@@ -98,7 +100,7 @@ class Caustics:
         """Adds the beams of one view: of mirrors, and of wider lobes."""
         shared: dict[str, Binding] = {
             "view_index": view_index,
-            "block_edge": max(lights.tile_size // BLOCKS, 1),
+            "block_edge": max(lights.tile_size // self._blocks, 1),
             "bias_real": bias_m,
             "reach": reach_m,
             "Beams": self._beams,
@@ -108,7 +110,9 @@ class Caustics:
             (self._mirror_beams, 0.0, WIDE_ALPHA),
             (self._lobe_beams, WIDE_ALPHA, GREATEST_ALPHA),
         ):
-            kernel.run((BLOCKS, BLOCKS, RAYS), shared, scene, least_alpha=least, greatest_alpha=greatest)
+            kernel.run(
+                (self._blocks, self._blocks, RAYS), shared, scene, least_alpha=least, greatest_alpha=greatest
+            )
 
     def release(self) -> None:
         """Frees the GL objects."""

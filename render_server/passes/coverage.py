@@ -38,6 +38,7 @@ class SampleCoverage:
         self.texture = texture_2d(gpu, size, 4, "f2")
         self.second_surface = texture_2d(gpu, size, 4, "f4")
         self._sums = gpu.ctx.framebuffer([self.texture, self.second_surface])
+        self._filled: Rectangle = (0, 0, *size)  # what may hold anything
         self._kernel = Kernel(gpu, "sample_coverage")
 
     def run(
@@ -55,9 +56,7 @@ class SampleCoverage:
         `scene` brings the camera of `view`, which looks at `raster` through the lens: not `with_antialiasing`.
         """
         in_picture, in_raster = rectangles
-        self.surface.clear()
-        self._sums.use()
-        self._sums.clear()
+        self._clear(in_picture)
         for number, (x, y) in enumerate(self._pattern):
             offset = (x / STEPS, y / STEPS)
             geometry.run(
@@ -85,6 +84,14 @@ class SampleCoverage:
                 offset=offset,
                 weight=1.0 / len(self._pattern),
             )
+
+    def _clear(self, rectangle: Rectangle) -> None:
+        """Clears what was filled before and what will be."""
+        for each in (self._filled, rectangle):
+            self.surface.clear(each)
+            self._sums.use()
+            self._sums.clear(viewport=each)
+        self._filled = rectangle
 
     def release(self) -> None:
         """Frees the GL objects."""

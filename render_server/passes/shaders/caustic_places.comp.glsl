@@ -1,5 +1,6 @@
 // Where each beam may light the picture.
 #include "common/geometry.glsl"
+#include "common/walk.glsl"
 #define FINDS_PLACES
 #include "common/beam_footprint.glsl"
 #include "common/camera.glsl"
@@ -36,5 +37,5 @@ BeamPlace place_of(Beam beam) {
 
 void main() {
     uint count = min(beam_count, uint(beams.length()));
-    for (uint i = gl_GlobalInvocationID.x; i < count; i += gl_NumWorkGroups.x * 64u) places[i] = place_of(beams[i]);
+    for (uint i = first_item(); i < count; i += items_apart()) places[i] = place_of(beams[i]);
 }

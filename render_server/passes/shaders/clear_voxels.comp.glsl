@@ -1,5 +1,6 @@
 // Empties the voxels that a set touched: its grid cells, and their texels in all directions of a mipmap.
 #include "common/volume.glsl"
+#include "common/walk.glsl"
 #define GRID_ACCESS
 #define TOUCHED_ACCESS readonly
 #include "common/voxel_store.glsl"
@@ -9,7 +10,7 @@ layout(rgba16f) writeonly uniform image3D mipmap;
 uniform bool free_slots;    // also release the slots
 
 void main() {
-    for (uint i = gl_GlobalInvocationID.x; i < slot_count; i += gl_NumWorkGroups.x * 64u) {
+    for (uint i = first_item(); i < slot_count; i += items_apart()) {
         ivec3 v = voxel_of_index(touched[i], volume_size);
         for (int k = 0; k < DIRECTIONS; ++k) imageStore(mipmap, v + ivec3(0, 0, k * volume_size), vec4(0.0));
         if (free_slots) grid[touched[i]] = 0u;

@@ -195,7 +195,7 @@ void main() {
     ivec2 size = textureSize(picture, 0), grid = textureSize(sample_pixels, 0);
     uint block = uint(scale * scale);
     uint count = (whole ? uint(grid.x * grid.y) : listed_count()) * block;
-    for (uint i = gl_GlobalInvocationID.x; i < count; i += gl_NumWorkGroups.x * 64u) {
+    for (uint i = first_item(); i < count; i += items_apart()) {
         uint index = whole ? i / block : texels[i / block];
         ivec2 pixel = pixel_in_block(texel_of_index(index, grid.x), int(i % block), scale);
         if (all(lessThan(pixel, size))) compose(pixel);

@@ -152,6 +152,6 @@ void unmix(ivec2 pixel) {
 
 void main() {
     int width = textureSize(real_surface_position, 0).x;
-    for (uint i = gl_GlobalInvocationID.x; i < listed_count(); i += gl_NumWorkGroups.x * 64u)
+    for (uint i = first_item(); i < listed_count(); i += items_apart())
         unmix(texel_of_index(texels[i], width));
 }

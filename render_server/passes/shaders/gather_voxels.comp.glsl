@@ -2,6 +2,7 @@
 // other surfaces, and of the environment where nothing is in front of it. CHANGE: E_rho from E_mu, by the cones that may meet the
 // objects' changes.
 #include "common/march.glsl"
+#include "common/walk.glsl"
 #include "common/environment.glsl"
 #include "common/diffuse_cones.glsl"
 #include "common/voxel_store.glsl"
@@ -50,5 +51,5 @@ void gather(int slot) {
 
 void main() {
     uint count = groups_held();
-    for (uint i = gl_GlobalInvocationID.x; i < count; i += gl_NumWorkGroups.x * 64u) gather(int(i));
+    for (uint i = first_item(); i < count; i += items_apart()) gather(int(i));
 }

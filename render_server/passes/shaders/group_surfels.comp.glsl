@@ -4,6 +4,7 @@
 #define GROUP_ENTRIES_ACCESS
 #define GROUP_SUMS_ACCESS
 #include "common/volume.glsl"
+#include "common/walk.glsl"
 #include "common/voxel_store.glsl"
 #include "common/surfel_groups.glsl"
 #ifdef SUM
@@ -45,7 +46,7 @@ void add_to_group(Surfel s, uint surfel, int side, vec3 n) {
 
 void main() {
     uint count = surfels_held();
-    for (uint i = gl_GlobalInvocationID.x; i < count; i += gl_NumWorkGroups.x * 64u) {
+    for (uint i = first_item(); i < count; i += items_apart()) {
         Surfel s = surfels[i];
         add_to_group(s, i, 0, s.normal_material.xyz);
         if (s.uv_voxel.w > 0.5) add_to_group(s, i, 1, -s.normal_material.xyz);

@@ -14,6 +14,7 @@
 #define SUMS_ACCESS
 #endif
 #include "common/volume.glsl"
+#include "common/walk.glsl"
 #include "common/voxel_store.glsl"
 #include "common/surfel_light.glsl"
 #include "common/environment.glsl"
@@ -213,7 +214,7 @@ void light(Surfel s, uint own, vec3 n) {
 
 void main() {
     uint count = surfels_held();
-    for (uint i = gl_GlobalInvocationID.x; i < count; i += gl_NumWorkGroups.x * 64u) {
+    for (uint i = first_item(); i < count; i += items_apart()) {
         Surfel s = surfels[i];
         light(s, 2u * i, s.normal_material.xyz);
         if (s.uv_voxel.w > 0.5) light(s, 2u * i + 1u, -s.normal_material.xyz);

@@ -5,6 +5,7 @@
 // both sides of a thin body do not count as two bodies.
 #define SURFELS_ACCESS readonly
 #include "common/voxel_store.glsl"
+#include "common/walk.glsl"
 #include "common/light_cells.glsl"
 #ifndef CUTOUTS
 #pragma switch CUTOUTS
@@ -36,7 +37,7 @@ void cover(Surfel s, vec3 n) {
 
 void main() {
     uint count = surfels_held();
-    for (uint i = gl_GlobalInvocationID.x; i < count; i += gl_NumWorkGroups.x * 64u) {
+    for (uint i = first_item(); i < count; i += items_apart()) {
         Surfel s = surfels[i];
         cover(s, s.normal_material.xyz);
         if (s.uv_voxel.w > 0.5) cover(s, -s.normal_material.xyz);

@@ -1,5 +1,6 @@
 // Marks the touched voxels of a set in a mipmap's occupancy, on all levels.
 #include "common/volume.glsl"
+#include "common/walk.glsl"
 #define TOUCHED_ACCESS readonly
 #include "common/voxel_store.glsl"
 #define OCCUPANCY_ACCESS
@@ -22,7 +23,7 @@ void occupy(ivec3 cell, int level) {
 }
 
 void main() {
-    for (uint i = gl_GlobalInvocationID.x; i < slot_count; i += gl_NumWorkGroups.x * 64u) {
+    for (uint i = first_item(); i < slot_count; i += items_apart()) {
         ivec3 v = voxel_of_index(touched[i], volume_size);
         for (int level = 0; level < volume_levels; ++level) occupy(v >> level, level);
     }

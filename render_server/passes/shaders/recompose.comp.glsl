@@ -26,7 +26,7 @@ void recompose(ivec2 pixel) {
 void main() {
     ivec2 size = textureSize(picture, 0), grid = textureSize(sample_pixels, 0);
     uint block = uint(scale * scale), count = listed_count() * block;
-    for (uint i = gl_GlobalInvocationID.x; i < count; i += gl_NumWorkGroups.x * 64u) {
+    for (uint i = first_item(); i < count; i += items_apart()) {
         ivec2 pixel = pixel_in_block(texel_of_index(texels[i / block], grid.x), int(i % block), scale);
         if (all(lessThan(pixel, size))) recompose(pixel);
     }

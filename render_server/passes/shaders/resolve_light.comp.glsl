@@ -1,6 +1,7 @@
 // Radiance of split-inject -> level 0 of V_delta and V_rho: of what a voxel holds of both sets, by area. The marker of V_eta goes with both: opacity 1 in
 // every voxel that real or virtual geometry touches ([P1] 3.2), so that one fetch gives radiance and opacity.
 #include "common/volume.glsl"
+#include "common/walk.glsl"
 #define TOUCHED_ACCESS readonly
 #include "common/voxel_store.glsl"
 #include "common/split_sums.glsl"
@@ -14,7 +15,7 @@ layout(std430) readonly buffer OtherLight { int other_light[]; };
 uniform bool skip_shared;   // voxels that the other set touched too are written by its own pass
 
 void main() {
-    for (uint i = gl_GlobalInvocationID.x; i < slot_count; i += gl_NumWorkGroups.x * 64u) {
+    for (uint i = first_item(); i < slot_count; i += items_apart()) {
         uint voxel = touched[i];
         uint other = other_grid[voxel];
         if (skip_shared && other != 0u) continue;

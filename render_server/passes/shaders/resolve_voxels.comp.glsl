@@ -2,6 +2,7 @@
 // the real set: (c_mu, a_real). RHO_REAL walks it too and adds the change of its light and the virtual set;
 // RHO_VIRTUAL walks the virtual set and writes the voxels without real geometry.
 #include "common/volume.glsl"
+#include "common/walk.glsl"
 #define TOUCHED_ACCESS readonly
 #define SUMS_ACCESS readonly
 #include "common/voxel_store.glsl"
@@ -38,7 +39,7 @@ vec4 virtual_texel(int slot, int k) {
 #endif
 
 void main() {
-    for (uint i = gl_GlobalInvocationID.x; i < slot_count; i += gl_NumWorkGroups.x * 64u) {
+    for (uint i = first_item(); i < slot_count; i += items_apart()) {
         uint voxel = touched[i];
 #ifdef RHO_VIRTUAL
         if (other_grid[voxel] != 0u) continue;

@@ -129,7 +129,7 @@ vec4 reflection(ivec2 pixel) {
 void main() {
     int grid_width = textureSize(sample_pixels, 0).x, edge = (scale + 1) / 2;
     uint quads = uint(edge * edge);
-    for (uint i = gl_GlobalInvocationID.x; i < listed_count() * quads; i += gl_NumWorkGroups.x * 64u) {
+    for (uint i = first_item(); i < listed_count() * quads; i += items_apart()) {
         ivec2 first = pixel_in_block(texel_of_index(texels[i / quads], grid_width), 0, scale);
         ivec2 quad = first / 2 + ivec2(int(i % quads) % edge, int(i % quads) / edge), pixel = first_of_quad(quad);
         if (pixel.x >= 0) imageStore(reflected, pixel, reflection(pixel));
@@ -141,7 +141,7 @@ void main() {
     ivec2 size = textureSize(object_coverage, 0);
     int grid_width = textureSize(sample_pixels, 0).x;
     uint block = uint(scale * scale);
-    for (uint i = gl_GlobalInvocationID.x; i < listed_count() * block; i += gl_NumWorkGroups.x * 64u) {
+    for (uint i = first_item(); i < listed_count() * block; i += items_apart()) {
         ivec2 pixel = pixel_in_block(texel_of_index(texels[i / block], grid_width), int(i % block), scale);
         if (any(greaterThanEqual(pixel, size)) || texelFetch(object_coverage, pixel, 0).r <= 0.0) continue;
         imageStore(reflected, pixel, reflection(pixel));

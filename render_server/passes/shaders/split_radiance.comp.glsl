@@ -2,13 +2,14 @@
 // voxel's radiance. Lights see the same surface, so their areas do not add up.
 #define TOUCHED_ACCESS readonly
 #include "common/voxel_store.glsl"
+#include "common/walk.glsl"
 #include "common/split_sums.glsl"
 
 layout(local_size_x = 64) in;
 layout(std430) buffer Light { int light[]; };
 
 void main() {
-    for (uint i = gl_GlobalInvocationID.x; i < slot_count; i += gl_NumWorkGroups.x * 64u) {
+    for (uint i = first_item(); i < slot_count; i += items_apart()) {
         uint at = i * uint(LIGHT_SUMS);
         int area = light[at + AREA];
         if (area == 0) continue;   // the light does not reach it

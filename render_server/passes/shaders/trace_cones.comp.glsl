@@ -62,6 +62,6 @@ void trace(ivec2 texel) {
 
 // The texels that select_cone_texels or low_res_grid listed.
 void main() {
-    for (uint i = gl_GlobalInvocationID.x; i < listed_count(); i += gl_NumWorkGroups.x * 64u)
+    for (uint i = first_item(); i < listed_count(); i += items_apart())
         trace(texel_of_index(texels[i], low_resolution_size.x));
 }

@@ -59,7 +59,7 @@ void main() {
     ivec2 size = textureSize(object_coverage, 0);
     int grid_width = textureSize(sample_pixels, 0).x;
     uint block = uint(scale * scale);
-    for (uint i = gl_GlobalInvocationID.x; i < listed_count() * block; i += gl_NumWorkGroups.x * 64u) {
+    for (uint i = first_item(); i < listed_count() * block; i += items_apart()) {
         ivec2 pixel = pixel_in_block(texel_of_index(texels[i / block], grid_width), int(i % block), scale);
         if (all(lessThan(pixel, size)) && texelFetch(object_coverage, pixel, 0).r > 0.0) shade(pixel);
     }

@@ -1,6 +1,7 @@
 // Voxelises triangles exactly (Schwarz & Seidel 2010 find the same voxels): each is clipped to the voxels that it may meet, which
 // voxel_pairs lists; area and centroid of each piece become a surfel. Thin, large and tiny triangles keep their area.
 #include "common/volume.glsl"
+#include "common/walk.glsl"
 #define GRID_ACCESS
 #define TOUCHED_ACCESS
 #define SURFELS_ACCESS
@@ -132,5 +133,5 @@ void clip_to_voxel(uvec2 pair) {
 
 void main() {
     uint count = min(pair_count, uint(pairs.length()));
-    for (uint i = gl_GlobalInvocationID.x; i < count; i += gl_NumWorkGroups.x * 64u) clip_to_voxel(pairs[i]);
+    for (uint i = first_item(); i < count; i += items_apart()) clip_to_voxel(pairs[i]);
 }

@@ -1,5 +1,6 @@
 // Injects `sent_out(surfel, normal)` (radiosity) from each side of every surfel of a store into the volume. Needs
 // voxel_store.glsl, inject_light.glsl and that function.
+#include "common/walk.glsl"
 
 void inject_side(Surfel s, vec3 n) {
     vec3 radiosity = sent_out(s, n);
@@ -12,7 +13,7 @@ void inject_side(Surfel s, vec3 n) {
 
 void main() {
     uint count = surfels_held();
-    for (uint i = gl_GlobalInvocationID.x; i < count; i += gl_NumWorkGroups.x * 64u) {
+    for (uint i = first_item(); i < count; i += items_apart()) {
         Surfel s = surfels[i];
         inject_side(s, s.normal_material.xyz);
         if (s.uv_voxel.w > 0.5) inject_side(s, -s.normal_material.xyz);

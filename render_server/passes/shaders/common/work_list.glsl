@@ -1,5 +1,6 @@
 // A list of texels of the reduced grid: passes walk it instead of branching, because software renderers run both sides
 // of a branch, and a GPU keeps its lanes full. What fills the list defines APPENDS_TEXELS.
+#include "common/walk.glsl"
 #ifdef APPENDS_TEXELS
 layout(std430) buffer Texels { uint texel_count; uint texels[]; };
 
