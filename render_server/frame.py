@@ -1,5 +1,6 @@
 """The resources of one frame that all methods share, and the stages that compute them."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import moderngl
@@ -20,7 +21,8 @@ from deltalight.render_server.passes.coverage import (
     ObjectCoverage,
     SampleCoverage,
 )
-from deltalight.render_server.passes.gbuffer import CameraImage, GeometryBuffer, RasterGeometry, RealSurface
+from deltalight.render_server.passes.gbuffer import CameraImage, GeometryBuffer, RasterGeometry
+from deltalight.render_server.passes.real_surface import RealSurface
 from deltalight.render_server.passes.voxel_light import AlbedoTexture
 from deltalight.render_server.scene.declared_surfaces import MAX_ROWS, SurfaceTable, plane_fits
 from deltalight.render_server.scene.depth_surface import DepthSurface
@@ -33,13 +35,13 @@ BIAS_SIGMAS = 3.0  # of depth noise: keeps real surfaces from shadowing themselv
 class Scan:
     """The camera's measurement of the real scene, taken when something last moved.
 
-    `depth` and `surface` are None if the scene gives a model. `noise_sigma` is the depth noise at 1 m (m,
-    grows with z^2), `typical_depth` the median depth (m). `tolerance` bounds the difference at which the
+    `depth` is None if the scene gives a model; `fitted` fits a surface to it, once. `noise_sigma` is the depth noise
+    at 1 m (m, grows with z^2), `typical_depth` the median depth (m). `tolerance` bounds the difference at which the
     fused surface still agrees with the depth (m, and m at 1 m); None if nothing is fused.
     """
 
     depth: DepthImage | None
-    surface: DepthSurface | None
+    fitted: Callable[[], DepthSurface]
     noise_sigma: float
     typical_depth: float
     tolerance: tuple[float, float] | None
@@ -130,16 +132,17 @@ class ObservationBuffers:
         self, scan: Scan, real: GeometryState, view: CameraView, declared: Bindings, surfaces: SurfaceTable
     ) -> Observation:
         """Fills the real geometry buffer from depth, from the given model, or from both if depth is fused."""
-        normals = None if scan.surface is None else scan.surface.normals
         raster_scene: dict[str, Binding] = {
             "Camera": self.raster_camera,
             **self.image.bindings,
             **declared,
             "noise_sigma": scan.noise_sigma,
-            "plane_fits": plane_fits(surfaces, scan.depth, normals, view.world_from_camera, scan.noise_sigma),
+            "plane_fits": plane_fits(
+                surfaces, scan.depth, scan.fitted, view.world_from_camera, scan.noise_sigma
+            ),
         }
-        if scan.depth is not None and normals is not None:
-            self.real_surface.from_depth(scan.depth, normals, raster_scene)
+        if scan.depth is not None:
+            self.real_surface.from_depth(scan.depth, scan.fitted, raster_scene)
         if scan.depth is None or scan.tolerance is not None:
             if self._model_raster is None:
                 self._model_raster = GeometryBuffer(self._gpu, view.raster[1])

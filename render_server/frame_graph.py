@@ -30,7 +30,8 @@ from deltalight.render_server.methods.registry import MethodChoice
 from deltalight.render_server.occlusion_fields import OcclusionFields
 from deltalight.render_server.passes.composite import Composite, DebugViews, RelitLayers
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid
-from deltalight.render_server.passes.gbuffer import CameraImage, GeometryBuffer, RealSurface
+from deltalight.render_server.passes.gbuffer import CameraImage, GeometryBuffer
+from deltalight.render_server.passes.real_surface import RealSurface
 from deltalight.render_server.passes.shading import DirectLight
 from deltalight.render_server.passes.voxel_light import AlbedoTexture
 from deltalight.render_server.scene.declared_surfaces import SurfaceTable

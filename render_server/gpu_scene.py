@@ -1,6 +1,7 @@
 """Triangles on the GPU as stages receive them: those of the real scene and of the virtual objects."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float32, Float64
@@ -92,6 +93,12 @@ class GeometryState:
     def bounds(self) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
         """Least and greatest coordinates, m."""
         return self.points.min(axis=0), self.points.max(axis=0)
+
+    @cached_property
+    def triangle_boxes(self) -> tuple[Float64[np.ndarray, "m 3"], Float64[np.ndarray, "m 3"]]:
+        """Least and greatest coordinates of each triangle, m."""
+        a, b, c = (self.corners[:, corner, :3].astype(np.float64) for corner in range(3))
+        return np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
 
     @property
     def lasting_points(self) -> Float64[np.ndarray, "k 3"]:

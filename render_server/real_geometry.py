@@ -1,5 +1,6 @@
 """The real scene's triangles: meshed from the frame's depth, fused from all frames, or given as a model."""
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -111,16 +112,16 @@ class RealGeometry:
 
         Three standard deviations of the noise cover at least what voxels round off.
         """
-        depth = None if self.is_model else taken.frame.depth
+        depth, fitted = None if self.is_model else taken.frame.depth, partial(self._surface_of, taken)
         if depth is None:
-            return Scan(None, None, 0.0, 1.0, None)
+            return Scan(None, fitted, 0.0, 1.0, None)
         known = depth.depth_m[depth.valid]
         typical_depth = float(np.median(known)) if known.size else 1.0
         rounded_m = 0.0 if self._tsdf is None else ROUNDED_VOXELS * self._tsdf.voxel_m
         sigma = max(noise_sigma(depth), rounded_m / (3 * typical_depth**2))
         # The fused surface agrees with depth up to half a voxel, and three standard deviations of the depth's noise.
         tolerance = None if self._tsdf is None else (0.5 * self._tsdf.voxel_m, 3 * sigma)
-        return Scan(depth, self._surface_of(taken), sigma, typical_depth, tolerance)
+        return Scan(depth, fitted, sigma, typical_depth, tolerance)
 
     def _surface_of(self, taken: PosedFrame) -> DepthSurface:
         """Returns the surface fitted to a frame's depth."""

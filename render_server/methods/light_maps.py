@@ -185,9 +185,9 @@ def shadow_receivers(real: GeometryState, extent: Points) -> Points:
     centre, reach = (low + high) / 2, SHADOW_REACH * float(np.max(high - low))
     points = real.points
     near = points[np.linalg.norm(points - centre, axis=1) <= reach]
-    corners = real.corners[..., :3].astype(np.float64)
-    first, last = corners.min(axis=1), corners.max(axis=1)
+    first, last = real.triangle_boxes
     meets = np.all((first <= centre + reach) & (last >= centre - reach), axis=1)
     large = meets & (np.max(last - first, axis=1) > LARGE_TRIANGLE * reach)
-    clipped = np.clip(corners[large].reshape(-1, 3), centre - reach, centre + reach)
+    corners = real.corners[large, :, :3].astype(np.float64)
+    clipped = np.clip(corners.reshape(-1, 3), centre - reach, centre + reach)
     return np.concatenate([near, clipped]) if len(near) or len(clipped) else points

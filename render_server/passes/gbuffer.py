@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int32, UInt8
 
 from deltalight.protocol.errors import DeltalightError
-from deltalight.protocol.frames import DepthImage, ViewFrame, decode_lut
+from deltalight.protocol.frames import ViewFrame, decode_lut
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel, RasterKernel
 from deltalight.render_server.gpu.textures import release_all, release_target, texture_2d
@@ -410,56 +410,3 @@ class RasterGeometry:
     def release(self) -> None:
         """Frees the program."""
         self._kernel.release()
-
-
-class RealSurface:
-    """World position + depth (RGBA32F; w = 0 unknown) and normal + surface entry (RGBA16F) on the picture's grid."""
-
-    def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
-        self.size = size
-        self.position = texture_2d(gpu, size, 4, "f4")
-        self.normal = texture_2d(gpu, size, 4, "f2")
-        self._depth = texture_2d(gpu, size, 1, "f4")
-        self._fitted = texture_2d(gpu, size, 3, "f4")
-        self._from_depth = Kernel(gpu, "real_surface")
-        self._from_model = Kernel(gpu, "real_surface_model")
-
-    @property
-    def bindings(self) -> dict[str, Binding]:
-        """Its textures by GLSL name."""
-        return {"real_surface_position": self.position, "real_surface_normal": self.normal}
-
-    def from_depth(self, depth: DepthImage, normals: Float32[np.ndarray, "h w 3"], scene: Bindings) -> None:
-        """Fills it from the clean, registered depth map and its normals (optical frame, zero where unknown)."""
-        known = np.where(depth.valid, depth.depth_m, 0.0).astype(np.float32)
-        self._depth.write(known.tobytes(), alignment=1)
-        self._fitted.write(np.ascontiguousarray(normals, np.float32).tobytes(), alignment=1)
-        self._from_depth.run(
-            self.size, scene, depth_map=self._depth, fitted_normals=self._fitted, **self._images()
-        )
-
-    def from_model(
-        self, raster: GeometryBuffer, scene: Bindings, *, tolerance: tuple[float, float] | None = None
-    ) -> None:
-        """Fills it from a raster of the given model or the fused surface, through the lens.
-
-        `tolerance` (m, and m at 1 m that grow with z^2): a pixel that depth filled before keeps its depth where the
-        surface differs by more (something moved), and takes the surface, the mean of many frames, where it agrees.
-        None: every pixel takes the surface.
-        """
-        self._from_model.run(
-            self.size,
-            scene,
-            model_raster_position=raster.position,
-            model_raster_normal=raster.normal,
-            keeps_depth=tolerance is not None,
-            tolerance=tolerance or (0.0, 0.0),
-            **self._images(),
-        )
-
-    def _images(self) -> dict[str, Binding]:
-        return {"position_out": self.position, "normal_out": self.normal}
-
-    def release(self) -> None:
-        """Frees the GL objects."""
-        release_all(self.position, self.normal, self._depth, self._fitted, self._from_depth, self._from_model)

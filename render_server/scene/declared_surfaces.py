@@ -1,6 +1,6 @@
 """Declared surfaces of the real scene (`real.surfaces`), compiled for shaders."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +10,7 @@ from deltalight.protocol.board import BoardSpec
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import DepthImage
 from deltalight.protocol.scene_objects import Region, Surface
+from deltalight.render_server.scene.depth_surface import DepthSurface
 
 MAX_SURFACES = 16
 MAX_ROWS = MAX_SURFACES + 17  # with the board's paper and its grey cards
@@ -140,11 +141,13 @@ def _region(region: Region, material_names: Sequence[str]) -> tuple[list[float],
 def plane_fits(
     table: SurfaceTable,
     depth: DepthImage | None,
-    normals: Float32[np.ndarray, "h w 3"] | None,
+    fitted: Callable[[], DepthSurface],
     world_from_camera: Float64[np.ndarray, "4 4"],
     noise_sigma: float,
 ) -> Float32[np.ndarray, "r 2"]:
     """Returns how depth saw each declared plane: its height over the declared one (m), and the noise at 1 m (m).
+
+    `fitted` fits a surface to `depth`; it is not called where no plane is declared.
 
     A plane may be declared some millimetres off, and depth errs by more than its noise where its calibration does:
     the height is the median of what lies within the tolerance and faces the plane's way, the noise the larger of
@@ -152,9 +155,9 @@ def plane_fits(
     """
     fits = np.tile(np.array([0.0, UNBOUNDED_M], np.float32), (MAX_ROWS, 1))
     planes = np.flatnonzero(table.packed[:, 3, 3] == PLANE)
-    if depth is None or normals is None or not len(planes):
+    if depth is None or not len(planes):
         return fits
-    seen = _sampled(depth, normals, world_from_camera)
+    seen = _sampled(depth, fitted().normals, world_from_camera)
     for index in planes:
         fits[index] = _plane_fit(table.packed[index].astype(float), seen, noise_sigma)
     return fits

@@ -25,6 +25,7 @@ MAX_SLOPE_DEG = 80.0
 NOISE_SIGMAS = 3.0
 MAX_TILT_ERROR_RAD = 0.05
 MAX_RADIUS = 5
+SAMPLE_STEP = 4  # rows and columns between the pixels that give the mean depth
 SHIFTS = ((0, -1), (0, 1), (-1, 0), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1))
 # Least spread of a window's valid pixels relative to a full window (determinant of their covariance).
 MIN_SUPPORT = 0.01
@@ -81,7 +82,7 @@ def depth_surface(depth: DepthImage, camera: CameraModel) -> DepthSurface:
     valid &= ~_lonely(jumps)
     inverse *= valid
     mask = valid.astype(np.float32)
-    radius = _window_radius(noise_sigma(depth) * float(camera.matrix[0, 0]), inverse, mask)
+    radius = window_radius(depth, camera)
     by_pixel = _window_gradient(inverse, mask, radius)
     _move_windows(by_pixel, valid & _crosses_edge(jumps, valid, radius), radius)
     gradient = by_ray(by_pixel, camera)
@@ -99,17 +100,23 @@ def jump_threshold(
     Three sigma of a difference, and the change on a surface that is 80 degrees from facing the camera:
     |dw| = w tan(slope) / f.
     """
+    slope, least = jump_terms(depth, camera)
+    return inverse_depth * (step_px * np.float32(slope)) + np.float32(least)
+
+
+def jump_terms(depth: DepthImage, camera: CameraModel) -> tuple[float, float]:
+    """Returns the terms of `jump_threshold`: by w and pixel, and the constant one (1/m)."""
     focal = float(np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1]))
-    slope = step_px * np.float32(np.tan(np.radians(MAX_SLOPE_DEG)) / focal)
-    return inverse_depth * slope + np.float32(NOISE_SIGMAS * np.sqrt(2) * noise_sigma(depth))
+    slope = float(np.tan(np.radians(MAX_SLOPE_DEG))) / focal
+    return slope, float(NOISE_SIGMAS * np.sqrt(2) * noise_sigma(depth))
 
 
-def _window_radius(
-    sigma_px: float, inverse: Float32[np.ndarray, "h w"], mask: Float32[np.ndarray, "h w"]
-) -> int:
-    """Returns the least radius whose slope error, sigma f z / sqrt(sum of squared offsets), is acceptable."""
-    mean = float(inverse.sum(dtype=np.float64) / max(float(mask.sum(dtype=np.float64)), 1.0))
-    error = sigma_px / max(mean, 1e-6)
+def window_radius(depth: DepthImage, camera: CameraModel) -> int:
+    """Returns the least radius whose slope error, sigma f z / sqrt(sum of squared offsets), is acceptable, pixels."""
+    sampled = depth.depth_m[::SAMPLE_STEP, ::SAMPLE_STEP]
+    known = sampled[depth.valid[::SAMPLE_STEP, ::SAMPLE_STEP] & (sampled > 0)]
+    mean = float(np.mean(1 / known, dtype=np.float64)) if known.size else 0.0
+    error = noise_sigma(depth) * float(camera.matrix[0, 0]) / max(mean, 1e-6)
     for radius in range(1, MAX_RADIUS):
         if error <= MAX_TILT_ERROR_RAD * np.sqrt((2 * radius + 1) ** 2 * radius * (radius + 1) / 3):
             return radius

@@ -15,6 +15,7 @@ from deltalight.render_server.passes.caustics import TILE
 from deltalight.render_server.passes.composite import Enlarge
 from deltalight.render_server.passes.cones import reuse_define
 from deltalight.render_server.passes.lpv import LpvPropagate
+from deltalight.render_server.passes.real_surface import RealSurface
 from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.gltf_samples import Plate, even
 from tests.render_server.protected_scenes import Case, frames_of, scene_of
@@ -103,6 +104,9 @@ def by_device(gpu: GpuContext, folder: Path) -> None:  # noqa: ARG001
             Kernel(
                 gpu, "caustic_gather", ROWS=rows, GROUP_ROWS=TILE // rows, **reuse_define(reuses)
             ).release()
+    for fits in (False, True):
+        RealSurface(gpu, (16, 16), fits_depth=fits).release()
+    Kernel(gpu, "real_surface", FITS_DEPTH=1, DECLARED_SURFACES=1).release()
     Enlarge(gpu, (16, 16)).release()
 
 

@@ -183,8 +183,8 @@ def test_how_depth_saw_a_plane() -> None:
     ]
     table = build_surface_table([Surface(region=region) for region in regions])
     place = look_at().world_from_camera
-    normals = depth_surface(view.depth, camera()).normals
-    fits = plane_fits(table, view.depth, normals, place, 0.001)
+    surface = depth_surface(view.depth, camera())
+    fits = plane_fits(table, view.depth, lambda: surface, place, 0.001)
     assert fits[0] == pytest.approx([0.008, 0.002], rel=0.1)
     assert fits[1].tolist() == [0.0, UNBOUNDED_M]
-    assert (plane_fits(table, None, None, place, 0.001)[:, 1] == UNBOUNDED_M).all()
+    assert (plane_fits(table, None, lambda: surface, place, 0.001)[:, 1] == UNBOUNDED_M).all()

@@ -1,11 +1,10 @@
 // World position and normal of the real surface at each pixel, from the clean depth map and its fitted normals
 // (render_server/scene/depth_surface.py).
 #include "common/measured_surfaces.glsl"
+#include "common/fitted_normal.glsl"
 
 layout(local_size_x = 8, local_size_y = 8) in;
-uniform sampler2D depth_map;       // m along the optical axis, 0 unknown
-uniform sampler2D picture_rays;    // (x/z, y/z)
-uniform sampler2D fitted_normals;  // optical frame; zero where unknown
+uniform sampler2D depth_map;   // m along the optical axis, 0 unknown
 layout(rgba32f) writeonly uniform image2D position_out;
 layout(rgba16f) writeonly uniform image2D normal_out;
 
@@ -51,7 +50,7 @@ void main() {
         return;
     }
     vec3 world = world_at(pixel, z);
-    vec3 fitted = texelFetch(fitted_normals, pixel, 0).xyz;
+    vec3 fitted = fitted_normal(pixel);
     bool unknown = fitted == vec3(0.0);
     vec3 normal = mat3(world_from_camera) * normalize(unknown ? -camera_at(pixel, z) : fitted);
     imageStore(position_out, pixel, vec4(world, z));

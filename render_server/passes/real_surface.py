@@ -1,0 +1,126 @@
+"""The real surfaces that the camera sees: from its depth, or from the given or fused geometry."""
+
+from collections.abc import Callable
+
+import moderngl
+import numpy as np
+
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.frames import DepthImage
+from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel
+from deltalight.render_server.gpu.textures import release_all, texture_2d
+from deltalight.render_server.passes.gbuffer import GeometryBuffer
+from deltalight.render_server.scene.depth_surface import DepthSurface, jump_terms, window_radius
+
+
+class DepthFit:
+    """Fits a plane to the surroundings of every pixel: on the GPU what scene/depth_surface.py does in numpy."""
+
+    def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
+        self._size = size
+        self._inverse = texture_2d(gpu, size, 1, "f4")
+        self._row_moments = texture_2d(gpu, size, 4, "f4")
+        self._row_depth = texture_2d(gpu, size, 2, "f4")
+        self._fits = texture_2d(gpu, size, 4, "f4")
+        self._invert = Kernel(gpu, "depth_inverse")
+        self._sum_rows = Kernel(gpu, "depth_rows")
+        self._fit = Kernel(gpu, "depth_columns")
+
+    def run(self, depth_map: moderngl.Texture, depth: DepthImage, camera: CameraModel) -> dict[str, Binding]:
+        """Fits `depth_map` (R32F, m, 0 unknown; the pixels of `depth`); returns what fitted_normal.glsl reads."""
+        found: dict[str, Binding] = {
+            "inverse_depth": self._inverse,
+            "window_radius": window_radius(depth, camera),
+            "window_fits": self._fits,
+        }
+        jumps = {"jump_threshold": jump_terms(depth, camera)}
+        self._invert.run(self._size, jumps, depth_map=depth_map, inverse_out=self._inverse)
+        self._sum_rows.run(
+            self._size, found, jumps, row_moments_out=self._row_moments, row_depth_out=self._row_depth
+        )
+        self._fit.run(
+            self._size,
+            found,
+            row_moments=self._row_moments,
+            row_depth=self._row_depth,
+            window_fits_out=self._fits,
+        )
+        return found
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        release_all(self._inverse, self._row_moments, self._row_depth, self._fits)
+        release_all(self._invert, self._sum_rows, self._fit)
+
+
+class RealSurface:
+    """World position + depth (RGBA32F; w = 0 unknown) and normal + surface entry (RGBA16F) on the picture's grid.
+
+    `fits_depth`: the GPU fits normals to depth; default: if it is one, because Mesa's software renderer takes longer
+    for it than numpy.
+    """
+
+    def __init__(self, gpu: GpuContext, size: tuple[int, int], *, fits_depth: bool | None = None) -> None:
+        self.size = size
+        self.position = texture_2d(gpu, size, 4, "f4")
+        self.normal = texture_2d(gpu, size, 4, "f2")
+        self._depth = texture_2d(gpu, size, 1, "f4")
+        self._fit: DepthFit | None = None
+        self._fitted: moderngl.Texture | None = None
+        if not gpu.is_software if fits_depth is None else fits_depth:
+            self._fit = DepthFit(gpu, size)
+            self._from_depth = Kernel(gpu, "real_surface", FITS_DEPTH=1)
+        else:
+            self._fitted = texture_2d(gpu, size, 3, "f4")
+            self._from_depth = Kernel(gpu, "real_surface")
+        self._from_model = Kernel(gpu, "real_surface_model")
+
+    @property
+    def bindings(self) -> dict[str, Binding]:
+        """Its textures by GLSL name."""
+        return {"real_surface_position": self.position, "real_surface_normal": self.normal}
+
+    def from_depth(self, depth: DepthImage, fitted: Callable[[], DepthSurface], scene: Bindings) -> None:
+        """Fills it from the clean, registered depth map; `fitted` fits it on the CPU if need be."""
+        known = np.where(depth.valid, depth.depth_m, 0.0).astype(np.float32)
+        self._depth.write(known.tobytes(), alignment=1)
+        self._from_depth.run(
+            self.size, scene, self._normals(depth, fitted), depth_map=self._depth, **self._images()
+        )
+
+    def _normals(self, depth: DepthImage, fitted: Callable[[], DepthSurface]) -> dict[str, Binding]:
+        """Returns what fitted_normal.glsl reads."""
+        if self._fit is not None:
+            return self._fit.run(self._depth, depth, depth.camera)
+        assert self._fitted is not None
+        normals = np.ascontiguousarray(fitted().normals, np.float32)
+        self._fitted.write(normals.tobytes(), alignment=1)
+        return {"fitted_normals": self._fitted}
+
+    def from_model(
+        self, raster: GeometryBuffer, scene: Bindings, *, tolerance: tuple[float, float] | None = None
+    ) -> None:
+        """Fills it from a raster of the given model or the fused surface, through the lens.
+
+        `tolerance` (m, and m at 1 m that grow with z^2): a pixel that depth filled before keeps its depth where the
+        surface differs by more (something moved), and takes the surface, the mean of many frames, where it agrees.
+        None: every pixel takes the surface.
+        """
+        self._from_model.run(
+            self.size,
+            scene,
+            model_raster_position=raster.position,
+            model_raster_normal=raster.normal,
+            keeps_depth=tolerance is not None,
+            tolerance=tolerance or (0.0, 0.0),
+            **self._images(),
+        )
+
+    def _images(self) -> dict[str, Binding]:
+        return {"position_out": self.position, "normal_out": self.normal}
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        release_all(self.position, self.normal, self._depth, self._fitted, self._fit)
+        release_all(self._from_depth, self._from_model)
