@@ -23,7 +23,7 @@ from deltalight.render_server.gpu.timers import PassTimers
 from deltalight.render_server.gpu_scene import GeometryState
 from deltalight.render_server.methods.registry import MethodChoice, choose_method
 from deltalight.render_server.occlusion_fields import OcclusionFields
-from deltalight.render_server.passes.composite import Composite, Enlarge
+from deltalight.render_server.passes.composite import Composite, Crossfade, Enlarge, Picture
 from deltalight.render_server.real_geometry import RealGeometry
 from deltalight.render_server.scene.declared_surfaces import SurfaceTable, build_surface_table
 from deltalight.render_server.scene.triangle_mesh import TriangleMesh
@@ -33,13 +33,23 @@ from deltalight.render_server.virtual_objects import VirtualObjects
 # Work on a frame at rest, until its picture has the best quality; a stage that was begun is finished.
 REFINE_S = 0.05
 REST_NS = 300_000_000  # without any change, after which a picture is refined
+FADE_NS = 400_000_000  # in which the refined picture takes the place of the one before
+
+
+@dataclass(frozen=True, eq=False)
+class Fade:
+    """How much (`share`, 0..1) of a refined picture shows, and the frame that it takes the place of."""
+
+    before: "RelitFrame"
+    share: float
+    crossfade: Crossfade
 
 
 @dataclass(frozen=True, eq=False)
 class RelitFrame:
     """A frame that `graph` can compose, at `level`; `enlarge` brings it to the camera's size.
 
-    `moves`: something in it does.
+    `moves`: something in it does. `fade`: its picture is not shown whole yet.
     """
 
     frame: ViewFrame
@@ -48,17 +58,23 @@ class RelitFrame:
     level: Level
     moves: bool
     enlarge: Enlarge | None
+    fade: Fade | None = None
 
-    def compose(self, *, with_linear: bool) -> Composite | Enlarge:
+    def compose(self, *, with_linear: bool) -> Picture:
         """Renders the picture (its `code`), and its linear radiance if `with_linear`, unless it is enlarged."""
         options = self.options
         composite = self.graph.render(
             CompositeOptions(options.output, options.additive, options.relights_real, with_linear)
         )
-        if self.enlarge is None:
+        if self.enlarge is not None:
+            coverage = self.shown().object_coverage
+            self.enlarge.run(self.frame.color, self.graph.buffers.image, composite, coverage)
+            return self.enlarge
+        if self.fade is None or with_linear:
             return composite
-        self.enlarge.run(self.frame.color, self.graph.buffers.image, composite, self.shown().object_coverage)
-        return self.enlarge
+        before = self.fade.before.compose(with_linear=False)
+        self.fade.crossfade.run(before.code, composite.code, self.fade.share)
+        return self.fade.crossfade
 
     def compose_view(self, view: View) -> Composite:
         """Renders the frame in another view, at the size of its graph."""
@@ -112,6 +128,8 @@ class LiveScene:
         self._best: FrameGraph | None = None
         self._spare: FrameGraph | None = None  # of the picture size before, which a budget may choose again
         self._enlarge: Enlarge | None = None
+        self._crossfade: Crossfade | None = None
+        self._refined_ns: int | None = None  # the refined picture has shown since
         self._changing: tuple[
             object, ...
         ] = ()  # what the newest picture was made from, camera and room left out,
@@ -251,12 +269,15 @@ class LiveScene:
         self._accumulated = frame
         changed |= self._note_change(objects, frame, moved=False)
         options = self._options(self._plan.scene.output)
+        enlarge = None if size == view.size else self._enlarged_to(view.size)
+        relit = RelitFrame(frame, graph, options, level, changed, enlarge)
+        best = None
         if self._is_at_rest(frame):
             best = self._refined(self._inputs(self._real, taken, view.size, objects, surfaces))
-            if best is not None:
-                return RelitFrame(frame, best, options, Level("best"), moves=False, enlarge=None)
-        enlarge = None if size == view.size else self._enlarged_to(view.size)
-        return RelitFrame(frame, graph, options, level, changed, enlarge)
+        if best is None:
+            self._refined_ns = None
+            return relit
+        return self._fading(relit, best, is_whole=whole or again)
 
     def _note_change(self, objects: GeometryState, frame: ViewFrame, *, moved: bool) -> bool:
         """Returns whether anything differs from what the newest picture was made from, and notes when it did."""
@@ -312,6 +333,20 @@ class LiveScene:
         options = self._options(self._plan.scene.output)
         return self._best if self._best.advance(options, time.monotonic() + REFINE_S) else None
 
+    def _fading(self, before: RelitFrame, best: FrameGraph, *, is_whole: bool) -> RelitFrame:
+        """Returns the refined frame, which takes the place of the one before within FADE_NS unless `is_whole`."""
+        if self._refined_ns is None:
+            self._refined_ns = before.frame.timestamp_ns - FADE_NS * is_whole
+        share = (before.frame.timestamp_ns - self._refined_ns) / FADE_NS
+        refined = replace(before, graph=best, level=Level("best"), moves=False, enlarge=None)
+        if is_whole or not 0 <= share < 1 or before.options.output.view != "composite":
+            return refined
+        size = before.frame.color.shape[1::-1]
+        if self._crossfade is None or self._crossfade.size != size:
+            release_all(self._crossfade)
+            self._crossfade = Crossfade(self._gpu, size)
+        return replace(refined, level=before.level, fade=Fade(before, share, self._crossfade))
+
     def _enlarged_to(self, size: tuple[int, int]) -> Enlarge:
         if self._enlarge is None or self._enlarge.size != size:
             release_all(self._enlarge)
@@ -364,6 +399,7 @@ class LiveScene:
             self._best,
             self._spare,
             self._enlarge,
+            self._crossfade,
             self._albedo,
             self._fields,
         )

@@ -25,7 +25,7 @@ from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.textures import AsyncReadback, read_texture
 from deltalight.render_server.graph import Graph
 from deltalight.render_server.live_scene import LiveScene, RelitFrame
-from deltalight.render_server.passes.composite import Composite, Enlarge
+from deltalight.render_server.passes.composite import Composite, Picture
 from deltalight.render_server.picking import SHOWN_FRACTION, Pick, ShownFrame, raster_texels
 from deltalight.render_server.view import CameraView, output_size, resized_frame
 
@@ -252,7 +252,7 @@ class SceneRenderer:
         return _StartedView(view, seen, take, relit)
 
     def _begin_reading(
-        self, frame: ViewFrame, relit: RelitFrame, view: ShownView, composite: Composite | Enlarge
+        self, frame: ViewFrame, relit: RelitFrame, view: ShownView, composite: Picture
     ) -> Callable[[], UInt8[np.ndarray, "h w 3"]]:
         """Begins to read a picture, and what the camera's noise on it needs; returns what takes both."""
         covered = self._noisy_part(frame, relit, view)

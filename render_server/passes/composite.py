@@ -191,6 +191,27 @@ class Enlarge:
         release_all(self._picture, self.code, self._kernel)
 
 
+class Crossfade:
+    """One picture going over into another of the same frame and size; `code` is RGBA8UI."""
+
+    def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
+        self.size = size
+        self.code = texture_2d(gpu, size, 4, "u1")
+        self._kernel = Kernel(gpu, "crossfade")
+
+    def run(self, before: moderngl.Texture, after: moderngl.Texture, share: float) -> None:
+        """Mixes two pictures' codes; `share` (0..1) is that of `after`."""
+        self._kernel.run(self.size, before=before, after=after, share=share, code_out=self.code)
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        release_all(self.code, self._kernel)
+
+
+Picture = Composite | Enlarge | Crossfade
+"""What has a relit picture as `code`."""
+
+
 class DebugViews:
     """Overwrites a composite's `code` (RGBA8UI) with a debug view: effects, delta, voxels, reflective shadow maps."""
 

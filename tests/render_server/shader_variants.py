@@ -12,7 +12,7 @@ from deltalight.protocol.scene import SceneDocument, parse_scene
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Kernel
 from deltalight.render_server.passes.caustics import TILE
-from deltalight.render_server.passes.composite import Enlarge
+from deltalight.render_server.passes.composite import Crossfade, Enlarge
 from deltalight.render_server.passes.cones import reuse_define
 from deltalight.render_server.passes.lpv import LpvPropagate
 from deltalight.render_server.passes.real_surface import RealSurface
@@ -108,6 +108,7 @@ def by_device(gpu: GpuContext, folder: Path) -> None:  # noqa: ARG001
         RealSurface(gpu, (16, 16), fits_depth=fits).release()
     Kernel(gpu, "real_surface", FITS_DEPTH=1, DECLARED_SURFACES=1).release()
     Enlarge(gpu, (16, 16)).release()
+    Crossfade(gpu, (16, 16)).release()
 
 
 PARTS: dict[str, Callable[[GpuContext, Path], None]] = {

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from deltalight.protocol.quality import TIERS
 from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.scene_method import DvctMethod
 from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.kernel import watched
 from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.protected_scenes import EYE, METHODS, Case, scene_of
 from tests.render_server.scenes import Stage, camera, depth_image, floor_depth, frame, look_at, psnr_db
@@ -121,6 +123,28 @@ def test_at_rest_it_becomes_the_best_picture(players: dict[str, Player]) -> None
     assert psnr_db(shown, wanted) > 60
     assert live.count < 200
     assert psnr_db(live.show(ASIDE[-1]), wanted) > 60  # and stays
+
+
+def test_the_best_picture_comes_without_a_jump(gpu: GpuContext, players: dict[str, Player]) -> None:
+    """It fades in within 0.4 s: eight frames here."""
+    live, fading, kernels = players["live"], [], set[str]()
+    for aside in ASIDE:
+        before = live.show(aside)
+    with watched(gpu, lambda run: kernels.add(run.kernel)):
+        while live.count < 200 and (not fading or "crossfade" in kernels):
+            kernels.clear()
+            shown = live.show(ASIDE[-1])
+            if "crossfade" in kernels:
+                fading.append(shown)
+            elif not fading:
+                before = shown
+    greatest = np.abs(shown - before).max()
+    assert greatest > 8
+    assert len(fading) == 8
+    for earlier, later in pairwise([before, *fading, shown]):
+        assert np.abs(later - earlier).max() <= greatest / 8 + 1
+    unchanged = (before == shown).all(axis=-1)
+    assert all((each[unchanged] == shown[unchanged]).all() for each in fading)
 
 
 def test_what_reaches_in_hides_at_once_and_is_relit_half_a_second_later(players: dict[str, Player]) -> None:

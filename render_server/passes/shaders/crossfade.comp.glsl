@@ -1,0 +1,13 @@
+// One picture going over into another, in codes. Where both show the same, so does this.
+layout(local_size_x = 8, local_size_y = 8) in;
+uniform usampler2D before;
+uniform usampler2D after;
+uniform float share;       // of `after`
+layout(rgba8ui) writeonly uniform uimage2D code_out;
+
+void main() {
+    ivec2 pixel = ivec2(gl_GlobalInvocationID.xy);
+    if (any(greaterThanEqual(pixel, textureSize(after, 0)))) return;
+    vec4 code = mix(vec4(texelFetch(before, pixel, 0)), vec4(texelFetch(after, pixel, 0)), share);
+    imageStore(code_out, pixel, uvec4(round(code)));
+}
