@@ -114,7 +114,7 @@ def change_in_room(
         direct, cones = graph["direct light"], graph["cones"]
         mu, rho = _texels(cones.mu), _texels(cones.rho)
         uncovered = _texels(graph["object surface"].coverage.texture)[..., 0] == 0
-        change = _texels(direct.rho) - _texels(direct.mu)
+        change = _texels(direct.light.rho) - _texels(direct.light.mu)
     return LightChange(change[..., :3], (rho - mu)[..., :3], uncovered & (rho[..., 3] > INSIDE))
 
 

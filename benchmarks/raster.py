@@ -45,8 +45,8 @@ def declare(g: "Graph", s: "FrameResources", setup: "Setup[RasterMethod]") -> "L
 
     size = setup.picture_size
     buffers, direct = LightBuffers(g.gpu, LEAST.rsm_size, 1), DirectLight(g.gpu, size)
-    for texture in (direct.mu, direct.rho, direct.lobe_mu, direct.lobe_rho):
-        texture.write(bytes(8 * size[0] * size[1]))  # no light without objects, and none with them
+    for light in (direct.light, direct.lobes):
+        light.clear()  # none without objects, and none with them
     shading = lighting.Shading(g.gpu, size, setup.resolved, buffers, direct, lighting.ShadingOptions())
 
     def place(lights: "LightSet") -> "LightBuffers":

@@ -61,7 +61,7 @@ def sample_light(graph: FrameGraph, lights: LightSet, bounce: Gathered | None) -
     Without `bounce`, all light that the cones gather is attributed to the lights.
     """
     fields, shown, frame = graph.evaluate(lights), graph.shown(), graph.inputs.frame
-    cones, direct = read_texture(fields.cones.mu), read_texture(fields.direct.mu)
+    cones, direct = read_texture(fields.cones.mu), read_texture(fields.direct.light.mu)
     rows, columns = (np.arange(n) // fields.grid.scale for n in direct.shape[:2])
     position = read_texture(shown.real_surface.position)
     known = position[..., 3] > 0

@@ -185,8 +185,8 @@ class ScreenCones:
             scene,
             reflected=self.reflected if self._traced is None else self._traced,
             sample_pixels=self._grid.pixels,
-            direct_mu=direct.mu,
-            direct_rho=direct.rho,
+            direct_mu=direct.light.mu,
+            direct_rho=direct.light.rho,
             cone_mu=cones.mu,
             cone_rho=cones.rho,
         )

@@ -8,19 +8,37 @@ from jaxtyping import Float64
 
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel, list_threads
-from deltalight.render_server.gpu.textures import release_all, texture_2d
+from deltalight.render_server.gpu.textures import release_all, release_target, texture_2d
 from deltalight.render_server.passes.caustics import Caustics
-from deltalight.render_server.passes.cones import ConeFields, LowResGrid, reuse_define
+from deltalight.render_server.passes.cones import ConeFields, LowResGrid
 from deltalight.render_server.passes.lights import LightBuffers
 from deltalight.render_server.view import CameraView
+
+
+class LightPair:
+    """Light without (mu) and with the objects (rho), RGBA16F."""
+
+    def __init__(self, gpu: GpuContext, size: tuple[int, int]) -> None:
+        self.mu, self.rho = (texture_2d(gpu, size, 4, "f2") for _ in range(2))
+        self._target = gpu.ctx.framebuffer([self.mu, self.rho])
+
+    def clear(self) -> None:
+        """Sets both to zero."""
+        self._target.use()
+        self._target.clear()
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        release_target(self._target)
+        release_all(self.mu, self.rho)
 
 
 class DirectLight:
     """E_mu and E_rho of the lights (RGBA16F), and their lobes on declared specular surfaces.
 
     With `shadow_cones`, that many cones through voxels give the objects' shadows ([P1] eq. 4); without, shadow maps
-    do. Without `objects_shadow` other passes do, and E_rho is E_mu. Pixels that objects do not reach are 0. With
-    `reuses`, only those are shaded whose light the last frame does not know (LightHistory).
+    do. Without `objects_shadow` other passes do, and E_rho is E_mu. Pixels that objects do not reach are 0. `texels`
+    lists the blocks of pixels that are shaded; with `reuses`, LightHistory fills it beforehand.
     """
 
     def __init__(
@@ -33,25 +51,23 @@ class DirectLight:
         reuses: bool = False,
     ) -> None:
         self._gpu, self._size = gpu, size
-        self.mu = texture_2d(gpu, size, 4, "f2")
-        self.rho = texture_2d(gpu, size, 4, "f2")
-        self.lobe_mu = texture_2d(gpu, size, 4, "f2")
-        self.lobe_rho = texture_2d(gpu, size, 4, "f2")
+        self.light, self.lobes = LightPair(gpu, size), LightPair(gpu, size)
         defines = {} if shadow_cones is None else {"SHADOW_CONES": 1, "DIRECTIONS": shadow_cones}
         if not objects_shadow:
             defines = {"REAL_SHADOWS": 1}
         self._kernel = Kernel(gpu, "direct_light", **defines)
-        self._select = Kernel(gpu, "select_direct_texels", **defines, **reuse_define(reuses))
-        self._texels = gpu.ctx.buffer(reserve=4)
+        self._select = Kernel(gpu, "select_direct_texels", **defines)
+        self._reuses = reuses
+        self.texels = gpu.ctx.buffer(reserve=4)
 
     @property
     def bindings(self) -> dict[str, Binding]:
         """Its textures by GLSL name."""
         return {
-            "direct_mu": self.mu,
-            "direct_rho": self.rho,
-            "lobe_mu": self.lobe_mu,
-            "lobe_rho": self.lobe_rho,
+            "direct_mu": self.light.mu,
+            "direct_rho": self.light.rho,
+            "lobe_mu": self.lobes.mu,
+            "lobe_rho": self.lobes.rho,
         }
 
     def run(
@@ -64,18 +80,26 @@ class DirectLight:
     ) -> None:
         """Shades the pixels. `joint`: the voxels that shadow cones march through; `caustics`: added to E_rho."""
         voxels: dict[str, Binding] = {} if joint is None else {"joint_mipmap": joint}
+        if not self._reuses:
+            self.select(grid, self.texels, voxels, scene)
         self._shade(grid, self.bindings, voxels, _caustics_on(grid, caustics), scene)
 
+    def select(self, grid: LowResGrid, texels: moderngl.Buffer, *scene: Bindings) -> None:
+        """Lists the texels where objects may change light, and clears all light."""
+        self.light.clear()
+        if any(each.get("specular_surfaces") for each in scene):
+            self.lobes.clear()
+        grid.empty_list(texels)
+        self._select.run(grid.size, grid.bindings, *scene, Texels=texels)
+
     def _shade(self, grid: LowResGrid, targets: Bindings, *scene: Bindings) -> None:
-        """Lists the texels that need light, empties the others, and shades those of the list."""
-        grid.empty_list(self._texels)
-        listed: Bindings = {**targets, **grid.bindings, "Texels": self._texels}
-        self._select.run(grid.size, listed, *scene)
+        """Shades the texels of the list."""
+        listed: Bindings = {**targets, **grid.bindings, "Texels": self.texels}
         self._kernel.run((list_threads(self._gpu, math.prod(self._size)),), listed, *scene)
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_all(self.mu, self.rho, self.lobe_mu, self.lobe_rho, self._kernel, self._select, self._texels)
+        release_all(self.light, self.lobes, self._kernel, self._select, self.texels)
 
 
 class LightHistory:
@@ -89,10 +113,13 @@ class LightHistory:
     def __init__(
         self, gpu: GpuContext, grid: LowResGrid, direct: DirectLight, cones: ConeFields, turns: int
     ) -> None:
-        self._grid, self._direct, self._cones, self._turns = grid, direct, cones, turns
+        self._gpu, self._grid, self._direct, self._cones, self._turns = gpu, grid, direct, cones, turns
+        self._reached = gpu.ctx.buffer(reserve=4)
         size = grid.picture_size
-        self._last_direct = tuple(texture_2d(gpu, size, 4, "f2") for _ in range(2))
+        self._last_light = LightPair(gpu, size)
         self._positions = [texture_2d(gpu, size, 4, "f4") for _ in range(2)]
+        self._kept = [gpu.ctx.framebuffer([each]) for each in self._positions]
+        self._seen_positions: moderngl.Framebuffer | None = None
         self._real_texels, self._object_texels = (
             [texture_2d(gpu, grid.size, 4, "f4") for _ in range(2)] for _ in range(2)
         )
@@ -113,10 +140,11 @@ class LightHistory:
         matrix = view.camera_from_world if last is None else last[1]
         self._turn = (self._turn + 1) % self._turns
         self._positions.reverse()
+        self._kept.reverse()
         self._real_texels.reverse()
         self._object_texels.reverse()
         direct = self._direct
-        self._last_direct, (direct.mu, direct.rho) = (direct.mu, direct.rho), self._last_direct
+        self._last_light, direct.light = direct.light, self._last_light
         found: dict[str, Binding] = {
             "has_history": has_history,
             "last_camera_from_world": matrix,
@@ -132,34 +160,48 @@ class LightHistory:
         return found
 
     def _fill(self, scene: Bindings, found: Bindings) -> None:
-        shared: Bindings = {**found, "scale": self._grid.scale}
+        grid, direct = self._grid, self._direct
+        shared: Bindings = {**found, **grid.bindings}
+        direct.select(grid, self._reached, scene)
+        self._keep(scene["real_surface_position"])
+        grid.empty_list(direct.texels)
         self._reproject.run(
-            self._grid.picture_size,
+            (list_threads(self._gpu, grid.texel_count),),
             shared,
             scene,
-            position_out=self._positions[0],
-            direct_mu_out=self._direct.mu,
-            direct_rho_out=self._direct.rho,
-            last_direct_mu=self._last_direct[0],
-            last_direct_rho=self._last_direct[1],
+            direct_mu_out=direct.light.mu,
+            direct_rho_out=direct.light.rho,
+            last_direct_mu=self._last_light.mu,
+            last_direct_rho=self._last_light.rho,
+            Texels=self._reached,
+            Needed=direct.texels,
         )
         self._find_stale.run(
             self._grid.size,
             shared,
             scene,
-            sample_pixels=self._grid.pixels,
             stale_out=self._stale,
             real_texels_out=self._real_texels[0],
             object_texels_out=self._object_texels[0],
         )
 
+    def _keep(self, positions: Binding) -> None:
+        """Copies the positions that the next frame looks up."""
+        if self._seen_positions is None or self._seen_positions.color_attachments[0] is not positions:
+            release_all(self._seen_positions)
+            self._seen_positions = self._gpu.ctx.framebuffer([positions])
+        self._gpu.ctx.copy_framebuffer(self._kept[0], self._seen_positions)
+
     def release(self) -> None:
         """Frees the GL objects."""
         release_all(
-            *self._last_direct,
+            self._last_light,
             *self._positions,
+            *self._kept,
+            self._seen_positions,
             *self._real_texels,
             *self._object_texels,
+            self._reached,
             self._stale,
             self._reproject,
             self._find_stale,

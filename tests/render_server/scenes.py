@@ -223,8 +223,8 @@ def fields_of(renderer: SceneRenderer) -> Fields:
     direct, cones, real = graph["direct light"], graph["cones"], graph["real surface"].surface
     cones_rho = array_of(cones.rho)
     return Fields(
-        array_of(direct.mu)[..., :3],
-        array_of(direct.rho)[..., :3],
+        array_of(direct.light.mu)[..., :3],
+        array_of(direct.light.rho)[..., :3],
         array_of(cones.mu)[..., :3],
         cones_rho[..., :3],
         cones_rho[..., 3],

@@ -108,8 +108,8 @@ def test_fields_of_dvct_under_a_lamp_are_those_of_two_full_solutions(
 def specular_of(renderer: SceneRenderer) -> dict[str, NDArray[np.float64]]:
     assert renderer.graph is not None
     cones, direct = renderer.graph["cones"], renderer.graph["direct light"]
-    textures = {"cone": cones.specular_rho, "lobe": direct.lobe_rho}
-    without = {"cone": cones.specular_mu, "lobe": direct.lobe_mu}
+    textures = {"cone": cones.specular_rho, "lobe": direct.lobes.rho}
+    without = {"cone": cones.specular_mu, "lobe": direct.lobes.mu}
     return {name: array_of(textures[name])[..., :3] - array_of(without[name])[..., :3] for name in textures}
 
 

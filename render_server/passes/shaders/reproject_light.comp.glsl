@@ -1,14 +1,18 @@
-// Direct light of the last frame at the pixels that see the same surfaces as then, and no edge of a shadow: there
-// alpha of E_rho is 1.
+// Direct light of the last frame in the texels that select_direct_texels listed, at the pixels that see the same surfaces
+// as then, and no edge of a shadow. Lists the texels that have others; and in turn one tile in `turns`, so that errors of
+// resampling do not add up.
 #include "common/geometry.glsl"
 #include "common/reprojection.glsl"
+#include "common/work_list.glsl"
 
-layout(local_size_x = 8, local_size_y = 8) in;
-layout(rgba32f) writeonly uniform image2D position_out;
+layout(local_size_x = 64) in;
 layout(rgba16f) writeonly uniform image2D direct_mu_out;
 layout(rgba16f) writeonly uniform image2D direct_rho_out;
+layout(std430) buffer Needed { uint needed_count; uint needed[]; };   // as Texels
 uniform sampler2D last_direct_mu;
 uniform sampler2D last_direct_rho;
+uniform ivec2 low_resolution_size;
+uniform int scale;
 
 // Change of the ratio of irradiances from pixel to pixel, from which on it is an edge: it would blur.
 const float SHARPEST = 0.04;
@@ -35,12 +39,24 @@ bool remembered(vec4 position, vec3 normal, out vec4 mu, out vec4 rho) {
     return total > LEAST_WEIGHT && most - least < SHARPEST;
 }
 
-void main() {
-    ivec2 pixel = ivec2(gl_GlobalInvocationID.xy);
-    if (any(greaterThanEqual(pixel, textureSize(real_surface_position, 0)))) return;
+// Whether a pixel's light is the last frame's.
+bool reproject(ivec2 pixel) {
     vec4 position = texelFetch(real_surface_position, pixel, 0), mu = vec4(0.0), rho = vec4(0.0);
     bool kept = has_history && remembered(position, texelFetch(real_surface_normal, pixel, 0).xyz, mu, rho);
     imageStore(direct_mu_out, pixel, mu);
-    imageStore(direct_rho_out, pixel, vec4(rho.rgb, kept || position.w <= 0.0 ? 1.0 : 0.0));
-    imageStore(position_out, pixel, position);
+    imageStore(direct_rho_out, pixel, rho);
+    return kept || position.w <= 0.0;
+}
+
+void main() {
+    ivec2 size = textureSize(real_surface_position, 0);
+    for (uint i = first_item(); i < listed_count(); i += items_apart()) {
+        ivec2 texel = texel_of_index(texels[i], low_resolution_size.x);
+        bool known = !is_due(texel);
+        for (int j = 0; j < (has_history ? scale * scale : 0); ++j) {
+            ivec2 pixel = pixel_in_block(texel, j, scale);
+            if (all(lessThan(pixel, size))) known = reproject(pixel) && known;
+        }
+        if (!has_history || !known) needed[atomicAdd(needed_count, 1u)] = texels[i];
+    }
 }
