@@ -100,6 +100,12 @@ class GeometryState:
         a, b, c = (self.corners[:, corner, :3].astype(np.float64) for corner in range(3))
         return np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
 
+    @cached_property
+    def triangle_edges(self) -> Float64[np.ndarray, " m"]:
+        """Longest edge of each triangle's box, m."""
+        low, high = self.triangle_boxes
+        return np.max(high - low, axis=1)
+
     @property
     def lasting_points(self) -> Float64[np.ndarray, "k 3"]:
         """Points that enclose the set at all times of its animations."""

@@ -187,7 +187,7 @@ def shadow_receivers(real: GeometryState, extent: Points) -> Points:
     near = points[np.linalg.norm(points - centre, axis=1) <= reach]
     first, last = real.triangle_boxes
     meets = np.all((first <= centre + reach) & (last >= centre - reach), axis=1)
-    large = meets & (np.max(last - first, axis=1) > LARGE_TRIANGLE * reach)
+    large = meets & (real.triangle_edges > LARGE_TRIANGLE * reach)
     corners = real.corners[large, :, :3].astype(np.float64)
     clipped = np.clip(corners.reshape(-1, 3), centre - reach, centre + reach)
     return np.concatenate([near, clipped]) if len(near) or len(clipped) else points
