@@ -104,7 +104,7 @@ class GeometryState:
     def triangle_edges(self) -> Float64[np.ndarray, " m"]:
         """Longest edge of each triangle's box, m."""
         low, high = self.triangle_boxes
-        return np.max(high - low, axis=1)
+        return np.asarray(np.max(high - low, axis=1))
 
     @property
     def lasting_points(self) -> Float64[np.ndarray, "k 3"]:
