@@ -2128,7 +2128,7 @@ export interface components {
              * @description What it shows: the view that was asked for, or until there is a picture of it the scene's own.
              * @enum {string}
              */
-            readonly view: "composite" | "effects" | "delta" | "volume" | "rsm" | "lights" | "camera";
+            readonly view: "composite" | "effects" | "delta" | "error" | "volume" | "rsm" | "lights" | "camera";
             /**
              * World From Camera
              * @description null without a pose.
@@ -2339,6 +2339,10 @@ export interface components {
              *         "view": "delta"
              *       },
              *       {
+             *         "name": "error",
+             *         "view": "error"
+             *       },
+             *       {
              *         "name": "volume",
              *         "view": "volume"
              *       },
@@ -2469,7 +2473,7 @@ export interface components {
              * @default composite
              * @enum {string}
              */
-            readonly view: "composite" | "effects" | "delta" | "volume" | "rsm" | "lights";
+            readonly view: "composite" | "effects" | "delta" | "error" | "volume" | "rsm" | "lights";
             /**
              * Width
              * @description Width, pixels; null = the camera's.
@@ -3574,7 +3578,7 @@ export interface components {
             readonly name: string;
             /**
              * View
-             * @description One of camera, composite, effects, delta, volume, rsm, lights.
+             * @description One of camera, composite, effects, delta, error, volume, rsm, lights.
              * @default composite
              */
             readonly view: string;
@@ -4683,7 +4687,7 @@ export interface operations {
         readonly parameters: {
             readonly query?: {
                 /** @description What to look at; without, the scene's own `output.view`. */
-                readonly view?: ("composite" | "effects" | "delta" | "volume" | "rsm" | "lights" | "camera") | null;
+                readonly view?: ("composite" | "effects" | "delta" | "error" | "volume" | "rsm" | "lights" | "camera") | null;
             };
             readonly header?: never;
             readonly path?: never;
