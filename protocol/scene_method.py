@@ -470,6 +470,7 @@ class Output(StrictModel):
     )
     antialiasing: bool = Field(default=False, description="Smooth the edges of virtual objects.")
     camera_artifacts: bool = Field(
-        default=False, description="Put the camera's noise on the virtual part, as its still frames show it."
+        default=False,
+        description="Put the camera's noise, sharpness and motion blur on the virtual part, as its frames show them.",
     )
     view: View = Field(default="composite", description="The picture, or a look inside.")

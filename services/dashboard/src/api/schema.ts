@@ -2446,7 +2446,7 @@ export interface components {
             readonly antialiasing: boolean;
             /**
              * Camera Artifacts
-             * @description Put the camera's noise on the virtual part, as its still frames show it.
+             * @description Put the camera's noise, sharpness and motion blur on the virtual part, as its frames show them.
              * @default false
              */
             readonly camera_artifacts: boolean;
