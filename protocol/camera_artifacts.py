@@ -10,7 +10,8 @@ from deltalight.protocol.camera_blur import (
     NO_MOTION,
     Color,
     Coverage,
-    blur_kernel,
+    LensBlur,
+    blur_kernels,
     blurred,
     measure_blur,
 )
@@ -29,13 +30,13 @@ class FrameArtifacts:
 
     frame: ViewFrame
     noise: NoiseModel | None
-    kernel: Float64[np.ndarray, "k k"] | None
+    kernels: Float64[np.ndarray, "3 k k"] | None
 
     def applied(self, color: Color, coverage: Coverage) -> Color:
         """Return a picture of the frame with blur and noise on its virtual part; as it is while none is known."""
         frame = self.frame
-        if self.kernel is not None:
-            color, coverage = blurred(color, coverage, self.kernel, frame.response)
+        if self.kernels is not None:
+            color, coverage = blurred(color, coverage, self.kernels, frame.response)
         if self.noise is None:
             return color
         return add_noise(color, coverage, self.noise, frame.frame_id, frame.response)
@@ -46,7 +47,7 @@ class CameraArtifacts:
 
     def __init__(self) -> None:
         self._noise = CameraNoise()
-        self._sigmas_px: list[float] = []
+        self._lens: list[LensBlur] = []
         self._last: ViewFrame | None = None
         self._pose: Float64[np.ndarray, "4 4"] = np.eye(4)
         self._motion_px = NO_MOTION
@@ -69,8 +70,16 @@ class CameraArtifacts:
         if frame is not self._last:
             self._follow(frame, world_from_camera, place_m)
             self._last, self._pose = frame, world_from_camera
-        sigma = float(np.median(self._sigmas_px)) if self._sigmas_px else None
-        return FrameArtifacts(frame, self._noise.model, blur_kernel(sigma, self._motion_px))
+        from_centre = np.nan_to_num(_pixel(frame, self._pose, place_m) - frame.camera.matrix[:2, 2])
+        kernels = blur_kernels(self._lens_blur(), self._motion_px, from_centre)
+        return FrameArtifacts(frame, self._noise.model, kernels)
+
+    def _lens_blur(self) -> LensBlur | None:
+        """Return the medians of what was measured."""
+        if not self._lens:
+            return None
+        sigma, red, blue = np.median([(each.sigma_px, each.red, each.blue) for each in self._lens], axis=0)
+        return LensBlur(float(sigma), float(red), float(blue))
 
     def _follow(
         self, frame: ViewFrame, pose: Float64[np.ndarray, "4 4"], place_m: Float64[np.ndarray, " 3"]
@@ -85,9 +94,9 @@ class CameraArtifacts:
         known = frame.exposure_s is not None
         self._motion_px = moved * min((frame.exposure_s or 0.0) * 1e9 / max(step_ns, 1), 1.0)
         is_still = float(np.linalg.norm(self._motion_px if known else moved)) < LEAST_MOTION_PX
-        if is_still and len(self._sigmas_px) < MOST_MEASURED:
-            sigma = measure_blur(frame)
-            self._sigmas_px += [] if sigma is None else [sigma]
+        if is_still and len(self._lens) < MOST_MEASURED:
+            found = measure_blur(frame)
+            self._lens += [] if found is None else [found]
 
 
 def _pixel(

@@ -9,11 +9,11 @@ from jaxtyping import Float32, Float64
 
 from deltalight.protocol.board import BoardSpec
 from deltalight.protocol.camera_artifacts import CameraArtifacts
-from deltalight.protocol.camera_blur import NO_MOTION, blur_kernel, blurred, measure_blur, mtf50
+from deltalight.protocol.camera_blur import NO_MOTION, LensBlur, blur_kernels, blurred, measure_blur, mtf50
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.frames import BoardPose, ViewFrame, decode_lut
 
-WIDTH, HEIGHT, FINE = 320, 240, 8
+WIDTH, HEIGHT, FINE = 320, 240, 5
 BOARD = BoardSpec(
     type="aruco_grid",
     dictionary="DICT_4X4_50",
@@ -43,8 +43,18 @@ def pose(turn_deg: float = 9.0) -> Float64[np.ndarray, "4 4"]:
     return matrix
 
 
-def shot(sigma_px: float, noise: float = 0.0, **more: object) -> ViewFrame:
-    """The board through a lens of that blur, a pixel's own area included."""
+def _larger(picture: Float32[np.ndarray, "h w"], by: float) -> Float32[np.ndarray, "h w"]:
+    """The picture, larger by a fraction about its centre."""
+    height, width = picture.shape
+    centre = np.array([(width - 1) / 2, (height - 1) / 2])
+    turn = np.column_stack([np.eye(2) * (1 + by), -by * centre])
+    return np.asarray(cv2.warpAffine(picture, turn, (width, height), borderMode=cv2.BORDER_REPLICATE))
+
+
+def shot(
+    sigma_px: float, noise: float = 0.0, red: float = 0.0, blue: float = 0.0, **more: object
+) -> ViewFrame:
+    """The board through a lens of that blur, a pixel's own area included; red and blue are larger by that."""
     seen, from_world = camera(FINE), np.linalg.inv(pose())
     picture = np.full((FINE * HEIGHT, FINE * WIDTH), 0.6, np.float32)
     cells = BOARD.opencv_dictionary().markerSize + 2 * BOARD.border_bits
@@ -56,8 +66,10 @@ def shot(sigma_px: float, noise: float = 0.0, **more: object) -> ViewFrame:
         ink = cv2.warpPerspective(255 - marker, warp, picture.shape[::-1], flags=cv2.INTER_LINEAR)
         picture -= 0.55 * ink.astype(np.float32) / 255
     soft = cv2.GaussianBlur(picture, (0, 0), FINE * np.sqrt(sigma_px**2 - PIXEL_VARIANCE))
-    gray = cv2.resize(soft, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA)[..., None]
-    linear = gray + np.random.default_rng(1).normal(0, noise, (HEIGHT, WIDTH, 3))
+    colors = np.stack([_larger(soft, each) for each in (red, 0.0, blue)], axis=-1)
+    linear = cv2.resize(colors, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA) + np.random.default_rng(
+        1
+    ).normal(0, noise, (HEIGHT, WIDTH, 3))
     values: dict[str, Any] = {
         "frame_id": 0,
         "timestamp_ns": 0,
@@ -80,7 +92,19 @@ def linear(color: np.ndarray) -> Float32[np.ndarray, "h w 3"]:
 def test_mtf50_is_that_of_the_lens(sigma_px: float, noise: float) -> None:
     found = measure_blur(shot(sigma_px, noise))
     assert found is not None
-    assert mtf50(found) == pytest.approx(mtf50(sigma_px), rel=0.1)
+    assert mtf50(found.sigma_px) == pytest.approx(mtf50(sigma_px), rel=0.1)
+    assert (found.red, found.blue) == pytest.approx((0.0, 0.0), abs=3e-4)
+
+
+def test_colours_of_other_sizes_are_found_and_put_on() -> None:
+    """Red 0.4 % larger, blue 0.3 % smaller than green: at 100 px from the centre, 0.4 and -0.3 px apart."""
+    found = measure_blur(shot(0.8, noise=0.005, red=0.004, blue=-0.003))
+    assert found is not None
+    assert (found.red, found.blue) == pytest.approx((0.004, -0.003), rel=0.15)
+    kernels = blur_kernels(LensBlur(0.8, 0.004, -0.003), NO_MOTION, np.array([100.0, 0.0]))
+    assert kernels is not None
+    at = np.arange(kernels.shape[1]) - kernels.shape[1] // 2
+    np.testing.assert_allclose((kernels.sum(axis=1) * at).sum(axis=1), [0.4, 0.0, -0.3], atol=1e-3)
 
 
 def test_a_board_out_of_sight_says_nothing() -> None:
@@ -111,9 +135,9 @@ def spread_px(picture: np.ndarray, slope: float = 0.2) -> float:
 @pytest.mark.parametrize("sigma_px", [0.6, 1.0, 1.7])
 def test_an_objects_edge_is_as_soft_as_the_lens(sigma_px: float) -> None:
     picture, coverage = edge_picture()
-    kernel = blur_kernel(sigma_px, NO_MOTION)
-    assert kernel is not None
-    soft, covered = blurred(picture, coverage, kernel, None)
+    kernels = blur_kernels(LensBlur(sigma_px), NO_MOTION, NO_MOTION)
+    assert kernels is not None
+    soft, covered = blurred(picture, coverage, kernels, None)
     assert mtf50(spread_px(soft)) == pytest.approx(mtf50(sigma_px), rel=0.1)
     untouched = covered == 0
     assert untouched.sum() > 1000
@@ -126,9 +150,9 @@ def test_what_is_behind_an_edge_is_not_blurred() -> None:
     """The camera's part of the picture has its blur already: stripes beside an object keep their contrast."""
     picture, coverage = edge_picture(slope=0.0)
     picture[::2, :48] = 150
-    kernel = blur_kernel(1.5, NO_MOTION)
-    assert kernel is not None
-    soft, covered = blurred(picture, coverage, kernel, None)
+    kernels = blur_kernels(LensBlur(1.5), NO_MOTION, NO_MOTION)
+    assert kernels is not None
+    soft, covered = blurred(picture, coverage, kernels, None)
     beside = (covered > 0.01) & (covered < 0.05)
     assert beside[::2].any()
     light, before = linear(soft), linear(picture)
@@ -141,8 +165,9 @@ def test_what_is_behind_an_edge_is_not_blurred() -> None:
 @pytest.mark.parametrize("motion_px", [(5.0, 0.0), (9.0, 4.0)])
 def test_motion_smears_along_its_way(motion_px: tuple[float, float]) -> None:
     """A box of the motion's length has the variance length^2 / 12, and none across."""
-    kernel = blur_kernel(0.8, np.array(motion_px))
-    assert kernel is not None
+    kernels = blur_kernels(LensBlur(0.8), np.array(motion_px), NO_MOTION)
+    assert kernels is not None
+    kernel = kernels[1]
     at = np.arange(len(kernel)) - len(kernel) // 2
     columns, rows = np.meshgrid(at, at)
     length = np.linalg.norm(motion_px)
@@ -166,10 +191,10 @@ def test_motion_is_the_poses_velocity_times_the_exposure() -> None:
     first, second = (
         artifacts.observe(each, each.pose.world_from_camera, place) for each in frames if each.pose
     )
-    assert first.kernel is None
-    assert second.kernel is not None
-    at = np.arange(len(second.kernel)) - len(second.kernel) // 2
-    variance = (second.kernel.sum(axis=0) * at**2).sum()
+    assert first.kernels is None
+    assert second.kernels is not None
+    at = np.arange(second.kernels.shape[1]) - second.kernels.shape[1] // 2
+    variance = (second.kernels[1].sum(axis=0) * at**2).sum()
     assert np.sqrt(12 * variance) == pytest.approx(0.25 * 0.01 / 0.25 * FOCAL_PX, rel=0.05)
     again = artifacts.observe(frames[1], moved, place)
-    assert np.array_equal(again.kernel, second.kernel)
+    assert np.array_equal(again.kernels, second.kernels)
