@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
+from deltalight.protocol.bloom import bloomed
 from deltalight.protocol.camera_artifacts import CameraArtifacts, FrameArtifacts
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.errors import DeltalightError
@@ -149,7 +150,7 @@ class SceneRenderer:
         """
         started_s = time.perf_counter()
         with_linear = with_linear or self._with_linear
-        source = self._source(self.sized(frame), whole=whole or with_linear)
+        source = self._source(self.sized(frame), whole=whole or with_linear or self.scene.output.has_bloom)
         main = self._start(source, self.scene.output.view, with_linear=with_linear)
         rest = [self._start_other(source, view) for view in others]
         cameras = next((each.seen for each in (main, *rest) if each.seen is not None), None)
@@ -230,7 +231,7 @@ class SceneRenderer:
         relit = source.relit
         if relit is None or (view == "lights" and source.is_lit):
             return self._start_other(source, view)
-        composite = relit.compose(with_linear=with_linear)
+        composite = relit.compose(with_linear=with_linear or self.scene.output.has_bloom)
         with self._live.timers.measure("readback"):
             take = self._begin_reading(source.frame, relit, view, composite)
             if isinstance(composite, Composite) and with_linear:
@@ -256,14 +257,20 @@ class SceneRenderer:
         """Begins to read a picture, and what the camera's artifacts on it need; returns what takes both."""
         artifacts = self._artifacts_of(frame, relit, view)
         self._readback.push(composite.code, "u1")
-        if artifacts is None:
-            return lambda: self._read(frame)
-        covered = relit.shown().object_coverage
-        self._readback.push(covered, covered.dtype)
+        if artifacts is not None:
+            covered = relit.shown().object_coverage
+            self._readback.push(covered, covered.dtype)
+        output, linear = self.scene.output, None
+        if output.has_bloom and view == "composite" and isinstance(composite, Composite):
+            linear = composite.linear
+            self._readback.push(linear, "f2")
 
         def take() -> UInt8[np.ndarray, "h w 3"]:
             color = self._read(frame)
-            return artifacts.applied(color, self._readback.pop()[..., 0].astype(np.float32))
+            coverage = None if artifacts is None else self._readback.pop()[..., 0].astype(np.float32)
+            if linear is not None:
+                color = bloomed(color, self._readback.pop()[..., :3].astype(np.float32), frame, output.bloom)
+            return color if artifacts is None or coverage is None else artifacts.applied(color, coverage)
 
         return take
 

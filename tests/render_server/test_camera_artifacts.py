@@ -67,3 +67,22 @@ def test_objects_are_smeared_as_the_camera_moves(gpu: GpuContext, tmp_path: Path
     assert reached[1].max() > columns.max()
     assert abs(reached[0].min() - rows.min()) <= 1
     assert abs(reached[0].max() - rows.max()) <= 1
+
+
+def test_a_glowing_object_has_bloom_in_every_composite(gpu: GpuContext, tmp_path: Path) -> None:
+    stage = Stage(tmp_path, COARSE)
+    lamp = stage.virtual(cube(0.1)) | {"material": {"base_color": [0, 0, 0], "emission": [2, 2, 2]}}
+    document = stage.document([lamp], [ambient(0.5)], floor())
+    pictures = []
+    for bloom in (0.0, 0.1):
+        scene = document.replaced(output=document.output.replaced(bloom=bloom))
+        renderer = SceneRenderer(gpu, scene)
+        first = renderer.submit(frame(), others=("delta", "composite")).finish()
+        pictures.append(first.color.astype(int))
+        assert np.array_equal(first.others[1].color, first.color)
+        covered = fields_of(renderer).matte > 0
+        renderer.release()
+    plain_picture, glowing = pictures
+    rows, columns = np.nonzero(covered)
+    beside = np.s_[rows.min() : rows.max(), columns.max() + 2]
+    assert (glowing[beside] - plain_picture[beside]).mean() > 1
