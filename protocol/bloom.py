@@ -1,7 +1,9 @@
 """Bloom: light that the lens scatters around bright things ([P1] 4.2), of what relighting changes alone.
 
 The camera's picture has the bloom of the real room already. So only the change of radiance is scattered: a share of
-it leaves its place and arrives around it, negative where an object hides a lamp. What arrives is what left.
+it leaves its place and arrives around it, negative where an object hides a lamp. What arrives is what left. What an
+object hides is taken as it is around there: the object itself gets the bloom of the room, and no trace of what is
+behind it.
 """
 
 import cv2
@@ -30,19 +32,26 @@ def _spread(change: Float32[np.ndarray, "h w 3"], sigma_px: float) -> Float32[np
 
 
 def bloomed(
-    color: UInt8[np.ndarray, "h w 3"], linear: Float32[np.ndarray, "h w 3"], frame: ViewFrame, share: float
+    color: UInt8[np.ndarray, "h w 3"],
+    linear: Float32[np.ndarray, "h w 3"],
+    coverage: Float32[np.ndarray, "h w"],
+    frame: ViewFrame,
+    share: float,
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Return a relit picture with bloom of its change; where none arrives it is the same to the bit.
 
-    `linear` is the picture in camera units, brighter than white where objects are; `share` 0..1 is the part of the
-    light that is scattered.
+    `linear` is the picture in camera units, beyond white where objects are, `coverage` what they cover; `share`
+    0..1 is the part of the light that is scattered.
     """
-    changed = (color != frame.color).any(axis=2, keepdims=True)
+    changed = (color != frame.color).any(axis=2, keepdims=True) | (coverage[..., None] > 0)
     if not changed.any():
         return color
-    change = np.where(changed, linear - linear_color(frame, frame.color), 0).astype(np.float32)
-    lut = decode_lut(frame.response)
-    before = np.where(changed, linear * np.float32(frame.exposure_scale), lut[color, np.arange(3)])
-    after = before + np.float32(share * frame.exposure_scale) * (scattered(change) - change)
+    lut, scale = decode_lut(frame.response), np.float32(frame.exposure_scale)
+    camera = linear_color(frame, frame.color)
+    hidden = np.clip(coverage, 0, 1)[..., None]
+    around = scattered(camera) / scattered(np.ones_like(camera))
+    change = np.where(changed, linear - camera + hidden * (camera - around), 0).astype(np.float32)
+    before = np.where(changed, linear * scale, lut[color, np.arange(3)])
+    after = before + share * scale * (scattered(change) - change)
     codes = [np.interp(after[..., c], lut[:, c], np.arange(256)) for c in range(3)]
     return np.asarray(np.rint(np.stack(codes, axis=-1)), np.uint8)

@@ -255,22 +255,24 @@ class SceneRenderer:
         self, frame: ViewFrame, relit: RelitFrame, view: ShownView, composite: Composite | Enlarge
     ) -> Callable[[], UInt8[np.ndarray, "h w 3"]]:
         """Begins to read a picture, and what the camera's artifacts on it need; returns what takes both."""
-        artifacts = self._artifacts_of(frame, relit, view)
+        artifacts, output = self._artifacts_of(frame, relit, view), self.scene.output
         self._readback.push(composite.code, "u1")
-        if artifacts is not None:
-            covered = relit.shown().object_coverage
-            self._readback.push(covered, covered.dtype)
-        output, linear = self.scene.output, None
+        linear = None
         if output.has_bloom and view == "composite" and isinstance(composite, Composite):
             linear = composite.linear
             self._readback.push(linear, "f2")
+        if artifacts is None and linear is None:
+            return lambda: self._read(frame)
+        covered = relit.shown().object_coverage
+        self._readback.push(covered, covered.dtype)
 
         def take() -> UInt8[np.ndarray, "h w 3"]:
             color = self._read(frame)
-            coverage = None if artifacts is None else self._readback.pop()[..., 0].astype(np.float32)
-            if linear is not None:
-                color = bloomed(color, self._readback.pop()[..., :3].astype(np.float32), frame, output.bloom)
-            return color if artifacts is None or coverage is None else artifacts.applied(color, coverage)
+            radiance = None if linear is None else self._readback.pop()[..., :3].astype(np.float32)
+            coverage = self._readback.pop()[..., 0].astype(np.float32)
+            if radiance is not None:
+                color = bloomed(color, radiance, coverage, frame, output.bloom)
+            return color if artifacts is None else artifacts.applied(color, coverage)
 
         return take
 
