@@ -2445,6 +2445,12 @@ export interface components {
              */
             readonly antialiasing: boolean;
             /**
+             * Bloom
+             * @description Share of the light of what changes that the lens scatters around it; 0 = none.
+             * @default 0
+             */
+            readonly bloom: number;
+            /**
              * Camera Artifacts
              * @description Put the camera's noise, sharpness and motion blur on the virtual part, as its frames show them.
              * @default false
