@@ -198,8 +198,3 @@ class CameraNoise:
         )
         rows, columns = np.mean([each.correlation for each in self._found], axis=0)
         return NoiseModel(read, shot, (float(rows), float(columns)))
-
-    def applied(self, color: Color, coverage: Float32[np.ndarray, "h w"], frame: ViewFrame) -> Color:
-        """Return a frame's picture with noise on its virtual part; as it is while no noise is known."""
-        model = self.model
-        return color if model is None else add_noise(color, coverage, model, frame.frame_id, frame.response)

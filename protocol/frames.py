@@ -111,9 +111,10 @@ class SensorFrame:
 class ViewFrame:
     """The input of one composite.
 
-    Linear camera colour is `decode_lut(response)[color] / exposure_scale`. `depth` is clean and registered to colour;
-    None if the scene gives a model. `board` lets the renderer find the board's white paper. `sky_lights` are lights
-    that the sensor node cut from its maps of radiance; the same object while they do not change.
+    Linear camera colour is `decode_lut(response)[color] / exposure_scale`. `exposure_s` is None if it is unknown.
+    `depth` is clean and registered to colour; None if the scene gives a model. `board` lets the renderer find the
+    board's white paper. `sky_lights` are lights that the sensor node cut from its maps of radiance; the same object
+    while they do not change.
     """
 
     frame_id: int
@@ -122,6 +123,7 @@ class ViewFrame:
     camera: CameraModel
     response: Float32[np.ndarray, "256 3"] | None = None
     exposure_scale: float = 1.0
+    exposure_s: float | None = None
     pose: BoardPose | None = None
     depth: DepthImage | None = None
     board: BoardSpec | None = None

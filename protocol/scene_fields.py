@@ -11,7 +11,7 @@ SplitKind = Literal["peaks", "all"]
 PeakThreshold = Annotated[float, Field(gt=0, le=1000)]
 SmoothingTime = Annotated[float, Field(ge=0, le=60)]
 
-View = Literal["composite", "effects", "delta", "volume", "rsm", "lights"]
+View = Literal["composite", "effects", "delta", "error", "volume", "rsm", "lights"]
 ShownView = Literal[
     View, "camera"
 ]  # what can be looked at; `camera` is the picture before anything was done to it

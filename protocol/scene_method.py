@@ -470,6 +470,18 @@ class Output(StrictModel):
     )
     antialiasing: bool = Field(default=False, description="Smooth the edges of virtual objects.")
     camera_artifacts: bool = Field(
-        default=False, description="Put the camera's noise on the virtual part, as its still frames show it."
+        default=False,
+        description="Put the camera's noise, sharpness and motion blur on the virtual part, as its frames show them.",
+    )
+    bloom: float = Field(
+        default=0.0,
+        ge=0,
+        le=0.5,
+        description="Share of the light of what changes that the lens scatters around it; 0 = none.",
     )
     view: View = Field(default="composite", description="The picture, or a look inside.")
+
+    @property
+    def has_bloom(self) -> bool:
+        """Whether the view `composite` has bloom, which is put on in the camera's own response."""
+        return self.bloom > 0 and self.tone == "camera"

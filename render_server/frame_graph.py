@@ -148,6 +148,9 @@ class Composition:
         view = options.output.view
         if view == "volume" and relit.voxels is not None:
             self._views.volume(self._composite.code, image, relit.voxels, relit.volume, scene)
+        elif view == "error":
+            error = None if relit.error is None else relit.error()
+            self._views.error(self._composite.code, error, relit.grid.scale)
         elif view == "rsm":
             self._views.shadow_maps(self._composite.code, relit.lights)
         elif view in ("effects", "delta"):
@@ -226,6 +229,7 @@ class FrameGraph:
             layers.volume,
             layers.lights,
             layers.reflection,
+            *(() if layers.error is None else (layers.error,)),
         )
         return g.stage("composite", composition.compose_again, s.image, relit)
 

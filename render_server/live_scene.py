@@ -79,7 +79,8 @@ class RelitFrame:
     def compose_view(self, view: View) -> Composite:
         """Renders the frame in another view, at the size of its graph."""
         output = self.options.output.replaced(view=view)
-        return self.graph.render_view(replace(self.options, output=output, with_linear=False))
+        with_linear = view == "composite" and output.has_bloom
+        return self.graph.render_view(replace(self.options, output=output, with_linear=with_linear))
 
     def shown(self) -> ShownBuffers:
         """Returns the geometry buffers."""

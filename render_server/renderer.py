@@ -9,12 +9,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import cv2
-import moderngl
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
+from deltalight.protocol.bloom import bloomed
+from deltalight.protocol.camera_artifacts import CameraArtifacts, FrameArtifacts
 from deltalight.protocol.camera_model import CameraModel
-from deltalight.protocol.camera_noise import CameraNoise
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import ViewFrame
 from deltalight.protocol.scene import SceneDocument
@@ -113,7 +113,7 @@ class SceneRenderer:
         self._sized: tuple[ViewFrame, ViewFrame] | None = None
         self._shown: ShownFrame | None = None
         self._relit: RelitFrame | None = None
-        self._noise = CameraNoise()
+        self._artifacts = CameraArtifacts()
         self.scene = scene
 
     def set_scene(self, scene: SceneDocument) -> None:
@@ -128,7 +128,7 @@ class SceneRenderer:
     def forget_frames(self) -> None:
         """Forgets everything seen in earlier frames, because the next ones come from another source."""
         self._shown = self._sized = None
-        self._noise.forget()
+        self._artifacts.forget()
         self._live.forget_frames()
 
     def render(self, frame: ViewFrame, *, with_linear: bool = False) -> CompositeFrame:
@@ -150,7 +150,7 @@ class SceneRenderer:
         """
         started_s = time.perf_counter()
         with_linear = with_linear or self._with_linear
-        source = self._source(self.sized(frame), whole=whole or with_linear)
+        source = self._source(self.sized(frame), whole=whole or with_linear or self.scene.output.has_bloom)
         main = self._start(source, self.scene.output.view, with_linear=with_linear)
         rest = [self._start_other(source, view) for view in others]
         cameras = next((each.seen for each in (main, *rest) if each.seen is not None), None)
@@ -231,7 +231,7 @@ class SceneRenderer:
         relit = source.relit
         if relit is None or (view == "lights" and source.is_lit):
             return self._start_other(source, view)
-        composite = relit.compose(with_linear=with_linear)
+        composite = relit.compose(with_linear=with_linear or self.scene.output.has_bloom)
         with self._live.timers.measure("readback"):
             take = self._begin_reading(source.frame, relit, view, composite)
             if isinstance(composite, Composite) and with_linear:
@@ -254,16 +254,25 @@ class SceneRenderer:
     def _begin_reading(
         self, frame: ViewFrame, relit: RelitFrame, view: ShownView, composite: Picture
     ) -> Callable[[], UInt8[np.ndarray, "h w 3"]]:
-        """Begins to read a picture, and what the camera's noise on it needs; returns what takes both."""
-        covered = self._noisy_part(frame, relit, view)
+        """Begins to read a picture, and what the camera's artifacts on it need; returns what takes both."""
+        artifacts, output = self._artifacts_of(frame, relit, view), self.scene.output
         self._readback.push(composite.code, "u1")
-        if covered is None:
+        linear = None
+        if output.has_bloom and view == "composite" and isinstance(composite, Composite):
+            linear = composite.linear
+            self._readback.push(linear, "f2")
+        if artifacts is None and linear is None:
             return lambda: self._read(frame)
+        covered = relit.shown().object_coverage
         self._readback.push(covered, covered.dtype)
 
         def take() -> UInt8[np.ndarray, "h w 3"]:
             color = self._read(frame)
-            return self._noise.applied(color, self._readback.pop()[..., 0].astype(np.float32), frame)
+            radiance = None if linear is None else self._readback.pop()[..., :3].astype(np.float32)
+            coverage = self._readback.pop()[..., 0].astype(np.float32)
+            if radiance is not None:
+                color = bloomed(color, radiance, coverage, frame, output.bloom)
+            return color if artifacts is None else artifacts.applied(color, coverage)
 
         return take
 
@@ -300,14 +309,16 @@ class SceneRenderer:
         size = frame.camera.width, frame.camera.height
         return np.asarray(color if color.shape[1::-1] == size else cv2.resize(color, size))
 
-    def _noisy_part(self, frame: ViewFrame, relit: RelitFrame, view: ShownView) -> moderngl.Texture | None:
-        """Learns the camera's noise; returns what the objects cover if the scene asks for that noise on them."""
+    def _artifacts_of(self, frame: ViewFrame, relit: RelitFrame, view: ShownView) -> FrameArtifacts | None:
+        """Learns from the camera's frame; returns what it puts on the objects if the scene asks for that."""
         output = self.scene.output
         if not output.camera_artifacts or view != "composite" or output.tone != "camera":
             return None
-        self._noise.observe(frame)
-        coverage = relit.shown().object_coverage
-        return coverage if coverage.size == frame.color.shape[1::-1] else None
+        shown = relit.shown()
+        if shown.object_coverage.size != frame.color.shape[1::-1]:
+            return None
+        low, high = shown.objects.bounds
+        return self._artifacts.observe(frame, shown.view.world_from_camera, (low + high) / 2)
 
     def release(self) -> None:
         """Frees all GL objects."""

@@ -89,6 +89,7 @@ class ViewFrameBuilder:
             camera=self._rig.camera,
             response=frame.response,
             exposure_scale=_exposure_scale(frame.exposure_s, self._reference.exposure_s),
+            exposure_s=frame.exposure_s or self._reference.exposure_s,
             pose=pose,
             depth=self._depth(frame, self._reference),
             board=self._rig.board,

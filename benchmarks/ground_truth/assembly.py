@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from deltalight.benchmarks.ground_truth.benchmark_scene import BenchmarkScene, Finish
+from deltalight.benchmarks.ground_truth.energy_keeping import energy_keeping
 from deltalight.benchmarks.ground_truth.parts import MeshFolder, diffuse, rgb, shape, two_sided
 from deltalight.render_server.lights.environment import read_radiance
 
@@ -23,16 +24,13 @@ Ours has +z, +x and +y in these places.
 
 
 def material(finish: Finish) -> dict[str, Any]:
-    """Return Mitsuba's Disney BRDF with the scene document's terms; Lambertian if the document says so."""
+    """Return Mitsuba's material of the scene document's terms; Lambertian if the document says so."""
+    color = rgb(finish.base_color)
     if finish.metallic == 0 and finish.specular == 0:
-        return diffuse(rgb(finish.base_color))
-    return {
-        "type": "principled",
-        "base_color": rgb(finish.base_color),
-        "roughness": finish.roughness,
-        "metallic": finish.metallic,
-        "specular": finish.specular,
-    }
+        return diffuse(color)
+    return energy_keeping(
+        color, roughness=finish.roughness, metallic=finish.metallic, specular=finish.specular
+    )
 
 
 def environment_light(radiance: Float32[np.ndarray, "h w 3"]) -> dict[str, Any]:

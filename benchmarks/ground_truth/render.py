@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Float64
 
+from deltalight.benchmarks.ground_truth import energy_keeping
 from deltalight.benchmarks.ground_truth.fisheye import fisheye_sensor
 from deltalight.benchmarks.ground_truth.parts import Matrix
 from deltalight.protocol.camera_model import CameraModel
@@ -73,6 +74,7 @@ def choose_variant() -> str:
         ) from error
     variant = "llvm_ad_rgb" if _llvm_works() else "scalar_rgb"
     mi.set_variant(variant)
+    energy_keeping.register()
     return variant
 
 

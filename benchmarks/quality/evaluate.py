@@ -128,6 +128,8 @@ def _result(case: SceneCase, rendered: Rendered) -> VariantResult:
     figures = scene_figures(rendered.pictures, case)
     if rendered.frame_ms is not None:
         figures["frame_ms"] = rendered.frame_ms
+    if rendered.delta_error is not None:
+        figures["delta_error"] = rendered.delta_error
     shown = rendered.pictures[_shown_frame(case)]
     return VariantResult(figures, shown, rendered.is_repeatable, rendered.history_codes, rendered.note)
 

@@ -13,6 +13,7 @@ from deltalight.benchmarks.variants import Variant
 from deltalight.protocol.frames import BoardPose, ViewFrame
 from deltalight.protocol.scene import SceneDocument
 from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.textures import read_texture
 from deltalight.render_server.renderer import SceneRenderer
 
 TIMED_PAIRS = 2
@@ -26,7 +27,8 @@ class Rendered:
 
     `frame_ms`: median time of a frame in which everything is rebuilt. `is_repeatable`: rendering the first frame
     again immediately gave the same bytes. `history_codes`: greatest difference of any channel, in 8-bit codes, when
-    it is rendered once more after other frames. None if nothing was rendered.
+    it is rendered once more after other frames. `delta_error`: rms of [P1] eq. 9 over the real surfaces in the first
+    frame's volume, irradiance in camera units. None if nothing was rendered, or there is no such error.
     """
 
     pictures: Sequence[Picture]
@@ -34,6 +36,7 @@ class Rendered:
     is_repeatable: bool | None = None
     history_codes: int | None = None
     note: str = ""
+    delta_error: float | None = None
 
 
 def render_variant(gpu: GpuContext, case: SceneCase, variant: Variant, volume_size: int | None) -> Rendered:
@@ -46,12 +49,22 @@ def render_variant(gpu: GpuContext, case: SceneCase, variant: Variant, volume_si
     renderer = SceneRenderer(gpu, documents[0])
     try:
         first, again = (renderer.render(case.views[0]).color for _ in range(2))
+        delta_error = _delta_error(renderer)
         later, frame_ms = _time_rebuilds(renderer, case.views[0])
         others = _render_rest(renderer, documents, case.views)
     finally:
         renderer.release()
     history_codes = int(np.abs(first.astype(int) - later).max())
-    return Rendered([first, *others], frame_ms, np.array_equal(first, again), history_codes)
+    is_repeatable = np.array_equal(first, again)
+    return Rendered([first, *others], frame_ms, is_repeatable, history_codes, delta_error=delta_error)
+
+
+def _delta_error(renderer: SceneRenderer) -> float | None:
+    graph = renderer.graph
+    if graph is None or "delta error" not in graph:
+        return None
+    error = read_texture(graph["delta error"]())
+    return float(np.sqrt(np.mean(error[error[..., 3] > 0, :3] ** 2)))
 
 
 def _time_rebuilds(renderer: SceneRenderer, view: ViewFrame) -> tuple[Picture, float]:

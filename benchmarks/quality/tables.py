@@ -47,6 +47,9 @@ LIGHT_AND_TIME = (
         "temporal_unchanged", "unsteady", 2, "wrong change between frames on unchanged pixels, rms, 1/255"
     ),
     Column("temporal_changed", "unsteady changed", 2, "the same on changed pixels"),
+    Column(
+        "delta_error", "E rms", 3, "the printed operator's error ([P1] eq. 9), irradiance in camera units"
+    ),
     Column("frame_ms", "ms", 1, "median time of a frame in which everything is built anew"),
 )
 

@@ -1,5 +1,8 @@
 """Delta voxel cone tracing: the exact operator, and the one of the paper (docs/method.md 3 and 4)."""
 
+from collections.abc import Callable
+from dataclasses import replace
+
 import moderngl
 
 from deltalight.protocol.scene_method import DvctMethod
@@ -38,6 +41,7 @@ from deltalight.render_server.passes.cones import ConeFields, LowResGrid, TraceC
 from deltalight.render_server.passes.lights import LightBuffers
 from deltalight.render_server.passes.shading import DirectLight
 from deltalight.render_server.passes.split_injection import (
+    DeltaError,
     FilterIsotropic,
     RealAlbedo,
     ResolveInjection,
@@ -238,9 +242,10 @@ def dvct_exact(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
 class PaperCones:
     """Marches nine diffuse cones and a specular one: through V_delta at real surfaces, through V_rho at objects."""
 
-    def __init__(self, gpu: GpuContext, fields: ConeFields) -> None:
-        self._fields = fields
+    def __init__(self, gpu: GpuContext, fields: ConeFields, volume_size: int) -> None:
+        self._gpu, self._fields, self._volume_size = gpu, fields, volume_size
         self._tracing = TraceConesPaper(gpu)
+        self._error: DeltaError | None = None  # made when somebody asks
 
     def trace(self, scene: Bindings, grid: LowResGrid, voxels: InjectedVoxels) -> ConeFields:
         """Traces the cones at real surfaces and at the objects."""
@@ -248,9 +253,22 @@ class PaperCones:
         self._tracing.trace_virtual(self._fields, grid, voxels.rho, scene)
         return self._fields
 
+    def find_error(
+        self, scene: Bindings, grid: LowResGrid, voxels: InjectedVoxels
+    ) -> Callable[[], moderngl.Texture]:
+        """Returns what traces [P1] eq. 9 (`DeltaError.run`)."""
+
+        def find() -> moderngl.Texture:
+            if self._error is None:
+                self._error = DeltaError(self._gpu, grid.size, self._volume_size)
+            real, volumes = voxels.real, (voxels.delta, voxels.rho)
+            return self._error.run(*volumes, real.store, real.volume, grid=grid, scene=scene)
+
+        return find
+
     def release(self) -> None:
         """Frees the GL objects."""
-        self._tracing.release()
+        release_all(self._tracing, self._error)
 
 
 def dvct_paper(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
@@ -268,14 +286,16 @@ def dvct_paper(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
     tier = settings.tier
     direct = DirectLight(g.gpu, size, shadow_cones=shadow_cones, reuses=tier.refresh_tiles > 0)
     shading = Shading(g.gpu, size, resolved, lit.buffers, direct, ShadingOptions(tier))
-    cones = PaperCones(g.gpu, shading.cones)
+    cones = PaperCones(g.gpu, shading.cones, resolved.volume_size)
 
     def trace(scene: Resource[Bindings], grid: Resource[LowResGrid]) -> Resource[ConeFields]:
+        g.value("delta error", cones.find_error, scene, grid, injected)
         return g.stage("cones", cones.trace, scene, grid, injected)
 
     volume = g.value("volume", placed_volume, "voxelize real")
     joint = g.value("joint voxels", joint_voxels, injected)
-    return shading_stages(g, s, shading, lit, volume, trace, voxels=joint)
+    layers = shading_stages(g, s, shading, lit, volume, trace, voxels=joint)
+    return replace(layers, error=g.resource("delta error"))
 
 
 def dvct(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:

@@ -112,7 +112,7 @@ class ShadingOptions:
 
 @dataclass(frozen=True, eq=False)
 class Layers:
-    """The layers that a method hands to composition; `voxels`, `volume` and `lights` are for debug views."""
+    """The layers that a method hands to composition; `voxels`, `volume`, `lights` and `error` are for debug views."""
 
     direct: Resource[DirectLight]
     cones: Resource[ConeFields]
@@ -123,6 +123,7 @@ class Layers:
     voxels: Resource[VoxelMipmap | None]
     volume: Resource[PlacedVolume]
     lights: Resource[LightBuffers]
+    error: Resource[Callable[[], moderngl.Texture]] | None = None
 
 
 class Shading:

@@ -1,5 +1,6 @@
 """Composition of the relit picture, as camera codes and linear radiance, and debug views."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import moderngl
@@ -65,7 +66,10 @@ class ChangeRatio:
 
 @dataclass(frozen=True)
 class RelitLayers:
-    """The layers that a relighting method hands to composition; `voxels`, `volume`, `lights` are for debug views."""
+    """The layers that a relighting method hands to composition.
+
+    `voxels`, `volume`, `lights` and `error` are for debug views.
+    """
 
     object_coverage: Binding
     virtual_radiance: moderngl.Texture
@@ -78,6 +82,8 @@ class RelitLayers:
     lights: LightBuffers
     reflection: moderngl.Texture | None = None
     """Objects in smooth real surfaces (`MirrorRays`); None: these surfaces use the cones' reflection."""
+    error: Callable[[], moderngl.Texture] | None = None
+    """Traces the error of the delta (`DeltaError.run`); None: the method makes none."""
 
 
 class Composite:
@@ -213,7 +219,7 @@ Picture = Composite | Enlarge | Crossfade
 
 
 class DebugViews:
-    """Overwrites a composite's `code` (RGBA8UI) with a debug view: effects, delta, voxels, reflective shadow maps."""
+    """Overwrites a composite's `code` (RGBA8UI) with a debug view: effects, delta, its error, voxels, shadow maps."""
 
     def __init__(self, gpu: GpuContext) -> None:
         self._gpu = gpu
@@ -256,6 +262,12 @@ class DebugViews:
             picture_rays=image.rays,
             voxels=voxels.texture,
             code_out=code,
+        )
+
+    def error(self, code: moderngl.Texture, error: moderngl.Texture | None, scale: int) -> None:
+        """Shows the error of the delta, of a grid at 1/scale of the picture; black if there is none."""
+        self._kernel("error_view").run(
+            code.size, delta_error=error, has_error=error is not None, scale=scale, code_out=code
         )
 
     def shadow_maps(self, code: moderngl.Texture, lights: LightBuffers) -> None:

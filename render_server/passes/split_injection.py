@@ -3,8 +3,9 @@
 import moderngl
 
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu.kernel import Bindings, Kernel, clear_buffer, list_threads
-from deltalight.render_server.gpu.textures import texture_2d
+from deltalight.render_server.gpu.kernel import Bindings, Kernel, clear_buffer, clear_volume, list_threads
+from deltalight.render_server.gpu.textures import release_all, texture_2d
+from deltalight.render_server.passes.cones import LowResGrid
 from deltalight.render_server.passes.lights import LightBuffers
 from deltalight.render_server.passes.voxels import PlacedVolume, VoxelMipmap, VoxelStore
 
@@ -131,3 +132,53 @@ class FilterIsotropic:
     def release(self) -> None:
         """Frees the program."""
         self._kernel.release()
+
+
+class DeltaError:
+    """[P1] eq. 9, E = C_rho - (C_mu + C_delta): the error of tracing volumes that were filtered apart.
+
+    V_mu, with the real scene's own opacity, is made of the same sums.
+    """
+
+    def __init__(self, gpu: GpuContext, size: tuple[int, int], volume_size: int) -> None:
+        self._gpu, self._threads = gpu, list_threads(gpu)
+        self._mu = VoxelMipmap(gpu, volume_size, 1)
+        self._error = texture_2d(gpu, size, 4, "f2")
+        self._resolve, self._trace = (
+            Kernel(gpu, "resolve_real_light"),
+            Kernel(gpu, "delta_error", DIRECTIONS=1, REAL=1),
+        )
+        self._filter = FilterIsotropic(gpu)
+
+    def run(
+        self,
+        delta: VoxelMipmap,
+        rho: VoxelMipmap,
+        real: VoxelStore,
+        volume: PlacedVolume,
+        *,
+        grid: LowResGrid,
+        scene: Bindings,
+    ) -> moderngl.Texture:
+        """Traces the nine diffuse cones through all three; returns E at real surfaces.
+
+        RGBA16F: irradiance, camera units; a: 1 where known. The size is the reduced grid's.
+        """
+        clear_volume(self._gpu, self._mu.texture)
+        own: Bindings = {**real.bindings, **volume.bindings}
+        self._resolve.run((self._threads,), own, mu=self._mu.texture, Light=real.delta_sums)
+        self._filter.run(self._mu, self._mu, volume)
+        self._trace.run(
+            grid.size,
+            grid.bindings,
+            scene,
+            volume_mu=self._mu.texture,
+            volume_rho=rho.texture,
+            volume_delta=delta.texture,
+            error_out=self._error,
+        )
+        return self._error
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        release_all(self._mu, self._error, self._resolve, self._trace, self._filter)

@@ -237,6 +237,7 @@ class FrameAssembler:
             camera=_of_size(self._camera(header.camera), header.shape),
             response=decode_response(color.parts[1]) if header.has_response else None,
             exposure_scale=(header.exposure_s or 1.0) / (self._reference_exposure_s or 1.0),
+            exposure_s=header.exposure_s or self._reference_exposure_s,
             pose=None if pose is None else _board_pose(pose.message),
             depth=None if depth is None else self._depth_image(depth),
             board=None if pose is None or pose.message.board is None else self._board(pose.message.board),

@@ -21,6 +21,7 @@ class View(StrEnum):
     COMPOSITE = "composite"
     EFFECTS = "effects"
     DELTA = "delta"
+    ERROR = "error"
     VOLUME = "volume"
     RSM = "rsm"
     LIGHTS = "lights"

@@ -3,9 +3,11 @@
 import importlib.util
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from jaxtyping import Float64
 
 from deltalight.benchmarks.ground_truth import fisheye, scene_demo
 from deltalight.benchmarks.ground_truth.assembly import environment_light, material
@@ -160,36 +162,63 @@ def test_furnace_keeps_materials_below_the_light(metallic: float) -> None:
             assert middle == pytest.approx(expected, rel=0.02)
 
 
-def reflected(finish: Finish, cosine: float) -> float:
-    """What a surface of the truth reflects of radiance 1 from everywhere (red)."""
+COSINES = np.array([0.05, 0.1, 0.2, 0.5, 0.75, 1.0])
+
+
+def reflected(bsdf: dict[str, Any], *, evenly: bool = False) -> Float64[np.ndarray, "6 3"]:
+    """What a material shows of radiance 1 from everywhere, seen from COSINES: by its own samples, or by even ones."""
     import drjit as dr
     import mitsuba as mi
 
     count = 1 << 16
-    si = dr.zeros(mi.SurfaceInteraction3f, count)
-    si.wi = mi.Vector3f(math.sqrt(1 - cosine**2), 0.0, cosine)
+    cosine = np.repeat(COSINES, count)
+    si = dr.zeros(mi.SurfaceInteraction3f, len(cosine))
+    si.wi = mi.Vector3f(np.sqrt(1 - cosine**2), 0.0, cosine)
     sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(1, count)
-    bsdf = mi.load_dict(material(finish))
-    _, weight = bsdf.sample(mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d())
-    return float(np.mean(np.array(weight[0])))
+    sampler.seed(1, len(cosine))
+    made, context = mi.load_dict(bsdf), mi.BSDFContext()
+    if evenly:
+        even = mi.warp.square_to_uniform_hemisphere(sampler.next_2d())
+        values = 2 * np.pi * np.array(made.eval(context, si, even))
+    else:
+        values = np.array(made.sample(context, si, sampler.next_1d(), sampler.next_2d())[1])
+    return np.asarray(values.reshape(3, len(COSINES), count).mean(axis=2).T)
 
 
 @pytest.mark.parametrize(
-    ("finish", "low", "high"),
-    [
-        (Finish((1.0, 1.0, 1.0), specular=0.0), 1.0, 1.0),
-        (Finish((1.0, 1.0, 1.0), roughness=0.3), 1.03, 1.22),
-        (Finish((1.0, 1.0, 1.0), roughness=1.0), 1.04, 1.52),
-        (Finish((1.0, 1.0, 1.0), roughness=0.3, metallic=1.0), 0.87, 1.0),
-        (Finish((1.0, 1.0, 1.0), roughness=1.0, metallic=1.0), 0.30, 0.59),
-    ],
+    ("roughness", "metallic", "low", "high"),
+    [(0.3, 0.0, 1.03, 1.22), (1.0, 0.0, 1.04, 1.52), (0.3, 1.0, 0.87, 1.0), (1.0, 1.0, 0.30, 0.59)],
 )
-def test_energy_of_the_truths_materials(finish: Finish, low: float, high: float) -> None:
-    """Mitsuba's `principled` adds lobe and base, and loses what microfacets throw at each other: docs/quality.md says
-    what that means for the figures. A white surface that keeps its light would show 1."""
+def test_truths_materials_keep_the_light(roughness: float, metallic: float, low: float, high: float) -> None:
+    """A white surface in even light of 1 shows 1. Mitsuba's `principled`, which truth had before, adds lobe and base,
+    and loses what microfacets throw at each other: from `low` to `high`, as docs/quality.md says."""
     choose_variant()
-    found = [reflected(finish, cosine) for cosine in (0.05, 0.1, 0.2, 0.5, 0.75, 1.0)]
-    print(f"roughness {finish.roughness}, metallic {finish.metallic}: {np.round(found, 3)}")
-    assert low - 0.01 < min(found)
-    assert max(found) < high + 0.01
+    own = material(Finish((1.0, 1.0, 1.0), roughness=roughness, metallic=metallic))
+    disney = reflected({**own, "type": "principled"})[:, 0]
+    kept = reflected(own)
+    print(
+        f"roughness {roughness}, metallic {metallic}: {np.round(kept[:, 0], 3)}, principled {np.round(disney, 3)}"
+    )
+    assert kept == pytest.approx(1.0, abs=0.01)
+    assert low - 0.01 < disney.min()
+    assert disney.max() < high + 0.01
+
+
+def test_truths_materials_are_sampled_as_they_are_evaluated() -> None:
+    """Means over the material's own samples and over even ones agree, colours apart; light goes both ways alike."""
+    import drjit as dr
+    import mitsuba as mi
+
+    choose_variant()
+    for finish in (
+        Finish((0.2, 0.5, 0.8), roughness=0.6),
+        Finish((0.9, 0.6, 0.3), roughness=0.7, metallic=1.0),
+    ):
+        bsdf = material(finish)
+        assert reflected(bsdf, evenly=True) == pytest.approx(reflected(bsdf), rel=0.02, abs=0.005)
+        made, context, si = mi.load_dict(bsdf), mi.BSDFContext(), dr.zeros(mi.SurfaceInteraction3f, 1)
+        one, other = mi.Vector3f(0.6, 0.0, 0.8), mi.Vector3f(0.0, -0.96, 0.28)
+        si.wi = one
+        there = np.array(made.eval(context, si, other)) / 0.28
+        si.wi = other
+        assert np.array(made.eval(context, si, one)) / 0.8 == pytest.approx(there, rel=1e-4)

@@ -47,7 +47,7 @@ TEXTURED: dict[Case, dict[str, Any]] = {
 }
 VIEWS = {
     Case("exact", "depth", "mirror"): ("effects", "delta", "volume", "rsm"),
-    Case("paper", "depth", "mirror"): ("volume",),
+    Case("paper", "depth", "mirror"): ("volume", "error"),
 }
 
 

@@ -9,7 +9,7 @@ from deltalight.benchmarks.ground_truth.sensors import ColorSensor
 from deltalight.protocol.frames import decode_lut
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.renderer import SceneRenderer
-from tests.render_server.scenes import COARSE, Stage, ambient, cube, fields_of, floor, frame, plain
+from tests.render_server.scenes import COARSE, Stage, ambient, cube, fields_of, floor, frame, look_at, plain
 
 pytestmark = pytest.mark.usefixtures("clean_gl")
 
@@ -39,3 +39,50 @@ def test_objects_get_the_cameras_noise(gpu: GpuContext, tmp_path: Path) -> None:
     before, after = (decode_lut(None)[each, np.arange(3)][covered] for each in (plain_second, second))
     expected = np.mean(0.01**2 + 3e-4 * before)
     assert np.mean((after - before) ** 2) == pytest.approx(expected, rel=0.2)
+
+
+def test_objects_are_smeared_as_the_camera_moves(gpu: GpuContext, tmp_path: Path) -> None:
+    """By the pose's way in the exposure; what the smeared object does not reach stays as it was, to the bit."""
+    still, moved = look_at(), look_at()
+    moved.world_from_camera[:3, 3] += 0.1 * moved.world_from_camera[:3, 0]
+    frames = [
+        frame(pose=pose, frame_id=number, timestamp_ns=number * 20_000_000, exposure_s=0.01)
+        for number, pose in enumerate((still, moved))
+    ]
+    stage = Stage(tmp_path, COARSE)
+    document = stage.document([stage.virtual(cube(0.3))], [ambient(0.5)], floor())
+    pictures = {}
+    for name, asked in (("off", False), ("on", True)):
+        scene = document.replaced(output=document.output.replaced(camera_artifacts=asked))
+        renderer = SceneRenderer(gpu, scene)
+        pictures[name] = [renderer.render(each).color.astype(int) for each in frames]
+        covered = fields_of(renderer).matte > 0
+        renderer.release()
+    (first, second), (plain_first, plain_second) = pictures["on"], pictures["off"]
+    assert np.array_equal(first, plain_first)
+    changed = (second != plain_second).any(axis=2)
+    rows, columns = np.nonzero(covered)
+    reached = np.nonzero(changed)
+    assert reached[1].min() < columns.min()
+    assert reached[1].max() > columns.max()
+    assert abs(reached[0].min() - rows.min()) <= 1
+    assert abs(reached[0].max() - rows.max()) <= 1
+
+
+def test_a_glowing_object_has_bloom_in_every_composite(gpu: GpuContext, tmp_path: Path) -> None:
+    stage = Stage(tmp_path, COARSE)
+    lamp = stage.virtual(cube(0.1)) | {"material": {"base_color": [0, 0, 0], "emission": [2, 2, 2]}}
+    document = stage.document([lamp], [ambient(0.5)], floor())
+    pictures = []
+    for bloom in (0.0, 0.1):
+        scene = document.replaced(output=document.output.replaced(bloom=bloom))
+        renderer = SceneRenderer(gpu, scene)
+        first = renderer.submit(frame(), others=("delta", "composite")).finish()
+        pictures.append(first.color.astype(int))
+        assert np.array_equal(first.others[1].color, first.color)
+        covered = fields_of(renderer).matte > 0
+        renderer.release()
+    plain_picture, glowing = pictures
+    rows, columns = np.nonzero(covered)
+    beside = np.s_[rows.min() : rows.max(), columns.max() + 2]
+    assert (glowing[beside] - plain_picture[beside]).mean() > 1

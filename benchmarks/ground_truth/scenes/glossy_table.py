@@ -9,6 +9,7 @@ from deltalight.benchmarks.ground_truth.benchmark_scene import (
     Finish,
     VirtualObject,
 )
+from deltalight.benchmarks.ground_truth.energy_keeping import energy_keeping
 from deltalight.benchmarks.ground_truth.lamps import Ambient, SphereLamp
 from deltalight.benchmarks.ground_truth.meshes import pawn, vase
 from deltalight.benchmarks.ground_truth.parts import MeshFolder, looking, shape, sheet_surface, texture
@@ -22,12 +23,7 @@ LAMP = SphereLamp((-0.55, -0.25, 0.75), 2.7, 0.08, (1.0, 0.95, 0.88))
 
 def _real(folder: MeshFolder) -> dict[str, Any]:
     stained = 0.30 * wood(11, 1080, 1200, planks=5)
-    varnish = {
-        "type": "principled",
-        "base_color": texture(stained),
-        "roughness": ROUGHNESS,
-        "specular": SPECULAR,
-    }
+    varnish = energy_keeping(texture(stained), roughness=ROUGHNESS, specular=SPECULAR)
     things = {
         "table": shape("rectangle", rooms.table_place(), bsdf=varnish),
         "tea": rooms.standing_box(0.05, 0.13, (0.075, 0.075, 0.120), 20.0, (0.70, 0.52, 0.10)),

@@ -9,6 +9,7 @@ from deltalight.benchmarks.ground_truth.benchmark_scene import (
     Finish,
     VirtualObject,
 )
+from deltalight.benchmarks.ground_truth.energy_keeping import energy_keeping
 from deltalight.benchmarks.ground_truth.lamps import Ambient, SphereLamp
 from deltalight.benchmarks.ground_truth.meshes import rabbit, ring
 from deltalight.benchmarks.ground_truth.parts import (
@@ -33,7 +34,7 @@ Only a path that happens to end in the lamp finds such light, so it would show a
 
 
 def _real(folder: MeshFolder) -> dict[str, Any]:
-    steel = {"type": "principled", "base_color": rgb(STEEL), "roughness": ROUGHNESS, "metallic": 1.0}
+    steel = energy_keeping(rgb(STEEL), roughness=ROUGHNESS, metallic=1.0)
     things = {
         "table": shape("rectangle", rooms.table_place(TABLE_BACK_Y_M), bsdf=steel),
         "tin": rooms.standing_box(0.03, 0.14, (0.10, 0.06, 0.13), 25.0, (0.12, 0.30, 0.50)),

@@ -1,8 +1,7 @@
 // Diffuse and specular cones of the paper's operator at 1/scale of the picture ([P1] eq. 6 and 8). REAL: C_delta, the
 // change of light on real surfaces. VIRTUAL: C_rho, the light of the volume on the objects, and of the environment in
 // the rest of a cone.
-#include "common/march_joint.glsl"
-#include "common/environment.glsl"
+#include "common/paper_cones.glsl"
 #include "common/brdf.glsl"
 #include "common/low_res_grid.glsl"
 
@@ -21,39 +20,6 @@ layout(rgba16f) writeonly uniform image2D specular_rho;     // rgb mean radiance
 #endif
 uniform sampler3D mipmap;   // V_delta for REAL, V_rho otherwise; a: V_eta
 #include "common/camera.glsl"
-
-const float START = 2.0;    // voxels along the normal, to leave the surface's own voxels
-// Nine cones: the normal, four at 45 degrees, four on the diagonals between ((1,1,1) about the normal).
-const int CONES = 9;
-const float HALF_ANGLE = 0.4759;     // rad: a ninth of the hemisphere's solid angle each, cos = 8/9
-const float RATIO = 1.0308;          // diameter / distance, 2 tan(HALF_ANGLE)
-const float DIAGONAL = 0.57735026919;
-const float RIGHT = 0.70710678119;
-const float COSINE_SUM = 1.0 + 4.0 * RIGHT + 4.0 * DIAGONAL;
-
-// Direction k about z; its z is its cosine weight.
-vec3 cone_direction(int k) {
-    if (k == 0) return vec3(0.0, 0.0, 1.0);
-    float phi = float(k - 1) * PI / 4.0;
-    float z = (k & 1) == 1 ? RIGHT : DIAGONAL;
-    return vec3(sqrt(1.0 - z * z) * vec2(cos(phi), sin(phi)), z);
-}
-
-vec2 in_volume(vec3 q, vec3 d) { return box_interval(q, d, vec3(0.0), vec3(float(volume_size))); }
-
-// E of the nine cones; unoccluded uniform light would give pi L.
-vec3 diffuse(vec3 q, vec3 n, bool with_environment) {
-    mat3 basis = basis_around(n);
-    vec3 e = vec3(0.0);
-    for (int k = 0; k < CONES; ++k) {
-        vec3 local = cone_direction(k);
-        vec3 d = basis * local;
-        vec4 c = march(mipmap, q, d, RATIO, in_volume(q, d));
-        if (with_environment) c.rgb += (1.0 - c.a) * environment(d, HALF_ANGLE);
-        e += local.z * c.rgb;
-    }
-    return e * PI / COSINE_SUM;
-}
 
 void store_specular(ivec2 texel, vec3 mu, vec3 rho) {
 #ifdef REAL
@@ -89,7 +55,7 @@ void shade(ivec2 texel, SurfacePoint s) {
     float fade = s.present ? volume_fade(q) : 0.0;
     vec3 e = s.present ? environment_irradiance(s.normal) : vec3(0.0);
     imageStore(irradiance_mu, texel, vec4(e, s.present ? 1.0 : 0.0));
-    if (fade > 0.0) e += diffuse(q + START * s.normal, s.normal, false);
+    if (fade > 0.0) e += diffuse(mipmap, q + START * s.normal, s.normal, false);
     imageStore(irradiance_rho, texel, vec4(e, fade));
     if (fade > 0.0 && s.roughness >= 0.0) specular(texel, s, q + START * s.normal);
     else store_specular(texel, vec3(0.0), vec3(0.0));
@@ -99,7 +65,7 @@ void shade(ivec2 texel, SurfacePoint s) {
     vec3 e = vec3(0.0), c = vec3(0.0);
     if (s.present) {
         vec3 q = volume_coordinate(s.position) + START * s.normal;
-        e = diffuse(q, s.normal, true);
+        e = diffuse(mipmap, q, s.normal, true);
         vec3 d = reflect(normalize(s.position - camera_position), s.normal);
         float half_angle = specular_half_angle(s.roughness);
         vec4 met = march(mipmap, q, d, 2.0 * tan(half_angle), in_volume(q, d));

@@ -2128,7 +2128,7 @@ export interface components {
              * @description What it shows: the view that was asked for, or until there is a picture of it the scene's own.
              * @enum {string}
              */
-            readonly view: "composite" | "effects" | "delta" | "volume" | "rsm" | "lights" | "camera";
+            readonly view: "composite" | "effects" | "delta" | "error" | "volume" | "rsm" | "lights" | "camera";
             /**
              * World From Camera
              * @description null without a pose.
@@ -2339,6 +2339,10 @@ export interface components {
              *         "view": "delta"
              *       },
              *       {
+             *         "name": "error",
+             *         "view": "error"
+             *       },
+             *       {
              *         "name": "volume",
              *         "view": "volume"
              *       },
@@ -2441,8 +2445,14 @@ export interface components {
              */
             readonly antialiasing: boolean;
             /**
+             * Bloom
+             * @description Share of the light of what changes that the lens scatters around it; 0 = none.
+             * @default 0
+             */
+            readonly bloom: number;
+            /**
              * Camera Artifacts
-             * @description Put the camera's noise on the virtual part, as its still frames show it.
+             * @description Put the camera's noise, sharpness and motion blur on the virtual part, as its frames show them.
              * @default false
              */
             readonly camera_artifacts: boolean;
@@ -2469,7 +2479,7 @@ export interface components {
              * @default composite
              * @enum {string}
              */
-            readonly view: "composite" | "effects" | "delta" | "volume" | "rsm" | "lights";
+            readonly view: "composite" | "effects" | "delta" | "error" | "volume" | "rsm" | "lights";
             /**
              * Width
              * @description Width, pixels; null = the camera's.
@@ -3574,7 +3584,7 @@ export interface components {
             readonly name: string;
             /**
              * View
-             * @description One of camera, composite, effects, delta, volume, rsm, lights.
+             * @description One of camera, composite, effects, delta, error, volume, rsm, lights.
              * @default composite
              */
             readonly view: string;
@@ -4683,7 +4693,7 @@ export interface operations {
         readonly parameters: {
             readonly query?: {
                 /** @description What to look at; without, the scene's own `output.view`. */
-                readonly view?: ("composite" | "effects" | "delta" | "volume" | "rsm" | "lights" | "camera") | null;
+                readonly view?: ("composite" | "effects" | "delta" | "error" | "volume" | "rsm" | "lights" | "camera") | null;
             };
             readonly header?: never;
             readonly path?: never;

@@ -14,6 +14,11 @@ export const VIEWS: readonly ViewText[] = [
     label: "Change of light",
     help: "Light gained in its own colour, light lost in red, amplified four times.",
   },
+  {
+    value: "error",
+    label: "Error of the paper",
+    help: "What the operator as printed gets wrong: red to yellow too dark, blue to white too bright. Black with others.",
+  },
   { value: "volume", label: "Volume", help: "The lit voxels or cells." },
   {
     value: "rsm",

@@ -44,7 +44,7 @@ const GROUPS: readonly { readonly title: string; readonly keys: readonly (readon
     title: "Views",
     keys: [
       ["1", "picture"],
-      ["2 … 7", "effects, change of light, volume, light's view, lights, camera"],
+      ["2 … 8", "effects, change of light, its error, volume, light's view, lights, camera"],
       ["?", "this list"],
     ],
   },

@@ -1,0 +1,244 @@
+"""The truth's glossy material: a BSDF for Mitsuba that keeps the light, as none of its own does at every roughness.
+
+It has the renderer's physics and none of its numbers: integrals are by quadrature here, a dielectric's Fresnel term
+is the exact one, and what microfacets throw at each other leaves in the lobe of Kulla and Conty (2017), not in
+Turquin's.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, TypeAlias
+
+import numpy as np
+from jaxtyping import Float64
+
+from deltalight.benchmarks.ground_truth.parts import Triple
+
+Numbers: TypeAlias = Any
+"""A float, an array of NumPy or of Dr.Jit, or a record of Mitsuba that holds some."""
+PLUGIN = "energy_keeping"
+LEAST_ALPHA = 1e-3
+QUADRATURE = 128
+"""Visible microfacets away from the normal, and around it."""
+DEGREE, ANGLES = 24, 64
+"""Of the polynomials in the root of the cosine, and the angles that they are fitted to."""
+_registered: set[str] = set()  # variants
+
+
+def energy_keeping(
+    base_color: dict[str, Any], *, roughness: float, metallic: float = 0.0, specular: float = 0.5
+) -> dict[str, Any]:
+    """Return a GGX lobe over a diffuse base, in the scene document's terms (docs/formats.md 3).
+
+    `base_color` is Mitsuba's: one colour, or a texture if `metallic` is 0. It is a material of one side.
+    """
+    values = {"roughness": roughness, "metallic": metallic, "specular": specular}
+    return {"type": PLUGIN, "base_color": base_color, **values}
+
+
+def fresnel(cosine: Numbers, f0: float, metallic: float) -> Numbers:
+    """Return what a microfacet reflects: the exact term of a dielectric, Schlick's of a metal."""
+    root = f0**0.5
+    eta = (1 + root) / (1 - root) if metallic < 1 else 1.0
+    schlick = f0 + (1 - f0) * (1 - cosine) ** 5
+    if metallic == 1:
+        return schlick
+    g = (eta * eta - 1 + cosine * cosine) ** 0.5
+    parallel = (cosine * (g + cosine) - 1) / (cosine * (g - cosine) + 1)
+    exact = 0.5 * ((g - cosine) / (g + cosine)) ** 2 * (1 + parallel * parallel)
+    return metallic * schlick + (1 - metallic) * exact
+
+
+def smith_visibility(cosine_i: Numbers, cosine_o: Numbers, alpha: float) -> Numbers:
+    """Return G / (4 cos cos) of the height-correlated Smith term (Heitz 2014)."""
+    a2 = alpha * alpha
+    sum_i = cosine_o * (cosine_i * cosine_i * (1 - a2) + a2) ** 0.5
+    sum_o = cosine_i * (cosine_o * cosine_o * (1 - a2) + a2) ** 0.5
+    return 0.5 / (sum_i + sum_o)
+
+
+@dataclass(frozen=True, eq=False)
+class LobeAlbedo:
+    """Share of the light from one direction that a GGX lobe reflects: Chebyshev polynomials in 2 sqrt(cosine) - 1.
+
+    `single` (R G B) is that of one reflection, `whole` as if microfacets reflected all. `further` (R G B) is the part
+    of what one reflection leaves between them, `1 - whole`, that more reflections let out. `mean` (R G B) is the
+    share of light from everywhere that all reflections let out, `mean_whole` that of `whole`.
+    """
+
+    single: Float64[np.ndarray, "3 k"]
+    whole: Float64[np.ndarray, " k"]
+    further: Float64[np.ndarray, " 3"]
+    mean: Float64[np.ndarray, " 3"]
+    mean_whole: float
+
+
+@cache
+def lobe_albedo(alpha: float, f0: Triple, metallic: float) -> LobeAlbedo:
+    """Integrate the lobe for a GGX roughness `alpha`."""
+    x = (1 - np.cos(np.pi * (np.arange(ANGLES) + 0.5) / ANGLES)) / 2
+    rows = np.array([_integrals(float(root * root), alpha, f0, metallic) for root in x])
+    fits = np.polynomial.chebyshev.chebfit(2 * x - 1, rows, DEGREE)
+    nodes, weights = np.polynomial.legendre.leggauss(2 * ANGLES)
+    cosine, weights = (nodes + 1) / 2, weights / 2
+    mean = 2 * np.polynomial.chebyshev.chebval(2 * np.sqrt(cosine) - 1, fits) @ (weights * cosine)
+    facet = np.array([2 * (weights * cosine) @ fresnel(cosine, each, metallic) for each in f0])
+    # A bounce in the gaps lets `mean[3]` out and keeps the rest for the next: a geometric series of bounces 2, 3, ...
+    further = facet**2 * mean[3] / (1 - facet * (1 - mean[3]))
+    return LobeAlbedo(fits[:, :3].T, fits[:, 3], further, mean[:3] + (1 - mean[3]) * further, float(mean[3]))
+
+
+def _integrals(cosine: float, alpha: float, f0: Triple, metallic: float) -> Float64[np.ndarray, " 4"]:
+    """Return the light that one reflection lets out, R G B and with F = 1: means over visible normals.
+
+    Those are on the unit sphere's part that the stretched view sees (Dupuy & Benyoub 2023).
+    """
+    # Gauss's nodes lie close at the ends: where facets lean so far that light goes down again is a small end of u.
+    nodes, weights = np.polynomial.legendre.leggauss(QUADRATURE)
+    u, v = np.meshgrid((nodes + 1) / 2, (np.arange(QUADRATURE) + 0.5) / QUADRATURE)
+    wi = np.array([np.sqrt(1 - cosine * cosine), 0.0, cosine])
+    stretched = wi * [alpha, alpha, 1]
+    stretched /= np.linalg.norm(stretched)
+    z = (1 - u) * (1 + stretched[2]) - stretched[2]
+    around = np.sqrt(np.maximum(1 - z * z, 0))
+    cap = np.stack([around * np.cos(2 * np.pi * v), around * np.sin(2 * np.pi * v), z], axis=-1) + stretched
+    m = cap * [alpha, alpha, 1]
+    m /= np.linalg.norm(m, axis=-1, keepdims=True)
+    facing = m @ wi
+    out = 2 * facing * m[..., 2] - cosine
+    seen = np.where(out > 0, _masking(np.maximum(out, 1e-9), cosine, alpha), 0.0)
+    parts = np.stack([*(fresnel(facing, each, metallic) * seen for each in f0), seen])
+    return np.asarray(parts.mean(axis=1) @ (weights / 2))
+
+
+def _masking(out: Float64[np.ndarray, "n n"], cosine: float, alpha: float) -> Float64[np.ndarray, "n n"]:
+    """Return G / G1 towards the light's side."""
+    g1 = 2 * cosine / (cosine + np.sqrt(cosine**2 * (1 - alpha**2) + alpha**2))
+    return np.asarray(smith_visibility(cosine, out, alpha) * 4 * cosine * out / g1)
+
+
+def _polynomial(coefficients: Float64[np.ndarray, " k"], x: Numbers) -> Numbers:
+    """Return a Chebyshev series by Clenshaw's recurrence, for numbers of Dr.Jit."""
+    last, before = 0.0 * x, 0.0 * x
+    for value in coefficients[:0:-1]:
+        last, before = float(value) + 2 * x * last - before, last
+    return float(coefficients[0]) + x * last - before
+
+
+def register() -> None:
+    """Make the material known to Mitsuba's current variant."""
+    import mitsuba as mi
+
+    variant = str(mi.variant())
+    if variant not in _registered:
+        mi.register_bsdf(PLUGIN, _material())
+        _registered.add(variant)
+
+
+def _material() -> type:
+    """Return the material's class, which is another for each variant."""
+    import drjit as dr
+    import mitsuba as mi
+
+    class EnergyKeeping(mi.BSDF):
+        """See `energy_keeping`."""
+
+        def __init__(self, props: Numbers) -> None:
+            super().__init__(props)
+            self.base, self.metallic = props.get_texture("base_color"), float(props["metallic"])
+            self.alpha = max(float(props["roughness"]) ** 2, LEAST_ALPHA)
+            f0 = self._normal_reflectance(0.08 * float(props["specular"]))
+            self.f0, self.lobe = f0, lobe_albedo(self.alpha, f0, self.metallic)
+            self.facets = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, self.alpha, True)
+            glossy = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide
+            diffuse = mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide
+            self.m_components, self.m_flags = [glossy, diffuse], glossy | diffuse
+
+        def _normal_reflectance(self, dielectric: float) -> Triple:
+            """Return F0, R G B; a metal's is its colour, which must be one for the whole surface."""
+            if self.metallic == 0:
+                return (dielectric,) * 3
+            color = np.array(self.base.eval(dr.zeros(mi.SurfaceInteraction3f))).ravel()
+            red, green, blue = (1 - self.metallic) * dielectric + self.metallic * color
+            return float(red), float(green), float(blue)
+
+        def _shares(self, cosine: Numbers) -> tuple[Numbers, Numbers]:
+            """Return what single reflection lets out, and what the gaps still hold."""
+            x = 2 * dr.sqrt(dr.clip(cosine, 0, 1)) - 1
+            single = mi.Color3f(*[_polynomial(each, x) for each in self.lobe.single])
+            return dr.clip(single, 0, 1), dr.clip(1 - _polynomial(self.lobe.whole, x), 0, 1)
+
+        def _below(self, cosine: Numbers) -> Numbers:
+            """Return what the lobe leaves to the diffuse base."""
+            single, held = self._shares(cosine)
+            return dr.maximum(1 - single - held * mi.Color3f(*self.lobe.further.tolist()), 0)
+
+        def _base(self, si: Numbers, active: Numbers) -> Numbers:
+            return (1 - self.metallic) * self.base.eval(si, active)
+
+        def _glossy_share(self, si: Numbers, active: Numbers) -> Numbers:
+            """Return the probability of sampling the lobe: its share of what is reflected."""
+            cosine = mi.Frame3f.cos_theta(si.wi)
+            single, held = self._shares(cosine)
+            gaps = held * mi.Color3f(*self.lobe.further.tolist())
+            lobe, rest = dr.mean(single), dr.mean(gaps + self._base(si, active) * self._below(cosine))
+            return lobe / dr.maximum(lobe + rest, 1e-6)
+
+        def sample(
+            self, ctx: Numbers, si: Numbers, sample1: Numbers, sample2: Numbers, active: Numbers = True
+        ) -> Numbers:
+            """Draw a direction; a context's choice of components is not heeded."""
+            is_glossy = sample1 < self._glossy_share(si, active)
+            normal, _ = self.facets.sample(si.wi, sample2)
+            even = mi.warp.square_to_cosine_hemisphere(sample2)
+            glossy, diffuse = (int(mi.BSDFFlags[f"{name}Reflection"]) for name in ("Glossy", "Diffuse"))
+            bs: Numbers = mi.BSDFSample3f()
+            bs.wo, bs.eta = dr.select(is_glossy, mi.reflect(si.wi, normal), even), 1.0
+            bs.sampled_component = dr.select(is_glossy, mi.UInt32(0), mi.UInt32(1))
+            bs.sampled_type = dr.select(is_glossy, mi.UInt32(glossy), mi.UInt32(diffuse))
+            value, bs.pdf = self.eval_pdf(ctx, si, bs.wo, active)
+            found = bs.pdf > 0
+            return bs, dr.select(found, value / dr.select(found, bs.pdf, 1), 0)
+
+        def eval(self, ctx: Numbers, si: Numbers, wo: Numbers, active: Numbers = True) -> Numbers:
+            """Return the BSDF times cosine."""
+            return self.eval_pdf(ctx, si, wo, active)[0]
+
+        def pdf(self, ctx: Numbers, si: Numbers, wo: Numbers, active: Numbers = True) -> Numbers:
+            """Return the density of `sample`, per solid angle."""
+            return self.eval_pdf(ctx, si, wo, active)[1]
+
+        def eval_pdf(self, _ctx: Numbers, si: Numbers, wo: Numbers, active: Numbers = True) -> Numbers:
+            """Return both."""
+            cosine_i, cosine_o = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(wo)
+            seen = active & (cosine_i > 0) & (cosine_o > 0)
+            cosine_i, cosine_o = dr.maximum(cosine_i, 1e-6), dr.maximum(cosine_o, 1e-6)
+            normal = dr.normalize(si.wi + wo)
+            facing = dr.maximum(dr.dot(si.wi, normal), 1e-6)
+            strength = self.facets.eval(normal) * smith_visibility(cosine_i, cosine_o, self.alpha)
+            glossy = strength * mi.Color3f(*[fresnel(facing, each, self.metallic) for each in self.f0])
+            value = cosine_o * (glossy + self._even(si, cosine_i, cosine_o, seen))
+            share = self._glossy_share(si, seen)
+            pdf = share * self.facets.pdf(si.wi, normal) / (4 * facing) + (1 - share) * cosine_o / dr.pi
+            return dr.select(seen, value, 0), dr.select(seen, pdf, 0)
+
+        def _even(self, si: Numbers, cosine_i: Numbers, cosine_o: Numbers, active: Numbers) -> Numbers:
+            """Return further reflections (Kulla & Conty 2017) and the base under the lobe (Kelemen 2001)."""
+            held_i, held_o = self._shares(cosine_i)[1], self._shares(cosine_o)[1]
+            mean_held = max(1 - self.lobe.mean_whole, 1e-6)
+            gaps = held_i * held_o / (dr.pi * mean_held) * mi.Color3f(*self.lobe.further.tolist())
+            mean_left = np.maximum(1 - self.lobe.mean, 1e-6)
+            below = self._below(cosine_i) * self._below(cosine_o) / mi.Color3f(*mean_left.tolist())
+            return gaps + self._base(si, active) * below / dr.pi
+
+        def eval_diffuse_reflectance(self, si: Numbers, active: Numbers = True) -> Numbers:
+            """Return the base's albedo, which guides denoisers."""
+            return self._base(si, active)
+
+        def traverse(self, cb: Numbers) -> None:
+            cb.put("base_color", self.base, mi.ParamFlags.Differentiable)
+
+        def to_string(self) -> str:
+            return f"EnergyKeeping[alpha={self.alpha}, metallic={self.metallic}]"
+
+    return EnergyKeeping

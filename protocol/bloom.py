@@ -1,0 +1,57 @@
+"""Bloom: light that the lens scatters around bright things ([P1] 4.2), of what relighting changes alone.
+
+The camera's picture has the bloom of the real room already. So only the change of radiance is scattered: a share of
+it leaves its place and arrives around it, negative where an object hides a lamp. What arrives is what left. What an
+object hides is taken as it is around there: the object itself gets the bloom of the room, and no trace of what is
+behind it.
+"""
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from deltalight.protocol.frames import ViewFrame, decode_lut, linear_color
+
+WIDTHS = (0.01, 0.03, 0.09)
+"""Of the picture's width: standard deviations of the three parts of equal light that scattered light spreads to."""
+PASSES = 3
+"""Boxes that follow each other: nearly a Gaussian, of finite reach, in a time that does not grow with its width."""
+
+
+def scattered(change: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
+    """Return light spread around where it was; what leaves the picture is lost."""
+    parts = [_spread(change, width * change.shape[1]) for width in WIDTHS]
+    return np.asarray(sum(parts) / np.float32(len(parts)), np.float32)
+
+
+def _spread(change: Float32[np.ndarray, "h w 3"], sigma_px: float) -> Float32[np.ndarray, "h w 3"]:
+    width = 2 * round((np.sqrt(12 * sigma_px**2 / PASSES + 1) - 1) / 2) + 1
+    for _ in range(PASSES):
+        change = np.asarray(cv2.blur(change, (width, width), borderType=cv2.BORDER_CONSTANT))
+    return change
+
+
+def bloomed(
+    color: UInt8[np.ndarray, "h w 3"],
+    linear: Float32[np.ndarray, "h w 3"],
+    coverage: Float32[np.ndarray, "h w"],
+    frame: ViewFrame,
+    share: float,
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Return a relit picture with bloom of its change; where none arrives it is the same to the bit.
+
+    `linear` is the picture in camera units, beyond white where objects are, `coverage` what they cover; `share`
+    0..1 is the part of the light that is scattered.
+    """
+    changed = (color != frame.color).any(axis=2, keepdims=True) | (coverage[..., None] > 0)
+    if not changed.any():
+        return color
+    lut, scale = decode_lut(frame.response), np.float32(frame.exposure_scale)
+    camera = linear_color(frame, frame.color)
+    hidden = np.clip(coverage, 0, 1)[..., None]
+    around = scattered(camera) / scattered(np.ones_like(camera))
+    change = np.where(changed, linear - camera + hidden * (camera - around), 0).astype(np.float32)
+    before = np.where(changed, linear * scale, lut[color, np.arange(3)])
+    after = before + share * scale * (scattered(change) - change)
+    codes = [np.interp(after[..., c], lut[:, c], np.arange(256)) for c in range(3)]
+    return np.asarray(np.rint(np.stack(codes, axis=-1)), np.uint8)

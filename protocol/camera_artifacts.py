@@ -1,0 +1,107 @@
+"""What a camera does to a picture, learned from its frames and put on the virtual part: blur, then noise."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+
+from deltalight.protocol.camera_blur import (
+    LEAST_MOTION_PX,
+    NO_MOTION,
+    Color,
+    Coverage,
+    LensBlur,
+    blur_kernels,
+    blurred,
+    measure_blur,
+)
+from deltalight.protocol.camera_noise import CameraNoise, NoiseModel, add_noise
+from deltalight.protocol.frames import ViewFrame
+
+MOST_MEASURED = 8
+"""Frames in which the lens's blur is measured."""
+LONGEST_STEP_NS = 500_000_000
+"""Between two frames; what a pose does for longer tells nothing about the exposure."""
+
+
+@dataclass(frozen=True, eq=False)
+class FrameArtifacts:
+    """What is known of one frame; None: nothing."""
+
+    frame: ViewFrame
+    noise: NoiseModel | None
+    kernels: Float64[np.ndarray, "3 k k"] | None
+
+    def applied(self, color: Color, coverage: Coverage) -> Color:
+        """Return a picture of the frame with blur and noise on its virtual part; as it is while none is known."""
+        frame = self.frame
+        if self.kernels is not None:
+            color, coverage = blurred(color, coverage, self.kernels, frame.response)
+        if self.noise is None:
+            return color
+        return add_noise(color, coverage, self.noise, frame.frame_id, frame.response)
+
+
+class CameraArtifacts:
+    """Learns a camera's noise and the blur of its lens, and follows its motion."""
+
+    def __init__(self) -> None:
+        self._noise = CameraNoise()
+        self._lens: list[LensBlur] = []
+        self._last: ViewFrame | None = None
+        self._pose: Float64[np.ndarray, "4 4"] = np.eye(4)
+        self._motion_px = NO_MOTION
+
+    def forget(self) -> None:
+        """Forget everything: other frames come from another camera."""
+        self.__init__()  # type: ignore[misc]
+
+    def observe(
+        self,
+        frame: ViewFrame,
+        world_from_camera: Float64[np.ndarray, "4 4"],
+        place_m: Float64[np.ndarray, " 3"],
+    ) -> FrameArtifacts:
+        """Learn from a frame, and return what its virtual part gets. The same frame again changes nothing.
+
+        `world_from_camera` is the pose that it is rendered with, `place_m` where the objects are (world).
+        """
+        self._noise.observe(frame)
+        if frame is not self._last:
+            self._follow(frame, world_from_camera, place_m)
+            self._last, self._pose = frame, world_from_camera
+        from_centre = np.nan_to_num(_pixel(frame, self._pose, place_m) - frame.camera.matrix[:2, 2])
+        kernels = blur_kernels(self._lens_blur(), self._motion_px, from_centre)
+        return FrameArtifacts(frame, self._noise.model, kernels)
+
+    def _lens_blur(self) -> LensBlur | None:
+        """Return the medians of what was measured."""
+        if not self._lens:
+            return None
+        sigma, red, blue = np.median([(each.sigma_px, each.red, each.blue) for each in self._lens], axis=0)
+        return LensBlur(float(sigma), float(red), float(blue))
+
+    def _follow(
+        self, frame: ViewFrame, pose: Float64[np.ndarray, "4 4"], place_m: Float64[np.ndarray, " 3"]
+    ) -> None:
+        """Find how far the objects' place moves in the picture; where it hardly does, measure the lens's blur."""
+        last = self._last
+        step_ns = 0 if last is None else frame.timestamp_ns - last.timestamp_ns
+        moved = NO_MOTION
+        if 0 < step_ns <= LONGEST_STEP_NS:
+            moved = _pixel(frame, pose, place_m) - _pixel(frame, self._pose, place_m)
+            moved = moved if np.isfinite(moved).all() else NO_MOTION
+        known = frame.exposure_s is not None
+        self._motion_px = moved * min((frame.exposure_s or 0.0) * 1e9 / max(step_ns, 1), 1.0)
+        is_still = float(np.linalg.norm(self._motion_px if known else moved)) < LEAST_MOTION_PX
+        if is_still and len(self._lens) < MOST_MEASURED:
+            found = measure_blur(frame)
+            self._lens += [] if found is None else [found]
+
+
+def _pixel(
+    frame: ViewFrame, pose: Float64[np.ndarray, "4 4"], place_m: Float64[np.ndarray, " 3"]
+) -> Float64[np.ndarray, " 2"]:
+    """Return where a place is in the picture; NaN behind the camera."""
+    seen = (place_m - pose[:3, 3]) @ pose[:3, :3]
+    return np.asarray(frame.camera.project(seen[None])[0] if seen[2] > 0 else np.full(2, np.nan))

@@ -1,0 +1,76 @@
+"""Bloom: light is scattered and none is made, and what it does not reach stays the camera's."""
+
+import numpy as np
+import pytest
+
+from deltalight.protocol.bloom import bloomed, scattered
+from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.frames import ViewFrame, decode_lut
+
+WIDTH, HEIGHT = 320, 240
+CAMERA = CameraModel(WIDTH, HEIGHT, np.array([[300, 0, 160], [0, 300, 120], [0, 0, 1.0]]))
+LUT = decode_lut(None)
+
+
+def lamp(radiance: float, code: int = 60) -> tuple[ViewFrame, np.ndarray, np.ndarray, np.ndarray]:
+    """A grey picture, and the same with a small virtual lamp: its codes, its radiance and what the lamp covers."""
+    frame = ViewFrame(0, 0, np.full((HEIGHT, WIDTH, 3), code, np.uint8), CAMERA, exposure_scale=0.5)
+    linear = np.full((HEIGHT, WIDTH, 3), LUT[code, 0] / 0.5, np.float32)
+    color, inside = frame.color.copy(), np.s_[118:122, 158:162]
+    linear[inside] = radiance
+    color[inside] = np.rint(np.interp(radiance * 0.5, LUT[:, 0], np.arange(256)))
+    coverage = np.zeros((HEIGHT, WIDTH), np.float32)
+    coverage[inside] = 1
+    return frame, color, linear, coverage
+
+
+def test_light_is_spread_and_none_is_made() -> None:
+    change = np.zeros((HEIGHT, WIDTH, 3), np.float32)
+    change[120, 160] = 5.0, -2.0, 0.0
+    found = scattered(change)
+    np.testing.assert_allclose(found.sum(axis=(0, 1)), [5.0, -2.0, 0.0], rtol=1e-4, atol=1e-6)
+    assert found[120, 160, 0] == found[..., 0].max() < 0.1
+    assert np.abs(found[:, 300:]).max() == 0
+
+
+def test_a_bright_thing_glows_on_what_is_around_it() -> None:
+    """And is itself as bright as what it keeps, beyond white or not."""
+    frame, color, linear, coverage = lamp(radiance=40.0)
+    found = bloomed(color, linear, coverage, frame, 0.2)
+    before, after = LUT[color, 0], LUT[found, 0]
+    assert found[120, 160, 0] == 255
+    assert after[120, 168, 0] > 1.5 * before[120, 168, 0]
+    change = np.where((color != frame.color), linear - LUT[60, 0] / 0.5, 0)
+    expected = before + 0.2 * 0.5 * scattered(change.astype(np.float32))
+    around = (color == frame.color) & (expected < 0.9)
+    np.testing.assert_allclose(after[around], expected[around], rtol=0.02, atol=1e-3)
+
+
+def test_where_nothing_arrives_the_picture_is_the_cameras() -> None:
+    frame, color, linear, coverage = lamp(radiance=1.0)
+    found = bloomed(color, linear, coverage, frame, 0.1)
+    assert np.array_equal(found[:, 290:], color[:, 290:])
+    assert np.array_equal(found[:30], color[:30])
+    assert bloomed(frame.color, linear, 0 * coverage, frame, 0.1) is frame.color
+
+
+def test_a_lamp_that_is_hidden_takes_its_glow_along() -> None:
+    frame, color, linear, coverage = lamp(radiance=0.0, code=200)
+    found = bloomed(color, linear, coverage, frame, 0.5)
+    assert found[120, 166, 0] < 200
+    assert found[120, 160, 0] > color[120, 160, 0] == 0
+    kept = LUT[found, 0].sum(dtype=float) / LUT[color, 0].sum(dtype=float)
+    assert kept == pytest.approx(1.0, abs=1e-3)
+
+
+def test_what_an_object_hides_does_not_shine_through() -> None:
+    """Stripes behind an even object, as bright in the mean: it stays even."""
+    frame, _, _, _ = lamp(radiance=1.0)
+    frame.color[:, ::8] = 200
+    linear = LUT[frame.color, 0] / 0.5
+    color, coverage = frame.color.copy(), np.zeros((HEIGHT, WIDTH), np.float32)
+    inside = np.s_[60:180, 80:240]
+    color[inside], linear[inside], coverage[inside] = 100, LUT[100, 0] / 0.5, 1
+    found = bloomed(color, linear, coverage, frame, 0.3)
+    row = found[120, 100:220, 0].astype(int)
+    assert np.abs(np.diff(row)).max() <= 1
