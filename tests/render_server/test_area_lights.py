@@ -105,7 +105,7 @@ def solve_unshadowed(gpu: GpuContext, document: SceneDocument) -> tuple[Fields, 
     renderer = SceneRenderer(gpu, document)
     renderer.render(frame(plain(0)))
     assert renderer.graph is not None
-    found, unshadowed = fields_of(renderer), array_of(renderer.graph["direct light"].mu)[..., 3]
+    found, unshadowed = fields_of(renderer), array_of(renderer.graph["direct light"].light.mu)[..., 3]
     renderer.release()
     return found, unshadowed
 

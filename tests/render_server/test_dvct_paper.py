@@ -175,7 +175,7 @@ def test_the_floor_loses_the_radiance_that_it_had(
 
 def test_where_the_real_scene_keeps_the_light_off_nothing_changes(gpu: GpuContext, assets: Path) -> None:
     with rendered(gpu, scene(assets, real="roofed")) as graph:
-        mu, rho = texels(graph["direct light"].mu), texels(graph["direct light"].rho)
+        mu, rho = texels(graph["direct light"].light.mu), texels(graph["direct light"].light.rho)
         cells = level_0(graph["filter"].delta)
     assert (mu[..., 3] > 0).any()
     assert not cells.any()
