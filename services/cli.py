@@ -6,9 +6,10 @@ SIGTERM.
 
 import signal
 import sys
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 from typer.main import get_command
 
 from deltalight import __version__
@@ -39,8 +40,23 @@ from deltalight.services.signals import Terminated, raise_on_sigterm
 from deltalight.services.warm_spare import wait_if_spare
 
 DEBUG_FLAG = "--debug"
+PYDANTIC_PREFIX = "Value error, "  # by which pydantic, which typer checks options with, begins such sentences
+
+
+class _Commands(TyperGroup):
+    """Shows wrong values of options without words of pydantic's."""
+
+    def invoke(self, ctx: Any) -> Any:  # noqa: ANN401 - click's context, of typer's own click in newer versions
+        """Run the command that was named."""
+        try:
+            return super().invoke(ctx)
+        except typer.BadParameter as fault:
+            fault.message = fault.message.removeprefix(PYDANTIC_PREFIX)
+            raise
+
 
 app = typer.Typer(
+    cls=_Commands,
     no_args_is_help=True,
     context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,

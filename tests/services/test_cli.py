@@ -125,6 +125,12 @@ def test_wrong_use_ends_with_2_and_names_what_is_wrong(
     assert "Traceback" not in done.stderr
 
 
+def test_a_wrong_choice_is_told_in_plain_words(cli: RunCli) -> None:
+    done = cli("recordings", "export", "take.mcap", "--format", "fbx", "-o", "out")
+    said = " ".join(done.stderr.replace("│", " ").split())
+    assert "Invalid value for '--format': 'fbx' is not one of 'dataset', 'colmap'" in said
+
+
 def test_help_loads_no_heavy_module() -> None:
     heavy = "('cv2', 'moderngl', 'zmq', 'fastapi', 'numpy', 'pydantic')"
     code = f"import sys, deltalight.services.cli\nprint([name for name in {heavy} if name in sys.modules])"
