@@ -13,6 +13,7 @@ from deltalight.services.exports.nerfstudio import write_nerfstudio
 from deltalight.services.exports.posed_views import PosedView, posed_views
 from deltalight.services.exports.ros_bags import export_bag
 from deltalight.services.exports.scene_glb import write_scene_glb
+from deltalight.services.exports.video import export_video
 from deltalight.services.files import appearing, make_output_folder, require_absent
 from deltalight.services.recording_copies import Copied, Track, export_recording
 
@@ -36,6 +37,8 @@ def export_as(wanted: ExportFormat, path: Path, out: Path, scene: Path | None, t
             return export_bag(open_source(path), out, "ros2", track)
         case ExportFormat.GLB:
             return _export_glb(open_source(path), out, scene, track)
+        case ExportFormat.MP4:
+            return export_video(open_source(path), out, track)
         case ExportFormat.COLMAP:
             return _export_folder(open_source(path), out, write_colmap, track)
         case ExportFormat.NERFSTUDIO:
