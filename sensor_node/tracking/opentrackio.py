@@ -2,8 +2,9 @@
 
 Facts of the standard that this follows: the 16-byte packet header and its Fletcher-16 checksum (modulus 256),
 segments, multicast groups 239.135.1.<source number> at port 55555 (section "Transport recommendations"); a
-right-handed stage in metres with z up, y forward and x to camera-right of a camera at rest, rotations in degrees, intrinsic about z (pan),
-x (tilt), y (roll) (field `transforms`), "clockwise" seen along the axis, so right-handed; lenses of OpenLensIO.
+right-handed stage in metres with z up, y forward and x to camera-right of a camera at rest; rotations in degrees,
+intrinsic about z (pan), x (tilt), y (roll) (field `transforms`), "clockwise" seen along the axis, so right-handed;
+lenses of OpenLensIO.
 """
 
 import json
