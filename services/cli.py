@@ -34,6 +34,7 @@ from deltalight.services.commands.replay import replay
 from deltalight.services.commands.schema import schema
 from deltalight.services.commands.server import server
 from deltalight.services.commands.up import up
+from deltalight.services.commands.virtual_camera import virtual_camera
 from deltalight.services.logs import configure_logging
 from deltalight.services.parent_death_signal import end_with_supervisor
 from deltalight.services.signals import Terminated, raise_on_sigterm
@@ -78,6 +79,7 @@ for command in (
     schema,
     board,
     ping,
+    virtual_camera,
 ):
     app.command(epilog=examples_of(command.__name__))(command)
 app.add_typer(api, name="api")

@@ -186,7 +186,8 @@ def _terms(lens: Lens, focal: float) -> Float64[np.ndarray, " k"]:
 class PacketReader:
     """Turns packets into samples; puts segments together.
 
-    Packets that are repeated, foreign or damaged are left out; `fault` is what was wrong with the last one, if anything.
+    Packets that are repeated, foreign or damaged are left out; `fault` is what was wrong with the last one, if
+    anything.
     """
 
     fault: str = ""

@@ -55,6 +55,7 @@ COMMANDS = {
     "bench soak",
     "bench sweep",
     "gpu-check",
+    "virtual-camera",
 }
 
 
@@ -78,7 +79,7 @@ def test_every_command_is_there_and_has_help() -> None:
 def test_help_has_a_short_form_and_ends_with_examples_that_can_be_run() -> None:
     root = get_command(app)
     assert isinstance(root, TyperGroup)
-    for name, lines in EXAMPLES.items():
+    for name, lines in ((function.replace("_", "-"), lines) for function, lines in EXAMPLES.items()):
         done = CliRunner().invoke(app, [name, "-h"], prog_name="deltalight", terminal_width=200)
         assert done.exit_code == 0, done.output
         shown = " ".join(done.output.split())
