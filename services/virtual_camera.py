@@ -1,7 +1,7 @@
 """A virtual camera of Linux: pictures written to a device of v4l2loopback, which other programs read.
 
-The kernel module is addressed by ioctl alone, without a library of another licence. Structures and numbers are those of
-<linux/videodev2.h> (Video for Linux API, sections "ioctl VIDIOC_QUERYCAP" and "ioctl VIDIOC_G_FMT, VIDIOC_S_FMT").
+The kernel module is addressed by ioctl alone, without a library of another licence. Structures and numbers are those
+of <linux/videodev2.h> (Video for Linux API, sections "ioctl VIDIOC_QUERYCAP" and "ioctl VIDIOC_G_FMT, VIDIOC_S_FMT").
 """
 
 import errno
