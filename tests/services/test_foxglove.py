@@ -67,7 +67,7 @@ class Watcher:
 @contextmanager
 def watching(port: int) -> Iterator[Watcher]:
     address, protocol = f"ws://127.0.0.1:{port}", Subprotocol("foxglove.sdk.v1")
-    with connect(address, subprotocols=[protocol], max_size=None, max_queue=None) as socket:
+    with connect(address, subprotocols=[protocol], max_size=None, max_queue=1 << 16) as socket:
         yield Watcher(socket)
 
 
