@@ -49,9 +49,9 @@ class RelitPictures:
     def add_frame(self, timestamp_ns: int) -> None:
         """Take note of a frame that was written."""
         self._frames.append(timestamp_ns)
-        for captured_ns, picture in self._waiting:
-            if captured_ns == timestamp_ns:
-                self._pair(captured_ns, picture)
+        picture = dict(self._waiting).get(timestamp_ns)  # of several of one frame, the newest
+        if picture is not None:
+            self._pair(timestamp_ns, picture)
 
     def _pair(self, timestamp_ns: int, picture: bytes) -> None:
         self._write(timestamp_ns, picture)
