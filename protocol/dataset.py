@@ -85,6 +85,7 @@ class DatasetReader:
         self._pose_times = [pose.timestamp_ns for pose in self._poses]
         self.fisheye = self._read_fisheye()
         self._fisheye_folder = self._open_fisheye()
+        self._composites = self._read_composites()
         self._check_first_pictures()
 
     def __len__(self) -> int:
@@ -118,6 +119,7 @@ class DatasetReader:
             world_from_camera=pose_at(self._poses, self._pose_times, entry.timestamp_ns, self.tolerance_ns),
             color_jpeg=data if is_jpeg(data) else None,
             fisheye=None if self._fisheye_folder is None else self._fisheye_folder.at(entry.timestamp_ns),
+            composite=self._composite_at(entry.timestamp_ns),
         )
 
     @property
@@ -136,6 +138,10 @@ class DatasetReader:
             steps, self._depth.camera, entry.path, "calibration/depth.yaml (or, without it, rgb.yaml)"
         )
         return depth_from_steps(steps, self._depth.scale, self._depth.camera, self._depth.noise_sigma_m)
+
+    def _composite_at(self, timestamp_ns: int) -> bytes | None:
+        path = self._composites.get(timestamp_ns)
+        return None if path is None else read_bytes(path)
 
     def _check_first_pictures(self) -> None:
         """Detect a folder with wrong sizes before anybody has begun to write results."""
@@ -246,6 +252,10 @@ class DatasetReader:
             return read_fisheye_list(path)
         self.notes.append(f"{self.path} has no fisheye.txt; light comes from the scene document.")
         return []
+
+    def _read_composites(self) -> dict[int, Path]:
+        path = self.path / "composite.txt"
+        return {entry.timestamp_ns: entry.path for entry in read_list(path)} if path.is_file() else {}
 
     def _open_fisheye(self) -> FisheyeFolder | None:
         calibration = load_fisheye_calibration(self.path) if self.fisheye else None

@@ -14,13 +14,14 @@ from deltalight.protocol.dataset_fisheye import FisheyeFolderWriter
 from deltalight.protocol.dataset_lists import format_timestamp
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import DepthImage, SensorFrame
-from deltalight.protocol.pictures import encode_png, exact_depth_scale, steps_from_depth
+from deltalight.protocol.pictures import encode_png, exact_depth_scale, is_jpeg, steps_from_depth
 from deltalight.protocol.poses import wxyz_from_rotation
 
 DEFAULT_DEPTH_SCALE = 0.001
 HEADERS = {
     "rgb.txt": "# timestamp filename [exposure_s]",
     "depth.txt": "# timestamp filename",
+    "composite.txt": "# timestamp filename (the relit picture of the frame)",
     "groundtruth.txt": "# timestamp tx ty tz qx qy qz qw (world_from_camera)",
 }
 
@@ -79,6 +80,8 @@ class DatasetWriter:
         if frame.fisheye is not None:
             self._fisheye.add(frame.fisheye)
         self._add_color(frame)
+        if frame.composite is not None:
+            self._add_composite(frame.composite, frame.timestamp_ns)
         self._last_ns = frame.timestamp_ns
         self._count += 1
 
@@ -114,6 +117,12 @@ class DatasetWriter:
             self._append("groundtruth.txt", frame.timestamp_ns, _pose_words(frame.world_from_camera))
         exposure = "" if frame.exposure_s is None else f" {frame.exposure_s!r}"
         self._append("rgb.txt", frame.timestamp_ns, name + exposure)
+
+    def _add_composite(self, picture: bytes, timestamp_ns: int) -> None:
+        (self.path / "composite").mkdir(exist_ok=True)
+        name = f"composite/{self._count:06d}.{'jpg' if is_jpeg(picture) else 'png'}"
+        (self.path / name).write_bytes(picture)
+        self._append("composite.txt", timestamp_ns, name)
 
     def _add_depth(self, depth: DepthImage, timestamp_ns: int) -> None:
         if self._depth_camera is None:

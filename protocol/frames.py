@@ -90,7 +90,7 @@ class SensorFrame:
     is linear R G B for each code (None = sRGB). `exposure_s` None = reference exposure. `world_from_camera` is a
     given pose, if any. `color_jpeg` holds the encoded bytes if the source has them. `fisheye` are the current
     fish-eye pictures. `found_pose` is what a node once found by the marker board: for viewers, because whoever
-    renders the frame finds it again.
+    renders the frame finds it again. `composite` is the picture that a render server once made of it, JPEG or PNG.
     """
 
     frame_id: int
@@ -105,6 +105,7 @@ class SensorFrame:
     color_jpeg: bytes | None = None
     fisheye: FisheyePictures | None = None
     found_pose: Float64[np.ndarray, "4 4"] | None = None
+    composite: bytes | None = None
 
 
 @dataclass(frozen=True, eq=False)

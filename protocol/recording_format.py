@@ -1,7 +1,8 @@
 """Contents of a recording (docs/formats.md 2): topics, Deltalight's own messages, and Foxglove's beside them.
 
 Every frame is a group of messages with one log time, the capture time: picture, depth and calibration as Foxglove
-displays them, and last a `FrameRecord`, which completes the group. The first group begins with a `SessionRecord` and,
+displays them, and last a `FrameRecord`, which completes the group. A relit picture may follow later, with the same
+log time. The first group begins with a `SessionRecord` and,
 if a scene document is attached, what Foxglove displays of it.
 Fish-eye pictures have groups of their own (`recording_fisheye`).
 """
@@ -31,6 +32,7 @@ FISHEYE_TOPIC, FISHEYE_LINEAR_TOPIC = "/fisheye/image", "/fisheye/linear"
 FISHEYE_CAMERA_TOPIC = "/fisheye/calibration"
 POSE_TOPIC = "/tf"
 SCENE_TOPIC = "/scene"
+COMPOSITE_TOPIC = "/composite"
 SESSION_TOPIC, FRAME_TOPIC = "/deltalight/session", "/deltalight/frame"
 FISHEYE_RECORD_TOPIC = "/deltalight/fisheye"
 FOXGLOVE_TOPICS: dict[str, Any] = {
@@ -43,6 +45,7 @@ FOXGLOVE_TOPICS: dict[str, Any] = {
     FISHEYE_CAMERA_TOPIC: CameraCalibration,
     POSE_TOPIC: FrameTransform,
     SCENE_TOPIC: SceneUpdate,
+    COMPOSITE_TOPIC: CompressedImage,
 }
 WORLD_FRAME, COLOR_FRAME, DEPTH_FRAME, FISHEYE_FRAME = "world", "camera", "depth_camera", "fisheye_camera"
 RESPONSE_BYTES = 256 * 3 * 4

@@ -9,12 +9,19 @@ from jaxtyping import Float64
 
 from deltalight.protocol.calibration import Extrinsics
 from deltalight.protocol.frames import DepthImage, FisheyePictures, SensorFrame
-from deltalight.protocol.pictures import encode_png, exact_depth_scale, known_depth, steps_from_depth
+from deltalight.protocol.pictures import (
+    encode_png,
+    exact_depth_scale,
+    is_jpeg,
+    known_depth,
+    steps_from_depth,
+)
 from deltalight.protocol.recording_fisheye import fisheye_messages
 from deltalight.protocol.recording_format import (
     COLOR_CAMERA_TOPIC,
     COLOR_FRAME,
     COLOR_TOPIC,
+    COMPOSITE_TOPIC,
     DEPTH_CAMERA_TOPIC,
     DEPTH_FRAME,
     DEPTH_TOPIC,
@@ -60,6 +67,8 @@ class FrameMessages:
         pose = frame.found_pose if frame.world_from_camera is None else frame.world_from_camera
         if pose is not None:
             yield _transform(pose, WORLD_FRAME, COLOR_FRAME, now)
+        if frame.composite is not None:
+            yield COMPOSITE_TOPIC, composite_message(frame.composite, now)
         yield FRAME_TOPIC, _record(frame, scale).packed()
 
     def _depth(self, depth: DepthImage, scale: float | None, frame: SensorFrame) -> Iterator[TopicMessage]:
@@ -105,6 +114,11 @@ def color_message(frame: SensorFrame) -> bytes:
     """Returns a frame's picture for Foxglove: its JPEG bytes if it has them, else PNG."""
     kind, data = ("jpeg", frame.color_jpeg) if frame.color_jpeg else ("png", encode_png(frame.color))
     return image_message(data, kind, frame.timestamp_ns)
+
+
+def composite_message(picture: bytes, timestamp_ns: int) -> bytes:
+    """Returns a relit picture, JPEG or PNG, for Foxglove; its frame is that of the camera."""
+    return image_message(picture, "jpeg" if is_jpeg(picture) else "png", timestamp_ns)
 
 
 def image_message(data: bytes, kind: str, timestamp_ns: int) -> bytes:

@@ -33,6 +33,7 @@ from deltalight.protocol.recording_fisheye import FisheyeTrack
 from deltalight.protocol.recording_format import (
     COLOR_FRAME,
     COLOR_TOPIC,
+    COMPOSITE_TOPIC,
     DEPTH_TOPIC,
     FISHEYE_RECORD_TOPIC,
     FRAME_TOPIC,
@@ -116,6 +117,8 @@ class RecordingReader:
         try:
             data = CompressedImage.FromString(parts[COLOR_TOPIC]).data
             depth = None if record.depth is None else _depth_image(record.depth, parts[DEPTH_TOPIC])
+            relit = parts.get(COMPOSITE_TOPIC)
+            composite = None if relit is None else CompressedImage.FromString(relit).data
         except (KeyError, ValueError, DecodeError) as error:
             raise DeltalightError(f"{name} is damaged; leave it out of the range of frames.") from error
         color, camera = decode_rgb(data, name), self._camera(record)
@@ -135,6 +138,7 @@ class RecordingReader:
             color_jpeg=data if is_jpeg(data) else None,
             fisheye=self._fisheye.at(record.timestamp_ns),
             found_pose=_found_pose(parts.get(POSE_TOPIC)) if pose is None else None,
+            composite=composite,
         )
 
     def _camera(self, record: FrameRecord) -> CameraModel:

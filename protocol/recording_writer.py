@@ -18,6 +18,7 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.files import ACTIVE_SUFFIX
 from deltalight.protocol.frames import SensorFrame
 from deltalight.protocol.recording_format import (
+    COMPOSITE_TOPIC,
     FOXGLOVE_TOPICS,
     OWN_TOPICS,
     SCENE_ATTACHMENT,
@@ -25,7 +26,7 @@ from deltalight.protocol.recording_format import (
     SESSION_TOPIC,
     SessionRecord,
 )
-from deltalight.protocol.recording_messages import FrameMessages
+from deltalight.protocol.recording_messages import FrameMessages, composite_message
 from deltalight.protocol.recording_scene import scene_message
 from deltalight.protocol.scene import DIGEST_PREFIX, SceneDocument
 
@@ -114,6 +115,12 @@ class RecordingWriter:
             self._writer.flush()
         self._last_ns = frame.timestamp_ns
         self._count += 1
+
+    def add_composite(self, timestamp_ns: int, picture: bytes) -> None:
+        """Append the relit picture, JPEG or PNG, of a frame that was added before without one."""
+        with self._disk_errors():
+            self._write(COMPOSITE_TOPIC, timestamp_ns, composite_message(picture, timestamp_ns))
+            self._writer.flush()
 
     def _check_names(self) -> None:
         if self.path.suffix != ".mcap":

@@ -41,6 +41,8 @@ from deltalight.sensor_node.frame_messages import (
 )
 from deltalight.sensor_node.health import Health
 from deltalight.sensor_node.pose_filter import PoseFilter, PoseFilterSettings
+from deltalight.sensor_node.tracking.receiver import TrackingSettings
+from deltalight.sensor_node.tracking.tracked_camera import TrackedCamera
 from deltalight.sensor_node.view_frames import ViewFrameBuilder
 
 if TYPE_CHECKING:
@@ -77,6 +79,9 @@ class NodeConfig(StrictModel):
     camera: CameraSettings = Field(default=CameraSettings(), description="How a live camera is opened.")
     fisheye: FisheyeSettings | None = Field(
         default=None, description="Camera that sees the light; null = what the source itself brings."
+    )
+    tracking: TrackingSettings | None = Field(
+        default=None, description="Tracking system that gives the camera's pose; null = the marker board."
     )
     color_encoding: Literal["jpeg", "raw"] = Field(
         default="jpeg", description="Code of colour pictures; JPEGs of the source go out as they are."
@@ -118,6 +123,8 @@ def node_camera(config: NodeConfig) -> Camera:
     """
     settings = config.camera.model_copy(update={"realtime": config.realtime, "loop": config.loop})
     camera = open_camera(config.source, settings)
+    if config.tracking is not None:
+        camera = TrackedCamera(camera, config.tracking)
     return (
         camera
         if config.fisheye is None

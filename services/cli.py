@@ -6,9 +6,10 @@ SIGTERM.
 
 import signal
 import sys
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 from typer.main import get_command
 
 from deltalight import __version__
@@ -33,14 +34,30 @@ from deltalight.services.commands.replay import replay
 from deltalight.services.commands.schema import schema
 from deltalight.services.commands.server import server
 from deltalight.services.commands.up import up
+from deltalight.services.commands.virtual_camera import virtual_camera
 from deltalight.services.logs import configure_logging
 from deltalight.services.parent_death_signal import end_with_supervisor
 from deltalight.services.signals import Terminated, raise_on_sigterm
 from deltalight.services.warm_spare import wait_if_spare
 
 DEBUG_FLAG = "--debug"
+PYDANTIC_PREFIX = "Value error, "  # by which pydantic, which typer checks options with, begins such sentences
+
+
+class _Commands(TyperGroup):
+    """Shows wrong values of options without words of pydantic's."""
+
+    def invoke(self, ctx: Any) -> Any:  # noqa: ANN401 - click's context, of typer's own click in newer versions
+        """Run the command that was named."""
+        try:
+            return super().invoke(ctx)
+        except typer.BadParameter as fault:
+            fault.message = fault.message.removeprefix(PYDANTIC_PREFIX)
+            raise
+
 
 app = typer.Typer(
+    cls=_Commands,
     no_args_is_help=True,
     context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
@@ -62,6 +79,7 @@ for command in (
     schema,
     board,
     ping,
+    virtual_camera,
 ):
     app.command(epilog=examples_of(command.__name__))(command)
 app.add_typer(api, name="api")

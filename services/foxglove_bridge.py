@@ -16,19 +16,18 @@ from deltalight.protocol.errors import DeltalightError, install_command
 from deltalight.protocol.frames import SensorFrame
 from deltalight.protocol.keys import Keys
 from deltalight.protocol.messages import CompositeMessage, Message
-from deltalight.protocol.recording_format import COLOR_TOPIC, FOXGLOVE_TOPICS, SCENE_TOPIC
-from deltalight.protocol.recording_messages import FrameMessages, image_message
+from deltalight.protocol.recording_format import COMPOSITE_TOPIC, FOXGLOVE_TOPICS, SCENE_TOPIC
+from deltalight.protocol.recording_messages import FrameMessages, composite_message
 from deltalight.protocol.recording_scene import scene_message
 from deltalight.protocol.scene import SceneDocument
 from deltalight.services.raw_frames import RAW_STREAMS, RawFrameAssembler
 from deltalight.services.recorder import scene_of_server
+from deltalight.services.relit_pictures import relit_picture
 from deltalight.services.stream_queue import StreamQueue
 
 if TYPE_CHECKING:
     from foxglove import Channel, Context
 
-RELIT_TOPIC = "/relit/image"
-TOPICS = {**FOXGLOVE_TOPICS, RELIT_TOPIC: FOXGLOVE_TOPICS[COLOR_TOPIC]}
 POLL_S = 0.1
 SCENE_PERIOD_S = 1.0
 REPEAT_S = 2.0  # what seldom changes comes again, for whoever came late; as nodes do
@@ -68,7 +67,7 @@ class FoxgloveServer:
         logging.getLogger("foxglove").setLevel(logging.WARNING)
         self._context = foxglove.Context()  # whose end closes its channels
         # Before clients can come: a channel that is made later is advertised before it can be subscribed to.
-        self._channels = {topic: _channel(topic, self._context) for topic in TOPICS}
+        self._channels = {topic: _channel(topic, self._context) for topic in FOXGLOVE_TOPICS}
         try:
             self._server = foxglove.start_server(
                 name="Deltalight", host=host, port=port, context=self._context
@@ -95,7 +94,7 @@ class FoxgloveServer:
 def _channel(topic: str, context: "Context") -> "Channel":
     from foxglove import Channel, Schema
 
-    kind = TOPICS[topic]
+    kind = FOXGLOVE_TOPICS[topic]
     data = build_file_descriptor_set(kind).SerializeToString()
     schema = Schema(name=kind.DESCRIPTOR.full_name, encoding="protobuf", data=data)
     return Channel(topic, message_encoding="protobuf", schema=schema, context=context)
@@ -152,9 +151,9 @@ class FoxgloveBridge:
     def _add(self, message: Message, parts: Sequence[memoryview]) -> None:
         if not isinstance(message, CompositeMessage):
             self._assembler.add(message, parts)
-        elif message.encoding == "jpeg":
-            picture = image_message(bytes(parts[0]), "jpeg", message.capture_ns)
-            self.server.publish(RELIT_TOPIC, picture, message.capture_ns)
+        elif (picture := relit_picture(message, parts)) is not None:
+            now_ns = message.capture_ns
+            self.server.publish(COMPOSITE_TOPIC, composite_message(picture, now_ns), now_ns)
 
     def _newest(self) -> SensorFrame | None:
         newest, frame = None, self._assembler.take(is_idle=self._idle_polls >= IDLE_POLLS)
@@ -168,7 +167,7 @@ class FoxgloveBridge:
         if time.monotonic() - self._repeated_s > REPEAT_S:
             self._messages, self._repeated_s = FrameMessages(self._job.extrinsics), time.monotonic()
         for topic, data in self._messages.of(frame):
-            if topic in TOPICS:
+            if topic in FOXGLOVE_TOPICS:
                 self.server.publish(topic, data, frame.timestamp_ns)
 
     def _watch_scene(self, stop: threading.Event) -> None:

@@ -2,8 +2,10 @@
 
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -15,12 +17,15 @@ from deltalight.protocol.frames import BoardPose, ViewFrame, linear_color
 from deltalight.protocol.radiance_files import require_openexr, write_exr
 from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.source import Source
-from deltalight.services.files import make_output_folder
+from deltalight.services.files import make_output_folder, require_absent
 from deltalight.services.object_sizes import size_warnings
+from deltalight.services.video_file import VIDEO_SUFFIX, require_video_support, video_file
 
 if TYPE_CHECKING:
     from deltalight.relighting import RelitPicture
     from deltalight.render_server.renderer import CompositeFrame, SceneRenderer
+
+    Write = Callable[[int, ViewFrame, CompositeFrame], None]
 
 INDEX_FILE = "frames.jsonl"
 
@@ -41,6 +46,11 @@ class RenderJob:
     def with_linear(self) -> bool:
         """Whether anything is written that is linear."""
         return self.with_exr or self.with_layers
+
+    @property
+    def is_video(self) -> bool:
+        """Whether the pictures become one file."""
+        return self.out.suffix == VIDEO_SUFFIX
 
 
 @dataclass
@@ -97,6 +107,8 @@ def run_job(job: RenderJob, progress: Progress) -> RenderSummary:
     A picture is complete before its line in frames.jsonl is written, and each line is written at once, so an
     interrupted run leaves a valid shorter run.
 
+    An `out` that ends in .mp4 is a video of the same pictures, which appears when all frames are rendered.
+
     Raises:
         DeltalightError: bad input, no OpenGL, or the output cannot be written.
     """
@@ -105,7 +117,11 @@ def run_job(job: RenderJob, progress: Progress) -> RenderSummary:
 
     if job.with_linear:
         require_openexr("--exr" if job.with_exr else "--layers exr")
-    make_output_folder(job.out)
+    if job.is_video and job.with_linear:
+        raise DeltalightError("--exr and --layers write files beside pictures; name a folder with --out.")
+    if job.is_video:
+        require_video_support()
+        require_absent(job.out)
     gpu = create_context(job.device, allow_software=True)
     try:
         progress.renderer(gpu.renderer_name, is_software=gpu.is_software)
@@ -113,15 +129,30 @@ def run_job(job: RenderJob, progress: Progress) -> RenderSummary:
         try:
             for sentence in size_warnings(job.scene):
                 progress.notice(sentence)
-            return _render_frames(job, renderer, RenderSummary(gpu.renderer_name, job.out), progress)
+            with _written(job) as write:
+                return _render_frames(
+                    job, renderer, RenderSummary(gpu.renderer_name, job.out), progress, write
+                )
         finally:
             renderer.release()
     finally:
         gpu.release()
 
 
+@contextmanager
+def _written(job: RenderJob) -> "Iterator[Write]":
+    """Yield what writes a frame: to a folder, or to a video that appears at the end."""
+    if not job.is_video:
+        make_output_folder(job.out)
+        yield partial(_write_frame, job)
+        return
+    times_ns = [job.source.timestamps_ns[number] for number in job.frames]
+    with video_file(job.out, times_ns) as video:
+        yield lambda _number, frame, composite: video.add(composite.color, frame.timestamp_ns)
+
+
 def _render_frames(
-    job: RenderJob, renderer: "SceneRenderer", summary: RenderSummary, progress: Progress
+    job: RenderJob, renderer: "SceneRenderer", summary: RenderSummary, progress: Progress, write: "Write"
 ) -> RenderSummary:
     from deltalight.relighting import RelitPicture
     from deltalight.sensor_node.fisheye import light_warnings
@@ -147,7 +178,7 @@ def _render_frames(
             if sentence not in notified:
                 progress.notice(sentence)
                 notified.add(sentence)
-        _write_frame(job, number, frame, composite)
+        write(number, frame, composite)
         if job.with_layers:
             _write_layers(job, number, RelitPicture.of(renderer.sized(frame), composite, renderer.layers()))
         progress.frame_done()

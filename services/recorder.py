@@ -16,18 +16,21 @@ from deltalight.protocol.envelope import decode
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import SensorFrame
 from deltalight.protocol.keys import Keys
-from deltalight.protocol.messages import ControlRequest, Message, StatsMessage
+from deltalight.protocol.messages import CompositeMessage, ControlRequest, Message, StatsMessage
 from deltalight.protocol.recording_writer import RecordingWriter
 from deltalight.protocol.request import RequestClient
 from deltalight.protocol.scene import SceneDocument, parse_scene
+from deltalight.protocol.subscriber import ReceivedMultipart
 from deltalight.services.files import require_new_recording
 from deltalight.services.raw_frames import RAW_STREAMS, RawFrameAssembler
+from deltalight.services.relit_pictures import RelitPictures
 from deltalight.services.stream_queue import StreamQueue
 
 SCENE_TIMEOUT_S = 5.0
 POLL_S = 0.1
 IDLE_POLLS = 3  # afterwards, frames whose partners are late are taken as they are
 SILENCE_S = 3.0
+LAST_PICTURE_S = 3.0  # how long a recording that ends waits for the relit picture of its last frame
 CHECK_PERIOD_S = 0.5
 LEAST_SPACE_S = 60.0
 STEADY_AFTER_S = 2.0  # earlier, the rate does not predict the future
@@ -37,6 +40,7 @@ STEADY_AFTER_S = 2.0  # earlier, the rate does not predict the future
 class RecordJob:
     """What to record where; `node` None is the node whose colour picture comes first.
 
+    `composites` is where a render server publishes the relit pictures to keep, None without.
     `duration_s` counts from the first frame. `extrinsics` are the transforms between the sensors, which the streams
     do not carry.
     """
@@ -49,6 +53,12 @@ class RecordJob:
     duration_s: float | None = None
     frames: int | None = None
     keys: Keys | None = None
+    composites: str | None = None
+
+    @property
+    def all_endpoints(self) -> tuple[str, ...]:
+        """The node's endpoints and the render server's."""
+        return self.endpoints if self.composites is None else (*self.endpoints, self.composites)
 
 
 @dataclass
@@ -63,6 +73,7 @@ class RecordStatus:
 
     out: Path
     frames: int = 0
+    composites: int = 0
     seconds: float = 0.0
     size_bytes: int = 0
     free_bytes: int = 0
@@ -82,6 +93,7 @@ class RecordStatus:
         return {
             "out": str(self.out),
             "frames": self.frames,
+            "composites": self.composites,
             "seconds": round(self.seconds, 3),
             "frames_per_s": round(self.frames / seconds, 2) if self.frames else 0.0,
             "bytes": self.size_bytes,
@@ -106,10 +118,12 @@ class Recorder:
         require_new_recording(job.out)
         self.status = RecordStatus(job.out)
         self._job, self._notice = job, notice
-        self._queue = StreamQueue(job.endpoints, ("stats", *RAW_STREAMS), job.keys)
+        streams = ("stats", *RAW_STREAMS, *(() if job.composites is None else ("composite",)))
+        self._queue = StreamQueue(job.all_endpoints, streams, job.keys)
         self._assembler = RawFrameAssembler(job.node)
         self._files = ExitStack()
         self._writer: RecordingWriter | None = None
+        self._relit = RelitPictures(self._write_composite)
         self._last_ns, self._idle_polls = -1, 0
         self._silent_since_s = self._checked_s = time.monotonic()
         self._is_silent = self._warned_of_space = False
@@ -127,9 +141,7 @@ class Recorder:
                 while not stop.is_set() and not self._is_enough():
                     self._receive(POLL_S)
                     self._check_progress()
-                self._queue.close()
-                while not self._is_enough() and self._receive(0):
-                    pass  # what arrived before the end belongs to the recording
+                self._take_rest()
                 self._measure()
             if self._writer is not None:
                 self.status.size_bytes = self._writer.path.stat().st_size
@@ -157,8 +169,29 @@ class Recorder:
             self._write(frame)
         return multipart is not None or frame is not None
 
+    def _take_rest(self) -> None:
+        """Write what arrived before the end and, where relit pictures come, wait for that of the last frame."""
+        awaits = self._relit.count > 0
+        if not awaits:
+            self._queue.close()  # what it holds can still be taken
+        until_s = time.monotonic() + LAST_PICTURE_S
+        while not self._is_enough() and self._receive(0) and not (awaits and time.monotonic() > until_s):
+            pass
+        while awaits and self._relit.last_ns < self._last_ns and time.monotonic() < until_s:
+            multipart = self._queue.take(POLL_S)
+            if multipart is not None and bytes(multipart[0]).startswith(b"composite."):
+                self._take_picture(multipart)
+
+    def _take_picture(self, multipart: ReceivedMultipart) -> None:
+        try:
+            self._add(*decode(multipart))
+        except DeltalightError as error:
+            self._count_broken(error)
+
     def _add(self, message: Message, parts: Sequence[memoryview]) -> None:
-        if not isinstance(message, StatsMessage):
+        if isinstance(message, CompositeMessage):
+            self._relit.add_picture(message, parts)
+        elif not isinstance(message, StatsMessage):
             self._assembler.add(message, parts)
         elif message.node == self._assembler.node:
             drops = message.drops.get("capture", 0)
@@ -180,10 +213,16 @@ class Recorder:
         self._writer.add(frame)
         self._last_ns = frame.timestamp_ns
         self.status.frames += 1
+        self._relit.add_frame(frame.timestamp_ns)
         self._silent_since_s = time.monotonic()
         if self._is_silent:
             self._is_silent = False
             self._notice("Frames come again.")
+
+    def _write_composite(self, timestamp_ns: int, picture: bytes) -> None:
+        assert self._writer is not None  # the frame was written
+        self._writer.add_composite(timestamp_ns, picture)
+        self.status.composites += 1
 
     def _begin(self, frame: SensorFrame) -> RecordingWriter:
         job, depth = self._job, frame.depth

@@ -14,7 +14,13 @@ from mcap.records import Channel, Chunk, Footer, Message
 from mcap.stream_reader import StreamReader, breakup_chunk
 
 from deltalight.protocol.errors import DeltalightError
-from deltalight.protocol.recording_format import FISHEYE_RECORD_TOPIC, FRAME_TOPIC, FisheyeRecord, FrameRecord
+from deltalight.protocol.recording_format import (
+    COMPOSITE_TOPIC,
+    FISHEYE_RECORD_TOPIC,
+    FRAME_TOPIC,
+    FisheyeRecord,
+    FrameRecord,
+)
 from deltalight.protocol.recording_reader import DAMAGE, MAX_RECORD_BYTES, RecordingReader
 
 GAP_PERIODS = 1.5  # a step in time longer than this many usual ones is a gap
@@ -137,6 +143,7 @@ def describe_recording(path: Path, progress: Callable[[float], None] | None = No
             for topic in sorted(scan.messages)
         },
         **_cameras(reader, scan),
+        "composites": scan.messages[COMPOSITE_TOPIC],
         "board": None if reader.board is None else reader.board.model_dump(mode="json", exclude_none=True),
         "extrinsics": sorted(reader.extrinsics.to_dict()),
         "scene": None if reader.scene is None else reader.scene.name,

@@ -17,6 +17,7 @@ EXAMPLES = {
     "graph": ("deltalight graph", "deltalight graph --method dlpv"),
     "schema": ("deltalight schema scene",),
     "board": ("deltalight board -o board.pdf",),
+    "virtual_camera": ("deltalight virtual-camera --device /dev/video10",),
     "ping": ("deltalight ping tcp://127.0.0.1:5603",),
 }
 

@@ -34,6 +34,13 @@ def node(
         str | None,
         typer.Option(help="Fish-eye camera that sees the light, as for --source; default: the source's own."),
     ] = None,
+    tracking: Annotated[
+        bool,
+        typer.Option(
+            "--tracking",
+            help="Take the camera's pose from OpenTrackIO packets; [node.tracking] of the settings says where from.",
+        ),
+    ] = False,
     calibration: Annotated[
         Path | None, typer.Option(help="Calibration folder of a live camera (rgb.yaml, board.yaml, ...).")
     ] = None,
@@ -66,6 +73,7 @@ def node(
         "loop": loop,
         "realtime": None if fast is None else not fast,
         "camera": None if calibration is None else {"calibration": calibration},
+        "tracking": {} if tracking else None,
         "fisheye": None if fisheye is None else {"source": fisheye},
     }
     from deltalight.services.node_process import run_configured_node

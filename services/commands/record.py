@@ -39,6 +39,12 @@ def record(
     extrinsics: Annotated[
         Path | None, typer.Option(help="calibration/extrinsics.yaml: transforms between the sensors.")
     ] = None,
+    composites: Annotated[
+        str | None,
+        typer.Option(
+            help="Endpoint of the render server whose relit pictures are kept too, beside the frames."
+        ),
+    ] = None,
     duration: Annotated[float | None, typer.Option(min=0.1, help="Stop after this many seconds.")] = None,
     frames: Annotated[int | None, typer.Option(min=1, help="Stop after this many frames.")] = None,
     config_file: ConfigFile = None,
@@ -55,7 +61,7 @@ def record(
 
     settings = load_configuration(config_file).section("keys", KeySettings)
     places = node_endpoints(subscribe, node, settings)
-    keys = settings.load(places if control is None else [*places, control])
+    keys = settings.load([*places, *(each for each in (control, composites) if each is not None)])
     job = RecordJob(
         out,
         tuple(places),
@@ -65,6 +71,7 @@ def record(
         duration_s=duration,
         frames=frames,
         keys=keys,
+        composites=composites,
     )
     console = Console(stderr=True, soft_wrap=True)
     recorder = Recorder(job, lambda sentence: console.print(sentence, markup=False, highlight=False))
@@ -150,8 +157,9 @@ def _print_summary(status: "RecordStatus", *, as_json: bool) -> None:
     elif not status.frames:
         typer.echo("Nothing was recorded and no file was written.", err=True)
     else:
+        relit = f", {status.composites} relit pictures" if status.composites else ""
         typer.echo(
-            f"{status.frames} frames in {status.seconds:.1f} s ({figures['frames_per_s']:.1f} a second),"
+            f"{status.frames} frames{relit} in {status.seconds:.1f} s ({figures['frames_per_s']:.1f} a second),"
             f" {status.size_bytes / 1e6:.1f} MB ({figures['mb_per_s']:.1f} MB/s), lost {_losses(status)},"
             f" {100 * figures['cpu_share']:.0f} % of a core, written to {status.out}"
         )

@@ -160,6 +160,7 @@ def _rows(found: dict[str, Any]) -> list[tuple[str, str]]:
         ("depth", _depth(found["depth"])),
         ("fish-eye", _fisheye(found["fisheye"])),
         ("given poses", str(found["given_poses"])),
+        ("relit pictures", str(found["composites"] or "none")),
         ("board", _board(found["board"])),
         ("transforms", ", ".join(found["extrinsics"]) or "none"),
         ("scene", "none" if found["scene"] is None else found["scene"] or "attached"),

@@ -24,7 +24,12 @@ class Layers(StrEnum):
 def render(
     source: Annotated[Path, typer.Argument(help="Dataset folder or .mcap recording.")],
     *,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the pictures; created if missing.")],
+    out: Annotated[
+        Path,
+        typer.Option(
+            "--out", "-o", help="Folder for the pictures, created if missing; or a video, NAME.mp4."
+        ),
+    ],
     scene: Annotated[
         Path | None, typer.Option(help="Scene document; default: the one in the recording.")
     ] = None,
@@ -59,7 +64,7 @@ def render(
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
-    """Render a recording to pictures: OUT/000000.png and so on, with one line per frame in OUT/frames.jsonl."""
+    """Render a recording to pictures, OUT/000000.png and so on, with facts in OUT/frames.jsonl; or to a video."""
     from deltalight.protocol.method_names import with_method
     from deltalight.protocol.source import open_source
     from deltalight.services.commands.options import parse_frames, parse_size

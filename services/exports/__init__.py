@@ -1,4 +1,4 @@
-"""Recordings and scenes in the formats of other programs: COLMAP, Nerfstudio, glTF, ROS bags."""
+"""Recordings and scenes in the formats of other programs: COLMAP, Nerfstudio, glTF, ROS bags, video."""
 
 from enum import StrEnum
 
@@ -12,3 +12,4 @@ class ExportFormat(StrEnum):
     GLB = "glb"
     ROS1 = "ros1"
     ROS2 = "ros2"
+    MP4 = "mp4"

@@ -11,8 +11,9 @@ from deltalight.services.exports import ExportFormat
 from deltalight.services.exports.colmap import write_colmap
 from deltalight.services.exports.nerfstudio import write_nerfstudio
 from deltalight.services.exports.posed_views import PosedView, posed_views
-from deltalight.services.exports.ros_bags import export_bag
+from deltalight.services.exports.ros_bags import Version, export_bag
 from deltalight.services.exports.scene_glb import write_scene_glb
+from deltalight.services.exports.video import export_video
 from deltalight.services.files import appearing, make_output_folder, require_absent
 from deltalight.services.recording_copies import Copied, Track, export_recording
 
@@ -30,12 +31,13 @@ def export_as(wanted: ExportFormat, path: Path, out: Path, scene: Path | None, t
     match wanted:
         case ExportFormat.DATASET:
             return export_recording(path, out, track)
-        case ExportFormat.ROS1:
-            return export_bag(open_source(path), out, "ros1", track)
-        case ExportFormat.ROS2:
-            return export_bag(open_source(path), out, "ros2", track)
+        case ExportFormat.ROS1 | ExportFormat.ROS2:
+            version: Version = "ros1" if wanted is ExportFormat.ROS1 else "ros2"
+            return export_bag(open_source(path), out, version, track)
         case ExportFormat.GLB:
             return _export_glb(open_source(path), out, scene, track)
+        case ExportFormat.MP4:
+            return export_video(open_source(path), out, track)
         case ExportFormat.COLMAP:
             return _export_folder(open_source(path), out, write_colmap, track)
         case ExportFormat.NERFSTUDIO:

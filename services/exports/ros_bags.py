@@ -1,7 +1,8 @@
 """ROS 1 and ROS 2 bags: recordings written as the usual messages of RGB-D cameras, and such bags read (extra `ros`).
 
 Depth is 16-bit millimetres or 32-bit metres (REP 118), poses are in `/tf`, the sensors' transform in `/tf_static`.
-What ROS has no message for, board, response and scene, is JSON on `/deltalight/description`.
+What ROS has no message for, board, response and scene, is JSON on `/deltalight/description`. Relit and fish-eye
+pictures have topics below `/deltalight/` too, so that the bag has one colour camera.
 """
 
 import json
@@ -28,6 +29,7 @@ from deltalight.protocol.poses import rigid_matrix, rotation_from_wxyz, wxyz_fro
 from deltalight.protocol.recording_writer import RecordingWriter
 from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.source import Source
+from deltalight.services.exports.ros_fisheye import FISHEYE_TOPICS, FisheyeReader, write_fisheye
 from deltalight.services.files import appearing, make_output_folder, require_absent, require_recording_name
 from deltalight.services.recording_copies import Copied, Track
 
@@ -36,7 +38,9 @@ if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
 COLOR, DEPTH = "/camera/color", "/camera/depth"
-DESCRIPTION, EXPOSURE = "/deltalight/description", "/deltalight/exposure_s"
+OWN = "/deltalight/"
+DESCRIPTION, EXPOSURE = f"{OWN}description", f"{OWN}exposure_s"
+COMPOSITE = f"{OWN}composite/compressed"
 WORLD, COLOR_FRAME, DEPTH_FRAME = "world", "camera_color_optical_frame", "camera_depth_optical_frame"
 WORLDS = (WORLD, "map")
 TOGETHER_NS = 20_000_000  # what is farther apart is not of the same frame
@@ -65,6 +69,7 @@ class _Bag:
     store: "Typestore"
     version: Version
     connections: dict[str, Any] = field(default_factory=dict)
+    fisheye_ns: int | None = None  # time of the fish-eye pictures that were written last
 
     def make(self, kind: str, *values: object, **named: object) -> Any:  # noqa: ANN401 - classes made at run time
         """Return a message such as `sensor_msgs/msg/Image`."""
@@ -76,6 +81,13 @@ class _Bag:
         numbers = (0,) if self.version == "ros1" else ()
         return self.make("std_msgs/msg/Header", *numbers, stamp, frame)
 
+    def image(self, header: object, encoding: str, picture: np.ndarray) -> Any:  # noqa: ANN401
+        """Return an uncompressed picture."""
+        height, width = picture.shape[:2]
+        data = np.ascontiguousarray(picture).view(np.uint8).ravel()
+        step = data.size // height
+        return self.make("sensor_msgs/msg/Image", header, height, width, encoding, 0, step, data)
+
     def write(self, topic: str, time_ns: int, message: Any) -> None:  # noqa: ANN401
         """Append a message."""
         kind = message.__msgtype__
@@ -86,7 +98,7 @@ class _Bag:
 
 
 def export_bag(source: Source, out: Path, version: Version, track: Track) -> Copied:
-    """Write frames as a bag: a file `.bag` for ROS 1, a folder for ROS 2. Fish-eye pictures are left out.
+    """Write frames as a bag: a file `.bag` for ROS 1, a folder for ROS 2.
 
     Raises:
         DeltalightError: rosbags is missing, a frame is damaged, `out` is taken, or the disk refuses.
@@ -107,8 +119,7 @@ def export_bag(source: Source, out: Path, version: Version, track: Track) -> Cop
                 _write_frame(bag, frame)
         require_absent(out)
         made.rename(out)
-    notes = ["Fish-eye pictures were left out."] if source[0].fisheye is not None else []
-    return Copied(out, len(source), notes=[*source.notes, *notes])
+    return Copied(out, len(source), notes=source.notes)
 
 
 def _writer(path: Path, version: Version) -> Any:  # noqa: ANN401
@@ -153,21 +164,30 @@ def _write_description(bag: _Bag, source: Source, first: SensorFrame) -> None:
 
 def _write_frame(bag: _Bag, frame: SensorFrame) -> None:
     time_ns, header = frame.timestamp_ns, bag.header(frame.timestamp_ns, COLOR_FRAME)
+    if frame.fisheye is not None and frame.fisheye.timestamp_ns != bag.fisheye_ns:
+        bag.fisheye_ns = frame.fisheye.timestamp_ns
+        write_fisheye(bag, frame.fisheye, time_ns)
     pose = frame.found_pose if frame.world_from_camera is None else frame.world_from_camera
     if pose is not None:
         bag.write("/tf", time_ns, _transform(bag, time_ns, WORLD, COLOR_FRAME, pose))
     if frame.exposure_s is not None:
         bag.write(EXPOSURE, time_ns, bag.make("std_msgs/msg/Float64", frame.exposure_s))
     bag.write(f"{COLOR}/camera_info", time_ns, _camera_info(bag, header, frame.camera))
+    if frame.composite is not None:
+        bag.write(COMPOSITE, time_ns, _compressed(bag, header, frame.composite))
     if frame.color_jpeg is not None:
-        data = np.frombuffer(frame.color_jpeg, np.uint8)
-        message = bag.make("sensor_msgs/msg/CompressedImage", header, "jpeg", data)
-        bag.write(f"{COLOR}/image_raw/compressed", time_ns, message)
+        bag.write(f"{COLOR}/image_raw/compressed", time_ns, _compressed(bag, header, frame.color_jpeg))
     else:
-        bag.write(f"{COLOR}/image_raw", time_ns, _image(bag, header, "rgb8", frame.color))
+        bag.write(f"{COLOR}/image_raw", time_ns, bag.image(header, "rgb8", frame.color))
     if frame.depth is not None:
         depth_ns = frame.depth_timestamp_ns or time_ns
         _write_depth(bag, frame.depth, depth_ns, is_of_color=frame.depth.camera == frame.camera)
+
+
+def _compressed(bag: _Bag, header: object, picture: bytes) -> Any:  # noqa: ANN401
+    kind = "jpeg" if is_jpeg(picture) else "png"
+    data = np.frombuffer(picture, np.uint8)
+    return bag.make("sensor_msgs/msg/CompressedImage", header, kind, data)
 
 
 def _write_depth(bag: _Bag, depth: DepthImage, time_ns: int, *, is_of_color: bool) -> None:
@@ -178,14 +198,7 @@ def _write_depth(bag: _Bag, depth: DepthImage, time_ns: int, *, is_of_color: boo
     )
     image = ("16UC1", steps) if is_exact else ("32FC1", known_depth(depth))
     bag.write(f"{DEPTH}/camera_info", time_ns, _camera_info(bag, header, depth.camera))
-    bag.write(f"{DEPTH}/image_raw", time_ns, _image(bag, header, *image))
-
-
-def _image(bag: _Bag, header: object, encoding: str, picture: np.ndarray) -> Any:  # noqa: ANN401
-    height, width = picture.shape[:2]
-    data = np.ascontiguousarray(picture).view(np.uint8).ravel()
-    step = data.size // height
-    return bag.make("sensor_msgs/msg/Image", header, height, width, encoding, 0, step, data)
+    bag.write(f"{DEPTH}/image_raw", time_ns, bag.image(header, *image))
 
 
 def _camera_info(bag: _Bag, header: object, camera: CameraModel) -> Any:  # noqa: ANN401
@@ -262,7 +275,7 @@ class _BagReader:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._bag = _opened(path)
-        topics = self._bag.topics
+        topics = {name: info for name, info in self._bag.topics.items() if not name.startswith(OWN)}
         compressed = [
             name for name, info in topics.items() if info.msgtype == "sensor_msgs/msg/CompressedImage"
         ]
@@ -283,6 +296,8 @@ class _BagReader:
         self._poses: deque[tuple[int, Float64[np.ndarray, "4 4"]]] = deque(maxlen=256)
         self._exposures: deque[tuple[int, float]] = deque(maxlen=256)
         self._depths: deque[tuple[int, Any]] = deque(maxlen=16)
+        self._composites: deque[tuple[int, bytes]] = deque(maxlen=16)
+        self._fisheye = FisheyeReader(f"of {path}", _rows)
 
     def close(self) -> None:
         """Close the bag."""
@@ -299,7 +314,8 @@ class _BagReader:
     def frames(self) -> Iterator[SensorFrame]:
         """Yield every colour picture whose camera is known, with depth, pose and exposure of its moment."""
         waiting: deque[_Waiting] = deque()
-        wanted = [self._color, self._depth, "/tf", EXPOSURE, *self._info_topics()]
+        own = (EXPOSURE, COMPOSITE, *FISHEYE_TOPICS)
+        wanted = [self._color, self._depth, "/tf", *own, *self._info_topics()]
         number = 0
         for topic, message in self._messages(*(name for name in wanted if name is not None)):
             time_ns = self._note(topic, message)
@@ -322,9 +338,14 @@ class _BagReader:
         if topic == EXPOSURE:
             self._exposures.append((self._time_ns, float(message.data)))
             return self._time_ns
+        if topic in FISHEYE_TOPICS:
+            self._fisheye.add(topic, message, self._time_ns)
+            return self._time_ns
         time_ns = _stamp_ns(message.header)
         if topic == self._depth:
             self._depths.append((time_ns, message))
+        elif topic == COMPOSITE:
+            self._composites.append((time_ns, bytes(message.data)))
         elif topic != self._color:
             self._infos[topic] = message
         return time_ns
@@ -356,6 +377,8 @@ class _BagReader:
             depth_timestamp_ns=None if depth is None else depth[0],
             world_from_camera=None if (pose := _nearest(self._poses, time_ns)) is None else pose[1],
             color_jpeg=jpeg,
+            fisheye=self._fisheye.at(time_ns),
+            composite=None if (relit := _nearest(self._composites, time_ns)) is None else relit[1],
         )
 
     def _picture(self, message: Any) -> tuple[np.ndarray, bytes | None]:  # noqa: ANN401

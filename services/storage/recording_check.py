@@ -15,7 +15,7 @@ MCAP_MAGIC, ZIP_MAGIC = b"\x89MCAP0\r\n", b"PK\x03\x04"
 MAX_FILES = 100_000
 COLORS = "rgb.txt"
 CONTENTS = "one dataset folder"
-LISTS = (COLORS, "depth.txt", "fisheye.txt", "groundtruth.txt")
+LISTS = (COLORS, "depth.txt", "composite.txt", "fisheye.txt", "groundtruth.txt")
 
 
 def check_recording(path: Path, out: str, limit: str) -> Facts:

@@ -70,7 +70,15 @@ def assert_same_pictures(ours: FisheyePictures | None, theirs: FisheyePictures |
 
 def assert_same_frames(ours: SensorFrame, theirs: SensorFrame) -> None:
     """Every field is the same to the bit."""
-    for name in ("frame_id", "timestamp_ns", "camera", "exposure_s", "depth_timestamp_ns", "color_jpeg"):
+    for name in (
+        "frame_id",
+        "timestamp_ns",
+        "camera",
+        "exposure_s",
+        "depth_timestamp_ns",
+        "color_jpeg",
+        "composite",
+    ):
         assert getattr(ours, name) == getattr(theirs, name), name
     for name in ("color", "response", "world_from_camera"):
         mine, other = getattr(ours, name), getattr(theirs, name)

@@ -45,6 +45,9 @@ STAND_IN_PERIOD_S = 0.1
 SCREENSHOTS = os.environ.get("DELTALIGHT_SCREENSHOTS")
 SIZE = {"width": 1280, "height": 800}
 AXE = DASHBOARD.parent / "node_modules" / "axe-core" / "axe.min.js"  # comes with the dashboard's tools
+GRIP_AT = 0.4  # where the gizmo's arrow is taken, in its own lengths
+GIZMO_SIZE = 1.35  # as the page sets it
+BOX_TOP_M = np.array([-0.06, 0.18, 0.134])  # of the green box, on the cardboard one
 JPEG_QUALITY = 82  # keeps each below 200 kB
 
 
@@ -350,3 +353,43 @@ def box_glb() -> bytes:
     box.visual = trimesh.visual.TextureVisuals(material=material)
     content: bytes = box.export(file_type="glb")
     return content
+
+
+@contextmanager
+def fresh_desk(
+    stack: Stack,
+    browser: Browser,
+    document: dict[str, object],
+    **context: Any,  # noqa: ANN401
+) -> Iterator[Desk]:
+    """The page of somebody who comes for the first time, in a browser of its own, with a scene as it begins."""
+    stack.client.put(stack.path, json=document).raise_for_status()
+    with browser.new_context(**context) as opened, desk(stack, opened) as seat:
+        yield seat
+
+
+def arrow_place(page: Desk, from_m: np.ndarray) -> tuple[tuple[float, float], float]:
+    """Where the gizmo's x arrow is on the screen, and how far from its origin that is in metres.
+
+    three's TransformControls keep their size on the screen: see `factor` in its source.
+    """
+    header = page.stack.header()
+    eye_m = np.array(header["world_from_camera"])[:3, 3]
+    camera = CameraModel.from_dict(header["camera"])
+    half_angle_tangent = camera.height / 2 / camera.matrix[1, 1]
+    length_m = np.linalg.norm(from_m - eye_m) * 1.9 * half_angle_tangent * GIZMO_SIZE / 4
+    reach_m = float(GRIP_AT * length_m)
+    return page.place_of(from_m + np.array([reach_m, 0, 0])), reach_m
+
+
+def seen_m(stack: Stack, page: Desk, point_m: np.ndarray) -> np.ndarray:
+    """The surface that the renderer finds where a point is seen."""
+    found = stack.client.post("/live/pick", json=page.pixel_at(page.place_of(point_m))).json()
+    assert found["kind"] == "real"
+    return np.array(found["point_m"])
+
+
+def is_on_box(page: Desk, stack: Stack) -> bool:
+    """Drag on to where the box is now (the recorded camera swings)."""
+    page.page.mouse.move(*page.place_of(BOX_TOP_M), steps=3)
+    return bool(abs(knot_m(stack)[2] - BOX_TOP_M[2]) < 0.015)

@@ -14,7 +14,9 @@ from deltalight.benchmarks.speed.motions import STANDING
 from deltalight.protocol.board import BoardSpec
 from deltalight.protocol.calibration import Extrinsics
 from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.envelope import encode
 from deltalight.protocol.frames import BoardPose, SensorFrame
+from deltalight.protocol.messages import CompositeMessage
 from deltalight.protocol.pictures import depth_from_steps
 from deltalight.protocol.publisher import Publisher
 from deltalight.protocol.recording_reader import RecordingReader
@@ -57,7 +59,10 @@ def camera(width: int = WIDTH, height: int = HEIGHT) -> CameraModel:
 
 
 def frames(count: int, *, as_jpeg: bool = True, with_fisheye: bool = False) -> list[SensorFrame]:
-    """Thirty frames a second with depth in millimetres and given poses; a new fish-eye bracket every third."""
+    """Thirty frames a second with depth in millimetres and given poses; a new fish-eye bracket every third.
+
+    Every second JPEG was relit, which left it as it is.
+    """
     made: list[SensorFrame] = []
     for index in range(count):
         rng = np.random.default_rng(index)
@@ -83,6 +88,7 @@ def frames(count: int, *, as_jpeg: bool = True, with_fisheye: bool = False) -> l
                 world_from_camera=pose,
                 color_jpeg=jpeg,
                 fisheye=coded(now_ns) if is_new else made[-1].fisheye if made else None,
+                composite=jpeg if index % 2 else None,
             )
         )
     return made
@@ -121,6 +127,24 @@ def messages(
     sent["pose"] = pose_multipart(pose, BOARD, stamps)
     sent["color"] = color_multipart(frame, stamps, "jpeg" if frame.color_jpeg else "raw", 90)
     return sent
+
+
+def composite(frame: SensorFrame) -> list[bytes]:
+    """What a render server sends for a frame: here the frame's own picture."""
+    assert frame.color_jpeg is not None
+    message = CompositeMessage(
+        node="cam",
+        frame_id=frame.frame_id,
+        capture_ns=frame.timestamp_ns,
+        clock_offset_ns=0,
+        encoding="jpeg",
+        shape=frame.color.shape,
+        status="no_pose",
+        camera=frame.camera.to_dict(),
+        received_ns=frame.timestamp_ns,
+        rendered_ns=frame.timestamp_ns,
+    )
+    return encode(message, [frame.color_jpeg])
 
 
 class Feed:

@@ -2,11 +2,13 @@
 
 import shutil
 from collections.abc import Iterator
+from io import BytesIO
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from deltalight.services.api.snapshot_store import SnapshotStore
 from tests.services.api_samples import RunningApi, running_api, sentence
@@ -59,6 +61,9 @@ def test_every_view_is_taken_by_default_and_kept(api: RunningApi, folder: Path) 
     picture = cv2.imdecode(np.frombuffer(answer.content, np.uint8), cv2.IMREAD_COLOR)
     assert picture is not None
     assert picture.shape == (4, 6, 3)
+    moving = client.get(f"/snapshots/{snapshot['id']}/before-after.gif")
+    assert (moving.status_code, moving.headers["content-type"]) == (200, "image/gif")
+    assert Image.open(BytesIO(moving.content)).size == (6, 4)
     assert sorted(path.name for path in folder.iterdir()) == [snapshot["id"]]
     assert client.delete(f"/snapshots/{snapshot['id']}").status_code == 204
     assert not list(folder.iterdir())
@@ -79,6 +84,8 @@ def test_the_order_names_views_and_methods(api: RunningApi, server: Recorder, fo
     assert str(folder) in str(order["folder"])
     listed = api.client.get("/snapshots").json()
     assert [each["files"] for each in listed] == [["paper.png", "d.png"]]
+    refused = api.client.get(f"/snapshots/{listed[0]['id']}/before-after.gif")
+    assert "no file 'camera.png'" in sentence(refused, 404)
 
 
 @pytest.mark.parametrize(

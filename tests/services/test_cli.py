@@ -55,6 +55,7 @@ COMMANDS = {
     "bench soak",
     "bench sweep",
     "gpu-check",
+    "virtual-camera",
 }
 
 
@@ -78,7 +79,7 @@ def test_every_command_is_there_and_has_help() -> None:
 def test_help_has_a_short_form_and_ends_with_examples_that_can_be_run() -> None:
     root = get_command(app)
     assert isinstance(root, TyperGroup)
-    for name, lines in EXAMPLES.items():
+    for name, lines in ((function.replace("_", "-"), lines) for function, lines in EXAMPLES.items()):
         done = CliRunner().invoke(app, [name, "-h"], prog_name="deltalight", terminal_width=200)
         assert done.exit_code == 0, done.output
         shown = " ".join(done.output.split())
@@ -123,6 +124,12 @@ def test_wrong_use_ends_with_2_and_names_what_is_wrong(
     assert done.returncode == 2
     assert named in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_a_wrong_choice_is_told_in_plain_words(cli: RunCli) -> None:
+    done = cli("recordings", "export", "take.mcap", "--format", "fbx", "-o", "out")
+    said = " ".join(done.stderr.replace("│", " ").split())
+    assert "Invalid value for '--format': 'fbx' is not one of 'dataset', 'colmap'" in said
 
 
 def test_help_loads_no_heavy_module() -> None:

@@ -182,6 +182,20 @@ def test_another_method_by_the_short_form_of_out(cli: RunCli, take: Path, tmp_pa
     assert [any("propagate" in name for name in of_one) for of_one in passes] == [True, False]
 
 
+def test_a_video_in_place_of_a_folder(cli: RunCli, take: Path, tmp_path: Path) -> None:
+    av = pytest.importorskip("av")
+    out = tmp_path / "take.mp4"
+    common = ("render", take / "take", "--scene", take / "scene.json", "--out", out)
+    done = cli(*common, "--frames", "0:2", "--json")
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["frames"] == 2
+    with av.open(str(out)) as container:
+        assert len(list(container.decode(video=0))) == 2
+    assert_refused(cli(*common), "already exists")
+    assert_refused(cli(*common[:-1], tmp_path / "b.mp4", "--exr"), "name a folder")
+    assert [path.name for path in tmp_path.iterdir()] == ["take.mp4"]
+
+
 def test_a_file_in_another_unit_is_told_with_the_scale_that_helps(
     cli: RunCli, take: Path, tmp_path: Path
 ) -> None:

@@ -6,24 +6,28 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image, ImageSequence
 from playwright.sync_api import Browser, Route
 
-from deltalight.protocol.camera_model import CameraModel
 from deltalight.services.demo import RECORDING, SCENE
 from deltalight.services.recording_copies import export_recording
 from tests.services.dashboard_samples import (
     AXE,
+    BOX_TOP_M,
     NEEDS_BROWSER,
     SIZE,
     Desk,
     Stack,
+    arrow_place,
     box_glb,
     demo_stack,
-    desk,
+    fresh_desk,
     green_centre,
+    is_on_box,
     knot_m,
     magenta,
     recorded_s,
+    seen_m,
     shows_knot,
     steep_place,
 )
@@ -36,10 +40,8 @@ pytestmark = [
     ),
 ]
 FREE_TABLE_M = (0.05, 0.25, 0.0)  # between the board and the boxes, where nothing stands
-BOX_TOP_M = np.array([-0.06, 0.18, 0.134])  # of the green box, on the cardboard one
+BALL_TOP_M = np.array([0.316, -0.178, 0.064])  # of the yellow ball
 BESIDE_GIZMO_M = np.array([-0.05, 0.0, 0.1])  # on the knot, from its origin
-GRIP_AT = 0.4  # where the gizmo's arrow is taken, in its own lengths
-GIZMO_SIZE = 1.35  # as the page sets it
 
 
 @pytest.fixture(scope="module")
@@ -56,11 +58,7 @@ def first_document(stack: Stack) -> dict[str, object]:
 @pytest.fixture
 def page(stack: Stack, browser: Browser, first_document: dict[str, object]) -> Iterator[Desk]:
     """The page of somebody who comes for the first time, and the demo's scene as it begins."""
-    stack.client.put(stack.path, json=first_document).raise_for_status()
-    with (
-        browser.new_context(viewport=SIZE, color_scheme="dark") as context,  # type: ignore[arg-type]
-        desk(stack, context) as seat,
-    ):
+    with fresh_desk(stack, browser, first_document, viewport=SIZE, color_scheme="dark") as seat:
         yield seat
 
 
@@ -192,20 +190,6 @@ def test_a_fault_of_one_panel_leaves_the_others(page: Desk) -> None:
     assert page.complaints == []
 
 
-def arrow_place(page: Desk, from_m: np.ndarray) -> tuple[tuple[float, float], float]:
-    """Where the gizmo's x arrow is on the screen, and how far from its origin that is in metres.
-
-    three's TransformControls keep their size on the screen: see `factor` in its source.
-    """
-    header = page.stack.header()
-    eye_m = np.array(header["world_from_camera"])[:3, 3]
-    camera = CameraModel.from_dict(header["camera"])
-    half_angle_tangent = camera.height / 2 / camera.matrix[1, 1]
-    length_m = np.linalg.norm(from_m - eye_m) * 1.9 * half_angle_tangent * GIZMO_SIZE / 4
-    reach_m = float(GRIP_AT * length_m)
-    return page.place_of(from_m + np.array([reach_m, 0, 0])), reach_m
-
-
 def test_the_gizmo_moves_an_object_along_its_axis(stack: Stack, page: Desk) -> None:
     page.named("treeitem", "knot").click()
     before_m, centre = knot_m(stack), green_centre(page.pixels())
@@ -241,12 +225,6 @@ def test_what_is_dragged_stands_on_what_the_camera_sees(stack: Stack, page: Desk
     assert pose["rotation_wxyz"] == before["rotation_wxyz"], "upright"
     page.page.keyboard.press("Control+z")
     page.until(lambda: stack.object("knot")["pose"] == before, "one undo takes the whole drag back")
-
-
-def is_on_box(page: Desk, stack: Stack) -> bool:
-    """Drag on to where the box is now (the recorded camera swings)."""
-    page.page.mouse.move(*page.place_of(BOX_TOP_M), steps=3)
-    return bool(abs(knot_m(stack)[2] - BOX_TOP_M[2]) < 0.015)
 
 
 def test_without_surfaces_what_is_dragged_keeps_its_height(stack: Stack, page: Desk) -> None:
@@ -312,6 +290,34 @@ def test_another_method_renders_the_next_picture(stack: Stack, page: Desk) -> No
     assert of_before.all_inner_texts() in ([], ["–"]), "passes that do not run have no times"
 
 
+def test_a_light_is_added_along_a_shadow(stack: Stack, page: Desk) -> None:
+    lamp = stack.document()["lights"]["manual"][0]
+    top_m, lamp_m = seen_m(stack, page, BALL_TOP_M), np.array(lamp["position_m"])
+    tip_m = lamp_m + (top_m - lamp_m) * lamp_m[2] / (lamp_m - top_m)[2]
+    page.named("button", "Add light").first.click()
+    page.named("menuitem", "From a shadow…").click()
+    page.page.mouse.click(*page.place_of(tip_m))
+    page.page.get_by_text("Now click the point").wait_for()
+    page.photograph("shadow_light")
+    page.page.mouse.click(*page.place_of(top_m))
+    page.named("treeitem", "Sun 3").wait_for()
+    light, way_m = stack.document()["lights"]["manual"][-1], tip_m - lamp_m
+    assert np.degrees(np.arccos(np.dot(light["direction"], way_m / np.linalg.norm(way_m)))) < 6
+    share = light["irradiance"] * np.dot(way_m, way_m) / lamp["intensity"]
+    assert 0.3 < share < 2, "the table is darker than what is assumed"
+
+
+def test_before_and_after_are_saved_as_a_moving_picture(page: Desk) -> None:
+    with page.page.expect_download() as saved:
+        page.named("button", "Save before and after as GIF").click()
+    assert saved.value.suggested_filename.startswith("before-after-")
+    shown = [
+        np.asarray(each.convert("RGB")) for each in ImageSequence.Iterator(Image.open(saved.value.path()))
+    ]
+    greens = [int((each[..., 1] > each[..., 0].astype(int) + 60).sum()) for each in shown]
+    assert max(greens) > 5 * min(greens) + 50, "the knot comes and goes"
+
+
 def test_two_methods_are_compared_on_one_frame(stack: Stack, page: Desk) -> None:
     page.named("tab", "Compare").click()
     page.named("combobox", "Right (B)").select_option("dvct")
@@ -375,6 +381,12 @@ def test_three_seconds_are_recorded_and_replayed(stack: Stack, page: Desk) -> No
     page.until(lambda: stack.get("/replay")["position_s"] > middle_s, "the end of the recording")
     position.press("Home")
     page.until(lambda: stack.get("/replay")["position_s"] < middle_s, "its start")
+    before_s = stack.get("/replay")["position_s"]
+    position.press("ArrowRight")
+    page.until(lambda: stack.get("/replay")["position_s"] > before_s, "the next frame")
+    step_s = take["duration_s"] / (take["frames"] - 1)
+    assert stack.get("/replay")["position_s"] - before_s < 2.5 * step_s
+    assert stack.get("/replay")["playing"] is False
     page.shows_newest()
     page.photograph("replay")
     page.named("button", "Back to live").click()
@@ -398,6 +410,7 @@ def test_a_zipped_folder_that_is_dropped_is_opened_with_a_checklist(
         "No fish-eye camera: place lamps by hand.",
     ]
     page.until(lambda: stack.get("/replay")["recording"] == "desk", "its replay")
+    assert stack.get("/replay")["playing"] is False, "it waits at its first frame"
     page.photograph("open_recording")
     page.named("button", "Back to live").click()
     page.until(lambda: stack.get("/replay")["recording"] is None, "live again")
@@ -456,12 +469,8 @@ def test_axe_finds_no_fault(page: Desk) -> None:
 @pytest.fixture
 def tablet(stack: Stack, browser: Browser, first_document: dict[str, object]) -> Iterator[Desk]:
     """A tablet held across: fingers in place of a mouse."""
-    stack.client.put(stack.path, json=first_document).raise_for_status()
-    viewport = {"width": 1024, "height": 768}
-    with (
-        browser.new_context(viewport=viewport, has_touch=True, is_mobile=True) as context,  # type: ignore[arg-type]
-        desk(stack, context) as seat,
-    ):
+    held = {"viewport": {"width": 1024, "height": 768}, "has_touch": True, "is_mobile": True}
+    with fresh_desk(stack, browser, first_document, **held) as seat:
         yield seat
 
 

@@ -23,7 +23,7 @@ from deltalight.services.exports.colmap import camera_line
 from deltalight.services.exports.recording import export_as
 from deltalight.services.exports.ros_bags import import_bag
 from deltalight.services.exports.scene_glb import write_scene_glb
-from tests.protocol.fisheye_samples import assert_same_frames
+from tests.protocol.fisheye_samples import assert_same_frames, linear
 from tests.services.conftest import RunCli
 from tests.services.record_samples import frames, write
 
@@ -176,7 +176,12 @@ def bag(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[ExportFormat, P
 def test_a_bag_comes_back_equal(bag: tuple[ExportFormat, Path], tmp_path: Path, *, as_jpeg: bool) -> None:
     wanted, path = bag
     scene = parse_scene({"name": "kept"})
-    before = RecordingReader(write(tmp_path / "before.mcap", frames(4, as_jpeg=as_jpeg), scene))
+    made = frames(4, as_jpeg=as_jpeg, with_fisheye=True)
+    if not as_jpeg:
+        made = [
+            replace(frame, fisheye=linear(made[index // 2].timestamp_ns)) for index, frame in enumerate(made)
+        ]
+    before = RecordingReader(write(tmp_path / "before.mcap", made, scene))
     assert export_as(wanted, before.path, path, None, quietly).frames == 4
     assert import_bag(path, tmp_path / "after.mcap", quietly).frames == 4
     after = RecordingReader(tmp_path / "after.mcap")

@@ -20,21 +20,19 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from websockets import Subprotocol
 from websockets.sync.client import ClientConnection, connect
 
-from deltalight.protocol.envelope import encode
 from deltalight.protocol.errors import DeltalightError
-from deltalight.protocol.frames import BoardPose, SensorFrame
-from deltalight.protocol.messages import CompositeMessage
+from deltalight.protocol.frames import BoardPose
 from deltalight.protocol.publisher import Publisher
-from deltalight.protocol.recording_format import matrix_of
+from deltalight.protocol.recording_format import FOXGLOVE_TOPICS, matrix_of
 from deltalight.protocol.request import ReplyServer
 from deltalight.protocol.scene import parse_scene
 from deltalight.protocol.source import open_source
 from deltalight.services.demo import RECORDING
-from deltalight.services.foxglove_bridge import TOPICS, BridgeJob, FoxgloveBridge, FoxgloveServer
+from deltalight.services.foxglove_bridge import BridgeJob, FoxgloveBridge, FoxgloveServer
 from deltalight.services.ports import endpoint, private_ports
 from tests.protocol.fisheye_samples import linear
 from tests.services.conftest import ROOT, RunCli
-from tests.services.record_samples import PERIOD_NS, frames, messages, write
+from tests.services.record_samples import PERIOD_NS, composite, frames, messages, write
 
 pytest.importorskip("foxglove", reason="foxglove-sdk is not installed")
 PATIENCE_S = 60
@@ -69,26 +67,8 @@ class Watcher:
 @contextmanager
 def watching(port: int) -> Iterator[Watcher]:
     address, protocol = f"ws://127.0.0.1:{port}", Subprotocol("foxglove.sdk.v1")
-    with connect(address, subprotocols=[protocol], max_size=None, max_queue=None) as socket:
+    with connect(address, subprotocols=[protocol], max_size=None, max_queue=1 << 16) as socket:
         yield Watcher(socket)
-
-
-def composite(frame: SensorFrame) -> list[bytes]:
-    """What a render server sends for a frame: here the frame's own picture."""
-    assert frame.color_jpeg is not None
-    message = CompositeMessage(
-        node="cam",
-        frame_id=frame.frame_id,
-        capture_ns=frame.timestamp_ns,
-        clock_offset_ns=0,
-        encoding="jpeg",
-        shape=frame.color.shape,
-        status="no_pose",
-        camera=frame.camera.to_dict(),
-        received_ns=frame.timestamp_ns,
-        rendered_ns=frame.timestamp_ns,
-    )
-    return encode(message, [frame.color_jpeg])
 
 
 @contextmanager
@@ -153,17 +133,17 @@ def test_a_client_receives_every_topic_of_a_recording(recording: Path, tmp_path:
         node = running.enter_context(replaying(recording))
         bridge = running.enter_context(bridging(node, control=control.endpoint))
         first = running.enter_context(watching(bridge.server.port))
-        first.watch(set(TOPICS))
+        first.watch(set(FOXGLOVE_TOPICS))
         late = running.enter_context(watching(bridge.server.port))
         late.watch({"/scene"})  # which is sent once, and again to whoever comes later
     for channel in first.channels.values():
-        kind = TOPICS[channel["topic"]]
+        kind = FOXGLOVE_TOPICS[channel["topic"]]
         assert (channel["encoding"], channel["schemaName"]) == ("protobuf", kind.DESCRIPTOR.full_name)
         time_ns, data = first.received[channel["topic"]]
         assert kind.FromString(data).IsInitialized()
         assert abs(time.time_ns() - time_ns) < PATIENCE_S * 1e9
     jpegs = {frame.color_jpeg for frame in open_source(recording)}
-    for topic in ("/color/image", "/relit/image"):
+    for topic in ("/color/image", "/composite"):
         assert CompressedImage.FromString(first.received[topic][1]).data in jpegs
     entities = {entity.id: entity for entity in SceneUpdate.FromString(late.received["/scene"][1]).entities}
     assert entities["object box"].models[0].data == asset.read_bytes()

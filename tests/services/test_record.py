@@ -33,7 +33,17 @@ from deltalight.services.cli import app
 from deltalight.services.recorder import Recorder, RecordJob, RecordStatus
 from deltalight.services.stream_queue import StreamQueue
 from tests.services.conftest import ROOT, RunCli
-from tests.services.record_samples import BOARD, HEIGHT, WIDTH, camera, feeding, frames, messages, write
+from tests.services.record_samples import (
+    BOARD,
+    HEIGHT,
+    WIDTH,
+    camera,
+    composite,
+    feeding,
+    frames,
+    messages,
+    write,
+)
 
 PATIENCE_S = 60
 Start = Callable[..., "subprocess.Popen[str]"]
@@ -226,6 +236,35 @@ def test_frames_and_duration_end_a_recording(tmp_path: Path) -> None:
     assert len(open_source(tmp_path / "a.mcap")) == 5
     assert longer.seconds >= 0.5
     assert longer.frames == len(open_source(tmp_path / "b.mcap")) >= 1
+
+
+def test_relit_pictures_are_kept_with_their_frames(cli: RunCli, tmp_path: Path) -> None:
+    """A renderer that is a frame behind: each picture comes after the next frame."""
+    node, server = Publisher("tcp://127.0.0.1:*"), Publisher("tcp://127.0.0.1:*")
+    job = RecordJob(tmp_path / "a.mcap", (node.endpoint,), frames=4, composites=server.endpoint)
+    with recording(job) as (running, notices, end):
+        before = None
+        for frame in frames(200):
+            for multipart in messages(frame).values():
+                node.send(multipart)
+            time.sleep(0.02)
+            if before is not None:
+                server.send(composite(before))
+            before = frame
+            if end.done():
+                break
+    node.close()
+    server.close()
+    status = end.result()
+    source = open_source(tmp_path / "a.mcap")
+    assert (status.frames, notices) == (4, [])
+    pictures = [(frame.composite, frame.color_jpeg) for frame in source if frame.composite is not None]
+    assert status.composites == len(pictures) >= 3  # the server's subscription may come after the first
+    assert all(relit == camera for relit, camera in pictures)
+    assert source[3].composite is not None  # it was waited for
+    shown = cli("recordings", "info", tmp_path / "a.mcap").stdout
+    assert f"relit pictures │ {status.composites}" in " ".join(shown.split())
+    assert running.status.as_dict()["composites"] == status.composites
 
 
 def test_a_node_that_goes_and_comes_back_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -31,6 +31,11 @@ def assembled(
     return found
 
 
+def raw_frames(count: int, **options: bool) -> list[SensorFrame]:
+    """Frames as a node sends them: no renderer has seen them."""
+    return [replace(frame, composite=None) for frame in frames(count, **options)]
+
+
 def only(frame: SensorFrame, *streams: str) -> list[list[bytes]]:
     sent = messages(frame)
     return [sent[stream] for stream in streams]
@@ -38,7 +43,7 @@ def only(frame: SensorFrame, *streams: str) -> list[list[bytes]]:
 
 @pytest.mark.parametrize("as_jpeg", [True, False])
 def test_frames_come_back_bit_for_bit_without_the_first(as_jpeg: bool) -> None:
-    sent = frames(6, as_jpeg=as_jpeg, with_fisheye=True)
+    sent = raw_frames(6, as_jpeg=as_jpeg, with_fisheye=True)
     assembler = RawFrameAssembler()
     found = assembled(sent, assembler)
     for ours, theirs in zip(found, sent[1:], strict=True):
@@ -51,20 +56,20 @@ def test_frames_come_back_bit_for_bit_without_the_first(as_jpeg: bool) -> None:
 
 
 def test_linear_fisheye_pictures_come_back_bit_for_bit() -> None:
-    sent = [replace(frame, fisheye=linear(frame.timestamp_ns)) for frame in frames(3)]
+    sent = [replace(frame, fisheye=linear(frame.timestamp_ns)) for frame in raw_frames(3)]
     for ours, theirs in zip(assembled(sent, RawFrameAssembler()), sent[1:], strict=True):
         assert_same_pictures(ours.fisheye, theirs.fisheye)
 
 
 def test_before_the_first_fisheye_picture_the_first_holds() -> None:
-    early, *sent = frames(3)
+    early, *sent = raw_frames(3)
     later = [replace(frame, fisheye=linear(sent[1].timestamp_ns)) for frame in sent]
     found = assembled([early, *later], RawFrameAssembler())
     assert_same_pictures(found[0].fisheye, later[0].fisheye)
 
 
 def test_fisheye_pictures_of_a_replay_that_began_again_stay_in_order() -> None:
-    sent = frames(6)
+    sent = raw_frames(6)
     shown = [linear(frame.timestamp_ns) for frame in sent[:2]]
     again = [replace(frame, fisheye=shown[index % 2]) for index, frame in enumerate(sent)]
     found = assembled(again, RawFrameAssembler())
@@ -77,14 +82,14 @@ def test_fisheye_pictures_of_a_replay_that_began_again_stay_in_order() -> None:
 
 
 def test_a_pose_that_the_board_showed_is_left_to_the_replay() -> None:
-    first, second = frames(2)
+    first, second = raw_frames(2)
     detected = messages(second, detected=BoardPose(np.eye(4), reprojection_error_px=0.2))
     found = assembled([first, list(detected.values())], RawFrameAssembler())
     assert [frame.world_from_camera for frame in found] == [None]
 
 
 def test_partners_may_come_after_their_colour_picture() -> None:
-    first, second, third = frames(3)
+    first, second, third = raw_frames(3)
     late = [only(second, "color"), only(third, "depth", "pose", "color"), only(second, "pose", "depth")]
     found = assembled([first, *late], RawFrameAssembler())
     for ours, theirs in zip(found, (second, third), strict=True):
@@ -92,7 +97,7 @@ def test_partners_may_come_after_their_colour_picture() -> None:
 
 
 def test_a_lost_partner_is_waited_for_two_pictures_long_and_counted() -> None:
-    sent = frames(6)
+    sent = raw_frames(6)
     assembler = RawFrameAssembler()
     assert not assembled([sent[0], only(sent[1], "pose", "color"), sent[2]], assembler)
     found = assembled([sent[3], only(sent[4], "depth", "color"), sent[5]], assembler)
@@ -106,7 +111,7 @@ def test_a_lost_partner_is_waited_for_two_pictures_long_and_counted() -> None:
 
 
 def test_numbers_that_are_skipped_are_counted_and_a_new_start_is_not() -> None:
-    sent = frames(5)
+    sent = raw_frames(5)
     numbers = (40, 41, 45, 46, 0)
     renumbered = [replace(frame, frame_id=number) for frame, number in zip(sent, numbers, strict=True)]
     assembler = RawFrameAssembler()
@@ -115,7 +120,7 @@ def test_numbers_that_are_skipped_are_counted_and_a_new_start_is_not() -> None:
 
 
 def test_other_nodes_are_told_and_not_mixed_in() -> None:
-    sent = frames(3)
+    sent = raw_frames(3)
     assembler = RawFrameAssembler()
     others = [list(messages(frame, node="desk").values()) for frame in sent]
     mixed = [item for pair in zip(sent, others, strict=True) for item in pair]
@@ -127,7 +132,7 @@ def test_other_nodes_are_told_and_not_mixed_in() -> None:
 
 
 def test_a_broken_picture_costs_its_own_frame_only() -> None:
-    first, second, third = frames(3)
+    first, second, third = raw_frames(3)
     broken = messages(second)
     broken["color"][2] = broken["color"][2][:200]
     assembler = RawFrameAssembler()
@@ -137,7 +142,7 @@ def test_a_broken_picture_costs_its_own_frame_only() -> None:
 
 
 def test_the_queue_keeps_order_and_counts_what_finds_no_room() -> None:
-    frame = frames(1)[0]
+    frame = raw_frames(1)[0]
     publisher = Publisher("tcp://127.0.0.1:*", streams=100)
     queue = StreamQueue([publisher.endpoint], ["depth", "color"])
     try:

@@ -3,12 +3,15 @@
 from pathlib import Path as FilePath
 from typing import Annotated, Any, get_args
 
+import numpy as np
 from fastapi import APIRouter, Body, Path, Response
+from jaxtyping import UInt8
 from pydantic import Field, StrictBool, model_validator
 
 from deltalight.protocol.documents import StrictModel
 from deltalight.protocol.message_fields import Name
 from deltalight.protocol.methods import Method
+from deltalight.protocol.pictures import decode_rgb, read_bytes
 from deltalight.protocol.scene_method import Output
 from deltalight.services.api.context import Context, Shared, in_pool
 from deltalight.services.api.file_response import StoredFileResponse
@@ -17,10 +20,12 @@ from deltalight.services.api.request_bodies import AS_SENT, checked
 from deltalight.services.api.routes.assets import UNCHANGING
 from deltalight.services.api.routes.live import NO_ANSWER
 from deltalight.services.api.snapshot_store import ID, SnapshotFacts, SnapshotPicture, files_of, now
+from deltalight.services.before_after import before_after_gif
 
 router = APIRouter(tags=["snapshots"], prefix="/snapshots")
 ROUTERS = (router,)
 VIEWS: tuple[str, ...] = ("camera", *get_args(Output.model_fields["view"].annotation))
+BEFORE_AFTER = ("camera", "composite")
 MAX_PICTURES = 16
 EXR = "composite.exr"
 # Sixteen pictures by the slowest method, in software.
@@ -105,6 +110,18 @@ def get_snapshot(shared: Shared, snapshot_id: SnapshotId) -> SnapshotFacts:
 
 
 @router.get(
+    "/{snapshot_id}/before-after.gif",
+    response_class=Response,
+    responses=responses(404) | {200: {"content": {"image/gif": {}}}},
+)
+@in_pool("thumbnails")
+def snapshot_before_after(shared: Shared, snapshot_id: SnapshotId) -> Response:
+    """Return a moving picture in which a line divides the camera's picture from the composite."""
+    before, after = (_picture(shared.snapshots.file(snapshot_id, f"{view}.png")) for view in BEFORE_AFTER)
+    return Response(before_after_gif(before, after), media_type="image/gif", headers=UNCHANGING)
+
+
+@router.get(
     "/{snapshot_id}/{file}", response_class=StoredFileResponse, responses=responses(404) | FILE_ANSWER
 )
 def snapshot_file(
@@ -145,6 +162,10 @@ def _taken(shared: Context, name: str, folder: FilePath, wanted: NewSnapshot) ->
         pictures=[_described(picture, files, faults) for picture in wanted.pictures],
         files=files,
     )
+
+
+def _picture(path: FilePath) -> UInt8[np.ndarray, "h w 3"]:
+    return decode_rgb(read_bytes(path), path.name)
 
 
 def _described(picture: WantedPicture, files: list[str], faults: dict[str, str]) -> SnapshotPicture:

@@ -2,7 +2,7 @@
 import { computed, effect, signal, type ReadonlySignal } from "@preact/signals";
 import { API } from "../api/http";
 import type { LiveHeader } from "../api/types";
-import { lensOf, type View } from "../math/camera";
+import { lensOf, type Pixel, type View } from "../math/camera";
 import { lookedAt } from "../state/scene";
 import { noteDrawn } from "./delay";
 import { RateMeter } from "./rate";
@@ -14,6 +14,14 @@ import { ReconnectingSocket, type Connection } from "./socket";
 const LATE_FRAMES = 3;
 const LATE_MS = { least: 1500, most: 10_000 };
 const TICK_MS = 500;
+// Noise and pores of a surface are averaged over so many pixels to each side.
+const PATCH_PX = 2;
+// Of R, G and B (Rec. ITU-R BT.709).
+const LUMINANCE = [
+  [0, 0.2126],
+  [1, 0.7152],
+  [2, 0.0722],
+] as const;
 
 export const frame = signal<LiveHeader | null>(null);
 export const pictureSize = signal<{ readonly width: number; readonly height: number } | null>(null);
@@ -84,6 +92,25 @@ async function receive(event: MessageEvent<unknown>): Promise<void> {
   } finally {
     socket.send("ack");
   }
+}
+
+/** Mean linear brightness around a pixel of the picture, as sRGB codes it; null outside. */
+export function brightnessAt([x, y]: Pixel): number | null {
+  const context = canvas?.getContext("2d");
+  const [left, top] = [Math.round(x) - PATCH_PX, Math.round(y) - PATCH_PX];
+  const edge = 2 * PATCH_PX + 1;
+  if (!canvas || !context || left < 0 || top < 0 || left + edge > canvas.width || top + edge > canvas.height)
+    return null;
+  const { data } = context.getImageData(left, top, edge, edge);
+  let sum = 0;
+  for (let index = 0; index < data.length; index += 4)
+    for (const [channel, weight] of LUMINANCE) sum += weight * linearFromCode(data[index + channel]!);
+  return sum / (edge * edge);
+}
+
+function linearFromCode(code: number): number {
+  const value = code / 255;
+  return value <= 0.04045 ? value / 12.92 : ((value + 0.055) / 1.055) ** 2.4;
 }
 
 function draw(bitmap: ImageBitmap, header: LiveHeader): void {

@@ -59,14 +59,14 @@ export async function isRecording(file: File): Promise<boolean> {
   return /(^|[^a-z0-9_])rgb\.txt/.test(list);
 }
 
-/** Send a recording and show it; its card tells what relighting lacks. */
+/** Send a recording and show its first frame; its card tells what relighting lacks. */
 export async function openRecording(file: File): Promise<void> {
   const kept = await sendShown(file.name, (progress) => uploadRecording(file, progress));
   if (!kept) return;
   announce(`${kept.id} is among the recordings.`);
   await readRecordings();
   openDrawer("recordings");
-  await showRecording(kept.id);
+  await showRecording(kept.id, { playing: false });
 }
 
 /** Show a recording in place of the camera; `settings` are those of the replay so far. */
@@ -80,6 +80,26 @@ export async function showRecording(id: string, settings: Partial<Replay> = {}):
 export async function changeReplay(body: ReplayChange): Promise<void> {
   const shown = await attempt(() => request<Replay>("PATCH", `${API}/replay`, { body }));
   if (shown) replay.value = shown;
+}
+
+let wanted: number | null = null;
+let isSeeking = false;
+
+/** Pause at a position; of those that come while one is being sought, only the newest counts. */
+export function scrub(position_s: number): void {
+  wanted = position_s;
+  if (replay.value) replay.value = { ...replay.value, position_s, playing: false };
+  if (!isSeeking) void seekNewest();
+}
+
+async function seekNewest(): Promise<void> {
+  isSeeking = true;
+  while (wanted !== null) {
+    const body = { position_s: wanted, playing: false };
+    wanted = null;
+    await changeReplay(body);
+  }
+  isSeeking = false;
 }
 
 export async function backToLive(): Promise<void> {
@@ -98,6 +118,18 @@ export async function takeSnapshot(
   isTakingSnapshot.value = false;
   if (taken) await readSnapshots();
   return taken;
+}
+
+const BEFORE_AFTER: readonly WantedPicture[] = [
+  { name: "camera", view: "camera" },
+  { name: "composite", view: "composite" },
+];
+
+/** Take the frame that is shown, before and after, and return where it is as a moving picture. */
+export async function takeBeforeAfter(): Promise<{ readonly path: string; readonly name: string } | undefined> {
+  const taken = await takeSnapshot(BEFORE_AFTER, false);
+  if (!taken) return undefined;
+  return { path: `${API}/snapshots/${taken.id}/before-after.gif`, name: `before-after-${taken.frame_id}.gif` };
 }
 
 export async function deleteSnapshot(id: string): Promise<void> {

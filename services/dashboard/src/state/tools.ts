@@ -3,7 +3,7 @@ import { effect, signal } from "@preact/signals";
 import type { Pose, Vector } from "../api/types";
 import { frame } from "../live/picture";
 
-export type Tool = "select" | "move" | "rotate" | "scale" | "place";
+export type Tool = "select" | "move" | "rotate" | "scale" | "place" | "shadow";
 
 export const tool = signal<Tool>("move");
 /** Snapping without Shift held; Shift then lets go. */

@@ -2,7 +2,7 @@ import { useEffect } from "preact/hooks";
 import { role } from "../../api/session";
 import type { Replay } from "../../api/types";
 import { clock } from "../../math/units";
-import { backToLive, changeReplay, readReplay, replay, showRecording } from "../../state/takes";
+import { backToLive, changeReplay, readReplay, recordings, replay, scrub, showRecording } from "../../state/takes";
 import { Button } from "../ui/Button";
 import { IconButton } from "../ui/IconButton";
 import { Select } from "../ui/Select";
@@ -50,6 +50,15 @@ export function ReplayBar() {
   );
 }
 
+/** Arrow keys go from frame to frame. */
+function stepFrame(event: KeyboardEvent, { recording, position_s, duration_s }: Replay): void {
+  const step = { ArrowLeft: -1, ArrowDown: -1, ArrowRight: 1, ArrowUp: 1 }[event.key];
+  const frames = recordings.value.find((each) => each.id === recording)?.frames ?? 0;
+  if (!step || frames < 2 || !duration_s) return;
+  event.preventDefault();
+  scrub(Math.max(0, Math.min(duration_s, (position_s ?? 0) + (step * duration_s) / (frames - 1))));
+}
+
 function Timeline({ shown, disabled }: { readonly shown: Replay; readonly disabled: boolean }) {
   const position = shown.position_s ?? 0;
   const duration = shown.duration_s ?? 0;
@@ -64,11 +73,12 @@ function Timeline({ shown, disabled }: { readonly shown: Replay; readonly disabl
         aria-valuetext={`${clock(position)} of ${clock(duration)}`}
         min={0}
         max={duration}
-        step={0.05}
+        step="any"
         value={position}
         disabled={disabled}
+        onKeyDown={(event) => stepFrame(event, shown)}
+        onInput={(event) => scrub(event.currentTarget.valueAsNumber)}
         ref={(element) => element?.style.setProperty("--filled", `${100 * share}%`)}
-        onChange={(event) => changeReplay({ position_s: event.currentTarget.valueAsNumber })}
       />
       <span class="quiet">{clock(duration)}</span>
     </>

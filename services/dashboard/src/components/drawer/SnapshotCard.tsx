@@ -12,8 +12,10 @@ export function SnapshotCard({ snapshot }: { readonly snapshot: Snapshot }) {
   const poster = snapshot.files.includes("composite.png")
     ? "composite.png"
     : snapshot.files.find((file) => file.endsWith(".png"));
+  const hasBoth = ["camera.png", "composite.png"].every((file) => snapshot.files.includes(file));
+  const files = hasBoth ? [...snapshot.files, "before-after.gif"] : snapshot.files;
   const entries: MenuEntry[] = [
-    ...snapshot.files.map((file): MenuEntry => ({
+    ...files.map((file): MenuEntry => ({
       label: file,
       icon: "download",
       onClick: () => download(`${path}/${file}`, `frame-${snapshot.frame_id}-${file}`),
@@ -34,7 +36,7 @@ export function SnapshotCard({ snapshot }: { readonly snapshot: Snapshot }) {
         <h3>Frame {snapshot.frame_id}</h3>
         <p class="quiet small">{taken}</p>
         <Menu label={`Files of frame ${snapshot.frame_id}`} entries={entries} kind="plain">
-          <Icon name="download" /> {snapshot.files.length} files
+          <Icon name="download" /> {files.length} files
         </Menu>
       </div>
     </article>

@@ -10,6 +10,7 @@ import { areKeysShown } from "./KeysDialog";
 import { LiveState } from "./LiveState";
 import { RecordButton } from "./RecordButton";
 import { SceneMenu } from "./SceneMenu";
+import { ShareButton } from "./ShareButton";
 import { SnapshotButton } from "./SnapshotButton";
 
 export function TopBar() {
@@ -47,6 +48,7 @@ export function TopBar() {
       {role.value === "view" && <span class="badge">view only</span>}
       <LiveState />
       <SnapshotButton />
+      <ShareButton />
       <RecordButton />
       <span class="rule" />
       <IconButton icon="keyboard" label="Keyboard shortcuts" hint="?" onClick={() => (areKeysShown.value = true)} />

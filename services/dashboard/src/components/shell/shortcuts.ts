@@ -65,7 +65,7 @@ function onPlainKey(key: string): boolean {
 }
 
 function leave(): boolean {
-  if (tool.value === "place") tool.value = "move";
+  if (tool.value === "place" || tool.value === "shadow") tool.value = "move";
   else {
     selectObject(null);
     selectLight(null);

@@ -16,6 +16,7 @@ import { Outlines } from "./Outlines";
 import { PicturePointer } from "./pointer";
 import { PictureNotice } from "./PictureNotice";
 import { Poster } from "./Poster";
+import { ShadowHint } from "./ShadowHint";
 import { stepSelection } from "./stepSelection";
 import { useGizmo } from "./useGizmo";
 
@@ -67,7 +68,7 @@ export function Picture() {
         <Outlines box={box} />
         <canvas class="layer" ref={handles} aria-hidden="true" />
         <div
-          class={`layer surface ${tool.value === "place" && selectedObjectId.value !== null ? "placing" : ""}`}
+          class={`layer surface ${isAiming() ? "placing" : ""}`}
           ref={surface}
           id="stage"
           role="application"
@@ -82,10 +83,16 @@ export function Picture() {
         />
         <CompareSlider />
         <PictureNotice />
+        <ShadowHint />
         {isDropping.value && <p class="drop-hint">Drop an object where it should stand, or a recording</p>}
       </div>
     </div>
   );
+}
+
+/** Whether the next click chooses a place. */
+function isAiming(): boolean {
+  return tool.value === "shadow" || (tool.value === "place" && selectedObjectId.value !== null);
 }
 
 async function dropAt(event: DragEvent, pixel: readonly [number, number]): Promise<void> {

@@ -6,10 +6,11 @@ import { pictureSize, view } from "../../live/picture";
 import type { Pixel } from "../../math/camera";
 import { placeObject } from "../../state/actions";
 import { pick } from "../../state/placing";
+import { takeShadowClick } from "../../state/shadowLight";
 import { ShadowSlide } from "../../state/shadowSlide";
 import { beginSlide, slidesOnSurfaces, type Slide } from "../../state/slide";
 import { selectedLight, selectedObjectId, selectLight, selectObject } from "../../state/selection";
-import { isSnapping, tool } from "../../state/tools";
+import { isSnapping, tool, type Tool } from "../../state/tools";
 import { lampAt, objectsAt } from "./hits";
 
 // A press that moves less is a click; a finger rolls where a mouse stands still.
@@ -96,7 +97,7 @@ export class PicturePointer {
 
   /** What a press here holds: the selection, or else the shadow that may be there. */
   private takes(at: Pixel): Press["begin"] {
-    if (role.value !== "control" || tool.value === "place" || !view.value) return null;
+    if (role.value !== "control" || isClicking(tool.value) || !view.value) return null;
     const lamp = lampAt(this.sheet(), at);
     if (lamp !== null) return lamp === selectedLight.value ? beginSlide : null;
     const held = selectedObjectId.value;
@@ -107,6 +108,10 @@ export class PicturePointer {
   private async click(at: Pixel): Promise<void> {
     const pixel = this.pixel(at);
     const held = selectedObjectId.value;
+    if (tool.value === "shadow") {
+      await takeShadowClick(pixel);
+      return;
+    }
     if (tool.value === "place" && held !== null && role.value === "control") {
       await placeObject(held, pixel);
       return;
@@ -135,6 +140,11 @@ export class PicturePointer {
     const factor = (pictureSize.value?.width ?? 1) / this.surface.getBoundingClientRect().width;
     return [x * factor - 0.5, y * factor - 0.5];
   }
+}
+
+/** Whether a tool takes clicks and nothing else. */
+function isClicking(inHand: Tool): boolean {
+  return inHand === "place" || inHand === "shadow";
 }
 
 function isClick(press: Press, [x, y]: Pixel, { pointerType }: PointerEvent): boolean {

@@ -1,0 +1,62 @@
+"""Before and after in one moving picture: a line goes across, with the camera's picture on its left."""
+
+import math
+from io import BytesIO
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image
+
+WIDTH = 480
+PICTURES = 24
+PERIOD_MS = 80
+REACH = 0.46  # of the width, to each side of the middle
+LINE_PX = 2
+COLORS = 192  # beside the line's white; GIF has 256
+
+
+def divided(
+    before: UInt8[np.ndarray, "h w 3"], after: UInt8[np.ndarray, "h w 3"], share: float
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Return `before` left of a white line at a share of the width, and `after` right of it."""
+    column = round(share * before.shape[1])
+    picture = after.copy()
+    picture[:, :column] = before[:, :column]
+    picture[:, max(column - LINE_PX // 2, 0) : column + LINE_PX // 2] = 255
+    return picture
+
+
+def before_after_gif(before: UInt8[np.ndarray, "h w 3"], after: UInt8[np.ndarray, "h w 3"]) -> bytes:
+    """Return a GIF that repeats for ever, in the size of `after` and at most WIDTH wide."""
+    after = _small(after)
+    before = _resized(before, (after.shape[1], after.shape[0]))
+    # One palette, without dithering, lets pictures share what does not change: half the size.
+    palette = _palette(np.vstack([before, after]))
+    shares = [0.5 + REACH * math.cos(2 * math.pi * step / PICTURES) for step in range(PICTURES)]
+    first, *rest = [
+        Image.fromarray(divided(before, after, share)).quantize(palette=palette, dither=Image.Dither.NONE)
+        for share in shares
+    ]
+    file = BytesIO()
+    first.save(file, "GIF", save_all=True, append_images=rest, duration=PERIOD_MS, loop=0, optimize=False)
+    return file.getvalue()
+
+
+def _palette(picture: UInt8[np.ndarray, "h w 3"]) -> Image.Image:
+    """Return an image whose palette is that of a picture, and white."""
+    colors = Image.fromarray(picture).quantize(COLORS, dither=Image.Dither.NONE).getpalette() or []
+    palette = Image.new("P", (1, 1))
+    palette.putpalette([*colors[: 3 * COLORS], 255, 255, 255])
+    return palette
+
+
+def _small(picture: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]:
+    height, width = picture.shape[:2]
+    if width <= WIDTH:
+        return picture
+    return _resized(picture, (WIDTH, max(round(WIDTH * height / width), 1)))
+
+
+def _resized(picture: UInt8[np.ndarray, "h w 3"], size: tuple[int, int]) -> UInt8[np.ndarray, "h2 w2 3"]:
+    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA))

@@ -1,0 +1,15 @@
+import { shadowTip } from "../../state/shadowLight";
+import { tool } from "../../state/tools";
+
+/** What to click for a light from a shadow. */
+export function ShadowHint() {
+  if (tool.value !== "shadow") return null;
+  const text = shadowTip.value
+    ? "Now click the point of the real thing that throws it. Esc ends."
+    : "Click the tip of a shadow that the camera sees. Esc ends.";
+  return (
+    <p class="drop-hint" role="status">
+      {text}
+    </p>
+  );
+}
