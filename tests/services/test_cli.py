@@ -28,6 +28,8 @@ COMMANDS = {
     "recordings recover",
     "recordings import",
     "recordings export",
+    "backup",
+    "restore",
     "board",
     "ping",
     "calibrate camera",
@@ -93,7 +95,7 @@ def test_a_shell_completes_commands_and_options(cli: RunCli, monkeypatch: pytest
     monkeypatch.setenv("_DELTALIGHT_COMPLETE", "complete_bash")
     monkeypatch.setenv("COMP_CWORD", "1")
     monkeypatch.setenv("COMP_WORDS", "deltalight re")
-    assert cli().stdout.split() == ["render", "record", "replay", "recordings"]
+    assert cli().stdout.split() == ["render", "record", "replay", "restore", "recordings"]
     monkeypatch.setenv("COMP_CWORD", "2")
     monkeypatch.setenv("COMP_WORDS", "deltalight render --met")
     assert cli().stdout.split() == ["--method"]
