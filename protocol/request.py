@@ -163,7 +163,7 @@ class ReplyServer:
         except Exception as error:  # the thread must survive a fault of the handler
             _log.exception("control handler failed", op=request.op)
             return self._reply(
-                request.id, error=f"{request.op} failed with {error!r}: see the log of {self._node}"
+                request.id, error=f"{request.op} failed with {error!r:.300}: see the log of {self._node}"
             )
 
     def _reply(

@@ -157,7 +157,7 @@ def _checked(path: Path, document: dict[str, Any], binary: bytes | None) -> Gltf
 
 def _count(value: object) -> int:
     if type(value) is not int or value < 0:
-        raise GltfFaultError(f"{value!r} stands where a count belongs")
+        raise GltfFaultError(f"{value!r:.60} stands where a count belongs")
     return value
 
 

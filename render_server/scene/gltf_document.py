@@ -35,7 +35,9 @@ def faults_named(path: Path) -> Iterator[None]:
     except GltfFaultError as fault:
         raise DeltalightError(f"{path}: {fault}; export the mesh again.") from fault
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, RecursionError) as error:
-        raise DeltalightError(f"{path} is not a valid glTF 2 file ({error!r}); export it again.") from error
+        raise DeltalightError(
+            f"{path} is not a valid glTF 2 file ({error!r:.300}); export it again."
+        ) from error
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,6 +19,7 @@ from uuid import uuid4
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from deltalight.protocol.cached_files import read_cached, write_cached
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.scene import DIGEST_PREFIX, SceneDocument
 from deltalight.services.storage.asset_kinds import (
@@ -197,10 +198,10 @@ class AssetStore:
         asset = self.get(digest)
         path = self.path(asset)
         place = path.with_name(THUMBNAIL)
-        if place.is_file():
+        if read_cached(place) is not None:
             return place
         with self._children:
-            if not place.is_file():
+            if read_cached(place) is None:
                 task: Task = "mesh-thumbnail" if asset.format.kind == "mesh" else "map-thumbnail"
                 self._draw(task, path, place, asset.names[0])
         return place
@@ -210,7 +211,7 @@ class AssetStore:
         try:
             run_limited(task, path, name, str(drawn), output_bytes=THUMBNAIL_BYTES)
             with disk_faults():
-                drawn.replace(place)
+                write_cached(place, drawn.read_bytes())
         finally:
             drawn.unlink(missing_ok=True)
 
