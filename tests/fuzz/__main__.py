@@ -23,7 +23,7 @@ TARGETS = (
     *("envelope", "codecs", "scene", "yaml", "lists", "camera"),
     *("mcap", "gltf", "mesh", "radiance", "archive"),
 )
-MEMORY_MB, ALLOCATION_MB, HANG_S = 3072, 2048, 20
+MEMORY_MB, ALLOCATION_MB, HANG_S = 3072, 2048, 300
 LONGEST_INPUT = 32_768
 DISTILLED_BYTES = 12_000  # of a target
 MOST_CRASHES = 20

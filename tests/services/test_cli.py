@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from typer.core import TyperGroup
@@ -43,6 +44,7 @@ COMMANDS = {
     "keys create",
     "keys list",
     "keys trust",
+    "keys allow",
     "config",
     "doctor",
     "foxglove",
@@ -207,3 +209,22 @@ def test_port_in_use_is_a_sentence_that_names_it(cli: RunCli, command: tuple[str
     assert done.returncode == 2, done.stderr
     assert str(port) in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_keys_allow_limits_what_a_trusted_machine_may_send(cli: RunCli, tmp_path: Path) -> None:
+    here, there = ("--folder", tmp_path / "here"), ("--folder", tmp_path / "there")
+    cli("keys", "create", "desk", *there)
+    assert "no key of `desk` is trusted" in cli("keys", "allow", "desk", "color", *here).stderr
+    cli("keys", "trust", tmp_path / "there" / "desk.key", *here)
+    assert "name the streams" in cli("keys", "allow", "desk", *here).stderr
+    assert "the nearest is color" in cli("keys", "allow", "desk", "colour", *here).stderr
+    assert (
+        cli("keys", "allow", "desk", "pose.desk", "color", *here).stdout
+        == "desk may send color, pose.desk.\n"
+    )
+    assert "may send only: color, pose.desk" in cli("keys", "list", *here).stdout
+    assert json.loads(cli("keys", "list", "--json", *here).stdout)["allow"] == {
+        "desk": ["color", "pose.desk"]
+    }
+    assert cli("keys", "allow", "desk", "--everything", *here).returncode == 0
+    assert "may send only" not in cli("keys", "list", *here).stdout
