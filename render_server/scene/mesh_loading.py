@@ -132,9 +132,8 @@ def _described_material(geometry: "trimesh.Trimesh") -> Material:
 
 def _file_geometry(geometry: "trimesh.Trimesh", path: Path) -> FileGeometry:
     positions, triangles = np.asarray(geometry.vertices, np.float32), np.asarray(geometry.faces, np.int64)
-    if positions.shape[1:] != (3,) or triangles.shape[1:] != (
-        3,
-    ):  # the loader takes any number from some files
+    # The loader takes vertices of any number of coordinates.
+    if positions.shape[1:] != (3,) or triangles.shape[1:] != (3,):
         raise DeltalightError(f"{path} has vertices that are not three numbers each; export it again.")
     normals = geometry._cache["vertex_normals"] if "vertex_normals" in geometry._cache else np.zeros(0)
     return FileGeometry(
