@@ -24,7 +24,9 @@ def unpacking(path: Path) -> Iterator[None]:
     try:
         yield
     except (zipfile.BadZipFile, NotImplementedError, zlib.error, EOFError, OSError) as error:
-        raise DeltalightError(f"{path} is a damaged or unusual .zip ({error}); pack it again.") from error
+        raise DeltalightError(
+            f"{path} is a damaged or unusual .zip ({error!s:.300}); pack it again."
+        ) from error
 
 
 class Archive:

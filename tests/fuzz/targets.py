@@ -257,5 +257,5 @@ def _zip(pieces: Sequence[bytes]) -> bytes:
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w") as made:
         for name, content in zip(pieces[::2], pieces[1::2], strict=False):
-            made.writestr(name.decode("latin-1") or "x", content)
+            made.writestr(name.decode("latin-1").replace("\0", "") or "x", content)
     return stream.getvalue()
