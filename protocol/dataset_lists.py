@@ -4,7 +4,7 @@ import statistics
 from bisect import bisect_left
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from itertools import pairwise, takewhile
 from pathlib import Path
 
@@ -118,12 +118,13 @@ def parse_timestamp(place: str, word: str) -> int:
         DeltalightError: not a number, negative, or beyond 64 bits.
     """
     try:
-        nanoseconds = int(Decimal(word) * 10**9)
-    except (InvalidOperation, ValueError, OverflowError):
-        nanoseconds = -1
-    if not 0 <= nanoseconds <= MAX_TIMESTAMP_NS:
-        raise DeltalightError(f"{place} has the timestamp `{word}`; write seconds, zero or more.")
-    return nanoseconds
+        nanoseconds = Decimal(word) * 10**9
+        is_known = 0 <= nanoseconds <= MAX_TIMESTAMP_NS  # as a whole number 1e999999 would take for ever
+    except ArithmeticError:
+        is_known = False
+    if not is_known:
+        raise DeltalightError(f"{place} has the timestamp `{word:.60}`; write seconds, zero or more.")
+    return int(nanoseconds)
 
 
 def format_timestamp(timestamp_ns: int) -> str:
