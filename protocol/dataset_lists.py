@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.files import is_file
 from deltalight.protocol.poses import interpolate_pose, rigid_matrix, rotation_from_wxyz
 
 MAX_TIMESTAMP_NS = 2**63 - 1
@@ -60,10 +61,10 @@ def read_list(path: Path) -> list[ListEntry]:
             raise DeltalightError(f"{place} is earlier than the line before; sort the list by time.")
     if not entries:
         raise DeltalightError(f"{path} names no picture; write lines `timestamp filename`.")
-    lost = [entry.path for entry in entries if not entry.path.is_file()]
+    lost = [entry.path for entry in entries if not is_file(entry.path)]
     if lost:
         raise DeltalightError(
-            f"{path} names {len(lost)} missing files, first {lost[0]}; restore them or cut the list."
+            f"{path} names {len(lost)} missing files, first {lost[0]!s:.500}; restore them or cut the list."
         )
     return entries
 
