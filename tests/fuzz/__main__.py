@@ -2,27 +2,24 @@
 
 It needs atheris (`python -m pip install atheris==3.0.0`), which has wheels for Linux on x86-64 only and so is in no
 lock. What fails is kept as a file in `kept/TARGET`, which the tests replay; the corpus grows in a folder of its own.
-`--distil` then takes the inputs that cover most per byte into `corpus/TARGET`.
+`--distil` then packs the shortest inputs that reached new code into `corpus/TARGET.bin`.
 """
 
 import argparse
-import hashlib
 import json
 import os
 import re
-import shutil
 import subprocess
 import sys
 import time
 from importlib.util import find_spec
 from pathlib import Path
 
-HERE = Path(__file__).parent
-CORPUS, KEPT = HERE / "corpus", HERE / "kept"
-TARGETS = (
-    *("envelope", "codecs", "scene", "yaml", "lists", "camera"),
-    *("mcap", "gltf", "mesh", "radiance", "archive"),
-)
+from deltalight.protocol.files import write_bytes
+from deltalight.protocol.vectors import frame_pieces
+from tests.fuzz.seeds import CORPUS, KEPT, corpus, seeds
+from tests.fuzz.targets import TARGETS
+
 MEMORY_MB, ALLOCATION_MB, HANG_S = 3072, 2048, 300
 LONGEST_INPUT = 32_768
 DISTILLED_BYTES = 6_000  # of a target
@@ -37,7 +34,7 @@ def main() -> None:
     for target in options.targets or TARGETS:
         grown = options.work / target
         grown.mkdir(parents=True, exist_ok=True)
-        _write_seeds(target)
+        _write_seeds(target, _seed_folder(grown))
         print(json.dumps(_fuzz(target, grown, 60 * options.minutes)), flush=True)
         if options.distil:
             _distil(target, grown)
@@ -54,13 +51,11 @@ def _options() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def _write_seeds(target: str) -> None:
-    from tests.fuzz.seeds import seeds
-
-    folder = CORPUS / target
+def _write_seeds(target: str, folder: Path) -> None:
+    """Write the first inputs and the corpus as files, which libFuzzer wants."""
     folder.mkdir(parents=True, exist_ok=True)
-    for number, content in enumerate(data for name, data in seeds() if name == target):
-        (folder / f"seed-{number:02d}").write_bytes(content)
+    for number, content in enumerate([*(data for name, data in seeds() if name == target), *corpus(target)]):
+        (folder / f"{number:04d}").write_bytes(content)
     (KEPT / target).mkdir(parents=True, exist_ok=True)
 
 
@@ -90,7 +85,7 @@ def _fuzz(target: str, grown: Path, seconds: float) -> dict[str, object]:
 
 
 def _run(target: str, grown: Path, *options: str) -> tuple[int, str]:
-    folders = [str(each) for each in (grown, CORPUS / target, KEPT / target)]
+    folders = [str(each) for each in (grown, _seed_folder(grown), KEPT / target)]
     limits = [f"-rss_limit_mb={MEMORY_MB}", f"-malloc_limit_mb={ALLOCATION_MB}", f"-timeout={HANG_S}"]
     command = [
         sys.executable,
@@ -121,21 +116,21 @@ def _contents(folder: Path) -> set[str]:
     return {path.name for path in folder.iterdir()}
 
 
+def _seed_folder(grown: Path) -> Path:
+    return grown.with_name(f"{grown.name}-seeds")
+
+
 def _distil(target: str, grown: Path) -> None:
-    """Replace what was distilled before: what libFuzzer keeps of everything, the shortest inputs first."""
-    merged = grown.with_name(f"{target}-merged")
-    shutil.rmtree(merged, ignore_errors=True)
-    merged.mkdir()
-    _run(target, merged, "-merge=1", str(grown))
-    for old in CORPUS.glob(f"{target}/grown-*"):
-        old.unlink()
-    room = DISTILLED_BYTES
-    for path in sorted(merged.iterdir(), key=lambda each: each.stat().st_size):
-        content = path.read_bytes()
+    """Pack the corpus anew: each input of the grown one reached new code; the shortest come first."""
+    chosen, room = [], DISTILLED_BYTES
+    for content in sorted(
+        {path.read_bytes() for path in grown.iterdir()}, key=lambda each: (len(each), each)
+    ):
         room -= len(content)
         if room < 0:
             break
-        (CORPUS / target / f"grown-{hashlib.sha256(content).hexdigest()[:12]}").write_bytes(content)
+        chosen.append(content)
+    write_bytes(CORPUS / f"{target}.bin", frame_pieces(chosen))
 
 
 if __name__ == "__main__":

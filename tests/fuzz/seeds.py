@@ -1,4 +1,4 @@
-"""The first inputs of each target: one small valid one of each kind."""
+"""The inputs of each target: one small valid one of each kind, what covers most, and what failed once."""
 
 import io
 import json
@@ -19,13 +19,25 @@ from deltalight.protocol.dataset_writer import DatasetWriter
 from deltalight.protocol.frames import DepthImage, SensorFrame
 from deltalight.protocol.radiance_files import write_exr
 from deltalight.protocol.recording_writer import RecordingWriter
-from deltalight.protocol.vectors import FOLDER
+from deltalight.protocol.vectors import FOLDER, unframe_pieces
 from tests.fuzz.targets import RECORD_TOPICS, packed
 from tests.render_server.gltf_samples import QUARTER_TURN, bent_bar
 from tests.services.test_gltf_zip import PIECES, RED_PNG, gltf
 
+CORPUS, KEPT = (Path(__file__).parent / name for name in ("corpus", "kept"))
 _LONG = "long" * 800
 SMALL = 6000  # bytes of a seed at most
+
+
+def corpus(target: str) -> list[bytes]:
+    """Return the inputs that were found to cover most."""
+    path = CORPUS / f"{target}.bin"
+    return unframe_pieces(path.read_bytes()) if path.is_file() else []
+
+
+def kept(target: str) -> list[bytes]:
+    """Return the inputs that failed once."""
+    return [path.read_bytes() for path in sorted((KEPT / target).glob("*"))]
 
 
 def seeds() -> Iterator[tuple[str, bytes]]:
