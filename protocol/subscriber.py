@@ -52,7 +52,8 @@ class Subscriber(ABC):
         self._keys_of: dict[zmq.Socket[bytes], bytes | None] = {}  # of the host at a socket's other end
         self._subscriptions, self._high_water_mark = tuple(subscriptions), high_water_mark
         try:
-            self.endpoints = self._attached(endpoints, bind=bind)
+            shared = self._opened(bind=bind)
+            self.endpoints = tuple(self._attach(endpoint, shared, bind=bind) for endpoint in endpoints)
         except DeltalightError:
             self._close_guards()
             self._context.destroy(0)
@@ -75,19 +76,14 @@ class Subscriber(ABC):
         self._context.term()  # interrupts the thread, which closes its own sockets
         self._thread.join()
 
-    def _attached(self, endpoints: Sequence[str], *, bind: bool) -> tuple[str, ...]:
-        """Attach all endpoints; each host with a key has a socket of its own, which tells whose messages come."""
-        attached, shared = [], None if endpoints else self._opened(bind=bind)
-        for endpoint in endpoints:
-            parts = check_endpoint(endpoint, self._keys)
-            is_alone = uses_keys(parts, self._keys) and not bind
-            socket = shared if shared is not None and not is_alone else self._opened(bind=bind)
-            if not is_alone:
-                shared = socket
-            attached.append(attach(socket, endpoint, bind=bind, keys=self._keys))
-            if is_alone and self._keys is not None:
-                self._keys_of[socket] = self._keys.peer(parts)
-        return tuple(attached)
+    def _attach(self, endpoint: str, shared: "zmq.Socket[bytes]", *, bind: bool) -> str:
+        """Attach an endpoint; a host with a key has a socket of its own, which tells whose messages come."""
+        parts, keys = check_endpoint(endpoint, self._keys), self._keys
+        if bind or keys is None or not uses_keys(parts, keys):
+            return attach(shared, endpoint, bind=bind, keys=keys)
+        socket = self._opened(bind=False)
+        self._keys_of[socket] = keys.peer(parts)
+        return attach(socket, endpoint, bind=False, keys=keys)
 
     def _opened(self, *, bind: bool) -> "zmq.Socket[bytes]":
         socket = open_socket(self._context, zmq.SUB, high_water_mark=self._high_water_mark)
