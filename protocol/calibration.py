@@ -43,7 +43,7 @@ class Extrinsics:
             if key not in known:
                 hint = nearest(str(key), known)
                 raise DeltalightError(
-                    f"{name}: unknown key `{key}`; the nearest known key is `{hint or known[0]}`."
+                    f"{name}: unknown key `{key!s:.60}`; the nearest known key is `{hint or known[0]}`."
                 )
         return cls(**{key: require_rigid(_matrix(value), f"{name}: `{key}`") for key, value in data.items()})
 

@@ -60,7 +60,9 @@ class CameraModel:
             raise DeltalightError("the camera's focal lengths must be positive; correct the calibration.")
         if lengths is None:
             known = " or ".join(DISTORTION_LENGTHS)
-            raise DeltalightError(f"the distortion model `{self.distortion_model}` is unknown; use {known}.")
+            raise DeltalightError(
+                f"the distortion model `{self.distortion_model:.60}` is unknown; use {known}."
+            )
         if self._coefficients.shape not in {(length,) for length in lengths}:
             raise DeltalightError(
                 f"{self.distortion_model} has no form of {self._coefficients.size} coefficients; "
@@ -187,7 +189,7 @@ class CameraModel:
             return cls(int(data["width"]), int(data["height"]), matrix, data["distortion_model"], distortion)
         except (KeyError, TypeError, ValueError) as error:
             raise DeltalightError(
-                f"a camera description is malformed ({error!r}); send all of its fields."
+                f"a camera description is malformed ({error!r:.300}); send all of its fields."
             ) from error
 
 

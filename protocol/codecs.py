@@ -158,6 +158,15 @@ def jpeg_size(part: Buffer) -> tuple[int, int]:
     data = memoryview(part).cast("B")
     if bytes(data[:2]) != b"\xff\xd8" or not bytes(data[-256:]).rstrip(b"\0").endswith(b"\xff\xd9"):
         raise EnvelopeError("the picture is not a complete jpeg: send one from its first to its last marker")
+    size = stated_jpeg_size(data)
+    if size is None:
+        raise EnvelopeError("the jpeg states no size: send a baseline or progressive one of 8 bits")
+    return size
+
+
+def stated_jpeg_size(part: Buffer) -> tuple[int, int] | None:
+    """Return height and width that the beginning of an 8-bit jpeg states; None if it states none."""
+    data = memoryview(part).cast("B")
     place = 2
     while place + 9 <= len(data) and data[place] == 0xFF:
         marker, length = data[place + 1], int.from_bytes(data[place + 2 : place + 4], "big")
@@ -172,7 +181,7 @@ def jpeg_size(part: Buffer) -> tuple[int, int]:
         if marker in _JPEG_OTHER_FRAMES or marker < 0xC0 or 0xD0 <= marker <= 0xDA or length < 2:
             break
         place += 2 + length
-    raise EnvelopeError("the jpeg states no size: send a baseline or progressive one of 8 bits")
+    return None
 
 
 def _compress(values: Shaped[np.ndarray, "..."]) -> bytes:

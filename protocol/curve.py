@@ -48,6 +48,14 @@ def secure(socket: zmq.Socket[bytes], endpoint: Endpoint, keys: Keys | None, *, 
         socket.curve_serverkey = keys.peer(endpoint)
 
 
+def sender_key(frame: zmq.Frame) -> bytes | None:
+    """Return the public key (Z85) of who sent a message to a bound socket; None without keys."""
+    try:
+        return str(frame.get("User-Id")).encode()  # as the authenticator told libzmq
+    except zmq.ZMQError:
+        return None
+
+
 class Guard:
     """Lets trusted keys into the sockets that one context binds, and counts a socket's refused connections.
 

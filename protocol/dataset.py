@@ -268,7 +268,7 @@ class DatasetReader:
 
 def _positive(value: object, name: str) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < 1e3:
-        raise DeltalightError(f"{name} is {value!r}; write a positive number of metres.")
+        raise DeltalightError(f"{name} is {value!r:.60}; write a positive number of metres.")
     return float(value)
 
 

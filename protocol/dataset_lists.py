@@ -4,7 +4,7 @@ import statistics
 from bisect import bisect_left
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from itertools import pairwise, takewhile
 from pathlib import Path
 
@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.files import is_file
 from deltalight.protocol.poses import interpolate_pose, rigid_matrix, rotation_from_wxyz
 
 MAX_TIMESTAMP_NS = 2**63 - 1
@@ -60,10 +61,10 @@ def read_list(path: Path) -> list[ListEntry]:
             raise DeltalightError(f"{place} is earlier than the line before; sort the list by time.")
     if not entries:
         raise DeltalightError(f"{path} names no picture; write lines `timestamp filename`.")
-    lost = [entry.path for entry in entries if not entry.path.is_file()]
+    lost = [entry.path for entry in entries if not is_file(entry.path)]
     if lost:
         raise DeltalightError(
-            f"{path} names {len(lost)} missing files, first {lost[0]}; restore them or cut the list."
+            f"{path} names {len(lost)} missing files, first {lost[0]!s:.500}; restore them or cut the list."
         )
     return entries
 
@@ -118,12 +119,13 @@ def parse_timestamp(place: str, word: str) -> int:
         DeltalightError: not a number, negative, or beyond 64 bits.
     """
     try:
-        nanoseconds = int(Decimal(word) * 10**9)
-    except (InvalidOperation, ValueError, OverflowError):
-        nanoseconds = -1
-    if not 0 <= nanoseconds <= MAX_TIMESTAMP_NS:
-        raise DeltalightError(f"{place} has the timestamp `{word}`; write seconds, zero or more.")
-    return nanoseconds
+        nanoseconds = Decimal(word) * 10**9
+        is_known = 0 <= nanoseconds <= MAX_TIMESTAMP_NS  # as a whole number 1e999999 would take for ever
+    except ArithmeticError:
+        is_known = False
+    if not is_known:
+        raise DeltalightError(f"{place} has the timestamp `{word:.60}`; write seconds, zero or more.")
+    return int(nanoseconds)
 
 
 def format_timestamp(timestamp_ns: int) -> str:

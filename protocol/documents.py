@@ -135,7 +135,7 @@ def _sentence(fault: ErrorDetails, document: Mapping[str, Any]) -> str:
         case "missing":
             return f"the key `{place}` is missing; add it."
         case "union_tag_invalid":
-            tag = str(context["tag"])
+            tag = str(context["tag"])[:LONGEST_WORD]
             expected = [word.strip(" '") for word in str(context["expected_tags"]).split(",")]
             hint = nearest(tag, expected)
             advice = f"the nearest is `{hint}` of" if hint else "use one of"

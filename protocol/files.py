@@ -15,6 +15,14 @@ ACTIVE_SUFFIX = ".active"  # of a recording that is not finished
 PNG_COMPRESSION = 1  # zlib level; higher levels cost more time than a frame takes to render
 
 
+def is_file(path: Path) -> bool:
+    """Whether there is such a file; not for a name that no file system takes, which documents of others may hold."""
+    try:
+        return path.is_file()
+    except OSError:
+        return False
+
+
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside `path`; move it into place at the end, remove it on an error.

@@ -3,6 +3,7 @@
 NAME.key_secret     this host's own secret key, readable by its owner only
 NAME.key            its public key, for other hosts to trust
 trusted/NAME.key    public key of another host that is trusted
+trusted/NAME.allow  what that host may send (rights.py); without it, everything
 """
 
 import os

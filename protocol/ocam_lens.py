@@ -123,7 +123,7 @@ class OcamLens(RadialLens):
             size = int(data["width"]), int(data["height"])
         except (KeyError, TypeError, ValueError) as error:
             raise DeltalightError(
-                f"an ocam lens is malformed ({error!r}); give polynomial, center, affine, width and height."
+                f"an ocam lens is malformed ({error!r:.300}); give polynomial, center, affine, width and height."
             ) from error
         coefficients = tuple(sign * v for v in polynomial)
         return cls(*size, coefficients, (x, y), (c, d, e), data.get("image_circle"))

@@ -1,5 +1,7 @@
 """Picture files and bytes of datasets and recordings: RGB colour, 16-bit depth and its steps."""
 
+import math
+import struct
 from pathlib import Path
 
 import cv2
@@ -7,12 +9,18 @@ import numpy as np
 from jaxtyping import Float32, UInt8, UInt16
 
 from deltalight.protocol.camera_model import CameraModel
+from deltalight.protocol.codecs import stated_jpeg_size
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import DepthImage
 
 TUM_DEPTH_SCALE = 1 / 5000
 KNOWN_DEPTH_SCALES = (0.001, TUM_DEPTH_SCALE, 0.0001, 0.00025)
 INVALID_CODES = (0, 65535)
+_PNG = b"\x89PNG\r\n\x1a\n"
+_PNG_CHUNK = struct.Struct(">I4s")  # length and kind; then the content and four bytes of checksum
+_PNG_HEAD = struct.Struct(">IIBBBBB")  # width, height, bits a channel, colour type and three more
+_PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by colour type
+_MOST_PER_BYTE = 1040  # deflate packs 1032 bytes into one at most, JPEG fewer
 _COLOR = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
 
 
@@ -60,14 +68,36 @@ def decode_depth_png(data: bytes, name: str) -> UInt16[np.ndarray, "h w"]:
 
 
 def _decode(data: bytes, flags: int) -> np.ndarray | None:
+    """Decode a PNG or JPEG; None for others, and for those that state more than their bytes can hold."""
+    if _stated_bytes(data) > _MOST_PER_BYTE * len(data):
+        return None
     try:
-        return (
-            np.asarray(picture)
-            if (picture := cv2.imdecode(np.frombuffer(data, np.uint8), flags)) is not None
-            else None
-        )
+        picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:
         return None
+    return None if picture is None else np.asarray(picture)
+
+
+def _stated_bytes(data: bytes) -> float:
+    """Return what a picture would take unpacked, by what it states; infinite if it is none, or not whole."""
+    if data.startswith(_PNG):
+        return _stated_png_bytes(data)
+    size = stated_jpeg_size(data) if is_jpeg(data) else None
+    return math.inf if size is None else 3.0 * size[0] * size[1]
+
+
+def _stated_png_bytes(data: bytes) -> float:
+    """As `_stated_bytes`; OpenCV also allocates by the length of each chunk, before it looks what is there."""
+    place, stated = len(_PNG), math.inf
+    while place + _PNG_CHUNK.size <= len(data):
+        length, kind = _PNG_CHUNK.unpack_from(data, place)
+        if kind == b"acTL" or place + _PNG_CHUNK.size + length > len(data):  # animated, or cut off
+            return math.inf
+        if kind == b"IHDR" and length == _PNG_HEAD.size:
+            width, height, depth, colors, *_ = _PNG_HEAD.unpack_from(data, place + _PNG_CHUNK.size)
+            stated = width * height * depth * _PNG_CHANNELS.get(colors, math.inf) / 8
+        place += _PNG_CHUNK.size + length + 4
+    return stated
 
 
 def encode_png(picture: np.ndarray) -> bytes:

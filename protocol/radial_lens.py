@@ -133,7 +133,7 @@ def require_image_circle(value: object) -> float | None:
     if value is None:
         return None
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < np.inf:
-        raise DeltalightError(f"`image_circle` is {value!r}; give its radius in pixels, above 0.")
+        raise DeltalightError(f"`image_circle` is {value!r:.60}; give its radius in pixels, above 0.")
     return float(value)
 
 

@@ -47,9 +47,13 @@ class Receiver(Subscriber):
 
     @property
     def drops(self) -> dict[str, int]:
-        """Number of messages of each topic that a newer one replaced before they were taken."""
+        """Number of messages of each topic that a newer one replaced before they were taken.
+
+        `not_allowed` is the number of those that a trusted host may not send.
+        """
+        refused = {"not_allowed": self.not_allowed} if self.not_allowed else {}
         with self._changed:
-            return dict(self._drops)
+            return {**self._drops, **refused}
 
     @property
     def refused(self) -> int:

@@ -85,7 +85,7 @@ class _Record(BaseModel):
             version = values["schema_version"]
             if version != SCHEMA_VERSION:
                 raise DeltalightError(
-                    f"{name} has schema version {version!r} and this program reads {SCHEMA_VERSION}; "
+                    f"{name} has schema version {version!r:.60} and this program reads {SCHEMA_VERSION}; "
                     "use the program that recorded it."
                 )
             return cls.model_validate(values)

@@ -9,15 +9,18 @@ from dataclasses import dataclass
 import structlog
 import zmq
 
-from deltalight.protocol.curve import guard
+from deltalight.protocol.clock import CLOCK_OP
+from deltalight.protocol.curve import guard, sender_key
 from deltalight.protocol.envelope import EnvelopeError
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.keys import Keys
 from deltalight.protocol.message_fields import as_sentence
 from deltalight.protocol.messages import MAX_PAYLOAD_BYTES, ControlReply, ControlRequest
 from deltalight.protocol.payloads import decode_control, encode_control
+from deltalight.protocol.rights import CONTROL, Rights, refusal
 from deltalight.protocol.sockets import attach, open_socket
 
+OPEN_OPS = (CLOCK_OP, "ping")  # for every trusted host: nodes compare clocks
 UNREADABLE_ID = "unreadable"
 REMEMBERED_REPLIES = 256
 MAX_PIECE_BYTES = MAX_PAYLOAD_BYTES + 4096  # CURVE adds to each piece
@@ -98,6 +101,7 @@ class ReplyServer:
         self._context = zmq.Context()
         self._socket = open_socket(self._context, zmq.REP, max_bytes=MAX_PIECE_BYTES)
         self._guard = guard(self._context, self._socket, keys, bind=True)
+        self._rights = None if keys is None else Rights(keys)
         try:
             self.endpoint = attach(self._socket, endpoint, bind=True, keys=keys)
         except DeltalightError:
@@ -113,6 +117,11 @@ class ReplyServer:
         """Connections that were refused because their keys are not right."""
         return 0 if self._guard is None else self._guard.refused
 
+    @property
+    def not_allowed(self) -> int:
+        """Requests that were refused because their host's key allows no commands."""
+        return 0 if self._rights is None else self._rights.refused
+
     def close(self) -> None:
         """Stop the thread after the reply to the current request was sent."""
         with self._answering:
@@ -125,20 +134,22 @@ class ReplyServer:
     def _run(self) -> None:
         try:
             while True:
-                request = self._socket.recv_multipart()
+                frames = self._socket.recv_multipart(copy=False)
+                sender = sender_key(frames[0])
                 with self._answering:
-                    self._socket.send_multipart(self._answer(request))
+                    self._socket.send_multipart(self._answer([frame.bytes for frame in frames], sender))
         except zmq.ContextTerminated:
             pass
         finally:
             self._socket.close(LAST_REPLY_MS)
 
-    def _answer(self, multipart: list[bytes]) -> list[bytes]:
+    def _answer(self, multipart: list[bytes], sender: bytes | None) -> list[bytes]:
         try:
             request = decode_control(multipart, ControlRequest)
         except EnvelopeError as error:
             return encode_control(self._reply(UNREADABLE_ID, error=str(error)))
         try:
+            self._require_right(sender, request)
             earlier = self._memory.find(request)
         except DeltalightError as error:
             return encode_control(self._reply(request.id, error=str(error)))
@@ -147,6 +158,12 @@ class ReplyServer:
         reply, pieces = self._encoded(self._answered(request))
         self._memory.remember(request, reply, sum(len(piece) for piece in pieces))
         return pieces
+
+    def _require_right(self, sender: bytes | None, request: ControlRequest) -> None:
+        rights = self._rights
+        if rights is None or sender is None or request.op in OPEN_OPS or rights.lets(sender, CONTROL):
+            return
+        raise DeltalightError(refusal(rights.name_of(sender), CONTROL))
 
     def _encoded(self, reply: ControlReply) -> tuple[ControlReply, list[bytes]]:
         try:
@@ -163,7 +180,7 @@ class ReplyServer:
         except Exception as error:  # the thread must survive a fault of the handler
             _log.exception("control handler failed", op=request.op)
             return self._reply(
-                request.id, error=f"{request.op} failed with {error!r}: see the log of {self._node}"
+                request.id, error=f"{request.op} failed with {error!r:.300}: see the log of {self._node}"
             )
 
     def _reply(

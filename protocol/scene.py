@@ -9,6 +9,7 @@ from pydantic import Field, field_validator, model_validator
 
 from deltalight.protocol.documents import StrictModel, read_mapping, validate
 from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.files import is_file
 from deltalight.protocol.methods import Method
 from deltalight.protocol.scene_lights import Lights, default_lights
 from deltalight.protocol.scene_method import DvctMethod, Output, Shading
@@ -101,7 +102,7 @@ def load_scene(path: Path) -> SceneDocument:
 
     def find(place: str, asset: str) -> str:
         found = resolve_asset(asset, path.parent)
-        if not found.startswith(DIGEST_PREFIX) and not Path(found).is_file():
+        if not found.startswith(DIGEST_PREFIX) and not is_file(Path(found)):
             raise DeltalightError(f"{path}: `{place}` names {found}, which does not exist; correct the path.")
         return found
 
@@ -109,8 +110,17 @@ def load_scene(path: Path) -> SceneDocument:
 
 
 def resolve_asset(asset: str, folder: Path) -> str:
-    """Return an asset's absolute path, read relative to `folder`; a `sha256:` name stays."""
-    return asset if asset.startswith(DIGEST_PREFIX) else str((folder / asset).resolve())
+    """Return an asset's absolute path, read relative to `folder`; a `sha256:` name stays.
+
+    Raises:
+        DeltalightError: it is no name that a file can have.
+    """
+    if asset.startswith(DIGEST_PREFIX):
+        return asset
+    try:
+        return str((folder / asset).resolve())
+    except (ValueError, OSError, RuntimeError) as error:  # a null byte; a link to itself
+        raise DeltalightError(f"{asset!r:.200} is no name of a file ({error}); correct the path.") from error
 
 
 def scene_json_schema() -> dict[str, Any]:

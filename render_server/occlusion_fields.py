@@ -1,10 +1,10 @@
 """The occlusion fields of a scene's objects: found on disk by content, or computed before or beside rendering."""
 
 import hashlib
-import os
 import threading
 from collections.abc import Callable
 from dataclasses import astuple, dataclass
+from io import BytesIO
 from pathlib import Path
 from zipfile import BadZipFile
 
@@ -14,8 +14,15 @@ from jaxtyping import Float32
 from rich.console import Console
 from rich.progress import Progress
 
+from deltalight.protocol.cached_files import (
+    cache_folder,
+    cache_limit_bytes,
+    mark_used,
+    prune,
+    read_cached,
+    write_cached,
+)
 from deltalight.protocol.errors import DeltalightError
-from deltalight.protocol.files import replacing
 from deltalight.protocol.scene_objects import SceneObject
 from deltalight.render_server.gpu_scene import PlacedObject
 from deltalight.render_server.scene.occlusion_field import (
@@ -36,15 +43,8 @@ from deltalight.render_server.scene.occlusion_transfer import (
 from deltalight.render_server.scene.triangle_mesh import TriangleMesh
 
 FIELD_VERSION = 1  # rises when the same input gives another field
-CACHE_VARIABLE = "DELTALIGHT_CACHE"
+CACHE = "occlusion-fields"
 OCCLUSION_FRACTION = 0.8  # of the computing time
-
-
-def default_folder() -> Path:
-    """Returns `occlusion-fields` in DELTALIGHT_CACHE, else in the user's cache folder."""
-    given = os.environ.get(CACHE_VARIABLE)
-    user = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return (Path(given) if given else user / "deltalight") / "occlusion-fields"
 
 
 def field_digest(surface: Float32[np.ndarray, "m 3 6"], settings: FieldSettings) -> str:
@@ -82,7 +82,7 @@ def compute_field(
 
 
 def store_field(folder: Path, digest: str, field: OcclusionField) -> None:
-    """Writes a field; the file appears when it is complete.
+    """Writes a field, and removes those that were not used for longest beyond the limit of the cache.
 
     Raises:
         DeltalightError: the folder cannot be written.
@@ -91,15 +91,21 @@ def store_field(folder: Path, digest: str, field: OcclusionField) -> None:
     arrays |= {"radius": np.array(field.radius), "occlusion": field.occlusion}
     if field.transfer is not None:
         arrays["transfer"] = field.transfer
-    with replacing(folder / f"{digest}.npz") as temporary:
-        folder.mkdir(parents=True, exist_ok=True)
-        np.savez(temporary, allow_pickle=False, **arrays)
+    stream, path = BytesIO(), folder / f"{digest}.npz"
+    np.savez(stream, allow_pickle=False, **arrays)
+    write_cached(path, stream.getvalue())
+    prune(folder, cache_limit_bytes(), keep=path)
 
 
 def load_field(folder: Path, digest: str, settings: FieldSettings) -> OcclusionField | None:
     """Reads a field; None if there is none, or if the file is damaged and must be replaced."""
+    path = folder / f"{digest}.npz"
+    content = read_cached(path)
+    if content is None:
+        return None
+    mark_used(path)
     try:
-        with np.load(folder / f"{digest}.npz", allow_pickle=False) as file:
+        with np.load(BytesIO(content), allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
     except (OSError, ValueError, BadZipFile, EOFError, NotImplementedError):
         return None
@@ -153,7 +159,7 @@ class OcclusionFields:
     ) -> None:
         self.waits = waits
         self._notify = notify
-        self._folder = folder or default_folder()
+        self._folder = folder or cache_folder(CACHE)
         self._entries: dict[tuple[object, ...], _Entry] = {}
         self._one_at_a_time = threading.Lock()
         self._ended = threading.Event()

@@ -16,6 +16,7 @@ from deltalight import __version__
 from deltalight.benchmarks.cli import bench, gpu_check
 from deltalight.protocol.errors import DeltalightError
 from deltalight.services.commands.api import api
+from deltalight.services.commands.backup import backup, restore
 from deltalight.services.commands.board import board
 from deltalight.services.commands.calibrate import calibrate
 from deltalight.services.commands.config import config
@@ -72,6 +73,8 @@ for command in (
     up,
     record,
     replay,
+    backup,
+    restore,
     foxglove,
     config,
     doctor,

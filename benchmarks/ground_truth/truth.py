@@ -1,7 +1,7 @@
 """Truth of benchmark scenes, rendered once and cached by the hash of everything that determines it."""
 
 import json
-import os
+import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -26,9 +26,11 @@ from deltalight.benchmarks.ground_truth.truth_pictures import TruthRenderer
 from deltalight.benchmarks.ground_truth.truth_writer import (
     MANIFEST_FILE,
     TRUTH_FOLDER,
+    is_whole,
     picture_path,
     write_truth,
 )
+from deltalight.protocol.cached_files import FOLDER_VARIABLE, cache_folder, cache_limit_bytes, prune
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.pictures import decode_rgb, read_bytes
@@ -36,7 +38,7 @@ from deltalight.protocol.scene import SceneDocument, load_scene
 
 RENDER_VERSION = 1
 """Increment when rendering changes in a way that the hashed numbers do not show (seeds, samples of depth...)."""
-CACHE_VARIABLE = "DELTALIGHT_CACHE"
+CACHE = "ground-truth"
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,10 +113,10 @@ class Truth:
 def ensure_truth(
     scene: BenchmarkScene, *, size: tuple[int, int], spp: int, progress: Progress, cache: Path | None = None
 ) -> Truth:
-    """Return the truth of a scene, rendering it if `cache` (default: `default_cache`) does not hold it.
+    """Return the truth of a scene, rendering it if `cache` (default: that of the user) does not hold it whole.
 
     `size` is width and height in pixels, `spp` the samples per pixel of each picture. The folder appears when it is
-    complete; an interrupted run leaves nothing.
+    complete; an interrupted run leaves nothing. What was not used for longest gives way beyond the cache's limit.
 
     Raises:
         DeltalightError: Mitsuba is missing, or size or spp cannot be rendered.
@@ -123,22 +125,16 @@ def ensure_truth(
     if spp < least or spp % least:
         raise DeltalightError(f"{spp} samples a pixel cannot be halved evenly; give a multiple of {least}.")
     variant = choose_variant()
-    camera, cache = scene.camera.resized(*size), cache or default_cache()
+    camera, cache = scene.camera.resized(*size), cache or cache_folder(CACHE)
     with _workshop(cache) as workshop:
         assembly = Assembly(scene, workshop)
         about = _about(scene, size, spp, variant)
         digest = content_hash(about, *_determining(assembly, camera))
         truth = Truth(cache / f"{scene.name}-{size[0]}x{size[1]}-{digest}", scene, size, spp)
-        if not truth.folder.is_dir():
+        if not is_whole(truth.folder):
             _render(truth, assembly, camera, about, progress)
+    prune(cache, cache_limit_bytes(), keep=truth.folder)
     return truth
-
-
-def default_cache() -> Path:
-    """Return `ground-truth` in DELTALIGHT_CACHE, else in the user's cache folder."""
-    given = os.environ.get(CACHE_VARIABLE)
-    user = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return (Path(given) if given else user / "deltalight") / "ground-truth"
 
 
 @contextmanager
@@ -149,7 +145,7 @@ def _workshop(cache: Path) -> Iterator[Path]:
         workshop = tempfile.TemporaryDirectory(dir=cache, prefix=".making-")
     except OSError as error:
         raise DeltalightError(
-            f"ground truth cannot be kept in {cache} ({error.strerror}); set {CACHE_VARIABLE} to a folder."
+            f"ground truth cannot be kept in {cache} ({error.strerror}); set {FOLDER_VARIABLE} to a folder."
         ) from error
     with workshop as folder:
         yield Path(folder)
@@ -188,6 +184,7 @@ def _render(
     made = assembly.folder / truth.folder.name
     write_truth(made, renderer, about)
     try:
+        shutil.rmtree(truth.folder, ignore_errors=True)  # a damaged one
         made.rename(truth.folder)
     except OSError:
         # Another process may have finished the same truth meanwhile.

@@ -1,5 +1,6 @@
 """Writing a benchmark scene's truth: the dataset folder of simulated sensors, and the reference pictures."""
 
+import hashlib
 import json
 import shutil
 from dataclasses import replace
@@ -18,6 +19,7 @@ from deltalight.benchmarks.ground_truth.truth_pictures import (
     TruthRenderer,
     world_from_fisheye,
 )
+from deltalight.protocol.cached_files import mark_used
 from deltalight.protocol.calibration import Extrinsics
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.dataset_writer import DatasetWriter
@@ -48,8 +50,30 @@ def write_truth(out: Path, renderer: TruthRenderer, about: dict[str, Any]) -> No
     write_documents(out, scene)
     for asset in renderer.assembly.assets.iterdir():
         shutil.copy(asset, out)
-    manifest = {**about, "halves_psnr_db": psnr_db}
+    manifest = {**about, "halves_psnr_db": psnr_db, "files": _hashes(out)}
     (out / TRUTH_FOLDER / MANIFEST_FILE).write_text(json.dumps(manifest, indent=2) + "\n")
+
+
+def is_whole(folder: Path) -> bool:
+    """Whether a truth is there and its files are what was written; marks it as used."""
+    try:
+        manifest = json.loads((folder / TRUTH_FOLDER / MANIFEST_FILE).read_text())
+        files: dict[str, str] = manifest.get("files", {})  # an older truth has none
+        is_same = files == {name: _hash(folder / name) for name in files}
+    except (OSError, ValueError, AttributeError):
+        return False
+    mark_used(folder)
+    return is_same
+
+
+def _hashes(folder: Path) -> dict[str, str]:
+    return {
+        str(path.relative_to(folder)): _hash(path) for path in sorted(folder.rglob("*")) if path.is_file()
+    }
+
+
+def _hash(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def sensor_frame(index: int, pictures: FramePictures, camera: CameraModel) -> SensorFrame:

@@ -10,6 +10,7 @@ from rich.progress import Progress
 from deltalight.benchmarks.ground_truth.scenes import SCENES, scene_named
 from deltalight.benchmarks.quality.ablation import ablation_chain
 from deltalight.benchmarks.quality.evaluate import QualityJob, measure_quality
+from deltalight.benchmarks.quality.kept import KeptResults
 from deltalight.benchmarks.quality.report import require_replaceable, write_report
 from deltalight.benchmarks.quality.report_data import as_data
 from deltalight.benchmarks.quality.tables import all_tables
@@ -28,7 +29,7 @@ def run_quality(
     out: Path,
     as_json: bool,
 ) -> None:
-    """Measure, write the report as folder `out`, and print it.
+    """Measure, write the report as folder `out`, and print it; goes on where a run of the same inputs was cut off.
 
     `scenes` None = all; `methods` None = the ablation chain; `size` is width and height in pixels.
 
@@ -38,15 +39,18 @@ def run_quality(
     chosen = SCENES if scenes is None else [scene_named(name.strip()) for name in scenes]
     variants = _ablation(volume_size) if methods is None else parse_variants(methods)
     require_replaceable(out)
-    console = Console(stderr=True)
+    console, kept = Console(stderr=True), KeptResults.beside(out)
     with Progress(console=console, transient=True) as progress:
-        result = measure_quality(QualityJob(chosen, variants, size, spp, volume_size, device), progress)
+        result = measure_quality(QualityJob(chosen, variants, size, spp, volume_size, device), progress, kept)
     write_report(result, out)
+    kept.remove()
     if as_json:
         print(json.dumps(as_data(result), indent=2))
     else:
         for table in all_tables(result):
             table.print(Console())
+    if kept.taken:
+        console.print(f"{kept.taken} results are from the run that was cut off.")
     console.print(f"The report is {out / 'index.html'}", soft_wrap=True)
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 from rich.progress import Progress
@@ -12,6 +13,7 @@ from deltalight.benchmarks.quality.case import SceneCase
 from deltalight.benchmarks.quality.ceiling import ideal_composite
 from deltalight.benchmarks.quality.denoising import require_denoiser
 from deltalight.benchmarks.quality.figures import Figures, mean_figures, scene_figures
+from deltalight.benchmarks.quality.kept import KeptResults, VariantResult
 from deltalight.benchmarks.quality.metrics import Picture
 from deltalight.benchmarks.quality.path_tracing import trace_in_time
 from deltalight.benchmarks.quality.renders import Rendered, render_variant
@@ -34,17 +36,6 @@ class QualityJob:
     volume_size: int | None = None
     device: int | None = None
     cache: Path | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class VariantResult:
-    """A variant on one scene: figures (figures.py), the picture that the report shows, and `Rendered`'s account."""
-
-    figures: Figures
-    shown: Picture
-    is_repeatable: bool | None = None
-    history_codes: int | None = None
-    note: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,8 +70,10 @@ class QualityResult:
         }
 
 
-def measure_quality(job: QualityJob, progress: Progress) -> QualityResult:
+def measure_quality(job: QualityJob, progress: Progress, kept: KeptResults | None = None) -> QualityResult:
     """Render missing truth and measure every variant on every scene.
+
+    What `kept` holds is taken from there, and every other result is put there as soon as it is known.
 
     Raises:
         DeltalightError: no OpenGL, truth is missing and cannot be rendered, or a variant cannot be used.
@@ -97,7 +90,9 @@ def measure_quality(job: QualityJob, progress: Progress) -> QualityResult:
             variants: dict[str, VariantResult] = {}
             for variant in job.variants:
                 progress.update(steps, description=f"measuring {scene.name}: {variant.name}")
-                variants[variant.name] = _measure(gpu, case, variant, job.volume_size, variants)
+                measure = partial(_measure, gpu, case, variant, job.volume_size, variants)
+                inputs = (gpu.renderer_name, truth.folder.name, variant, job.volume_size)
+                variants[variant.name] = measure() if kept is None else kept.result(measure, *inputs)
                 progress.advance(steps)
             variants[CEILING.name] = _result(case, Rendered([ideal_composite(one) for one in case.frames]))
             result.scenes.append(_scene_result(case, variants))

@@ -76,7 +76,7 @@ def soak(job: SoakJob, say: Say) -> SoakReport:
         station = stack.enter_context(running_station(profile, thread, job.seed))
         say("starting the station")
         _wait_for_page(station)
-        run = Run(station, Crowd(thread, station.places.page), profile, Random(job.seed))
+        run = Run(station, Crowd(thread, station.places.page), profile, Random(job.seed), thread)
         _wait_for_picture(run)
         log = _Log(time.monotonic())
         with Sampler(station) as sampler:

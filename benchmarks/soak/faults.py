@@ -5,9 +5,9 @@ import signal
 import time
 import uuid
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from random import Random
 from typing import Any
 
@@ -16,8 +16,10 @@ import numpy as np
 from jaxtyping import UInt8
 
 from deltalight.benchmarks.soak.crowd import BEHAVIOURS, Crowd, Seen
-from deltalight.benchmarks.soak.link import SHAPES
+from deltalight.benchmarks.soak.flow import Flow
+from deltalight.benchmarks.soak.link import SHAPES, LoopThread
 from deltalight.benchmarks.soak.nonsense import send_nonsense
+from deltalight.benchmarks.soak.peers import peers_on
 from deltalight.benchmarks.soak.profiles import Profile
 from deltalight.benchmarks.soak.station import SERVER, WEB, Station
 from deltalight.benchmarks.soak.takes_killed import kill_recorder
@@ -44,6 +46,7 @@ class Run:
     crowd: Crowd
     profile: Profile
     dice: Random
+    thread: LoopThread
 
 
 class Fault(ABC):
@@ -148,21 +151,22 @@ class Nonsense(Fault):
 
 @dataclass(frozen=True)
 class BadLink(Fault):
-    """Delay, jitter, a narrow band and loss between all nodes and the render server."""
+    """A bad network between all nodes and the render server; peers that render nothing have one each too."""
 
     shape: str
 
     def run(self, run: Run) -> Outcome:
         """Have it so for a while."""
+        profile, shape, seed = run.profile, SHAPES[self.shape], run.dice.randrange(2**32)
         with _compared(run) as outcome:
             try:
                 for link in run.station.links:
-                    link.shape = SHAPES[self.shape]
-                time.sleep(run.profile.load_s)
+                    link.shape = shape
+                peers = peers_on(run.thread, shape, profile, seed)
             finally:
                 for link in run.station.links:
                     link.shape = None
-        return outcome
+        return {**outcome, **{name: vars(flow) for name, flow in peers.items()}}
 
 
 @dataclass(frozen=True)
@@ -206,6 +210,8 @@ FAULTS: dict[str, Fault] = {
     "nonsense": Nonsense(),
     "link-arm": BadLink("arm"),
     "link-foxglove": BadLink("foxglove"),
+    "link-lossy": BadLink("lossy"),
+    "link-reorder": BadLink("reorder"),
     "cut": Cut(),
 }
 
@@ -224,35 +230,6 @@ def parse_faults(text: str) -> list[str]:
             hint = nearest(name, FAULTS) or ", ".join(FAULTS)
             raise DeltalightError(f"There is no fault '{name}'; did you mean {hint}?")
     return list(dict.fromkeys(names))
-
-
-@dataclass(frozen=True)
-class Flow:
-    """Pictures that the measuring viewer got in a span: a second, ages in ms, and the longest wait for one in s."""
-
-    frames_per_s: float
-    age_p50_ms: float | None
-    age_p95_ms: float | None
-    unwaited_p95_ms: float | None = field(metadata={"what": "of the ages without waiting for the renderer"})
-    longest_gap_s: float
-
-    @classmethod
-    def of(cls, seen: Sequence[Seen], began_s: float, ended_s: float) -> "Flow":
-        """Describe pictures that came between two moments."""
-        moments = [began_s, *(each.at_s for each in seen), ended_s]
-        ages = [each.age_ms for each in seen]
-        unwaited = [each.age_ms - each.waiting_ms for each in seen]
-        return cls(
-            len(seen) / (ended_s - began_s),
-            _percentile(ages, 50),
-            _percentile(ages, 95),
-            _percentile(unwaited, 95),
-            float(np.max(np.diff(moments))),
-        )
-
-
-def _percentile(values: Sequence[float], share: float) -> float | None:
-    return float(np.percentile(values, share)) if values else None
 
 
 @contextmanager

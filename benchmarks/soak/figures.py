@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from deltalight.benchmarks.soak.crowd import Seen
-from deltalight.benchmarks.soak.faults import LARGEST_DIFFERENCE, Flow
+from deltalight.benchmarks.soak.faults import LARGEST_DIFFERENCE
+from deltalight.benchmarks.soak.flow import Flow
 from deltalight.benchmarks.soak.profiles import Profile
 from deltalight.benchmarks.soak.report import Bar, FaultRecord, Figure, period_bar, worst
 from deltalight.benchmarks.soak.samples import (
@@ -140,21 +141,30 @@ def _loads(outcomes: _Outcomes) -> list[Figure | None]:
 
 
 def _links(outcomes: _Outcomes) -> list[Figure | None]:
-    any_age = Bar("shown", lambda _value: True)
     figures = [
         worst("picture back after a cut", "5 s, all links", outcomes.of("cut", "back_s"), BACK_FROM_CUT, "s")
     ]
     for name, what in (
         ("link-arm", "25 Mbit/s, 20±10 ms, 0.5 % lost"),
         ("link-foxglove", "80±20 ms, 2 % lost"),
+        ("link-lossy", "25 Mbit/s, 20±10 ms, 30 % lost"),
+        ("link-reorder", "25 Mbit/s, 20±10 ms, 25 % overtaken"),
     ):
+        for when, how in (("during", ""), ("newest", ", no rendering"), ("queued", ", everything queued")):
+            figures += _flow_figures(outcomes, (name, when), what + how)
+    return figures
+
+
+def _flow_figures(outcomes: _Outcomes, path: tuple[str, str], what: str) -> list[Figure | None]:
+    shown = Bar("shown", lambda _value: True)
+    return [
+        worst(title, what, outcomes.of(*path, key), shown, unit)
         for key, title, unit in (
             ("age_p50_ms", "age, median", "ms"),
             ("age_p95_ms", "age, 95 of 100", "ms"),
             ("longest_gap_s", "longest gap", "s"),
-        ):
-            figures.append(worst(title, what, outcomes.of(name, "during", key), any_age, unit))
-    return figures
+        )
+    ]
 
 
 def all_courses(

@@ -1,7 +1,7 @@
 """A bad network between a node and the render server: a proxy of one TCP connection at a time or more, on loopback.
 
-TCP keeps the order and loses nothing, so what a network loses shows as a wait of all that is behind it. Nothing here
-needs rights beyond the user's, nor anything of the kernel.
+TCP keeps the order and loses nothing, so what a network loses or reorders shows as a wait of all that is behind it.
+Nothing here needs rights beyond the user's, nor anything of the kernel.
 """
 
 import asyncio
@@ -20,21 +20,29 @@ SEGMENT_BYTES = 1448  # of TCP over Ethernet
 CHUNK_BYTES = 16 * SEGMENT_BYTES
 WAITING_CHUNKS = 4  # 64 segments, what is under way of a usual connection; then the sender has to wait
 RECEIVED_BYTES = 1 << 16  # that the kernel keeps for a link
+RETRANSMISSION_S = 0.2  # the least timeout of Linux; it doubles (RFC 6298, section 5)
+MOST_LOSSES = 8  # of one segment: the dice would allow more once in 15 000
 
 
 @dataclass(frozen=True)
 class Shape:
-    """What a link does to data: bits a second, seconds of delay and its jitter, share of segments that are lost."""
+    """What a link does to data: bits a second, seconds of delay and its jitter, share of segments that are lost.
+
+    `overtaken` is the share of segments that take a way of twice the delay, so that later ones overtake them.
+    """
 
     bits_per_s: float
     delay_s: float
     jitter_s: float
     loss: float
+    overtaken: float = 0.0
 
 
 SHAPES = {  # the networks that the documentation of others names
     "arm": Shape(25e6, 0.020, 0.010, 0.005),
     "foxglove": Shape(100e6, 0.080, 0.020, 0.02),
+    "lossy": Shape(25e6, 0.020, 0.010, 0.30),
+    "reorder": Shape(25e6, 0.020, 0.010, 0.0, overtaken=0.25),
 }
 
 
@@ -49,19 +57,33 @@ class Schedule:
     def leaves_s(self, now_s: float, size: int, shape: Shape | None) -> float:
         """Return when `size` bytes that enter now have left.
 
-        A lost segment holds up all that is behind it for one round trip: it is sent again once that is noticed.
+        A lost segment holds up all that is behind it: it is sent again once that is noticed, after a round trip; if
+        it is lost once more, after a timeout, which doubles each time. An overtaken one holds up for its longer way.
         """
         if shape is None:
             self._free_s = self._left_s = max(now_s, self._left_s)
             return self._left_s
         segments = -(-size // SEGMENT_BYTES)
-        lost = sum(self.dice.random() < shape.loss for _ in range(segments))
-        self._free_s = (
-            max(now_s, self._free_s) + 8 * size / shape.bits_per_s + 2 * shape.delay_s * min(lost, 1)
+        losses = max(self._losses(shape.loss) for _ in range(segments))
+        self._free_s = max(now_s, self._free_s) + 8 * size / shape.bits_per_s + held_up_s(losses, shape)
+        is_overtaken = any(self.dice.random() < shape.overtaken for _ in range(segments))
+        way_s = shape.delay_s * (2 if is_overtaken else 1) + self.dice.uniform(
+            -shape.jitter_s, shape.jitter_s
         )
-        jitter_s = self.dice.uniform(-shape.jitter_s, shape.jitter_s)
-        self._left_s = max(self._left_s, self._free_s + shape.delay_s + jitter_s)
+        self._left_s = max(self._left_s, self._free_s + way_s)
         return self._left_s
+
+    def _losses(self, share: float) -> int:
+        """Return how often a segment is lost before it arrives."""
+        return next((count for count in range(MOST_LOSSES) if self.dice.random() >= share), MOST_LOSSES)
+
+
+def held_up_s(losses: int, shape: Shape) -> float:
+    """Return how long a segment that was lost so often holds up those behind it."""
+    if losses == 0:
+        return 0.0
+    round_trip_s = 2 * shape.delay_s
+    return round_trip_s + max(RETRANSMISSION_S, round_trip_s) * (2.0 ** (losses - 1) - 1)
 
 
 class Link:

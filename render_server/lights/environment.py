@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64
 
 from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.files import is_file
 from deltalight.protocol.frames import decode_lut
 from deltalight.protocol.median_cut import PEAK_THRESHOLD, SkyGrid, Split, luminance_of, split_map
 from deltalight.protocol.pictures import decode_rgb, read_bytes
@@ -168,7 +169,7 @@ def read_radiance(path: Path) -> Float32[np.ndarray, "h w 3"]:
         DeltalightError: as `load_environment`.
     """
     suffix = path.suffix.lower()
-    if not path.is_file():
+    if not is_file(path):
         raise DeltalightError(f"the environment map {path} does not exist; correct the path.")
     if suffix in LINEAR_SUFFIXES:
         radiance = read_linear(path)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.files import is_file
 from deltalight.render_server.scene.gltf_document import (
     COMPONENT_TYPES,
     COMPONENTS,
@@ -60,7 +61,7 @@ def check_mesh_file(path: Path) -> str:
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
         raise DeltalightError(f"{path} is not a mesh file; use one of {', '.join(MESH_SUFFIXES)}.")
-    if not path.is_file():
+    if not is_file(path):
         raise DeltalightError(f"the mesh file {path} does not exist; correct the path.")
     if path.stat().st_size > MAX_FILE_BYTES:
         raise DeltalightError(f"{path} is larger than {MAX_FILE_BYTES >> 20} MB; simplify the mesh.")
@@ -157,7 +158,7 @@ def _checked(path: Path, document: dict[str, Any], binary: bytes | None) -> Gltf
 
 def _count(value: object) -> int:
     if type(value) is not int or value < 0:
-        raise GltfFaultError(f"{value!r} stands where a count belongs")
+        raise GltfFaultError(f"{value!r:.60} stands where a count belongs")
     return value
 
 
@@ -182,7 +183,7 @@ def _buffer(buffer: dict[str, Any], binary: bytes | None, folder: Path) -> bytes
 
 def _file_size(uri: str, folder: Path) -> int:
     path = file_inside(uri, folder)
-    return path.stat().st_size if path.is_file() else 0
+    return path.stat().st_size if is_file(path) else 0
 
 
 def _check_view(view: dict[str, Any], buffer_sizes: list[int]) -> int:

@@ -170,7 +170,7 @@ def _sampler(animation: dict[str, Any], number: int, channel: dict[str, Any]) ->
     sampler: dict[str, Any] = samplers[index]
     how = sampler.get("interpolation", "LINEAR")
     if how not in ("STEP", "LINEAR", "CUBICSPLINE"):
-        raise GltfFaultError(f"sampler {index} wants the interpolation {how!r}, which does not exist")
+        raise GltfFaultError(f"sampler {index} wants the interpolation {how!r:.60}, which does not exist")
     return sampler
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, Shaped
 
 from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.files import is_file
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -35,7 +36,9 @@ def faults_named(path: Path) -> Iterator[None]:
     except GltfFaultError as fault:
         raise DeltalightError(f"{path}: {fault}; export the mesh again.") from fault
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, RecursionError) as error:
-        raise DeltalightError(f"{path} is not a valid glTF 2 file ({error!r}); export it again.") from error
+        raise DeltalightError(
+            f"{path} is not a valid glTF 2 file ({error!r:.300}); export it again."
+        ) from error
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +143,7 @@ def uri_bytes(uri: str, folder: Path) -> bytes:
     if uri.startswith("data:"):
         return base64.b64decode(uri.partition("base64,")[2])
     path = file_inside(uri, folder)
-    if not path.is_file():
+    if not is_file(path):
         raise GltfFaultError(f"the file {uri} that it refers to is missing")
     return path.read_bytes()
 

@@ -83,7 +83,9 @@ def _open_scene(path: Path) -> "trimesh.Scene":
     except MemoryError:
         raise
     except Exception as error:  # a damaged file can make the loader fail in any way
-        raise DeltalightError(f"{path} cannot be read as a mesh ({error}); export it again.") from error
+        raise DeltalightError(
+            f"{path} cannot be read as a mesh ({error!s:.300}); export it again."
+        ) from error
 
 
 def _parts(scene: "trimesh.Scene", path: Path) -> list[tuple[int, TriangleMesh]]:
@@ -100,7 +102,7 @@ def _parts(scene: "trimesh.Scene", path: Path) -> list[tuple[int, TriangleMesh]]
         key = id(getattr(geometry.visual, "material", None))
         if key not in materials:
             materials[key] = _material(geometry, path)
-        made = converted(_file_geometry(geometry), materials[key], path)
+        made = converted(_file_geometry(geometry, path), materials[key], path)
         if made is not None:
             mesh = made.mesh
             parts.append((key, mesh if np.array_equal(matrix, np.eye(4)) else mesh.transformed(matrix)))
@@ -111,7 +113,9 @@ def _material(geometry: "trimesh.Trimesh", path: Path) -> Material:
     try:
         return _described_material(geometry).checked(str(path))
     except (TypeError, ValueError, AttributeError) as error:
-        raise DeltalightError(f"{path} has a malformed material ({error}); export it again.") from error
+        raise DeltalightError(
+            f"{path} has a malformed material ({error!s:.300}); export it again."
+        ) from error
 
 
 def _described_material(geometry: "trimesh.Trimesh") -> Material:
@@ -126,13 +130,16 @@ def _described_material(geometry: "trimesh.Trimesh") -> Material:
     return Material(base_color=np.ones(3, np.float32)) if has_colors else Material()
 
 
-def _file_geometry(geometry: "trimesh.Trimesh") -> FileGeometry:
-    positions = np.asarray(geometry.vertices, np.float32)
-    has_normals = "vertex_normals" in geometry._cache
+def _file_geometry(geometry: "trimesh.Trimesh", path: Path) -> FileGeometry:
+    positions, triangles = np.asarray(geometry.vertices, np.float32), np.asarray(geometry.faces, np.int64)
+    # The loader takes vertices of any number of coordinates.
+    if positions.shape[1:] != (3,) or triangles.shape[1:] != (3,):
+        raise DeltalightError(f"{path} has vertices that are not three numbers each; export it again.")
+    normals = geometry._cache["vertex_normals"] if "vertex_normals" in geometry._cache else np.zeros(0)
     return FileGeometry(
         positions,
-        np.asarray(geometry.faces, np.int64),
-        np.asarray(geometry._cache["vertex_normals"], np.float32) if has_normals else None,
+        triangles,
+        np.asarray(normals, np.float32) if np.shape(normals) == positions.shape else None,
         _uv(geometry, len(positions)),
         _colors(geometry),
     )

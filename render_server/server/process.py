@@ -234,6 +234,10 @@ def serve(
                 sender.forget()
             return SourceInUse(source.endpoints, is_another)
 
+        def drops() -> dict[str, int]:
+            refused = {"commands_not_allowed": replies.not_allowed} if replies.not_allowed else {}
+            return {"send": sender.dropped, **source.drops, **refused}
+
         session = RenderSession(
             renderer,
             scene,
@@ -243,7 +247,7 @@ def serve(
             keep_scene=lambda kept: _keep(settings.session, kept),
             use_source=use_source,
             count_objects=count_objects,
-            mailbox_drops=lambda: {"send": sender.dropped, **source.drops},
+            mailbox_drops=drops,
         )
         commands = CommandQueue()
         replies = ReplyServer(settings.control, commands.ask, node=settings.name, keys=keys)

@@ -135,7 +135,7 @@ def _live(source: str, eye: Eye) -> Generator[Picture]:
 
 def _natural(path: Path) -> list[tuple[int, str]]:
     """Return a sort key by which shot2 comes before shot10."""
-    return [(int(word), "") if word.isdigit() else (-1, word) for word in re.split(r"(\d+)", path.name)]
+    return [(int(word), "") if word.isdecimal() else (-1, word) for word in re.split(r"(\d+)", path.name)]
 
 
 def collect_views(

@@ -14,6 +14,7 @@ from threading import Lock
 from typing import Any, Literal
 from uuid import uuid4
 
+from deltalight.protocol.cached_files import read_cached, write_cached
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.files import ACTIVE_SUFFIX, write_bytes
 from deltalight.services.files import SUFFIX, make_output_folder
@@ -180,8 +181,9 @@ class RecordingStore:
         path = self._path(name)
         cached = self._cache / f"{name}.jpg"
         with self._reading, _naming(path):
-            if not cached.is_file() or cached.stat().st_mtime_ns < _status(path).st_mtime_ns:
-                write_bytes(cached, _first_picture(path))
+            made_ns = cached.stat().st_mtime_ns if cached.is_file() else 0
+            if made_ns < _status(path).st_mtime_ns or read_cached(cached) is None:
+                write_cached(cached, _first_picture(path))
         return cached
 
     def recover(self, name: str) -> StoredRecording:
@@ -212,7 +214,7 @@ class RecordingStore:
         path = self._path(name)
         # An unfinished file may also exist beside the one just recovered from it.
         unfinished = path.with_name(name + SUFFIX + ACTIVE_SUFFIX)
-        for each in (path, unfinished, self._cache / f"{name}.jpg", self._cache / f"{name}.json"):
+        for each in (path, unfinished, *self._cache.glob(f"{name}.*")):
             each.unlink(missing_ok=True)
 
     def _paths(self) -> Iterator[Path]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from deltalight.services.commands.options import ConfigFile, NodeName
+from deltalight.services.commands.options import ConfigFile, Data, NodeName, data_folder
 from deltalight.services.ports import COMPOSITE_PORT, endpoint
 
 if TYPE_CHECKING:
@@ -18,9 +18,6 @@ if TYPE_CHECKING:
 api = typer.Typer(
     invoke_without_command=True, help="Serve the dashboard, REST API and live video, or manage access tokens."
 )
-Data = Annotated[
-    Path | None, typer.Option(help="Folder of scenes and assets; default: the user's data folder.")
-]
 
 
 class TokenRole(StrEnum):
@@ -143,9 +140,6 @@ def _subscriptions(subscribe: list[str] | None, node: str | None, keys: "KeySett
 
 
 def _store(data: Path | None) -> "Store":
-    from deltalight.services.api.settings import ApiSettings
-    from deltalight.services.settings import load_configuration
-    from deltalight.services.storage.store import Store, default_folder
+    from deltalight.services.storage.store import Store
 
-    configured = load_configuration().section("api", ApiSettings).data
-    return Store(data or configured or default_folder())
+    return Store(data_folder(data))

@@ -11,6 +11,8 @@ EXAMPLES = {
     "up": ("deltalight up --source synthetic", "deltalight up --source take.mcap --scene scene.json"),
     "record": ("deltalight record -o take.mcap --duration 10",),
     "replay": ("deltalight replay take.mcap",),
+    "backup": ("deltalight backup station.zip",),
+    "restore": ("deltalight restore station.zip",),
     "foxglove": ("deltalight foxglove", "deltalight foxglove --port 8766"),
     "config": ("deltalight config",),
     "doctor": ("deltalight doctor",),

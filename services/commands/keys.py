@@ -6,6 +6,8 @@ from typing import Annotated
 
 import typer
 
+from deltalight.protocol.errors import DeltalightError
+
 keys = typer.Typer(no_args_is_help=True, help="Manage keys for connections to other machines.")
 
 Folder = Annotated[
@@ -34,17 +36,23 @@ def list_keys(
 ) -> None:
     """List this machine's key pairs and the keys it trusts."""
     from deltalight.protocol.keys import load_keys, own_keys, trusted_keys
+    from deltalight.protocol.rights import allowed
 
     place = _folder(folder)
     own = {name: load_keys(name, place).public.decode() for name in own_keys(place)}
     trusted = {name: key.decode() for name, key in trusted_keys(place).items()}
+    limits = {name: words for name in trusted if (words := allowed(place, name)) is not None}
     if as_json:
-        typer.echo(json.dumps({"folder": str(place), "own": own, "trusted": trusted}, indent=2))
+        allow = {name: sorted(words) for name, words in limits.items()}
+        listing = {"folder": str(place), "own": own, "trusted": trusted, "allow": allow}
+        typer.echo(json.dumps(listing, indent=2))
         return
     typer.echo(f"Keys in {place}")
     for title, found in (("own", own), ("trusted", trusted)):
         for name, public in found.items():
             typer.echo(f"{title:<8} {name:<24} {public}")
+            if title == "trusted" and name in limits:
+                typer.echo(f"{'':<8} may send only: {', '.join(sorted(limits[name])) or 'nothing'}")
         if not found:
             typer.echo(f"{title:<8} none")
 
@@ -62,6 +70,33 @@ def trust(
 
     kept = keep(file, _folder(folder), name)
     typer.echo(f"Trusted from now on: {kept} (remove that file to end it)")
+
+
+@keys.command(name="allow")
+def allow_host(
+    name: Annotated[str, typer.Argument(help="Name of a trusted key.")],
+    words: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[STREAM]...",
+            help="What its machine may send: streams (color), topics (color.desk), and control for commands.",
+        ),
+    ] = None,
+    *,
+    everything: Annotated[bool, typer.Option("--everything", help="No limit any more.")] = False,
+    folder: Folder = None,
+) -> None:
+    """Limit what a trusted machine may send here: nothing but the named streams; holds within a second."""
+    from deltalight.protocol.keys import trusted_keys
+    from deltalight.protocol.rights import allow
+
+    place = _folder(folder)
+    if name not in trusted_keys(place):
+        raise DeltalightError(f"no key of `{name}` is trusted in {place}: see `deltalight keys list`")
+    if everything == bool(words):
+        raise DeltalightError("name the streams that the machine may send, or give --everything.")
+    allow(place, name, None if everything else words)
+    typer.echo(f"{name} may send {'everything' if everything else ', '.join(sorted(words or []))}.")
 
 
 def _folder(given: Path | None) -> Path:

@@ -51,6 +51,9 @@ ConfigFile = Annotated[
         help="Configuration file; default: ./deltalight.toml, then ~/.config/deltalight/deltalight.toml.",
     ),
 ]
+Data = Annotated[
+    Path | None, typer.Option(help="Folder of scenes and assets; default: the user's data folder.")
+]
 NodeStreams = Annotated[
     list[str] | None,
     typer.Option(
@@ -116,3 +119,12 @@ def node_endpoints(subscribe: list[str] | None, node: str | None, settings: "Key
     from deltalight.services.discovery import node_endpoint
 
     return [node_endpoint(node, settings)]
+
+
+def data_folder(data: Path | None, config_file: Path | None = None) -> Path:
+    """Return the web process's data folder: of the command line, the configuration, or the default."""
+    from deltalight.services.api.settings import ApiSettings
+    from deltalight.services.settings import load_configuration
+    from deltalight.services.storage.store import default_folder
+
+    return data or load_configuration(config_file).section("api", ApiSettings).data or default_folder()

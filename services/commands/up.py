@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from deltalight.protocol.errors import DeltalightError
-from deltalight.services.commands.options import ConfigFile, NodeName
+from deltalight.services.commands.options import ConfigFile, Data, NodeName, data_folder
 from deltalight.services.ports import COMPOSITE_PORT, CONTROL_PORT, LOOPBACK, NODE_PORT, PAGE_PORT
 
 if TYPE_CHECKING:
@@ -28,9 +28,7 @@ def up(
             help="Scene document to import and show; default: the last one shown, else the recording's."
         ),
     ] = None,
-    data: Annotated[
-        Path | None, typer.Option(help="Folder of scenes and assets; default: the user's data folder.")
-    ] = None,
+    data: Data = None,
     port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the dashboard.")] = PAGE_PORT,
     node_port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the node's streams.")] = NODE_PORT,
     composite_port: Annotated[
@@ -67,7 +65,7 @@ def up(
         raise DeltalightError(
             "--source starts a node here and --node uses one elsewhere; give only one of them."
         )
-    folder = _data_folder(data, config_file)
+    folder = data_folder(data, config_file)
     with Store(folder) as store:
         shown = scene_to_show(store, _recording(source), scene)
     with session_file(shown) as session:
@@ -89,15 +87,6 @@ def up(
         with Supervisor(plan.specs()) as supervisor:
             typer.echo(f"The dashboard is at http://{LOOPBACK}:{port} (Ctrl-C ends everything).")
             supervisor.run()
-
-
-def _data_folder(data: Path | None, config_file: Path | None) -> Path:
-    """Return the web process's data folder: of the command line, the configuration, or the default."""
-    from deltalight.services.api.settings import ApiSettings
-    from deltalight.services.settings import load_configuration
-    from deltalight.services.storage.store import default_folder
-
-    return data or load_configuration(config_file).section("api", ApiSettings).data or default_folder()
 
 
 def _configured_source(config_file: Path | None) -> str:

@@ -24,7 +24,9 @@ def unpacking(path: Path) -> Iterator[None]:
     try:
         yield
     except (zipfile.BadZipFile, NotImplementedError, zlib.error, EOFError, OSError) as error:
-        raise DeltalightError(f"{path} is a damaged or unusual .zip ({error}); pack it again.") from error
+        raise DeltalightError(
+            f"{path} is a damaged or unusual .zip ({error!s:.300}); pack it again."
+        ) from error
 
 
 class Archive:
@@ -46,7 +48,7 @@ class Archive:
     ) -> None:
         self.path = path
         self._archive = archive
-        listed = [each for each in archive.infolist() if not each.is_dir()]
+        listed = [each for each in archive.infolist() if not each.filename.endswith("/")]
         if len(listed) > most_files:
             raise DeltalightError(f"{path} holds more than {most_files} files; pack {contents}.")
         for entry in listed:
@@ -78,7 +80,7 @@ class Archive:
     def _check(self, entry: zipfile.ZipInfo) -> None:
         name = entry.filename
         steps = name.split("/")
-        if name.startswith("/") or "\\" in name or ":" in steps[0] or ".." in steps:
+        if not name or name.startswith("/") or "\\" in name or ":" in steps[0] or ".." in steps:
             raise DeltalightError(
                 f"{self.path} holds the name {name!r:.200}, outside its own folder; pack it again."
             )

@@ -19,6 +19,7 @@ from uuid import uuid4
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from deltalight.protocol.cached_files import read_cached, write_cached
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.scene import DIGEST_PREFIX, SceneDocument
 from deltalight.services.storage.asset_kinds import (
@@ -32,6 +33,7 @@ from deltalight.services.storage.asset_kinds import (
     recognise,
 )
 from deltalight.services.storage.asset_sandbox import Task, probe, run_limited
+from deltalight.services.storage.data_folder import sync_folder
 from deltalight.services.storage.database import Database
 from deltalight.services.storage.faults import ConflictError, NotFoundError, StorageFaultError, TooLargeError
 from deltalight.services.storage.tables import AssetNameRow, AssetRow, AssetUseRow, SceneRow
@@ -196,10 +198,10 @@ class AssetStore:
         asset = self.get(digest)
         path = self.path(asset)
         place = path.with_name(THUMBNAIL)
-        if place.is_file():
+        if read_cached(place) is not None:
             return place
         with self._children:
-            if not place.is_file():
+            if read_cached(place) is None:
                 task: Task = "mesh-thumbnail" if asset.format.kind == "mesh" else "map-thumbnail"
                 self._draw(task, path, place, asset.names[0])
         return place
@@ -209,7 +211,7 @@ class AssetStore:
         try:
             run_limited(task, path, name, str(drawn), output_bytes=THUMBNAIL_BYTES)
             with disk_faults():
-                drawn.replace(place)
+                write_cached(place, drawn.read_bytes())
         finally:
             drawn.unlink(missing_ok=True)
 
@@ -232,14 +234,26 @@ class AssetStore:
                 shutil.rmtree(self._folder / digest, ignore_errors=True)
 
     def localised(self, document: SceneDocument) -> SceneDocument:
-        """Return a stored document with the paths of its assets' files, for the render server."""
-        return document.with_assets(
-            lambda _place, reference: str(self.path(self.get(reference.removeprefix(DIGEST_PREFIX))))
-        )
+        """Return a stored document with the paths of its assets' files, for the render server.
+
+        Raises:
+            StorageFaultError: a file was removed from the data folder.
+        """
+        return document.with_assets(lambda _place, reference: str(self._existing(reference)))
 
     def without_paths(self, sentence: str) -> str:
         """Return a sentence of the render server for clients: digests in place of files."""
         return sentence.replace(f"{self._folder.absolute()}{os.sep}", DIGEST_PREFIX)
+
+    def _existing(self, reference: str) -> Path:
+        asset = self.get(reference.removeprefix(DIGEST_PREFIX))
+        path = self.path(asset)
+        if not path.is_file():
+            raise StorageFaultError(
+                f"the file of {asset.names[0]} ({reference}) is gone from the data folder; upload it again, or end "
+                "the service and run `deltalight restore BACKUP`."
+            )
+        return path
 
     def _path(self, digest: str, format_name: str) -> Path:
         return (self._folder / digest / f"asset{BY_NAME[format_name].suffix}").absolute()
@@ -260,8 +274,8 @@ class AssetStore:
             with disk_faults():
                 place.parent.mkdir(exist_ok=True)
                 checked.replace(place)
-                _sync_folder(place.parent)
-                _sync_folder(self._folder)
+                sync_folder(place.parent)
+                sync_folder(self._folder)
             if known is None:
                 session.add(row)
                 session.flush()
@@ -369,11 +383,3 @@ def disk_faults() -> Iterator[None]:
         yield
     except OSError as fault:
         raise StorageFaultError(f"The file cannot be kept ({fault.strerror}); free some space.") from fault
-
-
-def _sync_folder(folder: Path) -> None:
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

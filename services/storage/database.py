@@ -16,6 +16,7 @@ from deltalight.services.storage.tables import MIGRATIONS, SCHEMA_VERSION, Base
 
 BUSY_TIMEOUT_S = 10.0
 _IMMEDIATE = "deltalight_immediate"
+_DAMAGED = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 
 
 class Database:
@@ -77,9 +78,14 @@ class Database:
             yield
         except IntegrityError:  # a fault of this program, not of the disk
             raise
-        except DatabaseError as fault:
+        except (DatabaseError, sqlite3.DatabaseError) as fault:
+            cause = fault.orig if isinstance(fault, DatabaseError) else fault
+            if getattr(cause, "sqlite_errorcode", 0) & 0xFF in _DAMAGED:
+                raise StorageFaultError(
+                    f"{self._path} is damaged ({cause}); end the service and run `deltalight restore BACKUP`."
+                ) from fault
             raise StorageFaultError(
-                f"The database cannot be used now ({fault.orig}); free some space, end other users of it, or name "
+                f"The database cannot be used now ({cause}); free some space, end other users of it, or name "
                 "another --data folder."
             ) from fault
 

@@ -7,6 +7,7 @@ from typing import Self
 from deltalight.protocol.errors import DeltalightError
 from deltalight.services.storage.asset_sandbox import probe as probe_asset
 from deltalight.services.storage.assets import AssetStore, Probe
+from deltalight.services.storage.data_folder import ASSETS, DATABASE, use_folder
 from deltalight.services.storage.database import Database
 from deltalight.services.storage.scenes import SceneStore
 from deltalight.services.storage.tokens import TokenStore
@@ -18,7 +19,7 @@ class Store:
     What a call has stored is durable when it returns. `probe` loads an upload once, with limits.
 
     Raises:
-        DeltalightError: the folder cannot be written, or has other contents.
+        DeltalightError: the folder cannot be written, has other contents or damaged ones, or is being restored.
     """
 
     def __init__(self, folder: Path, *, probe: Probe = probe_asset) -> None:
@@ -29,10 +30,13 @@ class Store:
                 f"{folder} cannot be written ({fault.strerror}); name another folder with --data."
             ) from fault
         self.folder = folder
-        self._database = Database(folder / "store.sqlite3")
-        self.assets = AssetStore(self._database, folder / "assets", probe)
-        self.scenes = SceneStore(self._database)
-        self.tokens = TokenStore(self._database)
+        with use_folder(folder) as opening:
+            self._database = Database(folder / DATABASE)
+            opening.callback(self._database.close)
+            self.assets = AssetStore(self._database, folder / ASSETS, probe)
+            self.scenes = SceneStore(self._database)
+            self.tokens = TokenStore(self._database)
+            self._opened = opening.pop_all()
 
     def __enter__(self) -> Self:
         return self
@@ -46,8 +50,8 @@ class Store:
         return self.folder / "poster.jpg"
 
     def close(self) -> None:
-        """Close the database."""
-        self._database.close()
+        """Close the database, and let others replace the folder's contents."""
+        self._opened.close()
 
 
 def default_folder() -> Path:

@@ -3,9 +3,11 @@
 import json
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from rich.progress import Progress
 
 from deltalight.benchmarks.ground_truth.scenes import SCENES
 from deltalight.benchmarks.quality import report
@@ -14,11 +16,12 @@ from deltalight.benchmarks.quality.evaluate import (
     QualityJob,
     QualityResult,
     SceneResult,
-    VariantResult,
+    measure_quality,
 )
+from deltalight.benchmarks.quality.kept import KeptResults, VariantResult
 from deltalight.benchmarks.quality.report import require_replaceable, write_report
 from deltalight.benchmarks.quality.tables import COLUMNS
-from deltalight.benchmarks.variants import parse_variants
+from deltalight.benchmarks.variants import Variant, parse_variants
 from deltalight.protocol.errors import DeltalightError
 
 
@@ -106,3 +109,39 @@ def test_interrupted_report_leaves_the_older_one(tmp_path: Path, monkeypatch: py
         write_report(result(30.0), folder)
     assert json.loads((folder / "quality.json").read_text())["means"]["exact"]["changed_psnr_db"] == 20
     assert list(tmp_path.iterdir()) == [folder]
+
+
+def test_a_run_goes_on_where_it_was_cut_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    measured: list[str] = []
+
+    def measure(_gpu: object, _case: object, variant: Variant, *_: object) -> VariantResult:
+        if len(measured) == 2:
+            raise KeyboardInterrupt
+        measured.append(variant.name)
+        return result().scenes[0].variants[variant.name]
+
+    truth = SimpleNamespace(folder=tmp_path / "scene-0123")
+    for name, value in {
+        "create_context": lambda _: SimpleNamespace(renderer_name="a renderer", release=lambda: None),
+        "ensure_truth": lambda *_, **__: truth,
+        "SceneCase": SimpleNamespace(opened=lambda _: SimpleNamespace(truth=truth, frames=[])),
+        "_measure": measure,
+        "_result": lambda *_: result().scenes[0].variants["camera"],
+        "_scene_result": lambda _, variants: variants,
+    }.items():
+        monkeypatch.setattr(f"deltalight.benchmarks.quality.evaluate.{name}", value)
+    job, kept = result().job, KeptResults.beside(tmp_path / "quality")
+    with pytest.raises(KeyboardInterrupt):
+        measure_quality(job, Progress(disable=True), kept)
+    damaged = next((tmp_path / ".quality.partial").glob("*.npz"))
+    damaged.write_bytes(damaged.read_bytes()[:-1])
+    measured.clear()
+    (again,) = measure_quality(job, Progress(disable=True), kept).scenes
+    assert kept.taken == 1
+    assert len(measured) == 2
+    taken, wanted = again["exact"], result().scenes[0].variants["exact"]
+    np.testing.assert_equal({**vars(taken)}, {**vars(wanted)})
+    with pytest.raises(ZeroDivisionError):
+        kept.result(lambda: 1 // 0, "another renderer", "scene-0123", job.variants[0], None)
+    kept.remove()
+    assert list(tmp_path.iterdir()) == []

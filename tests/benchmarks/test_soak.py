@@ -6,16 +6,19 @@ import socket
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
 
+from deltalight.benchmarks.soak import peers
 from deltalight.benchmarks.soak.command import SoakJob, run_soak
 from deltalight.benchmarks.soak.crowd import Seen
-from deltalight.benchmarks.soak.faults import FAULTS, Flow, parse_faults
+from deltalight.benchmarks.soak.faults import FAULTS, parse_faults
 from deltalight.benchmarks.soak.figures import Soaked, all_figures
-from deltalight.benchmarks.soak.link import SHAPES, Link, LoopThread, Schedule, Shape
+from deltalight.benchmarks.soak.flow import Flow
+from deltalight.benchmarks.soak.link import SHAPES, Link, LoopThread, Schedule, Shape, held_up_s
 from deltalight.benchmarks.soak.nonsense import _messages, mutated
 from deltalight.benchmarks.soak.plots import known_runs, nice_ceiling
 from deltalight.benchmarks.soak.profiles import PROFILES
@@ -38,10 +41,34 @@ def test_a_link_delays_by_its_band_and_its_way() -> None:
     assert schedule.leaves_s(20.0, 1000, SLOW_LINK) == pytest.approx(20.051)
 
 
-def test_what_is_lost_holds_up_all_behind_it_for_a_round_trip() -> None:
+def test_what_is_lost_holds_up_all_behind_it_until_it_is_there() -> None:
+    assert [held_up_s(losses, SLOW_LINK) for losses in range(4)] == pytest.approx([0, 0.1, 0.3, 0.7])
     lossy = Schedule(random.Random(1))
-    assert lossy.leaves_s(10.0, 1000, replace(SLOW_LINK, loss=1.0)) == pytest.approx(10.151)
-    assert lossy.leaves_s(10.0, 1000, SLOW_LINK) == pytest.approx(10.152)
+    left_s = [lossy.leaves_s(10.0, 1000, replace(SLOW_LINK, loss=0.3)) - 10.05 for _ in range(200)]
+    held_s = [after - before - 0.001 for before, after in pairwise(left_s)]
+    assert left_s == sorted(left_s)
+    assert sum(held > 0.09 for held in held_s) / 199 == pytest.approx(0.3, abs=0.1)
+    assert sum(held > 0.29 for held in held_s) / 199 == pytest.approx(0.09, abs=0.06)
+
+
+def test_what_is_overtaken_holds_up_for_its_longer_way_and_no_band_is_lost() -> None:
+    schedule = Schedule(random.Random(1))
+    assert schedule.leaves_s(10.0, 1000, replace(SLOW_LINK, overtaken=1.0)) == pytest.approx(10.101)
+    assert schedule.leaves_s(10.0, 1000, SLOW_LINK) == pytest.approx(10.101), "waits for the one before"
+    assert schedule.leaves_s(11.0, 1000, SLOW_LINK) == pytest.approx(11.051)
+
+
+def test_over_a_narrow_link_a_queue_ages_more_than_the_newest(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(peers, "message_bytes", lambda _size: 60_000)
+    load = replace(
+        PROFILES["small"], frames_per_s=50.0, load_s=2.5
+    )  # three times as much as the link carries
+    with LoopThread("peers") as thread:
+        flows = peers.peers_on(thread, SLOW_LINK, load, seed=1)
+    newest, queued = (flows[name].age_p95_ms for name in ("newest", "queued"))
+    assert newest is not None
+    assert queued is not None
+    assert 100 < newest < queued
 
 
 def test_jitter_keeps_the_order() -> None:

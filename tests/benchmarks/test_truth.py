@@ -1,7 +1,9 @@
 """Truth of benchmark scenes: complete or absent, repeatable, and readable as the dataset folder that it is."""
 
 import importlib.util
+import shutil
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +26,10 @@ from deltalight.benchmarks.ground_truth.parts import MeshFolder, box, looking, p
 from deltalight.benchmarks.ground_truth.point_lamps import point_lamps, with_point_lamps
 from deltalight.benchmarks.ground_truth.render import RoomRenderer, choose_variant
 from deltalight.benchmarks.ground_truth.scenes import scene_named
-from deltalight.benchmarks.ground_truth.truth import Truth, default_cache, ensure_truth
+from deltalight.benchmarks.ground_truth.truth import CACHE, Truth, ensure_truth
 from deltalight.benchmarks.ground_truth.truth_pictures import world_from_fisheye
+from deltalight.benchmarks.ground_truth.truth_writer import is_whole
+from deltalight.protocol.cached_files import cache_folder
 from deltalight.protocol.camera_model import load_camera_yaml
 from deltalight.protocol.dataset import open_dataset
 from deltalight.protocol.equidistant_lens import EquidistantLens
@@ -94,6 +98,23 @@ def test_truth_is_rendered_once(truth: Truth, monkeypatch: pytest.MonkeyPatch) -
 @pytest.mark.skipif(
     choose_variant() != "llvm_ad_rgb", reason="only Mitsuba's LLVM variant repeats a seed exactly"
 )
+def test_damaged_truth_is_rendered_again(
+    truth: Truth, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / truth.folder.name
+    shutil.copytree(truth.folder, folder)
+    assert is_whole(folder)
+    picture = folder / "rgb" / "000000.png"
+    picture.write_bytes(picture.read_bytes()[:-1])
+    assert not is_whole(folder)
+    write_again = partial(shutil.copytree, truth.folder)
+    monkeypatch.setattr(
+        "deltalight.benchmarks.ground_truth.truth.write_truth", lambda made, *_: write_again(made)
+    )
+    assert make(truth.scene, tmp_path).folder == folder
+    assert is_whole(folder)
+
+
 def test_truth_is_the_same_wherever_it_is_rendered(truth: Truth, tmp_path: Path) -> None:
     again = make(SCENE, tmp_path)
     assert again.folder.name == truth.folder.name
@@ -256,9 +277,9 @@ def test_samples_that_cannot_be_halved_are_refused(spp: int, tmp_path: Path) -> 
 def test_cache_is_where_the_environment_says(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
     monkeypatch.delenv("DELTALIGHT_CACHE", raising=False)
-    assert default_cache() == tmp_path / "xdg" / "deltalight" / "ground-truth"
+    assert cache_folder(CACHE) == tmp_path / "xdg" / "deltalight" / "ground-truth"
     monkeypatch.setenv("DELTALIGHT_CACHE", str(tmp_path / "own"))
-    assert default_cache() == tmp_path / "own" / "ground-truth"
+    assert cache_folder(CACHE) == tmp_path / "own" / "ground-truth"
 
 
 def test_cache_that_cannot_be_made_is_refused(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from deltalight.protocol.messages import ControlRequest
 from deltalight.protocol.publisher import Publisher
 from deltalight.protocol.receiver import Receiver
 from deltalight.protocol.request import ReplyServer, RequestClient
+from deltalight.protocol.rights import allow
 
 ANY = "tcp://127.0.0.1:0"
 SETTLE_S = 5.0
@@ -170,6 +172,72 @@ def test_control_needs_a_trusted_key(hosts: Hosts, opened: Callable[[Any], Any])
             client.request(question, PATIENCE_S)
     wait_until(lambda: server.refused > 0)
     assert trusted.request(question.model_copy(update={"id": "2"}), SETTLE_S).ok
+
+
+def test_a_host_may_publish_only_what_its_key_allows(hosts: Hosts, opened: Callable[[Any], Any]) -> None:
+    allow(hosts.server.folder, "node", ["color", "pose.desk"])
+    publisher = opened(Publisher(ANY, keys=hosts.node))
+    with structlog.testing.capture_logs() as lines:
+        receiver = opened(Receiver([at_node(publisher.endpoint)], [], keys=hosts.server))
+        found: set[str] = set()
+
+        def sent() -> bool:
+            for topic in (
+                b"lights.desk",
+                b"pose.shelf",
+                b"color.shelf",
+                b"pose.desk",
+                b"colors.desk",
+                b"lights.desk",
+            ):
+                publisher.send([topic, b""])
+            found.update(receiver.latest(0.05) or {})
+            return len(found) == 2 and receiver.not_allowed > 0
+
+        wait_until(sent)
+        assert found == {"color.shelf", "pose.desk"}
+        assert receiver.drops["not_allowed"] == receiver.not_allowed
+    sentences = [line["reason"] for line in lines if "may not" in line["event"]]
+    assert len(sentences) == len({sentence.split(";")[0] for sentence in sentences}) == 3
+    assert (
+        "the key `node` does not allow lights.desk; if it should, add lights to `deltalight keys allow"
+        in str(sentences)
+    )
+    allow(hosts.server.folder, "node", None)
+    before = opened(Receiver([at_node(publisher.endpoint)], [], keys=hosts.server))
+    wait_until(lambda: publisher.send([b"lights.desk", b""]) or bool(before.latest(0.05)))
+
+
+def test_rights_hold_for_hosts_that_connect_and_for_commands(
+    hosts: Hosts, opened: Callable[[Any], Any]
+) -> None:
+    allow(hosts.node.folder, "server", ["pose"])
+    receiver = opened(Receiver([ANY], [], bind=True, keys=hosts.node))
+    publisher = opened(Publisher(at_node(receiver.endpoints[0]), bind=False, keys=hosts.server))
+    found: set[str] = set()
+
+    def sent() -> bool:
+        publisher.send([b"color.desk", b""])
+        publisher.send([b"pose.desk", b""])
+        found.update(receiver.latest(0.05) or {})
+        return bool(found) and receiver.not_allowed > 0
+
+    wait_until(sent)
+    assert found == {"pose.desk"}
+    server = opened(ReplyServer(ANY, lambda request: {"op": request.op}, keys=hosts.node))
+    client = opened(RequestClient(at_node(server.endpoint), keys=hosts.server))
+    answers = [
+        client.request(ControlRequest(node="a", id=str(number), op=op), SETTLE_S)
+        for number, op in enumerate(["clock", "set_scene", "ping"])
+    ]
+    assert [answer.ok for answer in answers] == [True, False, True]
+    assert "the key `server` does not allow control" in str(answers[1].error)
+    assert server.not_allowed == 1
+    allow(hosts.node.folder, "server", ["pose", "control"])
+    numbers = count(3)  # rights are read once a second
+    wait_until(
+        lambda: client.request(ControlRequest(node="a", id=str(next(numbers)), op="set_scene"), SETTLE_S).ok
+    )
 
 
 # How a peer that wants keys begins (ZMTP 3.1, section 3.1): signature, version, mechanism, as server, filler.

@@ -1,5 +1,6 @@
 """Dataset folders: every form that docs/formats.md 1 allows, the real captures, and what bad folders are told."""
 
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from deltalight.protocol.dataset import open_dataset
 from deltalight.protocol.dataset_writer import DatasetWriter
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import SensorFrame
-from deltalight.protocol.pictures import depth_from_steps
+from deltalight.protocol.pictures import decode_depth_png, decode_rgb, depth_from_steps, encode_png
 from deltalight.protocol.source import open_source
 
 WIDTH, HEIGHT = 32, 24
@@ -334,3 +335,22 @@ def test_writing_keeps_jpeg_bytes_and_refuses_what_does_not_fit(tmp_path: Path) 
     assert frame.timestamp_ns == 5
     with pytest.raises(DeltalightError, match="already exists"), DatasetWriter(tmp_path / "a"):
         pass
+
+
+def test_a_picture_that_states_more_than_its_bytes_can_hold_is_refused_undecoded() -> None:
+    honest = np.zeros((1000, 2000, 3), np.uint8)
+    assert decode_rgb(encode_png(honest), "flat").shape == honest.shape
+    png, jpeg = encode_png(np.zeros((4, 4), np.uint16)), cv2.imencode(".jpg", honest[:16, :16])[1].tobytes()
+    size = struct.pack(">II", 16_000, 16_000)
+    lies = [
+        png[:16] + size + png[24:],  # the size
+        png[:33] + b"\x7f" + png[34:],  # the length of the chunk that follows
+        png[:33] + struct.pack(">I4sIII", 8, b"acTL", 2**31, 0, 0) + png[33:],  # many pictures
+        jpeg.replace(b"\x00\x10\x00\x10\x03", b"\x40\x00\x40\x00\x03"),
+    ]
+    assert jpeg not in lies
+    for data in lies:
+        with pytest.raises(DeltalightError, match="cannot be decoded"):
+            decode_rgb(data, "picture")
+        with pytest.raises(DeltalightError, match="not a 16-bit PNG"):
+            decode_depth_png(data, "picture")

@@ -16,6 +16,7 @@ from deltalight.protocol.keys import (
     trust,
     trusted_keys,
 )
+from deltalight.protocol.rights import allow, allowed
 
 
 def test_a_secret_key_is_its_owners_only(tmp_path: Path) -> None:
@@ -131,3 +132,17 @@ def test_an_endpoint_may_name_its_hosts_key() -> None:
 def test_the_users_folder_follows_xdg(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
     assert key_folder() == tmp_path / "deltalight" / "keys"
+
+
+def test_what_a_key_allows_is_known_streams_topics_and_control(tmp_path: Path) -> None:
+    (tmp_path / "trusted").mkdir()
+    assert allowed(tmp_path, "desk") is None
+    allow(tmp_path, "desk", ["color", "pose.desk", "control"])
+    assert allowed(tmp_path, "desk") == {"color", "pose.desk", "control"}
+    for word in ("colour", "color.", "color.a.b", "request", "../x", "*"):
+        with pytest.raises(DeltalightError, match="no stream, topic or `control`"):
+            allow(tmp_path, "desk", [word])
+    (tmp_path / "trusted" / "desk.allow").write_bytes(b"\xff\xff")
+    assert allowed(tmp_path, "desk") == set(), "a list that cannot be read allows nothing"
+    allow(tmp_path, "desk", None)
+    assert allowed(tmp_path, "desk") is None

@@ -273,3 +273,11 @@ def test_of_a_list_of_faults_only_the_first_is_made(place: tuple[str, ...]) -> N
         parse_scene(document)
     assert isinstance(fault.value.__cause__, ValidationError)
     assert fault.value.__cause__.error_count() == 1
+
+
+@pytest.mark.parametrize("name", ["a" * 3000 + ".glb", "a\0b.glb"])
+def test_names_that_no_file_has_are_sentences(tmp_path: Path, name: str) -> None:
+    path = tmp_path / "scene.json"
+    path.write_text(json.dumps({"objects": [{"asset": name}]}))
+    with pytest.raises(DeltalightError, match="correct the path"):
+        load_scene(path)

@@ -1,6 +1,7 @@
 """What is precomputed for occlusion fields: harmonics, what an object hides, what it reflects, and the files."""
 
 import math
+import os
 from pathlib import Path
 
 import numpy as np
@@ -167,7 +168,7 @@ def test_a_field_is_read_as_it_was_written_and_damage_is_noticed(
 ) -> None:
     store_field(tmp_path / "new", "ab", ball_field)
     path = tmp_path / "new" / "ab.npz"
-    assert [entry.name for entry in path.parent.iterdir()] == ["ab.npz"]
+    assert sorted(entry.name for entry in path.parent.iterdir()) == ["ab.npz", "ab.npz.sha256"]
     again = load_field(path.parent, "ab", SETTINGS)
     assert again is not None
     assert (again.occlusion == ball_field.occlusion).all()
@@ -194,18 +195,31 @@ def test_fields_are_computed_once_and_again_where_the_file_is_damaged(
     said: list[str] = []
     first = OcclusionFields(said.append, tmp_path).find(placed(ball), SETTINGS)
     assert first is not None
-    (file,) = tmp_path.iterdir()
-    written = file.stat().st_mtime_ns
+    (file,) = tmp_path.glob("*.npz")
     second = OcclusionFields(said.append, tmp_path).find(placed(ball), SETTINGS)
     assert second is not None
     assert (second.occlusion == first.occlusion).all()
-    assert file.stat().st_mtime_ns == written
     file.write_bytes(b"damaged")
     third = OcclusionFields(said.append, tmp_path).find(placed(ball), SETTINGS)
     assert third is not None
     assert (third.occlusion == first.occlusion).all()
     assert file.stat().st_size > 1000
     assert said == []
+
+
+def test_fields_that_were_not_used_for_longest_give_way(
+    tmp_path: Path, ball_field: OcclusionField, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for number in range(3):
+        store_field(tmp_path, str(number), ball_field)
+        os.utime(tmp_path / f"{number}.npz", ns=(number, number))
+    assert load_field(tmp_path, "0", SETTINGS) is not None
+    room = 3 * (tmp_path / "0.npz").stat().st_size
+    monkeypatch.setattr("deltalight.render_server.occlusion_fields.cache_limit_bytes", lambda: room)
+    store_field(tmp_path, "3", ball_field)
+    assert sorted(path.name for path in tmp_path.glob("*.npz*")) == [
+        f"{number}.npz{end}" for number in (0, 2, 3) for end in ("", ".sha256")
+    ]
 
 
 def test_a_second_start_computes_nothing(

@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from typer.core import TyperGroup
@@ -28,6 +29,8 @@ COMMANDS = {
     "recordings recover",
     "recordings import",
     "recordings export",
+    "backup",
+    "restore",
     "board",
     "ping",
     "calibrate camera",
@@ -41,6 +44,7 @@ COMMANDS = {
     "keys create",
     "keys list",
     "keys trust",
+    "keys allow",
     "config",
     "doctor",
     "foxglove",
@@ -94,7 +98,7 @@ def test_a_shell_completes_commands_and_options(cli: RunCli, monkeypatch: pytest
     monkeypatch.setenv("_DELTALIGHT_COMPLETE", "complete_bash")
     monkeypatch.setenv("COMP_CWORD", "1")
     monkeypatch.setenv("COMP_WORDS", "deltalight re")
-    assert cli().stdout.split() == ["render", "record", "replay", "recordings"]
+    assert cli().stdout.split() == ["render", "record", "replay", "restore", "recordings"]
     monkeypatch.setenv("COMP_CWORD", "2")
     monkeypatch.setenv("COMP_WORDS", "deltalight render --met")
     assert cli().stdout.split() == ["--method"]
@@ -212,3 +216,22 @@ def test_port_in_use_is_a_sentence_that_names_it(cli: RunCli, command: tuple[str
     assert done.returncode == 2, done.stderr
     assert str(port) in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_keys_allow_limits_what_a_trusted_machine_may_send(cli: RunCli, tmp_path: Path) -> None:
+    here, there = ("--folder", tmp_path / "here"), ("--folder", tmp_path / "there")
+    cli("keys", "create", "desk", *there)
+    assert "no key of `desk` is trusted" in cli("keys", "allow", "desk", "color", *here).stderr
+    cli("keys", "trust", tmp_path / "there" / "desk.key", *here)
+    assert "name the streams" in cli("keys", "allow", "desk", *here).stderr
+    assert "the nearest is color" in cli("keys", "allow", "desk", "colour", *here).stderr
+    assert (
+        cli("keys", "allow", "desk", "pose.desk", "color", *here).stdout
+        == "desk may send color, pose.desk.\n"
+    )
+    assert "may send only: color, pose.desk" in cli("keys", "list", *here).stdout
+    assert json.loads(cli("keys", "list", "--json", *here).stdout)["allow"] == {
+        "desk": ["color", "pose.desk"]
+    }
+    assert cli("keys", "allow", "desk", "--everything", *here).returncode == 0
+    assert "may send only" not in cli("keys", "list", *here).stdout

@@ -354,5 +354,5 @@ def test_a_store_of_another_version_is_refused(tmp_path: Path) -> None:
 
 def test_a_file_that_is_no_database_is_a_sentence(tmp_path: Path) -> None:
     (tmp_path / "store.sqlite3").write_bytes(b"not a database at all" * 100)
-    with pytest.raises(DeltalightError, match="database cannot be used"):
+    with pytest.raises(DeltalightError, match=r"store.sqlite3 is damaged .*deltalight restore BACKUP"):
         Store(tmp_path)

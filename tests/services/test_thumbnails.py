@@ -12,7 +12,7 @@ from deltalight.services.storage.faults import RejectedAssetError
 from deltalight.services.storage.store import Store
 from deltalight.services.storage.thumbnails import SIZE
 from tests.services.api_samples import UPLOAD, running_api, sentence
-from tests.services.storage_samples import TETRAHEDRON, glb
+from tests.services.storage_samples import TETRAHEDRON, glb, trusting_probe, upload
 from tests.services.test_gltf_zip import FILES, packed
 
 pytestmark = pytest.mark.slow
@@ -83,6 +83,24 @@ def test_gltf_is_y_up_and_textured(tmp_path: Path) -> None:
     assert len(solid) > 0.3 * SIZE * SIZE, "the square stands upright and is seen from the front"
     assert solid[:, 2].min() > 100
     assert solid[:, :2].max() < 30
+
+
+def test_a_damaged_thumbnail_is_drawn_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawings: list[str] = []
+
+    def draw(task: str, _path: Path, _name: str, out: str, **_limits: int) -> None:
+        drawings.append(task)
+        Path(out).write_bytes(b"picture")
+
+    monkeypatch.setattr("deltalight.services.storage.assets.run_limited", draw)
+    with Store(tmp_path, probe=trusting_probe) as store:
+        digest = upload(store, TETRAHEDRON, "t.obj").digest
+        place = store.assets.thumbnail(digest)
+        assert store.assets.thumbnail(digest) == place
+        assert drawings == ["mesh-thumbnail"]
+        place.write_bytes(b"picturf")
+        assert store.assets.thumbnail(digest).read_bytes() == b"picture"
+        assert len(drawings) == 2
 
 
 def test_a_map_is_shown_whole_whatever_its_kind_and_brightness(tmp_path: Path) -> None:

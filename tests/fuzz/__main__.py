@@ -1,0 +1,137 @@
+"""Coverage-guided fuzzing of the decoders: `python -m tests.fuzz TARGET... --minutes 5`.
+
+It needs atheris (`python -m pip install atheris==3.0.0`), which has wheels for Linux on x86-64 only and so is in no
+lock. What fails is kept as a file in `kept/TARGET`, which the tests replay; the corpus grows in a folder of its own.
+`--distil` then packs the shortest inputs that reached new code into `corpus/TARGET.bin`.
+"""
+
+import argparse
+import json
+import os
+import re
+import subprocess
+import sys
+import time
+from importlib.util import find_spec
+from pathlib import Path
+
+from deltalight.protocol.files import write_bytes
+from deltalight.protocol.vectors import frame_pieces
+from tests.fuzz.seeds import CORPUS, KEPT, corpus, seeds
+from tests.fuzz.targets import TARGETS
+
+MEMORY_MB, ALLOCATION_MB, HANG_S = 3072, 2048, 300
+LONGEST_INPUT = 32_768
+DISTILLED_BYTES = 6_000  # of a target
+MOST_CRASHES = 20
+
+
+def main() -> None:
+    """Fuzz the chosen targets one after the other and print their figures as JSON lines."""
+    options = _options()
+    if find_spec("atheris") is None:
+        sys.exit("fuzzing needs atheris: python -m pip install atheris==3.0.0 (Linux on x86-64)")
+    for target in options.targets or TARGETS:
+        grown = options.work / target
+        grown.mkdir(parents=True, exist_ok=True)
+        _write_seeds(target, _seed_folder(grown))
+        print(json.dumps(_fuzz(target, grown, 60 * options.minutes)), flush=True)
+        if options.distil:
+            _distil(target, grown)
+
+
+def _options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
+    parser.add_argument(
+        "targets", nargs="*", choices=[*TARGETS, []], metavar="TARGET", help=", ".join(TARGETS)
+    )
+    parser.add_argument("--minutes", type=float, default=2.0, help="for each target")
+    parser.add_argument("--work", type=Path, default=Path("build/fuzz"), help="folder of the grown corpus")
+    parser.add_argument("--distil", action="store_true", help="renew the corpus that the tests replay")
+    return parser.parse_args()
+
+
+def _write_seeds(target: str, folder: Path) -> None:
+    """Write the first inputs and the corpus as files, which libFuzzer wants."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for number, content in enumerate([*(data for name, data in seeds() if name == target), *corpus(target)]):
+        (folder / f"{number:04d}").write_bytes(content)
+    (KEPT / target).mkdir(parents=True, exist_ok=True)
+
+
+def _fuzz(target: str, grown: Path, seconds: float) -> dict[str, object]:
+    """Run until the time is up, again after each crash of the process; return the figures."""
+    began_s, executions, crashes, peak_mb, slowest_s = time.monotonic(), 0, 0, 0, 0
+    before = _contents(KEPT / target)
+    while (left_s := round(seconds - (time.monotonic() - began_s))) > 0 and crashes < MOST_CRASHES:
+        code, told = _run(target, grown, f"-max_total_time={left_s}")
+        executions += _figure(told, "number_of_executed_units")
+        peak_mb = max(peak_mb, _figure(told, "peak_rss_mb"))
+        slowest_s = max(slowest_s, _figure(told, "slowest_unit_time_sec"))
+        if code == 0:
+            break
+        crashes += 1
+        print(told[-3000:], file=sys.stderr, flush=True)
+    return {
+        "target": target,
+        "seconds": round(time.monotonic() - began_s),
+        "executions": executions,
+        "crashes": crashes,
+        "found": sorted(_contents(KEPT / target) - before),
+        "peak_mb": peak_mb,
+        "slowest_s": slowest_s,
+        "inputs": len(list(grown.iterdir())),
+    }
+
+
+def _run(target: str, grown: Path, *options: str) -> tuple[int, str]:
+    folders = [str(each) for each in (grown, _seed_folder(grown), KEPT / target)]
+    limits = [f"-rss_limit_mb={MEMORY_MB}", f"-malloc_limit_mb={ALLOCATION_MB}", f"-timeout={HANG_S}"]
+    command = [
+        sys.executable,
+        "-m",
+        "tests.fuzz.child",
+        target,
+        *options,
+        *limits,
+        f"-max_len={LONGEST_INPUT}",
+    ]
+    artifacts = f"-artifact_prefix={KEPT / target}/"
+    done = subprocess.run(
+        [*command, artifacts, "-print_final_stats=1", *folders],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"},
+        check=False,
+    )
+    return done.returncode, done.stderr.decode(errors="replace")
+
+
+def _figure(told: str, name: str) -> int:
+    found = re.search(rf"stat::{name}:\s+(\d+)", told)
+    return int(found.group(1)) if found else 0
+
+
+def _contents(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+def _seed_folder(grown: Path) -> Path:
+    return grown.with_name(f"{grown.name}-seeds")
+
+
+def _distil(target: str, grown: Path) -> None:
+    """Pack the corpus anew: each input of the grown one reached new code; the shortest come first."""
+    chosen, room = [], DISTILLED_BYTES
+    for content in sorted(
+        {path.read_bytes() for path in grown.iterdir()}, key=lambda each: (len(each), each)
+    ):
+        room -= len(content)
+        if room < 0:
+            break
+        chosen.append(content)
+    write_bytes(CORPUS / f"{target}.bin", frame_pieces(chosen))
+
+
+if __name__ == "__main__":
+    main()
