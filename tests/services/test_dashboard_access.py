@@ -36,7 +36,16 @@ LOOKING = {
         "Sign out",
     ),
     *("Outlines and lamps", "Close the drawer", "Lamp 1"),
-    *("View", "Picture", "Effects", "Change of light", "Volume", "Light's view", "Camera"),
+    *(
+        "View",
+        "Picture",
+        "Effects",
+        "Change of light",
+        "Volume",
+        "Light's view",
+        "Error of the paper",
+        "Camera",
+    ),
 }
 
 

@@ -145,14 +145,14 @@ def test_what_nodes_send_is_cut_to_the_limits_of_statistics_and_composites(
         SceneDocument(),
         mailbox_drops=lambda: topics,
         clock_ns=lambda: START,
-        renderer_name="abacus",
+        renderer_name="abacus" * 400,
     )
     wrong = color(1, START, START, {**camera().to_dict(), "distortion_model": "w" * 5000})
     for message in (wrong, depth(1, START), pose(1, START)):
         session.receive(message)
     assert session.step() is None
     stats = session.stats()
-    assert stats.detail.startswith("abacus; ")
+    assert stats.detail.startswith("abacus")
     assert len(stats.detail) == MAX_SENTENCE
     assert stats.drops["bad_frames"] == 1
     assert sum(stats.drops.values()) == 401
