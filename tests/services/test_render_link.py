@@ -3,6 +3,7 @@
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -62,7 +63,7 @@ class Shown:
         return [order["scene"]["name"] for order in self.server.payloads("set_scene")]  # type: ignore[index]
 
     def close(self) -> None:
-        self.server.close()
+        self.server.gate.set()
         self._pool.shutdown()
 
 
@@ -81,8 +82,10 @@ def shown(
     monkeypatch.setattr(render_link, "ALIVE_TIMEOUT_S", LONG_S)
     monkeypatch.setattr(live, "PICK_TIMEOUT_S", LONG_S)
     (control_port,) = ports.private_ports(1)
-    server = Recorder(control_port)
-    with running_api(tmp_path, control=ports.endpoint(control_port)) as api:
+    with (
+        closing(Recorder(control_port)) as server,  # after the API, which would wait for its last answer
+        running_api(tmp_path, control=ports.endpoint(control_port)) as api,
+    ):
         shown = Shown(api, server)
         try:
             yield shown

@@ -30,7 +30,7 @@ except BaseException as ending:
 @pytest.mark.parametrize(("name", "ending"), [("SIGTERM", "Terminated"), ("SIGINT", "KeyboardInterrupt")])
 def test_a_signal_while_an_object_is_freed_ends_the_program_all_the_same(name: str, ending: str) -> None:
     program = [sys.executable, "-c", PROGRAM.format(name=name)]
-    ended = subprocess.run(program, cwd=ROOT, capture_output=True, text=True, timeout=30, check=False)
+    ended = subprocess.run(program, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
     assert (ended.stdout.strip(), ended.stderr, ended.returncode) == (ending, "", 0)
 
 
@@ -51,7 +51,7 @@ except Terminated:
 
 def test_further_signals_do_not_break_off_what_the_first_one_ends() -> None:
     program = [sys.executable, "-c", FINISHING]
-    ended = subprocess.run(program, cwd=ROOT, capture_output=True, text=True, timeout=30, check=False)
+    ended = subprocess.run(program, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
     assert (ended.stdout.strip(), ended.stderr, ended.returncode) == ("finished", "", 0)
 
 
@@ -80,7 +80,7 @@ except KeyboardInterrupt:
 
 def test_a_signal_that_compiled_code_catches_leaves_no_traceback() -> None:
     program = [sys.executable, "-c", FREEING]
-    ended = subprocess.run(program, cwd=ROOT, capture_output=True, text=True, timeout=30, check=False)
+    ended = subprocess.run(program, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
     assert (ended.stdout.strip(), ended.stderr, ended.returncode) == ("ended", "", 0)
 
 
