@@ -38,7 +38,7 @@ from deltalight.protocol.message_fields import (
 from deltalight.protocol.quality import Quality
 from deltalight.protocol.scene_fields import LightCount, PeakThreshold, ShownView, SmoothingTime, SplitKind
 
-SCHEMA_VERSION: Final = 7
+SCHEMA_VERSION: Final = 8
 MAX_HEADER_BYTES = 64 * 1024
 MAX_PART_BYTES = 64 * 1024 * 1024
 MAX_PAYLOAD_BYTES = 4 * 1024 * 1024
@@ -90,7 +90,7 @@ class MessageBase(BaseModel):
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
-    schema_version: Literal[7] = SCHEMA_VERSION
+    schema_version: Literal[8] = SCHEMA_VERSION
     node: Name
     stream: Stream
     frame_id: Count
@@ -312,6 +312,7 @@ class CompositeMessage(MessageBase):
     clock. `scene_id` and `scene_revision` are those of the request that set the frame's scene. `camera`
     (`CameraModel.to_dict()` at the picture's size) and pose are those that it was rendered with. `quality` is that of
     `method.quality` (None if nothing was rendered); `scale` the part of its width that was, before it was enlarged.
+    `pass_times_ms` are those of the passes that ran, `reused_pass_times_ms` of the others when they last ran.
     `view` is what the picture shows; `others` are further views of the frame, which somebody asked for.
     """
 
@@ -327,6 +328,7 @@ class CompositeMessage(MessageBase):
     received_ns: Nanoseconds
     rendered_ns: Nanoseconds
     pass_times_ms: Durations = Field(default_factory=dict)
+    reused_pass_times_ms: Durations = Field(default_factory=dict)
     lights: LightList = ()
     drops: Counts = Field(default_factory=dict)
     quality: Quality | None = None

@@ -7,7 +7,7 @@ drawn.
 
 import inspect
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from difflib import get_close_matches
@@ -383,6 +383,12 @@ class Graph:
         """Begins a frame: reports tell what ran and changed since."""
         seen = {stage: stage.seen for stage in self._stages}
         self._begun = dict(seen), {item: item.version for item in self._resources.values()}
+
+    def reused_times_ms(self, ran: Container[str]) -> dict[str, float]:
+        """Times of the stages whose values a frame uses again, when they last ran; `ran` names the others."""
+        last_ms = {} if self.timers is None else self.timers.last_ms
+        kept = (stage.name for stage in self._stages if stage.seen is not None and stage.name not in ran)
+        return {name: last_ms[name] for name in kept if name in last_ms}
 
     def invalidate(self) -> None:
         """Makes every stage run again with the next run that needs it."""

@@ -6,7 +6,7 @@ No sockets, no files except the scene's assets.
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -46,7 +46,8 @@ class CompositeFrame:
     `color` is camera-coded, `linear` the same in camera units (before the response). `lights` are plain
     values. `camera` and `world_from_camera` are those that the picture was rendered with: while nothing
     moves, the pose stays that of the frame that the real scene was built from. It is None if the frame has
-    none, or if the picture is not the camera's. `others` is the frame in the other views that were requested.
+    none, or if the picture is not the camera's. `reused_pass_times_ms` are those of passes whose results it uses
+    again, when they last ran. `others` is the frame in the other views that were requested.
     """
 
     frame_id: int
@@ -57,6 +58,7 @@ class CompositeFrame:
     camera: CameraModel
     world_from_camera: Float64[np.ndarray, "4 4"] | None
     pass_times_ms: dict[str, float] = field(default_factory=dict)
+    reused_pass_times_ms: dict[str, float] = field(default_factory=dict)
     lights: list[dict[str, Any]] = field(default_factory=list)
     level: Level | None = None
     others: tuple[OtherView, ...] = ()
@@ -155,16 +157,22 @@ class SceneRenderer:
         rest = [self._start_other(source, view) for view in others]
         cameras = next((each.seen for each in (main, *rest) if each.seen is not None), None)
         self._shown = ShownFrame(source.frame, cameras, source.buffers, self._live.model)
-        times = {} if source.relit is None else dict(self._live.timers.end_frame())
+        times = self._end_frame(source)
         submitted_ms = 1e3 * (time.perf_counter() - started_s)
 
         def finish() -> CompositeFrame:
             if main.composed is not None:
-                self._live.account(main.composed, max(submitted_ms, sum(times.values())))
+                self._live.account(main.composed, max(submitted_ms, sum(times.ran.values())))
             return self._finished(source, main, rest, times, with_linear=with_linear)
 
         is_immediate = all(each.composed is None for each in (main, *rest))
         return PendingComposite(finish, is_immediate or self._gpu.is_software)
+
+    def _end_frame(self, source: "_Source") -> "_PassTimes":
+        if source.relit is None or self.graph is None:
+            return _PassTimes({}, {})
+        ran = dict(self._live.timers.end_frame())
+        return _PassTimes(ran, self.graph.reused_times_ms(ran))
 
     def _source(self, frame: ViewFrame, *, whole: bool) -> "_Source":
         """Relights a frame; without a pose there is nothing but the camera's picture."""
@@ -281,7 +289,7 @@ class SceneRenderer:
         source: "_Source",
         main: "_StartedView",
         rest: Sequence["_StartedView"],
-        times: dict[str, float],
+        times: "_PassTimes",
         *,
         with_linear: bool,
     ) -> CompositeFrame:
@@ -297,7 +305,8 @@ class SceneRenderer:
             "no_pose" if frame.pose is None else "ok",
             frame.camera,
             main.world_from_camera,
-            times,
+            times.ran,
+            times.reused,
             source.lights,
             None if main.composed is None else main.composed.level,
             tuple(OtherView(each.view, each.take(), each.world_from_camera) for each in rest),
@@ -324,6 +333,13 @@ class SceneRenderer:
         """Frees all GL objects."""
         self._live.release()
         self._readback.release()
+
+
+class _PassTimes(NamedTuple):
+    """Milliseconds by pass: of those that the frame ran, and of the others when they last ran."""
+
+    ran: dict[str, float]
+    reused: dict[str, float]
 
 
 @dataclass(frozen=True, eq=False)

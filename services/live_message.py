@@ -52,6 +52,9 @@ class PictureHeader(BaseModel):
     )
     drops: dict[str, int] = Field(description="What was lost before, by cause.")
     pass_times_ms: dict[str, float] = Field(description="Where its time went.")
+    reused_pass_times_ms: dict[str, float] = Field(
+        description="Passes whose results it uses again, with the times of their last run."
+    )
     lights: list[dict[str, Any]] = Field(description="What it was lit with.")
     camera: LiveCamera = Field(description="What projects points of the camera's space onto this picture.")
     world_from_camera: tuple[Row, Row, Row, Row] | None = Field(description="null without a pose.")

@@ -17,7 +17,14 @@ from deltalight.sensor_node.node import NodeConfig, run_node
 from deltalight.services.kept_memory import keep_freed_memory
 from deltalight.services.settings import load_configuration
 
-OPS = ("position", "play", "pause", "seek", "rate")  # of a replay's control endpoint (SPEC.md, section 6)
+OPS = (
+    "position",
+    "play",
+    "pause",
+    "seek",
+    "step",
+    "rate",
+)  # of a replay's control endpoint (SPEC.md, section 6)
 
 
 def run_configured_node(
@@ -78,6 +85,8 @@ def _execute(camera: PlaybackCamera, request: ControlRequest) -> dict[str, objec
             camera.pause()
         case "seek":
             camera.seek(_number(request.payload, "position_s"))
+        case "step":
+            camera.step(_whole_number(request.payload, "frames"))
         case "rate":
             camera.set_rate(_number(request.payload, "rate"))
         case unknown:
@@ -91,3 +100,10 @@ def _number(payload: Mapping[str, object], key: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise DeltalightError(f"the command needs a number as `{key}` in its payload.")
     return float(value)
+
+
+def _whole_number(payload: Mapping[str, object], key: str) -> int:
+    value = _number(payload, key)
+    if not value.is_integer():
+        raise DeltalightError(f"the command needs a whole number as `{key}` in its payload, not {value:g}.")
+    return int(value)

@@ -151,6 +151,7 @@ def _picture_examples() -> Iterator[Example]:
             received_ns=CAPTURE_NS + 2_000_000,
             rendered_ns=CAPTURE_NS + 30_000_000,
             pass_times_ms={"voxelize": 1.25, "cones": 20.5},
+            reused_pass_times_ms={"voxelize real": 7.5},
             lights=(LAMP,),
             drops={"color.desk": 3},
             quality="live",

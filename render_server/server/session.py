@@ -83,6 +83,10 @@ class Composite(Protocol):
         """Milliseconds of each pass."""
 
     @property
+    def reused_pass_times_ms(self) -> dict[str, float]:
+        """Milliseconds that passes whose results it uses again took when they last ran."""
+
+    @property
     def lights(self) -> Sequence[dict[str, Any]]:
         """The lights that the picture was rendered with."""
 
@@ -420,6 +424,7 @@ class RenderSession:
             received_ns=frame.received_ns,
             rendered_ns=self._rendered_ns[-1],
             pass_times_ms=composite.pass_times_ms,
+            reused_pass_times_ms=composite.reused_pass_times_ms,
             lights=tuple(composite.lights),
             drops=self.drops(),
             quality=None if composite.level is None else composite.level.quality,

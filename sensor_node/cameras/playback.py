@@ -135,6 +135,12 @@ class PlaybackCamera(Camera):
             self._jumped = True
             self._begin(self._index_at(position_s))
 
+    def step(self, frames: int) -> None:
+        """Go to the frame so many after the current one, or before it, within the recording (any thread)."""
+        with self._changed:
+            self._jumped = True
+            self._begin(min(max(self._index + frames, 0), len(self._times) - 1))
+
     def set_rate(self, rate: float) -> None:
         """Play this many recorded seconds per second (any thread).
 

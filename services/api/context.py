@@ -79,10 +79,9 @@ class Context:
         """Describe a scene, with its revision as entity tag; announce a change to all listeners first."""
         if changed:
             self._announce(scene)
-        delivery = self.link.show(scene) if changed and scene.head.is_active else self.link.delivery
+        delivery = self.link.show(scene) if changed and scene.head.is_active else self.link.delivery(scene)
         response.headers["ETag"] = f'"{scene.document.revision}"'
-        is_of_scene = delivery is not None and delivery.scene_id == scene.head.id
-        return SceneAnswer.of(scene, delivery if is_of_scene else None)
+        return SceneAnswer.of(scene, delivery)
 
     def _announce(self, scene: StoredScene) -> None:
         head = scene.head

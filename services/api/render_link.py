@@ -15,7 +15,7 @@ from deltalight.protocol.keys import Keys
 from deltalight.protocol.messages import ControlRequest
 from deltalight.protocol.request import RequestClient
 from deltalight.protocol.scene_fields import ShownView
-from deltalight.services.api.delivery import SILENT, Change, Deliveries, DeliveryStatus, pending
+from deltalight.services.api.delivery import BUSY, SILENT, Change, Deliveries, DeliveryStatus, pending
 from deltalight.services.storage.scenes import StoredScene
 from deltalight.services.storage.store import Store
 
@@ -109,9 +109,18 @@ class RenderLink:
         return self._answers is True
 
     @property
-    def delivery(self) -> DeliveryStatus | None:
+    def newest_delivery(self) -> DeliveryStatus | None:
         """The status of the last change that was sent."""
         return self._deliveries.newest
+
+    def delivery(self, scene: StoredScene) -> DeliveryStatus | None:
+        """Return the status of the last change of a scene that was sent; None for a scene that is not shown."""
+        newest = self._deliveries.newest
+        if newest is not None and newest.scene_id == scene.head.id:
+            return newest
+        if not scene.head.is_active:
+            return None
+        return pending(_change(scene), SILENT if self._answers is False else BUSY)
 
     def show(self, scene: StoredScene) -> DeliveryStatus:
         """Send a stored revision of the active scene; return its status, or `pending` if that takes long.

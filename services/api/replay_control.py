@@ -155,9 +155,13 @@ class ReplayControl:
         return position
 
     def change(
-        self, position_s: float | None = None, playing: bool | None = None, rate: float | None = None
+        self,
+        position_s: float | None = None,
+        step_frames: int | None = None,
+        playing: bool | None = None,
+        rate: float | None = None,
     ) -> Position:
-        """Seek, pause, resume, or change the rate.
+        """Seek, then step, pause, resume, or change the rate.
 
         Raises:
             ConflictError: nothing is replayed.
@@ -173,6 +177,8 @@ class ReplayControl:
                 replay.ask("pause")
             if position_s is not None:
                 replay.ask("seek", {"position_s": position_s})
+            if step_frames is not None:
+                replay.ask("step", {"frames": step_frames})
             position = replay.ask("play" if playing else "position")
         self._publish(position)
         return position

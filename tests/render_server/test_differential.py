@@ -194,6 +194,9 @@ def test_what_objects_do_not_change_is_the_cameras(gpu: GpuContext, stage: Stage
     assert np.array_equal(first.color, second.color)
     assert np.array_equal(first.color, fresh)
     assert set(second.pass_times_ms) == {"upload", "composite", "readback"}
+    assert second.reused_pass_times_ms == {
+        name: time_ms for name, time_ms in first.pass_times_ms.items() if name not in second.pass_times_ms
+    }
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -77,6 +78,19 @@ def test_numbers_times_and_stamps_rise_over_seek_pause_and_a_new_round(source: S
         assert later.depth_timestamp_ns is not None
         assert later.depth_timestamp_ns - later.timestamp_ns == 0
     assert all(earlier < later for earlier, later in pairwise(reader.stamps))
+
+
+def test_steps_go_from_frame_to_frame_whatever_the_times_between_them(tmp_path: Path) -> None:
+    recorded = [
+        replace(each, timestamp_ns=each.timestamp_ns + 5 * PERIOD_NS * (each.frame_id >= 3))
+        for each in frames(COUNT)
+    ]
+    source = open_source(write(tmp_path / "uneven.mcap", recorded))
+    with reading(source, playing=False, start_s=2 * PERIOD_S, stays=True) as reader:
+        assert reader.read(1) == [2]
+        for frames_on, expected in ((1, 3), (1, 4), (-2, 2), (-9, 0), (COUNT + 9, COUNT - 1)):
+            reader.camera.step(frames_on)
+            assert reader.read(1) == [expected]
 
 
 def test_a_pause_repeats_the_frame_now_and_then_with_a_new_stamp(

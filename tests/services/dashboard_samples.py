@@ -29,6 +29,7 @@ from playwright.sync_api import (
 
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.scene import SceneDocument
+from deltalight.protocol.source import open_source
 from deltalight.services import ports
 from deltalight.services.api.static_page import DASHBOARD
 from deltalight.services.demo import NAME, demo_plan, demo_scene
@@ -101,6 +102,12 @@ class Stack:
         answer = self.client.get(path)
         assert answer.status_code == 200, answer.text
         return answer.json()
+
+    def recorded_at_s(self, recording: str, folder: Path) -> list[float]:
+        """When the frames of a recording were captured; it is downloaded into the folder."""
+        file = folder / "downloaded.mcap"
+        file.write_bytes(self.client.get(f"/recordings/{recording}/content").raise_for_status().content)
+        return [time_ns / 1e9 for time_ns in open_source(file).timestamps_ns]
 
     def header(self) -> dict[str, Any]:
         """What the newest picture says of itself."""

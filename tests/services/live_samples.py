@@ -100,6 +100,7 @@ def composite(
         received_ns=now_ns - 2_000_000,
         rendered_ns=now_ns,
         pass_times_ms={"trace cones": 12.5, "compose": 1.0},
+        reused_pass_times_ms={"shadow maps": 3.0},
         drops={"color.cam": 3},
         lights=(LIGHT, AROUND),
     )

@@ -92,6 +92,7 @@ class Picture:
     camera: CameraModel
     world_from_camera: np.ndarray | None
     pass_times_ms: dict[str, float] = field(default_factory=lambda: {"linearize": 1.5})
+    reused_pass_times_ms: dict[str, float] = field(default_factory=lambda: {"voxelize": 4.0})
     lights: list[dict[str, Any]] = field(default_factory=list)
     linear: np.ndarray | None = None
     level: Level | None = field(default_factory=lambda: Level("live", 0.5))

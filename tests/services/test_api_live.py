@@ -71,6 +71,7 @@ def test_a_frames_header_says_what_it_shows_and_where_time_went(live: LiveApi) -
     with live_socket(live.address) as socket:
         header = read_frame(socket)
     assert header["pass_times_ms"] == {"trace cones": 12.5, "compose": 1.0}
+    assert header["reused_pass_times_ms"] == {"shadow maps": 3.0}
     assert header["drops"] == {"color.cam": 3}
     assert header["status"] == "ok"
     assert header["age_ms"] >= 5

@@ -88,6 +88,11 @@ def test_a_recording_is_shown_moved_through_and_left(
     assert client.patch("/replay", json={"playing": False}).json()["playing"] is False
     held = client.get("/replay").json()["position_s"]
     assert client.get("/replay").json()["position_s"] == held
+    on = client.patch("/replay", json={"step_frames": 2}).json()
+    assert (on["position_s"], on["playing"]) == (pytest.approx(held + 2 * PERIOD_NS / 1e9, abs=1e-6), False)
+    assert client.patch("/replay", json={"step_frames": -2}).json()["position_s"] == held
+    assert client.patch("/replay", json={"position_s": 0.2, "step_frames": -999}).json()["position_s"] == 0
+    assert "step_frames" in sentence(client.patch("/replay", json={"step_frames": 0.5}), 422)
     assert "is being replayed" in sentence(client.delete("/recordings/take"), 409)
     assert client.delete("/replay").status_code == 204
     assert source(server) is None
@@ -172,6 +177,7 @@ def test_the_control_endpoint_refuses_what_it_does_not_know(client: httpx.Client
     assert "did you mean seek?" in error("sek")
     assert "number as `position_s`" in error("seek")
     assert "number as `rate`" in error("rate", rate=True)
+    assert "whole number as `frames`" in error("step", frames=0.5)
     assert "rate of 0.05 to 20" in error("rate", rate=100.0)
     control.close()
     assert source(server) == [words[words.index("--publish") + 1]]

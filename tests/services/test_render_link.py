@@ -160,6 +160,19 @@ def test_a_slow_renderer_is_answered_as_pending_and_heard_of_later(
     assert (heard["scene_id"], heard["revision"], heard["state"]) == (shown.id, 2, "shown")
 
 
+def test_a_scene_that_became_active_while_the_renderer_is_busy_is_pending(
+    shown: Shown, wait_s: Callable[[float], None]
+) -> None:
+    other = shown.client.post("/scenes", json={"name": "other"}).json()["id"]
+    held = shown.hold_up()
+    wait_s(SHORT_S)
+    expected = {"state": "pending", "revision": 1, "detail": BUSY}
+    assert shown.client.post(f"/scenes/{other}/activate").json()["picture"] == expected
+    assert shown.client.get("/active-scene").json()["picture"] == expected
+    shown.server.gate.set()
+    held.result(LONG_S)
+
+
 def test_another_scene_takes_the_place_of_a_change_that_waits(shown: Shown) -> None:
     other = shown.client.post("/scenes", json={"name": "other"}).json()["id"]
     held = shown.hold_up()

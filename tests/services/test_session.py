@@ -66,6 +66,7 @@ def test_composite_carries_its_own_frames_header(session: RenderSession) -> None
     assert (rendered.message.frame_id, rendered.message.capture_ns) == (5, START + 5)
     assert rendered.message.status == "ok"
     assert rendered.message.pass_times_ms == {"linearize": 1.5}
+    assert rendered.message.reused_pass_times_ms == {"voxelize": 4.0}
     assert (rendered.message.quality, rendered.message.scale) == ("live", 0.5)
     assert rendered.message.drops["color.cam"] == 4
     assert np.all(rendered.pictures[0] == 250)

@@ -29,6 +29,7 @@ RecordingId = Annotated[
     Path(pattern=f"^{NAME.pattern}$", description="The recording's name.", examples=["take-20261121-101500"]),
 ]
 Rate = Annotated[float, Field(ge=MIN_RATE, le=MAX_RATE, description="Recorded seconds a second.")]
+MOST_STEPS = 1_000_000
 Seconds = Annotated[float, Field(ge=0, le=1e6, description="From the recording's first frame.")]
 POSTER_ANSWER: dict[int | str, dict[str, Any]] = {
     200: {"content": {"image/jpeg": {"schema": {"type": "string", "format": "binary"}}}}
@@ -183,6 +184,9 @@ class ReplayChange(StrictModel):
     """What is to be otherwise; the rest stays."""
 
     position_s: Seconds | None = None
+    step_frames: int | None = Field(
+        default=None, ge=-MOST_STEPS, le=MOST_STEPS, description="Frames on, or back: `1` is the next one."
+    )
     playing: bool | None = None
     rate: Rate | None = None
 
@@ -345,9 +349,9 @@ def change_replay(
     shared: Shared,
     change: Annotated[ReplayChange, AS_SENT, Body(examples=[{"position_s": 4.2, "playing": False}])],
 ) -> ReplayAnswer:
-    """Seek, pause, go on, play slower or faster."""
+    """Seek, step from frame to frame, pause, go on, play slower or faster."""
     wanted = checked(ReplayChange, change, "the change")
-    return replay_answer(shared.replay.change(wanted.position_s, wanted.playing, wanted.rate))
+    return replay_answer(shared.replay.change(**dict(wanted)))
 
 
 @replay_router.delete("", status_code=204)

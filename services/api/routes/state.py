@@ -88,7 +88,7 @@ def health(shared: Shared) -> Health:
 @state_router.get("/state")
 def state(shared: Shared) -> State:
     """Rates, drops, delays and remarks of the processes."""
-    delivery = shared.link.delivery
+    delivery = shared.link.newest_delivery
     return State(
         render_server=_server(shared),
         picture=None if delivery is None else PictureState.of(delivery),

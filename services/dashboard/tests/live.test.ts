@@ -4,7 +4,7 @@ import { droppedFrames, parseLiveMessage, qualityText } from "../src/live/messag
 import { lateBy } from "../src/live/picture";
 import { RateMeter } from "../src/live/rate";
 import { backoff } from "../src/live/socket";
-import { leadingPasses, OTHERS, stacked, timeOf, withKept, type Sample } from "../src/live/telemetry";
+import { leadingPasses, OTHERS, stacked, timeOf, type Sample } from "../src/live/telemetry";
 import { awaitedChange } from "../src/state/liveState";
 
 function message(header: object, jpeg: readonly number[]): ArrayBuffer {
@@ -17,7 +17,7 @@ function message(header: object, jpeg: readonly number[]): ArrayBuffer {
 }
 
 function sample(at: number, passes: Record<string, number>): Sample {
-  return { at, rate: 30, took: 20, passes, kept: new Set(), shows: "a 1" };
+  return { at, rate: 30, took: 20, passes, reused: new Set() };
 }
 
 describe("a message of the live picture", () => {
@@ -60,16 +60,6 @@ describe("the plots", () => {
     expect(leadingPasses(all, 4)).toEqual(["b", "c", "a", "d"]);
     expect(leadingPasses([...all, sample(2, { d: 1 })], 2)).toEqual(["d", "b", OTHERS]);
     expect(timeOf(all[0]!, OTHERS, ["b", "c", OTHERS])).toBe(2);
-  });
-
-  it("keep the times of passes that were used again, until the scene changes", () => {
-    const full = sample(0, { cones: 20, compose: 5 });
-    const still = { ...sample(1, {}), ...withKept(full, { compose: 6 }, "a 1") };
-    expect(still.passes).toEqual({ cones: 20, compose: 6 });
-    expect([...still.kept]).toEqual(["cones"]);
-    expect(withKept(still, { compose: 7 }, "a 1").passes).toEqual({ cones: 20, compose: 7 });
-    expect(withKept(still, { compose: 7 }, "a 2").passes).toEqual({ compose: 7 });
-    expect(withKept({ ...still, shows: null }, { compose: 7 }, null).passes).toEqual({ compose: 7 });
   });
 
   it("stack to the sum of all passes", () => {

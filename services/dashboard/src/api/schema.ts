@@ -473,7 +473,7 @@ export interface paths {
         readonly head?: never;
         /**
          * Change Replay
-         * @description Seek, pause, go on, play slower or faster.
+         * @description Seek, step from frame to frame, pause, go on, play slower or faster.
          */
         readonly patch: operations["change_replay"];
         readonly trace?: never;
@@ -2126,6 +2126,13 @@ export interface components {
             /** Renderer */
             readonly renderer: string;
             /**
+             * Reused Pass Times Ms
+             * @description Passes whose results it uses again, with the times of their last run.
+             */
+            readonly reused_pass_times_ms: {
+                readonly [key: string]: number;
+            };
+            /**
              * Scale
              * @description Fraction of its width and height that was rendered, and then enlarged.
              */
@@ -2964,6 +2971,11 @@ export interface components {
             readonly position_s?: number | null;
             /** Rate */
             readonly rate?: number | null;
+            /**
+             * Step Frames
+             * @description Frames on, or back: `1` is the next one.
+             */
+            readonly step_frames?: number | null;
         };
         /**
          * RevisionEntry

@@ -8,14 +8,10 @@ export interface Sample {
   readonly rate: number | null;
   /** What the renderer took for the frame, ms. */
   readonly took: number;
-  readonly passes: Passes;
+  readonly passes: Readonly<Record<string, number>>;
   /** Names of the passes whose results this frame used again: their times are those of when they ran. */
-  readonly kept: ReadonlySet<string>;
-  /** The scene and its revision; null where another program's is shown. */
-  readonly shows: string | null;
+  readonly reused: ReadonlySet<string>;
 }
-
-type Passes = Readonly<Record<string, number>>;
 
 const KEPT_S = 60;
 export const OTHERS = "others";
@@ -24,9 +20,9 @@ export const samples = signal<readonly Sample[]>([]);
 
 export function note(header: LiveHeader, nowMs: number, rate: number | null): void {
   const at = nowMs / 1000;
-  const shows = header.scene && `${header.scene.id} ${header.scene.revision}`;
-  const passes = withKept(samples.value.at(-1), header.pass_times_ms, shows);
-  const sample: Sample = { at, rate, took: header.render_ms, shows, ...passes };
+  const passes = { ...header.reused_pass_times_ms, ...header.pass_times_ms };
+  const reused = new Set(Object.keys(header.reused_pass_times_ms));
+  const sample: Sample = { at, rate, took: header.render_ms, passes, reused };
   const kept = samples.value.filter((each) => each.at > at - KEPT_S);
   samples.value = [...kept, sample];
 }
@@ -34,20 +30,6 @@ export function note(header: LiveHeader, nowMs: number, rate: number | null): vo
 /** What the slowest frame of the last minute took the renderer, ms. */
 export function slowestMs(): number {
   return samples.value.reduce((most, each) => Math.max(most, each.took), 0);
-}
-
-/**
- * While neither camera nor scene move, the renderer runs only what shows the next camera picture. The passes that it
- * leaves out keep their times, so that what a change costs stays readable; the next revision begins anew.
- */
-export function withKept(
-  before: Sample | undefined,
-  ran: Passes,
-  shows: string | null,
-): { passes: Passes; kept: ReadonlySet<string> } {
-  const earlier = before && shows !== null && before.shows === shows ? before.passes : {};
-  const kept = new Set(Object.keys(earlier).filter((name) => !(name in ran)));
-  return { passes: { ...earlier, ...ran }, kept };
 }
 
 /** Passes of the newest sample, then those before it, the costliest first, then `OTHERS` where there are more. */

@@ -82,20 +82,26 @@ export async function changeReplay(body: ReplayChange): Promise<void> {
   if (shown) replay.value = shown;
 }
 
-let wanted: number | null = null;
+let wanted: { readonly position_s?: number; readonly step_frames?: number } | null = null;
 let isSeeking = false;
 
 /** Pause at a position; of those that come while one is being sought, only the newest counts. */
 export function scrub(position_s: number): void {
-  wanted = position_s;
+  wanted = { position_s };
   if (replay.value) replay.value = { ...replay.value, position_s, playing: false };
+  if (!isSeeking) void seekNewest();
+}
+
+/** Pause so many frames further on, or back. */
+export function step(frames: number): void {
+  wanted = { ...wanted, step_frames: (wanted?.step_frames ?? 0) + frames };
   if (!isSeeking) void seekNewest();
 }
 
 async function seekNewest(): Promise<void> {
   isSeeking = true;
   while (wanted !== null) {
-    const body = { position_s: wanted, playing: false };
+    const body = { ...wanted, playing: false };
     wanted = null;
     await changeReplay(body);
   }

@@ -79,7 +79,7 @@ function PassLegend({ sample, names }: { readonly sample: Sample; readonly names
       </caption>
       <tbody>
         {names.map((name, index) => (
-          <tr key={name} class={sample.kept.has(name) ? "kept" : ""}>
+          <tr key={name} class={sample.reused.has(name) ? "reused" : ""}>
             <th scope="row">
               <i style={{ background: COLORS[index] }} />
               <span class="cut">{name.replaceAll("_", " ")}</span>
@@ -88,7 +88,7 @@ function PassLegend({ sample, names }: { readonly sample: Sample; readonly names
           </tr>
         ))}
       </tbody>
-      {sample.kept.size > 0 && (
+      {sample.reused.size > 0 && (
         <tfoot>
           <tr>
             <td colSpan={2}>Nothing is moving: pale passes are reused, and show the times of their last run.</td>

@@ -2,7 +2,7 @@ import { useEffect } from "preact/hooks";
 import { role } from "../../api/session";
 import type { Replay } from "../../api/types";
 import { clock } from "../../math/units";
-import { backToLive, changeReplay, readReplay, recordings, replay, scrub, showRecording } from "../../state/takes";
+import { backToLive, changeReplay, readReplay, replay, scrub, showRecording, step } from "../../state/takes";
 import { Button } from "../ui/Button";
 import { IconButton } from "../ui/IconButton";
 import { Select } from "../ui/Select";
@@ -51,12 +51,11 @@ export function ReplayBar() {
 }
 
 /** Arrow keys go from frame to frame. */
-function stepFrame(event: KeyboardEvent, { recording, position_s, duration_s }: Replay): void {
-  const step = { ArrowLeft: -1, ArrowDown: -1, ArrowRight: 1, ArrowUp: 1 }[event.key];
-  const frames = recordings.value.find((each) => each.id === recording)?.frames ?? 0;
-  if (!step || frames < 2 || !duration_s) return;
+function stepFrame(event: KeyboardEvent): void {
+  const frames = { ArrowLeft: -1, ArrowDown: -1, ArrowRight: 1, ArrowUp: 1 }[event.key];
+  if (!frames) return;
   event.preventDefault();
-  scrub(Math.max(0, Math.min(duration_s, (position_s ?? 0) + (step * duration_s) / (frames - 1))));
+  step(frames);
 }
 
 function Timeline({ shown, disabled }: { readonly shown: Replay; readonly disabled: boolean }) {
@@ -76,7 +75,7 @@ function Timeline({ shown, disabled }: { readonly shown: Replay; readonly disabl
         step="any"
         value={position}
         disabled={disabled}
-        onKeyDown={(event) => stepFrame(event, shown)}
+        onKeyDown={stepFrame}
         onInput={(event) => scrub(event.currentTarget.valueAsNumber)}
         ref={(element) => element?.style.setProperty("--filled", `${100 * share}%`)}
       />
