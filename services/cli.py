@@ -1,7 +1,7 @@
 """The `deltalight` command: registers the commands and reports faults by sentences and exit codes.
 
-Exit codes: 0 done, 1 a fault of the program (or `doctor` found one), 2 wrong use or bad input, 130 Ctrl-C, 143
-SIGTERM.
+Exit codes: 0 done, 1 a fault of the program (or `doctor` found one), 2 wrong use or bad input, 75 the GPU was reset,
+130 Ctrl-C, 143 SIGTERM.
 """
 
 import signal
@@ -148,7 +148,7 @@ def run(arguments: list[str]) -> int:
 def _report(fault: Exception) -> int:
     if isinstance(fault, DeltalightError):
         print(f"deltalight: {' '.join(str(fault).split())}", file=sys.stderr)
-        return 2
+        return fault.exit_code
     kind = type(fault).__name__
     print(
         f"deltalight: internal fault, {kind}: {fault}; run it again with --debug and report the traceback.",
