@@ -15,8 +15,7 @@ import httpx
 import numpy as np
 from jaxtyping import UInt8
 
-from deltalight.benchmarks.soak.crowd import BEHAVIOURS, Crowd, Seen
-from deltalight.benchmarks.soak.flow import Flow
+from deltalight.benchmarks.soak.crowd import BEHAVIOURS, Crowd, Flow, Seen
 from deltalight.benchmarks.soak.link import SHAPES, LoopThread
 from deltalight.benchmarks.soak.nonsense import send_nonsense
 from deltalight.benchmarks.soak.peers import peers_on

@@ -14,10 +14,9 @@ import pytest
 
 from deltalight.benchmarks.soak import peers
 from deltalight.benchmarks.soak.command import SoakJob, run_soak
-from deltalight.benchmarks.soak.crowd import Seen
+from deltalight.benchmarks.soak.crowd import Flow, Seen
 from deltalight.benchmarks.soak.faults import FAULTS, parse_faults
 from deltalight.benchmarks.soak.figures import Soaked, all_figures
-from deltalight.benchmarks.soak.flow import Flow
 from deltalight.benchmarks.soak.link import SHAPES, Link, LoopThread, Schedule, Shape, held_up_s
 from deltalight.benchmarks.soak.nonsense import _messages, mutated
 from deltalight.benchmarks.soak.plots import known_runs, nice_ceiling
