@@ -71,7 +71,7 @@ class Kill(Fault):
         station = run.station
         name = _chosen(self.process, run)
         documents, picture = _documents(station), _picture(run)
-        restarts = station.restarts()[name]
+        restarts, spare = station.restarts()[name], station.spare_id(name)
         killed_ns, killed_s = time.time_ns(), time.monotonic()
         station.kill(name)
         _wait(run, lambda: station.restarts()[name] > restarts)
@@ -80,6 +80,7 @@ class Kill(Fault):
         return {
             "process": name,
             "back_s": back_s,
+            "by_spare": station.process_id(name) == spare,
             "same_document": _documents(station) == documents,
             "difference": _settled_difference(run, picture),
         }

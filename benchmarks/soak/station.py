@@ -94,6 +94,10 @@ class Station:
         """Return the id of the process of that name which was started last."""
         return self._supervisor.process_ids()[name]
 
+    def spare_id(self, name: str) -> int | None:
+        """Return the id of the spare that waits to take the place of a process, None if there is none."""
+        return self._supervisor.spare_ids().get(name)
+
     def restarts(self) -> dict[str, int]:
         """Return how often each process was started again."""
         return self._supervisor.restarts()
