@@ -2,13 +2,16 @@
 
 import shlex
 import sys
+from typing import ClassVar
 
 
 class DeltalightError(Exception):
     """A fault that the user can fix: the message says in one sentence what is wrong and what to do.
 
-    The command line prints it without a traceback and exits with code 2; notebooks show the sentence alone.
+    The command line prints it without a traceback and exits with `exit_code`; notebooks show the sentence alone.
     """
+
+    exit_code: ClassVar[int] = 2
 
     def _render_traceback_(self) -> list[str]:
         """Returns the lines that IPython shows in place of a traceback."""

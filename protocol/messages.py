@@ -355,12 +355,15 @@ class CompositeMessage(MessageBase):
         return self
 
 
+ProcessState = Literal["starting", "running", "waiting", "degraded", "stopping"]
+
+
 class StatsMessage(MessageBase):
     """State of a process: rates in 1/s and drops by topic, a state, and a sentence for display."""
 
     stream: Literal["stats"] = "stats"
     frame_id: Count = 0
-    state: Literal["starting", "running", "waiting", "degraded", "stopping"]
+    state: ProcessState
     detail: Sentence = ""
     rates: Rates = Field(default_factory=dict)
     drops: Counts = Field(default_factory=dict)

@@ -61,9 +61,9 @@ class Publisher:
                 raise DeltalightError("the publisher is closed: open a new one to send")
             self._socket.send_multipart(multipart)
 
-    def close(self) -> None:
-        """Close the socket; discard what is still queued."""
+    def close(self, linger_ms: int = 0) -> None:
+        """Close the socket; discard what is still queued after `linger_ms`."""
         if self._guard is not None:
             self._guard.close()
         with self._lock:
-            self._context.destroy(0)
+            self._context.destroy(linger_ms)

@@ -21,13 +21,15 @@ from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.scene_fields import ShownView, View
 from deltalight.render_server.frame_budget import Level
 from deltalight.render_server.frame_graph import ShownBuffers
-from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.gpu.context import GpuContext, GpuMemoryError
 from deltalight.render_server.gpu.textures import AsyncReadback, read_texture
 from deltalight.render_server.graph import Graph
 from deltalight.render_server.live_scene import LiveScene, RelitFrame
 from deltalight.render_server.passes.composite import Composite, Picture
 from deltalight.render_server.picking import SHOWN_FRACTION, Pick, ShownFrame, raster_texels
 from deltalight.render_server.view import CameraView, output_size, resized_frame
+
+MEMORY_RETRY_S = 10.0  # after which a scene is built anew that the GPU had no memory for
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,9 +95,10 @@ class SceneRenderer:
     """Renders frames of one scene on one GPU context.
 
     `with_linear`: composites carry the linear picture too (for files). `notices` collects sentences that a user
-    should read (registration, memory), each once. `waits`: the first picture waits for what a method precomputes of
-    objects (pictures after `set_scene` never do), and for the search for light out of sight. `checks` is `Graph`'s.
-    `with_linear` leaves the document's budget aside.
+    should read (registration, memory, errors of OpenGL), each once. `waits`: the first picture waits for what a
+    method precomputes of objects (pictures after `set_scene` never do), and for the search for light out of sight.
+    `checks` is `Graph`'s. `with_linear` leaves the document's budget aside. Where the GPU's memory is full, frames
+    are refused; what the scene holds is made anew from time to time, and with the next scene.
     """
 
     def __init__(
@@ -109,14 +112,20 @@ class SceneRenderer:
     ) -> None:
         self._gpu = gpu
         self.notices: list[str] = []
-        self._live = LiveScene(gpu, scene, self.notices, waits=waits, is_paced=not with_linear, checks=checks)
-        self._readback = AsyncReadback(gpu)
         self._with_linear = with_linear
+        self._checks = checks
+        self._live = self._build(scene, waits=waits)
+        self._full: tuple[GpuMemoryError, float] | None = None  # and when to try again
+        self._readback = AsyncReadback(gpu)
         self._sized: tuple[ViewFrame, ViewFrame] | None = None
         self._shown: ShownFrame | None = None
         self._relit: RelitFrame | None = None
         self._artifacts = CameraArtifacts()
         self.scene = scene
+
+    def _build(self, scene: SceneDocument, *, waits: bool) -> LiveScene:
+        paced = not self._with_linear
+        return LiveScene(self._gpu, scene, self.notices, waits=waits, is_paced=paced, checks=self._checks)
 
     def set_scene(self, scene: SceneDocument) -> None:
         """Switches to another scene from the next frame on; keeps the old one on error.
@@ -126,6 +135,8 @@ class SceneRenderer:
         """
         self._live.set_scene(scene)
         self.scene = scene
+        if self._full is not None:
+            self._full = self._full[0], 0.0
 
     def forget_frames(self) -> None:
         """Forgets everything seen in earlier frames, because the next ones come from another source."""
@@ -149,7 +160,12 @@ class SceneRenderer:
 
         `whole`: at full size whatever the budget, as `with_linear` always is. `others`: views in which the frame is
         rendered beside the document's own.
+
+        Raises:
+            DeltalightError: the frame or the scene cannot be rendered, or the GPU's memory is full.
+            GpuResetError: the GPU was reset; this process renders nothing any more. `finish` raises the same.
         """
+        self._find_faults()
         started_s = time.perf_counter()
         with_linear = with_linear or self._with_linear
         source = self._source(self.sized(frame), whole=whole or with_linear or self.scene.output.has_bloom)
@@ -163,7 +179,9 @@ class SceneRenderer:
         def finish() -> CompositeFrame:
             if main.composed is not None:
                 self._live.account(main.composed, max(submitted_ms, sum(times.ran.values())))
-            return self._finished(source, main, rest, times, with_linear=with_linear)
+            done = self._finished(source, main, rest, times, with_linear=with_linear)
+            self._find_faults()
+            return done
 
         is_immediate = all(each.composed is None for each in (main, *rest))
         return PendingComposite(finish, is_immediate or self._gpu.is_software)
@@ -173,6 +191,35 @@ class SceneRenderer:
             return _PassTimes({}, {})
         ran = dict(self._live.timers.end_frame())
         return _PassTimes(ran, self.graph.reused_times_ms(ran))
+
+    def _find_faults(self) -> None:
+        """Finds faults of the device since the last call; builds the scene anew where its memory was full.
+
+        Raises:
+            GpuResetError: the context is lost.
+            GpuMemoryError: the memory is full, or was less than MEMORY_RETRY_S ago.
+        """
+        known = sum(self._gpu.errors.values())
+        try:
+            self._gpu.check()
+        except GpuMemoryError as fault:
+            self._full = fault, time.monotonic() + MEMORY_RETRY_S
+            self._shown = self._relit = None
+        if self._full is not None:
+            self._rebuild(*self._full)
+        if sum(self._gpu.errors.values()) > known:
+            sentence = (
+                f"OpenGL reports {', '.join(self._gpu.errors)}, so pictures may be wrong: please report it."
+            )
+            if sentence not in self.notices:
+                self.notices.append(sentence)
+
+    def _rebuild(self, fault: GpuMemoryError, retry_s: float) -> None:
+        if time.monotonic() < retry_s:
+            raise fault
+        self._live.release()
+        self._live = self._build(self.scene, waits=False)
+        self._full = None
 
     def _source(self, frame: ViewFrame, *, whole: bool) -> "_Source":
         """Relights a frame; without a pose there is nothing but the camera's picture."""

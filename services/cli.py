@@ -1,11 +1,13 @@
 """The `deltalight` command: registers the commands and reports faults by sentences and exit codes.
 
-Exit codes: 0 done, 1 a fault of the program (or `doctor` found one), 2 wrong use or bad input, 130 Ctrl-C, 143
-SIGTERM.
+Exit codes: 0 done, 1 a fault of the program (or `doctor` found one), 2 wrong use or bad input, 75 the GPU was reset,
+130 Ctrl-C, 143 SIGTERM.
 """
 
+import os
 import signal
 import sys
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 import typer
@@ -42,6 +44,8 @@ from deltalight.services.signals import Terminated, raise_on_sigterm
 from deltalight.services.warm_spare import wait_if_spare
 
 DEBUG_FLAG = "--debug"
+LIVE_COMMANDS = frozenset({"node", "server", "api"})  # which do the same for each frame
+BLAS_THREADS = "OPENBLAS_NUM_THREADS"
 PYDANTIC_PREFIX = "Value error, "  # by which pydantic, which typer checks options with, begins such sentences
 
 
@@ -120,8 +124,19 @@ def main() -> None:
     """Run the command line of this process and exit with its code."""
     raise_on_sigterm()
     end_with_supervisor()
+    limit_blas_threads(sys.argv[1:])
     wait_if_spare()
     sys.exit(run(sys.argv[1:]))
+
+
+def limit_blas_threads(words: Sequence[str]) -> None:
+    """Give live commands one thread of OpenBLAS each, unless the environment says how many.
+
+    A frame's matrices are small: more threads wait for each other, spinning, longer than they compute, and take the
+    cores from the other processes. It works until numpy is imported.
+    """
+    if LIVE_COMMANDS.intersection(words):
+        os.environ.setdefault(BLAS_THREADS, "1")
 
 
 def run(arguments: list[str]) -> int:
@@ -148,7 +163,7 @@ def run(arguments: list[str]) -> int:
 def _report(fault: Exception) -> int:
     if isinstance(fault, DeltalightError):
         print(f"deltalight: {' '.join(str(fault).split())}", file=sys.stderr)
-        return 2
+        return fault.exit_code
     kind = type(fault).__name__
     print(
         f"deltalight: internal fault, {kind}: {fault}; run it again with --debug and report the traceback.",

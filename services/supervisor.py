@@ -21,7 +21,7 @@ from deltalight.services.warm_spare import GO, spare_environment
 
 POLL_INTERVAL_S = 0.1
 RESTART_DELAY_S = 0.2
-SPARE_AFTER_S = 15.0  # of a process's life
+SPARE_AFTER_S = 4.0  # of a process's life: most have started by then
 STEADY_AFTER_S = 5.0  # whoever ran that long is started again at once
 MAXIMUM_RESTARTS = 5
 RESTART_WINDOW_S = 60.0

@@ -1,12 +1,12 @@
-"""Viewers of a soaked station: one that measures, and others that behave badly."""
+"""Viewers of a soaked station: one that measures how pictures flow, and others that behave badly."""
 
 import asyncio
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from random import Random
 from typing import Any, Final
 
@@ -33,6 +33,31 @@ class Seen:
     capture_ns: int
     age_ms: float
     waiting_ms: float
+
+
+@dataclass(frozen=True)
+class Flow:
+    """Pictures that the measuring viewer got in a span: a second, ages in ms, and the longest wait for one in s."""
+
+    frames_per_s: float
+    age_p50_ms: float | None
+    age_p95_ms: float | None
+    unwaited_p95_ms: float | None = field(metadata={"what": "of the ages without waiting for the renderer"})
+    longest_gap_s: float
+
+    @classmethod
+    def of(cls, seen: Sequence[Seen], began_s: float, ended_s: float) -> "Flow":
+        """Describe pictures that came between two moments."""
+        moments = [began_s, *(each.at_s for each in seen), ended_s]
+        ages = [each.age_ms for each in seen]
+        unwaited = [each.age_ms - each.waiting_ms for each in seen]
+        return cls(
+            len(seen) / (ended_s - began_s),
+            _percentile(ages, 50),
+            _percentile(ages, 95),
+            _percentile(unwaited, 95),
+            float(np.max(np.diff(moments))),
+        )
 
 
 class Crowd:
@@ -141,3 +166,7 @@ async def _quick(socket: ClientConnection) -> None:
     while True:
         await socket.recv()
         await socket.send("ack")
+
+
+def _percentile(values: Sequence[float], share: float) -> float | None:
+    return float(np.percentile(values, share)) if values else None

@@ -15,8 +15,7 @@ import httpx
 import numpy as np
 from jaxtyping import UInt8
 
-from deltalight.benchmarks.soak.crowd import BEHAVIOURS, Crowd, Seen
-from deltalight.benchmarks.soak.flow import Flow
+from deltalight.benchmarks.soak.crowd import BEHAVIOURS, Crowd, Flow, Seen
 from deltalight.benchmarks.soak.link import SHAPES, LoopThread
 from deltalight.benchmarks.soak.nonsense import send_nonsense
 from deltalight.benchmarks.soak.peers import peers_on
@@ -72,7 +71,7 @@ class Kill(Fault):
         station = run.station
         name = _chosen(self.process, run)
         documents, picture = _documents(station), _picture(run)
-        restarts = station.restarts()[name]
+        restarts, spare = station.restarts()[name], station.spare_id(name)
         killed_ns, killed_s = time.time_ns(), time.monotonic()
         station.kill(name)
         _wait(run, lambda: station.restarts()[name] > restarts)
@@ -81,6 +80,7 @@ class Kill(Fault):
         return {
             "process": name,
             "back_s": back_s,
+            "by_spare": station.process_id(name) == spare,
             "same_document": _documents(station) == documents,
             "difference": _settled_difference(run, picture),
         }

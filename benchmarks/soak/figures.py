@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from deltalight.benchmarks.soak.crowd import Seen
+from deltalight.benchmarks.soak.crowd import Flow, Seen
 from deltalight.benchmarks.soak.faults import LARGEST_DIFFERENCE
-from deltalight.benchmarks.soak.flow import Flow
 from deltalight.benchmarks.soak.profiles import Profile
 from deltalight.benchmarks.soak.report import Bar, FaultRecord, Figure, period_bar, worst
 from deltalight.benchmarks.soak.samples import (

@@ -16,11 +16,10 @@ from random import Random
 
 import zmq
 
-from deltalight.benchmarks.soak.crowd import Seen
-from deltalight.benchmarks.soak.flow import Flow
+from deltalight.benchmarks.soak.crowd import Flow, Seen
 from deltalight.benchmarks.soak.link import Link, LoopThread, Shape
 from deltalight.benchmarks.soak.profiles import Profile
-from deltalight.benchmarks.soak.take import resized
+from deltalight.benchmarks.soak.station import resized
 from deltalight.protocol.codecs import encode_color, encode_depth
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.publisher import Publisher

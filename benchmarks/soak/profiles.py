@@ -1,6 +1,6 @@
 """How large a station is soaked, and for how long each fault lasts."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from deltalight.protocol.documents import nearest
@@ -41,35 +41,32 @@ _FEW_CONES: dict[str, Any] = {
 }
 _PLAIN: dict[str, Any] = {"caustics": False, "screen_space": False, "far_volume": False, "shadow_samples": 1}
 
+_DESK = Profile(
+    nodes=1,
+    size=(320, 240),
+    frames_per_s=10.0,
+    output={"width": 160, "height": 120},
+    method={**_FEW_CONES, **_PLAIN},
+    calm_s=6.0,
+    load_s=15.0,
+    stop_s=10.0,
+    viewers=50,
+)
 PROFILES = {
-    "station": Profile(
+    "station": replace(
+        _DESK,
         nodes=4,
-        size=(320, 240),
         frames_per_s=15.0,
         output={"width": 320, "height": 240},
         method={"quality": "live"},
         calm_s=8.0,
         load_s=20.0,
-        stop_s=10.0,
-        viewers=50,
     ),
-    "desk": Profile(
-        nodes=1,
-        size=(320, 240),
-        frames_per_s=10.0,
-        output={"width": 160, "height": 120},
-        method={**_FEW_CONES, **_PLAIN},
-        calm_s=6.0,
-        load_s=15.0,
-        stop_s=10.0,
-        viewers=50,
-    ),
-    "small": Profile(
-        nodes=1,
-        size=(320, 240),
+    "desk": _DESK,
+    "small": replace(
+        _DESK,
         frames_per_s=5.0,
         output={"width": 96, "height": 72},
-        method={**_FEW_CONES, **_PLAIN},
         calm_s=1.0,
         load_s=3.0,
         stop_s=2.0,

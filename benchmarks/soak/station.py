@@ -1,4 +1,4 @@
-"""The station that is soaked: nodes, render server and web process, all supervised, and links between them."""
+"""The station that is soaked: nodes with what they replay, render server, web process, and links between them."""
 
 import os
 import signal
@@ -9,17 +9,22 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import cv2
 import httpx
+import numpy as np
 import structlog
 
 from deltalight.benchmarks.soak.link import Link, LoopThread
 from deltalight.benchmarks.soak.profiles import Profile
-from deltalight.benchmarks.soak.take import write_take
+from deltalight.benchmarks.speed.motions import STANDING
 from deltalight.protocol.documents import validate
 from deltalight.protocol.errors import DeltalightError
+from deltalight.protocol.frames import DepthImage, SensorFrame
+from deltalight.protocol.recording_reader import RecordingReader
+from deltalight.protocol.recording_writer import RecordingWriter
 from deltalight.protocol.scene import SceneDocument
 from deltalight.services import ports
-from deltalight.services.demo import demo_scene
+from deltalight.services.demo import RECORDING, demo_scene
 from deltalight.services.host import HostPlan
 from deltalight.services.host_store import activate_document, session_file
 from deltalight.services.storage.store import Store
@@ -89,6 +94,10 @@ class Station:
         """Return the id of the process of that name which was started last."""
         return self._supervisor.process_ids()[name]
 
+    def spare_id(self, name: str) -> int | None:
+        """Return the id of the spare that waits to take the place of a process, None if there is none."""
+        return self._supervisor.spare_ids().get(name)
+
     def restarts(self) -> dict[str, int]:
         """Return how often each process was started again."""
         return self._supervisor.restarts()
@@ -153,6 +162,34 @@ def running_station(profile: Profile, thread: LoopThread, seed: int) -> Iterator
         stack.callback(station.close)
         station.start()
         yield station
+
+
+def write_take(path: Path, size: tuple[int, int], frames_per_s: float) -> None:
+    """Write what the nodes replay: frames of the demo in which nothing moves but noise, at another size and rate.
+
+    Pictures before and after a fault can be compared.
+
+    Raises:
+        DeltalightError: the demo's recording is missing, or the file cannot be written.
+    """
+    reader = RecordingReader(RECORDING)
+    began_ns, period_ns = reader.timestamps_ns[0], round(1e9 / frames_per_s)
+    with RecordingWriter(path, board=reader.board, extrinsics=reader.extrinsics) as writer:
+        for number in STANDING:
+            now_ns = began_ns + number * period_ns
+            frame = resized(reader[number], size)
+            writer.add(replace(frame, frame_id=number, timestamp_ns=now_ns, depth_timestamp_ns=now_ns))
+
+
+def resized(frame: SensorFrame, size: tuple[int, int]) -> SensorFrame:
+    """Return a frame whose colour and registered depth have another size (width, height, pixels)."""
+    camera, depth = frame.camera.resized(*size), frame.depth
+    color = cv2.resize(frame.color, size, interpolation=cv2.INTER_AREA)
+    if depth is not None:
+        metres = cv2.resize(depth.depth_m, size, interpolation=cv2.INTER_NEAREST)
+        valid = cv2.resize(depth.valid.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST).astype(bool)
+        depth = DepthImage(metres, valid, camera, depth.noise_sigma_m)
+    return replace(frame, color=color.astype(np.uint8), camera=camera, depth=depth, color_jpeg=None)
 
 
 def soaked_scene(profile: Profile) -> SceneDocument:

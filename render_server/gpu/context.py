@@ -2,14 +2,17 @@
 
 import ctypes
 import os
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Final, Protocol
 
+import glcontext
 import moderngl
 
 from deltalight.protocol.errors import DeltalightError
+from deltalight.render_server.gpu.lost_context import check_reset, reporting, reset_status
 
 SPARE_PROGRAMS = 256  # kept linked while no kernel uses them: renderers are made again when settings change
 SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swiftshader", "swrast")
@@ -44,8 +47,14 @@ UNLISTED: Final = {  # limits that moderngl does not list
     "GL_MAX_COMPUTE_SHARED_MEMORY_SIZE": 0x8262,
 }
 
+NO_ERROR, OUT_OF_MEMORY = "GL_NO_ERROR", "GL_OUT_OF_MEMORY"  # as moderngl names them
+
 OBJECT_KINDS = ("Buffer", "Texture", "Sampler", "Program", "Shader", "Framebuffer", "VertexArray", "Query")
 HIGHEST_NAME = 8192  # drivers name objects from 1 on and use freed names again; some hundreds live at a time
+
+
+class GpuMemoryError(DeltalightError):
+    """The driver had no memory for what it was asked; OpenGL's state is undefined now (OpenGL 4.3, 2.3.1)."""
 
 
 class Program(Protocol):
@@ -95,6 +104,27 @@ class GpuContext:
     """Told of every program that a kernel asks for: its label and the text of each of its stages."""
 
     programs: SharedPrograms = field(default_factory=SharedPrograms)
+    reset_status: Callable[[], int] = lambda: 0
+    """Asks the driver whether the context was lost (lost_context.py); 0 = it was not."""
+    errors: Counter[str] = field(default_factory=Counter)
+    """Errors of OpenGL that `check` found, by name; each is a fault of this program or of the driver."""
+
+    def check(self) -> None:
+        """Finds what went wrong since the last call; does not wait for the GPU.
+
+        Raises:
+            GpuResetError: the context is lost, and what was read from it is worthless.
+            GpuMemoryError: something could not be stored.
+        """
+        check_reset(self.reset_status())
+        error = self.ctx.error
+        if error == OUT_OF_MEMORY:
+            raise GpuMemoryError(
+                "The GPU's memory is full, so nothing is rendered: end other programs that use it, or lower the size "
+                "of output, method.volume_size or method.memory_budget_mb."
+            )
+        if error != NO_ERROR:
+            self.errors[error] += 1
 
     @cached_property
     def defines(self) -> dict[str, str]:
@@ -232,11 +262,9 @@ def create_context(device: int | None = None, *, allow_software: bool = True) ->
         DeltalightError: there is no driver, no such device, one that has too little of something, or only a
             software renderer although none is allowed.
     """
-    options: dict[str, Any] = {"standalone": True, "backend": "egl", "require": 430}
-    if device is not None:
-        options["device_index"] = device
     try:
-        ctx = moderngl.create_context(**options)
+        context: Any = reporting(glcontext.get_backend_by_name("egl")(glversion=430, device_index=device))
+        ctx = moderngl.create_context(require=430, standalone=True, context=context)
     except Exception as error:  # moderngl and glcontext raise plain Exception
         raise DeltalightError(explain_context_failure(str(error))) from error
     name = str(ctx.info["GL_RENDERER"])
@@ -252,4 +280,5 @@ def create_context(device: int | None = None, *, allow_software: bool = True) ->
     except DeltalightError:
         ctx.release()
         raise
-    return GpuContext(ctx, name, str(ctx.info["GL_VERSION"]), software)
+    ask = reset_status(ctx, context.load)
+    return GpuContext(ctx, name, str(ctx.info["GL_VERSION"]), software, reset_status=ask)

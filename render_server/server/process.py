@@ -31,6 +31,7 @@ from deltalight.protocol.publisher import Publisher
 from deltalight.protocol.request import ReplyServer
 from deltalight.protocol.scene import SceneDocument, load_scene
 from deltalight.render_server.gpu.context import count_gl_objects, create_context
+from deltalight.render_server.gpu.lost_context import GpuResetError
 from deltalight.render_server.lights.lights import ENVIRONMENT_SIZE
 from deltalight.render_server.lights.octahedral import prefilter
 from deltalight.render_server.renderer import SceneRenderer
@@ -40,6 +41,7 @@ from deltalight.render_server.server.session import RenderedFrame, Renderer, Ren
 GPU_TIMEOUT_S = 0.002  # a started frame is read back after this time if no other one comes
 RECEIVE_TIMEOUT_S = 0.05  # bounds how long a command waits while no frames arrive
 STATS_INTERVAL_S = 1.0
+LAST_WORDS_MS = 100  # for what was sent at the end, where a subscriber is slow
 ANSWER_TIMEOUT_S = 20.0
 SNAPSHOT_TIMEOUT_S = 120.0  # a frame in many views and by several methods, in software
 
@@ -148,6 +150,10 @@ class Sender:
         except queue.Full:
             self.dropped += 1
 
+    def say_last(self, item: StatsMessage) -> None:
+        """Queues an item; waits for room."""
+        self._waiting.put((item, self._generation))
+
     def forget(self) -> None:
         """Discards all pictures offered so far."""
         self._generation += 1
@@ -183,6 +189,7 @@ def run_server(settings: ServerSettings, keys: Keys | None = None) -> None:
 
     Raises:
         DeltalightError: the scene is wrong, no OpenGL device is suitable, or a port is in use.
+        GpuResetError: the GPU was reset; a new process goes on where this one ended.
     """
     scene = settings.initial_scene()
     for fault in PLUGINS.faults.values():
@@ -222,7 +229,7 @@ def serve(
     """
     with ExitStack() as stack:
         publisher = Publisher(settings.publish, keys=keys)
-        stack.callback(publisher.close)
+        stack.callback(publisher.close, LAST_WORDS_MS)
         sender = Sender(publisher, settings.jpeg_quality)
         stack.callback(sender.close)
         source = FrameSource(settings.subscribe, keys)
@@ -254,7 +261,11 @@ def serve(
         stack.callback(replies.close)
         stack.callback(commands.close)
         log.info("render server runs", renderer=renderer_name, publish=settings.publish)
-        _loop(session, source, sender, commands)
+        try:
+            _loop(session, source, sender, commands)
+        except GpuResetError as fault:
+            sender.say_last(session.stats(ends_by=fault))
+            raise
 
 
 def _patience_s(session: RenderSession) -> float:

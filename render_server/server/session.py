@@ -26,12 +26,14 @@ from deltalight.protocol.messages import (
     CompositeMessage,
     ControlRequest,
     OtherPicture,
+    ProcessState,
     StatsMessage,
 )
 from deltalight.protocol.scene import SceneDocument, parse_scene
 from deltalight.protocol.scene_fields import ShownView
 from deltalight.protocol.subscriber import ReceivedMultipart
 from deltalight.render_server.frame_budget import Level
+from deltalight.render_server.gpu.lost_context import GpuResetError
 from deltalight.render_server.server.frames import AssembledFrame, FrameAssembler, SourceOrder
 from deltalight.render_server.server.snapshot import SnapshotOrder, take_snapshot
 
@@ -270,6 +272,7 @@ class RenderSession:
         A picture that a command finished comes first. A frame that cannot be rendered is counted and logged.
 
         Raises:
+            GpuResetError: the GPU was reset: this process renders nothing any more.
             Exception: `MAXIMUM_FAULTS_IN_A_ROW` unexpected faults without a picture: the renderer is broken, not the
                 frames, and only a restart of the process helps.
         """
@@ -283,6 +286,9 @@ class RenderSession:
             return None
         try:
             return self._render(frame)
+        except GpuResetError:
+            self.counts["gpu_resets"] += 1
+            raise
         except DeltalightError as fault:
             self._count_fault("bad_frames", fault)
         except Exception as fault:  # whatever failed, the next frame must still be rendered
@@ -296,17 +302,19 @@ class RenderSession:
         """Returns the numbers of lost frames, by cause; topics come last, because nodes choose their number."""
         return as_counts({**self._assembler.counts, **self.counts, **self._mailbox_drops()})
 
-    def stats(self) -> StatsMessage:
-        """Returns the state of the session."""
+    def stats(self, ends_by: DeltalightError | None = None) -> StatsMessage:
+        """Returns the state of the session, which may be that it ends by a fault."""
         now_ns = self._clock_ns()
         while self._rendered_ns and self._rendered_ns[0] < now_ns - RATE_WINDOW_S * 1e9:
             self._rendered_ns.popleft()
         is_running = bool(self._rendered_ns) and self._rendered_ns[-1] > now_ns - WAITING_AFTER_S * 1e9
+        state: ProcessState = "degraded" if self._last_fault else "running" if is_running else "waiting"
+        fault = self._last_fault if ends_by is None else str(ends_by)
         return StatsMessage(
             node=self._name,
             capture_ns=now_ns,
-            state="degraded" if self._last_fault else "running" if is_running else "waiting",
-            detail=as_sentence("; ".join(filter(None, (self._renderer_name, self._last_fault)))),
+            state=state if ends_by is None else "stopping",
+            detail=as_sentence("; ".join(filter(None, (self._renderer_name, fault)))),
             rates={"frames_per_s": len(self._rendered_ns) / RATE_WINDOW_S},
             drops=self.drops(),
         )
@@ -387,10 +395,11 @@ class RenderSession:
             self._finished = self._finish(before)
 
     def _render(self, frame: AssembledFrame | None) -> RenderedFrame | None:
-        before, self._started = self._started, None
+        before, started = self._started, None
         if frame is not None:
             self._newest = frame
-            self._started = self._start(frame)
+            started = self._start(frame)  # a fault leaves the frame before in flight
+        self._started = started
         if before is None and self._started is not None and self._started.pending.immediate:
             before, self._started = self._started, None
         return None if before is None else self._finish(before)

@@ -121,7 +121,7 @@ class _Reported(Collector):
             age.add_metric([process], report.age_s)
             for name, value in report.message.rates.items():
                 rate.add_metric([process, name], value)
-            for cause, count in report.message.drops.items():
+            for cause, count in report.lost.items():
                 drops.add_metric([process, cause], count)
         return [age, rate, drops]
 

@@ -2,14 +2,16 @@
 
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import structlog
 
 from deltalight.protocol.envelope import decode
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.keys import Keys
+from deltalight.protocol.message_fields import as_counts
 from deltalight.protocol.messages import Message, StatsMessage
 from deltalight.protocol.receiver import Receiver
 from deltalight.protocol.subscriber import ReceivedMultipart
@@ -26,11 +28,22 @@ log = structlog.get_logger()
 
 @dataclass(frozen=True)
 class Report:
-    """The newest report of a process, its time of arrival (monotonic seconds) and its latency."""
+    """The newest report of a process, its time of arrival (monotonic seconds) and its latency.
+
+    `before` holds what processes of its name had lost that said that they end, by cause.
+    """
 
     message: StatsMessage
     received_s: float
     delay_ms: float
+    before: Mapping[str, int] = field(default_factory=dict)
+
+    @property
+    def lost(self) -> dict[str, int]:
+        """What it and those before it lost, by cause."""
+        lost = Counter(self.message.drops)
+        lost.update(self.before)
+        return as_counts(lost)
 
     @property
     def age_s(self) -> float:
@@ -48,10 +61,17 @@ class ProcessWatch:
     def note(self, message: StatsMessage) -> Report:
         """Store a report that has just arrived."""
         sent_ns = message.capture_ns + message.clock_offset_ns
-        report = Report(message, time.monotonic(), (time.time_ns() - sent_ns) / 1e6)
+        delay_ms = (time.time_ns() - sent_ns) / 1e6
         with self._lock:
+            report = Report(message, time.monotonic(), delay_ms, self._lost_before(message.node))
             self._reports[message.node] = report
         return report
+
+    def _lost_before(self, name: str) -> Mapping[str, int]:
+        newest = self._reports.get(name)
+        if newest is None:
+            return {}
+        return newest.lost if newest.message.state == "stopping" else newest.before
 
     def reports(self) -> list[Report]:
         """Return the newest report of each process, ordered by name."""

@@ -26,8 +26,10 @@ def objects(gpu: GpuContext, tmp_path_factory: pytest.TempPathFactory) -> Iterat
 def clean_gl(gpu: GpuContext) -> Iterator[None]:
     """Modules ask for it with `pytestmark = pytest.mark.usefixtures("clean_gl")`."""
     assert gpu.ctx.error == "GL_NO_ERROR"
+    gpu.errors.clear()
     yield
     assert gpu.ctx.error == "GL_NO_ERROR"
+    assert not gpu.errors, "of frames"
 
 
 @pytest.fixture

@@ -1,6 +1,7 @@
 """The command line beside `render`: help, schema, doctor, sentences, quick start."""
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -13,7 +14,7 @@ from typer.testing import CliRunner
 
 from deltalight.services import doctor, ports
 from deltalight.services.api.serve import listening
-from deltalight.services.cli import app
+from deltalight.services.cli import BLAS_THREADS, app, limit_blas_threads
 from deltalight.services.commands.examples import EXAMPLES
 from tests.services.conftest import ROOT, RunCli
 
@@ -235,3 +236,15 @@ def test_keys_allow_limits_what_a_trusted_machine_may_send(cli: RunCli, tmp_path
     }
     assert cli("keys", "allow", "desk", "--everything", *here).returncode == 0
     assert "may send only" not in cli("keys", "list", *here).stdout
+
+
+def test_live_processes_have_one_thread_of_blas(monkeypatch: pytest.MonkeyPatch) -> None:
+    environment: dict[str, str] = {}
+    monkeypatch.setattr(os, "environ", environment)
+    limit_blas_threads(["render", "take.mcap"])
+    assert environment == {}
+    limit_blas_threads(["--log-level", "warning", "node", "--source", "synthetic"])
+    assert environment == {BLAS_THREADS: "1"}
+    environment[BLAS_THREADS] = "3"  # the user's own number
+    limit_blas_threads(["server"])
+    assert environment == {BLAS_THREADS: "3"}

@@ -1,10 +1,5 @@
 """A recorder loses nothing that it has written: one that writes in a loop is killed 50 times at any point."""
 
-import multiprocessing
-import os
-import random
-import signal
-import time
 from dataclasses import replace
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -15,16 +10,14 @@ from deltalight.protocol.files import ACTIVE_SUFFIX
 from deltalight.protocol.recording_reader import RecordingReader
 from deltalight.protocol.recording_writer import RecordingWriter
 from deltalight.services.recording_copies import recover_recording
+from tests.services.killed_writer import CYCLES, KilledWriter
 from tests.services.record_samples import BOARD, PERIOD_NS, STARTED_NS, frames
 
 pytestmark = pytest.mark.slow
-CYCLES = 50
-MOST_AWAITED = 6
-LONGEST_DELAY_S = 0.01  # some frames: the kill falls at any point of one
 SOURCE = frames(2)
 
 
-def record_until_killed(path: Path, acknowledge: Connection) -> None:
+def record_until_killed(acknowledge: Connection, path: Path) -> None:
     """Writes frames as fast as it can; tells of each when the writer has taken it."""
     writer, number = RecordingWriter(path, board=BOARD), 0
     while True:
@@ -34,32 +27,11 @@ def record_until_killed(path: Path, acknowledge: Connection) -> None:
         number += 1
 
 
-def run_and_kill(context: multiprocessing.context.ForkServerContext, path: Path, seed: int) -> int:
-    """Kills a recording process at a random moment of its work; returns how many frames it had written."""
-    choice = random.Random(seed)
-    receiver, sender = context.Pipe(duplex=False)
-    process = context.Process(target=record_until_killed, args=(path, sender))
-    process.start()
-    sender.close()
-    taken = [receiver.recv() for _ in range(choice.randint(1, MOST_AWAITED))]
-    time.sleep(choice.uniform(0, LONGEST_DELAY_S))
-    assert process.pid is not None
-    os.kill(process.pid, signal.SIGKILL)
-    process.join()
-    assert process.exitcode == -signal.SIGKILL
-    try:
-        while True:
-            taken.append(receiver.recv())
-    except EOFError:
-        return len(taken)
-
-
 def test_every_frame_that_was_written_is_in_the_closed_recording(tmp_path: Path) -> None:
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["tests.services.test_recording_kill"])
+    writer = KilledWriter(record_until_killed, most_awaited=6, longest_delay_s=0.01)
     for seed in range(CYCLES):
         path = tmp_path / f"{seed}.mcap"
-        written = run_and_kill(context, path, seed)
+        written = len(writer.run(seed, path))
         assert not path.exists()
         done = recover_recording(path.with_name(path.name + ACTIVE_SUFFIX), path, iter)
         assert done is not None

@@ -1,11 +1,6 @@
 """Nothing is lost by kill -9: a process that writes in a loop is killed 50 times at any point."""
 
-import multiprocessing
-import os
-import random
-import signal
 import sqlite3
-import time
 from multiprocessing.connection import Connection
 from pathlib import Path
 
@@ -13,18 +8,15 @@ import pytest
 
 from deltalight.services.storage.documents import patch_document
 from deltalight.services.storage.store import Store
+from tests.services.killed_writer import CYCLES, KilledWriter
 from tests.services.storage_samples import TETRAHEDRON, trusting_probe, upload
 
 pytestmark = pytest.mark.slow
-CYCLES = 50
-MOST_AWAITED = 8
-# About what a change takes, so that the kill falls at any point of one.
-LONGEST_DELAY_S = 0.02
 # Makes a revision some 30 kB, so that the log is moved into the database several times during the test.
 LAMPS = [{"type": "sphere", "position_m": [0, 0, 1 + index / 100]} for index in range(64)]
 
 
-def write_until_killed(folder: Path, acknowledge: Connection, seed: int) -> None:
+def write_until_killed(acknowledge: Connection, folder: Path, seed: int) -> None:
     """Makes revisions, undoes some, uploads assets; tells of each when the store has said that it is done."""
     with Store(folder, probe=trusting_probe) as store:
         scene_id = store.scenes.create({"name": f"process {seed}", "lights": {"manual": LAMPS}}).head.id
@@ -43,33 +35,12 @@ def write_until_killed(folder: Path, acknowledge: Connection, seed: int) -> None
                 acknowledge.send((asset.digest,))
 
 
-def run_and_kill(context: multiprocessing.context.ForkServerContext, folder: Path, seed: int) -> list[tuple]:
-    """Kills a writing process at a random moment of its work; returns what it had acknowledged."""
-    choice = random.Random(seed)
-    receiver, sender = context.Pipe(duplex=False)
-    process = context.Process(target=write_until_killed, args=(folder, sender, seed))
-    process.start()
-    sender.close()
-    acknowledged = [receiver.recv() for _ in range(choice.randint(1, MOST_AWAITED))]
-    time.sleep(choice.uniform(0, LONGEST_DELAY_S))
-    assert process.pid is not None
-    os.kill(process.pid, signal.SIGKILL)
-    process.join()
-    assert process.exitcode == -signal.SIGKILL
-    try:
-        while True:
-            acknowledged.append(receiver.recv())
-    except EOFError:
-        return acknowledged
-
-
 def test_nothing_acknowledged_is_lost_by_kill_9(tmp_path: Path) -> None:
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["tests.services.test_storage_kill"])
+    writer = KilledWriter(write_until_killed, most_awaited=8, longest_delay_s=0.02)
     revisions: list[tuple[str, int, str]] = []
     digests: list[str] = []
     for seed in range(CYCLES):
-        for entry in run_and_kill(context, tmp_path, seed):
+        for entry in writer.run(seed, tmp_path, seed):
             if len(entry) == 1:
                 digests += entry
             else:
