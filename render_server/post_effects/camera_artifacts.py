@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from deltalight.protocol.camera_blur import (
+from deltalight.protocol.frames import ViewFrame
+from deltalight.render_server.post_effects.camera_blur import (
     LEAST_MOTION_PX,
     NO_MOTION,
     Color,
@@ -15,8 +16,7 @@ from deltalight.protocol.camera_blur import (
     blurred,
     measure_blur,
 )
-from deltalight.protocol.camera_noise import CameraNoise, NoiseModel, add_noise
-from deltalight.protocol.frames import ViewFrame
+from deltalight.render_server.post_effects.camera_noise import CameraNoise, NoiseModel, add_noise
 
 MOST_MEASURED = 8
 """Frames in which the lens's blur is measured."""
