@@ -16,6 +16,7 @@ from deltalight.protocol.frames import ViewFrame
 from deltalight.protocol.octahedral import octahedral_grid, resample_to_octahedral
 from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.scene_method import NoneMethod, Shading
+from deltalight.protocol.scene_objects import Material
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Kernel
 from deltalight.render_server.lights.environment import load_environment
@@ -214,34 +215,44 @@ class Shaded:
 
 def shaded(gpu: GpuContext, document: SceneDocument, view: ViewFrame | None = None) -> Shaded:
     renderer = SceneRenderer(gpu, document)
-    renderer.render(frame() if view is None else view)
+    found = shaded_by(renderer, frame() if view is None else view)
+    renderer.release()
+    return found
+
+
+def shaded_by(renderer: SceneRenderer, view: ViewFrame) -> Shaded:
+    renderer.render(view)
     graph = renderer.graph
     assert graph is not None
     surface = graph["object surface"]
     pixels = array_of(surface.coverage.texture)[..., 0] == 1
     pixels &= with_neighbours(with_neighbours(pixels))
     open_ = uniform_filter(array_of(graph["ambient occlusion"].open)[..., 0], 4)
-    found = Shaded(
+    return Shaded(
         array_of(graph["image-based surface"])[pixels, :3],
         array_of(surface.buffer.normal)[pixels, :3],
         array_of(surface.buffer.position)[pixels, :3],
         open_[pixels],
     )
-    renderer.release()
-    return found
 
 
 def test_white_furnace(gpu: GpuContext, tmp_path: Path) -> None:
     """A white ball in even light shows that light, whatever it is made of and however rough."""
     stage = Stage(tmp_path, COARSE)
     around = 0.5
-    for finish in ({}, {"metallic": 1.0}, {"specular": 1.0}):
-        for roughness in (0.1, 1.0):
-            item = stage.virtual(ball(detail=5), (1.0, 1.0, 1.0), {**finish, "roughness": roughness})
-            found = shaded(gpu, image_based(stage.document([item], [ambient(around)], floor()), samples=4))
-            share = found.radiance / around
+    matt = stage.virtual(ball(detail=5), (1.0, 1.0, 1.0))
+    document = image_based(stage.document([matt], [ambient(around)], floor()), samples=4)
+    renderer = SceneRenderer(gpu, document)
+    for finish in ({"specular": 0.0}, {"metallic": 1.0}, {"specular": 1.0}):
+        for roughness in (0.1, 0.5, 1.0):
+            (item,) = document.objects
+            assert isinstance(item.material, Material)
+            material = item.material.replaced(**finish, roughness=roughness)
+            renderer.set_scene(document.replaced(objects=(item.replaced(material=material),)))
+            share = shaded_by(renderer, frame()).radiance / around
             assert share.max() <= 1.02
             assert share.mean() == pytest.approx(1.0, abs=0.02)
+    renderer.release()
 
 
 def test_matt_ball_shows_the_irradiance_of_the_lights_map(gpu: GpuContext, tmp_path: Path) -> None:

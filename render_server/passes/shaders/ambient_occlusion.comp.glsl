@@ -9,6 +9,7 @@ layout(r16f) writeonly uniform image2D occlusion_out;   // cosine-weighted fract
 uniform ivec4 rectangle;          // that may show an object: first pixel, size
 uniform float occlusion_radius;   // m, within which things count in full, and fade up to twice of it
 
+const float FLAT = 0.01;   // sine of the elevation up to which things are the surface itself, whose normal is of half floats
 const int SLICES = 2, STEPS = 16;  // of each of the pixels that INTERLEAVED counts, which are averaged
 
 vec4 object_at(vec2 pixel) {
@@ -31,21 +32,16 @@ float reach(vec3 p, vec3 tangent) {
     return farthest * part * a.z / (b.z - part * (b.z - a.z));   // uniform in the picture is not uniform in the world
 }
 
-// A slice: its normal, and the way along p's surface that leads back into it (by 1 along the normal).
-struct Slice { vec3 across; vec3 back; };
-
-// Greatest cosine to v of what stands along `tangent` from p; `lowest` is that of p's own horizon. Texels lie beside the slice:
-// what they show is moved into it at the same height over p's surface, so that a plane hides nothing of itself.
-float horizon(vec3 p, vec3 v, vec3 tangent, Slice slice, float lowest, float shift) {
+// Greatest cosine to v of what stands along `tangent` from p, above its surface; `lowest` is that of p's own horizon.
+float horizon(vec3 p, vec3 n, vec3 v, vec3 tangent, float lowest, float shift) {
     float found = lowest, farthest = reach(p, tangent);
     for (int k = 0; k < (occlusion_radius > 0.0 ? STEPS : 0); ++k) {
         float s = (float(k) + shift) / float(STEPS);
         vec3 c = in_camera(p + farthest * s * s * tangent);
         vec4 q = c.z > 0.0 ? object_at(seen_pixel(c)) : vec4(0.0);
         vec3 d = q.xyz - p;
-        d -= slice.back * dot(d, slice.across);
         float away = length(d);
-        if (q.w == 0.0 || away == 0.0) continue;
+        if (q.w == 0.0 || dot(d, n) <= FLAT * away) continue;
         float counted = clamp(2.0 - away / occlusion_radius, 0.0, 1.0);
         found = max(found, mix(lowest, dot(d, v) / away, counted));
     }
@@ -67,9 +63,8 @@ float open_fraction(vec3 p, vec3 n, vec3 v, vec2 noise) {
         vec3 within = n - across * dot(n, across);
         float size = length(within);
         float tilt = atan(dot(within, tangent), dot(within, v));
-        Slice slice = Slice(across, (across - n * dot(n, across)) / max(size * size, 1e-4));
-        float right = horizon(p, v, tangent, slice, cos(min(tilt + 0.5 * PI, PI)), noise.y);
-        float left = horizon(p, v, -tangent, slice, cos(min(0.5 * PI - tilt, PI)), noise.y);
+        float right = horizon(p, n, v, tangent, cos(min(tilt + 0.5 * PI, PI)), noise.y);
+        float left = horizon(p, n, v, -tangent, cos(min(0.5 * PI - tilt, PI)), noise.y);
         float upper = min(acos(clamp(right, -1.0, 1.0)), tilt + 0.5 * PI);
         float lower = max(-acos(clamp(left, -1.0, 1.0)), tilt - 0.5 * PI);
         seen += size * (arc(upper, tilt) + arc(lower, tilt));
