@@ -5,11 +5,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from deltalight.benchmarks.raster import RasterMethod, register_raster
-from deltalight.protocol.documents import nearest, parse_mapping, validate
+from deltalight.protocol.documents import StrictModel, nearest, parse_mapping, validate
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.methods import PLUGINS, SETTINGS
 from deltalight.protocol.scene import SceneDocument
-from deltalight.protocol.scene_method import MethodSettings, NoneMethod, Output
+from deltalight.protocol.scene_method import MethodSettings, NoneMethod, Output, Shading
 
 RASTER = RasterMethod.method_name()
 MODELS: dict[str, type[MethodSettings]] = {**SETTINGS, RASTER: RasterMethod}
@@ -28,7 +28,8 @@ ADJUSTABLE: dict[str, tuple[str, dict[str, Any]]] = {
     RASTER: (RASTER, {}),
 }
 """Variants that take settings: their kind and what they set themselves. Installed plugins are among them."""
-OUTPUT = "output."
+OTHER_PARTS: dict[str, type[StrictModel]] = {"output": Output, "shading": Shading}
+"""Parts of the scene document besides `method` whose settings a variant may name."""
 TIMED_VARIANT = "exact"
 """The kinds of path tracing take the time of this one's frame."""
 
@@ -37,7 +38,7 @@ TIMED_VARIANT = "exact"
 class Variant:
     """One way to make the picture; `settings` are changes of the scene document (kinds in MODELS).
 
-    A key names a setting of `method`, or one of `lights` or `output` with that before a dot.
+    A key names a setting of `method`, or one of `lights`, `output` or `shading` with that before a dot.
     """
 
     name: str
@@ -67,7 +68,7 @@ class Variant:
         model = MODELS.get(self.kind)
         if model is not None and not isinstance(document.method, model):
             document = document.model_copy(update={"method": model()})
-        parts: dict[str, dict[str, Any]] = {"method": {}, "lights": {}, "output": {}}
+        parts: dict[str, dict[str, Any]] = {"method": {}, "lights": {}, "output": {}, "shading": {}}
         if volume_size is not None and self._has_voxels(document.method):
             parts["method"]["volume_size"] = volume_size
         for key, value in self.settings.items():
@@ -123,7 +124,7 @@ RENDERED = tuple(
 def parse_variants(text: str, known: Collection[str] = FIXED) -> list[Variant]:
     """Parse `camera,paper,exact:cone_count=32,output.antialiasing=true`: names among `known`, separated by commas.
 
-    Settings are the method's, or the document's `output`.
+    Settings are the method's, or the document's `output` or `shading`.
 
     Raises:
         DeltalightError: an unknown name, or a setting that the method does not have or allow.
@@ -164,14 +165,21 @@ def _parse(text: str, known: Collection[str]) -> Variant:
         settings |= _setting(pair, text)
     where = f"--methods {text}"
     validate(MODELS[kind], {key: value for key, value in settings.items() if "." not in key}, where)
-    output = {key.removeprefix(OUTPUT): value for key, value in settings.items() if key.startswith(OUTPUT)}
-    others = [key for key in settings if "." in key and not key.startswith(OUTPUT)]
+    for part, model in OTHER_PARTS.items():
+        own_keys = {key.partition(".")[2]: value for key, value in settings.items() if _part(key) == part}
+        validate(model, own_keys, where)
+    others = [key for key in settings if _part(key) not in ("method", *OTHER_PARTS)]
     if others:
         raise DeltalightError(
-            f"`{others[0]}` in '{text}' is no setting; write one of the method, or output.KEY."
+            f"`{others[0]}` in '{text}' is no setting; write one of the method, output.KEY or shading.KEY."
         )
-    validate(Output, output, where)
     return Variant(text, f"{name} with {changes.replace(',', ', ')}", kind, settings)
+
+
+def _part(key: str) -> str:
+    """The part of the scene document that a setting belongs to."""
+    part, dot, _ = key.partition(".")
+    return part if dot else "method"
 
 
 def _setting(pair: str, variant: str) -> dict[str, Any]:

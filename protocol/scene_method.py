@@ -448,9 +448,28 @@ BUILT_IN_METHODS: tuple[type[MethodSettings], ...] = (
 
 
 class Shading(StrictModel):
-    """How virtual surfaces get their indirect light."""
+    """How virtual surfaces get their light."""
 
-    name: Literal["auto", "volume", "image_based", "precomputed"] = "auto"
+    name: Literal["auto", "volume", "image_based", "precomputed"] = Field(
+        default="auto",
+        description="As the method does (auto, volume), or by a map of all light around the objects alone "
+        "(image_based, docs/method.md 6.6).",
+    )
+    samples: int = Field(
+        default=40, ge=1, le=64, description="Of image_based: samples a pixel of what a surface mirrors."
+    )
+    occlusion_radius_m: float | None = Field(
+        default=None,
+        ge=0,
+        le=20,
+        description="Of image_based: objects keep light off themselves within this distance, metres, and less up to "
+        "twice of it; 0 = not at all, null = the longest edge of the largest object.",
+    )
+
+    @property
+    def is_image_based(self) -> bool:
+        """Whether objects are lit by a map of the light around them alone."""
+        return self.name == "image_based"
 
 
 class Output(StrictModel):
@@ -471,7 +490,8 @@ class Output(StrictModel):
     antialiasing: bool = Field(default=False, description="Smooth the edges of virtual objects.")
     camera_artifacts: bool = Field(
         default=False,
-        description="Put the camera's noise, sharpness and motion blur on the virtual part, as its frames show them.",
+        description="Put the camera's noise, sharpness, vignetting and motion blur on the virtual part, as its "
+        "frames show them.",
     )
     bloom: float = Field(
         default=0.0,

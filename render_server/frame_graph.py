@@ -317,12 +317,12 @@ class FrameGraph:
     def advance(self, options: CompositeOptions, until_s: float) -> bool:
         """Works on the frame until then (time.monotonic()); returns whether it is ready to render at once."""
         self._options.write(options, eq)
-        return self._run(until_s=until_s)
+        return self._run(self._composite, until_s=until_s)
 
     def render(self, options: CompositeOptions) -> Composite:
         """Composes the frame."""
         self._options.write(options, eq)
-        self._run()
+        self._run(self._composite)
         return self._composite.value
 
     def render_view(self, options: CompositeOptions) -> Composite:

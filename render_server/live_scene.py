@@ -148,7 +148,7 @@ class LiveScene:
     def _planned(self, scene: SceneDocument, before: LightEstimator | None = None) -> _Plan:
         """Checks everything that can fail before anything is replaced. `before`: the lights so far, of this room."""
         document = scene.method.replaced(quality=self._budget.level.quality)
-        method = choose_method(document, software=self._gpu.is_software)
+        method = choose_method(document, scene.shading, software=self._gpu.is_software)
         if method.remark is not None:
             self._notify(method.remark)
         method.require(scene.objects)
@@ -419,7 +419,7 @@ def unsupported_requests(scene: SceneDocument) -> list[str]:
     """Returns sentences on requests of the document that this release does not render."""
     materials = [item.material for item in scene.objects if isinstance(item.material, Material)]
     requests = {
-        f"shading.name `{scene.shading.name}`": scene.shading.name not in ("auto", "volume"),
+        f"shading.name `{scene.shading.name}`": scene.shading.name == "precomputed",
         "a material's transmission": any(material.transmission > 0 for material in materials),
     }
     return [

@@ -12,8 +12,6 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
-from deltalight.protocol.bloom import bloomed
-from deltalight.protocol.camera_artifacts import CameraArtifacts, FrameArtifacts
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import ViewFrame
@@ -27,6 +25,8 @@ from deltalight.render_server.graph import Graph
 from deltalight.render_server.live_scene import LiveScene, RelitFrame
 from deltalight.render_server.passes.composite import Composite, Picture
 from deltalight.render_server.picking import SHOWN_FRACTION, Pick, ShownFrame, raster_texels
+from deltalight.render_server.post_effects.bloom import bloomed
+from deltalight.render_server.post_effects.camera_artifacts import CameraArtifacts, FrameArtifacts
 from deltalight.render_server.view import CameraView, output_size, resized_frame
 
 MEMORY_RETRY_S = 10.0  # after which a scene is built anew that the GPU had no memory for

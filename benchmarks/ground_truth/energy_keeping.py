@@ -117,128 +117,13 @@ def _masking(out: Float64[np.ndarray, "n n"], cosine: float, alpha: float) -> Fl
     return np.asarray(smith_visibility(cosine, out, alpha) * 4 * cosine * out / g1)
 
 
-def _polynomial(coefficients: Float64[np.ndarray, " k"], x: Numbers) -> Numbers:
-    """Return a Chebyshev series by Clenshaw's recurrence, for numbers of Dr.Jit."""
-    last, before = 0.0 * x, 0.0 * x
-    for value in coefficients[:0:-1]:
-        last, before = float(value) + 2 * x * last - before, last
-    return float(coefficients[0]) + x * last - before
-
-
 def register() -> None:
     """Make the material known to Mitsuba's current variant."""
     import mitsuba as mi
 
+    from deltalight.benchmarks.ground_truth.energy_keeping_bsdf import material
+
     variant = str(mi.variant())
     if variant not in _registered:
-        mi.register_bsdf(PLUGIN, _material())
+        mi.register_bsdf(PLUGIN, material())
         _registered.add(variant)
-
-
-def _material() -> type:
-    """Return the material's class, which is another for each variant."""
-    import drjit as dr
-    import mitsuba as mi
-
-    class EnergyKeeping(mi.BSDF):
-        """See `energy_keeping`."""
-
-        def __init__(self, props: Numbers) -> None:
-            super().__init__(props)
-            self.base, self.metallic = props.get_texture("base_color"), float(props["metallic"])
-            self.alpha = max(float(props["roughness"]) ** 2, LEAST_ALPHA)
-            f0 = self._normal_reflectance(0.08 * float(props["specular"]))
-            self.f0, self.lobe = f0, lobe_albedo(self.alpha, f0, self.metallic)
-            self.facets = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, self.alpha, True)
-            glossy = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide
-            diffuse = mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide
-            self.m_components, self.m_flags = [glossy, diffuse], glossy | diffuse
-
-        def _normal_reflectance(self, dielectric: float) -> Triple:
-            """Return F0, R G B; a metal's is its colour, which must be one for the whole surface."""
-            if self.metallic == 0:
-                return (dielectric,) * 3
-            color = np.array(self.base.eval(dr.zeros(mi.SurfaceInteraction3f))).ravel()
-            red, green, blue = (1 - self.metallic) * dielectric + self.metallic * color
-            return float(red), float(green), float(blue)
-
-        def _shares(self, cosine: Numbers) -> tuple[Numbers, Numbers]:
-            """Return what single reflection lets out, and what the gaps still hold."""
-            x = 2 * dr.sqrt(dr.clip(cosine, 0, 1)) - 1
-            single = mi.Color3f(*[_polynomial(each, x) for each in self.lobe.single])
-            return dr.clip(single, 0, 1), dr.clip(1 - _polynomial(self.lobe.whole, x), 0, 1)
-
-        def _below(self, cosine: Numbers) -> Numbers:
-            """Return what the lobe leaves to the diffuse base."""
-            single, held = self._shares(cosine)
-            return dr.maximum(1 - single - held * mi.Color3f(*self.lobe.further.tolist()), 0)
-
-        def _base(self, si: Numbers, active: Numbers) -> Numbers:
-            return (1 - self.metallic) * self.base.eval(si, active)
-
-        def _glossy_share(self, si: Numbers, active: Numbers) -> Numbers:
-            """Return the probability of sampling the lobe: its share of what is reflected."""
-            cosine = mi.Frame3f.cos_theta(si.wi)
-            single, held = self._shares(cosine)
-            gaps = held * mi.Color3f(*self.lobe.further.tolist())
-            lobe, rest = dr.mean(single), dr.mean(gaps + self._base(si, active) * self._below(cosine))
-            return lobe / dr.maximum(lobe + rest, 1e-6)
-
-        def sample(
-            self, ctx: Numbers, si: Numbers, sample1: Numbers, sample2: Numbers, active: Numbers = True
-        ) -> Numbers:
-            """Draw a direction; a context's choice of components is not heeded."""
-            is_glossy = sample1 < self._glossy_share(si, active)
-            normal, _ = self.facets.sample(si.wi, sample2)
-            even = mi.warp.square_to_cosine_hemisphere(sample2)
-            glossy, diffuse = (int(mi.BSDFFlags[f"{name}Reflection"]) for name in ("Glossy", "Diffuse"))
-            bs: Numbers = mi.BSDFSample3f()
-            bs.wo, bs.eta = dr.select(is_glossy, mi.reflect(si.wi, normal), even), 1.0
-            bs.sampled_component = dr.select(is_glossy, mi.UInt32(0), mi.UInt32(1))
-            bs.sampled_type = dr.select(is_glossy, mi.UInt32(glossy), mi.UInt32(diffuse))
-            value, bs.pdf = self.eval_pdf(ctx, si, bs.wo, active)
-            found = bs.pdf > 0
-            return bs, dr.select(found, value / dr.select(found, bs.pdf, 1), 0)
-
-        def eval(self, ctx: Numbers, si: Numbers, wo: Numbers, active: Numbers = True) -> Numbers:
-            """Return the BSDF times cosine."""
-            return self.eval_pdf(ctx, si, wo, active)[0]
-
-        def pdf(self, ctx: Numbers, si: Numbers, wo: Numbers, active: Numbers = True) -> Numbers:
-            """Return the density of `sample`, per solid angle."""
-            return self.eval_pdf(ctx, si, wo, active)[1]
-
-        def eval_pdf(self, _ctx: Numbers, si: Numbers, wo: Numbers, active: Numbers = True) -> Numbers:
-            """Return both."""
-            cosine_i, cosine_o = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(wo)
-            seen = active & (cosine_i > 0) & (cosine_o > 0)
-            cosine_i, cosine_o = dr.maximum(cosine_i, 1e-6), dr.maximum(cosine_o, 1e-6)
-            normal = dr.normalize(si.wi + wo)
-            facing = dr.maximum(dr.dot(si.wi, normal), 1e-6)
-            strength = self.facets.eval(normal) * smith_visibility(cosine_i, cosine_o, self.alpha)
-            glossy = strength * mi.Color3f(*[fresnel(facing, each, self.metallic) for each in self.f0])
-            value = cosine_o * (glossy + self._even(si, cosine_i, cosine_o, seen))
-            share = self._glossy_share(si, seen)
-            pdf = share * self.facets.pdf(si.wi, normal) / (4 * facing) + (1 - share) * cosine_o / dr.pi
-            return dr.select(seen, value, 0), dr.select(seen, pdf, 0)
-
-        def _even(self, si: Numbers, cosine_i: Numbers, cosine_o: Numbers, active: Numbers) -> Numbers:
-            """Return further reflections (Kulla & Conty 2017) and the base under the lobe (Kelemen 2001)."""
-            held_i, held_o = self._shares(cosine_i)[1], self._shares(cosine_o)[1]
-            mean_held = max(1 - self.lobe.mean_whole, 1e-6)
-            gaps = held_i * held_o / (dr.pi * mean_held) * mi.Color3f(*self.lobe.further.tolist())
-            mean_left = np.maximum(1 - self.lobe.mean, 1e-6)
-            below = self._below(cosine_i) * self._below(cosine_o) / mi.Color3f(*mean_left.tolist())
-            return gaps + self._base(si, active) * below / dr.pi
-
-        def eval_diffuse_reflectance(self, si: Numbers, active: Numbers = True) -> Numbers:
-            """Return the base's albedo, which guides denoisers."""
-            return self._base(si, active)
-
-        def traverse(self, cb: Numbers) -> None:
-            cb.put("base_color", self.base, mi.ParamFlags.Differentiable)
-
-        def to_string(self) -> str:
-            return f"EnergyKeeping[alpha={self.alpha}, metallic={self.metallic}]"
-
-    return EnergyKeeping

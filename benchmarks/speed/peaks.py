@@ -59,8 +59,14 @@ def _fastest_s(gpu: GpuContext, work: Callable[[], None]) -> float:
 
 
 def stage_bytes(graph: Graph) -> dict[str, int]:
-    """Return for each stage the bytes of all that its resources hold, each once, without mip levels."""
-    return {stage.name: _bytes_of(graph, stage) for stage in graph.report() if not stage.is_value}
+    """Return for each stage that ever ran the bytes of all that its resources hold, each once, without mip levels."""
+    stages = [stage for stage in graph.report() if not stage.is_value]
+    return {stage.name: _bytes_of(graph, stage) for stage in stages if _has_run(graph, stage)}
+
+
+def _has_run(graph: Graph, stage: StageReport) -> bool:
+    """Whether anything needed the stage: image-based shading leaves out a method's own shading."""
+    return all(graph.resource(name).version > 0 for name in stage.outputs)
 
 
 def _bytes_of(graph: Graph, stage: StageReport) -> int:

@@ -1,4 +1,4 @@
-"""The sweeps of the dissertation ([D] 5.2 to 5.4): what stages take as a size grows, beside the published times.
+"""The sweeps of the dissertation ([D] 4.2, 5.2 to 5.4): what stages take as a size grows, beside the published times.
 
 Published: GeForce GTX 470 to GTX 780 with scenes of their own; ours: the demo on this machine. Compare how times
 grow, not the times.
@@ -75,7 +75,36 @@ def _volumes() -> Iterator[Point]:
         yield Point(f"{voxels}^3", method, times_ms, voxels == 64)
 
 
+def _image_based(samples: int, width: int, height: int) -> str:
+    settings = {"name": "image_based", "samples": samples}
+    picture = {"width": width, "height": height}
+    written = [f"shading.{key}={value}" for key, value in settings.items()]
+    return f"raster:{','.join([*written, *(f'output.{key}={value}' for key, value in picture.items())])}"
+
+
+def _pictures() -> Iterator[Point]:
+    for (width, height), published_ms in {(640, 480): 1.3, (1280, 720): 6.1, (1920, 1080): 14.4}.items():
+        yield Point(f"{height} rows", _image_based(40, width, height), (published_ms,), height < 1080)
+
+
+def _samples() -> Iterator[Point]:
+    for samples, published_ms in {1: 0.028, 10: 0.546, 20: 1.538, 30: 2.328, 40: 3.162}.items():
+        yield Point(f"{samples} samples", _image_based(samples, 1280, 720), (published_ms,), samples <= 20)
+
+
 SWEEPS = (
+    Sweep(
+        "Image-based shading by picture, 40 samples ([D] 4.2)",
+        "camera",
+        {"shading": ("ambient occlusion", "image-based surface")},
+        tuple(_pictures()),
+    ),
+    Sweep(
+        "Image-based shading by samples, 1280x720 ([D] figure 4.5)",
+        "camera",
+        {"shading": ("image-based surface",)},
+        tuple(_samples()),
+    ),
     Sweep(
         "Light injected into DLPVs by size of the shadow maps ([D] table 5.3)",
         "lamps",

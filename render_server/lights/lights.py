@@ -337,7 +337,8 @@ class LightSet:
     `environment` is the residual radiance map R without the lights, octahedral, world axes. `ground_fraction` (0..1)
     is the fraction of each of its texels that shows the real ground, because nothing else is known to be there.
     `registration` is the factor R G B that `lights` and `environment` still lack, ones where it is to be estimated
-    from the picture. `identities` number the lights where they are tracked over time.
+    from the picture. `identities` number the lights where they are tracked over time. `whole` is the map that the
+    lights were cut out of, where it is given.
     """
 
     lights: tuple[Light, ...]
@@ -345,6 +346,7 @@ class LightSet:
     ground_fraction: Float32[np.ndarray, "n n 1"]
     registration: Float32[np.ndarray, "3"]
     identities: tuple[int, ...] = ()
+    whole: Float32[np.ndarray, "n n 3"] | None = None
 
     def registered(self, factor: Float32[np.ndarray, "3"] | None = None) -> "LightSet":
         """Returns the set with the registration (or another factor) multiplied in."""
@@ -354,6 +356,7 @@ class LightSet:
             lights=tuple(light.scaled(chosen) for light in self.lights),
             environment=self.environment * chosen,
             registration=np.ones(3, np.float32),
+            whole=None if self.whole is None else self.whole * chosen,
         )
 
     def with_ground(self, radiance: Float32[np.ndarray, "3"]) -> "LightSet":
@@ -391,9 +394,9 @@ def build_lights(lights: documents.Lights) -> LightSet:
     Raises:
         DeltalightError: an environment map that cannot be read.
     """
-    shining, environment = (
-        _from_environment(lights) if lights.mode == "environment" else _manual(lights.manual)
-    )
+    if lights.mode == "environment":
+        return _from_environment(lights)
+    shining, environment = _manual(lights.manual)
     return light_set(lights, shining, environment, 1 - above_horizon(len(environment)))
 
 
@@ -425,15 +428,10 @@ def _manual(
     return shining, np.tile(ambient, (AMBIENT_SIZE, AMBIENT_SIZE, 1))
 
 
-def _from_environment(
-    lights: documents.Lights,
-) -> tuple[tuple[Light, ...], Float32[np.ndarray, "n n 3"]]:
-    settings = lights.fisheye
+def _from_environment(lights: documents.Lights) -> LightSet:
+    settings, environment = lights.fisheye, load_environment(lights.environment)
     split = split_environment(
-        load_environment(lights.environment),
-        settings.count,
-        threshold=settings.threshold,
-        whole_map=settings.split == "all",
+        environment, settings.count, threshold=settings.threshold, whole_map=settings.split == "all"
     )
     shining = tuple(
         DirectionalLight(
@@ -443,7 +441,10 @@ def _from_environment(
         )
         for light in split.lights
     )
-    return shining, resample_to_octahedral(split.residual.sample, ENVIRONMENT_SIZE)
+    residual, whole = (
+        resample_to_octahedral(each.sample, ENVIRONMENT_SIZE) for each in (split.residual, environment)
+    )
+    return replace(light_set(lights, shining, residual, 1 - above_horizon(ENVIRONMENT_SIZE)), whole=whole)
 
 
 @dataclass(frozen=True, eq=False)

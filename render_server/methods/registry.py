@@ -7,13 +7,14 @@ from typing import Any, Literal
 
 from deltalight.protocol.methods import PLUGINS
 from deltalight.protocol.plugins import Plugin
-from deltalight.protocol.scene_method import DvctMethod, MethodSettings, NoneMethod
+from deltalight.protocol.scene_method import DvctMethod, MethodSettings, NoneMethod, Shading
 from deltalight.protocol.scene_objects import SceneObject
 from deltalight.render_server.frame import FrameResources
 from deltalight.render_server.graph import Graph
 from deltalight.render_server.methods.aroof import AROOF
 from deltalight.render_server.methods.differential import DIFFERENTIAL
 from deltalight.render_server.methods.dvct import DVCT
+from deltalight.render_server.methods.image_based import image_based_radiance
 from deltalight.render_server.methods.lighting import Layers
 from deltalight.render_server.methods.lpv import DLPV
 from deltalight.render_server.methods.method import (
@@ -33,15 +34,16 @@ _BY_SETTINGS = {method.settings: method for method in BUILT_IN}
 class MethodChoice:
     """A method whose settings and memory were checked.
 
-    `settings` are those of the `document` within the limits of its quality. `remark`: a sentence for the user, or
-    none. `relights_real`: the real scene changes too. `plugin`: what the method comes from, unless it is the
-    project's own.
+    `settings` are those of the `document` within the limits of its quality. `shading`: how objects get their light.
+    `remark`: a sentence for the user, or none. `relights_real`: the real scene changes too. `plugin`: what the method
+    comes from, unless it is the project's own.
     """
 
     method: RelightingMethod[Any]
     document: MethodSettings
     settings: MethodSettings
     resolved: ResolvedSettings
+    shading: Shading = field(default_factory=Shading)
     remark: str | None = None
     relights_real: bool = field(default=True, compare=False)
     plugin: Plugin | None = None
@@ -53,7 +55,7 @@ class MethodChoice:
 
     def in_best_quality(self, *, software: bool) -> "MethodChoice":
         """Returns the same method as it is when nothing moves."""
-        return choose_method(self.document.replaced(quality="best"), software=software)
+        return choose_method(self.document.replaced(quality="best"), self.shading, software=software)
 
     @property
     def composition(self) -> Literal["ratio", "additive"]:
@@ -82,24 +84,30 @@ class MethodChoice:
             DeltalightError: a plugin cannot.
         """
         with _blamed(self.plugin), graph.of_plugin(self.plugin):
-            return self.method.declare(graph, resources, setup)
+            layers = self.method.declare(graph, resources, setup)
+        if self.shading.is_image_based:
+            radiance = image_based_radiance(graph, resources, self.shading, setup.picture_size)
+            layers = replace(layers, radiance=radiance)
+        return layers
 
 
-def choose_method(document: MethodSettings, *, software: bool) -> MethodChoice:
-    """Checks what the document asks for; `none` draws the objects as dvct does.
+def choose_method(
+    document: MethodSettings, shading: Shading | None = None, *, software: bool
+) -> MethodChoice:
+    """Checks what the document asks for; `none` draws the objects as dvct does. `shading` None: as the method does.
 
     Raises:
         DeltalightError: more memory than its budget, or a plugin that cannot be used.
     """
     if isinstance(document, NoneMethod):
-        return replace(
-            choose_method(DvctMethod(quality=document.quality), software=software), relights_real=False
-        )
+        drawn = choose_method(DvctMethod(quality=document.quality), shading, software=software)
+        return replace(drawn, relights_real=False)
     method, plugin = _registered(document)
     with _blamed(plugin):
         resolved = method.resolve(document, SOFTWARE_DEFAULTS if software else GPU_DEFAULTS)
         remark = None if method.state_memory is None else method.state_memory(document, resolved)
-    return MethodChoice(method, document, document.limited(), resolved, remark, plugin=plugin)
+    asked = Shading() if shading is None else shading
+    return MethodChoice(method, document, document.limited(), resolved, asked, remark, plugin=plugin)
 
 
 def _registered(settings: MethodSettings) -> tuple[RelightingMethod[Any], Plugin | None]:

@@ -89,18 +89,9 @@ class LightBuffers:
 
     def set_environment(self, radiance: Float32[np.ndarray, "n n 3"]) -> moderngl.TextureArray:
         """Uploads the residual environment R (octahedral), averaged over cones of doubling half-angle."""
-        prefiltered = prefilter(radiance)
-        size, count = len(radiance), len(prefiltered.levels)
-        directions = octahedral_grid(size)
-        layers = [radiance, *(sample_octahedral(level, directions) for level in prefiltered.levels[1:])]
-        rgba = np.ones((count, size, size, 4), np.float16)
-        rgba[..., :3] = np.stack(layers)
         if self._environment is not None:
             self._environment.release()
-        self._environment = self._gpu.ctx.texture_array((size, size, count), 4, rgba.tobytes(), dtype="f2")
-        self._environment.filter = (moderngl.LINEAR, moderngl.LINEAR)
-        self._environment.repeat_x = self._environment.repeat_y = False
-        self._environment_half_angle = float(prefiltered.half_angles[0])
+        self._environment, self._environment_half_angle = environment_texture(self._gpu, radiance)
         self._write_block()
         return self._environment
 
@@ -247,6 +238,22 @@ class MirrorVisibility:
     def release(self) -> None:
         """Frees the program."""
         self._kernel.release()
+
+
+def environment_texture(
+    gpu: GpuContext, radiance: Float32[np.ndarray, "n n 3"]
+) -> tuple[moderngl.TextureArray, float]:
+    """Returns a map averaged over cones (shaders/common/environment.glsl), and the half-angle of layer 0 (rad)."""
+    prefiltered = prefilter(radiance)
+    size, count = len(radiance), len(prefiltered.levels)
+    directions = octahedral_grid(size)
+    layers = [radiance, *(sample_octahedral(level, directions) for level in prefiltered.levels[1:])]
+    rgba = np.ones((count, size, size, 4), np.float16)
+    rgba[..., :3] = np.stack(layers)
+    texture = gpu.ctx.texture_array((size, size, count), 4, rgba.tobytes(), dtype="f2")
+    texture.filter = (moderngl.LINEAR, moderngl.LINEAR)
+    texture.repeat_x = texture.repeat_y = False
+    return texture, float(prefiltered.half_angles[0])
 
 
 def mirror_map_axes(mirror: MirrorLight, points: Float64[np.ndarray, "n 3"]) -> MapAxes:

@@ -2,7 +2,6 @@
 
 import threading
 import time
-from contextlib import ExitStack
 from dataclasses import replace
 from types import TracebackType
 from typing import Self
@@ -10,7 +9,8 @@ from typing import Self
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.fisheye_lens import FisheyeCalibration
 from deltalight.protocol.frames import FisheyePictures, SensorFrame
-from deltalight.sensor_node.cameras.base import Camera, EndOfStream, ImuSample, StreamState
+from deltalight.sensor_node.cameras.accompanied import AccompaniedCamera
+from deltalight.sensor_node.cameras.base import Camera, EndOfStream, StreamState
 
 # A reported exposure counts as the requested one within 5 % or two lines of a usual rolling shutter (15 us each).
 SAME_EXPOSURE, SAME_EXPOSURE_S = 0.05, 30e-6
@@ -131,56 +131,12 @@ class FisheyeCapture:
         )
 
 
-class CameraWithFisheye(Camera):
+class CameraWithFisheye(AccompaniedCamera):
     """A camera whose frames carry the newest fish-eye pictures of another one."""
 
     def __init__(self, camera: Camera, fisheye: FisheyeCapture) -> None:
-        self._camera, self._fisheye = camera, fisheye
-        self._stack = ExitStack()
-
-    def open(self) -> None:
-        """Open both.
-
-        Raises:
-            DeltalightError: one of them cannot be opened.
-        """
-        with ExitStack() as stack:
-            stack.enter_context(self._fisheye)
-            stack.enter_context(self._camera)
-            self._stack = stack.pop_all()
-        camera = self._camera
-        self.camera, self.board, self.extrinsics = camera.camera, camera.board, camera.extrinsics
-        self.depth_scale, self.exposure_is_measured = camera.depth_scale, camera.exposure_is_measured
-        self.notes = camera.notes
-
-    def close(self) -> None:
-        """Close both."""
-        self._stack.close()
-
-    def read(self) -> SensorFrame:
-        """Wait for the camera's next frame."""
-        return self._with_fisheye(self._camera.read())
-
-    def read_latest(self, max_age_s: float) -> SensorFrame:
-        """Return the camera's newest frame at once."""
-        return self._with_fisheye(self._camera.read_latest(max_age_s))
-
-    def imu_samples(self) -> list[ImuSample]:
-        """Return what the camera's inertial unit measured since the last call."""
-        return self._camera.imu_samples()
-
-    def interrupt(self) -> None:
-        """End a waiting `read`."""
-        self._camera.interrupt()
-
-    def set_exposure(self, seconds: float) -> None:
-        """Lock the camera's exposure."""
-        self._camera.set_exposure(seconds)
-
-    @property
-    def capture_ns(self) -> int:
-        """Capture time of the camera's frame, in ns since 1970 by this host's clock."""
-        return self._camera.capture_ns
+        super().__init__(camera, fisheye)
+        self._fisheye = fisheye
 
     @property
     def state(self) -> StreamState | None:
@@ -191,6 +147,6 @@ class CameraWithFisheye(Camera):
             return state
         return StreamState("stale", f"the fish-eye pictures are old: {fisheye.detail}")
 
-    def _with_fisheye(self, frame: SensorFrame) -> SensorFrame:
+    def _completed(self, frame: SensorFrame) -> SensorFrame:
         newest = self._fisheye.newest()
         return frame if newest is None else replace(frame, fisheye=newest)

@@ -111,8 +111,16 @@ def by_device(gpu: GpuContext, folder: Path) -> None:  # noqa: ARG001
     Crossfade(gpu, (16, 16)).release()
 
 
+def image_based(gpu: GpuContext, folder: Path) -> None:  # noqa: ARG001
+    """Compiles image-based shading, without and with a lens that bends and materials that have maps."""
+    for name, switch in (("ambient_occlusion", "lens_bends"), ("image_based_surface", "MATERIAL_MAPS")):
+        for defines in ({}, {switch: 1}):
+            Kernel(gpu, name, **defines).release()
+
+
 PARTS: dict[str, Callable[[GpuContext, Path], None]] = {
     **{str(case): partial(render, case, changes) for case, changes in CASES.items()},
     **{f"{case} textured": partial(render_textured, case, changes) for case, changes in TEXTURED.items()},
     "by device": by_device,
+    "image-based shading": image_based,
 }

@@ -8,6 +8,7 @@
 #include "common/lobe.glsl"
 #include "common/upsample.glsl"
 #include "common/work_list.glsl"
+#include "common/surface_change.glsl"
 #ifdef VOXELS
 #include "common/march.glsl"
 #include "common/environment.glsl"
@@ -15,7 +16,6 @@
 
 layout(local_size_x = 64) in;
 layout(rgba16f) writeonly uniform image2D reflected;   // rgb radiance times fraction; a: fraction of the lobe
-uniform sampler2D object_coverage;
 uniform sampler2D direct_mu;
 uniform sampler2D direct_rho;
 uniform sampler2D cone_mu;
@@ -64,22 +64,6 @@ vec4 look(vec3 from, vec3 d, float spread) {
     }
 #endif
     return seen;
-}
-
-// Change of position and normal from a pixel to the next along an axis; the smaller change of both sides, so that
-// edges do not count.
-struct Change { vec3 position; vec3 normal; };
-
-Change change_along(ivec2 pixel, ivec2 axis, vec4 position, vec4 normal) {
-    Change least = Change(vec3(0.0), vec3(1e3));
-    for (int side = -1; side <= 1; side += 2) {
-        ivec2 beside = clamp(pixel + side * axis, ivec2(0), textureSize(object_coverage, 0) - 1), raster = raster_texel(beside);
-        vec4 p = texelFetch(virtual_raster_position, raster, 0), n = texelFetch(virtual_raster_normal, raster, 0);
-        bool shown = p.w > 0.0 && texelFetch(object_coverage, beside, 0).r > 0.0;
-        bool next = shown && n.w == normal.w && distance(n, normal) < length(least.normal);
-        if (next) least = Change(float(side) * (p - position).xyz, float(side) * (n - normal).xyz);
-    }
-    return length(least.normal) < 1.0 ? least : Change(vec3(0.0), vec3(0.0));
 }
 
 // Diameter at distance 1 of what one cone represents: its part of the lobe, and the rotation of the reflection across

@@ -1,10 +1,8 @@
 // Radiance of a virtual object's surface towards v (docs/method.md 4.7). Needs lights.glsl and brdf.glsl.
-#include "common/materials.glsl"
+#include "common/gathered_light.glsl"
 
 uniform float noise_sigma;      // m at 1 m
 uniform float normal_offset;    // m: against self-shadowing by the virtual depth map
-
-struct Indirect { vec3 irradiance; vec3 specular; };
 
 vec3 direct_radiance(vec3 p, float depth, vec3 n, vec3 v, Material m) {
     vec3 sum = vec3(0.0);
@@ -22,12 +20,5 @@ vec3 direct_radiance(vec3 p, float depth, vec3 n, vec3 v, Material m) {
 }
 
 vec3 object_radiance(vec3 p, float depth, vec3 n, vec3 v, Material m, Indirect indirect) {
-    float n_dot_v = max(dot(n, v), 1e-3);
-    vec3 reflectance = specular_reflectance(m.f0, m.roughness, n_dot_v);
-#ifdef MATERIAL_MAPS
-    indirect.irradiance *= m.occlusion;
-    indirect.specular *= m.occlusion;
-#endif
-    return m.emission + direct_radiance(p, depth, n, v, m)
-        + m.diffuse / PI * (1.0 - reflectance) * indirect.irradiance + reflectance * indirect.specular;
+    return with_gathered(m.emission + direct_radiance(p, depth, n, v, m), m, max(dot(n, v), 1e-3), indirect);
 }

@@ -2,8 +2,7 @@
 // in the picture is unknown: the ray is lost there. It strides over STRIDE pixels, and goes pixel by pixel only through
 // the stride at whose end it is behind the picture's surface.
 #include "common/geometry.glsl"
-#include "common/camera_image.glsl"
-#include "common/lens.glsl"
+#include "common/seen_pixel.glsl"
 
 uniform float noise_sigma;    // m at 1 m
 
@@ -17,17 +16,6 @@ const float FLATTEST = 0.1;
 
 // `point` on a real surface whose middle `pixel` shows; `fraction`: its reliability, 0 where the ray was lost.
 struct ScreenHit { float distance; vec2 pixel; float depth; float fraction; };
-
-// Pixel (centres at .5) that shows a point in front of the camera: a pinhole's, displaced by the lens.
-vec2 seen_pixel(vec3 c) {
-    vec2 pixel = picture_pixel(c), last = picture_size - 1.0;
-    for (int i = 0; i < (lens_bends ? 2 : 0); ++i) {
-        vec2 ray = texelFetch(picture_rays, ivec2(clamp(pixel, vec2(0.0), last)), 0).xy;
-        vec2 centre = floor(clamp(pixel, vec2(0.0), last)) + 0.5;
-        pixel = centre + camera_pinhole.xy * (c.xy / c.z - ray);
-    }
-    return pixel;
-}
 
 bool in_picture(vec2 pixel) { return all(greaterThanEqual(pixel, vec2(0.0))) && all(lessThan(pixel, picture_size)); }
 

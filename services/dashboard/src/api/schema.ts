@@ -2479,7 +2479,7 @@ export interface components {
             readonly bloom: number;
             /**
              * Camera Artifacts
-             * @description Put the camera's noise, sharpness and motion blur on the virtual part, as its frames show them.
+             * @description Put the camera's noise, sharpness, vignetting and motion blur on the virtual part, as its frames show them.
              * @default false
              */
             readonly camera_artifacts: boolean;
@@ -3194,15 +3194,27 @@ export interface components {
         };
         /**
          * Shading
-         * @description How virtual surfaces get their indirect light.
+         * @description How virtual surfaces get their light.
          */
         readonly Shading: {
             /**
              * Name
+             * @description As the method does (auto, volume), or by a map of all light around the objects alone (image_based, docs/method.md 6.6).
              * @default auto
              * @enum {string}
              */
             readonly name: "auto" | "volume" | "image_based" | "precomputed";
+            /**
+             * Occlusion Radius M
+             * @description Of image_based: objects keep light off themselves within this distance, metres, and less up to twice of it; 0 = not at all, null = the longest edge of the largest object.
+             */
+            readonly occlusion_radius_m?: number | null;
+            /**
+             * Samples
+             * @description Of image_based: samples a pixel of what a surface mirrors.
+             * @default 40
+             */
+            readonly samples: number;
         };
         /**
          * ShelfAnswer

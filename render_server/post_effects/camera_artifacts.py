@@ -1,11 +1,12 @@
-"""What a camera does to a picture, learned from its frames and put on the virtual part: blur, then noise."""
+"""What a camera does to a picture, learned from its frames and put on the virtual part: vignetting, blur, noise."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64
 
-from deltalight.protocol.camera_blur import (
+from deltalight.protocol.frames import ViewFrame
+from deltalight.render_server.post_effects.camera_blur import (
     LEAST_MOTION_PX,
     NO_MOTION,
     Color,
@@ -15,8 +16,8 @@ from deltalight.protocol.camera_blur import (
     blurred,
     measure_blur,
 )
-from deltalight.protocol.camera_noise import CameraNoise, NoiseModel, add_noise
-from deltalight.protocol.frames import ViewFrame
+from deltalight.render_server.post_effects.camera_noise import CameraNoise, NoiseModel, add_noise
+from deltalight.render_server.post_effects.camera_vignetting import PaperVignetting, Vignetting, vignetted
 
 MOST_MEASURED = 8
 """Frames in which the lens's blur is measured."""
@@ -31,10 +32,13 @@ class FrameArtifacts:
     frame: ViewFrame
     noise: NoiseModel | None
     kernels: Float64[np.ndarray, "3 k k"] | None
+    vignetting: Vignetting | None = None
 
     def applied(self, color: Color, coverage: Coverage) -> Color:
-        """Return a picture of the frame with blur and noise on its virtual part; as it is while none is known."""
+        """Return a picture of the frame with all of it on its virtual part; as it is while none is known."""
         frame = self.frame
+        if self.vignetting is not None:
+            color = vignetted(color, coverage, self.vignetting.factors(frame.camera), frame)
         if self.kernels is not None:
             color, coverage = blurred(color, coverage, self.kernels, frame.response)
         if self.noise is None:
@@ -43,10 +47,11 @@ class FrameArtifacts:
 
 
 class CameraArtifacts:
-    """Learns a camera's noise and the blur of its lens, and follows its motion."""
+    """Learns a camera's noise, the blur of its lens and its vignetting, and follows its motion."""
 
     def __init__(self) -> None:
         self._noise = CameraNoise()
+        self._vignetting = PaperVignetting()
         self._lens: list[LensBlur] = []
         self._last: ViewFrame | None = None
         self._pose: Float64[np.ndarray, "4 4"] = np.eye(4)
@@ -69,10 +74,11 @@ class CameraArtifacts:
         self._noise.observe(frame)
         if frame is not self._last:
             self._follow(frame, world_from_camera, place_m)
+            self._vignetting.observe(frame)
             self._last, self._pose = frame, world_from_camera
         from_centre = np.nan_to_num(_pixel(frame, self._pose, place_m) - frame.camera.matrix[:2, 2])
         kernels = blur_kernels(self._lens_blur(), self._motion_px, from_centre)
-        return FrameArtifacts(frame, self._noise.model, kernels)
+        return FrameArtifacts(frame, self._noise.model, kernels, self._vignetting.model)
 
     def _lens_blur(self) -> LensBlur | None:
         """Return the medians of what was measured."""

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from deltalight.protocol.bloom import bloomed, scattered
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.frames import ViewFrame, decode_lut
+from deltalight.render_server.post_effects.bloom import bloomed, scattered
 
 WIDTH, HEIGHT = 320, 240
 CAMERA = CameraModel(WIDTH, HEIGHT, np.array([[300, 0, 160], [0, 300, 120], [0, 0, 1.0]]))

@@ -8,10 +8,17 @@ import pytest
 from jaxtyping import Float32, Float64
 
 from deltalight.protocol.board import BoardSpec
-from deltalight.protocol.camera_artifacts import CameraArtifacts
-from deltalight.protocol.camera_blur import NO_MOTION, LensBlur, blur_kernels, blurred, measure_blur, mtf50
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.frames import BoardPose, ViewFrame, decode_lut
+from deltalight.render_server.post_effects.camera_artifacts import CameraArtifacts
+from deltalight.render_server.post_effects.camera_blur import (
+    NO_MOTION,
+    LensBlur,
+    blur_kernels,
+    blurred,
+    measure_blur,
+    mtf50,
+)
 
 WIDTH, HEIGHT, FINE = 320, 240, 5
 BOARD = BoardSpec(

@@ -6,8 +6,13 @@ import pytest
 
 from deltalight.benchmarks.ground_truth.sensors import ColorSensor, srgb_bytes
 from deltalight.protocol.camera_model import CameraModel
-from deltalight.protocol.camera_noise import CameraNoise, NoiseModel, add_noise, estimate_noise
 from deltalight.protocol.frames import ViewFrame, decode_lut
+from deltalight.render_server.post_effects.camera_noise import (
+    CameraNoise,
+    NoiseModel,
+    add_noise,
+    estimate_noise,
+)
 
 SIZE = (240, 320)
 LINEAR = np.repeat(np.linspace(0.03, 0.8, SIZE[1], dtype=np.float32)[None, :, None], SIZE[0], 0).repeat(3, 2)

@@ -1,0 +1,65 @@
+// Radiance of the virtual surfaces under a map of all light around them ([D] 4.2, docs/method.md 6.6): irradiance by nine
+// harmonics, what surfaces mirror by filtered importance sampling, both less what the objects hide of it themselves.
+#include "common/geometry.glsl"
+#include "common/brdf.glsl"
+#include "common/environment.glsl"
+#include "common/filtered_lobe.glsl"
+#include "common/gathered_light.glsl"
+#include "common/harmonics.glsl"
+#include "common/interleaved.glsl"
+#include "common/shown_maps.glsl"
+#include "common/continuation.glsl"
+#include "common/surface_change.glsl"
+
+layout(local_size_x = 8, local_size_y = 8) in;
+layout(rgba16f) writeonly uniform image2D radiance_out;
+uniform sampler2D virtual_raster_tint;
+uniform sampler2D ambient_occlusion;   // open fraction of the hemisphere; the pixels of a block share its slices
+uniform vec3 irradiance_coefficients[9];
+uniform int sample_count;
+uniform ivec4 rectangle;               // that may show an object: first pixel, size
+
+vec3 irradiance(vec3 n) {
+    float basis[HARMONICS];
+    harmonics(n, basis);
+    vec3 sum = vec3(0.0);
+    for (int k = 0; k < 9; ++k) sum += basis[k] * irradiance_coefficients[k];
+    return max(sum, vec3(0.0));
+}
+
+// Mean over a block of pixels that show the same surface.
+float open_fraction(ivec2 pixel, vec4 position, vec3 normal) {
+    float sum = 0.0, total = 0.0, pixels = 2.0 * position.w / camera_pinhole.x;
+    for (int i = 0; i < INTERLEAVED * INTERLEAVED; ++i) {
+        ivec2 beside = pixel + ivec2(i % INTERLEAVED, i / INTERLEAVED) - INTERLEAVED / 2;
+        beside = clamp(beside, ivec2(0), textureSize(ambient_occlusion, 0) - 1);
+        ivec2 raster = raster_texel(beside);
+        vec4 p = texelFetch(virtual_raster_position, raster, 0);
+        vec3 n = texelFetch(virtual_raster_normal, raster, 0).xyz;
+        float w = p.w > 0.0 ? continuation(position.xyz, normal, p.xyz, n, pixels) + 1e-4 : 0.0;
+        sum += w * texelFetch(ambient_occlusion, beside, 0).r;
+        total += w;
+    }
+    return sum / total;
+}
+
+vec3 shaded(ivec2 pixel, ivec2 raster, vec4 position) {
+    vec4 normal = texelFetch(virtual_raster_normal, raster, 0);
+    vec3 n = normalize(normal.xyz), v = normalize(camera_position - position.xyz);
+    Material m = material_at(raster, int(normal.w), texelFetch(virtual_raster_tint, raster, 0));
+    float open = open_fraction(pixel, position, n);
+    vec3 across = change_along(pixel, ivec2(1, 0), position, normal).normal;
+    vec3 down = change_along(pixel, ivec2(0, 1), position, normal).normal;
+    float footprint = max(length(across), length(down));   // half of the turn of what is mirrored
+    int count = has_interface(m.f0) ? sample_count : 0;
+    Indirect arriving = Indirect(open * irradiance(n), open * lobe_radiance(n, v, m.f0, m.roughness, footprint, count));
+    return with_gathered(m.emission, m, max(dot(n, v), 1e-3), arriving);
+}
+
+void main() {
+    ivec2 inside = ivec2(gl_GlobalInvocationID.xy), pixel = rectangle.xy + inside;
+    if (any(greaterThanEqual(inside, rectangle.zw))) return;
+    ivec2 raster = raster_texel(pixel);
+    vec4 position = texelFetch(virtual_raster_position, raster, 0);
+    if (position.w > 0.0) imageStore(radiance_out, pixel, vec4(shaded(pixel, raster, position), 1.0));
+}
