@@ -68,3 +68,16 @@ def test_a_lamp_out_of_sight_is_dragged_by_its_sign_at_the_border(stack: Stack, 
     assert np.dot(way_m, world_from_camera[:3, 0]) < -0.9 * np.linalg.norm(way_m), "to the left"
     page.page.keyboard.press("Control+z")
     page.until(lambda: np.array_equal(lamp_m(stack), before_m), "one undo takes the whole drag back")
+
+
+def test_the_models_of_the_shelf_are_added_and_the_figure_walks(stack: Stack, page: Desk) -> None:
+    for name in ("Walking figure", "Glowing lantern", "Helmet"):
+        page.named("button", "Add object").click()
+        page.named("menuitem", name).click()
+        page.named("treeitem", name).wait_for()
+    figure = stack.object("Walking figure")
+    assert figure["animation"]["clip"] == "round"
+    assert figure["rigid"] is False
+    assert stack.object("Helmet")["animation"] is None
+    page.shows_newest()
+    page.photograph("shelf")

@@ -910,7 +910,7 @@ export interface paths {
         };
         /**
          * List Shelf
-         * @description List the simple objects that every service has: shapes of plain materials.
+         * @description List the objects that every service has: a few models, and shapes of plain materials.
          */
         readonly get: operations["list_shelf"];
         readonly put?: never;
@@ -3197,6 +3197,11 @@ export interface components {
          * @description An object of the shelf.
          */
         readonly ShelfAnswer: {
+            /**
+             * Clip
+             * @description Clip that it should play; null where nothing moves.
+             */
+            readonly clip: string | null;
             /**
              * File Name
              * @description Name of the asset that it becomes.

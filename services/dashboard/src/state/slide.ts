@@ -3,7 +3,7 @@ import type { PickAnswer, Pose, Vector } from "../api/types";
 import { lookAt, NewestPick } from "../live/pick";
 import { view } from "../live/picture";
 import { footOf, isTurnedAlike, levelled, type Bounds } from "../math/bounds";
-import { column, eyeOf, meetPlane, project, type Pixel, type View } from "../math/camera";
+import { column, eyeOf, isInPicture, meetPlane, project, type Pixel, type View } from "../math/camera";
 import { snap, SNAP_M, stepped } from "../math/snap";
 import { add, cross, dot, length, normalized, scaled, subtract, UP } from "../math/vector";
 import { boundsByObject } from "./assets";
@@ -136,7 +136,7 @@ export class SurfaceSlide implements Slide {
     this.foot = [x + this.grip[0], y + this.grip[1]];
     this.snaps = snaps;
     this.place();
-    if (isInPicture(this.foot)) this.surface.ask(this.foot);
+    if (view.value && isInPicture(view.value.lens, this.foot)) this.surface.ask(this.foot);
   }
 
   cancel(): void {
@@ -181,9 +181,4 @@ export class SurfaceSlide implements Slide {
     footing.value = { point: add(point, subtract(shown.translation_m, pose.translation_m)), normal };
     this.drag.move(shown);
   }
-}
-
-function isInPicture([x, y]: Pixel): boolean {
-  const lens = view.value?.lens;
-  return lens !== undefined && x >= 0 && y >= 0 && x < lens.width && y < lens.height;
 }
