@@ -1,12 +1,16 @@
-"""The dashboard in a real browser: what the picture does not show, lamps beside it."""
+"""The dashboard in a real browser: the room in 3-D, lamps beside the picture, models of the shelf."""
 
-from collections.abc import Iterator
+import gzip
+from collections.abc import Callable, Iterator
+from io import BytesIO
 
 import numpy as np
 import pytest
+from PIL import Image
 from playwright.sync_api import Browser
 
 from deltalight.protocol.camera_model import CameraModel
+from deltalight.services.api.static_page import DASHBOARD
 from deltalight.services.demo import RECORDING, SCENE
 from tests.services.dashboard_samples import NEEDS_BROWSER, SIZE, Desk, Stack, demo_stack, fresh_desk
 
@@ -17,6 +21,7 @@ pytestmark = [
     ),
 ]
 SIGN_MARGIN_PX = 18.0  # as the page keeps signs from the picture's border
+MOST_BYTES = 400_000  # of the first page, compressed
 BESIDE_M = [1.2, -0.1, 1.0]  # in the camera's axes: the picture ends nearer to its middle
 
 
@@ -81,3 +86,88 @@ def test_the_models_of_the_shelf_are_added_and_the_figure_walks(stack: Stack, pa
     assert stack.object("Helmet")["animation"] is None
     page.shows_newest()
     page.photograph("shelf")
+
+
+def loaded_bytes(page: Desk) -> dict[str, int]:
+    """What the page has loaded of its own files, compressed."""
+    names = page.page.evaluate("performance.getEntriesByType('resource').map((each) => each.name)")
+    files = {name.rpartition("/assets/")[2] for name in names if "/assets/" in name and "/api/" not in name}
+    return {name: len(gzip.compress((DASHBOARD / "assets" / name).read_bytes())) for name in files}
+
+
+def test_the_first_page_is_light_and_the_room_comes_when_it_is_asked_for(stack: Stack, page: Desk) -> None:
+    page.until(lambda: any(name.startswith("gizmo") for name in loaded_bytes(page)), "the gizmo")
+    first = loaded_bytes(page)
+    assert not any(name.startswith("room") for name in first)
+    poster = len(stack.client.get("/poster.jpg").content)
+    assert sum(first.values()) + poster + (DASHBOARD / "index.html").stat().st_size <= MOST_BYTES
+    page.named("button", "Room in 3-D").click()
+    page.until(lambda: any(name.startswith("room") for name in loaded_bytes(page)), "the room's own code")
+
+
+def seen(page: Desk) -> np.ndarray:
+    """What the room in 3-D shows."""
+    picture = Image.open(BytesIO(page.page.locator("canvas.room").screenshot()))
+    return np.asarray(picture.convert("RGB"), np.float64)
+
+
+def changes(page: Desk, what: str, act: Callable[[], object]) -> None:
+    before = seen(page)
+    act()
+    page.until(lambda: np.abs(seen(page) - before).mean() > 2, what)
+
+
+def test_the_room_is_looked_at_from_anywhere(stack: Stack, page: Desk) -> None:
+    page.named("button", "Room in 3-D").click()
+    canvas = page.page.locator("canvas.room[data-shown=true]")
+    canvas.wait_for()
+    page.until(lambda: seen(page).std() > 20, "the room")
+    green = seen(page)
+    assert ((green[..., 1] > 1.5 * green[..., 0]) & (green[..., 1] > 60)).sum() > 200, "the knot"
+    page.photograph("room")
+    box = canvas.bounding_box()
+    assert box is not None
+    middle = (box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    changes(page, "a turn by the mouse", lambda: page.drag(middle, (middle[0] + 120, middle[1] - 40)))
+    changes(page, "a zoom by the wheel", lambda: page.page.mouse.wheel(0, -400))
+    canvas.focus()
+    changes(page, "a turn by a key", lambda: page.page.keyboard.press("ArrowLeft"))
+    changes(page, "a zoom by a key", lambda: page.page.keyboard.press("-"))
+    changes(page, "the first look", lambda: page.named("button", "Look from the camera").click())
+    before = seen(page)
+    stack.client.delete(f"{stack.path}/objects/knot").raise_for_status()
+    page.until(lambda: np.abs(seen(page) - before).mean() > 0.5, "the room without the knot")
+    assert page.faults_for_screen_readers() == []
+    page.named("button", "Light appearance").click()
+    page.photograph("room_light")
+    assert page.faults_for_screen_readers() == []
+    page.page.locator("body").press("o")
+    page.named("img", "Live picture").wait_for()
+    page.shows_newest()
+
+
+def test_a_room_that_is_not_known_yet_says_so(page: Desk) -> None:
+    refusal = {"status": 422, "title": "Refused", "type": "urn:deltalight:problem:refused"}
+    sentence = "No surface of the room is known yet; ask again when depth shows some."
+    page.page.route(
+        "**/live/room.glb", lambda route: route.fulfill(status=422, json={**refusal, "detail": sentence})
+    )
+    page.named("button", "Room in 3-D").click()
+    page.page.get_by_role("status").filter(has_text=sentence).wait_for()
+    page.page.unroute("**/live/room.glb")
+    page.complaints.clear()  # the browser's own line about the refusal
+    page.named("button", "Read the room again").click()
+    page.page.locator("canvas.room[data-shown=true]").wait_for()
+
+
+def test_fingers_turn_the_room(stack: Stack, browser: Browser, first_document: dict[str, object]) -> None:
+    held = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
+    with fresh_desk(stack, browser, first_document, **held) as phone:
+        phone.named("button", "Room in 3-D").tap()
+        canvas = phone.page.locator("canvas.room[data-shown=true]")
+        canvas.wait_for()
+        box = canvas.bounding_box()
+        assert box is not None
+        x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+        changes(phone, "a turn by a finger", lambda: phone.swipe((x, y), (x + 90, y)))
+        assert phone.beyond_the_edge() == []

@@ -43,6 +43,12 @@ export async function requestText(path: string): Promise<string> {
   return text;
 }
 
+export async function requestBytes(path: string): Promise<ArrayBuffer> {
+  const answer = await send("GET", path, {});
+  if (!answer.ok) throw refusal(answer.status, await answer.text());
+  return answer.arrayBuffer();
+}
+
 async function send(method: string, path: string, options: RequestOptions): Promise<Response> {
   const init: RequestInit = { method, headers: headersOf(options) };
   if (options.body !== undefined) init.body = encode(options);
