@@ -3,6 +3,7 @@
 import gzip
 from collections.abc import Callable, Iterator
 from io import BytesIO
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +13,15 @@ from playwright.sync_api import Browser
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.services.api.static_page import DASHBOARD
 from deltalight.services.demo import RECORDING, SCENE
-from tests.services.dashboard_samples import NEEDS_BROWSER, SIZE, Desk, Stack, demo_stack, fresh_desk
+from tests.services.dashboard_samples import (
+    NEEDS_BROWSER,
+    SIZE,
+    Desk,
+    Stack,
+    demo_stack,
+    fresh_desk,
+    recorded_s,
+)
 
 pytestmark = [
     *NEEDS_BROWSER,
@@ -171,3 +180,21 @@ def test_fingers_turn_the_room(stack: Stack, browser: Browser, first_document: d
         x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
         changes(phone, "a turn by a finger", lambda: phone.swipe((x, y), (x + 90, y)))
         assert phone.beyond_the_edge() == []
+
+
+def test_relit_pictures_are_recorded_and_downloaded_as_a_video(stack: Stack, page: Desk) -> None:
+    pytest.importorskip("av")
+    page.named("tab", "Recordings").click()
+    page.named("switch", "Keep relit pictures too").click()
+    page.named("button", "Record").click()
+    page.until(lambda: recorded_s(stack) >= 1, "a second")
+    page.named("button", "Stop recording").click()
+    page.page.locator("article.take").get_by_role("button", name="Replay").wait_for()
+    (take,) = stack.get("/recordings")
+    assert take["composites"] > 0
+    page.named("button", f"Actions for {take['id']}").click()
+    with page.page.expect_download() as saved:
+        page.named("menuitem", "Download .mp4").click()
+    assert saved.value.suggested_filename == f"{take['id']}.mp4"
+    assert b"ftyp" in Path(saved.value.path()).read_bytes()[:16]
+    stack.client.delete(f"/recordings/{take['id']}").raise_for_status()

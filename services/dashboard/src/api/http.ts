@@ -26,6 +26,8 @@ export interface RequestOptions {
   readonly body?: unknown;
   readonly type?: string;
   readonly ifMatch?: number | undefined;
+  /** Of the bytes of a file, as HTTP names one. */
+  readonly range?: string | undefined;
   /** Changes of one gesture are undone together. */
   readonly gesture?: string | undefined;
 }
@@ -43,8 +45,8 @@ export async function requestText(path: string): Promise<string> {
   return text;
 }
 
-export async function requestBytes(path: string): Promise<ArrayBuffer> {
-  const answer = await send("GET", path, {});
+export async function requestBytes(path: string, range?: string): Promise<ArrayBuffer> {
+  const answer = await send("GET", path, { range });
   if (!answer.ok) throw refusal(answer.status, await answer.text());
   return answer.arrayBuffer();
 }
@@ -70,6 +72,7 @@ function encode(options: RequestOptions): string {
 function headersOf(options: RequestOptions): Headers {
   const headers = authorization();
   if (options.body !== undefined) headers.set("Content-Type", options.type ?? JSON_TYPE);
+  if (options.range !== undefined) headers.set("Range", options.range);
   if (options.ifMatch !== undefined) headers.set("If-Match", `"${options.ifMatch}"`);
   if (options.gesture !== undefined) headers.set("Deltalight-Gesture", options.gesture);
   return headers;
