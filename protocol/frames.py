@@ -156,4 +156,4 @@ def _srgb_lut() -> Float32[np.ndarray, "256 3"]:
 def srgb_code(linear: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     """Return the code of sRGB (IEC 61966-2-1), 0..1, of linear values; those outside of 0..1 are clipped."""
     clipped = np.clip(linear, 0, 1)
-    return np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055)
+    return np.asarray(np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055))

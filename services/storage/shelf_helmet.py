@@ -72,18 +72,18 @@ class Directions:
     @cached_property
     def ear(self) -> Map:
         """Degrees from the nearer ear's middle."""
-        return np.degrees(np.arccos(np.clip(np.abs(self.unit[..., 0]), 0, 1)))
+        return np.asarray(np.degrees(np.arccos(np.clip(np.abs(self.unit[..., 0]), 0, 1))))
 
     @cached_property
     def across(self) -> Map:
         """Degrees from the plane that halves the helmet."""
-        return np.degrees(np.arcsin(np.clip(np.abs(self.unit[..., 0]), 0, 1)))
+        return np.asarray(np.degrees(np.arcsin(np.clip(np.abs(self.unit[..., 0]), 0, 1))))
 
     @cached_property
     def stripe(self) -> Map:
         """1 on the stripe over the top, 0 elsewhere."""
         is_above = (self.visor > 1 + RIM_WIDTH) & ((self.elevation > 0) | (np.abs(self.azimuth) > 90))
-        return is_above * _step(STRIPE_DEG - self.across, 0.5)
+        return np.asarray(is_above * _step(STRIPE_DEG - self.across, 0.5))
 
     def noise(self, scale_deg: float) -> Map:
         """Smooth noise of about unit variance: a sum of waves in directions and phases that are always the same."""
@@ -214,7 +214,7 @@ def _lamps(at: Directions) -> Map:
     """Return 1 where it glows: a ring on each ear, and three lamps above the visor."""
     ring = _step(0.9 - np.abs(at.ear - 0.62 * EAR_DEG), 0.4)
     beside = np.min([np.abs(at.azimuth - each) for each in (-7.0, 0.0, 7.0)], axis=0)
-    return np.maximum(ring, _step(1.5 - np.hypot(beside, at.elevation - 30.5), 0.4))
+    return np.asarray(np.maximum(ring, _step(1.5 - np.hypot(beside, at.elevation - 30.5), 0.4)))
 
 
 def _height_m(at: Directions, lines: Map) -> Map:
@@ -241,4 +241,4 @@ def _normal_map(height_m: Map, at: Directions) -> Picture:
 
 
 def _bytes(values: Float64[np.ndarray, "h w 3"]) -> Picture:
-    return np.round(255 * np.clip(values, 0, 1)).astype(np.uint8)
+    return np.asarray(np.round(255 * np.clip(values, 0, 1)), np.uint8)
