@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, UInt8
+from jaxtyping import Bool, Float, Float32, Float64, UInt8
 
 from deltalight.protocol.board import BoardSpec
 from deltalight.protocol.camera_model import CameraModel
@@ -151,3 +151,9 @@ def _srgb_lut() -> Float32[np.ndarray, "256 3"]:
     table = np.repeat(linear[:, None], 3, axis=1).astype(np.float32)
     table.flags.writeable = False
     return table
+
+
+def srgb_code(linear: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    """Return the code of sRGB (IEC 61966-2-1), 0..1, of linear values; those outside of 0..1 are clipped."""
+    clipped = np.clip(linear, 0, 1)
+    return np.asarray(np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055))

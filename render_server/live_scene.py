@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float32, Float64
 
 from deltalight.protocol.frames import ViewFrame
 from deltalight.protocol.scene import SceneDocument
@@ -224,6 +224,12 @@ class LiveScene:
     def model(self) -> Sequence[TriangleMesh]:
         """The real scene's meshes, if a model is given."""
         return () if self._real is None else self._real.model
+
+    @property
+    def room_corners(self) -> Float32[np.ndarray, "m 3 3"] | None:
+        """Corners of the real scene's triangles in the world, m; None before the first."""
+        state = None if self._real is None else self._real.state
+        return None if state is None else state.corners[..., :3]
 
     def relight(self, frame: ViewFrame, view: CameraView, *, whole: bool = False) -> RelitFrame | None:
         """Prepares a frame for composition; returns None if no object is visible or there is no light yet.

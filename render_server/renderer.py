@@ -27,6 +27,8 @@ from deltalight.render_server.passes.composite import Composite, Picture
 from deltalight.render_server.picking import SHOWN_FRACTION, Pick, ShownFrame, raster_texels
 from deltalight.render_server.post_effects.bloom import bloomed
 from deltalight.render_server.post_effects.camera_artifacts import CameraArtifacts, FrameArtifacts
+from deltalight.render_server.room_mesh import RoomMesh, room_mesh
+from deltalight.render_server.scene.depth_mesh import depth_mesh
 from deltalight.render_server.view import CameraView, output_size, resized_frame
 
 MEMORY_RETRY_S = 10.0  # after which a scene is built anew that the GPU had no memory for
@@ -258,6 +260,24 @@ class SceneRenderer:
         if self._shown is None:
             raise DeltalightError("Nothing was rendered yet; ask again when there is a picture.")
         return self._shown.pick(x, y, ignore)
+
+    def room(self) -> RoomMesh:
+        """Returns the real scene as last built, else of the newest frame's depth, with the newest picture on it.
+
+        Raises:
+            DeltalightError: there is no picture of a known pose, or no surface in it.
+        """
+        shown = self._shown
+        if shown is None or shown.frame.pose is None:
+            raise DeltalightError("The camera's place is not known yet; ask again when the board is in view.")
+        view = CameraView(shown.frame.camera, shown.frame.pose.world_from_camera)
+        corners = self._live.room_corners
+        if corners is None and shown.frame.depth is not None:
+            mesh = depth_mesh(shown.frame.depth, view.camera, view.world_from_camera)
+            corners = mesh.positions[mesh.triangles]
+        if corners is None or not len(corners):
+            raise DeltalightError("No surface of the room is known yet; ask again when depth shows some.")
+        return room_mesh(corners, shown.frame, view)
 
     def layers(self) -> PictureLayers:
         """Reads back the layers of the newest picture, which is the camera's and at full size.

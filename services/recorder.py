@@ -57,8 +57,8 @@ class RecordJob:
 
     @property
     def all_endpoints(self) -> tuple[str, ...]:
-        """The node's endpoints and the render server's."""
-        return self.endpoints if self.composites is None else (*self.endpoints, self.composites)
+        """The node's endpoints and the render server's, each once."""
+        return tuple(dict.fromkeys((*self.endpoints, *filter(None, (self.composites,)))))
 
 
 @dataclass

@@ -25,7 +25,8 @@ QUALITY = {"crf": "18"}
 TICKS_PER_S = 90_000  # of MPEG's clock, which every player knows
 USUAL_RATE = Fraction(30)  # of a single picture
 BT709, LIMITED_RANGE = 1, 1  # ITU-T H.273: primaries, transfer and matrix of BT.709; 16 to 235
-NO_AV = f"mp4 files need the package av (PyAV): {install_command('av')}. Or name a folder, for pictures."
+NO_AV = f"mp4 files need the package av (PyAV): {install_command('av')}."
+INSTEAD = "Or name a folder, for pictures."
 
 
 class VideoWriter:
@@ -105,8 +106,8 @@ def video_file(path: Path, timestamps_ns: Sequence[int]) -> Iterator[VideoWriter
         writer.finish()
 
 
-def require_video_support() -> None:
-    """Refuse early.
+def require_video_support(instead: str = INSTEAD) -> None:
+    """Refuse early, with what to do instead.
 
     Raises:
         DeltalightError: PyAV is not installed, or its FFmpeg has no H.264 encoder of constant quality.
@@ -114,7 +115,7 @@ def require_video_support() -> None:
     try:
         import av
     except ImportError as fault:
-        raise DeltalightError(NO_AV) from fault
+        raise DeltalightError(f"{NO_AV} {instead}") from fault
     if CODEC not in av.codecs_available:
         raise DeltalightError(
             f"The FFmpeg of this PyAV has no encoder {CODEC}; install the wheel of the package av, or name a folder."

@@ -8,21 +8,20 @@ import uuid
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 import structlog
 from jaxtyping import Float32, Float64, UInt8
-from pydantic import ConfigDict, Field
 
 from deltalight.protocol.camera_model import CameraModel
-from deltalight.protocol.documents import StrictModel, nearest, validate
+from deltalight.protocol.documents import nearest, validate
 from deltalight.protocol.envelope import decode
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.frames import ViewFrame
 from deltalight.protocol.message_fields import as_counts, as_sentence
 from deltalight.protocol.messages import (
-    MAX_OTHERS,
     CompositeMessage,
     ControlRequest,
     OtherPicture,
@@ -35,6 +34,7 @@ from deltalight.protocol.subscriber import ReceivedMultipart
 from deltalight.render_server.frame_budget import Level
 from deltalight.render_server.gpu.lost_context import GpuResetError
 from deltalight.render_server.server.frames import AssembledFrame, FrameAssembler, SourceOrder
+from deltalight.render_server.server.orders import PickOrder, RoomOrder, WatchOrder
 from deltalight.render_server.server.snapshot import SnapshotOrder, take_snapshot
 
 RATE_WINDOW_S = 5.0
@@ -112,6 +112,13 @@ class Pick(Protocol):
         """Returns the pick as plain data."""
 
 
+class Room(Protocol):
+    """The real scene as a mesh (`room_mesh.RoomMesh`)."""
+
+    def write(self, path: Path) -> None:
+        """Writes it as a GLB file."""
+
+
 class Pending(Protocol):
     """A started frame (`renderer.PendingComposite`)."""
 
@@ -150,6 +157,9 @@ class Renderer(Protocol):
     def pick(self, x: float, y: float, ignore: str | None = None) -> Pick:
         """Picks what the newest picture shows at a pixel, looking through the object `ignore`."""
 
+    def room(self) -> Room:
+        """Returns the real scene as the newest picture shows it."""
+
     def forget_frames(self) -> None:
         """Forgets what earlier frames showed."""
 
@@ -182,22 +192,6 @@ class SourceInUse:
 
     endpoints: Sequence[str]
     is_another: bool
-
-
-class PickOrder(StrictModel):
-    """A pixel of the composite (centres are at integers), and an object to look through."""
-
-    model_config = ConfigDict(strict=True)
-
-    x: float
-    y: float
-    ignore: str | None = None
-
-
-class WatchOrder(StrictModel):
-    """The views that somebody looks at."""
-
-    views: tuple[ShownView, ...] = Field(max_length=MAX_OTHERS + 1)
 
 
 def _only_configured(_endpoints: Sequence[str] | None) -> SourceInUse:
@@ -332,6 +326,7 @@ class RenderSession:
             "set_view": self._set_view,
             "watch": self._watch,
             "pick": self._pick,
+            "room": self._room,
             "snapshot": self._snapshot,
             "set_source": self._set_source,
             "stats": lambda _: {"stats": self.stats().model_dump(mode="json")},
@@ -363,6 +358,11 @@ class RenderSession:
     def _pick(self, request: ControlRequest) -> dict[str, object]:
         order = validate(PickOrder, request.payload, "the command pick")
         return self._renderer.pick(order.x, order.y, order.ignore).as_dict()
+
+    def _room(self, request: ControlRequest) -> dict[str, object]:
+        order = validate(RoomOrder, request.payload, "the command room")
+        self._renderer.room().write(order.file)
+        return {}
 
     def _snapshot(self, request: ControlRequest) -> dict[str, object]:
         order = validate(SnapshotOrder, request.payload, "the command snapshot")

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from deltalight.protocol.documents import nearest
+from deltalight.protocol.errors import DeltalightError
 from deltalight.sensor_node.cameras.live import CameraFailure
 from deltalight.sensor_node.cameras.oak_frames import SUBPIXEL_BITS
 from deltalight.sensor_node.cameras.oak_sdk import load_depthai
@@ -49,6 +50,7 @@ class OakDevice:
 
         Raises:
             CameraFailure: no such device, no permission, in use, or it does not boot.
+            DeltalightError: the settings ask for what it cannot do.
         """
         dai = load_depthai()
         info = self._find(dai)
@@ -63,6 +65,9 @@ class OakDevice:
             raise CameraFailure(
                 f"the OAK {info.deviceId} does not start ({error}); plug it in again."
             ) from error
+        except DeltalightError:
+            self.close()
+            raise
         return streams
 
     def close(self) -> None:
@@ -122,8 +127,9 @@ class OakDevice:
         if is_slow:
             streams.remarks.append("colour comes as JPEG, because it is not on USB 3")
         if with_depth:
-            streams.depth = _queue(self._aligned_depth(dai, color, settings.fps))
-            streams.stereo_sockets = sockets.CAM_B, sockets.CAM_C
+            streams.depth = _queue(self._aligned_depth(dai, color, settings))
+            if settings.neural_depth is None:  # of the network's noise nothing is known
+                streams.stereo_sockets = sockets.CAM_B, sockets.CAM_C
         if device.getConnectedIMU() not in ("", "NONE"):
             streams.imu = _queue(self._imu(dai), size=QUEUE_SIZE * IMU_RATE_HZ)
         return streams
@@ -143,24 +149,47 @@ class OakDevice:
         encoder.build(color, frameRate=fps, profile=profile, quality=JPEG_QUALITY)
         return _queue(encoder.out)
 
-    def _aligned_depth(self, dai: Any, color: Any, fps: float) -> Any:  # noqa: ANN401
-        """Add stereo depth in mm, aligned to the colour camera; temporal filters are the node's task."""
+    def _aligned_depth(self, dai: Any, color: Any, settings: CameraSettings) -> Any:  # noqa: ANN401
+        """Add depth in mm, aligned to the colour camera; temporal filters are the node's task.
+
+        Raises:
+            DeltalightError: the settings ask for a network that the device cannot run.
+        """
+        is_rvc4 = self._device.getPlatform() == dai.Platform.RVC4
+        if settings.neural_depth is not None and not is_rvc4:
+            raise DeltalightError(
+                "This OAK cannot run NeuralDepth, which needs an OAK 4 (RVC4); take neural_depth out of the settings."
+            )
         left, right = (
-            self._pipeline.create(dai.node.Camera).build(socket).requestOutput(STEREO_SIZE, fps=fps)
+            self._pipeline.create(dai.node.Camera).build(socket)
             for socket in (dai.CameraBoardSocket.CAM_B, dai.CameraBoardSocket.CAM_C)
         )
-        stereo = self._pipeline.create(dai.node.StereoDepth).build(left, right)
+        if settings.neural_depth is not None:
+            matcher = self._neural_depth(dai, left, right, settings)
+        else:
+            matcher = self._stereo_depth(dai, left, right, settings.fps)
+        if is_rvc4:
+            align = self._pipeline.create(dai.node.ImageAlign)
+            matcher.depth.link(align.input)
+            color.link(align.inputAlignTo)
+            return align.outputAligned
+        color.link(matcher.inputAlignTo)
+        return matcher.depth
+
+    def _stereo_depth(self, dai: Any, left: Any, right: Any, fps: float) -> Any:  # noqa: ANN401
+        pair = (camera.requestOutput(STEREO_SIZE, fps=fps) for camera in (left, right))
+        stereo = self._pipeline.create(dai.node.StereoDepth).build(*pair)
         stereo.setLeftRightCheck(True)
         stereo.setSubpixel(True)
         stereo.setSubpixelFractionalBits(SUBPIXEL_BITS)
         stereo.initialConfig.postProcessing.temporalFilter.enable = False
-        if self._device.getPlatform() == dai.Platform.RVC4:
-            align = self._pipeline.create(dai.node.ImageAlign)
-            stereo.depth.link(align.input)
-            color.link(align.inputAlignTo)
-            return align.outputAligned
-        color.link(stereo.inputAlignTo)
-        return stereo.depth
+        return stereo
+
+    def _neural_depth(self, dai: Any, left: Any, right: Any, settings: CameraSettings) -> Any:  # noqa: ANN401
+        """Add the device's own network, which rectifies and scales the whole pictures itself."""
+        model = getattr(dai.DeviceModelZoo, f"NEURAL_DEPTH_{str(settings.neural_depth).upper()}")
+        pair = (camera.requestFullResolutionOutput(fps=settings.fps) for camera in (left, right))
+        return self._pipeline.create(dai.node.NeuralDepth).build(*pair, model)
 
     def _imu(self, dai: Any) -> Any:  # noqa: ANN401
         imu = self._pipeline.create(dai.node.IMU)

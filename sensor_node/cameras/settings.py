@@ -1,7 +1,7 @@
 """Settings of cameras in a node's configuration."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -33,6 +33,10 @@ class CameraSettings(StrictModel):
     lock: bool = Field(
         default=True,
         description="Without exposure_s and white_balance_k: let the camera settle, then keep both as they are.",
+    )
+    neural_depth: Literal["nano", "small", "medium", "large"] | None = Field(
+        default=None,
+        description="OAK 4: depth by the device's neural network of this size; null = by stereo matching.",
     )
     stall_s: float = Field(
         default=2.0, gt=0, le=60, description="A live camera that gives no frame for so long is reopened, s."

@@ -30,7 +30,7 @@ from deltalight.services.api.recording_session import RecordingSession, Recordin
 from deltalight.services.api.recording_store import RecordingStore
 from deltalight.services.api.render_link import RenderLink
 from deltalight.services.api.replay_control import ReplayControl
-from deltalight.services.api.routes import assets, live, recordings, scenes, shelf, snapshots, state
+from deltalight.services.api.routes import assets, live, recordings, room, scenes, shelf, snapshots, state
 from deltalight.services.api.settings import ApiSettings
 from deltalight.services.api.snapshot_store import SnapshotStore
 from deltalight.services.api.static_page import StaticPage
@@ -43,6 +43,7 @@ PREFIX = "/api/v1"
 ROUTERS = (
     *scenes.ROUTERS,
     *assets.ROUTERS,
+    *room.ROUTERS,
     *shelf.ROUTERS,
     *live.ROUTERS,
     *recordings.ROUTERS,

@@ -60,9 +60,15 @@ class RecordingSessions:
             return list(self._running.values())
 
     def start(
-        self, name: str | None, node: str | None, duration_s: float | None, scene: SceneDocument | None
+        self,
+        name: str | None,
+        node: str | None,
+        duration_s: float | None,
+        scene: SceneDocument | None,
+        *,
+        composites: bool = False,
     ) -> RecordingSession:
-        """Start a recording with this scene attached.
+        """Start a recording with this scene attached, and the relit pictures beside the frames if `composites`.
 
         Raises:
             ConflictError: the name is taken, or this node is being recorded.
@@ -78,7 +84,7 @@ class RecordingSessions:
             path = self._store.new_path(session.id)
             self._running[session.id] = session
         try:
-            session.child = self._child(session, path, duration_s, scene)
+            session.child = self._child(session, path, duration_s, scene, composites=composites)
         except BaseException:
             self._forget(session)
             raise
@@ -114,9 +120,17 @@ class RecordingSessions:
                 session.child.end(END_TIMEOUT_S)
 
     def _child(
-        self, session: RecordingSession, path: Path, duration_s: float | None, scene: SceneDocument | None
+        self,
+        session: RecordingSession,
+        path: Path,
+        duration_s: float | None,
+        scene: SceneDocument | None,
+        *,
+        composites: bool,
     ) -> ChildProcess:
         words = [word for endpoint in self._endpoints for word in ("--subscribe", endpoint)]
+        # One of these endpoints is the render server's, and the recorder takes such pictures from all of them.
+        words += ["--composites", self._endpoints[0]] if composites else []
         words += [] if session.node == NODE_ANY else ["--name", session.node]
         words += [] if duration_s is None else ["--duration", str(duration_s)]
         attached = None if scene is None else _scene_file(scene)

@@ -64,6 +64,7 @@ class RecordingStore:
             if left.stat().st_mtime < time.time() - UPLOAD_LEFT_OVER_AFTER_S:
                 shutil.rmtree(left, ignore_errors=True)
         self._naming_new = Lock()
+        self._encoding = Lock()  # of one video at a time, because that occupies all cores
         self._reading = Lock()  # recordings are read one at a time, because reading occupies the disk
         for path in folder.glob(f".*.tmp{SUFFIX}*"):
             if path.stat().st_mtime < time.time() - LEFT_OVER_AFTER_S:
@@ -184,6 +185,33 @@ class RecordingStore:
             made_ns = cached.stat().st_mtime_ns if cached.is_file() else 0
             if made_ns < _status(path).st_mtime_ns or read_cached(cached) is None:
                 write_cached(cached, _first_picture(path))
+        return cached
+
+    def video(self, name: str) -> Path:
+        """Return the relit pictures of a recording as an mp4 file, created on first request.
+
+        Raises:
+            NotFoundError: there is no such recording.
+            ConflictError: it was interrupted, or has no relit pictures.
+            DeltalightError: PyAV is missing, or the recording cannot be read.
+        """
+        from deltalight.protocol.source import open_source
+        from deltalight.services.exports.video import export_video
+        from deltalight.services.video_file import require_video_support
+
+        recording = self.get(name)
+        if recording.state == "interrupted":
+            raise ConflictError(f"{name} was interrupted; recover it, then download it.")
+        require_video_support("Or download the .mcap file, which has the pictures too.")
+        if not (recording.facts or {}).get("composites"):
+            raise ConflictError(
+                f"{name} has no relit pictures; record with `composites`, or render it by `deltalight render`."
+            )
+        cached = self._cache / f"{name}.mp4"
+        with self._encoding, _naming(recording.path):
+            if not cached.is_file() or cached.stat().st_mtime_ns < recording.changed_ns:
+                cached.unlink(missing_ok=True)
+                export_video(open_source(recording.path), cached, lambda numbers: numbers)
         return cached
 
     def recover(self, name: str) -> StoredRecording:

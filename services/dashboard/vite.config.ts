@@ -10,7 +10,7 @@ export default defineConfig({
     assetsInlineLimit: 0, // the page's policy allows no data: addresses
     modulePreload: { polyfill: false },
     chunkSizeWarningLimit: 2000, // Swagger UI, on a page of its own
-    rollupOptions: { input: ["index.html", "docs/index.html"] },
+    rolldownOptions: { input: ["index.html", "docs/index.html"] },
   },
   server: {
     proxy: {

@@ -1,12 +1,16 @@
-"""Objects that every service has: simple shapes of plain materials, generated as GLB files when they are wanted."""
+"""Objects that every service has: simple shapes of plain materials, and three models, as GLB files."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from deltalight.services.storage.faults import NotFoundError
+from deltalight.services.storage.shelf_glb import glb
+from deltalight.services.storage.shelf_helmet import helmet_glb
+from deltalight.services.storage.shelf_lantern import lantern_glb
 
 if TYPE_CHECKING:
     import trimesh
@@ -18,7 +22,22 @@ SECTIONS = 64  # of what is round: sides of a polygon that looks like a circle
 BALL_SUBDIVISIONS = 4
 VASE_HEIGHT_M, VASE_WALL_M = 0.18, 0.004
 VASE_RINGS = 21
-_Y_FROM_Z = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # glTF: y is up
+FIGURE = Path(__file__).parents[1] / "demo_assets" / "figure.glb"  # made by benchmarks/walking_figure.py
+
+
+@dataclass(frozen=True)
+class ShelfModel:
+    """A file that is more than a shape of one material; `clip` plays from the beginning, None = nothing moves."""
+
+    name: str
+    label: str
+    glb: Callable[[], bytes]
+    clip: str | None = None
+
+    @property
+    def file_name(self) -> str:
+        """The name of its file."""
+        return f"{self.label}.glb"
 
 
 @dataclass(frozen=True)
@@ -31,6 +50,7 @@ class ShelfItem:
     base_color: tuple[float, float, float]
     metallic: float
     roughness: float
+    clip = None  # nothing moves
 
     @property
     def file_name(self) -> str:
@@ -43,7 +63,6 @@ class ShelfItem:
         from trimesh.visual.material import PBRMaterial
 
         mesh = self.shape()
-        mesh.apply_transform(_Y_FROM_Z)
         material = PBRMaterial(
             name=self.label,
             baseColorFactor=[*self.base_color, 1.0],
@@ -51,8 +70,7 @@ class ShelfItem:
             roughnessFactor=self.roughness,
         )
         mesh.visual = TextureVisuals(material=material)
-        content: bytes = mesh.export(file_type="glb")
-        return content
+        return glb(mesh)
 
 
 def _ball() -> "trimesh.Trimesh":
@@ -105,9 +123,12 @@ def _plate() -> "trimesh.Trimesh":
 
 # Colours of chromium and gold as tabulated for physically based materials (documentation of Unreal Engine).
 # Chrome and grey ball are those that record the light of a film set.
-SHELF = {
+SHELF: dict[str, ShelfItem | ShelfModel] = {
     item.name: item
     for item in (
+        ShelfModel("walking-figure", "Walking figure", FIGURE.read_bytes, clip="round"),
+        ShelfModel("glowing-lantern", "Glowing lantern", lantern_glb),
+        ShelfModel("helmet", "Helmet", helmet_glb),
         ShelfItem("chrome-ball", "Chrome ball", _ball, (0.55, 0.556, 0.554), metallic=1.0, roughness=0.05),
         ShelfItem("grey-ball", "Grey ball", _ball, (0.18, 0.18, 0.18), metallic=0.0, roughness=1.0),
         ShelfItem("matte-cube", "Matte cube", _cube, (0.8, 0.8, 0.8), metallic=0.0, roughness=1.0),
@@ -120,7 +141,7 @@ SHELF = {
 }
 
 
-def shelf_item(name: str) -> ShelfItem:
+def shelf_item(name: str) -> ShelfItem | ShelfModel:
     """Return an object of the shelf.
 
     Raises:

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Int
 
-from deltalight.protocol.frames import LUMINANCE
+from deltalight.protocol.frames import LUMINANCE, srgb_code
 from deltalight.protocol.radiance_files import read_linear
 from deltalight.render_server.scene.asset_check import check_mesh_file
 from deltalight.render_server.scene.bvh import RayCaster
@@ -159,7 +159,6 @@ def _reduced(pixels: Pixels) -> Pixels:
 
 
 def _write(out: str, picture: Pixels) -> None:
-    linear = np.clip(picture[..., :3], 0, 1)
-    coded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    coded = srgb_code(picture[..., :3])
     codes = np.rint(255 * np.dstack([coded[..., ::-1], picture[..., 3]])).astype(np.uint8)
     Path(out).write_bytes(cv2.imencode(".png", codes)[1].tobytes())

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock, call
 
 import cv2
 import numpy as np
@@ -325,6 +326,8 @@ def test_the_sdk_has_what_the_device_is_driven_with() -> None:
         node.Camera: "build initialControl inputControl requestOutput",
         node.StereoDepth: "build depth initialConfig inputAlignTo setLeftRightCheck setSubpixel"
         " setSubpixelFractionalBits",
+        node.NeuralDepth: "build depth initialConfig",
+        dai.DeviceModelZoo: "NEURAL_DEPTH_NANO NEURAL_DEPTH_SMALL NEURAL_DEPTH_MEDIUM NEURAL_DEPTH_LARGE",
         node.ImageAlign: "input inputAlignTo outputAligned",
         node.VideoEncoder: "build out",
         node.IMU: "enableIMUSensor out setBatchReportThreshold setMaxBatchReports",
@@ -343,6 +346,67 @@ def test_the_sdk_has_what_the_device_is_driven_with() -> None:
     assert config.getDepthUnit().name == "MILLIMETER"
     config.postProcessing.temporalFilter.enable = True
     assert config.postProcessing.temporalFilter.enable
+
+
+class Wired(OakDevice):
+    """A device whose nodes note how they are wired; each knows no other words than the SDK's node of its kind."""
+
+    def __init__(self, platform: object) -> None:
+        super().__init__("test")
+        self.nodes: dict[str, list[Any]] = {}
+        self._device = MagicMock(spec=dai.Device)
+        self._device.getPlatform.return_value = platform
+        sockets = dai.CameraBoardSocket
+        self._device.getConnectedCameras.return_value = [sockets.CAM_A, sockets.CAM_B, sockets.CAM_C]
+        self._device.getConnectedIMU.return_value = "NONE"
+        self._device.getUsbSpeed.return_value = dai.UsbSpeed.SUPER
+        self._device.readCalibration.return_value = calibration()
+        self._pipeline = MagicMock(spec=dai.Pipeline)
+        self._pipeline.create.side_effect = self._create
+
+    def _create(self, kind: type) -> MagicMock:
+        made = MagicMock(spec=kind)
+        if hasattr(kind, "build"):
+            made.build.return_value = made
+        self.nodes.setdefault(kind.__name__, []).append(made)
+        return made
+
+    def build(self, settings: CameraSettings) -> OakStreams:
+        return self._build(dai, settings, (WIDTH, HEIGHT), with_depth=True)
+
+
+@pytest.mark.parametrize("size", ["nano", "small", "medium", "large"])
+def test_neural_depth_takes_the_place_of_stereo_and_is_aligned(size: str) -> None:
+    device = Wired(dai.Platform.RVC4)
+    streams = device.build(SETTINGS.replaced(neural_depth=size))
+    assert "StereoDepth" not in device.nodes
+    (network,), (align,) = device.nodes["NeuralDepth"], device.nodes["ImageAlign"]
+    color, left, right = device.nodes["Camera"]
+    for camera in (left, right):
+        camera.requestFullResolutionOutput.assert_called_once_with(fps=SETTINGS.fps)
+    model = getattr(dai.DeviceModelZoo, f"NEURAL_DEPTH_{size.upper()}")
+    given = (left.requestFullResolutionOutput.return_value, right.requestFullResolutionOutput.return_value)
+    network.build.assert_called_once_with(*given, model)
+    network.depth.link.assert_called_once_with(align.input)
+    color.requestOutput.return_value.link.assert_called_once_with(align.inputAlignTo)
+    assert streams.depth is align.outputAligned.createOutputQueue.return_value
+    assert streams.stereo_sockets is None, "its noise is not that of stereo matching"
+    assert dai.NeuralDepthConfig().getDepthUnit().name == "MILLIMETER"
+
+
+def test_without_a_network_stereo_matches_as_before() -> None:
+    for platform, is_aligned in ((dai.Platform.RVC4, True), (dai.Platform.RVC2, False)):
+        device = Wired(platform)
+        streams = device.build(SETTINGS)
+        assert "NeuralDepth" not in device.nodes
+        assert ("ImageAlign" in device.nodes) is is_aligned
+        assert device.nodes["StereoDepth"][0].setSubpixel.call_args == call(True)
+        assert streams.stereo_sockets == (dai.CameraBoardSocket.CAM_B, dai.CameraBoardSocket.CAM_C)
+
+
+def test_neural_depth_needs_an_oak_4() -> None:
+    with pytest.raises(DeltalightError, match="needs an OAK 4"):
+        Wired(dai.Platform.RVC2).build(SETTINGS.replaced(neural_depth="small"))
 
 
 def test_exposure_is_locked_as_set_or_as_it_came_to_rest(oak: Callable[..., OakCamera]) -> None:

@@ -309,7 +309,7 @@ def desk(stack: Stack, context: BrowserContext) -> Iterator[Desk]:
     try:
         seat.open()
         yield seat
-        assert seat.complaints == []
+        assert seat.complaints == [], seat.complaints
     finally:
         seat.page.close()
 

@@ -150,7 +150,8 @@ def composite(frame: SensorFrame) -> list[bytes]:
 class Feed:
     """A node in a thread: sends frames at 30 a second with rising numbers and times, until told to pause."""
 
-    def __init__(self, publisher: Publisher, node: str = "cam") -> None:
+    def __init__(self, publisher: Publisher, node: str = "cam", *, relights: bool = False) -> None:
+        self._relights = relights
         self.paused = threading.Event()
         self._publisher, self._node = publisher, node
         self._closing = threading.Event()
@@ -169,14 +170,16 @@ class Feed:
             frame = replace(source[number % 4], frame_id=number, timestamp_ns=time.time_ns())
             for multipart in messages(frame, node=self._node).values():
                 self._publisher.send(multipart)
+            if self._relights:
+                self._publisher.send(composite(frame))
             number += 1
 
 
 @contextmanager
-def feeding() -> Iterator[tuple[str, Feed]]:
-    """The endpoint of a feed that runs, and the feed."""
+def feeding(*, relights: bool = False) -> Iterator[tuple[str, Feed]]:
+    """The endpoint of a feed that runs, and the feed; one that `relights` sends each picture as relit, too."""
     publisher = Publisher("tcp://127.0.0.1:*")
-    feed = Feed(publisher)
+    feed = Feed(publisher, relights=relights)
     try:
         yield publisher.endpoint, feed
     finally:

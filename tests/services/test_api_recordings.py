@@ -2,6 +2,7 @@
 
 import os
 import signal
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -108,9 +109,42 @@ def test_it_ends_by_itself_after_its_time(client: httpx.Client) -> None:
     assert "choose another name" in sentence(taken, 409)
 
 
+def test_relit_pictures_are_kept_where_wanted_and_downloaded_as_a_video(tmp_path: Path) -> None:
+    av = pytest.importorskip("av")
+    with feeding(relights=True) as (endpoint, _), running_api(tmp_path, subscribe=[endpoint]) as relit:
+        for name, body in (("plain", {}), ("both", {"composites": True})):
+            relit.client.post("/recordings", json={"name": name, **body}).raise_for_status()
+            wait_for(lambda name=name: relit.client.get(f"/recordings/{name}").json()["frames"])
+            time.sleep(0.3)
+            relit.client.post(f"/recordings/{name}/stop").raise_for_status()
+        both, plain = (relit.client.get(f"/recordings/{name}").json() for name in ("both", "plain"))
+        assert plain["composites"] == 0
+        assert both["composites"] >= 2
+        assert "no relit pictures" in sentence(relit.client.get("/recordings/plain/video.mp4"), 409)
+        video = relit.client.get("/recordings/both/video.mp4")
+        assert (video.status_code, video.headers["content-type"]) == (200, "video/mp4")
+        (tmp_path / "a.mp4").write_bytes(video.content)
+        with av.open(str(tmp_path / "a.mp4")) as container:
+            assert sum(1 for _ in container.decode(video=0)) == both["composites"]
+        part = relit.client.get("/recordings/both/video.mp4", headers={"Range": "bytes=0-3"})
+        assert (part.status_code, part.content) == (206, video.content[:4])
+        relit.client.delete("/recordings/both").raise_for_status()
+        assert not list((tmp_path / "recordings").glob("**/both*"))
+
+
+def test_a_video_without_pyav_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "av", None)
+    (tmp_path / "recordings").mkdir()
+    write(tmp_path / "recordings" / "take.mcap", frames(3))
+    with running_api(tmp_path) as api:
+        said = sentence(api.client.get("/recordings/take/video.mp4"), 422)
+    assert "pip install av. Or download the .mcap file" in said
+
+
 @pytest.mark.parametrize(
     ("body", "expected"),
     [
+        ({"composites": 1}, "composites"),
         ({"name": "../take"}, "no name for a recording"),
         ({"name": "a.mcap"}, "no name for a recording"),
         ({"name": ""}, "no name for a recording"),

@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal, Self
 
 from fastapi import APIRouter, Body, Path, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
-from pydantic import Field
+from pydantic import Field, StrictBool
 
 from deltalight.protocol.documents import StrictModel
 from deltalight.protocol.errors import DeltalightError
@@ -34,6 +34,9 @@ Seconds = Annotated[float, Field(ge=0, le=1e6, description="From the recording's
 POSTER_ANSWER: dict[int | str, dict[str, Any]] = {
     200: {"content": {"image/jpeg": {"schema": {"type": "string", "format": "binary"}}}}
 }
+VIDEO_ANSWER: dict[int | str, dict[str, Any]] = {
+    200: {"content": {"video/mp4": {"schema": {"type": "string", "format": "binary"}}}}
+}
 _UPLOAD_BODY = {
     "requestBody": {
         "required": True,
@@ -57,6 +60,9 @@ class NewRecording(StrictModel):
     )
     node: Name | None = Field(
         default=None, description="Which node; null = the one whose picture comes first."
+    )
+    composites: StrictBool = Field(
+        default=False, description="Keep the relit pictures too, beside the frames, for `video.mp4`."
     )
 
 
@@ -118,6 +124,7 @@ class RecordingAnswer(StrictModel):
     duration_s: float | None
     frames: int | None
     frames_per_s: float | None
+    composites: int = Field(description="Relit pictures that were recorded along.")
     lost: dict[str, int] = Field(description="What never came, by stream; known while it grows.")
     streams: dict[str, Stream]
     scene: str | None = Field(description="Title of the attached scene, empty for one without; null = none.")
@@ -137,6 +144,7 @@ class RecordingAnswer(StrictModel):
             duration_s=figures.get("seconds"),
             frames=figures.get("frames"),
             frames_per_s=figures.get("frames_per_s"),
+            composites=figures.get("composites", 0),
             lost={**figures.get("missing", {}), **figures.get("dropped", {})},
             streams={},
             scene=None,
@@ -157,6 +165,7 @@ class RecordingAnswer(StrictModel):
             duration_s=facts.get("duration_s"),
             frames=facts.get("frames"),
             frames_per_s=facts.get("frames_per_s"),
+            composites=facts.get("composites", 0),
             lost={},
             streams={
                 topic: Stream(messages=figures["messages"], size_bytes=figures["bytes"])
@@ -223,7 +232,9 @@ def start_recording(
     order = checked(NewRecording, wanted, "the recording")
     active = shared.store.scenes.active()
     scene = None if active is None else active.document
-    session = shared.recording_sessions.start(order.name, order.node, order.duration_s, scene)
+    session = shared.recording_sessions.start(
+        order.name, order.node, order.duration_s, scene, composites=order.composites
+    )
     response.headers["Location"] = f"/api/v1/recordings/{session.id}"
     return RecordingAnswer.growing(session)
 
@@ -296,6 +307,22 @@ def download_recording(shared: Shared, recording_id: RecordingId) -> StoredFileR
         raise ConflictError(f"{recording.id} was interrupted; recover it, then download it.")
     path = recording.path
     return StoredFileResponse(path, media_type="application/octet-stream", filename=path.name)
+
+
+@router.get(
+    "/{recording_id}/video.mp4",
+    response_class=StoredFileResponse,
+    responses=responses(404, 409, 416, 422) | VIDEO_ANSWER,
+)
+@in_pool("recordings")
+def recording_video(shared: Shared, recording_id: RecordingId) -> StoredFileResponse:
+    """Download the relit pictures that were recorded along as a video (H.264); ranges of it too.
+
+    It is made when it is asked for first, which takes a while, and kept. The package `av` makes it (extra `video`).
+    """
+    _require_at_rest(shared, recording_id)
+    path = shared.recordings.video(recording_id)
+    return StoredFileResponse(path, media_type="video/mp4", filename=path.name)
 
 
 @router.get(

@@ -1,4 +1,4 @@
-"""Routes of the shelf: simple objects that the service generates."""
+"""Routes of the shelf: objects that every service has."""
 
 from typing import Annotated
 
@@ -21,13 +21,15 @@ class ShelfAnswer(BaseModel):
     name: str = Field(examples=["chrome-ball"])
     label: str = Field(description="Its name for people.", examples=["Chrome ball"])
     file_name: str = Field(description="Name of the asset that it becomes.", examples=["Chrome ball.glb"])
+    clip: str | None = Field(description="Clip that it should play; null where nothing moves.")
 
 
 @router.get("")
 def list_shelf() -> list[ShelfAnswer]:
-    """List the simple objects that every service has: shapes of plain materials."""
+    """List the objects that every service has: a few models, and shapes of plain materials."""
     return [
-        ShelfAnswer(name=each.name, label=each.label, file_name=each.file_name) for each in SHELF.values()
+        ShelfAnswer(name=each.name, label=each.label, file_name=each.file_name, clip=each.clip)
+        for each in SHELF.values()
     ]
 
 

@@ -1,7 +1,7 @@
 import { describe, expect, it } from "vitest";
 import type { PickAnswer, Pose, Vector } from "../src/api/types";
 import type { Bounds } from "../src/math/bounds";
-import { meetPlane, type Pixel, type View } from "../src/math/camera";
+import { isInPicture, meetPlane, type Pixel, type View } from "../src/math/camera";
 import { UP } from "../src/math/vector";
 import { beforeWall, footprintOf, freePlace, isFree, standable, startAt, type Wanted } from "../src/state/freeSpace";
 
@@ -64,6 +64,18 @@ describe("room for a new object", () => {
     expect(place![0] + radius).toBeLessThan(0.2);
     expect(place![1] + radius).toBeLessThan(0.2);
     expect(place![2]).toBeCloseTo(0, 9);
+  });
+
+  it("is looked for in the picture alone", async () => {
+    const asked: Pixel[] = [];
+    const near = { ...wanted(), start: [1.1, 0, 0] as const }; // 45 px from the right edge; the object spans 70 px
+    const place = await freePlace(near, (pixel) => {
+      asked.push(pixel);
+      return look()(pixel);
+    });
+    expect(place).not.toBeNull();
+    expect(asked.length).toBeGreaterThan(0);
+    expect(asked.every((pixel) => isInPicture(VIEW.lens, pixel))).toBe(true);
   });
 
   it("is none where every place is taken or none can be stood on", async () => {

@@ -1,24 +1,8 @@
 import { describe, expect, it } from "vitest";
 import type { ManualLight, Vector } from "../src/api/types";
 import { lampMarks } from "../src/components/stage/outlines";
-import { lensOf, type View } from "../src/math/camera";
+import { ABOVE } from "./views";
 
-// 1 m above the board's origin, looking straight down: optical x = world x, optical y = world -y.
-const ABOVE: View = {
-  lens: lensOf({
-    width: 640,
-    height: 480,
-    matrix: [600, 0, 319.5, 0, 600, 239.5, 0, 0, 1],
-    distortion_model: "plumb_bob",
-    distortion: [],
-  }),
-  worldFromCamera: [
-    [1, 0, 0, 0],
-    [0, -1, 0, 0],
-    [0, 0, -1, 1],
-    [0, 0, 0, 1],
-  ],
-};
 const SHEET = { view: ABOVE, factor: 1, width: 640, height: 480 };
 
 function mark(position_m: Vector) {

@@ -2,10 +2,12 @@ import { beforeEach, describe, expect, it, vi } from "vitest";
 import type { PickAnswer, Pose, Vector } from "../src/api/types";
 import { NewestPick } from "../src/live/pick";
 import { corners, footOf, restOn, standOn, type Bounds } from "../src/math/bounds";
-import type { Pixel } from "../src/math/camera";
+import type { Pixel, View } from "../src/math/camera";
 import { quaternionFromAngles, rotate } from "../src/math/rotation";
 import { dot, subtract, UP } from "../src/math/vector";
 import { stepped } from "../src/math/snap";
+import { levelWay } from "../src/state/slide";
+import { ABOVE } from "./views";
 
 // A box of 10 x 20 x 30 cm whose origin is at one of its corners.
 const BOX: Bounds = { minimum: [0, 0, 0], maximum: [0.1, 0.2, 0.3] };
@@ -78,5 +80,27 @@ describe("asking what is under the pointer", () => {
     picks.ask([4, 0]);
     await vi.advanceTimersByTimeAsync(500);
     expect(asked.at(-1)).toEqual([4, 0]);
+  });
+});
+
+describe("a lamp that is dragged at the picture's border", () => {
+  it("goes as far as the pointer at its distance, and keeps its height", () => {
+    const way = levelWay(ABOVE, [3, 0, 5], [60, -30]); // 5 m from the eye, behind the camera
+    [0.5, 0.25, 0].forEach((value, axis) => expect(way[axis]).toBeCloseTo(value, 9));
+  });
+
+  it("goes away from a viewer who looks at the horizon", () => {
+    const [right, forward, eye] = [[0, -1, 0] as const, [1, 0, 0] as const, [-2, 0, 1] as const];
+    const level: View = {
+      ...ABOVE,
+      worldFromCamera: [
+        [right[0], 0, forward[0], eye[0]],
+        [right[1], 0, forward[1], eye[1]],
+        [right[2], -1, forward[2], eye[2]],
+        [0, 0, 0, 1],
+      ],
+    };
+    const way = levelWay(level, [-2, 0, 3], [0, -300]);
+    [1, 0, 0].forEach((value, axis) => expect(way[axis]).toBeCloseTo(value, 9));
   });
 });

@@ -26,6 +26,8 @@ export interface RequestOptions {
   readonly body?: unknown;
   readonly type?: string;
   readonly ifMatch?: number | undefined;
+  /** Of the bytes of a file, as HTTP names one. */
+  readonly range?: string | undefined;
   /** Changes of one gesture are undone together. */
   readonly gesture?: string | undefined;
 }
@@ -41,6 +43,12 @@ export async function requestText(path: string): Promise<string> {
   const text = await answer.text();
   if (!answer.ok) throw refusal(answer.status, text);
   return text;
+}
+
+export async function requestBytes(path: string, range?: string): Promise<ArrayBuffer> {
+  const answer = await send("GET", path, { range });
+  if (!answer.ok) throw refusal(answer.status, await answer.text());
+  return answer.arrayBuffer();
 }
 
 async function send(method: string, path: string, options: RequestOptions): Promise<Response> {
@@ -64,6 +72,7 @@ function encode(options: RequestOptions): string {
 function headersOf(options: RequestOptions): Headers {
   const headers = authorization();
   if (options.body !== undefined) headers.set("Content-Type", options.type ?? JSON_TYPE);
+  if (options.range !== undefined) headers.set("Range", options.range);
   if (options.ifMatch !== undefined) headers.set("If-Match", `"${options.ifMatch}"`);
   if (options.gesture !== undefined) headers.set("Deltalight-Gesture", options.gesture);
   return headers;

@@ -63,6 +63,10 @@ export function project(view: View, point: Vector): Pixel | null {
   return z > 1e-6 ? pixelOf(view.lens, x / z, y / z) : null;
 }
 
+export function isInPicture({ width, height }: Lens, [x, y]: Pixel): boolean {
+  return x >= 0 && y >= 0 && x < width && y < height;
+}
+
 /** The same without the lens: what a pinhole camera of these intrinsics shows. */
 export function projectPinhole(view: View, point: Vector): Pixel | null {
   const [x, y, z] = cameraFromWorld(view, point);

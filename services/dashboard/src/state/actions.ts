@@ -18,11 +18,12 @@ import { tool } from "./tools";
 
 const UPRIGHT: Pose = { translation_m: [0, 0, 0], rotation_wxyz: [1, 0, 0, 0], scale: 1 };
 
-/** Add an object of an asset, named as a file: at a pixel, or where the middle of the picture has room for it. */
+/** Add an object of an asset, named as a file, playing a clip: at a pixel, or where the picture has room for it. */
 export async function addObject(
   asset: AssetAnswer,
   pixel: Pixel | null = null,
   name = assetName(asset),
+  clip: string | null = null,
 ): Promise<void> {
   if (!(await ensureScene())) return;
   const bounds = boundsOf(asset, null);
@@ -30,7 +31,8 @@ export async function addObject(
   const pose: Pose = { ...UPRIGHT, scale };
   const point = pixel ? await pointAt(pixel, footprintOf(pose, bounds).radius) : await roomInMiddle(pose, bounds);
   const id = freeId(name);
-  const body = { id, asset: asset.asset, pose: rounded(restOn(pose, bounds, point, UP)) };
+  const moves = clip === null ? {} : { animation: { clip }, rigid: false };
+  const body = { id, asset: asset.asset, pose: rounded(restOn(pose, bounds, point, UP)), ...moves };
   if (!(await change("POST", "/objects", body))) return;
   selectObject(id);
   announce(`${id} added.`);

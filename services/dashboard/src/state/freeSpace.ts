@@ -1,7 +1,7 @@
 // Where a new object has room: upright, on a real surface that the camera sees, beside the objects that are there.
 import type { PickAnswer, Pose, Vector } from "../api/types";
 import { corners, isSteep, restOn, type Bounds } from "../math/bounds";
-import { eyeOf, meetPlane, project, type Pixel, type View } from "../math/camera";
+import { eyeOf, isInPicture, meetPlane, project, type Pixel, type View } from "../math/camera";
 import { length, subtract, UP } from "../math/vector";
 
 export type Look = (pixel: Pixel) => Promise<PickAnswer | undefined>;
@@ -111,7 +111,7 @@ async function lookAround(view: View, place: Vector, radius: number, look: Look)
   const around = AROUND.map(([x, y]): Vector => [place[0] + x * radius, place[1] + y * radius, place[2]]);
   const pixels = [place, ...around].map((point) => project(view, point));
   const [middle, ...others] = await Promise.all(
-    pixels.map((pixel) => (pixel ? look(pixel) : Promise.resolve(undefined))),
+    pixels.map((pixel) => (pixel && isInPicture(view.lens, pixel) ? look(pixel) : Promise.resolve(undefined))),
   );
   const point = standable(middle);
   if (!point) return null;

@@ -39,6 +39,9 @@ export const standsOnSurfaces = kept("stands-on-surfaces", true);
 /** It leans with a slope that it is dragged onto; without, it stays turned as it is. */
 export const leansWithSurfaces = kept("leans-with-surfaces", false);
 
+/** Recordings keep the relit pictures too. */
+export const recordsRelit = kept("records-relit", false);
+
 export function openDrawer(tab: DrawerTab): void {
   drawerTab.value = tab;
   isDrawerOpen.value = true;

@@ -3,9 +3,9 @@ import type { PickAnswer, Pose, Vector } from "../api/types";
 import { lookAt, NewestPick } from "../live/pick";
 import { view } from "../live/picture";
 import { footOf, isTurnedAlike, levelled, type Bounds } from "../math/bounds";
-import { eyeOf, meetPlane, project, type Pixel } from "../math/camera";
+import { column, eyeOf, isInPicture, meetPlane, project, type Pixel, type View } from "../math/camera";
 import { snap, SNAP_M, stepped } from "../math/snap";
-import { add, dot, length, subtract, UP } from "../math/vector";
+import { add, cross, dot, length, normalized, scaled, subtract, UP } from "../math/vector";
 import { boundsByObject } from "./assets";
 import { handle, HandleDrag, type Handle } from "./handle";
 import { track } from "./pending";
@@ -31,7 +31,32 @@ export function beginSlide(pixel: Pixel): Slide | null {
   if (!held || !view.value) return null;
   if (held.objectId !== null && slidesOnSurfaces()) return slideOverSurfaces(held, held.objectId, pixel);
   const from = meetPlane(view.value, pixel, held.pose.translation_m, UP);
-  return from && new LevelSlide(held, from);
+  return (
+    from &&
+    new LevelSlide(held, (seen, at) => {
+      const to = meetPlane(seen, at, from, UP);
+      return to && subtract(to, from);
+    })
+  );
+}
+
+/** Take what is selected by its sign at the picture's border; the picture itself does not show it. */
+export function beginBorderSlide(pixel: Pixel): Slide | null {
+  const held = handle.value;
+  if (!held) return null;
+  const from = held.pose.translation_m;
+  return new LevelSlide(held, (seen, at) => levelWay(seen, from, [at[0] - pixel[0], at[1] - pixel[1]]));
+}
+
+/**
+ * How far a point goes over the level plane, m, while the pointer goes some pixels: to the right, and up for away from
+ * the viewer, by what a pixel spans at the point's distance. Holds for points behind the camera too.
+ */
+export function levelWay(seen: View, point: Vector, [dx, dy]: Pixel): Vector {
+  const pixel_m = length(subtract(point, eyeOf(seen))) / seen.lens.fx;
+  const [x, y] = column(seen.worldFromCamera, 0);
+  const right = Math.hypot(x, y) > 1e-6 ? normalized([x, y, 0]) : ([1, 0, 0] as const);
+  return add(scaled(right, dx * pixel_m), scaled(cross(UP, right), -dy * pixel_m));
 }
 
 let latest: SurfaceSlide | null = null;
@@ -42,23 +67,23 @@ function slideOverSurfaces(held: Handle, objectId: string, pixel: Pixel): Slide 
   return latest;
 }
 
-/** Keeps the height. */
+/** Keeps the height; `way` leads from where it was to where the pointer has it. */
 class LevelSlide implements Slide {
   private readonly drag: HandleDrag;
   private readonly pose: Pose;
 
   constructor(
     held: Handle,
-    private readonly from: Vector,
+    private readonly way: (seen: View, pixel: Pixel) => Vector | null,
   ) {
     this.drag = new HandleDrag(held);
     this.pose = held.pose;
   }
 
   move(pixel: Pixel, snaps: boolean): void {
-    const to = view.value && meetPlane(view.value, pixel, this.pose.translation_m, UP);
-    if (!to) return;
-    const [x, y, z] = add(this.pose.translation_m, subtract(to, this.from));
+    const way = view.value && this.way(view.value, pixel);
+    if (!way) return;
+    const [x, y, z] = add(this.pose.translation_m, way);
     this.drag.move({ ...this.pose, translation_m: snaps ? [snap(x, SNAP_M), snap(y, SNAP_M), z] : [x, y, z] });
   }
 
@@ -111,7 +136,7 @@ export class SurfaceSlide implements Slide {
     this.foot = [x + this.grip[0], y + this.grip[1]];
     this.snaps = snaps;
     this.place();
-    if (isInPicture(this.foot)) this.surface.ask(this.foot);
+    if (view.value && isInPicture(view.value.lens, this.foot)) this.surface.ask(this.foot);
   }
 
   cancel(): void {
@@ -156,9 +181,4 @@ export class SurfaceSlide implements Slide {
     footing.value = { point: add(point, subtract(shown.translation_m, pose.translation_m)), normal };
     this.drag.move(shown);
   }
-}
-
-function isInPicture([x, y]: Pixel): boolean {
-  const lens = view.value?.lens;
-  return lens !== undefined && x >= 0 && y >= 0 && x < lens.width && y < lens.height;
 }

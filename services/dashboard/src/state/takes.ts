@@ -1,10 +1,10 @@
 // Recordings, replay and snapshots.
 import { computed, signal } from "@preact/signals";
-import { API, request } from "../api/http";
+import { API, request, requestBytes } from "../api/http";
 import type { Recording, Replay, ReplayChange, Snapshot, WantedPicture } from "../api/types";
 import { uploadRecording } from "../api/upload";
 import { sendShown } from "./assets";
-import { openDrawer } from "./preferences";
+import { openDrawer, recordsRelit } from "./preferences";
 import { announce, attempt } from "./toasts";
 
 export const recordings = signal<readonly Recording[]>([]);
@@ -34,13 +34,20 @@ export async function readSnapshots(): Promise<void> {
 }
 
 export async function startRecording(): Promise<void> {
-  await attempt(() => request("POST", `${API}/recordings`, { body: {} }));
+  await attempt(() => request("POST", `${API}/recordings`, { body: { composites: recordsRelit.value } }));
   await readRecordings();
 }
 
 export async function stopRecording(id: string): Promise<void> {
   await attempt(() => request("POST", `${API}/recordings/${id}/stop`));
   await readRecordings();
+}
+
+/** Have the service make the video of a recording's relit pictures, which takes a while; false where it refuses. */
+export async function makeVideo(path: string, name: string): Promise<boolean> {
+  announce(`${name} is being made.`);
+  const begin = await attempt(() => requestBytes(path, "bytes=0-0"));
+  return begin !== undefined;
 }
 
 export async function deleteRecording(id: string): Promise<void> {

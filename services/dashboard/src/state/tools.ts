@@ -9,6 +9,8 @@ export const tool = signal<Tool>("move");
 /** Snapping without Shift held; Shift then lets go. */
 export const isSnapping = signal(false);
 export const areOutlinesShown = signal(true);
+/** The room in 3-D in place of the picture. */
+export const isRoomShown = signal(false);
 
 /** An object's pose that the picture does not show yet: where it is dragged to, until a frame has it. */
 export interface Draft {

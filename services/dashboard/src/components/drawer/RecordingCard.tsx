@@ -2,7 +2,7 @@ import { API } from "../../api/http";
 import { role } from "../../api/session";
 import type { Recording } from "../../api/types";
 import { bytes, clock } from "../../math/units";
-import { deleteRecording, isGrowing, replay, showRecording, stopRecording } from "../../state/takes";
+import { deleteRecording, isGrowing, makeVideo, replay, showRecording, stopRecording } from "../../state/takes";
 import { Button } from "../ui/Button";
 import { download } from "../ui/download";
 import { Icon } from "../ui/Icon";
@@ -16,6 +16,12 @@ export function RecordingCard({ recording }: { readonly recording: Recording }) 
   const isShown = replay.value?.recording === recording.id;
   const entries: MenuEntry[] = [
     { label: "Download .mcap", icon: "download", onClick: () => download(`${path}/content`, `${recording.id}.mcap`) },
+    {
+      label: "Download .mp4",
+      icon: "film",
+      disabled: recording.composites === 0,
+      onClick: () => downloadVideo(`${path}/video.mp4`, `${recording.id}.mp4`),
+    },
     { label: "Delete", icon: "trash", disabled: !mayChange || isShown, onClick: () => deleteRecording(recording.id) },
   ];
   return (
@@ -54,6 +60,10 @@ export function RecordingCard({ recording }: { readonly recording: Recording }) 
   );
 }
 
+async function downloadVideo(path: string, name: string): Promise<void> {
+  if (await makeVideo(path, name)) await download(path, name);
+}
+
 /** What relighting needs of a recording, and what to do without. */
 function Checklist({ recording }: { readonly recording: Recording }) {
   if (recording.checklist.length === 0) return null;
@@ -69,11 +79,12 @@ function Checklist({ recording }: { readonly recording: Recording }) {
   );
 }
 
-function factsText({ duration_s, frames, size_bytes, changed }: Recording): string {
+function factsText({ duration_s, frames, composites, size_bytes, changed }: Recording): string {
   const day = new Date(changed).toLocaleString([], { dateStyle: "medium", timeStyle: "short" });
   const facts = [
     duration_s === null ? "" : clock(duration_s),
     frames === null ? "" : `${frames} frames`,
+    composites === 0 ? "" : `${composites} relit pictures`,
     bytes(size_bytes),
     day,
   ];

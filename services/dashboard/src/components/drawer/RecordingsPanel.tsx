@@ -1,8 +1,10 @@
 import { useRef } from "preact/hooks";
 import { role } from "../../api/session";
+import { recordsRelit } from "../../state/preferences";
 import { openRecording, recordings } from "../../state/takes";
 import { Button } from "../ui/Button";
 import { isRead } from "../../state/events";
+import { Switch } from "../ui/Switch";
 import { Skeleton } from "../ui/Skeleton";
 import { Empty } from "../ui/Empty";
 import { RecordingCard } from "./RecordingCard";
@@ -21,6 +23,12 @@ export function RecordingsPanel() {
         Open a recording…
       </Button>
       <input ref={file} type="file" hidden accept=".mcap,.zip" onChange={(event) => onFile(event.currentTarget)} />
+      <Switch
+        label="Keep relit pictures too"
+        checked={recordsRelit.value}
+        onChange={(isOn) => (recordsRelit.value = isOn)}
+        disabled={role.value !== "control"}
+      />
       {recordings.value.length === 0 && (
         <Empty icon="film" title="No recordings yet">
           <p>

@@ -45,6 +45,7 @@ const GROUPS: readonly { readonly title: string; readonly keys: readonly (readon
     keys: [
       ["1", "picture"],
       ["2 … 8", "effects, change of light, its error, volume, light's view, lights, camera"],
+      ["O", "room in 3-D; arrows turn it, + and − zoom"],
       ["?", "this list"],
     ],
   },

@@ -7,7 +7,7 @@ import { endNudge } from "../../state/nudge";
 import { setView } from "../../state/scene";
 import { standsOnSurfaces } from "../../state/preferences";
 import { selectLight, selectedLight, selectedObjectId, selectObject } from "../../state/selection";
-import { areOutlinesShown, tool, type Tool } from "../../state/tools";
+import { areOutlinesShown, isRoomShown, tool, type Tool } from "../../state/tools";
 import { areKeysShown } from "./KeysDialog";
 
 const TOOL_KEYS: Readonly<Record<string, Tool>> = {
@@ -57,6 +57,7 @@ function onPlainKey(key: string): boolean {
   else if (nextView) setView(nextView.value);
   else if (key === "f" && role.value === "control") standsOnSurfaces.value = !standsOnSurfaces.value;
   else if (key === "h") areOutlinesShown.value = !areOutlinesShown.value;
+  else if (key === "o") isRoomShown.value = !isRoomShown.value;
   else if (key === "?") areKeysShown.value = true;
   else if (key === "escape") return leave();
   else if (key === "delete" || key === "backspace") return remove();

@@ -48,5 +48,5 @@ export function AddObjectButton() {
 
 async function addFromShelf(item: ShelfItem): Promise<void> {
   const asset = await takeFromShelf(item);
-  if (asset) await addObject(asset, null, item.file_name);
+  if (asset) await addObject(asset, null, item.file_name, item.clip);
 }

@@ -13,7 +13,7 @@ import { tool } from "../../state/tools";
 import { CompareSlider } from "./CompareSlider";
 import { usePictureBox } from "./fit";
 import { Outlines } from "./Outlines";
-import { PicturePointer } from "./pointer";
+import { isOnLamp, PicturePointer } from "./pointer";
 import { PictureNotice } from "./PictureNotice";
 import { Poster } from "./Poster";
 import { ShadowHint } from "./ShadowHint";
@@ -68,7 +68,7 @@ export function Picture() {
         <Outlines box={box} />
         <canvas class="layer" ref={handles} aria-hidden="true" />
         <div
-          class={`layer surface ${isAiming() ? "placing" : ""}`}
+          class={`layer surface ${isAiming() ? "placing" : isOnLamp.value ? "on-lamp" : ""}`}
           ref={surface}
           id="stage"
           role="application"

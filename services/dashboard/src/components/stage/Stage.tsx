@@ -1,4 +1,6 @@
 import { Picture } from "./Picture";
+import { isRoomShown } from "../../state/tools";
+import { RoomView } from "./RoomView";
 import { StageBar } from "./StageBar";
 import { StatusStrip } from "./StatusStrip";
 
@@ -6,7 +8,7 @@ export function Stage() {
   return (
     <main class="stage" aria-label="Live picture and tools">
       <StageBar />
-      <Picture />
+      {isRoomShown.value ? <RoomView /> : <Picture />}
       <StatusStrip />
     </main>
   );

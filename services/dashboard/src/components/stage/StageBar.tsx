@@ -5,7 +5,7 @@ import { VIEWS } from "../../forms/views";
 import { setMethod } from "../../state/actions";
 import { standsOnSurfaces } from "../../state/preferences";
 import { sceneDocument, setView, shownView } from "../../state/scene";
-import { areOutlinesShown, isSnapping, tool, type Tool } from "../../state/tools";
+import { areOutlinesShown, isRoomShown, isSnapping, tool, type Tool } from "../../state/tools";
 import { IconButton } from "../ui/IconButton";
 import { Segments, type Segment } from "../ui/Segments";
 import { Select } from "../ui/Select";
@@ -58,6 +58,13 @@ export function StageBar() {
         hint="H"
         pressed={areOutlinesShown.value}
         onClick={() => (areOutlinesShown.value = !areOutlinesShown.value)}
+      />
+      <IconButton
+        icon="orbit"
+        label="Room in 3-D"
+        hint="O"
+        pressed={isRoomShown.value}
+        onClick={() => (isRoomShown.value = !isRoomShown.value)}
       />
       <AddObjectButton />
       <span class="grow" />

@@ -5,7 +5,7 @@ import { corners } from "../../math/bounds";
 import { convexHull, isInside } from "../../math/hull";
 import { boundsByObject } from "../../state/assets";
 import { lights, objects } from "../../state/scene";
-import { lampMarks, type Sheet } from "./outlines";
+import { lampMarks, type LampMark, type Sheet } from "./outlines";
 
 const LAMP_REACH_PX = 16;
 
@@ -29,11 +29,10 @@ function area(hull: readonly Pixel[]): number {
   }, 0);
 }
 
-/** The lamp whose mark is under a point of the sheet. */
-export function lampAt(sheet: Pick<Sheet, "view" | "factor" | "width" | "height">, [x, y]: Pixel): number | null {
+/** The mark of a lamp that is under a point of the sheet. */
+export function lampAt(sheet: Pick<Sheet, "view" | "factor" | "width" | "height">, [x, y]: Pixel): LampMark | null {
   if (lights.value?.mode !== "manual") return null;
-  const near = lampMarks(sheet, lights.value.manual).filter(
-    ({ at }) => Math.hypot(at[0] - x, at[1] - y) < LAMP_REACH_PX,
+  return (
+    lampMarks(sheet, lights.value.manual).find(({ at }) => Math.hypot(at[0] - x, at[1] - y) < LAMP_REACH_PX) ?? null
   );
-  return near[0]?.index ?? null;
 }

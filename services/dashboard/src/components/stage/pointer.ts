@@ -8,16 +8,19 @@ import { placeObject } from "../../state/actions";
 import { pick } from "../../state/placing";
 import { takeShadowClick } from "../../state/shadowLight";
 import { ShadowSlide } from "../../state/shadowSlide";
-import { beginSlide, slidesOnSurfaces, type Slide } from "../../state/slide";
-import { selectedLight, selectedObjectId, selectLight, selectObject } from "../../state/selection";
+import { beginBorderSlide, beginSlide, slidesOnSurfaces, type Slide } from "../../state/slide";
+import { selectedObjectId, selectLight, selectObject } from "../../state/selection";
 import { isSnapping, tool, type Tool } from "../../state/tools";
 import { lampAt, objectsAt } from "./hits";
+import type { LampMark } from "./outlines";
 
 // A press that moves less is a click; a finger rolls where a mouse stands still.
 const CLICK_PX = { mouse: 4, touch: 10 };
 
 /** The object under the pointer. */
 export const hovered = signal<string | null>(null);
+/** Whether the sign of a lamp is under the pointer. */
+export const isOnLamp = signal(false);
 
 interface Press {
   readonly x: number;
@@ -53,8 +56,7 @@ export class PicturePointer {
     const at = this.place(event);
     const press = this.press;
     if (!press) {
-      const isOnGizmo = this.gizmo()?.isTouched === true;
-      hovered.value = view.value && !isOnGizmo ? (objectsAt(view.value, this.pixel(at))[0] ?? null) : null;
+      this.hover(at);
       return;
     }
     if (!press.slide && press.begin && !isClick(press, at, event)) {
@@ -73,7 +75,15 @@ export class PicturePointer {
   }
 
   leave(): void {
-    if (!this.press) hovered.value = null;
+    if (this.press) return;
+    hovered.value = null;
+    isOnLamp.value = false;
+  }
+
+  private hover(at: Pixel): void {
+    const seen = this.gizmo()?.isTouched === true ? null : view.value;
+    isOnLamp.value = seen !== null && lampAt(this.sheet(), at) !== null;
+    hovered.value = seen && (objectsAt(seen, this.pixel(at))[0] ?? null);
   }
 
   /** Put back what slides; false where nothing does. */
@@ -95,11 +105,11 @@ export class PicturePointer {
     return this.pixel(this.place(event));
   }
 
-  /** What a press here holds: the selection, or else the shadow that may be there. */
+  /** What a press here holds: a lamp, the selection, or else the shadow that may be there. */
   private takes(at: Pixel): Press["begin"] {
     if (role.value !== "control" || isClicking(tool.value) || !view.value) return null;
     const lamp = lampAt(this.sheet(), at);
-    if (lamp !== null) return lamp === selectedLight.value ? beginSlide : null;
+    if (lamp !== null) return (pixel) => takeLamp(lamp, pixel);
     const held = selectedObjectId.value;
     if (held !== null && objectsAt(view.value, this.pixel(at)).includes(held)) return beginSlide;
     return (pixel) => new ShadowSlide(pixel);
@@ -117,7 +127,7 @@ export class PicturePointer {
       return;
     }
     const lamp = view.value ? lampAt(this.sheet(), at) : null;
-    if (lamp !== null) selectLight(lamp);
+    if (lamp !== null) selectLight(lamp.index);
     else await this.select(pixel);
   }
 
@@ -140,6 +150,11 @@ export class PicturePointer {
     const factor = (pictureSize.value?.width ?? 1) / this.surface.getBoundingClientRect().width;
     return [x * factor - 0.5, y * factor - 0.5];
   }
+}
+
+function takeLamp({ index, isOutside }: LampMark, pixel: Pixel): Slide | null {
+  selectLight(index);
+  return isOutside ? beginBorderSlide(pixel) : beginSlide(pixel);
 }
 
 /** Whether a tool takes clicks and nothing else. */
