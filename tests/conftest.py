@@ -5,6 +5,7 @@ context, real captures.
 import gc
 import os
 import signal
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,6 +28,11 @@ gc.disable()
 
 SLOW_MARKERS = ("slow", "data")
 THREAD_COUNTS = ("LP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
+# OpenBLAS chooses its kernels by the processor's maker too, and they differ in the last bits of what they compute:
+# protected pictures were made with these. Whoever has loaded it already keeps what it chose.
+PROCESSOR = Path("/proc/cpuinfo")
+if "numpy" not in sys.modules and PROCESSOR.exists() and "avx512f" in PROCESSOR.read_text():
+    os.environ["OPENBLAS_CORETYPE"] = "SkylakeX"
 WORKER = os.environ.get("PYTEST_XDIST_WORKER")  # gw0, gw1, ...; None where tests are not spread
 
 if WORKER is not None:

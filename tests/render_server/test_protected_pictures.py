@@ -58,6 +58,7 @@ def made_with(gpu: GpuContext) -> dict[str, Any]:
         "renderer": gpu.renderer_name,
         "version": gpu.version,
         "cpu": [flag for flag in CPU_FLAGS if flag in flags],
+        "blas": os.environ.get("OPENBLAS_CORETYPE", ""),
     }
 
 
