@@ -33,6 +33,7 @@ LOOKING = {
         "Scenes: Gallery",
         "Keyboard shortcuts",
         "Light appearance",
+        "Room in 3-D",
         "Sign out",
     ),
     *("Outlines and lamps", "Close the drawer", "Lamp 1"),
