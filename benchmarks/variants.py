@@ -9,7 +9,8 @@ from deltalight.protocol.documents import StrictModel, nearest, parse_mapping, v
 from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.methods import PLUGINS, SETTINGS
 from deltalight.protocol.scene import SceneDocument
-from deltalight.protocol.scene_method import MethodSettings, NoneMethod, Output, Shading
+from deltalight.protocol.scene_method import MethodSettings, NoneMethod
+from deltalight.protocol.scene_output import Output, Shading
 
 RASTER = RasterMethod.method_name()
 MODELS: dict[str, type[MethodSettings]] = {**SETTINGS, RASTER: RasterMethod}

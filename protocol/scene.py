@@ -12,8 +12,9 @@ from deltalight.protocol.errors import DeltalightError
 from deltalight.protocol.files import is_file
 from deltalight.protocol.methods import Method
 from deltalight.protocol.scene_lights import Lights, default_lights
-from deltalight.protocol.scene_method import DvctMethod, Output, Shading
+from deltalight.protocol.scene_method import DvctMethod
 from deltalight.protocol.scene_objects import ModelGeometry, PrecomputedMaterial, RealScene, SceneObject
+from deltalight.protocol.scene_output import Output, Shading
 
 DIGEST_PREFIX = "sha256:"
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from deltalight.protocol.frames import ViewFrame
-from deltalight.protocol.scene_method import Output
+from deltalight.protocol.scene_output import Output
 from deltalight.render_server.frame import (
     FrameResources,
     Measurement,

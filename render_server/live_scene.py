@@ -11,8 +11,8 @@ from jaxtyping import Float32, Float64
 from deltalight.protocol.frames import ViewFrame
 from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.scene_fields import View
-from deltalight.protocol.scene_method import Output
 from deltalight.protocol.scene_objects import Material
+from deltalight.protocol.scene_output import Output
 from deltalight.render_server.estimation.albedo import AlbedoEstimator
 from deltalight.render_server.estimation.lighting import LightEstimator
 from deltalight.render_server.frame_budget import FrameBudget, Level

@@ -9,7 +9,7 @@ from jaxtyping import Float64
 
 from deltalight.protocol.camera_model import CameraModel
 from deltalight.protocol.frames import DepthImage, ViewFrame
-from deltalight.protocol.scene_method import Output
+from deltalight.protocol.scene_output import Output
 from deltalight.render_server.gpu.uniform_block import Block, Bool, Mat4, Vec2, Vec3, Vec4
 
 NEAR_M = 0.02

@@ -6,7 +6,7 @@ import moderngl
 import numpy as np
 from jaxtyping import Float32
 
-from deltalight.protocol.scene_method import Shading
+from deltalight.protocol.scene_output import Shading
 from deltalight.render_server.frame import FrameResources, ObjectSurface
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Bindings

@@ -7,8 +7,9 @@ from typing import Any, Literal
 
 from deltalight.protocol.methods import PLUGINS
 from deltalight.protocol.plugins import Plugin
-from deltalight.protocol.scene_method import DvctMethod, MethodSettings, NoneMethod, Shading
+from deltalight.protocol.scene_method import DvctMethod, MethodSettings, NoneMethod
 from deltalight.protocol.scene_objects import SceneObject
+from deltalight.protocol.scene_output import Shading
 from deltalight.render_server.frame import FrameResources
 from deltalight.render_server.graph import Graph
 from deltalight.render_server.methods.aroof import AROOF

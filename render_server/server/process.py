@@ -36,7 +36,8 @@ from deltalight.render_server.lights.lights import ENVIRONMENT_SIZE
 from deltalight.render_server.lights.octahedral import prefilter
 from deltalight.render_server.renderer import SceneRenderer
 from deltalight.render_server.server.frames import FrameAssembler, FrameSource, PairingSettings
-from deltalight.render_server.server.session import RenderedFrame, Renderer, RenderSession, SourceInUse
+from deltalight.render_server.server.renderer import Renderer
+from deltalight.render_server.server.session import RenderedFrame, RenderSession, SourceInUse
 
 GPU_TIMEOUT_S = 0.002  # a started frame is read back after this time if no other one comes
 RECEIVE_TIMEOUT_S = 0.05  # bounds how long a command waits while no frames arrive

@@ -9,19 +9,19 @@ from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import structlog
-from jaxtyping import Float32, Float64, UInt8
+from jaxtyping import Float64, UInt8
+from pydantic import ConfigDict, Field
 
-from deltalight.protocol.camera_model import CameraModel
-from deltalight.protocol.documents import nearest, validate
+from deltalight.protocol.documents import StrictModel, nearest, validate
 from deltalight.protocol.envelope import decode
 from deltalight.protocol.errors import DeltalightError
-from deltalight.protocol.frames import ViewFrame
 from deltalight.protocol.message_fields import as_counts, as_sentence
 from deltalight.protocol.messages import (
+    MAX_OTHERS,
     CompositeMessage,
     ControlRequest,
     OtherPicture,
@@ -31,10 +31,9 @@ from deltalight.protocol.messages import (
 from deltalight.protocol.scene import SceneDocument, parse_scene
 from deltalight.protocol.scene_fields import ShownView
 from deltalight.protocol.subscriber import ReceivedMultipart
-from deltalight.render_server.frame_budget import Level
 from deltalight.render_server.gpu.lost_context import GpuResetError
 from deltalight.render_server.server.frames import AssembledFrame, FrameAssembler, SourceOrder
-from deltalight.render_server.server.orders import PickOrder, RoomOrder, WatchOrder
+from deltalight.render_server.server.renderer import Pending, Renderer
 from deltalight.render_server.server.snapshot import SnapshotOrder, take_snapshot
 
 RATE_WINDOW_S = 5.0
@@ -45,126 +44,26 @@ LOG_INTERVAL_NS = 10**9
 log = structlog.get_logger()
 
 
-class OtherView(Protocol):
-    """A frame in another view (`renderer.OtherView`)."""
+class PickOrder(StrictModel):
+    """A pixel of the composite (centres are at integers), and an object to look through."""
 
-    @property
-    def view(self) -> ShownView:
-        """What it shows."""
+    model_config = ConfigDict(strict=True)
 
-    @property
-    def color(self) -> UInt8[np.ndarray, "h w 3"]:
-        """The picture, of the composite's size."""
-
-    @property
-    def world_from_camera(self) -> Float64[np.ndarray, "4 4"] | None:
-        """The camera's pose; None if the picture is not the camera's."""
+    x: float
+    y: float
+    ignore: str | None = None
 
 
-class Composite(Protocol):
-    """The result of a renderer (`renderer.CompositeFrame`)."""
+class WatchOrder(StrictModel):
+    """The views that somebody looks at."""
 
-    @property
-    def color(self) -> UInt8[np.ndarray, "h w 3"]:
-        """The finished picture, camera-coded RGB."""
-
-    @property
-    def status(self) -> str:
-        """`ok` or `no_pose`."""
-
-    @property
-    def camera(self) -> CameraModel:
-        """The camera at the picture's size."""
-
-    @property
-    def world_from_camera(self) -> Float64[np.ndarray, "4 4"] | None:
-        """The camera's pose; None if there is none."""
-
-    @property
-    def pass_times_ms(self) -> dict[str, float]:
-        """Milliseconds of each pass."""
-
-    @property
-    def reused_pass_times_ms(self) -> dict[str, float]:
-        """Milliseconds that passes whose results it uses again took when they last ran."""
-
-    @property
-    def lights(self) -> Sequence[dict[str, Any]]:
-        """The lights that the picture was rendered with."""
-
-    @property
-    def level(self) -> Level | None:
-        """The quality and scale that it was rendered at; None if nothing was."""
-
-    @property
-    def linear(self) -> Float32[np.ndarray, "h w 3"] | None:
-        """The picture before the camera's response, if requested."""
-
-    @property
-    def others(self) -> Sequence[OtherView]:
-        """The same frame in the other views that were requested."""
+    views: tuple[ShownView, ...] = Field(max_length=MAX_OTHERS + 1)
 
 
-class Pick(Protocol):
-    """What a pixel shows (`picking.Pick`)."""
+class RoomOrder(StrictModel):
+    """The GLB file to write the real scene to, on the render server's host."""
 
-    def as_dict(self) -> dict[str, object]:
-        """Returns the pick as plain data."""
-
-
-class Room(Protocol):
-    """The real scene as a mesh (`room_mesh.RoomMesh`)."""
-
-    def write(self, path: Path) -> None:
-        """Writes it as a GLB file."""
-
-
-class Pending(Protocol):
-    """A started frame (`renderer.PendingComposite`)."""
-
-    @property
-    def immediate(self) -> bool:
-        """Whether starting another frame first gains nothing."""
-
-    @property
-    def finish(self) -> Callable[[], Composite]:
-        """Returns the composite; waits for the GPU if it must."""
-
-
-class Renderer(Protocol):
-    """The part of `renderer.SceneRenderer` that a session uses."""
-
-    @property
-    def notices(self) -> Sequence[str]:
-        """Sentences for the user; the list only grows."""
-
-    def submit(
-        self,
-        frame: ViewFrame,
-        *,
-        with_linear: bool = False,
-        whole: bool = False,
-        others: Sequence[ShownView] = (),
-    ) -> Pending:
-        """Starts the composite of one frame, at full size if `whole`, and the same in `others`.
-
-        Frames finish in the order of their starts.
-        """
-
-    def sized(self, frame: ViewFrame) -> ViewFrame:
-        """Returns the frame at the composite's size."""
-
-    def pick(self, x: float, y: float, ignore: str | None = None) -> Pick:
-        """Picks what the newest picture shows at a pixel, looking through the object `ignore`."""
-
-    def room(self) -> Room:
-        """Returns the real scene as the newest picture shows it."""
-
-    def forget_frames(self) -> None:
-        """Forgets what earlier frames showed."""
-
-    def set_scene(self, scene: SceneDocument) -> None:
-        """Switches to another scene from the next frame on."""
+    file: Path
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,8 @@ from deltalight.protocol.documents import parse_mapping, validate
 from deltalight.protocol.methods import Method
 from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.scene_lights import Lights, ManualLight
-from deltalight.protocol.scene_method import Output, Shading
 from deltalight.protocol.scene_objects import RealScene, SceneObject
+from deltalight.protocol.scene_output import Output, Shading
 from deltalight.protocol.yaml_text import yaml_text
 from deltalight.services.api.context import Shared
 from deltalight.services.api.problems import ProblemError

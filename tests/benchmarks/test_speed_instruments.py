@@ -10,7 +10,7 @@ import pytest
 from deltalight.benchmarks.speed.instruments import GpuCounts, ReadBacks, counted
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Kernel
-from deltalight.render_server.gpu.textures import AsyncReadback, texture_2d
+from deltalight.render_server.gpu.textures import AsyncReadback, release_target, texture_2d
 
 FILL = """layout(local_size_x = 1) in;
 layout(std430) writeonly buffer Out { float values[]; };
@@ -77,7 +77,8 @@ def test_a_known_sequence_is_counted_exactly(gpu: GpuContext, fill: Kernel, out:
     fill.run((1,), Out=out, first=5.0, others=(2.0, 4.0))
     out.clear()
     assert counts == expected, "nothing is counted afterwards"
-    for item in (made, empty, other, readback, triangle, program, target, texture):
+    release_target(target)
+    for item in (made, empty, other, readback, triangle, program, texture):
         item.release()
 
 

@@ -15,8 +15,9 @@ from deltalight.protocol import scene_lights as documents
 from deltalight.protocol.frames import ViewFrame
 from deltalight.protocol.octahedral import octahedral_grid, resample_to_octahedral
 from deltalight.protocol.scene import SceneDocument
-from deltalight.protocol.scene_method import NoneMethod, Shading
+from deltalight.protocol.scene_method import NoneMethod
 from deltalight.protocol.scene_objects import Material
+from deltalight.protocol.scene_output import Shading
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Kernel
 from deltalight.render_server.lights.environment import load_environment

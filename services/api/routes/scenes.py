@@ -9,8 +9,8 @@ from fastapi import APIRouter, Path, Query, Response
 from deltalight.protocol.methods import Method
 from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.scene_lights import Lights, ManualLight
-from deltalight.protocol.scene_method import Output, Shading
 from deltalight.protocol.scene_objects import RealScene, SceneObject
+from deltalight.protocol.scene_output import Output, Shading
 from deltalight.services.api.context import ExpectedRevision, IfUnchanged, Shared, with_revision_of
 from deltalight.services.api.models import RevisionEntry, SceneAnswer, SceneSummary
 from deltalight.services.api.problems import responses

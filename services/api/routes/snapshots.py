@@ -12,7 +12,7 @@ from deltalight.protocol.documents import StrictModel
 from deltalight.protocol.message_fields import Name
 from deltalight.protocol.methods import Method
 from deltalight.protocol.pictures import decode_rgb, read_bytes
-from deltalight.protocol.scene_method import Output
+from deltalight.protocol.scene_output import Output
 from deltalight.services.api.context import Context, Shared, in_pool
 from deltalight.services.api.file_response import StoredFileResponse
 from deltalight.services.api.problems import ProblemError, responses, unavailable
