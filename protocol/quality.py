@@ -13,9 +13,10 @@ class QualityTier:
     `cone_count` and `shadow_samples` limit the settings of that name; a volume has `volume_share` of its voxels an
     edge. `reflection_cones` look up what a pixel of a smooth object reflects, in one of `reflection_step` x
     `reflection_step` pixels. `edge_samples` smooth an object's edges. `caustic_blocks` x `caustic_blocks` blocks of
-    each light's map of the objects send beams. One tile of the picture in `refresh_tiles` gets new light in each
-    frame in which only the camera moves, the others keep that of the frame before; 0: all get new light, and the real
-    scene is built anew whenever the camera moves.
+    each light's map of the objects send beams. While objects move, the light that they throw back, block between
+    surfaces and focus is found in one of `bounce_turns` frames; their shadows are in every one. One tile of the
+    picture in `refresh_tiles` gets new light in each frame in which only the camera moves, the others keep that of
+    the frame before; 0: all get new light, and the real scene is built anew whenever the camera moves.
     """
 
     cone_count: int = 64
@@ -26,6 +27,7 @@ class QualityTier:
     edge_samples: Literal[4, 8] = 8
     caustic_blocks: Literal[32, 64] = 64
     refresh_tiles: int = 0
+    bounce_turns: int = 1
 
 
 BEST = QualityTier()
@@ -41,5 +43,6 @@ TIERS: dict[Quality, QualityTier] = {
         edge_samples=4,
         caustic_blocks=32,
         refresh_tiles=16,
+        bounce_turns=2,
     ),
 }

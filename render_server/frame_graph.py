@@ -346,7 +346,8 @@ class FrameGraph:
         others = *(item.version for item in sources if item is not None), self._options.version
         options = self._options.value if self._options.version else None
         reuses_ratio = options is not None and options.reuses_ratio and not s.surfaces.value.is_specular
-        if not image.is_linear and not (reuses_ratio and others == self._others):
+        is_at_rest = others == self._others and not self.graph.is_lagging
+        if not image.is_linear and not (reuses_ratio and is_at_rest):
             image.linearize()
             self._linear.write(image)
         self._others = others

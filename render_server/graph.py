@@ -18,6 +18,7 @@ from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Dispatch, watched
 from deltalight.render_server.gpu.textures import gpu_objects, sizes_bytes
 from deltalight.render_server.gpu.timers import PassTimers
+from deltalight.render_server.lag import Lag
 
 Clock = Literal["scene", "lights", "world", "objects", "view"]
 CLOCKS: Final[tuple[Clock, ...]] = get_args(Clock)
@@ -63,7 +64,10 @@ class Resource(Generic[T]):
 
 @dataclass(eq=False)
 class Stage:
-    """A function of resources. `ran`: whether the last run of the graph called it; `plugin`: whose stage it is."""
+    """A function of resources.
+
+    `ran`: whether the last run of the graph called it; `plugin`: whose stage it is; `lag`: what it may wait for.
+    """
 
     name: str
     function: Callable[..., Any]
@@ -71,6 +75,7 @@ class Stage:
     outputs: tuple[Resource[Any], ...]
     same: Same | None
     plugin: Plugin | None = None
+    lag: Lag | None = None
     seen: tuple[int, ...] | None = None
     ran: bool = False
 
@@ -133,6 +138,8 @@ class Graph:
         self._polled: list[tuple[Resource[Any], Callable[[], Any], Same]] = []
         self._owned: list[Any] = []
         self._plugin: Plugin | None = None
+        self._lags: list[Lag] = []
+        self._lag: Lag | None = None
 
     def source(self, name: str, clock: Clock) -> Resource[Any]:
         """Declares a resource that is set from outside (`Resource.write`)."""
@@ -180,6 +187,24 @@ class Graph:
         finally:
             self._plugin = None
 
+    @contextmanager
+    def lagging(self, turns: int, *behind: Resource[Any]) -> Iterator[None]:
+        """What is declared in here follows changes of `behind` in one of `turns` frames (`Lag`); 1: in each."""
+        if turns == 1:
+            yield
+            return
+        self._lag = Lag(frozenset(behind), turns)
+        self._lags.append(self._lag)
+        try:
+            yield
+        finally:
+            self._lag = None
+
+    @property
+    def is_lagging(self) -> bool:
+        """Whether a stage waits, so that the next frame may show something else though nothing changes."""
+        return any(lag.is_waiting for lag in self._lags)
+
     def stages(
         self,
         name: str,
@@ -206,7 +231,7 @@ class Graph:
         for item in inputs:
             if isinstance(item, Resource) and item is not self._resources.get(item.name):
                 raise GraphError(f"Stage `{name}` reads `{item.name}` of another graph.")
-        stage = Stage(name, function, (), (), same, self._plugin)
+        stage = Stage(name, function, (), (), same, self._plugin, self._lag)
         stage.outputs = self._declare(outputs, stage)
         self._stages.append(stage)
         self._named[stage] = [item if isinstance(item, str) else item.name for item in inputs]
@@ -330,7 +355,9 @@ class Graph:
     def _update(self, stage: Stage) -> None:
         """Runs a stage if the version of any input differs from the one that it saw last."""
         versions = tuple(item.version for item in stage.inputs)
-        if versions == stage.seen:
+        if versions == stage.seen or (
+            stage.lag is not None and stage.lag.holds(stage.inputs, stage.seen, versions)
+        ):
             return
         for item in stage.inputs:
             if item.version == 0:
@@ -380,7 +407,9 @@ class Graph:
                     )
 
     def begin_frame(self) -> None:
-        """Begins a frame: reports tell what ran and changed since."""
+        """Begins a frame: reports tell what ran and changed since, and stages that waited take their turn."""
+        for lag in self._lags:
+            lag.begin_frame()
         seen = {stage: stage.seen for stage in self._stages}
         self._begun = dict(seen), {item: item.version for item in self._resources.values()}
 

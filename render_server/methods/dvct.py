@@ -18,6 +18,7 @@ from deltalight.render_server.methods.lighting import (
     Layers,
     Shading,
     ShadingOptions,
+    bounced_later,
     shading_stages,
     surfel_scene,
     volume_placement,
@@ -206,9 +207,10 @@ def dvct_exact(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
         g, s, resolved, settings.shadow_samples, settings.tier, mirrors=settings.mirrored_lights
     )
     g.section("voxels")
-    placement = volume_placement(g, s, resolved.volume_size, settings.volume_edge_m, settings.tier)
     voxels = DeltaVoxels(g.gpu, settings, resolved.volume_size)
-    mu, rho = delta_voxel_stages(g, s, lit, voxels, placement)
+    with bounced_later(g, s, lit, settings.tier):
+        placement = volume_placement(g, s, resolved.volume_size, settings.volume_edge_m, settings.tier)
+        mu, rho = delta_voxel_stages(g, s, lit, voxels, placement)
     shading = Shading(
         g.gpu,
         size,
@@ -279,9 +281,10 @@ def dvct_paper(g: Graph, s: FrameResources, setup: Setup[DvctMethod]) -> Layers:
     settings, resolved, size = setup.settings, setup.resolved, setup.picture_size
     lit = light_stages(g, s, resolved, settings.shadow_samples, settings.tier)
     g.section("voxels")
-    placement = volume_placement(g, s, resolved.volume_size, settings.volume_edge_m, settings.tier)
     voxels = InjectedVoxels(g.gpu, resolved.volume_size)
-    injected = injection_stages(g, s, lit, voxels, placement)
+    with bounced_later(g, s, lit, settings.tier):
+        placement = volume_placement(g, s, resolved.volume_size, settings.volume_edge_m, settings.tier)
+        injected = injection_stages(g, s, lit, voxels, placement)
     shadow_cones = voxels.directions if settings.resolved_shadow == "cone" else None
     tier = settings.tier
     direct = DirectLight(g.gpu, size, shadow_cones=shadow_cones, reuses=tier.refresh_tiles > 0)

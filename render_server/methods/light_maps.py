@@ -102,6 +102,7 @@ class LightStages:
         """Draws the objects as seen from the lights."""
         buffers = self.buffers
         self._maps.run(buffers.virtual_atlas, [objects.buffers], buffers.virtual_views)
+        self._maps.measure_distances(buffers.virtual_atlas)
         return buffers
 
     def map_mirrors(

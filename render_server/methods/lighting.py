@@ -1,6 +1,7 @@
 """Stages that methods share: volumes around the objects, and shading of the visible surfaces (docs/method.md 3)."""
 
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from operator import eq
 from typing import Any
@@ -23,7 +24,7 @@ from deltalight.render_server.passes.cones import ConeFields, LowResGrid
 from deltalight.render_server.passes.gbuffer import ObjectBvh
 from deltalight.render_server.passes.lights import LightBuffers
 from deltalight.render_server.passes.reflections import ROUGHEST, MirrorRays, ScreenCones
-from deltalight.render_server.passes.shading import DirectLight, LightHistory, VirtualSurface
+from deltalight.render_server.passes.shading import DirectLight, LightHistory, LightState, VirtualSurface
 from deltalight.render_server.passes.voxel_light import AlbedoTexture
 from deltalight.render_server.passes.voxels import (
     PlacedVolume,
@@ -57,6 +58,17 @@ def volume_placement(
         return placed
 
     return g.value("volume placement", place, object_extent(g, s), same=eq)
+
+
+def bounced_later(
+    g: Graph, s: FrameResources, lit: LitScene, tier: QualityTier, *also: Resource[Any]
+) -> AbstractContextManager[None]:
+    """What is declared in here may show objects that move as they were a frame before (`QualityTier.bounce_turns`).
+
+    `also`: other resources that follow the objects.
+    """
+    followers = s.objects, object_extent(g, s), lit.object_maps
+    return g.lagging(tier.bounce_turns, *followers, *lit.mirrored, *also)
 
 
 def no_voxels(_: object) -> None:
@@ -142,6 +154,7 @@ class Shading:
         options: ShadingOptions,
     ) -> None:
         self._gpu, self._options, self._lights, self._direct = gpu, options, lights, direct
+        self.tier = options.tier
         self.size, self._scale = size, resolved.cone_scale
         self.reuses_light = options.tier.refresh_tiles > 0
         self._bvh = ObjectBvh(gpu)
@@ -206,11 +219,13 @@ class Shading:
         self.grid.run(scene)
         return self.grid
 
-    def reuse_light(self, scene: Bindings, _grid: LowResGrid, light: object, view: CameraView) -> Bindings:
+    def reuse_light(
+        self, scene: Bindings, _grid: LowResGrid, light: LightState, view: CameraView
+    ) -> Bindings:
         """Fills in the last frame's light where it serves, and lists where light must be computed."""
         assert self._history is not None
         is_diffuse = not scene["specular_surfaces"]
-        return {**scene, **self._history.run(scene, light if is_diffuse else object(), view)}
+        return {**scene, **self._history.run(scene, light if is_diffuse else None, view)}
 
     def trace_beams(
         self,
@@ -344,16 +359,19 @@ def shading_stages(
         s.lights,
     )
     bvh = g.stage("object bvh", shading.set_objects, s.objects)
-    beams = g.stage(
-        "caustic beams", shading.trace_beams, s.objects, bvh, s.measured, volume, s.lights, *lit.all
-    )
+    with bounced_later(g, s, lit, shading.tier, bvh):
+        beams = g.stage(
+            "caustic beams", shading.trace_beams, s.objects, bvh, s.measured, volume, s.lights, *lit.all
+        )
     grid = g.stage("low res grid", shading.choose_pixels, scene)
     if shading.reuses_light:
         # What light at real surfaces depends on, besides the camera: another value whenever any of it changes.
-        changing: tuple[Resource[Any], ...] = (s.objects, s.surfaces, volume, s.lit_area, s.lights)
-        changing += (*lit.all, shown, marching)
-        light = g.value("light state", _new_object, *changing)
-        scene = g.stage("light reuse", shading.reuse_light, scene, grid, light, s.view)
+        shared: tuple[Resource[Any], ...] = (s.surfaces, s.lit_area, s.lights, lit.environment)
+        unblocked = g.value("unblocked light state", _new_object, *shared, lit.real_maps, *lit.mirrored)
+        bounced = g.value("bounced light state", _new_object, *shared, volume, shown, marching, beams)
+        direct = g.value("direct light state", _new_object, unblocked, bounced, s.objects, lit.object_maps)
+        states = g.value("light state", LightState, unblocked, direct, bounced)
+        scene = g.stage("light reuse", shading.reuse_light, scene, grid, states, s.view)
     cones = trace(scene, grid)
     caustics = g.stage("caustics", shading.cast_caustics, scene, grid, beams)
     direct = g.stage("direct light", light_directly or shading.light_directly, scene, grid, caustics, shown)

@@ -21,6 +21,7 @@ from deltalight.render_server.methods.lighting import (
     Layers,
     Shading,
     ShadingOptions,
+    bounced_later,
     casts_caustics,
     shading_stages,
     surfel_scene,
@@ -429,9 +430,10 @@ def dlpv(g: Graph, s: FrameResources, setup: Setup[DlpvMethod]) -> Layers:
     settings, resolved, size = setup.settings, setup.resolved, setup.picture_size
     lit = light_stages(g, s, resolved, settings.shadow_samples, settings.tier)
     g.section("propagation volumes")
-    cube = volume_placement(g, s, resolved.volume_size, settings.volume_edge_m, settings.tier)
     declare = printed_stages if settings.operator == "paper" else difference_stages
-    cells = declare(g, s, lit, settings, cube)
+    with bounced_later(g, s, lit, settings.tier):
+        cube = volume_placement(g, s, resolved.volume_size, settings.volume_edge_m, settings.tier)
+        cells = declare(g, s, lit, settings, cube)
     options = ShadingOptions(
         tier=settings.tier,
         caustics=settings.resolved_caustics,

@@ -77,6 +77,7 @@ class LightBuffers:
             "Lighting": self._block,
             "real_light_depth": self.real_atlas.depth,
             "virtual_light_depth": self.virtual_atlas.depth,
+            "caster_distance": self.virtual_atlas.caster_distance,
             "real_light_normal": self.real_atlas.normal,
             "virtual_light_normal": self.virtual_atlas.normal,
             "virtual_light_uv": self.virtual_atlas.uv,

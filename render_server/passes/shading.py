@@ -1,6 +1,7 @@
 """Full-resolution shading: direct light on the real surfaces, and radiance of the virtual ones."""
 
 import math
+from dataclasses import dataclass
 
 import moderngl
 import numpy as np
@@ -13,6 +14,8 @@ from deltalight.render_server.passes.caustics import Caustics
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid
 from deltalight.render_server.passes.lights import LightBuffers
 from deltalight.render_server.view import CameraView
+
+NOTHING_KEPT: Bindings = {"keeps_unblocked": False}
 
 
 class LightPair:
@@ -95,19 +98,33 @@ class DirectLight:
     def _shade(self, grid: LowResGrid, targets: Bindings, *scene: Bindings) -> None:
         """Shades the texels of the list."""
         listed: Bindings = {**targets, **grid.bindings, "Texels": self.texels}
-        self._kernel.run((list_threads(self._gpu, math.prod(self._size)),), listed, *scene)
+        self._kernel.run((list_threads(self._gpu, math.prod(self._size)),), listed, *scene, NOTHING_KEPT)
 
     def release(self) -> None:
         """Frees the GL objects."""
         release_all(self.light, self.lobes, self._kernel, self._select, self.texels)
 
 
+@dataclass(frozen=True, eq=False)
+class LightState:
+    """What light at real surfaces depends on besides the camera; each is another object whenever any of it changes.
+
+    `unblocked`: direct light without the objects; `direct`: that, and what objects block and focus of it; `bounced`:
+    what cones and beams bring.
+    """
+
+    unblocked: object
+    direct: object
+    bounced: object
+
+
 class LightHistory:
-    """Reuses the light of the last frame while only the camera moves.
+    """Reuses the light of the last frame as far as only the camera has moved.
 
     Irradiance does not depend on where it is seen from: what the last frame computed is looked up where the surface
     was in its picture (reverse reprojection caching, Nehab et al. 2007). Pixels whose surface it did not show are
-    computed, and in turn one tile in `turns`.
+    computed, and in turn one tile in `turns`. Where objects moved, pixels that show the same point as before keep
+    their light without the objects.
     """
 
     def __init__(
@@ -126,18 +143,20 @@ class LightHistory:
         self._stale = texture_2d(gpu, grid.size, 1, "u1")
         self._reproject = Kernel(gpu, "reproject_light")
         self._find_stale = Kernel(gpu, "stale_texels")
-        self._seen: tuple[object, Float64[np.ndarray, "4 4"]] | None = None
+        self._seen: tuple[LightState | None, Float64[np.ndarray, "4 4"]] = None, np.eye(4)
         self._turn = 0
 
-    def run(self, scene: Bindings, light: object, view: CameraView) -> dict[str, Binding]:
+    def run(self, scene: Bindings, light: LightState | None, view: CameraView) -> dict[str, Binding]:
         """Fills in the light that the last frame knows, and marks where cones and caustics are to compute it.
 
-        `light` is the same object as in the last frame if nothing but the camera has changed since. Returns the
-        bindings of the passes that compute the rest.
+        Without `light`, nothing is known, now and in the next frame. Returns the bindings of the passes that compute
+        the rest.
         """
-        last, self._seen = self._seen, (light, view.camera_from_world)
-        has_history = last is not None and last[0] is light
-        matrix = view.camera_from_world if last is None else last[1]
+        (last, matrix), self._seen = self._seen, (light, view.camera_from_world)
+        knows_direct, knows_bounced, knows_unblocked = False, False, False
+        if last is not None and light is not None:
+            knows_direct, knows_bounced = last.direct is light.direct, last.bounced is light.bounced
+            knows_unblocked = last.unblocked is light.unblocked
         self._turn = (self._turn + 1) % self._turns
         self._positions.reverse()
         self._kept.reverse()
@@ -146,7 +165,8 @@ class LightHistory:
         direct = self._direct
         self._last_light, direct.light = direct.light, self._last_light
         found: dict[str, Binding] = {
-            "has_history": has_history,
+            "has_history": knows_bounced,
+            "keeps_unblocked": knows_unblocked and not knows_direct,
             "last_camera_from_world": matrix,
             "last_position": self._positions[1],
             "last_real_texels": self._real_texels[1],
@@ -156,10 +176,10 @@ class LightHistory:
             "turn": self._turn,
             **self._cones.remember(),
         }
-        self._fill(scene, found)
+        self._fill(scene, found, knows_direct=knows_direct)
         return found
 
-    def _fill(self, scene: Bindings, found: Bindings) -> None:
+    def _fill(self, scene: Bindings, found: Bindings, *, knows_direct: bool) -> None:
         grid, direct = self._grid, self._direct
         shared: Bindings = {**found, **grid.bindings}
         direct.select(grid, self._reached, scene)
@@ -169,6 +189,7 @@ class LightHistory:
             (list_threads(self._gpu, grid.texel_count),),
             shared,
             scene,
+            has_history=knows_direct,
             direct_mu_out=direct.light.mu,
             direct_rho_out=direct.light.rho,
             last_direct_mu=self._last_light.mu,
@@ -180,6 +201,7 @@ class LightHistory:
             self._grid.size,
             shared,
             scene,
+            objects_moved=not knows_direct,
             stale_out=self._stale,
             real_texels_out=self._real_texels[0],
             object_texels_out=self._object_texels[0],

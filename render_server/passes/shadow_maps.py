@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from deltalight.render_server.gpu.context import GpuContext
-from deltalight.render_server.gpu.kernel import RasterKernel
-from deltalight.render_server.gpu.textures import release_target, texture_2d
+from deltalight.render_server.gpu.kernel import Kernel, RasterKernel
+from deltalight.render_server.gpu.textures import release_all, release_target, texture_2d
 from deltalight.render_server.lights.lights import DirectionalLight, Lamp, Light
 from deltalight.render_server.lights.mirror_lights import MirrorLight
 from deltalight.render_server.passes.gbuffer import MeshBuffers
@@ -20,6 +20,8 @@ NEAR_MARGIN = 0.98  # near and far planes lie a little outside of what they encl
 FAR_MARGIN = 1.02
 WIDEST_SINGLE_TANGENT = math.tan(math.radians(65))  # wider needs the six faces of a cube
 NEAREST_M = 1e-3
+CASTER_CELL = 8
+"""Texels an edge of the cells in which distances to casters are known; shaders/common/lights.glsl knows it too."""
 EVERYWHERE = (0.0, 0.0, 0.0, 1.0)  # the plane before which everything lies
 
 
@@ -48,6 +50,8 @@ class ShadowMapAtlas:
     """One depth texture and its reflective layers, a tile for every light view of one geometry set.
 
     `normal` (RGBA16F) holds normal and material, `uv` (RGBA32F) texture coordinates and vertex colour.
+    `caster_distance` (R32F, a texel for CASTER_CELL x CASTER_CELL) bounds how far away the nearest texel that shows
+    anything is from below, squared, in cells; 0 unless `ShadowMaps` measured it.
     """
 
     def __init__(self, gpu: GpuContext, tiles: int, tile_size: int) -> None:
@@ -61,6 +65,10 @@ class ShadowMapAtlas:
         self.depth.compare_func = ""
         self.depth.filter = (moderngl.NEAREST, moderngl.NEAREST)
         self.target = gpu.ctx.framebuffer([self.normal, self.uv], self.depth)
+        self.tile_cells = -(-tile_size // CASTER_CELL)
+        cells = (columns * self.tile_cells, rows * self.tile_cells)
+        self.caster_distance = texture_2d(gpu, cells, 1, "f4")
+        self.caster_distance.write(bytes(4 * cells[0] * cells[1]))
         self.clear()
 
     def clear(self) -> None:
@@ -77,7 +85,7 @@ class ShadowMapAtlas:
     def release(self) -> None:
         """Frees the GL objects."""
         release_target(self.target)
-        for item in (self.depth, self.normal, self.uv):
+        for item in (self.depth, self.normal, self.uv, self.caster_distance):
             item.release()
 
 
@@ -85,7 +93,11 @@ class ShadowMaps:
     """Draws meshes into the tiles of an atlas."""
 
     def __init__(self, gpu: GpuContext) -> None:
+        self._gpu = gpu
         self._kernel = RasterKernel(gpu, "reflective_shadow_map")
+        self._find_casters = Kernel(gpu, "caster_cells", CELL=CASTER_CELL)
+        self._spread = Kernel(gpu, "caster_distance")
+        self._rows: moderngl.Texture | None = None
 
     def run(self, atlas: ShadowMapAtlas, meshes: Sequence[MeshBuffers], views: Sequence[LightView]) -> None:
         """Draws all `meshes` for each view, tile by tile."""
@@ -105,9 +117,21 @@ class ShadowMaps:
                     front=EVERYWHERE if view.front is None else view.front,
                 )
 
+    def measure_distances(self, atlas: ShadowMapAtlas) -> None:
+        """Fills `caster_distance` of the maps as they were drawn."""
+        size, own = atlas.caster_distance.size, {"tile_cells": atlas.tile_cells}
+        if self._rows is None or self._rows.size != size:
+            release_all(self._rows)
+            self._rows = texture_2d(self._gpu, size, 1, "f4")
+        self._find_casters.run(
+            size, own, cells_out=atlas.caster_distance, depth_map=atlas.depth, tile_size=atlas.tile_size
+        )
+        self._spread.run(size, own, cells=atlas.caster_distance, cells_out=self._rows, axis=(1, 0))
+        self._spread.run(size, own, cells=self._rows, cells_out=atlas.caster_distance, axis=(0, 1))
+
     def release(self) -> None:
-        """Frees the program."""
-        self._kernel.release()
+        """Frees the GL objects."""
+        release_all(self._kernel, self._find_casters, self._spread, self._rows)
 
 
 def light_views(

@@ -9,14 +9,18 @@ import numpy as np
 import pytest
 import trimesh
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
 from scipy.optimize import curve_fit
 
 from deltalight.render_server.gpu.context import GpuContext
+from deltalight.render_server.passes.shadow_maps import CASTER_CELL, ShadowMaps
 from deltalight.render_server.passes.voxels import VolumePlacement
+from deltalight.render_server.renderer import SceneRenderer
 from tests.render_server.scenes import (
     Fields,
     Stage,
     ambient,
+    array_of,
     ball,
     cube,
     directional,
@@ -164,3 +168,58 @@ def test_marching_mu_only_where_it_differs_changes_nothing(
     always = solve(gpu, document)
     assert np.array_equal(sparing.cones_mu, always.cones_mu)
     assert np.array_equal(sparing.cones_rho, always.cones_rho)
+
+
+LAMPS = {
+    "wide lamp": sphere_light((0.5, -0.4, 0.5), 2.0, 0.15),
+    "sun": directional((-1.0, 0.3, -0.4), 2.0, 3.0),
+    "panel": {
+        "type": "rectangle",
+        "position_m": (0.7, 0.1, 0.4),
+        "axis_u_m": (0.0, 0.0, 0.05),
+        "axis_v_m": (0.0, 0.05, 0.0),
+        "radiance": 5.0,
+    },
+    "lamp among them": sphere_light((0.06, 0.02, 0.05), 0.05, 0.005),
+}
+
+
+@pytest.mark.parametrize("light", LAMPS.values(), ids=LAMPS)
+def test_looking_for_shadows_only_near_casters_changes_nothing(
+    gpu: GpuContext, stage: Stage, monkeypatch: pytest.MonkeyPatch, light: dict[str, object]
+) -> None:
+    objects = [stage.virtual(cube(0.08, (0.12, 0.08, 0))), stage.virtual(ball(0.05, (-0.05, -0.05, 0.09)))]
+    document = stage.document(objects, [light, ambient(0.15)], floor(), volume_edge_m=0.3, cone_scale=4)
+    sparing = solve(gpu, document)
+    monkeypatch.setattr(ShadowMaps, "measure_distances", lambda *_: None)  # then casters may be anywhere
+    always = solve(gpu, document)
+    reached, all_reached = ((each.direct_mu > 0).any(axis=-1) for each in (sparing, always))
+    assert not (reached & ~all_reached).any()
+    assert np.array_equal(sparing.direct_mu[reached], always.direct_mu[reached])
+    assert np.array_equal(sparing.direct_rho[reached], always.direct_rho[reached])
+    left = all_reached & ~reached
+    assert left.sum() > 100
+    assert np.array_equal(always.direct_mu[left], always.direct_rho[left])
+    assert np.abs(sparing.virtual_radiance - always.virtual_radiance).max() < 2e-3
+
+
+def test_distances_to_casters(gpu: GpuContext, stage: Stage) -> None:
+    """In tiles of 130 texels, whose last cells are cut; those of a lamp's other views tell nothing of them."""
+    lamps = [sphere_light((0.1, -0.1, 0.3), 1.0), directional((-1.0, 0.3, -1.0))]
+    objects = [stage.virtual(cube(0.08, (0.12, 0.08, 0))), stage.virtual(ball(0.02, (-0.2, -0.2, 0.1)))]
+    renderer = SceneRenderer(gpu, stage.document(objects, lamps, floor(), rsm_size=130))
+    renderer.render(frame())
+    assert renderer.graph is not None
+    atlas = renderer.graph["shadow maps objects"].virtual_atlas
+    shows = np.frombuffer(atlas.depth.read(alignment=1), np.float32).reshape(atlas.size[::-1]) < 1
+    squared, cells = array_of(atlas.caster_distance)[..., 0], atlas.tile_cells
+    for tile in range(atlas.tiles):
+        x, y, edge, _ = atlas.box(tile)
+        texels = distance_transform_edt(~shows[y : y + edge, x : x + edge])
+        column, row = x // edge * cells, y // edge * cells
+        bound = CASTER_CELL * np.sqrt(squared[row : row + cells, column : column + cells])
+        bound = np.kron(bound, np.ones((CASTER_CELL, CASTER_CELL)))[:edge, :edge]
+        assert shows[y : y + edge, x : x + edge].any()
+        assert (bound <= texels).all()
+        assert (bound >= texels - 3 * CASTER_CELL).all()
+    renderer.release()

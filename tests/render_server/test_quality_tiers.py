@@ -111,6 +111,57 @@ def test_a_camera_over_a_still_room_lights_no_voxel(gpu: GpuContext, tmp_path: P
     best.renderer.release()
 
 
+def dragged(scene: SceneDocument, along_m: float) -> SceneDocument:
+    first, *others = scene.objects
+    pose = first.pose.model_copy(update={"translation_m": (along_m, 0.0, 0.0)})
+    return scene.replaced(objects=(first.model_copy(update={"pose": pose}), *others))
+
+
+BOUNCES = {
+    "exact": {"voxelize objects", "light joint voxels", "bounces joint"},
+    "paper": {"voxelize objects", "split inject"},
+    "dlpv": {"voxelize objects", "inject change", "bounces"},
+}
+FOLLOWS = {"object surface", "shadow maps objects", "direct light", "virtual surface"}
+
+
+@pytest.mark.parametrize("method", BOUNCES)
+def test_light_bounces_later_off_objects_that_move(gpu: GpuContext, tmp_path: Path, method: str) -> None:
+    """In every other frame, and in the first at rest; what is seen of them and their shadows are in each."""
+    scene = scene_of(Case(method, "depth", "plain"), Stage(tmp_path))
+    player = Player(gpu, scene, "live")
+    player.show()
+    ran = []
+    for along_m in (0.004, 0.008, 0.012, 0.016, 0.016):
+        player.change(dragged(scene, along_m))
+        player.show()
+        ran.append(player.ran("objects"))
+    assert all(ran[frame] >= FOLLOWS for frame in range(4))
+    assert [bool(BOUNCES[method] & stages) for stages in ran] == [True, False, True, False, True]
+    assert all(BOUNCES[method] <= ran[frame] for frame in (0, 2, 4))
+    player.renderer.release()
+
+
+def test_a_dragged_object_is_close_to_the_best_and_as_if_put_there_once_it_stands(
+    gpu: GpuContext, scene: SceneDocument, players: dict[str, Player]
+) -> None:
+    live, best = players["live"], players["best"]
+    live.show()
+    for along_m in (0.004, 0.008, 0.012, 0.016):
+        shown = {}
+        for quality, player in (("live", live), ("best", best)):
+            player.change(dragged(scene, along_m))
+            shown[quality] = player.show()
+        assert psnr_db(shown["live"], shown["best"]) > 36
+    stands = live.show()
+    put = Player(gpu, scene, "live")
+    put.show()
+    put.change(dragged(scene, 0.016))
+    put.count = live.count - 1
+    assert np.abs(stands - put.show()).max() <= 1
+    put.renderer.release()
+
+
 def test_at_rest_it_becomes_the_best_picture(players: dict[str, Player]) -> None:
     live, best = players["live"], players["best"]
     for aside in ASIDE:

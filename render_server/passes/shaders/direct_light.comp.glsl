@@ -7,11 +7,12 @@
 #include "common/work_list.glsl"
 
 layout(local_size_x = 64) in;
-layout(rgba16f) writeonly uniform image2D direct_mu;    // rgb E_mu; a: unshadowed E, mean of channels
+layout(rgba16f) uniform image2D direct_mu;              // rgb E_mu; a: unshadowed E, mean of channels
 layout(rgba16f) writeonly uniform image2D direct_rho;   // rgb E_rho
 layout(rgba16f) writeonly uniform image2D lobe_mu;      // rgb radiance of light lobes
 layout(rgba16f) writeonly uniform image2D lobe_rho;
 #pragma switch bool specular_surfaces
+uniform bool keeps_unblocked;   // direct_mu holds what the last frame found; a = 0: nothing
 
 #ifdef SHADOW_CONES
 vec2 light_visibility(Light light, vec3 p, vec3 n, float bias) { return cone_visibility(light, p, n, bias); }
@@ -28,9 +29,11 @@ void light(ivec2 pixel, ivec2 size) {
     float unshadowed = 0.0;
     float bias = shadow_bias(position.w);
     bool reached = light_may_change(pixel, position, normal.xyz);
+    vec4 kept = keeps_unblocked ? imageLoad(direct_mu, pixel) : vec4(0.0);
+    bool known = kept.a > 0.0 && !shadow_may_reach(position.xyz, normal.xyz, bias);
     if (reached) {
         vec3 v = normalize(camera_position - position.xyz);
-        for (int i = 0; i < light_count; ++i) {
+        for (int i = 0; i < (known ? 0 : light_count); ++i) {
             vec3 l; float radius;
             vec3 across = light_at(lights[i], position.xyz, normal.xyz, l, radius);
             float cosine = dot(normal.xyz, l);
@@ -47,6 +50,7 @@ void light(ivec2 pixel, ivec2 size) {
             }
         }
     }
+    if (known) { e_mu = e_rho = kept.rgb; unshadowed = kept.a; }
     float fade = volume_fade(volume_coordinate(position.xyz));
     if (reached && fade > 0.0)
         e_rho += fade * caustic_irradiance(pixel, size, REAL_LAYER, position.xyz, normal.xyz, position.w);

@@ -13,6 +13,7 @@ uniform sampler2D last_direct_mu;
 uniform sampler2D last_direct_rho;
 uniform ivec2 low_resolution_size;
 uniform int scale;
+uniform bool keeps_unblocked;   // where a pixel shows the same point: its light without the objects
 
 // Change of the ratio of irradiances from pixel to pixel, from which on it is an edge: it would blur.
 const float SHARPEST = 0.04;
@@ -48,6 +49,11 @@ bool reproject(ivec2 pixel) {
     return kept || position.w <= 0.0;
 }
 
+void keep_unblocked(ivec2 pixel) {
+    bool same = texelFetch(last_position, pixel, 0) == texelFetch(real_surface_position, pixel, 0);
+    imageStore(direct_mu_out, pixel, same ? texelFetch(last_direct_mu, pixel, 0) : vec4(0.0));
+}
+
 void main() {
     ivec2 size = textureSize(real_surface_position, 0);
     for (uint i = first_item(); i < listed_count(); i += items_apart()) {
@@ -56,6 +62,10 @@ void main() {
         for (int j = 0; j < (has_history ? scale * scale : 0); ++j) {
             ivec2 pixel = pixel_in_block(texel, j, scale);
             if (all(lessThan(pixel, size))) known = reproject(pixel) && known;
+        }
+        for (int j = 0; j < (keeps_unblocked ? scale * scale : 0); ++j) {
+            ivec2 pixel = pixel_in_block(texel, j, scale);
+            if (all(lessThan(pixel, size))) keep_unblocked(pixel);
         }
         if (!has_history || !known) needed[atomicAdd(needed_count, 1u)] = texels[i];
     }

@@ -1,5 +1,5 @@
 // Where cones and caustics must be computed at each texel of the reduced grid: where the last frame did not see the
-// texel's surface; and in turn, one tile in `turns`, so that errors of resampling do not add up. Keeps the points that
+// texel's surface, on objects that moved; and in turn, one tile in `turns`, so that errors of resampling do not add up. Keeps the points that
 // the next frame looks up.
 #include "common/geometry.glsl"
 #include "common/reprojection.glsl"
@@ -10,6 +10,7 @@ uniform isampler2D sample_pixels;
 layout(r8ui) writeonly uniform uimage2D stale_out;
 layout(rgba32f) writeonly uniform image2D real_texels_out;
 layout(rgba32f) writeonly uniform image2D object_texels_out;
+uniform bool objects_moved;
 
 bool is_unknown(vec4 position, vec3 normal, bool object) {
     return position.w > 0.0 && (!has_history || last_texels(position, normal, object).total < LEAST_WEIGHT);
@@ -33,7 +34,7 @@ void main() {
     }
     bool due = is_due(texel);
     uint stale = due || is_unknown(real, real_normal, false) ? STALE_REAL : 0u;
-    if (object.w > 0.0 && (due || is_unknown(object, object_normal, true))) stale |= STALE_OBJECT;
+    if (object.w > 0.0 && (due || objects_moved || is_unknown(object, object_normal, true))) stale |= STALE_OBJECT;
     imageStore(stale_out, texel, uvec4(stale));
     imageStore(real_texels_out, texel, real);
     imageStore(object_texels_out, texel, object);

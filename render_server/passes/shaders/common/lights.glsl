@@ -36,6 +36,7 @@ layout(std430) readonly buffer Lights { Light lights[]; };
 layout(std430) readonly buffer LightViews { LightView light_views[]; };
 uniform sampler2D real_light_depth;
 uniform sampler2D virtual_light_depth;
+uniform sampler2D caster_distance;   // of virtual_light_depth: squared, in cells of CASTER_CELL x CASTER_CELL texels
 uniform sampler2DArray mirror_visibility;   // r, g: fraction of an image that a plane shows without and with objects
 #include "common/lighting.glsl"
 uniform int shadow_samples;
@@ -142,6 +143,7 @@ vec2 tile_texel(LightView view, vec2 s) {
 }
 
 const float NOTHING = 1e30;
+const float COMPARED_TEXELS = 2.0;   // beyond a sample's own place, by bilinear comparison and rounding
 const float WIDE_TEXELS = 6.0;   // penumbrae wider than this get more samples
 
 float first_depth(sampler2D map, LightView view, ivec2 texel) {
@@ -315,21 +317,39 @@ float passes(sampler2D map, Occluder o, vec2 offset) {
     return lit;
 }
 
-// Whether a virtual object can stand between p and any part of any light.
-bool object_may_shadow(vec3 p, float bias) {
+const float CASTER_CELL = 8.0;
+
+// Least distance of an object from a lateral position in its map, texels.
+float texels_to_caster(LightView view, vec2 s) {
+    vec2 t = (0.5 + 0.5 * s / view.tile.w) * view.tile.z, inside = clamp(t, vec2(0.5), vec2(view.tile.z - 0.5));
+    vec2 first = view.tile.xy / view.tile.z * ceil(view.tile.z / CASTER_CELL);
+    float from_inside = CASTER_CELL * sqrt(texelFetch(caster_distance, ivec2(first + inside / CASTER_CELL), 0).r);
+    float outside = distance(t, inside);
+    return max(from_inside - outside, outside);
+}
+
+// Whether a virtual object can stand between any part of a light and a point at most `margin` (m) from p.
+bool object_may_block(Light light, vec3 p, float bias, float margin) {
+    bool found = false;
+    for (int j = light.views.z; j < light.views.z + light.views.w && !found; ++j) {
+        LightView view = light_views[j];
+        vec3 v = (view.view_from_world * vec4(p, 1.0)).xyz;
+        float depth = v.z + margin, texel = 2.0 * view.tile.w / view.tile.z;
+        if (depth - bias <= view.range.x) continue;
+        vec2 s = lateral(view, v);
+        Spread k = spread_of(light, view, s, depth);
+        float reach = k.widest * drift(view, depth, view.range.x) * (k.square ? sqrt(2.0) : 1.0);
+        reach += view.range.z > 0.5 ? margin : margin * (1.0 + length(s)) / max(v.z - margin, 1e-3);
+        found = texels_to_caster(view, s) <= reach / texel + COMPARED_TEXELS;
+    }
+    return found;
+}
+
+// Whether a virtual object can stand between any part of any light and a point at most `margin` (m) from p.
+bool object_may_shadow(vec3 p, float bias, float margin) {
     for (int i = 0; i < light_count; ++i) {
-        Light light = lights[i];
-        vec2 shown = mirror_fraction(light, p);
-        if (shown.x != shown.y) return true;
-        for (int j = light.views.z; j < light.views.z + light.views.w; ++j) {
-            LightView view = light_views[j];
-            vec3 v = (view.view_from_world * vec4(p, 1.0)).xyz;
-            float depth = v.z - bias;
-            if (depth <= view.range.x) continue;
-            vec2 s = lateral(view, v);
-            float reach = spread_of(light, view, s, depth).widest * drift(view, depth, view.range.x);
-            if (all(lessThanEqual(abs(s), vec2(view.tile.w + reach)))) return true;
-        }
+        vec2 shown = mirror_fraction(lights[i], p);
+        if (shown.x != shown.y || object_may_block(lights[i], p, bias, margin)) return true;
     }
     return false;
 }
@@ -385,6 +405,7 @@ float real_visibility(Light light, vec3 p, vec3 n, float bias) {
 // 3). `bias_real`, `bias_virtual` (m) move the receiver towards the light.
 vec2 visibility(Light light, vec3 p, vec3 n, float bias_real, float bias_virtual) {
     Occluder real = occluder(real_light_depth, light, light.views.x, light.views.y, p, n, bias_real);
-    Occluder object = occluder(virtual_light_depth, light, light.views.z, light.views.w, p, n, bias_virtual);
+    int views = object_may_block(light, p, bias_virtual, 0.0) ? light.views.w : 0;
+    Occluder object = occluder(virtual_light_depth, light, light.views.z, views, p, n, bias_virtual);
     return mirror_fraction(light, p) * visible_fraction(light, real, object, p, n);
 }

@@ -1,0 +1,36 @@
+"""Stages of a frame graph that may show what moves as it was some frames before."""
+
+from collections.abc import Container, Sequence
+from dataclasses import dataclass
+
+
+@dataclass(eq=False)
+class Lag:
+    """Stages that follow changes of the inputs `behind` in one of `turns` frames, as long as these keep changing.
+
+    Their first change, a change of any other input, and a frame without change run the stages at once.
+    """
+
+    behind: Container[object]
+    turns: int
+    has_run: bool = False  # in this frame, because of `behind` alone
+    is_waiting: bool = False  # in this frame
+    _waited: int = 0  # frames in a row
+    _may_wait: bool = False
+
+    def begin_frame(self) -> None:
+        """Decides whether the stages may wait in this frame: if they ran in the last, or have not waited long."""
+        self._waited = self._waited + 1 if self.is_waiting else 0
+        self._may_wait = (self.has_run or self.is_waiting) and self._waited < self.turns - 1
+        self.has_run = self.is_waiting = False
+
+    def holds(self, inputs: Sequence[object], seen: Sequence[int] | None, versions: Sequence[int]) -> bool:
+        """Whether a stage waits; its inputs had the versions `seen` when it last ran (None: never). Notes it."""
+        if seen is None:
+            return False
+        changed = (item for item, old, new in zip(inputs, seen, versions, strict=True) if old != new)
+        if any(item not in self.behind for item in changed):
+            return False
+        self.is_waiting |= self._may_wait
+        self.has_run |= not self._may_wait
+        return self._may_wait
