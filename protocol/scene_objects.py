@@ -60,7 +60,25 @@ class Material(StrictModel):
     emission: Radiance = Field(
         default=(0.0, 0.0, 0.0), description="Emitted radiance, linear R G B, camera units."
     )
-    transmission: Fraction = Field(default=0.0, description="Share of light that passes through, 0..1.")
+    transmission: Fraction = Field(
+        default=0.0,
+        description="Share of the light that enters the surface and passes through it, 0..1; the rest is diffuse. "
+        "Each surface that light passes multiplies it by base_color. Refraction is by ior, or as specular has it.",
+    )
+    thin_walled: bool = Field(
+        default=False,
+        description="true = a sheet without thickness, which bends no light; false = a solid body.",
+    )
+    attenuation_color: Colour = Field(
+        default=(1.0, 1.0, 1.0),
+        description="Colour that white light has after `attenuation_distance_m` inside, linear R G B, 0..1.",
+    )
+    attenuation_distance_m: float | None = Field(
+        default=None,
+        gt=0,
+        le=1e4,
+        description="Path inside after which light has `attenuation_color`, metres. null = clear.",
+    )
 
 
 class PrecomputedMaterial(StrictModel):

@@ -11,7 +11,6 @@ from jaxtyping import Float32, Float64
 from deltalight.protocol.frames import ViewFrame
 from deltalight.protocol.scene import SceneDocument
 from deltalight.protocol.scene_fields import View
-from deltalight.protocol.scene_objects import Material
 from deltalight.protocol.scene_output import Output
 from deltalight.render_server.estimation.albedo import AlbedoEstimator
 from deltalight.render_server.estimation.lighting import LightEstimator
@@ -423,10 +422,8 @@ def _same_objects(some: Sequence[object], others: Sequence[object]) -> bool:
 
 def unsupported_requests(scene: SceneDocument) -> list[str]:
     """Returns sentences on requests of the document that this release does not render."""
-    materials = [item.material for item in scene.objects if isinstance(item.material, Material)]
     requests = {
         f"shading.name `{scene.shading.name}`": scene.shading.name == "precomputed",
-        "a material's transmission": any(material.transmission > 0 for material in materials),
     }
     return [
         f"{name} arrives with a later release and is left out." for name, asked in requests.items() if asked

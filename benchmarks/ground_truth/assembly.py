@@ -13,6 +13,7 @@ from deltalight.benchmarks.ground_truth.parts import MeshFolder, diffuse, rgb, s
 from deltalight.render_server.lights.environment import read_radiance
 
 ENVIRONMENT_FILE = "environment.hdr"
+GLASS_IOR = 1.5  # whose reflectance `specular` 0.5 is
 
 WORLD_FROM_MITSUBA_MAP = np.array(
     [[0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
@@ -24,8 +25,10 @@ Ours has +z, +x and +y in these places.
 
 
 def material(finish: Finish) -> dict[str, Any]:
-    """Return Mitsuba's material of the scene document's terms; Lambertian if the document says so."""
+    """Return Mitsuba's material of the scene document's terms; Lambertian or smooth glass if that says so."""
     color = rgb(finish.base_color)
+    if finish.transmission:
+        return {"type": "dielectric", "int_ior": GLASS_IOR, "ext_ior": 1.0, "specular_transmittance": color}
     if finish.metallic == 0 and finish.specular == 0:
         return diffuse(color)
     return energy_keeping(
@@ -80,7 +83,9 @@ class Assembly:
         """
         objects = {}
         for index, (item, file) in enumerate(zip(self.scene.objects, self._files, strict=True)):
-            place, bsdf = item.world_from_object[frame], two_sided(material(item.finish))
+            place, bsdf = item.world_from_object[frame], material(item.finish)
+            if not item.finish.transmission:
+                bsdf = two_sided(bsdf)
             glow = {"emitter": _area(item.finish.emission)} if any(item.finish.emission) else {}
             objects[f"object_{index}"] = shape("ply", place, filename=file, bsdf=bsdf, **glow)
         return {**self.without(), **objects}

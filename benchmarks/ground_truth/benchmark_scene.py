@@ -38,7 +38,8 @@ TABLE_Z_M = -0.0005
 class Finish:
     """Material of a virtual object in the scene document's terms (docs/formats.md 3); linear colours.
 
-    `metallic` 0 with `specular` 0 is Lambertian; metals and dielectrics have a GGX lobe.
+    `metallic` 0 with `specular` 0 is Lambertian; metals and dielectrics have a GGX lobe. `transmission` is 0, or 1
+    for smooth glass.
     """
 
     base_color: Triple
@@ -46,6 +47,7 @@ class Finish:
     metallic: float = 0.0
     specular: float = 0.5
     emission: Triple = (0.0, 0.0, 0.0)
+    transmission: float = 0.0
 
 
 @dataclass(frozen=True)

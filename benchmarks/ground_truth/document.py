@@ -41,6 +41,7 @@ def _object(item: VirtualObject, frame: int, assets: str) -> dict[str, Any]:
             "metallic": finish.metallic,
             "specular": finish.specular,
             "emission": list(finish.emission),
+            **({"transmission": finish.transmission} if finish.transmission else {}),
         },
     }
 

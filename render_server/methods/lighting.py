@@ -13,6 +13,7 @@ from deltalight.protocol.quality import BEST, QualityTier
 from deltalight.render_server.frame import FrameResources, Observation
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings
+from deltalight.render_server.gpu.textures import release_all
 from deltalight.render_server.gpu_scene import GeometryState, ObjectExtent
 from deltalight.render_server.graph import Graph, Resource
 from deltalight.render_server.lights.lights import LightSet
@@ -23,7 +24,7 @@ from deltalight.render_server.passes.composite import ChangeRatio
 from deltalight.render_server.passes.cones import ConeFields, LowResGrid
 from deltalight.render_server.passes.gbuffer import ObjectBvh
 from deltalight.render_server.passes.lights import LightBuffers
-from deltalight.render_server.passes.reflections import ROUGHEST, MirrorRays, ScreenCones
+from deltalight.render_server.passes.reflections import ROUGHEST, MirrorRays, ScreenCones, TransmittedLight
 from deltalight.render_server.passes.shading import DirectLight, LightHistory, LightState, VirtualSurface
 from deltalight.render_server.passes.voxel_light import AlbedoTexture
 from deltalight.render_server.passes.voxels import (
@@ -172,6 +173,7 @@ class Shading:
         self._screen: ScreenCones | None = None
         if options.screen_space:
             self._screen = ScreenCones(gpu, self.grid, options.march, options.tier)
+        self._transmitted: TransmittedLight | None = None
         self._rays: MirrorRays | None = None
         self.normal_offset: Callable[[Points], float] = lights.virtual_texel_m
         self.is_everywhere = False  # nothing is skipped because objects seem not to reach it
@@ -190,6 +192,7 @@ class Shading:
         Geometry, lights, volume, and values derived from them.
         """
         low, high = objects.bounds
+        has_caustics = self._caustics is not None and casts_caustics(objects)
         bounds = volume.placement.voxel_bounds(np.stack([low, high])).astype(float)
         return {
             **geometry,
@@ -201,8 +204,10 @@ class Shading:
             "object_low": tuple(bounds[:3]),
             "object_high": tuple(1.0 - bounds[3:]),
             "lit_area": (0, 0, *self.size) if self.is_everywhere else area,
-            "has_caustics": self._caustics is not None and casts_caustics(objects),
-            "hidden_too": self._screen is not None and reflects_screen(objects),
+            "has_caustics": has_caustics,
+            "beam_alpha": GREATEST_ALPHA if has_caustics else 0.0,
+            "hidden_too": objects.materials.transmits
+            or (self._screen is not None and reflects_screen(objects)),
         }
 
     def _normal_offset(self, objects: GeometryState) -> float:
@@ -242,7 +247,8 @@ class Shading:
         reach = volume.placement.size * volume.placement.voxel_edge
         own = {"normal_offset": self._normal_offset(objects)}
         scene = {**seen.bindings, **objects.materials.bindings, **self._lights.bindings, **own}
-        self._caustics.trace(self._lights, scene, bias_m=seen.scan.bias_m, reach_m=reach)
+        transmits = objects.materials.transmits
+        self._caustics.trace(self._lights, scene, bias_m=seen.scan.bias_m, reach_m=reach, transmits=transmits)
         return self._caustics
 
     def cast_caustics(self, scene: Bindings, _grid: LowResGrid, beams: Caustics | None) -> Caustics | None:
@@ -283,6 +289,7 @@ class Shading:
 
     def trace_screen(
         self,
+        objects: GeometryState,
         scene: Bindings,
         direct: DirectLight,
         cones: ConeFields,
@@ -291,7 +298,7 @@ class Shading:
         marching: Bindings,
     ) -> moderngl.Texture | None:
         """Traces what smooth objects reflect of the picture."""
-        if self._screen is None or not scene["hidden_too"]:
+        if self._screen is None or not reflects_screen(objects):
             return None
         seen.image.build_levels()
         self._screen.run(direct, cones, bvh, {**scene, **marching})
@@ -309,6 +316,30 @@ class Shading:
         self._surface.run(cones, grid, scene, screen=screen, caustics=caustics)
         return self._surface.radiance
 
+    def add_transmitted(
+        self,
+        radiance: moderngl.Texture,
+        objects: GeometryState,
+        scene: Bindings,
+        direct: DirectLight,
+        cones: ConeFields,
+        bvh: ObjectBvh,
+        seen: Observation,
+        marching: Bindings,
+    ) -> moderngl.Texture:
+        """Adds what transparent objects show of what is behind them, if there are any."""
+        if not objects.materials.transmits:
+            release_all(self._transmitted)
+            self._transmitted = None
+            return radiance
+        if self._transmitted is None:
+            self._transmitted = TransmittedLight(
+                self._gpu, self.grid, self._options.march, self._options.tier
+            )
+        seen.image.build_levels()
+        self._transmitted.run(radiance, direct, cones, bvh, {**scene, **marching})
+        return self._transmitted.radiance
+
     def release(self) -> None:
         """Frees the GL objects."""
         held = (
@@ -321,6 +352,7 @@ class Shading:
             self._change,
             self._caustics,
             self._screen,
+            self._transmitted,
             self._rays,
         )
         for item in held:
@@ -377,8 +409,10 @@ def shading_stages(
     direct = g.stage("direct light", light_directly or shading.light_directly, scene, grid, caustics, shown)
     reflection = g.stage("reflections", shading.reflect_objects, scene, grid, bvh, marching)
     change = g.stage("change of light", shading.compare, grid, direct, cones, reflection)
-    screen = g.stage("screen cones", shading.trace_screen, scene, direct, cones, bvh, s.observation, marching)
-    radiance = g.stage("virtual surface", shading.shade_objects, scene, grid, cones, caustics, screen)
+    behind = (s.objects, scene, direct, cones, bvh, s.observation, marching)
+    screen = g.stage("screen cones", shading.trace_screen, *behind)
+    reflected = g.stage("virtual surface", shading.shade_objects, scene, grid, cones, caustics, screen)
+    radiance = g.stage("transmitted light", shading.add_transmitted, reflected, *behind)
     return Layers(direct, cones, grid, change, radiance, reflection, shown, volume, lit.real_maps)
 
 

@@ -1,6 +1,7 @@
 """Caustics: light that smooth virtual surfaces cast on others, as beams traced from the lights' object maps."""
 
 import math
+from collections.abc import Sequence
 
 from deltalight.render_server.gpu.context import GpuContext
 from deltalight.render_server.gpu.kernel import Binding, Bindings, Kernel, clear_buffer, list_threads
@@ -42,6 +43,7 @@ class Caustics:
         self._beams = gpu.ctx.buffer(reserve=HEADER_BYTES + BEAM_BYTES)
         self._mirror_beams = Kernel(gpu, "caustic_beams", RAY_COUNT=RAYS)
         self._lobe_beams = Kernel(gpu, "caustic_beams", RAY_COUNT=RAYS, WIDE=1)
+        self._refracted_beams: Kernel | None = None
         self._places = gpu.ctx.buffer(reserve=PLACE_BYTES)
         self._find_places = Kernel(gpu, "caustic_places")
         # Software renderers pass barriers slowly, and read a beam once for each of few threads.
@@ -56,14 +58,22 @@ class Caustics:
         """The sums, for passes that shade."""
         return {"CausticSums": self._sums}
 
-    def trace(self, lights: LightBuffers, scene: Bindings, *, bias_m: float, reach_m: float) -> None:
-        """Traces the beams.
+    def trace(
+        self, lights: LightBuffers, scene: Bindings, *, bias_m: float, reach_m: float, transmits: bool
+    ) -> None:
+        """Traces the beams, through transparent objects too if any of them `transmits`.
 
         `bias_m` offsets receivers of real shadows towards the light; beams are traced up to `reach_m`.
         """
-        self._empty_beams(len(lights.virtual_views))
+        kernels = [(self._mirror_beams, 0.0, WIDE_ALPHA), (self._lobe_beams, WIDE_ALPHA, GREATEST_ALPHA)]
+        if transmits:
+            if self._refracted_beams is None:
+                self._refracted_beams = Kernel(self._gpu, "caustic_beams", RAY_COUNT=RAYS, REFRACTED=1)
+            kernels.append((self._refracted_beams, 0.0, GREATEST_ALPHA))
+        self._empty_beams(len(lights.virtual_views) * (2 if transmits else 1))
+        own: Bindings = {**scene, "bias_real": bias_m, "reach": reach_m}
         for view in range(len(lights.virtual_views)):
-            self._trace_beams(lights, lights.first_virtual_view + view, scene, bias_m, reach_m)
+            self._trace_beams(lights, lights.first_virtual_view + view, own, kernels)
 
     def run(self, scene: Bindings) -> None:
         """Fills the sums with the light of the beams where they end."""
@@ -87,7 +97,7 @@ class Caustics:
         self._splat.run((self._threads,), shared, scene)
 
     def _empty_beams(self, views: int) -> None:
-        """Allocates and clears the beams of that many views."""
+        """Allocates and clears the beams of that many views, each with one kind."""
         most = max(views * self._blocks**2 * RAYS, 1)
         if self._places.size < PLACE_BYTES * most:
             self._beams.orphan(HEADER_BYTES + BEAM_BYTES * most)
@@ -95,21 +105,20 @@ class Caustics:
         self._beams.write(bytes(HEADER_BYTES))
 
     def _trace_beams(
-        self, lights: LightBuffers, view_index: int, scene: Bindings, bias_m: float, reach_m: float
+        self,
+        lights: LightBuffers,
+        view_index: int,
+        scene: Bindings,
+        kernels: Sequence[tuple[Kernel, float, float]],
     ) -> None:
-        """Adds the beams of one view: of mirrors, and of wider lobes."""
+        """Adds the beams of one view, by each kernel those of materials from its least to its greatest alpha."""
         shared: dict[str, Binding] = {
             "view_index": view_index,
             "block_edge": max(lights.tile_size // self._blocks, 1),
-            "bias_real": bias_m,
-            "reach": reach_m,
             "Beams": self._beams,
             **self._objects.bindings,
         }
-        for kernel, least, greatest in (
-            (self._mirror_beams, 0.0, WIDE_ALPHA),
-            (self._lobe_beams, WIDE_ALPHA, GREATEST_ALPHA),
-        ):
+        for kernel, least, greatest in kernels:
             kernel.run(
                 (self._blocks, self._blocks, RAYS), shared, scene, least_alpha=least, greatest_alpha=greatest
             )
@@ -124,6 +133,7 @@ class Caustics:
             self._places,
             self._mirror_beams,
             self._lobe_beams,
+            self._refracted_beams,
             self._find_places,
             self._gather,
             self._splat,

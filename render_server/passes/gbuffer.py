@@ -256,7 +256,8 @@ class ObjectBvh:
 class MaterialTable:
     """Materials in a storage buffer; if any has maps or alpha, their textures in two arrays (common/materials.glsl).
 
-    `smoothest` is the least roughness of those that reflect specularly, 1 if none does. `draws_maps`: false for the
+    `smoothest` is the least roughness of those that reflect specularly, 1 if none does; `transmits` tells whether
+    light passes through any. `draws_maps`: false for the
     real scene, of which the camera tells how it looks.
     """
 
@@ -265,6 +266,7 @@ class MaterialTable:
         self._has_cutouts = draws_maps and any(material.alpha_mode for material in mesh.materials)
         self._has_maps = draws_maps and (self._has_cutouts or bool(maps))
         self.smoothest = _smoothest(mesh)
+        self.transmits = any(material.transmits for material in mesh.materials)
         self._colors = self._data = None
         table = mesh.material_table
         if self._has_maps:
@@ -272,6 +274,7 @@ class MaterialTable:
             self._data = MapArray(gpu, [each for each in maps if not each.is_color], "f1")
             table = np.hstack([table, map_table(mesh.materials, mesh.repeats_per_m(), self._layer)])
         self._buffer = gpu.ctx.buffer(np.ascontiguousarray(table, np.float32).tobytes())
+        self._transmittances = gpu.ctx.buffer(_transmittances(mesh).tobytes()) if self.transmits else None
 
     def _layer(self, each: TextureMap) -> int:
         array = self._colors if each.is_color else self._data
@@ -287,11 +290,13 @@ class MaterialTable:
             "data_maps": None if self._data is None else self._data.texture,
             "MATERIAL_MAPS": self._has_maps,
             "CUTOUTS": self._has_cutouts,
+            "TRANSMISSION": self.transmits,
+            "Transmittances": self._transmittances,
         }
 
     def release(self) -> None:
         """Frees the GL objects."""
-        release_all(self._buffer, self._colors, self._data)
+        release_all(self._buffer, self._transmittances, self._colors, self._data)
 
 
 class MapArray:
@@ -326,9 +331,19 @@ class MapArray:
         self.texture.release()
 
 
+def _transmittances(mesh: GpuMesh) -> Float32[np.ndarray, "k 4"]:
+    """Returns what each material lets through of light in its shadow, and its alpha (common/lights.glsl)."""
+    rows = np.zeros((len(mesh.materials), 4), np.float32)
+    for index, material in enumerate(mesh.materials):
+        if material.transmits:
+            rows[index] = *material.mean_transmittance(mesh.mean_path_m(index)), material.roughness**2
+    return rows
+
+
 def _smoothest(mesh: GpuMesh) -> float:
     table = mesh.material_table
     reflects = (table[:, METALLIC] > 0) | (table[:, REFLECTANCE] > 0).any(axis=1)
+    reflects |= np.array([material.transmits for material in mesh.materials])
     darkest = np.array([_least_green(material.metallic_roughness_map) for material in mesh.materials])
     return float(min((table[:, ROUGHNESS] * darkest)[reflects], default=1.0))
 

@@ -1,4 +1,4 @@
-"""Reflections: virtual objects in smooth real surfaces, and the camera's picture in smooth virtual ones."""
+"""Virtual objects in smooth real surfaces, and the camera's picture in smooth virtual ones and through them."""
 
 from collections.abc import Mapping
 
@@ -196,6 +196,56 @@ class ScreenCones:
     def release(self) -> None:
         """Frees the GL objects."""
         release_all(self.reflected, self._traced, self._kernel, self._fill)
+
+
+class TransmittedLight:
+    """Adds what transparent objects show of what is behind them, by rays that their surfaces refract.
+
+    `radiance` (RGBA16F): with it, of the objects on the picture's grid. `march` as of ScreenCones; without voxels,
+    what the picture does not show is the environment.
+    """
+
+    def __init__(
+        self,
+        gpu: GpuContext,
+        grid: LowResGrid,
+        march: Mapping[str, float | str] | None,
+        tier: QualityTier,
+    ) -> None:
+        self._grid = grid
+        self._threads = list_threads(gpu, grid.picture_size[0] * grid.picture_size[1])
+        self.radiance = texture_2d(gpu, grid.picture_size, 4, "f2")
+        voxels = {} if march is None else {"VOXELS": 1, **march}
+        rays = tier.reflection_cones
+        self._kernel = Kernel(gpu, "transmitted_light", RAY_COUNT=rays, MEDIAN_DISC=MEDIAN_DISC, **voxels)
+
+    def run(
+        self,
+        reflected: moderngl.Texture,
+        direct: DirectLight,
+        cones: ConeFields,
+        objects: ObjectBvh,
+        scene: Bindings,
+    ) -> None:
+        """Fills `radiance`; `reflected` is the objects' own. The picture needs its mip levels."""
+        self._kernel.run(
+            (self._threads,),
+            objects.bindings,
+            scene,
+            Texels=self._grid.virtual_texels,
+            scale=self._grid.scale,
+            reflected_radiance=reflected,
+            radiance_out=self.radiance,
+            sample_pixels=self._grid.pixels,
+            direct_mu=direct.light.mu,
+            direct_rho=direct.light.rho,
+            cone_mu=cones.mu,
+            cone_rho=cones.rho,
+        )
+
+    def release(self) -> None:
+        """Frees the GL objects."""
+        release_all(self.radiance, self._kernel)
 
 
 def _clear_list(texels: moderngl.Buffer) -> None:

@@ -30,7 +30,9 @@ DRAWN_EXTENSIONS = frozenset(
         "KHR_materials_emissive_strength",
         "KHR_materials_ior",
         "KHR_materials_specular",
+        "KHR_materials_transmission",
         "KHR_materials_unlit",
+        "KHR_materials_volume",
         "KHR_mesh_quantization",
         "KHR_texture_transform",
     }
@@ -45,11 +47,15 @@ LEFT_OUT_EXTENSIONS = frozenset(
         "KHR_materials_dispersion",
         "KHR_materials_iridescence",
         "KHR_materials_sheen",
-        "KHR_materials_transmission",
         "KHR_materials_variants",
-        "KHR_materials_volume",
     }
 )
+
+_LEFT_OUT_TEXTURES = {
+    "KHR_materials_specular": ("specularTexture", "specularColorTexture"),
+    "KHR_materials_transmission": ("transmissionTexture",),
+    "KHR_materials_volume": ("thicknessTexture",),
+}
 
 
 def check_mesh_file(path: Path) -> str:
@@ -97,11 +103,10 @@ def read_gltf(path: Path) -> GltfDocument:
 def left_out(gltf: GltfDocument) -> str | None:
     """Returns a sentence about what a document uses and no picture shows; None if that is nothing."""
     names = [str(name) for name in gltf.root.get("extensionsUsed", []) if name not in DRAWN_EXTENSIONS]
-    specular = [
-        each.get("extensions", {}).get("KHR_materials_specular", {}) for each in gltf.entries("materials")
-    ]
-    if any("specularTexture" in each or "specularColorTexture" in each for each in specular):
-        names.append("the textures of KHR_materials_specular")
+    used = [each.get("extensions", {}) for each in gltf.entries("materials")]
+    for extension, textures in _LEFT_OUT_TEXTURES.items():
+        if any(texture in each.get(extension, {}) for each in used for texture in textures):
+            names.append(f"the textures of {extension}")
     if any(_has_vertex_alpha(gltf, part) for mesh in gltf.entries("meshes") for part in mesh["primitives"]):
         names.append("the alpha of its vertex colours")
     return f"{gltf.path} is shown without {', '.join(dict.fromkeys(names))}." if names else None

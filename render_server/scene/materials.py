@@ -20,7 +20,8 @@ MAX_TEXTURE_PIXELS = 64_000_000
 MAX_FILE_PIXELS = 512_000_000  # of all pictures of a file that are decoded
 MAX_TEXTURE_EDGE = 1024  # texels that are kept of a picture's longer edge
 MAP_BYTES = 512 << 20  # of all texels of one kind, mip levels left out; beyond, textures lose resolution
-MATERIAL_FLOATS = 16
+MATERIAL_FLOATS = 20
+DARKEST_ATTENUATION = 1e-4  # black has no logarithm
 _DECODED_ROWS = 1 << 20  # pixels that are made linear at a time
 _MASK_SLOPE = 8.0  # of the coverage that an alpha mask becomes, over alpha
 
@@ -74,6 +75,9 @@ class Material:
     `specular`: F0 = 0.08 specular, which `ior` overrides; `f0_tint` multiplies either. `emission` is a radiance in
     camera units. `roughness` is perceptual (alpha = roughness squared). Maps multiply the values that they are named
     after: roughness by green, metallic by blue. `alpha` multiplies that of the base colour's map.
+
+    `transmission` is the fraction of the light entering the surface that goes on through it, the rest is diffuse. The
+    solid behind a surface that is not thin turns white light into `attenuation_color` over `attenuation_distance_m`.
     """
 
     base_color: Float32[np.ndarray, "3"] = field(default_factory=lambda: np.full(3, 0.8, np.float32))
@@ -84,6 +88,9 @@ class Material:
     f0_tint: Float32[np.ndarray, "3"] = field(default_factory=lambda: np.ones(3, np.float32))
     emission: Float32[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3, np.float32))
     transmission: float = 0.0
+    is_thin: bool = False
+    attenuation_color: Float32[np.ndarray, "3"] = field(default_factory=lambda: np.ones(3, np.float32))
+    attenuation_distance_m: float = math.inf
     double_sided: bool = False
     alpha_mode: AlphaMode = AlphaMode.OPAQUE
     alpha: float = 1.0
@@ -127,6 +134,35 @@ class Material:
         mixed = (1 - self.metallic) * self.dielectric_f0 + self.metallic * self.base_color
         return mixed.astype(np.float32)
 
+    @property
+    def transmits(self) -> bool:
+        """Whether light passes through it."""
+        return self.transmission > 0 and self.metallic < 1
+
+    @property
+    def refraction_index(self) -> float:
+        """Index of refraction of the solid; if none is given, that of a surface that is as specular (0.5: 1.5)."""
+        if self.ior is not None:
+            return max(self.ior, 1.0)
+        amplitude = math.sqrt(0.08 * self.specular)
+        return (1 + amplitude) / (1 - amplitude)
+
+    @property
+    def absorption_per_m(self) -> Float32[np.ndarray, "3"]:
+        """Absorption coefficient of the solid, 1/m: -ln(attenuation colour) / distance (KHR_materials_volume)."""
+        if self.is_thin:
+            return np.zeros(3, np.float32)
+        darkest = np.maximum(self.attenuation_color, DARKEST_ATTENUATION)
+        return np.asarray(-np.log(darkest) / np.float32(self.attenuation_distance_m), np.float32)
+
+    def mean_transmittance(self, path_m: float) -> Float32[np.ndarray, "3"]:
+        """Returns what passes of light at normal incidence: two surfaces and a path between, or a thin one; R G B."""
+        entered = (1 - self.dielectric_f0) * self.base_color * (self.transmission * (1 - self.metallic))
+        return np.asarray(
+            entered ** (1 if self.is_thin else 2) * np.exp(-self.absorption_per_m * np.float32(path_m)),
+            np.float32,
+        )
+
     @classmethod
     def from_document(cls, document: MaterialDocument) -> Self:
         """Makes a material from a scene document, which replaces the asset's own."""
@@ -138,6 +174,9 @@ class Material:
             ior=document.ior,
             emission=np.array(document.emission, np.float32),
             transmission=document.transmission,
+            is_thin=document.thin_walled,
+            attenuation_color=np.array(document.attenuation_color, np.float32),
+            attenuation_distance_m=document.attenuation_distance_m or math.inf,
         )
 
     @classmethod
@@ -152,6 +191,7 @@ class Material:
         strength = extensions.get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0)
         specular = extensions.get("KHR_materials_specular", {})
         transmission = extensions.get("KHR_materials_transmission", {}).get("transmissionFactor", 0.0)
+        volume = extensions.get("KHR_materials_volume", {})
         color = np.array(pbr.get("baseColorFactor", [1, 1, 1, 1]), np.float32)
         material = cls(
             base_color=color[:3],
@@ -161,6 +201,9 @@ class Material:
             f0_tint=_f0_tint(specular),
             emission=np.array(description.get("emissiveFactor", [0, 0, 0]), np.float32) * float(strength),
             transmission=float(transmission),
+            is_thin=not volume.get("thicknessFactor", 0.0),
+            attenuation_color=np.array(volume.get("attenuationColor", [1, 1, 1]), np.float32),
+            attenuation_distance_m=float(volume.get("attenuationDistance", math.inf)),
             double_sided=bool(description.get("doubleSided", False)),
             metallic_roughness_map=textures.data(pbr.get("metallicRoughnessTexture")),
             normal_map=textures.data(description.get("normalTexture"), "scale"),
@@ -223,11 +266,18 @@ class Material:
         """Returns the material with colour, metallic and roughness clipped to 1.
 
         Raises:
-            DeltalightError: a value is not finite or negative; `place` names the file.
+            DeltalightError: a value is not finite or negative, or light is absorbed over no distance; `place` names
+                the file.
         """
-        scalars = self.metallic, self.roughness, 1.0 if self.ior is None else self.ior, self.alpha
-        numbers = np.array([*self.base_color, *self.emission, *self.f0_tint, *scalars])
-        if numbers.shape != (13,) or not np.isfinite(numbers).all() or (numbers < 0).any():
+        ior = 1.0 if self.ior is None else self.ior
+        scalars = self.metallic, self.roughness, ior, self.alpha, self.transmission
+        colors = *self.base_color, *self.emission, *self.f0_tint, *self.attenuation_color
+        numbers = np.array([*colors, *scalars])
+        if not self.attenuation_distance_m > 0:
+            raise DeltalightError(
+                f"{place}: the material `{self.name}` has an attenuationDistance that is not above 0; correct it."
+            )
+        if numbers.shape != (17,) or not np.isfinite(numbers).all() or (numbers < 0).any():
             raise DeltalightError(
                 f"{place}: the material `{self.name}` has a value below 0 or not finite; correct it."
             )
@@ -236,6 +286,8 @@ class Material:
             base_color=np.minimum(self.base_color, 1.0),
             metallic=min(self.metallic, 1.0),
             roughness=min(self.roughness, 1.0),
+            transmission=min(self.transmission, 1.0),
+            attenuation_color=np.minimum(self.attenuation_color, 1.0),
         )
 
 
@@ -399,10 +451,11 @@ def _uv_matrix(transform: dict[str, Any]) -> Float32[np.ndarray, "2 3"]:
     return matrix
 
 
-def material_table(materials: Sequence[Material]) -> Float32[np.ndarray, "k 16"]:
-    """Packs materials for a shader, four vectors each.
+def material_table(materials: Sequence[Material]) -> Float32[np.ndarray, "k 20"]:
+    """Packs materials for a shader, five vectors each.
 
-    (base color, metallic), (dielectric F0, roughness), (emission, transmission), (double sided 0/1, 0, 0, 0).
+    (base color, metallic), (dielectric F0, roughness), (emission, transmission), (double sided 0/1, 0, 0, 0),
+    (absorption 1/m, index of refraction; 0: thin).
     """
     table = np.zeros((len(materials), MATERIAL_FLOATS), np.float32)
     for row, material in zip(table, materials, strict=True):
@@ -410,6 +463,7 @@ def material_table(materials: Sequence[Material]) -> Float32[np.ndarray, "k 16"]
         row[4:8] = *material.dielectric_f0, material.roughness
         row[8:12] = *material.emission, material.transmission
         row[12] = material.double_sided
+        row[16:20] = *material.absorption_per_m, 0.0 if material.is_thin else material.refraction_index
     return table
 
 

@@ -314,7 +314,7 @@ class GpuMesh:
     vertices: Float32[np.ndarray, "n 12"]
     triangles: Int32[np.ndarray, "m 3"]
     materials: tuple[Material, ...]
-    material_table: Float32[np.ndarray, "k 16"]
+    material_table: Float32[np.ndarray, "k 20"]
     second_uv: Float32[np.ndarray, "n 2"] | None
 
     def repeats_per_m(self) -> Float32[np.ndarray, " k"]:
@@ -328,6 +328,14 @@ class GpuMesh:
         ]
         scale = np.array([_map_area(each) for each in self.materials])
         return np.sqrt(scale * sums[0] / np.maximum(sums[1], 1e-30)).astype(np.float32)
+
+    def mean_path_m(self, material: int) -> float:
+        """Returns the mean length of straight paths through a closed part of that material, 4 V / A (Cauchy 1841)."""
+        of_part = self.vertices[self.triangles[:, 0], 11] == material
+        a, b, c = np.moveaxis(self.vertices[self.triangles[of_part], :3].astype(np.float64), 1, 0)
+        across = np.cross(b - a, c - a)
+        volume = abs(float(((a - a.mean(axis=0)) * across).sum())) / 6
+        return 4 * volume / max(float(np.linalg.norm(across, axis=1).sum()) / 2, 1e-30)
 
 
 def _map_area(material: Material) -> float:

@@ -1,5 +1,6 @@
 """Facts about a mesh or a map, found by loading it (in the worker)."""
 
+import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -64,7 +65,14 @@ def _material_facts(meshes: Sequence["TriangleMesh"]) -> Facts:
         "ior": None if material.ior is None else round(float(material.ior), 4),
         "emission": _rounded(emission),
         "transmission": round(float(material.transmission), 4),
+        "thin_walled": material.is_thin,
+        "attenuation_color": _rounded(material.attenuation_color),
+        "attenuation_distance_m": _finite(material.attenuation_distance_m),
     }
+
+
+def _finite(distance_m: float) -> float | None:
+    return round(distance_m, 6) if math.isfinite(distance_m) else None
 
 
 def _rounded(color: Iterable[float]) -> list[float]:

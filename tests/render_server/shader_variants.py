@@ -45,6 +45,14 @@ TEXTURED: dict[Case, dict[str, Any]] = {
     Case("dlpv-paper", "depth", "plain"): {"direct_filter": 1},
     Case("aroof", "depth", "mirror"): {},
 }
+GLASS: dict[Case, dict[str, Any]] = {
+    Case("exact", "depth", "mirror"): {},
+    Case("exact", "depth", "antialiased"): {"quality": "live"},
+    Case("paper", "depth", "mirror"): {},
+    Case("differential", "depth", "mirror"): {},
+    Case("dlpv", "model", "mirror"): {},
+    Case("aroof", "depth", "mirror"): {},
+}
 VIEWS = {
     Case("exact", "depth", "mirror"): ("effects", "delta", "volume", "rsm"),
     Case("paper", "depth", "mirror"): ("volume", "error"),
@@ -65,15 +73,34 @@ def render(case: Case, changes: dict[str, Any], gpu: GpuContext, folder: Path) -
 
 def render_textured(case: Case, changes: dict[str, Any], gpu: GpuContext, folder: Path) -> None:
     """Renders the case's first frame with a smooth object more that has maps and holes."""
-    plate = Plate(0.1, 0.1)
+    render_with(maps_and_holes(0.1), case, changes, gpu, folder)
+
+
+def render_glass(case: Case, changes: dict[str, Any], gpu: GpuContext, folder: Path) -> None:
+    """Renders the case's first frame with a sheet of glass more, plain and with maps and holes."""
+    transmission = {"KHR_materials_transmission": {"transmissionFactor": 1}}
+    plain, textured = Plate(0.1, 0.1), maps_and_holes(0.1)
+    plain.material["pbrMetallicRoughness"] = {"metallicFactor": 0, "roughnessFactor": 0}
+    for plate in (plain, textured):
+        plate.material["extensions"] = transmission
+        render_with(plate, case, changes, gpu, folder)
+
+
+def maps_and_holes(edge_m: float) -> Plate:
+    plate = Plate(edge_m, edge_m)
     plate.material |= {
         "alphaMode": "MASK",
         "normalTexture": plate.texture(even(128, 128, 255)),
         "pbrMetallicRoughness": {
             "baseColorTexture": plate.texture(even(255, 255, 255, 255)),
-            "metallicRoughnessTexture": plate.texture(even(0, 20, 255)),
+            "metallicRoughnessTexture": plate.texture(even(0, 20, 200)),
         },
     }
+    return plate
+
+
+def render_with(plate: Plate, case: Case, changes: dict[str, Any], gpu: GpuContext, folder: Path) -> None:
+    """Renders the case's first frame with the plate more."""
     asset = {
         "id": "plate",
         "asset": str(plate.write(folder / "plate.glb")),
@@ -121,6 +148,7 @@ def image_based(gpu: GpuContext, folder: Path) -> None:  # noqa: ARG001
 PARTS: dict[str, Callable[[GpuContext, Path], None]] = {
     **{str(case): partial(render, case, changes) for case, changes in CASES.items()},
     **{f"{case} textured": partial(render_textured, case, changes) for case, changes in TEXTURED.items()},
+    **{f"{case} glass": partial(render_glass, case, changes) for case, changes in GLASS.items()},
     "by device": by_device,
     "image-based shading": image_based,
 }

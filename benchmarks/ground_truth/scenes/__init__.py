@@ -1,4 +1,4 @@
-"""The benchmark's scenes, one per file."""
+"""The benchmark's scenes, one per file: those of all tables, and those of single materials."""
 
 import difflib
 
@@ -6,6 +6,7 @@ from deltalight.benchmarks.ground_truth.benchmark_scene import BenchmarkScene
 from deltalight.benchmarks.ground_truth.scenes import (
     concave_box,
     cornell,
+    glass,
     glossy_table,
     hidden_in_shadow,
     mirror_table,
@@ -29,6 +30,8 @@ SCENES: tuple[BenchmarkScene, ...] = (
     moving.SCENE,
     studio.SCENE,
 )
+MATERIAL_SCENES: tuple[BenchmarkScene, ...] = (glass.SCENE,)
+"""Of materials that SCENES lack; rendered only where they are named."""
 
 
 def scene_named(name: str) -> BenchmarkScene:
@@ -37,7 +40,7 @@ def scene_named(name: str) -> BenchmarkScene:
     Raises:
         DeltalightError: there is none; names the known ones and the nearest.
     """
-    known = {scene.name: scene for scene in SCENES}
+    known = {scene.name: scene for scene in (*SCENES, *MATERIAL_SCENES)}
     if name not in known:
         near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
         hint = f" did you mean `{near[0]}`?" if near else ""

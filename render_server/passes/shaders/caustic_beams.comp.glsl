@@ -1,6 +1,6 @@
 // Beams of light that smooth virtual surfaces reflect: the flux of each block of a light's map of the objects is
 // split over a few rays, each traced to the first surface that it hits. WIDE: they sample the GGX lobe; otherwise all
-// go in the mirror direction.
+// go in the mirror direction. REFRACTED: they go through transparent objects, along the strongest path.
 #include "common/light_rays.glsl"
 #include "common/brdf.glsl"
 #include "common/geometry.glsl"
@@ -8,6 +8,9 @@
 #include "common/ray_pattern.glsl"
 #include "common/lobe.glsl"
 #include "common/packing.glsl"
+#ifdef REFRACTED
+#include "common/refraction.glsl"
+#endif
 #define APPENDS_BEAMS
 #include "common/beams.glsl"
 
@@ -130,9 +133,9 @@ void set_footprint(inout Beam beam, Drift x, Drift y, float round) {
     beam.direction.w = FOOTPRINT_CUT * sqrt(half_sum + sqrt(max(half_sum * half_sum - det, 0.0)));
 }
 
-void send(Spot spot, vec3 direction, vec3 flux, float spread, Drift x, Drift y) {
+void send(vec3 from, vec3 direction, vec3 flux, float spread, Drift x, Drift y) {
     Beam beam;
-    beam.from = vec4(spot.point + normal_offset * spot.normal, 0.0);
+    beam.from = vec4(from, 0.0);
     MeshHit hit = closest_hit(Ray(beam.from.xyz, direction));
     float object = hit.triangle < 0 ? 1e30 : hit.distance;
     float real = meets_real(beam.from.xyz, direction, min(object, reach));
@@ -145,10 +148,86 @@ void send(Spot spot, vec3 direction, vec3 flux, float spread, Drift x, Drift y) 
     if (at < uint(beams.length())) beams[at] = beam;
 }
 
+ivec2 texel_of_ray(LightView view, ivec2 block, vec4 numbers) {
+    return ivec2(view.tile.xy) + ivec2((vec2(block) + numbers.zw) * float(block_edge));
+}
+
+#ifdef REFRACTED
+const int MOST_SURFACES = 12;    // that a path meets
+const float LEAST_PART = 0.01;   // of the light, that a path must keep
+
+// A path through transparent objects: where it leaves them, and what is left of its light. `ways`: whether it was reflected (1) or
+// went on (0) at each surface, after a leading 1; 0 where there is no such path. `bent`: how far rough surfaces turn it, relative to
+// a mirror's lobe.
+struct Passage { uint ways; vec3 from; vec3 direction; vec3 part; float bent; };
+
+Passage passage(LightView view, vec2 s) {
+    vec3 start = ray_point(view, s, view.range.z > 0.5 ? 0.0 : view.range.x);
+    Ray ray = Ray(start, normalize(ray_point(view, s, 2.0) - ray_point(view, s, 1.0)));
+    Passage way = Passage(1u, ray.from, ray.direction, vec3(1.0), 0.0);
+    int medium = -1;
+    for (int met = 0; met < MOST_SURFACES; ++met) {
+        MeshHit hit = closest_hit(ray);
+        bool ends = hit.triangle < 0 || !is_transparent(material_of_triangle(max(hit.triangle, 0)));
+        if (ends) { if (met == 0) way.ways = 0u; break; }
+        Interface i = interface_at(hit, ray, 0.0);
+        way.part *= kept_over(medium, hit.distance);
+        bool inside = medium >= 0;
+        vec3 reflectance = interface_reflectance(i, ray.direction, inside);
+        bool back = inside && reflectance.r == 1.0;
+        way.direction = back ? mirrored(i, ray.direction) : refracted(i, ray.direction, inside);
+        if (!back) {
+            way.part *= (1.0 - reflectance) * i.surface.passing;
+            medium = inside || materials[i.material].medium.w == 0.0 ? -1 : i.material;
+            float bent = max(materials[i.material].medium.w, 1.0) - 1.0, alpha = i.surface.roughness * i.surface.roughness;
+            way.bent = length(vec2(way.bent, 0.5 * bent * alpha));
+        }
+        way.from = leave(i, way.direction);
+        way.ways = way.ways << 1u | (back ? 1u : 0u);
+        ray = Ray(way.from, way.direction);
+    }
+    return way;
+}
+
+// Drift of a path from this texel to the next block along `axis`.
+Drift drift_through(LightView view, ivec2 texel, ivec2 axis, Passage here, float side) {
+    int apart = max(block_edge / 2, 1);
+    for (int sign = 1; sign >= -1; sign -= 2) {
+        Passage other = passage(view, texel_lateral(view, texel + sign * apart * axis));
+        if (other.ways != here.ways) continue;
+        float blocks = float(sign * block_edge) / float(apart) * RAYS_APART;
+        return Drift(blocks * (other.from - here.from), blocks * (other.direction - here.direction));
+    }
+    vec3 across = transpose(mat3(view.view_from_world)) * vec3(vec2(axis), 0.0) * side * float(block_edge) * RAYS_APART;
+    return Drift(across, vec3(0.0));
+}
+
+bool lets_through(int material) {
+    float roughness = materials[material].dielectric.a;
+    return is_transparent(material) && roughness * roughness < greatest_alpha;
+}
+
+void cast_ray(Light light, LightView view, ivec2 block, int j) {
+    ivec2 texel = texel_of_ray(view, block, ray_numbers(block, j));
+    Spot spot = spot_at(view, texel);
+    if (!spot.present || !lets_through(spot.material)) return;
+    vec3 to_light; float radius;
+    light_at(light, spot.point, spot.normal, to_light, radius);
+    vec2 s = texel_lateral(view, texel);
+    vec3 flux = float(block_edge * block_edge) / float(RAY_COUNT) * texel_light(light, view, s);
+    if (flux == vec3(0.0)) return;
+    flux *= real_visibility(light, spot.point, spot.normal, bias_real);
+    Passage way = passage(view, s);
+    if (way.ways == 0u || all(lessThan(way.part, vec3(LEAST_PART)))) return;
+    float side = texel_side(view, (view.view_from_world * vec4(spot.point, 1.0)).z);
+    Drift x = drift_through(view, texel, ivec2(1, 0), way, side), y = drift_through(view, texel, ivec2(0, 1), way, side);
+    send(way.from, way.direction, flux * way.part, length(vec2(LOBE_DEVIATION * way.bent, 0.5 * radius)), x, y);
+}
+#else
 // Ray j of a block: its texel is one of RAY_COUNT spread evenly over the block, which share the block's flux.
-void reflect_ray(Light light, LightView view, ivec2 block, int j) {
+void cast_ray(Light light, LightView view, ivec2 block, int j) {
     vec4 numbers = ray_numbers(block, j);
-    ivec2 texel = ivec2(view.tile.xy) + ivec2((vec2(block) + numbers.zw) * float(block_edge));
+    ivec2 texel = texel_of_ray(view, block, numbers);
     Spot spot = spot_at(view, texel);
     if (!spot.present || !is_wanted(texel, spot.material)) return;
     vec3 to_light; float radius;
@@ -173,13 +252,14 @@ void reflect_ray(Light light, LightView view, ivec2 block, int j) {
     float spread = length(vec2(LOBE_DEVIATION * alpha * LOBE_FRACTION, 0.5 * radius));   // half a disc's radius
     float side = texel_side(view, (view.view_from_world * vec4(spot.point, 1.0)).z);
     Drift x = drift_along(view, texel, ivec2(1, 0), spot, side), y = drift_along(view, texel, ivec2(0, 1), spot, side);
-    send(spot, direction, flux, spread, x, y);
+    send(spot.point + normal_offset * spot.normal, direction, flux, spread, x, y);
 }
+#endif
 
 void main() {
     LightView view = light_views[view_index];
     ivec3 at = ivec3(gl_GlobalInvocationID);
     Light light = lights[light_of_view(view_index)];
     if (any(greaterThanEqual(at.xy * block_edge, ivec2(view.tile.zz))) || is_image(light)) return;
-    reflect_ray(light, view, at.xy, at.z);
+    cast_ray(light, view, at.xy, at.z);
 }

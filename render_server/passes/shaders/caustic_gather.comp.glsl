@@ -5,6 +5,7 @@
 #define ADDS_CAUSTICS
 #include "common/beam_footprint.glsl"
 #include "common/camera.glsl"
+#include "common/lit_pixels.glsl"
 
 layout(local_size_x = 8, local_size_y = GROUP_ROWS) in;
 const int THREADS = 64 / ROWS;
@@ -23,7 +24,7 @@ shared uint picked[THREADS];
 // What light this texel needs.
 uint needs(ivec2 texel) {
     if (any(greaterThanEqual(texel, textureSize(sample_pixels, 0)))) return 0u;
-    ivec4 pixels = texelFetch(sample_pixels, texel, 0);
+    ivec4 pixels = lit_pixels(texelFetch(sample_pixels, texel, 0));
     uint found = (pixels.x >= 0 ? REAL : 0u) | (pixels.z >= 0 ? OBJECT : 0u);
 #ifdef REUSES
     found &= texelFetch(stale_texels, texel, 0).r;
@@ -42,7 +43,7 @@ void pick(uint i, uint count, ivec2 tile, int layer) {
 struct Texel { ivec2 place; bool needed; vec3 p; vec3 normal; ivec3 sum; };
 
 Texel texel_at(ivec2 place, uint needed, int layer) {
-    ivec4 pixels = texelFetch(sample_pixels, place, 0);
+    ivec4 pixels = lit_pixels(texelFetch(sample_pixels, place, 0));
     Texel t;
     t.place = place;
     t.needed = (needed & (layer == REAL_LAYER ? REAL : OBJECT)) != 0u;

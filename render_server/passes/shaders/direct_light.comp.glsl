@@ -1,5 +1,6 @@
 // Direct irradiance of the real surface at each pixel without and with the virtual objects (docs/method.md 3, direct), and
 // the light lobes on declared specular surfaces.
+#include "common/lit_pixels.glsl"
 #include "common/light_reach.glsl"
 #include "common/brdf.glsl"
 #include "common/surfaces.glsl"
@@ -7,6 +8,7 @@
 #include "common/work_list.glsl"
 
 layout(local_size_x = 64) in;
+uniform float beam_alpha;
 layout(rgba16f) uniform image2D direct_mu;              // rgb E_mu; a: unshadowed E, mean of channels
 layout(rgba16f) writeonly uniform image2D direct_rho;   // rgb E_rho
 layout(rgba16f) writeonly uniform image2D lobe_mu;      // rgb radiance of light lobes
@@ -40,13 +42,14 @@ void light(ivec2 pixel, ivec2 size) {
             if (cosine <= 0.0) continue;
             vec2 seen = light_visibility(lights[i], position.xyz, normal.xyz, bias);
             e_mu += across * cosine * seen.x;
-            e_rho += across * cosine * seen.y;
+            vec3 arrives = arriving(lights[i], position.xyz, seen, beam_alpha);
+            e_rho += across * cosine * arrives;
             unshadowed += dot(across, vec3(1.0 / 3.0)) * cosine;
             if (specular_surfaces && normal.w >= 0.0) {
                 SurfaceEntry e = surfaces[int(normal.w)];
                 vec3 lobe = across * specular_times_cosine(normal.xyz, v, l, e.f0.rgb, e.surface.x, radius);
                 s_mu += lobe * seen.x;
-                s_rho += lobe * seen.y;
+                s_rho += lobe * arrives;
             }
         }
     }

@@ -19,6 +19,12 @@
 #include "common/surfel_light.glsl"
 #include "common/environment.glsl"
 #include "common/brdf.glsl"
+#ifdef VIRTUAL
+#pragma switch TRANSMISSION
+#endif
+#ifdef REAL_DELTA
+#pragma switch TRANSMISSION
+#endif
 #ifndef GATHERED
 #include "common/lights.glsl"
 #endif
@@ -79,7 +85,7 @@ void irradiances(Surfel s, vec3 n, uint own, out vec3 mu, out vec3 rho) {
         if (cosine <= 0.0) continue;
         vec2 v = light_fraction(lights[i], p, n);
         mu += across * cosine * v.x;
-        rho += across * cosine * v.y;
+        rho += across * cosine * arriving(lights[i], p, v, 0.0);
     }
     if (keep_light) {
 #ifndef REAL_RHO
@@ -96,7 +102,8 @@ void irradiances(Surfel s, vec3 n, uint own, out vec3 mu, out vec3 rho) {
 }
 #endif
 
-void add(uint voxel, vec3 n, float area, vec3 radiance) {
+// `opaque`: fraction of the surface that lets no light through.
+void add(uint voxel, vec3 n, float area, float opaque, vec3 radiance) {
     int slot = int(grid[voxel]) - 1;
     float scale = area / (voxel_edge * voxel_edge);
     for (int k = 0; k < 6; ++k) {
@@ -108,7 +115,7 @@ void add(uint voxel, vec3 n, float area, vec3 radiance) {
 #else
         int at = slot * SUMS_PER_SLOT;
 #if !defined(GATHERED) || defined(SOLUTION)
-        atomicAdd(sums[at + COVERAGE + k], fixed_point(facing));
+        atomicAdd(sums[at + COVERAGE + k], fixed_point(facing * opaque));
 #endif
         for (int j = 0; j < 3; ++j) atomicAdd(sums[at + RADIANCE + k * 3 + j], fixed_point(radiance[j] * facing));
 #endif
@@ -205,11 +212,16 @@ void light(Surfel s, uint own, vec3 n) {
     ivec3 v = voxel_of_index(voxel, volume_size);
     for (int j = 0; j < 3; ++j) { atomicMin(support[j], v[j]); atomicMin(support[3 + j], -v[j]); }
 #endif
-    float area = s.position_area.w;
+    float area = s.position_area.w, opaque = 1.0;
 #if defined(VIRTUAL) && defined(MATERIAL_MAPS)
     area *= opacity_of(int(s.normal_material.w), s.uv_voxel.xy, sqrt(area));
 #endif
-    add(voxel, n, area, radiance);
+#if defined(VIRTUAL) && defined(TRANSMISSION)
+    Material m = material_of(int(s.normal_material.w), s.uv_voxel.xy, s.tint.rgb, sqrt(s.position_area.w));
+    vec3 passing = m.passing * (1.0 - mean_specular_reflectance(m.f0, m.roughness));
+    opaque -= dot(passing, vec3(1.0 / 3.0));
+#endif
+    add(voxel, n, area, opaque, radiance);
 }
 
 void main() {

@@ -1,5 +1,7 @@
 // The virtual objects in the mirror image of smooth real surfaces: rays over each pixel and its lobe. One invocation
 // per ray; a pixel's rays are adjacent in a workgroup and summed there.
+#pragma switch TRANSMISSION
+#define OPAQUE_SHADOWS   // that buffer would be one too many
 #include "common/lights.glsl"
 #include "common/brdf.glsl"
 #include "common/environment.glsl"
@@ -58,7 +60,13 @@ vec4 trace(ivec2 pixel, Ray ray, out float met_at) {
     Indirect indirect = gathered(pixel, s, distance(camera_position, ray.from) + hit.distance, open);
     Material material = material_of(s.material, s.uv, s.tint, 0.0);
     vec3 radiance = object_radiance(s.position, distance(camera_position, s.position), s.normal, -ray.direction, material, indirect);
+#ifdef TRANSMISSION
+    // What is behind goes on below the object, unrefracted.
+    vec3 passing = material.passing * (1.0 - specular_reflectance(material.f0, material.roughness, -dot(s.normal, ray.direction)));
+    return open * vec4(radiance, 1.0 - dot(passing, vec3(1.0 / 3.0)));
+#else
     return open * vec4(radiance, 1.0);
+#endif
 }
 
 void main() {

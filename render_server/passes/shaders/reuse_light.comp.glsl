@@ -2,6 +2,7 @@
 #include "common/geometry.glsl"
 #include "common/reprojection.glsl"
 #include "common/last_texels.glsl"
+#include "common/lit_pixels.glsl"
 
 layout(local_size_x = 8, local_size_y = 8) in;
 uniform isampler2D sample_pixels;
@@ -39,7 +40,7 @@ void reuse(ivec2 texel, int layer, vec4 position, vec3 normal) {
 void main() {
     ivec2 texel = ivec2(gl_GlobalInvocationID.xy);
     if (any(greaterThanEqual(texel, textureSize(sample_pixels, 0)))) return;
-    ivec4 pixels = texelFetch(sample_pixels, texel, 0);
+    ivec4 pixels = lit_pixels(texelFetch(sample_pixels, texel, 0));
     uint stale = texelFetch(stale_texels, texel, 0).r;
 #ifdef CAUSTICS
     if (pixels.x >= 0 && (stale & STALE_REAL) == 0u)

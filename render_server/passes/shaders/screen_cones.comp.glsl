@@ -1,67 +1,32 @@
 // Reflections of the visible real scene in smooth virtual surfaces, by cones across the picture ([D] 4.4.2): the
 // picture's radiance there, times the objects' change of its light. What a cone does not find in the picture it looks
 // up in voxels (VOXELS), or that fraction of the lobe is left to other passes.
-#include "common/screen_march.glsl"
 #include "common/brdf.glsl"
+#include "common/look.glsl"
 #include "common/ray_mesh.glsl"
 #include "common/shown_maps.glsl"
 #include "common/lobe.glsl"
-#include "common/upsample.glsl"
 #include "common/work_list.glsl"
 #include "common/surface_change.glsl"
-#ifdef VOXELS
-#include "common/march.glsl"
-#include "common/environment.glsl"
-#endif
 
 layout(local_size_x = 64) in;
 layout(rgba16f) writeonly uniform image2D reflected;   // rgb radiance times fraction; a: fraction of the lobe
-uniform sampler2D direct_mu;
-uniform sampler2D direct_rho;
-uniform sampler2D cone_mu;
-uniform sampler2D cone_rho;
 #include "common/camera.glsl"
 
-const float LEAST_IRRADIANCE = 1e-4;
 const float CLEAR = 1e-3;   // of the depth: distance of a ray's start from its own surface
-
-// E_rho / E_mu where a pixel sees a real surface, also behind objects.
-vec3 change_of_light(vec2 at) {
-    ivec2 pixel = clamp(ivec2(at), ivec2(0), textureSize(direct_mu, 0) - 1);
-    vec3 mu = vec3(0.0), rho = vec3(0.0);
-    float total = 0.0;
-    for (int j = 0; j < 4; ++j) {
-        float w;
-        ivec2 texel = low_texel(pixel, j, w);
-        if (texelFetch(sample_pixels, texel, 0).x == -1) continue;
-        vec4 e_mu = texelFetch(cone_mu, texel, 0), e_rho = texelFetch(cone_rho, texel, 0);
-        mu += w * e_mu.rgb;
-        rho += w * mix(e_mu.rgb, e_rho.rgb, e_rho.a);
-        total += w;
-    }
-    if (total == 0.0) return vec3(1.0);
-    mu = mu / total + texelFetch(direct_mu, pixel, 0).rgb;
-    rho = rho / total + texelFetch(direct_rho, pixel, 0).rgb;
-    return (max(rho, vec3(0.0)) + LEAST_IRRADIANCE) / (mu + LEAST_IRRADIANCE);
-}
 
 // Radiance times fraction of one cone, across the picture.
 vec4 look_across(vec3 from, vec3 d, float spread) {
     ScreenHit hit = screen_hit(from, d, spread);
     if (hit.fraction <= 0.0 || closest_hit(Ray(from, d)).distance < hit.distance) return vec4(0.0);
-    return hit.fraction * vec4(screen_radiance(hit, spread) * change_of_light(hit.pixel), 1.0);
+    return shown_at(hit, spread);
 }
 
 // The same, through everything that the cone may hit.
 vec4 look(vec3 from, vec3 d, float spread) {
     vec4 seen = look_across(from, d, spread);
 #ifdef VOXELS
-    if (seen.a < 1.0) {
-        bool differs;
-        Crossed met = march_one(mipmap_rho, volume_coordinate(from), d, spread, differs);
-        vec3 behind = (1.0 - blocked_fraction(met.coverage)) * environment(d, atan(0.5 * spread));
-        seen += (1.0 - seen.a) * vec4(met.c + behind, 1.0);
-    }
+    if (seen.a < 1.0) seen += (1.0 - seen.a) * vec4(look_in_voxels(from, d, spread), 1.0);
 #endif
     return seen;
 }

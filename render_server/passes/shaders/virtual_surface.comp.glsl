@@ -1,5 +1,6 @@
 // Radiance of the virtual surfaces (docs/method.md 4.7): direct light shadowed by real and virtual geometry, GGX lobes,
 // diffuse cones and the specular cone of the rho set.
+#include "common/lit_pixels.glsl"
 #include "common/lights.glsl"
 #include "common/brdf.glsl"
 #include "common/geometry.glsl"

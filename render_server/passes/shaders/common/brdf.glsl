@@ -31,6 +31,16 @@ vec3 fresnel_schlick(vec3 f0, float cosine) {
     return has_interface(f0) ? f0 + (1.0 - f0) * grazing_weight(cosine) : vec3(0.0);
 }
 
+// Fresnel's reflectance for unpolarised light; `eta`: index on this side over the one beyond. 1: total reflection.
+float fresnel_dielectric(float cosine, float eta) {
+    float sine2 = eta * eta * max(1.0 - cosine * cosine, 0.0);
+    if (sine2 >= 1.0) return 1.0;
+    float beyond = sqrt(1.0 - sine2);
+    float across = (eta * cosine - beyond) / (eta * cosine + beyond);
+    float along = (cosine - eta * beyond) / (cosine + eta * beyond);
+    return 0.5 * (across * across + along * along);
+}
+
 // Directional albedo of the lobe as if every microfacet reflected all light (x) or (1 - cosine)^5 of it (y): rational fits
 // in the roots of the cosine and of alpha to the integrals, within 0.012 from cosine 0.05 on.
 vec2 lobe_albedo(float roughness, float n_dot_v) {

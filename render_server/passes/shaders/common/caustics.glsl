@@ -2,6 +2,7 @@
 // geometry.glsl.
 #include "common/caustic_sums.glsl"
 #include "common/upsample.glsl"
+#include "common/lit_pixels.glsl"
 
 uniform bool has_caustics;       // the sums are bound
 
@@ -13,7 +14,7 @@ vec3 caustic_irradiance(ivec2 pixel, ivec2 size, int layer, vec3 p, vec3 n, floa
     for (int j = 0; j < 4; ++j) {
         float w;
         ivec2 texel = low_texel(pixel, j, w);
-        ivec4 at = texelFetch(sample_pixels, texel, 0);
+        ivec4 at = lit_pixels(texelFetch(sample_pixels, texel, 0));
         if ((layer == REAL_LAYER ? at.x : at.z) < 0) continue;
         ivec2 raster = raster_texel(at.zw);
         vec3 sp = layer == REAL_LAYER ? texelFetch(real_surface_position, at.xy, 0).xyz : texelFetch(virtual_raster_position, raster, 0).xyz;

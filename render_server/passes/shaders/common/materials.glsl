@@ -13,6 +13,7 @@ struct MaterialEntry {
     vec4 dielectric;   // F0 rgb; roughness
     vec4 emission;     // rgb radiance, camera units; transmission
     vec4 flags;        // double-sided
+    vec4 medium;       // absorption, 1/m rgb; index of refraction, 0: thin
 #ifdef MATERIAL_MAPS
     vec4 alpha;        // mode, alpha, repeats of the base colour's map per m
     MapEntry maps[5];
@@ -20,6 +21,8 @@ struct MaterialEntry {
 };
 layout(std430) readonly buffer Materials { MaterialEntry materials[]; };
 
+// Of a Material: `passing` is the fraction of the light entering the surface that goes on through it, `diffuse` what of
+// the rest comes back.
 #ifdef MATERIAL_MAPS
 uniform sampler2DArray color_maps;   // linear; a: alpha, of a mask the fraction that is there
 uniform sampler2DArray data_maps;
@@ -30,12 +33,14 @@ const float MASKED = 1.0, BLENDED = 2.0;   // modes of alpha
 const float APART = 5.588238;              // of the noise of materials and sides: what lies behind is left out elsewhere
 const float COARSEST = 32.0;   // mip level: a texture's mean
 
-struct Material { vec3 diffuse; vec3 f0; float roughness; vec3 emission; float occlusion; };
+struct Material { vec3 diffuse; vec3 f0; float roughness; vec3 emission; float occlusion; vec3 passing; };
 
 Material mapped(MaterialEntry e, vec3 base, float metallic, float roughness, float occlusion, vec3 glow) {
     metallic *= e.base_color.a;
     vec3 f0 = mix(e.dielectric.rgb, base, metallic);
-    return Material(base * (1.0 - metallic), f0, e.dielectric.a * roughness, e.emission.rgb * glow, occlusion);
+    vec3 entering = base * (1.0 - metallic);
+    return Material(entering * (1.0 - e.emission.a), f0, e.dielectric.a * roughness, e.emission.rgb * glow, occlusion,
+        entering * e.emission.a);
 }
 
 bool has_map(MapEntry m) { return m.u.w >= 0.0; }
@@ -95,14 +100,16 @@ bool is_cut_out(int index, float opacity, float even) {
 float even_noise(vec2 place) { return fract(52.9829189 * fract(dot(place, vec2(0.06711056, 0.00583715)))); }
 
 #else
-struct Material { vec3 diffuse; vec3 f0; float roughness; vec3 emission; };
+struct Material { vec3 diffuse; vec3 f0; float roughness; vec3 emission; vec3 passing; };
 
 // `tint`: the vertex colour, which multiplies the base colour. `size` (of a footprint, m) and `uv` are for maps.
 Material material_of(int index, vec2 uv, vec3 tint, float size) {
     MaterialEntry e = materials[index];
     vec3 base = e.base_color.rgb * tint;
     Material m;
-    m.diffuse = base * (1.0 - e.base_color.a);
+    vec3 entering = base * (1.0 - e.base_color.a);
+    m.diffuse = entering * (1.0 - e.emission.a);
+    m.passing = entering * e.emission.a;
     m.f0 = mix(e.dielectric.rgb, base, e.base_color.a);
     m.roughness = e.dielectric.a;
     m.emission = e.emission.rgb;

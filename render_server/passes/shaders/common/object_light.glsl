@@ -2,6 +2,7 @@
 #include "common/gathered_light.glsl"
 
 uniform float noise_sigma;      // m at 1 m
+uniform float beam_alpha;       // of the roughest transparent objects through which beams bring light; 0: none do
 uniform float normal_offset;    // m: against self-shadowing by the virtual depth map
 
 vec3 direct_radiance(vec3 p, float depth, vec3 n, vec3 v, Material m) {
@@ -11,7 +12,9 @@ vec3 direct_radiance(vec3 p, float depth, vec3 n, vec3 v, Material m) {
         vec3 across = light_at(lights[i], p, n, l, radius);
         float cosine = dot(n, l);
         if (cosine <= 0.0) continue;
-        float seen = visibility(lights[i], p + normal_offset * n, n, 3.0 * noise_sigma * depth * depth, 0.0).y;
+        vec3 lifted = p + normal_offset * n;
+        vec2 fraction = visibility(lights[i], lifted, n, 3.0 * noise_sigma * depth * depth, 0.0);
+        vec3 seen = arriving(lights[i], lifted, fraction, beam_alpha);
         vec3 base = m.diffuse / PI * diffuse_under_lobe(m.f0, m.roughness, cosine, dot(n, v));
         vec3 response = base * cosine + specular_times_cosine(n, v, l, m.f0, m.roughness, radius);
         sum += across * seen * response;

@@ -2237,6 +2237,25 @@ export interface components {
          */
         readonly Material: {
             /**
+             * Attenuation Color
+             * @description Colour that white light has after `attenuation_distance_m` inside, linear R G B, 0..1.
+             * @default [
+             *       1,
+             *       1,
+             *       1
+             *     ]
+             */
+            readonly attenuation_color: readonly [
+                number,
+                number,
+                number
+            ];
+            /**
+             * Attenuation Distance M
+             * @description Path inside after which light has `attenuation_color`, metres. null = clear.
+             */
+            readonly attenuation_distance_m?: number | null;
+            /**
              * Base Color
              * @description Linear R G B reflectance, 0..1.
              * @default [
@@ -2288,8 +2307,14 @@ export interface components {
              */
             readonly specular: number;
             /**
+             * Thin Walled
+             * @description true = a sheet without thickness, which bends no light; false = a solid body.
+             * @default false
+             */
+            readonly thin_walled: boolean;
+            /**
              * Transmission
-             * @description Share of light that passes through, 0..1.
+             * @description Share of the light that enters the surface and passes through it, 0..1; the rest is diffuse. Each surface that light passes multiplies it by base_color. Refraction is by ior, or as specular has it.
              * @default 0
              */
             readonly transmission: number;

@@ -93,6 +93,9 @@ const PLAIN: Material = {
   ior: null,
   emission: [0, 0, 0],
   transmission: 0,
+  thin_walled: false,
+  attenuation_color: [1, 1, 1],
+  attenuation_distance_m: null,
 };
 
 /** The material that an object's file gives it, to begin an override with. */

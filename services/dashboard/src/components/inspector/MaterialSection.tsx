@@ -42,7 +42,7 @@ function MaterialFields({ item, material, disabled }: MaterialFieldsProps) {
   const gesture = useGesture(objectTarget(item.id));
   const push = (change: Partial<Material>): void => gesture.push({ material: change });
   const help = (key: keyof Material): string => schemas.value.Material?.properties?.[key]?.description ?? "";
-  const shares = ["roughness", "metallic", "specular"] as const;
+  const shares = ["roughness", "metallic", "specular", "transmission"] as const;
   return (
     <>
       <div class="presets" role="group" aria-label="Materials to begin with">

@@ -1,0 +1,135 @@
+// What transparent objects show of what is behind them (docs/method.md 4.11): rays from the camera through their surfaces, which
+// refract and reflect them, and on into the picture, voxels or environment. Added to what the objects' surfaces reflect.
+#include "common/brdf.glsl"
+#include "common/environment.glsl"
+#include "common/look.glsl"
+#include "common/ray_mesh.glsl"
+#include "common/refraction.glsl"
+#include "common/work_list.glsl"
+
+layout(local_size_x = 64) in;
+layout(rgba16f) readonly uniform image2D reflected_radiance;   // of the objects
+layout(rgba16f) writeonly uniform image2D radiance_out;
+uniform sampler2D object_coverage;
+uniform float pixel_size;      // m at 1 m depth
+#include "common/camera.glsl"
+
+const int MOST_SURFACES = 24;      // that the paths of one ray may meet
+const int HELD = 4;                // paths that wait
+const float LEAST_WEIGHT = 0.004;  // of a path that goes on: a step of 8-bit codes
+
+struct Path { vec3 from; vec3 direction; vec3 weight; int medium; };
+
+Path held[HELD];
+int held_count;
+
+float greatest(vec3 c) { return max(max(c.r, c.g), c.b); }
+
+void hold(vec3 from, vec3 direction, vec3 weight, int medium) {
+    if (held_count < HELD && greatest(weight) > LEAST_WEIGHT) held[held_count++] = Path(from, direction, weight, medium);
+}
+
+// What a path sees that leaves the transparent objects; `object`: distance of the next surface of any object.
+vec3 outside(vec3 from, vec3 d, float spread, float object) {
+    ScreenHit hit = screen_hit(from, d, spread);
+    vec4 seen = hit.fraction > 0.0 && hit.distance < object ? shown_at(hit, spread) : vec4(0.0);
+#ifdef VOXELS
+    if (seen.a < 1.0) seen.rgb += (1.0 - seen.a) * look_in_voxels(from, d, spread);
+#else
+    seen.rgb += (1.0 - seen.a) * environment(d, atan(0.5 * spread));
+#endif
+    return seen.rgb;
+}
+
+// Holds what the surface makes of a path: one part goes on through it, the other is reflected. That part of the path
+// from the camera is the surface's own reflection already.
+void divide(Interface i, Path path, bool first) {
+    bool inside = path.medium >= 0;
+    vec3 reflectance = interface_reflectance(i, path.direction, inside);
+    int beyond = inside || materials[i.material].medium.w == 0.0 ? -1 : i.material;
+    vec3 back = mirrored(i, path.direction), through = refracted(i, path.direction, inside);
+    if (!first) hold(leave(i, back), back, path.weight * reflectance, path.medium);
+    hold(leave(i, through), through, path.weight * (1.0 - reflectance) * i.surface.passing, beyond);
+}
+
+// Radiance along all paths of a ray that meets a transparent surface first.
+vec3 follow(Ray ray, MeshHit hit, float spread) {
+    vec3 sum = vec3(0.0);
+    held_count = 0;
+    float length_m = hit.distance;
+    divide(interface_at(hit, ray, pixel_size * length_m), Path(ray.from, ray.direction, vec3(1.0), -1), true);
+    for (int met = 0; met < MOST_SURFACES && held_count > 0; ++met) {
+        Path path = held[--held_count];
+        Ray next = Ray(path.from, path.direction);
+        MeshHit object = closest_hit(next);
+        bool stops = object.triangle < 0 || !is_transparent(material_of_triangle(max(object.triangle, 0)));
+        bool shown = false;
+        if (path.medium < 0 && !stops) {
+            ScreenHit real = screen_hit(path.from, path.direction, spread);
+            shown = real.fraction > 0.0 && real.distance < object.distance;
+        }
+        if (stops || shown || met == MOST_SURFACES - 1) {
+            float inside_m = object.triangle < 0 ? 0.0 : object.distance;
+            sum += path.weight * kept_over(path.medium, inside_m) * outside(path.from, path.direction, spread, object.distance);
+        } else {
+            path.weight *= kept_over(path.medium, object.distance);
+            divide(interface_at(object, next, pixel_size * (length_m + object.distance)), path, false);
+        }
+    }
+    return sum;
+}
+
+Ray camera_ray(ivec2 pixel, vec2 within) {
+    vec2 ray = texelFetch(picture_rays, pixel, 0).xy + within / camera_pinhole.xy;
+    return Ray(camera_position, normalize(transpose(mat3(camera_from_world)) * vec3(ray, 1.0)));
+}
+
+vec2 place_within(int j) { return fract(float(j) * vec2(0.7548776662, 0.5698402910) + 0.5) - 0.5; }
+
+// Diameter at distance 1 of what a ray stands for: each of two rough surfaces turns it by n - 1 of the turn of its microfacets, and so
+// do both curved ones from ray to ray, `turned` apart.
+float spread_behind(Interface first, float turned) {
+    float bent = max(materials[first.material].medium.w, 1.0) - 1.0;
+    float alpha = first.surface.roughness * first.surface.roughness;
+    return bent * length(vec2(sqrt(2.0) * MEDIAN_DISC * alpha, 2.0 * turned)) + pixel_size;
+}
+
+// Radiance through the transparent surface of a pixel, by rays spread evenly over it.
+vec3 transmitted(ivec2 pixel) {
+    MeshHit hits[RAY_COUNT];
+    vec3 normals[RAY_COUNT];
+    for (int j = 0; j < RAY_COUNT; ++j) {
+        Ray ray = camera_ray(pixel, place_within(j));
+        hits[j] = closest_hit(ray);
+        if (hits[j].triangle < 0) continue;
+        if (!is_transparent(material_of_triangle(hits[j].triangle))) { hits[j].triangle = -1; continue; }
+        normals[j] = interface_at(hits[j], ray, 0.0).normal;
+    }
+    vec3 sum = vec3(0.0);
+    float count = 0.0;
+    for (int j = 0; j < RAY_COUNT; ++j) {
+        if (hits[j].triangle < 0) continue;
+        float turned = 0.0;
+        for (int k = 0; k < RAY_COUNT; ++k)
+            if (hits[k].triangle >= 0) turned = max(turned, distance(normals[j], normals[k]));
+        Ray ray = camera_ray(pixel, place_within(j));
+        sum += follow(ray, hits[j], spread_behind(interface_at(hits[j], ray, 0.0), turned));
+        count += 1.0;
+    }
+    return sum / max(count, 1.0);
+}
+
+// The pixels of the texels that show an object.
+void main() {
+    ivec2 size = imageSize(radiance_out);
+    int grid_width = textureSize(sample_pixels, 0).x;
+    uint block = uint(scale * scale);
+    for (uint i = first_item(); i < listed_count() * block; i += items_apart()) {
+        ivec2 pixel = pixel_in_block(texel_of_index(texels[i / block], grid_width), int(i % block), scale);
+        if (any(greaterThanEqual(pixel, size)) || texelFetch(object_coverage, pixel, 0).r <= 0.0) continue;
+        vec4 own = imageLoad(reflected_radiance, pixel);
+        int shown = int(texelFetch(virtual_raster_normal, raster_texel(pixel), 0).w);
+        if (is_transparent(shown)) own.rgb += transmitted(pixel);
+        imageStore(radiance_out, pixel, own);
+    }
+}
