@@ -1,8 +1,8 @@
 """Marker detection in pictures, and the two poses of a flat target, for board, lamps and calibration."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable, Iterator
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -26,6 +26,13 @@ LEAST_SIDE_PX = 10
 Quads = dict[int, Float64[np.ndarray, "4 2"]]
 
 
+class Seen(NamedTuple):
+    """Corners of markers that were read, by id, and of quads of which nothing was read (pixels, clockwise)."""
+
+    quads: Quads
+    unread: Float64[np.ndarray, "n 4 2"]
+
+
 class MarkerFinder:
     """Finds the markers of one board's dictionary and refines their corners."""
 
@@ -34,14 +41,15 @@ class MarkerFinder:
 
     def quads(self, gray: UInt8[np.ndarray, "h w"], wanted: Collection[int]) -> Quads:
         """Return the corners of every wanted marker that is large enough to be read, by id."""
-        found, ids, _ = self._detector.detectMarkers(gray)
-        named = zip(() if ids is None else ids.ravel(), found, strict=True)
-        quads = {int(name): quad.reshape(4, 2).astype(np.float64) for name, quad in named}
-        return {
-            name: quad
-            for name, quad in quads.items()
-            if name in wanted and shortest_side(quad) >= LEAST_SIDE_PX
-        }
+        return self.seen(gray, wanted).quads
+
+    def seen(self, gray: UInt8[np.ndarray, "h w"], wanted: Collection[int]) -> Seen:
+        """Return the wanted markers that are large enough to be read, and what may be others, of the same size."""
+        found, ids, others = self._detector.detectMarkers(gray)
+        named = zip(() if ids is None else ids.ravel(), _large(found), strict=True)
+        quads = {int(name): quad for name, quad in named if quad is not None and name in wanted}
+        unread = [quad for quad in _large(others) if quad is not None]
+        return Seen(quads, np.array(unread, np.float64).reshape(-1, 4, 2))
 
     def refined(
         self, light: Float32[np.ndarray, "h w"], camera: CameraModel, corners: Float64[np.ndarray, "n 4 2"]
@@ -89,6 +97,13 @@ class MarkerFinder:
         return cv2.aruco.CharucoDetector(
             cv2.aruco.CharucoBoard(size, square, board.marker_length_m, board.opencv_dictionary(), ids)
         )
+
+
+def _large(found: Iterable[np.ndarray]) -> Iterator[Float64[np.ndarray, "4 2"] | None]:
+    """Yield each quad, None in place of those that are too small to be read."""
+    for each in found:
+        quad = each.reshape(4, 2).astype(np.float64)
+        yield quad if shortest_side(quad) >= LEAST_SIDE_PX else None
 
 
 def shortest_side(quad: Float64[np.ndarray, "4 2"]) -> float:
