@@ -16,7 +16,7 @@ from deltalight.sensor_node.marker_finder import (
     Quads,
     linear_luminance,
     planar_poses,
-    shortest_side,
+    shortest_sides,
 )
 
 # Corners with larger residuals, and above three times the median, are occluded and left out.
@@ -40,6 +40,9 @@ class _Matches(NamedTuple):
 
     def only(self, kept: Bool[np.ndarray, " n"]) -> "_Matches":
         return _Matches(*(values[kept] for values in self))
+
+    def with_(self, others: "_Matches") -> "_Matches":
+        return _Matches(*(np.concatenate(both) for both in zip(self, others, strict=True)))
 
 
 class _Solution(NamedTuple):
@@ -103,7 +106,7 @@ class BoardDetector:
             return _Matches(self._chessboard[numbers], pixels, self._camera.unproject(pixels))
         matches = self._matched(light, quads)
         others = self._recognized(matches, quads, unread)
-        return self._matched(light, {**quads, **others}) if others else matches
+        return matches.with_(self._matched(light, others)) if others else matches
 
     def _matched(self, light: Float32[np.ndarray, "h w"], quads: Quads) -> _Matches:
         """Match markers' corners, refined."""
@@ -125,12 +128,13 @@ class BoardDetector:
         places = self._projected(
             solutions[0].camera_from_world, np.array([self._corners[n] for n in missing])
         )
+        turned = np.concatenate([np.roll(unread, turn, axis=1) for turn in range(4)])
         found: Quads = {}
-        for name, place in zip(missing, places, strict=True):
-            turned = np.concatenate([np.roll(unread, turn, axis=1) for turn in range(4)])
+        limits = NEAR_PX + NEAR_FRACTION * shortest_sides(places)
+        for name, place, limit in zip(missing, places, limits, strict=True):
             misses = np.linalg.norm(turned - place, axis=-1).max(axis=-1)
             nearest = int(misses.argmin())
-            if misses[nearest] <= NEAR_PX + NEAR_FRACTION * shortest_side(place):
+            if misses[nearest] <= limit:
                 found[name] = turned[nearest]
         return found
 
