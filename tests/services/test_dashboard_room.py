@@ -155,6 +155,23 @@ def test_the_room_is_looked_at_from_anywhere(stack: Stack, page: Desk) -> None:
     page.shows_newest()
 
 
+def test_the_room_of_fused_depth_is_shown_too(stack: Stack, page: Desk) -> None:
+    """Its surfaces come from all frames so far, and most of them have the newest picture on them."""
+    page.named("button", "Room in 3-D").click()
+    canvas = page.page.locator("canvas.room[data-shown=true]")
+    canvas.wait_for()
+    page.until(lambda: seen(page).std() > 20, "the room of the newest depth")
+    of_depth, document = seen(page), stack.document()
+    page.page.locator("body").press("o")
+    stack.client.put(stack.path, json={**document, "real": {"geometry": "fused"}}).raise_for_status()
+    page.until(lambda: stack.header()["scene"]["revision"] > document["revision"], "the fused scene")
+    page.named("button", "Room in 3-D").click()
+    canvas.wait_for()
+    page.until(lambda: seen(page).std() > 20, "the fused room")
+    page.photograph("room_fused")
+    assert np.abs(seen(page) - of_depth).mean() < 25, "the same room from the same place"
+
+
 def test_a_room_that_is_not_known_yet_says_so(page: Desk) -> None:
     refusal = {"status": 422, "title": "Refused", "type": "urn:deltalight:problem:refused"}
     sentence = "No surface of the room is known yet; ask again when depth shows some."
