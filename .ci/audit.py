@@ -3,7 +3,7 @@
     ./run audit all.zip
 
 The database is given, and nothing is asked over a network: a record (.json), a folder of them, or a .zip such as
-those that https://osv.dev offers for PyPI and npm. Format: OSV schema 1.7 (https://ossf.github.io/osv-schema), `affected`.
+those that https://osv.dev offers for PyPI and npm. Format: OSV schema 1.7, https://ossf.github.io/osv-schema.
 """
 
 import json
